@@ -1,6 +1,7 @@
 """Run a comparison, a loop analysis or a what-if from its request.
 
-The order: readers, alignment, KF, comparison with EKF2, explanations.
+A comparison reads and aligns the recordings, runs KF, compares it with EKF2, and explains the
+difference.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ import numpy as np
 from px4fuse.comparison.causal_replays import (
     Intervention,
     Trial,
-    interventions,
     planned_variants,
+    run_interventions,
 )
 from px4fuse.comparison.comparison import compare, compare_prepared
 from px4fuse.comparison.difference_steps import explain_ekf2_difference, explanation_variants
@@ -64,7 +65,7 @@ from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
 if TYPE_CHECKING:
     from px4fuse.loop.model import Loop
 
-# The report contains one noise estimate for both horizontal axes; `px4fuse tune` has each axis
+# The report contains one noise estimate for both horizontal axes; `px4fuse tune` prints all axes
 REPORTED_AXES = (HORIZONTAL, "down")
 
 
@@ -128,13 +129,13 @@ class Analysis(Comparison):
     @cached_property
     def _reruns(self) -> tuple[tuple[Intervention, ...], tuple[Trial, ...]]:
         model = self.ekf2_model
-        tried = interventions(
+        reruns = run_interventions(
             self, self.tuning, self.clock, self.heading, self.bias_scale_jump_fit, model
         )
-        if isinstance(model, Model):  # frees most of the memory; later requests replay again
+        if isinstance(model, Model):  # frees most of the memory; later replays are computed again
             model.runs.clear()
             model.intervals.clear()
-        return tried
+        return reruns
 
     @cached_property
     def bias_scale_jump_fit(self) -> BiasScaleJumpFit | Unavailable:
@@ -157,7 +158,7 @@ class Analysis(Comparison):
     def time_correlation_fit(
         self,
     ) -> tuple[SourceLowPass | Unavailable, TimeCorrelatedNoise | Unavailable]:
-        """Low pass and time-correlated noise of the position source, without position jumps."""
+        """Low-pass filter and time-correlated noise of the source, with jumps removed."""
         horizontal = self._horizontal_estimate()
         if isinstance(horizontal, Unavailable):
             return horizontal, horizontal
@@ -167,11 +168,11 @@ class Analysis(Comparison):
             if isinstance(self.bias_scale_jump_fit, BiasScaleJumpFit)
             else ()
         )
-        # the exact time of a jump is unknown: exclude the measurements after it
+        # measurements just after a jump are excluded, because the exact time of the jump is unknown
         time_s, excluded_s = axes[0].measurement_time_s, axis_tuning.outlier_time_s
         for jump in jumps:
-            near = (time_s >= jump.time_s) & (time_s < jump.time_s + OUTLIERS_AFTER_STEP_S)
-            excluded_s = np.union1d(excluded_s, time_s[near])
+            is_after_jump = (time_s >= jump.time_s) & (time_s < jump.time_s + OUTLIERS_AFTER_STEP_S)
+            excluded_s = np.union1d(excluded_s, time_s[is_after_jump])
         correlation_fit = fit_time_correlation(
             self.flight,
             axes,
@@ -183,16 +184,18 @@ class Analysis(Comparison):
         )
         if isinstance(correlation_fit, Unavailable):
             return correlation_fit, correlation_fit
-        smooth, slow = correlation_fit
+        low_pass, correlated_noise = correlation_fit
         truths = [self.axes[axis.name].truth for axis in axes]
-        known = [truth for truth in truths if not isinstance(truth, Unavailable)]
-        if len(known) == len(axes):
-            slow = fit_time_correlation_to_truth(axes, known, excluded_s, offset_s, jumps, slow)
-        return smooth, slow
+        available_truths = [truth for truth in truths if not isinstance(truth, Unavailable)]
+        if len(available_truths) == len(axes):
+            correlated_noise = fit_time_correlation_to_truth(
+                axes, available_truths, excluded_s, offset_s, jumps, correlated_noise
+            )
+        return low_pass, correlated_noise
 
     @property
     def smoothing(self) -> SourceLowPass | Unavailable:
-        """Low pass of the position source, or Unavailable."""
+        """Low-pass filter of the position source, or Unavailable."""
         return self.time_correlation_fit[0]
 
     @property
@@ -210,10 +213,14 @@ class Analysis(Comparison):
         clock, offset_s = self.clock, 0.0
         if isinstance(clock, ClockOffset) and clock.is_determinable:
             offset_s = clock.remaining_s if abs(clock.remaining_s) > clock.three_sigma_s else 0.0
-        for name, group in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
+        for name, axis_names in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
             axis_tuning = self.tuning.get(name)
-            if isinstance(axis_tuning, AxisTuning) and self.axes.keys() >= set(group):
-                return tuple(self.axes[each].axis for each in group), axis_tuning, offset_s
+            if isinstance(axis_tuning, AxisTuning) and self.axes.keys() >= set(axis_names):
+                return (
+                    tuple(self.axes[axis_name].axis for axis_name in axis_names),
+                    axis_tuning,
+                    offset_s,
+                )
         return Unavailable(
             "causes other than noise",
             "the noises of the horizontal axes could not be estimated",
@@ -223,7 +230,7 @@ class Analysis(Comparison):
 
 @dataclass(frozen=True)
 class AidsOnlyAnalysis:
-    """EKF2's aids in a flight without positions for KF.
+    """Evaluation of EKF2's aids in a flight without positions for KF.
 
     Attributes
     ----------
@@ -243,8 +250,8 @@ class AidsOnlyAnalysis:
 def failed_checks(analysis: Analysis | AidsOnlyAnalysis) -> dict[str, str]:
     """Return the failed EKF2 checks for ``--checks``: axis or aid, and its verdict.
 
-    Overconfident axes and aids fail, also biased aids and aids that were not fused for too long.
-    KF, underconfident aids and aids with too few samples do not.
+    A check fails for overconfident axes and aids, biased aids, and aids that were not fused for too
+    long; not for KF, underconfident aids, and aids with too few samples.
     """
     failed = {}
     if isinstance(analysis, Analysis):
@@ -277,8 +284,8 @@ def run_or_evaluate_aids(
                 f"{flight.log.name}: the vehicle did not fly, so nothing can be analysed "
                 f"({aids.reason}). px4fuse info {flight.log.name} lists what is logged."
             )
-        neither = f"{no_position.reason}, and EKF2's aids cannot be checked: {aids.reason}"
-        raise MissingDataError(f"{flight.log.name}: {neither}", no_position.remedy)
+        reason = f"{no_position.reason}, and EKF2's aids cannot be checked: {aids.reason}"
+        raise MissingDataError(f"{flight.log.name}: {reason}", no_position.remedy)
     return AidsOnlyAnalysis(flight, aids, no_position)
 
 
@@ -314,17 +321,18 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
     log = Path(request.log)
     progress(f"reading {display_name(log)}")
     flight = read_log(log, system=request.system if request.mavlink is None else None)
-    # late imports: scipy.signal and scipy.ndimage take 0.2 s and are needed for alignment only
+    # imported here, because scipy.signal and scipy.ndimage take 0.2 s and only alignment needs them
     if request.mavlink is not None:
         from px4fuse.alignment.merge_recordings import join  # noqa: PLC0415
 
-        other = read_log(Path(request.mavlink), system=request.system)
-        if not other.log.format.startswith("MAVLink"):
+        mavlink_flight = read_log(Path(request.mavlink), system=request.system)
+        if not mavlink_flight.log.format.startswith("MAVLink"):
             raise LogError(
-                f"--mavlink {other.log.name} is a {other.log.format}, not a MAVLink recording.",
+                f"--mavlink {mavlink_flight.log.name} is a {mavlink_flight.log.format}, not a "
+                "MAVLink recording.",
                 "Give the ULog as LOG and the recording (.tlog) with --mavlink.",
             )
-        flight = join(flight, other)
+        flight = join(flight, mavlink_flight)
     position, offset = request.position, request.clock_offset_s
     if position is None:
         return flight
@@ -332,10 +340,14 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
     from px4fuse.readers.position_csv import read_position_csv  # noqa: PLC0415
 
     units = {"time_unit": position.time_unit, "length_unit": position.length_unit}
-    file = read_position_csv(Path(position.path), columns=position.columns, **units)
+    position_file = read_position_csv(Path(position.path), columns=position.columns, **units)
     clock_offset_s = None if isinstance(offset, str) else offset
     return align_position_file(
-        flight, file, frame=position.frame, yaw_deg=position.yaw_deg, clock_offset_s=clock_offset_s
+        flight,
+        position_file,
+        frame=position.frame,
+        yaw_deg=position.yaw_deg,
+        clock_offset_s=clock_offset_s,
     )
 
 
@@ -353,7 +365,7 @@ def run_comparison(
 def prepare_comparison(
     request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
 ) -> Comparison:
-    """Read a flight; choose source, segment and axes. Tuning and time offset need no more.
+    """Read a flight and choose source, segment and axes, which is enough for tuning and sync.
 
     Arguments and errors are those of :func:`run`.
     """
@@ -432,7 +444,7 @@ class WhatIfAnalysis:
     ----------
     flight : Flight
     whatif : WhatIf
-        Replays in ``whatif``: first the changes (if any), then the values of the sweep.
+        Results; its ``whatif`` contains the changes (if any), then the values of the sweep.
     changes : mapping from PX4 name to value
         Empty if only a sweep is requested.
     asked : bool
@@ -469,36 +481,36 @@ def run_what_if(
         A file cannot be read, EKF2 cannot be replayed from it or the replay does not agree with
         the log, or a parameter is unknown or out of PX4's range.
     """
-    changes, swept = check_parameters(request.changes), request.sweep
+    changes, sweep = check_parameters(request.changes), request.sweep
     values: list[float] = []
-    if swept is not None:
-        values = sweep_values(swept.parameter, swept.low, swept.high, swept.count)
-        if swept.parameter in changes:
-            raise SettingsError(f"{swept.parameter} is both set and swept.", "Set it or sweep it.")
+    if sweep is not None:
+        values = sweep_values(sweep.parameter, sweep.low, sweep.high, sweep.count)
+        if sweep.parameter in changes:
+            raise SettingsError(f"{sweep.parameter} is both set and swept.", "Set it or sweep it.")
     recordings = ComparisonRequest(log=request.log, mavlink=request.mavlink, system=request.system)
     flight = flight or read_flight(recordings, progress)
     progress("replaying EKF2")
     model = open_model(flight)
     if isinstance(model, Unavailable):
         raise MissingDataError(f"{flight.log.name}: {model.what}: {model.reason}", model.remedy)
-    is_default_change = not changes and swept is None and not request.without
+    is_default_change = not changes and sweep is None and not request.without
     difference_steps: Mapping[str, DifferenceExplanation | Unavailable] = {}
-    compared = None
+    comparison = None
     try:
         if model.agreement.good:
-            compared = compare(flight, axes=("north", "east", AISLE), sigma_z_given=False)
+            comparison = compare(flight, axes=("north", "east", AISLE), sigma_z_given=False)
     except MissingDataError:  # EKF2 can be replayed without a comparison
         if is_default_change:
             raise
-    if compared is not None:
-        tuning, clock = estimate_noises_and_clock(compared, progress)
-        difference_steps = explain_ekf2_difference(compared, model, clock)
+    if comparison is not None:
+        tuning, clock = estimate_noises_and_clock(comparison, progress)
+        difference_steps = explain_ekf2_difference(comparison, model, clock)
         if is_default_change:
-            changes = ml_ekf2_parameters(compared, model, tuning, clock)
+            changes = ml_ekf2_parameters(comparison, model, tuning, clock)
             if not changes:
-                raise MissingDataError(_explain_missing_change(compared, model))
+                raise MissingDataError(_explain_missing_change(comparison, model))
     settings = [changes] if changes or request.without else []
-    settings += [{**changes, swept.parameter: value} for value in values] if swept else []
+    settings += [{**changes, sweep.parameter: value} for value in values] if sweep else []
     progress("replaying with other parameters")
     replays = what_if(model, settings, request.without)
     if isinstance(replays, Unavailable):
@@ -510,16 +522,16 @@ def run_what_if(
     )
 
 
-def _explain_missing_change(compared: Comparison, model: Model) -> str:
+def _explain_missing_change(comparison: Comparison, model: Model) -> str:
     """Format the error for a log that gives no maximum-likelihood change of EKF2's parameters."""
-    source = compared.source
+    source = comparison.source
     reason = f"noise and delay of {source.name} cannot be estimated from this log"
     if source.origin.is_gnss or source.origin.may_drift:
         reason = (
             f"innovations do not show the slow errors of {source.name}, and its delay is correct "
             "or cannot be estimated"
         )
-    name, noise = compared.flight.log.name, model.inputs.aid.noise
+    name, noise = comparison.flight.log.name, model.inputs.aid.noise
     return f"{name}: {reason}. Give a change, for example `changes` {noise}=0.1."
 
 
@@ -538,8 +550,8 @@ def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Ana
     progress("replaying EKF2")
 
     def requested_variants(inputs: Inputs) -> list[Variant]:
-        tried = planned_variants(comparison, tuning, clock, heading, inputs)
-        return [*explanation_variants(comparison, inputs), *tried]
+        cause_variants = planned_variants(comparison, tuning, clock, heading, inputs)
+        return [*explanation_variants(comparison, inputs), *cause_variants]
 
     model = open_model(comparison.flight, requested_variants)
     difference_steps = explain_ekf2_difference(comparison, model, clock)

@@ -9,7 +9,7 @@ from msgspec import structs
 
 from px4fuse import request
 from px4fuse.analysis import Analysis, run, run_what_if
-from px4fuse.comparison.model import FilterSummary, UnjudgedFilter
+from px4fuse.comparison.model import FilterSummary, UntestedFilter
 from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.whatif import WhatIf
@@ -26,7 +26,8 @@ from px4fuse.writing import write_all
 
 Pathlike = str | Path
 Progress = Callable[[str], None]
-# Columns of table() and their types: fields of FilterSummary and AgainstTruth; nis_band is split
+# Columns of table() and their types: fields of FilterSummary (nis_band is split) and of
+# ErrorsAgainstTruth
 COLUMNS = {
     "count": "Int64",
     "nis_mean": "float64",
@@ -150,7 +151,7 @@ def table(analysis: Analysis) -> pd.DataFrame:
     return pd.DataFrame(list(rows.values()), index, list(COLUMNS)).astype(COLUMNS)
 
 
-def _summary_row(summary: FilterSummary | UnjudgedFilter) -> dict[str, Any]:
+def _summary_row(summary: FilterSummary | UntestedFilter) -> dict[str, Any]:
     truth = {} if isinstance(summary.truth, Unavailable) else structs.asdict(summary.truth)
     numbers = {"verdict": "", **truth, "count": None, **structs.asdict(summary)}
     numbers["nis_low"], numbers["nis_high"] = numbers.get("nis_band", (None, None))

@@ -23,30 +23,30 @@ class Aid:
     name : str
         PX4's name, as in ``estimator_aid_src_<name>``.
     switch : str
-        Parameter that enables its fusion, from v1.14 on; EKF2_AID_MASK before.
+        Parameter that enables fusion of the aid, from v1.14 on; before, EKF2_AID_MASK does.
     noise, gate, delay : str
-        Parameters of its standard deviation, its gate in √S, and its age in ms.
+        Parameters of standard deviation, gate (√S) and age (ms).
     noise_mode : str
         Parameter that ignores reported variances if 1; empty without such a parameter.
-    place : tuple of str
+    lever_arm : tuple of str
         Parameters of the lever arm of the sensor (m, FRD).
     label, unit : str
-        Name for users, and unit of its innovations.
-    reported : str
-        Other origin of its variance, if ``noise`` does not determine it; else empty.
+        Name for users, and unit of the innovations.
+    noise_origin : str
+        Origin of the variance if it is not ``noise`` alone; else empty.
     default_gate : float
-        Gate if the log has no ``gate``.
+        Gate if the log does not contain the parameter ``gate``.
     axes : tuple of str
-        Axes of its innovations, in PX4's order.
+        Axes of the innovations, in PX4's order.
     fields : tuple of str
         Fields of ``estimator_innovations`` and ``_variances``, by axis; empty without such fields.
-    before : tuple of str
+    old_fields : tuple of str
         Fields of ``ekf2_innovations`` (v1.8 to v1.10); ``_var`` is appended for the variance.
     flags : tuple of tuple of str
         Fields of ``estimator_status_flags``. The aid is enabled if any flag of the first logged
         group is set.
-    bit : int or None
-        Bit of the same meaning in ``estimator_status.control_mode_flags``.
+    status_bit : int or None
+        Bit in ``estimator_status.control_mode_flags`` that is set if the aid is enabled.
     """
 
     name: str
@@ -55,16 +55,16 @@ class Aid:
     gate: str = ""
     delay: str = ""
     noise_mode: str = ""
-    place: tuple[str, ...] = ()
+    lever_arm: tuple[str, ...] = ()
     label: str = ""
     unit: str = "m"
-    reported: str = ""
+    noise_origin: str = ""
     default_gate: float = 5.0
     axes: tuple[str, ...] = ()
     fields: tuple[str, ...] = ()
-    before: tuple[str, ...] = ()
+    old_fields: tuple[str, ...] = ()
     flags: tuple[tuple[str, ...], ...] = ()
-    bit: int | None = None
+    status_bit: int | None = None
 
     @property
     def own_parameters(self) -> frozenset[str]:
@@ -72,17 +72,17 @@ class Aid:
         return frozenset((self.noise, self.gate, self.delay, self.noise_mode))
 
     def logged_parameters(self, logged: Mapping[str, float]) -> dict[str, float]:
-        """Return its parameters and its switch from those of a log."""
+        """Return the logged parameters of this aid, with its switch."""
         names = (self.noise, self.delay, self.gate, self.noise_mode, self.switch, AID_MASK)
         return {name: float(logged[name]) for name in names if name in logged}
 
 
 AID_MASK = "EKF2_AID_MASK"
-# from main of 2026 on EKF2 uses the measurement time of a fix if the driver provides it
+# exists from main of 2026 on, in which EKF2 uses the measurement time of a fix from the driver
 GNSS_MODE = "EKF2_GPS_MODE"
-# relative tolerance; the rounding error of a float32 is 6e-8
-FLOAT32_ERROR = 1e-6
-# age of a fix of the first receiver from v1.17 on; EKF2 subtracts it from the timestamp
+# relative tolerance of range limits; the rounding error of a float32 is 6e-8
+FLOAT32_TOLERANCE = 1e-6
+# parameters of the age of a fix of the first receiver from v1.17 on, which EKF2 subtracts
 RECEIVER_DELAYS = ("SENS_GNSS0_DELAY", "SENS_GPS0_DELAY")
 
 
@@ -104,39 +104,39 @@ class Parameter:
     minimum: float
     maximum: float
 
-    def outside(self, value: float) -> str:
-        """Return the fault of a finite value outside the range; empty if it is inside.
+    def describe_range_error(self, value: float) -> str:
+        """Return a text if a finite value is outside the range, else "".
 
         Logged values are float32, in which the limit 0.01 is 0.0099999998.
         """
-        low = self.minimum - FLOAT32_ERROR * abs(self.minimum)
-        high = self.maximum + FLOAT32_ERROR * abs(self.maximum)
+        low = self.minimum - FLOAT32_TOLERANCE * abs(self.minimum)
+        high = self.maximum + FLOAT32_TOLERANCE * abs(self.maximum)
         if low <= value <= high:
             return ""
         unit = f" {self.unit}" if self.unit else ""
         return f" {value:g}{unit} is outside PX4's range {self.minimum:g} to {self.maximum:g}"
 
 
-TABLE = table(__file__, "ekf2_parameters.toml", dict)
+TABLES = table(__file__, "ekf2_parameters.toml", dict)
 AIDS, DISTURBANCES = (
     msgspec.convert({name: {"name": name, **row} for name, row in rows.items()}, dict[str, Aid])
-    for rows in (TABLE["aids"], TABLE["disturbances"])
+    for rows in (TABLES["aids"], TABLES["disturbances"])
 )
 EV_POS, GNSS_POS, GNSS_VEL, GNSS_HGT, BAROMETER, FLOW, MAG = map(
     AIDS.__getitem__,
     ("ev_pos", "gnss_pos", "gnss_vel", "gnss_hgt", "baro_hgt", "optical_flow", "mag"),
 )
-PARAMETERS = msgspec.convert(TABLE["parameters"], dict[str, Parameter])
-# parameters of the model, and all other logged ones that px4fuse computes with
-RANGES = PARAMETERS | msgspec.convert(TABLE["logged"], dict[str, Parameter])
+PARAMETERS = msgspec.convert(TABLES["parameters"], dict[str, Parameter])
+# parameters of the model, and other logged parameters with which px4fuse computes
+RANGES = PARAMETERS | msgspec.convert(TABLES["logged"], dict[str, Parameter])
 FIELD_NOISES = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
 # defaults up to v1.13 (ekf2_params.c)
 OLD_DEFAULTS: Mapping[str, float] = {EV_POS.delay: 175.0}
-# only these parameters are part of the results
-REPORTED: tuple[str, ...] = tuple(TABLE["reported"])
+# parameters that are written to the results
+REPORTED: tuple[str, ...] = tuple(TABLES["reported"])
 
 
-def settings_in_force(
+def effective_settings(
     logged: Mapping[str, float], aid: Aid = EV_POS, *others: Aid
 ) -> dict[str, float]:
     """Return the values of the model's parameters: logged ones, else PX4's defaults.
@@ -148,15 +148,21 @@ def settings_in_force(
     aid, *others : Aid
         Fused aids; parameters of other aids are omitted.
     """
-    used = {fused_aid.switch for fused_aid in (aid, *others)}
-    of_others = {
+    used_switches = {fused_aid.switch for fused_aid in (aid, *others)}
+    excluded_names = {
         name
         for other in (EV_POS, GNSS_POS, GNSS_VEL, MAG, BAROMETER)
-        if other.switch not in used
-        for name in (*other.own_parameters, *other.place, *(FIELD_NOISES if other == MAG else ()))
+        if other.switch not in used_switches
+        for name in (
+            *other.own_parameters,
+            *other.lever_arm,
+            *(FIELD_NOISES if other == MAG else ()),
+        )
     }
     defaults = {
-        name: parameter.default for name, parameter in PARAMETERS.items() if name not in of_others
+        name: parameter.default
+        for name, parameter in PARAMETERS.items()
+        if name not in excluded_names
     }
     if fuses_by_mask(logged) and aid == EV_POS:
         defaults |= OLD_DEFAULTS
@@ -168,7 +174,9 @@ def fuses_by_mask(logged: Mapping[str, float]) -> bool:
     return AID_MASK in logged and EV_POS.switch not in logged
 
 
-def valid_parameters(logged: Mapping[str, float]) -> tuple[dict[str, float], tuple[str, ...]]:
+def replace_invalid_parameters(
+    logged: Mapping[str, float],
+) -> tuple[dict[str, float], tuple[str, ...]]:
     """Replace logged parameters that are not finite or outside PX4's range by their defaults.
 
     Returns
@@ -180,20 +188,20 @@ def valid_parameters(logged: Mapping[str, float]) -> tuple[dict[str, float], tup
 
     Examples
     --------
-    >>> valid_parameters({"EKF2_EVP_GATE": 0.0, "SYS_AUTOSTART": 4001.0})[0]
+    >>> replace_invalid_parameters({"EKF2_EVP_GATE": 0.0, "SYS_AUTOSTART": 4001.0})[0]
     {'EKF2_EVP_GATE': 5.0, 'SYS_AUTOSTART': 4001.0}
     """
     valid, notes = {}, []
-    defaults = {name: known.default for name, known in RANGES.items()}
+    defaults = {name: parameter.default for name, parameter in RANGES.items()}
     if fuses_by_mask(logged):
         defaults |= OLD_DEFAULTS
     for name, value in logged.items():
-        known = RANGES.get(name)
+        parameter = RANGES.get(name)
         finite = math.isfinite(value)
-        fault = "" if known is None else known.outside(value)
+        fault = "" if parameter is None else parameter.describe_range_error(value)
         if finite and not fault:
             valid[name] = value
-        elif known is None:
+        elif parameter is None:
             notes.append(f"{name} is not a finite number and is not used.")
         else:
             valid[name] = defaults[name]
@@ -202,7 +210,7 @@ def valid_parameters(logged: Mapping[str, float]) -> tuple[dict[str, float], tup
     return valid, tuple(notes)
 
 
-def check_parameters(chosen: Mapping[str, float]) -> dict[str, float]:
+def check_parameters(changes: Mapping[str, float]) -> dict[str, float]:
     """Return the parameters, if all are in the model and within PX4's range.
 
     Raises
@@ -215,19 +223,19 @@ def check_parameters(chosen: Mapping[str, float]) -> dict[str, float]:
     >>> check_parameters({"EKF2_EVP_NOISE": 0.2})
     {'EKF2_EVP_NOISE': 0.2}
     """
-    for name, value in chosen.items():
-        known = PARAMETERS.get(name)
-        if known is None:
+    for name, value in changes.items():
+        parameter = PARAMETERS.get(name)
+        if parameter is None:
             raise SettingsError(
                 f"{name} is not a parameter of the EKF2 replay",
                 f"{suggest_name(name, PARAMETERS)}Choose from {', '.join(PARAMETERS)}.",
             )
-        if not known.minimum <= value <= known.maximum or not math.isfinite(value):
-            unit = f" {known.unit}" if known.unit else ""
+        if not parameter.minimum <= value <= parameter.maximum or not math.isfinite(value):
+            unit = f" {parameter.unit}" if parameter.unit else ""
             raise SettingsError(
-                f"{name}={value:g} is outside PX4's range of {known.minimum:g} to "
-                f"{known.maximum:g}{unit} (default {known.default:g})."
+                f"{name}={value:g} is outside PX4's range of {parameter.minimum:g} to "
+                f"{parameter.maximum:g}{unit} (default {parameter.default:g})."
             )
         if name == EV_POS.noise_mode and value not in (0.0, 1.0):
             raise SettingsError(f"{name}={value:g}: give 0 or 1.")
-    return {name: float(value) for name, value in chosen.items()}
+    return {name: float(value) for name, value in changes.items()}

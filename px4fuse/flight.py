@@ -20,16 +20,16 @@ import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.ekf2_parameters import BAROMETER, Aid
-from px4fuse.log import ClockMap, InputFile, LogInfo, Stream, Unused
+from px4fuse.log import ClockMap, InputFile, LogInfo, Stream, UnusedData
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.position_source import Origin
 from px4fuse.record import NotNegative, Record, Vector
 from px4fuse.record import Unavailable as Unavailable  # noqa: PLC0414 - public re-export
 
 AxisName = Literal["north", "east", "down"]
-# Fraction of intervals near the median, below which the samples are in bursts
-BURST_SHARE = 0.8
-# Methods of a ClockMap without a measurement time
+# Minimum fraction of regular intervals (up to 3 medians); below, the samples arrive in bursts
+MIN_REGULAR_SHARE = 0.8
+# Methods of a ClockMap that do not provide times of measurement
 ARRIVAL_METHODS = ("arrival time", "receive time", "position in the stream")
 AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
 
@@ -213,8 +213,10 @@ class PositionTrack:
             "log",
             "alignment",
         )
-        owners = {name: self.origin if hasattr(self.origin, name) else self for name in names}
-        return {name: getattr(owners[name], name) for name in names}
+        owner_by_name = {
+            name: self.origin if hasattr(self.origin, name) else self for name in names
+        }
+        return {name: getattr(owner_by_name[name], name) for name in names}
 
     @property
     def rate_hz(self) -> float:
@@ -263,7 +265,7 @@ RECORD_NOT_LOGGED = Unavailable(
 
 GROUND_EFFECT, BAD_ACCELERATION = "gnd_effect", "bad_acc_vertical"
 # Weight of a new sample in EKF2's low-pass filter of optical flow (_flow_vel_body_lpf, ekf.h)
-FLOW_SHARE = 0.1
+FLOW_FILTER_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
@@ -293,9 +295,9 @@ class FusionRecord:
         filtered innovations (expected minus measured).
     flow : DataFrame, shape (l, 5)
         Velocity from optical flow, ``forward_m_s`` and ``right_m_s`` (body FRD): weighted mean of
-        ``samples`` values at intervals of ``interval_s``, with higher weight of later ones
-        (:data:`FLOW_SHARE`). The index is the time of the last value, ``noise_m2_s2`` is R of
-        each. Empty if not logged.
+        ``samples`` values at intervals of ``interval_s``, with a higher weight of later values
+        (:data:`FLOW_FILTER_WEIGHT`). The index is the time of the last value; ``noise_m2_s2`` is R
+        of each value. Empty if not logged.
     latitude_deg : float
         Latitude of the origin; NaN if not logged.
     altitude_m : float
@@ -322,15 +324,15 @@ class FusionRecord:
     __repr__ = one_line_repr
 
     @property
-    def keeps_latitude(self) -> bool:
+    def stores_latitude(self) -> bool:
         """True if EKF2 stores its position as latitude and longitude (since v1.16)."""
         return not np.isfinite(self.delayed["north_m"]).any()
 
     def was_in_state(self, state: str, times_s: Array) -> BoolArray:
         """Return a mask of the times in one of :attr:`states`; all False if not logged."""
-        known = self.states.get(state)
+        steps = self.states.get(state)
         return (
-            np.zeros(len(times_s), bool) if known is None else step_values_at(known, times_s) > 0.0
+            np.zeros(len(times_s), bool) if steps is None else step_values_at(steps, times_s) > 0.0
         )
 
 
@@ -368,8 +370,8 @@ class AidLog:
 
 def step_values_at(steps: pd.Series[float], times: pd.Index[float] | Array) -> Array:
     """Return the values of a step function; before its first time, the first value."""
-    at = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
-    return np.asarray(steps, dtype=np.float64)[at]
+    rows = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
+    return np.asarray(steps, dtype=np.float64)[rows]
 
 
 @dataclass(frozen=True)
@@ -482,7 +484,7 @@ class Flight:
         "ekf2_innovations", "ekf2_fusing", "truth", "airborne".
     clocks : tuple of ClockMap
         Maps from other clocks to the boot clock.
-    unused : tuple of Unused
+    unused : tuple of UnusedData
         Other position-related data in the log that px4fuse does not use.
     inputs : tuple of InputFile
         Files read in addition to the log.
@@ -504,7 +506,7 @@ class Flight:
     missing: tuple[Unavailable, ...] = ()
     streams: Mapping[str, Stream] = field(default_factory=dict)
     clocks: tuple[ClockMap, ...] = ()
-    unused: tuple[Unused, ...] = ()
+    unused: tuple[UnusedData, ...] = ()
     inputs: tuple[InputFile, ...] = ()
     modes: tuple[FlightMode, ...] | Unavailable = MODES_NOT_LOGGED
     tumble_spans: tuple[tuple[float, float], ...] = ()
@@ -528,7 +530,7 @@ def sample_rate(samples: pd.DataFrame) -> float:
     if len(samples) < 2:
         return float("nan")
     intervals = samples.index.to_series().diff().dropna()
-    regular = intervals[intervals <= 3.0 * intervals.median()]
-    if len(regular) < BURST_SHARE * len(intervals):
-        regular = intervals
-    return float(1.0 / regular.mean())
+    regular_intervals = intervals[intervals <= 3.0 * intervals.median()]
+    if len(regular_intervals) < MIN_REGULAR_SHARE * len(intervals):
+        regular_intervals = intervals
+    return float(1.0 / regular_intervals.mean())

@@ -21,11 +21,13 @@ _Identity = tuple[int, int] | str
 
 @dataclass(frozen=True)
 class _Register:
-    """Input files and folders, and all folders above them."""
+    """Input files, and the folders that contain them."""
 
-    read: set[_Identity] = field(default_factory=set)
-    containing: dict[_Identity, Path] = field(default_factory=dict)
-    entered: set[Path] = field(default_factory=set)  # folders whose parents are in `containing`
+    inputs: set[_Identity] = field(default_factory=set)
+    input_by_folder: dict[_Identity, Path] = field(default_factory=dict)
+    registered_folders: set[Path] = field(
+        default_factory=set
+    )  # folders whose parents are in `containing`
 
 
 _register: ContextVar[_Register | None] = ContextVar("register", default=None)
@@ -33,22 +35,22 @@ _register: ContextVar[_Register | None] = ContextVar("register", default=None)
 
 @contextmanager
 def inputs_protected() -> Iterator[None]:
-    """Register the files that are read inside the context, and reject writing to them."""
-    before = _register.set(_Register())
+    """Register all files that are read inside the context, and reject writing to them."""
+    token = _register.set(_Register())
     try:
         yield
     finally:
-        _register.reset(before)
+        _register.reset(token)
 
 
 @contextmanager
-def own_files() -> Iterator[None]:
-    """Read files of px4fuse inside the context without registering them, to update them."""
-    before = _register.set(None)
+def inputs_not_registered() -> Iterator[None]:
+    """Do not register files that are read inside the context, because they will be updated."""
+    token = _register.set(None)
     try:
         yield
     finally:
-        _register.reset(before)
+        _register.reset(token)
 
 
 def add_input(path: Path) -> None:
@@ -56,12 +58,12 @@ def add_input(path: Path) -> None:
     register = _register.get()
     if register is None or (identity := _identity(path)) is None:
         return
-    register.read.add(identity)
-    for folder in {path.absolute().parent, path.resolve().parent} - register.entered:
-        register.entered.add(folder)
-        for above in map(_identity, (folder, *folder.parents)):
-            if above is not None:
-                register.containing.setdefault(above, path)
+    register.inputs.add(identity)
+    for folder in {path.absolute().parent, path.resolve().parent} - register.registered_folders:
+        register.registered_folders.add(folder)
+        for parent in map(_identity, (folder, *folder.parents)):
+            if parent is not None:
+                register.input_by_folder.setdefault(parent, path)
 
 
 def check_outputs(targets: Iterable[Path]) -> None:
@@ -74,7 +76,7 @@ def check_outputs(targets: Iterable[Path]) -> None:
     """
     register = _register.get() or _Register()
     for target in targets:
-        if _identity(target) in register.read:
+        if _identity(target) in register.inputs:
             raise OutputError(
                 f"{target} is an input of this command and was not overwritten. Choose "
                 "another output name."
@@ -93,14 +95,14 @@ def check_output_folder(folder: Path) -> None:
     """
     register = _register.get() or _Register()
     entries = _entries(folder)
-    for place in (
+    for path in (
         folder,
         *entries,
         *(subentry for entry in entries for subentry in _entries(entry)),
     ):
-        if (identity := _identity(place)) is None:
+        if (identity := _identity(path)) is None:
             continue
-        input_path = place if identity in register.read else register.containing.get(identity)
+        input_path = path if identity in register.inputs else register.input_by_folder.get(identity)
         if input_path is not None:
             raise OutputError(
                 f"-o {folder} contains an input of this command, {input_path}",

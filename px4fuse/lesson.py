@@ -41,9 +41,9 @@ def example_1() -> Replay:
 
 
 def kalman_lines() -> Iterator[str]:
-    """Yield the six lines of Example 1: the state after each UWB update."""
-    run = example_1()
-    for time, row in run.steps.loc[run.updates.index].iterrows():
+    """Yield the lines of Example 1: the state after each of the six UWB updates."""
+    kf_run = example_1()
+    for time, row in kf_run.steps.loc[kf_run.updates.index].iterrows():
         seconds = float(str(time))
         yield (
             f"t {seconds:.1f} s: p {row['position_m']:.2f} (true "
@@ -54,7 +54,7 @@ def kalman_lines() -> Iterator[str]:
 
 
 def loop_lines() -> Iterator[str]:
-    """Yield the six lines of Example 2: the loop closure error, distributed over the distance."""
+    """Yield the lines of Example 2: the loop closure error, and the five corrected corners."""
     odometry = np.array(ODOMETRY_M)
     misclosure = odometry[-1] - odometry[0]
     total = cumulative_distance(odometry)[-1]

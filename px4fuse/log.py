@@ -97,7 +97,7 @@ class Stream:
 
 
 @dataclass(frozen=True)
-class Unused:
+class UnusedData:
     """Position-related topic or message that px4fuse does not use, with the reason."""
 
     name: str

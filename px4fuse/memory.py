@@ -5,9 +5,9 @@ import sys
 
 
 def release_free_memory() -> None:
-    """Return freed memory to the operating system, which the C library (glibc) keeps otherwise.
+    """Return freed memory to the operating system; otherwise the C library (glibc) keeps it.
 
-    The freed pieces are too small for large arrays.
+    The kept pieces are too small for large arrays.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
     if trim is not None:

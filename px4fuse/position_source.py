@@ -25,7 +25,7 @@ class Origin(Record, frozen=True):
     aid : Aid or None
         EKF2 aid of this source, with its EKF2 parameters; None if EKF2 never fuses it.
     is_automatic : bool
-        True if it may be selected by default; for GNSS only if EKF2 fused it.
+        True if the source may be selected by default; for GNSS only if EKF2 fused it.
     """
 
     kind: PositionKind
@@ -44,22 +44,22 @@ class Origin(Record, frozen=True):
 
     @property
     def reconstructed(self) -> bool:
-        """True if it was derived from EKF2's logged data instead of logged as received."""
+        """True if the positions are derived from EKF2's logged data, not logged as received."""
         return self.path in ("kept by EKF2", "rebuilt from innovations")
 
     @property
     def has_all_samples(self) -> bool:
-        """True if it contains all samples of the sender."""
+        """True if the track contains all samples of the sender."""
         return self.path in ("given file", "as it arrived")
 
     @property
     def is_vision(self) -> bool:
-        """True if EKF2 fuses it as external vision."""
+        """True if EKF2 fuses the source as external vision."""
         return self.aid == EV_POS
 
     @property
     def fused_as_gnss(self) -> bool:
-        """True if EKF2 fuses it as GNSS."""
+        """True if EKF2 fuses the source as GNSS."""
         return self.aid == GNSS_POS
 
     @property
@@ -73,9 +73,9 @@ class Origin(Record, frozen=True):
 
     @property
     def preference(self) -> int:
-        """Index in :data:`ORIGINS`; the smallest is preferred."""
-        places = [(known.aid, known.path) for known in ORIGINS]
-        return places.index((self.aid, self.path))
+        """Index in :data:`ORIGINS`; the source with the smallest index is preferred."""
+        origins = [(known.aid, known.path) for known in ORIGINS]
+        return origins.index((self.aid, self.path))
 
 
 POSITION_FILE = Origin("file", "given file", EV_POS)
@@ -99,5 +99,5 @@ def find_origin(kind: str, path: str) -> Origin:
 
 
 def with_orientation(origin: Origin, *, turns: bool) -> Origin:
-    """Change the kind "uwb" to "vio" if the orientation of the track changes (``turns``)."""
+    """Change the kind "uwb" to "vio" if the track has a changing orientation (``turns``)."""
     return replace(origin, kind="vio") if origin.kind == "uwb" and turns else origin

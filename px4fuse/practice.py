@@ -29,14 +29,14 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-# Choices that can occur together: one acts on the motion, the other on single samples. A wrong
-# noise would hide another mistake
+# Choices that can occur in one flight: one affects the whole motion, the other single samples. A
+# wrong noise is not combined, because it would hide another mistake
 COMBINABLE_GROUPS = ({"clock", "source"}, {"clock", "gate"}, {"frame", "source"}, {"frame", "gate"})
-HARDEST_LEVEL = 3
+MAX_LEVEL = 3
 MAX_SEED = 2**32 - 1
 SIGMA_A_M_S2, SIGMA_Z_M = 0.10, 0.10
-# Less than a minute, with two turns. The IMU errors are small, because large ones would look like a
-# time offset or a misaligned frame
+# A flight of less than a minute with two turns. The IMU errors are small, because large errors
+# would resemble a time offset or a misaligned frame
 SCENARIO_VALUES: dict[str, Any] = {
     "passes": 3,
     "speed_m_s": 1.5,
@@ -47,7 +47,7 @@ SCENARIO_VALUES: dict[str, Any] = {
     "yaw_error_deg": 0.2,
 }
 LENGTH_M = (8.0, 12.0)  # m; range of the aisle length
-# Finding that contains the time of a mistake
+# Finding from which the time span of a mistake is taken
 FINDING_WITH_TIME = {
     "nlos": "source_outliers",
     "jump": "source_position_jump",
@@ -69,7 +69,7 @@ class HiddenMistake(Record, frozen=True):
     sizes : tuple of str
         Size for each level, as on the command line.
     view : str
-        View of the page that shows it.
+        View of the page that shows the mistake.
     fault : str
         Name of the mistake.
     size_text : str
@@ -119,7 +119,7 @@ class PracticeFlight:
     sizes: tuple[str, ...]
 
     @property
-    def right(self) -> list[str]:
+    def correct_answers(self) -> list[str]:
         """Correct answers, sorted."""
         return sorted({mistake.choice for mistake in self.mistakes}) or ["nothing"]
 
@@ -143,11 +143,11 @@ def draw(seed: int, level: int = 1, count: int = 10) -> tuple[PracticeFlight, ..
 
 
 def _draw_flight(rng: np.random.Generator, choice: str, level: int) -> PracticeFlight:
-    mistakes = [one for one in HIDDEN_MISTAKES if one.choice == choice]
+    mistakes = [mistake for mistake in HIDDEN_MISTAKES if mistake.choice == choice]
     mistakes = [mistakes[rng.integers(len(mistakes))]] if mistakes else []
-    if level == HARDEST_LEVEL and mistakes and rng.random() < 0.5:
+    if level == MAX_LEVEL and mistakes and rng.random() < 0.5:
         second_mistakes = [
-            one for one in HIDDEN_MISTAKES if {one.choice, choice} in COMBINABLE_GROUPS
+            mistake for mistake in HIDDEN_MISTAKES if {mistake.choice, choice} in COMBINABLE_GROUPS
         ]
         mistakes += [second_mistakes[rng.integers(len(second_mistakes))]] if second_mistakes else []
     sizes = []
@@ -155,7 +155,11 @@ def _draw_flight(rng: np.random.Generator, choice: str, level: int) -> PracticeF
         sign = "-" if mistake.either_sign and rng.random() < 0.5 else ""
         sizes.append(f"{sign}{mistake.sizes[level - 1]}")
     noise_m = next(
-        (float(s) for one, s in zip(mistakes, sizes, strict=True) if one.mistake == NOISY_UWB),
+        (
+            float(s)
+            for mistake, s in zip(mistakes, sizes, strict=True)
+            if mistake.mistake == NOISY_UWB
+        ),
         SIGMA_Z_M,
     )
     scenario = Scenario(
@@ -188,11 +192,11 @@ def practice_text(
     str
         HTML page that loads nothing from a network; write it as UTF-8.
     """
-    rounds, scripts = draw(seed, level, count), []
+    practice_flights, scripts = draw(seed, level, count), []
     data: dict[str, Any] = {}
-    for number, one in enumerate(rounds):
+    for number, practice_flight in enumerate(practice_flights):
         progress(f"flight {number + 1}", number, count)
-        data, script = _flight_data(one, number)
+        data, script = _flight_data(practice_flight, number)
         scripts.append(script)
     return page_text(
         "\n".join(scripts),
@@ -205,14 +209,14 @@ def practice_text(
     )
 
 
-def _flight_data(one: PracticeFlight, number: int) -> tuple[dict[str, Any], str]:
+def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str, Any], str]:
     """Return the data of a flight, and its elements with the compressed answer."""
     mistakes = [
         f"{mistake.mistake}={size}"
-        for mistake, size in zip(one.mistakes, one.sizes, strict=True)
+        for mistake, size in zip(practice_flight.mistakes, practice_flight.sizes, strict=True)
         if mistake.mistake != NOISY_UWB
     ]
-    simulation = flights.simulate(one.scenario, parse(mistakes))
+    simulation = flights.simulate(practice_flight.scenario, parse(mistakes))
     flight = flights.to_flight(simulation, f"flight {number + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
     analysis = run(request, flight=flight)
@@ -220,17 +224,17 @@ def _flight_data(one: PracticeFlight, number: int) -> tuple[dict[str, Any], str]
     data, card = flight_data(analysis, packer), build_card(analysis, findings, request)
     described = [
         _describe_mistake(mistake, size, findings)
-        for mistake, size in zip(one.mistakes, one.sizes, strict=True)
+        for mistake, size in zip(practice_flight.mistakes, practice_flight.sizes, strict=True)
     ]
     key = {
-        "right": one.right,
+        "right": practice_flight.correct_answers,
         "mistakes": described,
         "rerun": _rerun_sentence(card) if described else NO_MISTAKE,
         "card": card_html(_name_mistakes(card, described), has_apply=True),
     }
-    packed = base64.b64encode(zlib.compress(json.dumps(key).encode())).decode()
+    compressed_key = base64.b64encode(zlib.compress(json.dumps(key).encode())).decode()
     scripts = data_scripts(data, analysis, packer, f"-{number}")
-    return data, f'{scripts}\n<script type="text/plain" id="key-{number}">{packed}</script>'
+    return data, f'{scripts}\n<script type="text/plain" id="key-{number}">{compressed_key}</script>'
 
 
 def _describe_mistake(

@@ -1,8 +1,8 @@
 """Reading of input files: regular files only, up to a size limit.
 
-Each file is registered as an input, which no output replaces. A device, named pipe or socket may
-block or never end, and a sparse file may be larger than the memory. So type and size are checked
-before a file is opened, and no more than the limit is read.
+Each file is registered as an input, so that no output replaces it. A device, named pipe or socket
+may block or never end, and a sparse file may be larger than the memory. Therefore type and size are
+checked before a file is opened, and at most the limit is read.
 """
 
 import hashlib
@@ -52,11 +52,11 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
     try:
         status = path.stat()
     except (OSError, ValueError) as error:  # ValueError: the path contains NUL
-        near = ""
+        suggestion = ""
         with suppress(OSError):  # no suggestion if the folder cannot be listed
             if isinstance(error, FileNotFoundError):
-                near = suggest_name(path.name, os.listdir(path.parent)).strip()  # noqa: PTH208
-        raise _unreadable(name, error, error_type, near) from error
+                suggestion = suggest_name(path.name, os.listdir(path.parent)).strip()  # noqa: PTH208
+        raise _unreadable(name, error, error_type, suggestion) from error
     if stat.S_ISDIR(status.st_mode):
         raise error_type(f"{name} is a folder", "Give a file.")
     if not stat.S_ISREG(status.st_mode):
@@ -111,8 +111,8 @@ def read_bytes_limited(
     content = b"" if size > limit_bytes else _read(path, size + 1, error_type, name)
     if len(content) > size:  # the file grows, or is in /proc, where sizes are 0
         content = _read(path, limit_bytes + 1, error_type, name)
-    if (least := max(size, len(content))) > limit_bytes:
-        raise error_type(_too_large(name, least, limit_bytes), f"{size_remedy}.")
+    if (size_found := max(size, len(content))) > limit_bytes:
+        raise error_type(_too_large(name, size_found, limit_bytes), f"{size_remedy}.")
     if empty_remedy is not None and not content:
         raise error_type(f"{name}: the file is empty", f"{empty_remedy}.")
     return content
@@ -164,10 +164,10 @@ def read_text(
 
 
 def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
-    """Return files by their SHA-256; for a folder, all regular files in it.
+    """Map the SHA-256 of files to their paths; of a folder, all regular files are included.
 
     In a folder, files larger than :data:`max_log_bytes` are ignored. Of files with the same content
-    the first is returned.
+    the first is used.
 
     Raises
     ------
@@ -198,19 +198,19 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
 def files_below(folder: Path) -> list[Path]:
     """Return all files in a folder and its subfolders, sorted; links are not followed.
 
-    A folder that cannot be listed is returned, too.
+    A folder that cannot be listed is included, so that reading it raises the error.
     """
     files: list[Path] = []
-    folders_left = [folder]
-    while folders_left:
-        place = folders_left.pop()
+    open_folders = [folder]
+    while open_folders:
+        folder_path = open_folders.pop()
         try:
-            with os.scandir(place) as entries:
+            with os.scandir(folder_path) as entries:
                 for entry in entries:
-                    into = folders_left if entry.is_dir(follow_symlinks=False) else files
-                    into.append(Path(entry.path))
+                    target = open_folders if entry.is_dir(follow_symlinks=False) else files
+                    target.append(Path(entry.path))
         except OSError:
-            files.append(place)
+            files.append(folder_path)
     return sorted(files)
 
 

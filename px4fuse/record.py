@@ -37,7 +37,7 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
 
 
 class Unavailable(Record, frozen=True):
-    """Missing data with the reason and how to log them; it replaces the record.
+    """Missing data, with reason and action, in place of a record.
 
     Attributes
     ----------
@@ -70,8 +70,8 @@ else:
     class RecordOrUnavailable:
         """``RecordOrUnavailable[T, A]``: a record T, or a subclass A of :class:`Unavailable`.
 
-        msgspec needs a tag to decode a union of two structs, and these have none. So each union is
-        a separate type, which :func:`decode_record_or_unavailable` decodes.
+        msgspec needs tags to decode a union of two structs, and the records have none. So each
+        union is a separate type, which :func:`decode_record_or_unavailable` decodes.
         """
 
         def __class_getitem__(cls, kinds: tuple[type, type]) -> type:
@@ -93,7 +93,7 @@ def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
     Raises
     ------
     ValueError
-        The value is neither of the two.
+        The value is neither the record nor an Unavailable.
     """
     record_type, unavailable_type = union_type.kinds
     kind = (

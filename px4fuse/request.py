@@ -1,14 +1,14 @@
 """Requests: the files and settings of one analysis, parsed from a command line.
 
-:func:`px4fuse.analysis.run` takes a request. The results record it, so that a report can be made
-again without its command line.
+The results contain the request, so that :func:`px4fuse.analysis.run` can repeat an analysis without
+its command line.
 """
 
 import os
 import re
 import shlex
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import PurePath
 from typing import Annotated, Any, Literal, Self
 
@@ -19,7 +19,7 @@ AUTO: Literal["auto"] = "auto"
 SIGMA_A_M_S2, SIGMA_Z_M, DT_S = 0.5, 0.10, 0.1
 AxisName = Literal["north", "east", "down", "aisle"]
 InputName = Literal["imu", "zero"]
-# Kind of a position source, which the messages in a log may leave open
+# Kind of a position source; the messages in a log may not determine it
 SourceKind = Literal["uwb", "vio", "mocap", "gnss"]
 # Height source of a GNSS flight
 HeightName = Literal["gnss", "barometer"]
@@ -326,7 +326,7 @@ def with_options(text: str, option_names: Mapping[str, str] = COMPARISON_OPTIONS
 
 
 def command_line(
-    request: Request | EvaluationRequest, command: str | None = None, *, typed: bool = False
+    request: Request | EvaluationRequest, command: str | None = None, *, for_shell: bool = False
 ) -> str:
     """Format the command line that repeats an analysis, without defaults.
 
@@ -336,28 +336,35 @@ def command_line(
     command : str, optional
         Name of the command; by default ``compare``, ``loop``, ``whatif`` or
         ``evaluate``.
-    typed : bool
+    for_shell : bool
         True: with paths, quoted for the shell of this system, so that it can be pasted. False: with
         file names only, quoted for a POSIX shell.
     """
-    shown_request = request if typed else request.without_paths()
+    shown_request = request if for_shell else request.without_paths()
     # required fields are files; all other fields are options
-    needed = [field.name for field in msgspec.structs.fields(shown_request) if field.required]
-    files = [_path_argument(getattr(shown_request, name)) for name in needed]
+    required_names = [
+        field.name for field in msgspec.structs.fields(shown_request) if field.required
+    ]
+    files = [_path_argument(getattr(shown_request, name)) for name in required_names]
     arguments = [command or str(type(shown_request).__struct_config__.tag or "evaluate"), *files]
     arguments += [word for pair in _all_options(shown_request) for word in pair if word is not None]
     if isinstance(shown_request, WhatIfRequest):
         for name, value in shown_request.changes.items():
             arguments += ["--set", f"{name}={_option_text(value)}"]
         if (sweep := shown_request.sweep) is not None:
-            ends = f"{_option_text(sweep.low)}:{_option_text(sweep.high)}:{sweep.count}"
-            arguments += ["--sweep", f"{sweep.parameter}={ends}"]
+            values = f"{_option_text(sweep.low)}:{_option_text(sweep.high)}:{sweep.count}"
+            arguments += ["--sweep", f"{sweep.parameter}={values}"]
         for name in shown_request.without:
             arguments += ["--without", name]
         for since in {*shown_request.without.values()} - {0.0}:
             arguments += ["--from", _option_text(since)]
-    join = subprocess.list2cmdline if typed and os.name == "nt" else shlex.join
-    return join(["px4fuse", *arguments])
+    words = ["px4fuse", *arguments]
+    return quote_command(words) if for_shell else shlex.join(words)
+
+
+def quote_command(words: Sequence[str]) -> str:
+    """Join the words of a command, quoted for the shell of this system."""
+    return subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)
 
 
 def settings_name(request: ComparisonRequest | EvaluationRequest | LoopRequest) -> str:
@@ -369,8 +376,8 @@ def settings_name(request: ComparisonRequest | EvaluationRequest | LoopRequest) 
     name_suffix = ""
     for option, value in _all_options(request.without_paths()):
         is_file = option in ("--mavlink", "--position")
-        typed = PurePath(value).stem if is_file and value is not None else value
-        name_suffix += f"_{option[2:]}" + ("" if typed is None else f"-{typed}")
+        text = PurePath(value).stem if is_file and value is not None else value
+        name_suffix += f"_{option[2:]}" + ("" if text is None else f"-{text}")
     return re.sub(r"[^\w.,+-]+", "-", name_suffix)
 
 
@@ -386,9 +393,9 @@ def _all_options(request: msgspec.Struct) -> Iterator[tuple[str, str | None]]:
         value = getattr(request, field.name)
         if field.name not in option_names or value == field.default:
             continue
-        several = value if field.name in ("axes", "closures", "rpe") else (value,)
-        for single in several:
-            text = None if isinstance(single, bool) else _option_text(single)
+        values = value if field.name in ("axes", "closures", "rpe") else (value,)
+        for single_value in values:
+            text = None if isinstance(single_value, bool) else _option_text(single_value)
             yield option_names[field.name], text
     if (position := getattr(request, "position", None)) is not None:
         yield from _all_options(position)

@@ -3,9 +3,9 @@
 import re
 import unicodedata
 
-FORMULA = "=+-@"
+FORMULA_STARTS = "=+-@"
 # Excel truncates cells after 32,767 characters
-MAX_CHARACTERS = 32_000
+MAX_CELL_LENGTH = 32_000
 
 
 def neutralise_formulas(text: str) -> str:
@@ -17,7 +17,7 @@ def neutralise_formulas(text: str) -> str:
     # in some regions Excel splits cells at semicolons, even within quotes
     cells = (f"'{cell}" if _is_formula(cell) else cell for cell in text.split(";"))
     safe_text = "".join(map(_replace_control_character, ";".join(cells)))
-    return safe_text if len(safe_text) <= MAX_CHARACTERS else safe_text[:MAX_CHARACTERS] + "…"
+    return safe_text if len(safe_text) <= MAX_CELL_LENGTH else safe_text[:MAX_CELL_LENGTH] + "…"
 
 
 def neutralise_id(text: str) -> str:
@@ -37,7 +37,7 @@ def _is_formula(text: str) -> bool:
         # Z: separators; C: control and format characters, surrogates
         if character in "\"'" or unicodedata.category(character)[0] in "ZC":
             continue
-        return unicodedata.normalize("NFKC", character)[0] in FORMULA
+        return unicodedata.normalize("NFKC", character)[0] in FORMULA_STARTS
     return False
 
 

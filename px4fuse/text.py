@@ -69,14 +69,14 @@ def capitalise_first(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def join_first(names: Sequence[str], most: int, between: str = ", ") -> str:
-    """Join the first ``most`` names, and append the number of the others.
+def join_first(names: Sequence[str], max_count: int, separator: str = ", ") -> str:
+    """Join the first ``max_count`` names, and append the number of the others.
 
     >>> join_first("abcd", 2), join_first("ab", 2)
     ('a, b and 2 more', 'a, b')
     """
-    suffix = f" and {len(names) - most} more" if len(names) > most else ""
-    return between.join(names[:most]) + suffix
+    suffix = f" and {len(names) - max_count} more" if len(names) > max_count else ""
+    return separator.join(names[:max_count]) + suffix
 
 
 def format_p_value(p: float) -> str:

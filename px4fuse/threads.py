@@ -1,6 +1,6 @@
 """Environment variables for single-threaded linear algebra.
 
-The matrices are small, so more threads would only wait for each other.
+The matrices are small, so more threads would mostly wait for each other.
 """
 
 # Libraries read these variables when they are loaded

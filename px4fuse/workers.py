@@ -25,14 +25,14 @@ from px4fuse.threads import ONE_THREAD
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-# A worker is replaced after this number of jobs, which limits the caches of libraries. The imports
-# of a new process take 2 s
+# A worker is replaced after this number of jobs, because caches of libraries grow. More frequent
+# replacement would cost time: the imports of a new process take 2 s
 JOBS_PER_WORKER = 80
 # s; one report of a 10-minute flight takes about 60 s
 TIMEOUT_S = 120.0
 MEMORY_BYTES = 4_000_000_000
 # s for the imports of a new process on a slow and busy computer
-START_S = 180.0
+START_TIMEOUT_S = 180.0
 # Read by a Python interpreter when it starts
 _ENVIRONMENT = {
     # without it, an interpreter imports modules from the current folder first: a submitted
@@ -57,18 +57,18 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.pipe, child_pipe = context.Pipe()
         self.process = context.Process(target=_serve, args=(child_pipe, function, memory_bytes))
-        before = dict(os.environ)
+        environment = dict(os.environ)
         os.environ.update(_ENVIRONMENT)
         try:
             self.process.start()
         finally:
             os.environ.clear()
-            os.environ.update(before)
+            os.environ.update(environment)
         child_pipe.close()  # so the pipe is closed when the process ends
-        self.ready = False
+        self.is_ready = False
         self.job = job
         self.jobs_done = 0
-        self.deadline = time.monotonic() + START_S
+        self.deadline = time.monotonic() + START_TIMEOUT_S
 
     def end(self) -> None:
         self.process.kill()
@@ -107,13 +107,13 @@ def run_bounded(
     (int, object)
         Index of a job and its result or :class:`JobFailure`, in the order in which jobs finish.
     """
-    waiting = list(range(len(jobs)))[::-1]
+    waiting_jobs = list(range(len(jobs)))[::-1]
     workers: dict[Connection, _Worker] = {}
     try:
-        while waiting or workers:
-            while waiting and len(workers) < (processes or os.cpu_count() or 1):
-                # assigned now, sent when the process is ready: a failed start costs one job
-                new_worker = _Worker(function, memory_bytes, waiting.pop())
+        while waiting_jobs or workers:
+            while waiting_jobs and len(workers) < (processes or os.cpu_count() or 1):
+                # the job is assigned now, so that a process that fails to start ends only one job
+                new_worker = _Worker(function, memory_bytes, waiting_jobs.pop())
                 workers[new_worker.pipe] = new_worker
             # wait until the first deadline at most
             first_deadline = min(worker.deadline for worker in workers.values())
@@ -121,21 +121,21 @@ def run_bounded(
             for pipe, worker in list(workers.items()):
                 if pipe in ready_pipes:
                     is_usable, result = _receive_result(worker)
-                    if is_usable and not worker.ready:
-                        worker.ready = True
+                    if is_usable and not worker.is_ready:
+                        worker.is_ready = True
                     else:
                         yield worker.job, result
                         worker.jobs_done += 1
-                        if not is_usable or worker.jobs_done >= JOBS_PER_WORKER or not waiting:
+                        if not is_usable or worker.jobs_done >= JOBS_PER_WORKER or not waiting_jobs:
                             workers.pop(pipe).end()
                             continue
-                        worker.job = waiting.pop()
+                        worker.job = waiting_jobs.pop()
                     worker.deadline = time.monotonic() + timeout_s
                     # a process that died meanwhile is detected at the next read of its pipe
                     with suppress(BrokenPipeError, ConnectionResetError):
                         pipe.send(jobs[worker.job])
                 elif time.monotonic() >= worker.deadline:
-                    limit = timeout_s if worker.ready else START_S
+                    limit = timeout_s if worker.is_ready else START_TIMEOUT_S
                     workers.pop(pipe).end()
                     yield worker.job, JobFailure(f"the time limit of {limit:g} s was exceeded.")
     finally:
@@ -147,9 +147,9 @@ def run_one_bounded(
     function: Callable[[Job], Result], job: Job, timeout_s: float, memory_bytes: int = MEMORY_BYTES
 ) -> Result | JobFailure:
     """Call a function on one job in a worker process, within limits: see :func:`run_bounded`."""
-    work = run_bounded(function, [job], timeout_s=timeout_s, memory_bytes=memory_bytes)
-    with closing(work):
-        return next(work)[1]
+    results = run_bounded(function, [job], timeout_s=timeout_s, memory_bytes=memory_bytes)
+    with closing(results):
+        return next(results)[1]
 
 
 def _receive_result(worker: _Worker) -> tuple[bool, Any]:
@@ -159,8 +159,8 @@ def _receive_result(worker: _Worker) -> tuple[bool, Any]:
     except (EOFError, OSError):
         worker.process.join(5)
         status = f"exit code {worker.process.exitcode}"
-        when = "" if worker.ready else " during its start"
-        return False, JobFailure(f"the worker process ended{when} ({status}).")
+        phase = "" if worker.is_ready else " during its start"
+        return False, JobFailure(f"the worker process ended{phase} ({status}).")
     # unpickling runs code of the result's classes, which may raise any exception
     except Exception as error:  # noqa: BLE001
         return False, JobFailure(f"the result could not be unpickled ({type(error).__name__}).")
@@ -173,26 +173,26 @@ def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int |
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _limit_memory(memory_bytes)
-    pipe.send((True, None))
-    while True:
-        try:
-            job = pipe.recv()
-        except (EOFError, OSError):
-            return
-        try:
-            message = pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)
-        except MemoryError:
-            # the next job would not have enough memory, so the process ends
-            failure = JobFailure("the memory limit for one file was exceeded.")
-            message = pickle.dumps((False, failure))
-        except Exception as error:  # noqa: BLE001 - the failure of a job is its result
-            # imported here: the import takes 2 s and is needed for errors only
-            from px4fuse.results.reading import one_line  # noqa: PLC0415
+    with suppress(EOFError, OSError):  # the parent closed the pipe, or was killed
+        pipe.send((True, None))
+        while True:
+            pipe.send_bytes(_result_of(function, pipe.recv()))
 
-            kind = "" if isinstance(error, Px4FuseError) else f"{type(error).__name__}: "
-            message = pickle.dumps((True, JobFailure(one_line(f"{kind}{error}", 300))))
-        del job
-        pipe.send_bytes(message)
+
+def _result_of(function: Callable[[Any], Any], job: Any) -> bytes:
+    """Run a job; return the pickled message for :func:`_receive_result`."""
+    try:
+        return pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)
+    except MemoryError:
+        # the next job would not have enough memory, so the process ends
+        failure = JobFailure("the memory limit for one file was exceeded.")
+        return pickle.dumps((False, failure))
+    except Exception as error:  # noqa: BLE001 - the failure of a job is its result
+        # imported here: the import takes 2 s and is needed for errors only
+        from px4fuse.results.reading import one_line  # noqa: PLC0415
+
+        kind = "" if isinstance(error, Px4FuseError) else f"{type(error).__name__}: "
+        return pickle.dumps((True, JobFailure(one_line(f"{kind}{error}", 300))))
 
 
 def _end_with_parent() -> None:
@@ -209,7 +209,7 @@ def _limit_memory(memory_bytes: int | None) -> None:
     except ImportError:
         return
     # no core dump: it would contain the file of a student
-    for kind, most in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, memory_bytes)):
-        if most is not None:
+    for resource_kind, limit in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, memory_bytes)):
+        if limit is not None:
             with suppress(ValueError, OSError):  # macOS refuses some values
-                resource.setrlimit(kind, (most, most))
+                resource.setrlimit(resource_kind, (limit, limit))

@@ -15,15 +15,15 @@ from px4fuse.input_files import check_outputs
 
 STANDARD_OUTPUT = Path("-")
 # s to wait for a reader of a named pipe
-READER_S = 5.0
+READER_TIMEOUT_S = 5.0
 # True on Windows, which does not replace a file that another program has open
-LOCKS = sys.platform == "win32"
+LOCKS_OPEN_FILES = sys.platform == "win32"
 # Maximum number of paths in a message; more paths are counted
-_MOST_NAMED = 4
+_MAX_LISTED = 4
 
 
 def write_all(
-    contents: Mapping[Path, bytes], placed: Callable[[Path], None] = lambda _: None
+    contents: Mapping[Path, bytes], on_written: Callable[[Path], None] = lambda _: None
 ) -> None:
     """Write outputs in the order given, and stop at the first that cannot be written.
 
@@ -36,7 +36,7 @@ def write_all(
     contents : mapping from Path to bytes
         Missing folders are created. :data:`STANDARD_OUTPUT` is standard output.
     placed : callable
-        Called with each path after it is written.
+        Called with each path after the output is written.
 
     Raises
     ------
@@ -56,9 +56,9 @@ def write_all(
             pipe_error = error
             continue
         except OSError as error:
-            raise _refusal(path, error, written) from error
+            raise _make_output_error(path, error, written) from error
         written.append(path)
-        placed(path)
+        on_written(path)
     if pipe_error is not None:
         raise pipe_error
 
@@ -69,8 +69,8 @@ def written_before(paths: Sequence[Path]) -> str:
     >>> written_before([Path("a.pdf"), Path("a.json")])
     'already written: a.pdf, a.json'
     """
-    few = len(paths) <= _MOST_NAMED
-    return f"already written: {', '.join(map(str, paths)) if few else f'{len(paths)} files'}"
+    is_listed = len(paths) <= _MAX_LISTED
+    return f"already written: {', '.join(map(str, paths)) if is_listed else f'{len(paths)} files'}"
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -82,7 +82,7 @@ def _write(path: Path, content: bytes) -> None:
     elif stat.S_ISREG(mode := _mode(path)):
         _replace(path.resolve(), content)
     else:
-        with _opened_pipe(path) if stat.S_ISFIFO(mode) else path.open("wb") as file:
+        with _open_pipe(path) if stat.S_ISFIFO(mode) else path.open("wb") as file:
             file.write(content)
 
 
@@ -95,45 +95,47 @@ def _is_standard_output(path: Path) -> bool:
 
 
 def _mode(path: Path) -> int:
-    """Return the mode of a file; that of a regular file if it does not exist."""
+    """Return the mode of a file; if it does not exist, the mode of a regular file."""
     try:
         return path.stat().st_mode
     except FileNotFoundError:
         return stat.S_IFREG
 
 
-def _replace(real: Path, content: bytes) -> None:
+def _replace(target: Path, content: bytes) -> None:
     """Write a file completely or not at all."""
-    real.parent.mkdir(parents=True, exist_ok=True)
+    target.parent.mkdir(parents=True, exist_ok=True)
     # a short name: the target's name may already have the maximum length
-    temporary = real.with_name(f".px4fuse-{secrets.token_hex(8)}")
+    temporary = target.with_name(f".px4fuse-{secrets.token_hex(8)}")
     try:
         with temporary.open("xb") as file:
             file.write(content)
-        temporary.replace(real)
+        temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
 
 
-def _opened_pipe(path: Path) -> IO[bytes]:
-    """Open a named pipe; waits at most READER_S for a reader."""
-    until = time.monotonic() + READER_S
+def _open_pipe(path: Path) -> IO[bytes]:
+    """Open a named pipe; wait at most READER_TIMEOUT_S for a reader."""
+    deadline = time.monotonic() + READER_TIMEOUT_S
     while True:
         try:
-            number = os.open(path, os.O_WRONLY | os.O_NONBLOCK)
+            descriptor = os.open(path, os.O_WRONLY | os.O_NONBLOCK)
         except OSError as error:
-            if error.errno != errno.ENXIO or time.monotonic() > until:
+            if error.errno != errno.ENXIO or time.monotonic() > deadline:
                 raise
             time.sleep(0.05)
         else:
-            os.set_blocking(number, True)
-            return os.fdopen(number, "wb")
+            os.set_blocking(descriptor, True)
+            return os.fdopen(descriptor, "wb")
 
 
-def _refusal(path: Path, error: OSError, written: Sequence[Path]) -> OutputError:
+def _make_output_error(path: Path, error: OSError, written: Sequence[Path]) -> OutputError:
     name = "standard output" if path == STANDARD_OUTPUT else path
-    why = "the pipe has no reader" if error.errno == errno.ENXIO else error.strerror
-    is_locked = LOCKS and isinstance(error, PermissionError)
-    before = f"; {written_before(written)}" if written else ""
+    reason = "the pipe has no reader" if error.errno == errno.ENXIO else error.strerror
+    is_locked = LOCKS_OPEN_FILES and isinstance(error, PermissionError)
+    already_written = f"; {written_before(written)}" if written else ""
     remedy = "Close the program that has it open, or choose" if is_locked else "Choose"
-    return OutputError(f"{name}: cannot be written ({why}){before}", f"{remedy} another name.")
+    return OutputError(
+        f"{name}: cannot be written ({reason}){already_written}", f"{remedy} another name."
+    )

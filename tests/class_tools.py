@@ -85,4 +85,4 @@ def entry(student_id: str, name: str, total: float | None, **more) -> Entry:
     one = (
         None if total is None else graded_report(f"{student_id}.pdf", total, student_id=student_id)
     )
-    return Entry(name, student_id, one, total=total, **({"of": 10.0} | more))
+    return Entry(name, student_id, one, total=total, **({"max_points": 10.0} | more))

@@ -5,7 +5,7 @@ import numpy as np
 from px4fuse.ekf2.inputs import FusionRules, Inputs
 from px4fuse.ekf2.intervals import Events
 from px4fuse.ekf2.model import Model, open_model
-from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, Stretch
+from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment
 from px4fuse.flight import Flight
 from px4fuse.trajectory.rotation import skew
 
@@ -20,12 +20,12 @@ def opened(flight: Flight) -> Model:
     return found
 
 
-def step_matrix(stretch: Stretch, k: int, *, trapezoid: bool = True) -> np.ndarray:
+def step_matrix(segment: ReplaySegment, k: int, *, trapezoid: bool = True) -> np.ndarray:
     """Return ∂(state after step k) / ∂(state before); PX4's covariance has no trapezoid."""
-    dt, after = stretch.step_s[k], stretch.rotation[k + 1]
+    dt, after = segment.step_s[k], segment.rotation[k + 1]
     F = EYE.copy()
     F[0:3, 9:12] = -after * dt
-    F[3:6, 0:3] = -skew(after @ stretch.force_m_s2[k]) * dt
+    F[3:6, 0:3] = -skew(after @ segment.force_m_s2[k]) * dt
     F[3:6, 12:15] = -after * dt
     F[6:9, 3:6] = np.eye(3) * dt
     if trapezoid:  # mean of the velocities before and after
@@ -33,23 +33,25 @@ def step_matrix(stretch: Stretch, k: int, *, trapezoid: bool = True) -> np.ndarr
     return F
 
 
-def step_noise(stretch: Stretch, k: int, gyro: float, force: float) -> np.ndarray:
-    return np.diag(np.repeat([gyro**2, force**2, 0.0, 0.0, 0.0], 3) * stretch.step_s[k] ** 2)
+def step_noise(segment: ReplaySegment, k: int, gyro: float, force: float) -> np.ndarray:
+    return np.diag(np.repeat([gyro**2, force**2, 0.0, 0.0, 0.0], 3) * segment.step_s[k] ** 2)
 
 
-def step_state(stretch: Stretch, k: int, x: np.ndarray) -> np.ndarray:
+def step_state(segment: ReplaySegment, k: int, x: np.ndarray) -> np.ndarray:
     """Predict the state by one step, directly from the equations."""
-    dt, after = stretch.step_s[k], stretch.rotation[k + 1]
-    force = after @ stretch.force_m_s2[k]
+    dt, after = segment.step_s[k], segment.rotation[k + 1]
+    force = after @ segment.force_m_s2[k]
     x = x.copy()
     velocity = x[3:6].copy()
     x[3:6] += (force + GRAVITY_M_S2 - skew(force) @ x[0:3] - after @ x[12:15]) * dt
     x[6:9] += 0.5 * dt * (velocity + x[3:6])
-    x[0:3] += -after @ x[9:12] * dt - stretch.correction_rad[k]
+    x[0:3] += -after @ x[9:12] * dt - segment.correction_rad[k]
     return x
 
 
-def plain_replay(inputs: Inputs, stretch: Stretch, events: Events) -> tuple[np.ndarray, np.ndarray]:
+def plain_replay(
+    inputs: Inputs, segment: ReplaySegment, events: Events
+) -> tuple[np.ndarray, np.ndarray]:
     """Return innovations and variances of a flight as flown, without rejections.
 
     Covariance and state are predicted in each step; every measurement is fused separately.
@@ -59,9 +61,9 @@ def plain_replay(inputs: Inputs, stretch: Stretch, events: Events) -> tuple[np.n
     drift = np.zeros(15)
     drift[9:12] = settings["EKF2_GYR_B_NOISE"] ** 2
     drift[12:15] = settings["EKF2_ACC_B_NOISE"] ** 2
-    deviation = np.sqrt(stretch.variance)
-    P = deviation[:, None] * stretch.correlation * deviation
-    x, k = stretch.state.copy(), 0
+    deviation = np.sqrt(segment.variance)
+    P = deviation[:, None] * segment.correlation * deviation
+    x, k = segment.state.copy(), 0
     R = settings["EKF2_EVP_NOISE"] ** 2
     innovations, variances = [], []
 
@@ -71,11 +73,11 @@ def plain_replay(inputs: Inputs, stretch: Stretch, events: Events) -> tuple[np.n
         x = x + K * nu
         P = P - np.outer(K, P[i])
 
-    for end, sample, action in zip(events.end, events.sample, events.action, strict=True):
+    for end, sample, action in zip(events.end_step, events.sample, events.action, strict=True):
         while k < end:
-            F = step_matrix(stretch, k, trapezoid=False)
-            x = step_state(stretch, k, x)
-            P = F @ P @ F.T + step_noise(stretch, k, gyro, force)
+            F = step_matrix(segment, k, trapezoid=False)
+            x = step_state(segment, k, x)
+            P = F @ P @ F.T + step_noise(segment, k, gyro, force)
             P += np.diag(drift * inputs.step_s**2)
             k += 1
         position = inputs.received.position_m[sample]
@@ -83,13 +85,13 @@ def plain_replay(inputs: Inputs, stretch: Stretch, events: Events) -> tuple[np.n
             innovations.append(position[:2] - x[6:8])
             variances.append([P[6, 6] + R, P[7, 7] + R])
         for i, value, target in (
-            (2, stretch.attitude_error_rad[end, 2], stretch.attitude_variance_rad2[end, 2]),
-            (8, stretch.down_m[end], stretch.down_variance_m2[end]),
+            (2, segment.attitude_error_rad[end, 2], segment.attitude_variance_rad2[end, 2]),
+            (8, segment.down_m[end], segment.down_variance_m2[end]),
         ):
             if P[i, i] > target:
                 fuse(i, value - x[i], P[i, i] * target / (P[i, i] - target))
         if action:
             for i in (6, 7):
                 fuse(i, position[i - 6] - x[i], R)
-        x[2] = stretch.attitude_error_rad[end, 2]
+        x[2] = segment.attitude_error_rad[end, 2]
     return np.array(innovations), np.array(variances)

@@ -12,7 +12,7 @@ from exchange import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import Intervention
-from px4fuse.comparison.model import FILTERS, AgainstTruth, FilterSummary, UnjudgedFilter
+from px4fuse.comparison.model import FILTERS, ErrorsAgainstTruth, FilterSummary, UntestedFilter
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.hypotheses import BiasScaleJumpFit, Estimate, Jump
 from px4fuse.filter.settings import Settings
@@ -113,13 +113,13 @@ def axis(name: str = "north", **parts: Any) -> Any:
     filters = {
         key: _with_truth(parts.pop(key, NONE), parts.pop(f"{key}_truth", NONE)) for key in FILTERS
     }
-    axis = SimpleNamespace(name=name, called="the aisle" if name == "aisle" else name)
+    axis = SimpleNamespace(name=name, label="the aisle" if name == "aisle" else name)
     return SimpleNamespace(axis=axis, filters=filters, **usual | parts)
 
 
 def _with_truth(one: Any, truth: Any) -> Any:
     if one is NONE:
-        return UnjudgedFilter("it", "no topic for it", "Log it.", truth=truth)
+        return UntestedFilter("it", "no topic for it", "Log it.", truth=truth)
     known = {
         name: getattr(one, name) for name in Consistency.__struct_fields__ if hasattr(one, name)
     }
@@ -128,13 +128,13 @@ def _with_truth(one: Any, truth: Any) -> Any:
 
 def tried(
     owner: Any, change: dict[str, float], axis: str = "north", of: Any = "nis",
-    before: float = 9.0, explains: float = 1.0,
+    before: float = 9.0, explained_fraction: float = 1.0,
 ) -> Intervention:  # fmt: skip
     """Make the result of a re-run: the share of a statistic that a change explains."""
-    after = before ** (1.0 - explains)
+    after = before ** (1.0 - explained_fraction)
     return Intervention(
         statistic=of, filter=owner, axis=axis, change=change, before=before, after=after,
-        explained_fraction=explains, is_sufficient=explains == 1.0,
+        explained_fraction=explained_fraction, is_sufficient=explained_fraction == 1.0,
     )  # fmt: skip
 
 
@@ -152,8 +152,8 @@ def statement(nis: float = 1.0, verdict: str = "consistent", **parts: Any) -> An
     )
 
 
-def against_truth(nees: float, rmse_m: float = 0.4) -> AgainstTruth:
-    return AgainstTruth(count=100, position_rmse_m=rmse_m, nees_position_mean=nees)
+def against_truth(nees: float, rmse_m: float = 0.4) -> ErrorsAgainstTruth:
+    return ErrorsAgainstTruth(count=100, position_rmse_m=rmse_m, nees_position_mean=nees)
 
 
 def hiding(nis: float = 1.0, nees: float = 4.0, name: str = "north", **parts: Any) -> Any:

@@ -23,7 +23,7 @@ from pypdf.generic import (
 
 from px4fuse.errors import ResultsError
 from px4fuse.reading import files_by_sha256
-from px4fuse.results.contract import Reported, to_json
+from px4fuse.results.contract import ReportedResults, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.verification import verification
 from px4fuse.verification.model import Verdict
@@ -183,18 +183,18 @@ def set_value(value: Any, *path: Any) -> Change:
     return change
 
 
-def attached_results(pdf: bytes) -> Reported:
+def attached_results(pdf: bytes) -> ReportedResults:
     """Read the attached results without the checks of read_report."""
     return read_results(PdfReader(io.BytesIO(pdf)).attachments["results.json"][0])
 
 
-def to_dict(report: Reported) -> dict[str, Any]:
+def to_dict(report: ReportedResults) -> dict[str, Any]:
     """Convert results to a dictionary that can be changed."""
     made: dict[str, Any] = json.loads(to_json(report))
     return made
 
 
-def read_again(results: dict[str, Any]) -> Reported:
+def read_again(results: dict[str, Any]) -> ReportedResults:
     """Decode changed results as from a report."""
     return read_results(to_json(results).encode())
 
@@ -208,7 +208,7 @@ class VerifiedReport:
     again: Recomputed
     files: Mapping[str, Path]
 
-    def recompute(self, results: Reported, logs: Mapping[str, Path]) -> Recomputed | Verdict:
+    def recompute(self, results: ReportedResults, logs: Mapping[str, Path]) -> Recomputed | Verdict:
         """Return the analysis; the stored one if request, student, log and versions are equal."""
         ours, theirs = (
             # the command is derived from the request

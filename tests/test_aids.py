@@ -17,7 +17,7 @@ from px4fuse.ekf2.aids import AidResult, evaluate_aids
 from px4fuse.ekf2_parameters import AIDS
 from px4fuse.errors import MissingDataError
 from px4fuse.findings import find_aids
-from px4fuse.findings.aids import find_in
+from px4fuse.findings.aids import detect_in_aids
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
 from px4fuse.flight import AidLog, Flight, Unavailable
 from px4fuse.readers import read_log
@@ -197,12 +197,12 @@ def test_aid_mean_change_is_reported_with_time() -> None:
         "east",
     )
     # a change of KF's own source is another finding
-    assert not [*find_in({"gnss_vel": found}, "gnss_pos")]
+    assert not [*detect_in_aids({"gnss_vel": found}, "gnss_pos")]
     # the same for an aid that is rejected after the change
     rejected = replace(found, verdict="not_fused")
-    (starved,) = find_in({"gnss_vel": rejected}, "gnss_pos")
+    (starved,) = detect_in_aids({"gnss_vel": rejected}, "gnss_pos")
     assert starved.evidence[CAUSE] == SENSOR
-    assert next(find_in({"mag": rejected}, "gnss_pos")).evidence[CAUSE] == CHANGE
+    assert next(detect_in_aids({"mag": rejected}, "gnss_pos")).evidence[CAUSE] == CHANGE
     little = log.samples.copy()
     little.loc[35.0:, "innovation_east"] -= 0.2
     assert evaluate(replace(log, samples=little)).axes["east"].change is None

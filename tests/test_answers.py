@@ -43,7 +43,8 @@ def test_empty_form_has_no_answers_and_lists_every_mistake(tmp_path: Path) -> No
 def test_read_answers_returns_filled_in_values(tmp_path: Path) -> None:
     text = EMPTY.replace('kind = ""', 'kind = "yaw"').replace('size = ""', "size = -0.367")
     text = text.replace('unit = ""', 'unit = "rad"', 1).replace('q2 = ""', "q2 = [3, 7]")
-    found = read(tmp_path, text.replace('verdict_kf = ""', 'verdict_ours = "overstated"'))
+    former = 'verdict_ours = "overstated"'  # former name
+    found = read(tmp_path, text.replace('verdict_kf = ""', former))
     (claim,) = found.mistakes
     assert claim.size_in_first_unit() == pytest.approx(-21.03, abs=0.01)
     assert found.quantities[1] == (3.0, 7.0)
@@ -135,5 +136,5 @@ def test_compare_answers_option_adds_form_to_page_and_results(
     reader = PdfReader(report)
     results = read_results(reader.attachments["results.json"][0])
     assert isinstance(results, ComparisonResults)
-    assert results.student.answers.claims_no_mistake  # type: ignore[union-attr]
+    assert results.student.answers.names_no_mistake  # type: ignore[union-attr]
     assert any("Answer form" in page.extract_text() for page in reader.pages)

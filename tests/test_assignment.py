@@ -17,14 +17,14 @@ import px4fuse
 from px4fuse.analysis import explain
 from px4fuse.answer_form import Answers, read_answers
 from px4fuse.assignment import assignment
-from px4fuse.assignment.assignment import assign, fly, key_path
+from px4fuse.assignment.assignment import assign, key_path, simulate_assigned
 from px4fuse.assignment.key import AnswerKey, key_text, read_key
 from px4fuse.assignment.random_assignment import (
     ASSIGNABLE_MISTAKES,
-    COUNTS,
+    COUNT_FRACTIONS,
     EASIEST_DIFFICULTY,
     HARDEST_DIFFICULTY,
-    LOOP_SHARE,
+    LOOP_FRACTION,
     draw,
 )
 from px4fuse.assignment.roster import Person
@@ -52,7 +52,7 @@ CHOICE = {choice.mistake: choice for kind in ASSIGNABLE_MISTAKES.values() for ch
 
 
 def choices_of(drawn):
-    return [CHOICE[typed.partition("=")[0]] for typed in drawn.typed]
+    return [CHOICE[typed.partition("=")[0]] for typed in drawn.mistake_options]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -62,11 +62,11 @@ def cached_flights():
 
     def from_memory(*given):
         if repr(given) not in made:
-            made[repr(given)] = fly(*given)
+            made[repr(given)] = simulate_assigned(*given)
         return made[repr(given)]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assignment, "fly", from_memory)
+        patch.setattr(assignment, "simulate_assigned", from_memory)
         yield
 
 
@@ -80,7 +80,7 @@ def files(folder):
 class TestDraw:
     def test_same_secret_and_id_give_same_bytes(self):
         given = SECRET, CLASS[0], "aisle", 2, True
-        assert fly(*given) == assignment.fly(*given)
+        assert simulate_assigned(*given) == assignment.simulate_assigned(*given)
         # the id as another platform may spell it
         assert draw(SECRET, "S1 ", "aisle") == draw(SECRET, "s1", "aisle")
 
@@ -92,7 +92,7 @@ class TestDraw:
         assert not draw(SECRET, "s1", "loop").scenario.truth
         assert not draw(SECRET, "s1", "aisle", truth=False).scenario.truth
         assert (scenario.seed, scenario.sigma_uwb_m, scenario.heading_deg) == PINNED[0]
-        assert drawn.typed == PINNED[1]
+        assert drawn.mistake_options == PINNED[1]
         loops = [n for n in range(12) if draw(SECRET, f"s{n}", "mixed").scenario.kind == "loop"]
         assert loops == [1, 5, 9, 11]
 
@@ -106,8 +106,8 @@ class TestDraw:
     @pytest.mark.parametrize("kind", ["aisle", "loop"])
     def test_mistake_counts_have_configured_shares(self, kind):
         flights = [draw(SECRET, f"s{n}", kind) for n in range(1000)]
-        for count, share in enumerate(COUNTS[kind]):
-            found = sum(len(one.typed) == count for one in flights) / 1000
+        for count, share in enumerate(COUNT_FRACTIONS[kind]):
+            found = sum(len(one.mistake_options) == count for one in flights) / 1000
             assert found == pytest.approx(share, abs=0.05)
         names = {choice.mistake for one in flights for choice in choices_of(one)}
         assert names == {choice.mistake for choice in ASSIGNABLE_MISTAKES[kind]}
@@ -115,7 +115,7 @@ class TestDraw:
     def test_mixed_kind_equals_separate_draws_of_each_kind(self):
         mixed = [draw(SECRET, f"s{n}", "mixed") for n in range(1000)]
         kinds = Counter(one.scenario.kind for one in mixed)
-        assert kinds["loop"] / 1000 == pytest.approx(LOOP_SHARE, abs=0.05)
+        assert kinds["loop"] / 1000 == pytest.approx(LOOP_FRACTION, abs=0.05)
         assert all(one == draw(SECRET, f"s{n}", one.scenario.kind) for n, one in enumerate(mixed))
 
     def test_two_mistakes_are_compatible_and_within_size_limits(self):
@@ -123,24 +123,24 @@ class TestDraw:
         for n in range(300):
             drawn = draw(SECRET, f"s{n}", "aisle", 2)
             first, second = choices_of(drawn)
-            assert first.goes_with(second)
-            assert second.goes_with(first)
-            parse(drawn.typed)
+            assert first.is_detectable_with(second)
+            assert second.is_detectable_with(first)
+            parse(drawn.mistake_options)
             ratios = [EASIEST_DIFFICULTY]
-            for choice, text in zip(choices_of(drawn), drawn.typed, strict=True):
-                if choice.limit is None:
+            for choice, text in zip(choices_of(drawn), drawn.mistake_options, strict=True):
+                if choice.detectable_size is None:
                     assert text == choice.mistake
                     continue
                 size = float(re.search(r"=([-+]?[\d.]+)", text)[1])
                 signs[choice.mistake, size > 0] += 1
-                ratio = choice.limit / abs(size)
-                ratios.append(1.0 / ratio if choice.less_is_plainer else ratio)
-                if choice.at_s is not None:
+                ratio = choice.detectable_size / abs(size)
+                ratios.append(1.0 / ratio if choice.is_smaller_easier else ratio)
+                if choice.start_range_s is not None:
                     at = float(text.rpartition(",")[2].removesuffix("s"))
-                    assert choice.at_s[0] <= at <= choice.at_s[1]
+                    assert choice.start_range_s[0] <= at <= choice.start_range_s[1]
             assert drawn.difficulty == pytest.approx(max(ratios), abs=0.011)
             assert EASIEST_DIFFICULTY <= drawn.difficulty <= HARDEST_DIFFICULTY
-        both = {choice.mistake for choice in ASSIGNABLE_MISTAKES["aisle"] if choice.either_sign}
+        both = {choice.mistake for choice in ASSIGNABLE_MISTAKES["aisle"] if choice.has_either_sign}
         assert {name for name, positive in signs if not positive} == both
 
     def test_size_limits_are_smallest_detected_sizes(self):
@@ -153,14 +153,14 @@ class TestDraw:
             matches = ((plain.search(row.condition), row) for row in rows.itertuples())
             sizes = {float(match[2] or 0.0): row for match, row in matches if match}
             found = {size: row for size, row in sizes.items() if row.rate >= 0.95}
-            if choice.limit is None:
+            if choice.detectable_size is None:
                 assert list(found) == [0.0]
                 continue
-            assert choice.limit == (max if choice.less_is_plainer else min)(found)
-            assert found[choice.limit].flights >= 20
+            assert choice.detectable_size == (max if choice.is_smaller_easier else min)(found)
+            assert found[choice.detectable_size].flights >= 20
             # each larger size is found, too
-            larger = [s for s in sizes if (s < choice.limit) == choice.less_is_plainer]
-            assert set(larger) <= {choice.limit, *found}
+            larger = [s for s in sizes if (s < choice.detectable_size) == choice.is_smaller_easier]
+            assert set(larger) <= {choice.detectable_size, *found}
 
     def test_difficulties_are_spread_over_their_range(self):
         each = [draw(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]
@@ -172,7 +172,7 @@ class TestDraw:
     ("kind", "number", "count"), [("aisle", 0, 2), ("aisle", 1, 2), ("aisle", 2, 1), ("loop", 0, 1)]
 )
 def test_fly_log_has_finding_of_each_mistake_in_key(tmp_path, kind, number, count):
-    log, answer = assignment.fly(SECRET, CLASS[number], kind, count, True)
+    log, answer = assignment.simulate_assigned(SECRET, CLASS[number], kind, count, True)
     path = tmp_path / answer.file
     path.write_bytes(log)
     flight = px4fuse.read_log(path)
@@ -248,14 +248,14 @@ class TestAssign:
 
     def test_assign_interrupted_run_is_continued(self, tmp_path, monkeypatch):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
-        flown = assignment.fly
+        flown = assignment.simulate_assigned
 
         def stop_at_last(*given):
             if given[1] == CLASS[-1]:
                 raise KeyboardInterrupt
             return flown(*given)
 
-        monkeypatch.setattr(assignment, "fly", stop_at_last)
+        monkeypatch.setattr(assignment, "simulate_assigned", stop_at_last)
         with pytest.raises(KeyboardInterrupt):
             assign(CLASS, folder, key_file, None, "aisle", 2)
         monkeypatch.undo()
@@ -296,7 +296,9 @@ class TestAssign:
 
 class TestKey:
     def key(self):
-        answers = (assignment.fly(SECRET, one, "aisle", 2, True)[1] for one in CLASS[:2])
+        answers = (
+            assignment.simulate_assigned(SECRET, one, "aisle", 2, True)[1] for one in CLASS[:2]
+        )
         return AnswerKey("aisle", tuple(answers), "s")
 
     def test_key_text_is_read_back_equal(self, tmp_path):

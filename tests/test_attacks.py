@@ -33,9 +33,9 @@ from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.truth import form_truth
 from px4fuse.errors import ResultsError
 from px4fuse.grading.model import GradedReport
-from px4fuse.grading.rubric import Rubric, assess, read_rubric, refused_report
+from px4fuse.grading.rubric import Rubric, grade_unreadable, read_rubric, score_report
 from px4fuse.report import pdf as pdf_module
-from px4fuse.results.contract import Reported
+from px4fuse.results.contract import ReportedResults
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -74,13 +74,15 @@ class Flight:
     key: AnswerKey
 
     def graded(
-        self, report: Reported | ResultsError, verdict: Verdict, rubric: Rubric
+        self, report: ReportedResults | ResultsError, verdict: Verdict, rubric: Rubric
     ) -> GradedReport:
         if isinstance(report, ResultsError):
-            made = refused_report(rubric, self.key, f"{report.reason}.", report.remedy)
-            return GradedReport("a.pdf", "", "", verdict, made.items, pending=made.pending)
-        made = assess(report, verdict, rubric, self.key)
-        return GradedReport("a.pdf", "", "", verdict, made.items, made.flags, made.pending)
+            made = grade_unreadable(rubric, self.key, f"{report.reason}.", report.remedy)
+            return GradedReport(
+                "a.pdf", "", "", verdict, made.items, pending_action=made.pending_action
+            )
+        made = score_report(report, verdict, rubric, self.key)
+        return GradedReport("a.pdf", "", "", verdict, made.items, made.flags, made.pending_action)
 
     def with_notes(self, text: str, rubric: Rubric) -> GradedReport:
         """Grade the report with other notes, as verified."""
@@ -135,9 +137,9 @@ def honest(flight: Flight, rubric: Rubric) -> GradedReport:
 
 def test_grade_honest_report_is_verified_with_points(honest: GradedReport) -> None:
     assert honest.status == "verified"
-    assert honest.pending == ""
+    assert honest.pending_action == ""
     assert honest.flags == ()
-    points = {item.title: item.points / item.of for item in honest.items}
+    points = {item.title: item.points / item.max_points for item in honest.items}
     assert points["Mistakes of the flight"] > 0.4, honest.items
 
 
@@ -204,7 +206,9 @@ FILES: dict[str, tuple[Change, str, str]] = {
     ),
     "libraries removed": (set_value({}, "provenance", "libraries"), "cannot verify", "Ask how"),
     "an unknown log": (set_value("c" * 64, "log", "sha256"), "other log", "add s01.ulg to --logs."),
-    "log of another student": (set_value("b" * 64, "log", "sha256"), "other log", "given to s02"),
+    "log of another student": (
+        set_value("b" * 64, "log", "sha256"), "other log", "given to student s02",
+    ),
     "better NIS": (
         set_value(1.0, "axes", "north", "filters", "kf", "nis_mean"), "numbers differ", "",
     ),
@@ -221,7 +225,7 @@ FILES: dict[str, tuple[Change, str, str]] = {
         set_value("a\n" * 10_000, "student", "notes"), "cannot verify", "Ask how",
     ),
     "the id of another student": (
-        set_value("s02", "student", "id"), "page differs", "given to s01",
+        set_value("s02", "student", "id"), "page differs", "given to student s01",
     ),
 }  # fmt: skip
 
@@ -241,17 +245,17 @@ def test_grade_forged_results_are_not_verified(
         flight.honest.with_results(results) if status == "page differs" else blank_page(None, text)
     )
     try:
-        report: Reported | ResultsError = read_report(pdf, "a.pdf")
+        report: ReportedResults | ResultsError = read_report(pdf, "a.pdf")
         verdict = flight.honest.verified(pdf)
     except ResultsError as error:
         report, verdict = error, cannot_verify(str(error))
     graded = flight.graded(report, verdict, rubric)
     assert graded.status != "verified"
-    assert not graded.counted
+    assert not graded.counted_points
     assert graded.status == status
     assert not any("Error" in reason for reason in graded.verdict.reasons), graded.verdict.reasons
-    assert pending in graded.pending
-    assert bool(graded.pending) == bool(pending)
+    assert pending in graded.pending_action
+    assert bool(graded.pending_action) == bool(pending)
     assert graded.points <= honest.points + 1e-9
 
 
@@ -267,7 +271,7 @@ def test_grade_painted_page_is_scored_from_redrawn_report(
     assert graded.points == honest.points
     for rule, counted in (("pending", None), ("zero", 0.0)):
         strict = flight.graded(attached_results(pdf), verdict, replace(rubric, pages=rule))
-        assert strict.counted == counted
+        assert strict.counted_points == counted
 
 
 # ------------------------------------------------------------------ loops
@@ -290,9 +294,9 @@ def grade_loop(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> Gra
     results = decode_results(changed_results(LOOP, student__id="s01", **values))
     key = truth and AnswerKey("loop", (Answer("s01", "", "", LOOP["track"]["sha256"], *truth),))
     verdict = Verdict("verified", (), True, page_status="same")
-    made = assess(results, verdict, read_rubric(None), key)
+    made = score_report(results, verdict, read_rubric(None), key)
     items = tuple(item for item in made.items if "Loop" in item.title)
-    return GradedReport("a.pdf", "", "", verdict, items, made.flags, made.pending)
+    return GradedReport("a.pdf", "", "", verdict, items, made.flags, made.pending_action)
 
 
 LANDED = {"landed_at": {"forward_m": 6.0, "right_m": 0.0}}

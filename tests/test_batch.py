@@ -38,9 +38,9 @@ from px4fuse.fleet import engine, job, run
 from px4fuse.fleet.engine import connect_cluster, run_jobs
 from px4fuse.fleet.job import Job
 from px4fuse.fleet.logs import find_logs
-from px4fuse.fleet.rows import COLUMNS, axis_rows, csv_bytes, fleet_table, log_columns
-from px4fuse.fleet.run import Fleet, load_cached_rows
-from px4fuse.fleet.terminal import summary
+from px4fuse.fleet.rows import COLUMN_TYPES, axis_rows, csv_bytes, log_columns, make_table
+from px4fuse.fleet.run import BatchResult, load_cached_rows
+from px4fuse.fleet.terminal import format_summary
 from px4fuse.report.screen import show
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.contract import schema, to_json
@@ -125,7 +125,7 @@ def test_batch_table_has_numbers_or_reason_of_each_log(tmp_path):
     output = tmp_path / "out"
     table = px4fuse.batch(logs, output, reports=True)
 
-    assert list(table.columns) == list(COLUMNS)
+    assert list(table.columns) == list(COLUMN_TYPES)
     of = {name: rows.reset_index(drop=True) for name, rows in table.groupby("name")}
     assert set(of) == {"f1.ulg", "twin.ulg", "broken.ulg", "dataflash.BIN"}
     assert list(table["name"]) == sorted(table["name"])
@@ -158,22 +158,23 @@ def test_batch_table_has_numbers_or_reason_of_each_log(tmp_path):
 
     twin = of["twin.ulg"].loc[0]
     assert (twin["status"], twin["log_sha256"]) == ("not compared", first.loc[0, "log_sha256"])
-    assert "same file as" in twin["reason"]
+    assert "identical to" in twin["reason"]
     assert "f1.ulg" in twin["reason"]
     assert of["broken.ulg"].loc[0, "status"] == of["dataflash.BIN"].loc[0, "status"] == "failed"
     assert "DataFlash" in of["dataflash.BIN"].loc[0, "reason"]
     assert of["dataflash.BIN"].loc[0, "remedy"].startswith("Give the .tlog")
 
     assert_same(pd.read_parquet(output / "fleet.parquet"), table)
-    written = pd.read_csv(output / "fleet.csv", dtype=COLUMNS, keep_default_na=False, na_values={
-        name: [""] for name, kind in COLUMNS.items() if kind != "str"
-    })  # fmt: skip
+    na_values = {name: [""] for name, kind in COLUMN_TYPES.items() if kind != "str"}
+    written = pd.read_csv(
+        output / "fleet.csv", dtype=COLUMN_TYPES, keep_default_na=False, na_values=na_values
+    )
     pd.testing.assert_frame_equal(written, table, rtol=1e-9)
 
 
 def test_batch_terminal_counts_reasons_of_logs(capsys):
     table = made_up(60).fillna({"axis": "", "change": ""})
-    show(terminal(), summary(Fleet(table, 3, frozenset(), ())).blocks)
+    show(terminal(), format_summary(BatchResult(table, 3, frozenset(), ())).blocks)
     said = " ".join(capsys.readouterr().out.split())
     failed = table[table["status"] == "failed"]
     assert f"{len(failed)} logs, for example {failed['log'].iloc[0]}: failed: {DAMAGED[0]}" in said
@@ -181,7 +182,7 @@ def test_batch_terminal_counts_reasons_of_logs(capsys):
 
 
 def test_batch_csv_missing_numbers_empty_no_formulas(tmp_path):
-    table = fleet_table([{"name": "=1+1.ulg", "updates": 3, "kf_nis_mean": None}, {"reason": None}])
+    table = make_table([{"name": "=1+1.ulg", "updates": 3, "kf_nis_mean": None}, {"reason": None}])
     assert table["kf_nis_mean"].isna().all()
     assert table["updates"].isna().tolist() == [False, True]
     head, row, _ = csv_bytes(table).decode("utf-8-sig").splitlines()
@@ -189,7 +190,7 @@ def test_batch_csv_missing_numbers_empty_no_formulas(tmp_path):
     assert values["name"] == "'=1+1.ulg"
     assert (values["updates"], values["kf_nis_mean"]) == ("3", "")
     # a file name that is not UTF-8 is replaced
-    table = fleet_table([{"log": os.fsdecode(b"flight-\xff.ulg"), "status": "failed"}])
+    table = make_table([{"log": os.fsdecode(b"flight-\xff.ulg"), "status": "failed"}])
     table.to_parquet(tmp_path / "fleet.parquet")
     assert pd.read_parquet(tmp_path / "fleet.parquet")["log"].item() == "flight-?.ulg"
     assert "flight-?.ulg" in csv_bytes(table).decode()
@@ -441,7 +442,7 @@ def test_batch_shared_logs_run_completely(shared_logs, tmp_path):
 
 
 def test_batch_unusable_cluster_prints_one_line(monkeypatch, flights):
-    monkeypatch.setattr(engine, "CONNECT_S", 0.5)
+    monkeypatch.setattr(engine, "CONNECT_TIMEOUT_S", 0.5)
     for address in ("tcp://127.0.0.1:1", "nonsense://x", ""):
         with (
             pytest.raises(SettingsError, match="no Dask scheduler answers"),
@@ -488,7 +489,7 @@ def assert_cluster_gives_the_same_table(address, flights, undisturbed, tmp_path)
     (other / "METADATA").write_text("Metadata-Version: 2.1\nName: px4fuse\nVersion: 9.9\n")
     path = f"{tmp_path}{os.pathsep}{batch_tools.REPOSITORY}"
     with started_worker(address, tmp_path / "third", path):
-        assert "runs px4fuse 9.9, but this computer runs" in error_line("batch", *arguments)
+        assert "has px4fuse 9.9; this computer has" in error_line("batch", *arguments)
 
 
 def assert_failed_job_does_not_affect_others(address):

@@ -75,7 +75,7 @@ def test_group_by_cause_lists_consequences_after_cause(given: Any, told: Any) ->
 
 def test_verdict_notes_small_factor_and_not_white_are_listed(sample: Analysis) -> None:
     small, white = verdict_notes(sample)
-    assert "KF aisle (1.09×)" in small
+    assert "KF aisle (σ 1.09 times too large)" in small
     verdict = format_verdict(sample.axes["aisle"].filters["kf"])
     assert verdict == "underconfident, σ 1.09× too large"
     assert "Ljung-Box test, p < 0.001" in white

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from pypdf import PdfReader
 
 from px4fuse.answer_form import Answers, StudentMistake
-from px4fuse.grading.class_page import html_text, tenths
+from px4fuse.grading.class_page import count_tenths, html_text
 from px4fuse.grading.model import Entry, GradedReport, Item, Override
 from px4fuse.grading.outputs import anonymise_entry
 from px4fuse.verification.model import Mismatch, PageDifference, Verdict
@@ -45,17 +45,17 @@ def graded(name: str, points: float | None, **more: Any) -> GradedReport:
     )  # fmt: skip
 
 
-OF_ENTRY = ("handed_in_at", "late_s", "deduction", "overrides", "comment", "total",
-            "others")  # fmt: skip
+OF_ENTRY = ("submitted_at", "late_s", "deduction", "overrides", "comment", "total",
+            "other_reports")  # fmt: skip
 
 
 def row(name: str, points: float | None, **more: Any) -> Entry:
     """Make the entry of a student with one report; other arguments are for the report."""
     own = {key: more.pop(key) for key in OF_ENTRY if key in more}
     one = graded(name, points, **more)
-    own["handed_in"] = own.pop("handed_in_at", "")
-    own.setdefault("total", None if points is None else one.counted)
-    return Entry(name, one.student_id, one, of=one.of, flags=one.flags, **own)
+    own["submission_time"] = own.pop("submitted_at", "")
+    own.setdefault("total", None if points is None else one.counted_points)
+    return Entry(name, one.student_id, one, max_points=one.max_points, flags=one.flags, **own)
 
 
 FORM = Answers(
@@ -68,7 +68,7 @@ CLASS = (
         18.5,
         id="1007",
         numbers={"mean NIS": 1.02},
-        redrawn_name="reports/1007.pdf",
+        redrawn_path="reports/1007.pdf",
         mistakes={"positions that jump": True},
     ),
     row(
@@ -93,13 +93,15 @@ CLASS = (
         notes=BREAKOUT,
         reasons=(BREAKOUT,),
         numbers={MARKUP: 1.0},
-        pending=MARKUP,
+        pending_action=MARKUP,
         form=FORM,
         mistakes={MARKUP: False},
-        redrawn_name="javascript:alert(1)",
+        redrawn_path="javascript:alert(1)",
         comment=BREAKOUT,
-        items=(Item(BREAKOUT, 5.0, 20.0, MARKUP, by_hand=True, awaits_points=True),),
-        handed_in_at=MARKUP,
+        items=(
+            Item(BREAKOUT, 5.0, 20.0, MARKUP, is_scored_by_instructor=True, awaits_points=True),
+        ),
+        submitted_at=MARKUP,
         overrides={BREAKOUT: Override(None, MARKUP)},
     ),
     row(REVERSED, 8.0, id="5"),
@@ -130,7 +132,7 @@ def test_class_page_any_text_adds_no_html_elements(text: str) -> None:
             word, 5.0, id=word, file=f"{word}.pdf", flags=(word,), reasons=(word,),
             notes=f"So: {word}",
             numbers={word: 1.0}, items=(Item(word, 5.0, 20.0, word),), mistakes={word: False},
-            pending=word, form=FORM, comment=word,
+            pending_action=word, form=FORM, comment=word,
         )  # fmt: skip
         return html_text([one], word, word)
 
@@ -142,7 +144,8 @@ def test_class_page_any_text_adds_no_html_elements(text: str) -> None:
 
 def test_class_page_pending_points_are_not_averaged() -> None:
     said = {"Notes": Override(9.0, "Good.")}
-    entries = [row("Ada", 10.0, late_s=61), row("Bo", 20.0), row("Cy", 12.0, pending="Run 0.1.1."),
+    entries = [row("Ada", 10.0, late_s=61), row("Bo", 20.0),
+               row("Cy", 12.0, pending_action="Run 0.1.1."),
                row("Di", 13.0, overrides=said, total=13.0)]  # fmt: skip
     text = html_text(entries, "Class", "px4fuse 1")
     assert "2 min late" in text  # 61 s are rounded up
@@ -182,13 +185,14 @@ def anonymous_class() -> list[Entry]:
         flag = f"The same log as {others[0][0]}, {others[0][1]} ({others[0][2] or 'x'}). {SAYS}"
         said = f"Your report names {name}, {student_id}. {SAYS}"
         entry = row(
-            name, 9.0, id=student_id, file=file, flags=(flag,), reasons=(said,), pending=said,
+            name, 9.0, id=student_id, file=file, flags=(flag,), reasons=(said,),
+            pending_action=said,
             notes=f"{name} ({student_id}): {SAYS} 王小明", form=FORM,
             numbers={"mean NIS": 1.0}, items=(Item("Settings", 9.0, 20.0, said),),
             mistakes={"positions that jump": False}, comment=said,
             overrides={"Settings": Override(10.0, said)},
-            others=(graded(name, 3.0, file=f"old/{file}"),),
-            redrawn_name=f"reports/{student_id}.pdf", sha256="ab" * 32,
+            other_reports=(graded(name, 3.0, file=f"old/{file}"),),
+            redrawn_path=f"reports/{student_id}.pdf", sha256="ab" * 32,
         )  # fmt: skip
         entry = entry if file else Entry(name, student_id, None)
         entries.append(anonymise_entry(entry, f"Student {(7 * number) % 4 + 1:03}"))
@@ -285,7 +289,7 @@ def test_class_page_keys_step_through_reports(page: Browser) -> None:
 
 
 def test_class_page_redrawn_report_is_linked() -> None:
-    one = row("Zoë", 18.5, redrawn_name="reports/1.pdf", pages=(PageDifference(1, "a word"),))
+    one = row("Zoë", 18.5, redrawn_path="reports/1.pdf", pages=(PageDifference(1, "a word"),))
     made = content(html_text([one, row("Bo", 1.0)], "Class", "px4fuse 1"))
     (leads,) = (part for part in made["rows"][0][3] if part[0] == "links")
     assert [to for _, to in leads[2]] == ["reports/1.pdf"]
@@ -293,7 +297,7 @@ def test_class_page_redrawn_report_is_linked() -> None:
 
 
 def test_tenths_count_values_by_lower_edge() -> None:
-    assert tenths([0, 5, 5.5, 9, 99], 10) == [
+    assert count_tenths([0, 5, 5.5, 9, 99], 10) == [
         (count, f"{edge}") for edge, count in enumerate((1, 0, 0, 0, 0, 2, 0, 0, 0, 2))
     ]
 

@@ -31,7 +31,7 @@ finite = st.floats(allow_nan=False, allow_infinity=False, width=32)
 
 
 def entry(graded: GradedReport, **more) -> Entry:
-    values = {"total": graded.points, "of": graded.of} | more
+    values = {"total": graded.points, "max_points": graded.max_points} | more
     return Entry(graded.student, graded.student_id, graded, **values)
 
 
@@ -42,7 +42,7 @@ def graded(text: str, numbers: dict[str, float] | None = None, points: float = 1
         items=(Item(text, points, 2.0, text),), flags=(text, text), numbers=numbers or {},
         log_sha256="ab" * 32,
     )  # fmt: skip
-    return entry(one, others=(one,), handed_in=text, comment=text, flags=(text, text))
+    return entry(one, other_reports=(one,), submission_time=text, comment=text, flags=(text, text))
 
 
 def cells(text: str, delimiter: str = ",") -> list[list[str]]:
@@ -137,8 +137,8 @@ def test_csv_text_has_bom_and_crlf() -> None:
 def test_csv_text_lists_late_pending_and_missing() -> None:
     one = GradedReport("a.pdf", "A", "1", VERIFIED, (Item("notes", 1.5, 2.0, ""),))
     late = entry(one, late_s=5400.0, deduction=0.4, total=1.1, comment="see me")
-    pending = entry(replace(one, pending="Run 0.1.1."), total=None)
-    head, *rest = cells(csv_text([late, pending, Entry("C", "-17", None, of=4.0)]))
+    pending = entry(replace(one, pending_action="Run 0.1.1."), total=None)
+    head, *rest = cells(csv_text([late, pending, Entry("C", "-17", None, max_points=4.0)]))
     asked = ("id", "status", "points", "pending points", "deducted", "total", "hours late",
              "pending", "comment")  # fmt: skip
     assert [[dict(zip(head, row, strict=True))[name] for name in asked] for row in rest] == [

@@ -10,7 +10,7 @@ from pyulog import ULog
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.model import AxisComparison, Comparison, Difference, UnjudgedFilter
+from px4fuse.comparison.model import AxisComparison, Comparison, Difference, UntestedFilter
 from px4fuse.comparison.preparation import prepare
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import Settings
@@ -204,7 +204,7 @@ class TestMissingParts:
             assert result.filters["kf"].count == 600
             assert result.filters["kf"].truth.position_rmse_m < 0.09
             ekf2 = result.filters["ekf2"]
-            assert isinstance(ekf2, UnjudgedFilter)
+            assert isinstance(ekf2, UntestedFilter)
             assert ekf2.reason == comparison.flight.ekf2.reason
             for part in (
                 result.ekf2_state, result.ekf2_variance, result.ekf2_innovations,

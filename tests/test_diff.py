@@ -10,9 +10,9 @@ from msgspec import structs
 from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.ekf2.aids import AidAxis, AidResult
-from px4fuse.fleet.changes import changes, number_changes
+from px4fuse.fleet.changes import list_changes, number_changes
 from px4fuse.fleet.inputs import DiffInput
-from px4fuse.fleet.measures import MEASURES, Number, numbers
+from px4fuse.fleet.measures import MEASURES, ComparedNumber, collect_numbers
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
 from px4fuse.results.contract import ChangeResults, ComparisonResults, to_json
@@ -22,8 +22,8 @@ from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
 
-def number(value: float, interval=None) -> Number:
-    return Number("label", "m", value, interval)
+def number(value: float, interval=None) -> ComparedNumber:
+    return ComparedNumber("label", "m", value, interval)
 
 
 # -- numbers ---------------------------------------------------------------------------------------
@@ -75,14 +75,14 @@ def by_path(found: ChangeResults) -> dict[str, tuple[float | None, float | None]
 
 
 def test_changes_of_equal_flights_are_not_worse(clean):
-    found = changes(clean, flown(503))
+    found = list_changes(clean, flown(503))
     assert found.worse == ()
     assert {one.name for one in found.settings} <= {"start (s)", "end (s)"}
-    assert changes(clean, clean).numbers == ()
+    assert list_changes(clean, clean).numbers == ()
 
 
 def test_changes_of_noisy_source_have_recorded_interval(clean):
-    found = changes(clean, flown(502, sigma_uwb_m=0.2))
+    found = list_changes(clean, flown(502, sigma_uwb_m=0.2))
     (sigma_z,) = [one for one in found.numbers if one.path == "tuning.horizontal.sigma_z_m"]
     assert sigma_z.label == "SIGMA_Z estimate, horizontal"
     assert sigma_z.a_interval == clean.results.tuning["horizontal"].sigma_z_m_interval
@@ -91,7 +91,7 @@ def test_changes_of_noisy_source_have_recorded_interval(clean):
 
 
 def test_changes_of_ekf2_noise_are_worse_in_nis_of_ekf2(clean):
-    found = changes(clean, flown(506, "ekf2-noise=0.3"))
+    found = list_changes(clean, flown(506, "ekf2-noise=0.3"))
     (noise,) = [one for one in found.settings if one.name == "EKF2_EVP_NOISE"]
     assert (noise.a, noise.b) == (0.1, 0.3)
     assert "ekf2_underconfident" in {one.id for one in found.findings if one.only_in == "B"}
@@ -127,8 +127,8 @@ def nees(side: DiffInput, value: float) -> DiffInput:
 def test_changes_of_nees_beyond_limit_are_worse(clean, value, said):
     before, after = nees(clean, 1.0), nees(clean, value)
     worse = [f"Mean NEES of KF, north: 1 (consistent) → {said}"] if said else []
-    assert list(changes(before, after).worse) == worse
-    assert changes(after, before).worse == ()
+    assert list(list_changes(before, after).worse) == worse
+    assert list_changes(after, before).worse == ()
 
 
 def test_changes_of_nis_need_band_and_factor_to_be_worse(clean):
@@ -138,8 +138,8 @@ def test_changes_of_nis_need_band_and_factor_to_be_worse(clean):
         (1.7, "consistent", 0), (0.5, "underconfident", 1),
     ):  # fmt: skip
         after = with_kf(clean, nis_mean=nis_mean, verdict=verdict)
-        assert len(changes(before, after).worse) == count
-        assert changes(after, after).worse == ()
+        assert len(list_changes(before, after).worse) == count
+        assert list_changes(after, after).worse == ()
 
 
 def test_changes_with_new_error_are_worse(clean):
@@ -147,13 +147,13 @@ def test_changes_with_new_error_are_worse(clean):
     errors = {one.id for one in late.results.findings if one.severity == "error"}
     assert errors
     alone = as_input(replace(clean.results, findings=late.results.findings))
-    worse = changes(as_input(replace(clean.results, findings=())), alone).worse
+    worse = list_changes(as_input(replace(clean.results, findings=())), alone).worse
     assert set(worse) == {f"New finding of severity error: {one}." for one in errors}
-    assert changes(alone, clean).worse == ()
+    assert list_changes(alone, clean).worse == ()
     # the same finding with a higher severity is new
     raised = tuple(structs.replace(one, severity="error") for one in clean.results.findings)
     assert raised
-    assert changes(clean, as_input(replace(clean.results, findings=raised))).worse
+    assert list_changes(clean, as_input(replace(clean.results, findings=raised))).worse
 
 
 # -- the list of measures --------------------------------------------------------------------------
@@ -162,7 +162,7 @@ def test_changes_with_new_error_are_worse(clean):
 def test_measures_have_unique_paths_and_valid_intervals(clean):
     paths = [one["path"] for one in MEASURES]
     assert len(set(paths)) == len(paths)
-    found = numbers(clean.results)
+    found = collect_numbers(clean.results)
     assert {path for path, one in found.items() if one.interval} >= {
         "tuning.horizontal.sigma_z_m", "tuning.horizontal.sigma_a_two_state_m_s2", "clock.offset_s",
     }  # fmt: skip
@@ -188,7 +188,7 @@ def aid_axis(nis_mean: float) -> AidAxis:
 def test_measures_of_aids_leave_out_position_source(clean):
     axes = aid_axis(1.2), aid_axis(0.9)
     judged = {"gnss_vel": aid(*axes, rejected_fraction=0.1), "ev_pos": aid(*axes)}
-    found = numbers(structs.replace(clean.results, aids=judged))
+    found = collect_numbers(structs.replace(clean.results, aids=judged))
     of_aids = {path: one for path, one in found.items() if path.startswith("aids.")}
     # external vision is the source itself, and listed by axis
     assert {path.split(".")[1] for path in of_aids} == {"gnss_vel"}
@@ -197,12 +197,12 @@ def test_measures_of_aids_leave_out_position_source(clean):
     share = of_aids["aids.gnss_vel.rejected_fraction"]
     assert (share.label, share.unit) == ("rejected by EKF2, GNSS velocity", "share")
     source = structs.replace(clean.results.source, kind="gnss")
-    found = numbers(structs.replace(clean.results, source=source, aids=judged))
+    found = collect_numbers(structs.replace(clean.results, source=source, aids=judged))
     assert "ev_pos" in {path.split(".")[1] for path in found}
 
 
 def test_changes_without_an_axis_list_its_numbers(clean):
     part = as_input(replace(clean.results, axes={"north": clean.results.axes["north"]}))
-    found = by_path(changes(clean, part))
+    found = by_path(list_changes(clean, part))
     assert found["axes.down.filters.kf.nis_mean"][1] is None
     assert all(b is None for _, b in found.values())

@@ -64,10 +64,10 @@ def test_model_gnss_flight_includes_earth_rotation() -> None:
     assert metres == pytest.approx((1.00357, 1.00302, 1.0), abs=1e-5)
     flat_m, round_m = (found.inputs.received.position_m for found in (flat, round_))
     np.testing.assert_allclose(round_m, flat_m * metres)
-    (flat_stretch,), (stretch,) = flat.inputs.stretches, round_.inputs.stretches
-    np.testing.assert_allclose(stretch.state[6:9], flat_stretch.state[6:9] * metres)
-    turned = stretch.correction_rad - flat_stretch.correction_rad
-    expected = earth_rate_rad_s(known) * stretch.step_s[:, None]
+    (flat_stretch,), (segment,) = flat.inputs.segments, round_.inputs.segments
+    np.testing.assert_allclose(segment.state[6:9], flat_stretch.state[6:9] * metres)
+    turned = segment.correction_rad - flat_stretch.correction_rad
+    expected = earth_rate_rad_s(known) * segment.step_s[:, None]
     np.testing.assert_allclose(turned, expected, atol=1e-12)
     for name in ("delayed", "published"):
         difference = getattr(round_.flown, name) - getattr(flat.flown, name)

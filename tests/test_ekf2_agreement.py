@@ -40,10 +40,10 @@ def replayed(fused_at: list[float], taken: list[float] | None = None) -> pd.Data
 def test_match_updates_uses_measurement_or_fusion_time():
     """An older topic has no measurement time, and repeats the last fusion for 0.5 s."""
     times = np.array([0.9, 0.9941, 1.0, 1.1059, 1.1061, 1.2, 1.3])
-    found = match_updates(replayed([9.0, 9.0, 9.0], [1.0, 1.1, 1.2]), times, own=True)
+    found = match_updates(replayed([9.0, 9.0, 9.0], [1.0, 1.1, 1.2]), times, is_own_topic=True)
     assert found.tolist() == [-1, 0, 0, 1, -1, 2, -1]
     times = np.array([0.9998, 0.99995, 1.0, 1.5, 1.5001, 2.0, 2.4])
-    found = match_updates(replayed([1.0, 2.0], [0.8, 1.8]), times, own=False)
+    found = match_updates(replayed([1.0, 2.0], [0.8, 1.8]), times, is_own_topic=False)
     assert found.tolist() == [-1, 0, 0, 0, -1, 1, 1]
 
 
@@ -154,7 +154,7 @@ def test_velocity_agreement_constant_is_empty():
     samples = pd.DataFrame(0.1, index=index, columns=[*columns, "innovation_down", "variance_down"])
     ekf2 = made(Ekf2, aids={"gnss_vel": made(AidLog, samples=samples)})
     replay = SimpleNamespace(updates=updates, evaluated_s=((0.0, 99.0),), other_aid_updates={})
-    assert _velocity_agreement(ekf2, replay, own=True) == ({}, True)
+    assert _velocity_agreement(ekf2, replay, is_own_topic=True) == ({}, True)
 
 
 def test_heading_error_without_evaluated_state_is_none():

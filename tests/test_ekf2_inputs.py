@@ -1,4 +1,4 @@
-"""Inputs of the EKF2 replay from a log: parameters, rules, vision, and stretches of steps.
+"""Inputs of the EKF2 replay from a log: parameters, rules, vision, and segments of steps.
 
 The limits are repeated here, so that a change in the code needs a change in the test.
 """
@@ -27,10 +27,10 @@ from px4fuse.ekf2.inputs import (
     read_vision,
 )
 from px4fuse.ekf2.replay_segments import (
-    Stretch,
-    _stretch,
-    down_sampled,
-    find_stretches,
+    ReplaySegment,
+    _make_segment,
+    downsample_imu,
+    find_replay_segments,
     predict_s,
     step_ends,
 )
@@ -39,8 +39,8 @@ from px4fuse.ekf2_parameters import (
     GNSS_POS,
     PARAMETERS,
     check_parameters,
+    effective_settings,
     fuses_by_mask,
-    settings_in_force,
 )
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Columns, Ekf2, Flight, FusionRecord, PositionTrack, Reset, Unavailable
@@ -64,13 +64,15 @@ AID = ("estimator_aid_src_ev_pos",)
 
 def test_settings_in_force_use_px4_defaults():
     """Defaults of PX4's module.yaml and params_*.yaml, by fused aid."""
-    vision, gnss = settings_in_force({}), settings_in_force({}, GNSS_POS)
+    vision, gnss = effective_settings({}), effective_settings({}, GNSS_POS)
     for names, other_names, begin in ((vision, gnss, "EKF2_EV"), (gnss, vision, "EKF2_GPS")):
         assert {*names} - {*other_names} == {name for name in PARAMETERS if name.startswith(begin)}
-    assert settings_in_force({"EKF2_AID_MASK": 1.0}, GNSS_POS)["EKF2_GPS_DELAY"] == 110.0
-    assert settings_in_force({})["EKF2_EV_DELAY"] == 0.0
-    assert settings_in_force({"EKF2_AID_MASK": 8.0})["EKF2_EV_DELAY"] == 175.0
-    assert settings_in_force({"EKF2_AID_MASK": 8.0, "EKF2_EV_DELAY": 50.0})["EKF2_EV_DELAY"] == 50.0
+    assert effective_settings({"EKF2_AID_MASK": 1.0}, GNSS_POS)["EKF2_GPS_DELAY"] == 110.0
+    assert effective_settings({})["EKF2_EV_DELAY"] == 0.0
+    assert effective_settings({"EKF2_AID_MASK": 8.0})["EKF2_EV_DELAY"] == 175.0
+    assert (
+        effective_settings({"EKF2_AID_MASK": 8.0, "EKF2_EV_DELAY": 50.0})["EKF2_EV_DELAY"] == 50.0
+    )
     assert not fuses_by_mask({"EKF2_AID_MASK": 8.0, "EKF2_EV_CTRL": 15.0})
 
 
@@ -106,8 +108,8 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     monkeypatch.setattr(
         inputs_module, "read_vision", lambda *_: made(ReceivedPositions, stamp_s=np.zeros(1))
     )
-    stretch = made(Stretch, field=None)
-    monkeypatch.setattr(inputs_module, "find_stretches", lambda *_, **_more: (stretch,))
+    segment = made(ReplaySegment, field=None)
+    monkeypatch.setattr(inputs_module, "find_replay_segments", lambda *_, **_more: (segment,))
 
     def prepared(
         interval_s: float = 0.008, horizon_s: Any = 0.1, firmware: str = "PX4 v1.16.1",
@@ -151,7 +153,7 @@ def test_prepare_inputs_checks_imu_and_horizon(flown):
     assert flown(fusing=NONE).vision_height is False
     every = np.arange(2, 998)
     assert "11% of the IMU samples are missing" in flown(without=every[::10]).reason
-    # fewer missing samples, and a gap, at which a stretch ends
+    # fewer missing samples, and a gap, at which a segment ends
     assert isinstance(flown(without=every[::12]), Inputs)
     assert isinstance(flown(without=np.arange(400, 600)), Inputs)
 
@@ -240,7 +242,7 @@ def test_logged_decisions_match_measurement_time():
         assert not reset.any()
 
 
-# ---------------------------------------------------------------- stretches
+# ---------------------------------------------------------------- segments
 
 
 def test_position_corrections_exclude_resets():
@@ -284,7 +286,7 @@ def test_down_sampled_gain_is_in_final_frame():
     """With 1 mrad per sample, earlier velocity changes are rotated by the later rotation."""
     turn = np.tile([0.0, 0.0, 0.001], (3, 1))
     gain = np.tile([1.0, 0.0, 0.0], (3, 1))
-    total, gained = down_sampled(turn, gain, np.array([2, 3]))
+    total, gained = downsample_imu(turn, gain, np.array([2, 3]))
     assert_allclose(total[:, 2], [0.002, 0.001])
     assert_allclose(gained[:, 0], [2.0, 1.0])
     assert_allclose(gained[:, 1], [-0.002, -0.0005], atol=1e-12)
@@ -317,7 +319,7 @@ def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, Fusio
 
 def test_stretch_rotating_vehicle_has_expected_fields():
     flown = turning(10.0 + 0.1 * np.arange(21))
-    found = _stretch(*flown, 5, 11.5)
+    found = _make_segment(*flown, 5, 11.5)
     steps = 10.5 + 0.01 * np.arange(101)
     assert_allclose(found.time_s, steps, atol=1e-9)
     assert_allclose(found.step_s, 0.01, atol=1e-9)
@@ -337,11 +339,11 @@ def test_stretch_rotating_vehicle_has_expected_fields():
     assert_allclose(found.attitude_error_rad[:, 2], 0.05 + 0.1 * (steps - 10.5), atol=1e-6)
     assert found.fusing
     flown[3].delayed[Columns.POSITION] = 3.0
-    assert_allclose(_stretch(*flown, 5, 11.5).state[6:9], [3.0, 3.0, 10.5])
+    assert_allclose(_make_segment(*flown, 5, 11.5).state[6:9], [3.0, 3.0, 10.5])
 
 
-def stretches(monkeypatch, **parts: Any) -> list[tuple[float, float]]:
-    """Return start and end of each stretch of a 60 s flight with samples every 0.01 or 0.1 s."""
+def segments(monkeypatch, **parts: Any) -> list[tuple[float, float]]:
+    """Return start and end of each segment of a 60 s flight with samples every 0.01 or 0.1 s."""
     found: list[tuple[float, float]] = []
     tenths = np.arange(0.0, 60.0, 0.1)
     usual = {
@@ -353,13 +355,15 @@ def stretches(monkeypatch, **parts: Any) -> list[tuple[float, float]]:
     def keep(_imu: Any, _attitude: Any, _ekf2: Any, record: Any, at: int, high: float) -> None:
         found.append((float(record.delayed.index[at]), round(float(high), 2)))
 
-    monkeypatch.setattr("px4fuse.ekf2.replay_segments._stretch", keep)
+    monkeypatch.setattr("px4fuse.ekf2.replay_segments._make_segment", keep)
     imu, fused, delayed = (
         pd.DataFrame(index=each) for each in (given.imu, given.fused, given.delayed)
     )
     ekf2 = made(Ekf2, innovations={"north": fused}, instances=given.instances)
     record = made(FusionRecord, delayed=delayed)
-    find_stretches(made(Flight, airborne=given.airborne), imu, imu, ekf2, record, given.vision)
+    find_replay_segments(
+        made(Flight, airborne=given.airborne), imu, imu, ekf2, record, given.vision
+    )
     return found
 
 
@@ -369,27 +373,27 @@ def without(times: np.ndarray, low: float, high: float) -> np.ndarray:
 
 def test_find_stretches_applies_limits(monkeypatch):
     imu, vision = np.arange(0.0, 60.0, 0.01), np.arange(0.0, 60.0, 0.1)
-    assert stretches(monkeypatch) == [(1.0, 59.99)]
+    assert segments(monkeypatch) == [(1.0, 59.99)]
     # 1 s of fusion, 4 s in the air
     late = np.arange(20.0, 60.0, 0.1)
-    assert stretches(monkeypatch, fused=late) == [(21.0, 59.99)]
-    assert stretches(monkeypatch, airborne=((10.0, 50.0), (52.0, 60.0))) == [(14.0, 59.99)]
-    assert stretches(monkeypatch, airborne=((70.0, 90.0),)) == [(1.0, 59.99)]
+    assert segments(monkeypatch, fused=late) == [(21.0, 59.99)]
+    assert segments(monkeypatch, airborne=((10.0, 50.0), (52.0, 60.0))) == [(14.0, 59.99)]
+    assert segments(monkeypatch, airborne=((70.0, 90.0),)) == [(1.0, 59.99)]
     # gaps above 2 s in vision and above 0.05 s in the IMU split the flight
-    assert len(stretches(monkeypatch, vision=without(vision, 30.0, 31.9))) == 1
+    assert len(segments(monkeypatch, vision=without(vision, 30.0, 31.9))) == 1
     exactly = without(np.arange(0.0, 60.0, 0.125), 30.0, 32.0)
-    assert len(stretches(monkeypatch, vision=exactly)) == 1
-    parted = stretches(monkeypatch, vision=without(vision, 30.0, 32.2))
+    assert len(segments(monkeypatch, vision=exactly)) == 1
+    parted = segments(monkeypatch, vision=without(vision, 30.0, 32.2))
     assert parted == [(1.0, 30.0), (33.5, 59.99)]
-    assert len(stretches(monkeypatch, imu=without(imu, 30.0, 30.04))) == 1
-    parted = stretches(monkeypatch, imu=without(imu, 30.0, 30.07))
+    assert len(segments(monkeypatch, imu=without(imu, 30.0, 30.04))) == 1
+    parted = segments(monkeypatch, imu=without(imu, 30.0, 30.07))
     assert [start for start, _ in parted] == [1.0, 31.5]
     # another EKF2 instance has different states and splits the flight
-    parted = stretches(monkeypatch, instances=((-np.inf, 0), (30.2, 1)))
+    parted = segments(monkeypatch, instances=((-np.inf, 0), (30.2, 1)))
     assert parted == [(1.0, 30.2), (31.5, 59.99)]
-    # a stretch has at least 10 s and ends 1 s after the last vision sample
-    assert stretches(monkeypatch, fused=np.arange(48.0, 60.0, 0.1))[0][0] == 49.0
-    assert stretches(monkeypatch, fused=np.arange(49.3, 60.0, 0.1)) == []
-    assert stretches(monkeypatch, fused=np.array([])) == []
-    assert stretches(monkeypatch, vision=np.arange(5.0, 40.0, 0.1)) == [(6.0, 40.9)]
+    # a segment has at least 10 s and ends 1 s after the last vision sample
+    assert segments(monkeypatch, fused=np.arange(48.0, 60.0, 0.1))[0][0] == 49.0
+    assert segments(monkeypatch, fused=np.arange(49.3, 60.0, 0.1)) == []
+    assert segments(monkeypatch, fused=np.array([])) == []
+    assert segments(monkeypatch, vision=np.arange(5.0, 40.0, 0.1)) == [(6.0, 40.9)]
     assert predict_s(made(FusionRecord, parameters={})) == 0.01

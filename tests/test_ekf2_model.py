@@ -34,8 +34,8 @@ def vision_of(flight: Flight) -> pd.DataFrame:
 
 
 def test_interval_equals_product_of_steps(model: Model) -> None:
-    stretch, made = model.inputs.stretches[0], next(iter(model.intervals.values()))[0]
-    end = made.events.end
+    segment, made = model.inputs.segments[0], next(iter(model.intervals.values()))[0]
+    end = made.events.end_step
     starts = np.concatenate([[0], end[:-1]])
     gyro, force = (model.inputs.settings[f"EKF2_{name}_NOISE"] for name in ("GYR", "ACC"))
     noise = np.zeros_like(made.transition)
@@ -44,12 +44,12 @@ def test_interval_equals_product_of_steps(model: Model) -> None:
         F, Q = np.eye(15), np.zeros((15, 15))
         x = x0 = np.random.default_rng(at).normal(0.0, 0.01, 15)
         for k in range(starts[at], end[at]):
-            F = step_matrix(stretch, k) @ F
-            old = step_matrix(stretch, k, trapezoid=False)
-            Q = old @ Q @ old.T + step_noise(stretch, k, gyro, force)
-            x = step_state(stretch, k, x)
+            F = step_matrix(segment, k) @ F
+            old = step_matrix(segment, k, trapezoid=False)
+            Q = old @ Q @ old.T + step_noise(segment, k, gyro, force)
+            x = step_state(segment, k, x)
         assert made.transition[at] == pytest.approx(F, abs=1e-12)
-        moved = made.transition[at] @ x0 + made.turn[at] + made.drive[at]
+        moved = made.transition[at] @ x0 + made.correction_input[at] + made.acceleration_input[at]
         assert moved == pytest.approx(x, abs=1e-12)
         # closed forms assume equal steps and a mean force; the real ones vary
         part = slice(0, 9)
@@ -64,21 +64,21 @@ def test_delayed_states_follow_from_interval_start(model: Model, attitude: bool)
     (part,) = run_variants(model.inputs, [variant], model.intervals)
     kept = np.random.default_rng(4).normal(0.0, 0.05, part.state.shape)
     state, _ = delayed_states(replace(part, state=kept), 0)
-    stretch, ends = part.stretch, part.events[0].end
+    segment, ends = part.segment, part.events[0].end_step
     if not attitude:
-        stretch = replace(stretch, correction_rad=np.zeros_like(stretch.correction_rad))
+        segment = replace(segment, correction_rad=np.zeros_like(segment.correction_rad))
     np.testing.assert_array_equal(state[ends], kept[1:, 0])
     for at in (0, 1, 57, 300, len(ends)):  # after the last event follows one more interval
         x = kept[at, 0]
-        first, last = np.concatenate([[0], ends, [len(stretch.step_s)]])[[at, at + 1]]
+        first, last = np.concatenate([[0], ends, [len(segment.step_s)]])[[at, at + 1]]
         for k in range(first, last - 1):
-            x = step_state(stretch, k, x)
+            x = step_state(segment, k, x)
             np.testing.assert_allclose(state[k + 1], x, rtol=0.0, atol=1e-10)
 
 
 def test_recursion_matches_plain_replay(model: Model) -> None:
     events = next(iter(model.intervals.values()))[0].events
-    nu, S = plain_replay(model.inputs, model.inputs.stretches[0], events[events.end < 3000])
+    nu, S = plain_replay(model.inputs, model.inputs.segments[0], events[events.end_step < 3000])
     updates = model.flown.updates.iloc[: len(nu)]
     assert len(nu) > 100
     for at, axis in enumerate(HORIZONTAL):

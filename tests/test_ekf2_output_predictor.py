@@ -11,7 +11,7 @@ from px4fuse.ekf2.replay_segments import (
     GRAVITY_M_S2,
     POSITION,
     VELOCITY,
-    Stretch,
+    ReplaySegment,
 )
 
 STEP_S = 0.01
@@ -60,11 +60,11 @@ def test_publish_matches_step_by_step_buffer(lag: int) -> None:
     reset = np.zeros((n + 1, 3))
     reset[150:] = 0.7, -0.2, 0.0
     position += reset
-    stretch = made_of(Stretch, rotation=turn, force_m_s2=force, step_s=np.full(n, STEP_S))
+    segment = made_of(ReplaySegment, rotation=turn, force_m_s2=force, step_s=np.full(n, STEP_S))
     state = np.zeros((n + 1, 15))
     state[:, VELOCITY], state[:, POSITION], state[:, ACCELEROMETER_BIAS] = velocity, position, bias
     settings = {"EKF2_TAU_VEL": 0.25, "EKF2_TAU_POS": 0.4}
-    made = publish(stretch, state, reset, turned, lag, settings)
+    made = publish(segment, state, reset, turned, lag, settings)
     expected = buffered(gain, velocity, position, reset, lag, 0.25, 0.4)
     for found, known in zip(made, expected, strict=True):
         assert found == pytest.approx(known, abs=1e-9)

@@ -15,13 +15,13 @@ from findings_tools import log, made
 from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2.filter_recursion import (
-    StretchRun,
+    SegmentRun,
     Variant,
     _Fusion,
     _limit_bias,
     _sequential_update,
     _settled_correlation,
-    run_stretch,
+    run_segment,
 )
 from px4fuse.ekf2.filter_recursion import _measurements as measurements
 from px4fuse.ekf2.inputs import FusionRules, Inputs, ReceivedPositions
@@ -36,8 +36,8 @@ from px4fuse.ekf2.intervals import (
     make_intervals,
 )
 from px4fuse.ekf2.model import Model, replay_settings
-from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, Stretch, add_field_states
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, settings_in_force
+from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment, add_field_states
+from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, effective_settings
 from px4fuse.errors import SettingsError
 from px4fuse.trajectory.rotation import skew
 
@@ -59,7 +59,7 @@ def test_measurements_apply_lever_arm_and_noise():
     vision = made(ReceivedPositions, position_m=np.array([[1.0, 2.0, 3.0]]),
                   variance_m2=np.array([[0.04, 0.0001, 0.0]]))  # fmt: skip
     turned = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
-    stretch = made(Stretch, rotation=np.array([np.eye(3), turned]))
+    segment = made(ReplaySegment, rotation=np.array([np.eye(3), turned]))
     parameters = {
         "EKF2_EVP_NOISE": np.array([0.1, 0.001]), "EKF2_EV_NOISE_MD": np.array([0.0, 1.0]),
         "EKF2_EV_POS_X": np.array([0.0, 0.3]), "EKF2_EV_POS_Y": np.zeros(2),
@@ -67,21 +67,21 @@ def test_measurements_apply_lever_arm_and_noise():
     }  # fmt: skip
     inputs = made(Inputs, received=vision, imu_offset_m=np.zeros(3))
     at = np.array([0]), np.array([[1]])
-    position, noise = measurements(inputs, stretch, *at, parameters, np.array([True, True]))
+    position, noise = measurements(inputs, segment, *at, parameters, np.array([True, True]))
     # 0.3 m ahead of a body that faces east: the body is west of the sensor
     assert np.isnan(position[..., :3]).all()
     np.testing.assert_allclose(position[0, :, 3:], [[1, 2, 3], [1, 1.7, 3]], atol=1e-12)
     # the reported variance, at least EKF2_EVP_NOISE; or EKF2_EVP_NOISE only, at least 1 cm
     np.testing.assert_allclose(noise[0, :, 3:], [[0.04, 0.01, 0.01], [1e-4, 1e-4, 1e-4]])
-    _, noise = measurements(inputs, stretch, *at, parameters, np.array([False, False]))
+    _, noise = measurements(inputs, segment, *at, parameters, np.array([False, False]))
     np.testing.assert_allclose(noise[0, :, 3:], [[0.01, 0.01, 0.01], [1e-4, 1e-4, 1e-4]])
 
 
 def deciding(
     *,
     action: int = FUSE,
-    startable: bool = False,
-    gated: bool = True,
+    can_start: bool = False,
+    has_gate: bool = True,
     follows_log: bool = False,
     logged: float = np.nan,
     logged_reset: bool = False,
@@ -94,14 +94,15 @@ def deciding(
 ) -> tuple[bool, bool, bool, float, bool, int]:
     """Return rejected, fused and reset at 10 s; then last fusion, stopped, remaining resets."""
     fusion = _Fusion(
-        rules, 10.0 - gap_s, action=np.array([[action]]), startable=np.array([[startable]]),
-        time_s=np.array([[10.0]]), gated=np.array([gated]), as_logged=np.array([follows_log]),
+        rules, 10.0 - gap_s, action=np.array([[action]]), can_start=np.array([[can_start]]),
+        time_s=np.array([[10.0]]), has_gate=np.array([has_gate]),
+        uses_logged_decisions=np.array([follows_log]),
         rejected=np.array([logged]), reset=np.array([logged_reset]),
     )  # fmt: skip
-    fusion.velocity_s = np.array([10.0 - velocity_gap_s])
-    fusion.stopped, fusion.left = np.array([stopped]), np.array([left])
+    fusion.last_velocity_s = np.array([10.0 - velocity_gap_s])
+    fusion.is_stopped, fusion.remaining_resets = np.array([stopped]), np.array([left])
     rejected, taken, reset, _ = fusion.decide(0, np.array([outside]), np.array([False]))
-    last, stop, rest = fusion.last_s[0], fusion.stopped[0], fusion.left[0]
+    last, stop, rest = fusion.last_position_s[0], fusion.is_stopped[0], fusion.remaining_resets[0]
     return bool(rejected[0]), bool(taken[0]), bool(reset[0]), float(last), bool(stop), int(rest)
 
 
@@ -112,10 +113,10 @@ def deciding(
     ({"gap_s": 1.5}, (True, False, True, 10.0, False, 4)),
     ({"gap_s": 1.5, "left": 1}, (True, False, True, 10.0, False, 0)),
     ({"gap_s": 1.5, "left": 0}, (True, False, False, 8.5, True, 0)),
-    ({"gated": False}, (False, True, False, 10.0, False, 5)),
+    ({"has_gate": False}, (False, True, False, 10.0, False, 5)),
     ({"action": START, "left": 2}, (False, False, True, 10.0, False, 5)),
     ({"stopped": True, "outside": False}, (False, False, False, 9.5, True, 5)),
-    ({"stopped": True, "startable": True, "left": 0}, (True, False, True, 10.0, False, 5)),
+    ({"stopped": True, "can_start": True, "left": 0}, (True, False, True, 10.0, False, 5)),
     ({"action": IDLE}, (False, False, False, 9.5, False, 5)),
     # logged decisions
     ({"follows_log": True, "logged": 0.0}, (False, True, False, 10.0, False, 5)),
@@ -197,7 +198,7 @@ def test_sequential_update_uses_initial_innovations():
     assert np.linalg.eigvalsh(left[0]).min() > -1e-9
 
 
-def on_gnss(north_m: list[float], north_m_s: list[float], **more: Any) -> StretchRun:
+def on_gnss(north_m: list[float], north_m_s: list[float], **more: Any) -> SegmentRun:
     """:func:`at_rest` on GNSS, with a velocity for each fix."""
     speed = np.zeros((len(north_m_s), 3))
     speed[:, 0] = north_m_s
@@ -239,7 +240,7 @@ def test_recursion_gate_limit_uses_published_motion(north_m, share, fused):
     assert 5.0 * math.sqrt(S) == pytest.approx(2.515, abs=0.001)
     moved = np.zeros((20, 2))
     moved[10, 0] = share * (1.0 - R / S) * done.innovation[10, 0, 3]
-    assert bool(on_gnss(fixes, [0.0] * 20, moved_m=moved).fused[10, 0]) is fused
+    assert bool(on_gnss(fixes, [0.0] * 20, correction_m=moved).fused[10, 0]) is fused
     assert bool(done.fused[10, 0]) is (north_m < 2.515)
 
 
@@ -247,21 +248,21 @@ def test_settled_correlation_matches_kalman_filter():
     """Reference: a plain Kalman filter of a vehicle at rest for one minute, facing east."""
     turn = Rotation.from_euler("z", 110.0, degrees=True).as_matrix()
     count = 6000
-    stretch = made(
-        Stretch, step_s=np.full(count, 0.01), rotation=np.tile(turn, (count + 1, 1, 1)),
+    segment = made(
+        ReplaySegment, step_s=np.full(count, 0.01), rotation=np.tile(turn, (count + 1, 1, 1)),
         force_m_s2=np.zeros((count, 3)) - GRAVITY_M_S2, variance=np.empty(15),
     )  # fmt: skip
     P = np.diag(np.repeat([0.1, 0.3, 0.5, 1e-5, 0.2], 3) ** 2)
     for k in range(count):
-        F = step_matrix(stretch, k)
-        P = F @ P @ F.T + step_noise(stretch, k, 1e-4, 0.35)
+        F = step_matrix(segment, k)
+        P = F @ P @ F.T + step_noise(segment, k, 1e-4, 0.35)
         if k % 10 == 9:
             for row in (3, 4, 5):
                 P -= np.outer(P[row], P[row]) / (P[row, row] + 0.01)
     deviation = np.sqrt(np.diag(P))
     known = (P / deviation[:, None] / deviation)[:2, 12:14]
-    stretch.variance[:] = np.diag(P)
-    found = _settled_correlation(stretch)
+    segment.variance[:] = np.diag(P)
+    found = _settled_correlation(segment)
     np.testing.assert_allclose(found[:2, 12:14], known, atol=0.03)
     assert np.abs(known).max() > 0.9
     np.testing.assert_allclose(np.diag(found), 1.0)
@@ -319,12 +320,12 @@ def test_recursion_magnetometer_estimates_heading(speed_m_s):
 def at_rest(
     measured_m: list[float], down_m: float = 0.0, aid: Aid = EV_POS, rules: FusionRules = RULES,
     speed_m_s: Any = None, tilt_rad2: float = np.inf, without: Any = None,
-    heading_rad: float = 0.0, field_gauss: Any = None, moved_m: Any = None, **settings: float,
-) -> StretchRun:  # fmt: skip
+    heading_rad: float = 0.0, field_gauss: Any = None, correction_m: Any = None, **settings: float,
+) -> SegmentRun:  # fmt: skip
     """Run a level vehicle at rest at the origin, measured at 10 Hz at these north positions."""
     count = 10 * (len(measured_m) + 1)
     flat = np.zeros((count, 3))
-    stretch = Stretch(
+    segment = ReplaySegment(
         time_s=10.0 + 0.01 * np.arange(count + 1), step_s=np.full(count, 0.01),
         rotation=np.tile(np.eye(3), (count + 1, 1, 1)), correction_rad=flat,
         force_m_s2=flat - GRAVITY_M_S2,
@@ -334,12 +335,12 @@ def at_rest(
         down_variance_m2=np.full(count + 1, 4e-4), attitude_error_rad=np.zeros((count + 1, 3)),
         correlation=np.eye(15),
     )  # fmt: skip
-    stretch.state[2] = heading_rad
+    segment.state[2] = heading_rad
     if field_gauss is not None:
         at, known = np.arange(7, count, 7), np.append(field_gauss, np.zeros(3))
         gauss = np.tile(field_gauss, (len(at), 1))
-        stretch = add_field_states(stretch, stretch.time_s[at], gauss, 1.0, known, np.full(6, 1e-8))
-        stretch.variance[2] = 0.01
+        segment = add_field_states(segment, segment.time_s[at], gauss, 1.0, known, np.full(6, 1e-8))
+        segment.variance[2] = 0.01
     stamp = 10.105 + 0.1 * np.arange(len(measured_m))
     north = np.array(measured_m)
     vision = ReceivedPositions(
@@ -347,15 +348,17 @@ def at_rest(
         np.zeros((len(stamp), 3)), np.full(len(stamp), np.nan), np.zeros(len(stamp), bool), "uwb",
     )  # fmt: skip
     exact = None if speed_m_s is None else np.zeros_like(speed_m_s)
-    vision = replace(vision, moved_m=moved_m, velocity_m_s=speed_m_s, velocity_variance_m2_s2=exact)
+    vision = replace(
+        vision, correction_m=correction_m, velocity_m_s=speed_m_s, velocity_variance_m2_s2=exact
+    )
     inputs = Inputs(
-        settings_in_force(settings, aid, *([MAG] if stretch.field else [])), (stretch,), vision,
+        effective_settings(settings, aid, *([MAG] if segment.field else [])), (segment,), vision,
         rules, 0.01, 0.1, 0.01,
         vision_height=False, imu_offset_m=np.zeros(3), aid=aid,
     )  # fmt: skip
-    intervals = make_intervals(inputs, stretch, Timing(0.0, 0.1))
-    variant = Variant(inputs.settings, as_logged=True, without=without or {})
-    return run_stretch(inputs, stretch, [variant], [intervals])
+    intervals = make_intervals(inputs, segment, Timing(0.0, 0.1))
+    variant = Variant(inputs.settings, uses_logged_decisions=True, without=without or {})
+    return run_segment(inputs, segment, [variant], [intervals])
 
 
 def test_recursion_at_rest_matches_kalman_filter():
@@ -417,8 +420,8 @@ def test_interval_unit_noise_matches_steps(n):
         assert np.max(np.abs(found[0] - true) / scale) < (1e-9 if n == 4 else 0.03)
 
 
-def stretch_of(count: int, *, fusing: bool = True) -> Stretch:
-    return made(Stretch, time_s=10.0 + 0.01 * np.arange(count + 1), fusing=fusing)
+def stretch_of(count: int, *, fusing: bool = True) -> ReplaySegment:
+    return made(ReplaySegment, time_s=10.0 + 0.01 * np.arange(count + 1), fusing=fusing)
 
 
 def vision_of(stamps: list[float], age_s: float = 0.0) -> ReceivedPositions:
@@ -427,11 +430,11 @@ def vision_of(stamps: list[float], age_s: float = 0.0) -> ReceivedPositions:
 
 
 def acting(stamps: list[float], *, fusing: bool = True, rules: FusionRules = RULES) -> list[int]:
-    stretch = stretch_of(500, fusing=fusing)
+    segment = stretch_of(500, fusing=fusing)
     taken = np.array(stamps)
-    end = np.searchsorted(stretch.time_s, taken - 1e-9)
+    end = np.searchsorted(segment.time_s, taken - 1e-9)
     inputs = made(Inputs, rules=rules)
-    action, _ = _actions(inputs, stretch, taken, end, np.ones(len(taken), bool))
+    action, _ = _actions(inputs, segment, taken, end, np.ones(len(taken), bool))
     return action.tolist()
 
 
@@ -460,17 +463,17 @@ def test_events_sample_is_fused_at_its_step_end():
     found = events([10.2, 10.305, 10.9])
     has_sample = found.sample >= 0
     assert found.sample.tolist() == [0, 1, -1, -1, 2]
-    assert found.end[has_sample].tolist() == [20, 30, 90]
-    assert found.end[~has_sample].tolist() == [50, 70]
+    assert found.end_step[has_sample].tolist() == [20, 30, 90]
+    assert found.end_step[~has_sample].tolist() == [50, 70]
     assert found.time_s == pytest.approx([10.195, 10.3, 10.5, 10.7, 10.895])
     assert found.usable[has_sample].all()
     assert not found.usable[~has_sample].any()
     assert found.action.tolist() == [FUSE, FUSE, IDLE, IDLE, IDLE]
-    assert events([10.2, 10.305], delay_s=0.05).end[:2].tolist() == [15, 25]
+    assert events([10.2, 10.305], delay_s=0.05).end_step[:2].tolist() == [15, 25]
     assert events([10.505]).sample[:3].tolist() == [-1, -1, 0]
     # in the first step, and before it
     assert events([10.01]).usable[0]
-    assert events([10.01]).end[0] == 1
+    assert events([10.01]).end_step[0] == 1
     assert not events([10.004]).usable[0]
     # of two samples in one step the newer one
     assert events([10.2, 10.202]).usable[:2].tolist() == [False, True]

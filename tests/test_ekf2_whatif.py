@@ -17,7 +17,7 @@ from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.inputs import Inputs, ReceivedPositions
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.replay import Ekf2Replay, along, rms_to_truth
-from px4fuse.ekf2.replay_segments import SensorSamples, Stretch
+from px4fuse.ekf2.replay_segments import ReplaySegment, SensorSamples
 from px4fuse.ekf2.steps import (
     ATTITUDE,
     FIELD_STEP,
@@ -80,8 +80,8 @@ def test_steps_add_up_to_total_difference(model):
         assert axis.longest_rejection is None
         assert tuple(step.name for step in axis.steps) == STEPS
         for quantity in ("position_mean_square_m2", "velocity_mean_square_m2_s2"):
-            left = getattr(axis, quantity.replace("_mean", "_left_mean"))
-            total = sum(getattr(step, quantity) for step in axis.steps) + left
+            unexplained = getattr(axis, f"unexplained_{quantity.removeprefix('position_')}")
+            total = sum(getattr(step, quantity) for step in axis.steps) + unexplained
             assert total == pytest.approx(getattr(axis, quantity), abs=1e-12)
         assert axis.unexplained_fraction < 0.03
         by_name = {step.name: step for step in axis.steps}
@@ -107,8 +107,8 @@ def test_steps_without_common_time_are_unavailable(model):
 def test_step_variants_change_one_property_each():
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(ReceivedPositions)
-    plain = (made(Stretch, flow=None, heights=None),)
-    flight = made(Inputs, settings=flown, step_s=0.01, received=received, stretches=plain)
+    plain = (made(ReplaySegment, flow=None, heights=None),)
+    flight = made(Inputs, settings=flown, step_s=0.01, received=received, segments=plain)
     kf_settings = Settings(0.5, 0.2, 0.16, clock_offset_s=-0.05)
     found = list(step_variants(flight, kf_settings).values())
     settings = [variant.settings for variant in found]
@@ -118,8 +118,8 @@ def test_step_variants_change_one_property_each():
     assert settings[0]["EKF2_EV_POS_X"] == 0.0
     assert [variant.biases for variant in found] == [False] * 3 + [True] * 4
     assert [variant.attitude for variant in found] == [False] * 5 + [True] * 2
-    assert [variant.gated for variant in found] == [False] * 6 + [True]
-    assert [variant.as_logged for variant in found] == [False] * 6 + [True]
+    assert [variant.has_gate for variant in found] == [False] * 6 + [True]
+    assert [variant.uses_logged_decisions for variant in found] == [False] * 6 + [True]
     assert [variant.timestamp_offset_s for variant in found] == [-0.05] + [None] * 6
     gnss = made(
         Inputs,
@@ -127,16 +127,16 @@ def test_step_variants_change_one_property_each():
         step_s=0.01,
         received=made(ReceivedPositions, velocity_m_s=np.zeros((1, 3))),
         settings={"EKF2_ACC_NOISE": 0.35, "EKF2_GPS_P_NOISE": 0.5, "EKF2_GPS_DELAY": 110.0},
-        stretches=plain,
+        segments=plain,
     )
     found = list(step_variants(gnss, kf_settings).values())
     assert [variant.velocity for variant in found] == [False] * 6 + [True] * 2
-    assert [variant.gated for variant in found] == [False] * 7 + [True]
+    assert [variant.has_gate for variant in found] == [False] * 7 + [True]
     # the GNSS positions of KF already include the delay
     assert found[0].timestamp_offset_s == pytest.approx(-0.16)
     assert [variant.settings["EKF2_GPS_P_NOISE"] for variant in found] == [0.2] * 2 + [0.5] * 6
-    flow = (made(Stretch, flow=made(SensorSamples), heights=None),)
-    more = {"stretches": flow, "settings": gnss.settings | {"EKF2_MAG_NOISE": 0.05}}
+    flow = (made(ReplaySegment, flow=made(SensorSamples), heights=None),)
+    more = {"segments": flow, "settings": gnss.settings | {"EKF2_MAG_NOISE": 0.05}}
     variants = step_variants(made(Inputs, **{**vars(gnss), **more}), kf_settings)
     assert list(variants)[-5:] == [ATTITUDE, FIELD_STEP, VELOCITY_STEP, FLOW_STEP, GATE]
     assert ["mag" in each.without for each in variants.values()] == [True] * 6 + [False] * 4

@@ -16,20 +16,20 @@ from px4fuse.errors import SettingsError
 from px4fuse.grading.class_page import _point_boxes
 from px4fuse.grading.entries import (
     Course,
-    class_entries,
-    due_time,
-    in_zone_of,
-    late_rule,
-    moodle_time,
+    add_time_zone,
+    build_entries,
+    parse_due_time,
+    parse_late_rule,
+    parse_moodle_time,
     read_overrides,
 )
 from px4fuse.grading.model import Override, Submission
 from px4fuse.grading.outputs import feedback_text
 from px4fuse.grading.rubric import read_rubric
-from px4fuse.grading.submissions import origin_of
+from px4fuse.grading.submissions import parse_origin
 from px4fuse.verification.model import Verdict
 
-DUE = due_time("2026-11-20 12:00:00 +01:00")
+DUE = parse_due_time("2026-11-20 12:00:00 +01:00")
 RUBRIC = read_rubric(None)
 LATEST = Course(RUBRIC)
 PEOPLE = (Person("1", "Ada Lovelace", login="ada"), Person("2", "Grace Hopper", login="grace"))
@@ -39,8 +39,8 @@ def make_entries(files, term=LATEST, overrides=None, people=PEOPLE, packed=None)
     """Make the entries of reports, given by file name."""
     reports = [replace(one, submission=name, sha256=name) for name, one in files.items()]
     zipped, times = Path("x.zip"), packed or {}
-    found = [Submission(zipped, name, name, times.get(name), origin_of(name)) for name in files]
-    return class_entries(reports, found, replace(term, roster=people), overrides or {})
+    found = [Submission(zipped, name, name, times.get(name), parse_origin(name)) for name in files]
+    return build_entries(reports, found, replace(term, roster=people), overrides or {})
 
 
 def blackboard(login: str, stamp: str, name: str = "r.pdf") -> str:
@@ -57,17 +57,17 @@ THREE = {
 @pytest.mark.parametrize(("attempt", "points"), [("latest", 7.0), ("first", 4.0), ("best", 9.0)])
 def test_class_entries_attempt_rule_selects_counting_report(attempt, points) -> None:
     (ada, grace), _ = make_entries(THREE, Course(RUBRIC, attempt=attempt))
-    assert ada.counting.points == ada.total == points
-    assert len(ada.others) == 2
-    assert ada.counting not in ada.others
-    assert (grace.counting, grace.total, grace.of) == (None, None, 10.0)
+    assert ada.counted_report.points == ada.total == points
+    assert len(ada.other_reports) == 2
+    assert ada.counted_report not in ada.other_reports
+    assert (grace.counted_report, grace.total, grace.max_points) == (None, None, 10.0)
 
 
 def test_class_entries_late_report_has_deduction() -> None:
-    term = Course(RUBRIC, due=DUE, late=late_rule("10%/day"))
+    term = Course(RUBRIC, due=DUE, late_rule=parse_late_rule("10%/day"))
     (ada, _), _ = make_entries(THREE, term)
     assert (ada.late_s, ada.deduction, ada.total) == (46 * 3600.0, 2.0, 5.0)
-    assert ada.handed_in == "2026-11-22 10:00"
+    assert ada.submission_time == "2026-11-22 10:00"
     # the best attempt is the one after deduction
     files = {blackboard("ada", "20-11-00-00"): graded_report("", 6.0),
              blackboard("ada", "22-10-00-00"): graded_report("", 7.0)}  # fmt: skip
@@ -80,11 +80,16 @@ def test_class_entries_late_report_has_deduction() -> None:
     [
         (DUE, "100%/day", 46 * 3600.0, 10.0),  # points are never negative
         # end of summer time: on 25 October the hour from 2 to 3 occurs twice
-        (due_time("2026-10-24 23:00:00 Europe/Berlin"), "1%/hour", 683 * 3600.0 + 3600.0, 10.0),
+        (
+            parse_due_time("2026-10-24 23:00:00 Europe/Berlin"),
+            "1%/hour",
+            683 * 3600.0 + 3600.0,
+            10.0,
+        ),
     ],
 )
 def test_class_entries_deduction_ends_at_zero_points(due, rule, late_s, off) -> None:
-    (ada, _), _ = make_entries(THREE, Course(RUBRIC, due=due, late=late_rule(rule)))
+    (ada, _), _ = make_entries(THREE, Course(RUBRIC, due=due, late_rule=parse_late_rule(rule)))
     assert (ada.late_s, ada.deduction) == (late_s, off)
     assert ada.total == 0.0
 
@@ -93,9 +98,9 @@ def test_class_entries_zip_time_orders_without_deduction() -> None:
     first, second = "hoppergrace_7_8_b.pdf", "hoppergrace_7_9_a.pdf"
     packed = {first: datetime(2026, 11, 24), second: datetime(2026, 11, 25)}
     files = {second: graded_report("", 7.0), first: graded_report("", 9.0)}
-    term = Course(RUBRIC, due=DUE, late=late_rule("10%/day"))
+    term = Course(RUBRIC, due=DUE, late_rule=parse_late_rule("10%/day"))
     (_, grace), _ = make_entries(files, term, packed=packed)
-    assert (grace.total, grace.late_s, grace.handed_in) == (7.0, None, "")
+    assert (grace.total, grace.late_s, grace.submission_time) == (7.0, None, "")
     assert "no points" in grace.flags[0]
     # a late mark without a time has no deduction either
     (_, grace), _ = make_entries({"hoppergrace_LATE_7_8_r.pdf": graded_report("", 7.0)}, term)
@@ -126,8 +131,8 @@ def test_class_entries_differing_forms_are_pending() -> None:
     files = {"a.pdf": of_form(4.0, "yaw"), "b.pdf": of_form(9.0, "nlos")}
     (ada, _), _ = make_entries(files)
     assert ada.total is None
-    assert ada.counting.pending == "Ask which of 2 reports counts: their forms differ."
-    assert len(ada.others) == 1
+    assert ada.counted_report.pending_action == "Ask which of 2 reports counts: their forms differ."
+    assert len(ada.other_reports) == 1
     assert make_entries(files, Course(RUBRIC, attempt="best"))[0][0].total == 9.0
     # equal forms are not pending
     (ada, _), _ = make_entries({name: of_form(4.0, "yaw") for name in files})
@@ -136,26 +141,32 @@ def test_class_entries_differing_forms_are_pending() -> None:
 
 def test_class_entries_pending_report_keeps_counting_report() -> None:
     """For example a later report of another student with this student's id."""
-    files = {"a.pdf": of_form(9.0, "yaw"), "z.pdf": of_form(2.0, "nlos", pending="Ask whose.")}
+    files = {
+        "a.pdf": of_form(9.0, "yaw"),
+        "z.pdf": of_form(2.0, "nlos", pending_action="Ask whose."),
+    }
     packed = {"a.pdf": datetime(2026, 11, 18), "z.pdf": datetime(2026, 11, 19)}
     for times in (None, packed):
         (ada, _), _ = make_entries(files, packed=times)
         assert ada.total == 9.0
-        assert [one.submission for one in ada.others] == ["z.pdf"]
+        assert [one.submission for one in ada.other_reports] == ["z.pdf"]
         assert ada.flags == ("z.pdf is pending, so another file counts.",)
     waiting = replace(
         files["a.pdf"].items[0], awaits_points=True
     )  # waits for the points of the notes
     files["a.pdf"] = replace(files["a.pdf"], items=(waiting,))
     (ada, _), _ = make_entries(files)
-    assert ada.counting.submission == "a.pdf"
+    assert ada.counted_report.submission == "a.pdf"
 
 
 def test_class_entries_imitated_platform_name_is_flagged() -> None:
     name = blackboard("ada", "20-10-00-00", "ada_attempt_2026-11-18-10-00-00_r.pdf")
     (ada, _), _ = make_entries({name: graded_report("", 4.0)})
-    assert ada.handed_in == "2026-11-20 10:00"
-    assert ada.flags == ("The file name imitates the names of a platform (found: Blackboard).",)
+    assert ada.submission_time == "2026-11-20 10:00"
+    assert ada.flags == (
+        "The file name looks like a file name of a platform, but a student wrote it "
+        "(platform of the export: Blackboard).",
+    )
 
 
 def test_class_entries_better_file_of_submission_counts() -> None:
@@ -171,7 +182,7 @@ def test_class_entries_platform_id_overrides_report_id() -> None:
         blackboard("grace", "19-10-00-00"): graded_report("", 8.0, student="Ada", student_id="1")
     }
     (ada, grace), _ = make_entries(files)
-    assert ada.counting is None
+    assert ada.counted_report is None
     assert grace.total == 8.0
     assert "is that of 1 (Ada Lovelace)" in grace.flags[0]
 
@@ -231,7 +242,7 @@ def test_overrides_replace_points_and_add_comments(tmp_path) -> None:
         "A": Override(9.5, "A good idea."), "total": Override(8.0, "Agreed."),
         "": Override(None, "Come and\nsee me."),
     }  # fmt: skip
-    assert (ada.counting.points, ada.total, grace.total) == (15.5, 8.0, 3.0)
+    assert (ada.counted_report.points, ada.total, grace.total) == (15.5, 8.0, 3.0)
     told = ("1 has no item 'C'", "2 has no item 'B'", "no student has the id 3")
     assert notes == tuple(f"overrides.csv: {one}." for one in told)
     text, reason = feedback_text(ada, "Lab"), "Because. Your instructor: A good idea."
@@ -254,7 +265,7 @@ def test_overrides_replace_points_and_add_comments(tmp_path) -> None:
 )  # fmt: skip
 def test_overrides_excess_or_duplicate_row_is_noted(rows, points, told, tmp_path) -> None:
     (ada, _), notes = make_entries(TWO, overrides=write_overrides(tmp_path, *rows))
-    assert (ada.counting.points, ada.total) == points
+    assert (ada.counted_report.points, ada.total) == points
     assert notes == tuple(f"overrides.csv: {one}." for one in told)
 
 
@@ -273,7 +284,7 @@ def test_overrides_class_page_download_is_complete(tmp_path) -> None:
 
 
 def test_overrides_total_makes_pending_points_count(tmp_path) -> None:
-    files = {"1.pdf": graded_report("", 4.0, student_id="1", pending="Run 0.1.1.")}
+    files = {"1.pdf": graded_report("", 4.0, student_id="1", pending_action="Run 0.1.1.")}
     (ada, _), _ = make_entries(files, overrides=write_overrides(tmp_path, "1,A,9,"))
     assert ada.total is None
     (ada, _), _ = make_entries(files, overrides=write_overrides(tmp_path, "1,total,9,"))
@@ -298,12 +309,12 @@ def test_read_overrides_semicolons_and_decimal_commas_are_read(tmp_path) -> None
 @pytest.mark.parametrize(
     ("row", "says"),
     [
-        ("1,A,abc,", "row 2: points 'abc': give a number from 0"),
+        ("1,A,abc,", "row 2: points 'abc': give a number of 0 or more"),
         ("1,A,-1,", "give a number"),
         ("1,A,nan,", "give a number"),
         ("1,A,1_5,", "give a number"),
         ("1,,5,", "and an item or total"),
-        ("1,A,5,\n1,A,6,", "is given twice"),
+        ("1,A,5,\n1,A,6,", "a second row for student 1, item A"),
     ],
 )
 def test_read_overrides_invalid_row_raises_error(tmp_path, row, says) -> None:
@@ -331,14 +342,14 @@ BERLIN = "2026-11-20T23:59:59+01:00"
     ],
 )
 def test_due_time_with_zone_is_parsed(text, is_) -> None:
-    assert due_time(text) == datetime.fromisoformat(is_)
+    assert parse_due_time(text) == datetime.fromisoformat(is_)
 
 
 def test_due_time_without_zone_uses_local_zone(monkeypatch) -> None:
     monkeypatch.setenv("TZ", "America/New_York")
     time.tzset()
     try:
-        assert due_time("2026-11-20 23:59") == datetime(2026, 11, 21, 4, 59, 59, tzinfo=UTC)
+        assert parse_due_time("2026-11-20 23:59") == datetime(2026, 11, 21, 4, 59, 59, tzinfo=UTC)
     finally:
         monkeypatch.undo()
         time.tzset()
@@ -346,8 +357,8 @@ def test_due_time_without_zone_uses_local_zone(monkeypatch) -> None:
 
 @pytest.mark.parametrize(
     ("read", "said", "texts"),
-    [(due_time, "--due", ("", "tomorrow", "20.11.2026", "2026-11-20 23:59 Mars/Base", "Z")),
-     (late_rule, "--late", ("", "10", "10%", "-1%/day", "110%/day", "10%/week", "x%/day"))],
+    [(parse_due_time, "--due", ("", "tomorrow", "20.11.2026", "2026-11-20 23:59 Mars/Base", "Z")),
+     (parse_late_rule, "--late", ("", "10", "10%", "-1%/day", "110%/day", "10%/week", "x%/day"))],
 )  # fmt: skip
 def test_due_time_and_late_rule_invalid_text_is_one_line(read, said, texts) -> None:
     for text in texts:
@@ -358,21 +369,21 @@ def test_due_time_and_late_rule_invalid_text_is_one_line(read, said, texts) -> N
 
 def test_late_rule_counts_started_days_up_to_limit() -> None:
     for late_s, off in ((0.0, 0), (1.0, 12), (86_400.0, 12), (86_400.5, 24), (1e9, 120)):
-        assert late_rule("10%/day").deduction(late_s, 120.0) == off
+        assert parse_late_rule("10%/day").deduction(late_s, 120.0) == off
     # a rule may state a limit, and hours
-    assert late_rule("1 % / hour up to 5%").deduction(3600.0 * 3.5, 100.0) == 4.0
-    assert late_rule("1%/hour up to 5%").deduction(1e6, 100.0) == 5.0
+    assert parse_late_rule("1 % / hour up to 5%").deduction(3600.0 * 3.5, 100.0) == 4.0
+    assert parse_late_rule("1%/hour up to 5%").deduction(1e6, 100.0) == 5.0
 
 
-def test_in_zone_of_naive_time_uses_zone_of_due_time() -> None:
-    due = due_time("2026-11-20 23:59:00 +05:30")
+def test_add_time_zone_naive_time_uses_zone_of_due_time() -> None:
+    due = parse_due_time("2026-11-20 23:59:00 +05:30")
     bare = datetime(2026, 11, 21, 0, 59)
-    assert (in_zone_of(bare, due) - due).total_seconds() == 3600.0
+    assert (add_time_zone(bare, due) - due).total_seconds() == 3600.0
     told = datetime(2026, 11, 20, 18, 29, tzinfo=timezone(timedelta(0)))
-    assert in_zone_of(told, due) == due
+    assert add_time_zone(told, due) == due
 
 
 def test_moodle_time_parses_english_dates_only() -> None:
-    assert moodle_time("Friday, 20 November 2026, 23:58") == datetime(2026, 11, 20, 23, 58)
-    assert moodle_time("Friday, 20 November 2026, 11:58 PM") == datetime(2026, 11, 20, 23, 58)
-    assert moodle_time("Freitag, 20. November 2026, 23:58") is None
+    assert parse_moodle_time("Friday, 20 November 2026, 23:58") == datetime(2026, 11, 20, 23, 58)
+    assert parse_moodle_time("Friday, 20 November 2026, 11:58 PM") == datetime(2026, 11, 20, 23, 58)
+    assert parse_moodle_time("Freitag, 20. November 2026, 23:58") is None

@@ -44,10 +44,10 @@ from px4fuse.filter.signals import Segment
 from px4fuse.filter.tuning import Noise
 from px4fuse.findings import (
     Finding,
-    by_root,
     ekf2_not_fusing,
     ekf2_rejecting,
     ekf2_resets,
+    group_by_root,
     hidden_errors,
     imu,
     missing,
@@ -59,7 +59,7 @@ from px4fuse.findings import (
     source_positions,
     source_stamps,
 )
-from px4fuse.findings.model import fraction_on, moments, spans_at
+from px4fuse.findings.model import fraction_on, spans_with_value, zero_length_spans
 from px4fuse.flight import Columns, FusionRecord, Reset, Unavailable
 from px4fuse.log import Dropout
 from px4fuse.position_source import (
@@ -101,15 +101,15 @@ def test_fraction_on_first_value_extends_backwards() -> None:
     flag, whole = pd.Series([1.0, 0.0, 1.0], index=[20.0, 30.0, 80.0]), Segment(10.0, 110.0, "")
     assert fraction_on(flag, whole) == 0.5
     assert fraction_on(flag, Segment(25.0, 35.0, "")) == 0.5
-    assert spans_at(0.0, flag, whole) == ((30.0, 80.0),)
-    assert spans_at(1.0, flag, whole) == ((10.0, 30.0), (80.0, 110.0))
-    assert spans_at(0.0, flag, Segment(40.0, 50.0, "")) == ((40.0, 50.0),)
+    assert spans_with_value(0.0, flag, whole) == ((30.0, 80.0),)
+    assert spans_with_value(1.0, flag, whole) == ((10.0, 30.0), (80.0, 110.0))
+    assert spans_with_value(0.0, flag, Segment(40.0, 50.0, "")) == ((40.0, 50.0),)
 
 
 def test_by_root_groups_consequences_behind_cause() -> None:
     first, other = make_finding("kf_underconfident"), make_finding("no_motion", "note")
     follows = make_finding("kf_underconfident", caused_by="kf_underconfident")
-    assert by_root([first, follows, other]) == [[first, follows], [other]]
+    assert group_by_root([first, follows, other]) == [[first, follows], [other]]
 
 
 # ---------------------------------------------------------------- EKF2
@@ -129,7 +129,9 @@ def test_ekf2_resets_and_dropouts_outside_segment_are_ignored(
     assert switch.evidence == {"count": 2, "at_s": 10.5}
     assert reset.evidence == {"count": 2, "largest_m": 5.0, "at_s": 10.5}
     lost = tuple(Dropout(at, 1.0) for at in (8.9, 9.0, 50.0, 110.0, 110.1))
-    finding = only(recording.dropouts, analysis(log=log(dropouts=(*lost, Dropout(60.0, 0.5)))))
+    finding = only(
+        recording.detect_dropouts, analysis(log=log(dropouts=(*lost, Dropout(60.0, 0.5))))
+    )
     assert finding.evidence == {"count": 4, "total_s": 3.5}
 
 
@@ -178,7 +180,7 @@ UNKNOWN = "The log does not contain the reason"
         (never_fusing(parameters={"EKF2_AID_MASK": 1.0}), "EKF2_AID_MASK is 1: bit 3", "to 9."),
         (never_fusing(parameters={"EKF2_AID_MASK": 9.0}), UNKNOWN, "EKF2_EV_CTRL"),
         (never_fusing(2.0), UNKNOWN, "EKF2_EV_CTRL"),  # releases before v1.14 have no limit
-        (never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}), "come every 0.50 s", "10 Hz"),
+        (never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}), "arrive every 0.50 s", "10 Hz"),
         (
             never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}, origin=LOGGED_BY_EKF2),
             UNKNOWN,
@@ -229,7 +231,7 @@ def test_ekf2_rejecting_severity_follows_share(count: int, of: int, expected: st
     ):
         assert severity(ekf2_rejecting.detect, one) == expected
         for finding in ekf2_rejecting.detect(one):
-            assert finding.spans_s == moments(20.0 + np.arange(count))
+            assert finding.spans_s == zero_length_spans(20.0 + np.arange(count))
             assert quantity in finding.message
             assert finding.remedy.endswith(remedy)
 
@@ -314,7 +316,7 @@ def test_imu_rates_below_98_percent_are_reported(imu_hz, attitude_hz, expected) 
         (log(format="MAVLink tlog", has_ulog=False), "at {:g} Hz (MAV_CMD_SET"),
         (log(format="MAVLink tlog"), "at {0:g} Hz (PX4 console: mavlink stream"),
     ):
-        found = list(imu.rates(analysis(flight=flight, log=info).flight))
+        found = list(imu.detect_low_rates(analysis(flight=flight, log=info).flight))
         assert [finding.evidence["needed_hz"] * 2.0 for finding in found] == expected
         assert all(action.format(hz) in f.remedy for f, hz in zip(found, expected, strict=True))
 
@@ -339,7 +341,9 @@ def test_source_as_sent_logger_limit_is_reported(
     profile = log(parameters={"SDLOG_PROFILE": 2.0})
     for origin in (ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS):
         of = source(name=name, origin=origin, rate_hz=rate_hz)
-        found = list(missing.source_as_sent(analysis(source=of, missing=lacks, log=profile)))
+        found = list(
+            missing.detect_source_not_logged(analysis(source=of, missing=lacks, log=profile))
+        )
         assert [one.id for one in found] == ["source_not_logged", "source_rate_limited_by_logger"][
             : 1 + decimated
         ]
@@ -352,7 +356,7 @@ def test_source_as_sent_logger_limit_is_reported(
         (ALIGNED, (SimpleNamespace(origin=RECEIVED),)),
     ):  # fmt: skip
         one = analysis(source=source(name=name, origin=origin), flight={"positions": tracks})
-        assert named(missing.source_as_sent, one) == {}
+        assert named(missing.detect_source_not_logged, one) == {}
 
 
 @pytest.mark.parametrize(("rate_hz", "least_s"), [(2.0, 2.5), (10.0, 1.0)])
@@ -362,7 +366,7 @@ def test_gaps_above_five_intervals_and_1_s_are_reported(rate_hz: float, least_s:
         time = np.concatenate([np.arange(10.0, 20.5, 0.5), [20.0 + gap_s, 20.5 + gap_s]])
         one = analysis(axes=(axis(),), source=source(rate_hz=rate_hz))
         one.lines[0].measurement_time_s = time
-        found = list(source_intervals.gaps(one))
+        found = list(source_intervals.detect_source_gaps(one))
         assert [each.evidence for each in found] == [
             {"count": 1, "longest_s": gap_s, "at_s": 20.0}
         ] * there
@@ -383,7 +387,7 @@ def test_placement_conflict_is_error_and_doubt_is_warning() -> None:
     placed = SimpleNamespace(
         misplaced=("as good as ned: give --position-frame ned.",), warnings=("it is weak.",)
     )
-    frame, yaw = source_frame.placement(analysis(source=source(alignment=placed)))
+    frame, yaw = source_frame.detect_uncertain_alignment(analysis(source=source(alignment=placed)))
     assert (frame.severity, yaw.severity) == ("error", "warning")
     assert frame.message == "uwb: As good as ned: give --position-frame ned."
 
@@ -451,8 +455,8 @@ def with_extent(extent_m: float) -> Any:
 
 FUSED, FRAME = ekf2_not_fusing.detect, source_frame.detect
 EDGES = [
-    (missing.innovations, with_innovations(75), None),
-    (missing.innovations, with_innovations(74), "note"),
+    (missing.detect_missing_innovations, with_innovations(75), None),
+    (missing.detect_missing_innovations, with_innovations(74), "note"),
     # motion capture is an independent reference if EKF2 fuses external vision
     (FUSED, motion_capture_flight("vehicle_mocap_odometry", 0.0), "warning"),
     (FUSED, motion_capture_flight("vehicle_mocap_odometry", 1.0), None),
@@ -471,7 +475,7 @@ EDGES = [
     ),
     *(
         (
-            imu.gaps,
+            imu.detect_imu_gaps,
             analysis(
                 axes=(axis(replay=SimpleNamespace(input_gap_s=gap_s)),),
                 flight={"imu": at_rate(rate_hz)},
@@ -485,8 +489,8 @@ EDGES = [
             (0.501, 4.0, "warning"),
         )
     ),
-    (source_positions.motion, with_extent(0.5), None),
-    (source_positions.motion, with_extent(0.499), "warning"),
+    (source_positions.detect_little_motion, with_extent(0.5), None),
+    (source_positions.detect_little_motion, with_extent(0.499), "warning"),
     *(
         (FRAME, analysis(heading=heading), expected)
         for heading, expected in (
@@ -581,19 +585,23 @@ def no_truth(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remedies, "filter_errors_m", lambda *_: None)
 
 
-BIAS, JUMPS, SCALE = imu.bias, source_positions.jumps, source_positions.scale
+BIAS, JUMPS, SCALE = (
+    imu.detect_bias,
+    source_positions.detect_jumps,
+    source_positions.detect_scale_error,
+)
 ARRIVALS, DOWNSAMPLED, CLOCK = (
-    source_stamps.arrivals,
-    source_intervals.downsampling,
+    source_stamps.detect_arrival_times,
+    source_intervals.detect_downsampling,
     source_clock.detect,
 )
 
 
 def wrong_delay(one: Any) -> Any:
-    return source_clock.delay(one, one.clock)
+    return source_clock.detect_wrong_delay(one, one.clock)
 
 
-STATED = source_positions.stated_variance
+STATED = source_positions.detect_wrong_variance
 SOURCE_EDGES = [
     *((BIAS, analysis(bias_scale_jump_fit=with_bias(sign * bias, sigma)), expected)
       for sign in (1.0, -1.0)
@@ -626,24 +634,27 @@ SOURCE_EDGES = [
     (DOWNSAMPLED, at_multiples([1, 2] * 30, origin=ALIGNED), None),
     (DOWNSAMPLED, at_multiples([1, 2] * 30, origin=MOTION_CAPTURE), "warning"),
     # two samples lost in one interval
-    *((source_intervals.losses, at_multiples([1] * singles + [3], 0.25, **parts), expected)
+    *((source_intervals.detect_lost_samples, at_multiples([1] * singles + [3], 0.25, **parts),
+       expected)
       for singles, parts, expected in (
           (96, {"clock_map": clock_map()}, "note"), (97, {"clock_map": clock_map()}, None),
           (47, {"clock_map": None}, None), (47, {"clock_map": clock_map("arrival time")}, None),
           (47, {"clock_map": clock_map(distinct=2)}, None))),
-    *((source_positions.smoothing, low_pass(gain, lag_s), expected) for gain, lag_s, expected in (
+    *((source_positions.detect_low_pass, low_pass(gain, lag_s), expected)
+      for gain, lag_s, expected in (
         (6.0, 0.05, "warning"), (5.9, 0.05, None), (6.0, 0.049, None),
         (6.0, 0.0999, "warning"), (6.0, 0.1, "error"))),
     # correlated errors without a lag are not from a low pass
-    *((source_positions.smoothing, low_pass(99.0, 1.0, coloured=slow(99.0, lag)), expected)
+    *((source_positions.detect_low_pass, low_pass(99.0, 1.0, coloured=slow(99.0, lag)), expected)
       for lag, expected in ((0.9, None), (1.0, "error"))),
-    *((source_noise.time_correlated_noise, analysis(coloured=slow(gain, lag)), expected)
+    *((source_noise.detect_time_correlated_noise, analysis(coloured=slow(gain, lag)), expected)
       for gain, lag, expected in (
           (5.0, 0.9, "warning"), (4.9, 0.0, None), (99.0, 1.0, None))),
-    *((source_noise.repeats, repeating(again, count), expected) for again, count, expected in (
+    *((source_noise.detect_repeated_positions, repeating(again, count), expected)
+      for again, count, expected in (
         (10, 200, "warning"), (9, 100, None), (10, 201, None), (30, 100, "error"),
         (29, 100, "warning"))),
-    (source_noise.repeats, repeating(50, 100, moved_m=0.5), None),
+    (source_noise.detect_repeated_positions, repeating(50, 100, moved_m=0.5), None),
     *((source_noise.detect, analysis(coloured=slow(99.0, 0.0), **parts), None)
       for parts in (ODOMETRY, REBUILT)),
     (JUMPS, jumping(jump(0.0, 0.9), coloured=slow(0.0, 0.0, 0.2)), None),
@@ -665,11 +676,11 @@ SOURCE_EDGES = [
     # without an estimated time offset the timestamps may be late
     *((which, of(clock=clock), expected)
       for which, of in ((SCALE, partial(scaled, 0.5)),
-                        (source_positions.smoothing, partial(low_pass, 99.0, 1.0)))
+                        (source_positions.detect_low_pass, partial(low_pass, 99.0, 1.0)))
       for clock, expected in ((NONE, None), (late(0.0, is_determinable=False), "error"))),
     (SCALE, scaled(0.5, smoothing=SourceLowPass(0.5, 1.0, 99.0, 0.1)), None),
     *((source_positions.detect, scaled(0.5, **parts), None) for parts in (ODOMETRY, REBUILT)),
-    *((source_positions.outliers,
+    *((source_positions.detect_outliers,
        analysis(tuning=tuned(outlier_time_s=20.0 + np.arange(outliers), count=count)), expected)
       for outliers, count, expected in (
           (3, 600, "warning"), (3, 601, None), (3, 150, "error"), (3, 151, "warning"),
@@ -706,12 +717,12 @@ def test_bias_reports_interval_tilt_and_ekf2_estimate() -> None:
     one = analysis(
         bias_scale_jump_fit=with_bias(0.3, 0.05, -0.4), ekf2=bias_of_ekf2(0.1, -0.2, 0.0)
     )
-    finding = only(imu.bias, one)
+    finding = only(imu.detect_bias, one)
     assert "tilt error of 2.9° has the same effect" in finding.message  # 0.5 of 9.80665 m/s²
     assert "EKF2 estimates +0.10 m/s² forward and -0.20 m/s² right." in finding.message
     assert finding.evidence == {"bias_m_s2": 0.5, "sigma_m_s2": 0.05}
     outside = bias_of_ekf2(9.0, 9.0, 9.0)["accelerometer_bias"].iloc[[0, 4]]
-    assert named(imu.bias, analysis(ekf2={"accelerometer_bias": outside})) == {}
+    assert named(imu.detect_bias, analysis(ekf2={"accelerometer_bias": outside})) == {}
 
 
 @pytest.mark.parametrize(
@@ -727,11 +738,11 @@ def test_source_stamps_recording_reports_clock_faults(clock: Any, expected: list
 
 def test_arrivals_end_at_first_measurement_time() -> None:
     one = analysis(ekf2=ages(12, 20, 0.05))
-    finding = only(source_stamps.arrivals, one)
+    finding = only(source_stamps.detect_arrival_times, one)
     assert finding.evidence == {"until_s": 32.0, "latency_s": 0.05}
     assert finding.spans_s == ((20.0, 32.0),)
-    assert source_stamps.until_synchronised(one) == (32.0, 0.05)
-    assert source_stamps.until_synchronised(analysis(ekf2=ages(30, 0))) is None
+    assert source_stamps.find_synchronisation(one) == (32.0, 0.05)
+    assert source_stamps.find_synchronisation(analysis(ekf2=ages(30, 0))) is None
 
 
 def test_base_interval_is_found_within_jitter() -> None:
@@ -752,22 +763,22 @@ def test_base_interval_is_found_within_jitter() -> None:
 def test_losses_do_not_count_gaps() -> None:
     for longest, lost in ((5.0, [4]), (5.1, [])):  # intervals of 0.25 s
         one = at_multiples([1.0] * 20 + [longest], 0.25, clock_map=clock_map())  # type: ignore[list-item]
-        assert [each.evidence["lost"] for each in source_intervals.losses(one)] == lost
+        assert [each.evidence["lost"] for each in source_intervals.detect_lost_samples(one)] == lost
 
 
 def test_jumps_report_count_and_largest() -> None:
     sizes = (jump(0.3, 0.0, at_s=30.0), jump(0.6, 0.8, at_s=60.0), jump(0.1, 0.0, at_s=90.0))
-    finding = only(source_positions.jumps, jumping(*sizes))
+    finding = only(source_positions.detect_jumps, jumping(*sizes))
     assert finding.evidence == {"count": 2, "size_m": 1.0, "at_s": 60.0, "sigma_m": 0.02}
     assert finding.spans_s == ((30.0, 30.0), (60.0, 60.0))
 
 
 def test_scale_and_reported_variance_state_direction() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
-        finding = only(source_positions.scale, scaled(signed))
+        finding = only(source_positions.detect_scale_error, scaled(signed))
         assert f"20 % too {word} (± 2 %)" in finding.message
     for reported, word in ((2.0, "large"), (0.5, "small")):
-        finding = only(source_positions.stated_variance, stating(reported, 1.0))
+        finding = only(source_positions.detect_wrong_variance, stating(reported, 1.0))
         assert f"4 times too {word}{', unless it covers' * (word == 'large')}" in finding.message
 
 
@@ -778,9 +789,11 @@ def test_stated_variance_covering_true_errors_is_accepted(error_m, expected):
     axes = tuple(axis(name, truth=still) for name in ("north", "east"))
     for each in axes:
         each.axis.measurement_time_s, each.axis.measurement_m = time, error_m * (-1.0) ** time
-    assert severity(source_positions.stated_variance, stating(2.0, 1.0, axes=axes)) == expected
+    assert (
+        severity(source_positions.detect_wrong_variance, stating(2.0, 1.0, axes=axes)) == expected
+    )
     # a variance that is too small is reported in both cases
-    assert severity(source_positions.stated_variance, stating(0.5, 1.0, axes=axes)) == "error"
+    assert severity(source_positions.detect_wrong_variance, stating(0.5, 1.0, axes=axes)) == "error"
 
 
 @pytest.mark.parametrize(
@@ -792,7 +805,7 @@ def test_stated_variance_covering_true_errors_is_accepted(error_m, expected):
 )
 def test_outliers_next_to_a_jump_are_ignored(jumps, count, times_text):
     outliers = tuned(outlier_time_s=np.array([18.9, 19.0, 25.9, 26.0, 27.0]), count=100)
-    finding = only(source_positions.outliers, jumping(*jumps, tuning=outliers))
+    finding = only(source_positions.detect_outliers, jumping(*jumps, tuning=outliers))
     assert (finding.evidence["count"], finding.evidence["first_s"]) == (count, 18.9)
     assert times_text in finding.message
 
@@ -870,7 +883,7 @@ def test_clock_offset_contradicted_by_truth_has_no_finding(monkeypatch, after_m,
             late(0.05, interval_s=(0.04, 0.07)),
             0.0,
             "50 ms early (95 % 40 to 70 ms)",
-            "no parameter for early timestamps",
+            "does not correct early timestamps",
         ),
         (
             late(-0.301, interval_s=(-0.4, -0.2)),

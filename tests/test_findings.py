@@ -20,7 +20,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import TITLES, Finding, by_root, find
+from px4fuse.findings import TITLES, Finding, find, group_by_root
 from px4fuse.findings.model import CATALOGUE, GROUPS, load_examples
 from px4fuse.flight import AXIS_NAMES, Columns, Flight, Reset, Unavailable
 from px4fuse.log import ClockMap, Dropout
@@ -334,7 +334,7 @@ def test_find_narrow_gate_lists_gate_before_rejections(gate, expected) -> None:
     assert (first.id, first.severity) == ("ekf2_gate_too_small", "error")
     assert first.evidence == {"gate": gate, "rejected_by_gate": pytest.approx(expected, abs=1e-4)}
     assert re.search(r"EKF2 rejected [23]\d %", first.message)
-    group = by_root((first, *others))[0]
+    group = group_by_root((first, *others))[0]
     assert {"ekf2_rejects_positions", "ekf2_overconfident"} <= {one.id for one in group}
     # a gate without rejections is not reported
     assert not found(compare(with_ekf2(gate=gate)(aisle_flight())))

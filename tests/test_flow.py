@@ -25,7 +25,7 @@ from px4fuse.simulation.scenario import make_scenario
 INTERVAL_S, SHARE = 0.02, 0.1
 
 
-def low_passed(raw: np.ndarray) -> np.ndarray:
+def low_pass_weights(raw: np.ndarray) -> np.ndarray:
     """Apply EKF2's AlphaFilter."""
     found = raw.copy()
     for k in range(1, len(raw)):
@@ -46,12 +46,12 @@ def true_velocity(times: np.ndarray) -> np.ndarray:
 
 def flow_of(noise_m_s: float = 0.0, every: int = 10) -> pd.DataFrame:
     """Return logged flow rows of a sensor at 50 Hz."""
-    (stretch,) = model().inputs.stretches
-    times = np.arange(stretch.time_s[0] + 1.0, stretch.time_s[-1] - 0.5, INTERVAL_S)
-    turn = stretch.rotation[np.searchsorted(stretch.time_s, times - 1e-9)]
+    (segment,) = model().inputs.segments
+    times = np.arange(segment.time_s[0] + 1.0, segment.time_s[-1] - 0.5, INTERVAL_S)
+    turn = segment.rotation[np.searchsorted(segment.time_s, times - 1e-9)]
     raw = np.einsum("nji,nj->ni", turn, true_velocity(times))[:, :2]
     raw += np.random.default_rng(1).normal(0.0, 1.0, raw.shape) * noise_m_s
-    remaining = low_passed(raw)[::every]
+    remaining = low_pass_weights(raw)[::every]
     decay = (1.0 - SHARE) ** every
     mean = (remaining[1:] - decay * remaining[:-1]) / (1.0 - decay)
     return pd.DataFrame({
@@ -63,8 +63,8 @@ def flow_of(noise_m_s: float = 0.0, every: int = 10) -> pd.DataFrame:
 def flying(noise_m_s: float = 0.3) -> Model:
     """Return the model with flow samples."""
     inputs = model().inputs
-    stretches = tuple(add_flow_samples(one, flow_of(noise_m_s), 3.0) for one in inputs.stretches)
-    return replace(model(), inputs=replace(inputs, stretches=stretches))
+    segments = tuple(add_flow_samples(one, flow_of(noise_m_s), 3.0) for one in inputs.segments)
+    return replace(model(), inputs=replace(inputs, segments=segments))
 
 
 def test_read_flow_recovers_mean_between_rows(tmp_path):
@@ -75,7 +75,7 @@ def test_read_flow_recovers_mean_between_rows(tmp_path):
     # irregular logging intervals, with one of 50 samples
     rows = np.cumsum([*[10, 10, 9, 11] * 6, 50, *[10, 10, 9, 11] * 12])
     log.add(topic("estimator_optical_flow_vel", at[rows], {
-        "vel_body": raw[rows], "vel_body_filtered": low_passed(raw)[rows],
+        "vel_body": raw[rows], "vel_body_filtered": low_pass_weights(raw)[rows],
         "flow_rate_compensated": raw[rows][:, ::-1] * [1.0, -1.0] / 6.0,
     }))  # fmt: skip
     log.add(topic("vehicle_optical_flow", at[::25], {
@@ -108,14 +108,14 @@ def test_read_flow_recovers_mean_between_rows(tmp_path):
 @pytest.mark.parametrize("every", [1, 10])
 def test_flow_samples_give_velocity_at_next_event(every):
     """The motion since a sample is known from the IMU, so corners cause no innovations."""
-    (stretch,) = model().inputs.stretches
-    with_flow = add_flow_samples(stretch, flow_of(every=every), 3.0)
-    end = next(iter(model().intervals.values()))[0].events.end
-    found = mean_by_event(with_flow.flow, end, stretch.imu_velocity_m_s)
-    has_sample = found.number > 0.0
-    assert found.number.sum() == pytest.approx(len(flow_of(every=every)) * every, abs=12.0)
-    speed = true_velocity(stretch.time_s[end[has_sample]])
-    expected = np.einsum("kab,kb->ka", found.turn[has_sample], speed)
+    (segment,) = model().inputs.segments
+    with_flow = add_flow_samples(segment, flow_of(every=every), 3.0)
+    end = next(iter(model().intervals.values()))[0].events.end_step
+    found = mean_by_event(with_flow.flow, end, segment.imu_velocity_m_s)
+    has_sample = found.sample_count > 0.0
+    assert found.sample_count.sum() == pytest.approx(len(flow_of(every=every)) * every, abs=12.0)
+    speed = true_velocity(segment.time_s[end[has_sample]])
+    expected = np.einsum("kab,kb->ka", found.rotation_to_body[has_sample], speed)
     off = found.value[has_sample] - expected
     assert np.sqrt(np.mean(off**2)) < 0.03
     assert np.ptp(expected, axis=0).min() > 0.7
@@ -133,7 +133,9 @@ def test_fuse_flow_mean_is_weighted_by_sample_count():
     far = samples._replace(value=np.array([[3.1, 0.0]]))  # 3 σ of one sample are 3.07
     np.testing.assert_array_equal(fuse_flow(x, P, far, 3.0)[0], x)
     assert fuse_flow(x, P, far, 3.1)[0][0, 3] > 1.0
-    none = samples._replace(number=np.zeros(1), noise=np.zeros(1), turn=np.zeros((1, 2, 3)))
+    none = samples._replace(
+        sample_count=np.zeros(1), noise=np.zeros(1), rotation_to_body=np.zeros((1, 2, 3))
+    )
     np.testing.assert_array_equal(fuse_flow(x, P, none, 3.0)[0], x)
 
 
@@ -155,8 +157,8 @@ def test_replay_without_gnss_flow_limits_drift():
 
 
 def stretches_s(flight: Flight) -> list[tuple[float, float]]:
-    stretches = opened(flight).inputs.stretches
-    return [(float(one.time_s[0]), float(one.time_s[-1])) for one in stretches]
+    segments = opened(flight).inputs.segments
+    return [(float(one.time_s[0]), float(one.time_s[-1])) for one in segments]
 
 
 def test_stretches_split_at_height_resets_and_clipping():
@@ -199,11 +201,11 @@ def test_read_gnss_while_disabled_omits_fixes():
 
 def test_stretch_start_correlation_is_from_earlier_flight():
     """Six seconds at rest and the climb correlate tilt and accelerometer bias."""
-    (stretch,) = model().inputs.stretches
-    assert stretch.history is not None
-    assert stretch.history.time_s[-1] == pytest.approx(stretch.time_s[0], abs=1e-6)
-    assert stretch.history.time_s[0] < 1.0
-    of_tilt = stretch.correlation[:2, 12:15] @ stretch.rotation[0].T
+    (segment,) = model().inputs.segments
+    assert segment.history is not None
+    assert segment.history.time_s[-1] == pytest.approx(segment.time_s[0], abs=1e-6)
+    assert segment.history.time_s[0] < 1.0
+    of_tilt = segment.correlation[:2, 12:15] @ segment.rotation[0].T
     # θ × f = Rb with f = -g: the north bias couples with the east tilt, and vice versa
     np.testing.assert_allclose(of_tilt[:, :2], [[0.0, 0.98], [-0.98, 0.0]], atol=0.02)
 
@@ -239,11 +241,11 @@ def test_model_real_flow_flights_agree_with_log(name, shared_logs, model_of):
 
 @pytest.mark.reallogs
 def test_model_flow_beyond_limit_splits_stretch(shared_logs, monkeypatch):
-    monkeypatch.setattr("px4fuse.ekf2.replay.MAX_CARRIED_OFF_M", 0.3)
+    monkeypatch.setattr("px4fuse.ekf2.replay.MAX_FLOW_ONLY_DIFFERENCE_M", 0.3)
     found = opened(read_log(shared_logs / "gps" / "main202603_gps_outage_flow.ulg"))
     assert set(found.agreement.doubtful) == {"optical_flow"}
     assert 0.3 < found.agreement.carried_difference_m < 0.5
-    before, after = found.inputs.stretches
+    before, after = found.inputs.segments
     assert before.time_s[-1] == pytest.approx(42.1, abs=0.2)
     assert after.time_s[0] == pytest.approx(74.0, abs=1.0)
 
@@ -252,7 +254,7 @@ def test_model_flow_beyond_limit_splits_stretch(shared_logs, monkeypatch):
 def test_model_crash_flight_is_replayed_until_tumble(shared_logs):
     """Vertical velocity was reset at 47 s; the IMU clipped strongly at 26 and 46 s."""
     found = opened(read_log(shared_logs / "real" / "PX4_flight-review-rs_ekf_failure.ulg"))
-    ends = [(one.time_s[0], one.time_s[-1]) for one in found.inputs.stretches]
+    ends = [(one.time_s[0], one.time_s[-1]) for one in found.inputs.segments]
     assert np.array(ends) == pytest.approx(np.array([(6.7, 24.7), (30.7, 44.2), (49.7, 67.2)]),
                                            abs=0.1)  # fmt: skip
     agreement = found.agreement

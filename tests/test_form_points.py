@@ -14,7 +14,14 @@ from exchange import replace
 from form_guesses import at_random, constants
 from scipy.stats import spearmanr
 
-from px4fuse.answer_form import CURES, MISTAKES, PANELS, Answers, StudentMistake, update_values
+from px4fuse.answer_form import (
+    CORRECTIONS,
+    MISTAKES,
+    PANELS,
+    Answers,
+    StudentMistake,
+    update_renamed_values,
+)
 from px4fuse.assignment.random_assignment import draw
 from px4fuse.assignment.truth import FormTruth, TrueMistake, VerdictTruth, form_truth
 from px4fuse.cli.simulate import simulate
@@ -82,7 +89,7 @@ def test_each_simulated_mistake_has_kind_panel_and_cure() -> None:
     assert set(TABLE["shows"]) | {"cover"} == set(PANELS)
     for name in SIMULATED:
         offered = cures(TrueMistake(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
-        assert {cure for cure, _, _ in offered} <= set(CURES)
+        assert {cure for cure, _, _ in offered} <= set(CORRECTIONS)
         assert max(share for _, _, share in offered) == 1.0
         assert set(panels(name)) > {"cover"}
 
@@ -90,34 +97,34 @@ def test_each_simulated_mistake_has_kind_panel_and_cure() -> None:
 def test_form_points_correct_is_full_and_empty_is_zero() -> None:
     assert form_points(RIGHT, TRUTH).points_by_part == FULL
     assert parts(Answers(log_sha256=SHA256)) == [0.0] * 6
-    assert form_points(RIGHT, TRUTH).named == {"clock-offset": True, "dropout": True}
+    assert form_points(RIGHT, TRUTH).is_named_by_mistake == {"clock-offset": True, "dropout": True}
 
 
 FULL = dict(zip(PART_NAMES, (30.0, 15.0, 10.0, 15.0, 15.0, 15.0), strict=True))
 DELAY = {"parameter": "EKF2_EV_DELAY", "value": 200.0, "value_unit": "ms"}
 GATE = {"parameter": "EKF2_EVP_GATE", "value": 3.0, "value_unit": "sd"}
-NO_MISTAKES = {"kinds": 0.0, "sizes": 0.0, "when": 0.0, "cure": 0.0}
+NO_MISTAKES = {"mistakes": 0.0, "sizes": 0.0, "time and panel": 0.0, "correction": 0.0}
 # A form, and its parts with reduced points
 HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
     # wrong sign: a third of the points for size and cure of this mistake
-    (with_claim(size=-190.0, value=0.2), {"sizes": 10.0, "cure": 10.0}),
+    (with_claim(size=-190.0, value=0.2), {"sizes": 10.0, "correction": 10.0}),
     (with_claim(size=140.0), {"sizes": 11.25}),
-    (with_claim(size=900.0, value=-0.9), {"sizes": 7.5, "cure": 11.25}),
-    (with_claim(panel="map"), {"when": 7.5}),
-    (with_claim(when=""), {"when": 7.5}),
+    (with_claim(size=900.0, value=-0.9), {"sizes": 7.5, "correction": 11.25}),
+    (with_claim(panel="map"), {"time and panel": 7.5}),
+    (with_claim(when=""), {"time and panel": 7.5}),
     (with_claim(**DELAY), {}),
-    (with_claim(**GATE), {"cure": 7.5}),
+    (with_claim(**GATE), {"correction": 7.5}),
     # similar mistake: 0.4 of the kind, a third of the size, half of the time
-    (with_claim(kind="ekf2-delay"), {"kinds": 21.0, "sizes": 10.0, "when": 7.5}),
+    (with_claim(kind="ekf2-delay"), {"mistakes": 21.0, "sizes": 10.0, "time and panel": 7.5}),
     # each wrong mistake costs 10 points
-    (with_false("yaw"), {"kinds": 20.0}),
+    (with_false("yaw"), {"mistakes": 20.0}),
     (with_false("yaw", "nlos", "scale"), NO_MISTAKES),
     (replace(RIGHT, mistakes=(StudentMistake("none"),)), NO_MISTAKES),
     (replace(RIGHT, verdict_kf="consistent"), {"verdicts": 10.0}),
     (replace(RIGHT, verdict_ekf2="consistent"), {"verdicts": 12.5}),
     (replace(RIGHT, ekf2_did=("dead-reckoned, then reset",)), {"verdicts": 12.5}),
-    (replace(RIGHT, quantities=(0.53, (3.0,), None)), {"quantities": 5.0}),
-    (replace(RIGHT, quantities=(9.0, (), None)), {"verdicts": 7.5, "quantities": 0.0}),
+    (replace(RIGHT, quantities=(0.53, (3.0,), None)), {"numbers": 5.0}),
+    (replace(RIGHT, quantities=(9.0, (), None)), {"verdicts": 7.5, "numbers": 0.0}),
 ]
 
 
@@ -159,7 +166,7 @@ def test_form_points_constant_form_on_loops_is_low() -> None:
     truths = []
     for number in range(300):
         drawn = draw(b"constant forms", f"s{number}", "loop")
-        sizes = [float(typed.partition("=")[2].rstrip("m")) for typed in drawn.typed]
+        sizes = [float(typed.partition("=")[2].rstrip("m")) for typed in drawn.mistake_options]
         measured = [size + rng.normal(0.0, 0.4) for size in sizes]
         wrong = [TrueMistake("open-end", size, size - 0.3, size + 0.3, 65.0) for size in measured]
         verdicts = VerdictTruth("underconfident", 7.0), VerdictTruth("overconfident", 1.1)
@@ -193,12 +200,12 @@ def simulation_of(typed: str) -> flights.Simulation:
 
 
 def answers_of(form: dict[str, Any]) -> Answers:
-    form = update_values(form)  # the forms use the values before schema 4
+    form = update_renamed_values(form)  # the forms use the values before schema 4
     claims = []
     for one in form["mistakes"] or []:
         when = one["when"]
-        parameter = one["parameter"] if one["parameter"] in CURES else ""
-        unit = one["value_unit"] if one["value_unit"] in CURES.get(parameter, {}) else ""
+        parameter = one["parameter"] if one["parameter"] in CORRECTIONS else ""
+        unit = one["value_unit"] if one["value_unit"] in CORRECTIONS.get(parameter, {}) else ""
         claims.append(
             StudentMistake(
                 one["kind"], one["size"],

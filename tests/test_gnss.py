@@ -320,7 +320,7 @@ def test_noise_remedy_needs_parameter_above_accuracy(
     prepared = prepare(flight_of(log, tmp_path))
     monkeypatch.setattr(findings_tools, "SEGMENT", prepared.segment)
     no_model = Unavailable("replay", "no IMU", "Log it.")
-    words = noises._noise_above_reported(
+    words = noises._format_excessive_noise(
         stand_in(source=prepared.source, log=prepared.flight.log, ekf2_model=no_model)
     )
     assert bool(words) is expected
@@ -487,7 +487,7 @@ def test_what_if_gnss_delay_changes_heading(models):
         return logged, after
 
     for model in models.values():
-        assert {stretch.field is None for stretch in model.inputs.stretches} == {False}
+        assert {segment.field is None for segment in model.inputs.segments} == {False}
         assert model.agreement.heading_rms_difference_deg < 0.5
         # height follows the logged EKF2 height
         state, replayed = model.flight.ekf2.state["down_m"], model.flown.published["down_m"]
@@ -640,7 +640,7 @@ def test_read_gnss_driver_time_replaces_delay(tmp_path):
 def test_rules_gnss_reset_depends_on_release(north_m, parameters, scale, with_velocity):
     delayed = pd.DataFrame({"north_m": [north_m]})
     record = made(FusionRecord, parameters=parameters, per_step_biases=False, delayed=delayed)
-    rules = _rules(record, 0.01, gnss=True)
+    rules = _rules(record, 0.01, is_gnss=True)
     assert (rules.reset_scale, rules.with_velocity) == (scale, with_velocity)
     assert (rules.reset_s, rules.stop_s) == (7.0, np.inf)
 

@@ -64,7 +64,7 @@ def test_grade_table_lists_every_submitted_file(submitted, tmp_path) -> None:
         [submitted, tmp_path / "more.zip"], Course(read_rubric(None)), output, processes=1
     )
     assert {path for path in tmp_path.rglob("*") if not path.is_relative_to(output)} == before
-    assert len(outcome.graded) == 6
+    assert len(outcome.reports) == 6
     text = (output / "class.csv").read_text(encoding="utf-8-sig")
     table = list(csv.DictReader(io.StringIO(text)))
     assert len(table) == 6
@@ -96,9 +96,9 @@ def test_grade_pages_beyond_limits_cannot_be_verified(tmp_path, monkeypatch) -> 
     )
     (only,) = grade(
         [folder], Course(read_rubric(None), logs=[LOG.parent]), tmp_path / "class"
-    ).graded
+    ).reports
     assert only.status == "cannot verify"
-    assert only.pending.startswith("Ask for the PDF that px4fuse wrote")
+    assert only.pending_action.startswith("Ask for the PDF that px4fuse wrote")
     assert any("not compared within the limits" in flag for flag in only.flags)
 
 
@@ -114,7 +114,7 @@ def test_grade_with_log_verifies_unchanged_report_only(tmp_path) -> None:
     (folder / "c.pdf").write_bytes(forged(pdf, lambda writer: writer.remove_page(7)))
     output = tmp_path / "class"
     outcome = grade([folder], Course(read_rubric(None), logs=[LOG.parent]), output, processes=2)
-    first, second, third = outcome.graded
+    first, second, third = outcome.reports
     assert first.verdict.status == "verified"
     assert first.verdict.with_log
     assert first.numbers["SIGMA_Z (m)"] == 0.1
@@ -136,8 +136,8 @@ def test_grade_with_log_verifies_unchanged_report_only(tmp_path) -> None:
     assert first.flags == ()
     # a second run reuses all results
     again = grade([folder], Course(read_rubric(None), logs=[LOG.parent]), output, processes=2)
-    assert again.reused == 3
-    assert again.graded == outcome.graded
+    assert again.reused_count == 3
+    assert again.reports == outcome.reports
 
 
 @pytest.mark.usefixtures("jobs_in_process")
@@ -150,7 +150,7 @@ def test_grade_again_processes_changed_files_only(submitted, tmp_path) -> None:
             Course(read_rubric(None), title=title),
             output,
             processes=2,
-        ).reused
+        ).reused_count
 
     assert reused() == 2  # there are three copies of one report
     assert reused("Lab 4") == 3  # other files are read again
@@ -177,7 +177,7 @@ def test_grade_with_other_logs_verifies_again(tmp_path) -> None:
         outcome = grade(
             [tmp_path / "in"], Course(read_rubric(None), logs=logs), tmp_path / "out", processes=1
         )
-        said.append((outcome.graded[0].verdict.status, outcome.reused))
+        said.append((outcome.reports[0].verdict.status, outcome.reused_count))
         # only the redrawn report of this run
         assert len([*(tmp_path / "out" / "records").glob("*.p*")]) == len(logs)
     assert said == [
@@ -196,11 +196,11 @@ def test_grade_missing_log_makes_points_pending(tmp_path) -> None:
     for given, status in ((sha256, "cannot verify"), ("0" * 64, "other log")):
         key = AnswerKey("aisle", (Answer("1", "Ada", "1.ulg", given),))
         outcome = grade([tmp_path / "in"], Course(rubric, key, logs), tmp_path / "out", processes=1)
-        (one,) = outcome.graded
+        (one,) = outcome.reports
         assert one.verdict.status == status
         assert one.points > 0
-        assert one.counted is None
-        assert "aisle_uwb.ulg" in one.pending
+        assert one.counted_points is None
+        assert "aisle_uwb.ulg" in one.pending_action
 
 
 @pytest.mark.usefixtures("jobs_in_process")
@@ -249,7 +249,7 @@ def test_grade_command_passes_course_options(tmp_path, monkeypatch) -> None:
     assert course.worksheets[0].head == ("id", "Grade")
     assert (course.column, course.anonymous, course.attempt) == ("Grade", True, "best")
     assert course.due.isoformat() == "2026-11-20T23:59:59+01:00"
-    assert (course.late.text, course.include_pending) == ("5%/hour", False)
+    assert (course.late_rule.text, course.include_pending) == ("5%/hour", False)
 
 
 def test_grade_write_rubric_writes_default_once(tmp_path, monkeypatch) -> None:

@@ -14,11 +14,11 @@ from exchange import replace
 from findings_tools import made
 
 from px4fuse.analysis import WhatIfAnalysis
-from px4fuse.ekf2.filter_recursion import StretchRun, Variant
+from px4fuse.ekf2.filter_recursion import SegmentRun, Variant
 from px4fuse.ekf2.heights import HeightFilter, add_heights, barometer_samples
 from px4fuse.ekf2.model import Model, run_variants
-from px4fuse.ekf2.replay_segments import HeightSamples, Stretch
-from px4fuse.ekf2.whatif import HEIGHT_FOLLOWS, HEIGHT_STAYS, what_if
+from px4fuse.ekf2.replay_segments import HeightSamples, ReplaySegment
+from px4fuse.ekf2.whatif import HEIGHT_LOGGED_NOTE, HEIGHT_REPLAYED_NOTE, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.flight import AidLog, Flight
 from px4fuse.readers import read_log
@@ -36,10 +36,10 @@ BOTH = ("baro_hgt", "gnss_hgt")
 STEP_S, PERIOD_S = 0.01, 0.1
 
 
-def climbing(heights: HeightSamples, count: int = 400, up_m_s2: float = 0.0) -> Stretch:
+def climbing(heights: HeightSamples, count: int = 400, up_m_s2: float = 0.0) -> ReplaySegment:
     force = np.tile([0.0, 0.0, -9.80665 - up_m_s2], (count, 1))
     return made(
-        Stretch, time_s=STEP_S * np.arange(count + 1), step_s=np.full(count, STEP_S),
+        ReplaySegment, time_s=STEP_S * np.arange(count + 1), step_s=np.full(count, STEP_S),
         rotation=np.tile(np.eye(3), (count + 1, 1, 1)), force_m_s2=force, heights=heights,
     )  # fmt: skip
 
@@ -61,14 +61,18 @@ def of_baro(steps: list[int], down_m: list[float], **more: float) -> HeightSampl
 
 
 def fusing(
-    stretch: Stretch, end: np.ndarray, *, reference_until: float = np.inf, gated: bool = True
+    segment: ReplaySegment,
+    end: np.ndarray,
+    *,
+    reference_until: float = np.inf,
+    has_gate: bool = True,
 ) -> HeightFilter:
-    (samples,) = barometer_samples(stretch, [end])
-    there, time_s = np.zeros((len(end), 1), bool), stretch.time_s[end][:, None]
+    (samples,) = barometer_samples(segment, [end])
+    there, time_s = np.zeros((len(end), 1), bool), segment.time_s[end][:, None]
     on = {"baro_hgt": np.ones_like(there), "gnss_hgt": time_s < reference_until}
     parameters = {"EKF2_BARO_NOISE": np.array([0.5]), "EKF2_BARO_GATE": np.array([5.0])}
     return HeightFilter(
-        stretch, samples[..., None], time_s, there, on, parameters, np.array([gated])
+        segment, samples[..., None], time_s, there, on, parameters, np.array([has_gate])
     )
 
 
@@ -151,8 +155,8 @@ def test_height_sample_weight_equals_repeated_samples() -> None:
     P[0, 8, 8] = 0.5
     variances = []
     for steps, weight in (([10], 2.0), ([10, 10], 1.0)):
-        stretch = climbing(of_baro(steps, [0.3] * len(steps), weight=weight))
-        heights = fusing(stretch, np.array([10]))
+        segment = climbing(of_baro(steps, [0.3] * len(steps), weight=weight))
+        heights = fusing(segment, np.array([10]))
         x, after = heights.fuse(0, np.zeros((1, 9)), P, np.zeros(1), np.ones(1))
         variances.append((after[0, 8, 8], x[0, 8]))
         assert heights.update_log[0, 0, 1, 0] == pytest.approx(0.75)
@@ -168,9 +172,9 @@ def test_heights_ground_effect_ignores_low_barometer(innovation, expected) -> No
     assert found["innovation_down_m"].item() == pytest.approx(expected)
 
 
-@pytest.mark.parametrize(("gated", "fused"), [(True, 0.0), (False, 1.0)])
-def test_height_outside_gate_is_rejected(gated: bool, fused: float) -> None:
-    _, found = standing(of_baro([10], [2.6]), gated=gated)
+@pytest.mark.parametrize(("has_gate", "fused"), [(True, 0.0), (False, 1.0)])
+def test_height_outside_gate_is_rejected(has_gate: bool, fused: float) -> None:
+    _, found = standing(of_baro([10], [2.6]), has_gate=has_gate)
     assert (found["fused"].item(), found["rejected"].item()) == (fused, 1.0 - fused)
 
 
@@ -205,7 +209,7 @@ def test_what_if_barometer_noise_matches_real_run() -> None:
             assert getattr(predicted.heights["baro_hgt"], name) == pytest.approx(expected, rel=0.02)
         error_m = logged.height_rmse_to_truth_m
         assert predicted.height_rmse_to_truth_m == pytest.approx(error_m, rel=0.1)
-        assert HEIGHT_FOLLOWS in found.notes
+        assert HEIGHT_REPLAYED_NOTE in found.notes
     # with 25 times the variance the barometer corrects the height less
     tight, loose = (
         column.heights["baro_hgt"].nis_mean for column in (found.whatif[0], found.logged)
@@ -228,8 +232,8 @@ def test_what_if_long_height_rejection_is_unpredictable() -> None:
     jump.loc[40.0:50.0, "down_m"] += 3.0
     model = opened_once()
     ekf2, other = model.flight.ekf2, replace(flight, barometer=jump)
-    stretches = add_heights(other, ekf2, ekf2.record, model.inputs.stretches)
-    jumping = replace(model, inputs=replace(model.inputs, stretches=stretches))
+    segments = add_heights(other, ekf2, ekf2.record, model.inputs.segments)
+    jumping = replace(model, inputs=replace(model.inputs, segments=segments))
     found = what_if(jumping, [{"EKF2_BARO_GATE": gate} for gate in (3.0, 50.0)])
     assert [one.is_predictable for one in found.whatif] == [False, True]
     assert found.whatif[0].heights["baro_hgt"].longest_without_fusion_s > 5.0
@@ -249,7 +253,7 @@ def test_model_disagreeing_height_is_excluded() -> None:
     own = np.interp(model.flown.delayed.index, flight.ekf2.state.index, flight.ekf2.state["down_m"])
     assert np.abs(model.flown.delayed["down_m"] - own).max() < 0.5
     found = what_if(model, [{"EKF2_GPS_DELAY": 0.0}])
-    assert HEIGHT_STAYS in found.notes
+    assert HEIGHT_LOGGED_NOTE in found.notes
     with pytest.raises(SettingsError, match=r"EKF2_BARO_NOISE has no effect .*barometer: "):
         what_if(model, [{"EKF2_BARO_NOISE": 1.0}])
     with pytest.raises(SettingsError, match=r"baro_hgt: in this log .*barometer: "):
@@ -259,7 +263,7 @@ def test_model_disagreeing_height_is_excluded() -> None:
 def test_add_heights_insufficient_log_returns_reason() -> None:
     flight = outdoors()
     model = opened_once()
-    ekf2, stretches = model.flight.ekf2, model.inputs.stretches
+    ekf2, segments = model.flight.ekf2, model.inputs.segments
     record = ekf2.record
 
     def why(enabled: dict[str, float], rows: int = 1, **parameters: float) -> str:
@@ -270,7 +274,7 @@ def test_add_heights_insufficient_log_returns_reason() -> None:
         }
         log = replace(record, parameters=record.parameters | parameters)
         other = replace(flight, barometer=flight.barometer.iloc[::rows])
-        update_log = add_heights(other, replace(ekf2, aids=found), log, stretches)
+        update_log = add_heights(other, replace(ekf2, aids=found), log, segments)
         return update_log if isinstance(update_log, str) else ""
 
     assert why({"baro_hgt": 1.0}) == ""
@@ -283,34 +287,34 @@ def test_add_heights_insufficient_log_returns_reason() -> None:
     assert "barometer is logged at 3.3 Hz" in why({"baro_hgt": 1.0}, rows=3)
     old = {"EKF2_AID_MASK": 1.0}
     log = replace(record, parameters=old)
-    assert "before PX4 v1.14" in add_heights(flight, ekf2, log, stretches)
+    assert "before PX4 v1.14" in add_heights(flight, ekf2, log, segments)
 
 
 def test_recursion_bad_acceleration_noise_is_4_9() -> None:
     """The noise is BADACC_BIAS_PNOISE of covariance.cpp."""
     inputs = opened_once().inputs
-    (stretch,) = inputs.stretches
-    spoilt = replace(stretch, bad_acceleration_share=np.ones(len(stretch.time_s), bool))
+    (segment,) = inputs.segments
+    spoilt = replace(segment, bad_acceleration_share=np.ones(len(segment.time_s), bool))
 
-    def ran(one: Stretch, **changed: float) -> StretchRun:
+    def ran(one: ReplaySegment, **changed: float) -> SegmentRun:
         settings = inputs.settings | changed
-        return run_variants(replace(inputs, stretches=(one,)), [Variant(settings)], {})[0]
+        return run_variants(replace(inputs, segments=(one,)), [Variant(settings)], {})[0]
 
-    np.testing.assert_array_equal(ran(spoilt).state, ran(stretch, EKF2_ACC_NOISE=4.9).state)
+    np.testing.assert_array_equal(ran(spoilt).state, ran(segment, EKF2_ACC_NOISE=4.9).state)
     # one clipped axis of three equals a third of the steps
     third = np.sqrt((2.0 * inputs.settings["EKF2_ACC_NOISE"] ** 2 + 4.9**2) / 3.0)
-    clipped = replace(stretch, bad_acceleration_share=np.full(len(stretch.time_s), 1.0 / 3.0))
-    expected = ran(stretch, EKF2_ACC_NOISE=float(third)).variance
+    clipped = replace(segment, bad_acceleration_share=np.full(len(segment.time_s), 1.0 / 3.0))
+    expected = ran(segment, EKF2_ACC_NOISE=float(third)).variance
     np.testing.assert_allclose(ran(clipped).variance, expected, rtol=1e-9)
 
 
 def test_stretch_clipped_axes_increase_noise_share() -> None:
     flight = outdoors()
-    (plain,) = opened_once().inputs.stretches
+    (plain,) = opened_once().inputs.segments
     clipped = pd.Series(0, flight.imu.index)
     at = plain.time_s[[100, 200]] - 1e-4
     clipped.iloc[np.searchsorted(flight.imu.index, at)] = [0b101, 0b111]
-    (update_log,) = opened(replace(flight, imu=flight.imu.assign(clipped=clipped))).inputs.stretches
+    (update_log,) = opened(replace(flight, imu=flight.imu.assign(clipped=clipped))).inputs.segments
     assert not plain.bad_acceleration_share.any()
     assert update_log.bad_acceleration_share[[100, 200]].tolist() == [pytest.approx(2.0 / 3.0), 1.0]
     assert np.flatnonzero(update_log.bad_acceleration_share).tolist() == [100, 200]

@@ -31,8 +31,13 @@ from px4fuse.simulation.scenario import Scenario
 
 pytestmark = pytest.mark.usefixtures("quick_filter")
 RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
-OF_CAUSES = (imu.bias, sent.detect, stamps.arrivals, intervals.downsampling)
-DETECTORS = (*OF_CAUSES, source_clock.detect, source_frame.detect, noises.deviating_settings)
+OF_CAUSES = (
+    imu.detect_bias,
+    sent.detect,
+    stamps.detect_arrival_times,
+    intervals.detect_downsampling,
+)
+DETECTORS = (*OF_CAUSES, source_clock.detect, source_frame.detect, noises.detect_wrong_settings)
 
 
 def analysed(flight: Flight, settings: Settings = RIGHT, **span: float) -> Analysis:
@@ -237,7 +242,7 @@ def with_ekf2(*mistakes: str) -> Analysis:
 
 @pytest.mark.parametrize(("jump", "severity"), [("50ms", "warning"), ("300ms", "error")])
 def test_clock_change_from_publication_age_has_severity(jump, severity):
-    (finding,) = stamps.arrivals(with_ekf2(f"clock-jump={jump}"))
+    (finding,) = stamps.detect_arrival_times(with_ekf2(f"clock-jump={jump}"))
     assert finding.severity == severity
     assert finding.evidence["until_s"] == pytest.approx(50.0, abs=0.5)
     assert finding.evidence["latency_s"] == pytest.approx(float(jump[:-2]) / 1e3, abs=0.005)

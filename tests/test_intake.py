@@ -21,7 +21,7 @@ from pypdf.generic import (
 from results_tools import LOOP, decode_results
 
 from px4fuse.errors import ResultsError
-from px4fuse.results.contract import Reported, to_json
+from px4fuse.results.contract import ReportedResults, to_json
 from px4fuse.results.model import Student
 from px4fuse.verification import pdf_input
 from px4fuse.verification.pdf_input import read_report
@@ -369,5 +369,5 @@ def test_read_report_unexpected_types_are_read_or_rejected():
         for value in odd:
             with suppress(ResultsError):
                 assert isinstance(
-                    read_report(small_report(edit=on_root(key, value)), "r.pdf"), Reported
+                    read_report(small_report(edit=on_root(key, value)), "r.pdf"), ReportedResults
                 )

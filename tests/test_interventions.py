@@ -11,17 +11,17 @@ from exchange import replace
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.comparison.causal_replays import (
-    CLOCK,
-    FORWARD,
+    CLOCK_OFFSET,
+    FORWARD_BIAS,
     MIN_EXPLAINED_SHARE,
     OUTLIERS,
-    TURN,
+    ROTATION,
     Intervention,
-    cause_of,
-    interventions,
+    find_cause,
     planned_variants,
+    run_interventions,
 )
-from px4fuse.comparison.causal_replays import RIGHT as TO_RIGHT
+from px4fuse.comparison.causal_replays import RIGHT_BIAS as TO_RIGHT
 from px4fuse.comparison.comparison import compare
 from px4fuse.ekf2.filter_recursion import Variant
 from px4fuse.ekf2.model import replay_settings, with_misaligned_positions, with_position_noise
@@ -46,7 +46,7 @@ def flown(*mistakes: str, sigma_a=0.27, sigma_z=0.10, passes=4) -> Analysis:
 
 
 def cause(analysis: Analysis, owner: Any, of: Any = "nis") -> Intervention:
-    return cause_of(analysis.causes, owner, "aisle", of)
+    return find_cause(analysis.causes, owner, "aisle", of)
 
 
 def test_interventions_without_discrepancy_are_empty() -> None:
@@ -62,14 +62,14 @@ def test_interventions_without_discrepancy_are_empty() -> None:
         ("nlos=7%", {}, "kf", "nis", {OUTLIERS: (25, 4)}),
         ("nlos=7%", {}, "ekf2", "nis", {OUTLIERS: (25, 4)}),
         ("nlos=7%", {"sigma_z": 0.05}, "kf", "nis", {OUTLIERS: (25, 4), "sigma_z_m": (0.1, 0.01)}),
-        (LATE, {}, "kf", "nees", {CLOCK: (-0.25, 0.06)}),
+        (LATE, {}, "kf", "nees", {CLOCK_OFFSET: (-0.25, 0.06)}),
         (LATE, {}, "ekf2", "nees",
          {"EKF2_EV_DELAY": (250, 60), "EKF2_DELAY_MAX": (300, 0)}),
         # no parameter of EKF2 shifts positions to an earlier time than their timestamp
-        ("clock-offset=-0.19", {}, "ekf2", "nees", {CLOCK: (0.19, 0.06)}),
-        ("accel-bias=0.5", {}, "kf", "nis", {FORWARD: (0.5, 0.03), TO_RIGHT: (-0.04, 0.03)}),
-        ("yaw=20", {}, "kf", "nees", {TURN: (-20, 4)}),
-        ("yaw=20", {}, "ekf2", "nees", {TURN: (-20, 4)}),
+        ("clock-offset=-0.19", {}, "ekf2", "nees", {CLOCK_OFFSET: (0.19, 0.06)}),
+        ("accel-bias=0.5", {}, "kf", "nis", {FORWARD_BIAS: (0.5, 0.03), TO_RIGHT: (-0.04, 0.03)}),
+        ("yaw=20", {}, "kf", "nees", {ROTATION: (-20, 4)}),
+        ("yaw=20", {}, "ekf2", "nees", {ROTATION: (-20, 4)}),
         ("ekf2-noise=0.03", {}, "ekf2", "nis", {"EKF2_EVP_NOISE": (0.1, 0.01)}),
         ("ekf2-noise=0.5", {}, "ekf2", "nis", {"EKF2_EVP_NOISE": (0.1, 0.01)}),
         ("ekf2-gate=1", {"passes": 6}, "ekf2", "nis", {"EKF2_EVP_GATE": (5, 0)}),
@@ -82,7 +82,7 @@ def test_cause_of_simulated_mistake_is_that_mistake(mistake, settings, owner, of
     assert found.change.keys() == change.keys()
     for name, (value, within) in change.items():
         assert found.change[name] == pytest.approx(value, abs=within)
-    assert found.needs_no_other
+    assert found.is_complete_cause
     # the summary names the re-run of this filter
     told = summarise(analysis, find(analysis))[0]
     ekf2, kf_case = told.split("Along the aisle KF ")
@@ -92,7 +92,11 @@ def test_cause_of_simulated_mistake_is_that_mistake(mistake, settings, owner, of
 def test_kf_changes_remove_bias_from_acceleration() -> None:
     analysis = flown("accel-bias=0.5")
     found, imu = cause(analysis, "kf"), analysis.flight.imu
-    without = imu[Columns.SPECIFIC_FORCE] - [found.change[FORWARD], found.change[TO_RIGHT], 0.0]
+    without = imu[Columns.SPECIFIC_FORCE] - [
+        found.change[FORWARD_BIAS],
+        found.change[TO_RIGHT],
+        0.0,
+    ]
     flight = replace(analysis.flight, imu=imu.assign(**without))
     again = compare(flight, analysis.settings).axes["aisle"].filters["kf"]
     assert found.after == pytest.approx(again.nis_mean, rel=1e-6)
@@ -110,7 +114,7 @@ def test_ekf2_changes_vibration_raises_noise_to_px4_limit() -> None:
 
 def test_offset_applied_to_kf_is_candidate_for_ekf2() -> None:
     bare = flown("clock-offset=-0.19")
-    offset_s = cause(bare, "kf", "nees").change[CLOCK]
+    offset_s = cause(bare, "kf", "nees").change[CLOCK_OFFSET]
     analysis = explain(compare(bare.flight, replace(RIGHT, clock_offset_s=offset_s)))
     assert {row.filter for row in analysis.causes} == {"ekf2"}
     again, before = cause(analysis, "ekf2", "nees"), cause(bare, "ekf2", "nees")
@@ -126,7 +130,7 @@ def test_offset_applied_to_kf_is_candidate_for_ekf2() -> None:
 )
 def test_kf_rerun_equals_comparison_with_the_change(analysis, of) -> None:
     analysis = analysis()
-    found = cause_of(analysis.causes, "kf", "north", of)
+    found = find_cause(analysis.causes, "kf", "north", of)
     again = compare(analysis.flight, replace(analysis.settings, **found.change))
 
     def statistic(of_comparison: Any) -> float:
@@ -143,7 +147,7 @@ def test_kf_rerun_equals_comparison_with_the_change(analysis, of) -> None:
 
 def test_ekf2_rerun_equals_what_if() -> None:
     analysis = flown("ekf2-noise=0.03")
-    found = [cause_of(analysis.causes, "ekf2", axis) for axis in ("north", "east")]
+    found = [find_cause(analysis.causes, "ekf2", axis) for axis in ("north", "east")]
     model, change = analysis.ekf2_model, found[0].change  # type: ignore[union-attr]
     replays = what_if(replace(model), [change])  # a copy without cached replays
     for one, axis in zip(found, ("north", "east"), strict=True):
@@ -210,7 +214,7 @@ def test_ekf2_changes_include_non_default_parameter() -> None:
     settings = {**analysis.ekf2_model.inputs.settings, "EKF2_ACC_NOISE": 0.5, "EKF2_GYR_NOISE": 0.1}
     inputs = replace(analysis.ekf2_model.inputs, settings=settings)
     model = replace(analysis.ekf2_model, inputs=inputs)
-    rows = interventions(analysis, analysis.tuning, analysis.clock, analysis.heading,
+    rows = run_interventions(analysis, analysis.tuning, analysis.clock, analysis.heading,
                          analysis.bias_scale_jump_fit, model)  # fmt: skip
     tried = [one.change for one in rows if (one.axis, one.statistic) == ("aisle", "nis")]
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
@@ -224,19 +228,24 @@ def test_is_cause_requires_half_to_one_and_a_half() -> None:
         )  # fmt: skip
 
     for explains in (MIN_EXPLAINED_SHARE - 0.01, 1.51, -1.0):
-        assert cause_of([one({"sigma_z_m": 1.0}, explains)], "kf", "aisle") is None
+        assert find_cause([one({"sigma_z_m": 1.0}, explains)], "kf", "aisle") is None
     part, whole = one({"sigma_a_m_s2": 0.1}, 0.99), one({"sigma_z_m": 1.0}, 0.9, into=True)
     assert (
-        cause_of([part, whole], "kf", "aisle") is whole
+        find_cause([part, whole], "kf", "aisle") is whole
     )  # a change into the band precedes a larger share
-    both = one({CLOCK: 0.1, "sigma_z_m": 1.0}, 1.0, into=True)
-    assert cause_of([both, whole], "kf", "aisle") is whole  # fewer changes precede
-    fault = one({CLOCK: 0.1}, 0.9, into=True)
-    assert cause_of([whole, fault], "kf", "aisle") is fault  # sensor faults precede settings
-    nearly, far = one({FORWARD: 0.3, TO_RIGHT: 0.1}, 0.8), one({FORWARD: 0.3, TO_RIGHT: 0.1}, 0.7)
-    assert cause_of([whole, nearly], "kf", "aisle") is nearly  # both bias components are one change
-    assert cause_of([whole, far], "kf", "aisle") is whole
-    assert cause_of([whole], "ekf2", "aisle") is cause_of([whole], "kf", "north") is None
+    both = one({CLOCK_OFFSET: 0.1, "sigma_z_m": 1.0}, 1.0, into=True)
+    assert find_cause([both, whole], "kf", "aisle") is whole  # fewer changes precede
+    fault = one({CLOCK_OFFSET: 0.1}, 0.9, into=True)
+    assert find_cause([whole, fault], "kf", "aisle") is fault  # sensor faults precede settings
+    nearly, far = (
+        one({FORWARD_BIAS: 0.3, TO_RIGHT: 0.1}, 0.8),
+        one({FORWARD_BIAS: 0.3, TO_RIGHT: 0.1}, 0.7),
+    )
+    assert (
+        find_cause([whole, nearly], "kf", "aisle") is nearly
+    )  # both bias components are one change
+    assert find_cause([whole, far], "kf", "aisle") is whole
+    assert find_cause([whole], "ekf2", "aisle") is find_cause([whole], "kf", "north") is None
 
 
 def test_candidate_without_required_data_is_skipped() -> None:
@@ -248,7 +257,7 @@ def test_candidate_without_required_data_is_skipped() -> None:
             "tuning": analysis.tuning, "clock": analysis.clock, "heading": analysis.heading,
             "bias_scale_jump_fit": analysis.bias_scale_jump_fit, "model": analysis.ekf2_model,
         }  # fmt: skip
-        rows = interventions(analysis, **{**known, **parts})
+        rows = run_interventions(analysis, **{**known, **parts})
         return {(row.filter, name) for row in rows for name in row.change}
 
     assert tried() == {("kf", "sigma_z_m"), ("kf", OUTLIERS), ("ekf2", OUTLIERS)}
@@ -259,4 +268,4 @@ def test_candidate_without_required_data_is_skipped() -> None:
     )
     assert tried(heading=turned, tuning={}) == set()
     turned = replace(turned, misalignment_deg=3.1)
-    assert tried(heading=turned, tuning={}) == {("kf", TURN), ("ekf2", TURN)}
+    assert tried(heading=turned, tuning={}) == {("kf", ROTATION), ("ekf2", ROTATION)}

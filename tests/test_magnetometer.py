@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from ulog_tools import Log, gnss_log, seconds_of, stamps, topic
 
 from px4fuse.ekf2.magnetometer import EventSamples, fuse_field, mean_by_event
-from px4fuse.ekf2.replay_segments import SensorSamples, Stretch, _field_span, _mean_field
+from px4fuse.ekf2.replay_segments import ReplaySegment, SensorSamples, _field_span, _mean_field
 from px4fuse.flight import Columns, FusionRecord
 from px4fuse.readers import read_log
 
@@ -73,7 +73,7 @@ def test_fuse_field_weighted_sample_equals_repeats() -> None:
     seen = field_samples(Rotation.from_euler("z", 0.4), np.zeros(3))
     noise, gate = np.array([0.05]), np.array([3.0])
     x, P = known_field_state()
-    once = fuse_field(x, P, seen._replace(number=np.full(1, 5.0)), noise, gate)
+    once = fuse_field(x, P, seen._replace(sample_count=np.full(1, 5.0)), noise, gate)
     for _ in range(5):
         x, P, _ = fuse_field(x, P, seen, noise, gate)
     np.testing.assert_allclose(once[0], x, atol=1e-9)
@@ -83,7 +83,7 @@ def test_fuse_field_weighted_sample_equals_repeats() -> None:
 def test_fuse_field_variants_use_separate_noise_and_gate() -> None:
     x, P = known_field_state(4)
     seen = field_samples(Rotation.identity(), np.array([0.3, 0.0, 0.0]), size=4)
-    seen = seen._replace(number=np.array([1.0, 1.0, 0.0, 1.0]))
+    seen = seen._replace(sample_count=np.array([1.0, 1.0, 0.0, 1.0]))
     noise, gate = np.array([0.05, 0.2, 0.2, 0.0]), np.array([3.0, 3.0, 3.0, 100.0])
     after, left, innovation = fuse_field(x, P, seen, noise, gate)
     # 0.3 gauss is 6 σ for the first variant; the third has no sample
@@ -107,10 +107,10 @@ def test_mean_by_event_assigns_next_event() -> None:
     sensed = SensorSamples(step, gauss, turn, np.full(4, 2.0), np.array([0.1, 0.3, 0.2, 0.4]))
     found = mean_by_event(sensed, np.array([1, 3, 6, 6, 8]))
     np.testing.assert_allclose(found.noise, [0.0, 0.2, 0.2, 0.0, 0.0])
-    assert found.number.tolist() == [0.0, 4.0, 2.0, 0.0, 0.0]
+    assert found.sample_count.tolist() == [0.0, 4.0, 2.0, 0.0, 0.0]
     np.testing.assert_allclose(found.value[1], gauss[:2].mean(axis=0))
-    np.testing.assert_allclose(found.turn[1], rotation[2:4].mean(axis=0).T)
-    np.testing.assert_allclose(found.turn[2], rotation[6].T)
+    np.testing.assert_allclose(found.rotation_to_body[1], rotation[2:4].mean(axis=0).T)
+    np.testing.assert_allclose(found.rotation_to_body[2], rotation[6].T)
 
 
 # ---------------------------------------------------------------- reading
@@ -182,30 +182,34 @@ def test_mean_field_recovers_mean_measurement() -> None:
     error = np.tile([0.002, -0.003, 0.01], (len(time_s), 1))
     body = np.array([0.02, -0.01, 0.03])
     rng = np.random.default_rng(7)
-    taken_s = time_s[0] + 0.2 + interval_s * np.arange(rows * every)
-    step = np.searchsorted(time_s, taken_s - 1e-9)
-    measured = rng.normal(0.0, 0.3, (len(taken_s), 3))
+    measured_at_s = time_s[0] + 0.2 + interval_s * np.arange(rows * every)
+    step = np.searchsorted(time_s, measured_at_s - 1e-9)
+    measured = rng.normal(0.0, 0.3, (len(measured_at_s), 3))
     own = Rotation.from_rotvec(error[step]) * rotation[step]
     innovation = own.inv().apply(EARTH) + body - measured
     share = interval_s / (interval_s + 0.5)
     filtered = innovation.copy()
-    for k in range(1, len(taken_s)):
+    for k in range(1, len(measured_at_s)):
         filtered[k] = filtered[k - 1] + share * (innovation[k] - filtered[k - 1])
-    remaining = np.r_[np.arange(every - 1, len(taken_s), every)]
+    remaining = np.r_[np.arange(every - 1, len(measured_at_s), every)]
     remaining = np.delete(
         remaining, [count, *range(20, 26)]
     )  # the logger missed one row, then three seconds
     fields = [*Columns.EARTH_FIELD, *Columns.BODY_FIELD]
     delayed = pd.DataFrame(dict(zip(fields, [*EARTH, *body], strict=True)), [99.0, 200.0])
     matrices = rotation.as_matrix()
-    stretch = made(Stretch, time_s=time_s, rotation=matrices, attitude_error_rad=error)
-    found = _mean_field(stretch, delayed, taken_s[remaining], filtered[remaining])
+    segment = made(ReplaySegment, time_s=time_s, rotation=matrices, attitude_error_rad=error)
+    found = _mean_field(segment, delayed, measured_at_s[remaining], filtered[remaining])
     near = np.flatnonzero(np.diff(remaining) < 20) + 1
-    assert found.samples.tolist() == np.diff(remaining)[near - 1].tolist()
-    assert sorted(set(found.samples)) == [7.0, 14.0]
+    assert found.sample_count.tolist() == np.diff(remaining)[near - 1].tolist()
+    assert sorted(set(found.sample_count)) == [7.0, 14.0]
     assert found.step.tolist() == step[remaining[near]].tolist()
     for row, samples, value, turn in zip(
-        remaining[near], found.samples.astype(int), found.value, found.turn, strict=True
+        remaining[near],
+        found.sample_count.astype(int),
+        found.value,
+        found.rotation_to_body,
+        strict=True,
     ):
         of = row - np.arange(samples)
         weight = (1.0 - share) ** np.arange(samples)

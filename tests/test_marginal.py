@@ -147,10 +147,10 @@ def with_constants(offsets: int = 3) -> Positions:
     initial = np.zeros((COUNT, 2))
     initial[START] = WEAK
     return Positions(
-        measurement_m=measured, start=START, length_s=length,
+        measurement_m=measured, segment_starts=START, length_s=length,
         noise_unit=0.1 * np.stack(continuous_noise_unit(length)),
         noise_fixed=np.outer([0.3, 0.0, 0.2], rng.choice([0.0, 0.01], COUNT - 1)),
-        initial=initial, constant_sigma=np.array([0.3, 1.0, 0.1]),
+        prior_precision=initial, constant_sigma=np.array([0.3, 1.0, 0.1]),
         delta_position_m=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
         delta_velocity_m_s=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
     )  # fmt: skip
@@ -175,7 +175,7 @@ def stretch_normal(
     # position and velocity for the signals of data and constants
     means = [np.zeros((2, 4))]
     cross = {(0, 0): np.diag(1.0 / WEAK)}  # covariance of each state with all earlier ones
-    for k, row in enumerate(rows[1:], start=1):
+    for k, row in enumerate(rows[1:], segment_starts=1):
         length = part.length_s[row - 1]
         f = np.array([[1.0, length], [0.0, 1.0]])
         legs = part.delta_position_m, part.delta_velocity_m_s
@@ -242,7 +242,7 @@ def test_fit_positions_single_measurement_has_no_effect(start_known: bool) -> No
     """A single position in a stretch has the same likelihood as none."""
     part = with_constants()
     if not start_known:
-        part = replace(part, initial=np.zeros((COUNT, 2)))
+        part = replace(part, prior_precision=np.zeros((COUNT, 2)))
     without = part.measurement_m.copy()
     without[15, 2] = np.nan
     for noises in SOME_NOISES:

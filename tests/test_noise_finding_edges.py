@@ -33,11 +33,12 @@ from findings_tools import (
 from px4fuse.comparison.model import Difference
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.filter.consistency import classify_mean_nis
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HeldOutCheck, Noise
 from px4fuse.findings import Finding, cause_text, hidden_errors, loops, noises
 from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.noises import _is_default
+from px4fuse.findings.noises import _has_default_noises
 from px4fuse.findings.summary import summarise
 from px4fuse.loop.model import Closure, Loop
 
@@ -53,12 +54,12 @@ def no_replay(monkeypatch: pytest.MonkeyPatch) -> None:
     format_kf_remedy, rerun_settings = noises.remedy.format_kf_remedy, list[Settings]()
 
     def options_only(
-        of: Any, changes: Any, more: str = "", unseen_nats: float | None = None
+        of: Any, changes: Any, more: str = "", held_out_nats: float | None = None
     ) -> str:
         text = format_kf_remedy(of, changes, more)
         typed = text.removeprefix("px4fuse compare LOG ").removesuffix(".")
         changed = rerun_settings[-1]
-        return f"[{typed}|{changed.sigma_z_m:g}|{changed.sigma_a_m_s2:g}|{unseen_nats}]."
+        return f"[{typed}|{changed.sigma_z_m:g}|{changed.sigma_a_m_s2:g}|{held_out_nats}]."
 
     monkeypatch.setattr(noises.remedy, "format_kf_remedy", options_only)
     monkeypatch.setattr(noises.remedy, "filter_errors_m", lambda _, new: rerun_settings.append(new))
@@ -96,9 +97,9 @@ def test_setting_deviation_severity_at_limits(
 
 
 def test_deviating_settings_lists_larger_deviation_first() -> None:
-    held = made(HeldOutCheck, gain_nats=0.25)
+    held = made(HeldOutCheck, log_likelihood_gain_per_measurement=0.25)
     fitted = tuned(Noise(0.5, 0.45, 0.55), Noise(0.1, 0.09, 0.11), held_out=held)
-    worse, other = noises.deviating_settings(analysis(source=MOVING, tuning=fitted))
+    worse, other = noises.detect_wrong_settings(analysis(source=MOVING, tuning=fitted))
     assert (worse.id, worse.caused_by) == ("sigma_a_too_large", None)
     assert (other.id, other.caused_by) == ("sigma_z_too_large", "sigma_a_too_large")
     assert worse.severity == "error"
@@ -109,22 +110,22 @@ def test_deviating_settings_lists_larger_deviation_first() -> None:
         in worse.message
     )
     small = tuned(Noise(2.0, 1.9, 2.1), Noise(9.0, 8.9, None), held_out=held)
-    worse, _ = noises.deviating_settings(analysis(source=MOVING, tuning=small))
+    worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=small))
     assert (
         "times too small. The maximum-likelihood estimate is 9 m/s² (horizontal). P"
         in worse.message
     )
-    assert named(noises.deviating_settings, analysis(source=MOVING)) == {}
+    assert named(noises.detect_wrong_settings, analysis(source=MOVING)) == {}
 
 
 def test_deviating_settings_bound_is_typed_as_at_least_5_mm() -> None:
     bounded = tuned(Noise(None, None, 0.0021))
-    finding = only(noises.deviating_settings, analysis(source=MOVING, tuning=bounded))
+    finding = only(noises.detect_wrong_settings, analysis(source=MOVING, tuning=bounded))
     assert finding.remedy == "[--sigma-z 0.005|0.005|1|None]."
     assert "is at least 480 times too large" in finding.message
     assert "estimate is at most 0.0021 m (horizontal). The" in finding.message
     known = analysis(source=MOVING, tuning=tuned(Noise(0.00211, 0.002, 0.0022)))
-    assert only(noises.deviating_settings, known).remedy == "[--sigma-z 0.00211|0.00211|1|None]."
+    assert only(noises.detect_wrong_settings, known).remedy == "[--sigma-z 0.00211|0.00211|1|None]."
 
 
 @pytest.mark.parametrize(
@@ -146,7 +147,7 @@ def test_deviating_settings_drift_or_hidden_error_keep_noise(
 ) -> None:
     estimate = 3.0 * (parts.get("settings") or CHOSEN).sigma_z_m
     fitted = tuned(Noise(estimate, 0.9 * estimate, 1.1 * estimate), Noise(0.1, 0.09, 0.11))
-    assert list(named(noises.deviating_settings, analysis(tuning=fitted, **parts))) == expected
+    assert list(named(noises.detect_wrong_settings, analysis(tuning=fitted, **parts))) == expected
 
 
 def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
@@ -176,13 +177,13 @@ def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
 def test_near_zero_process_noise_needs_slow_correlated_filter(
     one: Any, expected: str | None
 ) -> None:
-    assert severity(noises.process_noise_near_zero, analysis(axes=(one,))) == expected
+    assert severity(noises.detect_process_noise_near_zero, analysis(axes=(one,))) == expected
 
 
 def test_near_zero_process_noise_reports_response_time() -> None:
     slower = following(0.01)
     slower.axis.name = "east"
-    finding = only(noises.process_noise_near_zero, analysis(axes=(following(0.05), slower)))
+    finding = only(noises.detect_process_noise_near_zero, analysis(axes=(following(0.05), slower)))
     assert finding.remedy == "Increase SIGMA_A."
     assert "5.0 % between updates, and the gain falls to 0.050. KF needs 5 s" in finding.message
     assert finding.evidence["response_s"] == pytest.approx(5.0)
@@ -190,7 +191,7 @@ def test_near_zero_process_noise_reports_response_time() -> None:
         (Noise(2.3456, 2.0, 3.0), " [--sigma-a 2.35|1|2.35|None]."), (Noise(None, None, 3.0), ""),
     ):  # fmt: skip
         one = analysis(axes=(following(0.05),), tuning=tuned(None, estimate))
-        assert only(noises.process_noise_near_zero, one).remedy == f"Increase SIGMA_A.{more}"
+        assert only(noises.detect_process_noise_near_zero, one).remedy == f"Increase SIGMA_A.{more}"
 
 
 # ---------------------------------------------------------------- variances
@@ -206,13 +207,20 @@ def test_variances_severity_at_limits() -> None:
         (1.563, "warning"), (1.56, None), (3.99, "warning"), (4.0, "error"), (0.25, "error"),
         (0.251, "warning"), (0.641, None), (0.639, "warning"),
     ):  # fmt: skip
-        assert severity(noises.variances, analysis(axes=(kf(nis),))) == expected, nis
-    assert severity(noises.variances, analysis(axes=(kf(9.0, verdict="consistent"),))) is None
+        assert (
+            severity(noises.detect_inconsistent_variances, analysis(axes=(kf(nis),))) == expected
+        ), nis
+    assert (
+        severity(
+            noises.detect_inconsistent_variances, analysis(axes=(kf(9.0, verdict="consistent"),))
+        )
+        is None
+    )
 
 
 def test_variances_group_axes_with_vertical_as_consequence() -> None:
     axes = (kf(2.0), kf(3.0, "east"), kf(9.0, "down"), kf(0.1, "aisle"))
-    found = tuple(noises.variances(analysis(axes=axes)))
+    found = tuple(noises.detect_inconsistent_variances(analysis(axes=axes)))
     assert [(one.id, one.caused_by, one.evidence["axis"]) for one in found] == [
         ("kf_underconfident", None, "aisle"), ("kf_overconfident", None, "east"),
         ("kf_overconfident", "kf_overconfident", "down"),
@@ -224,12 +232,16 @@ def test_variances_group_axes_with_vertical_as_consequence() -> None:
 
 def test_variances_underconfident_drift_or_error_keep_noise() -> None:
     for nis, is_kept, level in ((0.2, True, "note"), (5.0, False, "error")):
-        finding = only(noises.variances, analysis(axes=(kf(nis),), source=ODOMETRY))
+        finding = only(
+            noises.detect_inconsistent_variances, analysis(axes=(kf(nis),), source=ODOMETRY)
+        )
         assert (finding.remedy == noises.KEEP_NOISES_DRIFT) is is_kept
         assert finding.severity == level
     for owner, there in (("kf", True), ("ekf2", False)):
         worse = {owner: statement(), f"{owner}_truth": against_truth(9.0)}
-        finding = only(noises.variances, analysis(axes=(kf(0.2), axis("east", **worse))))
+        finding = only(
+            noises.detect_inconsistent_variances, analysis(axes=(kf(0.2), axis("east", **worse)))
+        )
         assert (finding.remedy == noises.KEEP_NOISES_TRUTH) is there
         assert finding.evidence["cause"] == "elsewhere"
 
@@ -239,7 +251,7 @@ def test_variances_default_settings_lower_severity() -> None:
         ({}, "warning"), ({"sigma_z_m": 0.11}, "error"), ({"sigma_a_m_s2": 0.51}, "error"),
     ):  # fmt: skip
         one = analysis(axes=(kf(5.0),), settings=Settings(**chosen))
-        assert severity(noises.variances, one) == level
+        assert severity(noises.detect_inconsistent_variances, one) == level
 
 
 def fused(noise_m: float, nis: float = 5.0, name: str = "north", **parts: Any) -> Any:
@@ -256,7 +268,9 @@ def fused(noise_m: float, nis: float = 5.0, name: str = "north", **parts: Any) -
      ({}, 0.124, True), ({}, 0.126, False), ({}, 0.081, True), ({}, 0.079, False)],
 )  # fmt: skip
 def test_is_default_ekf2_noise_unless_sender_reports_another(flown, used_m, default):
-    assert _is_default(analysis(log=log(parameters=flown)), "ekf2", fused(used_m)) is default
+    assert (
+        _has_default_noises(analysis(log=log(parameters=flown)), "ekf2", fused(used_m)) is default
+    )
 
 
 @pytest.mark.parametrize(
@@ -317,7 +331,9 @@ def test_variances_cause_determines_action(owner, change, kind, action, monkeypa
     causes = (tried(owner, {"sigma_z_m": 7.0}, explained_fraction=0.4), tried(owner, change),
               tried(owner, {"sigma_z_m": 7.0}, explained_fraction=1.6))  # fmt: skip
     one = axis("north", **{owner: statement(9.0, "overconfident")})
-    finding = only(noises.variances, analysis(axes=(one,), causes=causes, ekf2_model=model))
+    finding = only(
+        noises.detect_inconsistent_variances, analysis(axes=(one,), causes=causes, ekf2_model=model)
+    )
     assert action in finding.remedy
     assert finding.evidence["cause"] == kind
 
@@ -326,15 +342,18 @@ def test_variances_without_cause_report_closest_rerun() -> None:
     little = tried("kf", {"sigma_z_m": 7.0}, explained_fraction=0.4)
     causes = (little, tried("kf", {"sigma_z_m": 2.0}, "east"),
               tried("kf", {"clock_offset_s": 0.2}, explained_fraction=0.1))  # fmt: skip
-    finding = only(noises.variances, analysis(axes=(kf(9.0),), causes=causes))
+    finding = only(noises.detect_inconsistent_variances, analysis(axes=(kf(9.0),), causes=causes))
     assert finding.evidence["cause"] == "elsewhere"
     assert finding.remedy == (
         f"{noises.NOT_EXPLAINED} Closest: re-run with SIGMA_Z 7 m instead of 1 m: mean NIS 9 → 3.7 "
         "(expected 1)."
     )
-    assert only(noises.variances, analysis(axes=(kf(9.0),))).remedy == noises.UNKNOWN_NOISE
+    assert (
+        only(noises.detect_inconsistent_variances, analysis(axes=(kf(9.0),))).remedy
+        == noises.UNKNOWN_NOISE
+    )
     known = analysis(axes=(kf(9.0),), tuning=tuned())
-    assert only(noises.variances, known).remedy == noises.NOT_EXPLAINED
+    assert only(noises.detect_inconsistent_variances, known).remedy == noises.NOT_EXPLAINED
 
 
 def test_variances_noise_too_small_to_estimate_is_a_bound() -> None:
@@ -343,7 +362,7 @@ def test_variances_noise_too_small_to_estimate_is_a_bound() -> None:
             axes=(kf(0.2),), tuning=tuned(Noise(None, None, high)),
             causes=(tried("kf", {"sigma_z_m": typed}, before=0.2),),
         )  # fmt: skip
-        finding = only(noises.variances, one)
+        finding = only(noises.detect_inconsistent_variances, one)
         assert f"at this rate. [--sigma-z {typed}, and a smaller SIGMA_A|{typed}|" in finding.remedy
         assert finding.evidence["sigma_z_asked_m"] == high
         assert finding.evidence["sigma_z_asked_is_upper_bound"] == 1.0
@@ -382,7 +401,7 @@ def test_variances_noise_too_small_to_estimate_is_a_bound() -> None:
 def test_variances_ekf2_without_replay_compare_noises(one, estimate, parameters, text) -> None:
     tuning = {**tuned(estimate), "down": tuned(estimate)["horizontal"]}
     flown = analysis(axes=(one,), log=log(parameters=parameters), tuning=tuning)
-    assert text in only(noises.variances, flown).remedy
+    assert text in only(noises.detect_inconsistent_variances, flown).remedy
 
 
 # ---------------------------------------------------------------- the loop and the drift
@@ -416,7 +435,7 @@ def loop(*closures: Closure, **parts: Any) -> Loop:
 def test_loop_closures_gnc_weight_determines_findings(
     closures: tuple[Closure, ...], expected: list[str]
 ) -> None:
-    found = list(loops.closures(loop(*closures, is_end_assumed=False)))
+    found = list(loops.detect_inconsistent_closures(loop(*closures, is_end_assumed=False)))
     assert [finding.id for finding in found] == expected
     if expected == ["loop_drift_too_small"]:
         dropped = sum((each.weight_gnc or 0.0) < 0.5 for each in closures)
@@ -457,7 +476,7 @@ def flight_of(result: Any, **parts: Any) -> Any:
 def along(ekf2_nis: float, kf_nis: float, name: str = "aisle", **parts: Any) -> Any:
     """Make an axis on which EKF2 and KF have these mean NIS."""
     ekf2, kf_statement = (
-        statement(nis, "consistent" if nis == 1.0 else "off") for nis in (ekf2_nis, kf_nis)
+        statement(nis, classify_mean_nis(nis, (1.0, 1.0))) for nis in (ekf2_nis, kf_nis)
     )
     frame = pd.DataFrame({"position_m": [0.0]}, index=[10.0])
     usual = {"ekf2_state": frame, "difference": NONE}
@@ -583,8 +602,13 @@ def test_summary_smaller_noise_contradicted_by_truth_is_no_cause() -> None:
         tried("kf", {"sigma_z_m": 0.5}, "aisle", before=0.2), contradicts_truth=True
     )
     one = flight_of(with_truth(0.2), causes=(contradicted,))
-    assert summarise(one, ())[0].endswith("too large. The errors against ground truth need this σ.")
-    finding = only(noises.variances, analysis(axes=(kf(0.2, "aisle"),), causes=(contradicted,)))
+    assert summarise(one, ())[0].endswith(
+        "too large. A smaller σ would be below the errors against ground truth."
+    )
+    finding = only(
+        noises.detect_inconsistent_variances,
+        analysis(axes=(kf(0.2, "aisle"),), causes=(contradicted,)),
+    )
     assert (finding.remedy, finding.severity) == (noises.KEEP_NOISES_TRUTH, "note")
     assert finding.evidence["cause"] == "elsewhere"
 

@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from msgspec import structs
 
 from px4fuse.analysis import Analysis, explain
-from px4fuse.comparison.causal_replays import TURN, cause_of
+from px4fuse.comparison.causal_replays import ROTATION, find_cause
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.remedy import aid_of
-from px4fuse.ekf2.whatif import HEADING_STAYS, what_if
+from px4fuse.ekf2.whatif import HEADING_LOGGED_NOTE, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings
@@ -160,7 +160,7 @@ def test_outdoor_mistake_is_first_finding(mistake: str, root: str) -> None:
 @pytest.mark.parametrize(
     ("mistake", "of", "name", "value", "within"),
     [
-        ("heading=20", "nees", TURN, 20.0, 3.0),
+        ("heading=20", "nees", ROTATION, 20.0, 3.0),
         ("clock-offset=-0.1", "nees", "EKF2_GPS_DELAY", 10.0, 60.0),
         ("r-scale=0.1", "nis", "EKF2_GPS_P_NOISE", 0.4, 0.02),
         ("vibration=1", "nees", "EKF2_ACC_NOISE", 1.0, 0.0),
@@ -170,7 +170,7 @@ def test_outdoor_mistake_is_cause_of_ekf2_error(
     mistake: str, of: Any, name: str, value: float, within: float
 ) -> None:
     analysis = flown(mistake)
-    found = cause_of(analysis.causes, "ekf2", "aisle", of)
+    found = find_cause(analysis.causes, "ekf2", "aisle", of)
     assert found.change[name] == pytest.approx(value, abs=within)
     assert found.is_sufficient
     assert "EKF2" in summarise(analysis, find(analysis))[0]
@@ -193,7 +193,7 @@ def test_what_if_without_magnetometer_keeps_heading(tmp_path: Path) -> None:
     log.write_bytes(to_ulog(simulate(OUTDOOR, parse(["ekf2-delay=0", "heading=3"]))))
     model = opened(read_log(log))
     result = what_if(model, [{"EKF2_GPS_DELAY": 110.0}])
-    assert result.notes[0] == HEADING_STAYS
+    assert result.notes[0] == HEADING_LOGGED_NOTE
     errors = [one.heading_error_mean_deg for one in (result.logged, *result.whatif)]
     assert errors[1] == pytest.approx(errors[0], abs=0.1)
     with pytest.raises(SettingsError, match="does not contain all fused magnetometer samples"):

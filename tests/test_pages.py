@@ -47,9 +47,9 @@ from pypdf.generic import (
 from px4fuse.errors import ResultsError
 from px4fuse.verification import pages
 from px4fuse.verification.model import PageDifference
-from px4fuse.verification.pages import COORDINATE_PT, compare_pages
+from px4fuse.verification.pages import COORDINATE_TOLERANCE_PT, compare_pages
 from px4fuse.verification.pdf_input import read_report
-from px4fuse.verification.verification import Rounding, same_words
+from px4fuse.verification.verification import Rounding, is_same_text_rounded
 
 STRING = TextStringObject
 N = NumberObject
@@ -533,8 +533,8 @@ def test_compare_pages_forged_report_is_found(pdf: bytes, kind: str) -> None:
     forge, said, structural = FORGERIES[kind]
     found = compare(forged(pdf, forge), pdf)
     assert any(one.what.startswith(said) for one in found), found
-    assert any(one.structural for one in found) == structural, found
-    assert len(found) <= pages.MAX_FOUND + 1
+    assert any(one.is_structural for one in found) == structural, found
+    assert len(found) <= pages.MAX_LISTED_DIFFERENCES + 1
     assert all(one.what.isprintable() and len(one.what) < 200 for one in found)
 
 
@@ -618,7 +618,7 @@ def test_compare_pages_pattern_is_compared() -> None:
         "/p0", lambda c: c.replace(b"1 scn", b"0 scn", 1),
     )  # fmt: skip
     (found,) = compare(forged(pdf, patterns), pdf)
-    assert (found.page, found.structural) == (at, False)
+    assert (found.page, found.is_structural) == (at, False)
 
 
 # -- unforged files -----------------------------------------------------------------------------
@@ -711,7 +711,7 @@ def shift_operands(by: float, operator: bytes = b"l") -> Edit:
 
 @pytest.mark.parametrize(("factor", "equal"), [(0.3, True), (0.99, True), (1.01, False)])
 def test_compare_pages_coordinates_within_tolerance(pdf: bytes, factor: float, equal: bool) -> None:
-    made = forged(pdf, on_page(1, shift_operands(factor * COORDINATE_PT)))
+    made = forged(pdf, on_page(1, shift_operands(factor * COORDINATE_TOLERANCE_PT)))
     assert (compare(made, pdf) == ()) == equal
 
 
@@ -726,8 +726,8 @@ def test_compare_pages_rounded_number_is_equal(pdf: bytes) -> None:
 
     assert compare(made, pdf, alike=alike) == ()
     ((theirs, ours),) = [pair for pair in asked if pair[0] != pair[1]]
-    assert same_words(theirs, ours, lambda *_: True)
-    assert not same_words(theirs, ours, Rounding(()))
+    assert is_same_text_rounded(theirs, ours, lambda *_: True)
+    assert not is_same_text_rounded(theirs, ours, Rounding(()))
     # the positions of the letters are unchanged
     digit = once(rb"(?<=\))(-?[\d.]+)(?=\()", b"-9000")
     assert compare(forged(made, on_page(1, digit)), made, alike=alike) != ()
@@ -744,7 +744,7 @@ def test_compare_pages_beyond_limits_is_a_difference(
     """Pages are compared in a separate process."""
     monkeypatch.setattr(pages, "TIMEOUT_S", 0.001)
     (found,) = compare(pdf, pdf)
-    assert found.structural
+    assert found.is_structural
     assert "within the limits" in found.what
     monkeypatch.undo()
     assert compare(pdf, pdf) == ()

@@ -46,8 +46,8 @@ def test_draw_uses_all_choices_equally_often(seed: int, level: int, count: int) 
     first = Counter(one.mistakes[0].choice if one.mistakes else "nothing" for one in rounds)
     assert max(first.values()) - min(first[name] for name in CHOICES) <= 1
     for one in rounds:
-        assert set(one.right) <= set(CHOICES)
-        assert len(one.right) == max(len(one.mistakes), 1)
+        assert set(one.correct_answers) <= set(CHOICES)
+        assert len(one.correct_answers) == max(len(one.mistakes), 1)
         assert len(one.mistakes) <= (2 if level == 3 else 1)
         for mistake, size in zip(one.mistakes, one.sizes, strict=True):
             assert size.removeprefix("-") == mistake.sizes[level - 1]
@@ -192,7 +192,9 @@ def keys(file: Path) -> list[dict[str, Any]]:
 def test_page_source_does_not_show_answers(quiz: Path) -> None:
     source = quiz.read_text(encoding="utf-8")
     answers = keys(quiz)
-    assert [one["right"] for one in answers] == [one.right for one in draw(SEED, 1, COUNT)]
+    assert [one["right"] for one in answers] == [
+        one.correct_answers for one in draw(SEED, 1, COUNT)
+    ]
     for content in re.findall(r'id="content-\d+">([^<]+)<', source):
         flight = json.loads(content)["flight"]
         assert flight["findings"] == flight["summary"] == []

@@ -109,8 +109,8 @@ def test_kf_remedy_contradicted_by_truth_is_not_advised() -> None:
         axes[name] = replace(axis, truth=truth, filters=filters)
     blind = replace(comparison, axes=axes)
     typed = "px4fuse compare LOG --sigma-z 0.2."
-    assert remedies.format_kf_remedy(blind, {"sigma_z_m": 0.2}, unseen_nats=0.1) == typed
-    unseen = remedies.format_kf_remedy(blind, {"sigma_z_m": 0.2}, unseen_nats=-0.1)
+    assert remedies.format_kf_remedy(blind, {"sigma_z_m": 0.2}, held_out_nats=0.1) == typed
+    unseen = remedies.format_kf_remedy(blind, {"sigma_z_m": 0.2}, held_out_nats=-0.1)
     assert not unseen.startswith("px4fuse compare")
     assert "first half" in unseen
 
@@ -171,7 +171,7 @@ def test_remedy_tests_require_improvement_without_larger_rmse(after, noise, fewe
 def ekf2_remedy(analysis: Analysis, **changes: float) -> str:
     model, why, fallback_remedy = analysis.ekf2_model, "Reason: ", "Other action."
     return remedies.format_ekf2_remedy(
-        model, changes, remedies.noise_helps, difference_steps=why, fallback_remedy=fallback_remedy
+        model, changes, remedies.noise_helps, prefix=why, fallback_remedy=fallback_remedy
     )
 
 

@@ -12,7 +12,7 @@ from results_tools import EXAMPLE, LOOP, changed_results, decode_results
 import px4fuse
 from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.model import UnjudgedFilter
+from px4fuse.comparison.model import UntestedFilter
 from px4fuse.errors import ResultsError
 from px4fuse.flight import Flight
 from px4fuse.report.pdf import render
@@ -75,7 +75,7 @@ def test_results_too_few_updates_have_reason_not_zero(sample_flight):
     """One second of flight is too short for a test of consistency."""
     _, made = document(sample_flight, start_s=40.0, end_s=41.0)
     north = made.axes["north"]
-    assert isinstance(north.filters["kf"], UnjudgedFilter)
+    assert isinstance(north.filters["kf"], UntestedFilter)
     assert "only 4 innovations" in north.filters["kf"].reason
     assert "nis_mean" not in to_json(north.filters["kf"])
     assert_valid(to_json(made))
@@ -197,7 +197,7 @@ def test_results_number_outside_bounds_is_absent_with_reason():
     wrong = replace(axis, filters={"kf": kf, "ekf2": ekf2})
     found = within_bounds(replace(results, axes={"aisle": wrong}))
     filters = found.axes["aisle"].filters
-    assert isinstance(filters["kf"], UnjudgedFilter)
+    assert isinstance(filters["kf"], UntestedFilter)
     assert filters["kf"].reason == "axes.aisle.filters.kf.nis_mean is -3 (allowed: 0 to 1e+06)"
     assert filters["kf"].truth == kf.truth
     assert filters["ekf2"] == replace(ekf2, sigma_p_median_m=None)

@@ -13,7 +13,7 @@ from px4fuse.assignment.roster import Person, Register, read_people, read_roster
 from px4fuse.assignment.sheet import Sheet, read_sheet
 from px4fuse.errors import SettingsError
 from px4fuse.grading.model import ExportOrigin
-from px4fuse.grading.outputs import fill_grades, grade_column
+from px4fuse.grading.outputs import fill_grades, find_grade_column
 
 SUBMITTED = "Friday, 20 November 2026, 11:58 PM"
 # format of mod/assign/gradingtable.php of Moodle
@@ -48,9 +48,9 @@ PEOPLE = [
     Person("44", "Pending Pat", "pat@x.edu", "ppat"),
 ]
 ENTRIES = (
-    entry("0042", "Jane Doe", 87.5, of=120.0),
-    entry("43", "Max Roe", 104.0, of=120.0),
-    entry("44", "Pending Pat", None, of=120.0),
+    entry("0042", "Jane Doe", 87.5, max_points=120.0),
+    entry("43", "Max Roe", 104.0, max_points=120.0),
+    entry("44", "Pending Pat", None, max_points=120.0),
 )
 TEXTS = ("Points 87.5\n  <b>=1+1</b>\n", "Well done.\n", "Pending.\n")
 
@@ -230,7 +230,7 @@ def test_fill_grades_changes_grade_and_feedback_only(
     if text is MOODLE:
         assert people[0][feedback] == "Points 87.5<br>&nbsp;&nbsp;&lt;b&gt;=1+1&lt;/b&gt;"
     if text is not BLACKBOARD:
-        assert any("above the maximum of the platform (100)" in note for note in notes)
+        assert any("above the maximum of 100 on the platform" in note for note in notes)
 
 
 def test_fill_grades_anonymous_row_matches_participant(tmp_path) -> None:
@@ -243,7 +243,7 @@ def test_fill_grades_anonymous_row_matches_participant(tmp_path) -> None:
 def test_fill_grades_missing_student_is_noted(tmp_path) -> None:
     sheet = table(tmp_path, "\r\n".join(MOODLE.split("\r\n")[:2]) + "\r\n")
     _, notes = fill_grades(sheet, ENTRIES, register(sheet), "", TEXTS)
-    assert notes == ("table.csv: no row for Max Roe.",)
+    assert notes == ("table.csv has no row for Max Roe. These grades were not entered.",)
 
 
 def test_fill_grades_keeps_semicolon_and_decimal_comma(tmp_path) -> None:
@@ -269,5 +269,5 @@ def test_fill_grades_keeps_semicolon_and_decimal_comma(tmp_path) -> None:
 )
 def test_grade_column_ambiguous_or_missing_raises_error(tmp_path, text, column, says) -> None:
     with pytest.raises(SettingsError, match=says) as caught:
-        grade_column(table(tmp_path, text), column)
+        find_grade_column(table(tmp_path, text), column)
     assert "\n" not in str(caught.value)

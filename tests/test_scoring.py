@@ -23,10 +23,10 @@ from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.truth import FormTruth, TrueMistake, VerdictTruth
 from px4fuse.errors import ResultsError
 from px4fuse.findings import TITLES
-from px4fuse.grading.flags import class_flags, own_flags
+from px4fuse.grading.flags import flag_equal_contents, flag_settings
 from px4fuse.grading.model import Entry, GradedReport
 from px4fuse.grading.outputs import feedback_text
-from px4fuse.grading.rubric import assess, parse_rubric, read_rubric
+from px4fuse.grading.rubric import parse_rubric, read_rubric, score_report
 from px4fuse.results.contract import to_plain
 from px4fuse.simulation.flights import HARDWARE
 from px4fuse.verification.model import Verdict
@@ -40,7 +40,9 @@ NONE = {"what": "it", "reason": "too few of them", "remedy": ""}
 
 
 def assess_results(results=EXAMPLE, verdict=VERIFIED, key=None, rubric=None, owner_id=""):
-    return assess(decode_results(results), verdict, rubric or read_rubric(None), key, owner_id)
+    return score_report(
+        decode_results(results), verdict, rubric or read_rubric(None), key, owner_id
+    )
 
 
 def check_points(check, results=EXAMPLE, /, verdict=VERIFIED, key=None, **parameters):
@@ -101,7 +103,7 @@ CHECKED = [
      {"setting": "sigma_z_m"}, 1.0, "within"),
     ("tuning", changed_results(tuning__horizontal=NONE), {"setting": "sigma_z_m"}, 0.0,
      "too few of them"),
-    ("tuning", NORTH, {"setting": "sigma_z_m"}, 0.0, "leave --axis out"),
+    ("tuning", NORTH, {"setting": "sigma_z_m"}, 0.0, "omit --axis"),
     ("number", EXAMPLE, {"path": RMSE, "at_most": 0.05, "name": "the error"}, 0.0,
      "The error is 0.06499; required: at most 0.05."),
     ("number", EXAMPLE, {"path": RMSE, "at_most": 0.06, "zero_at": 0.07}, 0.5, ""),
@@ -113,29 +115,29 @@ CHECKED = [
     ("number", EXAMPLE, {"path": "clock.interval_s.1", "at_most": 0.1}, 1.0, ""),
     ("number", BLIND, {"path": "log.name", "at_most": 1.0}, 0.0, "has no number for"),
     ("number", NORTH, {"path": f"tuning.horizontal.held_out.{GAIN}", "at_most": 1.0}, 0.0,
-     "leave --axis out"),
+     "omit --axis"),
     ("consistent", changed_results(horizontal__kf__verdict="consistent"), {}, 1.0, "is consistent"),
     ("consistent", EXAMPLE, {}, 0.72, "σ of KF is 1.06 times too large"),
     ("consistent", changed_results(horizontal__kf__nis_mean=2.0), {}, 0.0, "1.41 times too small"),
-    ("consistent", NORTH, {}, 0.0, "leave --axis out"),
+    ("consistent", NORTH, {}, 0.0, "omit --axis"),
     ("consistent", changed_results(**UNDERSTATED), {}, 0.0, "times too small"),
     ("consistent", changed_results(**UNDERSTATED, settings__sigma_a_m_s2=0.36), {}, 1.0,
-     "no setting corrects the rest"),
+     "settings do not make KF consistent"),
     ("clock", EXAMPLE, {}, 1.0, "the estimate is -0.022 to 0.061 s (95 %)"),
     ("clock", changed_results(clock__applied_s=0.25), {}, 0.0, "0.250 s"),
     ("clock", UNCLEAR, {}, 0.5, "no acceleration)."),
     ("clock", changed_results(clock=NONE), {}, 0.0, "too few of them"),
     ("clock", LOOP, {}, 0.0, "is not a compare report"),
-    ("clock", changed_results(**JUMPS), {}, 0.5, "state its time in your form"),
+    ("clock", changed_results(**JUMPS), {}, 0.5, "State the time in your form"),
     ("clock", with_form(["clock-jump"], **JUMPS), {}, 1.0, "as your form states"),
-    ("clock", with_form(["dropout"], **JUMPS), {}, 0.5, "state its time in your form"),
-    ("loop", LOOP, {}, 1.0, "changed from 0.41 m to 0.26 m"),
+    ("clock", with_form(["dropout"], **JUMPS), {}, 0.5, "State the time in your form"),
+    ("loop", LOOP, {}, 1.0, "ATE 0.41 → 0.26 m"),
     ("loop", changed_results(LOOP, **{f"{AFTER}__scores": WORSE}), {}, 0.75, "increases the error"),
     ("loop", changed_results(LOOP, **{f"{AFTER}__scores": {}}), {}, 0.875, "--reference"),
     ("loop", changed_results(LOOP, **{AFTER: NONE}), {}, 0.5, "not corrected"),
     ("loop", EXAMPLE, {}, 0.0, "no external vision with orientation"),
     ("loop", changed_results(LOOP, loop__is_absolute_track=True), {}, 0.0, "does not drift"),
-    ("loop", REJECTED, {}, 0.25, "no closure was accepted"),
+    ("loop", REJECTED, {}, 0.25, "No closure was accepted"),
     ("loop", changed_results(LOOP, loop__closure_error_m=..., loop__true_end=NONE), {}, 0.0,
      "too few of them"),
     ("number", changed_results(axes__north__updates__count=50), {"path": "axes.*.updates.count",
@@ -174,17 +176,20 @@ class TestForm:
         found = with_form(["dropout"], student__id="S01 ")
         points, comment = check_points("answers", found, key=key())
         assert points == 0.3
-        assert "kinds 30 of 30, sizes 0 of 15" in comment
-        assert "You found dropout." in comment
+        assert "mistakes 30 of 30, sizes 0 of 15" in comment
+        assert "You named dropout, which is right." in comment
         points, comment = check_points("answers", with_form(["yaw"], student__id="s01"), key=key())
         assert points == 0.0
-        assert "you missed dropout (gap in the position source of this length)" in comment.lower()
-        assert "not in your flight: yaw" in comment
+        assert (
+            "you did not name dropout (gap in the position source of this length)"
+            in comment.lower()
+        )
+        assert "flight does not have yaw" in comment
 
     @pytest.mark.parametrize(
         ("form", "said"),
         [
-            ({}, "report contains no form"),
+            ({}, "report contains no answer form"),
             ({"log_sha256": "c" * 64}, "was made for another log"),
             ({"log_sha256": SHA, "mistakes": [{"kind": "gremlins"}]}, "cannot be read (kind"),
             ({"log_sha256": SHA, "mistakes": [{"kind": "yaw", "size": 900.0}]}, "cannot be read"),
@@ -212,7 +217,7 @@ class TestForm:
     def test_notes_await_points_of_instructor(self):
         for notes, awaits_points in (("", False), ("I saw a gap.", True)):
             made = assess_results(with_notes(notes, student__id="s01"), key=key())
-            assert (made.awaits_points, made.counted is None, made.items[-1].points) == (
+            assert (made.awaits_points, made.counted_points is None, made.items[-1].points) == (
                 awaits_points,
                 awaits_points,
                 0.0,
@@ -228,33 +233,36 @@ class TestScore:
         made = assess_results(verdict=verdict)
         assert {item.points for item in made.items} == {0.0}
         assert all("SIGMA_A is 0.5" in item.comment for item in made.items)
-        assert made.pending == ""
+        assert made.pending_action == ""
 
     def test_unverified_report_is_pending_or_zero_by_rubric(self):
         verdict = Verdict("other log", ("no log",), False, remedy="Look.")
         made = assess_results(verdict=verdict)
         assert made.items[0].points == 0.0
         assert sum(item.points for item in made.items) > 30
-        assert made.pending == "Look."
+        assert made.pending_action == "Look."
         zero = assess_results(verdict=verdict, rubric=replace(read_rubric(None), unverified="zero"))
         assert {item.points for item in zero.items} == {0.0}
-        assert zero.pending == ""
+        assert zero.pending_action == ""
 
     @pytest.mark.parametrize("student_id", ["s02", "S02", "ѕ02", "s77", "", " "])
     def test_log_of_other_student_follows_rubric_rule(self, student_id):
         given = changed_results(student__id=student_id)
         said = f"id in the report is {student_id}" if student_id.strip() else "report has no id"
-        assert f"given to s01, the {said}" in assess_results(given, key=key()).pending
+        assert (
+            f"given to student s01, but the {said}"
+            in assess_results(given, key=key()).pending_action
+        )
         for rule, earns in (("zero", False), ("count", True)):
             rubric = replace(read_rubric(None), others_log=rule)
             made = assess_results(given, key=key(), rubric=rubric)
-            assert (made.pending, any(item.points for item in made.items)) == ("", earns)
+            assert (made.pending_action, any(item.points for item in made.items)) == ("", earns)
         # with the owner from the platform
-        assert assess_results(given, key=key(), owner_id="s01").pending == ""
+        assert assess_results(given, key=key(), owner_id="s01").pending_action == ""
 
     def test_log_outside_answer_key_is_pending(self):
         made = assess_results(with_notes("", student__id="s01"), key=key(sha256="c" * 64))
-        assert "not about a log of the answer key" in made.pending
+        assert "not about a log of the answer key" in made.pending_action
 
     @pytest.mark.parametrize("results", [EXAMPLE, LOOP], ids=["compare", "loop"])
     def test_any_valid_results_can_be_scored(self, results):
@@ -281,11 +289,11 @@ class TestScore:
             except ResultsError:
                 continue
             read += 1
-            for item in assess(found, VERIFIED, rubric, key()).items:
-                assert 0.0 <= item.points <= item.of
+            for item in score_report(found, VERIFIED, rubric, key()).items:
+                assert 0.0 <= item.points <= item.max_points
                 assert len(item.comment) < 1500
                 assert item.comment.isprintable()
-            list(own_flags(found))
+            list(flag_settings(found))
         assert read > 40
 
 
@@ -311,7 +319,7 @@ class TestFeedback:
              ("could not be verified: one; page 3: two. Make a new report",), "Points"),
             ({"student": "=cmd|' /C calc'!A0\n<script>", "student_id": "\x1b[31m"},
              ("=cmd|' /C calc'!A0 <script>",), "\x1b"),
-            ({"items": assess_results().items, "pending": "Add uwb.csv to --logs."},
+            ({"items": assess_results().items, "pending_action": "Add uwb.csv to --logs."},
              ("pending, not counted yet",), "--logs"),
         ],
     )  # fmt: skip
@@ -350,16 +358,16 @@ class TestFeedback:
         ({"settings__input": "zero"}, ("IMU",)),
         ({"axes": {"down": EXAMPLE["axes"]["down"]}}, ("vertical",)),
         ({"log__hardware": HARDWARE}, ("simulate",)),
-        ({"settings__sigma_z_m": 100.0}, ("SIGMA_Z 100 is far from",)),
-        ({"settings__sigma_a_m_s2": 0.001}, ("SIGMA_A 0.001 is far from",)),
+        ({"settings__sigma_z_m": 100.0}, ("SIGMA_Z 100 differs by more than",)),
+        ({"settings__sigma_a_m_s2": 0.001}, ("SIGMA_A 0.001 differs by more than",)),
         ({"source__path": "kept by EKF2"}, ("kept by EKF2",)),
     ],
 )
 def test_own_flags_suspicious_report_lists_each_flag(values, said):
-    found = list(own_flags(decode_results(changed_results(**values))))
+    found = list(flag_settings(decode_results(changed_results(**values))))
     assert len(found) == len(said)
     assert all(word in flag for word, flag in zip(said, found, strict=True))
-    assert list(own_flags(decode_results(LOOP))) == []
+    assert list(flag_settings(decode_results(LOOP))) == []
 
 
 @pytest.mark.parametrize(
@@ -372,7 +380,9 @@ def test_own_flags_suspicious_report_lists_each_flag(values, said):
     ],
 )
 def test_own_flags_stated_drift_far_from_usual(option, stated, said):
-    found = list(own_flags(decode_results(changed_results(LOOP, **{f"request__{option}": stated}))))
+    found = list(
+        flag_settings(decode_results(changed_results(LOOP, **{f"request__{option}": stated})))
+    )
     assert len(found) == bool(said)
     assert all(flag.startswith(said) for flag in found)
 
@@ -388,31 +398,31 @@ def report(number, **values):
 
 class TestClassFlags:
     def test_class_flags_different_reports_have_none(self):
-        assert class_flags([report(n) for n in range(12)]) == {}
+        assert flag_equal_contents([report(n) for n in range(12)]) == {}
 
     def test_class_flags_shared_log_id_or_file_is_listed(self):
-        made = class_flags(
+        made = flag_equal_contents(
             [report(1, student="a\n<b>", log_sha256="x"), report(2, log_sha256="x"), report(4),
              report(5),
              report(6, student_id="1005"),
              report(7, sha256="y"), report(8, sha256="y")]
         )  # fmt: skip
         assert set(made) == {f"{n}.pdf" for n in (1, 2, 5, 6, 7, 8)}
-        assert "same log as Student2" in made["1.pdf"][0]
+        assert "same log as that of Student2" in made["1.pdf"][0]
         for flag in (flag for flags in made.values() for flag in flags):
             assert re.fullmatch(r"[A-Z].*\.", flag)
             assert flag.isprintable()
-        assert "same student id" in made["5.pdf"][0]
-        assert "same file" in made["8.pdf"][0]
+        assert "The id in this report is also in that of" in made["5.pdf"][0]
+        assert "identical to that of" in made["8.pdf"][0]
 
     def test_class_flags_two_reports_of_one_student_name_id(self):
         two = [
             report(1, log_sha256="x"),
             report(1, log_sha256="x", sha256="z", submission="b.pdf"),
         ]
-        assert class_flags(two) == {
-            "1.pdf": ["The same student id as in Student1 Name1, 1001 (b.pdf)."],
-            "b.pdf": ["The same student id as in Student1 Name1, 1001 (1.pdf)."],
+        assert flag_equal_contents(two) == {
+            "1.pdf": ["The id in this report is also in that of Student1 Name1, 1001 (b.pdf)."],
+            "b.pdf": ["The id in this report is also in that of Student1 Name1, 1001 (1.pdf)."],
         }
 
     def test_class_flags_similar_form_numbers_are_listed(self):
@@ -420,10 +430,10 @@ class TestClassFlags:
         mine = Answers(log_sha256=SHA, mistakes=claims, quantities=(0.123, None, 0.45))
         other = (StudentMistake("nlos", 1.24), StudentMistake("yaw", -20.3))
         theirs = Answers(log_sha256=SHA, mistakes=other, quantities=(0.124, 0.7, None))
-        made = class_flags([report(1, form=mine), report(2, form=theirs)])
+        made = flag_equal_contents([report(1, form=mine), report(2, form=theirs)])
         assert set(made) == {"1.pdf", "2.pdf"}
-        assert "The answer form has the same numbers as" in made["1.pdf"][0]
+        assert "The answer form has the same numbers as that of" in made["1.pdf"][0]
         # two equal numbers are not enough
         theirs = replace(theirs, quantities=(0.2, 0.7, 0.45))
         apart = replace(mine, quantities=(0.123, None, 0.3))
-        assert class_flags([report(1, form=apart), report(2, form=theirs)]) == {}
+        assert flag_equal_contents([report(1, form=apart), report(2, form=theirs)]) == {}

@@ -204,7 +204,7 @@ class TestMistakes:
 
     def test_nlos_has_exact_fraction_in_bursts(self):
         simulation = simulate(Scenario(seed=6, sigma_uwb_m=0.0), parse(["nlos=5%,3m"]))
-        outlier, motion = simulation.positions.outlier, simulation.motion
+        outlier, motion = simulation.positions.is_outlier, simulation.motion
         time = simulation.positions.measured_s
         flying = (time > motion.take_off_s) & (time < motion.touch_down_s)
         assert np.count_nonzero(outlier) == round(0.05 * np.count_nonzero(flying))
@@ -315,7 +315,7 @@ def test_scenario_invalid_values_raise_error(changes):
     (AISLE, ["open-end"], "requires --kind loop"), (UNFILTERED, ["ekf2-noise"], "--no-ekf2"),
     (LOOP, ["open-end=7"], "Use at most 6 m"),
     (Scenario(passes=100, length_m=100.0), [], "limited to 3600 s"),
-    (AISLE, ["dropout=600s,0s"], "no data in vehicle_visual_odometry"),
+    (AISLE, ["dropout=600s,0s"], "vehicle_visual_odometry contains no data"),
 ])  # fmt: skip
 def test_simulate_unsuitable_mistake_raises_error(scenario, texts, expected):
     with pytest.raises(SettingsError, match=expected):

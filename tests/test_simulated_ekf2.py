@@ -190,7 +190,7 @@ def test_simulated_ekf2_ignores_older_timestamps():
     taken = topics["estimator_aid_src_ev_pos"]["timestamp_sample"].astype(np.int64)
     assert np.any(np.diff(sent) < 0)
     assert np.all(np.diff(taken) > 0)
-    rows = ekf2._arrived_samples(simulation.positions)
+    rows = ekf2._received_positions(simulation.positions)
     assert len(rows.stamp_s) < len(sent)
     assert np.all(np.diff(rows.stamp_s) > 0)
 

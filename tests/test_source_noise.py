@@ -17,7 +17,7 @@ from px4fuse.filter.fitting import Noises
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, find
 from px4fuse.findings.cause_grouping import SETTINGS
-from px4fuse.findings.source_noise import detect, noise_variation
+from px4fuse.findings.source_noise import detect, detect_noise_variation
 from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
@@ -233,7 +233,7 @@ def test_noise_variation_fused_outliers_are_not_reported() -> None:
     """At 2 Hz outliers pull KF away, so most innovations within 13 s are large."""
     analysis = analysed(partial(errors.with_outliers, share=0.05), 2.0, seed=13)
     assert {"source_outliers"} == set(root_findings(analysis))
-    assert list(noise_variation(analysis)) == []
+    assert list(detect_noise_variation(analysis)) == []
 
 
 def test_time_correlation_few_samples_or_no_imu_is_unavailable() -> None:

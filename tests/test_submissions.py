@@ -19,7 +19,7 @@ from px4fuse.assignment.roster import Person
 from px4fuse.errors import ResultsError, SettingsError
 from px4fuse.grading import submissions
 from px4fuse.grading.model import Submission
-from px4fuse.grading.submissions import find_submissions, origin_of, read, with_origins
+from px4fuse.grading.submissions import add_origins, find_submissions, parse_origin, read
 from px4fuse.reading import files_by_sha256
 from px4fuse.verification.pdf_input import MAX_BYTES, read_report
 
@@ -48,7 +48,7 @@ def reason(submission: Submission) -> str:
 
 
 def name_and_number(name: str) -> tuple[str, str]:
-    origin = origin_of(name)
+    origin = parse_origin(name)
     return origin.person.name, "".join(origin.person.numbers.values())
 
 
@@ -69,7 +69,7 @@ def test_find_submissions_searches_folders_and_sorts(tmp_path):
     assert [each.name for each in found] == ["A/Report.PDF", "b/report.pdf", "c.pdf"]
     assert notes == ("Ignored files (not PDF): 3.",)
     assert [read(each) for each in found] == [PDF] * 3
-    assert all(each.entry == "" for each in found)
+    assert all(each.zip_entry == "" for each in found)
 
 
 @pytest.mark.parametrize(
@@ -94,11 +94,11 @@ def test_origin_of_uses_platform_part_of_name(name, is_):
 
 
 def test_origin_of_reads_login_time_and_late_mark():
-    blackboard = origin_of("Lab 3_roe1_attempt_2026-11-20-12-34-56_Lab_doe1_attempt_x.pdf")
+    blackboard = parse_origin("Lab 3_roe1_attempt_2026-11-20-12-34-56_Lab_doe1_attempt_x.pdf")
     assert (blackboard.person.login, blackboard.platform) == ("roe1", "blackboard")
-    assert origin_of("Lab_roe1_attempt_2026-99-20-12-34-56_r.pdf").time is None
-    ilias = origin_of("Lab 3/Roe_Max_roe1_77/Late Submission - r.pdf")
-    assert (ilias.platform, ilias.person.login, ilias.late) == ("ilias", "roe1", True)
+    assert parse_origin("Lab_roe1_attempt_2026-99-20-12-34-56_r.pdf").time is None
+    ilias = parse_origin("Lab 3/Roe_Max_roe1_77/Late Submission - r.pdf")
+    assert (ilias.platform, ilias.person.login, ilias.is_late) == ("ilias", "roe1", True)
 
 
 METADATA = """---
@@ -128,7 +128,7 @@ def test_with_origins_forged_name_keeps_platform_and_time():
         "Lab_mal_attempt_2026-11-23-10-00-00_Doe Jane_4711_assignsubmission_file_r.pdf",
     ]
     files = [Submission(Path("export.zip"), name, name) for name in (*usual, *forged)]
-    origins = [one.origin for one in with_origins(files, {})]
+    origins = [one.origin for one in add_origins(files, {})]
     assert {one.platform for one in origins} == {"blackboard"}
     assert [one.person.login for one in origins[3:]] == ["eve", "mal"]
     assert {one.time.day for one in origins[3:]} == {23}
@@ -193,7 +193,7 @@ def test_find_submissions_zip_inside_export_is_not_opened(tmp_path):
     # the same for an unpacked export
     write(tmp_path / "unpacked" / name, handed_in)
     ((again,), _) = find_submissions([tmp_path / "unpacked"])
-    assert (again.name, again.entry) == (name, "")
+    assert (again.name, again.zip_entry) == (name, "")
 
 
 def test_find_submissions_80_files_are_found(tmp_path):

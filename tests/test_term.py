@@ -16,7 +16,7 @@ from golden_tools import assert_matches_golden
 from px4fuse.assignment.key import Answer, AnswerKey
 from px4fuse.assignment.roster import read_people
 from px4fuse.assignment.sheet import read_sheet
-from px4fuse.grading.entries import Course, due_time, late_rule
+from px4fuse.grading.entries import Course, parse_due_time, parse_late_rule
 from px4fuse.grading.grade import GradeOutcome, grade
 from px4fuse.grading.model import Entry
 from px4fuse.grading.rubric import read_rubric, rubric_text
@@ -133,9 +133,10 @@ class Lab:
         return table(self.folder / "grades.csv", HEADS["blackboard"], rows, "\t")
 
     def grade(self, rubric=None) -> GradeOutcome:
-        due = due_time("2026-11-20 12:00:00 Europe/Berlin")
+        due = parse_due_time("2026-11-20 12:00:00 Europe/Berlin")
         course = Course(rubric or read_rubric(None), self.key, [self.logs], "Lab", self.roster,
-                        tuple(map(read_sheet, self.sheets)), due=due, late=late_rule("10%/day"),
+                        tuple(map(read_sheet, self.sheets)), due=due,
+                        late_rule=parse_late_rule("10%/day"),
                         anonymous=True)  # fmt: skip
         return grade(self.exports, course, self.output, processes=1)
 
@@ -157,7 +158,7 @@ def test_grade_term_applies_new_rubric_and_overrides(lab, monkeypatch) -> None:
     verified = skip_verification(monkeypatch)
     outcome = lab.grade()
     check_golden_tables(lab.output)
-    assert outcome.reused == 2  # the copied and the repeated report
+    assert outcome.reused_count == 2  # the copied and the repeated report
     count = len(verified)
     check_other_rubric(lab, outcome)
     check_overrides(lab, outcome)
@@ -179,14 +180,14 @@ def check_other_rubric(lab: Lab, outcome: GradeOutcome) -> None:
     doubled = re.sub(r"(?m)^points = (\d+)", lambda m: f"points = {2 * int(m[1])}", rubric_text())
     (lab.folder / "lab.toml").write_text(doubled, encoding="utf-8")
     second = lab.grade(read_rubric(lab.folder / "lab.toml"))
-    assert second.reused == 38  # two files are not reports
+    assert second.reused_count == 38  # two files are not reports
     assert entry_of(second, 1).total == pytest.approx(2 * entry_of(outcome, 1).total, abs=0.2)
 
 
 def check_overrides(lab: Lab, outcome: GradeOutcome) -> None:
     """Check that overrides are applied, not overwritten, and kept when grading again."""
     usual = entry_of(outcome, 1)
-    item = usual.counting.items[0].title
+    item = usual.counted_report.items[0].title
     said = lab.output / "overrides.csv"
     assert said.read_text(encoding="utf-8-sig") == "id,item,points,comment\n"
     with said.open("a", encoding="utf-8", newline="") as file:
@@ -197,7 +198,7 @@ def check_overrides(lab: Lab, outcome: GradeOutcome) -> None:
     before = said.read_bytes()
     third = lab.grade()
     assert said.read_bytes() == before
-    expected = usual.total - usual.counting.items[0].points + 1.0
+    expected = usual.total - usual.counted_report.items[0].points + 1.0
     assert entry_of(third, 1).total == pytest.approx(expected)
     assert entry_of(third, 40).total == 12.0
     assert "overrides.csv: no student has the id 0099." in third.notes

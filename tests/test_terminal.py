@@ -133,7 +133,7 @@ def test_expand_commands_adds_typed_files_and_options() -> None:
     ]  # fmt: skip
     assert shlex.split(loops) == ["px4fuse", "loop", "my flights/a'b.ulg", "--from", "12.5"]
     # a file name that begins with - is not an option
-    typed = command_line(ComparisonRequest(log="-a.ulg"), "tune", typed=True)
+    typed = command_line(ComparisonRequest(log="-a.ulg"), "tune", for_shell=True)
     assert typed == "px4fuse tune ./-a.ulg"
 
 

@@ -52,8 +52,8 @@ from px4fuse.verification import pages, verification
 from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import (
     ESTIMATE_RELATIVE_TOLERANCE,
-    LIMIT,
-    NO_LOG,
+    LIMIT_NOTE,
+    NO_LOG_REASON,
     RELATIVE_TOLERANCE,
     compare_results,
     flatten,
@@ -97,7 +97,7 @@ def test_verify_example_report_is_verified(aisle: VerifiedReport) -> None:
     assert verdict.status == "verified", verdict
     assert verdict.with_log
     assert verdict.page_status == "same"
-    assert LIMIT in verdict.reasons
+    assert LIMIT_NOTE in verdict.reasons
 
 
 def test_verify_loop_report_is_verified(loop: VerifiedReport) -> None:
@@ -112,7 +112,7 @@ def test_verify_without_log_cannot_verify(aisle: VerifiedReport, loop: VerifiedR
     for one in (aisle, loop):
         verdict = verify(attached_results(one.pdf), one.pdf, {})
         assert verdict.status == "cannot verify"
-        assert verdict.reasons == (NO_LOG,)
+        assert verdict.reasons == (NO_LOG_REASON,)
         assert verdict.redrawn == b""
         assert not verdict.with_log
 
@@ -478,7 +478,7 @@ def test_verify_changed_document_states_reason(aisle: VerifiedReport, name: str)
     if expected == "cannot verify":
         assert said in verdict.reasons[0]
         assert verdict.remedy.startswith("Ask for the PDF")
-        assert LIMIT not in verdict.reasons
+        assert LIMIT_NOTE not in verdict.reasons
 
 
 @pytest.mark.parametrize("key", ["/OpenAction", "/AA"])
@@ -585,10 +585,10 @@ def test_verify_command_prints_and_writes_verdict(
     target = tmp_path / "verdict.json"
     output = run_checked("verify", REPORT, LOOP_LOG, "--json", target, code=1).output
     assert "other log" in output
-    assert LIMIT in output
+    assert LIMIT_NOTE in output
     told = json.loads(target.read_text(encoding="utf-8"))
     assert told["status"] == "other log"
-    assert told["limit"] == LIMIT
+    assert told["limit"] == LIMIT_NOTE
     assert "cannot verify" in run_checked("verify", REPORT, code=1).output
     output = run_checked("verify", REPORT, "--json", "-", code=1).output
     assert json.loads(output)["status"] == "cannot verify"

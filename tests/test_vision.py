@@ -19,12 +19,12 @@ from exchange import replace
 from px4fuse.analysis import explain, run_what_if
 from px4fuse.comparison.comparison import compare
 from px4fuse.ekf2 import steps
-from px4fuse.ekf2.filter_recursion import StretchRun, Variant, run_stretch
+from px4fuse.ekf2.filter_recursion import SegmentRun, Variant, run_segment
 from px4fuse.ekf2.inputs import Inputs, ReceivedPositions
 from px4fuse.ekf2.intervals import Events, make_intervals
 from px4fuse.ekf2.model import Model, modelled_aids, open_model, replay_settings, run_variants
-from px4fuse.ekf2.replay_segments import Stretch
-from px4fuse.ekf2.vision import STOP_S
+from px4fuse.ekf2.replay_segments import ReplaySegment
+from px4fuse.ekf2.vision import MAX_SAMPLE_GAP_S
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import Settings
@@ -102,7 +102,7 @@ class PlainBias:
 
 
 def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
-    inputs: Inputs, stretch: Stretch, events: Events
+    inputs: Inputs, segment: ReplaySegment, events: Events
 ) -> tuple[np.ndarray, np.ndarray]:
     """Run a plain EKF: one prediction at a time, each fix and each vision sample at its step.
 
@@ -117,12 +117,12 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
     drift[9:12] = settings["EKF2_GYR_B_NOISE"] ** 2
     drift[12:15] = settings["EKF2_ACC_B_NOISE"] ** 2
     noises = settings["EKF2_GYR_NOISE"], settings["EKF2_ACC_NOISE"]
-    deviation = np.sqrt(stretch.variance)
-    x, P = stretch.state.copy(), deviation[:, None] * stretch.correlation * deviation
-    taken_s = vision.stamp_s - 1e-3 * settings["EKF2_EV_DELAY"] - 0.5 * inputs.step_s
-    steps = np.searchsorted(stretch.time_s, taken_s - 1e-9).tolist()
+    deviation = np.sqrt(segment.variance)
+    x, P = segment.state.copy(), deviation[:, None] * segment.correlation * deviation
+    measured_at_s = vision.stamp_s - 1e-3 * settings["EKF2_EV_DELAY"] - 0.5 * inputs.step_s
+    steps = np.searchsorted(segment.time_s, measured_at_s - 1e-9).tolist()
     has_sample = {step: row for row, step in enumerate(steps) if step > 0}
-    at = {int(event.end): event for event in events}
+    at = {int(event.end_step): event for event in events}
     gps2, fixes, update_log = settings["EKF2_GPS_P_NOISE"] ** 2, [], []
     biases: list[PlainBias] = []
 
@@ -134,9 +134,9 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
         A[:, i] -= K
         P = A @ P @ A.T + np.outer(K, K) * R
 
-    for k in range(1, int(events.end[-1]) + 1):
-        F, x = step_matrix(stretch, k - 1, trapezoid=False), step_state(stretch, k - 1, x)
-        P = F @ P @ F.T + step_noise(stretch, k - 1, *noises) + np.diag(drift * inputs.step_s**2)
+    for k in range(1, int(events.end_step[-1]) + 1):
+        F, x = step_matrix(segment, k - 1, trapezoid=False), step_state(segment, k - 1, x)
+        P = F @ P @ F.T + step_noise(segment, k - 1, *noises) + np.diag(drift * inputs.step_s**2)
         for bias in biases:
             bias.predict(inputs.step_s)
         event = at.get(k)
@@ -152,7 +152,7 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
             for j in range(5):
                 fuse(3 + j, nu[j], S[j], R[j])
         if event is not None:
-            x[2] = stretch.attitude_error_rad[k, 2]
+            x[2] = segment.attitude_error_rad[k, 2]
         if k not in has_sample:
             continue
         position, off = (
@@ -166,7 +166,7 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
         nu = position - [bias.bias for bias in biases] - x[6:8]
         R = np.array([R0 + bias.variance for bias in biases])
         S = np.diag(P)[6:8] + R
-        update_log.append(np.concatenate([[taken_s[has_sample[k]]], nu, S]))
+        update_log.append(np.concatenate([[measured_at_s[has_sample[k]]], nu, S]))
         for j, bias in enumerate(biases):
             bias.fuse(float(off[j]), R0 + P[6 + j, 6 + j], inputs.step_s)
         if np.all(nu**2 <= settings["EKF2_EVP_GATE"] ** 2 * S):
@@ -178,10 +178,10 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
 def flying(vision: ReceivedPositions | None, seconds: float = 40.0, **settings: float) -> Inputs:
     """Return the start of the flight, with only GNSS and vision correcting tilt and height."""
     inputs = on_gnss().inputs
-    (whole,) = inputs.stretches
+    (whole,) = inputs.segments
     count = int(np.searchsorted(whole.time_s, whole.time_s[0] + seconds))
     unknown = np.full((count, 3), np.inf)
-    stretch = replace(
+    segment = replace(
         whole, time_s=whole.time_s[:count], step_s=whole.step_s[: count - 1],
         rotation=whole.rotation[:count], correction_rad=whole.correction_rad[: count - 1],
         force_m_s2=whole.force_m_s2[: count - 1], down_m=whole.down_m[:count], field=None,
@@ -191,19 +191,19 @@ def flying(vision: ReceivedPositions | None, seconds: float = 40.0, **settings: 
         attitude_error_rad=whole.attitude_error_rad[:count],
     )  # fmt: skip
     known = {**inputs.settings, **SETTINGS, **settings}
-    return replace(inputs, stretches=(stretch,), vision=vision, settings=known)
+    return replace(inputs, segments=(segment,), vision=vision, settings=known)
 
 
-def ran(inputs: Inputs, *variants: Variant) -> StretchRun:
-    (stretch,) = inputs.stretches
+def ran(inputs: Inputs, *variants: Variant) -> SegmentRun:
+    (segment,) = inputs.segments
     variants = variants or (Variant(inputs.settings),)
-    made = [make_intervals(inputs, stretch, one.timing(inputs)) for one in variants]
-    return run_stretch(inputs, stretch, variants, made)
+    made = [make_intervals(inputs, segment, one.timing(inputs)) for one in variants]
+    return run_segment(inputs, segment, variants, made)
 
 
-def update_log(done: StretchRun, at: int = 0) -> pd.DataFrame:
+def update_log(done: SegmentRun, at: int = 0) -> pd.DataFrame:
     assert done.vision is not None
-    return done.vision.updates(at, done.stretch.time_s[done.events[at].end])
+    return done.vision.updates(at, done.segment.time_s[done.events[at].end_step])
 
 
 @pytest.mark.parametrize(("rate_hz", "late_s", "settings"), [
@@ -215,7 +215,7 @@ def test_recursion_matches_plain_filter(
     inputs = flying(sent(rate_hz, late_s=late_s), **settings)
     done, alone = ran(inputs), ran(replace(inputs, vision=None))
     events = done.events[0]
-    fixes, rows = plain_both(inputs, done.stretch, events)
+    fixes, rows = plain_both(inputs, done.segment, events)
     used = events.action > 0
     nu, S = done.innovation[used, 0, :5], done.innovation_variance[used, 0, :5]
     late = slice(30, None)  # after the transient of the bias
@@ -251,9 +251,9 @@ def test_vision_noise_with_gnss_is_at_least_gnss_noise() -> None:
 def test_vision_lever_arm_is_subtracted() -> None:
     """EKF2_EV_POS is in the body frame, rotated by the attitude at each sample."""
     inputs, vision, lever_arm_m = flying(sent()), sent(), np.array([1.5, -0.5, 0.8])
-    (stretch,) = inputs.stretches
-    step = np.searchsorted(stretch.time_s, vision.stamp_s - 0.5 * inputs.step_s - 1e-9)
-    turn = stretch.rotation[np.minimum(step, len(stretch.rotation) - 1)]
+    (segment,) = inputs.segments
+    step = np.searchsorted(segment.time_s, vision.stamp_s - 0.5 * inputs.step_s - 1e-9)
+    turn = segment.rotation[np.minimum(step, len(segment.rotation) - 1)]
     beside = replace(vision, position_m=vision.position_m + turn @ lever_arm_m)
     settings = {
         f"EKF2_EV_POS_{axis}": value for axis, value in zip("XYZ", lever_arm_m, strict=True)
@@ -268,7 +268,7 @@ def test_vision_bias_estimates_frame_offset() -> None:
     assert done.vision is not None
     np.testing.assert_allclose(-done.vision.bias.value_m[0], FRAME_M[:2], atol=0.5)
     truth = on_gnss().flight.truth
-    end_s = float(done.stretch.time_s[done.events[0].end[-1]])
+    end_s = float(done.segment.time_s[done.events[0].end_step[-1]])
     for axis in (0, 1):
         name = Columns.POSITION[axis]
         true = np.interp(end_s, truth.samples.index, truth.samples[name])
@@ -278,7 +278,7 @@ def test_vision_bias_estimates_frame_offset() -> None:
 def test_vision_jump_is_rejected_until_bias_reset() -> None:
     """A jump of vision by 20 m does not move EKF2."""
     vision = sent(sigma_m=0.05)
-    at_s = float(on_gnss().inputs.stretches[0].time_s[0]) + 20.0
+    at_s = float(on_gnss().inputs.segments[0].time_s[0]) + 20.0
     jumped = replace(vision, position_m=vision.position_m + 20.0 * (vision.stamp_s > at_s)[:, None])
     smooth, done = ran(flying(vision)), ran(flying(jumped))
     found = update_log(done)
@@ -287,17 +287,17 @@ def test_vision_jump_is_rejected_until_bias_reset() -> None:
     assert rejected[-1] - rejected[0] == pytest.approx(1.0, abs=0.1)
     assert found.loc[rejected[-1] + 0.01 :, "fused"].all()
     assert not found["reset"].any()
-    assert not done.moved_m.any()
+    assert not done.position_reset_m.any()
     difference = done.state[-1, 0, 6:8] - smooth.state[-1, 0, 6:8]
     assert np.abs(difference).max() < 0.05
-    without_gate = ran(flying(jumped), Variant(flying(jumped).settings, gated=False))
+    without_gate = ran(flying(jumped), Variant(flying(jumped).settings, has_gate=False))
     assert not update_log(without_gate)["rejected"].any()
 
 
 def test_vision_gap_restarts_bias() -> None:
     vision = sent(sigma_m=0.05)
-    at_s = float(on_gnss().inputs.stretches[0].time_s[0]) + 20.0
-    for gap_s, anew in ((0.9 * STOP_S, False), (1.5 * STOP_S, True)):
+    at_s = float(on_gnss().inputs.segments[0].time_s[0]) + 20.0
+    for gap_s, anew in ((0.9 * MAX_SAMPLE_GAP_S, False), (1.5 * MAX_SAMPLE_GAP_S, True)):
         remaining = (vision.stamp_s < at_s) | (vision.stamp_s > at_s + gap_s)
         moved = vision.position_m + 20.0 * (vision.stamp_s > at_s)[:, None]
         fields = ("stamp_s", "arrival_s", "variance_m2", "rejected", "reset")
@@ -310,14 +310,14 @@ def test_vision_gap_restarts_bias() -> None:
 def test_vision_without_gnss_resets_position() -> None:
     """Reset without bias, with the noise of vision (ev_pos_control.cpp)."""
     inputs = flying(sent(sigma_m=0.05))
-    lost_s = float(inputs.stretches[0].time_s[0]) + 20.0
+    lost_s = float(inputs.segments[0].time_s[0]) + 20.0
     lost = dict.fromkeys(("gnss_pos", "gnss_vel"), lost_s)
     done = ran(inputs, Variant(inputs.settings), Variant(inputs.settings, without=lost))
     found, flown = update_log(done, 1), update_log(done, 0)
     assert not flown["reset"].any()
     (reset_s,) = found.index[found["reset"] > 0.0]
     assert reset_s == pytest.approx(lost_s, abs=0.3)
-    moved = done.moved_m[:, 1]
+    moved = done.position_reset_m[:, 1]
     np.testing.assert_allclose(moved.sum(axis=0), FRAME_M[:2], atol=0.6)
     assert done.vision is not None
     np.testing.assert_array_equal(done.vision.bias.value_m[1], 0.0)
@@ -337,13 +337,13 @@ def test_vision_bias_follows_gnss_reset() -> None:
         done = ran(replace(inputs, rules=rules, received=off_by(inputs.received, 30.0)))
         # up to v1.16 any fused position, also from vision, prevents a reset to GNSS
         assert int(done.reset.sum()) == (not with_velocity)
-        assert done.moved_m.sum() == pytest.approx(0.0 if with_velocity else 30.0, abs=3.0)
+        assert done.position_reset_m.sum() == pytest.approx(0.0 if with_velocity else 30.0, abs=3.0)
         assert update_log(done)["fused"].mean() > 0.999
 
 
 def off_by(received: ReceivedPositions, north_m: float) -> ReceivedPositions:
     """Return the positions with an offset from 15 s on."""
-    start_s = float(on_gnss().inputs.stretches[0].time_s[0])
+    start_s = float(on_gnss().inputs.segments[0].time_s[0])
     far = (received.stamp_s > start_s + 15.0)[:, None] * np.array([north_m, 0.0, 0.0])
     return replace(received, position_m=received.position_m + far)
 
@@ -353,8 +353,8 @@ def test_vision_both_rejected_resets_to_vision() -> None:
     done = ran(replace(inputs, received=off_by(inputs.received, 40.0)))
     found = update_log(done)
     (reset_s,) = found.index[found["reset"] > 0.0]
-    assert reset_s == pytest.approx(float(done.stretch.time_s[0]) + 16.0, abs=0.2)
-    np.testing.assert_allclose(done.moved_m.sum(axis=(0, 1)), [20.0, 0.0], atol=0.7)
+    assert reset_s == pytest.approx(float(done.segment.time_s[0]) + 16.0, abs=0.2)
+    np.testing.assert_allclose(done.position_reset_m.sum(axis=(0, 1)), [20.0, 0.0], atol=0.7)
     assert found.loc[reset_s + 0.1 :, "fused"].all()
     assert done.vision is not None
     np.testing.assert_allclose(-done.vision.bias.value_m[0], FRAME_M[:2], atol=0.7)
@@ -405,7 +405,7 @@ def flown(
     heard = replace(vision, position_m=(-1.0 if flipped else 1.0) * vision.position_m
                     + wrong_m * noise)  # fmt: skip
 
-    def both(inputs: Inputs, variants: list[Variant], known: Any) -> list[StretchRun]:
+    def both(inputs: Inputs, variants: list[Variant], known: Any) -> list[SegmentRun]:
         settings = {**inputs.settings, **SETTINGS, **changed}
         given = replace(inputs, vision=heard, settings=settings)
         runs.extend(usual_run(given, [Variant(settings, without={"ev_pos": off_from_s})], known))

@@ -135,6 +135,20 @@ def test_worker_does_not_import_from_current_folder(tmp_path):
     assert not (work / "executed").exists()
 
 
+def test_worker_closed_pipe_ends_without_traceback():
+    script = """if True:
+        from multiprocessing import Pipe
+        from px4fuse.workers import _serve
+        parent, worker = Pipe()
+        parent.close()
+        _serve(worker, len, None)
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
 def test_worker_parent_killed_ends_hanging_job(tmp_path):
     with hanging(tmp_path) as parent:

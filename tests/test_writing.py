@@ -168,7 +168,7 @@ def test_write_locked_file_advises_to_close_the_program(tmp_path, monkeypatch) -
     path.write_bytes(b"old")
     at_rename_to(path, monkeypatch, deny)
     for locks, said in ((True, "Close the program that has it open, or c"), (False, "C")):
-        monkeypatch.setattr(writing, "LOCKS", locks)
+        monkeypatch.setattr(writing, "LOCKS_OPEN_FILES", locks)
         with pytest.raises(OutputError, match=rf"\. {said}hoose another"):
             write_all({path: b"new"})
         assert path.read_bytes() == b"old"
@@ -394,7 +394,7 @@ def test_output_closed_stdout_exits_with_0(words: str) -> None:
 def test_write_pipe_without_reader_ends_after_timeout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample_log: Path
 ) -> None:
-    monkeypatch.setattr("px4fuse.writing.READER_S", 0.1)
+    monkeypatch.setattr("px4fuse.writing.READER_TIMEOUT_S", 0.1)
     os.mkfifo(tmp_path / "pipe")
     pipe = tmp_path / "pipe"
     assert "the pipe has no reader" in error_line("info", sample_log, "--json", pipe)

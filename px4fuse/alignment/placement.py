@@ -38,7 +38,7 @@ MAX_UNIX_DIFFERENCE_S = 60.0  # clocks of computers in a lab differ by less
 
 def align_position_file(
     flight: Flight,
-    file: PositionRecording,
+    recording: PositionRecording,
     *,
     frame: str | None = None,
     yaw_deg: float | Literal["auto"] | None = None,
@@ -72,10 +72,10 @@ def align_position_file(
         A parameter cannot be estimated, or file and log do not overlap in time.
     """
     _check_options(frame, yaw_deg, clock_offset_s)
-    samples = finite_rows(file.samples, ["x_m", "y_m"])
+    samples = finite_rows(recording.samples, ["x_m", "y_m"])
     if len(samples) < tracks.MIN_SAMPLES:
         raise MissingDataError(
-            f"{file.name} contains {len(samples)} positions; at least "
+            f"{recording.name} contains {len(samples)} positions; at least "
             f"{tracks.MIN_SAMPLES} are needed. Check the file and the segment (--start, "
             "--end)."
         )
@@ -83,44 +83,51 @@ def align_position_file(
     boot_s = flight.log.boot_time_s
     spans_text = (
         f"the log covers {boot_s:.2f} s to {boot_s + flight.log.duration_s:.2f} s of the boot "
-        f"clock, the file {start_s:.2f} s to {end_s:.2f} s of its {file.clock} clock"
+        f"clock, the file {start_s:.2f} s to {end_s:.2f} s of its {recording.clock} clock"
     )
     lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_s
     if lag_s is not None and not start_s - end_s <= lag_s <= flight.log.duration_s:
         raise MissingDataError(
-            f"{file.name}: with --clock-offset {clock_offset_s:.3f} the file does not "
+            f"{recording.name}: with --clock-offset {clock_offset_s:.3f} the file does not "
             f"overlap the log ({spans_text}).",
             "Correct --clock-offset, or omit it: px4fuse then estimates the time offset.",
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
     try:
-        problem = AlignmentProblem(samples, frame or file.frame, yaw_rad, lag_s)
+        problem = AlignmentProblem(samples, frame or recording.frame, yaw_rad, lag_s)
         match = matching.find_match(flight, problem)
     except NoMatchError as error:
-        raise MissingDataError(f"{file.name}: {error}; {spans_text}", f"{error.remedy}.") from None
+        raise MissingDataError(
+            f"{recording.name}: {error}; {spans_text}", f"{error.remedy}."
+        ) from None
     alignment, aligned_samples = _describe_alignment(
-        flight, file, problem, match, frame, yaw_deg, clock_offset_s
+        flight, recording, problem, match, frame, yaw_deg, clock_offset_s
     )
     clock_source = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
     track = PositionTrack(
-        name=file.name,
+        name=recording.name,
         origin=POSITION_FILE,
         description=f"external position file, {len(aligned_samples)} samples, {alignment.frame}"
         f"{rotation_text}",
         samples=aligned_samples,
         frame="NED",
-        clock=f"{file.clock} clock of the file, {alignment.clock_offset_s:+.3f} s to the boot "
+        clock=f"{recording.clock} clock of the file, {alignment.clock_offset_s:+.3f} s to the boot "
         f"clock, {clock_source}",
-        topics=(file.name,),
-        log=file.name,
+        topics=(recording.name,),
+        log=recording.name,
         alignment=alignment,
     )
-    reader_notes = tuple(f"{file.name}: {text}" for text in (*file.detected, *file.notes))
-    dropped = {file.name: file.dropped} if file.dropped else {}
+    reader_notes = tuple(
+        f"{recording.name}: {text}" for text in (*recording.detected, *recording.notes)
+    )
+    dropped = {recording.name: recording.dropped} if recording.dropped else {}
     notes, dropped = (*flight.log.notes, *reader_notes), {**flight.log.dropped, **dropped}
     log = structs.replace(flight.log, notes=notes, dropped=dropped)
-    inputs = (*flight.inputs, InputFile(file.name, file.sha256, file.size_bytes, "position"))
+    inputs = (
+        *flight.inputs,
+        InputFile(recording.name, recording.sha256, recording.size_bytes, "position"),
+    )
     return replace(flight, log=log, positions=(track, *flight.positions), inputs=inputs)
 
 
@@ -140,7 +147,7 @@ def _check_options(
 
 def _describe_alignment(
     flight: Flight,
-    file: PositionRecording,
+    recording: PositionRecording,
     problem: AlignmentProblem,
     match: Match | None,
     frame_option: str | None,
@@ -160,7 +167,7 @@ def _describe_alignment(
         frame_reason = "given with --position-frame"
     if match:
         frame, reference = match.frame, match.reference.name
-        if not (frame_option or file.frame):
+        if not (frame_option or recording.frame):
             frame_reason = f"fits {reference} best; residuals: {match.residuals_text}"
             if is_yaw_free and frame == "enu":
                 frame_reason += "; nwu differs from enu only in yaw, which was estimated"
@@ -186,7 +193,7 @@ def _describe_alignment(
     )
     warnings = _find_warnings(
         flight,
-        file,
+        recording,
         match,
         is_yaw_free,
         correlation=unexplained_correlation,
@@ -298,7 +305,7 @@ def _find_frame_conflicts(
 
 def _find_warnings(
     flight: Flight,
-    file: PositionRecording,
+    recording: PositionRecording,
     match: Match | None,
     is_yaw_free: bool,
     *,
@@ -331,7 +338,7 @@ def _find_warnings(
         )
     # a large difference of UNIX times indicates another flight
     start_s = flight.log.start_unix_s
-    if file.clock == "UNIX" and start_s is not None and clock_offset_s is not None:
+    if recording.clock == "UNIX" and start_s is not None and clock_offset_s is not None:
         difference_s = abs(flight.log.boot_time_s - clock_offset_s - start_s)
         if difference_s >= MAX_UNIX_DIFFERENCE_S:
             yield (

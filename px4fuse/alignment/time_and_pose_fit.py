@@ -73,7 +73,7 @@ class Fit(CorrelationPeak):
 
 
 def find_correlation_peak(
-    file: SampledTrack, reference: SampledTrack, yaw_rad: float | None
+    file_track: SampledTrack, reference: SampledTrack, yaw_rad: float | None
 ) -> CorrelationPeak:
     """Find the lag with the greatest likelihood gain on the grid; yaw is estimated if None.
 
@@ -87,17 +87,17 @@ def find_correlation_peak(
     NoMatchError
         No lag has sufficient overlap.
     """
-    if not file.is_valid.any() or not reference.is_valid.any():
+    if not file_track.is_valid.any() or not reference.is_valid.any():
         raise NoMatchError("too few samples between gaps to match the tracks")
     track_moments = moments(
-        file.horizontal_m, reference.horizontal_m, file.is_valid, reference.is_valid
+        file_track.horizontal_m, reference.horizontal_m, file_track.is_valid, reference.is_valid
     )
     count, covariance, power = (
         track_moments.count,
         track_moments.covariance,
         track_moments.power_a + track_moments.power_b,
     )
-    min_count = min(np.count_nonzero(file.is_valid), np.count_nonzero(reference.is_valid))
+    min_count = min(np.count_nonzero(file_track.is_valid), np.count_nonzero(reference.is_valid))
     has_overlap = count >= max(
         tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / GRID_STEP_S, min_count / 2.0)
     )
@@ -113,7 +113,7 @@ def find_correlation_peak(
     best_index = int(np.argmax(np.where(has_overlap, likelihood_gain, -np.inf)))
 
     def lag_at(index: int) -> float:
-        return float(reference.time_s[0]) + (index - len(file.is_valid) + 1) * GRID_STEP_S
+        return float(reference.time_s[0]) + (index - len(file_track.is_valid) + 1) * GRID_STEP_S
 
     # lags on this peak: up to half of its concordance, and at least MIN_PEAK_DISTANCE_S around it
     low_indices = np.flatnonzero(concordance < 0.5 * concordance[best_index])
@@ -143,7 +143,7 @@ def find_correlation_peak(
 
 
 def fit_by_least_squares(
-    file: SampledTrack,
+    file_track: SampledTrack,
     reference: SampledTrack,
     peak: CorrelationPeak,
     yaw_rad: float | None,
@@ -162,15 +162,15 @@ def fit_by_least_squares(
     NoMatchError
         Too few samples overlap the reference.
     """
-    reference_m, is_known = reference.at(file.time_s + peak.lag_s)
-    is_used = is_known & file.is_valid
+    reference_m, is_known = reference.at(file_track.time_s + peak.lag_s)
+    is_used = is_known & file_track.is_valid
     if np.count_nonzero(is_used) < tracks.MIN_SAMPLES:
         raise NoMatchError(
             f"only {np.count_nonzero(is_used)} positions of the file overlap the reference in time"
         )
-    time = file.time_s[is_used] + peak.lag_s
+    time = file_track.time_s[is_used] + peak.lag_s
     file_m, target_m = (
-        file.horizontal_m[is_used],
+        file_track.horizontal_m[is_used],
         (reference_m[:, 0] + 1j * reference_m[:, 1])[is_used],
     )
     centre_m = np.mean(file_m)
@@ -228,7 +228,7 @@ def fit_by_least_squares(
     sigma = np.sqrt(np.maximum(variance, 0.0))
     is_at_limit = is_lag_free and abs(lag_shift_s) > 0.99 * MAX_LAG_SHIFT_S
     ned, _ = reference.at(time + lag_shift_s)
-    down_difference = ned[:, 2] - file.position_m[is_used, 2]
+    down_difference = ned[:, 2] - file_track.position_m[is_used, 2]
     down_difference = down_difference[np.isfinite(down_difference)]
     origin_down = float(np.median(down_difference)) if len(down_difference) else 0.0
     horizontal_rms = truncated_rms(np.abs(complex_residuals)) / np.sqrt(2.0)

@@ -12,14 +12,14 @@ from px4fuse.assignment.random_assignment import AssignedFlight, Kinds, draw
 from px4fuse.assignment.roster import Person, normalise_text
 from px4fuse.assignment.truth import form_truth
 from px4fuse.errors import OutputError, SettingsError
-from px4fuse.input_files import own_files
+from px4fuse.input_files import inputs_not_registered
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.text import to_json_types
 from px4fuse.writing import write_all
 
-# numbers of the simulation that the answer key contains
-TRUTH = (
+# true values of the simulation that the answer key contains
+TRUTH_NAMES = (
     "duration_s",
     "sigma_z_m",
     "sigma_a_m_s2",
@@ -30,23 +30,23 @@ TRUTH = (
 )
 
 
-def fly(
+def simulate_assigned(
     secret: bytes, student: Person, kind: Kinds, count: int | None = None, truth: bool = True
 ) -> tuple[bytes, Answer]:
-    """Simulate the flight of one student; return its log (ULog) and its answer."""
+    """Simulate the flight of one student; return the log (ULog) and its answer in the key."""
     assigned_flight = draw(secret, student.student_id, kind, count, truth)
-    simulation = flights.simulate(assigned_flight.scenario, parse(assigned_flight.typed))
+    simulation = flights.simulate(assigned_flight.scenario, parse(assigned_flight.mistake_options))
     log = flights.to_ulog(simulation)
     sha256 = hashlib.sha256(log).hexdigest()
-    known = flights.answer(simulation)["truth"]
+    true_values = flights.answer(simulation)["truth"]
     return log, Answer(
         student_id=student.student_id,
         name=student.name,
         file=student.file,
         sha256=sha256,
         scenario=to_json_types(asdict(assigned_flight.scenario)),
-        mistakes=assigned_flight.typed,
-        truth={name: float(known[name]) for name in TRUTH},
+        mistakes=assigned_flight.mistake_options,
+        truth={name: float(true_values[name]) for name in TRUTH_NAMES},
         difficulty=assigned_flight.difficulty,
         form=form_truth(simulation, sha256),
     )
@@ -64,8 +64,8 @@ def key_path(folder: Path, key_option: Path | None) -> Path:
     path = key_option or resolved_folder.parent / f"{resolved_folder.name}_answers.json"
     if resolved_folder in (path.resolve(), *path.resolve().parents):
         raise OutputError(
-            f"{path} is in the students' folder, so students could read the answer key. "
-            "Choose another place with --answer."
+            f"The answer key {path} would be in the students' folder, where students can read it. "
+            "Choose another folder with --answer."
         )
     return path
 
@@ -78,30 +78,30 @@ def assign(
     kind: Kinds,
     count: int | None = None,
     truth: bool = True,
-    step: Callable[[int, int], None] = lambda done, of: None,
+    progress: Callable[[int, int], None] = lambda finished_count, of: None,
 ) -> tuple[AnswerKey, int]:
-    """Write log and form of each student into a folder, and the answer key.
+    """Write the log and the answer form of each student to a folder, and the answer key.
 
     The key is written before log and form of a student, so that an interrupted run can continue.
-    Existing files are never replaced: an existing log must be identical, and a key may only gain
-    students.
+    An existing log or form is never replaced: it must be identical. Students can be added to an
+    existing key, but its other answers must be those of this run.
 
     Parameters
     ----------
     secret : bytes or None
-        None uses the secret of an existing key, or generates one.
+        None for the secret in the existing key, or for a new random secret.
     count : int, optional
         Number of mistakes per flight; drawn by default.
     truth : bool
         Logs of aisle flights contain the ground truth.
-    step : callable
-        Called after each flight with the number of finished flights and of all.
+    progress : callable
+        Called after each flight with the number of finished flights, and the number of all.
 
     Returns
     -------
     AnswerKey
     int
-        Number of logs that were written; the others existed already.
+        Number of written logs; the other logs existed already.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def assign(
     OutputError
         A file exists with other content, or cannot be written.
     """
-    with own_files():
+    with inputs_not_registered():
         key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
     answers = {normalise_text(answer.student_id): answer for answer in key.answers}
     _check_extends(
@@ -123,24 +123,24 @@ def assign(
         secret = new_secret.encode()
     elif new_secret.encode() != secret:
         new_secret = ""
-    written = 0
-    for done, student in enumerate(students, start=1):
-        log, answer = fly(secret, student, kind, count, truth)
-        known = answers.setdefault(normalise_text(student.student_id), answer)
-        _check_extends(key_file, known.sha256 == answer.sha256)
+    written_count = 0
+    for finished_count, student in enumerate(students, start=1):
+        log, answer = simulate_assigned(secret, student, kind, count, truth)
+        stored_answer = answers.setdefault(normalise_text(student.student_id), answer)
+        _check_extends(key_file, stored_answer.sha256 == answer.sha256)
         form = form_text(student.file, answer.sha256).encode()
         contents = {folder / student.file: log, folder / form_name(student.file): form}
-        new = {
+        missing_contents = {
             path: content for path, content in contents.items() if not _is_written(path, content)
         }
         key = AnswerKey(kind, tuple(answers.values()), new_secret)
-        # the key first: an interrupted run needs its secret to continue
+        # the key is written first, because an interrupted run needs its secret to continue
         write_all({key_file: key_text(key).encode()})
         key_file.chmod(0o600)  # readable only for the instructor
-        write_all(new)
-        written += folder / student.file in new
-        step(done, len(students))
-    return key, written
+        write_all(missing_contents)
+        written_count += folder / student.file in missing_contents
+        progress(finished_count, len(students))
+    return key, written_count
 
 
 def preview(
@@ -157,37 +157,36 @@ def preview(
     SettingsError
         One flight cannot have this many mistakes, or there is no secret.
     OutputError
-        The existing key was made by an earlier px4fuse.
+        The existing key was written by another version of px4fuse.
     """
     if secret is None:
-        before = read_key(key_file) if key_file.exists() else None
-        if before is None or not before.secret:
+        stored_key = read_key(key_file) if key_file.exists() else None
+        if stored_key is None or not stored_key.secret:
             raise SettingsError(
-                "--preview requires --secret-file or --secret. A generated secret is not "
-                "stored, so the next run would draw other flights."
+                "--preview requires --secret-file: --preview stores no secret, so the next run "
+                "would draw other flights."
             )
-        secret = before.secret.encode()
+        secret = stored_key.secret.encode()
     return [draw(secret, student.student_id, kind, count) for student in students]
 
 
-def _is_written(target: Path, log: bytes) -> bool:
-    """Return True if the file exists with this content; OutputError if it differs."""
-    if not target.exists() and not target.is_symlink():
+def _is_written(path: Path, content: bytes) -> bool:
+    """Return True if the file exists with this content; raise OutputError for other content."""
+    if not path.exists() and not path.is_symlink():
         return False
-    if target.is_file() and target.stat().st_size == len(log) and target.read_bytes() == log:
+    if path.is_file() and path.stat().st_size == len(content) and path.read_bytes() == content:
         return True
     raise OutputError(
-        f"{target} already exists with other content. It was not "
-        "overwritten. Use the same secret and options as before, or another folder "
-        "(-o)."
+        f"{path} exists with other content and was not overwritten. Use the same secret and "
+        "options as for the existing files, or another folder (-o)."
     )
 
 
-def _check_extends(key_file: Path, same: bool) -> None:
-    """Raise OutputError if an existing answer key is not part of the new one."""
-    if not same:
+def _check_extends(key_file: Path, is_extension: bool) -> None:
+    """Raise OutputError unless the new answer key is an extension of the existing one."""
+    if not is_extension:
         raise OutputError(
-            f"{key_file} is the answer key of other flights. It was not overwritten. Use "
-            "the same secret, options and students as before (more students may be "
-            "added), or another file (--answer)."
+            f"{key_file} is the answer key of other flights and was not overwritten. Use the "
+            "secret, options and students of the existing key (you can add students), or another "
+            "file (--answer)."
         )

@@ -1,4 +1,4 @@
-"""Answer key of an assignment: flight and mistakes of each student."""
+"""Answer key of an assignment: flight, mistakes and right answers of each student."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -6,13 +6,13 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from px4fuse.answer_form import update_values
+from px4fuse.answer_form import update_renamed_values
 from px4fuse.assignment.roster import MAX_STUDENTS, Person, Register, normalise_text
 from px4fuse.assignment.truth import FormTruth
 from px4fuse.errors import SettingsError
 from px4fuse.reading import read_text
 
-# bytes; a key of 1000 students has two million
+# bytes; the key of 1000 students has two million bytes
 MAX_KEY_BYTES = 20_000_000
 NOTE = (
     "For the instructor only: this file lists the mistakes of every student's flight. Do not hand "
@@ -37,14 +37,14 @@ class Answer(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
     scenario : dict
         Fields of :class:`px4fuse.simulation.scenario.Scenario`.
     mistakes : tuple of str
-        As ``px4fuse simulate --mistake`` reads them; empty for a flight without a mistake.
+        Values of ``px4fuse simulate --mistake``; empty for a flight without a mistake.
     truth : dict
-        Numbers that the log does not contain, such as ``sigma_z_m``, ``sigma_a_m_s2`` and
-        ``clock_offset_to_add_s``.
+        True values of the simulation, which the log does not contain: ``sigma_z_m``,
+        ``sigma_a_m_s2``, ``clock_offset_to_add_s`` and others.
     difficulty : float or None
         See :class:`px4fuse.assignment.random_assignment.AssignedFlight`.
     form : FormTruth or None
-        Right answers to the form.
+        Right answers of the answer form.
     """
 
     student_id: Annotated[str, Meta(max_length=1000, pattern=r"\S")]
@@ -64,14 +64,14 @@ class _Schema(msgspec.Struct, frozen=True):
 
 
 class AnswerKey(msgspec.Struct, frozen=True):
-    """Answers of a class, as stored in the JSON file.
+    """Answers for all students of a class, and the secret; written as JSON.
 
     Attributes
     ----------
     kind : str
         Kind of the flights.
     secret : str
-        Secret from which the flights were drawn, if px4fuse generated it; else "".
+        Secret from which px4fuse drew the flights; "" if the instructor gave it.
     """
 
     kind: _Text
@@ -86,7 +86,7 @@ class AnswerKey(msgspec.Struct, frozen=True):
         return f"AnswerKey({self.kind!r}, {len(self.answers)} students)"
 
     def of_student(self, student_id: str) -> Answer | None:
-        """Return the answer for a student id, compared as in :class:`Register`."""
+        """Return the answer for a student id; :class:`Register` compares the ids."""
         student_index = Register(Person(a.student_id) for a in self.answers).student_index(
             Person(student_id)
         )
@@ -112,7 +112,7 @@ def read_key(path: Path) -> AnswerKey:
     """
     text = read_text(path, SettingsError, MAX_KEY_BYTES, name=str(path))
     try:
-        key = msgspec.convert(update_values(msgspec.json.decode(text)), AnswerKey)
+        key = msgspec.convert(update_renamed_values(msgspec.json.decode(text)), AnswerKey)
         if len({normalise_text(answer.student_id) for answer in key.answers}) < len(key.answers):
             raise ValueError("two students have the same id")
     except (msgspec.MsgspecError, RecursionError, ValueError) as error:

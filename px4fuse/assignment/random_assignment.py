@@ -1,7 +1,7 @@
-"""Random assignment: draw flight, mistakes and sizes of each student.
+"""Random assignment: draws flight, mistakes and their sizes for each student.
 
-Numbers are drawn by HMAC (RFC 2104) from the secret of the instructor and the id of the student:
-without the secret they cannot be predicted, and a second run gives the same flights.
+Random numbers are the HMAC (RFC 2104) of the student id with the instructor's secret as key. They
+cannot be predicted without the secret, and a second run gives the same flights.
 """
 
 from __future__ import annotations
@@ -20,108 +20,118 @@ from px4fuse.errors import SettingsError
 from px4fuse.record import Record, table
 from px4fuse.simulation.scenario import Kind, Scenario, make_scenario
 
-# kind of flight of a class; mixed: drawn for each student
+# kind of flight of a class; for "mixed", the kind is drawn for each student
 Kinds = Literal["aisle", "loop", "mixed"]
 
-MIN_SECRET = 8  # characters
-# part of every draw: if it changes, the flights change, and existing keys cannot be extended
+MIN_SECRET_LENGTH = 8  # characters
+# part of each HMAC message. With another label all flights change, and existing answer keys cannot
+# be extended
 DRAW_LABEL = "px4fuse assignment 2"
-# fractions of flights with 0, 1, 2 mistakes if --mistakes is not given. A loop has only one
-# possible mistake; with fewer flights without a mistake, "open-end" would be a safe guess
-COUNTS: dict[Kind, tuple[float, ...]] = {"aisle": (0.1, 0.5, 0.4), "loop": (0.4, 0.6)}
+# fractions of flights with 0, 1 and 2 mistakes, without --mistakes. Loops have one possible
+# mistake, "open-end". Many loops have none, so that students cannot guess it
+COUNT_FRACTIONS: dict[Kind, tuple[float, ...]] = {"aisle": (0.1, 0.5, 0.4), "loop": (0.4, 0.6)}
 # fraction of loops in a mixed class
-LOOP_SHARE = 1 / 3
-# range of the difficulty: the smallest size that px4fuse detects in 19 of 20 flights, divided by
-# the size in the flight
+LOOP_FRACTION = 1 / 3
+# range of the difficulty: smallest detectable size of the mistake over its size in the flight
 EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
 
 
 class AssignableMistake(Record, frozen=True):
-    """Mistake that may be drawn, with detectable sizes.
+    """Mistake that can be assigned, with its smallest detectable size.
 
     Attributes
     ----------
     mistake : str
         Name in :data:`px4fuse.simulation.mistakes.MISTAKES`.
     group : str
-        Mistakes of the same group are not combined: one would hide the other.
-    limit : float or None
+        Two mistakes of one group are not assigned together: one would hide the other.
+    detectable_size : float or None
         Smallest size, in ``unit``, that px4fuse detects in 19 of 20 flights
         (tests/studies/rates.csv); None for a mistake without a size.
     unit : str
-        Unit as in ``--mistake``.
-    less_is_plainer : bool
-        A smaller number is a larger mistake.
-    at_s : (float, float) or None
+        Unit of ``detectable_size``, as in ``--mistake``.
+    is_smaller_easier : bool
+        True if a smaller number is easier to detect.
+    has_either_sign : bool
+        True if the sign of the size is drawn.
+    start_range_s : (float, float) or None
         Range of the start time (s), for a mistake that has one.
-    hides : tuple of str
-        Groups that are not combined with this mistake.
+    hidden_groups : tuple of str
+        Groups whose mistakes are not assigned together with this mistake.
     """
 
     mistake: str
     group: str
-    limit: float | None = None
+    detectable_size: float | None = None
     unit: str = ""
-    less_is_plainer: bool = False
-    either_sign: bool = False
-    at_s: tuple[float, float] | None = None
-    hides: tuple[str, ...] = ()
+    is_smaller_easier: bool = False
+    has_either_sign: bool = False
+    start_range_s: tuple[float, float] | None = None
+    hidden_groups: tuple[str, ...] = ()
 
-    def goes_with(self, other: AssignableMistake) -> bool:
-        """Return True if both mistakes can be detected in one flight."""
+    def is_detectable_with(self, other: AssignableMistake) -> bool:
+        """Return True if both mistakes can be detected in the same flight."""
         return not (
-            self.group == other.group or self.group in other.hides or other.group in self.hides
+            self.group == other.group
+            or self.group in other.hidden_groups
+            or other.group in self.hidden_groups
         )
 
-    def typed(self, difficulty: float, sign: float = 1.0, at: float = 0.5) -> str:
-        """Format the mistake for ``px4fuse simulate --mistake``, with the size of a difficulty.
+    def format_option(
+        self, difficulty: float, sign: float = 1.0, start_fraction: float = 0.5
+    ) -> str:
+        """Format the value of ``--mistake`` that gives this difficulty.
 
-        ``at``: start time, as fraction of its range.
+        ``start_fraction``: start time, as a fraction of ``start_range_s`` (0 to 1).
         """
-        if self.limit is None:
+        if self.detectable_size is None:
             return self.mistake
-        size = self.limit * difficulty if self.less_is_plainer else self.limit / difficulty
+        size = (
+            self.detectable_size * difficulty
+            if self.is_smaller_easier
+            else self.detectable_size / difficulty
+        )
         text = f"{self.mistake}={math.copysign(float(f'{size:.3g}'), sign):g}{self.unit}"
-        if self.at_s is None:
+        if self.start_range_s is None:
             return text
-        first, last = self.at_s
-        return f"{text},{first + at * (last - first):.0f}s"
+        earliest_s, latest_s = self.start_range_s
+        return f"{text},{earliest_s + start_fraction * (latest_s - earliest_s):.0f}s"
 
 
 class DrawingRules(Record, frozen=True):
-    """Rules for one kind of flight: possible mistakes, and numbers of the scenario.
+    """Rules for one kind of flight: possible mistakes, and ranges of the scenario's numbers.
 
-    Numbers are (low, high, decimals), by field.
+    A range is (low, high, decimals), by field of the scenario.
     """
 
     mistakes: tuple[AssignableMistake, ...]
     numbers: dict[str, tuple[float, float, int]]
 
 
-_OF_KIND = table(__file__, "drawn.toml", dict[Kind, DrawingRules])
-ASSIGNABLE_MISTAKES = {kind: of.mistakes for kind, of in _OF_KIND.items()}
+_RULES_BY_KIND = table(__file__, "drawn.toml", dict[Kind, DrawingRules])
+ASSIGNABLE_MISTAKES = {kind: rules.mistakes for kind, rules in _RULES_BY_KIND.items()}
 
 
 @dataclass(frozen=True)
 class AssignedFlight:
-    """Flight that was drawn for a student.
+    """Flight that is assigned to a student.
 
     Attributes
     ----------
-    typed : tuple of str
-        Mistakes, as ``--mistake`` reads them.
+    mistake_options : tuple of str
+        Values of ``--mistake``.
     difficulty : float
-        Difficulty of the hardest mistake. Mistakes without a size do not count. A flight without
-        mistakes has the highest difficulty: excluding all mistakes requires the most work.
+        Largest difficulty of the mistakes with a size. A flight without a mistake has the largest
+        difficulty, because excluding all mistakes is the most work.
     """
 
     scenario: Scenario
-    typed: tuple[str, ...]
+    mistake_options: tuple[str, ...]
     difficulty: float
 
 
-def uniform(secret: bytes, student_id: str, kind: Kinds, label: str) -> float:
-    """Return a reproducible number in [0, 1); without the secret it cannot be predicted."""
+def draw_uniform(secret: bytes, student_id: str, kind: Kinds, label: str) -> float:
+    """Return a reproducible random number in [0, 1) for a student and a label."""
     message = "\0".join((DRAW_LABEL, kind, normalise_text(student_id), label))
     digest = hmac.new(secret, message.encode(errors="replace"), hashlib.sha256).digest()
     return int.from_bytes(digest[:7], "big") / 2**56
@@ -139,64 +149,74 @@ def draw(
     count : int, optional
         Number of mistakes; drawn by default.
     truth : bool
-        The log of an aisle contains the ground truth. Logs of loops never do: ground truth
-        contains the landing place.
+        True to log the ground truth of aisle flights. The log of a loop never contains it, because
+        the ground truth shows the landing place.
 
     Raises
     ------
     SettingsError
         One flight cannot have this many mistakes.
     """
-    max_count = min(len(COUNTS[k]) for k in (COUNTS if kind == "mixed" else (kind,))) - 1
+    max_count = (
+        min(len(COUNT_FRACTIONS[k]) for k in (COUNT_FRACTIONS if kind == "mixed" else (kind,))) - 1
+    )
     if count is not None and not 0 <= count <= max_count:
         raise SettingsError(
             f"--mistakes {count} is out of range: a flight of kind {kind} has 0 to "
             f"{max_count} detectable mistakes."
         )
     if kind == "mixed":
-        kind = "loop" if uniform(secret, student_id, kind, "kind") < LOOP_SHARE else "aisle"
-    draw_number = partial(uniform, secret, student_id, kind)
+        kind = "loop" if draw_uniform(secret, student_id, kind, "kind") < LOOP_FRACTION else "aisle"
+    draw_number = partial(draw_uniform, secret, student_id, kind)
     if count is None:
-        count = bisect(list(accumulate(COUNTS[kind][:-1])), draw_number("count"))
+        count = bisect(list(accumulate(COUNT_FRACTIONS[kind][:-1])), draw_number("count"))
     chosen_mistakes: list[tuple[AssignableMistake, float, str]] = []
     for choice in sorted(
         ASSIGNABLE_MISTAKES[kind], key=lambda c: draw_number(f"order {c.mistake}")
     ):
         if len(chosen_mistakes) < count and all(
-            choice.goes_with(other) for other, *_ in chosen_mistakes
+            choice.is_detectable_with(other) for other, *_ in chosen_mistakes
         ):
             name = choice.mistake
-            share = 0.0 if choice.limit is None else draw_number(f"size {name}")
-            sign = -1.0 if choice.either_sign and draw_number(f"sign {name}") < 0.5 else 1.0
-            difficulty = EASIEST_DIFFICULTY + (HARDEST_DIFFICULTY - EASIEST_DIFFICULTY) * share
+            difficulty_fraction = (
+                0.0 if choice.detectable_size is None else draw_number(f"size {name}")
+            )
+            sign = -1.0 if choice.has_either_sign and draw_number(f"sign {name}") < 0.5 else 1.0
+            difficulty = (
+                EASIEST_DIFFICULTY + (HARDEST_DIFFICULTY - EASIEST_DIFFICULTY) * difficulty_fraction
+            )
             chosen_mistakes.append(
-                (choice, difficulty, choice.typed(difficulty, sign, draw_number(f"at {name}")))
+                (
+                    choice,
+                    difficulty,
+                    choice.format_option(difficulty, sign, draw_number(f"at {name}")),
+                )
             )
     numbers: dict[str, Any] = {
         name: round(low + (high - low) * draw_number(name), decimals)
-        for name, (low, high, decimals) in _OF_KIND[kind].numbers.items()
+        for name, (low, high, decimals) in _RULES_BY_KIND[kind].numbers.items()
     }
     has_truth, seed = truth and kind == "aisle", int(draw_number("seed") * 2**32)
     scenario = make_scenario(kind, truth=has_truth, seed=seed, **numbers)
     hardest = max((difficulty for _, difficulty, _ in chosen_mistakes), default=HARDEST_DIFFICULTY)
     return AssignedFlight(
-        scenario, tuple(typed for *_, typed in chosen_mistakes), round(hardest, 2)
+        scenario, tuple(option for *_, option in chosen_mistakes), round(hardest, 2)
     )
 
 
 def encode_secret(text: str, where: str) -> bytes:
-    """Return a secret as bytes; ``where`` names its option or file in errors.
+    """Encode a secret as bytes; ``where`` names its option or file in errors.
 
     Raises
     ------
     SettingsError
-        The secret is shorter than MIN_SECRET.
+        The secret is shorter than MIN_SECRET_LENGTH.
     """
     stripped = text.strip()
-    if len(stripped) < MIN_SECRET:
+    if len(stripped) < MIN_SECRET_LENGTH:
         raise SettingsError(
             f"{where}: the secret has only {len(stripped)} characters and can be guessed.",
-            f"Use {MIN_SECRET} or more, or omit it: px4fuse then generates one and "
-            "stores it in the answer key.",
+            f"Use {MIN_SECRET_LENGTH} or more characters, or omit the secret: px4fuse then "
+            "generates one and stores it in the answer key.",
         )
     return stripped.encode(errors="replace")

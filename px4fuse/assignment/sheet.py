@@ -1,7 +1,7 @@
-"""Tables (CSV) of learning platforms and users: reading, and writing with changed cells.
+"""Tables (CSV) of learning platforms and users: reading, and writing of a changed copy.
 
-Encodings (UTF-8 with and without byte order mark, UTF-16, Windows-1252) and separators are
-detected. A written table keeps the encoding and all cells that were not changed.
+The reader detects encoding (UTF-8 with and without byte order mark, UTF-16, Windows-1252) and
+separator. A copy has the encoding and the separator of the original.
 """
 
 import codecs
@@ -29,7 +29,7 @@ class Sheet:
     head : tuple of str
         Titles of the columns.
     rows : tuple of tuple of str
-        Cells; each row has at least the length of ``head``.
+        Cells of each row; at least one per title.
     """
 
     path: Path
@@ -39,12 +39,12 @@ class Sheet:
     separator: str = ","
 
     def column(self, titles: Sequence[str]) -> int | None:
-        """Return the index of the first of these titles that exists, or None."""
+        """Return the column index of the first of these titles in the table; None if none is."""
         plain_titles = [normalise_title(title) for title in self.head]
         return next((plain_titles.index(title) for title in titles if title in plain_titles), None)
 
     def cell(self, row: Sequence[str], titles: Sequence[str]) -> str:
-        """Return the cell of a row under the first of these titles that exists; else ""."""
+        """Return the cell of a row in the column that :meth:`column` finds; "" if there is none."""
         column_index = self.column(titles)
         return "" if column_index is None else row[column_index].strip()
 
@@ -59,7 +59,9 @@ class Sheet:
         """Encode the table in its original encoding."""
         try:
             return self.text.encode(self.encoding)
-        except UnicodeEncodeError:  # feedback may have characters outside of Windows-1252
+        except (
+            UnicodeEncodeError
+        ):  # feedback may contain characters that Windows-1252 does not have
             return self.text.encode("utf-8-sig")
 
 
@@ -90,13 +92,13 @@ def read_sheet(path: Path) -> Sheet:
         encoding = "utf-16"
     try:
         text = content.decode(encoding)
-    except UnicodeDecodeError:  # encoding of spreadsheets on Windows
+    except UnicodeDecodeError:  # spreadsheet programs on Windows write Windows-1252
         encoding = "cp1252"
         text = content.decode(encoding, errors="replace")
     if "\0" in text:
         raise SettingsError(f"{path} is not a text file.", "Give a CSV file with a header.")
     header = next((line for line in text.splitlines() if line.strip()), "")
-    # quoted cells may contain separators
+    # separators in quoted titles are not counted
     separator = max(SEPARATORS, key=re.sub(r'"[^"]*"', "", header).count)
     try:
         lines = [*csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)]
@@ -109,19 +111,19 @@ def read_sheet(path: Path) -> Sheet:
     return Sheet(path, tuple(head), tuple(padded_rows), encoding, separator)
 
 
-def number(value: float | None) -> str:
-    """Format a number for spreadsheets; "" if it is absent or not finite.
+def format_cell_number(value: float | None) -> str:
+    """Format a number for a cell; "" if the number is absent or not finite.
 
-    >>> number(7.0), number(0.1 + 0.2), number(float("nan"))
+    >>> format_cell_number(7.0), format_cell_number(0.1 + 0.2), format_cell_number(float("nan"))
     ('7', '0.3', '')
     """
     return "" if value is None or not math.isfinite(value) else f"{value:.10g}"
 
 
-def decimal(text: str) -> float | None:
+def parse_decimal(text: str) -> float | None:
     """Parse a number with decimal point or comma; None if the text is not a number.
 
-    >>> decimal("12,5"), decimal("1_5"), decimal("nan")
+    >>> parse_decimal("12,5"), parse_decimal("1_5"), parse_decimal("nan")
     (12.5, None, None)
     """
     return float(text.replace(",", ".")) if re.fullmatch(r"[+-]?\d+([.,]\d*)?", text) else None

@@ -1,4 +1,4 @@
-"""Right answers to the form of a simulated flight."""
+"""Right answers of the answer form for a simulated flight."""
 
 import math
 from collections.abc import Mapping
@@ -22,14 +22,15 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
 
-# relative error up to which a size is right
-TOLERANCE = 0.15
-# m; error up to which a closure error is right
-CLOSURE_WITHIN_M = 0.3
-# fraction of rejected samples from which the form must name rejection
+# relative tolerance of the size of a mistake
+SIZE_TOLERANCE = 0.15
+# m; tolerance of a loop closure error
+CLOSURE_TOLERANCE_M = 0.3
+# fraction of rejected samples above which the form must name the rejections
 MIN_REJECTED_SHARE = 0.005
-# m, s; smallest position reset that counts, and time until EKF2 has its first position
-MIN_RESET_M, SETTLED_S = 0.2, 5.0
+# smallest reset (m) that the form must name, and time (s) from the start of the segment in which
+# resets are not counted, because EKF2 resets to its first position
+MIN_RESET_M, EKF2_START_S = 0.2, 5.0
 EKF2_BEHAVIOUR = table(__file__, "did.toml", dict[str, dict[str, set[str]]])
 
 
@@ -39,8 +40,8 @@ class TrueMistake(Record, frozen=True):
     Attributes
     ----------
     size : float or None
-        In the first unit of :data:`px4fuse.answer_form.MISTAKES`; answers from ``low`` to ``high``
-        are right.
+        Size in the first unit of :data:`px4fuse.answer_form.MISTAKES`. Answers from ``low`` to
+        ``high`` are right.
     from_s, until_s : float or None
         Time (s) since the first data; both None: the whole flight.
     """
@@ -54,21 +55,21 @@ class TrueMistake(Record, frozen=True):
 
 
 class VerdictTruth(Record, frozen=True):
-    """Verdict of the report on a filter's reported σ, and its factor in σ; "" without a verdict."""
+    """Verdict on the reported σ of a filter ("" without one), and the factor of σ."""
 
     verdict: str
     factor: float | None = None
 
 
 class FormTruth(Record, frozen=True):
-    """Right answers to the form of one flight.
+    """Right answers of the answer form for one flight.
 
     Attributes
     ----------
     sigma_z_m : float
         True position noise of the source (1 σ).
     ekf2_did, ekf2_did_also : tuple of str
-        Behaviour of EKF2 that must be named, and that may be named.
+        Behaviour of EKF2 that the form must name, and further behaviour that it may name.
     quantities : tuple
         Answers to :func:`px4fuse.answer_form.draw_questions`; None if the flight is too short.
     """
@@ -83,14 +84,14 @@ class FormTruth(Record, frozen=True):
 
 
 def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
-    """Return the right answers, from the simulation and a comparison with default settings."""
-    known = flights.answer(simulation)
+    """Compute the right answers from the simulation and a comparison with default settings."""
+    answer = flights.answer(simulation)
     comparison = compare(flights.to_flight(simulation), Settings())
     mistakes = tuple(
-        _true_mistake(name, values, known["truth"], comparison)
-        for name, values in known["mistakes"].items()
+        _true_mistake(name, values, answer["truth"], comparison)
+        for name, values in answer["mistakes"].items()
     )
-    sigma_z_m = known["truth"]["sigma_z_m"]
+    sigma_z_m = answer["truth"]["sigma_z_m"]
     return FormTruth(
         mistakes,
         sigma_z_m,
@@ -107,16 +108,16 @@ def _true_mistake(
     sizes = SIMULATED[name].sizes
     if not sizes:
         return TrueMistake(name)
-    size, tolerance = values[sizes[0]], TOLERANCE * abs(values[sizes[0]])
-    if name == "open-end":  # the measurable size includes the odometry drift
+    size, tolerance = values[sizes[0]], SIZE_TOLERANCE * abs(values[sizes[0]])
+    if name == "open-end":  # a student measures the closure error, which includes odometry drift
         odometry = trajectory_of(comparison.flight, "vio")
-        measured = analyse(LoopSource(odometry, comparison.flight)).closure_error_m
-        size, tolerance = measured if isinstance(measured, float) else size, CLOSURE_WITHIN_M
+        measured_m = analyse(LoopSource(odometry, comparison.flight)).closure_error_m
+        size, tolerance = measured_m if isinstance(measured_m, float) else size, CLOSURE_TOLERANCE_M
     low, high = size - tolerance, size + tolerance
-    if name == "clock-offset":  # the 95 % interval of the estimated time offset is right, too
-        _, found = estimate_noises_and_clock(comparison)
-        if isinstance(found, ClockOffset) and found.is_determinable:
-            low, high = min(low, -found.interval_s[1]), max(high, -found.interval_s[0])
+    if name == "clock-offset":  # all values in the 95 % interval of the estimate are right
+        _, time_offset = estimate_noises_and_clock(comparison)
+        if isinstance(time_offset, ClockOffset) and time_offset.is_determinable:
+            low, high = min(low, -time_offset.interval_s[1]), max(high, -time_offset.interval_s[0])
     from_s = until_s = None
     match name:
         case "clock-jump":
@@ -131,8 +132,8 @@ def _true_mistake(
     return TrueMistake(name, size, low, high, from_s, until_s)
 
 
-def _verdict(comparison: Comparison, which: FilterName) -> VerdictTruth:
-    filter_summary = comparison.main.filters[which]
+def _verdict(comparison: Comparison, filter_name: FilterName) -> VerdictTruth:
+    filter_summary = comparison.main.filters[filter_name]
     if not isinstance(filter_summary, FilterSummary):
         return VerdictTruth("")
     is_consistent = filter_summary.verdict == "consistent"
@@ -143,11 +144,11 @@ def _verdict(comparison: Comparison, which: FilterName) -> VerdictTruth:
 def _ekf2_behaviour(
     comparison: Comparison, mistakes: tuple[TrueMistake, ...], sigma_z_m: float
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the behaviour of EKF2 that must be named and that may be named."""
-    size_of = {wrong.kind: wrong.size or 0.0 for wrong in mistakes}
+    """Return the behaviour of EKF2 that the form must name, and that it may name in addition."""
+    size_of = {mistake.kind: mistake.size or 0.0 for mistake in mistakes}
     required, allowed = (
-        [behaviour for behaviour, kinds in EKF2_BEHAVIOUR[which].items() if kinds & size_of.keys()]
-        for which in ("does", "may_do")
+        [behaviour for behaviour, kinds in EKF2_BEHAVIOUR[rule].items() if kinds & size_of.keys()]
+        for rule in ("required", "allowed")
     )
     if size_of.get("ekf2-noise", 0.0) > sigma_z_m:
         required.append("weighted the positions too little")
@@ -157,7 +158,7 @@ def _ekf2_behaviour(
         if (innovations["rejected"] > 0).mean() > MIN_REJECTED_SHARE:
             required.append("rejected outliers" if has_bad_samples else "rejected good samples")
     ekf2 = comparison.flight.ekf2
-    since_s = comparison.segment.start_s + SETTLED_S
+    since_s = comparison.segment.start_s + EKF2_START_S
     for reset in ekf2.resets if isinstance(ekf2, Ekf2) else ():
         is_large = reset.quantity == "position" and math.hypot(*reset.delta[:2]) > MIN_RESET_M
         if is_large and reset.time_s > since_s:
@@ -170,25 +171,31 @@ def _ekf2_behaviour(
 
 
 def quantity_truth(
-    result: AxisComparison, quantity: FormQuestion
+    result: AxisComparison, question: FormQuestion
 ) -> float | tuple[float, ...] | None:
-    """Answer a question by a replay of KF with its settings; None if the flight is too short.
+    """Answer a question by a replay of KF with the settings of the question.
 
-    "silence": σ of the position after predictions by F and Q (steps of DT), without update.
+    None if the flight has too few measurements. The answer to "silence" is the position σ after
+    predictions with F and Q (steps of DT), without an update.
     """
-    settings = Settings(quantity.sigma_a_m_s2, quantity.sigma_z_m)
-    run = replay(result.axis, settings)
-    updates = run.updates
-    at = quantity.update - 1
-    if at >= len(updates):
+    settings = Settings(question.sigma_a_m_s2, question.sigma_z_m)
+    kf_replay = replay(result.axis, settings)
+    updates = kf_replay.updates
+    update_index = question.update - 1
+    if update_index >= len(updates):
         return None
-    row, covariance = updates.iloc[at], run.steps.loc[updates.index[at], COVARIANCES]
-    match quantity.kind:
+    row, covariance = (
+        updates.iloc[update_index],
+        kf_replay.steps.loc[updates.index[update_index], COVARIANCES],
+    )
+    match question.kind:
         case "gate":
-            part = updates.iloc[at : at + GATE_UPDATES + 1]
-            nis = part["innovation_m"] ** 2 / part["innovation_variance_m2"]
-            outside = np.flatnonzero(nis > quantity.extra**2) + quantity.update
-            return tuple(outside.astype(float).tolist())
+            following_updates = updates.iloc[update_index : update_index + GATE_UPDATES + 1]
+            nis = (
+                following_updates["innovation_m"] ** 2 / following_updates["innovation_variance_m2"]
+            )
+            outside_numbers = np.flatnonzero(nis > question.extra**2) + question.update
+            return tuple(outside_numbers.astype(float).tolist())
         case "silence":
             p, f = symmetric_matrix(tuple(covariance)), transition(settings.dt_s)
             q = (
@@ -196,11 +203,11 @@ def quantity_truth(
                 * settings.dt_s
                 * symmetric_matrix(process_noise_unit(settings.dt_s))
             )
-            for _ in range(round(quantity.extra / settings.dt_s)):
+            for _ in range(round(question.extra / settings.dt_s)):
                 p = f @ p @ f.T + q
             return math.sqrt(p[0, 0])
         case "nis":
             return float(row["innovation_m"] ** 2 / row["innovation_variance_m2"])
         case "variance":
             return float(covariance.iloc[0])
-    return float(row["gain_position" if quantity.kind == "gain" else "innovation_m"])
+    return float(row["gain_position" if question.kind == "gain" else "innovation_m"])

@@ -7,7 +7,7 @@ from importlib import metadata
 from msgspec.structs import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.causes import FILTER_NAMES, RankedCause, make_cause, rank_causes
+from px4fuse.card.causes import FILTER_NAMES, RankedCause, improvement, make_cause, rank_causes
 from px4fuse.card.model import (
     MAX_CAUSES,
     MAX_HEADLINE_LENGTH,
@@ -23,12 +23,12 @@ from px4fuse.card.model import (
 )
 from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.card.verdicts import verdicts as make_verdicts
-from px4fuse.comparison.model import AgainstTruth, AxisComparison
+from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings.model import Finding, by_root
+from px4fuse.findings.model import Finding, group_by_root
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 
@@ -36,6 +36,7 @@ MAX_NOTES = 3
 MAX_ACTIONS = 3
 # Rejected fraction and resets from which the effect names them
 MIN_NAMED_REJECTION = 0.01
+BETTER_POSITION = ("position and σ", "position")
 NO_FAULT = "No fault found: KF and EKF2 are consistent"
 # Findings of a source whose errors the innovations cannot show
 SHIFTED_SOURCE = frozenset(
@@ -63,7 +64,7 @@ def build_card(
         Name and id.
     """
     result = analysis.main
-    roots = [group[0] for group in by_root(findings)]
+    roots = [group[0] for group in group_by_root(findings)]
     verdicts = make_verdicts(result)
     ranked = rank_causes(analysis, roots)
     causes = tuple(make_cause(analysis, each, verdicts, request) for each in ranked[:MAX_CAUSES])
@@ -78,7 +79,7 @@ def build_card(
         effect_text=_effect_text(analysis, effect, verdicts),
         do_this=_do_this(causes),
         verdicts=verdicts,
-        reconcile=_reconcile(analysis, verdicts, [one.id for one in findings]),
+        reconcile=_reconcile(analysis, verdicts, causes, [one.id for one in findings]),
         difference=_difference(effect, ranked),
         causes=causes,
         more_causes=max(len(ranked) - MAX_CAUSES, 0),
@@ -138,7 +139,7 @@ def _effect(analysis: Analysis) -> Effect:
         position_rmse_m={
             owner: truth.position_rmse_m
             for owner, statement in result.filters.items()
-            if isinstance(truth := statement.truth, AgainstTruth)
+            if isinstance(truth := statement.truth, ErrorsAgainstTruth)
         },
         horizontal_rmse_m=_horizontal_rmse_m(analysis),
         difference_rms_m=None if isinstance(difference, Unavailable) else difference.position_rms_m,
@@ -149,7 +150,7 @@ def _effect(analysis: Analysis) -> Effect:
 
 def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
     """Format the axis with its reference: "along the aisle, 30° from north"."""
-    called, heading = result.axis.called, result.heading_deg
+    called, heading = result.axis.label, result.heading_deg
     if result.axis.name != "aisle" or heading is None:
         return f"along {called}"
     reference = "north"
@@ -163,7 +164,7 @@ def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
     axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
     for owner in FILTER_NAMES:
         truths = [axis.filters[owner].truth for axis in axes]
-        known = [truth.position_rmse_m for truth in truths if isinstance(truth, AgainstTruth)]
+        known = [truth.position_rmse_m for truth in truths if isinstance(truth, ErrorsAgainstTruth)]
         if len(known) == 2:
             found[owner] = math.hypot(*known)
     return found
@@ -174,7 +175,7 @@ def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]
     sentences = []
     if effect.position_rmse_m:
         sentences.append(
-            f"Position RMSE against ground truth along {analysis.main.axis.called}: "
+            f"Position RMSE against ground truth along {analysis.main.axis.label}: "
             f"{_by_filter(effect.position_rmse_m)}"
             f"{_in_brackets('horizontal', effect.horizontal_rmse_m)}."
         )
@@ -257,12 +258,23 @@ def _mark_explained(verdicts: Sequence[Verdict], causes: Sequence[Cause]) -> tup
     )
 
 
-def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], ids: Sequence[str]) -> str:
-    """Explain two verdicts of one filter that differ."""
+def _reconcile(
+    analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence[Cause], ids: Sequence[str]
+) -> str:
+    """Explain two verdicts of one filter that differ, or ratios of which one is far larger."""
+    corrected = {
+        "ekf2" if rerun.is_prediction else "kf"
+        for cause in causes[:1]
+        for rerun in cause.reruns
+        if rerun.improves == "position and σ"
+    }
     differing = [
         owner
         for owner in FILTER_NAMES
-        if _differ(*(verdict for verdict in verdicts if verdict.filter == owner))
+        if _differ(
+            *(verdict for verdict in verdicts if verdict.filter == owner),
+            is_corrected=owner in corrected,
+        )
     ]
     if not differing:
         return ""
@@ -290,10 +302,11 @@ def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], ids: Sequence[st
     return "The two verdicts differ, and no tested change explains it."
 
 
-def _differ(source: Verdict, truth: Verdict) -> bool:
+def _differ(source: Verdict, truth: Verdict, *, is_corrected: bool) -> bool:
     if source.ratio is None or truth.ratio is None:
         return False
-    return source.word != truth.word or truth.ratio > 2.0 * source.ratio
+    is_far_larger = truth.ratio > 2.0 * source.ratio and not is_corrected
+    return source.word != truth.word or is_far_larger
 
 
 def _gate_sentence(analysis: Analysis) -> str:
@@ -318,14 +331,16 @@ def _difference(effect: Effect, ranked: Sequence[RankedCause]) -> str:
         return ""
     text = f"KF − EKF2: {format_metres(effect.difference_rms_m)} m RMS"
     trials = ranked[0].trials
-    owners = {trial.filter for trial in trials}
+    owners = {trial.filter for trial in trials if improvement(trial) in BETTER_POSITION}
     if len(owners) == 2:
         return f"{text}. Both filters have the fault, so this difference does not show it."
-    after = [trial.after.difference_rms_m for trial in trials]
-    if not after or after[0] is None:
+    after = {trial.filter: trial.after.difference_rms_m for trial in reversed(trials)}
+    owner: FilterName = "ekf2" if owners == {"ekf2"} or set(after) == {"ekf2"} else "kf"
+    after_m = after.get(owner)
+    if after_m is None:
         return f"{text}."
-    predicted = "predicted " if owners == {"ekf2"} else ""
-    return f"{text}; {format_metres(after[0])} m {predicted}after the fix."
+    predicted = "predicted " if owner == "ekf2" else ""
+    return f"{text}; {format_metres(after_m)} m {predicted}after the fix."
 
 
 def _notes(roots: Sequence[Finding]) -> tuple[Note, ...]:
@@ -362,16 +377,12 @@ def _settings(analysis: Analysis, request: ComparisonRequest) -> str:
         ("sigma_z_m", "SIGMA_Z", "m"),
         ("dt_s", "DT", "s"),
     ):
-        origin = (
-            "default" if (getattr(chosen, name) == getattr(Settings(), name)) else "set by option"
-        )
-        if (
-            name == "sigma_z_m"
-            and request.sigma_z_m is None
-            and not (getattr(chosen, name) == getattr(Settings(), name))
-        ):
+        value, origin = getattr(chosen, name), "set by option"
+        if value == getattr(Settings(), name):
+            origin = "default"
+        elif name == "sigma_z_m" and request.sigma_z_m is None:
             origin = f"from {aid_of(analysis).noise}"
-        texts.append(f"{label} {getattr(chosen, name):g} {unit} ({origin})")
+        texts.append(f"{label} {value:g} {unit} ({origin})")
     return ", ".join(texts)
 
 

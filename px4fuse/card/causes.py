@@ -13,7 +13,7 @@ from msgspec import structs
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import Action, Cause, FilterName, Improvement, Rerun, Target, Verdict
 from px4fuse.comparison.causal_replays import (
-    CLOCK,
+    CLOCK_OFFSET,
     OUTLIERS,
     SIGMA_A,
     SIGMA_Z,
@@ -137,16 +137,25 @@ def _tier(finding: Finding, trials: Iterable[Trial]) -> int:
 
 
 def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
-    """Return the best re-run of each kind and filter that corrects a finding."""
+    """Return the re-runs that correct a finding: the best one of each kind and filter.
+
+    Best: the smallest change that brings a verdict into its band, else the smallest ratios. For KF
+    the default settings are added.
+    """
     kinds = RERUN_KINDS.get(finding.id, frozenset())
+    kinds |= {"defaults"} if "noises" in kinds else set()
     best: dict[tuple[FilterName, str], Trial] = {}
     for trial in trials:
-        if len(trial.kinds) != 1 or trial.kinds[0] not in kinds:
-            continue
-        key = trial.filter, trial.kinds[0]
-        if key not in best or distance_from_one(trial.after) < distance_from_one(best[key].after):
-            best[key] = trial
+        if len(trial.kinds) == 1 and trial.kinds[0] in kinds:
+            key = trial.filter, trial.kinds[0]
+            best[key] = min(trial, best.get(key, trial), key=_preference)
     return tuple(best.values())
+
+
+def _preference(trial: Trial) -> tuple[bool, int, float]:
+    """Sort key of re-runs of one kind; the best one is the smallest."""
+    enters = _enters_band(trial)
+    return not enters, len(trial.change) if enters else 0, distance_from_one(trial.after)
 
 
 def ratios(outcome: Outcome) -> dict[Reference, float]:
@@ -262,7 +271,9 @@ def _actions(
     general = Action(_target(finding), finding.remedy) if finding.remedy else None
     delay = by_kind.get(("ekf2", "delay"))
     if offset := by_kind.get(("ekf2", "time offset")) or by_kind.get(("kf", "time offset")):
-        shift = offset.change[CLOCK] - analysis.settings.clock_offset_s * (offset.filter == "kf")
+        shift = offset.change[CLOCK_OFFSET] - analysis.settings.clock_offset_s * (
+            offset.filter == "kf"
+        )
         verb = f"subtract {-shift:.3f} s from" if shift < 0 else f"add {shift:.3f} s to"
         sender = Action("sender", f"{verb} the timestamp (usec) of each position")
         if delay is not None:
@@ -274,7 +285,11 @@ def _actions(
     elif general is not None and not _is_setting(finding):
         actions.append(general)
     for (owner, kind), trial in by_kind.items():
-        if owner == "kf" and trial.change.keys() <= COMPARISON_OPTIONS.keys():
+        if (
+            owner == "kf"
+            and kind != "defaults"
+            and trial.change.keys() <= COMPARISON_OPTIONS.keys()
+        ):
             actions.append(run_again(request, trial.change))
         elif (
             owner == "ekf2"
@@ -285,18 +300,27 @@ def _actions(
     named = {action.target for action in actions}
     named |= {action.target for alternative in alternatives for action in alternative}
     for owner, name in FILTER_NAMES.items():
-        if name not in named and (text := _no_change(owner, name, verdicts)):
+        if name not in named and (text := _no_change(finding, owner, verdicts)):
             actions.append(Action(name, text))
     return alternatives, tuple(actions)
 
 
-def _no_change(owner: FilterName, name: str, verdicts: Sequence[Verdict]) -> str:
+def _no_change(finding: Finding, owner: FilterName, verdicts: Sequence[Verdict]) -> str:
     """Return the reason why a filter needs no change, or "" if it is not evaluated."""
-    own = [verdict for verdict in verdicts if verdict.filter == owner and verdict.ratio is not None]
-    if not own:
+    words = {
+        verdict.against: verdict.word
+        for verdict in verdicts
+        if verdict.filter == owner and verdict.ratio is not None
+    }
+    if not words:
         return ""
-    if all(verdict.word == "consistent" for verdict in own):
+    if set(words.values()) == {"consistent"}:
         return "no change: consistent"
+    if finding.id == "source_outliers":
+        if owner == "kf":
+            return "no option rejects outliers; do not raise --sigma-z for them"
+        if words.get("truth", "consistent") == "consistent":
+            return "no change: its gate rejects outliers, and σ covers the error"
     return "no setting corrects this" if owner == "kf" else "no parameter corrects this"
 
 
@@ -359,7 +383,8 @@ def _label(trial: Trial, trials: Sequence[Trial]) -> str:
             for name, value in trial.change.items()
             if name in (SIGMA_A, SIGMA_Z)
         )
-        return f"KF, {options}" if options else "KF"
+        prefix = "default " if kind == "defaults" else ""
+        return f"KF, {prefix}{options}" if options else "KF"
     others = [each for each in trials if each.filter == "ekf2"]
     if len(others) < 2:
         return "EKF2 (replay)"
@@ -376,4 +401,8 @@ def _closing_sentence(
             "(this log only) is added to the timestamps (s), the delay parameter is the age of a "
             "position (ms)."
         )
+    defaults = next((trial for trial in useful if trial.kinds == ("defaults",)), None)
+    if defaults is not None and len(useful) > 1:
+        options = " and ".join(COMPARISON_OPTIONS[name] for name in defaults.change)
+        return f"Without {options} (default) KF is as good."
     return ""

@@ -84,7 +84,7 @@ def batch(
     if scheduler is not None and workers is not None:
         raise SettingsError("--workers applies to this computer. Omit it with --scheduler.")
     from px4fuse.fleet.run import run
-    from px4fuse.fleet.terminal import summary
+    from px4fuse.fleet.terminal import format_summary
 
     gc.enable()  # Dask leaves reference cycles, which would fill the memory in a long run
     try:
@@ -103,7 +103,7 @@ def batch(
     except KeyboardInterrupt as interrupt:
         message = f"finished results are in {output}. Run the same command to continue."
         raise outputs.Interrupted(interrupt, message) from None
-    outputs.write_and_print({}, summary(fleet), written=fleet.written)
+    outputs.write_and_print({}, format_summary(fleet), written=fleet.written)
     severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1] if fail_on in SEVERITIES else ()
     failed = fail_on is not None and bool((fleet.table["status"] == FAILED).any())
     if failed or fleet.severities & set(severities):

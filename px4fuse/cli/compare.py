@@ -26,6 +26,8 @@ SEVERITIES = get_args(Severity)
     is_flag=True,
     help="Exit with 1 if an EKF2 aid is overconfident, biased or not fused for a long time.",
 )
+@click.option("-v", "--verbose", is_flag=True, help="Print all findings, axes and settings.")
+@click.option("-q", "--quiet", is_flag=True, help="Print the diagnosis on one line only.")
 @options.open_option
 def compare(
     log: Path,
@@ -33,6 +35,8 @@ def compare(
     json_path: Path | None,
     fail_on: Severity | None,
     checks: bool,
+    verbose: bool,
+    quiet: bool,
     **option_values: Any,
 ) -> None:
     """Check EKF2 against a two-state Kalman filter and report mistakes.
@@ -57,7 +61,8 @@ def compare(
         if output is None and json_path is None:
             output = outputs.default_report(log.stem, settings_name(request), results)
         contents = outputs.result_files(results, json_path, output, outcome, show_progress)
-    outputs.write_and_print(contents, summary(outcome, results, output), request)
+    page = summary(outcome, results, verbose=verbose, quiet=quiet)
+    outputs.write_and_print(contents, page, request)
     failed = failed_checks(outcome) if checks else {}
     for name, verdict in failed.items():
         click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)

@@ -25,11 +25,11 @@ def diff(a: Path, b: Path, json_path: Path | None) -> None:
     input.
     """
     from px4fuse.fleet.changes import diff as compare_inputs
-    from px4fuse.fleet.terminal import differences
+    from px4fuse.fleet.terminal import format_differences
 
     outputs.check_targets([json_path])  # report an impossible output before the long analysis
     with outputs.progress(json_path) as show_progress:
         results = compare_inputs(a, b, progress=show_progress)
-    outputs.write_and_print(outputs.result_files(results, json_path), differences(results))
+    outputs.write_and_print(outputs.result_files(results, json_path), format_differences(results))
     if results.worse:
         sys.exit(1)

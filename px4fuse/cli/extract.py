@@ -19,7 +19,7 @@ from px4fuse.cli.options import (
 )
 from px4fuse.cli.outputs import write_outputs
 from px4fuse.errors import OutputError, to_one_line
-from px4fuse.input_files import check_output_folder, own_files
+from px4fuse.input_files import check_output_folder, inputs_not_registered
 from px4fuse.reading import read_text
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def extract(
 def _require_same_flight(folder: Path, sha256: str) -> None:
     """Raise an OutputError if the folder contains the tables of another log."""
     try:
-        with own_files():
+        with inputs_not_registered():
             text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
         earlier_log = json.loads(text)["log"]
         is_other_log = earlier_log["sha256"] != sha256

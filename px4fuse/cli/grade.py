@@ -136,14 +136,14 @@ def grade(
     from px4fuse.assignment.key import read_key
     from px4fuse.assignment.roster import read_people
     from px4fuse.assignment.sheet import read_sheet
-    from px4fuse.grading.entries import Course, due_time, late_rule
+    from px4fuse.grading.entries import Course, parse_due_time, parse_late_rule
     from px4fuse.grading.grade import grade as grade_submissions
     from px4fuse.grading.rubric import read_rubric, rubric_text
 
     if write_rubric is not None:
         write_new(write_rubric, rubric_text().encode())
         return
-    late_deduction = late_rule(late) if late else None
+    late_deduction = parse_late_rule(late) if late else None
     if late_deduction is not None and due is None:
         raise SettingsError("--late requires --due TIME.")
     if not submissions:
@@ -161,8 +161,8 @@ def grade(
         worksheets=tuple(map(read_sheet, worksheet)),
         column=column or "",
         attempt=attempt,
-        due=due_time(due) if due else None,
-        late=late_deduction,
+        due=parse_due_time(due) if due else None,
+        late_rule=late_deduction,
         include_pending=include_pending,
         anonymous=anonymous,
     )
@@ -178,7 +178,7 @@ def grade(
     except KeyboardInterrupt as interrupt:
         message = f"finished results are in {output}. Run the same command to continue."
         raise Interrupted(interrupt, message) from None
-    write_and_print({}, _page(outcome), written=outcome.written)
+    write_and_print({}, _page(outcome), written=outcome.written_paths)
 
 
 def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None:
@@ -206,21 +206,22 @@ def _page(outcome: GradeOutcome) -> Page:
 
     page, rows = Page(), []
     for entry in outcome.entries:
-        attempt = entry.counting
+        attempt = entry.counted_report
         pending = ", pending" if attempt and entry.total is None else ""
         status = attempt.status + pending if attempt else "missing"
         status_colour = GOOD_COLOUR if status == "verified" else SEVERITY_COLOURS["warning"]
         total = "–" if entry.total is None else f"{entry.total:g}"
         name = one_line(entry.student or entry.student_id, 60)
         file, flags = attempt.submission if attempt else "", f"{len(entry.flags) or ''}"
-        rows.append((name, file, (status, status_colour), f"{total} / {entry.of:g}", flags))
+        rows.append((name, file, (status, status_colour), f"{total} / {entry.max_points:g}", flags))
     page.table(("student", "submission", "status", "points", "flags"), rows, right=(3, 4))
-    counts = Counter(attempt.status for attempt in outcome.graded)
+    counts = Counter(attempt.status for attempt in outcome.reports)
     status_counts = ", ".join(f"{count} {status}" for status, count in counts.most_common())
-    missing = sum(entry.counting is None for entry in outcome.entries)
+    missing = sum(entry.counted_report is None for entry in outcome.entries)
     page.write(
-        f"{len(outcome.graded)} submissions: {status_counts or 'none'}; no submission from "
-        f"{missing} of {len(outcome.entries)} students; {outcome.reused} reused from an earlier run"
+        f"{len(outcome.reports)} submissions: {status_counts or 'none'}; no submission from "
+        f"{missing} of {len(outcome.entries)} students; stored verifications of "
+        f"{outcome.reused_count} submissions were used"
     )
     for note in outcome.notes:
         page.write(note, colour=MUTED_COLOUR)

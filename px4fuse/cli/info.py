@@ -85,7 +85,7 @@ def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
     ]
     page.table(("possible", "analysis", ""), rows)
     if next(ability.possible for ability in inventory.abilities if ability.name == "compare"):
-        command = command_line(request, "compare", typed=True)
+        command = command_line(request, "compare", for_shell=True)
         page.add("command", text=command, label="Run")
     lists = {
         "Action": [

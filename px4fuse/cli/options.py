@@ -29,7 +29,7 @@ from px4fuse.request import (
     PositionFile,
     SourceKind,
 )
-from px4fuse.units import NAMES, in_unit
+from px4fuse.units import NAMES, convert_to_unit
 
 if TYPE_CHECKING:
     from px4fuse.results.model import Student
@@ -115,7 +115,7 @@ class TypedQuantity(click.ParamType["float | str"]):
         try:
             number = float(value)
         except ValueError:
-            converted = in_unit(value, self.unit)
+            converted = convert_to_unit(value, self.unit)
             example_text = f"{self.example if converted is None else converted:.12g}"
             self.fail(
                 f"{value!r} is not a number{unit}. Give for example {example_text}"

@@ -62,7 +62,7 @@ def sample(output: Path) -> None:
                 "file, or choose another folder (-o)."
             )
     first_log = next(path for path in contents if path.suffix == ".ulg")
-    command = command_line(ComparisonRequest(log=str(first_log)), "compare", typed=True)
+    command = command_line(ComparisonRequest(log=str(first_log)), "compare", for_shell=True)
     page = Page()
     page.add("command", text=command, label="Run")
     write_and_print(contents, page)

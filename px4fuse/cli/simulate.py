@@ -64,7 +64,7 @@ def _scenario_options(command: Command) -> Command:
         default_text = f"{default:g}" + (f"; outdoors {outdoors:g}" if outdoors else "")
         help_text = f"{quantity.meaning}  [default: {default_text}]"
         kind = TypedQuantity(quantity.unit, default)
-        command = click.option(quantity.typed, field, type=kind, help=help_text)(command)
+        command = click.option(quantity.cli_name, field, type=kind, help=help_text)(command)
     return command
 
 
@@ -271,13 +271,13 @@ def _write_assignment(
     drawn_flights: list[tuple[tuple[str, ...], float | None]]
     if preview:
         previews = assignment.preview(students, key_file, secret, kind, count)
-        drawn_flights = [(assigned.typed, assigned.difficulty) for assigned in previews]
+        drawn_flights = [(assigned.mistake_options, assigned.difficulty) for assigned in previews]
         rows = [
             (
                 student.student_id,
                 student.name,
                 assigned.scenario.kind,
-                " ".join(assigned.typed) or "none",
+                " ".join(assigned.mistake_options) or "none",
                 f"{assigned.difficulty:.2f}",
             )
             for student, assigned in zip(students, previews, strict=True)

@@ -69,7 +69,7 @@ def verify(
 
 
 def _verdict_data(pdf: bytes, verdict: Verdict) -> dict[str, object]:
-    from px4fuse.verification.verification import LIMIT
+    from px4fuse.verification.verification import LIMIT_NOTE
 
     values = asdict(verdict)
     for name in ("redrawn", "remedy", "missing"):  # only px4fuse grade uses these fields
@@ -79,7 +79,7 @@ def _verdict_data(pdf: bytes, verdict: Verdict) -> dict[str, object]:
         "report_sha256": hashlib.sha256(pdf).hexdigest(),
         "outcome": verdict.outcome,
         **values,
-        "limit": LIMIT,
+        "limit": LIMIT_NOTE,
     }
 
 
@@ -87,13 +87,13 @@ def _page(name: str, verdict: Verdict, output: Path | None) -> Page:
     from px4fuse.report.page import Page
     from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
     from px4fuse.results.reading import one_line
-    from px4fuse.verification.verification import LIMIT
+    from px4fuse.verification.verification import LIMIT_NOTE
 
     page = Page()
     colours = {"verified": GOOD_COLOUR, "cannot verify": SEVERITY_COLOURS["warning"]}
     colour = colours.get(verdict.outcome, SEVERITY_COLOURS["error"])
     page.write(f"{one_line(name, 200)}: {verdict.outcome}", bold=True, colour=colour)
-    sentences = [one_line(reason, 400) for reason in verdict.reasons if reason != LIMIT]
+    sentences = [one_line(reason, 400) for reason in verdict.reasons if reason != LIMIT_NOTE]
     sentences += [
         f"{difference.path}: report {difference.recorded}, re-computed {difference.recomputed}"
         for difference in verdict.differences
@@ -106,5 +106,5 @@ def _page(name: str, verdict: Verdict, output: Path | None) -> Page:
         page.write(
             "Action: write the report again from the log with -o FILE.pdf, and read that report."
         )
-    page.write(LIMIT, colour=MUTED_COLOUR)
+    page.write(LIMIT_NOTE, colour=MUTED_COLOUR)
     return page

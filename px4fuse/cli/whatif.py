@@ -9,7 +9,7 @@ import click
 
 from px4fuse.cli import options, outputs
 from px4fuse.errors import SettingsError
-from px4fuse.units import NAMES, in_unit
+from px4fuse.units import NAMES, convert_to_unit
 
 if TYPE_CHECKING:
     from px4fuse.request import Sweep
@@ -120,7 +120,7 @@ def _parse_number(option_text: str, name: str, value: str) -> float:
         return float(value)
     except ValueError as error:
         unit = PARAMETERS[name].unit.replace("^2", "²") if name in PARAMETERS else ""
-        converted = in_unit(value, unit)
+        converted = convert_to_unit(value, unit)
         unit_text = f" in {NAMES[unit]}" if unit else ""
         problem = "" if converted is None else f"{unit_text}. Give {converted:g}"
         raise SettingsError(f"{option_text}: {value!r} is not a number{problem}.") from error

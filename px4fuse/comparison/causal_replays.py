@@ -1,11 +1,11 @@
 """Causes of inconsistency, found by re-running a filter with one change at a time.
 
 A discrepancy is a mean NIS outside its band, or errors larger than the reported σ (mean NEES). Each
-candidate change is re-run alone; if none suffices, the best one is combined with each other one. A
-cause is the smallest change that brings the statistic into its band, or else explains at least half
-of its logarithm. A smaller noise is not a cause if the reported σ would then be smaller than the
-errors against ground truth. A fault of a sensor that explains as much as a setting comes first: the
-setting would only hide it.
+candidate change is re-run alone; if none suffices, the best change is combined with each other one.
+The cause is the smallest change that brings the statistic into its band, or else explains at least
+half of the logarithm of the statistic. A smaller noise is not a cause if the reported σ would then
+be smaller than the errors against ground truth. A sensor fault that explains as much as a setting
+is preferred: the setting would only hide the fault.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import difference, error_statistics, kf_error_statistics
 from px4fuse.comparison.estimates import Tuning, first_axis_tuning
 from px4fuse.comparison.model import (
-    AgainstTruth,
     AxisComparison,
     Comparison,
     Difference,
+    ErrorsAgainstTruth,
     FilterName,
     FilterSummary,
-    UnjudgedFilter,
+    UntestedFilter,
 )
 from px4fuse.comparison.projection import project, project_truth
 from px4fuse.comparison.remedy import is_fused_source, ml_delay_change, noise_change
 from px4fuse.ekf2.filter_recursion import Variant
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings, with_misaligned_positions
-from px4fuse.ekf2.replay import HORIZONTAL as LEVEL
+from px4fuse.ekf2.replay import HORIZONTAL as HORIZONTAL_AXES
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Ekf2Replay, inside_spans
 from px4fuse.ekf2_parameters import EV_POS, GNSS_VEL, PARAMETERS
 from px4fuse.filter.consistency import nis_band
@@ -47,10 +47,10 @@ from px4fuse.filter.hypotheses import BiasScaleJumpFit
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import (
     Acceleration,
-    along,
+    cut_to_segment,
     ned_acceleration,
     project_acceleration,
-    within,
+    weighted_sum,
 )
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -59,23 +59,25 @@ from px4fuse.record import Count, NotNegative, Positive, Record, Share
 
 Statistic = Literal["nis", "nees", "difference"]
 Change = Mapping[str, float]
-# Mean NEES from which errors exceed the reported σ (by 2 in σ); below 3 without a fault
+# Mean NEES from which errors count as larger than the reported σ (2 σ); flights without a fault
+# have less than 3
 MIN_NEES_FINDING = 4.0
-# Largest mean NEES after a change to a smaller noise, if the mean NEES was above 1 before
+# Limit of the mean NEES after a change to a smaller noise, if the mean NEES was above 1 before
 MAX_NEES_AFTER_CHANGE = 2.0
 # Mean NIS above which the innovations already show that the σ is too small
-MAX_UNSUSPICIOUS_NIS = 1.5
-# Share of ln(statistic) that a cause explains: at least this, at most 2 minus this
+MAX_UNREMARKABLE_NIS = 1.5
+# Share of ln(statistic) that a cause explains: at least 0.5, at most 1.5 (overshoot)
 MIN_EXPLAINED_SHARE = 0.5
-# Distance from the whole logarithm within which a sensor fault suffices: noises are approximate
-SUFFICIENT_TOLERANCE = 0.25
+# Maximum distance of the explained share from 1 at which a sensor fault alone is the cause; the
+# noises of the re-run are approximate
+SENSOR_CAUSE_TOLERANCE = 0.25
 # Share of ln(statistic) that a change must explain to be combined with the best one
 MIN_HELPFUL_SHARE = 0.1
-CLOCK, TURN, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
-FORWARD, RIGHT = "bias_forward_m_s2", "bias_right_m_s2"
+CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
+FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
 # Changes that correct a sensor; they precede changes of settings
-SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK, TURN, FORWARD))
-# m; smallest SIGMA_Z of a re-run: accuracy of motion capture in flight
+SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
+# m; minimum SIGMA_Z of a re-run: accuracy of motion capture in flight
 SMALLEST_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
 # Kind of a change by its name
@@ -83,16 +85,17 @@ KF_KINDS = {
     SIGMA_A: "noises",
     SIGMA_Z: "noises",
     OUTLIERS: "outliers",
-    CLOCK: "time offset",
-    TURN: "rotation",
-    FORWARD: "bias",
-    RIGHT: "bias",
+    CLOCK_OFFSET: "time offset",
+    ROTATION: "rotation",
+    FORWARD_BIAS: "bias",
+    RIGHT_BIAS: "bias",
 }
-# Parts of a change that do not count as separate changes
-ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT))
+# Parameters that another change requires; they do not count as separate changes
+ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
 SETTING_CHANGES = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
-# SIGMA_A also covers tilt error and bias, so EKF2_ACC_NOISE is raised only above this factor
+# Minimum ratio of SIGMA_A to EKF2_ACC_NOISE for a larger EKF2_ACC_NOISE: SIGMA_A also covers tilt
+# error and bias
 VIBRATION_FACTOR = 3.0
 # Parameters of EKF2 that are re-run with PX4's default if another value was flown
 PARAMETERS_OF_EKF2 = (
@@ -105,8 +108,8 @@ PARAMETERS_OF_EKF2 = (
 )
 # Columns of north and east
 INNOVATION_COLUMNS, INNOVATION_VARIANCE_COLUMNS = UPDATE_COLUMNS[:2], UPDATE_COLUMNS[2:4]
-POSITION_VARIANCES = [f"position_variance_{axis}_m2" for axis in LEVEL]
-OBSERVATION_VARIANCES = [f"observation_variance_{axis}_m2" for axis in LEVEL]
+POSITION_VARIANCES = [f"position_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
+OBSERVATION_VARIANCES = [f"observation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 NO_DIFFERENCE = Unavailable(
     "difference KF - EKF2", "the filters use different frames after the change", ""
 )
@@ -114,7 +117,7 @@ NO_DIFFERENCE = Unavailable(
 MAX_REPLAY_FACTOR = 1.10
 # Further changes that are combined with the best one
 MAX_PAIRS = 4
-# Misalignments within this many σ are not significant
+# σ; smaller misalignments are not significant
 HEADING_SIGMAS = 3.0
 
 
@@ -177,13 +180,12 @@ class Trial(Record, frozen=True, kw_only=True):
 
 
 class Intervention(Record, frozen=True, kw_only=True):
-    """One change, and the statistic before and after it.
+    """Re-run of a filter with a change: a statistic before and after.
 
     Attributes
     ----------
     statistic : {"nis", "nees", "difference"}
-        Statistic: mean NIS, mean NEES of position, or RMS difference KF - EKF2 (m). The last one is
-        computed for causes only.
+        Mean NIS, mean NEES of position, or RMS difference KF - EKF2 (m, for causes only).
     filter : {"kf", "ekf2"}
     axis : str
     change : mapping from name to value
@@ -193,13 +195,13 @@ class Intervention(Record, frozen=True, kw_only=True):
     before, after : float
         Statistic without the change (EKF2: from the log) and with it (from a re-run).
     explained_fraction : float
-        Share of ln(statistic) that the change removes; above 1 it overshoots. For the RMS
+        Share of ln(statistic) that the change removes; above 1 the change overshoots. For the RMS
         difference, the share of the mean square.
     is_sufficient : bool
         True if the mean NIS is in its 95 % band, or the mean NEES below
         :data:`MIN_NEES_FINDING`.
     contradicts_truth : bool
-        True if the reported σ would then be smaller than the errors.
+        True if the reported σ with the change is smaller than the errors against ground truth.
     """
 
     statistic: Statistic
@@ -214,59 +216,59 @@ class Intervention(Record, frozen=True, kw_only=True):
 
     @property
     def is_cause(self) -> bool:
-        """True if it explains at least half of ln(statistic) and does not overshoot by more."""
+        """True if the explained share of ln(statistic) is 0.5 to 1.5."""
         return (
             MIN_EXPLAINED_SHARE <= self.explained_fraction <= 2.0 - MIN_EXPLAINED_SHARE
             and not self.contradicts_truth
         )
 
     @property
-    def of_sensors(self) -> bool:
-        """True if it corrects a sensor, which precedes changes of settings."""
+    def corrects_sensor(self) -> bool:
+        """True if the change corrects a sensor, which precedes changes of settings."""
         return not SENSOR_CHANGES.isdisjoint(self.change)
 
     @property
-    def needs_no_other(self) -> bool:
-        """True if no other cause is needed: in the band, or nearly all by a sensor."""
+    def is_complete_cause(self) -> bool:
+        """True if the statistic is in its band, or a sensor fault explains nearly all of it."""
         return self.is_sufficient or (
-            self.of_sensors and abs(self.explained_fraction - 1.0) <= SUFFICIENT_TOLERANCE
+            self.corrects_sensor and abs(self.explained_fraction - 1.0) <= SENSOR_CAUSE_TOLERANCE
         )
 
 
-def interventions_on(
-    causes: Iterable[Intervention], owner: FilterName, axis: str, statistic: Statistic = "nis"
+def interventions_for(
+    causes: Iterable[Intervention], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> list[Intervention]:
-    """Return the re-runs for one discrepancy."""
+    """Return the re-runs that test causes of one discrepancy."""
     return [
         intervention
         for intervention in causes
         if (intervention.statistic, intervention.filter, intervention.axis)
-        == (statistic, owner, axis)
+        == (statistic, filter_name, axis)
     ]
 
 
-def cause_of(
-    causes: Iterable[Intervention], owner: FilterName, axis: str, statistic: Statistic = "nis"
+def find_cause(
+    causes: Iterable[Intervention], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> Intervention | None:
     """Return the cause of one discrepancy, or None if no re-run explains it."""
     return min(
         (
             intervention
-            for intervention in interventions_on(causes, owner, axis, statistic)
+            for intervention in interventions_for(causes, filter_name, axis, statistic)
             if intervention.is_cause
         ),
         key=lambda intervention: (
-            not intervention.needs_no_other,
+            not intervention.is_complete_cause,
             len(intervention.change.keys() - ACCOMPANYING_CHANGES),
-            not intervention.of_sensors,
+            not intervention.corrects_sensor,
             abs(intervention.explained_fraction - 1.0),
         ),
         default=None,
     )
 
 
-class ErrorBeyondSigma(NamedTuple):
-    """Position RMSE and NEES against ground truth, larger than the reported σ."""
+class ErrorAboveSigma(NamedTuple):
+    """Position error against ground truth larger than the reported σ: mean NEES, RMSE, σ, NIS."""
 
     nees: float
     rmse_m: float
@@ -274,21 +276,21 @@ class ErrorBeyondSigma(NamedTuple):
     nis_mean: float
 
 
-def error_beyond_reported_sigma(
-    statement: FilterSummary | UnjudgedFilter,
-) -> ErrorBeyondSigma | None:
-    """Return the errors if they exceed the reported σ without effect on the innovations."""
-    truth = statement.truth
-    if isinstance(statement, Unavailable) or isinstance(truth, Unavailable):
+def error_above_reported_sigma(
+    summary: FilterSummary | UntestedFilter,
+) -> ErrorAboveSigma | None:
+    """Return the position error if it exceeds the reported σ, but innovations do not show this."""
+    truth = summary.truth
+    if isinstance(summary, Unavailable) or isinstance(truth, Unavailable):
         return None
     nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
-    if nees < MIN_NEES_FINDING or statement.nis_mean >= MAX_UNSUSPICIOUS_NIS:
+    if nees < MIN_NEES_FINDING or summary.nis_mean >= MAX_UNREMARKABLE_NIS:
         return None
-    reported_sigma_m = statement.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
-    return ErrorBeyondSigma(nees, rmse_m, reported_sigma_m, statement.nis_mean)
+    reported_sigma_m = summary.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
+    return ErrorAboveSigma(nees, rmse_m, reported_sigma_m, summary.nis_mean)
 
 
-def interventions(
+def run_interventions(
     comparison: Comparison,
     tuning: Tuning,
     clock: ClockOffset | Unavailable,
@@ -310,20 +312,22 @@ def interventions(
         EKF2 of the same flight.
     """
     estimates = comparison, tuning, clock, heading
-    filters: list[_FilterChanges] = [_KfChanges(*estimates, bias_scale_jump_fit)]
+    filters: list[_FilterRerun] = [_KfRerun(*estimates, bias_scale_jump_fit)]
     if (
         isinstance(model, Model)
         and model.agreement.good
         and is_fused_source(comparison, model.inputs)
     ):
-        filters.append(_Ekf2Changes(*estimates, model.inputs, model))
+        filters.append(_Ekf2Rerun(*estimates, model.inputs, model))
     rows: list[Intervention] = []
-    for changed in filters:
-        for result, statistic in changed.discrepancies():
-            tried_changes = _try_candidates(changed, result, statistic)
+    for filter_changes in filters:
+        for result, statistic in filter_changes.discrepancies():
+            tried_changes = _try_candidates(filter_changes, result, statistic)
             rows += tried_changes
-            if cause := cause_of(tried_changes, changed.owner, result.axis.name, statistic):
-                rows += _difference_reduction(cause, result, changed)
+            if cause := find_cause(
+                tried_changes, filter_changes.filter_name, result.axis.name, statistic
+            ):
+                rows += _difference_reduction(cause, result, filter_changes)
     return tuple(rows), tuple(trial for changed in filters for trial in _try_on_main_axis(changed))
 
 
@@ -334,13 +338,10 @@ def planned_variants(
     heading: HeadingError | Unavailable,
     inputs: Inputs,
 ) -> list[Variant]:
-    """Return the EKF2 variants that :func:`interventions` will need, as far as known.
-
-    Variants that are missing here are replayed on demand.
-    """
+    """Return EKF2 variants that :func:`run_interventions` needs; others are replayed on demand."""
     if not is_fused_source(comparison, inputs):
         return []
-    ekf2_changes, flown = _Ekf2Changes(comparison, tuning, clock, heading, inputs), inputs.settings
+    ekf2_changes, flown = _Ekf2Rerun(comparison, tuning, clock, heading, inputs), inputs.settings
     changes = [
         change
         for discrepancy in ekf2_changes.discrepancies()
@@ -352,11 +353,11 @@ def planned_variants(
 
 
 def _difference_reduction(
-    cause: Intervention, result: AxisComparison, changed: _FilterChanges
+    cause: Intervention, result: AxisComparison, filter_changes: _FilterRerun
 ) -> list[Intervention]:
     """Compute the RMS difference KF - EKF2 (m) with and without a cause."""
     before, after = (
-        changed.outcome(result, change).difference_rms_m for change in ({}, cause.change)
+        filter_changes.outcome(result, change).difference_rms_m for change in ({}, cause.change)
     )
     if not before or not after:
         return []
@@ -373,32 +374,35 @@ def _difference_reduction(
     ]
 
 
-def is_inconsistent(statement: FilterSummary | UnjudgedFilter) -> TypeGuard[FilterSummary]:
+def is_inconsistent(statement: FilterSummary | UntestedFilter) -> TypeGuard[FilterSummary]:
     """Return True if the filter was tested and is not consistent."""
     return not isinstance(statement, Unavailable) and statement.verdict != "consistent"
 
 
-def _find_discrepancies(statement: FilterSummary | UnjudgedFilter) -> list[Statistic]:
+def _find_discrepancies(summary: FilterSummary | UntestedFilter) -> list[Statistic]:
     """Return the statistics of a filter that are outside their limits."""
-    found: list[Statistic] = ["nees"] if error_beyond_reported_sigma(statement) else []
-    return [*found, "nis"] if is_inconsistent(statement) else found
+    statistics: list[Statistic] = ["nees"] if error_above_reported_sigma(summary) else []
+    return [*statistics, "nis"] if is_inconsistent(summary) else statistics
 
 
 def _try_candidates(
-    changed: _FilterChanges, result: AxisComparison, statistic: Statistic
+    filter_changes: _FilterRerun, result: AxisComparison, statistic: Statistic
 ) -> list[Intervention]:
-    """Re-run all candidates alone; if none suffices, combine the best with each other one."""
-    statement, candidates = result.filters[changed.owner], changed.candidates(result, statistic)
-    assert isinstance(statement, FilterSummary)  # else it has no discrepancy
-    truth = statement.truth
+    """Re-run all candidate changes alone; if none suffices, the best with each other one."""
+    summary, candidates = (
+        result.filters[filter_changes.filter_name],
+        filter_changes.candidates(result, statistic),
+    )
+    assert isinstance(summary, FilterSummary)  # else it has no discrepancy
+    truth = summary.truth
     nees = None if isinstance(truth, Unavailable) else truth.nees_position_mean
-    before = statement.nis_mean if nees is None or statistic == "nis" else nees
+    before = summary.nis_mean if nees is None or statistic == "nis" else nees
     is_checked_by_truth = (
         statistic == "nis" and before < 1.0 and not isinstance(result.truth, Unavailable)
     )
 
     def rerun(change: Change) -> list[Intervention]:
-        outcome = changed.outcome(result, change)
+        outcome = filter_changes.outcome(result, change)
         after = outcome.value(statistic)
         if not after:
             return []
@@ -409,7 +413,7 @@ def _try_candidates(
         return [
             Intervention(
                 statistic=statistic,
-                filter=changed.owner,
+                filter=filter_changes.filter_name,
                 axis=result.axis.name,
                 change=change,
                 before=before,
@@ -420,7 +424,7 @@ def _try_candidates(
             )
         ]
 
-    single_changes = [each for change in candidates for each in rerun(change)]
+    single_changes = [intervention for change in candidates for intervention in rerun(change)]
     helpful_changes = sorted(
         (
             intervention
@@ -429,7 +433,7 @@ def _try_candidates(
         ),
         key=lambda intervention: abs(intervention.explained_fraction - 1.0),
     )
-    if not helpful_changes or any(each.is_sufficient for each in helpful_changes):
+    if not helpful_changes or any(intervention.is_sufficient for intervention in helpful_changes):
         return single_changes
     best_change, *other_changes = helpful_changes
     return single_changes + [
@@ -442,12 +446,12 @@ def _try_candidates(
 def _outcome(
     innovation_m: Array,
     variance_m2: Array,
-    errors: AgainstTruth | Unavailable,
+    errors: ErrorsAgainstTruth | Unavailable,
     kf_minus_ekf2: Difference | Unavailable,
     rejected_fraction: float | None = None,
 ) -> Outcome:
     """Collect the statistics of one run; those that cannot be computed are None."""
-    truth = errors if isinstance(errors, AgainstTruth) else None
+    truth = errors if isinstance(errors, ErrorsAgainstTruth) else None
     has_innovations = len(innovation_m) > 0
     return Outcome(
         innovations=len(innovation_m),
@@ -461,9 +465,9 @@ def _outcome(
     )
 
 
-def _try_on_main_axis(changed: _FilterChanges) -> list[Trial]:
+def _try_on_main_axis(changed: _FilterRerun) -> list[Trial]:
     """Run all candidate changes along the main axis, and the best one with each other one."""
-    result, owner = changed.comparison.main, changed.owner
+    result, owner = changed.comparison.main, changed.filter_name
     if not isinstance(result.filters[owner], FilterSummary):
         return []
     candidates = changed.main_axis_candidates(result)
@@ -476,7 +480,9 @@ def _try_on_main_axis(changed: _FilterChanges) -> list[Trial]:
     def run(change: Change) -> Trial:
         return Trial(
             filter=owner,
-            kinds=tuple(
+            kinds=("defaults",)
+            if change == changed.default_change()
+            else tuple(
                 dict.fromkeys(
                     changed.kind_of(name) for name in change if name not in ACCOMPANYING_CHANGES
                 )
@@ -516,7 +522,7 @@ def _agrees(logged: Outcome, replayed: Outcome) -> bool:
 
 
 def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
-    """Return the tuning of an axis: for horizontal axes the common one if available."""
+    """Return the tuning of an axis; for a horizontal axis that of both axes if available."""
     return first_axis_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
@@ -526,34 +532,34 @@ def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
 
 
 @dataclass(frozen=True)
-class _FilterChanges:
-    """Candidate changes of one filter, and its statistics after a change."""
+class _FilterRerun:
+    """Candidate changes of one filter, and statistics of re-runs with a change."""
 
     comparison: Comparison
     tuning: Tuning
     clock: ClockOffset | Unavailable
     heading: HeadingError | Unavailable
 
-    owner: ClassVar[FilterName]
+    filter_name: ClassVar[FilterName]
 
     def discrepancies(self) -> list[tuple[AxisComparison, Statistic]]:
-        """Return the discrepancies with their axes; for EKF2 along horizontal axes only."""
+        """Return axis and statistic of each discrepancy; for EKF2 of horizontal axes only."""
         return [
             (result, statistic)
             for result in self.comparison.axes.values()
-            if self.owner == "kf" or result.axis.name != "down"
-            for statistic in _find_discrepancies(result.filters[self.owner])
+            if self.filter_name == "kf" or result.axis.name != "down"
+            for statistic in _find_discrepancies(result.filters[self.filter_name])
         ]
 
     @abstractmethod
     def noise_candidates(
-        self, statement: FilterSummary, tuned: AxisTuning, over: bool
+        self, summary: FilterSummary, tuned: AxisTuning, is_underconfident: bool
     ) -> list[Change]:
         """Return maximum-likelihood noises whose interval excludes the value in use."""
 
     @abstractmethod
     def other_candidates(self, tuned: AxisTuning | None) -> list[Change]:
-        """Return further candidates; ``tuned`` is None if the reported σ is too large."""
+        """Return further candidates; pass ``tuned`` None if the reported σ is too large."""
 
     @abstractmethod
     def outcome(self, result: AxisComparison, change: Change) -> Outcome:
@@ -567,6 +573,10 @@ class _FilterChanges:
     def replay_start_s(self) -> float | None:
         """Time (s) from which a re-run is evaluated; None for the whole segment."""
         return None
+
+    def default_change(self) -> Change:
+        """Return the change to the default settings; empty if there is none."""
+        return {}
 
     def flown_outcome(self, result: AxisComparison) -> Outcome | None:
         """Return the statistics as flown, of the same samples as a re-run.
@@ -586,42 +596,47 @@ class _FilterChanges:
 
     def candidates(self, result: AxisComparison, statistic: Statistic) -> list[Change]:
         """Return the candidate changes for a discrepancy along an axis."""
-        statement, origin = result.filters[self.owner], self.comparison.source.origin
-        assert isinstance(statement, FilterSummary)  # else it has no discrepancy
-        is_underconfident = statistic == "nis" and statement.nis_mean < 1.0
+        summary, origin = result.filters[self.filter_name], self.comparison.source.origin
+        assert isinstance(summary, FilterSummary)  # else it has no discrepancy
+        is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
         tuned = tuning_of_axis(self.tuning, result.axis.name)
         changes = list[Change]()
-        # innovations against GNSS or a drifting source do not show its slow errors
-        hides_noise = origin.may_drift or origin.is_gnss
-        if tuned is not None and not (is_underconfident and hides_noise):
-            changes += self.noise_candidates(statement, tuned, is_underconfident)
+        # innovations do not show the slow errors of GNSS or of a drifting source, so they do not
+        # justify a smaller noise
+        hides_slow_errors = origin.may_drift or origin.is_gnss
+        if tuned is not None and not (is_underconfident and hides_slow_errors):
+            changes += self.noise_candidates(summary, tuned, is_underconfident)
         if tuned is not None and not is_underconfident and len(tuned.outlier_time_s):
             changes.append({OUTLIERS: float(len(tuned.outlier_time_s))})
         changes += self.time_offset_candidates()
         if result.axis.name == "down":
             return changes
-        if isinstance(turn := self.heading, HeadingError):
-            is_significant = abs(turn.misalignment_deg) > HEADING_SIGMAS * turn.sigma_deg
-            changes += [{TURN: -round(turn.misalignment_deg, 1)}] if is_significant else []
+        if isinstance(heading := self.heading, HeadingError):
+            is_significant = abs(heading.misalignment_deg) > HEADING_SIGMAS * heading.sigma_deg
+            changes += [{ROTATION: -round(heading.misalignment_deg, 1)}] if is_significant else []
         return changes + self.other_candidates(None if is_underconfident else tuned)
 
     def time_offset_candidates(self) -> list[Change]:
-        """Return the time offset if the part that the filter does not apply is significant."""
+        """Return the time offset if the part that the filter does not yet apply is significant."""
         if isinstance(self.clock, Unavailable) or not self.clock.is_determinable:
             return []
         applied_s = self.comparison.settings.clock_offset_s
         offset_s = applied_s + self.clock.remaining_s
-        missing_s = offset_s - (applied_s if self.owner == "kf" else 0.0)
-        return [{CLOCK: round(offset_s, 3)}] if abs(missing_s) > self.clock.three_sigma_s else []
+        unapplied_s = offset_s - (applied_s if self.filter_name == "kf" else 0.0)
+        return (
+            [{CLOCK_OFFSET: round(offset_s, 3)}]
+            if abs(unapplied_s) > self.clock.three_sigma_s
+            else []
+        )
 
 
 @dataclass(frozen=True)
-class _KfChanges(_FilterChanges):
-    """KF with changes."""
+class _KfRerun(_FilterRerun):
+    """Re-runs of KF."""
 
     bias_scale_jump_fit: BiasScaleJumpFit | Unavailable
 
-    owner = "kf"
+    filter_name = "kf"
 
     def kind_of(self, name: str) -> str:
         """Return the kind of a change of KF."""
@@ -633,30 +648,34 @@ class _KfChanges(_FilterChanges):
         noises = [change for change in changes if change.keys() <= SETTING_CHANGES]
         if len(noises) > 1:
             changes.append({name: value for change in noises for name, value in change.items()})
+        defaults = self.default_change()
+        return [*changes, *([defaults] if defaults and noises else [])]
+
+    def default_change(self) -> Change:
+        """Return the default of each noise that was set; SIGMA_Z of GNSS is that of EKF2."""
         chosen, default = self.comparison.settings, Settings()
         names = (SIGMA_A,) if self.comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
-        defaults = {
+        return {
             name: getattr(default, name)
             for name in names
             if getattr(chosen, name) != getattr(default, name)
         }
-        return [*changes, *([defaults] if defaults and noises else [])]
 
     def noise_candidates(
-        self, statement: FilterSummary, tuned: AxisTuning, over: bool
+        self, summary: FilterSummary, tuned: AxisTuning, is_underconfident: bool
     ) -> list[Change]:
         """Return SIGMA_A and SIGMA_Z whose interval excludes the value in use."""
         changes = list[Change]()
         for name, noise in ((SIGMA_A, tuned.sigma_a_two_state), (SIGMA_Z, tuned.sigma_z)):
             chosen_sigma = getattr(self.comparison.settings, name)
-            ml_sigma = noise.value or (noise.high if over else None) or 0.0
-            bound = noise.high if over else noise.low
+            ml_sigma = noise.value or (noise.high if is_underconfident else None) or 0.0
+            bound = noise.high if is_underconfident else noise.low
             if noise.value is None and name == SIGMA_Z:
                 ml_sigma = max(ml_sigma, SMALLEST_SIGMA_Z_M)
             if (
                 ml_sigma
                 and bound is not None
-                and (chosen_sigma > bound if over else chosen_sigma < bound)
+                and (chosen_sigma > bound if is_underconfident else chosen_sigma < bound)
             ):
                 changes.append({name: float(f"{ml_sigma:.3g}")})
         return changes
@@ -669,7 +688,7 @@ class _KfChanges(_FilterChanges):
         ):
             return []
         forward, right = self.bias_scale_jump_fit.forward_bias, self.bias_scale_jump_fit.right_bias
-        return [{FORWARD: round(forward.value, 3), RIGHT: round(right.value, 3)}]
+        return [{FORWARD_BIAS: round(forward.value, 3), RIGHT_BIAS: round(right.value, 3)}]
 
     def _acceleration_without_bias(
         self, change: Change, direction: Array
@@ -678,7 +697,7 @@ class _KfChanges(_FilterChanges):
         flight, imu = self.comparison.flight, self.comparison.flight.imu
         if isinstance(imu, Unavailable):
             return imu
-        bias = pd.Series([change[FORWARD], change[RIGHT], 0.0], Columns.SPECIFIC_FORCE)
+        bias = pd.Series([change[FORWARD_BIAS], change[RIGHT_BIAS], 0.0], Columns.SPECIFIC_FORCE)
         flight = replace(flight, imu=imu.assign(**(imu[Columns.SPECIFIC_FORCE] - bias)))
         corrected_ned = ned_acceleration(flight)
         if isinstance(corrected_ned, Unavailable):
@@ -692,17 +711,19 @@ class _KfChanges(_FilterChanges):
             name: change[name] for name in change if name in vars(Settings())
         }
         settings = replace(self.comparison.settings, **kf_settings)
-        truth, is_gnss_rotation = result.truth, TURN in change and source.origin.is_gnss
-        if TURN in change:
-            rotated_direction = _rotate_direction(axis.direction, change[TURN])
-            measured_m = along(within(source.samples, segment), Columns.POSITION, rotated_direction)
+        truth, is_gnss_rotation = result.truth, ROTATION in change and source.origin.is_gnss
+        if ROTATION in change:
+            rotated_direction = _rotate_direction(axis.direction, change[ROTATION])
+            measured_m = weighted_sum(
+                cut_to_segment(source.samples, segment), Columns.POSITION, rotated_direction
+            )
             axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
             if (
                 is_gnss_rotation
             ):  # GNSS and ground truth refer to true north; the attitude is misaligned
                 rotated_axis = replace(axis, direction=rotated_direction)
                 truth = project_truth(self.comparison.flight.truth, rotated_axis, segment)
-        if FORWARD in change:
+        if FORWARD_BIAS in change:
             axis = replace(
                 axis, acceleration=self._acceleration_without_bias(change, axis.direction)
             )
@@ -728,17 +749,14 @@ class _KfChanges(_FilterChanges):
 
 
 @dataclass(frozen=True)
-class _Ekf2Changes(_FilterChanges):
-    """EKF2 with changes, if it fused the analysed source.
-
-    Without ``model`` only the candidates are available.
-    """
+class _Ekf2Rerun(_FilterRerun):
+    """Re-runs of EKF2, if EKF2 fused the analysed source; without ``model`` candidates only."""
 
     inputs: Inputs
     model: Model | None = None
     replays: dict[tuple[tuple[str, float], ...], Ekf2Replay] = field(default_factory=dict)
 
-    owner = "ekf2"
+    filter_name = "ekf2"
 
     def kind_of(self, name: str) -> str:
         """Return the kind of a change of EKF2."""
@@ -778,15 +796,15 @@ class _Ekf2Changes(_FilterChanges):
         return [*changes, *(offset for offset in offsets if offset not in changes)]
 
     @property
-    def used_m(self) -> float:
-        """Median √R (m) as flown."""
+    def flown_noise_m(self) -> float:
+        """Median √R (m) of EKF2 as flown."""
         aid, flown = self.inputs.aid, self.inputs.settings
-        takes_stated = not aid.noise_mode or flown[aid.noise_mode] != 1.0
-        stated = self.inputs.received.variance_m2[:, :2] * takes_stated
-        return float(np.sqrt(np.median(np.maximum(stated, flown[aid.noise] ** 2))))
+        uses_reported = not aid.noise_mode or flown[aid.noise_mode] != 1.0
+        reported_m2 = self.inputs.received.variance_m2[:, :2] * uses_reported
+        return float(np.sqrt(np.median(np.maximum(reported_m2, flown[aid.noise] ** 2))))
 
     def time_offset_candidates(self) -> list[Change]:
-        """Return a change of EKF2's delay, or else a shift of the timestamps."""
+        """Return a change of EKF2's delay parameter, else a shift of the timestamps."""
         delay = ml_delay_change(self.comparison, self.inputs, self.clock)
         return [delay] if delay else super().time_offset_candidates()
 
@@ -820,19 +838,19 @@ class _Ekf2Changes(_FilterChanges):
         return {ACC_NOISE: float(f"{ml_noise:.2g}")} if ml_noise > flown else {}
 
     def noise_candidates(
-        self, statement: FilterSummary, tuned: AxisTuning, over: bool
+        self, summary: FilterSummary, tuned: AxisTuning, is_underconfident: bool
     ) -> list[Change]:
         """Return the source's measurement noise if its interval excludes EKF2's value."""
         noise = tuned.sigma_z
-        if (noise.low or 0.0) <= self.used_m <= (noise.high or np.inf):
+        if (noise.low or 0.0) <= self.flown_noise_m <= (noise.high or np.inf):
             return []
         ml_noise_m = noise.value
-        if ml_noise_m is None:  # EKF2's innovations give an upper bound
-            ml_noise_m = float(np.hypot(statement.innovation_std_m, statement.innovation_mean_m))
-        return [noise_change(self.inputs.aid, self.inputs.settings, self.used_m, ml_noise_m)]
+        if ml_noise_m is None:  # the RMS of EKF2's innovations is an upper bound of the noise
+            ml_noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
+        return [noise_change(self.inputs.aid, self.inputs.settings, self.flown_noise_m, ml_noise_m)]
 
     def outcome(self, result: AxisComparison, change: Change) -> Outcome:
-        """Replay EKF2 with the change; the difference without a change is from the log."""
+        """Replay EKF2 with the change; without a change the difference is that of the log."""
         assert self.model is not None
         compared_s, axis, segment = (
             self.model.flown.evaluated_s,
@@ -840,15 +858,15 @@ class _Ekf2Changes(_FilterChanges):
             self.comparison.segment,
         )
         ekf2_replay = self._replay_with(self.model, change)
-        if TURN in change and self.comparison.source.origin.is_gnss:
-            # the change corrects the attitude: only its frame rotates, north stays
-            axis = replace(axis, direction=_rotate_direction(axis.direction, -change[TURN]))
+        if ROTATION in change and self.comparison.source.origin.is_gnss:
+            # the change corrects the attitude, so the axis keeps its direction relative to north
+            axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))
         weights = axis.direction[:2]
         updates = ekf2_replay.updates
         updates = updates[inside_spans(updates.index, compared_s)]
-        innovation_variance_m2 = along(updates, INNOVATION_VARIANCE_COLUMNS, weights**2)
-        prior_m2 = innovation_variance_m2 - along(updates, OBSERVATION_VARIANCES, weights**2)
-        posterior_m2 = along(updates, POSITION_VARIANCES, weights**2)
+        innovation_variance_m2 = weighted_sum(updates, INNOVATION_VARIANCE_COLUMNS, weights**2)
+        prior_m2 = innovation_variance_m2 - weighted_sum(updates, OBSERVATION_VARIANCES, weights**2)
+        posterior_m2 = weighted_sum(updates, POSITION_VARIANCES, weights**2)
         variance = pd.DataFrame(
             {
                 "position_variance_m2": 0.5 * (prior_m2 + posterior_m2),
@@ -864,7 +882,7 @@ class _Ekf2Changes(_FilterChanges):
         else:
             compared = published
         return _outcome(
-            along(updates, INNOVATION_COLUMNS, weights),
+            weighted_sum(updates, INNOVATION_COLUMNS, weights),
             innovation_variance_m2,
             error_statistics(published, variance, result.truth),
             difference(result.replay, compared),
@@ -878,14 +896,18 @@ class _Ekf2Changes(_FilterChanges):
         key = tuple(sorted(change.items()))
         if key not in self.replays:
             settings = {name: value for name, value in change.items() if name in PARAMETERS}
-            model = with_misaligned_positions(model, change.get(TURN, 0.0), change.get(CLOCK, 0.0))
+            model = with_misaligned_positions(
+                model, change.get(ROTATION, 0.0), change.get(CLOCK_OFFSET, 0.0)
+            )
             excluded_s, tuned = None, tuning_of_axis(self.tuning, HORIZONTAL)
             if OUTLIERS in change and tuned is not None:
                 delay_s = 1e-3 * self.inputs.settings[self.inputs.aid.delay]
                 is_gnss_source = self.comparison.source.origin.fused_as_gnss
                 excluded_s = tuned.outlier_time_s - self.comparison.settings.clock_offset_s
                 excluded_s = (
-                    excluded_s + (delay_s if is_gnss_source else 0.0) + change.get(CLOCK, 0.0)
+                    excluded_s
+                    + (delay_s if is_gnss_source else 0.0)
+                    + change.get(CLOCK_OFFSET, 0.0)
                 )
             (self.replays[key],) = replay_settings(model, [settings], excluded_s)
         return self.replays[key]

@@ -11,13 +11,13 @@ from msgspec import structs
 from px4fuse.arrays import Array
 from px4fuse.comparison import projection
 from px4fuse.comparison.model import (
-    AgainstTruth,
     AxisComparison,
     Comparison,
     Difference,
+    ErrorsAgainstTruth,
     FilterName,
     FilterSummary,
-    UnjudgedFilter,
+    UntestedFilter,
     Updates,
 )
 from px4fuse.comparison.preparation import Choices, prepare
@@ -26,8 +26,8 @@ from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import RECORD_NOT_LOGGED, Ekf2, Flight, Unavailable, sample_rate
 
-STATE = ("position_m", "velocity_m_s")
-VARIANCES = ("position_variance_m2", "velocity_variance_m2_s2")
+STATE_COLUMNS = ("position_m", "velocity_m_s")
+VARIANCE_COLUMNS = ("position_variance_m2", "velocity_variance_m2_s2")
 Frame = pd.DataFrame | Unavailable
 
 
@@ -59,10 +59,11 @@ def compare_prepared(
     """Run KF on a prepared comparison; fill in its axes and its horizontal NIS."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
-        state, statement = projection.continuous_state(ekf2, prepared.source, prepared.segment)
-        notes += [f"EKF2 {statement}"] if statement else []
+        state, note = projection.continuous_state(ekf2, prepared.source, prepared.segment)
+        notes += [f"EKF2 {note}"] if note else []
         notes += ekf2.notes
-        # after a removed reset, logged positions at the fusion horizon are in another frame
+        # after the removal of a reset, positions at the fusion horizon are in another frame than
+        # the published state
         is_unchanged = state.equals(ekf2.state)
         ekf2 = (
             ekf2 if is_unchanged else replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
@@ -72,11 +73,11 @@ def compare_prepared(
         line.name: _compare_axis(prepared, ekf2, replay(line, prepared.settings))
         for line in prepared.lines
     }
-    by_filter: dict[FilterName, HorizontalNis | None] = {
+    nis_by_filter: dict[FilterName, HorizontalNis | None] = {
         "kf": _horizontal_nis({name: axis.replay.updates for name, axis in axes.items()}),
         "ekf2": _horizontal_nis({name: axis.ekf2_innovations for name, axis in axes.items()}),
     }
-    horizontal = {name: nis for name, nis in by_filter.items() if nis is not None}
+    horizontal = {name: nis for name, nis in nis_by_filter.items() if nis is not None}
     return replace(prepared, notes=tuple(notes), axes=axes, horizontal=horizontal)
 
 
@@ -132,8 +133,8 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
 
 
 def _summarise_filter(
-    innovations: Frame, variance: Frame, truth: AgainstTruth | Unavailable, gate: float
-) -> FilterSummary | UnjudgedFilter:
+    innovations: Frame, variance: Frame, truth: ErrorsAgainstTruth | Unavailable, gate: float
+) -> FilterSummary | UntestedFilter:
     """Summarise a filter from its innovations, its variances and its errors."""
     sigmas: dict[str, Any] = {
         name: float(np.sqrt(values.median())) if len(values) else None
@@ -150,7 +151,7 @@ def _summarise_filter(
         if not isinstance(consistency, Unavailable):
             return FilterSummary(**structs.asdict(consistency), **sigmas, truth=truth)
         innovations = consistency
-    return UnjudgedFilter(**structs.asdict(innovations), **sigmas, truth=truth)
+    return UntestedFilter(**structs.asdict(innovations), **sigmas, truth=truth)
 
 
 def _known_values(frame: Frame, column: str) -> pd.Series:
@@ -158,10 +159,11 @@ def _known_values(frame: Frame, column: str) -> pd.Series:
     return pd.Series(dtype=float) if isinstance(frame, Unavailable) else frame[column].dropna()
 
 
-def difference(run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailable:
+def difference(kf_run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailable:
     """Compute KF - EKF2 along one axis at EKF2's sample times."""
     kf_minus_ekf2 = (
-        np.array(state_at(run, ekf2_state.index.to_numpy())) - ekf2_state[[*STATE]].to_numpy().T
+        np.array(state_at(kf_run, ekf2_state.index.to_numpy()))
+        - ekf2_state[[*STATE_COLUMNS]].to_numpy().T
     )
     position, velocity = kf_minus_ekf2[:, np.isfinite(kf_minus_ekf2).all(axis=0)]
     if len(position) < projection.MIN_COMMON_SAMPLES:
@@ -186,22 +188,26 @@ def _rmse(error: Array) -> float:
     return float(np.sqrt(np.nanmean(error**2)))
 
 
-def kf_error_statistics(run: Replay, truth: Frame, ekf2_state: Frame) -> AgainstTruth | Unavailable:
+def kf_error_statistics(
+    kf_run: Replay, truth: Frame, ekf2_state: Frame
+) -> ErrorsAgainstTruth | Unavailable:
     """Compute KF's errors against ground truth at EKF2's sample times, else at KF's steps."""
-    times = (run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state).index.to_numpy()
-    return error_statistics(*kf_state_and_variance(run, times), truth)
+    times = (kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state).index.to_numpy()
+    return error_statistics(*kf_state_and_variance(kf_run, times), truth)
 
 
-def kf_state_and_variance(run: Replay, times: Array) -> tuple[pd.DataFrame, pd.DataFrame]:
+def kf_state_and_variance(kf_run: Replay, times: Array) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return state and variances of KF at other times (s)."""
     state, variance = (
-        pd.DataFrame(dict(zip(columns, state_function(run, times), strict=True)), index=times)
-        for columns, state_function in ((STATE, state_at), (VARIANCES, variance_at))
+        pd.DataFrame(dict(zip(columns, state_function(kf_run, times), strict=True)), index=times)
+        for columns, state_function in ((STATE_COLUMNS, state_at), (VARIANCE_COLUMNS, variance_at))
     )
     return state, variance
 
 
-def error_statistics(state: Frame, variance: Frame, truth: Frame) -> AgainstTruth | Unavailable:
+def error_statistics(
+    state: Frame, variance: Frame, truth: Frame
+) -> ErrorsAgainstTruth | Unavailable:
     """Compute errors of a filter against ground truth along one axis, and its mean NEES.
 
     All numbers are of the times of ``state``. Variances are interpolated to them, because EKF2's
@@ -211,16 +217,16 @@ def error_statistics(state: Frame, variance: Frame, truth: Frame) -> AgainstTrut
         return state
     if isinstance(truth, Unavailable):
         return truth
-    position_m, velocity_m_s = (_errors(state, truth, column) for column in STATE)
+    position_m, velocity_m_s = (_errors(state, truth, column) for column in STATE_COLUMNS)
     if np.isfinite(position_m).sum() < projection.MIN_COMMON_SAMPLES:
         return Unavailable(
             "error against ground truth", "no common samples", "Choose a segment with ground truth."
         )
     nees_position, nees_velocity = (
         _mean_nees(normalise_errors(state.index.to_numpy(), error, variance, column))
-        for error, column in zip((position_m, velocity_m_s), VARIANCES, strict=True)
+        for error, column in zip((position_m, velocity_m_s), VARIANCE_COLUMNS, strict=True)
     )
-    return AgainstTruth(
+    return ErrorsAgainstTruth(
         count=int(np.isfinite(position_m).sum()),
         position_rmse_m=_rmse(position_m),
         velocity_rmse_m_s=_rmse(velocity_m_s) if np.isfinite(velocity_m_s).any() else None,
@@ -272,7 +278,7 @@ def normalised_position_errors(
         state, variance = result.ekf2_state, result.ekf2_variance
     time_s = state.index.to_numpy()
     normalised = normalise_errors(
-        time_s, _errors(state, result.truth, STATE[0]), variance, VARIANCES[0]
+        time_s, _errors(state, result.truth, STATE_COLUMNS[0]), variance, VARIANCE_COLUMNS[0]
     )
     is_known = np.isfinite(normalised)
     if not is_known.any():
@@ -293,6 +299,6 @@ def _horizontal_nis(frames: Mapping[str, Frame]) -> HorizontalNis | None:
     ]
     if len(frames_of_axes) < 2:
         return None
-    # only updates with the same timestamp on both axes
+    # horizontal NIS needs both components of an update, which have the same timestamp
     joint = pd.concat(frames_of_axes, axis=1, join="inner").to_numpy().T
     return assess_horizontal((joint[0], joint[1]), (joint[2], joint[3]))

@@ -1,7 +1,8 @@
 """Explanation of the difference KF - EKF2 along each horizontal axis, step by step.
 
-The steps are those of :mod:`px4fuse.ekf2.steps`, from KF as set to the logged EKF2. For the largest
-steps, sentences state both filters' behaviour, the share and the time of the largest effect.
+The steps of :mod:`px4fuse.ekf2.steps` lead from KF with the chosen settings to the logged EKF2. For
+the largest steps, sentences state the behaviour of KF and EKF2, the share of the difference, and
+the time of the largest effect.
 """
 
 from dataclasses import replace
@@ -12,7 +13,7 @@ from msgspec import structs
 
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.remedy import noise_used_m
-from px4fuse.ekf2 import steps as ways
+from px4fuse.ekf2 import steps
 from px4fuse.ekf2.filter_recursion import Variant
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model
@@ -27,8 +28,9 @@ from px4fuse.flight import Unavailable
 EQUAL_RMSE_TOLERANCE = 0.05
 # Share of the mean square below which a text omits the second step
 MIN_NOTABLE_SHARE = 0.05
-# m, and factor on the largest replayed difference: a larger difference elsewhere is reported
-MIN_ELSEWHERE_M, MIN_ELSEWHERE_RATIO = 0.5, 3.0
+# Minimum difference outside the replayed parts that is reported: m, and factor on the largest
+# replayed difference
+MIN_UNREPLAYED_M, MIN_UNREPLAYED_RATIO = 0.5, 3.0
 
 
 def explain_ekf2_difference(
@@ -54,13 +56,13 @@ def explain_ekf2_difference(
         reason = "the EKF2 replay covers horizontal positions only"
         return {
             "down": Unavailable(
-                ways.ANALYSIS_NAME, reason, "Analyse a horizontal axis too (--axis)."
+                steps.ANALYSIS_NAME, reason, "Analyse a horizontal axis too (--axis)."
             )
         }
     if isinstance(model, Unavailable):
-        return {name: structs.replace(model, what=ways.ANALYSIS_NAME) for name in results}
+        return {name: structs.replace(model, what=steps.ANALYSIS_NAME) for name in results}
     settings = _settings(comparison, model.inputs)
-    explanations = ways.explain_by_steps(
+    explanations = steps.explain_by_steps(
         model, settings, {name: axis.replay for name, axis in results.items()}
     )
     if isinstance(explanations, Unavailable):
@@ -68,22 +70,26 @@ def explain_ekf2_difference(
     reasons = _step_reasons(comparison, model, clock)
     sentences_by_axis: dict[str, DifferenceExplanation | Unavailable] = {}
     for name, explanation in explanations.items():
-        outside = structs.replace(
+        with_unreplayed_part = structs.replace(
             explanation, outside=_unreplayed_part(results[name], explanation.spans_s)
         )
-        sentences_by_axis[name] = add_sentences(outside, comparison.axes[name].axis.called, reasons)
+        sentences_by_axis[name] = add_sentences(
+            with_unreplayed_part, comparison.axes[name].axis.label, reasons
+        )
     return sentences_by_axis
 
 
 def explanation_variants(comparison: Comparison, inputs: Inputs) -> list[Variant]:
     """Return the EKF2 variants that :func:`explain_ekf2_difference` needs."""
-    return list(ways.step_variants(inputs, _settings(comparison, inputs)).values())
+    return list(steps.step_variants(inputs, _settings(comparison, inputs)).values())
 
 
 def _settings(comparison: Comparison, inputs: Inputs) -> Settings:
     """Return KF's settings; without time offset if EKF2 fused another source."""
-    same = comparison.source.name == inputs.received.source
-    return comparison.settings if same else replace(comparison.settings, clock_offset_s=0.0)
+    is_same_source = comparison.source.name == inputs.received.source
+    return (
+        comparison.settings if is_same_source else replace(comparison.settings, clock_offset_s=0.0)
+    )
 
 
 def _unreplayed_part(result: AxisComparison, spans: Spans) -> UnreplayedPart | None:
@@ -109,9 +115,9 @@ def add_sentences(
     axis_label : str
         Name of the axis in a sentence.
     reasons : dict
-        Behaviour of EKF2 and KF, by step.
+        Texts on the behaviour of EKF2 and KF, by step.
     """
-    reasons = {**reasons, ways.GATE: f"{reasons[ways.GATE]}{_rejection_text(explanation)}"}
+    reasons = {**reasons, steps.GATE: f"{reasons[steps.GATE]}{_rejection_text(explanation)}"}
     first, second, *_ = sorted(explanation.steps, key=lambda step: -step.position_mean_square_m2)
     cause = (
         f"Largest contribution to the difference KF - EKF2 along {axis_label}: {first.name} "
@@ -125,10 +131,10 @@ def add_sentences(
             f"{_moment_text(second)}"
         )
     sentences += [_velocity_sentence(explanation), *_truth_sentences(explanation)]
-    far_m = max(
-        MIN_ELSEWHERE_M, MIN_ELSEWHERE_RATIO * float(np.max(np.abs(explanation.kf_minus_ekf2_m)))
+    min_reported_m = max(
+        MIN_UNREPLAYED_M, MIN_UNREPLAYED_RATIO * float(np.max(np.abs(explanation.kf_minus_ekf2_m)))
     )
-    if explanation.outside is not None and explanation.outside.maximum_m > far_m:
+    if explanation.outside is not None and explanation.outside.maximum_m > min_reported_m:
         sentences.append(
             "Outside the replayed parts (EKF2 starting or not fusing the source) KF and "
             f"EKF2 differ by up to {explanation.outside.maximum_m:.1f} m (at "
@@ -139,7 +145,7 @@ def add_sentences(
 
 def _format_share(step: Step, explanation: DifferenceExplanation) -> str:
     share = step.position_mean_square_m2 / explanation.position_mean_square_m2
-    if share > 1.0:  # the shares add up to 100 %, and some are negative
+    if share > 1.0:  # shares of other steps are negative, because all shares add up to 100 %
         return "more than the whole mean square; other steps reduce it"
     return f"{100 * share:.0f} % of the mean square"
 
@@ -150,13 +156,15 @@ def _moment_text(step: Step) -> str:
 
 def _rejection_text(explanation: DifferenceExplanation) -> str:
     """Format the longest run of rejected samples as a sentence; empty without one."""
-    run = explanation.longest_rejection
-    if run is None:
+    rejection_run = explanation.longest_rejection
+    if rejection_run is None:
         return ""
-    samples = f"{run.samples} samples in a row" if run.samples > 1 else "a sample"
+    samples = (
+        f"{rejection_run.samples} samples in a row" if rejection_run.samples > 1 else "a sample"
+    )
     return (
-        f". At {run.start_s:.0f} s EKF2 rejected {samples} and drifted "
-        f"{run.distance_m:.2g} m in {run.duration_s:.1f} s"
+        f". At {rejection_run.start_s:.0f} s EKF2 rejected {samples} and drifted "
+        f"{rejection_run.distance_m:.2g} m in {rejection_run.duration_s:.1f} s"
     )
 
 
@@ -166,56 +174,56 @@ def _step_reasons(
     """Format the behaviour of KF and EKF2 at each step."""
     settings, inputs, source = comparison.settings, model.inputs, comparison.source
     flown, aid = inputs.settings, inputs.aid
-    samples = (
-        f"KF predicts every {settings.dt_s:g} s and starts on its own; EKF2 predicts every "
+    samples_text = (
+        f"KF predicts every {settings.dt_s:g} s from its first position; EKF2 predicts every "
         f"{1e3 * inputs.step_s:.0f} ms"
     )
     if settings.input == "zero":
-        samples = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
+        samples_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
     elif source.name != inputs.received.source:
-        samples = f"KF uses {source.name}; EKF2 uses {inputs.received.source}"
+        samples_text = f"KF uses {source.name}; EKF2 uses {inputs.received.source}"
     age_ms = 1e3 * (source.age_s - settings.clock_offset_s)
-    delay = (
+    delay_text = (
         f"EKF2 assumes positions are {flown[aid.delay]:g} ms old ({aid.delay}), KF {age_ms:.0f} ms"
     )
     if isinstance(clock, ClockOffset) and clock.is_determinable:
         ends_s = (clock.offset_s, *clock.interval_s[::-1])
         ml_delay_ms, low, high = (1e3 * (source.age_s - at) for at in ends_s)
-        delay += (
+        delay_text += (
             f". The maximum-likelihood estimate is {ml_delay_ms:.0f} ms "
             f"(95 % {low:.0f} to {high:.0f} ms)"
         )
     equivalent_sigma_a = flown["EKF2_ACC_NOISE"] * np.sqrt(inputs.step_s / settings.dt_s)
-    imu, positions = (
+    imu_weight, position_weight = (
         ("more", "less") if equivalent_sigma_a < settings.sigma_a_m_s2 else ("less", "more")
     )
     return {
-        ways.SAMPLES: samples,
-        ways.STAMPS: delay,
-        ways.NOISE: (
+        steps.SAMPLES: samples_text,
+        steps.STAMPS: delay_text,
+        steps.NOISE: (
             f"EKF2 uses a measurement noise of {noise_used_m(model):.2g} m ({aid.noise}), "
             f"KF {settings.sigma_z_m:.2g} m"
         ),
-        ways.BIASES: "EKF2 estimates the accelerometer bias; KF does not",
-        ways.PROCESS: (
+        steps.BIASES: "EKF2 estimates the accelerometer bias; KF does not",
+        steps.PROCESS: (
             f"EKF2_ACC_NOISE {flown['EKF2_ACC_NOISE']:g} corresponds to SIGMA_A "
             f"{equivalent_sigma_a:.2g} m/s²; KF uses {settings.sigma_a_m_s2:.2g} m/s². "
-            f"EKF2 weights the IMU {imu} and the positions {positions}"
+            f"EKF2 weights the IMU {imu_weight} and the positions {position_weight}"
         ),
-        ways.ATTITUDE: (
+        steps.ATTITUDE: (
             "EKF2 corrects its attitude with the positions; KF uses the logged attitude"
         ),
-        ways.FIELD_STEP: (
+        steps.FIELD_STEP: (
             "EKF2 estimates heading with the magnetometer; KF uses EKF2's published heading"
         ),
-        ways.VELOCITY_STEP: "EKF2 also fuses GNSS velocity; KF only GNSS position",
-        ways.FLOW_STEP: "EKF2 also fuses optical flow; KF only positions",
-        ways.VISION_STEP: "EKF2 fuses external vision and GNSS; KF only one of them",
-        ways.GATE: (
+        steps.VELOCITY_STEP: "EKF2 also fuses GNSS velocity; KF only GNSS position",
+        steps.FLOW_STEP: "EKF2 also fuses optical flow; KF only positions",
+        steps.VISION_STEP: "EKF2 fuses external vision and GNSS; KF only one of them",
+        steps.GATE: (
             f"EKF2 rejects {100 * model.agreement.rejected_fraction_logged:.1f} % of the samples; "
             "KF has no gate"
         ),
-        ways.OUTPUT: (
+        steps.OUTPUT: (
             f"EKF2 runs {1e3 * inputs.horizon_s:.0f} ms behind and predicts to the present with "
             f"the IMU, smoothed with EKF2_TAU_POS {flown['EKF2_TAU_POS']:g} s; KF has no delay"
         ),
@@ -223,19 +231,19 @@ def _step_reasons(
 
 
 def _velocity_sentence(explanation: DifferenceExplanation) -> str:
-    position, total = explanation.position_mean_square_m2, explanation.velocity_mean_square_m2_s2
-    first = max(explanation.steps, key=lambda part: part.velocity_mean_square_m2_s2)
-    share = first.velocity_mean_square_m2_s2 / total
-    # a share above 1 compensates an earlier step, so it is not a contribution by itself
+    position, velocity = explanation.position_mean_square_m2, explanation.velocity_mean_square_m2_s2
+    first = max(explanation.steps, key=lambda step: step.velocity_mean_square_m2_s2)
+    share = first.velocity_mean_square_m2_s2 / velocity
+    # a step with a share above 1 compensates an earlier step, so it is not the largest contribution
     largest = (
         f" Largest contribution in velocity: {first.name} ({100 * share:.0f} %)."
         if share <= 1.0
         else ""
     )
-    velocity_left_share = explanation.unexplained_velocity_mean_square_m2_s2 / total
+    velocity_left_share = explanation.unexplained_velocity_mean_square_m2_s2 / velocity
     return (
         f"RMS difference KF - EKF2 over the replayed parts: {np.sqrt(position):.3f} m and "
-        f"{np.sqrt(total):.3f} m/s.{largest} Share of the mean square that the replay does not "
+        f"{np.sqrt(velocity):.3f} m/s.{largest} Share of the mean square that the replay does not "
         f"explain: {_unexplained_text(explanation.unexplained_fraction)} in position, "
         f"{_unexplained_text(velocity_left_share)} in velocity."
     )

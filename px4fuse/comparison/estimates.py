@@ -1,10 +1,10 @@
 """Estimates of noises, time offset and frame misalignment from the data of a comparison.
 
 Innovations compare a filter with its source only. Odometry is smooth over seconds and drifts by
-metres within minutes. A filter that follows it closely has small innovations and a large error, so
-its innovations do not give the measurement noise. Its scale and heading errors look like a changing
-time offset. ``Origin.may_drift`` marks such sources; :func:`widen_for_drift` widens the interval of
-their time offset.
+metres within minutes. A filter that follows odometry closely has small innovations and a large
+error, so the innovations do not give the measurement noise. Scale and heading errors of odometry
+resemble a changing time offset. ``Origin.may_drift`` marks such sources; :func:`widen_for_drift`
+widens the interval of their time offset.
 """
 
 from collections.abc import Callable, Mapping
@@ -25,15 +25,15 @@ from px4fuse.flight import Flight, Unavailable
 
 # Minimum IMU rate for a time offset
 MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
-# Hz; rate of vehicle_imu (IMU_INTEG_RATE): slower telemetry skips samples
+# Hz; rate of vehicle_imu (IMU_INTEG_RATE); telemetry with a lower rate skips samples
 MIN_TELEMETRY_IMU_HZ = 200.0
 # Measured stream rates are up to 2 % below the nominal rate
 CLOCK_RATE_MARGIN = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
-# s; smaller steps of the time offset may be drift (0.1 s at 1 m/s is 0.1 m, the noise of UWB)
+# s; a smaller step of the time offset may be drift of the source (0.1 m at 1 m/s, the noise of UWB)
 MIN_CHANGE_S = 0.10
-# Parts on each side of a step, which give the scatter of that side
+# Minimum number of parts on each side of a step, from which the scatter is estimated
 MIN_PARTS = 2
 
 Progress = Callable[[str], None]
@@ -93,7 +93,7 @@ def estimate_noises_and_clock(
     progress: Progress = ignore_progress,
     names: tuple[str, ...] | None = (HORIZONTAL,),
 ) -> tuple[Tuning, ClockOffset | Unavailable]:
-    """Estimate the noises and the time offset that remains after the applied one.
+    """Estimate the noises, and the time offset in addition to the applied one.
 
     Parameters are those of :func:`tuned`.
     """
@@ -143,9 +143,9 @@ def estimate_frame_rotation(
 def missing_imu_rate(flight: Flight) -> Unavailable | None:
     """Return Unavailable if the IMU rate is too low for a time offset, else None.
 
-    A ULog's sample is the mean over its interval. A telemetry message is the newest of several
-    samples, and PX4 has subtracted EKF2's bias estimate (``HIGHRES_IMU.hpp``), which depends on
-    the positions to be tested.
+    A sample in a ULog is the mean over its interval. A telemetry message contains only the newest
+    of several samples, minus EKF2's bias estimate (``HIGHRES_IMU.hpp``), which depends on the
+    positions to be tested.
     """
     if isinstance(flight.imu, Unavailable) or len(flight.imu) < 2:
         return None
@@ -156,30 +156,33 @@ def missing_imu_rate(flight: Flight) -> Unavailable | None:
     if rate_hz >= CLOCK_RATE_MARGIN * needed_hz:
         return None
     rate_text = f"{rate_hz:.{1 if rate_hz < 10 else 0}f} Hz"
-    description = f"was logged at {rate_text}"
+    rate_note = f"was logged at {rate_text}"
     remedy = "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate."
     if is_telemetry:
-        description = f"was received over telemetry at {rate_text}, decimated from a higher rate"
+        rate_note = f"was received over telemetry at {rate_text}, decimated from a higher rate"
         remedy = f"Have the IMU sent at {needed_hz:g} Hz."
         if flight.log.has_ulog:
             remedy = "Give the ULog of the same flight as LOG, and this recording with --mavlink."
-    reason = f"the IMU {description}; at least {needed_hz:g} Hz needed"
+    reason = f"the IMU {rate_note}; at least {needed_hz:g} Hz needed"
     return Unavailable("clock offset", reason, remedy)
 
 
 def widen_for_drift(clock: ClockOffset) -> ClockOffset:
     """Widen the interval of a time offset for a source that may drift.
 
-    Scale errors, heading errors and drift of odometry change the offset of each part by more than
-    the noise. The scatter of the parts about their mean measures these errors and widens the
-    interval. Only a significant step of at least ``MIN_CHANGE_S`` is a change of the clock.
+    Scale errors, heading errors and drift of odometry change the estimated offset of each part of
+    the flight by more than the noise. The scatter of the parts about their mean measures these
+    errors and widens the interval. Only a significant step of at least ``MIN_CHANGE_S`` counts as a
+    change of the clock.
     """
     offset = np.array([part.offset_s for part in clock.parts])
     weight = np.array([part.sigma_s**-2.0 for part in clock.parts])
     if len(offset) <= MIN_PARTS:
         return structs.replace(clock, change_p_value=None, drift_ppm=None, drift_sigma_ppm=None)
     scatter = np.sqrt(max(1.0, _weighted_square_sum(offset, weight) / (len(offset) - 1)))
-    low, high = (clock.offset_s + scatter * (end - clock.offset_s) for end in clock.interval_s)
+    low, high = (
+        clock.offset_s + scatter * (limit_s - clock.offset_s) for limit_s in clock.interval_s
+    )
     reason = clock.reason
     if not reason and (high - low) / 2.0 > MAX_HALF_INTERVAL_S:
         reason = (
@@ -206,8 +209,9 @@ def _weighted_square_sum(offset: Array, weight: Array) -> float:
 def _largest_step_p_value(offset: Array, weight: Array) -> float | None:
     """Return the p-value of the largest step between parts, or None for too few parts.
 
-    Student's t of two weighted means with a common scatter from within both sides, times the
-    number of tested places (Bonferroni). The p-value is 1 for a step below ``MIN_CHANGE_S``.
+    Student's t-test of the weighted means before and after the step, with the scatter within both
+    sides. The p-value is multiplied by the number of tested steps (Bonferroni), and is 1 for a step
+    below ``MIN_CHANGE_S``.
     """
     count = len(offset)
     split_rows = range(MIN_PARTS, count - MIN_PARTS + 1)

@@ -11,9 +11,10 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.flight import Ekf2, FlightMode, Unavailable
 from px4fuse.record import Span
 
-# s, and number of intervals: a longer pause is a gap; jitter and single losses are shorter
-GAP_S = 1.0
-GAP_INTERVALS = 5.0
+# Minimum length of a gap, in s and in intervals of the source; jitter and single lost samples are
+# shorter
+MIN_GAP_S = 1.0
+MIN_GAP_INTERVALS = 5.0
 
 
 @dataclass(frozen=True)
@@ -32,9 +33,9 @@ class Events:
     modes : tuple of FlightMode
         Empty if not logged.
     resets_s : tuple of float
-        Resets of EKF2's position or velocity.
+        Times of resets of EKF2's position or velocity.
     rejected_s : mapping from axis name to ndarray
-        Measurements that EKF2 rejected.
+        Times of measurements that EKF2 rejected.
     """
 
     gaps: tuple[Span, ...]
@@ -47,13 +48,13 @@ class Events:
     rejected_s: Mapping[str, Array]
 
 
-def longest_s(interval_s: float) -> float:
-    """Return the longest interval (s) that is not a gap, for a source's usual interval."""
-    return max(GAP_S, GAP_INTERVALS * interval_s)
+def max_interval_s(interval_s: float) -> float:
+    """Return the longest interval (s) that is not a gap, for a median interval (s)."""
+    return max(MIN_GAP_S, MIN_GAP_INTERVALS * interval_s)
 
 
 def source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
-    """Return the spans (s) between measurements that are gaps of the source.
+    """Return the gaps (spans in s without measurements) of a source.
 
     Parameters
     ----------
@@ -62,7 +63,7 @@ def source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
     rate_hz : float
         Rate of the source between gaps.
     """
-    is_gap = np.diff(time_s) > longest_s(1.0 / rate_hz)
+    is_gap = np.diff(time_s) > max_interval_s(1.0 / rate_hz)
     return tuple(zip(time_s[:-1][is_gap].tolist(), time_s[1:][is_gap].tolist(), strict=True))
 
 

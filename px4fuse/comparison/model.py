@@ -29,7 +29,7 @@ FilterName = Literal["kf", "ekf2"]
 FILTERS: tuple[FilterName, FilterName] = ("kf", "ekf2")
 
 
-class AgainstTruth(Record, frozen=True, kw_only=True):
+class ErrorsAgainstTruth(Record, frozen=True, kw_only=True):
     """Errors of one filter against ground truth, which no filter used.
 
     NEES is per component (expected 1), of the same samples as the errors: at the times of EKF2's
@@ -53,28 +53,28 @@ class FilterSummary(Consistency, frozen=True, kw_only=True):
         Median reported σ over the segment; None if not logged.
     sigma_p_before_update_m, sigma_p_after_update_m : float or None
         Median reported σ before and after an update; for EKF2 from P⁻ = S - R, P⁺ = P⁻R/S.
-    truth : AgainstTruth or Unavailable
+    truth : ErrorsAgainstTruth or Unavailable
     """
 
     sigma_p_median_m: Positive | None = None
     sigma_v_median_m_s: Positive | None = None
     sigma_p_before_update_m: Positive | None = None
     sigma_p_after_update_m: Positive | None = None
-    truth: OrUnavailable[AgainstTruth]
+    truth: OrUnavailable[ErrorsAgainstTruth]
 
 
-class UnjudgedFilter(Unavailable, frozen=True, kw_only=True):
-    """Filter without a consistency result, with the reason; else like :class:`FilterSummary`."""
+class UntestedFilter(Unavailable, frozen=True, kw_only=True):
+    """:class:`FilterSummary` with the reason instead of a consistency result."""
 
     sigma_p_median_m: Positive | None = None
     sigma_v_median_m_s: Positive | None = None
     sigma_p_before_update_m: Positive | None = None
     sigma_p_after_update_m: Positive | None = None
-    truth: OrUnavailable[AgainstTruth]
+    truth: OrUnavailable[ErrorsAgainstTruth]
 
 
 class Difference(Record, frozen=True, kw_only=True):
-    """KF - EKF2 at EKF2's sample times."""
+    """Difference KF - EKF2 at EKF2's sample times."""
 
     count: Count
     position_rms_m: NotNegative
@@ -86,7 +86,7 @@ class Difference(Record, frozen=True, kw_only=True):
 
 
 class Updates(Record, frozen=True, kw_only=True):
-    """Measurements of one axis; ``input_gap_s`` is the time without IMU data (s)."""
+    """Statistics of the measurements of one axis; ``input_gap_s``: total time without IMU data."""
 
     count: Count
     first_s: float
@@ -101,11 +101,13 @@ class AxisResult(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     heading_deg : float or None
+        Heading of the axis, clockwise from north; None for the down axis.
     direction : (float, float, float)
         Unit vector in NED.
     note : str
+        Origin of the direction.
     updates : Updates
-    filters : mapping from "kf" and "ekf2" to FilterSummary or UnjudgedFilter
+    filters : mapping from "kf" and "ekf2" to FilterSummary or UntestedFilter
     difference : Difference or Unavailable
     rejected_fraction : float or None
         Share of the source's samples that EKF2 rejected; None if not logged.
@@ -115,7 +117,7 @@ class AxisResult(Record, frozen=True, kw_only=True):
     direction: Vector
     note: str
     updates: Updates
-    filters: Mapping[FilterName, RecordOrUnavailable[FilterSummary, UnjudgedFilter]]
+    filters: Mapping[FilterName, RecordOrUnavailable[FilterSummary, UntestedFilter]]
     difference: OrUnavailable[Difference]
     rejected_fraction: Share | None = None
 

@@ -11,7 +11,7 @@ from px4fuse.comparison.projection import observation_variance
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.errors import MissingDataError, SettingsError, suggest_name
 from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
-from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, make_axes, within
+from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
 from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable
 from px4fuse.position_source import POSITION_FILE, PositionKind
 from px4fuse.readers.mavlink_messages import POSITION_INPUTS
@@ -28,12 +28,13 @@ from px4fuse.trajectory.rotation import interpolate, to_matrix
 
 # Origins of external positions by their PX4 topic or MAVLink message
 LOGGED_ORIGINS = TOPIC_ORIGINS | {source.name: source.origin for source in POSITION_INPUTS}
-NOT_ITS_OWN_TRUTH = Unavailable(
+NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
     "the position source is the only reference in the log, and KF uses it as its input",
     "Choose another --position-source; this one is then used as ground truth.",
 )
-# Default axes of GNSS: its height is much noisier than its position, and SIGMA_Z is one number
+# Default axes of GNSS, without down: GNSS height is much noisier than GNSS position, and SIGMA_Z is
+# one number for all axes
 GNSS_AXES = (AISLE, "north", "east")
 
 
@@ -99,7 +100,7 @@ def prepare(
         track = replace(track, origin=structs.replace(track.origin, kind=kind))
     track = _move_to_vehicle(shift_clock(track, settings.clock_offset_s), flight)
     track = _use_barometer_height(track, flight, choices.get("height"))
-    flight = flight_for_source(flight, track)
+    flight = select_innovations(flight, track)
     missing = flight.missing
     segment = choose_segment(flight, track, choices.get("start_s"), choices.get("end_s"))
     names, heading_deg = choices.get("axes"), choices.get("heading_deg")
@@ -107,11 +108,11 @@ def prepare(
         names = GNSS_AXES
     lines = make_axes(flight, track, segment, names=names, heading_deg=heading_deg)
     if isinstance(flight.truth, Truth) and flight.truth.name == track.name:
-        flight = replace(flight, truth=NOT_ITS_OWN_TRUTH)
+        flight = replace(flight, truth=NO_SEPARATE_TRUTH)
     notes = (*flight.log.notes, *track.notes)
     if track.origin.fused_as_gnss and not choices.get("sigma_z_given", True):
-        usual_m = PARAMETERS[GNSS_POS.noise].default
-        sigma_z_m = observation_variance(flight, track, lines[0], segment, usual_m) ** 0.5
+        default_m = PARAMETERS[GNSS_POS.noise].default
+        sigma_z_m = observation_variance(flight, track, lines[0], segment, default_m) ** 0.5
         if sigma_z_m >= SIGMA_Z_RANGE_M[0]:
             settings = replace(settings, sigma_z_m=float(f"{sigma_z_m:.3g}"))
     acceleration = lines[0].acceleration
@@ -124,11 +125,11 @@ def prepare(
     return Comparison(flight, track, reason, segment, settings, lines, notes, missing)
 
 
-def flight_for_source(flight: Flight, track: PositionTrack) -> Flight:
+def select_innovations(flight: Flight, track: PositionTrack) -> Flight:
     """Return the flight with EKF2's GNSS innovations if GNSS is the source, else unchanged."""
     if isinstance(flight.ekf2, Unavailable) or not track.origin.fused_as_gnss:
         return flight
-    # missing data of other sources do not affect this comparison
+    # the comparison does not need missing data of other sources, so they are not listed
     missing_of_vision, streams = _missing_of_vision(flight.ekf2), dict(flight.streams)
     ekf2 = with_gnss_innovations(
         flight.ekf2, GNSS if track.barometer is None else GNSS_AND_BAROMETER
@@ -142,7 +143,7 @@ def flight_for_source(flight: Flight, track: PositionTrack) -> Flight:
 
 
 def _missing_of_vision(ekf2: Ekf2) -> tuple[Unavailable, ...]:
-    """Return the missing innovations of EKF2, each with its reason."""
+    """Return the reasons for missing EKF2 innovations."""
     return tuple(part for part in ekf2.innovations.values() if isinstance(part, Unavailable))
 
 
@@ -206,26 +207,32 @@ def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
 def _use_barometer_height(
     track: PositionTrack, flight: Flight, height_name: HeightName | None
 ) -> PositionTrack:
-    """Replace the track's height by the barometer's if requested or if EKF2 fused that.
+    """Replace the track's height by that of the barometer if requested or if EKF2 fused it.
 
-    A barometer has no absolute zero: the median difference to EKF2's height defines it.
+    A barometer has no absolute zero: its zero is set to EKF2's height by the median difference.
     """
-    ekf2, heights, name = flight.ekf2, flight.barometer, flight.log.name
+    ekf2, heights, log_name = flight.ekf2, flight.barometer, flight.log.name
     if height_name and not track.origin.fused_as_gnss:
-        raise SettingsError(f"{name}: `height` needs a GNSS position; this one is {track.name}.")
+        raise SettingsError(
+            f"{log_name}: `height` needs a GNSS position; this one is {track.name}."
+        )
     is_fused_by_ekf2 = fused_aid(ekf2, BAROMETER.name) and not fused_aid(ekf2, GNSS.vertical)
     uses_barometer = height_name == "barometer" or (
         height_name is None and track.origin.fused_as_gnss and is_fused_by_ekf2
     )
     if not uses_barometer or heights is None:
         if height_name == "barometer":
-            raise MissingDataError(f"{name}: no barometer height in the log.", GNSS.to_log)
+            raise MissingDataError(f"{log_name}: no barometer height in the log.", GNSS.to_log)
         return track
     zero_m, zero_text = heights["down_m"].iloc[0], "its first height"
     if isinstance(ekf2, Ekf2):
-        down = np.interp(heights.index, ekf2.state.index, ekf2.state["down_m"], np.nan, np.nan)
+        ekf2_down_m = np.interp(
+            heights.index, ekf2.state.index, ekf2.state["down_m"], np.nan, np.nan
+        )
         offset_m = (
-            float(np.nanmedian(heights["down_m"] - down)) if np.isfinite(down).any() else zero_m
+            float(np.nanmedian(heights["down_m"] - ekf2_down_m))
+            if np.isfinite(ekf2_down_m).any()
+            else zero_m
         )
         zero_m, zero_text = offset_m, "the median of EKF2's height"
     note = f"the down axis uses the barometer, with its zero set to {zero_text}"
@@ -237,22 +244,26 @@ def _use_barometer_height(
 def explain_missing_source(flight: Flight) -> Unavailable:
     """Return the reason why no track is a position source by default, and the remedy."""
     damaged = "the file is damaged, and " if flight.log.damage else ""
-    unused = next((track.name for track in flight.positions if not track.origin.is_automatic), "")
-    looked_for = "no vehicle_visual_odometry, motion capture or EKF2 innovations of external vision"
+    unused_track = next(
+        (track.name for track in flight.positions if not track.origin.is_automatic), ""
+    )
+    missing_topics = (
+        "no vehicle_visual_odometry, motion capture or EKF2 innovations of external vision"
+    )
     remedy = (
         "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as "
         "VISION_POSITION_ESTIMATE, or give the position file with --position."
     )
     if flight.log.format.startswith("MAVLink"):
-        looked_for = "no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP"
+        missing_topics = "no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP"
         ulog = ", or the ULog" if flight.log.has_ulog else ""
         remedy = f"give the position file of the positioning system with `position`{ulog}."
-    if unused:
+    if unused_track:
         remedy = (
             "The log contains only GPS, which EKF2 did not fuse: use it with "
-            f"--position-source {unused}, or {remedy}"
+            f"--position-source {unused_track}, or {remedy}"
         )
-    reason = f"{damaged}no external position in this log ({looked_for})"
+    reason = f"{damaged}no external position in this log ({missing_topics})"
     return Unavailable("position source", reason, capitalise_first(remedy))
 
 
@@ -295,41 +306,41 @@ def choose_segment(
     flight : Flight
     track : PositionTrack
     start_s, end_s : float, optional
-        Override either end (seconds from the first data).
+        Chosen start and end (seconds from the first data); None: automatic.
 
     Raises
     ------
     SettingsError
         The segment is empty or contains fewer than three measurements.
     """
-    runs_s = track.samples.index[[0, -1]].tolist()
-    low, high = max(runs_s[0], 0.0), min(runs_s[1], flight.log.duration_s)
+    source_span_s = track.samples.index[[0, -1]].tolist()
+    low, high = max(source_span_s[0], 0.0), min(source_span_s[1], flight.log.duration_s)
     if isinstance(flight.airborne, Unavailable):
         reason = "whole duration of the source (no land detector in the log)"
     elif not flight.airborne:
         reason = "whole duration of the source (the vehicle never took off)"
     else:
         reason = "whole duration of the source (no positions in flight)"
-        flying = max(low, flight.airborne[0][0]), min(high, flight.airborne[-1][1])
-        if flying[0] < flying[1]:
-            (low, high), reason = flying, "source available and vehicle airborne"
+        flight_span_s = max(low, flight.airborne[0][0]), min(high, flight.airborne[-1][1])
+        if flight_span_s[0] < flight_span_s[1]:
+            (low, high), reason = flight_span_s, "source available and vehicle airborne"
     if start_s is not None or end_s is not None:
         low, high = low if start_s is None else start_s, high if end_s is None else end_s
-        ends = {"--start": start_s, "--end": end_s}
-        option_names = [text for text, value in ends.items() if value is not None]
+        options = {"--start": start_s, "--end": end_s}
+        option_names = [text for text, value in options.items() if value is not None]
         reason = f"chosen with {' and '.join(option_names)}"
-        clipped = max(low, 0.0), min(high, flight.log.duration_s)
-        if clipped != (low, high) and clipped[0] < clipped[1]:
-            low, high = clipped
+        clipped_s = max(low, 0.0), min(high, flight.log.duration_s)
+        if clipped_s != (low, high) and clipped_s[0] < clipped_s[1]:
+            low, high = clipped_s
             reason += ", cut at the ends of the data"
     if not low < high:
         raise SettingsError(
-            f"{flight.log.name}: no positions between {low:.6g} s and {high:.6g} s; the "
-            f"position source runs from {runs_s[0]:.2f} s to {runs_s[1]:.2f} s. Change "
+            f"{flight.log.name}: no positions between {low:.6g} s and {high:.6g} s; the position "
+            f"source runs from {source_span_s[0]:.2f} s to {source_span_s[1]:.2f} s. Change "
             "--start or --end."
         )
     segment = Segment(low, high, reason)
-    count = len(within(track.samples, segment))
+    count = len(cut_to_segment(track.samples, segment))
     if count < MIN_MEASUREMENTS:
         raise SettingsError(
             f"{flight.log.name}: {track.name} has only {count} measurements between "

@@ -9,7 +9,7 @@ import pandas as pd
 
 from px4fuse.arrays import Array
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS
-from px4fuse.filter.signals import AISLE, Axis, Segment, along, within
+from px4fuse.filter.signals import AISLE, Axis, Segment, cut_to_segment, weighted_sum
 from px4fuse.flight import (
     Columns,
     Ekf2,
@@ -32,8 +32,8 @@ PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_variance_m2": (Columns.POSITION_VARIANCE, 2),
     "velocity_variance_m2_s2": (Columns.VELOCITY_VARIANCE, 2),
 }
-# Resets are removed only if that reduces EKF2's median squared distance to the measurements to
-# this share; otherwise the published output, which controlled the vehicle, is kept.
+# Resets are removed only if the removal reduces EKF2's median squared distance to the measurements
+# to less than this share; otherwise the published output, which controlled the vehicle, is kept
 MAX_DISTANCE_RATIO = 0.95
 
 
@@ -43,9 +43,9 @@ def continuous_state(
     """Remove resets from EKF2's state if they change its frame.
 
     A reset that changes EKF2's frame must be removed before positions are compared. A reset that
-    moves EKF2 back to the measurements corrects an error; its removal would add that error to the
-    rest of the flight. Resets are removed if that clearly reduces the median distance to the
-    measurements.
+    moves EKF2 back to the measurements corrects an error; without this reset, the rest of the
+    flight would have that error. Resets are removed if the removal clearly reduces the median
+    distance to the measurements.
 
     Returns
     -------
@@ -73,7 +73,7 @@ def continuous_state(
             continue
         reset_texts = kept_resets
         if quantity == "position":  # a velocity does not depend on the frame's origin
-            samples = within(track.samples, segment)[columns].dropna()
+            samples = cut_to_segment(track.samples, segment)[columns].dropna()
             best_state = min(
                 _continuous_candidates(ekf2.state[columns], resets, axes),
                 key=partial(_median_square_distance, samples),
@@ -96,11 +96,13 @@ def _continuous_candidates(
 ) -> Iterator[pd.DataFrame]:
     """Yield the continuous position in the frame of each stretch between resets."""
     deltas = np.array([reset.delta for reset in resets])[:, axes]
-    after = np.array([published.index >= reset.time_s for reset in resets]).T
-    for stretch in range(len(resets) + 1):
+    is_after = np.array([published.index >= reset.time_s for reset in resets]).T
+    for earlier_count in range(len(resets) + 1):
         # in the frame of this stretch: add the resets before it, subtract those after it
-        shift = (~after[:, :stretch]) @ deltas[:stretch] - after[:, stretch:] @ deltas[stretch:]
-        yield published + shift
+        shift_m = (~is_after[:, :earlier_count]) @ deltas[:earlier_count] - is_after[
+            :, earlier_count:
+        ] @ deltas[earlier_count:]
+        yield published + shift_m
 
 
 def _median_square_distance(samples: pd.DataFrame, state: pd.DataFrame) -> float:
@@ -113,10 +115,11 @@ def _median_square_distance(samples: pd.DataFrame, state: pd.DataFrame) -> float
 
 def project(frame: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
     """Project the columns of :data:`PROJECTED_COLUMNS` onto the axis, within the segment."""
-    rows = within(frame, segment)
+    rows = cut_to_segment(frame, segment)
     available = {name: part for name, part in PROJECTED_COLUMNS.items() if part[0][0] in frame}
     projected = {
-        name: along(rows, of, axis.direction**power) for name, (of, power) in available.items()
+        name: weighted_sum(rows, columns, axis.direction**power)
+        for name, (columns, power) in available.items()
     }
     return pd.DataFrame(projected, index=rows.index)
 
@@ -153,20 +156,26 @@ def project_innovations(
         if isinstance(frame, Unavailable):
             return frame
         frames.append(frame)
-    rows = within(frames[0], segment).copy()
+    rows = cut_to_segment(frames[0], segment).copy()
     if axis.name == AISLE:
         rows = _innovations_along(rows, frames[1], axis.direction)
     if rows.empty:
         return Unavailable(
             "EKF2 innovations", "no samples in the segment", "Analyse a longer segment."
         )
-    r = rows["observation_variance_m2"].fillna(observation_variance(flight, track, axis, segment))
-    s_total = rows["innovation_variance_m2"]
-    prior = (s_total - r).where(s_total > r)
-    rows["observation_variance_m2"] = r
-    rows["prior_variance_m2"] = prior
+    noise_variance = rows["observation_variance_m2"].fillna(
+        observation_variance(flight, track, axis, segment)
+    )
+    innovation_variance = rows["innovation_variance_m2"]
+    prior_variance = (innovation_variance - noise_variance).where(
+        innovation_variance > noise_variance
+    )
+    rows["observation_variance_m2"] = noise_variance
+    rows["prior_variance_m2"] = prior_variance
     # a rejected sample does not change P
-    rows["posterior_variance_m2"] = (prior * r / s_total).where(~(rows["rejected"] > 0), prior)
+    rows["posterior_variance_m2"] = (prior_variance * noise_variance / innovation_variance).where(
+        ~(rows["rejected"] > 0), prior_variance
+    )
     return rows
 
 
@@ -178,7 +187,7 @@ def _innovations_along(north: pd.DataFrame, east: pd.DataFrame, direction: Array
     projected = c * c * n + s * s * e  # correct for variances only; the other columns follow
     projected["innovation_m"] = c * n["innovation_m"] + s * e["innovation_m"]
     for column in ("test_ratio", "fused", "rejected"):
-        # the larger: before v1.14 PX4 logs one ratio for both axes, and rejects both together
+        # the larger value of both axes, because PX4 rejects both together
         projected[column] = np.fmax(n[column], e[column])
     return projected
 
@@ -211,7 +220,7 @@ def observation_variance(
     ignores_reported = track.alignment is not None or aid == BAROMETER
     if ignores_reported or parameters.get(aid.noise_mode) == 1.0:
         return r
-    reported = within(track.samples, segment)[Columns.POSITION_VARIANCE].median()
+    reported = cut_to_segment(track.samples, segment)[Columns.POSITION_VARIANCE].median()
     reported_along = float(np.nansum(reported.to_numpy() * axis.direction**2))
     return max(r, reported_along)
 

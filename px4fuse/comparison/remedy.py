@@ -1,7 +1,7 @@
 """Maximum-likelihood EKF2 parameters, and the replayed effect of a change to EKF2 or KF.
 
-A change is proposed with its effect and only if the replay confirms it. If EKF2 cannot be replayed,
-the text states that.
+A change is proposed with its effect, and only if a replay confirms the effect. If EKF2 cannot be
+replayed, the text states the reason.
 """
 
 import math
@@ -28,12 +28,12 @@ from px4fuse.flight import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 from px4fuse.text import capitalise_first
 
-# Ratio of √R to EKF2_EVP_NOISE above which R is from the sender
+# Minimum ratio of √R to EKF2_EVP_NOISE from which R counts as reported by the sender
 MIN_REPORTED_RATIO = 1.25
-# ms; one prediction step of EKF2 (EKF2_PREDICT_US), and the transmission time of a message
-UPDATE_MS, ARRIVAL_MS = 10.0, 30.0
+# ms; one prediction step of EKF2 (EKF2_PREDICT_US), and transmission time of a message
+PREDICTION_STEP_MS, TRANSMISSION_MS = 10.0, 30.0
 # ms; EKF2_DELAY_MAX is rounded up to a multiple
-DELAY_STEP_MS = 50.0
+DELAY_MAX_STEP_MS = 50.0
 # Placeholder of the command to paste; px4fuse.report.commands inserts the log
 COMMAND = "px4fuse compare LOG"
 # A noise change must reduce |ln(mean NIS)| to less than this share
@@ -41,12 +41,12 @@ MAX_LOG_NIS_RATIO = 0.8
 # A change must reduce the rejected share to less than this share
 MAX_REJECTED_RATIO = 0.5
 # Significant ratio of two RMSEs: errors are correlated over seconds, so a flight of two minutes has
-# about fifty independent ones, and the standard error of their RMSE is 10 %
+# about fifty independent errors, and the standard error of the RMSE is 10 %
 MAX_ERROR_RATIO = 1.10
 # Significant ratio of two RMSEs of KF, whose replay is exact
 MAX_KF_ERROR_RATIO = 1.005
-# Share of rejected samples below which a text omits it
-REJECTED_SHOWN = 0.005
+# Minimum share of rejected samples that a text states
+MIN_SHOWN_REJECTED_SHARE = 0.005
 
 
 def ml_ekf2_parameters(
@@ -68,10 +68,10 @@ def ml_ekf2_parameters(
     Returns
     -------
     dict
-        Empty without an estimate or if EKF2 did not fuse the analysed source. The delay is given
-        only if the flown value is outside its interval. For GNSS and drifting sources, the noise is
-        included only if EKF2 uses less than the short-term noise: their innovations do not show the
-        slow errors.
+        Empty without an estimate or if EKF2 did not fuse the analysed source. The delay is included
+        only if the flown value is outside its interval. For GNSS and drifting sources the noise is
+        included only if EKF2 uses less than the short-term noise: innovations do not show the slow
+        errors of these sources.
     """
     if not is_fused_source(comparison, model.inputs):
         return {}
@@ -96,32 +96,36 @@ def is_fused_source(comparison: Comparison, inputs: Inputs) -> bool:
 def ml_delay_change(
     comparison: Comparison, inputs: Inputs, clock: ClockOffset | Unavailable
 ) -> dict[str, float]:
-    """Return EKF2's maximum-likelihood delay; empty without an estimate or if it is as flown."""
+    """Return EKF2's maximum-likelihood delay; empty without an estimate or change."""
     if isinstance(clock, Unavailable) or not clock.is_determinable:
         return {}
     age_s, flown = comparison.source.age_s, inputs.settings[inputs.aid.delay]
-    high, low = (1e3 * (age_s - end) for end in clock.interval_s)
-    if low - UPDATE_MS <= flown <= high + UPDATE_MS:
+    high, low = (1e3 * (age_s - offset_s) for offset_s in clock.interval_s)
+    if low - PREDICTION_STEP_MS <= flown <= high + PREDICTION_STEP_MS:
         return {}
     return delay_change(inputs, 1e3 * (age_s - clock.offset_s))
 
 
 def aid_of(comparison: Comparison, axis: str = "") -> Aid:
-    """Return the aid that EKF2 fuses the source as, along an axis."""
+    """Return the aid as which EKF2 fuses the source along an axis."""
     return comparison.source.aid(axis) or EV_POS
 
 
 def delay_ms(comparison: Comparison) -> float | None:
     """Return the age of positions (ms, relative to their timestamps) that EKF2 assumes.
 
-    None if the parameter is not logged, EKF2 never fuses the source, or the receiver states its
-    own measurement times.
+    None if the parameter is not logged, EKF2 never fuses the source, or the receiver reports
+    measurement times.
     """
     source = comparison.source
     if source.origin.aid is None:
         return None
-    found = comparison.flight.log.parameters.get(source.origin.aid.delay)
-    return None if source.origin.fused_as_gnss and source.age_s == 0.0 != found else found
+    parameter_ms = comparison.flight.log.parameters.get(source.origin.aid.delay)
+    return (
+        None
+        if source.origin.fused_as_gnss and source.age_s == 0.0 != parameter_ms
+        else parameter_ms
+    )
 
 
 def noise_change(
@@ -129,7 +133,8 @@ def noise_change(
 ) -> dict[str, float]:
     """Return the parameters that set EKF2's position noise to ``noise_m``.
 
-    Two digits, within PX4's range. ``settings`` and ``used_m`` (median √R) are those as flown.
+    The value has two digits and is within PX4's range. ``settings`` and ``used_m`` (median √R) are
+    the parameters and the noise as flown.
     """
     changes = {aid.noise: max(float(f"{noise_m:.2g}"), PARAMETERS[aid.noise].minimum)}
     is_reported = used_m > MIN_REPORTED_RATIO * settings.get(aid.noise, math.inf)
@@ -142,17 +147,17 @@ def noise_change(
 def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
     """Return the parameters that set the position age that EKF2 assumes to ``delay_ms``.
 
-    Empty if the delay exceeds PX4's range or the source has its own measurement times; 0 for early
-    timestamps.
+    Empty if the delay exceeds PX4's range or EKF2 uses the measurement times of the source. For
+    early timestamps the delay is 0.
     """
     delay = inputs.aid.delay
     parameter = PARAMETERS[delay]
     if delay_ms > parameter.maximum or inputs.received.uses_sender_times:
         return {}
     changes = {delay: max(float(round(delay_ms)), parameter.minimum)}
-    needed, flown = changes[delay] + ARRIVAL_MS, inputs.settings
-    if not inputs.rules.horizon_by_delay and needed > flown["EKF2_DELAY_MAX"]:
-        changes["EKF2_DELAY_MAX"] = DELAY_STEP_MS * math.ceil(needed / DELAY_STEP_MS)
+    needed_ms, flown = changes[delay] + TRANSMISSION_MS, inputs.settings
+    if not inputs.rules.horizon_by_delay and needed_ms > flown["EKF2_DELAY_MAX"]:
+        changes["EKF2_DELAY_MAX"] = DELAY_MAX_STEP_MS * math.ceil(needed_ms / DELAY_MAX_STEP_MS)
     return {name: value for name, value in changes.items() if value != flown[name]}
 
 
@@ -166,7 +171,7 @@ def noise_used_m(model: Model) -> float:
 def format_whatif_effect(before: Summary, after: Summary) -> str:
     """Format the effect of changed EKF2 parameters from replays without and with the change."""
     texts = []
-    if max(before.rejected_fraction, after.rejected_fraction) >= REJECTED_SHOWN:
+    if max(before.rejected_fraction, after.rejected_fraction) >= MIN_SHOWN_REJECTED_SHARE:
         texts.append(
             f"rejected {100 * before.rejected_fraction:.0f} % → "
             f"{100 * after.rejected_fraction:.0f} %"
@@ -188,7 +193,7 @@ def format_ekf2_remedy(
     changes: Mapping[str, float],
     helps: Callable[[Summary, Summary], bool],
     *,
-    why: str = "",
+    prefix: str = "",
     fallback_remedy: str,
 ) -> str:
     """Format a change of EKF2's parameters as an action with its replayed effect.
@@ -199,13 +204,13 @@ def format_ekf2_remedy(
         EKF2 of the flight.
     changes : mapping
     helps : callable
-        Returns True if the change helps, from the summaries as flown and with the change.
-    why : str
+        Called with the summaries as flown and with the change; returns True if the change helps.
+    prefix : str
         Text before the action.
     fallback_remedy : str
         Action if the replay shows that the change does not help.
     """
-    setting = f"{why}set {format_settings(changes)}"
+    setting = f"{prefix}set {format_settings(changes)}"
     replays = model if isinstance(model, Unavailable) else what_if(model, [changes])
     if isinstance(replays, Unavailable):
         return f"{capitalise_first(setting)}. {format_not_replayed(replays)}"
@@ -222,27 +227,27 @@ def format_ekf2_remedy(
     return f"{fallback_remedy} {settings_text} does not help: {effect}."
 
 
-def filter_errors_m(comparison: Comparison, changed: Settings) -> tuple[float, float] | None:
+def filter_errors_m(comparison: Comparison, settings: Settings) -> tuple[float, float] | None:
     """Return KF's position RMSE (m) with the current and with other settings.
 
-    Root of the summed mean squares of all axes except the aisle, which is a combination of the
-    others. None without ground truth.
+    All axes are combined (root of the summed mean squares) except the aisle, which is a
+    combination of north and east. None without ground truth.
     """
     if isinstance(comparison.flight.truth, Unavailable):
         return None
     names = tuple(name for name in comparison.axes if name != AISLE) or (AISLE,)
     results = [comparison.axes[name] for name in names]
-    later_s = changed.clock_offset_s - comparison.settings.clock_offset_s
+    shift_s = settings.clock_offset_s - comparison.settings.clock_offset_s
     lines = make_axes(
         comparison.flight,
-        shift_clock(comparison.source, later_s),
+        shift_clock(comparison.source, shift_s),
         comparison.segment,
         names=names,
         heading_deg=results[0].heading_deg,
     )
     errors_m: list[tuple[float, float]] = []
     for result, line in zip(results, lines, strict=True):
-        kf_run, before = quick_replay(line, changed), result.filters["kf"].truth
+        kf_run, before = quick_replay(line, settings), result.filters["kf"].truth
         after = kf_error_statistics(kf_run, result.truth, result.ekf2_state)
         if isinstance(before, Unavailable) or isinstance(after, Unavailable):
             return None
@@ -255,7 +260,7 @@ def format_kf_remedy(
     comparison: Comparison,
     changes: Mapping[str, float],
     suffix: str = "",
-    unseen_nats: float | None = None,
+    held_out_nats: float | None = None,
 ) -> str:
     """Format other settings of KF as an action, if ground truth or held-out data confirm it.
 
@@ -266,9 +271,9 @@ def format_kf_remedy(
         Rounded to three digits.
     suffix : str
         Text after the options.
-    unseen_nats : float or None
-        Log-likelihood gain per measurement of the second half with settings estimated on the first;
-        None if unknown.
+    held_out_nats : float or None
+        Log-likelihood gain per measurement of the second half of the flight with settings estimated
+        on the first half; None if unknown.
     """
     rounded_settings: dict[str, Any] = {
         name: float(f"{value:.3g}") for name, value in changes.items()
@@ -282,10 +287,10 @@ def format_kf_remedy(
     changed = replace(comparison.settings, **rounded_settings)
     errors = filter_errors_m(comparison, changed)
     if errors is None:
-        if unseen_nats is not None and unseen_nats <= 0.0:
+        if held_out_nats is not None and held_out_nats <= 0.0:
             return (
                 f"No change advised: {options_text} is the maximum-likelihood estimate, but "
-                "settings estimated on the first half do not improve the second half."
+                "settings estimated on the first half of the flight do not improve the second half."
             )
         return f"{COMMAND} {options_text}."
     before, after = errors
@@ -298,9 +303,9 @@ def format_kf_remedy(
     return f"{COMMAND} {options_text}: {effect}."
 
 
-def format_not_replayed(why: Unavailable) -> str:
+def format_not_replayed(prefix: Unavailable) -> str:
     """Format the reason why a remedy could not be replayed."""
-    return f"Not replayed: {why.reason}."
+    return f"Not replayed: {prefix.reason}."
 
 
 def format_settings(changes: Mapping[str, float]) -> str:

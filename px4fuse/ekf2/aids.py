@@ -26,12 +26,13 @@ AidVerdict = Literal[
     "disabled",
     "too few samples",
 ]
-# Limits for a biased aid: |mean ν| / RMS ν, and |mean ν| / √S. Above both, the mean does not
-# average out and EKF2 follows it
+# Limits for a biased aid: |mean ν| / RMS ν, and |mean ν| / √S. Above both limits the mean does not
+# average out, and EKF2 follows the bias
 MIN_BIAS_SHARE, MIN_BIAS_IN_SIGMA = 0.5, 0.2
-# Change of mean ν/√S in flight: window length (s), minimum samples per window, windows before the
-# change, minimum change in √S, minimum change over the scatter of the earlier window means
-WINDOW_S, IN_WINDOW, WINDOWS_BEFORE, MIN_CHANGE_IN_SIGMA, MIN_CHANGE_SCATTER_RATIO = (
+# Change of mean ν/√S in flight: window length (s), minimum number of samples per window, minimum
+# number of windows before the change, minimum change (√S), and minimum ratio of the change to the
+# scatter of the earlier window means
+WINDOW_S, MIN_WINDOW_SAMPLES, MIN_WINDOWS_BEFORE, MIN_CHANGE_IN_SIGMA, MIN_CHANGE_SCATTER_RATIO = (
     10.0,
     5,
     2,
@@ -44,8 +45,8 @@ NOT_FUSED_LIMIT_S = 5.0
 NOT_FUSED_INTERVALS = 10.0  # the same limit in intervals between logged fused samples
 # relative difference below which √R counts as equal to a noise parameter
 NOISE_TOLERANCE = 0.02
-# m above ground from which aids are evaluated; for low flights half of the maximum height. Below,
-# rotor downwash disturbs the barometer, and the land detector may report flight on the ground
+# m; minimum height above ground at which aids are evaluated, for low flights half of the maximum
+# height. Near the ground rotor downwash disturbs the barometer, and the land detector may be wrong
 MIN_HEIGHT_M = 2.0
 
 
@@ -55,7 +56,7 @@ class AidAxis(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     samples : int
-        Fused samples and those rejected while the aid was enabled.
+        Number of samples that EKF2 fused or rejected while the aid was enabled.
     innovation_mean, innovation_std : float
     s_sqrt_median : float
         Median of √S.
@@ -97,17 +98,19 @@ class AidResult(Record, frozen=True, kw_only=True):
     enabled_fraction : float or None
         Share of the flight in which EKF2 enabled the aid; None if not logged.
     fused_fraction : float
-        Share of the samples received while enabled.
+        Fused share of the samples received while the aid was enabled.
     fused_logged : bool
-        True if the log states for each sample if it was fused; False if the gate is applied here.
+        True if the log contains for each sample whether EKF2 fused it; False if px4fuse applies the
+        gate instead.
     rejected_fraction : float
-        Share of the samples received while enabled that were rejected along any axis.
+        Share of the samples received while the aid was enabled that were rejected along any axis.
     longest_gap_s : (float, float)
-        Start and end of the longest time without a fused sample that began while enabled.
+        Start and end of the longest time without a fused sample that began while the aid was
+        enabled.
     resets : int
-        Resets of EKF2 to the aid; these samples are excluded.
+        Number of resets of EKF2 to the aid; these samples are excluded.
     gate : float
-        In √S.
+        Innovation gate in √S.
     noise : float or None
         Median √R; None if R is not logged.
     noise_from : str
@@ -195,10 +198,10 @@ def evaluate_aids(flight: Flight) -> dict[str, AidResult] | Unavailable:
 def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidResult:
     samples = log.samples.loc[start_s:end_s]
     times = samples.index.to_numpy()
-    gate = _gate_in_force(aid, log)
+    gate = _effective_gate(aid, log)
     innovation, variance = (
-        samples[[f"{what}_{axis}" for axis in log.axes]].to_numpy()
-        for what in ("innovation", "variance")
+        samples[[f"{quantity}_{axis}" for axis in log.axes]].to_numpy()
+        for quantity in ("innovation", "variance")
     )
     enabled = np.ones(len(samples), bool)
     enabled_fraction = None
@@ -215,13 +218,13 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
         fused, rejected = (samples[flag].to_numpy() > 0.0 for flag in ("fused", "rejected"))
         noise = samples[[f"noise_{axis}" for axis in log.axes]].to_numpy()
         # after a reset to the aid, EKF2 logs innovation 0 and S = R
-        reset = ((innovation == 0.0) & np.isclose(variance, noise)).all(axis=1)
+        is_reset = ((innovation == 0.0) & np.isclose(variance, noise)).all(axis=1)
         noise_median = float(np.median(np.sqrt(noise[fused, 0]))) if fused.any() else None
     else:
         rejected = np.max(innovation**2 / variance, axis=1, initial=0.0) > gate**2
-        fused, reset, noise_median = ~rejected, np.zeros(len(samples), bool), None
-    is_evaluated = (fused | rejected) & enabled & ~reset
-    without_s = _longest_gap(times, fused & enabled, log, start_s, end_s)
+        fused, is_reset, noise_median = ~rejected, np.zeros(len(samples), bool), None
+    is_evaluated = (fused | rejected) & enabled & ~is_reset
+    unfused_span_s = _longest_gap(times, fused & enabled, log, start_s, end_s)
     axes = {}
     for number, axis in enumerate(log.axes):
         assessment = assess(innovation[is_evaluated, number], variance[is_evaluated, number], gate)
@@ -252,62 +255,69 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
         fused_fraction=_fraction(fused & enabled, enabled),
         fused_logged=fused_logged,
         rejected_fraction=_fraction(rejected & enabled, enabled),
-        longest_gap_s=without_s,
-        resets=int(reset.sum()),
+        longest_gap_s=unfused_span_s,
+        resets=int(is_reset.sum()),
         gate=gate,
         noise=noise_median,
         noise_from=_noise_origin(aid, log, noise_median),
         axes=axes,
         verdict="disabled"
         if is_disabled
-        else _verdict(axes, without_s[1] - without_s[0], times[fused & (not fused_logged)]),
+        else _verdict(
+            axes, unfused_span_s[1] - unfused_span_s[0], times[fused & (not fused_logged)]
+        ),
     )
 
 
 def _largest_mean_change(time_s: Array, normalised: Array) -> Span | None:
     """Return time (s) and size (√S) of the largest significant change of mean ν/√S, or None.
 
-    Compares the mean of the two windows after each candidate window with the mean of all windows
-    before. The change begins in the candidate window if its mean has moved by a third of the
-    change.
+    The mean of the two windows after each candidate window is compared with the mean of all windows
+    before. The change begins in the candidate window if the mean of the candidate window differs by
+    at least a third of the change.
     """
     window = np.floor((time_s - time_s[0]) / WINDOW_S)
     window_statistics = (
-        pd.Series(normalised).groupby(window).agg(["mean", "size"]).query("size >= @IN_WINDOW")
+        pd.Series(normalised)
+        .groupby(window)
+        .agg(["mean", "size"])
+        .query("size >= @MIN_WINDOW_SAMPLES")
     )
-    mean, worst = window_statistics["mean"].to_numpy(), None
-    for window_index in range(WINDOWS_BEFORE, len(mean) - 2):
+    mean, largest_change = window_statistics["mean"].to_numpy(), None
+    for window_index in range(MIN_WINDOWS_BEFORE, len(mean) - 2):
         mean_change = float(
             np.mean(mean[window_index + 1 : window_index + 3]) - np.mean(mean[:window_index])
         )
         earlier = normalised[window < window_statistics.index[window_index]]
-        chance = float(np.std(earlier)) / math.sqrt(
+        standard_error = float(np.std(earlier)) / math.sqrt(
             2.0 * window_statistics["size"].iloc[:window_index].median()
         )
-        scatter = max(float(np.std(mean[:window_index], ddof=1)), chance)
+        scatter = max(float(np.std(mean[:window_index], ddof=1)), standard_error)
         if abs(mean_change) > max(
-            MIN_CHANGE_IN_SIGMA, MIN_CHANGE_SCATTER_RATIO * scatter, abs(worst[1]) if worst else 0.0
+            MIN_CHANGE_IN_SIGMA,
+            MIN_CHANGE_SCATTER_RATIO * scatter,
+            abs(largest_change[1]) if largest_change else 0.0,
         ):
             has_begun = (
                 abs(mean[window_index] - np.mean(mean[:window_index])) > abs(mean_change) / 3.0
             )
-            first = window_statistics.index[window_index if has_begun else window_index + 1]
-            worst = float(time_s[0] + WINDOW_S * first), mean_change
-    return worst
+            first_window = window_statistics.index[window_index if has_begun else window_index + 1]
+            largest_change = float(time_s[0] + WINDOW_S * first_window), mean_change
+    return largest_change
 
 
-def _fraction(selected: BoolArray, whole_set: BoolArray) -> float:
-    return float(selected.sum() / max(whole_set.sum(), 1))
+def _fraction(is_selected: BoolArray, is_in_set: BoolArray) -> float:
+    return float(is_selected.sum() / max(is_in_set.sum(), 1))
 
 
-def _gate_in_force(aid: Aid, log: AidLog) -> float:
+def _effective_gate(aid: Aid, log: AidLog) -> float:
     """Return the gate in √S, from the logged test ratios or else from the parameter."""
     axis = log.axes[0]
     if f"ratio_{axis}" in log.samples:
-        evaluated = log.samples[log.samples[f"ratio_{axis}"] > 0.0]
-        nis = evaluated[f"innovation_{axis}"] ** 2 / evaluated[f"variance_{axis}"]
-        if len(evaluated) and (nis > 0.0).any():
-            return float(np.sqrt(np.median(nis / evaluated[f"ratio_{axis}"])))
+        rows = log.samples[log.samples[f"ratio_{axis}"] > 0.0]
+        nis = rows[f"innovation_{axis}"] ** 2 / rows[f"variance_{axis}"]
+        if len(rows) and (nis > 0.0).any():
+            return float(np.sqrt(np.median(nis / rows[f"ratio_{axis}"])))
     return max(log.parameters.get(aid.gate, aid.default_gate), 0.01)
 
 
@@ -315,12 +325,12 @@ def _noise_origin(aid: Aid, log: AidLog, noise: float | None) -> str:
     """Return the parameter that R is derived from, or the reported accuracy."""
     value = log.parameters.get(aid.noise)
     if noise is None or value is None:
-        return "" if noise is None else aid.reported
+        return "" if noise is None else aid.noise_origin
     # EKF2 multiplies the noise of GNSS heights by 1.5
     for expected in (value, 1.5 * value, np.sqrt(value)):
         if abs(noise - expected) <= NOISE_TOLERANCE * expected:
             return aid.noise
-    return aid.reported or aid.noise
+    return aid.noise_origin or aid.noise
 
 
 def _longest_gap(times: Array, fused: BoolArray, log: AidLog, start_s: float, end_s: float) -> Span:
@@ -338,7 +348,8 @@ def _longest_gap(times: Array, fused: BoolArray, log: AidLog, start_s: float, en
 
 
 def _verdict(axes: dict[str, AidAxis], longest_gap_duration_s: float, fused_s: Array) -> AidVerdict:
-    # the older topics repeat samples at a reduced rate and contain zeros between fusions
+    # topics of old releases repeat samples at a reduced rate and are zero between fusions, so the
+    # limit follows from the logged rate
     interval_s = float(np.median(np.diff(fused_s))) if len(fused_s) > 1 else 0.0
     if longest_gap_duration_s > max(NOT_FUSED_LIMIT_S, NOT_FUSED_INTERVALS * interval_s):
         return "not_fused"

@@ -1,4 +1,4 @@
-"""Bias of a sensor relative to EKF2's reference, as EKF2 estimates it besides its filter.
+"""Bias of a sensor relative to EKF2's reference, estimated by EKF2 outside its Kalman filter.
 
 Source: PX4-Autopilot ``EKF/bias_estimator`` (``bias_estimator.cpp``; before v1.15
 ``EKF/bias_estimator.cpp``).
@@ -8,16 +8,16 @@ import numpy as np
 
 from px4fuse.arrays import Array, BoolArray
 
-# m/s/√Hz, random walk of the bias (bias_nsd, common.h); m², lower limits of the variances of bias
-# and measurement; gate in √S
+# Noise density of the bias random walk (m/s/√Hz; bias_nsd, common.h), lower limits of the variances
+# of bias and measurement (m²), and gate (√S)
 BIAS_DENSITY, MIN_VARIANCE_M2, MIN_NOISE_M2, BIAS_GATE = 0.13, 1e-8, 1e-4, 3.0
-# Mean signed test ratio above which the random walk is increased (isOffsetDetected), the factor on
-# its variance, and the averaging time (s)
+# Mean signed test ratio above which the random walk is increased (isOffsetDetected), factor on the
+# variance of the random walk, and averaging time of the test ratio (s)
 MAX_MEAN_SIGNED_RATIO, NOISE_FACTOR, FILTER_S = 0.2, 1e3, 10.0
 
 
 class BiasEstimator:
-    """Bias of one sensor in S filter variants, updated with each sample.
+    """Bias of one sensor in S filter variants along k axes, updated with each sample.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class BiasEstimator:
         noise_m2: Array,
         time_s: Array,
         has_sample: BoolArray,
-        learning: BoolArray,
+        updates_bias: BoolArray,
         weight: float = 1.0,
     ) -> tuple[Array, Array]:
         """Return innovation and R with the current bias, then update the bias.
@@ -50,24 +50,26 @@ class BiasEstimator:
         nu, predicted_variance, noise_m2 : ndarray
             Innovation without bias, HPH' and R.
         time_s, has_sample, learning : ndarray
-            Sample time, True for variants with a sample, True for variants that update the bias.
+            Sample time; True for variants with a sample; True for variants that update the bias.
         weight : float
             Number of samples of EKF2 that the logged sample represents.
         """
-        is_learning, bounded_noise = has_sample & learning, np.maximum(noise_m2, MIN_NOISE_M2)
-        raised = np.where(np.abs(self.mean_signed_ratio) > MAX_MEAN_SIGNED_RATIO, NOISE_FACTOR, 1.0)
-        variance_growth = BIAS_DENSITY**2 * (time_s - self.last_s) * raised * is_learning
+        updates_now, bounded_noise = has_sample & updates_bias, np.maximum(noise_m2, MIN_NOISE_M2)
+        density_factor = np.where(
+            np.abs(self.mean_signed_ratio) > MAX_MEAN_SIGNED_RATIO, NOISE_FACTOR, 1.0
+        )
+        variance_growth = BIAS_DENSITY**2 * (time_s - self.last_s) * density_factor * updates_now
         variance = np.minimum(self.variance_m2 + variance_growth, bounded_noise)
         nu, R = nu + self.value_m, noise_m2 + variance
         S = variance + np.maximum((noise_m2 + predicted_variance) / weight, MIN_NOISE_M2)
         ratio = nu * nu / (BIAS_GATE**2 * S)
-        K = variance / S * (is_learning & (ratio < 1.0))
+        K = variance / S * (updates_now & (ratio < 1.0))
         self.value_m = self.value_m - K * nu
         self.variance_m2 = np.maximum(variance * (1.0 - K), MIN_VARIANCE_M2)
         signed = np.minimum(ratio, 1.0) * np.sign(-nu)
         self.mean_signed_ratio = (
             self.mean_signed_ratio
-            + self.filter_weight * weight * is_learning * (signed - self.mean_signed_ratio)
+            + self.filter_weight * weight * updates_now * (signed - self.mean_signed_ratio)
         )
         self.last_s = np.where(has_sample, time_s, self.last_s)
         return nu, R

@@ -26,7 +26,7 @@ def earth_rate_rad_s(record: FusionRecord) -> Array:
 
 def ekf2_metres_per_metre(record: FusionRecord) -> tuple[float, float, float]:
     """Return metres in EKF2's state per published metre: north, east, down."""
-    if np.isnan(record.latitude_deg) or not record.keeps_latitude:
+    if np.isnan(record.latitude_deg) or not record.stores_latitude:
         return 1.0, 1.0, 1.0
     squared = ECCENTRICITY**2
     q = 1.0 - squared * np.sin(np.radians(record.latitude_deg)) ** 2

@@ -1,8 +1,9 @@
 """Fusion of GNSS and barometer heights in the EKF2 replay.
 
 EKF2 estimates a bias for the sensor that is not the height reference. Barometer samples between two
-events are fused at the later event; the vertical motion in between follows from the state and the
-IMU.
+events (ends of intervals, see :mod:`px4fuse.ekf2.intervals`) are fused at the later event; the
+vertical motion in between follows from the state and the IMU. Array shapes: E events, S variants,
+k samples per event.
 
 Sources: PX4-Autopilot ``EKF/aid_sources`` (``barometer/baro_height_control.cpp``,
 ``gnss/gnss_height_control.cpp``), before v1.16 ``EKF/baro_height_control.cpp`` and
@@ -19,7 +20,7 @@ from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.bias import BiasEstimator
 from px4fuse.ekf2.replay_segments import (
     HeightSamples,
-    Stretch,
+    ReplaySegment,
     pad_samples,
     sample_steps,
     samples_by_event,
@@ -27,104 +28,112 @@ from px4fuse.ekf2.replay_segments import (
 from px4fuse.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, fuses_by_mask
 from px4fuse.flight import GROUND_EFFECT, Ekf2, Flight, FusionRecord, step_values_at
 
-SPEED_DOWN, DOWN = 5, 8
+VELOCITY_DOWN, DOWN = 5, 8
 SENSORS = (BAROMETER, GNSS_HGT)
 HEIGHTS = (*SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
-DEAD_ZONE_M = 4.0  # m; default of EKF2_GND_EFF_DZ
-REFERENCES = {0: BAROMETER.name, 1: GNSS_HGT.name}  # values of EKF2_HGT_REF
-# s; height biases are logged at 2 Hz
-BIAS_LATE_S = 1.0
-# Hz; barometer rate in EKF2 from v1.15 and before, and the lowest logged rate that can be replayed.
-# One logged sample represents several if the log has fewer
-BAROMETER_HZ, OLD_BAROMETER_HZ, LEAST_HZ = 10.0, 15.0, 4.0
+DEFAULT_DEAD_ZONE_M = 4.0  # m; default of EKF2_GND_EFF_DZ
+HEIGHT_REFERENCES = {0: BAROMETER.name, 1: GNSS_HGT.name}  # values of EKF2_HGT_REF
+# s; start of the replay before the first logged height bias (2 Hz) that is accepted
+MAX_BIAS_LOG_DELAY_S = 1.0
+# Hz; barometer rate in EKF2 from v1.15 on, the rate before v1.15, and the lowest logged rate that
+# can be replayed. At a lower logged rate one logged sample represents several
+BAROMETER_HZ, OLD_BAROMETER_HZ, MIN_BAROMETER_LOG_HZ = 10.0, 15.0, 4.0
 # lower limits of gates (√S) and of the noise of position (m) and velocity (m/s)
-MIN_GATE, MIN_SD = 1.0, 0.01
+MIN_GATE, MIN_SIGMA = 1.0, 0.01
 
 
 def add_heights(
-    flight: Flight, ekf2: Ekf2, record: FusionRecord, stretches: Sequence[Stretch]
-) -> tuple[Stretch, ...] | str:
-    """Return the stretches with height samples, or the reason why the log is not sufficient."""
-    parameters, times = record.parameters, np.concatenate([stretch.time_s for stretch in stretches])
+    flight: Flight, ekf2: Ekf2, record: FusionRecord, segments: Sequence[ReplaySegment]
+) -> tuple[ReplaySegment, ...] | str:
+    """Add height samples to the segments, or return the reason why the log is not sufficient."""
+    parameters, times = record.parameters, np.concatenate([segment.time_s for segment in segments])
     if fuses_by_mask(parameters):
         return "EKF2 before PX4 v1.14 fuses only one height sensor"
     enabled = {name: log.enabled for name, log in ekf2.aids.items() if log.enabled is not None}
     enabled_shares = {
-        name: float(np.mean(step_values_at(on, times) > 0.0)) for name, on in enabled.items()
+        name: float(np.mean(step_values_at(is_enabled, times) > 0.0))
+        for name, is_enabled in enabled.items()
     }
     fused = [aid.name for aid in SENSORS if enabled_shares.get(aid.name) == 1.0]
-    if more := [aid for aid in HEIGHTS if enabled_shares.get(aid.name) and aid.name not in fused]:
-        return f"EKF2 also fused {more[0].label} in part of the flight"
-    reference = REFERENCES.get(int(parameters.get("EKF2_HGT_REF", 1.0)))
+    if other_aids := [
+        aid for aid in HEIGHTS if enabled_shares.get(aid.name) and aid.name not in fused
+    ]:
+        return f"EKF2 also fused {other_aids[0].label} in part of the flight"
+    reference = HEIGHT_REFERENCES.get(int(parameters.get("EKF2_HGT_REF", 1.0)))
     if len(fused) == 1:  # a single sensor is the reference
         (reference,) = fused
     if reference not in fused:
         return "the height reference is neither GNSS nor barometer, or not logged"
-    taken_s, down_m = np.zeros((2, 0))
+    measured_at_s, down_m = np.zeros((2, 0))
     if BAROMETER.name in fused and flight.barometer is not None:
-        taken_s = flight.barometer.index.to_numpy() - 0.5 * ekf2.step_s
+        measured_at_s = flight.barometer.index.to_numpy() - 0.5 * ekf2.step_s
         down_m = flight.barometer["down_m"].to_numpy() + record.altitude_m
-    effect_height_m = parameters.get("EKF2_GND_EFF_DZ", DEAD_ZONE_M)
-    dead_zone_m = np.where(record.was_in_state(GROUND_EFFECT, taken_s), effect_height_m, 0.0)
+    effect_height_m = parameters.get("EKF2_GND_EFF_DZ", DEFAULT_DEAD_ZONE_M)
+    dead_zone_m = np.where(record.was_in_state(GROUND_EFFECT, measured_at_s), effect_height_m, 0.0)
     ekf2_rate_hz = OLD_BAROMETER_HZ if record.per_step_biases else BAROMETER_HZ
-    new_stretches, delayed = [], record.delayed["down_m"]
-    for stretch in stretches:
-        start_s, bias = float(stretch.time_s[0]), (0.0, 0.0)
-        for other in {*fused} - {reference}:
-            logged_bias = record.height_bias.get(other)
+    new_segments, delayed = [], record.delayed["down_m"]
+    for segment in segments:
+        start_s, bias = float(segment.time_s[0]), (0.0, 0.0)
+        for aid_name in {*fused} - {reference}:
+            logged_bias = record.height_bias.get(aid_name)
             if (
                 logged_bias is None
-                or not logged_bias.index[0] - BIAS_LATE_S < start_s < logged_bias.index[-1]
+                or not logged_bias.index[0] - MAX_BIAS_LOG_DELAY_S < start_s < logged_bias.index[-1]
             ):
-                return f"EKF2's bias of the {AIDS[other].label} is not logged"
+                return f"EKF2's bias of the {AIDS[aid_name].label} is not logged"
             value, variance = (
                 np.interp(start_s, logged_bias.index, logged_bias[name]) for name in logged_bias
             )
             bias = float(value), float(variance)
-        samples = barometer_samples_inside(stretch, taken_s, down_m, dead_zone_m)
-        rate_hz = len(samples[0]) / float(stretch.time_s[-1] - start_s)
-        if BAROMETER.name in fused and rate_hz < LEAST_HZ:
+        samples = barometer_samples_inside(segment, measured_at_s, down_m, dead_zone_m)
+        rate_hz = len(samples[0]) / float(segment.time_s[-1] - start_s)
+        if BAROMETER.name in fused and rate_hz < MIN_BAROMETER_LOG_HZ:
             return f"the barometer is logged at {rate_hz:.1f} Hz"
         weight = max(ekf2_rate_hz / rate_hz, 1.0) if rate_hz else 1.0
-        state = stretch.state.copy()
+        state = segment.state.copy()
         state[DOWN] = np.interp(start_s, delayed.index, delayed)
         heights = HeightSamples(tuple(fused), reference, bias, *samples, weight)
-        new_stretches.append(replace(stretch, state=state, heights=heights))
-    return tuple(new_stretches)
+        new_segments.append(replace(segment, state=state, heights=heights))
+    return tuple(new_segments)
 
 
 def barometer_samples_inside(
-    stretch: Stretch, taken_s: Array, down_m: Array, dead_zone_m: Array
+    segment: ReplaySegment, measured_at_s: Array, down_m: Array, dead_zone_m: Array
 ) -> tuple[IntArray, Array, Array, Array]:
-    """Return the barometer samples inside a stretch, preceded by the prediction step of each."""
-    step, is_inside = sample_steps(stretch, taken_s)
-    return step, taken_s[is_inside], down_m[is_inside], dead_zone_m[is_inside]
+    """Return prediction step, time (s), height (m, down) and dead zone (m) of barometer samples."""
+    step, is_inside = sample_steps(segment, measured_at_s)
+    return step, measured_at_s[is_inside], down_m[is_inside], dead_zone_m[is_inside]
 
 
-def barometer_samples(stretch: Stretch, ends: Sequence[IntArray]) -> list[Array]:
+def barometer_samples(segment: ReplaySegment, ends: Sequence[IntArray]) -> list[Array]:
     """Return barometer samples by fusion event, one array per set of event steps.
 
-    Each array has shape (5, k, E), with k the maximum number of samples in one interval. Rows:
-    height at the event without the motion of the state (m, down), sample age (s), sample time (s),
-    dead zone (m), and 1; all 0 without a sample.
+    Each array has shape (5, k, E). Rows: height (m, down) as in
+    :func:`~px4fuse.ekf2.replay_segments.samples_by_event`, sample age (s), sample time (s), dead
+    zone (m), and 1; all are 0 without a sample.
     """
-    heights = stretch.heights
+    heights = segment.heights
     assert heights is not None
-    sample_columns = heights.down_m[:, None], slice(2, 3), heights.taken_s, heights.dead_zone_m
+    sample_columns = (
+        heights.down_m[:, None],
+        slice(2, 3),
+        heights.measured_at_s,
+        heights.dead_zone_m,
+    )
     return pad_samples(
         [
-            samples_by_event(stretch, event_steps, heights.step, *sample_columns)
+            samples_by_event(segment, event_steps, heights.step, *sample_columns)
             for event_steps in ends
         ]
     )
 
 
 class HeightFilter:
-    """Height fusion of S variants through one stretch, event by event.
+    """Height fusion of S variants through one segment, event by event.
 
     Parameters
     ----------
-    stretch : Stretch
+    segment : ReplaySegment
     barometer : ndarray, shape (5, k, E, S) or (5, k, E, 1)
         From :func:`barometer_samples`.
     fix_s, has_fix : ndarray, shape (E, S) or (E, 1)
@@ -132,43 +141,43 @@ class HeightFilter:
     enabled : mapping from PX4's name of an aid to ndarray of bool, shape (E, S)
         True while the aid is fused.
     parameters : mapping from PX4's name to ndarray, shape (S,)
-    gated : ndarray of bool, shape (S,)
+    has_gate : ndarray of bool, shape (S,)
         True for variants that apply the gate.
 
     Attributes
     ----------
     update_log : ndarray, shape (E, k + 1, 3, S)
-        For the barometer samples and GNSS at each event: innovation (m, measurement minus state),
-        its variance (m²), and 1 if fused.
+        For the k barometer samples and the GNSS height of each event: innovation (m, measurement
+        minus state), its variance (m²), and 1 if fused.
     """
 
     def __init__(
         self,
-        stretch: Stretch,
+        segment: ReplaySegment,
         barometer: Array,
         fix_s: Array,
         has_fix: BoolArray,
         enabled: Mapping[str, BoolArray],
         parameters: Mapping[str, Array],
-        gated: BoolArray,
+        has_gate: BoolArray,
     ) -> None:
-        heights, size = stretch.heights, len(gated)
+        heights, size = segment.heights, len(has_gate)
         assert heights is not None
         self.fused = heights.fused
-        self.down_m, self.age_s, taken_s, self.dead_zone_m, is_sample = barometer
-        self.time_s = [*taken_s, fix_s]
+        self.down_m, self.age_s, measured_at_s, self.dead_zone_m, is_sample = barometer
+        self.time_s = [*measured_at_s, fix_s]
         self.update_log = np.full((len(fix_s), len(self.time_s), 3, size), np.nan)
         has_fix = has_fix & enabled[GNSS_HGT.name] & (GNSS_HGT.name in heights.fused)
         self.has_sample = [*((is_sample > 0.0) & enabled[BAROMETER.name]), has_fix]
         self.any = [np.any(each, axis=1).tolist() for each in self.has_sample]
         self.in_ground_effect = self.dead_zone_m.any(axis=2)
         gates = [np.maximum(parameters.get(aid.gate, MIN_GATE), MIN_GATE) for aid in SENSORS]
-        self.gate2 = [np.where(gated, gate**2, np.inf) for gate in gates]
-        self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SD), MIN_SD) ** 2
+        self.gate2 = [np.where(has_gate, gate**2, np.inf) for gate in gates]
+        self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SIGMA), MIN_SIGMA) ** 2
         self.biased = [aid.name != heights.reference for aid in SENSORS]
         self.weight, self.learning = (heights.weight, 1.0), enabled[heights.reference]
         value_m, variance_m2 = (np.full(size, part) for part in heights.bias)
-        start_s, step_s = float(stretch.time_s[0]), float(np.median(stretch.step_s))
+        start_s, step_s = float(segment.time_s[0]), float(np.median(segment.step_s))
         self.bias = BiasEstimator(value_m, variance_m2, start_s, step_s)
 
     def updates(self, sensor: str, variant: int, end_s: Array) -> pd.DataFrame:
@@ -204,10 +213,12 @@ class HeightFilter:
         for slot in range(len(self.down_m)):
             if self.any[slot][e]:
                 age_s = self.age_s[slot, e]
-                column = P[:, :, DOWN] - age_s[:, None] * P[:, :, SPEED_DOWN]
-                spread = column[:, DOWN] - age_s * column[:, SPEED_DOWN]
-                nu = self.down_m[slot, e] - x[:, DOWN] + age_s * x[:, SPEED_DOWN]
-                x, P = self._fuse_innovation(e, slot, 0, x, P, column, spread, nu, self.noise_m2)
+                column = P[:, :, DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
+                predicted_variance = column[:, DOWN] - age_s * column[:, VELOCITY_DOWN]
+                nu = self.down_m[slot, e] - x[:, DOWN] + age_s * x[:, VELOCITY_DOWN]
+                x, P = self._fuse_innovation(
+                    e, slot, 0, x, P, column, predicted_variance, nu, self.noise_m2
+                )
         if self.any[-1][e]:
             column, nu = P[:, :, DOWN], gnss_m - x[:, DOWN]
             x, P = self._fuse_innovation(e, -1, 1, x, P, column, column[:, DOWN], nu, gnss_m2)
@@ -221,7 +232,7 @@ class HeightFilter:
         x: Array,
         P: Array,
         column: Array,
-        spread: Array,
+        predicted_variance: Array,
         nu: Array,
         R: Array,
     ) -> tuple[Array, Array]:
@@ -229,12 +240,18 @@ class HeightFilter:
         if self.biased[sensor_index]:
             has_sample, time_s = self.has_sample[slot][e], self.time_s[slot][e]
             nu, R = self.bias.remove_bias(
-                nu, spread, R, time_s, has_sample, self.learning[e], self.weight[sensor_index]
+                nu,
+                predicted_variance,
+                R,
+                time_s,
+                has_sample,
+                self.learning[e],
+                self.weight[sensor_index],
             )
         if sensor_index == 0 and self.in_ground_effect[slot, e]:
             nu = np.where(nu > 0.0, np.maximum(nu - self.dead_zone_m[slot, e], 0.0), nu)
-        S = spread + R
+        S = predicted_variance + R
         is_fused = self.has_sample[slot][e] & (nu * nu <= self.gate2[sensor_index] * S)
         self.update_log[e, slot] = nu, S, is_fused
-        K = column * (is_fused / (spread + R / self.weight[sensor_index]))[:, None]
+        K = column * (is_fused / (predicted_variance + R / self.weight[sensor_index]))[:, None]
         return x + K * nu[:, None], P - K[:, :, None] * column[:, None]

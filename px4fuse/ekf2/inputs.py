@@ -18,9 +18,9 @@ from px4fuse.ekf2.heights import add_heights
 from px4fuse.ekf2.output_predictor import corrections
 from px4fuse.ekf2.replay_segments import (
     IMU_GAP_S,
-    MIN_STRETCH_S,
-    Stretch,
-    find_stretches,
+    MIN_SEGMENT_S,
+    ReplaySegment,
+    find_replay_segments,
     predict_s,
 )
 from px4fuse.ekf2_parameters import (
@@ -34,8 +34,8 @@ from px4fuse.ekf2_parameters import (
     GNSS_VEL,
     MAG,
     Aid,
+    effective_settings,
     fuses_by_mask,
-    settings_in_force,
 )
 from px4fuse.flight import (
     Columns,
@@ -59,48 +59,52 @@ MODEL_NOTE = (
     "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
 )
 # s, logging interval of the topics with a copy of the vision samples (logged_topics.cpp)
-COPY_INTERVAL_S = {"estimator_visual_odometry_aligned": 0.2, "estimator_aid_src_ev_pos": 0.5}
+VISION_COPY_INTERVALS_S = {
+    "estimator_visual_odometry_aligned": 0.2,
+    "estimator_aid_src_ev_pos": 0.5,
+}
 ROTATE_VISION_BIT = 64  # EKF2_AID_MASK, up to v1.13
-# s; aid-source topics contain EKF2's measurement time within about 1 ms
-SAME_SAMPLE_S = 0.006
+# s; estimator_aid_src topics contain EKF2's measurement time within about 1 ms
+SAMPLE_MATCH_TOLERANCE_S = 0.006
 GNSS_VELOCITY_BIT = 4  # bit in EKF2_GPS_CTRL; before v1.14 GNSS velocity is always fused
 GNSS_LABELS = (GNSS_POS.label, GNSS_VEL.label)
-# s; vehicle_local_position is logged every 0.1 s
-RESET_SHOWS_S = 0.2
-# s; longer steps lose rotation and vibration, EKF2 predicts every 8 to 13 ms
+# s; longest time from a reset to its publication: vehicle_local_position is logged every 0.1 s
+MAX_RESET_PUBLICATION_S = 0.2
+# s; EKF2 predicts every 8 to 13 ms, and longer IMU intervals lose rotation and vibration
 MAX_IMU_INTERVAL_S = 0.012
-# maximum fraction of IMU samples missing from the log outside gaps; EKF2 received them
+# maximum fraction of IMU samples that EKF2 received and the log lacks, outside gaps
 MAX_LOST_SHARE = 0.1
 # first release whose estimator_states have the timestamp of the fusion horizon
-STAMPED_AT_HORIZON = "PX4 v1.13"
+FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
 UNLIMITED_RESETS = 1_000_000
 MAX_INTERVAL_S = 0.25
 
 
 @dataclass(frozen=True)
 class ReceivedPositions:
-    """Position samples as received by EKF2, in time order; shape (m,) or (m, ...).
+    """Position samples as received by EKF2, in time order; m: number of samples.
 
     Attributes
     ----------
     stamp_s, arrival_s : ndarray, shape (m,)
+        Timestamps and arrival times.
     position_m : ndarray, shape (m, 3)
-        NED.
+        Position in NED.
     variance_m2 : ndarray, shape (m, 3)
-        As reported by the sender; 0 if not reported.
+        Variance reported by the sender; 0 if not reported.
     velocity_m_s, velocity_variance_m2_s2 : ndarray, shape (m, 3), or None
-        NED, if EKF2 fuses velocity with each position.
+        Velocity in NED with its variance, if EKF2 fuses velocity with each position.
     rejected : ndarray, shape (m,)
-        1 if the gate of EKF2 rejected it, else 0; NaN if not logged.
+        1 if EKF2's gate rejected the sample, else 0; NaN if not logged.
     reset : ndarray of bool, shape (m,)
-        True if EKF2 reset its position to it, if rejections are logged.
+        True if EKF2 reset its position to the sample; False if rejections are not logged.
     source : str
-        Name of the track.
+        Name of the position track.
     uses_sender_times : bool
         True if EKF2 uses the measurement times of the sender instead of the delay parameter.
-    moved_m : ndarray, shape (m, 2), or None
+    correction_m : ndarray, shape (m, 2), or None
         Position correction of EKF2 at each sample (m, north and east), estimated from the published
-        position. Only if some rejections are not logged.
+        position. None if all rejections are logged, or none occurred.
     """
 
     stamp_s: Array
@@ -113,7 +117,7 @@ class ReceivedPositions:
     velocity_m_s: Array | None = None
     velocity_variance_m2_s2: Array | None = None
     uses_sender_times: bool = False
-    moved_m: Array | None = None
+    correction_m: Array | None = None
 
     __repr__ = one_line_repr
 
@@ -131,12 +135,12 @@ class FusionRules:
     reset_s : float
         The position is reset to the sample after this time of rejections.
     resets : int
-        Resets in a row, after which fusion stops until a sample on which it may start.
+        Number of resets in a row after which fusion stops, until a sample with which it may start.
     reset_scale : float
-        Position variance after a reset over the variance of the sample.
+        Ratio of the position variance after a reset to the variance of the sample.
     with_velocity : bool
-        True if velocity is reset with position: when both were rejected for ``reset_s``, or
-        position for twice as long.
+        True if velocity is reset together with position: after both were rejected for ``reset_s``,
+        or position for twice as long.
     bias_floor : float or None
         Lower limit of the accelerometer bias variance (m²/s⁴), if the release has one.
     horizon_by_delay : bool
@@ -162,15 +166,15 @@ class Inputs:
     ----------
     settings : dict
         Logged values of the parameters in the model, by PX4 name.
-    stretches : tuple of Stretch
+    segments : tuple of ReplaySegment
     received : ReceivedPositions
     aid : Aid
         Aid as which EKF2 fused the positions.
     rules : FusionRules
     step_s : float
-        Average prediction step.
+        Mean prediction step.
     horizon_s : float
-        Age of the fusion horizon.
+        Delay of the fusion horizon.
     predict_s : float
         EKF2_PREDICT_US.
     vision_height : bool
@@ -186,7 +190,7 @@ class Inputs:
     """
 
     settings: dict[str, float]
-    stretches: tuple[Stretch, ...]
+    segments: tuple[ReplaySegment, ...]
     received: ReceivedPositions
     rules: FusionRules
     step_s: float
@@ -211,8 +215,9 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     ----------
     flight : Flight
     doubtful : mapping from PX4's name of an aid to str
-        Aids whose replay disagrees with the log, with the reason. For a height sensor the logged
-        EKF2 height is used; optical flow does not bridge gaps; vision besides GNSS is not fused.
+        Aids whose replay disagrees with the log, with the reason. With a height sensor among them
+        the logged EKF2 height is used; with optical flow, flow does not bridge gaps of the source;
+        vision besides GNSS is not fused.
     """
     imu, attitude, ekf2 = flight.imu, flight.attitude, flight.ekf2
     if isinstance(imu, Unavailable):
@@ -222,8 +227,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if isinstance(ekf2, Unavailable):
         return ekf2
     aid = replayed_aid(ekf2)
-    gnss, logged_ekf2 = aid == GNSS_POS, ekf2
-    if gnss:
+    is_gnss, logged_ekf2 = aid == GNSS_POS, ekf2
+    if is_gnss:
         ekf2 = with_gnss_innovations(ekf2)
     record, horizon_s = ekf2.record, ekf2.horizon_s
     if isinstance(record, Unavailable):
@@ -232,19 +237,23 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         record = replace(record, latitude_deg=np.nan)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
-    modelled_aids = (*GNSS_LABELS, *([FLOW.label] if len(record.flow) else [])) if gnss else ()
-    if more := [aid_name for aid_name in record.other_aiding if aid_name not in modelled_aids]:
-        fused, off = ("GNSS", "") if gnss else ("vision position", f", {GNSS_POS.switch} 0")
+    modelled_aids = (*GNSS_LABELS, *([FLOW.label] if len(record.flow) else [])) if is_gnss else ()
+    if unmodelled_aids := [
+        aid_name for aid_name in record.other_aiding if aid_name not in modelled_aids
+    ]:
+        fused, disable_gnss = (
+            ("GNSS", "") if is_gnss else ("vision position", f", {GNSS_POS.switch} 0")
+        )
         return Unavailable(
             "EKF2 replay",
             f"EKF2 fused horizontal aids besides {fused} that the model does not contain "
-            f"({', '.join(more)})",
-            f"Fly with EKF2_OF_CTRL 0{off} and without bit 2 of {EV_POS.switch}.",
+            f"({', '.join(unmodelled_aids)})",
+            f"Fly with EKF2_OF_CTRL 0{disable_gnss} and without bit 2 of {EV_POS.switch}.",
         )
     if missing := _missing_imu(imu.index.to_numpy()):
         return missing
     position_samples = (
-        read_gnss(flight, ekf2, record) if gnss else read_vision(flight, ekf2, record, attitude)
+        read_gnss(flight, ekf2, record) if is_gnss else read_vision(flight, ekf2, record, attitude)
     )
     if isinstance(position_samples, Unavailable):
         return position_samples
@@ -254,28 +263,28 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
             f"the log has no sample of {aid.label} at a time at which EKF2 reports its fusion",
             "Record estimator_status_flags and the source for the whole flight.",
         )
-    uses_vision = gnss and EV_POS.name not in doubtful
+    uses_vision = is_gnss and EV_POS.name not in doubtful
     vision = (
         _read_vision_besides_gnss(flight, logged_ekf2, record, attitude) if uses_vision else None
     )
     if isinstance(vision, Unavailable):
         return vision
     # since v1.17 each receiver has its lever arm, logged in its messages
-    track = _gnss_track(flight) if gnss else None
-    place = {} if track is None else dict(zip(aid.place, track.lever_arm_m, strict=True))
+    track = _gnss_track(flight) if is_gnss else None
+    lever_arm = {} if track is None else dict(zip(aid.lever_arm, track.lever_arm_m, strict=True))
     if isinstance(horizon_s, Unavailable):
-        if not flight.log.firmware.startswith(STAMPED_AT_HORIZON):
+        if not flight.log.firmware.startswith(FIRST_RELEASE_WITH_HORIZON_TIMES):
             return Unavailable(ANALYSIS_NAME, horizon_s.reason, horizon_s.remedy)
-        horizon_s = 0.0  # one-step buffer: EKF2_EV_DELAY is at most EKF2_PREDICT_US
-    carrying_s, flow = position_samples.stamp_s, record.flow if gnss else record.flow.iloc[:0]
+        horizon_s = 0.0  # EKF2_EV_DELAY is at most EKF2_PREDICT_US, so the buffer has one step
+    aiding_s, flow = position_samples.stamp_s, record.flow if is_gnss else record.flow.iloc[:0]
     if len(flow) and FLOW.name not in doubtful:
-        carrying_s = np.union1d(carrying_s, flow.index)
-    stretches = find_stretches(flight, imu, attitude, ekf2, record, carrying_s, gnss=gnss)
-    if not stretches:
+        aiding_s = np.union1d(aiding_s, flow.index)
+    segments = find_replay_segments(flight, imu, attitude, ekf2, record, aiding_s, is_gnss=is_gnss)
+    if not segments:
         fused = aid.label.removesuffix(", position")
         return Unavailable(
             "EKF2 replay",
-            f"{fused} was never fused for {MIN_STRETCH_S:g} s in flight without a gap in "
+            f"{fused} was never fused for {MIN_SEGMENT_S:g} s in flight without a gap in "
             "it or in the IMU",
             "Record without dropouts (faster SD card, fewer topics) and with a steady "
             "position source.",
@@ -283,30 +292,30 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     fusing = ekf2.fusing
     if len(flow):
         gate = record.parameters.get(FLOW.gate, FLOW.default_gate)
-        stretches = tuple(add_flow_samples(stretch, flow, gate) for stretch in stretches)
+        segments = tuple(add_flow_samples(segment, flow, gate) for segment in segments)
     height_reason = "; ".join(
-        f"{AIDS[name].label}: {why}"
-        for name, why in doubtful.items()
+        f"{AIDS[name].label}: {reason}"
+        for name, reason in doubtful.items()
         if name not in (FLOW.name, EV_POS.name)
     )
-    if gnss and not height_reason:
-        new_stretches = add_heights(flight, ekf2, record, stretches)
-        stretches, height_reason = (
-            (stretches, new_stretches) if isinstance(new_stretches, str) else (new_stretches, "")
+    if is_gnss and not height_reason:
+        new_segments = add_heights(flight, ekf2, record, segments)
+        segments, height_reason = (
+            (segments, new_segments) if isinstance(new_segments, str) else (new_segments, "")
         )
     other_aids = [EV_POS] if vision else []
-    other_aids += [MAG] if any(stretch.field for stretch in stretches) else []
-    heights = stretches[0].heights
+    other_aids += [MAG] if any(segment.field for segment in segments) else []
+    heights = segments[0].heights
     other_aids += [BAROMETER] if heights and BAROMETER.name in heights.fused else []
     return Inputs(
-        settings=settings_in_force(record.parameters, aid, *other_aids) | place,
-        stretches=stretches,
+        settings=effective_settings(record.parameters, aid, *other_aids) | lever_arm,
+        segments=segments,
         received=position_samples,
-        rules=_rules(record, ekf2.step_s, gnss=gnss),
+        rules=_rules(record, ekf2.step_s, is_gnss=is_gnss),
         step_s=ekf2.step_s,
         horizon_s=horizon_s,
         predict_s=predict_s(record),
-        vision_height=not gnss
+        vision_height=not is_gnss
         and isinstance(fusing, pd.DataFrame)
         and bool(fusing["vertical"].mean() > 0.5),
         imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
@@ -341,20 +350,29 @@ def _missing_imu(time_s: Array) -> Unavailable | None:
     )
 
 
-def _rules(record: FusionRecord, step_s: float, *, gnss: bool) -> FusionRules:
+def _rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules:
     """Return the rules for starts, stops and resets of the release that wrote the log."""
-    floor = 5e-8 / step_s**2 if record.per_step_biases else None
-    by_delay = "EKF2_DELAY_MAX" not in record.parameters
-    if gnss:
+    bias_floor = 5e-8 / step_s**2 if record.per_step_biases else None
+    is_horizon_from_delay = "EKF2_DELAY_MAX" not in record.parameters
+    if is_gnss:
         # resetHorizontalPositionTo, gps_control.cpp: variance doubled from v1.16 on; from main of
         # 2026 on each aid is checked separately
-        scale = 2.0 if record.keeps_latitude else 1.0
-        both = GNSS_MODE not in record.parameters
-        return FusionRules(np.inf, np.inf, 7.0, UNLIMITED_RESETS, floor, by_delay, scale, both)
+        reset_scale = 2.0 if record.stores_latitude else 1.0
+        resets_together = GNSS_MODE not in record.parameters
+        return FusionRules(
+            np.inf,
+            np.inf,
+            7.0,
+            UNLIMITED_RESETS,
+            bias_floor,
+            is_horizon_from_delay,
+            reset_scale,
+            resets_together,
+        )
     # Limits: EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
     is_old_release = fuses_by_mask(record.parameters)
     intervals = (np.inf, 7.0, 7.0, UNLIMITED_RESETS) if is_old_release else (0.2, 0.4, 1.0, 5)
-    return FusionRules(*intervals, floor, by_delay)
+    return FusionRules(*intervals, bias_floor, is_horizon_from_delay)
 
 
 def replayed_aid(ekf2: Ekf2) -> Aid:
@@ -366,7 +384,7 @@ def replayed_aid(ekf2: Ekf2) -> Aid:
 
 
 def _enabled_log(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
-    """Return when EKF2 enabled an aid; None if never, or not logged."""
+    """Return the step function "aid enabled" (1 or 0); None if never enabled or not logged."""
     log = ekf2.aids.get(aid.name)
     return (
         log.enabled if log is not None and log.enabled is not None and log.enabled.any() else None
@@ -395,21 +413,21 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
     if (enabled := ekf2.aids[GNSS_POS.name].enabled) is not None:
         is_enabled = step_values_at(enabled, samples.index) > 0.0
         samples, velocities = samples[is_enabled], velocities[is_enabled]
-    # add the delay to the measurement time, so that the replay subtracts it again
-    flown = settings_in_force(parameters, GNSS_POS)
+    # the track is at measurement times; the replay subtracts the delay, which is added here
+    flown = effective_settings(parameters, GNSS_POS)
     flown_s = flown[GNSS_POS.delay] * 1e-3
-    stamp = samples.index.to_numpy() + flown_s
+    timestamp_s = samples.index.to_numpy() + flown_s
     # m, upper limit of the GNSS position noise in EKF2 (gps_control.cpp)
-    worst_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
-    reported_variance = samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=worst_m**2)
+    max_noise_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
+    reported_variance = samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=max_noise_m**2)
     velocity = velocities[Columns.VELOCITY].to_numpy()
-    fused = fuses_by_mask(parameters) or switch & GNSS_VELOCITY_BIT
+    fuses_velocity = fuses_by_mask(parameters) or switch & GNSS_VELOCITY_BIT
     velocity_variance = velocities[Columns.VELOCITY_VARIANCE].fillna(0.0).to_numpy()
-    has_velocity = bool(fused and np.isfinite(velocity).all())
-    decisions = _logged_decisions(ekf2, record, stamp, GNSS_POS)
+    has_velocity = bool(fuses_velocity and np.isfinite(velocity).all())
+    decisions = _logged_decisions(ekf2, record, timestamp_s, GNSS_POS)
     return ReceivedPositions(
-        stamp,
-        stamp,
+        timestamp_s,
+        timestamp_s,
         samples[Columns.POSITION].to_numpy() * ekf2_metres_per_metre(record),
         reported_variance.to_numpy(),
         *decisions,
@@ -417,7 +435,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
         velocity if has_velocity else None,
         velocity_variance if has_velocity else None,
         uses_sender_times=track.age_s == 0.0 != flown_s,
-        moved_m=_position_corrections(
+        correction_m=_position_corrections(
             ekf2, samples.index.to_numpy(), decisions[0], flown["EKF2_TAU_POS"]
         ),
     )
@@ -460,13 +478,13 @@ def read_vision(
     if isinstance(track, Unavailable):
         return track
     samples = track.samples.dropna(subset=Columns.POSITION[:2])
-    stamp = samples.index.to_numpy()
+    timestamp_s = samples.index.to_numpy()
     position = samples[Columns.POSITION].to_numpy(copy=True)
     variance = samples[Columns.POSITION_VARIANCE].fillna(0.0).to_numpy(copy=True)
-    rotated = not isinstance(ekf2.fusing, pd.DataFrame) or not ekf2.fusing["yaw"].any()
+    is_rotated_by_ekf2 = not isinstance(ekf2.fusing, pd.DataFrame) or not ekf2.fusing["yaw"].any()
     if fuses_by_mask(record.parameters):
-        rotated = bool(int(record.parameters[AID_MASK]) & ROTATE_VISION_BIT)
-    if track.frame == "FRD" and rotated:
+        is_rotated_by_ekf2 = bool(int(record.parameters[AID_MASK]) & ROTATE_VISION_BIT)
+    if track.frame == "FRD" and is_rotated_by_ekf2:
         if track.orientation is None:
             return Unavailable(
                 "EKF2 replay",
@@ -474,19 +492,19 @@ def read_vision(
                 "into NED",
                 "Send the position in NED, or with an orientation.",
             )
-        published, sent = (
-            interpolate(stamp, frame.index.to_numpy(), frame[Columns.QUATERNION].to_numpy())
+        ekf2_attitude, source_attitude = (
+            interpolate(timestamp_s, frame.index.to_numpy(), frame[Columns.QUATERNION].to_numpy())
             for frame in (attitude, track.orientation)
         )
-        turn = to_matrix(multiply(published, conjugate(sent)))
-        position = np.einsum("nij,nj->ni", turn, position)
-        variance = np.einsum("nij,nj->ni", turn**2, variance)
+        rotation = to_matrix(multiply(ekf2_attitude, conjugate(source_attitude)))
+        position = np.einsum("nij,nj->ni", rotation, position)
+        variance = np.einsum("nij,nj->ni", rotation**2, variance)
     age = record.vision_age_s
-    arrival = np.full(len(stamp), -np.inf)  # unknown: never late
+    arrival = np.full(len(timestamp_s), -np.inf)  # unknown: never late
     if len(age) and "vehicle_visual_odometry" in track.topics:
-        arrival = stamp + np.interp(stamp, age.index.to_numpy(), age.to_numpy())
-    decisions = _logged_decisions(ekf2, record, stamp)
-    return ReceivedPositions(stamp, arrival, position, variance, *decisions, track.name)
+        arrival = timestamp_s + np.interp(timestamp_s, age.index.to_numpy(), age.to_numpy())
+    decisions = _logged_decisions(ekf2, record, timestamp_s)
+    return ReceivedPositions(timestamp_s, arrival, position, variance, *decisions, track.name)
 
 
 def _read_vision_besides_gnss(
@@ -511,10 +529,10 @@ def _read_vision_besides_gnss(
 
 
 def _logged_decisions(
-    ekf2: Ekf2, record: FusionRecord, stamp: Array, aid: Aid = EV_POS
+    ekf2: Ekf2, record: FusionRecord, timestamp_s: Array, aid: Aid = EV_POS
 ) -> tuple[Array, BoolArray]:
-    """Return logged rejections and resets of each sample, matched by measurement time."""
-    rejected, reset = np.full(len(stamp), np.nan), np.zeros(len(stamp), dtype=bool)
+    """Return the logged rejection and reset of each sample, matched by measurement time."""
+    rejected, reset = np.full(len(timestamp_s), np.nan), np.zeros(len(timestamp_s), dtype=bool)
     innovations, horizon_s = ekf2.innovations["north"], ekf2.horizon_s
     has_own_topic = aid_source(aid) in ekf2.innovation_topics
     if (
@@ -523,15 +541,18 @@ def _logged_decisions(
         or not has_own_topic
     ):
         return rejected, reset
-    delay_s = settings_in_force(record.parameters, aid)[aid.delay] * 1e-3
-    measured_s = stamp - delay_s - 0.5 * ekf2.step_s
+    delay_s = effective_settings(record.parameters, aid)[aid.delay] * 1e-3
+    measured_s = timestamp_s - delay_s - 0.5 * ekf2.step_s
     sample_row = same_sample(innovations.index.to_numpy(), measured_s)
     rejected[sample_row >= 0] = innovations["rejected"].to_numpy()[sample_row[sample_row >= 0]]
     # a reset shows in the first published row after it, one horizon after the measurement
-    published = measured_s + horizon_s
+    publication_s = measured_s + horizon_s
     for reset_s in horizontal_resets_s(ekf2):
-        earlier_rows = np.flatnonzero((published <= reset_s) & (rejected != 0.0))
-        if len(earlier_rows) and reset_s - published[earlier_rows[-1]] < RESET_SHOWS_S:
+        earlier_rows = np.flatnonzero((publication_s <= reset_s) & (rejected != 0.0))
+        if (
+            len(earlier_rows)
+            and reset_s - publication_s[earlier_rows[-1]] < MAX_RESET_PUBLICATION_S
+        ):
             reset[earlier_rows[-1]] = True
     return rejected, reset
 
@@ -541,10 +562,12 @@ def aid_source(aid: Aid) -> str:
     return f"estimator_aid_src_{aid.name}"
 
 
-def same_sample(known_s: Array, wanted_s: Array) -> IntArray:
-    """Return the row of the sample at each measurement time; -1 without one."""
-    at = np.clip(np.searchsorted(known_s, wanted_s - SAME_SAMPLE_S), 0, len(known_s) - 1)
-    return np.where(np.abs(known_s[at] - wanted_s) <= SAME_SAMPLE_S, at, -1)
+def same_sample(sample_s: Array, measurement_s: Array) -> IntArray:
+    """Return the row of the sample at each measurement time; -1 if there is no sample."""
+    row = np.clip(
+        np.searchsorted(sample_s, measurement_s - SAMPLE_MATCH_TOLERANCE_S), 0, len(sample_s) - 1
+    )
+    return np.where(np.abs(sample_s[row] - measurement_s) <= SAMPLE_MATCH_TOLERANCE_S, row, -1)
 
 
 def horizontal_resets_s(ekf2: Ekf2) -> Array:
@@ -556,20 +579,20 @@ def horizontal_resets_s(ekf2: Ekf2) -> Array:
 
 def _vision_track(flight: Flight) -> PositionTrack | Unavailable:
     """Return the complete track that EKF2 received."""
-    why = ["no vehicle_visual_odometry"]
+    reasons = ["no vehicle_visual_odometry"]
     for track in sorted(flight.positions, key=lambda t: t.origin == POSITION_FILE):
         if track.origin.is_vision and track.origin.has_all_samples:
             return track
-        if track.name in COPY_INTERVAL_S:
+        if track.name in VISION_COPY_INTERVALS_S:
             interval = float(np.median(np.diff(track.samples.index.to_numpy())))
-            if interval < 0.9 * COPY_INTERVAL_S[track.name] and interval <= 0.25:
+            if interval < 0.9 * VISION_COPY_INTERVALS_S[track.name] and interval <= 0.25:
                 return track
-            why.append(
+            reasons.append(
                 f"{track.name} has a sample interval of {interval:.2g} s; EKF2 may have fused "
                 "more samples"
             )
     return Unavailable(
         "EKF2 replay",
-        "; ".join(why),
+        "; ".join(reasons),
         "Set SDLOG_PROFILE to 129 (default and vision), or add the MAVLink recording (--mavlink).",
     )

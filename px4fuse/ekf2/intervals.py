@@ -1,7 +1,10 @@
-"""Intervals between position samples: state transition and process noise, computed once.
+"""Intervals between events: state transition and process noise, computed once.
 
-The attitude and biases of a replay with changed parameters hardly differ from the logged ones. The
-transition about the nominal attitude is therefore used for all settings. All intervals are
+An event ends an interval: a position sample or, in a gap of the source, a time at which height and
+heading are fused. E: number of events.
+
+Attitude and biases of a replay with changed parameters hardly differ from the logged ones.
+Therefore the transition about the nominal attitude is used for all parameters. All intervals are
 integrated together, one prediction step at a time.
 
 Error state: attitude error δθ (earth frame, estimate = exp(δθ) · nominal), velocity, position,
@@ -28,34 +31,34 @@ from px4fuse.ekf2.replay_segments import (
     STATES,
     THETA,
     VELOCITY,
-    Stretch,
+    ReplaySegment,
 )
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.trajectory.rotation import skew
 
-# s; EKF2 never fuses a sample that arrives this long behind the fusion horizon (RingBuffer.h,
-# pop_first_older_than)
-MAX_LATE_S = 0.1
-# s; a sample this long behind the fusion horizon counts as late (3 cm at 1 m/s)
-LATE_S = 0.03
+# s; EKF2 never fuses a sample that arrives later than this after the fusion horizon has passed it
+# (RingBuffer.h, pop_first_older_than)
+MAX_LATENESS_S = 0.1
+# s; a sample that is fused later than this counts as late (3 cm at 1 m/s)
+MIN_LATENESS_S = 0.03
 # Action of a sample: none, update of the state, or start of fusion with a reset
 IDLE, FUSE, START = 0, 1, 2
-# Columns of the effects within an interval: initial attitude error, gyro bias, accelerometer bias,
-# correction of the nominal attitude, and gravity plus specific force
+# Number of columns of the effects in an interval: of initial attitude error, gyro bias and
+# accelerometer bias (3 columns each), correction of the nominal attitude, and acceleration
 EFFECT_COLUMNS = 11
-TURN, INPUT = 9, 10
+CORRECTION_COLUMN, INPUT_COLUMN = 9, 10
 
 # Events at the ends of the intervals, in time order
 Events = np.recarray[Any, Any]
 EVENT = np.dtype(
     [
-        ("end", np.intp),  # index of the prediction step after which the event occurs
+        ("end_step", np.intp),  # index of the prediction step after which the event occurs
         ("sample", np.intp),  # index of its position sample, -1 without a sample
         ("action", np.intp),
-        ("usable", bool),  # sample received in time, fused or not
-        ("startable", bool),  # fusion may start on it after a stop
-        ("late", bool),  # arrived behind the fusion horizon, fused late
-        ("lost", bool),  # too late, never fused
+        ("usable", bool),  # sample arrived early enough to be fused
+        ("can_start", bool),  # EKF2 may start fusion with this sample after a stop
+        ("late", bool),  # sample arrived after the fusion horizon had passed, and is fused late
+        ("lost", bool),  # sample arrived too late and is never fused
         ("time_s", float),  # s, measurement time in EKF2: timestamp - delay - half a step
     ]
 )
@@ -63,23 +66,23 @@ EVENT = np.dtype(
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """Intervals of one stretch, each ending in one of E events.
+    """Intervals of one segment, each ending in one of E events.
 
     Attributes
     ----------
     events : recarray, shape (E,)
-        With the fields of :data:`EVENT`.
+        Fields: :data:`EVENT`.
     transition : ndarray, shape (E, 15, 15)
-    turn, drive : ndarray, shape (E, 15)
-        Input to the state: by the correction of the nominal attitude, and by acceleration.
+    correction_input, acceleration_input : ndarray, shape (E, 15)
+        Change of the state by the correction of the nominal attitude, and by the acceleration.
     gyro_noise, accelerometer_noise : ndarray, shape (E, 9, 9)
-        Covariance of attitude, velocity and position added for unit noise.
+        Covariance of attitude, velocity and position added by noise of 1 rad/s or 1 m/s².
     """
 
     events: Events
     transition: Array
-    turn: Array
-    drive: Array
+    correction_input: Array
+    acceleration_input: Array
     gyro_noise: Array
     accelerometer_noise: Array
 
@@ -94,39 +97,42 @@ class Timing:
     horizon_s: float
 
 
-def make_intervals(inputs: Inputs, stretch: Stretch, timing: Timing) -> Intervals:
-    """Compute the intervals of a stretch; number and order are equal for all delays."""
-    events = _events(inputs, stretch, timing)
-    start, end = np.concatenate([[0], events.end[:-1]]), events.end
-    count, duration_s = len(end), stretch.time_s[end] - stretch.time_s[start]
+def make_intervals(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Intervals:
+    """Compute the intervals of a segment; number and order of events are equal for all delays."""
+    events = _events(inputs, segment, timing)
+    start, end = np.concatenate([[0], events.end_step[:-1]]), events.end_step
+    count, duration_s = len(end), segment.time_s[end] - segment.time_s[start]
     transition = np.tile(np.eye(STATES), (count, 1, 1))
-    turn, drive = np.zeros((2, count, STATES))
-    effects = _effects(stretch, start, end)
+    correction_input, acceleration_input = np.zeros((2, count, STATES))
+    effects = _effects(segment, start, end)
     transition[:, :IMU_STATE_COUNT, THETA], transition[:, :IMU_STATE_COUNT, BIASES] = (
         effects[..., :3],
         effects[..., 3:9],
     )
-    turn[:, :IMU_STATE_COUNT], drive[:, :IMU_STATE_COUNT] = effects[..., TURN], effects[..., INPUT]
+    correction_input[:, :IMU_STATE_COUNT], acceleration_input[:, :IMU_STATE_COUNT] = (
+        effects[..., CORRECTION_COLUMN],
+        effects[..., INPUT_COLUMN],
+    )
     transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
     noises = _noises((end - start).astype(float), duration_s, transition[:, VELOCITY, THETA])
-    return Intervals(events, transition, turn, drive, *noises)
+    return Intervals(events, transition, correction_input, acceleration_input, *noises)
 
 
-def _events(inputs: Inputs, stretch: Stretch, timing: Timing) -> Events:
-    received, time_s = inputs.received, stretch.time_s
+def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
+    received, time_s = inputs.received, segment.time_s
     first, last_row = np.searchsorted(received.stamp_s, time_s[[0, -1]])
     stamp, last = received.stamp_s[first:last_row], len(time_s) - 1
     measured_s = stamp - timing.delay_s - 0.5 * inputs.step_s
-    # samples that arrive behind the horizon are fused late, or never
+    # a sample that arrives after the fusion horizon has passed it is fused late, or never
     due_s = np.maximum(measured_s, received.arrival_s[first:last_row] - timing.horizon_s)
     end = np.searchsorted(time_s, due_s - 1e-9)
     is_inside = (end > 0) & (end <= last)
     end = np.maximum.accumulate(np.minimum(end, last))
-    is_in_time = time_s[end] < measured_s + MAX_LATE_S
-    usable = is_inside & is_in_time
-    usable[:-1] &= end[1:] > end[:-1]  # EKF2 fuses the newer of two samples in one step
-    action, startable = _actions(inputs, stretch, measured_s, end, usable)
-    # additional events in gaps of the source, equally many for every delay
+    is_in_time = time_s[end] < measured_s + MAX_LATENESS_S
+    is_usable = is_inside & is_in_time
+    is_usable[:-1] &= end[1:] > end[:-1]  # EKF2 fuses the newer of two samples in one step
+    action, can_start = _actions(inputs, segment, measured_s, end, is_usable)
+    # additional events in gaps of the source; their number does not depend on the delay
     gap_s = np.diff(np.concatenate([time_s[:1], stamp, time_s[-1:]]))
     extra_events = np.maximum(np.ceil(gap_s / inputs.max_interval_s).astype(int) - 1, 0)
     sample_places, total = (
@@ -138,31 +144,38 @@ def _events(inputs: Inputs, stretch: Stretch, timing: Timing) -> Events:
         np.concatenate([[0], end, [last]]),
     )
     events = np.zeros(total, EVENT)
-    events["end"] = np.rint(np.interp(np.arange(total), known_places, ends))
-    events["sample"], events["time_s"] = -1, time_s[events["end"]]
-    late, lost = is_inside & is_in_time & (due_s - measured_s > LATE_S), is_inside & ~is_in_time
+    events["end_step"] = np.rint(np.interp(np.arange(total), known_places, ends))
+    events["sample"], events["time_s"] = -1, time_s[events["end_step"]]
+    late, lost = (
+        is_inside & is_in_time & (due_s - measured_s > MIN_LATENESS_S),
+        is_inside & ~is_in_time,
+    )
     samples = np.arange(first, last_row)
     events[sample_places] = np.rec.fromarrays(
-        [end, samples, action, usable, startable, late, lost, measured_s], dtype=EVENT
+        [end, samples, action, is_usable, can_start, late, lost, measured_s], dtype=EVENT
     )
     return events.view(np.recarray)
 
 
 def _actions(
-    inputs: Inputs, stretch: Stretch, taken_s: Array, end: IntArray, usable: BoolArray
+    inputs: Inputs,
+    segment: ReplaySegment,
+    measured_at_s: Array,
+    end: IntArray,
+    is_usable: BoolArray,
 ) -> tuple[IntArray, BoolArray]:
-    """Return the action of each sample, and True if fusion may start on it (ev_control.cpp)."""
+    """Return the action of each sample, and True if fusion may start with it (ev_control.cpp)."""
     rules = inputs.rules
-    action = np.full(len(taken_s), IDLE)
-    startable = np.zeros(len(taken_s), dtype=bool)
-    usable_rows = np.flatnonzero(usable)
-    interval = np.diff(taken_s[usable_rows], prepend=-np.inf)
-    startable[usable_rows] = interval < rules.start_interval_s
-    # s, age of the previous sample in the last step before this fusion
-    gaps_s = stretch.time_s[end[usable_rows] - 1] - np.concatenate(
-        [[np.inf], taken_s[usable_rows[:-1]]]
+    action = np.full(len(measured_at_s), IDLE)
+    can_start = np.zeros(len(measured_at_s), dtype=bool)
+    usable_rows = np.flatnonzero(is_usable)
+    interval = np.diff(measured_at_s[usable_rows], prepend=-np.inf)
+    can_start[usable_rows] = interval < rules.start_interval_s
+    # s, age of the previous usable sample one step before the fusion of each sample
+    gaps_s = segment.time_s[end[usable_rows] - 1] - np.concatenate(
+        [[np.inf], measured_at_s[usable_rows[:-1]]]
     )
-    is_fusing = stretch.fusing
+    is_fusing = segment.fusing
     for row, (interval_s, gap_s) in enumerate(zip(interval.tolist(), gaps_s.tolist(), strict=True)):
         is_fusing = is_fusing and not gap_s > rules.stop_s
         if is_fusing:
@@ -170,33 +183,36 @@ def _actions(
         elif interval_s < rules.start_interval_s:
             action[usable_rows[row]] = START
             is_fusing = True
-    return action, startable
+    return action, can_start
 
 
-def _effects(stretch: Stretch, start: IntArray, end: IntArray) -> Array:
-    """Return the effects on attitude, velocity and position at the end of each interval.
+def _effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
+    """Return the effects of all columns on attitude, velocity and position at each event.
 
-    The shape is (E, 9, 11). All intervals advance together by one step.
+    Shape (E, 9, EFFECT_COLUMNS).
     """
     length = end - start
-    # process step 1 of all intervals, then step 2, ..., with longer intervals first
+    # integrate step 1 of all intervals, then step 2, ...: longer intervals stand first, so that
+    # those still running are a prefix
     longest_first = np.argsort(-length, kind="stable")
     first = start[longest_first]
     attitude, velocity, position = effects = np.zeros((3, len(end), 3, EFFECT_COLUMNS))
     attitude[:, :, 0:3] = np.eye(3)
-    force_m_s2 = np.einsum("nij,nj->ni", stretch.rotation[1:], stretch.force_m_s2)
+    force_m_s2 = np.einsum("nij,nj->ni", segment.rotation[1:], segment.force_m_s2)
     steps = np.arange(int(length.max(initial=0)))
-    for at, count in zip(steps, np.searchsorted(-length[longest_first], -steps), strict=True):
-        step, rows = first[:count] + at, slice(count)
-        dt, force = stretch.step_s[step][:, None, None], force_m_s2[step]
-        rotation_step = -stretch.rotation[1:][step] * dt  # ∂δθ/∂b_g and ∂v/∂b_a of one step
+    for step_number, count in zip(
+        steps, np.searchsorted(-length[longest_first], -steps), strict=True
+    ):
+        step, rows = first[:count] + step_number, slice(count)
+        dt, force = segment.step_s[step][:, None, None], force_m_s2[step]
+        rotation_step = -segment.rotation[1:][step] * dt  # ∂δθ/∂b_g and ∂v/∂b_a of one step
         position[rows] += 0.5 * dt * velocity[rows]
         velocity[rows] += (-skew(force) * dt) @ attitude[rows]  # ∂v/∂δθ of one step
         velocity[rows, :, 6:9] += rotation_step
-        velocity[rows, :, INPUT] += (force + GRAVITY_M_S2) * dt[:, :, 0]
+        velocity[rows, :, INPUT_COLUMN] += (force + GRAVITY_M_S2) * dt[:, :, 0]
         position[rows] += 0.5 * dt * velocity[rows]
         attitude[rows, :, 3:6] += rotation_step
-        attitude[rows, :, TURN] -= stretch.correction_rad[step]
+        attitude[rows, :, CORRECTION_COLUMN] -= segment.correction_rad[step]
     effects[:, longest_first] = effects.copy()
     return np.concatenate(effects, axis=1)
 

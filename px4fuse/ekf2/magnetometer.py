@@ -1,7 +1,8 @@
 """Magnetometer fusion of all three axes, with earth and body fields as states.
 
-Samples between two events are fused as their mean at the later event: the attitude error hardly
-changes in between.
+Samples between two events (ends of intervals, see :mod:`px4fuse.ekf2.intervals`) are fused as their
+mean at the later event: the attitude error hardly changes in between. Array shapes: E events, S
+variants.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/magnetometer`` (``mag_fusion.cpp``: fuseMag;
 ``mag_control.cpp``: R and its lower limit), ``EKF/covariance.cpp`` (process noise of the fields).
@@ -15,7 +16,7 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.ekf2.replay_segments import BODY_FIELD, EARTH_FIELD, THETA, SensorSamples
 from px4fuse.trajectory.rotation import skew
 
-MIN_SD_GAUSS = 0.01  # lower limit of EKF2_MAG_NOISE
+MIN_SIGMA_GAUSS = 0.01  # lower limit of EKF2_MAG_NOISE
 EYE = np.eye(3)
 CROSS = skew(EYE).reshape(3, 9)  # v @ CROSS is the cross product matrix [v]×
 
@@ -23,26 +24,27 @@ CROSS = skew(EYE).reshape(3, 9)  # v @ CROSS is the cross product matrix [v]×
 class EventSamples(NamedTuple):
     """Means of the samples that are fused at each event; shape (E, ...), or (E, S, ...).
 
-    ``value`` and ``turn`` as in :class:`~px4fuse.ekf2.replay_segments.SensorSamples`, with
-    velocities at the event. ``number``: samples that EKF2 received; ``noise``: R of one sample.
+    ``value`` and ``rotation_to_body`` as in
+    :class:`~px4fuse.ekf2.replay_segments.SensorSamples`, but velocities are those at the event.
+    ``sample_count``: samples that EKF2 received; ``noise``: R of one sample.
     """
 
     value: Array
-    turn: Array
-    number: Array
+    rotation_to_body: Array
+    sample_count: Array
     noise: Array
 
 
 def mean_by_event(
-    sensed: SensorSamples, end: IntArray, imu_velocity_m_s: Array | None = None
+    sensor_samples: SensorSamples, event_steps: IntArray, imu_velocity_m_s: Array | None = None
 ) -> EventSamples:
-    """Return means of the samples fused at each event; ``end`` is the step of each event.
+    """Return means of the samples fused at each event.
 
-    Pass ``imu_velocity_m_s`` of :class:`~px4fuse.ekf2.replay_segments.Stretch` for velocity
+    Pass ``imu_velocity_m_s`` of :class:`~px4fuse.ekf2.replay_segments.ReplaySegment` for velocity
     samples.
     """
-    event = np.searchsorted(end, sensed.step)
-    is_inside, size = event < len(end), len(end)
+    event = np.searchsorted(event_steps, sensor_samples.step)
+    is_inside, size = event < len(event_steps), len(event_steps)
     event = event[is_inside]
     count = np.maximum(np.bincount(event, minlength=size), 1)
 
@@ -51,11 +53,13 @@ def mean_by_event(
         np.add.at(total, event, rows[is_inside])
         return np.asarray((total.T / count).T)
 
-    value, turn, noise = map(mean, (sensed.value, sensed.turn, sensed.noise))
+    value, rotation_to_body, noise = map(
+        mean, (sensor_samples.value, sensor_samples.rotation_to_body, sensor_samples.noise)
+    )
     if imu_velocity_m_s is not None:
-        value = value + np.einsum("eab,eb->ea", turn, imu_velocity_m_s[end])
-    number = np.bincount(event, sensed.samples[is_inside], size)
-    return EventSamples(value, turn, np.asarray(number, float), noise)
+        value = value + np.einsum("eab,eb->ea", rotation_to_body, imu_velocity_m_s[event_steps])
+    sample_count = np.bincount(event, sensor_samples.sample_count[is_inside], size)
+    return EventSamples(value, rotation_to_body, np.asarray(sample_count, float), noise)
 
 
 def fuse_field(
@@ -66,7 +70,7 @@ def fuse_field(
     The innovations have shape (3, S, 3): innovation (gauss), its variance for one sample, and 1 if
     fused; NaN without a sample.
     """
-    R = np.maximum(noise_gauss, MIN_SD_GAUSS) ** 2
+    R = np.maximum(noise_gauss, MIN_SIGMA_GAUSS) ** 2
     return fuse_mean(x, P, field_samples, R, gate, EARTH_FIELD, BODY_FIELD)
 
 
@@ -84,21 +88,21 @@ def fuse_mean(
     Parameters
     ----------
     sample_mean : EventSamples
-        Of one event.
+        Mean of one event.
     R, gate : ndarray, shape (S,)
-        Variance of one sample, and gate in √S.
+        Variance of one sample, and gate in units of √innovation variance.
     rows : slice
         NED vector states that the sensor measures in the body frame.
     bias_rows : slice, optional
         Body-frame states that add to the measurement.
     """
-    state, number = x[:, rows], sample_mean.number
-    cross_state, cross_turn = (
+    state, sample_count = x[:, rows], sample_mean.sample_count
+    cross_state, cross_theta = (
         (vectors @ CROSS).reshape(-1, 3, 3) for vectors in (state, x[:, THETA])
     )
     H = np.zeros((len(x), sample_mean.value.shape[-1], x.shape[1]))
-    H[:, :, THETA] = sample_mean.turn @ cross_state
-    H[:, :, rows] = sample_mean.turn @ (EYE - cross_turn)
+    H[:, :, THETA] = sample_mean.rotation_to_body @ cross_state
+    H[:, :, rows] = sample_mean.rotation_to_body @ (EYE - cross_theta)
     predicted = (H[:, :, rows] @ state[:, :, None])[:, :, 0]
     if bias_rows is not None:
         H[:, :, bias_rows] = EYE
@@ -108,11 +112,11 @@ def fuse_mean(
     diagonal = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]  # a view of the diagonal of S
     innovation_record = np.empty((3, *nu.shape))
     innovation_record[0], innovation_record[1] = nu, diagonal + R[:, None]
-    has_sample = number > 0.0
+    has_sample = sample_count > 0.0
     is_fused = has_sample & (nu * nu <= gate[:, None] ** 2 * innovation_record[1]).all(axis=1)
     innovation_record[2] = is_fused[:, None]
     innovation_record[:, ~has_sample] = np.nan
-    diagonal += np.where(has_sample, R / np.maximum(number, 1.0), 1.0)[:, None]
+    diagonal += np.where(has_sample, R / np.maximum(sample_count, 1.0), 1.0)[:, None]
     K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
     x = x + (K @ nu[:, :, None])[:, :, 0]
     P = P - K @ HP

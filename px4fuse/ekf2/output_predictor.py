@@ -1,9 +1,9 @@
 """Output predictor of EKF2: from the state at the fusion horizon to the published state.
 
-The output predictor propagates the delayed state to the present with the IMU. Each step it compares
-the buffered output at the fusion horizon with the state. It corrects velocity and position of the
-whole buffer by gain · error + 0.1 · gain² · Σ error, gain = step / τ. This is linear and equal in
-every step, so recursive filters compute it for the whole stretch.
+The output predictor propagates the delayed state to the present with the IMU. In each step it
+compares the buffered output at the fusion horizon with the state, and corrects velocity and
+position of the whole buffer by gain · error + 0.1 · gain² · Σ error, with gain = step / τ. This
+recursion is linear with constant coefficients, so recursive filters compute it for a whole segment.
 
 Source: PX4-Autopilot ``EKF/output_predictor/output_predictor.cpp`` (``EKF/ekf.cpp`` before v1.14).
 """
@@ -22,22 +22,22 @@ from px4fuse.ekf2.replay_segments import (
     GRAVITY_M_S2,
     POSITION,
     VELOCITY,
-    Stretch,
+    ReplaySegment,
 )
 
-INTEGRAL_SHARE = 0.1
+INTEGRAL_GAIN = 0.1
 # time constants after which the effect of a correction is neglected
-FOLLOWED_TIME_CONSTANTS = 5.0
-# weight of a prior of 0, which separates two corrections between the same rows
-NO_CORRECTION = 1e-3
-# Median row intervals after which rows count as missing; fraction of a correction that the
-# remaining rows must show
-MISSING_ROWS, MIN_SHOWN_SHARE = 3.0, 0.5
-ATTITUDE_SHARE = 0.5
+MAX_TIME_CONSTANTS = 5.0
+# weight of the prior "correction 0", which makes two corrections between the same rows solvable
+PRIOR_WEIGHT = 1e-3
+# Interval, in median intervals, above which rows count as missing; and minimum fraction of a
+# correction in the other rows
+MAX_ROW_INTERVALS, MIN_VISIBLE_SHARE = 3.0, 0.5
+ATTITUDE_GAIN = 0.5
 
 
 def publish(
-    stretch: Stretch,
+    segment: ReplaySegment,
     state: Array,
     reset_m: Array,
     attitude_difference_rad: Array,
@@ -48,7 +48,7 @@ def publish(
 
     Parameters
     ----------
-    stretch : Stretch
+    segment : ReplaySegment
     state : ndarray, shape (n + 1, 15) or more
         State at the fusion horizon, by its time of validity.
     reset_m : ndarray, shape (n + 1, 3)
@@ -58,40 +58,44 @@ def publish(
     lag : int
         Steps between fusion horizon and present.
     settings : mapping
-        With EKF2_TAU_VEL and EKF2_TAU_POS.
+        Parameters by PX4 name, among them EKF2_TAU_VEL and EKF2_TAU_POS.
 
     Returns
     -------
     velocity_m_s, position_m : ndarray, shape (n + 1, 3)
         Dead reckoning from the first state until step ``lag``.
     """
-    step_s, mean_step = stretch.step_s[:, None], float(np.mean(stretch.step_s))
+    step_s, mean_step = segment.step_s[:, None], float(np.mean(segment.step_s))
     # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
-    force = stretch.force_m_s2 - delay_by(state[:, ACCELEROMETER_BIAS], lag)[1:]
-    force = np.einsum("nij,nj->ni", stretch.rotation[1:], force)
-    gain = (force + np.cross(attitude_difference_rad[1:], force) + GRAVITY_M_S2) * step_s
-    dead_reckoned = np.cumsum(np.concatenate([state[:1, VELOCITY], gain]), axis=0)
+    force = segment.force_m_s2 - delay_by(state[:, ACCELEROMETER_BIAS], lag)[1:]
+    force = np.einsum("nij,nj->ni", segment.rotation[1:], force)
+    velocity_increments = (
+        force + np.cross(attitude_difference_rad[1:], force) + GRAVITY_M_S2
+    ) * step_s
+    dead_reckoned = np.cumsum(np.concatenate([state[:1, VELOCITY], velocity_increments]), axis=0)
     velocity_correction = _follow_offset(
         state[:, VELOCITY] - dead_reckoned, lag, mean_step, settings["EKF2_TAU_VEL"]
     )
     velocity = dead_reckoned + velocity_correction
     # the IMU changes the velocity within a step; corrections apply at its end
-    position_increments = (velocity[:-1] + 0.5 * gain) * step_s
-    steady = state[:, POSITION] - reset_m  # EKF2 shifts the buffer with a reset
-    dead_reckoned = np.cumsum(np.concatenate([steady[:1], position_increments]), axis=0)
+    position_increments = (velocity[:-1] + 0.5 * velocity_increments) * step_s
+    position_without_resets = state[:, POSITION] - reset_m  # EKF2 shifts the buffer with a reset
+    dead_reckoned = np.cumsum(
+        np.concatenate([position_without_resets[:1], position_increments]), axis=0
+    )
     position = dead_reckoned + _follow_offset(
-        steady - dead_reckoned, lag, mean_step, settings["EKF2_TAU_POS"]
+        position_without_resets - dead_reckoned, lag, mean_step, settings["EKF2_TAU_POS"]
     )
     return velocity, position + delay_by(reset_m, lag)
 
 
 def _follow_offset(offset: Array, lag: int, step_s: float, tau_s: float) -> Array:
-    """Return the sum of the corrections with which the output follows the state.
+    """Return the sum c of the corrections with which the output follows the state.
 
-    With e_k = offset_(k-lag) - c_k: c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
+    In step k, with gain g and error e_k = offset_(k-lag) - c_k: c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
     """
     g = step_s / np.clip(tau_s, step_s, 10.0)
-    h = INTEGRAL_SHARE * g**2
+    h = INTEGRAL_GAIN * g**2
     delayed_offset = delay_by(offset - offset[0], lag)
     correction_sum = _recursive_filter(
         np.array([g + h, -g]), np.array([1.0, g + h - 2.0, 1.0 - g]), delayed_offset
@@ -100,12 +104,12 @@ def _follow_offset(offset: Array, lag: int, step_s: float, tau_s: float) -> Arra
 
 
 def corrections(
-    time_s: Array, velocity_m_s: Array, position_m: Array, known_s: Array, tau_s: float
+    time_s: Array, velocity_m_s: Array, position_m: Array, sample_s: Array, tau_s: float
 ) -> Array:
     """Estimate EKF2's position correction at each sample from the published position.
 
-    After a time t the published position contains 1 - exp(-t / τ) of a correction, in addition to
-    its integrated velocity. Least squares over all corrections.
+    A time t after a correction, the published position contains 1 - exp(-t / τ) of the correction,
+    in addition to the integrated velocity. All corrections are estimated together by least squares.
 
     Parameters
     ----------
@@ -120,35 +124,37 @@ def corrections(
     Returns
     -------
     ndarray, shape (m, a)
-        NaN if rows of the log are missing after it.
+        Correction along a axes; NaN if rows of the log are missing after the sample.
     """
     interval_s = np.diff(time_s)
     dead_reckoned = 0.5 * (velocity_m_s[1:] + velocity_m_s[:-1]) * interval_s[:, None]
     correction_increments = np.diff(position_m, axis=0) - dead_reckoned
     usual_s = float(np.median(interval_s))
     is_usable = np.isfinite(correction_increments).all(axis=1) & (
-        interval_s < MISSING_ROWS * usual_s
+        interval_s < MAX_ROW_INTERVALS * usual_s
     )
     correction_increments[~is_usable] = 0.0
-    span = math.ceil(FOLLOWED_TIME_CONSTANTS * tau_s / usual_s) + 1
-    row = np.searchsorted(time_s, known_s, side="right") - 1 + np.arange(span)[:, None]
+    row_count = math.ceil(MAX_TIME_CONSTANTS * tau_s / usual_s) + 1
+    row = np.searchsorted(time_s, sample_s, side="right") - 1 + np.arange(row_count)[:, None]
     is_inside = (
         (row >= 0)
         & (row < len(correction_increments))
         & is_usable[np.clip(row, 0, len(correction_increments) - 1)]
     )
-    row, sample = row[is_inside], np.nonzero(is_inside)[1]
+    row, sample_index = row[is_inside], np.nonzero(is_inside)[1]
     decay_start, decay_end = (
-        np.exp(-np.maximum(time_s[each] - known_s[sample], 0.0) / tau_s) for each in (row, row + 1)
+        np.exp(-np.maximum(time_s[each] - sample_s[sample_index], 0.0) / tau_s)
+        for each in (row, row + 1)
     )
     shares = csr_array(
-        (decay_start - decay_end, (row, sample)), shape=(len(correction_increments), len(known_s))
+        (decay_start - decay_end, (row, sample_index)),
+        shape=(len(correction_increments), len(sample_s)),
     )
-    normal = shares.T @ shares + NO_CORRECTION * eye_array(len(known_s))
+    normal = shares.T @ shares + PRIOR_WEIGHT * eye_array(len(sample_s))
     result = np.reshape(
-        spsolve(normal.tocsc(), shares.T @ correction_increments), (len(known_s), -1)
+        spsolve(normal.tocsc(), shares.T @ correction_increments), (len(sample_s), -1)
     )
-    return np.where(shares.sum(axis=0)[:, None] > MIN_SHOWN_SHARE, result, np.nan)
+    return np.where(shares.sum(axis=0)[:, None] > MIN_VISIBLE_SHARE, result, np.nan)
 
 
 def delay_by(values: Array, lag: int) -> Array:
@@ -157,7 +163,7 @@ def delay_by(values: Array, lag: int) -> Array:
 
 
 def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float) -> Array:
-    """Return the published attitude correction that follows an attitude error of the filter.
+    """Return the correction of the published attitude that follows an attitude error of the filter.
 
     Each step corrects the newest attitude by 0.5 · step / horizon of the error at the fusion
     horizon.
@@ -169,10 +175,10 @@ def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float)
     lag : int
     step_s, horizon_s : float
     """
-    share = ATTITUDE_SHARE * step_s / max(horizon_s, step_s)
+    gain = ATTITUDE_GAIN * step_s / max(horizon_s, step_s)
     numerator, denominator = np.zeros((2, lag + 2))
-    numerator[-1], denominator[:2] = share, (1.0, -1.0)
-    denominator[-1] += share
+    numerator[-1], denominator[:2] = gain, (1.0, -1.0)
+    denominator[-1] += gain
     return _recursive_filter(numerator, denominator, error_rad)
 
 

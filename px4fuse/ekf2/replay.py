@@ -43,7 +43,7 @@ VELOCITY_UPDATE_COLUMNS = [
 ]
 MIN_SAMPLES = 20
 CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
-# s; the older topics repeat a sample until the next fusion, with later timestamps
+# s; topics of old releases repeat a sample with later timestamps until the next fusion
 MAX_REPEAT_S = 0.5
 # Measured on simulated flights of v1.13 to main: for complete logs the correlation is above 0.997
 # and the median S ratio within 0.3 %. With a downsampled source or IMU dropouts S differs by more
@@ -52,11 +52,12 @@ MIN_CORRELATION = 0.95
 MAX_S_DIFFERENCE = 0.05
 # m RMS of the published position; complete logs are within 0.013 m
 MAX_PUBLISHED_DIFFERENCE_M = 0.10
-# m; larger while optical flow is the only horizontal aid, because flow is logged at a reduced rate
-MAX_CARRIED_OFF_M = 0.5
-# With many rejections one sample near the gate limit changes the next ones. Then rejected shares
-# and mean NIS must agree, and single samples in a replay with the logged rejections
-REJECTING_SHARE = 0.1
+# m; limit while optical flow is the only horizontal aid, larger because flow is logged at a reduced
+# rate
+MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
+# Above this rejected share one sample near the gate limit changes many later ones. Then rejected
+# shares and mean NIS must agree, and single innovations only in a replay with logged rejections
+MANY_REJECTIONS_SHARE = 0.1
 MAX_REJECTED_DIFFERENCE = 0.05
 MAX_NIS_DIFFERENCE = 0.25
 # factor on MAX_PUBLISHED_DIFFERENCE_M while most samples are rejected
@@ -95,18 +96,18 @@ class Agreement(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     north, east : AxisAgreement
-        Of the fused position.
+        Agreement of the fused position.
     ev_pos, gnss_pos : mapping from "north" and "east" to AxisAgreement
-        The same by aid; also vision fused besides GNSS.
+        The same by name of the aid; also of vision fused besides GNSS.
     gnss_vel : mapping from "north", "east" and "down" to AxisAgreement
         GNSS velocity; "down" only if GNSS height is fused too.
     gnss_hgt, baro_hgt : mapping from "down" to AxisAgreement
         Heights, if the log contains all fused samples.
     samples : int
-        Logged innovations compared, without the first seconds of each stretch
+        Number of compared logged innovations, without the first seconds of each segment
         (:data:`~px4fuse.ekf2.replay_segments.SETTLING_S`).
     rejected_fraction_logged, rejected_fraction_replayed : float
-        Share of these samples.
+        Share of these samples that EKF2 and the replay rejected.
     decisions_same : float
         Share of samples rejected in both or in neither.
     published_rms_difference_m : float
@@ -114,8 +115,8 @@ class Agreement(Record, frozen=True, kw_only=True):
     heading_rms_difference_deg : float or None
         Heading of the filter; None if the replay uses the logged heading.
     carried_difference_m : float or None
-        Largest horizontal difference while optical flow was the only aid, which the other numbers
-        exclude; None if there was no such time.
+        Largest horizontal difference while optical flow was the only aid; the other numbers exclude
+        these times. None if there were no such times.
     doubtful : mapping from PX4's name of an aid to str
         Aids whose replay does not agree, with the reason. The replay then uses the logged EKF2
         height, does not bridge gaps with optical flow, and omits vision besides GNSS.
@@ -159,14 +160,14 @@ class Agreement(Record, frozen=True, kw_only=True):
 
 
 class Replayed(Record, frozen=True, kw_only=True, omit_defaults=False):
-    """EKF2 replay from the log, in the form that is serialised.
+    """Written fields of an EKF2 replay.
 
     Attributes
     ----------
     source : str
         Position track that was fused.
     stretches_s : tuple of (float, float)
-        Replayed parts of the flight, each started from the log.
+        Replayed segments of the flight, each started from the log.
     settings : mapping
         All parameters of the model, by PX4 name, in PX4's units.
     late, lost : int
@@ -189,17 +190,17 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
     Attributes
     ----------
     changed : mapping
-        Parameters changed on request.
-    updates : DataFrame, shape (m, 14), (m, 20) with velocity
-        One row per sample, at EKF2's measurement time (timestamp - delay - half a step): innovation
-        (measurement minus state) and its variance S, north and east; 1 or 0 for rejected, fused and
-        reset; variances of position and velocity after it, R, and the end of its prediction step;
-        then the velocity innovations.
-    other_aid_updates : mapping from PX4's name to DataFrame, shape (k, 5), (k, 8) of vision
+        Parameters with values other than logged.
+    updates : DataFrame, shape (m, 14), or (m, 20) with velocity
+        One row per position sample, at EKF2's measurement time (timestamp - delay - half a step).
+        Columns: :data:`UPDATE_COLUMNS` (variances of position and velocity are those after the
+        update, ``fused_at_s`` is the end of the prediction step), and with velocity
+        :data:`VELOCITY_UPDATE_COLUMNS`. Innovations are measurement minus state.
+    other_aid_updates : mapping from PX4's name to DataFrame, shape (k, 5), or (k, 8) for vision
         One row per sample of GNSS height, barometer, and vision besides GNSS: innovation and S
         (``innovation_down_m``, ``innovation_variance_down_m2``), ``rejected``, ``fused`` and
-        ``fused_at_s``; for vision north and east, and ``reset``. No row if only the bias of vision
-        was reset.
+        ``fused_at_s``; for vision north and east, and ``reset``. A sample with which only the bias
+        of vision was reset has no row.
     flow_only_spans_s : tuple of (float, float)
         Times between positions in which optical flow was the only horizontal aid.
     delayed : DataFrame, shape (n, 7)
@@ -221,14 +222,14 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
 
     @property
     def evaluated_s(self) -> Spans:
-        """Evaluated parts: each stretch without its start and without flow-only times."""
+        """Evaluated spans: each segment without its start and without flow-only times."""
         spans = []
         for start, end in self.stretches_s:
             begin = start + SETTLING_S
-            for last, again in self.flow_only_spans_s:
-                if begin < last < end:
-                    spans.append((begin, last))
-                    begin = again + SETTLING_S
+            for flow_start, flow_end in self.flow_only_spans_s:
+                if begin < flow_start < end:
+                    spans.append((begin, flow_start))
+                    begin = flow_end + SETTLING_S
             if begin < end:
                 spans.append((begin, end))
         return tuple(spans)
@@ -241,12 +242,14 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     ----------
     flight : Flight
     replay : Ekf2Replay
-        With the logged parameters.
+        Replay with the logged parameters.
     """
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    own = aid_source(replayed_aid(ekf2)) in ekf2.innovation_topics
-    log, model = _matched_samples(replay, replay.updates, logged_innovations(ekf2), own=own)
+    is_own_topic = aid_source(replayed_aid(ekf2)) in ekf2.innovation_topics
+    log, model = _matched_samples(
+        replay, replay.updates, logged_innovations(ekf2), is_own_topic=is_own_topic
+    )
     if len(log) < MIN_SAMPLES:
         return Unavailable(
             "EKF2 replay",
@@ -254,7 +257,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
             "are needed)",
             "Fly longer on external vision, and record with SDLOG_PROFILE bit 0 (default).",
         )
-    if _constant(log, model, HORIZONTAL):
+    if _has_constant_innovations(log, model, HORIZONTAL):
         return Unavailable(
             "EKF2 replay",
             "the logged innovations are constant, so agreement cannot be tested",
@@ -270,16 +273,17 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     good, reason = _agreement_verdict(axes, *shares)
     on_gnss = replayed_aid(ekf2) == GNSS_POS
     other_agreements, doubtful = _other_agreements(ekf2, replay)
-    velocity, constant = _velocity_agreement(ekf2, replay, own=own)
+    velocity, constant = _velocity_agreement(ekf2, replay, is_own_topic=is_own_topic)
     if constant:
         doubtful[GNSS_VEL.name] = CONSTANT_INNOVATIONS
     position = {GNSS_POS.name if on_gnss else EV_POS.name: axes}
     distance_m = np.hypot(north.position_rms_difference_m, east.position_rms_difference_m)
-    carried_m = _flow_only_error_m(ekf2, replay)
-    if carried_m is not None and carried_m > MAX_CARRIED_OFF_M:
+    flow_only_m = _flow_only_error_m(ekf2, replay)
+    if flow_only_m is not None and flow_only_m > MAX_FLOW_ONLY_DIFFERENCE_M:
         doubtful[FLOW.name] = (
             f"while {FLOW.label} was the only horizontal aid, the published position differs by "
-            f"{_format_beyond(carried_m, MAX_CARRIED_OFF_M)} m (limit {MAX_CARRIED_OFF_M:g} m)"
+            f"{_format_beyond(flow_only_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m (limit "
+            f"{MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
         )
     return Agreement(
         north=north,
@@ -295,20 +299,20 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
         good=good,
         reason=reason,
         heading_rms_difference_deg=_heading_error_deg(ekf2, replay),
-        carried_difference_m=carried_m,
+        carried_difference_m=flow_only_m,
     )
 
 
 def _flow_only_error_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     """Return the largest horizontal difference (m) to the log in flow-only times, or None."""
     times = ekf2.state.index
-    within = inside_spans(times, replay.flow_only_spans_s)
-    if not within.any():
+    is_inside = inside_spans(times, replay.flow_only_spans_s)
+    if not is_inside.any():
         return None
     north, east = (
-        along(replay.published, Columns.POSITION, one, times[within].to_numpy())
-        - along(ekf2.state, Columns.POSITION, one, times[within].to_numpy())
-        for one in np.eye(3)[:2]
+        along(replay.published, Columns.POSITION, axis_direction, times[is_inside].to_numpy())
+        - along(ekf2.state, Columns.POSITION, axis_direction, times[is_inside].to_numpy())
+        for axis_direction in np.eye(3)[:2]
     )
     return float(np.hypot(north, east).max())
 
@@ -328,14 +332,16 @@ def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     return float(np.degrees(rms(np.angle(np.exp(1j * error)))))
 
 
-def _constant(logged: pd.DataFrame, model: pd.DataFrame, axes: Iterable[AxisName]) -> bool:
-    """Return True if the innovations of an axis are constant, so that no correlation exists."""
+def _has_constant_innovations(
+    logged: pd.DataFrame, model: pd.DataFrame, axes: Iterable[AxisName]
+) -> bool:
+    """Return True if logged or replayed innovations of an axis are constant: no correlation."""
     columns = [f"innovation_{axis}_m" for axis in axes]
-    return not all(np.ptp(one[columns], axis=0).all() for one in (logged, model))
+    return not all(np.ptp(frame[columns], axis=0).all() for frame in (logged, model))
 
 
 def _velocity_agreement(
-    ekf2: Ekf2, replay: Ekf2Replay, *, own: bool
+    ekf2: Ekf2, replay: Ekf2Replay, *, is_own_topic: bool
 ) -> tuple[dict[str, AxisAgreement], bool]:
     """Return the agreement of GNSS velocity, and True if its innovations are constant.
 
@@ -344,7 +350,7 @@ def _velocity_agreement(
     log = ekf2.aids.get("gnss_vel")
     if log is None or VELOCITY_UPDATE_COLUMNS[0] not in replay.updates:
         return {}, False
-    logged, model = _matched_samples(replay, replay.updates, log.samples, own=own)
+    logged, model = _matched_samples(replay, replay.updates, log.samples, is_own_topic=is_own_topic)
     if len(logged) < MIN_SAMPLES:
         return {}, False
     names: dict[str, str] = {}  # map to the column names of a position
@@ -355,24 +361,24 @@ def _velocity_agreement(
     model = model[VELOCITY_UPDATE_COLUMNS].rename(columns=names)
     # down only if the logged EKF2 height is not used
     axes = AXIS_NAMES if GNSS_HGT.name in replay.other_aid_updates else HORIZONTAL
-    if _constant(logged, model, axes):
+    if _has_constant_innovations(logged, model, axes):
         return {}, True
     return {axis: _axis_agreement(axis, logged, model, ekf2, replay) for axis in axes}, False
 
 
 def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the agreement of the other aids, and the reasons for those that disagree."""
+    """Return the agreement of aids other than the position, and the reason of each disagreement."""
     agreements: dict[str, dict[str, AxisAgreement]] = {}
     doubtful = {}
     for name, updates in replay.other_aid_updates.items():
         log = ekf2.aids[name]
-        own = aid_source(AIDS[name]) in log.topics
+        is_own_topic = aid_source(AIDS[name]) in log.topics
         rows = logged_aid_innovations(name, log)
-        logged, model = _matched_samples(replay, updates, rows, own=own)
+        logged, model = _matched_samples(replay, updates, rows, is_own_topic=is_own_topic)
         if len(logged) < MIN_SAMPLES:
             doubtful[name] = f"only {len(logged)} logged innovations to compare with"
             continue
-        if _constant(logged, model, axes_of(updates)):
+        if _has_constant_innovations(logged, model, axes_of(updates)):
             doubtful[name] = CONSTANT_INNOVATIONS
             continue
         agreements[name] = {
@@ -398,10 +404,10 @@ def axes_of(updates: pd.DataFrame) -> list[AxisName]:
 
 
 def _matched_samples(
-    replay: Ekf2Replay, updates: pd.DataFrame, logged: pd.DataFrame, *, own: bool
+    replay: Ekf2Replay, updates: pd.DataFrame, logged: pd.DataFrame, *, is_own_topic: bool
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return the evaluated logged innovations and the updates of the same samples."""
-    matched = match_updates(updates, logged.index.to_numpy(), own=own)
+    matched = match_updates(updates, logged.index.to_numpy(), is_own_topic=is_own_topic)
     is_used = (matched >= 0) & inside_spans(logged.index, replay.evaluated_s)
     return logged[is_used], updates.iloc[matched[is_used]]
 
@@ -431,12 +437,12 @@ def inside_spans(times_s: ArrayLike, spans: Spans) -> BoolArray:
     return is_inside
 
 
-def match_updates(updates: pd.DataFrame, times: Array, *, own: bool) -> IntArray:
-    """Return the row of the update of each logged innovation; -1 without one.
+def match_updates(updates: pd.DataFrame, times: Array, *, is_own_topic: bool) -> IntArray:
+    """Return the row of the update of each logged innovation; -1 if there is no update.
 
-    ``own``: the times are EKF2's measurement times, from the topic of the aid.
+    ``is_own_topic``: True if the log has a topic of this aid, whose times are measurement times.
     """
-    if own:
+    if is_own_topic:
         return same_sample(updates.index.to_numpy(), times)
     fused_at = updates["fused_at_s"].to_numpy()
     row = np.searchsorted(fused_at, times + 1e-4, side="right") - 1
@@ -472,7 +478,7 @@ def _axis_agreement(
 
 def along(frame: pd.DataFrame, columns: list[str], direction: Array, times: Array) -> Array:
     """Interpolate the component of a time-indexed vector along a direction."""
-    summed = signals.along(frame, columns, direction[: len(columns)])
+    summed = signals.weighted_sum(frame, columns, direction[: len(columns)])
     return np.asarray(np.interp(times, frame.index, summed))
 
 
@@ -511,19 +517,19 @@ def _agreement_verdict(
             "samples that are not in the log"
         )
     min_correlation = min(axis.innovation_correlation for axis in axes.values())
-    correlated = f"correlation of replayed and logged innovations {min_correlation:.4f}"
+    correlation_text = f"correlation of replayed and logged innovations {min_correlation:.4f}"
     if min_correlation >= MIN_CORRELATION:
-        off_m = max(axis.position_rms_difference_m for axis in axes.values())
-        most_m = published_factor * MAX_PUBLISHED_DIFFERENCE_M
-        if off_m > most_m:
+        difference_m = max(axis.position_rms_difference_m for axis in axes.values())
+        limit_m = published_factor * MAX_PUBLISHED_DIFFERENCE_M
+        if difference_m > limit_m:
             return False, (
                 "the innovations agree, but the published position differs by "
-                f"{_format_beyond(off_m, most_m)} m RMS (limit {most_m:g} m): EKF2's output has "
-                "other inputs"
+                f"{_format_beyond(difference_m, limit_m)} m RMS (limit {limit_m:g} m): the log "
+                "lacks an input of EKF2's output predictor"
             )
-        return True, f"{correlated} or better"
-    if max(logged_share, replayed_share) < REJECTING_SHARE:
-        return False, f"{correlated} only (at least {MIN_CORRELATION:g})"
+        return True, f"{correlation_text} or better"
+    if max(logged_share, replayed_share) < MANY_REJECTIONS_SHARE:
+        return False, f"{correlation_text} only (at least {MIN_CORRELATION:g})"
     rejected_difference = abs(replayed_share - logged_share)
     nis = max(abs(a.nis_mean_replayed / a.nis_mean_logged - 1.0) for a in axes.values())
     text = f"rejected {replayed_share:.1%} (log {logged_share:.1%}); mean NIS differs by {nis:.0%}"
@@ -534,15 +540,15 @@ def _agreement_verdict(
     return True, f"{text}; single innovations differ: each rejection changes the next ones"
 
 
-def _format_beyond(value: float, most: float) -> str:
+def _format_beyond(value: float, limit: float) -> str:
     """Format a value above a limit with as many decimals as show the excess, at least two."""
-    return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > most or n == 16)
+    return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 
 
 def with_logged_rejections(
     agreement: Agreement, logged_rejections_agreement: Agreement, *, has_all_decisions: bool
 ) -> Agreement:
-    """Return the agreement with the verdict of the replay with logged rejections.
+    """Return the agreement, with the verdict from a replay with logged rejections.
 
     With many rejections one sample near the gate limit makes the replay differ from the log,
     although the filter is the same.
@@ -550,9 +556,10 @@ def with_logged_rejections(
     Parameters
     ----------
     agreement, logged_rejections_agreement : Agreement
-        Of the replay with the model's gate, and with the logged rejections.
+        Agreement of the replay with the model's gate, and of that with the logged rejections.
     has_all_decisions : bool
-        True if every decision of EKF2 is known: then the second agreement is returned.
+        True if every decision of EKF2 is known. Then also the numbers are those of the second
+        agreement.
     """
     good, reason = _agreement_verdict(
         logged_rejections_agreement.axes, 0.0, 0.0, REJECTING_TOLERANCE_FACTOR

@@ -1,4 +1,4 @@
-"""Continuous parts of a flight for the EKF2 replay: prediction steps and initial state.
+"""Segments of a flight for the EKF2 replay, without gaps: prediction steps and initial state.
 
 Source: PX4-Autopilot ``EKF/imu_down_sampler/imu_down_sampler.cpp``.
 """
@@ -33,30 +33,31 @@ RESTART_GAP_S = 2.0
 # s; PX4 limits a prediction step to 2 EKF2_PREDICT_US, so motion in a longer gap is lost
 IMU_GAP_S = 0.05
 # s; minimum time of fusion before the replay starts
-START_AFTER_S = 1.0
+MIN_FUSION_S = 1.0
 # s; minimum time in the air before the replay starts: on the ground EKF2 fuses zero velocity and
-# gravity, and take-off separates tilt from accelerometer bias
-AIRBORNE_S = 4.0
+# gravity, and only the motion after take-off makes tilt and accelerometer bias distinguishable
+MIN_AIRBORNE_S = 4.0
 SETTLING_S = 5.0  # s; time of the replay before it is evaluated
-# s; EKF2 resets heading and fields after take-off, and only later samples are logged
-FIELD_AFTER_S = 1.0
+# s; time from the first logged three-axis sample until the log contains the fields that EKF2 resets
+# after take-off
+FIELD_RESET_S = 1.0
 # s; flight time before the start of the replay, used to estimate the initial correlations
-HISTORY_S = 20.0
-# Hz; EKF2 fuses the field at 14 Hz (SENS_MAG_RATE 15), a logged sample represents several; and the
-# lowest logged rate that can be replayed
-FIELD_HZ, MIN_FIELD_HZ = 14.0, 1.5
+CORRELATION_HISTORY_S = 20.0
+# Hz; rate at which EKF2 fuses the magnetometer (SENS_MAG_RATE 15), so one logged sample represents
+# several; and lowest logged rate that can be replayed
+MAG_FUSION_HZ, MIN_MAG_LOG_HZ = 14.0, 1.5
 # s, time constant of EKF2's low-pass filter of innovations (updateAidSourceStatus, ekf_helper.cpp)
 FILTER_S = 0.5
-MIN_STRETCH_S = 10.0
+MIN_SEGMENT_S = 10.0
 # s; resets are published up to the largest delay plus one row of the log later
 MAX_RESET_DELAY_S = 0.5
-# fraction of clipped samples within 1 s above which the motion is lost
+# fraction of clipped IMU samples within 1 s above which the replay is interrupted
 MAX_CLIPPED_SHARE = 0.05
 
 GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # CONSTANTS_ONE_G
 
 
-# Row ranges in Stretch.state
+# Row ranges in ReplaySegment.state
 STATES = 15
 IMU_STATE_COUNT = 9  # states that the IMU propagates: all except the biases
 THETA, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -66,7 +67,9 @@ EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)  # NED and FRD, if fused
 
 @dataclass(frozen=True)
 class SensorSamples:
-    """Magnetometer or optical flow samples of one stretch, as m means of several samples.
+    """Magnetometer or optical flow data of one segment: m means of several samples each.
+
+    k: measured components, 3 of a magnetometer and 2 of optical flow.
 
     Attributes
     ----------
@@ -74,11 +77,11 @@ class SensorSamples:
         Prediction step after which EKF2 fuses the last sample of each mean.
     value : ndarray, shape (m, k)
         Magnetic field (gauss, body FRD); or velocity forward and right (m/s) minus the velocity
-        change that the IMU measured since the start of the stretch.
-    turn : ndarray, shape (m, k, 3)
+        change that the IMU measured since the start of the segment.
+    rotation_to_body : ndarray, shape (m, k, 3)
         Mean rotation from NED to the body axes.
-    samples : ndarray, shape (m,)
-        Number of samples that EKF2 received.
+    sample_count : ndarray, shape (m,)
+        Number of samples in each mean that EKF2 received.
     noise : ndarray, shape (m,)
         R of one sample; 0 if it follows from the parameters.
     gate : float
@@ -87,8 +90,8 @@ class SensorSamples:
 
     step: IntArray
     value: Array
-    turn: Array
-    samples: Array
+    rotation_to_body: Array
+    sample_count: Array
     noise: Array
     gate: float = np.inf
 
@@ -97,19 +100,19 @@ class SensorSamples:
 
 @dataclass(frozen=True)
 class HeightSamples:
-    """Height measurements of one stretch.
+    """Height measurements of one segment.
 
     Attributes
     ----------
     fused : tuple of str
         PX4's names of the height sensors: barometer, GNSS, or both.
     reference : str
-        Sensor without bias.
+        PX4's name of the sensor without bias.
     bias : (float, float)
         Initial bias of the other sensor (m, positive: too high), and its variance (m²).
     step : ndarray of int, shape (m,)
         Prediction step after which EKF2 fuses each barometer sample.
-    taken_s, down_m : ndarray, shape (m,)
+    measured_at_s, down_m : ndarray, shape (m,)
         EKF2's measurement time, and the height.
     dead_zone_m : ndarray, shape (m,)
         Dead zone: in ground effect a height this far below the state is ignored.
@@ -121,7 +124,7 @@ class HeightSamples:
     reference: str
     bias: tuple[float, float]
     step: IntArray
-    taken_s: Array
+    measured_at_s: Array
     down_m: Array
     dead_zone_m: Array
     weight: float
@@ -130,11 +133,11 @@ class HeightSamples:
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """Continuous part of a flight that is replayed in one run of n prediction steps.
+class ReplaySegment:
+    """Part of a flight without gaps, replayed in one run of n prediction steps.
 
-    The nominal attitude is the published one. The model estimates its error, so the equations are
-    linear. Vectors are in NED unless noted.
+    The nominal attitude is the published one. The model estimates the error of the nominal
+    attitude, so the equations are linear. Vectors are in NED unless noted.
 
     Attributes
     ----------
@@ -151,7 +154,8 @@ class Stretch:
     accelerometer_bias_m_s2 : ndarray, shape (3,)
         Nominal bias: the logged one at the start.
     state : ndarray, shape (15,) or (21,)
-        Initial attitude error, velocity, position, errors of both biases, magnetic fields.
+        Initial attitude error, velocity, position, errors of gyro and accelerometer bias, and with
+        21 states the magnetic fields of earth and body.
     variance : ndarray, shape (15,) or (21,)
         Initial variances, in the same order.
     down_m : ndarray, shape (n + 1,)
@@ -161,22 +165,22 @@ class Stretch:
         Logged variances.
     attitude_error_rad : ndarray, shape (n + 1, 3)
         Logged attitude at the fusion horizon minus the nominal attitude.
-    correlation : ndarray, shape (n, n)
-        Of the initial state; estimated, because the log has variances only.
+    correlation : ndarray, shape (15, 15) or (21, 21)
+        Correlations of the initial state; estimated, because the log has variances only.
     fusing : bool
         True if EKF2 fuses the source at the start.
     field : SensorSamples or None
-        Magnetometer samples, then 21 states; None: the logged EKF2 heading is used.
+        Magnetometer samples, with 21 states; None: the logged EKF2 heading is used.
     heights : HeightSamples or None
-        None: the logged EKF2 height, or that of vision, is used.
+        None: the height of EKF2 or of external vision is used.
     bad_acceleration_share : ndarray, shape (n + 1,), or None
-        Share of accelerometer axes to which EKF2 gave a larger noise in the step before: all during
-        a bad vertical acceleration, else the clipped ones; None: never.
+        Share of accelerometer axes with a larger noise in the step before: all axes while EKF2
+        reports a bad vertical acceleration, else the clipped axes. None if there are no such times.
     flow : SensorSamples or None
         Optical flow samples, if EKF2 fused them.
     metres : (float, float, float)
         Metres in the state per published metre, north, east and down.
-    history : Stretch or None
+    history : ReplaySegment or None
         Flight before the start, from which the initial correlations are estimated.
     """
 
@@ -199,7 +203,7 @@ class Stretch:
     bad_acceleration_share: Array | None = None
     flow: SensorSamples | None = None
     metres: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    history: "Stretch | None" = None
+    history: "ReplaySegment | None" = None
 
     __repr__ = one_line_repr
 
@@ -207,8 +211,8 @@ class Stretch:
     def imu_velocity_m_s(self) -> Array:
         """Velocity change from the IMU since the start (m/s, NED), shape (n + 1, 3)."""
         force = np.einsum("nij,nj->ni", self.rotation[1:], self.force_m_s2) + GRAVITY_M_S2
-        gained = np.cumsum(force * self.step_s[:, None], axis=0)
-        return np.concatenate([np.zeros((1, 3)), gained])
+        velocity_increments = np.cumsum(force * self.step_s[:, None], axis=0)
+        return np.concatenate([np.zeros((1, 3)), velocity_increments])
 
     @cached_property
     def imu_displacement_m(self) -> Array:
@@ -219,41 +223,52 @@ class Stretch:
 
 
 def samples_by_event(
-    stretch: Stretch, end: IntArray, step: IntArray, position_m: Array, axes: slice, *more: Array
+    segment: ReplaySegment,
+    event_steps: IntArray,
+    measurement_step: IntArray,
+    position_m: Array,
+    axes: slice,
+    *more: Array,
 ) -> Array:
-    """Return position samples by the event at which they are fused, in up to k slots per event.
+    """Sort position samples by the event at which they are fused, in k slots per event.
+
+    k: largest number of samples between two events; E: events.
 
     Parameters
     ----------
-    stretch : Stretch
+    segment : ReplaySegment
     end : ndarray of int, shape (E,)
         Step of each event.
     step : ndarray of int, shape (m,)
         Prediction step after which each position was measured; increasing.
     position_m : ndarray, shape (m, a)
+        Positions along a axes.
     axes : slice
-        Its axes within north, east and down.
+        These axes within north, east and down.
     *more : ndarray, shape (m,)
         Further columns.
 
     Returns
     -------
     ndarray, shape (a + 2 + len(more), k, E)
-        Position at the event without the motion of the state, age, ``more``, and 1; all 0 in empty
-        slots.
+        Position plus the IMU displacement up to the event relative to constant velocity; age;
+        ``more``; and 1. All are 0 in empty slots.
     """
-    event = np.searchsorted(end, step)
-    event = event[event < len(end)]
+    event = np.searchsorted(event_steps, measurement_step)
+    event = event[event < len(event_steps)]
     count = len(event)
-    step, event_step = step[:count], end[event]
-    age_s = stretch.time_s[event_step] - stretch.time_s[step]
-    path, speed = stretch.imu_displacement_m[:, axes], stretch.imu_velocity_m_s[:, axes]
+    measurement_step, event_step = measurement_step[:count], event_steps[event]
+    age_s = segment.time_s[event_step] - segment.time_s[measurement_step]
+    path, speed = segment.imu_displacement_m[:, axes], segment.imu_velocity_m_s[:, axes]
     position_m = (
-        position_m[:count] + path[event_step] - path[step] - speed[event_step] * age_s[:, None]
+        position_m[:count]
+        + path[event_step]
+        - path[measurement_step]
+        - speed[event_step] * age_s[:, None]
     )
     slot = np.arange(count) - np.searchsorted(event, event)
     sample_columns = *position_m.T, age_s, *(each[:count] for each in more), np.ones(count)
-    samples = np.zeros((len(sample_columns), slot.max(initial=-1) + 1, len(end)))
+    samples = np.zeros((len(sample_columns), slot.max(initial=-1) + 1, len(event_steps)))
     samples[:, slot, event] = sample_columns
     return samples
 
@@ -266,7 +281,7 @@ def pad_samples(sample_arrays: Sequence[Array]) -> list[Array]:
     ]
 
 
-def find_stretches(
+def find_replay_segments(
     flight: Flight,
     imu: pd.DataFrame,
     attitude: pd.DataFrame,
@@ -274,8 +289,8 @@ def find_stretches(
     record: FusionRecord,
     source_s: Array,
     *,
-    gnss: bool = False,
-) -> tuple[Stretch, ...]:
+    is_gnss: bool = False,
+) -> tuple[ReplaySegment, ...]:
     """Find the parts of a flight without gaps in IMU and positions, after EKF2 started to fuse.
 
     Parameters
@@ -287,9 +302,9 @@ def find_stretches(
     record : FusionRecord
     source_s : ndarray
         Timestamps of the position samples.
-    gnss : bool
-        True if EKF2 fuses GNSS: magnetic fields are then states if the log permits, and a bad or
-        clipped acceleration gets a larger noise.
+    is_gnss : bool
+        True if EKF2 fuses GNSS. Then magnetic fields are states if the log contains the
+        magnetometer samples, and a bad or clipped acceleration gets a larger noise.
     """
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
@@ -299,75 +314,84 @@ def find_stretches(
     for stamps, limit in ((time, IMU_GAP_S), (source_s, RESTART_GAP_S)):
         gap = np.flatnonzero(np.diff(stamps) > limit)
         cuts += [*stamps[gap], *stamps[gap + 1]]
-    cuts += _break_times_s(imu, ekf2) if gnss else ()
+    cuts += _break_times_s(imu, ekf2) if is_gnss else ()
     first = max(attitude.index[0], source_s[0])
     last = min(attitude.index[-1], source_s[-1] + 1.0)
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
-    field_span = _field_span(record) if gnss else None
+    field_span = _field_span(record) if is_gnss else None
     cuts += field_span[1:] if field_span else ()
     # another EKF2 instance has different states
     cuts += [time_s for time_s, _ in ekf2.instances[1:]]
-    stretches = []
+    segments = []
     for low, high in pairwise(np.unique(np.clip(cuts, first, last))):
         fused_inside = fused[(fused >= low) & (fused <= high)]
         if not len(fused_inside):
             continue
-        starts = [off + AIRBORNE_S for off, _ in airborne if off < high][:1]
+        starts = [take_off_s + MIN_AIRBORNE_S for take_off_s, _ in airborne if take_off_s < high][
+            :1
+        ]
         if field_span and low <= field_span[0] < high:
             starts.append(field_span[0])
-        start_row = int(np.searchsorted(states, max([fused_inside[0] + START_AFTER_S, *starts])))
-        if start_row == len(states) or high - states[start_row] < MIN_STRETCH_S:
+        start_row = int(np.searchsorted(states, max([fused_inside[0] + MIN_FUSION_S, *starts])))
+        if start_row == len(states) or high - states[start_row] < MIN_SEGMENT_S:
             continue
         is_covered = (time[1:] > states[start_row]) & (time[:-1] < high)
         if not np.all(np.diff(time)[is_covered] <= IMU_GAP_S):
             continue
         stretch_inputs = imu, attitude, ekf2, record
-        if not gnss:
-            stretches.append(_stretch(*stretch_inputs, start_row, high))
+        if not is_gnss:
+            segments.append(_make_segment(*stretch_inputs, start_row, high))
             continue
-        stretch = _gnss_stretch(*stretch_inputs, start_row, high)
-        history_row = int(np.searchsorted(states, max(first, states[start_row] - HISTORY_S)))
+        segment = _make_gnss_segment(*stretch_inputs, start_row, high)
+        history_row = int(
+            np.searchsorted(states, max(first, states[start_row] - CORRELATION_HISTORY_S))
+        )
         if history_row < start_row:
-            stretch = replace(
-                stretch, history=_gnss_stretch(*stretch_inputs, history_row, states[start_row])
+            segment = replace(
+                segment, history=_make_gnss_segment(*stretch_inputs, history_row, states[start_row])
             )
         has_field = field_span and field_span[0] <= states[start_row] and high <= field_span[1]
-        stretches.append(
-            _add_field(stretch, record, start_row, ekf2.step_s) if has_field else stretch
+        segments.append(
+            _add_field(segment, record, start_row, ekf2.step_s) if has_field else segment
         )
-    return tuple(stretches)
+    return tuple(segments)
 
 
-def _gnss_stretch(
+def _make_gnss_segment(
     imu: pd.DataFrame,
     attitude: pd.DataFrame,
     ekf2: Ekf2,
     record: FusionRecord,
     start_row: int,
     end_s: float,
-) -> Stretch:
-    """Return a stretch with earth rotation and a larger noise of bad accelerations."""
-    stretch = _on_rotating_earth(_stretch(imu, attitude, ekf2, record, start_row, end_s), record)
+) -> ReplaySegment:
+    """Make a segment with earth rotation and a larger noise of bad accelerations."""
+    segment = _add_earth_rotation(
+        _make_segment(imu, attitude, ekf2, record, start_row, end_s), record
+    )
     return replace(
-        stretch, bad_acceleration_share=_bad_acceleration_share(imu, record, stretch.time_s)
+        segment, bad_acceleration_share=_bad_acceleration_share(imu, record, segment.time_s)
     )
 
 
-def _on_rotating_earth(stretch: Stretch, record: FusionRecord) -> Stretch:
+def _add_earth_rotation(segment: ReplaySegment, record: FusionRecord) -> ReplaySegment:
     """Add earth rotation, and convert the position to metres of EKF2's state."""
-    metres, state = ekf2_metres_per_metre(record), stretch.state.copy()
+    metres, state = ekf2_metres_per_metre(record), segment.state.copy()
     state[POSITION] *= metres
-    turned = earth_rate_rad_s(record) * stretch.step_s[:, None]
+    earth_rotation_rad = earth_rate_rad_s(record) * segment.step_s[:, None]
     return replace(
-        stretch, state=state, metres=metres, correction_rad=stretch.correction_rad + turned
+        segment,
+        state=state,
+        metres=metres,
+        correction_rad=segment.correction_rad + earth_rotation_rad,
     )
 
 
 def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
     """Return the times (s) at which the replay must be interrupted.
 
-    These are the limits of times with many clipped samples, in which motion is lost, and of resets
-    of height and vertical velocity, which are published with a delay.
+    These are start and end of clipping, in which motion is lost, and of each reset of height or
+    vertical velocity, which is published with a delay.
     """
     breaks = [
         time
@@ -396,14 +420,14 @@ def _bad_acceleration_share(imu: pd.DataFrame, record: FusionRecord, time_s: Arr
     return share_by_step
 
 
-def _stretch(
+def _make_segment(
     imu: pd.DataFrame,
     attitude: pd.DataFrame,
     ekf2: Ekf2,
     record: FusionRecord,
     start_row: int,
     end_s: float,
-) -> Stretch:
+) -> ReplaySegment:
     start = record.delayed.iloc[start_row].astype(np.float64)
     time = imu.index.to_numpy()
     first_row = int(np.argmin(np.abs(time - record.delayed.index[start_row])))
@@ -415,20 +439,27 @@ def _stretch(
     bias = np.asarray(start[Columns.ACCELEROMETER_BIAS])
     rate = imu[Columns.ANGULAR_RATE].to_numpy()[1:] - np.asarray(start[Columns.GYRO_BIAS])
     force = imu[Columns.SPECIFIC_FORCE].to_numpy()[1:] - bias
-    turn, gain = down_sampled(rate * interval[:, None], force * interval[:, None], ends)
+    rotation_vectors, velocity_increments = downsample_imu(
+        rate * interval[:, None], force * interval[:, None], ends
+    )
     times = time[np.concatenate([[0], ends])]
     step = np.diff(times)
-    gyro = cumulative_product(np.concatenate([[[1.0, 0.0, 0.0, 0.0]], from_vector(turn)]))
+    gyro = cumulative_product(
+        np.concatenate([[[1.0, 0.0, 0.0, 0.0]], from_vector(rotation_vectors)])
+    )
 
     def attitude_beyond(
         frame: pd.DataFrame, early_s: float, end_stamps: Array
     ) -> tuple[Array, Array]:
-        """Return times and rotations of a frame beyond the known attitudes."""
-        inside = (frame.index >= times[0] - early_s) & (frame.index <= times[-1])
-        at_s, own = frame.index[inside].to_numpy(), frame.loc[inside, Columns.QUATERNION].to_numpy()
-        return at_s, multiply(own, conjugate(interpolate(at_s, times, end_stamps)))
+        """Return times of a frame, and its rotations relative to attitudes at the steps."""
+        is_inside = (frame.index >= times[0] - early_s) & (frame.index <= times[-1])
+        at_s, attitude_samples = (
+            frame.index[is_inside].to_numpy(),
+            frame.loc[is_inside, Columns.QUATERNION].to_numpy(),
+        )
+        return at_s, multiply(attitude_samples, conjugate(interpolate(at_s, times, end_stamps)))
 
-    # rotation of the published attitude beyond the gyro, earth frame
+    # rotation of the published attitude relative to the integrated gyro, earth frame
     extra_rotation = interpolate(times, *attitude_beyond(attitude, 0.0, gyro))
     nominal = multiply(extra_rotation, gyro)
     states, turned_states = attitude_beyond(record.delayed, 1e-4, nominal)
@@ -437,12 +468,12 @@ def _stretch(
     position = start[Columns.POSITION].to_numpy()
     position = np.where(np.isfinite(position), position, published)
     position[2] = published[2]  # altitude and height have different origins from v1.16 on
-    return Stretch(
+    return ReplaySegment(
         time_s=times,
         step_s=step,
         rotation=to_matrix(nominal),
         correction_rad=to_vector(multiply(extra_rotation[1:], conjugate(extra_rotation[:-1]))),
-        force_m_s2=gain / step[:, None],
+        force_m_s2=velocity_increments / step[:, None],
         accelerometer_bias_m_s2=bias,
         state=np.concatenate([error[0], start[Columns.VELOCITY], position, np.zeros(6)]),
         variance=np.asarray(start[Columns.DELAYED_VARIANCE[:15]]),
@@ -462,65 +493,67 @@ def _field_span(record: FusionRecord) -> tuple[float, float] | None:
     """Return start and end (s) of continuous three-axis magnetometer fusion, or None."""
     fused = record.field_gauss["fused_3d"] if len(record.field_gauss) else pd.Series(dtype=float)
     times, is_fused = fused.index.to_numpy(), fused.to_numpy() > 0.0
-    if not is_fused.any() or 1.0 / np.median(np.diff(times)) < MIN_FIELD_HZ:
+    if not is_fused.any() or 1.0 / np.median(np.diff(times)) < MIN_MAG_LOG_HZ:
         return None
     first, last = np.flatnonzero(is_fused)[[0, -1]]
     if not is_fused[first:last].all():
         return None
-    return float(times[first]) + FIELD_AFTER_S, float(times[last])
+    return float(times[first]) + FIELD_RESET_S, float(times[last])
 
 
-def _add_field(stretch: Stretch, record: FusionRecord, start_row: int, step_s: float) -> Stretch:
-    """Return the stretch with the magnetic fields as states."""
+def _add_field(
+    segment: ReplaySegment, record: FusionRecord, start_row: int, step_s: float
+) -> ReplaySegment:
+    """Add the logged magnetic fields to the states of a segment."""
     start, frame = record.delayed.iloc[start_row], record.field_gauss
     stamps = frame.index.to_numpy()
     age_s = record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
-    weight = max(FIELD_HZ * float(np.median(np.diff(stamps))), 1.0)
+    weight = max(MAG_FUSION_HZ * float(np.median(np.diff(stamps))), 1.0)
     gauss = frame.iloc[:, :3].to_numpy()
     fields = np.asarray(start[[*Columns.EARTH_FIELD, *Columns.BODY_FIELD]])
     variance = np.asarray(start[Columns.DELAYED_VARIANCE[-6:]])
-    extended = add_field_states(stretch, stamps - age_s, gauss, weight, fields, variance)
+    extended = add_field_states(segment, stamps - age_s, gauss, weight, fields, variance)
     if Columns.FIELD_INNOVATION[0] not in frame:
         return extended
     filtered_gauss = frame[Columns.FIELD_INNOVATION].to_numpy()
     return replace(
-        extended, field=_mean_field(stretch, record.delayed, stamps - age_s, filtered_gauss)
+        extended, field=_mean_field(segment, record.delayed, stamps - age_s, filtered_gauss)
     )
 
 
 def _mean_field(
-    stretch: Stretch, delayed: pd.DataFrame, taken_s: Array, filtered_gauss: Array
+    segment: ReplaySegment, delayed: pd.DataFrame, measured_at_s: Array, filtered_gauss: Array
 ) -> SensorSamples:
-    """Return means of the field between two rows, from EKF2's low-pass filtered innovations.
+    """Reconstruct the mean field between two rows from EKF2's low-pass filtered innovations.
 
-    An innovation is the predicted minus the measured field, and the prediction is known.
+    The logged innovation is predicted minus measured field, and the log contains the prediction.
     """
-    between_s = np.diff(taken_s)
-    is_inside = (taken_s[:-1] > stretch.time_s[0]) & (taken_s[1:] <= stretch.time_s[-1])
+    between_s = np.diff(measured_at_s)
+    is_inside = (measured_at_s[:-1] > segment.time_s[0]) & (measured_at_s[1:] <= segment.time_s[-1])
     rows = np.flatnonzero(is_inside & (between_s > 0.0) & (between_s < RESTART_GAP_S)) + 1
-    taken_s, between_s = taken_s[rows], between_s[rows - 1]
-    count = np.maximum(np.rint(FIELD_HZ * between_s), 1.0)
+    measured_at_s, between_s = measured_at_s[rows], between_s[rows - 1]
+    count = np.maximum(np.rint(MAG_FUSION_HZ * between_s), 1.0)
     share = between_s / (between_s + count * FILTER_S)
     decay = ((1.0 - share) ** count)[:, None]
     innovation = (filtered_gauss[rows] - decay * filtered_gauss[rows - 1]) / (1.0 - decay)
-    step, weight = low_passed(stretch, taken_s, count, between_s / count, share)
-    turn = stretch.rotation[step].swapaxes(2, 3)
+    step, weight = low_pass_weights(segment, measured_at_s, count, between_s / count, share)
+    rotation_to_body = segment.rotation[step].swapaxes(2, 3)
     earth, body = (
-        np.column_stack([np.interp(taken_s, delayed.index, delayed[name]) for name in names])
+        np.column_stack([np.interp(measured_at_s, delayed.index, delayed[name]) for name in names])
         for names in (Columns.EARTH_FIELD, Columns.BODY_FIELD)
     )
     rotated_earth_field = earth[:, None] - np.cross(
-        stretch.attitude_error_rad[step], earth[:, None]
+        segment.attitude_error_rad[step], earth[:, None]
     )
-    expected = np.einsum("ki,kiab,kib->ka", weight, turn, rotated_earth_field) + body
-    mean = np.einsum("ki,kiab->kab", weight, turn)
+    expected = np.einsum("ki,kiab,kib->ka", weight, rotation_to_body, rotated_earth_field) + body
+    mean = np.einsum("ki,kiab->kab", weight, rotation_to_body)
     return SensorSamples(step[:, 0], expected - innovation, mean, count, np.zeros(len(rows)))
 
 
-def low_passed(
-    stretch: Stretch, newest_s: Array, count: Array, interval_s: Array, share: Array | float
+def low_pass_weights(
+    segment: ReplaySegment, newest_s: Array, count: Array, interval_s: Array, share: Array | float
 ) -> tuple[IntArray, Array]:
-    """Return the steps of the samples behind a low-pass filtered mean, and their weights.
+    """Return the steps of the samples in each low-pass filtered mean, and the sample weights.
 
     Parameters
     ----------
@@ -537,39 +570,46 @@ def low_passed(
     back = np.arange(int(count.max(initial=1.0)))
     weight = np.where(back < count[:, None], (1.0 - np.reshape(share, (-1, 1))) ** back, 0.0)
     weight /= weight.sum(axis=1, keepdims=True)
-    taken_s = newest_s[:, None] - back * interval_s[:, None]
-    return np.searchsorted(stretch.time_s, taken_s - 1e-9), weight
+    measured_at_s = newest_s[:, None] - back * interval_s[:, None]
+    return np.searchsorted(segment.time_s, measured_at_s - 1e-9), weight
 
 
 def add_field_states(
-    stretch: Stretch, taken_s: Array, gauss: Array, weight: float, fields: Array, variance: Array
-) -> Stretch:
+    segment: ReplaySegment,
+    measured_at_s: Array,
+    gauss: Array,
+    weight: float,
+    fields: Array,
+    variance: Array,
+) -> ReplaySegment:
     """Add the fields of earth and body to the states, uncorrelated with the others.
 
     Parameters
     ----------
-    taken_s, gauss : ndarray, shape (m,) and (m, 3)
+    measured_at_s, gauss : ndarray, shape (m,) and (m, 3)
         Magnetometer samples (body FRD) at EKF2's measurement time.
     weight : float
         Number of EKF2 samples per logged sample.
     fields, variance : ndarray, shape (6,)
-        At the start: earth (NED) and body (FRD).
+        Fields of earth (NED) and body (FRD) at the start, and their variances.
     """
-    step, inside = sample_steps(stretch, taken_s)
-    turn, count = stretch.rotation[step].transpose(0, 2, 1), len(step)
+    step, is_inside = sample_steps(segment, measured_at_s)
+    rotation_to_body, count = segment.rotation[step].transpose(0, 2, 1), len(step)
     return replace(
-        stretch,
-        state=np.concatenate([stretch.state, fields]),
-        variance=np.concatenate([stretch.variance, variance]),
-        correlation=block_diag(stretch.correlation, np.eye(len(fields))),
-        field=SensorSamples(step, gauss[inside], turn, np.full(count, weight), np.zeros(count)),
+        segment,
+        state=np.concatenate([segment.state, fields]),
+        variance=np.concatenate([segment.variance, variance]),
+        correlation=block_diag(segment.correlation, np.eye(len(fields))),
+        field=SensorSamples(
+            step, gauss[is_inside], rotation_to_body, np.full(count, weight), np.zeros(count)
+        ),
     )
 
 
-def sample_steps(stretch: Stretch, taken_s: Array) -> tuple[IntArray, BoolArray]:
-    """Return the prediction step after which each sample is fused, and True for samples inside."""
-    step = np.searchsorted(stretch.time_s, taken_s - 1e-9)
-    is_inside = (step > 0) & (step < len(stretch.time_s))
+def sample_steps(segment: ReplaySegment, measured_at_s: Array) -> tuple[IntArray, BoolArray]:
+    """Return the fusion step of each sample inside the segment, and True for these samples."""
+    step = np.searchsorted(segment.time_s, measured_at_s - 1e-9)
+    is_inside = (step > 0) & (step < len(segment.time_s))
     return step[is_inside], is_inside
 
 
@@ -582,11 +622,11 @@ def _interpolate(series: pd.Series, times: Array) -> Array:
     return np.asarray(np.interp(times, series.index, series))
 
 
-def step_ends(interval_s: Array, known: IntArray, target_s: float) -> IntArray:
+def step_ends(interval_s: Array, logged_ends: IntArray, target_s: float) -> IntArray:
     """Return the ends of EKF2's prediction steps, as numbers of IMU intervals from the start.
 
-    A step ends after :func:`samples_per_step` samples, or when it is longer than the target. Logged
-    ends restart the count.
+    A step ends after :func:`samples_per_step` samples, or when the step is longer than the target.
+    Each logged end restarts the count of samples.
 
     Parameters
     ----------
@@ -602,8 +642,8 @@ def step_ends(interval_s: Array, known: IntArray, target_s: float) -> IntArray:
     ndarray of int
         The last one is at most n.
     """
-    samples_needed = samples_per_step(target_s, float(np.median(interval_s)), known)
-    known_ends = set(known.tolist())
+    samples_needed = samples_per_step(target_s, float(np.median(interval_s)), logged_ends)
+    known_ends = set(logged_ends.tolist())
     ends, count, total = [], 0, 0.0
     for sample, interval in enumerate(interval_s.tolist(), start=1):
         count, total = count + 1, total + interval
@@ -614,14 +654,20 @@ def step_ends(interval_s: Array, known: IntArray, target_s: float) -> IntArray:
     return np.array(ends, dtype=np.intp)
 
 
-def down_sampled(turn: Array, gain: Array, ends: IntArray) -> tuple[Array, Array]:
+def downsample_imu(
+    rotation_vectors: Array, velocity_increments: Array, ends: IntArray
+) -> tuple[Array, Array]:
     """Return rotation and velocity change of each step, in the body frame at its end."""
     starts = np.concatenate([[0], ends[:-1]])
-    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(turn, axis=0)])
-    total = turned[ends] - turned[starts]
+    summed_rotation = np.concatenate([np.zeros((1, 3)), np.cumsum(rotation_vectors, axis=0)])
+    step_rotation = summed_rotation[ends] - summed_rotation[starts]
     count = ends - starts
-    of_step = np.repeat(np.arange(len(ends)), count)
+    step_of_row = np.repeat(np.arange(len(ends)), count)
     used_rows = slice(0, int(ends[-1]))
-    remaining_turn = turned[ends][of_step] - 0.5 * (turned[:-1][used_rows] + turned[1:][used_rows])
-    seen_from_end = gain[used_rows] - np.cross(remaining_turn, gain[used_rows])
-    return total, np.add.reduceat(seen_from_end, starts, axis=0)
+    remaining_rotation = summed_rotation[ends][step_of_row] - 0.5 * (
+        summed_rotation[:-1][used_rows] + summed_rotation[1:][used_rows]
+    )
+    increments_at_end = velocity_increments[used_rows] - np.cross(
+        remaining_rotation, velocity_increments[used_rows]
+    )
+    return step_rotation, np.add.reduceat(increments_at_end, starts, axis=0)

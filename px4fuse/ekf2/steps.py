@@ -3,12 +3,12 @@
 Each step is a replay of the whole flight with one more property of EKF2. The order is fixed: sample
 times, noises, estimated states, gate, and output predictor. The mean square difference to the
 logged EKF2 changes with each step, so the steps and the unexplained remainder add up to the whole
-difference. The first step changes KF on the chosen grid and source to the same filter with EKF2's
-samples and prediction steps.
+difference. The first step keeps the filter equations of KF, but uses the samples and prediction
+steps of EKF2.
 
-Biases come before process noise, because EKF2's small process noise makes a filter without bias
-states worse. The last replays use the logged rejections: with many rejections one sample near the
-gate limit would change all later ones.
+Biases come before process noise: without bias states EKF2's small process noise would increase the
+error. The last replays use the logged rejections: with many rejections one sample near the gate
+limit would change all later ones.
 """
 
 from collections.abc import Mapping
@@ -37,8 +37,8 @@ OTHER_TIME = Unavailable(
     "ground truth and replay do not overlap in time",
     "Record both at the same time.",
 )
-# Process noise: KF adds SIGMA_A² · DT per second; EKF2 adds EKF2_ACC_NOISE² · Δt² per step, which
-# is EKF2_ACC_NOISE² · Δt per second
+# Names of the steps. Equal process noise: KF adds SIGMA_A² · DT per second; EKF2 adds
+# EKF2_ACC_NOISE² · Δt² per step Δt, which is EKF2_ACC_NOISE² · Δt per second
 SAMPLES = "samples and time steps"
 STAMPS = "timestamps and delay"
 NOISE = "measurement noise"
@@ -51,7 +51,7 @@ FLOW_STEP = "optical flow"
 VISION_STEP = "external vision"
 GATE = "gate, missed samples and resets"
 OUTPUT = "output predictor"
-# The other four precede GATE if EKF2 fuses these aids
+# Steps of every flight; the steps of other aids precede GATE if EKF2 fuses these aids
 STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 COLUMNS = (Columns.POSITION, Columns.VELOCITY)
@@ -91,8 +91,9 @@ class RejectionRun(Record, frozen=True, kw_only=True):
     start_s : float
         Time of the first rejected sample.
     samples : int
+        Number of rejected samples.
     duration_s : float
-        Time until a sample was used again.
+        Time until a sample was fused again.
     distance_m : float
         Largest distance of EKF2 from the same filter without a gate.
     """
@@ -104,12 +105,12 @@ class RejectionRun(Record, frozen=True, kw_only=True):
 
 
 class UnreplayedPart(Record, frozen=True):
-    """Part of the segment without replay (EKF2 starting or not fusing).
+    """Largest difference KF - EKF2 in parts without replay (EKF2 starting or not fusing).
 
     Attributes
     ----------
     maximum_m : float
-        Largest difference KF - EKF2 there.
+        Absolute value.
     at_s : float
         Time of this difference.
     """
@@ -124,19 +125,19 @@ class DifferenceSteps(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     count : int
-        EKF2 samples in the means.
+        Number of EKF2 samples over which means are taken.
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
         Mean square difference of KF to the logged EKF2.
     steps : tuple of Step
     unexplained_mean_square_m2, unexplained_velocity_mean_square_m2_s2 : float
-        Mean square difference of the model to the logged EKF2.
+        Unexplained remainder: mean square difference of the replay to the logged EKF2.
     position_rmse_to_truth_m : mapping from "kf" and "ekf2" to float or Unavailable
     spans_s : tuple of (float, float)
-        Parts of the flight in the means.
+        Spans of the flight over which means are taken.
     longest_rejection : RejectionRun or None
-        None without rejections.
+        Longest run of rejections; None without rejections.
     outside : UnreplayedPart or None
-        None if the replay covers the segment.
+        None if the replay covers the analysed segment.
     sentences : tuple of str
         Explanations of the difference, largest contribution first.
     """
@@ -165,9 +166,9 @@ class DifferenceExplanation(DifferenceSteps, frozen=True, kw_only=True, eq=False
     Attributes
     ----------
     times_s, kf_minus_ekf2_m, unexplained_m : ndarray
-        EKF2 sample times, difference KF - EKF2, and difference model - EKF2 in position.
+        EKF2 sample times; position differences KF - EKF2 and replay - EKF2.
     cause : str
-        Sentence of the largest step, without its time.
+        Sentence about the step with the largest contribution, without its time.
     """
 
     schema_type = DifferenceSteps
@@ -182,7 +183,7 @@ class DifferenceExplanation(DifferenceSteps, frozen=True, kw_only=True, eq=False
 def explain_by_steps(
     model: Model, settings: Settings | None = None, runs: Mapping[str, Replay] | None = None
 ) -> dict[str, DifferenceExplanation] | Unavailable:
-    """Compute the steps from KF to the logged EKF2, without explanations.
+    """Compute the steps from KF to the logged EKF2, without explanatory sentences.
 
     Parameters
     ----------
@@ -190,8 +191,8 @@ def explain_by_steps(
     settings : Settings, optional
         Settings of KF; its time offset is that of the source that EKF2 fused.
     runs : mapping from axis name to Replay, optional
-        KF along horizontal axes; by default the same filter with EKF2's samples and steps, north
-        and east.
+        Runs of KF along horizontal axes. Default: along north and east the result of the first
+        step, which has EKF2's samples and prediction steps.
 
     Returns
     -------
@@ -209,7 +210,7 @@ def explain_by_steps(
     )
     evaluated_spans, times = model.flown.evaluated_s, ekf2.state.index.to_numpy()
     is_inside = inside_spans(times, evaluated_spans)
-    # all steps have the times of the replay
+    # only times that the replay and all KF runs cover
     for index in (flown.delayed.index, *(run.steps.index for run in (runs or {}).values())):
         is_inside &= (times >= index[0]) & (times <= index[-1])
     times = times[is_inside]
@@ -222,7 +223,7 @@ def explain_by_steps(
     span = float(times[0]), float(times[-1])
     directions = {name: run.axis.direction for name, run in (runs or {}).items()}
     directions = directions or {"north": np.eye(3)[0], "east": np.eye(3)[1]}
-    ungated, stages = flown.delayed, []
+    without_gate, stages = flown.delayed, []
     # one track at a time, to limit memory
     tracks = chain(delayed, (flown.published, ekf2.state))
     for stage, track in zip((*variants, OUTPUT, "EKF2 as logged"), tracks, strict=True):
@@ -239,19 +240,21 @@ def explain_by_steps(
             FLOW_STEP,
             VISION_STEP,
         ):  # the last step without a gate
-            ungated = track
+            without_gate = track
     spans = Segment(*span, "").cut(evaluated_spans)
-    longest_rejection = _longest_rejection(flown, ungated, span, evaluated_spans)
+    longest_rejection = _longest_rejection(flown, without_gate, span, evaluated_spans)
     truth, steps_by_axis = model.flight.truth, {}
     no_truth = OTHER_TIME if isinstance(truth, Truth) else truth
     for axis_index, (axis, direction) in enumerate(directions.items()):
         kf_state = state_at(runs[axis], times) if runs else stages[0][axis_index]
         # KF, after each step, and the logged EKF2: shape (k + 2, 2, n)
-        path = np.array([kf_state, *(stage[axis_index] for stage in stages)])
-        difference = path - path[-1]
-        errors = [rms_to_truth(model.flight, track, direction, times) for track in path[:, 0]]
+        positions_by_step = np.array([kf_state, *(stage[axis_index] for stage in stages)])
+        difference = positions_by_step - positions_by_step[-1]
+        errors = [
+            rms_to_truth(model.flight, track, direction, times) for track in positions_by_step[:, 0]
+        ]
         position, velocity = np.mean(difference[:-1] ** 2, axis=2).T.tolist()
-        position_change = np.abs(np.diff(path[:-1, 0], axis=0))
+        position_change = np.abs(np.diff(positions_by_step[:-1, 0], axis=0))
         steps = tuple(
             Step(
                 name=name,
@@ -285,7 +288,7 @@ def explain_by_steps(
 
 
 def step_variants(inputs: Inputs, kf_settings: Settings) -> dict[str, Variant]:
-    """Return the filter after each step except the last; each changes one property."""
+    """Return the variant after each step except the last; each step changes one property."""
     flown, aid, received = inputs.settings, inputs.aid, inputs.received
     kf_process_noise = {
         "EKF2_ACC_NOISE": float(
@@ -296,17 +299,17 @@ def step_variants(inputs: Inputs, kf_settings: Settings) -> dict[str, Variant]:
     # the delay is already subtracted from the GNSS timestamps of KF
     applied_delay_s = flown[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     offset_s = kf_settings.clock_offset_s - applied_delay_s
-    without_lever_arm = {**kf_parameters, **dict.fromkeys(aid.place, 0.0)}
+    without_lever_arm = {**kf_parameters, **dict.fromkeys(aid.lever_arm, 0.0)}
     aids = modelled_aids(inputs)
-    others = [name for name in (FLOW.name, EV_POS.name) if name in aids[1:]]
+    other_aids = [name for name in (FLOW.name, EV_POS.name) if name in aids[1:]]
     kf_variant = Variant(
         kf_parameters,
         biases=False,
         attitude=False,
         velocity=False,
         reported=False,
-        gated=False,
-        without=dict.fromkeys((MAG.name, *others), 0.0),
+        has_gate=False,
+        without=dict.fromkeys((MAG.name, *other_aids), 0.0),
     )
     variants = {
         SAMPLES: replace(kf_variant, settings=without_lever_arm, timestamp_offset_s=offset_s),
@@ -319,17 +322,19 @@ def step_variants(inputs: Inputs, kf_settings: Settings) -> dict[str, Variant]:
         ATTITUDE: (variant := replace(noise, settings=flown, biases=True, attitude=True)),
     }
     if MAG.name in aids:
-        variants[FIELD_STEP] = variant = replace(variant, without=dict.fromkeys(others, 0.0))
+        variants[FIELD_STEP] = variant = replace(variant, without=dict.fromkeys(other_aids, 0.0))
     if received.velocity_m_s is not None:
         variants[VELOCITY_STEP] = variant = replace(variant, velocity=True)
-    for position, name in enumerate(others, start=1):
+    for position, name in enumerate(other_aids, start=1):
         step = FLOW_STEP if name == FLOW.name else VISION_STEP
-        variants[step] = variant = replace(variant, without=dict.fromkeys(others[position:], 0.0))
-    return variants | {GATE: Variant(flown, as_logged=True)}
+        variants[step] = variant = replace(
+            variant, without=dict.fromkeys(other_aids[position:], 0.0)
+        )
+    return variants | {GATE: Variant(flown, uses_logged_decisions=True)}
 
 
 def _longest_rejection(
-    flown: Ekf2Replay, ungated: pd.DataFrame, span: tuple[float, float], spans: Spans
+    flown: Ekf2Replay, without_gate: pd.DataFrame, span: tuple[float, float], spans: Spans
 ) -> RejectionRun | None:
     updates = flown.updates[inside_spans(flown.updates.index, spans)]
     updates = updates[updates["fused_at_s"].between(*span)]
@@ -343,7 +348,8 @@ def _longest_rejection(
     begin, end = time[starts[longest]], time[min(ends[longest], len(time) - 1)]
     rejected_part = flown.delayed.loc[begin:end]
     ungated_difference = [
-        rejected_part[column] - np.interp(rejected_part.index, ungated.index, ungated[column])
+        rejected_part[column]
+        - np.interp(rejected_part.index, without_gate.index, without_gate[column])
         for column in Columns.POSITION[:2]
     ]
     return RejectionRun(

@@ -2,7 +2,9 @@
 
 The bias adapts within seconds, so vision determines the relative motion and GNSS the position.
 Without GNSS there is no bias: EKF2 then resets its position to that of vision. Samples between two
-events are fused at the later event; the motion in between follows from the state and the IMU.
+events (ends of intervals, see :mod:`px4fuse.ekf2.intervals`) are fused at the later event; the
+motion in between follows from the state and the IMU. Array shapes: E events, S variants, k samples
+per event.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/external_vision`` (``ev_pos_control.cpp``; before v1.16
 ``EKF/ev_pos_control.cpp``), ``EKF/control.cpp`` (vision is fused after GNSS and heights).
@@ -15,16 +17,16 @@ import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.bias import BiasEstimator
-from px4fuse.ekf2.heights import MIN_GATE, MIN_SD
+from px4fuse.ekf2.heights import MIN_GATE, MIN_SIGMA
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.intervals import MAX_LATE_S
-from px4fuse.ekf2.replay_segments import Stretch, pad_samples, samples_by_event
+from px4fuse.ekf2.intervals import MAX_LATENESS_S
+from px4fuse.ekf2.replay_segments import ReplaySegment, pad_samples, samples_by_event
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 
 SPEED, HORIZONTAL = slice(3, 5), slice(6, 8)
 # s; time without a sample after which fusion stops (2 EV_MAX_INTERVAL, ev_control.cpp); time
 # outside the gate after which EKF2 resets the bias or the position (no_aid_timeout_max, common.h)
-STOP_S, FAILING_S = 0.4, 1.0
+MAX_SAMPLE_GAP_S, MAX_REJECTED_S = 0.4, 1.0
 COLUMNS = [
     "innovation_north_m",
     "innovation_east_m",
@@ -37,48 +39,52 @@ COLUMNS = [
 
 
 def vision_samples(
-    inputs: Inputs, stretch: Stretch, end: IntArray, settings: Mapping[str, float], horizon_s: float
+    inputs: Inputs,
+    segment: ReplaySegment,
+    event_steps: IntArray,
+    settings: Mapping[str, float],
+    horizon_s: float,
 ) -> Array:
     """Return vision samples by the event at which they are fused, shape (8, k, E).
 
     Rows: north and east as in :func:`~px4fuse.ekf2.replay_segments.samples_by_event`, age,
     measurement time, fusion time, reported variances north and east, and 1.
     """
-    vision, time_s = inputs.vision, stretch.time_s
+    vision, time_s = inputs.vision, segment.time_s
     assert vision is not None
-    taken_s = vision.stamp_s - settings[EV_POS.delay] * 1e-3 - 0.5 * inputs.step_s
-    due_s = np.maximum(taken_s, vision.arrival_s - horizon_s)
+    measured_at_s = vision.stamp_s - settings[EV_POS.delay] * 1e-3 - 0.5 * inputs.step_s
+    due_s = np.maximum(measured_at_s, vision.arrival_s - horizon_s)
     step = np.maximum.accumulate(np.searchsorted(time_s, due_s - 1e-9))
-    is_usable = (step > 0) & (step < len(time_s)) & (due_s < taken_s + MAX_LATE_S)
+    is_usable = (step > 0) & (step < len(time_s)) & (due_s < measured_at_s + MAX_LATENESS_S)
     is_usable &= np.isfinite(vision.position_m[:, 0])
     is_usable[:-1] &= step[1:] > step[:-1]  # EKF2 fuses the newer of two samples in one step
     step = step[is_usable]
-    lever_arm_m = np.array([settings[name] for name in EV_POS.place]) - inputs.imu_offset_m
-    position_m = (vision.position_m[is_usable] - stretch.rotation[step] @ lever_arm_m)[:, :2]
-    more_columns = taken_s[is_usable], time_s[step], *vision.variance_m2[is_usable, :2].T
-    return samples_by_event(stretch, end, step, position_m, slice(0, 2), *more_columns)
+    lever_arm_m = np.array([settings[name] for name in EV_POS.lever_arm]) - inputs.imu_offset_m
+    position_m = (vision.position_m[is_usable] - segment.rotation[step] @ lever_arm_m)[:, :2]
+    more_columns = measured_at_s[is_usable], time_s[step], *vision.variance_m2[is_usable, :2].T
+    return samples_by_event(segment, event_steps, step, position_m, slice(0, 2), *more_columns)
 
 
 class VisionFilter:
-    """Vision fusion of S variants through one stretch, event by event.
+    """Vision fusion of S variants through one segment, event by event.
 
     Parameters
     ----------
-    stretch : Stretch
+    segment : ReplaySegment
     sample_arrays : sequence of S ndarrays, shape (8, k, E)
         From :func:`vision_samples`.
     enabled : mapping from PX4's name of an aid to ndarray of bool, shape (E, S)
         True while the aid is fused.
     parameters : mapping from PX4's name to ndarray, shape (S,)
-    gated, reported : ndarray of bool, shape (S,)
+    has_gate, reported : ndarray of bool, shape (S,)
         True if the gate is applied; True if reported variances are used.
 
     Attributes
     ----------
     update_log : ndarray, shape (E, k, 7, S)
-        For each sample the innovation (m, measurement minus state) and its variance, north and
-        east; 1 if rejected, fused, reset; NaN if EKF2 did not evaluate it.
-    moved_m : ndarray, shape (E, S, 2)
+        For each sample: innovation (m, measurement minus state) and its variance, north and east;
+        1 if rejected, fused, or followed by a reset. NaN if EKF2 did not evaluate the sample.
+    position_reset_m : ndarray, shape (E, S, 2)
         Position reset at each event.
     fused_s : ndarray, shape (S,)
         Time of the last position fusion or reset.
@@ -86,34 +92,34 @@ class VisionFilter:
 
     def __init__(
         self,
-        stretch: Stretch,
+        segment: ReplaySegment,
         sample_arrays: Sequence[Array],
         enabled: Mapping[str, BoolArray],
         parameters: Mapping[str, Array],
-        gated: BoolArray,
+        has_gate: BoolArray,
         reported: BoolArray,
     ) -> None:
         samples = np.stack(pad_samples(sample_arrays), axis=-1)
         self.position_m = np.moveaxis(samples[:2], 0, -1)
-        self.age_s, self.taken_s, self.now_s = samples[2:5]
+        self.age_s, self.measured_at_s, self.now_s = samples[2:5]
         _, count, events, size = samples.shape
         self.update_log = np.full((events, count, 7, size), np.nan)
-        self.moved_m = np.zeros((events, size, 2))
+        self.position_reset_m = np.zeros((events, size, 2))
         has_sample = (samples[7] > 0.0) & enabled[EV_POS.name]
-        # samples of the event's step are fused after GNSS
+        # samples fused in the last step of the interval follow GNSS, earlier samples precede GNSS
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
-        self.gated, self.without_gnss = gated, ~enabled[GNSS_POS.name]
+        self.has_gate, self.without_gnss = has_gate, ~enabled[GNSS_POS.name]
         self.gate2 = np.maximum(parameters[EV_POS.gate], MIN_GATE)[:, None] ** 2
         reported_variance = samples[5:7] * (reported & (parameters[EV_POS.noise_mode] != 1.0))
-        min_variance = np.maximum(parameters[EV_POS.noise], MIN_SD) ** 2
+        min_variance = np.maximum(parameters[EV_POS.noise], MIN_SIGMA) ** 2
         with_gnss_innovations = np.where(self.without_gnss, 0.0, parameters[GNSS_POS.noise] ** 2)
         self.noise_m2 = np.moveaxis(
             np.maximum(reported_variance, np.maximum(min_variance, with_gnss_innovations)), 0, -1
         )
-        start_s = float(stretch.time_s[0])
+        start_s = float(segment.time_s[0])
         unknown_variance = np.full((size, 2), np.inf)
         self.bias = BiasEstimator(
-            np.zeros((size, 2)), unknown_variance, start_s, float(np.median(stretch.step_s))
+            np.zeros((size, 2)), unknown_variance, start_s, float(np.median(segment.step_s))
         )
         self.last_sample_s, self.last_attempt_s = np.full((2, size), -np.inf)
         self.fused_s, self.was_without_gnss = np.full(size, start_s), self.without_gnss[0]
@@ -125,21 +131,21 @@ class VisionFilter:
         """
         update_log = self.update_log[..., variant]
         event, place = np.nonzero(np.isfinite(update_log[:, :, 0]))
-        index = pd.Index(self.taken_s[place, event, variant], name="time_s")
+        index = pd.Index(self.measured_at_s[place, event, variant], name="time_s")
         frame = pd.DataFrame(update_log[event, place], index, COLUMNS)
         return frame.assign(fused_at_s=end_s[event])
 
     def fuse(
         self, e: int, x: Array, P: Array, at_event: bool, gnss_fused_s: Array
     ) -> tuple[Array, Array]:
-        """Return state and covariance after the samples of one event.
+        """Return state and covariance after fusing the samples of one event.
 
         Parameters
         ----------
         e : int
         x, P : ndarray
         at_event : bool
-            True: samples of the event's step; False: earlier ones.
+            True: samples in the last step of the interval; False: earlier samples.
         gnss_fused_s : ndarray, shape (S,)
             Time of the last position fusion from GNSS.
         """
@@ -160,45 +166,53 @@ class VisionFilter:
         sample_state = now_s[:, None], has_sample[:, None], ~without_gnss[:, None]
         nu, R = self.bias.remove_bias(distance_m, diagonal.copy(), noise_m2, *sample_state)
         diagonal += R
-        has_restarted = (now_s - self.last_sample_s > STOP_S) | (
+        has_restarted = (now_s - self.last_sample_s > MAX_SAMPLE_GAP_S) | (
             without_gnss != self.was_without_gnss
         )
-        outside = (nu * nu > self.gate2 * diagonal).any(axis=1) & self.gated & ~has_restarted
-        is_failing = outside & (now_s - self.last_attempt_s > FAILING_S)
-        restart, is_fused = (
-            has_sample & (has_restarted | is_failing),
-            has_sample & ~outside & ~has_restarted,
+        is_outside_gate = (
+            (nu * nu > self.gate2 * diagonal).any(axis=1) & self.has_gate & ~has_restarted
         )
-        reset = restart & (without_gnss | (is_failing & (now_s - gnss_fused_s > FAILING_S)))
+        is_failing = is_outside_gate & (now_s - self.last_attempt_s > MAX_REJECTED_S)
+        restarts, is_fused = (
+            has_sample & (has_restarted | is_failing),
+            has_sample & ~is_outside_gate & ~has_restarted,
+        )
+        reset = restarts & (without_gnss | (is_failing & (now_s - gnss_fused_s > MAX_REJECTED_S)))
         is_evaluated = has_sample & ~has_restarted | reset
         # the innovation after a reset is 0
-        update_log = *np.where(reset, 0.0, nu.T), *diagonal.T, outside & ~reset, is_fused, reset
+        update_log = (
+            *np.where(reset, 0.0, nu.T),
+            *diagonal.T,
+            is_outside_gate & ~reset,
+            is_fused,
+            reset,
+        )
         self.update_log[e, place] = np.where(is_evaluated, np.stack(update_log), np.nan)
         K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
         x, P = x + (K @ nu[:, :, None])[:, :, 0], P - K @ HP
         if reset.any():
-            moved_m = np.where(without_gnss[:, None], distance_m, nu) * reset[:, None]
+            position_reset_m = np.where(without_gnss[:, None], distance_m, nu) * reset[:, None]
             variance = np.where(without_gnss[:, None], noise_m2, R)
-            set_states(x, P, reset, HORIZONTAL, x[:, HORIZONTAL] + moved_m, variance)
-            self.moved_m[e] += moved_m
-        if restart.any():
-            new_bias, no_bias = (restart & ~reset)[:, None], (reset & without_gnss)[:, None]
+            set_states(x, P, reset, HORIZONTAL, x[:, HORIZONTAL] + position_reset_m, variance)
+            self.position_reset_m[e] += position_reset_m
+        if restarts.any():
+            new_bias, no_bias = (restarts & ~reset)[:, None], (reset & without_gnss)[:, None]
             self.bias.value_m = np.where(
                 new_bias, -distance_m, np.where(no_bias, 0.0, self.bias.value_m)
             )
             self.bias.variance_m2 = np.where(no_bias, 0.0, self.bias.variance_m2)
         self.last_sample_s = np.where(has_sample, now_s, self.last_sample_s)
-        self.last_attempt_s = np.where(is_fused | restart, now_s, self.last_attempt_s)
+        self.last_attempt_s = np.where(is_fused | restarts, now_s, self.last_attempt_s)
         self.fused_s = np.where(is_fused | reset, now_s, self.fused_s)
         self.was_without_gnss = np.where(has_sample, without_gnss, self.was_without_gnss)
         return x, P
 
 
 def set_states(
-    x: Array, P: Array, which: BoolArray, rows: slice, value: Array, variance: Array
+    x: Array, P: Array, is_selected: BoolArray, rows: slice, value: Array, variance: Array
 ) -> None:
     """Set states of selected variants to measured values, with their variance."""
-    x[which, rows] = value[which]
-    P[which, :, rows] = 0.0
-    P[which, rows, :] = 0.0
-    P[which, rows, rows] = np.eye(value.shape[1]) * variance[which][:, :, None]
+    x[is_selected, rows] = value[is_selected]
+    P[is_selected, :, rows] = 0.0
+    P[is_selected, rows, :] = 0.0
+    P[is_selected, rows, rows] = np.eye(value.shape[1]) * variance[is_selected][:, :, None]

@@ -1,4 +1,4 @@
-"""EKF2 with other parameters: logged, replayed and changed results over the same times."""
+"""EKF2 with other parameters: results as logged, as replayed and with changes, at equal times."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record, Share
 
 ANALYSIS_NAME = "EKF2 what-if"
-# fraction of the replayed samples that the log must contain to measure gaps between fusions
+# fraction of the replayed samples that the log must contain to measure the time between fusions
 MIN_COMPLETE_SHARE = 0.9
 NO_TRUTH = Unavailable(
     "RMSE against ground truth",
@@ -40,16 +40,16 @@ NO_TRUTH = Unavailable(
     "Record motion capture (ATT_POS_MOCAP) besides the position source, or fly in simulation.",
 )
 # Notes for flights on GNSS
-HEADING_FOLLOWS = (
+HEADING_REPLAYED_NOTE = (
     "Heading is replayed with the magnetometer (as flown it differs from the log by {:.1f}° RMS)"
 )
-HEADING_STAYS = (
+HEADING_LOGGED_NOTE = (
     "The logged EKF2 heading is used in all columns: the log does not contain all fused "
     "magnetometer samples"
 )
-HEIGHT_FOLLOWS = "Height is replayed with the logged height sensors"
-HEIGHT_STAYS = "The logged EKF2 height is used in all columns"
-OWN_HEADING, OWN_HEIGHT = (
+HEIGHT_REPLAYED_NOTE = "Height is replayed with the logged height sensors"
+HEIGHT_LOGGED_NOTE = "The logged EKF2 height is used in all columns"
+HEADING_NOT_REPLAYED, HEIGHT_NOT_REPLAYED = (
     Unavailable(
         "heading error",
         "with external vision the replay uses the logged EKF2 heading",
@@ -63,10 +63,10 @@ OWN_HEADING, OWN_HEIGHT = (
 MIN_EVALUATED_S = 5.0
 SWEEP_VALUES = 9
 MAX_SWEEP_VALUES = 200
-# Position noise (m) and number of repeated runs. A result is predictable if this noise hardly
-# changes it
-DISTURBED_M, DISTURBED_RUNS = 0.002, 4
-# Rejected share below which no repeated runs are needed, and above which nothing is predictable
+# Additional position noise (m) and number of repeated runs with this noise. A result is predictable
+# if the noise hardly changes the result
+DISTURBANCE_M, DISTURBANCE_RUNS = 0.002, 4
+# Rejected share up to which no repeated runs are needed, and above which no result is predictable
 MIN_REJECTED_SHARE, MAX_REJECTED_SHARE = 0.02, 0.35
 # s; time without height fusion after which EKF2 resets the height (hgt_fusion_timeout_max,
 # common.h)
@@ -82,7 +82,7 @@ class AxisSummary(Record, frozen=True):
     Attributes
     ----------
     nis_mean : float
-        Over all evaluated samples, including rejected ones.
+        Mean NIS over all evaluated samples, including rejected ones.
     nis_band : (float, float)
         95 % band of the mean NIS of a consistent filter.
     innovation_std_m : float
@@ -119,7 +119,10 @@ class HeightSummary(Record, frozen=True):
 
     @property
     def is_predictable(self) -> bool:
-        """Return True if predictable: no height reset (not modelled), and few rejections."""
+        """Return True if the result is predictable: no height reset and few rejections.
+
+        The replay does not model a height reset.
+        """
         is_without_reset = self.longest_without_fusion_s <= HEIGHT_TIMEOUT_S
         return is_without_reset and self.rejected_fraction <= MAX_REJECTED_SHARE
 
@@ -159,10 +162,10 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     rejected_fraction: Share
     longest_without_fusion_s: NotNegative | Unavailable
     resets: Count
-    heading_error_mean_deg: float | Unavailable = OWN_HEADING
+    heading_error_mean_deg: float | Unavailable = HEADING_NOT_REPLAYED
     heights: Mapping[str, HeightSummary] = {}
     others: Mapping[str, HeightSummary] = {}
-    height_rmse_to_truth_m: NotNegative | Unavailable = OWN_HEIGHT
+    height_rmse_to_truth_m: NotNegative | Unavailable = HEIGHT_NOT_REPLAYED
     late: Count = 0
     lost: Count = 0
     is_predictable: bool = True
@@ -196,7 +199,7 @@ class WhatIf:
     Attributes
     ----------
     agreement : Agreement
-        Agreement of replay and log, the precondition for the rest.
+        Agreement of the replay with the log, which all other results require.
     logged, replayed : Summary
         As flown, from the log and from the model.
     whatif : tuple of Summary
@@ -204,7 +207,7 @@ class WhatIf:
     evaluated_s : tuple of (float, float)
         Evaluated times (s), equal for all columns.
     notes : tuple of str
-        One sentence each.
+        Limitations of the replay, one sentence each.
     """
 
     agreement: Agreement
@@ -248,15 +251,17 @@ def what_if(
     replays = replay_settings(model, settings, without=without)
     flight, evaluated_s = model.flight, model.flown.evaluated_s
     if without:
-        since = min(without.values())
-        # a further stretch would start from the log, in which the aid was fused
+        disabled_s = min(without.values())
+        # a later segment would start from a logged state into which the aid was fused
         remaining_spans = [
-            (max(start, since), end) for start, end in evaluated_s if end - since > MIN_EVALUATED_S
+            (max(start, disabled_s), end)
+            for start, end in evaluated_s
+            if end - disabled_s > MIN_EVALUATED_S
         ]
         evaluated_s = tuple(remaining_spans[:1])
         if not evaluated_s:
             raise SettingsError(
-                f"--from {since:g} s leaves less than {MIN_EVALUATED_S:g} s of the replayed "
+                f"--from {disabled_s:g} s leaves less than {MIN_EVALUATED_S:g} s of the replayed "
                 f"flight, which ends at {model.flown.evaluated_s[-1][1]:.0f} s. Choose an "
                 "earlier time."
             )
@@ -285,9 +290,13 @@ def what_if(
 
 
 def _heading_and_height_notes(model: Model) -> tuple[str, str]:
-    off_deg = model.agreement.heading_rms_difference_deg
-    heading = HEADING_STAYS if off_deg is None else HEADING_FOLLOWS.format(off_deg)
-    return heading, HEIGHT_STAYS if model.inputs.height_reason else HEIGHT_FOLLOWS
+    difference_deg = model.agreement.heading_rms_difference_deg
+    heading = (
+        HEADING_LOGGED_NOTE
+        if difference_deg is None
+        else HEADING_REPLAYED_NOTE.format(difference_deg)
+    )
+    return heading, HEIGHT_LOGGED_NOTE if model.inputs.height_reason else HEIGHT_REPLAYED_NOTE
 
 
 def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) -> list[float]:
@@ -319,7 +328,7 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) 
 def _mark_unpredictable(
     model: Model, summaries: Sequence[Summary], evaluated_s: Spans, without: Mapping[str, float]
 ) -> tuple[Summary, ...]:
-    """Mark the results that change when noise is added to the positions."""
+    """Mark results as not predictable that change when noise is added to the positions."""
     runs = [[summary] for summary in summaries]
     uncertain_runs = [
         repeated_runs
@@ -327,10 +336,10 @@ def _mark_unpredictable(
         if repeated_runs[0].changed
         and MIN_REJECTED_SHARE < repeated_runs[0].rejected_fraction <= MAX_REJECTED_SHARE
     ]
-    for seed in range(DISTURBED_RUNS if uncertain_runs else 0):
-        disturbed_model = with_position_noise(model, DISTURBED_M, seed)
+    for seed in range(DISTURBANCE_RUNS if uncertain_runs else 0):
+        noisy_model = with_position_noise(model, DISTURBANCE_M, seed)
         repeated_replays = replay_settings(
-            disturbed_model,
+            noisy_model,
             [repeated_runs[0].changed for repeated_runs in uncertain_runs],
             without=without,
         )
@@ -341,8 +350,8 @@ def _mark_unpredictable(
             summary,
             is_predictable=all(height.is_predictable for height in summary.heights.values())
             and all(
-                disturbed_model.rejected_fraction <= MAX_REJECTED_SHARE
-                for disturbed_model in summary.others.values()
+                noisy_model.rejected_fraction <= MAX_REJECTED_SHARE
+                for noisy_model in summary.others.values()
             )
             and (
                 not summary.changed
@@ -381,9 +390,11 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
     # the variance grows between two samples; both ends define the interpolation
     variance = pd.DataFrame(index=np.column_stack([fused_at_s - 1e-6, fused_at_s]).ravel())
     for axis in HORIZONTAL:
-        s, r = (updates[f"{of}_variance_{axis}_m2"] for of in ("innovation", "observation"))
-        after = updates[f"position_variance_{axis}_m2"]
-        variance[f"{axis}_m2"] = np.column_stack([s - r, after]).ravel()
+        s, r = (
+            updates[f"{quantity}_variance_{axis}_m2"] for quantity in ("innovation", "observation")
+        )
+        variance_after = updates[f"position_variance_{axis}_m2"]
+        variance[f"{axis}_m2"] = np.column_stack([s - r, variance_after]).ravel()
     fused = evaluated_updates["fused_at_s"][
         (evaluated_updates["fused"] > 0) | (evaluated_updates["reset"] > 0)
     ]
@@ -455,9 +466,10 @@ def _make_summary(
     heading: pd.Series,
     **more: Any,
 ) -> Summary:
-    """Compute a column from innovations, published position, variance and ``more``.
+    """Compute a column of the what-if table.
 
-    ``variance`` None stands for the logged variance; others are interpolated at its times.
+    ``variance`` is interpolated at the times of the logged variance; None: the logged variance.
+    ``more`` contains further fields of :class:`Summary`.
     """
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
@@ -476,8 +488,10 @@ def _make_summary(
         else:
             variance_s = logged.index[inside_spans(logged.index, evaluated_s)].to_numpy()
             known_variance = logged if variance is None else variance
-            stated = np.interp(variance_s, known_variance.index, known_variance[f"{axis}_m2"])
-            sigma = float(np.sqrt(np.median(stated)))
+            sigma_variance = np.interp(
+                variance_s, known_variance.index, known_variance[f"{axis}_m2"]
+            )
+            sigma = float(np.sqrt(np.median(sigma_variance)))
         more[axis] = AxisSummary(
             *_innovation_statistics(evaluated_updates, axis), sigma, error_m(direction)
         )
@@ -524,7 +538,7 @@ def _heading_error(
 ) -> float | Unavailable:
     """Return the mean of a heading (rad) minus the true heading, in degrees."""
     if GNSS_POS.noise not in replay.settings:
-        return OWN_HEADING
+        return HEADING_NOT_REPLAYED
     true_attitude = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude
     if true_attitude is None:
         return replace(NO_TRUTH, what="heading error", reason="the log has no true attitude")
@@ -545,7 +559,7 @@ def _longest_between_fusions(fused_s: Array, evaluated_s: Spans) -> float:
 def _deviation_note(
     model: Model, replay: Ekf2Replay, without: Mapping[str, float], evaluated_s: Spans
 ) -> str:
-    """Describe the difference to the replay as flown without some aids."""
+    """Describe the position difference between the replays without some aids and as flown."""
     flown, changed_position = (
         replay_run.published.loc[
             inside_spans(replay_run.published.index, evaluated_s), Columns.POSITION
@@ -556,7 +570,7 @@ def _deviation_note(
     distance = np.hypot(*horizontal)
     lost_text = ", ".join(f"{name} from {since:g} s on" for name, since in without.items())
     heights = {*model.flown.other_aid_updates} - {EV_POS.name}
-    position = {*modelled_aids(model.inputs)} - {MAG.name} - heights
+    horizontal_aids = {*modelled_aids(model.inputs)} - {MAG.name} - heights
     height = f"; the height by at most {down.max():.3g} m" if heights & {*without} else ""
     give_up_note = (
         "; without a horizontal aid EKF2 stops providing a position after EKF2_NOAID_TOUT (5 s), "
@@ -566,7 +580,7 @@ def _deviation_note(
     return (
         f"Without {lost_text} the published position differs from the replay as flown by at most "
         f"{distance.max():.3g} m (at {at_s:.1f} s), {distance[-1]:.3g} m at the end{height}"
-        + (give_up_note if position <= without.keys() else "")
+        + (give_up_note if horizontal_aids <= without.keys() else "")
     )
 
 

@@ -14,7 +14,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.card.build import describe_axis
 from px4fuse.card.model import AXIS_ENDS, BANDS, Verdict
 from px4fuse.card.verdicts import verdicts
-from px4fuse.comparison.model import AgainstTruth, AxisComparison, Comparison
+from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.ekf2_parameters import PARAMETERS
@@ -28,7 +28,7 @@ from px4fuse.filter.settings import (
     SIGMA_Z_RANGE_M,
     Settings,
 )
-from px4fuse.filter.signals import AISLE, Acceleration, Axis, along, imu_gaps, within
+from px4fuse.filter.signals import AISLE, Acceleration, Axis, cut_to_segment, imu_gaps, weighted_sum
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Columns, PositionTrack, Unavailable
@@ -167,7 +167,7 @@ def _axis_signals(
     """Return measurements (in and near the segment) and integrated acceleration of an axis."""
     segment = comparison.segment
     time = raw.samples.index.to_numpy()
-    value = along(raw.samples, Columns.POSITION, axis.direction)
+    value = weighted_sum(raw.samples, Columns.POSITION, axis.direction)
     half_range_s = OFFSET_HALF_RANGE_S + abs(comparison.settings.clock_offset_s)
     is_in_reach = (time >= segment.start_s - half_range_s) & (time <= segment.end_s + half_range_s)
     is_in_reach &= np.isfinite(value)
@@ -191,7 +191,7 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
     """Return the axis description, NIS bands, EKF2 and ground truth of one axis."""
     name = result.axis.name
     return {
-        "called": result.axis.called,
+        "called": result.axis.label,
         "along": describe_axis(analysis, result),
         "verdicts": [_verdict_data(verdict) for verdict in verdicts(result)],
         "heading": result.axis.heading_deg,
@@ -231,7 +231,7 @@ def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
         "summary": _summary(consistency),
         "r": None,
     }
-    if isinstance(consistency.truth, AgainstTruth):
+    if isinstance(consistency.truth, ErrorsAgainstTruth):
         ekf2["summary"] |= {
             "truthP": consistency.truth.position_rmse_m,
             "truthV": consistency.truth.velocity_rmse_m_s,
@@ -308,7 +308,7 @@ def _map_data(analysis: Analysis) -> dict[str, Any]:
 
 def _track_data(comparison: Comparison, packer: Packer) -> list[int] | str:
     """Pack time, north and east of the source's track, or return the reason why it is missing."""
-    samples = within(comparison.source.samples, comparison.segment)
+    samples = cut_to_segment(comparison.source.samples, comparison.segment)
     track = samples[Columns.POSITION[:2]].dropna()
     if not len(track):
         return "the source has no horizontal position"
@@ -341,7 +341,7 @@ def _ekf2_settings(request: ComparisonRequest, analysis: Analysis) -> dict[str, 
     example = WhatIfRequest(
         log=request.log, mavlink=request.mavlink, system=request.system, changes=changes
     )
-    return {"flown": flown, "command": command_line(example, typed=True)}
+    return {"flown": flown, "command": command_line(example, for_shell=True)}
 
 
 def _command_data(request: ComparisonRequest, comparison: Comparison) -> dict[str, Any]:
@@ -362,8 +362,8 @@ def _command_data(request: ComparisonRequest, comparison: Comparison) -> dict[st
         heading_deg=heading if base_request.heading_deg is None else base_request.heading_deg,
     )
     return {
-        "base": command_line(base_request, typed=True),
-        "fixed": command_line(fixed_request, typed=True),
+        "base": command_line(base_request, for_shell=True),
+        "fixed": command_line(fixed_request, for_shell=True),
         "input": request.input,
         "default_input": "zero"
         if isinstance(comparison.lines[0].acceleration, Unavailable)

@@ -259,11 +259,11 @@ def filter_positions(intervals: Preintegrated) -> Positions:
     return centre_on_path(
         Positions(
             measurement_m=measured_m,
-            start=np.array([0]),
+            segment_starts=np.array([0]),
             length_s=intervals.length_s,
             noise_unit=intervals.noise_unit.T,
             noise_fixed=intervals.noise_fixed.T,
-            initial=prior_precision,
+            prior_precision=prior_precision,
             constant_sigma=np.sqrt([INITIAL_COVARIANCE[0], INITIAL_COVARIANCE[2]]),
             delta_position_m=dp,
             delta_velocity_m_s=dv,

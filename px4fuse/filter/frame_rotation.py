@@ -21,7 +21,7 @@ from px4fuse.arrays import Array, cumulative_integral
 from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S
 from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, continuous_noise_unit
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import IMU_GAP_S, Segment, ned_acceleration, within
+from px4fuse.filter.signals import IMU_GAP_S, Segment, cut_to_segment, ned_acceleration
 from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import NotNegative, Record, Share
@@ -159,7 +159,7 @@ def estimate_heading_error(
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, Unavailable):
         return acceleration
-    samples = within(track.samples, segment)[Columns.POSITION[:2]].dropna()
+    samples = cut_to_segment(track.samples, segment)[Columns.POSITION[:2]].dropna()
     samples = samples.set_axis(samples.index.to_numpy() + offset_s)
     first_s, last_s = acceleration.index[[0, -1]]
     samples = samples[(samples.index >= first_s) & (samples.index <= last_s)]
@@ -216,7 +216,7 @@ def _compare_orientations(
     attitude: pd.DataFrame, orientation: pd.DataFrame, segment: Segment, offset_s: float
 ) -> HeadingError | None:
     """Return heading of the source minus heading of the attitude; None with too few samples."""
-    samples = within(orientation, segment)
+    samples = cut_to_segment(orientation, segment)
     time_s = samples.index.to_numpy() + offset_s
     attitude_s = attitude.index.to_numpy()
     is_covered = (time_s >= attitude_s[0]) & (time_s <= attitude_s[-1])

@@ -180,9 +180,9 @@ def fit_bias_scale_jumps(
             design, step_columns=unit_steps(design.time_s, [jump.time_s for jump in jumps])
         )
         sigma_a, fit = _fit_sigma_a(design, sigma_a_grid, is_skipped)
-    forward, right, turn = map(fit.estimate, (FORWARD, RIGHT, ROTATION))
+    forward, right, rotation = map(fit.estimate, (FORWARD, RIGHT, ROTATION))
     return BiasScaleJumpFit(
-        forward, right, turn, _fit_scale(design, sigma_a, is_skipped), jumps, sigma_a
+        forward, right, rotation, _fit_scale(design, sigma_a, is_skipped), jumps, sigma_a
     )
 
 
@@ -206,18 +206,27 @@ def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
 
 def _fit_scale(design: DesignMatrix, sigma_a: float, is_skipped: BoolArray) -> Estimate:
     """Estimate the scale factor error from the likelihood on a grid, corrected for rotation."""
-    fit_at = cache(lambda at: design.fit(sigma_a, is_skipped, float(SCALE_GRID[at])))
+    fit_at = cache(
+        lambda grid_index: design.fit(sigma_a, is_skipped, float(SCALE_GRID[grid_index]))
+    )
     # ln S is omitted: it grows with the scale and would bias the estimate towards zero
-    lowest_index = _index_of_minimum(lambda at: fit_at(at).square_sum, len(SCALE_GRID))
-    at = int(np.clip(lowest_index, 1, len(SCALE_GRID) - 2))
-    scores = np.array([fit_at(neighbour).square_sum / 2.0 for neighbour in (at - 1, at, at + 1)])
+    lowest_index = _index_of_minimum(
+        lambda grid_index: fit_at(grid_index).square_sum, len(SCALE_GRID)
+    )
+    grid_index = int(np.clip(lowest_index, 1, len(SCALE_GRID) - 2))
+    scores = np.array(
+        [
+            fit_at(neighbour).square_sum / 2.0
+            for neighbour in (grid_index - 1, grid_index, grid_index + 1)
+        ]
+    )
     vertex_shift, curvature = parabola_vertex(scores, 1)
     step = float(SCALE_GRID[1] - SCALE_GRID[0])
     if curvature <= 0.0:
         return Estimate(0.0, float("inf"))
-    scale = SCALE_GRID[at] + float(np.clip(vertex_shift, -1.5, 1.5)) * step
-    sigma = step / np.sqrt(curvature) * max(fit_at(at).residual_rms, 1.0)
-    rotation_factor = np.hypot(1.0, fit_at(at).coefficients[ROTATION])
+    scale = SCALE_GRID[grid_index] + float(np.clip(vertex_shift, -1.5, 1.5)) * step
+    sigma = step / np.sqrt(curvature) * max(fit_at(grid_index).residual_rms, 1.0)
+    rotation_factor = np.hypot(1.0, fit_at(grid_index).coefficients[ROTATION])
     return Estimate(float(scale * rotation_factor - 1.0), float(sigma))
 
 

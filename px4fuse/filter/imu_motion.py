@@ -71,9 +71,9 @@ class Signals:
     def at(self, time_s: Array) -> tuple[Array, Array]:
         """Return position and velocity at other times, shape (..., 3, constants)."""
         last_index = len(self.time_s) - 1
-        at = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
-        elapsed_s = (time_s - self.time_s[at])[..., None, None]
-        position, velocity, acceleration = np.moveaxis(self.table[at], -3, 0)
+        row = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
+        elapsed_s = (time_s - self.time_s[row])[..., None, None]
+        position, velocity, acceleration = np.moveaxis(self.table[row], -3, 0)
         position += elapsed_s * (velocity + (0.5 * elapsed_s) * acceleration)
         velocity += elapsed_s * acceleration
         return position, velocity
@@ -145,8 +145,8 @@ class PreparedMotion:
         """
         length_s = np.diff(self.time_s)
         noise_unit = self.dt_s * np.stack(continuous_noise_unit(length_s))
-        initial = np.zeros((len(self.time_s), 2))
-        initial[self.edges[:-1]] = START_PRECISION
+        prior_precision = np.zeros((len(self.time_s), 2))
+        prior_precision[self.edges[:-1]] = START_PRECISION
         shape = len(self.directions), len(offset_s), 1 + len(CONSTANT_SIGMAS), len(length_s)
         dp, dv = np.zeros((2, *shape))
         for begin, end, signals in zip(self.edges, self.edges[1:], self.signals, strict=False):
@@ -161,11 +161,11 @@ class PreparedMotion:
             dp[rows] = np.diff(position) - velocity[..., :-1] * np.diff(time)
         return Positions(
             measurement_m=self.measurement_m,
-            start=self.edges[:-1],
+            segment_starts=self.edges[:-1],
             length_s=length_s,
             noise_unit=noise_unit,
             noise_fixed=np.zeros_like(noise_unit),
-            initial=initial,
+            prior_precision=prior_precision,
             constant_sigma=np.concatenate(
                 [CONSTANT_SIGMAS[:2], [self.heading_sigma_rad], CONSTANT_SIGMAS[3:]]
             ),
@@ -203,10 +203,10 @@ class PreparedMotion:
         ratios = [factor * noises.sigma_a_m_s2 / sigma for factor in factors]
         coarse_motion = self.downsample(COARSE_MEASUREMENTS)
         position_batches = coarse_motion.position_batches(offsets, scaled=scaled)
-        fits = fit_ratios(
+        ratio_fits = fit_ratios(
             position_batches, ratios, noises.random_walk_m / sigma, coarse_motion.weight, sigma
         )
-        scores = np.stack([fit.scaled(sigma).scores()[0] for fit in fits])
+        scores = np.stack([fit.scaled(sigma).scores()[0] for fit in ratio_fits])
         factor_index, offset_index = np.unravel_index(np.argmin(scores), scores.shape)
         sigma_a = noises.sigma_a_m_s2 * factors[int(factor_index)]
         return float(offsets[offset_index]), replace(noises, sigma_a_m_s2=sigma_a)

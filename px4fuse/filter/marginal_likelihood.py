@@ -50,14 +50,14 @@ class Positions:
     ----------
     measurement_m : ndarray, shape (m, a)
         NaN if an axis has no measurement.
-    start : ndarray of int, shape (s,)
+    segment_starts : ndarray of int, shape (s,)
         First state of each segment.
     length_s : ndarray, shape (m - 1,)
         Intervals between successive measurements, also between segments.
     noise_unit, noise_fixed : ndarray, shape (3, m - 1)
         Elements 00, 01, 11 of Q of each interval for SIGMA_A = 1 m/s², and the part that does not
         depend on SIGMA_A.
-    initial : ndarray, shape (m, 2)
+    prior_precision : ndarray, shape (m, 2)
         Prior precision of position and velocity; 0 without a prior.
     constant_sigma : ndarray, shape (c,)
         Prior standard deviations of the constants of each segment.
@@ -69,11 +69,11 @@ class Positions:
     """
 
     measurement_m: Array
-    start: IntArray
+    segment_starts: IntArray
     length_s: Array
     noise_unit: Array
     noise_fixed: Array
-    initial: Array
+    prior_precision: Array
     constant_sigma: Array
     delta_position_m: Array
     delta_velocity_m_s: Array
@@ -82,12 +82,12 @@ class Positions:
     @cached_property
     def segments(self) -> list[tuple[int, int]]:
         """First state of each segment, and the state after its last."""
-        return list(pairwise([*self.start.tolist(), len(self.measurement_m)]))
+        return list(pairwise([*self.segment_starts.tolist(), len(self.measurement_m)]))
 
     @cached_property
     def is_joined(self) -> BoolArray:
         """Mask of the intervals inside a segment, shape (m - 1,)."""
-        return ~np.isin(np.arange(1, len(self.measurement_m)), self.start)
+        return ~np.isin(np.arange(1, len(self.measurement_m)), self.segment_starts)
 
     def in_sigma_z_units(
         self, sigma_z_m: float, random_walk: float, weight: Array
@@ -112,7 +112,7 @@ class Positions:
         scaled_positions = replace(
             self,
             noise_fixed=noise_fixed,
-            initial=self.initial * sigma_z_m**2,
+            prior_precision=self.prior_precision * sigma_z_m**2,
             correlated_noise=correlated_noise,
         )
         return scaled_positions, 1.0 / np.concatenate([start_weights, weight])
@@ -133,16 +133,17 @@ class Positions:
                 axis for axis in axes_left if np.array_equal(is_measured[:, axis], is_axis_measured)
             ]
             axes_left = [axis for axis in axes_left if axis not in axes]
-            precision = self.initial.copy()
+            precision = self.prior_precision.copy()
             # a segment with fewer than two measurements gets a prior and has no likelihood
-            has_too_few = np.add.reduceat(is_axis_measured.astype(int), self.start) < 2
+            has_too_few = np.add.reduceat(is_axis_measured.astype(int), self.segment_starts) < 2
             is_used = is_axis_measured & ~np.repeat(
-                has_too_few, np.diff([*self.start, len(is_measured)])
+                has_too_few, np.diff([*self.segment_starts, len(is_measured)])
             )
             precision[:, 0] += np.where(is_used, 1.0 / variance_m2, 0.0)
-            precision[self.start[has_too_few]] += 1.0
+            precision[self.segment_starts[has_too_few]] += 1.0
             is_known = (precision > 0.0) & (
-                (precision > self.initial) | (self.initial > MIN_KNOWN_START_PRECISION)
+                (precision > self.prior_precision)
+                | (self.prior_precision > MIN_KNOWN_START_PRECISION)
             )
             system = factorise(
                 self.length_s, noise, self.is_joined, precision, self.correlated_noise
@@ -150,7 +151,7 @@ class Positions:
             # a practically unknown initial state does not count in the likelihood
             log_unknown_precision = float(np.sum(np.log(precision[(precision > 0.0) & ~is_known])))
             system = replace(system, log_determinant=system.log_determinant + log_unknown_precision)
-            yield axes, system, int(np.count_nonzero(is_known)) - 2 * len(self.start)
+            yield axes, system, int(np.count_nonzero(is_known)) - 2 * len(self.segment_starts)
 
 
 @dataclass(frozen=True)
@@ -231,7 +232,7 @@ def fit_positions(
         measured_m = np.zeros((axes, 1, 1 + len(positions.constant_sigma), states))
         measured_m[:, 0, 0] = np.nan_to_num(positions.measurement_m.T)
     dp, dv = positions.delta_position_m, positions.delta_velocity_m_s
-    gram = np.zeros((len(positions.start), *dp.shape[1:3], dp.shape[2]))
+    gram = np.zeros((len(positions.segment_starts), *dp.shape[1:3], dp.shape[2]))
     log_determinant, degrees_of_freedom = 0.0, 0
     for axes, system, axis_degrees_of_freedom in positions.factorised_systems(
         sigma_a_m_s2, variance_m2
@@ -272,7 +273,7 @@ def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
     ):
         data = np.nan_to_num(measured[:, axes].T)[:, None]
         state = system.solve(data, dp[axes, :, 0], dv[axes, :, 0])
-        state[:, :, positions.start] = 0.0
+        state[:, :, positions.segment_starts] = 0.0
         path, speed = state[..., 0], state[..., 1]
         measured[:, axes] -= path[:, 0].T
         path_increment = np.diff(path) - positions.length_s * speed[..., :-1]
@@ -307,7 +308,7 @@ def expected_squares(
     coefficients = np.concatenate([np.ones((len(constants), 1)), constants], axis=1)
     # the coefficients of an interval are those of the segment in which the interval ends
     interval_coefficients = np.repeat(
-        coefficients, np.diff([*positions.start, len(variance_m2)]), axis=0
+        coefficients, np.diff([*positions.segment_starts, len(variance_m2)]), axis=0
     )[1:]
     increments = positions.delta_position_m, positions.delta_velocity_m_s
     dp, dv = (np.einsum("akn,nk->an", array[:, 0], interval_coefficients) for array in increments)

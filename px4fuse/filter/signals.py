@@ -110,7 +110,7 @@ class Axis:
     __repr__ = one_line_repr
 
     @property
-    def called(self) -> str:
+    def label(self) -> str:
         """Name in messages; "the aisle" only for an elongated track or with --heading."""
         if self.name != AISLE:
             return self.name
@@ -168,7 +168,7 @@ def aisle_heading(track: PositionTrack, segment: Segment) -> tuple[float, float]
         Ratio of the standard deviations along and across this direction; 1 without a main
         direction.
     """
-    horizontal = within(track.samples, segment)[Columns.POSITION[:2]].dropna().to_numpy()
+    horizontal = cut_to_segment(track.samples, segment)[Columns.POSITION[:2]].dropna().to_numpy()
     centred = horizontal - horizontal.mean(axis=0)
     _, singular_values, directions = np.linalg.svd(centred, full_matrices=False)
     heading_deg = float(np.degrees(np.arctan2(directions[0, 1], directions[0, 0]))) % 180.0
@@ -221,8 +221,8 @@ def make_axes(
         samples = track.samples
         if name == "down" and track.barometer is not None:
             samples = track.barometer.reindex(columns=Columns.POSITION)
-        samples = within(samples, segment)
-        projected = along(samples, Columns.POSITION, direction)
+        samples = cut_to_segment(samples, segment)
+        projected = weighted_sum(samples, Columns.POSITION, direction)
         is_finite = np.isfinite(projected)
         if np.count_nonzero(is_finite) < MIN_MEASUREMENTS:
             if names is None:
@@ -247,7 +247,7 @@ def too_few_measurements(name: str, count: int, min_count: int) -> Unavailable:
     )
 
 
-def along(frame: pd.DataFrame, columns: list[str], weights: Array) -> Array:
+def weighted_sum(frame: pd.DataFrame, columns: list[str], weights: Array) -> Array:
     """Return the weighted sum of columns; columns with weight zero may be NaN."""
     total = np.zeros(len(frame))
     for column, weight in zip(columns, weights, strict=True):
@@ -342,6 +342,6 @@ def step_means(acceleration: Acceleration, edges: ArrayLike) -> tuple[Array, Arr
     )
 
 
-def within(frame: pd.DataFrame, segment: Segment) -> pd.DataFrame:
+def cut_to_segment(frame: pd.DataFrame, segment: Segment) -> pd.DataFrame:
     """Return the rows of a time-indexed frame inside a segment, both ends included."""
     return frame[(frame.index >= segment.start_s) & (frame.index <= segment.end_s)]

@@ -33,7 +33,7 @@ from px4fuse.filter.imu_motion import (
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
 from px4fuse.filter.marginal_likelihood import FittedPositions, products_by_segment
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Segment, within
+from px4fuse.filter.signals import Segment, cut_to_segment
 from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record, Share, Span
@@ -170,7 +170,7 @@ def estimate_time_offset(
     """
     # GNSS is noisier vertically, and all axes share one SIGMA_Z
     axes = 2 if track.origin.is_gnss else 3
-    samples = within(track.samples, segment)[Columns.POSITION[:axes]]
+    samples = cut_to_segment(track.samples, segment)[Columns.POSITION[:axes]]
     samples = samples.dropna(subset=Columns.POSITION[:2])
     if outlier_time_s is not None:
         samples = samples[~np.isin(samples.index.to_numpy(), outlier_time_s)]

@@ -1,11 +1,11 @@
-"""Detectors of mistakes and conditions, one file for those that share a condition.
+"""Detectors of mistakes and conditions; detectors that share a condition are in one file.
 
 A file declares thresholds with unit and source and, in ``detect``, the condition, message, action
 and evidence of its findings. A detector does not print, and reports nothing that the log does not
 show.
 
-To add a finding: its file with a ``detect``, the file in :data:`DETECTORS`, its title, group and
-meaning in ``catalogue.toml``, and the flights for its rate in ``tests/studies/rates.csv``.
+To add a finding: write a file with a ``detect`` and add it to :data:`DETECTORS`; add title, group
+and meaning to ``catalogue.toml``, and the rates to ``tests/studies/rates.csv``.
 """
 
 from collections.abc import Callable, Mapping
@@ -33,22 +33,22 @@ from px4fuse.findings import (
     source_stamps,
 )
 from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.model import TITLES, Finding, Found, Severity, by_root
+from px4fuse.findings.model import TITLES, Finding, Findings, Severity, group_by_root
 from px4fuse.loop.model import Loop
 
 __all__ = [
     "TITLES",
     "Finding",
     "Severity",
-    "by_root",
     "find",
     "find_aids",
     "find_loop",
     "finding_title",
+    "group_by_root",
 ]
 
 # Detectors of a comparison; group_by_cause orders their findings
-DETECTORS: tuple[Callable[[Analysis], Found], ...] = (
+DETECTORS: tuple[Callable[[Analysis], Findings], ...] = (
     aids.detect,
     ekf2_noise.detect,
     ekf2_not_fusing.detect,
@@ -70,7 +70,7 @@ DETECTORS: tuple[Callable[[Analysis], Found], ...] = (
 
 
 def find(subject: Analysis | Comparison) -> tuple[Finding, ...]:
-    """Find all mistakes of a flight, most severe first, consequences behind their cause.
+    """Find all mistakes of a flight, most severe first, each cause followed by its consequences.
 
     Parameters
     ----------
@@ -83,16 +83,16 @@ def find(subject: Analysis | Comparison) -> tuple[Finding, ...]:
 
 def find_loop(loop: Loop) -> tuple[Finding, ...]:
     """Find mistakes of a loop, most severe first."""
-    return group_by_cause(loops.find_in(loop))
+    return group_by_cause(loops.detect_in_loop(loop))
 
 
 def find_aids(results: Mapping[str, AidResult]) -> tuple[Finding, ...]:
     """Find faults of EKF2's aids on a flight without position source, most severe first."""
-    return group_by_cause(aids.find_in(results))
+    return group_by_cause(aids.detect_in_aids(results))
 
 
 def finding_title(finding: str) -> str:
-    """Title of a finding; an unknown id is returned with blanks.
+    """Return the title of a finding; of an unknown id, the id with blanks.
 
     >>> finding_title("source_gap"), finding_title("of_a_later_version")
     ('Gap in the position source', 'of a later version')

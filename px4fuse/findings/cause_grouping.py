@@ -1,16 +1,16 @@
-"""Order of the findings, and grouping of consequences behind their cause.
+"""Order of the findings, and grouping of each cause with its consequences.
 
-A report then has one finding per fault to correct; its consequences keep their evidence.
+A report thus lists one finding per fault to correct, and the consequences below it.
 """
 
 from collections.abc import Iterable
 
 from msgspec.structs import replace
 
-from px4fuse.findings.model import SEVERITIES, TITLES, Finding, by_root
+from px4fuse.findings.model import SEVERITIES, TITLES, Finding, group_by_root
 from px4fuse.record import table
 
-# Key in the evidence of a finding about a variance: kind of the cause, by the re-runs
+# Evidence key of findings about a variance: kind of the cause that the re-runs show
 CAUSE = "cause"
 NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "measurement noise",
@@ -22,10 +22,10 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "accelerometer",
     "elsewhere",
 )
-# Key in the evidence of time-correlated noise: its white part over the σ that a filter assumes. It
-# is set if the ratio is large: the assumed noise is then wrong in addition
+# Evidence key of time-correlated noise: ratio of the white part to the σ that a filter assumes. The
+# key is present only if the ratio is large, so that the assumed noise is wrong in addition
 WHITE_RATIO = "white_over_assumed"
-# Kinds of cause of an aid's finding: the sensor of the position source, or a shift in flight
+# Kinds of cause of findings about an aid: the sensor of the position source, or a shift in flight
 SENSOR, CHANGE = "the source's sensor", "change"
 
 _KF_VARIANCES = frozenset({"kf_underconfident", "kf_overconfident"})
@@ -54,37 +54,42 @@ RECORDING = frozenset(
 
 
 def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Sort findings in the order of correction, consequences behind their cause.
+    """Sort findings in the order of correction, each cause followed by its consequences.
 
-    By severity, then in the order of :data:`TITLES`; findings about the recording come before
+    The order follows severity, then :data:`TITLES`; findings about the recording precede
     errors of noises. A cause is at least as severe as its consequences.
     """
-    places = list(TITLES)
-    groups = sorted(by_root(findings), key=lambda group: places.index(group[0].id))
-    for cause, listed in CONSEQUENCES.items():
+    ids = list(TITLES)
+    groups = sorted(group_by_root(findings), key=lambda group: ids.index(group[0].id))
+    for cause, effect_ids in CONSEQUENCES.items():
         cause_group = next((group for group in groups if group[0].id == cause), None)
         if cause_group is None or WHITE_RATIO in cause_group[0].evidence:
             continue
         effect_groups = [
-            group for group in groups if group is not cause_group and _is_effect(group[0], listed)
+            group
+            for group in groups
+            if group is not cause_group and _is_effect(group[0], effect_ids)
         ]
         groups = [group for group in groups if group not in effect_groups]
-        for first, *rest in effect_groups:
-            cause_group += [replace(first, caused_by=cause), *rest]
+        for effect, *further_effects in effect_groups:
+            cause_group += [replace(effect, caused_by=cause), *further_effects]
         # the severity of a KF variance follows from the setting that causes it
         severities = (
-            first.severity for first, *_ in effect_groups if first.id not in _KF_VARIANCES
+            effect.severity for effect, *_ in effect_groups if effect.id not in _KF_VARIANCES
         )
         severity = min((cause_group[0].severity, *severities), key=SEVERITIES.index)
         cause_group[0] = replace(cause_group[0], severity=severity)
     return tuple(finding for group in sorted(groups, key=_report_rank) for finding in group)
 
 
-def _is_effect(finding: Finding, listed: tuple[str, ...]) -> bool:
-    return finding.id in listed or f"{finding.id}:{finding.evidence.get(CAUSE)}" in listed
+def _is_effect(finding: Finding, effect_ids: tuple[str, ...]) -> bool:
+    return finding.id in effect_ids or f"{finding.id}:{finding.evidence.get(CAUSE)}" in effect_ids
 
 
 def _report_rank(group: list[Finding]) -> int:
-    """Sort key of a group in a report: severity, recording before noises."""
-    error, warning = 2 if group[0].id in NOISES else 0, 1 if group[0].id in RECORDING else 3
-    return {"error": error, "warning": warning, "note": 4}[group[0].severity]
+    """Return the sort key of a group: severity, with the recording before noises."""
+    error_rank, warning_rank = (
+        2 if group[0].id in NOISES else 0,
+        1 if group[0].id in RECORDING else 3,
+    )
+    return {"error": error_rank, "warning": warning_rank, "note": 4}[group[0].severity]

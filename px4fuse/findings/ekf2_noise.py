@@ -10,7 +10,7 @@ from px4fuse.comparison.causal_replays import Trial, distance_from_one
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings.model import Found, Severity, finding, format_percent
+from px4fuse.findings.model import Findings, Severity, finding, format_percent
 from px4fuse.flight import Unavailable
 from px4fuse.text import format_factor
 
@@ -20,7 +20,7 @@ MIN_RATIO_ERROR = 2.0
 MIN_NAMED_REJECTION = 0.05
 
 
-def detect(analysis: Analysis) -> Found:
+def detect(analysis: Analysis) -> Findings:
     """Detect a measurement noise whose change brings EKF2's innovations into their band."""
     aid = aid_of(analysis)
     trials = [

@@ -5,48 +5,49 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.filter.hypotheses import MIN_BIAS_M_S2, BiasScaleJumpFit
-from px4fuse.filter.signals import Segment, imu_gaps, within
-from px4fuse.findings.model import MAX_MOMENT_S, Found, error, finding, warning
+from px4fuse.filter.signals import Segment, cut_to_segment, imu_gaps
+from px4fuse.findings.model import MIN_SPAN_S, Findings, error, finding, warning
 from px4fuse.flight import Columns, Ekf2, Flight, sample_rate
 from px4fuse.record import Span
 
-BIAS_ERROR_M_S2 = 0.3  # m/s²; a position error of 0.15 m after 1 s
-TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))  # tilt with the effect of a bias of 1 m/s²
+BIAS_ERROR_M_S2 = 0.3  # m/s²; causes a position error of 0.15 m after 1 s
+TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))  # tilt error equivalent to a bias of 1 m/s²
 MIN_IMU_GAP_S = 0.2  # s in total; two prediction steps
 MIN_IMU_RATE_HZ = 50.0  # Hz; 5 IMU samples per DT of 0.1 s, and a margin against aliasing
-MIN_ATTITUDE_RATE_HZ = 10.0  # Hz; PX4 logs 20 Hz by default, 0.1 s of a tilt can be interpolated
-MAX_CLIPPED_S = 0.1  # s; one prediction step, a touch-down clips one or two samples
-MIN_CLIPPING_PAUSE_S = 2.0  # s; a longer pause separates two spans
+MIN_ATTITUDE_RATE_HZ = 10.0  # Hz; tilt can be interpolated over 0.1 s; PX4 logs 20 Hz by default
+MAX_CLIPPED_S = 0.1  # s; one prediction step; a touch-down clips one or two samples
+MIN_CLIPPING_PAUSE_S = 2.0  # s; clipped samples after a longer pause are a separate span
 RATE_MARGIN = 0.98  # measured stream rates are slightly below the requested rate
 
 
-def detect(analysis: Analysis) -> Found:
+def detect(analysis: Analysis) -> Findings:
     """Detect all faults of the IMU and of the attitude."""
-    yield from tumbling(analysis)
-    yield from bias(analysis)
-    yield from clipping(analysis)
-    yield from gaps(analysis)
-    yield from rates(analysis.flight)
+    yield from detect_tumbling(analysis)
+    yield from detect_bias(analysis)
+    yield from detect_clipping(analysis)
+    yield from detect_imu_gaps(analysis)
+    yield from detect_low_rates(analysis.flight)
 
 
-def bias(analysis: Analysis) -> Found:
+def detect_bias(analysis: Analysis) -> Findings:
     """Detect an accelerometer bias.
 
-    The estimate from the positions is used if there is one. EKF2's estimate replaces it otherwise,
-    and for the down axis.
+    The horizontal estimate is from the positions. Without that, and along down, EKF2's estimate is
+    used.
     """
-    found, of_ekf2 = analysis.bias_scale_jump_fit, _ekf2_bias(analysis)
-    if isinstance(found, BiasScaleJumpFit) and found.has_bias:
-        forward, right, size = found.forward_bias, found.right_bias, found.bias.value
+    fit, ekf2_bias = analysis.bias_scale_jump_fit, _ekf2_bias(analysis)
+    if isinstance(fit, BiasScaleJumpFit) and fit.has_bias:
+        forward, right, size = fit.forward_bias, fit.right_bias, fit.bias.value
         message = (
             f"The accelerometer is biased by {forward.value:+.2f} m/s² forward and "
             f"{right.value:+.2f} m/s² right. The bias is estimated from the positions "
             f"(± {1.96 * forward.sigma:.2f} m/s²); a tilt error of "
             f"{size * TILT_DEG_PER_M_S2:.1f}° has the same effect. KF has no state for it."
         )
-        if of_ekf2 is not None:
+        if ekf2_bias is not None:
             message += (
-                f" EKF2 estimates {of_ekf2[0]:+.2f} m/s² forward and {of_ekf2[1]:+.2f} m/s² right."
+                f" EKF2 estimates {ekf2_bias[0]:+.2f} m/s² forward and {ekf2_bias[1]:+.2f} m/s² "
+                "right."
             )
         yield finding(
             "error" if size >= BIAS_ERROR_M_S2 else "warning",
@@ -54,34 +55,34 @@ def bias(analysis: Analysis) -> Found:
             message,
             "Calibrate the accelerometers and the level horizon at the temperature of the flight. "
             "A larger SIGMA_A only hides the bias.",
-            {"bias_m_s2": size, "sigma_m_s2": found.bias.sigma},
+            {"bias_m_s2": size, "sigma_m_s2": fit.bias.sigma},
         )
-    elif of_ekf2 is not None:
-        # horizontally the estimate from the positions is better than that of EKF2
+    elif ekf2_bias is not None:
+        # the positions, which are more accurate than EKF2's estimate, show no horizontal bias
         size = float(
-            np.linalg.norm(of_ekf2[2:] if isinstance(found, BiasScaleJumpFit) else of_ekf2)
+            np.linalg.norm(ekf2_bias[2:] if isinstance(fit, BiasScaleJumpFit) else ekf2_bias)
         )
         if size >= MIN_BIAS_M_S2:
             yield warning(
                 "accelerometer_bias",
-                f"EKF2 estimates an accelerometer bias of {size:.2f} m/s² ({of_ekf2[0]:+.2f} "
-                f"forward, {of_ekf2[1]:+.2f} right, {of_ekf2[2]:+.2f} down). KF has no state for "
-                "it and needs a larger SIGMA_A.",
+                f"EKF2 estimates an accelerometer bias of {size:.2f} m/s² ({ekf2_bias[0]:+.2f} "
+                f"forward, {ekf2_bias[1]:+.2f} right, {ekf2_bias[2]:+.2f} down). KF has no state "
+                "for it and needs a larger SIGMA_A.",
                 "Calibrate the accelerometers at the temperature of the flight.",
                 {"bias_m_s2": size},
             )
 
 
 def _ekf2_bias(analysis: Analysis) -> list[float] | None:
-    """Median accelerometer bias that EKF2 estimates: forward, right, down (m/s²)."""
+    """Return EKF2's median accelerometer bias forward, right and down (m/s²); None if unknown."""
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2) or not isinstance(ekf2.accelerometer_bias, pd.DataFrame):
         return None
-    inside = within(ekf2.accelerometer_bias, analysis.segment)[Columns.SPECIFIC_FORCE]
+    inside = cut_to_segment(ekf2.accelerometer_bias, analysis.segment)[Columns.SPECIFIC_FORCE]
     return None if inside.empty else [float(median) for median in inside.median()]
 
 
-def tumbling(analysis: Analysis) -> Found:
+def detect_tumbling(analysis: Analysis) -> Findings:
     """Detect roll or pitch beyond the limits of PX4's failure detector."""
     if spans := analysis.segment.cut(analysis.flight.tumble_spans):
         end_s = max(spans[0][0] - 1.0, 0.0)
@@ -89,20 +90,20 @@ def tumbling(analysis: Analysis) -> Found:
             "attitude_failure",
             "Roll or pitch exceeded the limits of PX4's failure detector (FD_FAIL_R, FD_FAIL_P) at "
             f"{spans[0][0]:.1f} s. Data after that time do not represent normal flight.",
-            f"Analyse the flight up to then: --end {end_s:.1f}. Check the other findings for the "
-            "time before.",
+            f"Analyse only the time before: --end {end_s:.1f}. Check the other findings for the "
+            "cause.",
             {"total_s": sum(end - start for start, end in spans)},
             spans,
         )
 
 
-def clipping(analysis: Analysis) -> Found:
+def detect_clipping(analysis: Analysis) -> Findings:
     """Detect accelerometer samples at the end of the range."""
     imu = analysis.flight.imu
     if not isinstance(imu, pd.DataFrame) or "clipped" not in imu:
         return
-    inside = within(imu, analysis.segment)
-    time_s = inside.index[inside["clipped"] > 0.0].to_numpy()
+    samples = cut_to_segment(imu, analysis.segment)
+    time_s = samples.index[samples["clipped"] > 0.0].to_numpy()
     total_s = len(time_s) / sample_rate(imu)
     if total_s > MAX_CLIPPED_S:
         bursts = np.split(time_s, np.flatnonzero(np.diff(time_s) > MIN_CLIPPING_PAUSE_S) + 1)
@@ -114,11 +115,11 @@ def clipping(analysis: Analysis) -> Found:
             "Check propellers, motors and mounting for vibration or impacts. Analyse a segment "
             "without clipping (--start, --end).",
             {"count": len(time_s), "total_s": total_s},
-            tuple((float(each[0]), float(each[-1])) for each in bursts),
+            tuple((float(burst[0]), float(burst[-1])) for burst in bursts),
         )
 
 
-def gaps(analysis: Analysis) -> Found:
+def detect_imu_gaps(analysis: Analysis) -> Findings:
     """Detect IMU gaps longer than two prediction steps and two IMU intervals."""
     gap_s, imu = next(iter(analysis.axes.values())).replay.input_gap_s, analysis.flight.imu
     interval_s = 1.0 / sample_rate(imu) if isinstance(imu, pd.DataFrame) else 0.0
@@ -136,38 +137,38 @@ def gaps(analysis: Analysis) -> Found:
 
 
 def _gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
-    """Spans without IMU samples in the segment, also at its ends."""
+    """Return the spans without IMU samples in the segment, also at its ends."""
     time_s = imu.index.to_numpy()
-    gap = imu_gaps(time_s)
-    missing = list(zip(time_s[:-1][gap].tolist(), time_s[1:][gap].tolist(), strict=True))
-    outside = ((segment.start_s, float(time_s[0])), (float(time_s[-1]), segment.end_s))
-    missing += [(start, end) for start, end in outside if end - start > MAX_MOMENT_S]
-    inside = (span for span in missing if span[1] > segment.start_s and span[0] < segment.end_s)
-    return tuple(sorted(inside))
+    is_gap = imu_gaps(time_s)
+    gaps = list(zip(time_s[:-1][is_gap].tolist(), time_s[1:][is_gap].tolist(), strict=True))
+    ends = ((segment.start_s, float(time_s[0])), (float(time_s[-1]), segment.end_s))
+    gaps += [(start, end) for start, end in ends if end - start > MIN_SPAN_S]
+    gaps_inside = (span for span in gaps if span[1] > segment.start_s and span[0] < segment.end_s)
+    return tuple(sorted(gaps_inside))
 
 
-def too_slow(samples: pd.DataFrame, needed_hz: float) -> bool:
+def is_rate_too_low(samples: pd.DataFrame, needed_hz: float) -> bool:
     """Return True if the sample rate is more than 2 % below the needed rate."""
     return sample_rate(samples) < RATE_MARGIN * needed_hz
 
 
-def rates(flight: Flight) -> Found:
+def detect_low_rates(flight: Flight) -> Findings:
     """Detect IMU or attitude below the rate that the acceleration in NED needs."""
     log = flight.log
-    for part, name, default, needed_hz in (
+    for samples, name, default_topic, needed_hz in (
         (flight.imu, "imu", "sensor_combined", MIN_IMU_RATE_HZ),
         (flight.attitude, "attitude", "vehicle_attitude", MIN_ATTITUDE_RATE_HZ),
     ):
-        topic = flight.streams[name].topics[0] if name in flight.streams else default
-        if isinstance(part, pd.DataFrame) and too_slow(part, needed_hz):
-            rate_hz, wanted_hz = sample_rate(part), 2.0 * needed_hz
+        topic = flight.streams[name].topics[0] if name in flight.streams else default_topic
+        if isinstance(samples, pd.DataFrame) and is_rate_too_low(samples, needed_hz):
+            rate_hz, requested_hz = sample_rate(samples), 2.0 * needed_hz
             action = f"Add 16 to SDLOG_PROFILE (bit 4, high rate: {topic} at full rate)."
             if log.format.startswith("MAVLink"):
-                action = f"Request {topic} at {wanted_hz:g} Hz (MAV_CMD_SET_MESSAGE_INTERVAL)."
+                action = f"Request {topic} at {requested_hz:g} Hz (MAV_CMD_SET_MESSAGE_INTERVAL)."
                 if log.has_ulog:
                     action = (
-                        f"Request {topic} at {wanted_hz:g} Hz (PX4 console: mavlink stream -d "
-                        f"DEVICE -s {topic} -r {wanted_hz:g}), or add the ULog (--mavlink)."
+                        f"Request {topic} at {requested_hz:g} Hz (PX4 console: mavlink stream -d "
+                        f"DEVICE -s {topic} -r {requested_hz:g}), or add the ULog (--mavlink)."
                     )
             yield warning(
                 "imu_rate_too_low",

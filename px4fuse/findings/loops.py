@@ -1,7 +1,7 @@
 """False or inconsistent loop closures, drift larger than stated, and assumptions about a loop."""
 
 from px4fuse.analysis import Analysis
-from px4fuse.findings.model import Finding, Found, error, note, warning
+from px4fuse.findings.model import Finding, Findings, error, note, warning
 from px4fuse.loop.model import LANDING, Closure, Loop
 from px4fuse.text import capitalise_first
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
@@ -11,62 +11,62 @@ EVIDENCE = ("time_1_s", "time_2_s", "distance_m", "d2", "degrees_of_freedom", "p
 MIN_KEPT_WEIGHT = 0.5  # GNC weights end at 0 or 1 (Yang et al. 2020)
 
 
-def detect(analysis: Analysis) -> Found:
+def detect(analysis: Analysis) -> Findings:
     """Detect faults of the loop of a flight, if it has one."""
     if isinstance(analysis.loop, Loop):
-        yield from find_in(analysis.loop)
+        yield from detect_in_loop(analysis.loop)
 
 
-def find_in(loop: Loop) -> Found:
+def detect_in_loop(loop: Loop) -> Findings:
     """Detect faults of a loop."""
-    yield from closures(loop)
-    yield from assumptions(loop)
+    yield from detect_inconsistent_closures(loop)
+    yield from detect_assumptions(loop)
 
 
-def closures(loop: Loop) -> Found:
+def detect_inconsistent_closures(loop: Loop) -> Findings:
     """Detect closures that the drift does not explain, or that contradict the others."""
     weights = [1.0 if c.weight_gnc is None else c.weight_gnc for c in loop.closures]
-    dropped = sum(weight < MIN_KEPT_WEIGHT for weight in weights)
-    most = dropped > MAX_DROPPED_SHARE * len(weights)
-    if most:
+    dropped_count = sum(weight < MIN_KEPT_WEIGHT for weight in weights)
+    drops_most = dropped_count > MAX_DROPPED_SHARE * len(weights)
+    if drops_most:
         yield warning(
             "loop_drift_too_small",
-            f"Robust optimisation drops {dropped} of {len(weights)} loop closures. An odometry "
-            "drift larger than stated is more likely than that most closures are false.",
+            f"Robust optimisation drops {dropped_count} of {len(weights)} loop closures. An "
+            "odometry drift larger than stated is more likely than that most closures are false.",
             "Increase --drift or --heading-drift.",
-            {"dropped": dropped, "closures": len(weights)},
+            {"dropped": dropped_count, "closures": len(weights)},
         )
     for closure, weight in zip(loop.closures, weights, strict=True):
         if not closure.accepted:
             yield _false_closure(closure, loop.is_end_assumed)
-        elif weight < MIN_KEPT_WEIGHT and not most:
+        elif weight < MIN_KEPT_WEIGHT and not drops_most:
             yield warning(
                 "loop_closure_inconsistent",
                 f"{capitalise_first(str(closure))} contradicts the other closures. Robust "
-                "optimisation drops it, although the drift alone could explain its closure error.",
+                "optimisation drops this closure, although drift could explain the closure error.",
                 "Remove the closure, or use the robust solution (GNC).",
                 _evidence(closure) | {"gnc_weight": weight},
             )
 
 
-def assumptions(loop: Loop) -> Found:
+def detect_assumptions(loop: Loop) -> Findings:
     """Detect a loop on positions that do not drift, and a landing place that is assumed."""
     gap_m = loop.closure_error_m
     evidence = {} if gap_m is None else {"closure_error_m": gap_m}
     if loop.is_absolute_track:
         yield warning(
             "loop_on_absolute_positions",
-            "This track follows an absolute positioning system, so it does not drift. Its closure "
-            "error is the noise of one position. Distributing it along the path makes the path "
-            "worse.",
+            "This track follows an absolute positioning system and does not drift. Its closure "
+            "error is the noise of one position. A correction with this closure error makes the "
+            "path worse.",
             "Measure the loop on odometry: send visual-inertial odometry to PX4 as ODOMETRY.",
             evidence,
         )
     if evidence and loop.is_end_assumed:
         yield note(
             "loop_landing_assumed",
-            "The landing place is unknown, so px4fuse assumes the take-off place. A distance "
-            "between the two counts as closure error.",
+            "The landing place is unknown, so px4fuse assumes the take-off place. The distance "
+            "between landing and take-off counts as closure error.",
             "Measure the landing place and give --landed-at FORWARD,RIGHT (m, along and to the "
             "right of the nose at take-off).",
             evidence,

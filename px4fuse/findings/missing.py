@@ -5,11 +5,11 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2_parameters import BAROMETER
-from px4fuse.findings.model import Found, format_percent, note, warning
+from px4fuse.findings.model import Findings, format_percent, note, warning
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.position_source import RECEIVED
 
-WANTED_TOPIC = "vehicle_visual_odometry"
+RECEIVED_TOPIC = "vehicle_visual_odometry"
 VISION_PROFILE_BIT = 128  # SDLOG_PROFILE bit 7, logged_topics.cpp
 LOGGER_TOLERANCE = 0.25  # of the interval; jitter of PX4's logger on flights
 # s; intervals at which PX4's default profile decimates these topics (logged_topics.cpp)
@@ -18,17 +18,18 @@ LOGGER_INTERVALS_S = {
     "estimator_aid_src_ev_pos": (0.5,),
     "ekf2_state_plus_innovation": (0.5, 0.2),  # 0.2 in v1.11
 }
-MIN_INNOVATION_SHARE = 0.75  # of the source's samples; losing a quarter does not bias a test
+NOTHING_TO_SET = "Nothing to set"  # first words of a remedy without an action
+MIN_INNOVATION_SHARE = 0.75  # of the source's samples; missing a quarter does not bias the test
 
 
-def detect(analysis: Analysis) -> Found:
+def detect(analysis: Analysis) -> Findings:
     """Detect all data that the log lacks."""
-    yield from unavailable(analysis)
-    yield from source_as_sent(analysis)
-    yield from innovations(analysis)
+    yield from detect_unavailable_data(analysis)
+    yield from detect_source_not_logged(analysis)
+    yield from detect_missing_innovations(analysis)
 
 
-def unavailable(analysis: Analysis) -> Found:
+def detect_unavailable_data(analysis: Analysis) -> Findings:
     """Detect a missing EKF2 state, a missing acceleration, and too few innovations."""
     ekf2, acceleration = analysis.flight.ekf2, analysis.lines[0].acceleration
     if isinstance(ekf2, Unavailable):
@@ -53,18 +54,22 @@ def unavailable(analysis: Analysis) -> Found:
             return
 
 
-def source_as_sent(analysis: Comparison) -> Found:
-    """Detect that the log lacks the position as received, and a logger limit of its replacement."""
-    source, received = analysis.source, RECEIVED.preference
-    logged = any(track.origin.preference == received for track in analysis.flight.positions)
-    if source.origin.has_all_samples or logged:
+def detect_source_not_logged(analysis: Comparison) -> Findings:
+    """Detect that the received positions are not logged, and a low logging rate of their copy."""
+    source, preference = analysis.source, RECEIVED.preference
+    is_logged = any(track.origin.preference == preference for track in analysis.flight.positions)
+    if source.origin.has_all_samples or is_logged:
         return
     rate_hz, profile = source.rate_hz, int(analysis.flight.log.parameters.get("SDLOG_PROFILE", 1))
-    reasons = (part.reason for part in analysis.missing if part.source == WANTED_TOPIC)
+    reasons = (
+        missing_data.reason
+        for missing_data in analysis.missing
+        if missing_data.source == RECEIVED_TOPIC
+    )
     action = f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} and fly again."
     yield warning(
         "source_not_logged",
-        f"The log lacks {WANTED_TOPIC} ({next(reasons, 'it is not in this log')}). px4fuse uses "
+        f"The log lacks {RECEIVED_TOPIC} ({next(reasons, 'it is not in this log')}). px4fuse uses "
         f"{source.name} ({source.description}) at {rate_hz:.1f} Hz instead.",
         action,
         {"rate_hz": rate_hz, "sdlog_profile": profile},
@@ -74,21 +79,22 @@ def source_as_sent(analysis: Comparison) -> Found:
             yield warning(
                 "source_rate_limited_by_logger",
                 f"{source.name} is logged at {rate_hz:.1f} Hz, the logger's limit for this topic "
-                f"({1.0 / interval:g} Hz). The source may be faster; the samples between are lost.",
+                f"({1.0 / interval:g} Hz). If the source is faster, the log lacks its other "
+                "samples.",
                 action,
                 {"rate_hz": rate_hz, "logger_limit_hz": 1.0 / interval},
             )
 
 
-def innovations(analysis: Comparison) -> Found:
+def detect_missing_innovations(analysis: Comparison) -> Findings:
     """Detect fewer logged EKF2 innovations than measurements."""
     ekf2, axes = analysis.flight.ekf2, analysis.axes.values()
-    found = (
+    counts = (
         (result.axis.name, len(frame))
         for result in axes
         if isinstance(frame := result.ekf2_innovations, pd.DataFrame)
     )
-    axis, logged = next(found, ("", 0))
+    axis, logged = next(counts, ("", 0))
     # a reconstructed source has as many samples as there are innovations
     if not axis or analysis.source.origin.reconstructed or not isinstance(ekf2, Ekf2):
         return
@@ -101,6 +107,6 @@ def innovations(analysis: Comparison) -> Found:
             f"The log contains {logged} EKF2 innovations for {count} measurements; "
             f"{format_percent(1.0 - logged / count)} are missing. Rejections between logged "
             "samples are not visible.",
-            f"Nothing to set: no profile of PX4's logger records {topic} at a higher rate.",
+            f"{NOTHING_TO_SET}: no profile of PX4's logger records {topic} at a higher rate.",
             {"logged": logged, "measurements": count},
         )

@@ -16,7 +16,7 @@ from px4fuse.record import Record, Span, table
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "note")
 MAX_LISTED_SPANS = 3  # more time spans are summarised as one range
-MAX_MOMENT_S = 0.05  # s; a shorter span is printed as one time
+MIN_SPAN_S = 0.05  # s; a shorter span is printed as a single time
 
 
 class CatalogueEntry(Record, frozen=True):
@@ -57,12 +57,12 @@ class Example(Record, frozen=True):
     Attributes
     ----------
     message, remedy : str
-        Of one flight.
+        Message and action on one flight.
     clean_flights, false_alarms : int
-        Flights without a mistake, and on how many of them the finding appears.
+        Number of flights without a mistake, and number of these with the finding.
     detection : dict
-        Share of the flights with a mistake on which it appears, by option of px4fuse simulate or
-        setting.
+        Share of the flights with a mistake that have the finding, by option of px4fuse simulate or
+        by setting.
     """
 
     message: str
@@ -85,7 +85,7 @@ class Finding(Record, frozen=True, omit_defaults=False):
     Attributes
     ----------
     id : str
-        Stable id in snake case, a key of the catalogue.
+        Key of the catalogue, in snake case; it does not change between versions.
     severity : {"error", "warning", "note"}
         error: the comparison or the flight is misleading; warning: a number is wrong or missing;
         note: background for reading the report.
@@ -94,14 +94,14 @@ class Finding(Record, frozen=True, omit_defaults=False):
     remedy : str
         Action: a command, a parameter with its value, or a check.
     evidence : dict
-        Numbers behind the finding, with units in their names.
+        Numbers that the finding is based on, with units in their names.
     title : str
         First sentence of the message, without full stop: the fault with its numbers.
     caused_by : str or None
-        Id of the finding that it follows from: the nearest one before it with that id.
+        Id of the finding that causes this one: the nearest preceding finding with this id.
     spans_s : tuple of (float, float)
-        Start and end of each occurrence, seconds from the first data; empty if it concerns the
-        whole flight.
+        Start and end of each occurrence, seconds from the first data; empty if the finding
+        concerns the whole flight.
     """
 
     id: Annotated[str, Meta(pattern="^[a-z0-9_]+$")]
@@ -119,20 +119,20 @@ class Finding(Record, frozen=True, omit_defaults=False):
         if len(self.spans_s) > MAX_LISTED_SPANS:
             return f"from {self.spans_s[0][0]:.1f} s to {self.spans_s[-1][1]:.1f} s"
         return ", ".join(
-            f"{start:.1f} s to {end:.1f} s" if end - start > MAX_MOMENT_S else f"{start:.1f} s"
+            f"{start:.1f} s to {end:.1f} s" if end - start > MIN_SPAN_S else f"{start:.1f} s"
             for start, end in self.spans_s
         )
 
     @property
     def has_time_in_message(self) -> bool:
-        """Return True if the message names the time, as the evidence does."""
+        """Return True if the message contains the time; the evidence then contains it, too."""
         return not {"at_s", "first_s", "until_s"}.isdisjoint(self.evidence)
 
     def __repr__(self) -> str:
         return f"<{self.severity} {self.id}: {self.message} {self.remedy}>"
 
 
-Found = Iterator[Finding]
+Findings = Iterator[Finding]
 
 
 def finding(
@@ -151,22 +151,22 @@ def finding(
 error, warning, note = (partial(finding, severity) for severity in SEVERITIES)
 
 
-def by_root(findings: Iterable[Finding]) -> list[list[Finding]]:
+def group_by_root(findings: Iterable[Finding]) -> list[list[Finding]]:
     """Group findings: each root cause, followed by its consequences."""
     groups: list[list[Finding]] = []
-    for one in findings:
-        if one.caused_by is None:
+    for entry in findings:
+        if entry.caused_by is None:
             groups.append([])
-        groups[-1].append(one)
+        groups[-1].append(entry)
     return groups
 
 
-def moments(times_s: Iterable[float]) -> tuple[Span, ...]:
-    """Spans of zero length at the given times (s)."""
+def zero_length_spans(times_s: Iterable[float]) -> tuple[Span, ...]:
+    """Return spans of zero length at the given times (s)."""
     return tuple((float(time), float(time)) for time in times_s)
 
 
-def one_level_lower(severity: Severity) -> Severity:
+def lower_severity(severity: Severity) -> Severity:
     """Lower a severity by one level, for default settings that the user did not choose."""
     return "warning" if severity == "error" else "note"
 
@@ -181,15 +181,18 @@ def format_percent(share: float, digits: int = 0) -> str:
     return f"{100.0 * share:.{digits}f} %"
 
 
-def spans_at(value: float, steps: pd.Series, segment: Segment) -> tuple[Span, ...]:
-    """Parts of a segment in which a step function has a value; its first value extends back."""
+def spans_with_value(value: float, steps: pd.Series, segment: Segment) -> tuple[Span, ...]:
+    """Return the spans of a segment in which a step function has a value.
+
+    Before its first time the step function has its first value.
+    """
     edges = np.clip(np.append(steps.index.to_numpy(), np.inf), segment.start_s, segment.end_s)
     edges[0] = segment.start_s
-    there = (steps.to_numpy() == value) & (np.diff(edges) > 0.0)
-    return tuple(zip(edges[:-1][there].tolist(), edges[1:][there].tolist(), strict=True))
+    has_value = (steps.to_numpy() == value) & (np.diff(edges) > 0.0)
+    return tuple(zip(edges[:-1][has_value].tolist(), edges[1:][has_value].tolist(), strict=True))
 
 
 def fraction_on(steps: pd.Series, segment: Segment) -> float:
-    """Fraction of a segment in which a 0/1 step function is 1."""
-    on_s = sum(end - start for start, end in spans_at(1.0, steps, segment))
+    """Return the fraction of a segment in which a 0/1 step function is 1."""
+    on_s = sum(end - start for start, end in spans_with_value(1.0, steps, segment))
     return on_s / (segment.end_s - segment.start_s)

@@ -5,41 +5,42 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.inputs import MODEL_NOTE
-from px4fuse.findings.model import Found, finding, format_count, note, warning
+from px4fuse.findings.model import Findings, finding, format_count, note, warning
 from px4fuse.flight import Ekf2, Flight
 from px4fuse.text import capitalise_first
 
 
-def detect(analysis: Analysis) -> Found:
+def detect(analysis: Analysis) -> Findings:
     """Detect all faults of the recording, lost data first."""
-    yield from dropouts(analysis)
-    yield from loss(analysis.flight)
-    yield from clocks_set_back(analysis.flight)
-    yield from estimators(analysis)
+    yield from detect_dropouts(analysis)
+    yield from detect_lost_data(analysis.flight)
+    yield from detect_clocks_set_back(analysis.flight)
+    yield from detect_other_estimators(analysis)
 
 
-def dropouts(analysis: Comparison) -> Found:
+def detect_dropouts(analysis: Comparison) -> Findings:
     """Detect logger dropouts in the segment."""
     segment = analysis.segment
-    lost = [
-        each
-        for each in analysis.flight.log.dropouts
-        if each.start_s <= segment.end_s and each.start_s + each.duration_s >= segment.start_s
+    dropouts = [
+        dropout
+        for dropout in analysis.flight.log.dropouts
+        if dropout.start_s <= segment.end_s
+        and dropout.start_s + dropout.duration_s >= segment.start_s
     ]
-    if lost:
-        total_s = sum(each.duration_s for each in lost)
-        longest_s = max(each.duration_s for each in lost)
+    if dropouts:
+        total_s = sum(dropout.duration_s for dropout in dropouts)
+        longest_s = max(dropout.duration_s for dropout in dropouts)
         yield warning(
             "logger_dropouts",
-            f"The logger lost data {format_count(len(lost))}, {total_s:.2f} s in total, at most "
-            f"{longest_s:.2f} s at once. All topics are missing in these intervals.",
+            f"The logger lost data {format_count(len(dropouts))}, {total_s:.2f} s in total, at "
+            f"most {longest_s:.2f} s at once. All topics are missing in these intervals.",
             "Use a faster SD card, or log fewer topics (SDLOG_PROFILE).",
-            {"count": len(lost), "total_s": total_s},
-            tuple((each.start_s, each.start_s + each.duration_s) for each in lost),
+            {"count": len(dropouts), "total_s": total_s},
+            tuple((dropout.start_s, dropout.start_s + dropout.duration_s) for dropout in dropouts),
         )
 
 
-def loss(flight: Flight) -> Found:
+def detect_lost_data(flight: Flight) -> Findings:
     """Detect bytes that cannot be read, a log that ends in flight, and dropped samples."""
     log = flight.log
     if log.damage or log.ends_in_flight:
@@ -59,18 +60,23 @@ def loss(flight: Flight) -> Found:
             {"lost_bytes": log.bytes - log.bytes_read, "ends_in_flight": float(log.ends_in_flight)},
         )
     for topic, count in list(log.dropped.items())[:1]:
-        others = len(log.dropped) - 1
-        also = f" (also in {others} other topic{'s' if others > 1 else ''})" if others else ""
+        other_count = len(log.dropped) - 1
+        other_topics = (
+            f" (also in {other_count} other topic{'s' if other_count > 1 else ''})"
+            if other_count
+            else ""
+        )
         yield note(
             "samples_out_of_order",
-            f"{count} samples of {topic} were dropped: their timestamps are zero or go back{also}.",
+            f"{count} samples of {topic} were dropped: their timestamps are zero or go "
+            f"back{other_topics}.",
             "The file is complete: a clock was set back, or messages overtook each other. If this "
             "is the position source, synchronise its clock before take-off (TIMESYNC).",
-            {"notes": others + 1},
+            {"notes": other_count + 1},
         )
 
 
-def clocks_set_back(flight: Flight) -> Found:
+def detect_clocks_set_back(flight: Flight) -> Findings:
     """Detect restarts of the boot clock, and receive times that go back."""
     log = flight.log
     if log.restarts:
@@ -81,17 +87,17 @@ def clocks_set_back(flight: Flight) -> Found:
             "Record each flight in a separate file.",
             {"count": log.restarts},
         )
-    if back := log.receive_time_reversals:
+    if reversals := log.receive_time_reversals:
         yield note(
             "receive_time_went_back",
-            f"The receive time went back {format_count(back)}: the recording computer's clock was "
-            "set, or recordings were joined. The senders' timestamps are not affected.",
+            f"The receive time went back {format_count(reversals)}: the recording computer's clock "
+            "was set, or recordings were joined. The senders' timestamps are not affected.",
             "Switch off time synchronisation of the recording computer while recording.",
-            {"count": back},
+            {"count": reversals},
         )
 
 
-def estimators(analysis: Analysis) -> Found:
+def detect_other_estimators(analysis: Analysis) -> Findings:
     """Detect EKF2 data of a model or of another estimator, or without innovations."""
     log, ekf2 = analysis.flight.log, analysis.flight.ekf2
     if MODEL_NOTE in log.notes:
@@ -107,7 +113,7 @@ def estimators(analysis: Analysis) -> Found:
             "not_px4",
             f"This log is from {log.autopilot}. EKF2 in this report means the estimator of "
             f"{log.autopilot}. The PX4 parameters named do not exist there.",
-            "Read EKF2 as the autopilot's own estimator.",
+            'Read "EKF2" in this report as the estimator of this autopilot.',
             {"autopilot": log.autopilot},
         )
     if log.format.startswith("MAVLink"):

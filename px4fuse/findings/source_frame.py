@@ -3,44 +3,44 @@
 from px4fuse.analysis import Analysis
 from px4fuse.filter.frame_rotation import MAX_DRIFT_P_VALUE, HeadingError
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSING_SHARE_ERROR
-from px4fuse.findings.model import Finding, Found, Severity, finding, fraction_on, note, warning
+from px4fuse.findings.model import Finding, Findings, Severity, finding, fraction_on, note, warning
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.text import capitalise_first
 
 MIN_HEADING_SIGMAS = 4.0  # standard deviations; clean flights reach 3.2
 MIN_HEADING_ERROR_DEG = 5.0  # °; EKF2's magnetic heading was wrong by 3 to 4° on real flights
 LARGE_HEADING_ERROR_DEG = 15.0  # °; a quarter of each axis appears on the other
-# Published in EKF2's frame, after EKF2 rotated the received positions (EKF2.cpp)
+# Topic with the positions after EKF2 rotated them into its frame (EKF2.cpp)
 IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
 CALIBRATE = "Calibrate the magnetometer away from metal and motors."
 
 
-def detect(analysis: Analysis) -> Found:
+def detect(analysis: Analysis) -> Findings:
     """Detect all faults of the source's frame and of EKF2's heading."""
     if analysis.source.frame == "FRD":
-        yield frame_not_north(analysis)
+        yield make_frame_finding(analysis)
     heading = analysis.heading
     if isinstance(heading, HeadingError) and not analysis.source.origin.reconstructed:
         yield from detect_misalignment(analysis, heading)
-    yield from placement(analysis)
+    yield from detect_uncertain_alignment(analysis)
 
 
-def frame_not_north(analysis: Analysis) -> Finding:
-    """Make the finding of a source in FRD, depending on whether EKF2 fused its yaw."""
+def make_frame_finding(analysis: Analysis) -> Finding:
+    """Make the finding of a source in FRD; its severity depends on EKF2's fusion of yaw."""
     ekf2, log = analysis.flight.ekf2, analysis.flight.log
     fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else None
     fault = (
         "The position source is in FRD: its x axis is the vehicle's heading at start, not north."
     )
-    read_as_x = "Read 'north' as the source's x axis."
+    action = "Read 'north' as the source's x axis."
     if isinstance(fusing, Unavailable):
         if log.has_ulog:
-            read_as_x += " The ULog shows whether EKF2 uses the same frame."
-        unknown = "The recording does not show whether EKF2 fused its yaw."
-        return note("source_frame_frd", f"{fault} {unknown}", read_as_x)
+            action += " The ULog shows whether EKF2 uses the same frame."
+        detail = "The recording does not show whether EKF2 fused its yaw."
+        return note("source_frame_frd", f"{fault} {detail}", action)
     if fusing is not None and fraction_on(fusing["yaw"], analysis.segment) > MIN_FUSING_SHARE_ERROR:
-        same = "EKF2 fused its yaw, so EKF2 uses the same frame."
-        return note("source_frame_frd", f"{fault} {same}", read_as_x)
+        detail = "EKF2 fused its yaw, so EKF2 uses the same frame."
+        return note("source_frame_frd", f"{fault} {detail}", action)
     return warning(
         "source_frame_frd",
         f"{fault} The IMU is rotated into NED, so the axes of positions and IMU may differ.",
@@ -48,17 +48,17 @@ def frame_not_north(analysis: Analysis) -> Finding:
     )
 
 
-def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Found:
+def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     """Detect a rotation between the motion measured by the IMU and by the positions."""
-    name, turn, sigma = analysis.source.name, heading.misalignment_deg, heading.sigma_deg
+    name, turn_deg, sigma_deg = analysis.source.name, heading.misalignment_deg, heading.sigma_deg
     is_gnss = analysis.source.origin.is_gnss
     if heading.drifts:
         yield _drift_finding(analysis, heading)
         return
-    needed_deg = max(MIN_HEADING_SIGMAS * sigma, MIN_HEADING_ERROR_DEG)
-    if abs(turn) < needed_deg or _is_explained_by_bias(analysis):
+    limit_deg = max(MIN_HEADING_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG)
+    if abs(turn_deg) < limit_deg or _is_explained_by_bias(analysis):
         return
-    rotation = f"rotated by {turn:+.0f}° ± {1.96 * sigma:.0f}° (clockwise from above)"
+    rotation = f"rotated by {turn_deg:+.0f}° ± {1.96 * sigma_deg:.0f}° (clockwise from above)"
     finding_id = "ekf2_heading_error"
     if is_gnss:
         message = (
@@ -73,7 +73,7 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Found:
         )
         action = (
             "Align the positioning frame with north, or calibrate the magnetometer away from metal "
-            f"and motors. {_fuse_yaw(analysis.flight.log.has_ulog)}"
+            f"and motors. {_format_yaw_fusion(analysis.flight.log.has_ulog)}"
         )
     else:
         finding_id = "source_frame_misaligned"
@@ -82,19 +82,19 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Found:
             "positioning frame is not aligned with north, or the heading is wrong (magnetometer)."
         )
         action = (
-            f"Rotate the positions by {-turn:+.0f}° before they are sent (a file: --position-yaw), "
-            "or calibrate the magnetometer."
+            f"Rotate the positions by {-turn_deg:+.0f}° before they are sent (a file: "
+            "--position-yaw), or calibrate the magnetometer."
         )
     yield finding(
-        "error" if abs(turn) >= LARGE_HEADING_ERROR_DEG else "warning",
+        "error" if abs(turn_deg) >= LARGE_HEADING_ERROR_DEG else "warning",
         finding_id,
         message,
         action,
-        {"misalignment_deg": turn, "sigma_deg": sigma},
+        {"misalignment_deg": turn_deg, "sigma_deg": sigma_deg},
     )
 
 
-def _fuse_yaw(has_ulog: bool) -> str:
+def _format_yaw_fusion(has_ulog: bool) -> str:
     if not has_ulog:
         return "Or let the autopilot fuse the source's yaw."
     return (
@@ -104,10 +104,10 @@ def _fuse_yaw(has_ulog: bool) -> str:
 
 def _is_explained_by_bias(analysis: Analysis) -> bool:
     """Return True if an accelerometer bias explains the misalignment as well as a rotation."""
-    found = analysis.bias_scale_jump_fit
-    if isinstance(found, Unavailable) or analysis.source.orientation is not None:
+    fit = analysis.bias_scale_jump_fit
+    if isinstance(fit, Unavailable) or analysis.source.orientation is not None:
         return False
-    return abs(found.rotation.value) < MIN_HEADING_SIGMAS * found.rotation.sigma
+    return abs(fit.rotation.value) < MIN_HEADING_SIGMAS * fit.rotation.sigma
 
 
 def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
@@ -117,7 +117,7 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     if heading.by != "orientation":
         basis = "the positions and the IMU"
     possible_cause = "a magnetometer indoors, or odometry whose heading drifts"
-    action = f"{CALIBRATE} {_fuse_yaw(analysis.flight.log.has_ulog)}"
+    action = f"{CALIBRATE} {_format_yaw_fusion(analysis.flight.log.has_ulog)}"
     if analysis.source.origin.is_gnss:
         possible_cause = "a magnetometer near currents or steel"
         action = f"{CALIBRATE} Check EKF2_GPS_DELAY: a wrong delay also rotates the heading."
@@ -141,13 +141,13 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     )
 
 
-def placement(analysis: Analysis) -> Found:
+def detect_uncertain_alignment(analysis: Analysis) -> Findings:
     """Detect an uncertain alignment (frame, yaw, time) of a position file."""
-    found = analysis.source.alignment
-    doubts: dict[Severity, tuple[str, ...]] = {}
-    if found is not None:
-        doubts = {"error": found.misplaced, "warning": found.warnings}
-    for severity, sentences in doubts.items():
+    alignment = analysis.source.alignment
+    sentences_by_severity: dict[Severity, tuple[str, ...]] = {}
+    if alignment is not None:
+        sentences_by_severity = {"error": alignment.misplaced, "warning": alignment.warnings}
+    for severity, sentences in sentences_by_severity.items():
         for sentence in sentences:
             yield finding(
                 severity,

@@ -1,6 +1,6 @@
 """Position noise that is time-correlated, repeated, unequal between axes or varying in flight.
 
-R describes white noise of constant size, so neither KF nor EKF2 can model these.
+R describes white noise of constant size, so neither KF nor EKF2 can model such noise.
 """
 
 from dataclasses import asdict
@@ -12,50 +12,52 @@ from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.filter.correlated_noise import TimeCorrelatedNoise
 from px4fuse.filter.likelihood import innovations, preintegrate
-from px4fuse.filter.signals import within
+from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, tune
 from px4fuse.findings.cause_grouping import WHITE_RATIO
-from px4fuse.findings.model import Found, error, format_percent, note, warning
+from px4fuse.findings.model import Findings, error, format_percent, note, warning
 from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_NATS, hardly_moved
 from px4fuse.flight import Columns, Unavailable
 from px4fuse.text import format_number
 
-MIN_CORRELATION_GAIN_NATS = 5.0  # likelihood ratio 150 for two parameters; 1 of 400 clean flights
+MIN_CORRELATION_GAIN_NATS = 5.0  # likelihood ratio 150; 1 of 400 clean flights exceeds it
 MIN_REPEAT_SHARE = 0.05  # of the positions
 MIN_REPEAT_SHARE_ERROR = 0.3  # of the positions; the actual rate is then clearly lower
 MIN_REPEATS = 10
 MIN_AXIS_RATIO = 1.5  # ratio of σ between the axes
-MIN_AXIS_NIS_RATIO = 1.7  # ratio of the mean NIS; below, the axes are not tuned separately
+MIN_AXIS_NIS_RATIO = (
+    1.7  # ratio of the mean NIS; below, axes are not tuned separately, to save time
+)
 MIN_PART_RATIO = 2.0  # ratio of σ between the noisier part and the rest
-MIN_PART_RATIO_WITHOUT_OUTLIERS = 1.5  # the same ratio, outliers not fused
+MIN_PART_RATIO_WITHOUT_OUTLIERS = 1.5  # ratio of σ if outliers are not fused
 MIN_PART_RATIO_ERROR = 4.0  # ratio of σ
 MAX_PARTS, MIN_PART_COUNT = 12, 25  # parts of the flight, and measurements in each
 
 
-def detect(analysis: Analysis) -> Found:
-    """Detect all kinds; odometry and positions rebuilt from EKF2 output cannot be tested."""
+def detect(analysis: Analysis) -> Findings:
+    """Detect such noise; odometry and positions rebuilt from EKF2 output cannot be tested."""
     if analysis.source.orientation is not None or analysis.source.origin.reconstructed:
         return
-    yield from repeats(analysis)
-    yield from time_correlated_noise(analysis)
-    yield from unequal_noise(analysis)
-    yield from noise_variation(analysis)
+    yield from detect_repeated_positions(analysis)
+    yield from detect_time_correlated_noise(analysis)
+    yield from detect_unequal_noise(analysis)
+    yield from detect_noise_variation(analysis)
 
 
-def time_correlated_noise(analysis: Analysis) -> Found:
-    """Detect errors that are correlated in time, but do not lag."""
-    found = analysis.coloured
-    if not isinstance(found, TimeCorrelatedNoise) or found.gain_nats < MIN_CORRELATION_GAIN_NATS:
+def detect_time_correlated_noise(analysis: Analysis) -> Findings:
+    """Detect position errors that are correlated in time, without a lag of the positions."""
+    noise = analysis.coloured
+    if not isinstance(noise, TimeCorrelatedNoise) or noise.gain_nats < MIN_CORRELATION_GAIN_NATS:
         return
-    if found.lag_nats >= MIN_LAG_NATS:
-        return  # low-pass filtered: another finding
-    low, high = (format_number(end, 1) for end in (found.low_s, found.high_s))
-    over = f"{low} to {high} s" if np.isfinite(found.high_s) else f"at least {low} s"
+    if noise.lag_nats >= MIN_LAG_NATS:
+        return  # low-pass filtered: source_positions reports it
+    low, high = (format_number(end, 1) for end in (noise.low_s, noise.high_s))
+    correlation_time = f"{low} to {high} s" if np.isfinite(noise.high_s) else f"at least {low} s"
     is_gnss = analysis.source.origin.is_gnss
-    evidence = {name: value for name, value in asdict(found).items() if np.isfinite(value)}
+    evidence = {name: value for name, value in asdict(noise).items() if np.isfinite(value)}
     assumed_m = [analysis.settings.sigma_z_m, *map(ekf2_noise_m, analysis.axes.values())]
-    if (ratio := found.white_m / float(np.nanmin(assumed_m))) > NOISE_RATIO_TOLERANCE:
+    if (ratio := noise.white_m / float(np.nanmin(assumed_m))) > NOISE_RATIO_TOLERANCE:
         evidence[WHITE_RATIO] = ratio
     hint = "Set R to cover both parts; GNSS errors are usually time-correlated."
     if not is_gnss:
@@ -66,113 +68,129 @@ def time_correlated_noise(analysis: Analysis) -> Found:
     make_finding = note if is_gnss else warning
     yield make_finding(
         "source_noise_time_correlated",
-        f"The errors of {analysis.source.name} are correlated over {over}. A time-correlated part "
-        f"of {found.slow_m:.2g} m (1 σ) adds to white noise of {found.white_m:.2g} m. KF and EKF2 "
-        "assume independent errors: they follow the correlated part and report a σ that is too "
-        "small. Innovations do not show this part.",
+        f"The errors of {analysis.source.name} are correlated over {correlation_time}. A "
+        f"time-correlated part of {noise.slow_m:.2g} m (1 σ) adds to white noise of "
+        f"{noise.white_m:.2g} m. KF and EKF2 assume independent errors: they follow the correlated "
+        "part and report a σ that is too small. Innovations do not show this part.",
         f"Do not lower SIGMA_Z or the EKF2 measurement noise to the white part. {hint}",
         evidence,
     )
 
 
-def repeats(analysis: Analysis) -> Found:
+def detect_repeated_positions(analysis: Analysis) -> Findings:
     """Detect positions that repeat the previous one while the vehicle moves."""
     if hardly_moved(analysis):
         return
-    sent = within(analysis.source.samples, analysis.segment)[Columns.POSITION].dropna().to_numpy()
-    again = np.all(np.diff(sent, axis=0) == 0.0, axis=1)
-    count, share = int(again.sum()), float(again.mean()) if len(again) else 0.0
+    positions_m = (
+        cut_to_segment(analysis.source.samples, analysis.segment)[Columns.POSITION]
+        .dropna()
+        .to_numpy()
+    )
+    is_repeated = np.all(np.diff(positions_m, axis=0) == 0.0, axis=1)
+    count, share = int(is_repeated.sum()), float(is_repeated.mean()) if len(is_repeated) else 0.0
     if count < MIN_REPEATS or share < MIN_REPEAT_SHARE:
         return
     make_finding = error if share >= MIN_REPEAT_SHARE_ERROR else warning
     yield make_finding(
         "source_samples_repeated",
-        f"{count} of {len(again)} positions of {analysis.source.name} ({format_percent(share)}) "
-        "repeat the previous one. The filters count each repetition as a new, independent "
-        "measurement, at a time at which nothing was measured.",
+        f"{count} of {len(is_repeated)} positions of {analysis.source.name} "
+        f"({format_percent(share)}) repeat the previous one. KF and EKF2 use each repetition as a "
+        "new, independent measurement, although nothing was measured at that time.",
         "Send each position once, with its time of measurement.",
         {"count": count, "share": share},
     )
 
 
-def unequal_noise(analysis: Analysis) -> Found:
+def detect_unequal_noise(analysis: Analysis) -> Findings:
     """Detect different noises along north and east."""
     if analysis.source.origin.is_gnss:
-        return  # the white part is a small part of the errors of GNSS
-    pair = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
-    statements = [axis.filters["kf"] for axis in pair]
-    nis = [one.nis_mean for one in statements if not isinstance(one, Unavailable)]
+        return  # GNSS errors are mostly time-correlated, and SIGMA_Z is their white part
+    axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
+    summaries = [axis.filters["kf"] for axis in axes]
+    nis = [each_axis.nis_mean for each_axis in summaries if not isinstance(each_axis, Unavailable)]
     if len(nis) < 2 or max(nis) < MIN_AXIS_NIS_RATIO * min(nis):
         return
-    tuned = [
-        found
-        for axis in pair
-        for found in tune((axis.axis,), analysis.settings, (axis.axis.name,)).values()
-        if isinstance(found, AxisTuning)
+    tunings = [
+        axis_tuning
+        for axis in axes
+        for axis_tuning in tune((axis.axis,), analysis.settings, (axis.axis.name,)).values()
+        if isinstance(axis_tuning, AxisTuning)
     ]
-    sizes = [(one.sigma_z.value, one.sigma_z.low, one.sigma_z.high, one.name) for one in tuned]
-    known = sorted((s, low, high, name) for s, low, high, name in sizes if s and low and high)
-    if len(known) < 2:
+    intervals = [
+        (each_axis.sigma_z.value, each_axis.sigma_z.low, each_axis.sigma_z.high, each_axis.name)
+        for each_axis in tunings
+    ]
+    known_intervals = sorted(
+        (s, low, high, name) for s, low, high, name in intervals if s and low and high
+    )
+    if len(known_intervals) < 2:
         return
-    (small, _, small_high, less), (large, large_low, _, more) = known
+    (small, _, small_high, quieter_axis), (large, large_low, _, noisier_axis) = known_intervals
     if large < MIN_AXIS_RATIO * small or large_low <= small_high:
         return
     yield warning(
         "source_noise_unequal_axes",
-        f"The noise of {analysis.source.name} is {large:.2g} m along {more} and {small:.2g} m "
-        f"along {less}. One SIGMA_Z, or one EKF2 measurement noise, does not fit both axes.",
-        f"Analyse each axis separately (--axis {more} --sigma-z {large:.2g}). For EKF2 use the "
-        "larger value. Place the anchors on all sides of the flight area.",
-        {f"{less}_sigma_z_m": small, f"{more}_sigma_z_m": large},
+        f"The noise of {analysis.source.name} is {large:.2g} m along {noisier_axis} and "
+        f"{small:.2g} m along {quieter_axis}. One SIGMA_Z, or one EKF2 measurement noise, does not "
+        "fit both axes.",
+        f"Analyse each axis separately (--axis {noisier_axis} --sigma-z {large:.2g}). For EKF2 use "
+        "the larger value. Place the anchors on all sides of the flight area.",
+        {f"{quieter_axis}_sigma_z_m": small, f"{noisier_axis}_sigma_z_m": large},
     )
 
 
-def noise_variation(analysis: Analysis) -> Found:
+def detect_noise_variation(analysis: Analysis) -> Findings:
     """Detect a part of the flight in which most innovations are larger."""
-    tuned, chosen = analysis.tuning.get(HORIZONTAL), analysis.settings
-    if tuned is None:
+    axis_tuning, settings = analysis.tuning.get(HORIZONTAL), analysis.settings
+    if axis_tuning is None:
         return
     # tuning is unavailable if a third of the measurements look like outliers
-    sigma_a: float | None = chosen.sigma_a_m_s2
-    sigma_z: float | None = chosen.sigma_z_m
+    sigma_a: float | None = settings.sigma_a_m_s2
+    sigma_z: float | None = settings.sigma_z_m
     outlier_time_s = np.zeros(0)
-    if isinstance(tuned, AxisTuning):
-        sigma_a, sigma_z = tuned.sigma_a_two_state.value, tuned.sigma_z.value
-        outlier_time_s = tuned.outlier_time_s
+    if isinstance(axis_tuning, AxisTuning):
+        sigma_a, sigma_z = axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value
+        outlier_time_s = axis_tuning.outlier_time_s
     lines = [analysis.axes[name].axis for name in ("north", "east") if name in analysis.axes]
     if sigma_a is None or sigma_z is None or len(lines) < 2:
         return
-    legs = [preintegrate(line, chosen) for line in lines]
-    time = lines[0].measurement_time_s[-len(legs[0].measurement_m) :]
+    increments_by_axis = [preintegrate(line, settings) for line in lines]
+    time = lines[0].measurement_time_s[-len(increments_by_axis[0].measurement_m) :]
     if len(time) < MAX_PARTS * MIN_PART_COUNT // 2:
         return
     count = min(MAX_PARTS, len(time) // MIN_PART_COUNT)
     edges = np.linspace(0, len(time), count + 1).astype(int)
 
-    def sized(skip: BoolArray | None) -> Array:
-        # with the maximum-likelihood noises: wrong ones change the innovations along the flight
-        axis_innovations = [innovations(each, sigma_a, sigma_z, skip) for each in legs]
+    def relative_innovations(is_excluded: BoolArray | None) -> Array:
+        # maximum-likelihood noises, because wrong noises change the innovations along the flight
+        axis_innovations = [
+            innovations(sizes_, sigma_a, sigma_z, is_excluded) for sizes_ in increments_by_axis
+        ]
         normalised = np.abs([nu / np.sqrt(s) for nu, s in axis_innovations])
         # each axis relative to its median, so that unequal axes have no effect
         return np.asarray(normalised / np.median(normalised, axis=1, keepdims=True))
 
-    sizes = sized(None)
-    sigma = np.array([np.median(sizes[:, low:high]) for low, high in pairwise(edges)])
-    loud = sigma > np.sqrt(sigma.min() * sigma.max())
-    begins = int(np.argmax(loud))
-    ends = begins + int(np.argmin(loud[begins:])) if not loud[begins:].all() else count
-    if loud.sum() != ends - begins or loud.all():
+    sizes = relative_innovations(None)
+    part_sigma = np.array([np.median(sizes[:, low:high]) for low, high in pairwise(edges)])
+    is_noisy = part_sigma > np.sqrt(part_sigma.min() * part_sigma.max())
+    first_part = int(np.argmax(is_noisy))
+    end_part = (
+        first_part + int(np.argmin(is_noisy[first_part:]))
+        if not is_noisy[first_part:].all()
+        else count
+    )
+    if is_noisy.sum() != end_part - first_part or is_noisy.all():
         return  # not a single contiguous part
-    quiet = np.ones(len(time), bool)
-    quiet[edges[begins] : edges[ends]] = False
-    # a fused outlier also makes the innovations after it large
+    is_quiet = np.ones(len(time), bool)
+    is_quiet[edges[first_part] : edges[end_part]] = False
+    # a fused outlier also increases the innovations after it, so both ratios must be large
     ratio, ratio_without_outliers = (
-        float(np.median(each[:, ~quiet]) / np.median(each[:, quiet]))
-        for each in (sizes, sized(np.isin(time, outlier_time_s)))
+        float(np.median(sizes_[:, ~is_quiet]) / np.median(sizes_[:, is_quiet]))
+        for sizes_ in (sizes, relative_innovations(np.isin(time, outlier_time_s)))
     )
     if ratio < MIN_PART_RATIO or ratio_without_outliers < MIN_PART_RATIO_WITHOUT_OUTLIERS:
         return
-    start, end = float(time[edges[begins]]), float(time[edges[ends] - 1])
+    start, end = float(time[edges[first_part]]), float(time[edges[end_part] - 1])
     check = "anchors in view, distance and obstacles"
     if analysis.source.origin.is_gnss:
         check = "satellites in view, walls, trees and radio interference"

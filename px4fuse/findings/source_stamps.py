@@ -5,7 +5,7 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.findings.model import Found, error, warning
+from px4fuse.findings.model import Findings, error, warning
 from px4fuse.flight import ARRIVAL_METHODS, Ekf2, FusionRecord
 from px4fuse.log import ClockMap
 
@@ -14,24 +14,24 @@ MAX_ARRIVAL_AGE_S = 0.001  # s; from receiving a message to publishing it
 MIN_LATENCY_S = 0.02  # s; at 1 m/s a fifth of the noise of good UWB (0.1 m)
 MIN_LATENCY_ERROR_S = 0.10  # s; at 1 m/s the noise of good UWB (0.1 m)
 MIN_SAMPLES = 10
-MIN_PURE_SHARE = 0.95  # of the samples of each part; allows a few late messages
+MIN_CONSISTENT_SHARE = 0.95  # of the samples before and after the change; allows late messages
 ANSWER_TIMESYNC = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "
     "every request). Send positions only after 500 answers, which take 50 s at 10 Hz."
 )
 
 
-def detect(analysis: Analysis) -> Found:
+def detect(analysis: Analysis) -> Findings:
     """Detect wrong timestamps, by the clock map of a recording or the ages in a ULog."""
     clock, name = analysis.source.clock_map, analysis.source.name
     if clock is None:
-        yield from arrivals(analysis)
+        yield from detect_arrival_times(analysis)
     elif clock.distinct_stamps is not None:
-        yield from constant(name, clock, clock.distinct_stamps)
+        yield from detect_constant_timestamps(name, clock, clock.distinct_stamps)
     elif clock.method in ARRIVAL_METHODS:
         kf_times = f"the sender's timestamps, mapped by the {clock.method}"
         if clock.method == "arrival time":
-            kf_times = "arrival times too, so its track is late by the age of the positions"
+            kf_times = "arrival times too, so the KF track is late by the age of the positions"
         yield warning(
             "companion_not_synchronised",
             f"The sender of {name} was never synchronised with the autopilot (TIMESYNC). EKF2 "
@@ -41,16 +41,16 @@ def detect(analysis: Analysis) -> Found:
         )
 
 
-def constant(name: str, clock: ClockMap, distinct: int) -> Found:
+def detect_constant_timestamps(name: str, clock: ClockMap, distinct_count: int) -> Findings:
     """Make the findings of constant timestamps and of the jitter of the receive times."""
     yield error(
         "source_timestamps_constant",
-        f"The {clock.pairs} timestamps of {name} have only {distinct} distinct "
-        f"value{'s' if distinct > 1 else ''}. The time of measurement is unknown; px4fuse uses the "
-        "receive time instead.",
-        "Send the time of measurement in the message (usec, time_usec), in microseconds and as an "
-        "integer. A 32-bit float cannot hold it.",
-        {"stamps": clock.pairs, "distinct": distinct},
+        f"The {clock.pairs} timestamps of {name} have only {distinct_count} distinct "
+        f"value{'s' if distinct_count > 1 else ''}. The time of measurement is unknown; px4fuse "
+        "uses the receive time instead.",
+        "Send the time of measurement in the message (usec, time_usec), in microseconds and as a "
+        "64-bit integer. A 32-bit float is not precise enough.",
+        {"stamps": clock.pairs, "distinct": distinct_count},
     )
     if (jitter_s := clock.jitter_s) > MAX_RECEIPT_JITTER_S:
         yield warning(
@@ -63,30 +63,31 @@ def constant(name: str, clock: ClockMap, distinct: int) -> Found:
         )
 
 
-def arrivals(analysis: Analysis) -> Found:
+def detect_arrival_times(analysis: Analysis) -> Findings:
     """Detect timestamps that are arrival times, in the whole flight or until TIMESYNC converged.
 
-    PX4 then uses the time of arrival as timestamp (Timesync.cpp). The log shows it directly: the
-    age of the published positions, publication minus timestamp, is zero instead of the latency.
+    Without TIMESYNC, PX4 uses the arrival time as timestamp (Timesync.cpp). The log shows this
+    directly: publication minus timestamp of the positions is zero instead of the latency.
     """
     age, name = _age_s(analysis), analysis.source.name
     if age is None:
         return
-    synchronised = until_synchronised(analysis)
-    if synchronised is not None:
-        until, latency = synchronised
-        make_finding = error if latency >= MIN_LATENCY_ERROR_S else warning
+    synchronisation = find_synchronisation(analysis)
+    if synchronisation is not None:
+        until_s, latency_s = synchronisation
+        make_finding = error if latency_s >= MIN_LATENCY_ERROR_S else warning
         yield make_finding(
             "source_timestamps_are_arrival_times",
-            f"The timestamps of {name} are arrival times until {until:.1f} s. From then on they "
-            f"are times of measurement, {latency:.3f} s before arrival: TIMESYNC had not converged "
-            "before (PX4 needs 500 answers). One time offset cannot correct both parts.",
-            f"Analyse the second part: px4fuse compare LOG --start {until:.0f}. Let the clocks "
+            f"The timestamps of {name} are arrival times until {until_s:.1f} s: until then "
+            "TIMESYNC had not converged (PX4 needs 500 answers). Later timestamps are times of "
+            f"measurement, {latency_s:.3f} s before arrival. One time offset cannot correct both "
+            "parts.",
+            f"Analyse the second part: px4fuse compare LOG --start {until_s:.0f}. Let the clocks "
             "synchronise for one minute before take-off.",
-            {"until_s": until, "latency_s": latency},
-            ((float(age.index[0]), until),),
+            {"until_s": until_s, "latency_s": latency_s},
+            ((float(age.index[0]), until_s),),
         )
-    elif np.mean(age.abs() < MAX_ARRIVAL_AGE_S) >= MIN_PURE_SHARE:
+    elif np.mean(age.abs() < MAX_ARRIVAL_AGE_S) >= MIN_CONSISTENT_SHARE:
         yield warning(
             "source_timestamps_are_arrival_times",
             f"The timestamps of {name} are arrival times. The sender was never synchronised with "
@@ -96,26 +97,31 @@ def arrivals(analysis: Analysis) -> Found:
         )
 
 
-def until_synchronised(analysis: Analysis) -> tuple[float, float] | None:
-    """End of the arrival times and the latency after it (s); None if there is no such change.
+def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
+    """Return the time (s) from which timestamps are measurement times, and the latency (s).
 
-    The end is chosen so that the fewest samples are on the wrong side.
+    None if there is no such change. The time is chosen so that the fewest samples are on the wrong
+    side.
     """
     age = _age_s(analysis)
     if age is None:
         return None
-    arrival = (age.abs() < MAX_ARRIVAL_AGE_S).to_numpy()
-    wrong: Array = np.cumsum(~arrival) + np.sum(arrival) - np.cumsum(arrival)
-    cut = int(np.argmin(wrong)) + 1
-    if np.mean(arrival) >= MIN_PURE_SHARE or min(cut, len(age) - cut) < MIN_SAMPLES:
+    is_arrival = (age.abs() < MAX_ARRIVAL_AGE_S).to_numpy()
+    wrong_count: Array = np.cumsum(~is_arrival) + np.sum(is_arrival) - np.cumsum(is_arrival)
+    cut = int(np.argmin(wrong_count)) + 1
+    if np.mean(is_arrival) >= MIN_CONSISTENT_SHARE or min(cut, len(age) - cut) < MIN_SAMPLES:
         return None
-    latency = float(age.iloc[cut:].median())
-    pure = min(np.mean(arrival[:cut]), np.mean(~arrival[cut:])) >= MIN_PURE_SHARE
-    return (float(age.index[cut]), latency) if pure and latency >= MIN_LATENCY_S else None
+    latency_s = float(age.iloc[cut:].median())
+    is_consistent = (
+        min(np.mean(is_arrival[:cut]), np.mean(~is_arrival[cut:])) >= MIN_CONSISTENT_SHARE
+    )
+    return (
+        (float(age.index[cut]), latency_s) if is_consistent and latency_s >= MIN_LATENCY_S else None
+    )
 
 
 def _age_s(analysis: Analysis) -> pd.Series | None:
-    """Age (s) of each position at publication; None if the log does not contain it."""
+    """Return the age (s) of each position at publication; None if not in the log."""
     ekf2, source, segment = analysis.flight.ekf2, analysis.source, analysis.segment
     record = ekf2.record if isinstance(ekf2, Ekf2) else None
     if not isinstance(record, FusionRecord) or source.origin.reconstructed or source.clock_map:

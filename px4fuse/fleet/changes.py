@@ -11,18 +11,18 @@ from px4fuse.fleet.inputs import DiffInput, Progress, Results, read_inputs
 from px4fuse.fleet.measures import (
     ABSOLUTE_TOLERANCE,
     RELATIVE_TOLERANCE,
-    Number,
-    numbers,
+    ComparedNumber,
+    collect_numbers,
 )
-from px4fuse.fleet.rows import at
+from px4fuse.fleet.rows import value_at
 from px4fuse.results import contract
 from px4fuse.results.model import provenance, schema_of
 from px4fuse.text import format_factor, format_number
 
-# Limit of √(mean NEES) of a consistent filter, and its inverse. The errors of one flight are
-# correlated, so there is no 95 % band
-NEES_SIGMA_OFF = 1.5
-NAMES = {"kf": "KF", "ekf2": "EKF2"}
+# Maximum √(mean NEES) of a consistent filter; its inverse is the minimum. The errors of one flight
+# are correlated in time, so a 95 % band for independent errors does not apply
+MAX_NEES_SIGMA_RATIO = 1.5
+FILTER_LABELS = {"kf": "KF", "ekf2": "EKF2"}
 # Settings and flight data that diff compares, with their path in the results
 SETTINGS = {
     "SIGMA_A (m/s²)": "settings.sigma_a_m_s2",
@@ -56,66 +56,66 @@ def diff(
     Raises
     ------
     LogError, MissingDataError, ResultsError
-        A file cannot be read, is not from ``px4fuse compare``, or both are the same file.
+        A file cannot be read, or is not from ``px4fuse compare``; A and B are the same file.
     """
-    return changes(*read_inputs(Path(a), Path(b), progress))
+    return list_changes(*read_inputs(Path(a), Path(b), progress))
 
 
-def changes(a: DiffInput, b: DiffInput) -> contract.ChangeResults:
+def list_changes(a: DiffInput, b: DiffInput) -> contract.ChangeResults:
     """List the differences of two comparisons."""
-    findings = tuple(_findings(a.results, b.results))
+    findings = tuple(_finding_changes(a.results, b.results))
     return contract.ChangeResults(
         schema=schema_of(contract.CHANGES),
-        a=_compared(a),
-        b=_compared(b),
-        settings=tuple(_settings(a.results, b.results)),
-        numbers=tuple(number_changes(numbers(a.results), numbers(b.results))),
+        a=_describe_input(a),
+        b=_describe_input(b),
+        settings=tuple(_setting_changes(a.results, b.results)),
+        numbers=tuple(number_changes(collect_numbers(a.results), collect_numbers(b.results))),
         findings=findings,
-        worse=tuple(_worse(a.results, b.results, findings)),
+        worse=tuple(_worse_verdicts(a.results, b.results, findings)),
         provenance=provenance(shlex.join(["px4fuse", "diff", a.given, b.given])),
     )
 
 
-def _compared(side: DiffInput) -> contract.Compared:
-    log = side.results.log
-    return contract.Compared(
-        given=side.given,
-        kind=side.kind,
+def _describe_input(diff_input: DiffInput) -> contract.DiffInput:
+    log = diff_input.results.log
+    return contract.DiffInput(
+        given=diff_input.given,
+        kind=diff_input.kind,
         log=log.name,
         log_sha256=log.sha256,
-        px4fuse=side.results.provenance.px4fuse,
+        px4fuse=diff_input.results.provenance.px4fuse,
     )
 
 
-def _settings(a: Results, b: Results) -> Iterator[contract.SettingChange]:
+def _setting_changes(a: Results, b: Results) -> Iterator[contract.SettingChange]:
     """Yield settings, flight data and PX4 parameters that differ."""
     values_a, values_b = (
-        {name: at(results, path) for name, path in SETTINGS.items()} | _parameters(results)
+        {name: value_at(results, path) for name, path in SETTINGS.items()} | _parameters(results)
         for results in (a, b)
     )
     for name in {**values_a, **values_b}:
-        if (first := values_a.get(name)) != (second := values_b.get(name)):
-            yield contract.SettingChange(name, first, second)
+        if (value_a := values_a.get(name)) != (value_b := values_b.get(name)):
+            yield contract.SettingChange(name, value_a, value_b)
 
 
 def _parameters(results: Results) -> dict[str, float]:
     """Return the PX4 parameters of log and EKF2 replay, rounded to 6 digits (logged as float32)."""
-    parameters = (at(results, "ekf2_replay.settings") or {}) | dict(results.log.parameters)
+    parameters = (value_at(results, "ekf2_replay.settings") or {}) | dict(results.log.parameters)
     return {name: float(f"{parameters[name]:.6g}") for name in sorted(parameters)}
 
 
 def number_changes(
-    first: Mapping[str, Number], second: Mapping[str, Number]
+    numbers_a: Mapping[str, ComparedNumber], numbers_b: Mapping[str, ComparedNumber]
 ) -> Iterator[contract.NumberChange]:
-    """Yield the numbers that differ, and those that only one side has.
+    """Yield the numbers that differ, and those that only A or only B contains.
 
     Parameters
     ----------
-    first, second : mapping
+    numbers_a, numbers_b : mapping
         Numbers of A and B by their path in the results.
     """
-    for path in {**first, **second}:
-        a, b = first.get(path), second.get(path)
+    for path in {**numbers_a, **numbers_b}:
+        a, b = numbers_a.get(path), numbers_b.get(path)
         if (
             a
             and b
@@ -137,22 +137,24 @@ def number_changes(
         )
 
 
-def _findings(a: Results, b: Results) -> Iterator[contract.FindingChange]:
-    """Yield the findings that only one of the two has, compared by id and severity."""
-    both: tuple[tuple[Results, Results, contract.Which], ...]
-    both = ((b, a, "B"), (a, b, "A"))
-    for results, other, only_in in both:
+def _finding_changes(a: Results, b: Results) -> Iterator[contract.FindingChange]:
+    """Yield the findings that only A or only B contains, compared by id and severity."""
+    sides: tuple[tuple[Results, Results, contract.DiffSide], ...]
+    sides = ((b, a, "B"), (a, b, "A"))
+    for results, other, only_in in sides:
         ids = {(finding.id, finding.severity) for finding in other.findings}
         for finding in results.findings:
             if (finding.id, finding.severity) not in ids:
                 yield contract.FindingChange(finding.id, finding.severity, finding.message, only_in)
 
 
-def _worse(a: Results, b: Results, findings: Iterable[contract.FindingChange]) -> Iterator[str]:
+def _worse_verdicts(
+    a: Results, b: Results, findings: Iterable[contract.FindingChange]
+) -> Iterator[str]:
     """Yield a sentence for each verdict that is worse in B, and for each new error."""
-    before, after = _verdicts(a), _verdicts(b)
-    for name, (value_a, was_consistent) in before.items():
-        value_b, is_consistent = after.get(name, (value_a, True))
+    verdicts_a, verdicts_b = _verdicts(a), _verdicts(b)
+    for name, (value_a, was_consistent) in verdicts_a.items():
+        value_b, is_consistent = verdicts_b.get(name, (value_a, True))
         if was_consistent and not is_consistent:
             ratio = value_b**0.5
             factor = f"{format_factor(max(ratio, 1.0 / ratio))} times too"
@@ -163,23 +165,23 @@ def _worse(a: Results, b: Results, findings: Iterable[contract.FindingChange]) -
             )
             values = f"{format_number(value_a)} (consistent) → {format_number(value_b)}"
             yield f"{name}: {values} ({verdict})."
-    errors = [
+    error_ids = [
         finding.id for finding in findings if (finding.only_in, finding.severity) == ("B", "error")
     ]
-    for error in dict.fromkeys(errors):
-        yield f"New finding of severity error: {error}."
+    for finding_id in dict.fromkeys(error_ids):
+        yield f"New finding of severity error: {finding_id}."
 
 
 def _verdicts(results: Results) -> dict[str, tuple[float, bool]]:
-    """Return mean NIS and mean NEES by filter and axis, each with True if consistent."""
+    """Return mean NIS and mean NEES by label (filter and axis), with True if consistent."""
     verdicts: dict[str, tuple[float, bool]] = {}
-    for axis, result in (at(results, "axes") or {}).items():
-        for name, label in NAMES.items():
+    for axis, result in (value_at(results, "axes") or {}).items():
+        for name, label in FILTER_LABELS.items():
             summary = result.filters[name]
             if isinstance(summary, FilterSummary):
                 is_consistent = not is_inconsistent(summary)
                 verdicts[f"Mean NIS of {label}, {axis}"] = summary.nis_mean, is_consistent
-            if (nees := at(summary, "truth.nees_position_mean")) is not None:
-                consistent = NEES_SIGMA_OFF**-2 <= nees <= NEES_SIGMA_OFF**2
-                verdicts[f"Mean NEES of {label}, {axis}"] = nees, consistent
+            if (nees := value_at(summary, "truth.nees_position_mean")) is not None:
+                is_consistent = MAX_NEES_SIGMA_RATIO**-2 <= nees <= MAX_NEES_SIGMA_RATIO**2
+                verdicts[f"Mean NEES of {label}, {axis}"] = nees, is_consistent
     return verdicts

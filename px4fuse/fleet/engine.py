@@ -1,7 +1,7 @@
 """Execution of jobs on this computer or on a Dask cluster.
 
-Each job runs in a process of :mod:`px4fuse.workers`, with limits of time and memory; the workers of
-a cluster start these processes.
+Each job runs in a process of :mod:`px4fuse.workers`, with limits of time and memory. On a cluster,
+the Dask workers start these processes.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ from px4fuse.workers import Job, JobFailure, Result
 if TYPE_CHECKING:
     from distributed import Client
 
-CONNECT_S = 15.0  # s to wait for the scheduler
+# s; maximum time until the scheduler answers, and until it has a worker
+CONNECT_TIMEOUT_S = 15.0
 # Jobs per Dask task: the imports of a process take 2 s, so several jobs share one process
 JOBS_PER_TASK = 4
 
 
 @contextmanager
 def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
-    """Connect to a Dask cluster; yields None if this computer does the work.
+    """Connect to a Dask cluster; yield its client, or None to run the jobs on this computer.
 
     Parameters
     ----------
@@ -46,7 +47,7 @@ def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
     if scheduler is None:
         client = _session_client()
         if client is not None:
-            _check(client)
+            _check_workers(client)
         yield client
         return
     try:
@@ -57,8 +58,8 @@ def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
             "--scheduler requires Dask.", 'Run pip install "px4fuse[batch]".'
         ) from error
     try:
-        # a failed client must not become the default client of this session
-        client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
+        # a client whose connection fails must not become the default client of this session
+        client = Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise SettingsError(
             f"--scheduler {scheduler}: no Dask scheduler answers ({one_line(str(error), 120)}).",
@@ -66,7 +67,7 @@ def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
         ) from error
     # without this, Dask prints tracebacks when the scheduler ends
     with silence_logging_cmgr(logging.CRITICAL), client, client.as_current():
-        _check(client)
+        _check_workers(client)
         yield client
 
 
@@ -77,28 +78,30 @@ def _session_client() -> Client | None:
 
     try:
         client: Client = default_client()
-    except ValueError:  # this session has no client
+    except ValueError:  # this Python session has no Dask client
         return None
     return client
 
 
-def _check(client: Client) -> None:
+def _check_workers(client: Client) -> None:
     """Raise an error if the cluster has no workers or other versions of px4fuse."""
     address = client.scheduler_info()["address"]
     try:
-        client.wait_for_workers(1, timeout=CONNECT_S)
+        client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
     except TimeoutError as error:
         raise SettingsError(
             f"Scheduler {address} has no workers.",
             f"Start them with: dask worker {address} --nthreads 1",
         ) from error
-    here = metadata.version("px4fuse")
+    own_version = metadata.version("px4fuse")
     for name, worker_version in client.run(metadata.version, "px4fuse", on_error="return").items():
-        if worker_version != here:
-            other = f"px4fuse {worker_version}" if isinstance(worker_version, str) else "no px4fuse"
+        if worker_version != own_version:
+            worker_text = (
+                f"px4fuse {worker_version}" if isinstance(worker_version, str) else "no px4fuse"
+            )
             raise SettingsError(
-                f"Worker {name} runs {other}, but this computer runs {here}.",
-                "Install the same version on both.",
+                f"Worker {name} has {worker_text}; this computer has px4fuse {own_version}.",
+                "Install the same version of px4fuse on both.",
             )
 
 
@@ -132,25 +135,26 @@ def run_jobs(
 
     chunks = [jobs[start : start + JOBS_PER_TASK] for start in range(0, len(jobs), JOBS_PER_TASK)]
     futures = dict(
-        zip(client.map(partial(_run_several, work), chunks, pure=False), chunks, strict=True)
+        zip(client.map(partial(_run_chunk, work), chunks, pure=False), chunks, strict=True)
     )
     try:
         for future in as_completed(list(futures)):
             chunk = futures.pop(future)
             if future.status not in ("finished", "error"):
                 raise Px4FuseError("the connection to the Dask scheduler was lost.")
-            error = future.exception()  # the worker ended several times, or cannot load the job
-            failed = JobFailure(one_line(f"{type(error).__name__}: {error}", 300))
-            results = [failed] * len(chunk) if error else future.result()
+            # error: the worker process ended several times, or cannot load the job
+            error = future.exception()
+            failure = JobFailure(one_line(f"{type(error).__name__}: {error}", 300))
+            results = [failure] * len(chunk) if error else future.result()
             yield from zip(chunk, results, strict=True)
     finally:
         if futures and client.status == "running":
             client.cancel(list(futures))
 
 
-def _run_several(work: Callable[..., Iterator[tuple[int, Any]]], jobs: Sequence[Any]) -> list[Any]:
-    """Run some jobs one by one in a separate process, on a worker of a cluster."""
-    # the process of a Dask worker is a daemon by default, which must not have children
+def _run_chunk(work: Callable[..., Iterator[tuple[int, Any]]], jobs: Sequence[Any]) -> list[Any]:
+    """Run the jobs of one Dask task one after the other, in a child process of the worker."""
+    # a Dask worker is a daemon process by default, and a daemon must not start child processes
     multiprocessing.current_process().daemon = False
     results_by_index = dict(work(jobs, processes=1))
     return [results_by_index[index] for index in range(len(jobs))]

@@ -21,14 +21,15 @@ from px4fuse.verification.pdf_input import attached_results
 Kind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]
 Results = ComparisonResults | AidsResults
-# Settings of the other input with which a log is analysed; the second list only for the same log
+# Settings that the analysis of a log takes from the other input. The settings of the second list
+# are taken only if both inputs are of the same log
 _FILTER_FIELDS = ("sigma_a_m_s2", "sigma_z_m", "dt_s", "input", "axes", "clock_offset_s")
 _SEGMENT_FIELDS = ("heading_deg", "start_s", "end_s", "position_source", "source_kind", "height")
 
 
 @dataclass(frozen=True)
 class DiffInput:
-    """One of the two inputs of diff; ``given`` is the file name."""
+    """Input A or B of diff, with its results; ``given`` is the file name."""
 
     given: str
     kind: Kind
@@ -38,14 +39,14 @@ class DiffInput:
 def read_inputs(
     a: Path, b: Path, progress: Progress = lambda _: None
 ) -> tuple[DiffInput, DiffInput]:
-    """Read both inputs; a log is analysed with the settings of the other input's results.
+    """Read both inputs; analyse a log with the settings in the results of the other input.
 
     Raises
     ------
     LogError, MissingDataError
         A log cannot be read, or does not contain the required data.
     ResultsError
-        An input cannot be read, is not from ``px4fuse compare``, or both are the same file.
+        An input cannot be read, or is not from ``px4fuse compare``; A and B are the same file.
     """
     first, second = (_read_attached(path) for path in (a, b))
     if a.samefile(b):

@@ -1,4 +1,4 @@
-"""Job of a worker: reads one log and returns its rows, results and report."""
+"""Job of ``px4fuse batch``: analyses one log and returns its rows, results and report."""
 
 import re
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from px4fuse.request import ComparisonRequest, with_options
 
 @dataclass(frozen=True)
 class Job:
-    """Log to compare, with the settings and limits.
+    """Log to analyse, with settings and limits.
 
     Attributes
     ----------
@@ -23,19 +23,19 @@ class Job:
         Absolute path or URL.
     request : ComparisonRequest
         Settings of the analysis; its log is replaced by ``address``.
-    reports : bool
-        True to write the PDF report, too.
+    with_report : bool
+        True to make the PDF report.
     max_bytes : int
         Maximum size of a log (bytes).
-    known : frozenset of str
-        SHA-256 of logs of this size whose results exist already.
+    finished_hashes : frozenset of str
+        SHA-256 of the logs of this file size whose results exist already.
     """
 
     address: str
     request: ComparisonRequest
-    reports: bool
+    with_report: bool
     max_bytes: int
-    known: frozenset[str] = frozenset()
+    finished_hashes: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,10 @@ class Outcome:
     sha256 : str
         SHA-256 of the log; empty if it could not be read.
     rows : tuple of Row
-        One per axis; one if the log could not be compared; none if its results exist already.
+        One row per axis. A single row if the log could not be compared. No row if the results of
+        the log exist already.
     results, report : bytes
-        JSON and PDF; empty if not written.
+        JSON and PDF; empty if not made.
     """
 
     sha256: str
@@ -64,14 +65,14 @@ def analyse(job: Job) -> Outcome:
     Returns
     -------
     Outcome
-        For a log that cannot be compared, one row with the reason.
+        With one row that contains the reason, if the log cannot be compared.
     """
     sha256 = ""
     max_log_bytes.set(job.max_bytes)
     try:
         with local_file(job.address) as path:
             sha256 = _sha256(path)
-            if sha256 in job.known:
+            if sha256 in job.finished_hashes:
                 return Outcome(sha256)
             outcome = _compare_log(job, path, sha256)
             if _sha256(path) != sha256:
@@ -79,10 +80,10 @@ def analyse(job: Job) -> Outcome:
                 raise LogError("the file changed while it was read", remedy)
             return outcome
     except Px4FuseError as error:
-        return Outcome(sha256, (refused_row(error, FAILED) | {"log_sha256": sha256},))
+        return Outcome(sha256, (failure_row(error, FAILED) | {"log_sha256": sha256},))
 
 
-def refused_row(error: Px4FuseError, status: str, name: str = "") -> Row:
+def failure_row(error: Px4FuseError, status: str, name: str = "") -> Row:
     """Return the row of a log that could not be compared, with reason and action."""
     reason = with_options(error.reason).removeprefix(f"{name}: ")
     return {"status": status, "reason": reason, "remedy": with_options(error.remedy)}
@@ -96,27 +97,27 @@ def _compare_log(job: Job, path: Path, sha256: str) -> Outcome:
     from px4fuse.results.contract import to_json  # noqa: PLC0415
 
     request = msgspec.structs.replace(job.request, log=str(path))
-    common: Row = {"name": path.name, "log_sha256": sha256}
+    row: Row = {"name": path.name, "log_sha256": sha256}
     try:
         flight = read_flight(request)
-        common |= log_columns(log_record(flight))
+        row |= log_columns(log_record(flight))
         analysis = run_or_evaluate_aids(request, flight=flight)
         if isinstance(analysis, AidsOnlyAnalysis):
-            common |= finding_columns(find_aids(analysis.aids), analysis.aids)
+            row |= finding_columns(find_aids(analysis.aids), analysis.aids)
             missing_data = MissingDataError(
                 analysis.missing_data.reason, analysis.missing_data.remedy
             )
-            return Outcome(sha256, (common | refused_row(missing_data, NOT_COMPARED, path.name),))
+            return Outcome(sha256, (row | failure_row(missing_data, NOT_COMPARED, path.name),))
         contract_results = results(request, analysis)
-        text, report = to_json(contract_results), b""
-        if job.reports:
+        results_json, report = to_json(contract_results), b""
+        if job.with_report:
             from px4fuse.report.pdf import render  # noqa: PLC0415
 
-            report = render(analysis, contract_results, text)
+            report = render(analysis, contract_results, results_json)
     except Px4FuseError as error:
         status = NOT_COMPARED if isinstance(error, MissingDataError) else FAILED
-        return Outcome(sha256, (common | refused_row(error, status, path.name),))
-    return Outcome(sha256, tuple(axis_rows(contract_results)), text.encode(), report)
+        return Outcome(sha256, (row | failure_row(error, status, path.name),))
+    return Outcome(sha256, tuple(axis_rows(contract_results)), results_json.encode(), report)
 
 
 def _sha256(path: Path) -> str:

@@ -18,22 +18,22 @@ from px4fuse.results.reading import one_line
 if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
 
-#: Suffixes of logs in a folder; a file that is given by its name may have any suffix
+#: Suffixes by which logs in a folder are found; a file given by its name may have any suffix
 SUFFIXES = (".ulg", ".tlog", ".bin")
 
 
 @dataclass(frozen=True, order=True)
 class FoundLog:
-    """Log that was found but not read yet.
+    """Address and size of a log, before the log is read.
 
     Attributes
     ----------
     name : str
         File name without folder.
     log : str
-        Path or URL relative to the argument.
+        Path or URL for the table; relative to the working directory if the argument is relative.
     address : str
-        Absolute path or URL, as a worker opens it.
+        Absolute path or URL, with which a worker opens the log.
     size_bytes : int or None
         None if the file system does not provide it.
     """
@@ -66,39 +66,43 @@ def find_logs(patterns: Iterable[str]) -> list[FoundLog]:
 def _logs_in(pattern: str) -> list[FoundLog]:
     if not pattern:
         raise SettingsError("the name of a log is empty", "Give files, folders, globs or URLs.")
-    files, root = _file_system(pattern)
+    file_system, root = _file_system(pattern)
     try:
-        if files.isdir(root):
-            all_files = files.find(root, detail=True)
-            infos = {
+        if file_system.isdir(root):
+            all_files = file_system.find(root, detail=True)
+            info_by_path = {
                 path: info
                 for path, info in all_files.items()
                 if PurePosixPath(path).suffix.lower() in SUFFIXES
             }
-        elif files.exists(root):  # the worker rejects a device or a pipe
-            infos = {root: files.info(root) if files.isfile(root) else {}}
+        elif file_system.exists(root):  # the worker rejects a device or a pipe
+            info_by_path = {root: file_system.info(root) if file_system.isfile(root) else {}}
         else:
             all_files = (
-                files.glob(root, detail=True) if any(sign in pattern for sign in "*?[") else {}
+                file_system.glob(root, detail=True)
+                if any(wildcard in pattern for wildcard in "*?[")
+                else {}
             )
-            infos = {path: info for path, info in all_files.items() if info["type"] == "file"}
-    # OSError, or an exception of the package for this URL (no account, no such bucket)
+            info_by_path = {
+                path: info for path, info in all_files.items() if info["type"] == "file"
+            }
+    # OSError, or an exception of the package for this type of URL (no account, no such bucket)
     except Exception as error:
         raise SettingsError(
             f"{pattern}: cannot be read ({one_line(str(error), 200) or type(error).__name__})."
         ) from error
-    if not infos:
+    if not info_by_path:
         raise SettingsError(
             f"{pattern}: no logs found",
             f"Give existing logs, or folders with logs ({', '.join(SUFFIXES)}).",
         )
     found_logs = []
-    for path, info in infos.items():
-        address = path if _is_local(files) else files.unstrip_protocol(path)
-        is_relative = _is_local(files) and not Path(pattern).is_absolute()
+    for path, info in info_by_path.items():
+        address = path if _is_local(file_system) else file_system.unstrip_protocol(path)
+        is_relative = _is_local(file_system) and not Path(pattern).is_absolute()
         log = os.path.relpath(path) if is_relative else address
         found_logs.append(FoundLog(_file_name(path), log, address, info.get("size")))
-        if _is_local(files):
+        if _is_local(file_system):
             add_input(Path(path))
     return found_logs
 
@@ -119,11 +123,11 @@ def local_file(address: str) -> Iterator[Path]:
     SettingsError
         The URL requires a package that is not installed.
     """
-    files, path = _file_system(address)
-    if _is_local(files):
+    file_system, path = _file_system(address)
+    if _is_local(file_system):
         yield Path(path)
         return
-    size, limit = files.info(path).get("size"), max_log_bytes.get()
+    size, limit = file_system.info(path).get("size"), max_log_bytes.get()
     if size is not None and size > limit:
         raise LogError(
             f"the file has {size / 1e6:,.0f} MB; the limit is {limit / 1e6:,.0f} MB",
@@ -131,15 +135,15 @@ def local_file(address: str) -> Iterator[Path]:
         )
     with TemporaryDirectory(prefix="px4fuse-") as folder:
         local = Path(folder, _file_name(path))
-        files.get_file(path, str(local))
+        file_system.get_file(path, str(local))
         yield local
 
 
 def _file_system(address: str) -> tuple[AbstractFileSystem, str]:
-    from fsspec.core import url_to_fs  # noqa: PLC0415 - of the extra `batch`
+    from fsspec.core import url_to_fs  # noqa: PLC0415 - needs the extra `batch`
 
     try:
-        files, path = url_to_fs(address)
+        file_system, path = url_to_fs(address)
     except ImportError as error:  # the cause contains the name of the missing package
         package = getattr(error.__cause__, "name", None) or "the package of this URL type"
         raise SettingsError(
@@ -147,13 +151,13 @@ def _file_system(address: str) -> tuple[AbstractFileSystem, str]:
         ) from error
     except ValueError as error:  # unknown protocol
         raise SettingsError(f"{address}: {error}", "Give a path or another URL.") from error
-    return files, path
+    return file_system, path
 
 
-def _is_local(files: AbstractFileSystem) -> bool:
+def _is_local(file_system: AbstractFileSystem) -> bool:
     from fsspec.implementations.local import LocalFileSystem  # noqa: PLC0415
 
-    return isinstance(files, LocalFileSystem)
+    return isinstance(file_system, LocalFileSystem)
 
 
 def _file_name(path: str) -> str:

@@ -1,4 +1,8 @@
-"""Numbers by which ``diff`` compares two results, with their recorded 95 % intervals."""
+"""Numbers that ``px4fuse diff`` compares, with their 95 % intervals; ``measures.csv`` lists them.
+
+A path leads to a value in the results (keys joined by dots). In a pattern, ``*`` replaces the name
+of an axis, a tuning result or an aid.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -7,20 +11,21 @@ from px4fuse.ekf2_parameters import AIDS
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import Clock
-from px4fuse.fleet.rows import at, read_rows
+from px4fuse.fleet.rows import read_rows, value_at
 from px4fuse.results.contract import AidsResults, ComparisonResults, Interval
 
-# Columns: path in the results (* is an axis, a tuning or an aid), label, unit ("share": 0 to 1),
-# and the field with the 95 % interval (empty if none is recorded)
+# Columns: pattern of the path, label, unit ("share": fraction from 0 to 1), and field with the 95 %
+# interval (empty if the results contain none)
 MEASURES = read_rows("measures.csv")
-# Numbers within either tolerance are equal: computers differ in the last digits
+# Numbers whose difference is within either tolerance are not listed. The absolute tolerance is in
+# the unit of the number
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 0.01, 0.001
-_REJECTED = "axes.*.rejected_fraction"
+_REJECTED_PATTERN = "axes.*.rejected_fraction"
 
 
 @dataclass(frozen=True)
-class Number:
-    """Number of a comparison with its 95 % interval; None if none is recorded."""
+class ComparedNumber:
+    """Value in the results, with its 95 % interval; None if the results contain none."""
 
     label: str
     unit: str
@@ -28,45 +33,48 @@ class Number:
     interval: Interval | None = None
 
 
-def numbers(results: ComparisonResults | AidsResults) -> dict[str, Number]:
-    """Return the numbers of a comparison by their path in the results."""
+def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, ComparedNumber]:
+    """Return the numbers of MEASURES by their path; without those that are not determined."""
     axes = {} if isinstance(results, AidsResults) else results.axes
-    # one horizontal axis is enough: EKF2 rejects north and east together
-    level = next((name for name in ("north", "east", AISLE) if name in axes), "")
-    # the aid of the position source is skipped: the axes contain its numbers
-    own: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
-    if at(results, "source.kind") == "gnss":
-        own = ("gnss_pos",)
-    numbers_by_path: dict[str, Number] = {}
+    # EKF2 rejects north and east together, so the rejections of one horizontal axis are compared
+    horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")
+    # the axes contain the numbers of the aid that is the position source
+    source_aids: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
+    if value_at(results, "source.kind") == "gnss":
+        source_aids = ("gnss_pos",)
+    numbers_by_path: dict[str, ComparedNumber] = {}
     for measure in MEASURES:
-        kind, interval = measure["path"], measure["interval"]
-        for path, names in _places(results, kind):
+        pattern, interval_field = measure["path"], measure["interval"]
+        for path, names in _matching_paths(results, pattern):
             parent, _, field = path.rpartition(".")
-            record, first_name = at(results, parent), names[0] if names else ""
+            record, first_name = value_at(results, parent), names[0] if names else ""
             value = getattr(record, field, None)
-            unclear = isinstance(record, Clock) and not record.is_determinable
-            unclear |= isinstance(record, HeadingError) and record.drifts
-            is_duplicate = kind == _REJECTED and first_name not in (level, "down")
-            is_duplicate |= kind.startswith("aids.") and first_name in own
-            if unclear or is_duplicate or not isinstance(value, int | float):
+            is_undetermined = isinstance(record, Clock) and not record.is_determinable
+            is_undetermined |= isinstance(record, HeadingError) and record.drifts
+            is_duplicate = pattern == _REJECTED_PATTERN and first_name not in (
+                horizontal_axis,
+                "down",
+            )
+            is_duplicate |= pattern.startswith("aids.") and first_name in source_aids
+            if is_undetermined or is_duplicate or not isinstance(value, int | float):
                 continue
             labels = (AIDS[name].label if name in AIDS else name for name in names)
-            numbers_by_path[path] = Number(
+            numbers_by_path[path] = ComparedNumber(
                 ", ".join((measure["label"], *labels)),
                 measure["unit"],
                 float(value),
-                getattr(record, interval) if interval else None,
+                getattr(record, interval_field) if interval_field else None,
             )
     return numbers_by_path
 
 
-def _places(
-    results: ComparisonResults | AidsResults, kind: str
+def _matching_paths(
+    results: ComparisonResults | AidsResults, pattern: str
 ) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield every path that matches the pattern, with the names that replace its ``*``."""
-    head, several, tail = kind.partition(".*")
-    if not several:
-        yield kind, ()
-    for name in (at(results, head) or ()) if several else ():
-        for path, names in _places(results, f"{head}.{name}{tail}"):
+    """Yield each path in the results that matches the pattern, and the names in place of ``*``."""
+    head, has_wildcard, tail = pattern.partition(".*")
+    if not has_wildcard:
+        yield pattern, ()
+    for name in (value_at(results, head) or ()) if has_wildcard else ():
+        for path, names in _matching_paths(results, f"{head}.{name}{tail}"):
             yield path, (name, *names)

@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from px4fuse.findings import finding_title
-from px4fuse.fleet.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, PLACES
+from px4fuse.fleet.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, RESULT_PATHS
 from px4fuse.text import format_factor, format_number, join_first
 from px4fuse.webpage import frame
 from px4fuse.webpage.frame import Cell, Column, Row, Section
@@ -16,11 +16,11 @@ from px4fuse.webpage.safe import clean, local_link
 
 STATUS_STYLES = {DONE: "good", NOT_COMPARED: "open", FAILED: "bad"}
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
-# Columns of the table that an opened row shows, by axis and for the whole log
-AXIS_COLUMNS = [name for name, place in PLACES.items() if "{" in place]
+# Columns that the page shows if the user opens a row: one value per axis, and one per log
+AXIS_COLUMNS = [name for name, path in RESULT_PATHS.items() if "{" in path]
 LOG_COLUMNS = [
     name
-    for name, place in PLACES.items()
+    for name, path in RESULT_PATHS.items()
     if name
     not in (
         *AXIS_COLUMNS,
@@ -41,15 +41,15 @@ FILTERS = (
     ("Finding", "finding", "All"),
     ("Action", "remedy", "All"),
 )
-# Limit of the ratio of actual and reported σ, either way, of a consistent filter
-CONSISTENT_RATIO = 1.25
-# Axes that represent a log: the aisle if known, else north and east, else down
+# Maximum ratio of actual to reported σ, or of reported to actual σ, of a consistent filter
+MAX_CONSISTENT_RATIO = 1.25
+# Axes whose numbers are shown for the log: the aisle if it exists, else north and east, else down
 MAIN_AXES = (("aisle",), ("north", "east"), ("down",))
 
-#: One log: the non-empty columns of its rows (main axes first), and ``sigma_ratios`` ("kf" and
-#: "ekf2": actual σ over reported σ, from the mean NIS of the main axes), ``status``
-#: (the best of its axes), ``lacking`` (reasons and actions for missing results), ``axes`` (their
-#: rows), ``findings`` (ids) and ``tags`` (filter values with their labels)
+#: Entry of one log: the non-empty columns of its rows, of the main axes if present, and
+#: ``sigma_ratios`` (by "kf" and "ekf2": actual over reported σ, √(mean NIS) of the main axes),
+#: ``status`` ("done" if one axis is), ``lacking`` (reasons for missing results, with actions),
+#: ``axes`` (rows with an axis), ``findings`` (ids) and ``tags`` (label by page filter value)
 Log = Mapping[str, Any]
 
 
@@ -59,15 +59,15 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     Parameters
     ----------
     table : DataFrame
-        One row per log and axis, with the columns of :data:`px4fuse.fleet.rows.COLUMNS`; a log that
-        could not be read has one row without axis.
+        One row per log and axis, with the columns of :data:`px4fuse.fleet.rows.COLUMN_TYPES`; a log
+        that could not be read has one row without axis.
     made_with : str
         Name and version of px4fuse.
 
     Returns
     -------
     str
-        To write as UTF-8. It depends on the input only, not on the date.
+        HTML to write as UTF-8; equal for equal input, because it does not contain the date.
     """
     logs = logs_of(table)
     names = short_names(logs)
@@ -82,11 +82,11 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             frame.text_cell(log.get("firmware", "")),
             Cell(log["status"], log["status"], style_class=STATUS_STYLES[log["status"]]),
             *(
-                _figure(log["sigma_ratios"].get(filter_name), describe_sigma_ratio)
+                _value_cell(log["sigma_ratios"].get(filter_name), describe_sigma_ratio)
                 for filter_name in ("kf", "ekf2")
             ),
             *(
-                _figure(log.get(name), format_number)
+                _value_cell(log.get(name), format_number)
                 for name in ("sigma_z_m", "clock_offset_s", "position_rms_m")
             ),
             Cell()
@@ -118,7 +118,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     )
 
 
-def _figure(value: float | None, format_value: Callable[[float], str]) -> Cell:
+def _value_cell(value: float | None, format_value: Callable[[float], str]) -> Cell:
     return Cell() if value is None else frame.number_cell(value, format_value(value))
 
 
@@ -128,7 +128,7 @@ def _details(log: Log) -> tuple[Section, ...]:
         for name in AXIS_COLUMNS
         if any(name in axis for axis in log["axes"])
     ]
-    heads = ["", *(axis["axis"] for axis in log["axes"])]
+    titles = ["", *(axis["axis"] for axis in log["axes"])]
     return (
         frame.list_section(
             "Missing results", [reason for reason, _ in log["lacking"] if reason], is_warning=True
@@ -138,7 +138,7 @@ def _details(log: Log) -> tuple[Section, ...]:
         frame.list_section(
             "Findings", [f"{finding_title(id_)} ({id_})" for id_ in log["findings"]]
         ),
-        frame.table_section("Axes", heads if axes else (), axes, range(1, len(heads))),
+        frame.table_section("Axes", titles if axes else (), axes, range(1, len(titles))),
     )
 
 
@@ -158,7 +158,7 @@ def _format_value(value: str | float) -> str:
 
 
 def _filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Return the filters of the page with their options, most frequent first."""
+    """Return the selection lists of the page with their options, most frequent option first."""
     counts = Counter(tag for log in logs for tag in log["tags"])
     label_by_tag: Mapping[str, str] = {
         tag: label for log in logs for tag, label in log["tags"].items()
@@ -179,7 +179,7 @@ def _filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
 
 
 def logs_of(table: pd.DataFrame) -> list[Log]:
-    """Combine the rows of each log into one entry, in the order of the table."""
+    """Combine the rows of each log into one :data:`Log`, in the order of the table."""
     rows: dict[str, list[dict[str, Any]]] = defaultdict(list)
     present = (table.notna() & (table != "")).to_numpy()
     for row, is_present in zip(table.to_dict("records"), present, strict=True):
@@ -194,9 +194,11 @@ def logs_of(table: pd.DataFrame) -> list[Log]:
 
 def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
     axes = [row for row in rows if "axis" in row]
-    main = next((m for names in MAIN_AXES if (m := [a for a in axes if a["axis"] in names])), rows)
+    main_rows = next(
+        (m for names in MAIN_AXES if (m := [a for a in axes if a["axis"] in names])), rows
+    )
     log: dict[str, Any] = {}
-    for row in reversed((*main, *rows)):
+    for row in reversed((*main_rows, *rows)):
         log |= row
     reasons_and_remedies = ((row.get("reason", ""), row.get("remedy", "")) for row in rows)
     log |= {
@@ -204,7 +206,7 @@ def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
         "sigma_ratios": {
             filter_name: ratio
             for filter_name in ("kf", "ekf2")
-            if (ratio := _mean_sigma_ratio(main, f"{filter_name}_nis_mean")) is not None
+            if (ratio := _mean_sigma_ratio(main_rows, f"{filter_name}_nis_mean")) is not None
         },
         "status": DONE if any(row["status"] == DONE for row in rows) else rows[0]["status"],
         "lacking": tuple(dict.fromkeys(pair for pair in reasons_and_remedies if any(pair))),
@@ -230,19 +232,19 @@ def _tags(log: Log) -> dict[str, str]:
 
 
 def short_names(logs: Sequence[Log]) -> dict[str, str]:
-    """Shorten long ids of flight controllers to their last digits if these are unique."""
+    """Shorten ids of flight controllers above 20 characters to the last 8 if these are unique."""
     long_ids = {vehicle for log in logs if len(vehicle := log.get("vehicle", "")) > 20}
     short_ids = {vehicle: f"…{vehicle[-8:]}" for vehicle in long_ids}
     return short_ids if len(set(short_ids.values())) == len(short_ids) else {}
 
 
 def describe_sigma_ratio(ratio: float) -> str:
-    """Describe the reported σ of a filter, from the ratio of actual to reported σ.
+    """Describe the reported σ of a filter; ``ratio``: actual σ over reported σ.
 
     >>> [describe_sigma_ratio(ratio) for ratio in (1.2, 3.2, 0.25)]
     ['consistent', '3.2 × too small', '4 × too large']
     """
     factor = max(ratio, 1.0 / ratio)
-    if factor <= CONSISTENT_RATIO:
+    if factor <= MAX_CONSISTENT_RATIO:
         return "consistent"
     return f"{format_factor(factor)} × too {'small' if ratio > 1.0 else 'large'}"

@@ -1,4 +1,4 @@
-"""Rows of the table of ``px4fuse batch``, made of results, and their formats."""
+"""Rows of the table of ``px4fuse batch``: one per axis of a log, made of the results."""
 
 import csv
 from collections.abc import Iterable, Mapping
@@ -17,7 +17,7 @@ from px4fuse.text import utc_time
 
 DONE, NOT_COMPARED, FAILED = "done", "not compared", "failed"
 FINDING_SEPARATOR = ";"
-# Tuning result of each axis
+# Tuning result of each axis; an axis that is not listed has a result of its name
 _TUNING_OF_AXIS = {"north": "horizontal", "east": "horizontal"}
 
 
@@ -28,35 +28,35 @@ def read_rows(name: str) -> list[dict[str, str]]:
 
 
 _COLUMNS = read_rows("columns.csv")
-#: Columns of the table with their path in the results; empty if the value is composed
-PLACES = {row["column"]: row["place"] for row in _COLUMNS}
-#: Types of the columns; missing numbers are NA, missing texts are empty
-COLUMNS = {row["column"]: row["type"] for row in _COLUMNS}
+#: Path in the results of each column; empty if the value is composed of several fields
+RESULT_PATHS = {row["column"]: row["path"] for row in _COLUMNS}
+#: Data type of each column; missing numbers are NA, missing texts are empty
+COLUMN_TYPES = {row["column"]: row["type"] for row in _COLUMNS}
 
 Row = dict[str, Any]
 
 
-def at(results: object, path: str) -> Any:
-    """Return the value at a path in the results; None if there is none."""
+def value_at(results: object, path: str) -> Any:
+    """Return the value at a path in the results (keys joined by dots); None if it is missing."""
 
-    def below(parent: Any, name: str) -> Any:
+    def child(parent: Any, name: str) -> Any:
         if isinstance(parent, tuple):
             return parent[int(name)]
         return parent.get(name) if isinstance(parent, Mapping) else getattr(parent, name, None)
 
-    return reduce(below, path.split("."), results)
+    return reduce(child, path.split("."), results)
 
 
 def axis_rows(results: ComparisonResults) -> list[Row]:
     """Return the rows of one log, one per axis; columns without a value are absent.
 
-    A σ ratio is actual σ over reported σ: above 1 the filter is overconfident. SIGMA_Z and
-    SIGMA_A are the maximum-likelihood estimates, for north and east together. The clock
-    offset is present if it is determinable.
+    ``kf_sigma_ratio`` and ``ekf2_sigma_ratio`` are actual σ over reported σ: above 1 the filter is
+    overconfident. SIGMA_Z and SIGMA_A are maximum-likelihood estimates; north and east have a
+    common estimate. A time offset that the flight does not determine is absent.
     """
     common = log_columns(results.log) | finding_columns(results.findings, results.aids)
-    common["summary"] = "\n".join(results.summary)
-    clock = bool(at(results, "clock.is_determinable"))
+    common["summary"] = results.card.headline
+    has_time_offset = bool(value_at(results, "clock.is_determinable"))
     rows = []
     for name, axis in results.axes.items():
         unavailable = next((f for f in axis.filters.values() if isinstance(f, Unavailable)), None)
@@ -66,16 +66,16 @@ def axis_rows(results: ComparisonResults) -> list[Row]:
             "reason": f"{unavailable.what}: {unavailable.reason}" if unavailable else "",
             "remedy": unavailable.remedy if unavailable else "",
         }
-        for column, place in PLACES.items():
-            if column not in row and place and (clock or not place.startswith("clock.")):
+        for column, path in RESULT_PATHS.items():
+            if column not in row and path and (has_time_offset or not path.startswith("clock.")):
                 tuned = _TUNING_OF_AXIS.get(name, name)
-                row[column] = at(results, place.format(axis=name, tuned=tuned))
+                row[column] = value_at(results, path.format(axis=name, tuned=tuned))
         rows.append(row)
     return rows
 
 
 def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) -> Row:
-    """Return the findings that are causes, and the verdict on each aid that EKF2 fused."""
+    """Return ids and severities of findings that no other finding causes, and verdicts on aids."""
     causes = [finding for finding in findings if finding.caused_by is None]
     fused = [f"{name} {aid.verdict}" for name, aid in aids.items() if aid.verdict != "disabled"]
     return {
@@ -88,22 +88,22 @@ def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) 
 def log_columns(log: Log) -> Row:
     """Return the columns that describe the log."""
     start, values = utc_time(log.start_unix_s), {"log": log}
-    places = {name: place for name, place in PLACES.items() if place.startswith("log.")}
-    return {name: at(values, place) for name, place in places.items()} | {
+    paths = {name: path for name, path in RESULT_PATHS.items() if path.startswith("log.")}
+    return {name: value_at(values, path) for name, path in paths.items()} | {
         "airframe": f"{airframe:g}" if (airframe := log.parameters.get("SYS_AUTOSTART")) else "",
         "date": f"{start[:19]}Z" if start else "",
     }
 
 
-def fleet_table(rows: Iterable[Row]) -> pd.DataFrame:
-    """Make the table of all rows, with all columns in order and with their types."""
-    texts = dict.fromkeys((name for name, kind in COLUMNS.items() if kind == "str"), "")
-    filled_rows = [texts | clean_row(row) for row in rows]
-    return pd.DataFrame(filled_rows, columns=list(COLUMNS)).astype(COLUMNS)
+def make_table(rows: Iterable[Row]) -> pd.DataFrame:
+    """Make the table of all rows, with the columns and types of COLUMN_TYPES."""
+    text_columns = dict.fromkeys((name for name, kind in COLUMN_TYPES.items() if kind == "str"), "")
+    filled_rows = [text_columns | clean_row(row) for row in rows]
+    return pd.DataFrame(filled_rows, columns=list(COLUMN_TYPES)).astype(COLUMN_TYPES)
 
 
 def clean_row(row: Row) -> Row:
-    """Drop missing values, and replace bytes of file names that are not UTF-8."""
+    """Remove missing values, and replace bytes that are not UTF-8, as in file names."""
     return {
         name: value.encode(errors="replace").decode() if isinstance(value, str) else value
         for name, value in row.items()
@@ -113,10 +113,12 @@ def clean_row(row: Row) -> Row:
 
 def csv_bytes(table: pd.DataFrame) -> bytes:
     """Write the table as CSV for Excel and LibreOffice, without active formulas."""
-    texts = {
+    text_columns = {
         name: table[name].map(neutralise_formulas)
-        for name, kind in COLUMNS.items()
+        for name, kind in COLUMN_TYPES.items()
         if kind == "str"
     }
-    text = table.assign(**texts).to_csv(index=False, lineterminator="\r\n", float_format="%.10g")
+    text = table.assign(**text_columns).to_csv(
+        index=False, lineterminator="\r\n", float_format="%.10g"
+    )
     return ("\ufeff" + text).encode()

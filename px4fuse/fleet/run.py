@@ -19,39 +19,39 @@ from px4fuse.errors import LogError, Px4FuseError, SettingsError
 from px4fuse.filter.settings import Settings
 from px4fuse.fleet import TIMEOUT_S
 from px4fuse.fleet.engine import connect_cluster, run_jobs
-from px4fuse.fleet.job import Job, Outcome, analyse, file_stem, refused_row
+from px4fuse.fleet.job import Job, Outcome, analyse, failure_row, file_stem
 from px4fuse.fleet.logs import FoundLog, find_logs
 from px4fuse.fleet.page import html_text
-from px4fuse.fleet.rows import FAILED, NOT_COMPARED, Row, clean_row, csv_bytes, fleet_table
+from px4fuse.fleet.rows import FAILED, NOT_COMPARED, Row, clean_row, csv_bytes, make_table
 from px4fuse.input_files import check_output_folder
 from px4fuse.reading import max_log_bytes
 from px4fuse.request import ComparisonRequest, command_line
 from px4fuse.workers import MEMORY_BYTES, JobFailure, run_bounded
 from px4fuse.writing import write_all
 
-# Columns with the files of a log, relative to the output folder
-FILES = ("results", "report")
-_RESUME_NOTE = "Finished results are kept. Run the same command to continue."
+# Columns of the table with the paths of a log's outputs, relative to the output folder
+FILE_COLUMNS = ("results", "report")
+RESUME_NOTE = "Finished results are kept. Run the same command to continue."
 
 Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
-class Fleet:
-    """Table of many logs, and the files of the run.
+class BatchResult:
+    """Table of many logs, and written files.
 
     Attributes
     ----------
     table : DataFrame
-        One row per log and axis, with the columns of :data:`px4fuse.fleet.rows.COLUMNS`.
-    reused : int
+        One row per log and axis, with the columns of :data:`px4fuse.fleet.rows.COLUMN_TYPES`.
+    reused_count : int
         Number of logs whose results are from an earlier run.
     severities : frozenset of str
         Severities of all findings.
     """
 
     table: pd.DataFrame
-    reused: int
+    reused_count: int
     severities: frozenset[str]
     written: tuple[Path, ...]
 
@@ -72,20 +72,20 @@ class CachedRows(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True)
-class _Run:
-    """State of a run: output folder, version, settings, and the logs processed so far."""
+class _RunState:
+    """Output folder, px4fuse version, settings, and the logs that are finished so far."""
 
     output: Path
     px4fuse: str
     settings: str
-    # SHA-256 of logs with rows, by address
-    hash_of: dict[str, str] = field(default_factory=dict)
-    # First log of each SHA-256; logs with the same content are compared once
-    first_of: dict[str, FoundLog] = field(default_factory=dict)
+    # SHA-256 by address, for the logs that did not fail
+    hash_by_address: dict[str, str] = field(default_factory=dict)
+    # First log by SHA-256; only the first of several logs with the same content has rows
+    first_log_by_hash: dict[str, FoundLog] = field(default_factory=dict)
     # Rows of logs that failed, by address
     failed_rows: dict[str, Row] = field(default_factory=dict)
-    # SHA-256 of logs with results of an earlier run
-    reused: set[str] = field(default_factory=set)
+    # SHA-256 of the logs whose results are from an earlier run
+    reused_hashes: set[str] = field(default_factory=set)
 
 
 def batch(
@@ -105,12 +105,12 @@ def batch(
     paths : str, Path or iterable of them
         Files, folders, globs and URLs.
     output : str or Path, optional
-        Folder for the table and the results of each log; a second run processes only new logs. By
-        default no file is kept.
+        Folder for the table and the results of each log; a second run processes only new and
+        failed logs. By default no file is kept.
     reports : bool
         True to write a PDF report for each log.
     timeout_s : float
-        For one log.
+        Maximum time for one log.
     scheduler : str, optional
         Address of a Dask scheduler.
     workers : int, optional
@@ -135,10 +135,16 @@ def batch(
         A result cannot be written.
     """
     sources = (paths,) if isinstance(paths, str | Path) else paths
-    with TemporaryDirectory(prefix="px4fuse-") as scratch:
-        folder = Path(scratch if output is None else output)
-        fleet = run(map(str, sources), folder, reports=reports and output is not None, **settings)
-    return fleet.table if output is not None else fleet.table.assign(results="", report="")
+    with TemporaryDirectory(prefix="px4fuse-") as temporary_folder:
+        folder = Path(temporary_folder if output is None else output)
+        batch_result = run(
+            map(str, sources), folder, reports=reports and output is not None, **settings
+        )
+    return (
+        batch_result.table
+        if output is not None
+        else batch_result.table.assign(results="", report="")
+    )
 
 
 def run(
@@ -152,11 +158,11 @@ def run(
     memory_gb: float = MEMORY_BYTES / 1e9,
     progress: Progress = lambda what, done, of: None,
     **settings: Any,
-) -> Fleet:
-    """Compare many logs like :func:`batch`, and return the table with details of the run.
+) -> BatchResult:
+    """Compare many logs like :func:`batch`, into a folder; return the table with written files.
 
-    If the run ends early (Ctrl-C, full disk, lost cluster), the finished results are in the folder,
-    and in the table if it can be written.
+    If the run ends early (Ctrl-C, full disk, lost cluster), the folder contains the finished
+    results, and a table of them if it can be written.
 
     Raises
     ------
@@ -185,7 +191,7 @@ def run(
     Settings(
         request.sigma_a_m_s2, sigma_z_m, request.dt_s
     )  # raises an error for values out of range
-    state = _Run(output, metadata.version("px4fuse"), command_line(request))
+    state = _RunState(output, metadata.version("px4fuse"), command_line(request))
     hashes_by_size = _cached_hashes(state, reports)
     log_by_address = {log.address: log for log in logs}
     jobs = [
@@ -198,31 +204,33 @@ def run(
         )
         for log in logs
     ]
-    bounded = partial(run_bounded, analyse, timeout_s=timeout_s, memory_bytes=int(memory_gb * 1e9))
+    run_in_processes = partial(
+        run_bounded, analyse, timeout_s=timeout_s, memory_bytes=int(memory_gb * 1e9)
+    )
     with (
         connect_cluster(scheduler) as client,
-        closing(run_jobs(client, bounded, jobs, workers)) as work,
+        closing(run_jobs(client, run_in_processes, jobs, workers)) as finished_jobs,
     ):
         progress("comparing", 0, len(jobs))
         try:
             try:
-                for number, (job, outcome) in enumerate(work, 1):
+                for number, (job, outcome) in enumerate(finished_jobs, 1):
                     _cache_outcome(state, log_by_address[job.address], outcome)
                     progress(f"comparing, {len(state.failed_rows)} failed", number, len(jobs))
             finally:
-                fleet = _write_fleet(state, logs)
+                batch_result = _write_table(state, logs)
         except Px4FuseError as error:
-            raise type(error)(f"{error} {_RESUME_NOTE}") from error
-    return fleet
+            raise type(error)(f"{error} {RESUME_NOTE}") from error
+    return batch_result
 
 
-def _cached_hashes(state: _Run, reports: bool) -> dict[int | None, set[str]]:
-    """Return the SHA-256 of logs whose results and files exist, by file size."""
+def _cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]]:
+    """Return the SHA-256 of the logs whose rows and output files exist, by size of the log."""
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
     for cached in load_cached_rows(state.output, state.px4fuse, state.settings):
-        first = cached.rows[0]
-        files = [state.output / first.get(kind, "") for kind in FILES[: 1 + reports]]
-        if "axis" not in first or all(file.is_file() for file in files):
+        first_row = cached.rows[0]
+        files = [state.output / first_row.get(kind, "") for kind in FILE_COLUMNS[: 1 + reports]]
+        if "axis" not in first_row or all(file.is_file() for file in files):
             hashes_by_size[cached.size_bytes].add(cached.sha256)
     return hashes_by_size
 
@@ -238,30 +246,30 @@ def load_cached_rows(folder: Path, px4fuse: str, settings: str) -> Iterator[Cach
             yield cached
 
 
-def _cache_outcome(state: _Run, log: FoundLog, outcome: Outcome | JobFailure) -> None:
-    """Store the outcome of a log in the state and in the output folder."""
+def _cache_outcome(state: _RunState, log: FoundLog, outcome: Outcome | JobFailure) -> None:
+    """Add the outcome of a log to the state, and write its results to the output folder."""
     if isinstance(outcome, JobFailure):
         remedy = "Increase --timeout or --memory, or run px4fuse compare on this log."
-        outcome = Outcome("", (refused_row(LogError(outcome.reason.rstrip("."), remedy), FAILED),))
+        outcome = Outcome("", (failure_row(LogError(outcome.reason.rstrip("."), remedy), FAILED),))
     if outcome.rows and outcome.rows[0]["status"] == FAILED:
         state.failed_rows[log.address] = outcome.rows[0]
         return
-    first = min(log, state.first_of.get(outcome.sha256, log))
+    first_log = min(log, state.first_log_by_hash.get(outcome.sha256, log))
     if not outcome.rows:
-        state.reused.add(outcome.sha256)
-    elif first is log:
+        state.reused_hashes.add(outcome.sha256)
+    elif first_log is log:
         _write_log(state, log, outcome)
-    state.hash_of[log.address] = outcome.sha256
-    state.first_of[outcome.sha256] = first
+    state.hash_by_address[log.address] = outcome.sha256
+    state.first_log_by_hash[outcome.sha256] = first_log
 
 
-def _write_log(state: _Run, log: FoundLog, outcome: Outcome) -> None:
+def _write_log(state: _RunState, log: FoundLog, outcome: Outcome) -> None:
     """Write the results, the report and the cached rows of a log."""
     stem = f"results/{file_stem(log.name, outcome.sha256)}"
     named_contents = {f"{stem}.json": outcome.results, f"{stem}.pdf": outcome.report}
     files = {
         kind: name if named_contents[name] else ""
-        for kind, name in zip(FILES, named_contents, strict=True)
+        for kind, name in zip(FILE_COLUMNS, named_contents, strict=True)
     }
     rows = [clean_row(row) | files for row in outcome.rows]
     cached = CachedRows(outcome.sha256, state.px4fuse, state.settings, log.size_bytes, rows)
@@ -269,24 +277,25 @@ def _write_log(state: _Run, log: FoundLog, outcome: Outcome) -> None:
     write_all({state.output / name: content for name, content in contents.items() if content})
 
 
-def _write_fleet(state: _Run, logs: Iterable[FoundLog]) -> Fleet:
-    """Write the table of all logs that are finished so far."""
+def _write_table(state: _RunState, logs: Iterable[FoundLog]) -> BatchResult:
+    """Write the table of all logs that are finished so far, as CSV, Parquet and web page."""
     severities: set[str] = set()
-    rows_of = {
+    rows_by_hash = {
         cached.sha256: cached.rows
         for cached in load_cached_rows(state.output, state.px4fuse, state.settings)
     }
 
     def rows_of_log(log: FoundLog) -> Iterable[Row]:
-        if log.address not in state.hash_of:
+        if log.address not in state.hash_by_address:
             return [state.failed_rows[log.address]] if log.address in state.failed_rows else []
-        sha256 = state.hash_of[log.address]
-        first = state.first_of[sha256]
-        if first is log and sha256 in rows_of:
-            return rows_of[sha256]
-        status, reason = NOT_COMPARED, f"same file as {first.log}; not analysed again"
-        if first is log:
-            status, reason = FAILED, "another run in this folder replaced the rows of this log"
+        sha256 = state.hash_by_address[log.address]
+        first_log = state.first_log_by_hash[sha256]
+        if first_log is log and sha256 in rows_by_hash:
+            return rows_by_hash[sha256]
+        status, reason = NOT_COMPARED, f"identical to {first_log.log}, whose rows have the results"
+        if first_log is log:
+            reason = "another px4fuse batch with the same output folder replaced the rows"
+            status, reason = FAILED, f"{reason} of this log"
         return [{"status": status, "log_sha256": sha256, "reason": reason}]
 
     def rows() -> Iterator[Row]:
@@ -297,7 +306,7 @@ def _write_fleet(state: _Run, logs: Iterable[FoundLog]) -> Fleet:
                 severities.update(row.get("severities", ()))
                 yield row | common
 
-    table = fleet_table(rows())
+    table = make_table(rows())
     page = html_text(table, state.output.resolve().name, f"px4fuse {state.px4fuse}")
     parquet = io.BytesIO()
     table.to_parquet(parquet, index=False)
@@ -307,4 +316,4 @@ def _write_fleet(state: _Run, logs: Iterable[FoundLog]) -> Fleet:
         state.output / "fleet.html": page.encode(),
     }
     write_all(contents)
-    return Fleet(table, len(state.reused), frozenset(severities), tuple(contents))
+    return BatchResult(table, len(state.reused_hashes), frozenset(severities), tuple(contents))

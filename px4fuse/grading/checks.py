@@ -1,7 +1,7 @@
-"""Checks of a rubric: each check is a class of items; its fields are the parameters.
+"""Checks of a rubric: each check is a class of items; its fields are the parameters of the check.
 
-A check scores the :class:`Evidence` of a report. ``rubric.toml`` describes each check: the report
-(verified, numbers, form, text), the filter (settings, consistency, time offset) and the loop.
+A check scores the :class:`Evidence` of a report. ``rubric.toml`` describes all checks: of the
+report (verified, number, answers, text), the filter (tuning, consistent, clock) and the loop.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from msgspec import Meta
 
 from px4fuse.answer_form import Answers, check
 from px4fuse.assignment.key import Answer, AnswerKey
-from px4fuse.comparison.model import AgainstTruth
+from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.filter.consistency import HorizontalNis
 from px4fuse.filter.time_offset import Clock
 from px4fuse.filter.tuning import HORIZONTAL
@@ -29,7 +29,7 @@ from px4fuse.results.contract import (
     TUNED_FIELDS,
     ComparisonResults,
     LoopResults,
-    Reported,
+    ReportedResults,
     to_plain,
 )
 from px4fuse.results.reading import one_line
@@ -38,22 +38,22 @@ from px4fuse.trajectory.evaluation import Score
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import flatten, is_number, log_sha256
 
-MAX_QUOTE = 160
-NEEDS_BOTH_AXES = " (it needs the axes north and east: leave --axis out)"
-# regular expression: no control characters
+MAX_QUOTE_LENGTH = 160
+BOTH_AXES_ADVICE = " (the axes north and east are required: omit --axis)"
+# regular expression of one character that is not a control character
 _PLAIN = r"[^\x00-\x1f\x7f]"
 Text = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN}*$")]
 Title = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN}*[^\s\x00-\x1f\x7f]{_PLAIN}*$")]
 Bound = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Factor = Annotated[float, Meta(ge=1.0, le=1000.0)]
-# share of the points (0 to 1), and its reason
-Scored = tuple[float, str]
+# share of the points (0 to 1), and the reason as a sentence for the student
+ShareAndReason = tuple[float, str]
 
 
 class RubricItem(
     msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="check"
 ):
-    """Part of the grade; subclasses implement the checks.
+    """Item of the rubric; subclasses implement the checks.
 
     Attributes
     ----------
@@ -61,8 +61,10 @@ class RubricItem(
         Maximum points.
     report : {"any", "compare", "loop"}
         Command whose reports have this item.
-    needs_key, by_hand : bool
-        The item needs an answer key; the item is scored by the instructor.
+    needs_key : bool
+        True if reports have the item only with an answer key.
+    by_hand : bool
+        True if the instructor scores the item.
     """
 
     needs_key: ClassVar[bool] = False
@@ -72,7 +74,7 @@ class RubricItem(
     points: Annotated[float, Meta(ge=0.0, le=1000.0)]
     report: Literal["any", "compare", "loop"] = "any"
 
-    def score(self, evidence: Evidence) -> Scored:
+    def score(self, evidence: Evidence) -> ShareAndReason:
         """Return the share of the points (0 to 1), and a sentence with the reason."""
         raise NotImplementedError
 
@@ -81,25 +83,27 @@ class RubricItem(
         return self.report in ("any", kind) and (key is not None or not self.needs_key)
 
 
-def falling_share(off: float, factor: float) -> float:
-    """Return the share for a deviation by a factor: 1 at 1, 0 from ``factor``, log scale.
+def share_for_deviation(deviation_factor: float, factor: float) -> float:
+    """Return the share of the points for a deviation: 1 at a factor of 1, 0 from ``factor`` on.
 
-    >>> [round(falling_share(off, 4.0), 2) for off in (1.0, 2.0, 4.0, 9.0)]
+    Between them the share decreases linearly with the logarithm of the deviation.
+
+    >>> [round(share_for_deviation(off, 4.0), 2) for off in (1.0, 2.0, 4.0, 9.0)]
     [1.0, 0.5, 0.0, 0.0]
     """
-    if off <= 1.0:
+    if deviation_factor <= 1.0:
         return 1.0
-    return max(1.0 - math.log(off) / math.log(factor), 0.0) if factor > 1.0 else 0.0
+    return max(1.0 - math.log(deviation_factor) / math.log(factor), 0.0) if factor > 1.0 else 0.0
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Data for the checks: results of a report, verification verdict, and answer key.
+    """Data for the checks of one report: results, verdict of the verification, and answer key.
 
     ``owner_id`` is the student id according to the learning platform.
     """
 
-    results: Reported
+    results: ReportedResults
     verdict: Verdict
     key: AnswerKey | None
     owner_id: str = ""
@@ -121,15 +125,15 @@ class Evidence:
 
     @cached_property
     def assigned_answer(self) -> Answer | None:
-        """Answer for the student, by the id of the platform, else of the report."""
+        """Answer for the student, found by the id on the platform, else by the id in the report."""
         if self.key is None:
             return None
-        claimed = self.key.of_student(text_of(self.results.student.id))
-        return self.key.of_student(self.owner_id) or claimed
+        answer_by_stated_id = self.key.of_student(shorten_text(self.results.student.id))
+        return self.key.of_student(self.owner_id) or answer_by_stated_id
 
     @cached_property
     def is_own_log(self) -> bool:
-        """True if the log was given to this student, or without an answer key."""
+        """True if the log was assigned to this student, or there is no answer key."""
         assigned_answer = self.assigned_answer
         return self.key is None or (
             assigned_answer is not None and assigned_answer.sha256 == log_sha256(self.results)
@@ -137,58 +141,60 @@ class Evidence:
 
     @cached_property
     def form(self) -> Answers | str:
-        """Form about this log, or the reason why it is missing."""
+        """Completed answer form about the log of the report, or the reason why it is missing."""
         answers = self.results.student.answers
         if not isinstance(answers, Answers):
-            return "your report contains no form: make the report with --answers answers.toml"
+            return "your report contains no answer form. Make the report with --answers FILE"
         try:
             check(answers)
         except ValueError as error:
-            return f"your form cannot be read ({text_of(str(error))})"
+            return f"your answer form cannot be read ({shorten_text(str(error))})"
         if answers.log_sha256 != log_sha256(self.results):
-            return "your form was made for another log"
+            return "your answer form was made for another log than your report"
         return answers
 
     @cached_property
     def form_points(self) -> FormPoints | str:
-        """Points of the form, or the reason why it has none."""
+        """Points of the answer form, or the reason why the form has no points."""
         if self.answer is None or (self.assigned_answer and not self.is_own_log):
-            assigned_answer = (
-                f" ({text_of(self.assigned_answer.file)})" if self.assigned_answer else ""
+            file_text = (
+                f" ({shorten_text(self.assigned_answer.file)})" if self.assigned_answer else ""
             )
             return (
-                f"this report is not about the log that you were given{assigned_answer}; make a "
+                f"this report is not about the log that you were given{file_text}. Make a "
                 "report of that log, with your --id"
             )
         if isinstance(self.form, str):
             return self.form
-        answer_key_form = self.answer.form
+        form_truth = self.answer.form
         return (
             "the answer key contains no answers to the form"
-            if answer_key_form is None
-            else form_points(self.form, answer_key_form)
+            if form_truth is None
+            else form_points(self.form, form_truth)
         )
 
     def names_mistake(self, *kinds: str) -> bool:
-        """Return True if the form names one of these kinds of mistakes."""
+        """Return True if the student's form names a mistake of one of these kinds."""
         form = self.form
-        return isinstance(form, Answers) and any(one.kind in kinds for one in form.mistakes)
+        return isinstance(form, Answers) and any(mistake.kind in kinds for mistake in form.mistakes)
 
     def has_finding(self, finding: str) -> bool:
         """Return True if the report contains a finding with this id."""
-        return any(one.id == finding for one in self.results.findings)
+        return any(recorded.id == finding for recorded in self.results.findings)
 
     def missing_reason(self, path: str) -> str:
-        """Format the reason for a missing value in brackets, if the results state it."""
+        """Return the reason for a missing value, in brackets; "" if the results state none."""
         steps = path.split(".")
-        for end in range(len(steps), 0, -1):
-            for _, reason in values_at(self.values, ".".join((*steps[:end], "reason"))):
-                return in_brackets(reason)
-        return NEEDS_BOTH_AXES if HORIZONTAL in path else ""
+        for count in range(len(steps), 0, -1):
+            for _, reason in values_at(self.values, ".".join((*steps[:count], "reason"))):
+                return format_reason(reason)
+        return BOTH_AXES_ADVICE if HORIZONTAL in path else ""
 
 
 def values_at(values: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
-    """Return paths and values that match a path; ``*`` is any key, quotes enclose dots.
+    """Return all paths that match a pattern, with their values.
+
+    In the pattern, ``*`` matches any key, and quotes enclose a key that contains dots.
 
     >>> values_at({"a.b.c.0": 1, "a.b.c.d.0": 2}, 'a."b.c".*')
     [('a.b.c.0', 1)]
@@ -197,37 +203,38 @@ def values_at(values: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
     return [(name, value) for name, value in values.items() if pattern.fullmatch(name)]
 
 
-def text_of(value: str) -> str:
-    """Format a text on one line, without control characters, at most MAX_QUOTE characters."""
-    return one_line(value, MAX_QUOTE)
+def shorten_text(value: str) -> str:
+    """Shorten a text to one line of MAX_QUOTE_LENGTH characters, without control characters."""
+    return one_line(value, MAX_QUOTE_LENGTH)
 
 
-def in_brackets(reason: str) -> str:
+def format_reason(reason: str) -> str:
     """Format a reason in brackets, with a leading blank; "" without a reason."""
-    text = text_of(reason).rstrip(".")
+    text = shorten_text(reason).rstrip(".")
     return f" ({text})" if text else ""
 
 
 # ------------------------------------------------------------------ the report
 
 
-NO_COMPARISON: Scored = (0.0, "Your report is not a compare report.")
+NO_COMPARISON: ShareAndReason = (0.0, "Your report is not a compare report.")
 
 
 class VerifiedItem(RubricItem, frozen=True, kw_only=True, tag="verified"):
-    """Check that the numbers agree with a new run of the analysis on the log."""
+    """Check that the numbers of the report agree with a new run of the analysis on its log."""
 
-    def score(self, evidence: Evidence) -> Scored:
+    def score(self, evidence: Evidence) -> ShareAndReason:
         """Return 1 for a verified report, else 0."""
         verdict = evidence.verdict
-        why = in_brackets("".join(verdict.reasons[:1]))
-        return float(verdict.status == "verified"), f"Verification: {verdict.status}{why}."
+        reason_text = format_reason("".join(verdict.reasons[:1]))
+        return float(verdict.status == "verified"), f"Verification: {verdict.status}{reason_text}."
 
 
 class NumberItem(RubricItem, frozen=True, kw_only=True, tag="number"):
-    """Check that a number is within bounds; of several numbers on ``path`` the worst counts.
+    """Check that a number is within bounds; if ``path`` matches several numbers, the worst counts.
 
-    Points decrease to zero at ``zero_at``; without ``zero_at`` there are none out of bounds.
+    Outside the bounds the points decrease linearly to zero at ``zero_at``; without ``zero_at`` they
+    are zero.
     """
 
     path: Text
@@ -242,11 +249,11 @@ class NumberItem(RubricItem, frozen=True, kw_only=True, tag="number"):
         bounded = math.isfinite(self.at_least) or math.isfinite(self.at_most)
         if not bounded or self.at_least > self.at_most or self._width() < 0.0:
             raise ValueError(
-                "give at_least, at_most or both (at_least <= at_most), and zero_at outside of them"
+                "give at_least, at_most or both (at_least <= at_most); zero_at must be outside"
             )
 
     def _width(self) -> float:
-        """Return the distance from a bound to ``zero_at``."""
+        """Return the distance from the nearer bound to ``zero_at``; negative if it is inside."""
         zero = self.zero_at
         return 0.0 if zero is None else max(self.at_least - zero, zero - self.at_most)
 
@@ -256,7 +263,7 @@ class NumberItem(RubricItem, frozen=True, kw_only=True, tag="number"):
             return 1.0
         return max(1.0 - excess / self._width(), 0.0) if self._width() > 0.0 else 0.0
 
-    def score(self, evidence: Evidence) -> Scored:
+    def score(self, evidence: Evidence) -> ShareAndReason:
         """Return 1 within the bounds, decreasing to 0 at ``zero_at``."""
         values = values_at(evidence.values, self.path)
         values_by_path = {name: float(value) for name, value in values if is_number(value)}
@@ -267,7 +274,7 @@ class NumberItem(RubricItem, frozen=True, kw_only=True, tag="number"):
                 f"Your report has no number for {label}{evidence.missing_reason(self.path)}.",
             )
         name, number = min(values_by_path.items(), key=lambda pair: self._share(pair[1]))
-        share, label = self._share(number), self.name or f"the number {text_of(name)}"
+        share, label = self._share(number), self.name or f"the number {shorten_text(name)}"
         bounds = (("at least", self.at_least), ("at most", self.at_most))
         limits = [f"{word} {bound:.4g}" for word, bound in bounds if math.isfinite(bound)]
         statement = f"{capitalise_first(label)} is {f'{number:.4g} {self.unit}'.strip()}"
@@ -276,19 +283,19 @@ class NumberItem(RubricItem, frozen=True, kw_only=True, tag="number"):
 
 
 class AnswersItem(RubricItem, frozen=True, kw_only=True, tag="answers"):
-    """Check the form about the flight against the answer key."""
+    """Compare the answer form of the student with the answer key."""
 
     needs_key: ClassVar[bool] = True
 
-    def score(self, evidence: Evidence) -> Scored:
+    def score(self, evidence: Evidence) -> ShareAndReason:
         """Return the share of the points of :mod:`px4fuse.grading.form_points`."""
         form_result = evidence.form_points
         if isinstance(form_result, str):
             return 0.0, f"{capitalise_first(form_result)}."
         points_by_part = [
-            f"{name} {points:.3g} of {form_result.of[name]:g}"
+            f"{name} {points:.3g} of {form_result.max_points_by_part[name]:g}"
             for name, points in form_result.points_by_part.items()
-            if form_result.of[name]
+            if form_result.max_points_by_part[name]
         ]
         return (
             form_result.share,
@@ -303,7 +310,7 @@ class TextItem(RubricItem, frozen=True, kw_only=True, tag="text"):
     needs_key: ClassVar[bool] = True
     by_hand: ClassVar[bool] = True
 
-    def score(self, evidence: Evidence) -> Scored:
+    def score(self, evidence: Evidence) -> ShareAndReason:
         """Return 0, until the instructor gives points."""
         if not evidence.results.student.notes.strip():
             return 0.0, "Your report has no text. Write a text and add it with --notes."
@@ -313,7 +320,7 @@ class TextItem(RubricItem, frozen=True, kw_only=True, tag="text"):
 # ------------------------------------------------------------------ the filter
 
 
-# findings on timestamps that no constant offset corrects
+# findings about timestamps whose time offset is not constant
 CHANGING_CLOCK_FINDINGS = ("source_time_offset_changes", "source_timestamps_are_arrival_times")
 Sigma = Literal["sigma_z_m", "sigma_a_m_s2"]
 # name in messages, unit and option of each noise
@@ -324,13 +331,13 @@ NOISE_SETTINGS: dict[Sigma, tuple[str, str, str]] = {
 
 
 class TuningItem(RubricItem, frozen=True, kw_only=True, tag="tuning"):
-    """Check that a noise fits its maximum-likelihood estimate; zero points from ``factor``."""
+    """Check that SIGMA_A or SIGMA_Z is within the 95 % interval of its estimate."""
 
     setting: Sigma
     factor: Factor = 2.0
 
-    def score(self, evidence: Evidence) -> Scored:
-        """Return 1 within the 95 % interval, decreasing to 0 at ``factor`` from its end."""
+    def score(self, evidence: Evidence) -> ShareAndReason:
+        """Return 1 within the 95 % interval, decreasing to 0 at ``factor`` times its end."""
         if evidence.comparison is None:
             return NO_COMPARISON
         return _score_tuning(evidence, evidence.comparison, self.setting, self.factor)
@@ -338,54 +345,59 @@ class TuningItem(RubricItem, frozen=True, kw_only=True, tag="tuning"):
 
 def _score_tuning(
     evidence: Evidence, comparison: ComparisonResults, name: Sigma, factor: float = 2.0
-) -> Scored:
+) -> ShareAndReason:
     label, unit, option = NOISE_SETTINGS[name]
     chosen_value: float = getattr(comparison.settings, name)
     tuned = comparison.tuning.get(HORIZONTAL)
     interval = getattr(tuned, f"{TUNED_FIELDS[name]}_interval", None)
     if interval is None or interval[1] is None:
-        why = evidence.missing_reason(f"tuning.{HORIZONTAL}")
-        return 0.0, f"Your report has no 95 % interval for {label}{why}."
+        reason_text = evidence.missing_reason(f"tuning.{HORIZONTAL}")
+        return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
     low, high = interval
     if name == "sigma_z_m" and evidence.has_finding("source_may_drift"):
-        # innovations do not show the error of a drifting source: values up to this error are right
-        high = max(high, _error_m(comparison))
-    factor_off = max(chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0)
-    side = "within" if factor_off == 1.0 else "above" if chosen_value > high else "below"
+        # innovations do not show the drift of a source, so a SIGMA_Z up to the known error is right
+        high = max(high, _largest_source_error_m(comparison))
+    deviation_factor = max(chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0)
+    position_text = (
+        "within" if deviation_factor == 1.0 else "above" if chosen_value > high else "below"
+    )
     statement = (
-        f"Your {label} {chosen_value:.3g} {unit} is {side} the 95 % interval of the "
+        f"Your {label} {chosen_value:.3g} {unit} is {position_text} the 95 % interval of the "
         f"maximum-likelihood estimate ({low:.3g} to {high:.3g} {unit})"
     )
-    if factor_off != 1.0:
+    if deviation_factor != 1.0:
         statement += (
-            f" by a factor of {format_factor(factor_off)}. Set {option} within this interval"
+            f" by a factor of {format_factor(deviation_factor)}. Set {option} within this interval"
         )
-    return falling_share(factor_off, factor), f"{statement}."
+    return share_for_deviation(deviation_factor, factor), f"{statement}."
 
 
-def _error_m(comparison: ComparisonResults) -> float:
-    """Return the largest known error (m) of the source, by ground truth or loop; else 0."""
+def _largest_source_error_m(comparison: ComparisonResults) -> float:
+    """Return the largest error (m) by ground truth or loop closure; 0 if both are missing."""
     truths = [axis.filters["kf"].truth for axis in comparison.axes.values()]
-    errors_m = [truth.position_rmse_m for truth in truths if isinstance(truth, AgainstTruth)]
+    errors_m = [truth.position_rmse_m for truth in truths if isinstance(truth, ErrorsAgainstTruth)]
     if isinstance(comparison.loop, LoopResult):
         errors_m.append(comparison.loop.closure_error_m or 0.0)
     return max(errors_m, default=0.0)
 
 
 class ConsistencyItem(RubricItem, frozen=True, kw_only=True, tag="consistent"):
-    """Check that KF is consistent, or that no setting makes it so; zero from ``factor`` in σ."""
+    """Check that KF is consistent, or that no other SIGMA_A and SIGMA_Z would make it consistent.
+
+    From a σ that is too small or too large by ``factor`` on, there are no points.
+    """
 
     factor: Factor = 2.0
 
-    def score(self, evidence: Evidence) -> Scored:
-        """Score the NIS verdict on north and east together."""
+    def score(self, evidence: Evidence) -> ShareAndReason:
+        """Score the verdict on the joint NIS of north and east."""
         comparison = evidence.comparison
         if comparison is None:
             return NO_COMPARISON
         nis_result = comparison.horizontal.get("kf")
         if not isinstance(nis_result, HorizontalNis):
-            why = evidence.missing_reason(f"{HORIZONTAL}.kf")
-            return 0.0, f"Your report has no verdict on KF{why}."
+            reason_text = evidence.missing_reason(f"{HORIZONTAL}.kf")
+            return 0.0, f"Your report has no verdict on KF{reason_text}."
         if nis_result.verdict == "consistent":
             return 1.0, "KF is consistent."
         side = "small" if nis_result.nis_mean > 1.0 else "large"
@@ -393,33 +405,34 @@ class ConsistencyItem(RubricItem, frozen=True, kw_only=True, tag="consistent"):
         statement = f"The reported σ of KF is {factor_text} times too {side}"
         if all(_score_tuning(evidence, comparison, name)[0] == 1.0 for name in NOISE_SETTINGS):
             return 1.0, (
-                f"{statement}, although both noises fit the data: no setting corrects the rest."
+                f"{statement}. SIGMA_A and SIGMA_Z are within their 95 % intervals, so other "
+                "settings do not make KF consistent."
             )
-        return falling_share(nis_result.sigma_error_factor, self.factor), (
-            f"{statement}. Compare your noises with the tuning page, and look for errors that the "
-            "noise model does not contain."
+        return share_for_deviation(nis_result.sigma_error_factor, self.factor), (
+            f"{statement}. Compare SIGMA_A and SIGMA_Z with the maximum-likelihood estimates, and "
+            "look for errors that are not white noise."
         )
 
 
 class ClockItem(RubricItem, frozen=True, kw_only=True, tag="clock"):
     """Check that the applied time offset agrees with the estimated one.
 
-    ``undeterminable``: share of the points if the flight does not determine the offset. For a
-    handed-out log, which the student did not choose, all points are given.
+    ``undeterminable``: share of the points if the flight does not determine the offset. An assigned
+    log gives all points in this case, because the student could not choose the flight.
     """
 
     margin_s: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.03
     undeterminable: Share = 0.5
 
-    def score(self, evidence: Evidence) -> Scored:
-        """Return 1 or 0; ``undeterminable`` if the offset cannot be estimated."""
+    def score(self, evidence: Evidence) -> ShareAndReason:
+        """Return 1 if the offsets agree, else 0; ``undeterminable`` without an estimate."""
         if evidence.comparison is None:
             return NO_COMPARISON
         clock = evidence.comparison.clock
         if not isinstance(clock, Clock) or not clock.is_determinable:
             share = self.undeterminable if isinstance(clock, Clock) else 0.0
-            why = in_brackets(clock.reason or "")
-            statement = f"The time offset cannot be estimated from your flight{why}."
+            reason_text = format_reason(clock.reason or "")
+            statement = f"The time offset cannot be estimated from your flight{reason_text}."
             return 1.0 if evidence.answer is not None else share, statement
         (low, high), applied = clock.interval_s, clock.applied_s
         statement = f"You applied a time offset of {applied:.3f} s"
@@ -427,9 +440,9 @@ class ClockItem(RubricItem, frozen=True, kw_only=True, tag="clock"):
             return 1.0, f"{statement}; the estimate is {low:.3f} to {high:.3f} s (95 %)."
         if any(map(evidence.has_finding, CHANGING_CLOCK_FINDINGS)):
             statement = "The time offset changes in your flight"
-            known = evidence.names_mistake("clock-jump", "clock-drift")
-            advice = ", as your form states" if known else "; state its time in your form"
-            return 1.0 if known else self.undeterminable, f"{statement}{advice}."
+            is_named = evidence.names_mistake("clock-jump", "clock-drift")
+            advice = ", as your form states" if is_named else ". State the time in your form"
+            return 1.0 if is_named else self.undeterminable, f"{statement}{advice}."
         return (
             0.0,
             f"{statement}, but the estimate is {low:.3f} to {high:.3f} s (95 %). "
@@ -440,67 +453,93 @@ class ClockItem(RubricItem, frozen=True, kw_only=True, tag="clock"):
 # ------------------------------------------------------------------ a loop
 
 
-# m; distance of landing and take-off up to which a loop is closed (accuracy of a measuring tape)
-CLOSED_M = 0.5
-# share of the last quarter for a corrected path without a reference (no ATE)
+# m; largest distance between landing and take-off of a closed loop (accuracy of a measuring tape)
+MAX_CLOSED_LOOP_M = 0.5
+# share of the quarter for a reduced ATE, if the path was corrected but has no reference for an ATE
 NO_REFERENCE_SHARE = 0.5
 
 
 class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
-    """Check a loop; a quarter each: error measured, closure accepted, path corrected, ATE reduced.
+    """Check a loop: closure error measured, closure accepted, path corrected, ATE reduced.
 
-    If the vehicle landed elsewhere (answer key), a path without an accepted closure has all points.
+    Each gives a quarter of the points. If the vehicle did not land at the take-off place (answer
+    key), a report without an accepted closure gets all points.
     """
 
-    def score(self, evidence: Evidence) -> Scored:
-        """Return the share of the four quarters, and a sentence with closure error and ATE."""
+    def score(self, evidence: Evidence) -> ShareAndReason:
+        """Return the share of the points, and sentences with closure error and ATE."""
         loop = evidence.results.loop
-        accepted = isinstance(loop, LoopResult) and any(one.accepted for one in loop.closures)
-        landed_m = evidence.answer.truth.get("closure_error_m") if evidence.answer else None
-        if landed_m is not None and landed_m > CLOSED_M and not accepted:
-            landed = format_length(landed_m)
-            return 1.0, f"Your vehicle landed {landed} from take-off: no correction is right."
+        is_accepted = isinstance(loop, LoopResult) and any(
+            closure.accepted for closure in loop.closures
+        )
+        landing_distance_m = (
+            evidence.answer.truth.get("closure_error_m") if evidence.answer else None
+        )
+        if (
+            landing_distance_m is not None
+            and landing_distance_m > MAX_CLOSED_LOOP_M
+            and not is_accepted
+        ):
+            distance_text = format_length(landing_distance_m)
+            return 1.0, (
+                f"Your vehicle landed {distance_text} from the take-off place, so it is right that "
+                "no loop closure was accepted."
+            )
         if not isinstance(loop, LoopResult) or loop.closure_error_m is None:
-            missing = loop.true_end if isinstance(loop, LoopResult) else loop
-            why = in_brackets(getattr(missing, "reason", ""))
-            return 0.0, f"Your report contains no loop closure error{why}."
+            unavailable = loop.true_end if isinstance(loop, LoopResult) else loop
+            reason_text = format_reason(getattr(unavailable, "reason", ""))
+            return 0.0, f"Your report contains no loop closure error{reason_text}."
         if loop.is_absolute_track:
-            return 0.0, "The track of your loop does not drift. Measure the loop on odometry."
-        error_text, path = format_length(loop.closure_error_m), format_length(loop.path_length_m)
-        statement = f"You measured a loop closure error of {error_text} after {path}"
-        if not accepted:
-            return 0.25, f"{statement}; no closure was accepted."
-        corrected, comment = _score_corrections(loop.corrections)
-        return (2.0 + corrected) / 4.0, f"{statement}; the closure was accepted{comment}"
+            return (
+                0.0,
+                "The track in your report does not drift. Use odometry, for example LOG:vio.",
+            )
+        error_text, path_text = (
+            format_length(loop.closure_error_m),
+            format_length(loop.path_length_m),
+        )
+        statement = f"You measured a loop closure error of {error_text} after {path_text}"
+        if not is_accepted:
+            return 0.25, f"{statement}. No closure was accepted."
+        quarter_count, comment = _score_corrections(loop.corrections)
+        return (2.0 + quarter_count) / 4.0, f"{statement}. The closure was accepted. {comment}"
 
 
-def _score_corrections(corrections: Mapping[CorrectionName, OrUnavailable[Correction]]) -> Scored:
-    """Return 1 for a corrected path, plus 1 for an ATE below the uncorrected one."""
+def _score_corrections(
+    corrections: Mapping[CorrectionName, OrUnavailable[Correction]],
+) -> ShareAndReason:
+    """Return 1 for a corrected path, plus 1 if the correction reduces the ATE."""
     ways: tuple[CorrectionName, ...] = ("by_distance_plain", "by_distance", "pose_graph_gated")
-    corrected_paths = [one for one in map(corrections.get, ways) if isinstance(one, Correction)]
+    corrected_paths = [
+        correction
+        for correction in map(corrections.get, ways)
+        if isinstance(correction, Correction)
+    ]
     if not corrected_paths:
-        return 0.0, ", but the path was not corrected."
-    before = _ate_by_reference(corrections.get("uncorrected"))
+        return 0.0, "The path was not corrected."
+    ate_before_m = _ate_by_reference(corrections.get("uncorrected"))
     pairs = [
-        (before[name], after_m)
-        for one in corrected_paths
-        for name, after_m in _ate_by_reference(one).items()
-        if before.get(name)
+        (ate_before_m[name], after_m)
+        for correction in corrected_paths
+        for name, after_m in _ate_by_reference(correction).items()
+        if ate_before_m.get(name)
     ]
     if not pairs:
         return 1.0 + NO_REFERENCE_SHARE, (
-            " and the path corrected. Without a reference its error is unknown; use --reference."
+            "The path was corrected. The report contains no ATE: add a trajectory with --reference."
         )
     before_m, after_m = min(pairs, key=lambda pair: pair[1] / pair[0])
-    changed = f" and the path corrected. Its ATE changed from {before_m:.3g} m to {after_m:.3g} m"
+    statement = f"The path was corrected: ATE {before_m:.3g} → {after_m:.3g} m"
     if after_m < before_m:
-        return 2.0, f"{changed}."
-    return 1.0, f"{changed}. Explain why the correction increases the error."
+        return 2.0, f"{statement}."
+    return 1.0, f"{statement}. Explain why the correction increases the error."
 
 
 def _ate_by_reference(correction: object) -> dict[str, float]:
-    """Return the ATE (m) of a correction, by reference."""
+    """Return the ATE (m) of a corrected path against each reference."""
     scores = correction.scores if isinstance(correction, Correction) else {}
     return {
-        name: one.ate.translation_m.rmse for name, one in scores.items() if isinstance(one, Score)
+        name: score.ate.translation_m.rmse
+        for name, score in scores.items()
+        if isinstance(score, Score)
     }

@@ -1,7 +1,7 @@
-"""Flags: sentences on suspicious reports for the instructor. They do not change points.
+"""Flags: sentences for the instructor about suspicious reports. They do not change points.
 
-A flag is not a proof. Two students may share a flight, and following the advice of px4fuse leads to
-the same settings.
+A flag does not prove a copy: two students may fly together, and students who follow the advice of
+px4fuse get the same settings.
 """
 
 from collections import defaultdict
@@ -15,51 +15,52 @@ from px4fuse.assignment.roster import normalise_text
 from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.grading.model import GradedReport
 from px4fuse.request import LoopRequest
-from px4fuse.results.contract import LoopResults, Reported
+from px4fuse.results.contract import LoopResults, ReportedResults
 from px4fuse.results.reading import one_line
 from px4fuse.simulation import flights
 from px4fuse.text import capitalise_first, join_first
 from px4fuse.verification.model import Verdict
 
-# number of equal values in two forms that is not a coincidence, and relative tolerance for copies
-# with small changes
-SAME_NUMBERS, MAX_NUMBER_DIFFERENCE = 3, 0.02
-# fraction of the log below which a segment chosen by hand is flagged
-MIN_CHOSEN_SHARE = 0.5
+# number of equal values from which two forms are flagged, and relative tolerance of an equal value,
+# so that small changes to a copy are detected
+MIN_SAME_NUMBERS, SAME_NUMBER_TOLERANCE = 3, 0.02
+# fraction of the log below which a segment from --start and --end is flagged
+MIN_SEGMENT_FRACTION = 0.5
 # factor between a setting and its maximum-likelihood estimate above which the setting is flagged
 MAX_SETTING_FACTOR = 30.0
-# factor between the stated drift and the default of px4fuse loop above which the drift is flagged
-FAR_OFF = 4.0
-MAX_SHOWN = 4
-# pairs of reports with equal contents
+# factor between --drift (or --heading-drift) and its default above which the option is flagged
+MAX_DRIFT_FACTOR = 4.0
+# reports that the sentence of a flag lists
+MAX_LISTED_REPORTS = 4
+# pairs of reports with the same contents
 Pairs = Iterator[tuple[GradedReport, GradedReport]]
 
 
-def page_flags(verdict: Verdict) -> Iterator[str]:
+def flag_pages(verdict: Verdict) -> Iterator[str]:
     """Flag a PDF that differs from the redrawn report, with the first difference."""
     if verdict.pages:
         first, *others = verdict.pages
-        more_text = f" Further differences: {len(others)}." if others else ""
+        more_text = f" The PDF has {len(others)} more differences." if others else ""
         yield (
             "The PDF differs from the report that px4fuse draws from the log. "
             f"{capitalise_first(first.sentence)}.{more_text} Read the redrawn report."
         )
 
 
-def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
+def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[str]:
     """Flag unusual settings of one report.
 
-    ``handed_out``: an answer key exists, so that simulated logs are expected.
+    ``has_key``: True if there is an answer key; a simulated log is then expected.
     """
     if isinstance(results, LoopResults):
-        yield from _drift_flags(results.request)
+        yield from _flag_drift(results.request)
         return
     settings, whole_s = results.settings, results.log.duration_s
-    share = (settings.end_s - settings.start_s) / whole_s if whole_s else 1.0
-    chosen = (results.request.start_s, results.request.end_s) != (None, None)
-    if chosen and share < MIN_CHOSEN_SHARE:
+    segment_fraction = (settings.end_s - settings.start_s) / whole_s if whole_s else 1.0
+    has_segment = (results.request.start_s, results.request.end_s) != (None, None)
+    if has_segment and segment_fraction < MIN_SEGMENT_FRACTION:
         yield (
-            f"The segment was chosen by hand and covers {share:.0%} of the log "
+            f"The student analysed only {segment_fraction:.0%} of the log "
             f"({settings.start_s:.1f} to {settings.end_s:.1f} s of {whole_s:.1f} s). Ask for the "
             "reason."
         )
@@ -76,138 +77,149 @@ def own_flags(results: Reported, handed_out: bool = False) -> Iterator[str]:
             f"{tracks_as_received[0]}, the positions as received by PX4."
         )
     for name, label in (("sigma_z_m", "SIGMA_Z"), ("sigma_a_m_s2", "SIGMA_A")):
-        chosen = getattr(settings, name)
-        tuned = (one for one in results.tuning.values() if isinstance(one, NoiseEstimate))
-        ml_values = [ml_value for one in tuned if (ml_value := getattr(one, name))]
-        if ml_values and not min(
+        value = getattr(settings, name)
+        tuned = (
+            estimate for estimate in results.tuning.values() if isinstance(estimate, NoiseEstimate)
+        )
+        ml_values = [ml_value for estimate in tuned if (ml_value := getattr(estimate, name))]
+        if ml_values and not min(ml_values) / MAX_SETTING_FACTOR < value < MAX_SETTING_FACTOR * max(
             ml_values
-        ) / MAX_SETTING_FACTOR < chosen < MAX_SETTING_FACTOR * max(ml_values):
+        ):
             yield (
-                f"{label} {chosen:g} is far from its maximum-likelihood estimate "
-                f"({ml_values[0]:.3g})."
+                f"{label} {value:g} differs by more than a factor of {MAX_SETTING_FACTOR:g} from "
+                f"its maximum-likelihood estimate ({ml_values[0]:.3g})."
             )
-    if results.log.hardware == flights.HARDWARE and not handed_out:
+    if results.log.hardware == flights.HARDWARE and not has_key:
         yield "The log is simulated (px4fuse simulate), not a real flight."
 
 
-def _drift_flags(request: LoopRequest) -> Iterator[str]:
-    """Flag a stated drift that differs from the default by more than the factor FAR_OFF.
+def _flag_drift(request: LoopRequest) -> Iterator[str]:
+    """Flag a stated drift that differs from the default by more than the factor MAX_DRIFT_FACTOR.
 
-    The stated drift decides whether a loop closure is accepted.
+    The chi-square test of a loop closure uses this drift.
     """
-    usual = LoopRequest(source="")
-    for option, unit, stated, default in (
-        ("--drift", "m", request.position_drift_m, usual.position_drift_m),
-        ("--heading-drift", "°", request.heading_drift_deg, usual.heading_drift_deg),
+    defaults = LoopRequest(source="")
+    for option, unit, drift, default in (
+        ("--drift", "m", request.position_drift_m, defaults.position_drift_m),
+        ("--heading-drift", "°", request.heading_drift_deg, defaults.heading_drift_deg),
     ):
-        if not default / FAR_OFF <= stated <= default * FAR_OFF:
+        if not default / MAX_DRIFT_FACTOR <= drift <= default * MAX_DRIFT_FACTOR:
             yield (
-                f"{option} is {stated:g} {unit} per 100 m (default {default:g} {unit}). It decides "
-                "whether the loop closure is accepted. Ask for the reason."
+                f"{option} is {drift:g} {unit} per 100 m (default {default:g} {unit}). The test of "
+                "the loop closure depends on this value. Ask for the reason."
             )
 
 
-def _form_numbers(one: GradedReport) -> dict[tuple[str, str], float]:
-    """Return sizes, values and quantities of a form, by their place."""
-    if one.form is None:
+def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
+    """Return the numbers of a form, by (mistake, "size" or "value") or ("", question)."""
+    if report.form is None:
         return {}
     values_by_place: dict[tuple[str, str], object] = {
-        (each.kind, name): getattr(each, name)
-        for each in one.form.mistakes
+        (mistake.kind, name): getattr(mistake, name)
+        for mistake in report.form.mistakes
         for name in ("size", "value")
     }
-    values_by_place |= {("", f"q{at}"): number for at, number in enumerate(one.form.quantities)}
+    values_by_place |= {
+        ("", f"q{index}"): number for index, number in enumerate(report.form.quantities)
+    }
     return {key: float(n) for key, n in values_by_place.items() if isinstance(n, float | int)}
 
 
-def _same_numbers(one: Mapping[Any, float], other: Mapping[Any, float]) -> int:
-    """Count nearly equal numbers with more than one digit; values of corrections must be equal."""
+def _count_same_numbers(numbers: Mapping[Any, float], other_numbers: Mapping[Any, float]) -> int:
+    """Count the equal numbers of two forms that have more than one digit.
+
+    Sizes and answers are equal within SAME_NUMBER_TOLERANCE, values of corrections exactly.
+    """
     return sum(
-        _digits(number) > 1
-        and abs(number - other[key]) <= (key[1] != "value") * MAX_NUMBER_DIFFERENCE * abs(number)
-        for key, number in one.items()
-        if key in other
+        _count_digits(number) > 1
+        and abs(number - other_numbers[key])
+        <= (key[1] != "value") * SAME_NUMBER_TOLERANCE * abs(number)
+        for key, number in numbers.items()
+        if key in other_numbers
     )
 
 
-def _student_key(one: GradedReport) -> str:
-    return normalise_text(one.student_id) or normalise_text(one.student) or one.submission
+def _student_key(report: GradedReport) -> str:
+    return normalise_text(report.student_id) or normalise_text(report.student) or report.submission
 
 
-# contents that two reports must not share: sentence, content (empty: not compared), and owner;
-# pairs with the same owner are not flagged, such as two reports of a student on one log
+# contents that the reports of two owners must not share: sentence, content (an empty content is not
+# compared), and owner. Example: two reports of one student may be about the same log
 COMMON_CHECKS: tuple[
     tuple[str, Callable[[GradedReport], object], Callable[[GradedReport], str]], ...
 ] = (
-    ("The same file as {}.", attrgetter("sha256"), attrgetter("submission")),
+    ("This PDF is identical to that of {}.", attrgetter("sha256"), attrgetter("submission")),
     (
-        "The same student id as in {}.",
-        lambda one: normalise_text(one.student_id),
+        "The id in this report is also in that of {}.",
+        lambda report: normalise_text(report.student_id),
         attrgetter("submission"),
     ),
-    ("The same log as {}.", attrgetter("log_sha256"), _student_key),
+    ("This report is about the same log as that of {}.", attrgetter("log_sha256"), _student_key),
     (
-        "The same numbers as {}, from a log with another SHA-256: a copy of the log.",
-        lambda one: (
-            one.verdict.status == "verified"
-            and len(one.numbers) >= SAME_NUMBERS
-            and tuple(one.numbers.values())
+        "The numbers are those of {}, but the SHA-256 of the log differs: a changed copy of the "
+        "log.",
+        lambda report: (
+            report.verdict.status == "verified"
+            and len(report.numbers) >= MIN_SAME_NUMBERS
+            and tuple(report.numbers.values())
         ),
         attrgetter("log_sha256"),
     ),
 )
 
 
-def class_flags(graded: Sequence[GradedReport]) -> Mapping[str, Sequence[str]]:
-    """Return flags on equal contents of several reports, by submission name."""
+def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequence[str]]:
+    """Return flags for reports with the same contents, by name of the submission."""
     flags_by_submission: dict[str, list[str]] = defaultdict(list)
     for sentence, pairs in (
         *(
-            (sentence, _same_pairs(graded, key_of, owner_of))
+            (sentence, _same_pairs(reports, key_of, owner_of))
             for sentence, key_of, owner_of in COMMON_CHECKS
         ),
-        ("The answer form has the same numbers as {}.", _copied_forms(graded)),
+        ("The answer form has the same numbers as that of {}.", _copied_forms(reports)),
     ):
-        others: dict[str, list[str]] = defaultdict(list)
+        texts_by_submission: dict[str, list[str]] = defaultdict(list)
         for first, second in pairs:
-            for one, other in ((first, second), (second, first)):
+            for report, other in ((first, second), (second, first)):
                 file = one_line(other.submission, 80)
-                others[one.submission].append(f"{_name(other)} ({file})")
-        for name, names in others.items():
-            flags_by_submission[name].append(sentence.format(join_first(names, MAX_SHOWN, "; ")))
+                texts_by_submission[report.submission].append(f"{_student_text(other)} ({file})")
+        for name, texts in texts_by_submission.items():
+            flags_by_submission[name].append(
+                sentence.format(join_first(texts, MAX_LISTED_REPORTS, "; "))
+            )
     return flags_by_submission
 
 
 def _same_pairs(
-    graded: Sequence[GradedReport],
+    reports: Sequence[GradedReport],
     key_of: Callable[[GradedReport], object],
     owner_of: Callable[[GradedReport], str],
 ) -> Pairs:
     groups: dict[object, list[GradedReport]] = defaultdict(list)
-    for one in graded:
-        groups[key_of(one)].append(one)
+    for report in reports:
+        groups[key_of(report)].append(report)
     for key, group in groups.items():
-        for one, other in combinations(group if key else (), 2):
-            if owner_of(one) != owner_of(other):
-                yield one, other
+        for report, other in combinations(group if key else (), 2):
+            if owner_of(report) != owner_of(other):
+                yield report, other
 
 
-def _copied_forms(graded: Sequence[GradedReport]) -> Pairs:
-    """Yield pairs of reports of different students with the same numbers in the form."""
-    numbers = [(one, _form_numbers(one)) for one in graded]
-    for (one, form_numbers), (other, other_numbers) in combinations(numbers, 2):
-        if _same_numbers(form_numbers, other_numbers) >= SAME_NUMBERS and _student_key(
-            one
+def _copied_forms(reports: Sequence[GradedReport]) -> Pairs:
+    """Yield pairs of reports of different students whose forms have the same numbers."""
+    numbers_by_report = [(report, _form_numbers(report)) for report in reports]
+    for (report, numbers), (other, other_numbers) in combinations(numbers_by_report, 2):
+        if _count_same_numbers(numbers, other_numbers) >= MIN_SAME_NUMBERS and _student_key(
+            report
         ) != _student_key(other):
-            yield one, other
+            yield report, other
 
 
-def _name(one: GradedReport) -> str:
-    """Format the student of a report for a sentence."""
-    names = filter(None, (one.student.strip(), one.student_id.strip()))
-    return one_line(", ".join(names) or one.submission, 80)
+def _student_text(report: GradedReport) -> str:
+    """Format name and id of the student; without both, the name of the submission."""
+    names = filter(None, (report.student.strip(), report.student_id.strip()))
+    return one_line(", ".join(names) or report.submission, 80)
 
 
-def _digits(number: float) -> int:
+def _count_digits(number: float) -> int:
     """Count the significant digits of a number."""
     return len(Decimal(repr(abs(number))).normalize().as_tuple().digits) if number else 0

@@ -1,8 +1,8 @@
 """Points of an answer form (of 100), by comparison with the answer key.
 
-The weights and shares reproduce grading by hand. Guessing does not pay: each mistake that the
-flight does not have costs points, and what can be guessed without measurement counts only with the
-right size. ``form_points.toml`` contains the tables.
+The weights and shares reproduce grading by hand. A student who guesses loses points: each false
+claim (named mistake that the flight does not have) costs points, and a mistake that can be guessed
+without a measurement counts only with the right size. ``form_points.toml`` contains the tables.
 """
 
 import math
@@ -15,29 +15,45 @@ from px4fuse.answer_form import MISTAKES, Answers, QuantityAnswer, StudentMistak
 from px4fuse.assignment.truth import FormTruth, TrueMistake
 from px4fuse.record import table
 
+# points that each false claim costs, and number of false claims from which no mistake has points
 FALSE_CLAIM_POINTS, MAX_FALSE_CLAIMS = 10.0, 3
+# shares of the points for naming another mistake: a related one, one with the same effect on
+# EKF2's noise, and a consequence
 NEIGHBOUR_SHARE, SAME_NUMBER_SHARE, EFFECT_SHARE = 0.4, 2.0 / 3.0, 0.15
-# mistakes that can be guessed without measurement count only with the right size; a close size is
-# not enough, because the drawn sizes are close to each other
+# mistakes that can be guessed without a measurement: only the right size has points. A close size
+# has none, because the assigned sizes are close to each other
 GUESSABLE_KINDS = frozenset(("open-end",))
-ANY_VALUE = (-math.inf, math.inf)
+ANY_BOUNDS = (-math.inf, math.inf)
+# a time is right within the larger of these tolerances: seconds, and fraction of the time
 TIME_TOLERANCE_S, TIME_TOLERANCE_SHARE = 2.0, 0.05
+# relative tolerances of a computed number, for all of its points and for half of them
 FULL_TOLERANCE, HALF_TOLERANCE = 0.02, 0.10
+# relative tolerance of the size of a mistake, for half of its points
 HALF_SIZE_TOLERANCE = 0.4
 
 
 @dataclass(frozen=True)
 class _Cure:
-    """Correction of mistakes; ``to``: bounds of right values, or a rule of :func:`cures`."""
+    """Correction of mistakes: a parameter with its right values, as in ``form_points.toml``.
+
+    Attributes
+    ----------
+    of : mapping
+        Share of the points, by mistake.
+    to : (float, float) or str
+        Bounds of the right values, or the name of a rule in :func:`cures`.
+    late : bool
+        True if the correction is right for late timestamps only.
+    """
 
     parameter: str
     of: Mapping[str, float]
-    to: tuple[float, float] | str = ANY_VALUE
+    to: tuple[float, float] | str = ANY_BOUNDS
     late: bool = False
 
 
 TABLE = table(__file__, "form_points.toml", dict)
-CURES = msgspec.convert(TABLE["cures"], tuple[_Cure, ...])
+CORRECTIONS = msgspec.convert(TABLE["cures"], tuple[_Cure, ...])
 NEIGHBOURS = msgspec.convert([*TABLE["neighbours"].values()], tuple[frozenset[str], ...])
 PART_NAMES = tuple(TABLE["weights"])
 
@@ -50,79 +66,84 @@ class FormPoints:
     ----------
     points_by_part : mapping
         Points of each part.
-    of : mapping
+    max_points_by_part : mapping
         Maximum points of each part.
     feedback : tuple of str
-        Right and wrong mistakes, for the student.
-    named : mapping
-        Mistakes of the flight; True if the form names them.
+        Phrases about right, missed and false mistakes, for the student.
+    is_named_by_mistake : mapping
+        True for each mistake of the flight that the form names.
     """
 
     points_by_part: Mapping[str, float]
-    of: Mapping[str, float]
+    max_points_by_part: Mapping[str, float]
     feedback: tuple[str, ...] = ()
-    named: Mapping[str, bool] = field(default_factory=dict)
+    is_named_by_mistake: Mapping[str, bool] = field(default_factory=dict)
 
     @property
     def share(self) -> float:
         """Fraction of all points."""
-        return sum(self.points_by_part.values()) / sum(self.of.values())
+        return sum(self.points_by_part.values()) / sum(self.max_points_by_part.values())
 
 
 def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
-    """Compute the points of a form for a flight with known answers."""
-    is_claimed_clean = not truth.mistakes and answers.claims_no_mistake
-    weights = TABLE["weights_clean" if is_claimed_clean else "weights"]
+    """Compute the points of a form by comparison with the right answers."""
+    is_clean_named = not truth.mistakes and answers.names_no_mistake
+    weights = TABLE["weights_clean" if is_clean_named else "weights"]
     shares = dict.fromkeys(PART_NAMES, 0.0)
     matches, false_claims = _match_claims(answers, truth)
     if truth.mistakes and len(false_claims) < MAX_FALSE_CLAIMS:
         shares |= _mistake_shares(matches, truth)
-    shares["quantities"] = computed = _quantities_share(answers, truth)
-    # half if no number was computed: many flights have the same verdicts, which can be guessed
-    shares["verdicts"] = _verdicts_share(answers, truth) * (1.0 if computed else 0.5)
+    shares["numbers"] = quantities_share = _quantities_share(answers, truth)
+    # half of the points if no number is right: the verdicts of most flights can be guessed
+    shares["verdicts"] = _verdicts_share(answers, truth) * (1.0 if quantities_share else 0.5)
     points_by_part = {name: weights[name] * share for name, share in shares.items()}
-    if is_claimed_clean:
-        points_by_part["kinds"] = weights["kinds"]
+    if is_clean_named:
+        points_by_part["mistakes"] = weights["mistakes"]
     elif truth.mistakes and all(mistake.size is None for mistake in truth.mistakes):
-        points_by_part["kinds"] += weights["sizes"] * shares["kinds"]  # no mistake has a size
-    points_by_part["kinds"] = max(
-        points_by_part["kinds"] - FALSE_CLAIM_POINTS * len(false_claims), 0.0
+        # no mistake of this flight has a size, so the points for sizes are given for the mistakes
+        points_by_part["mistakes"] += weights["sizes"] * shares["mistakes"]
+    points_by_part["mistakes"] = max(
+        points_by_part["mistakes"] - FALSE_CLAIM_POINTS * len(false_claims), 0.0
     )
-    claimed = [claim.kind for claim in answers.mistakes]
-    named = {mistake.kind: mistake.kind in claimed for mistake in truth.mistakes}
+    claimed_kinds = [claim.kind for claim in answers.mistakes]
+    is_named_by_mistake = {
+        mistake.kind: mistake.kind in claimed_kinds for mistake in truth.mistakes
+    }
     return FormPoints(
         points_by_part,
         weights,
-        tuple(_mistake_feedback(matches, false_claims, is_claimed_clean)),
-        named,
+        tuple(_mistake_feedback(matches, false_claims, is_clean_named)),
+        is_named_by_mistake,
     )
 
 
+# mistake of the flight, mistake of the form that matches it best, and share of the points
 Match = tuple[TrueMistake, StudentMistake | None, float]
 
 
 def _mistake_feedback(
-    matches: list[Match], false_claims: list[StudentMistake], is_claimed_clean: bool
+    matches: list[Match], false_claims: list[StudentMistake], is_clean_named: bool
 ) -> Iterator[str]:
-    """Yield a phrase for each right, missed or wrong mistake."""
+    """Yield a phrase for each right or missed mistake, and one for all false claims."""
     if not matches:
-        yield f"your flight has no mistake{', as your form states' * is_claimed_clean}"
+        yield f"your flight has no mistake{', as your form states' * is_clean_named}"
     for mistake, claim, _ in matches:
         mistake_text = f"{mistake.kind} ({MISTAKES[mistake.kind].description})"
         if claim is None:
-            yield f"you missed {mistake_text}"
+            yield f"you did not name {mistake_text}"
         elif claim.kind != mistake.kind:
             yield f"you named {claim.kind} instead of {mistake_text}"
         else:
-            yield f"you found {mistake.kind}"
+            yield f"you named {mistake.kind}, which is right"
     if false_claims:
-        yield f"not in your flight: {', '.join(claim.kind for claim in false_claims)}"
+        yield f"your flight does not have {', '.join(claim.kind for claim in false_claims)}"
 
 
 def _match_claims(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[StudentMistake]]:
-    """Match each mistake with a claim and its share; also return the unmatched (false) claims.
+    """Match each mistake of the flight with one of the form; also return the false claims.
 
-    The best matches are taken first: the same kind, then related mistakes, then consequences.
+    Pairs with the largest share are matched first: equal mistakes, then related mistakes, then
+    consequences.
     """
     unmatched = [claim for claim in answers.mistakes if claim.kind != "none"]
     claim_by_kind: dict[str, tuple[StudentMistake, float]] = {}
@@ -140,51 +161,54 @@ def _match_claims(answers: Answers, truth: FormTruth) -> tuple[list[Match], list
     ], unmatched
 
 
-def kind_share(kind: str, claimed: str) -> float:
-    """Return the share of the points for naming ``claimed`` instead of ``kind``."""
-    if kind == claimed:
+def kind_share(kind: str, claimed_kind: str) -> float:
+    """Return the share of the points for naming ``claimed_kind`` instead of ``kind``."""
+    if kind == claimed_kind:
         return 1.0
-    if (kind, claimed) == ("r-scale", "ekf2-noise"):
+    if (kind, claimed_kind) == ("r-scale", "ekf2-noise"):
         return SAME_NUMBER_SHARE
-    if any({kind, claimed} <= group for group in NEIGHBOURS):
+    if any({kind, claimed_kind} <= group for group in NEIGHBOURS):
         return NEIGHBOUR_SHARE
-    return EFFECT_SHARE if claimed in TABLE["effects"].get(kind, ()) else 0.0
+    return EFFECT_SHARE if claimed_kind in TABLE["effects"].get(kind, ()) else 0.0
 
 
 def _mistake_shares(matches: list[Match], truth: FormTruth) -> dict[str, float]:
-    """Return the shares of kinds, sizes, when and cure: means over the mistakes."""
-    sized = sum(mistake.size is not None for mistake, _, _ in matches)
-    shares = dict.fromkeys(("kinds", "sizes", "when", "cure"), 0.0)
+    """Return the shares of the four parts about mistakes: means over the mistakes."""
+    sized_count = sum(mistake.size is not None for mistake, _, _ in matches)
+    shares = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
     for mistake, claim, share in matches:
         if claim is None:
             continue
-        size = size_share(mistake, claim)
+        size_points = size_share(mistake, claim)
         when_points = when_share(mistake, claim) * (1.0 if claim.kind == mistake.kind else 0.5)
         cure_points = cure_share(mistake, claim, truth)
-        weight = size if mistake.kind in GUESSABLE_KINDS else 1.0
-        shares["kinds"] += share / len(matches)
-        shares["when"] += when_points * weight / len(matches)
-        shares["cure"] += cure_points * weight / len(matches)
-        shares["sizes"] += size / max(sized, 1)
+        weight = size_points if mistake.kind in GUESSABLE_KINDS else 1.0
+        shares["mistakes"] += share / len(matches)
+        shares["time and panel"] += when_points * weight / len(matches)
+        shares["correction"] += cure_points * weight / len(matches)
+        shares["sizes"] += size_points / max(sized_count, 1)
     return shares
 
 
 def size_share(mistake: TrueMistake, claim: StudentMistake) -> float:
-    """Return the share for a size: 1, 1/2 (close), or 1/3 (wrong sign, or related mistake)."""
+    """Return the share for a size: 1 (right), 1/2 (close), or 1/3.
+
+    1/3 is for a size with the wrong sign, and for the right size of a related mistake.
+    """
     size = claim.size_in_first_unit()
     if mistake.size is None or mistake.low is None or mistake.high is None or size is None:
         return 0.0
     if claim.kind != mistake.kind:
-        same_unit = [*MISTAKES[claim.kind].units][:1] == [*MISTAKES[mistake.kind].units][:1]
-        return 1.0 / 3.0 if mistake.low <= size <= mistake.high and same_unit else 0.0
-    close = mistake.kind not in GUESSABLE_KINDS and abs(
+        has_same_unit = [*MISTAKES[claim.kind].units][:1] == [*MISTAKES[mistake.kind].units][:1]
+        return 1.0 / 3.0 if mistake.low <= size <= mistake.high and has_same_unit else 0.0
+    is_close = mistake.kind not in GUESSABLE_KINDS and abs(
         size - mistake.size
     ) <= HALF_SIZE_TOLERANCE * abs(mistake.size)
-    return _value_share(size, mistake.low, mistake.high, 0.5 if close else 0.0)
+    return _value_share(size, mistake.low, mistake.high, 0.5 if is_close else 0.0)
 
 
 def when_share(mistake: TrueMistake, claim: StudentMistake) -> float:
-    """Return the share for time and panel: one half each."""
+    """Return the share for time and panel: one half for each."""
     if mistake.from_s is None and mistake.until_s is None:
         is_time_right = claim.when == "whole flight"
     else:
@@ -208,28 +232,29 @@ def panels(kind: str) -> list[str]:
 def cure_share(mistake: TrueMistake, claim: StudentMistake, truth: FormTruth) -> float:
     """Return the share for a correction and its value."""
     value = claim.value_in_first_unit()
-    worth = [
+    shares = [
         share
-        if (low, high) == ANY_VALUE
+        if (low, high) == ANY_BOUNDS
         else share * (0.5 if value is None else _value_share(value, low, high, 0.5))
         for parameter, (low, high), share in cures(mistake, truth)
         if parameter == claim.parameter
     ]
-    return max(worth, default=0.0)
+    return max(shares, default=0.0)
 
 
 def _value_share(value: float, low: float, high: float, fallback: float) -> float:
-    """Return 1 for a value within bounds, 1/3 with the wrong sign, else ``fallback``."""
+    """Return 1 for a value within bounds, 1/3 for its negative within bounds, else ``fallback``."""
     if low <= value <= high:
         return 1.0
     return 1.0 / 3.0 if low <= -value <= high else fallback
 
 
+# parameter, bounds of the right values, and share of the points
 Cure = tuple[str, tuple[float, float], float]
 
 
 def cures(mistake: TrueMistake, truth: FormTruth) -> tuple[Cure, ...]:
-    """Return the corrections of a mistake: parameter, bounds of right values, share of points."""
+    """Return the corrections of a mistake, with bounds in the unit of the parameter."""
     size, low, high = (
         0.0 if value is None else value for value in (mistake.size, mistake.low, mistake.high)
     )
@@ -251,13 +276,13 @@ def cures(mistake: TrueMistake, truth: FormTruth) -> tuple[Cure, ...]:
             bounds[row.to] if isinstance(row.to, str) else row.to,
             0.0 if row.late and size <= 0.0 else row.of[mistake.kind],
         )
-        for row in CURES
+        for row in CORRECTIONS
         if mistake.kind in row.of
     )
 
 
 def _verdicts_share(answers: Answers, truth: FormTruth) -> float:
-    """Return the mean share for both verdicts and the behaviour of EKF2."""
+    """Return the mean share for the verdicts on KF and EKF2, and for the behaviour of EKF2."""
     shares = [_ekf2_behaviour_share(answers, truth)]
     for answer, known in ((answers.verdict_kf, truth.kf), (answers.verdict_ekf2, truth.ekf2)):
         shares.append(1.0 if answer and answer == known.verdict else 0.0)
@@ -265,36 +290,39 @@ def _verdicts_share(answers: Answers, truth: FormTruth) -> float:
 
 
 def _ekf2_behaviour_share(answers: Answers, truth: FormTruth) -> float:
-    """Return 1 for the complete behaviour of EKF2 without a false one; 1/2 for a part."""
-    claimed, required = set(answers.ekf2_did), set(truth.ekf2_did)
+    """Return the share for the behaviour of EKF2: 1 if complete, 1/2 with one error.
+
+    An error is a missing or a false statement.
+    """
+    named, required = set(answers.ekf2_did), set(truth.ekf2_did)
     allowed = required | set(truth.ekf2_did_also)
-    false_count, right_count = len(claimed - allowed), len(claimed & allowed)
+    false_count, right_count = len(named - allowed), len(named & allowed)
     if not right_count or false_count > 1:
         return 0.0
-    is_complete = required <= claimed or (
-        len(required) == 1 and bool(claimed & set(truth.ekf2_did_also))
+    is_complete = required <= named or (
+        len(required) == 1 and bool(named & set(truth.ekf2_did_also))
     )
     return 1.0 if is_complete and not false_count else 0.5
 
 
 def _quantities_share(answers: Answers, truth: FormTruth) -> float:
-    """Return the mean share for the numbers that the flight determines."""
-    # an empty list is not counted: it is right on most flights
-    known = sum(value not in (None, ()) for value in truth.quantities)
+    """Return the mean share for the numbers that can be computed from the flight."""
+    # an empty list has no points, because it is the right answer on most flights
+    known_count = sum(value not in (None, ()) for value in truth.quantities)
     pairs = zip(answers.quantities, truth.quantities, strict=False)
-    return sum(_quantity_share(*pair) for pair in pairs) / max(known, 1)
+    return sum(_quantity_share(*pair) for pair in pairs) / max(known_count, 1)
 
 
-def _quantity_share(answer: QuantityAnswer, known: QuantityAnswer) -> float:
-    if isinstance(answer, tuple) and isinstance(known, tuple):
-        difference_count = len(set(answer) ^ set(known))
+def _quantity_share(answer: QuantityAnswer, true_value: QuantityAnswer) -> float:
+    if isinstance(answer, tuple) and isinstance(true_value, tuple):
+        difference_count = len(set(answer) ^ set(true_value))
         return (
             (1.0, 0.5)[difference_count]
-            if difference_count < 2 and set(answer) & set(known)
+            if difference_count < 2 and set(answer) & set(true_value)
             else 0.0
         )
-    if isinstance(answer, float | int) and isinstance(known, float | int):
-        for within, share in ((FULL_TOLERANCE, 1.0), (HALF_TOLERANCE, 0.5)):
-            if abs(answer - known) <= within * abs(known):
+    if isinstance(answer, float | int) and isinstance(true_value, float | int):
+        for tolerance, share in ((FULL_TOLERANCE, 1.0), (HALF_TOLERANCE, 0.5)):
+            if abs(answer - true_value) <= tolerance * abs(true_value):
                 return share
     return 0.0

@@ -10,16 +10,16 @@ from pathlib import Path
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.errors import ResultsError
 from px4fuse.grading import submissions
-from px4fuse.grading.entries import OVERRIDES_NAME, Course, class_entries, read_overrides
+from px4fuse.grading.entries import OVERRIDES_NAME, Course, build_entries, read_overrides
 from px4fuse.grading.model import Entry, GradedReport, Submission
-from px4fuse.grading.outputs import grade_column, write_class
-from px4fuse.grading.records import RECORDS, load_or_verify
-from px4fuse.grading.rubric import Rubric, assess, refused_report
+from px4fuse.grading.outputs import find_grade_column, write_class
+from px4fuse.grading.records import RECORDS_FOLDER, load_or_verify
+from px4fuse.grading.rubric import Rubric, grade_unreadable, score_report
 from px4fuse.reading import files_by_sha256, max_log_bytes
 from px4fuse.results.reading import one_line
 from px4fuse.workers import JobFailure, run_bounded
 
-FAILED = "Do not open the file. Ask for the PDF that px4fuse wrote."
+FAILED_REMEDY = "Do not open the file. Ask for the PDF that px4fuse wrote."
 
 
 @dataclass(frozen=True)
@@ -29,24 +29,24 @@ class GradeOutcome:
     Attributes
     ----------
     entries : tuple of Entry
-        Students of the class list, then others; without redrawn reports.
+        Rows of the class list, then rows of unknown students; without the redrawn PDFs.
     notes : tuple of str
-        Ignored files and other remarks.
-    reused : int
-        Number of reports whose stored verification was used, because nothing changed.
-    written : tuple of Path
+        Sentences about ignored files, overrides and grades.
+    reused_count : int
+        Number of reports whose stored verification was loaded.
+    written_paths : tuple of Path
         Files and folders that were written.
     """
 
     entries: tuple[Entry, ...]
     notes: tuple[str, ...]
-    reused: int
-    written: tuple[Path, ...]
+    reused_count: int
+    written_paths: tuple[Path, ...]
 
     @property
-    def graded(self) -> tuple[GradedReport, ...]:
-        """All files, those that count first, in the order of the entries."""
-        return tuple(one for entry in self.entries for one in entry.files)
+    def reports(self) -> tuple[GradedReport, ...]:
+        """All reports, by entry; the first report of an entry counts."""
+        return tuple(report for entry in self.entries for report in entry.reports)
 
 
 def grade(
@@ -64,82 +64,95 @@ def grade(
     paths : sequence of Path
         PDFs, folders and zip files.
     output : Path
-        Folder for the class table (``class.csv``, ``class.html``), the redrawn ``reports/``,
-        ``feedback/``, ``grades/`` for learning platforms, and stored verifications, which make a
-        second run fast. Its ``overrides.csv`` is read.
+        Folder for the class table (``class.csv``, ``class.html``), ``reports/`` drawn again,
+        ``feedback/``, ``grades/`` for learning platforms, and ``records/``: stored verifications,
+        which make a second run fast. ``overrides.csv`` in this folder is read.
     processes : int, optional
-        Number of processes; by default that of the cores.
+        Number of processes; by default one per core.
     progress : callable
-        Called with the number of finished submissions and of all.
+        Called with the number of finished submissions, and the number of all.
 
     Raises
     ------
     SettingsError
-        No submission was found, or a table is not valid.
+        No submission was found, or ``overrides.csv`` or a worksheet is not valid.
     OutputError
         The folder cannot be written.
     """
     overrides = read_overrides(output / OVERRIDES_NAME)
-    for sheet in course.worksheets:
-        grade_column(sheet, course.column)
+    for worksheet in course.worksheets:
+        find_grade_column(worksheet, course.column)
     unread_names = sorted(
-        one.name for one in output.glob("overrides*") if one.name != OVERRIDES_NAME
+        file.name for file in output.glob("overrides*") if file.name != OVERRIDES_NAME
     )
     unread_notes = [
         f"{one_line(name, 80)} was not read; only {OVERRIDES_NAME} is read."
         for name in unread_names
     ]
-    found_files, notes = submissions.find_submissions(paths)
+    found_submissions, notes = submissions.find_submissions(paths)
     jobs = []
-    for submission in found_files:
+    for submission in found_submissions:
         student_index = course.register.student_index(submission.origin.person)
-        owner = "" if student_index is None else course.register.people[student_index].student_id
-        jobs.append((submission, owner))
+        owner_id = "" if student_index is None else course.register.people[student_index].student_id
+        jobs.append((submission, owner_id))
     rules, logs = (course.rubric, course.key), files_by_sha256(course.logs)
-    scored = partial(grade_one, *rules, logs, output / RECORDS, max_log_bytes.get())
+    grade_job = partial(
+        grade_submission, *rules, logs, output / RECORDS_FOLDER, max_log_bytes.get()
+    )
     graded_by_index: dict[int, GradedReport] = {}
-    reused = 0
-    progress(0, len(found_files))
-    with closing(run_bounded(scored, jobs, processes=processes)) as work:
-        for index, result in work:
+    reused_count = 0
+    progress(0, len(found_submissions))
+    with closing(run_bounded(grade_job, jobs, processes=processes)) as results:
+        for index, result in results:
             if isinstance(result, JobFailure):
-                one = refused_report(*rules, f"grading failed: {result.reason}", FAILED)
-                recalled = False
+                graded_report = grade_unreadable(
+                    *rules, f"grading failed: {result.reason}", FAILED_REMEDY
+                )
+                is_loaded = False
             else:
-                one, recalled = result
-            submission = found_files[index]
-            known = one.student or one.student_id
-            student = one.student if known else submission.origin.person.name
-            graded_by_index[index] = replace(one, submission=submission.name, student=student)
-            reused += recalled
-            progress(len(graded_by_index), len(found_files))
-    graded = [graded_by_index[index] for index in range(len(found_files))]
-    entries, override_notes = class_entries(graded, found_files, course, overrides)
-    written, class_notes = write_class(entries, course, output)
+                graded_report, is_loaded = result
+            submission = found_submissions[index]
+            has_identity = graded_report.student or graded_report.student_id
+            student = graded_report.student if has_identity else submission.origin.person.name
+            graded_by_index[index] = replace(
+                graded_report, submission=submission.name, student=student
+            )
+            reused_count += is_loaded
+            progress(len(graded_by_index), len(found_submissions))
+    graded = [graded_by_index[index] for index in range(len(found_submissions))]
+    entries, override_notes = build_entries(graded, found_submissions, course, overrides)
+    written_paths, class_notes = write_class(entries, course, output)
     return GradeOutcome(
-        entries, (*notes, *unread_notes, *override_notes, *class_notes), reused, written
+        entries, (*notes, *unread_notes, *override_notes, *class_notes), reused_count, written_paths
     )
 
 
-def grade_one(
+def grade_submission(
     rubric: Rubric,
     key: AnswerKey | None,
     logs: Mapping[str, Path],
     records: Path,
-    largest_log_bytes: int,
+    max_bytes: int,
     job: tuple[Submission, str],
 ) -> tuple[GradedReport, bool]:
-    """Read, verify (or load the stored verification) and score one file, in a separate process."""
-    max_log_bytes.set(largest_log_bytes)
+    """Read, verify and score one file, in a separate process.
+
+    Returns
+    -------
+    GradedReport
+    bool
+        True if a stored verification was loaded.
+    """
+    max_log_bytes.set(max_bytes)
     submission, owner_id = job
-    handed_out = frozenset(answer.sha256 for answer in key.answers) if key else frozenset()
-    sha256, recalled = "", False
+    assigned_hashes = frozenset(answer.sha256 for answer in key.answers) if key else frozenset()
+    sha256, is_loaded = "", False
     try:
         content = submissions.read(submission)
         sha256 = hashlib.sha256(content).hexdigest()
-        results, verdict, recalled = load_or_verify(records, content, logs, handed_out)
+        results, verdict, is_loaded = load_or_verify(records, content, logs, assigned_hashes)
     except ResultsError as error:
-        one = refused_report(rubric, key, f"{error.reason}.", error.remedy)
+        graded_report = grade_unreadable(rubric, key, f"{error.reason}.", error.remedy)
     else:
-        one = assess(results, verdict, rubric, key, owner_id)
-    return replace(one, sha256=sha256), recalled
+        graded_report = score_report(results, verdict, rubric, key, owner_id)
+    return replace(graded_report, sha256=sha256), is_loaded

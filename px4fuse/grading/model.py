@@ -9,8 +9,8 @@ from px4fuse.answer_form import Answers
 from px4fuse.assignment.roster import Person
 from px4fuse.verification.model import Verdict
 
-# title of the sum over all items
-TOTAL = "total"
+# title of the sum over all items, in overrides.csv and messages
+TOTAL_TITLE = "total"
 
 
 UNKNOWN_PERSON = Person("")
@@ -18,27 +18,27 @@ UNKNOWN_PERSON = Person("")
 
 @dataclass(frozen=True)
 class ExportOrigin:
-    """Information of a learning platform about a file.
+    """Student and submission time of a file, according to a learning platform.
 
     Attributes
     ----------
     platform : str
-        One of :data:`px4fuse.grading.submissions.PLATFORMS`; "" if the name is not of a platform.
+        One of :data:`px4fuse.grading.submissions.PLATFORMS`; "" if no platform wrote the file name.
     person : Person
-        Student; the number is that of the platform (participant in Moodle, user in Canvas and
-        ILIAS, submission in Gradescope).
+        Student. Its number on the platform is that of the participant (Moodle), the user (Canvas,
+        ILIAS) or the submission (Gradescope).
     time : datetime or None
         Submission time; without time zone if the platform omits it.
-    late : bool
+    is_late : bool
         The platform marks the file as late.
     is_imitated : bool
-        The part of the name that the student chose imitates the names of a platform.
+        The part of the file name that the student chose looks like the file names of a platform.
     """
 
     platform: str = ""
     person: Person = UNKNOWN_PERSON
     time: datetime | None = None
-    late: bool = False
+    is_late: bool = False
     is_imitated: bool = False
 
 
@@ -47,25 +47,25 @@ UNKNOWN_SUBMITTER = ExportOrigin()
 
 @dataclass(frozen=True)
 class Submission:
-    """PDF that was handed in: a file, or an entry of a zip file.
+    """Submitted PDF: a file, or an entry of a zip file.
 
     Attributes
     ----------
     file : Path
         The PDF, or the zip file that contains it.
-    entry : str
+    zip_entry : str
         Name of the entry in the zip file; "" for a file.
     name : str
-        Name in messages: one line of at most 200 characters, without folders of this computer;
-        unique in a run by a number at the end.
+        Name in messages: one line of at most 200 characters, without folders of this computer. A
+        number at the end makes it unique in a run.
     time : datetime or None
-        Time of the zip entry, in an unknown time zone: submission or packing.
+        Time of the zip entry, in an unknown time zone; the time of submission or of the download.
     origin : ExportOrigin
         Student and time according to a platform.
     """
 
     file: Path
-    entry: str
+    zip_entry: str
     name: str
     time: datetime | None = None
     origin: ExportOrigin = UNKNOWN_SUBMITTER
@@ -75,20 +75,20 @@ class Submission:
 class Item:
     """Points of a report for one item of the rubric, with a comment.
 
-    ``by_hand``: scored by the instructor; ``awaits_points``: not yet scored.
+    ``awaits_points``: the instructor has to score this item, and has not done it yet.
     """
 
     title: str
     points: float
-    of: float
+    max_points: float
     comment: str
-    by_hand: bool = False
+    is_scored_by_instructor: bool = False
     awaits_points: bool = False
 
 
 @dataclass(frozen=True)
 class GradedReport:
-    """Submission with verdict and points; missing texts are empty.
+    """Submitted report with verdict and points; missing texts are empty.
 
     Attributes
     ----------
@@ -101,21 +101,21 @@ class GradedReport:
     items : tuple of Item
         In the order of the rubric.
     flags : tuple of str
-        Sentences on suspicious contents, for the instructor.
-    pending : str
+        Sentences about suspicious contents, for the instructor.
+    pending_action : str
         Action of the instructor before the points count; "" if they count.
     form : Answers or None
         Completed answer form.
     numbers : mapping
-        Numbers of the class table, by column title.
+        Numbers of the report for the class table, by column title.
     sha256, log_sha256, version : str
         SHA-256 of the PDF and of its log, and px4fuse version of the report.
     notes : str
         Text of the student.
     mistakes : mapping
         Mistakes of the student's flight (answer key); True if the form names them.
-    redrawn_name : str
-        Path of the redrawn PDF, relative to the class page.
+    redrawn_path : str
+        Path of the PDF that px4fuse drew again from the log, relative to the class page.
     """
 
     submission: str
@@ -124,7 +124,7 @@ class GradedReport:
     verdict: Verdict
     items: tuple[Item, ...] = ()
     flags: tuple[str, ...] = ()
-    pending: str = ""
+    pending_action: str = ""
     form: Answers | None = None
     numbers: Mapping[str, float] = field(default_factory=dict)
     sha256: str = ""
@@ -132,22 +132,22 @@ class GradedReport:
     version: str = ""
     notes: str = field(default="", repr=False)
     mistakes: Mapping[str, bool] = field(default_factory=dict)
-    redrawn_name: str = ""
+    redrawn_path: str = ""
 
     @property
     def status(self) -> str:
-        """Outcome of the verification, including "page differs"."""
+        """Status of the verification, or "page differs"."""
         return self.verdict.outcome
 
     @property
     def points(self) -> float:
-        """Sum over the items; only a proposal while :attr:`pending`."""
+        """Sum over the items; a proposal while there is a :attr:`pending_action`."""
         return sum(item.points for item in self.items)
 
     @property
-    def counted(self) -> float | None:
-        """Points that count; None while they, or points of an item, are pending."""
-        return None if self.pending or self.awaits_points else self.points
+    def counted_points(self) -> float | None:
+        """Points that count; None if the report is pending or an item is not scored yet."""
+        return None if self.pending_action or self.awaits_points else self.points
 
     @property
     def awaits_points(self) -> bool:
@@ -155,14 +155,14 @@ class GradedReport:
         return any(item.awaits_points for item in self.items)
 
     @property
-    def of(self) -> float:
+    def max_points(self) -> float:
         """Maximum points."""
-        return sum(item.of for item in self.items)
+        return sum(item.max_points for item in self.items)
 
 
 @dataclass(frozen=True)
 class Override:
-    """Points or comment, or both, that the instructor sets."""
+    """Points, comment, or both, from the instructor; they replace those of px4fuse."""
 
     points: float | None = None
     comment: str = ""
@@ -170,18 +170,18 @@ class Override:
 
 @dataclass(frozen=True)
 class Entry:
-    """Row of the class: a student, or a report of an unknown student.
+    """Row of the class table: a student, or a report of an unknown student.
 
     Attributes
     ----------
     student, student_id : str
-        As in the class list, else as in the report or platform.
-    counting : GradedReport or None
-        Attempt that counts, with overrides applied; None without a submission.
-    others : tuple of GradedReport
-        Other attempts, earliest first.
-    handed_in : str
-        Submission time of the counting attempt; "" if unknown.
+        From the class list; without a class list from the report or the platform.
+    counted_report : GradedReport or None
+        Report that counts, with overrides applied; None without a submission.
+    other_reports : tuple of GradedReport
+        Reports of the same student that do not count, earliest first.
+    submission_time : str
+        Submission time of the report that counts; "" if unknown.
     late_s : float or None
         Time after the due time (s), 0 if in time; None if unknown.
     deduction : float
@@ -192,29 +192,29 @@ class Entry:
         Comment of the instructor on the whole report.
     total : float or None
         Grade in points; None while pending or missing.
-    of : float
+    max_points : float
         Maximum points.
     flags : tuple of str
-        All flags: on student and attempt, on the report, and on equal contents of other reports.
+        Sentences about the student, the submission, the report, and equal contents of reports.
     """
 
     student: str
     student_id: str
-    counting: GradedReport | None
-    others: tuple[GradedReport, ...] = ()
-    handed_in: str = ""
+    counted_report: GradedReport | None
+    other_reports: tuple[GradedReport, ...] = ()
+    submission_time: str = ""
     late_s: float | None = None
     deduction: float = 0.0
     overrides: Mapping[str, Override] = field(default_factory=dict)
     comment: str = ""
     total: float | None = None
-    of: float = 0.0
+    max_points: float = 0.0
     flags: tuple[str, ...] = ()
 
     @property
-    def files(self) -> tuple[GradedReport, ...]:
-        """All attempts, the one that counts first."""
-        return (*([self.counting] if self.counting else []), *self.others)
+    def reports(self) -> tuple[GradedReport, ...]:
+        """All reports of the student; the first one counts."""
+        return (*([self.counted_report] if self.counted_report else []), *self.other_reports)
 
     @property
     def display_name(self) -> str:
@@ -222,8 +222,10 @@ class Entry:
         return self.student or self.student_id or "no name"
 
 
-def columns(entries: Sequence[Entry]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the titles of all items and of all numbers of the class, each once."""
-    graded = [one for entry in entries if (one := entry.counting)]
-    items = dict.fromkeys(item.title for one in graded for item in one.items)
-    return tuple(items), tuple(dict.fromkeys(title for one in graded for title in one.numbers))
+def list_titles(entries: Sequence[Entry]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the titles of all items and of all numbers in the class table, each once."""
+    reports = [report for entry in entries if (report := entry.counted_report)]
+    items = dict.fromkeys(item.title for report in reports for item in report.items)
+    return tuple(items), tuple(
+        dict.fromkeys(title for report in reports for title in report.numbers)
+    )

@@ -1,8 +1,8 @@
 """Output files of grading: class table and page, redrawn reports, feedback, platform tables.
 
-Tables exported by a platform are returned with the grade and, if they have a column for it, the
-feedback; all other cells stay. Rows of students without a grade (pending, or no submission) are not
-changed: a platform reads an empty cell as "delete", and zero as a grade.
+px4fuse enters grades into copies of the tables that platforms export, and feedback if a table has a
+column for it. All other cells stay unchanged. The row of a student without a grade (pending, or no
+submission) is not changed: platforms delete a grade if the cell is empty, and read 0 as a grade.
 
 - Moodle: "Using Assignment", Offline grading worksheet, docs.moodle.org.
   ``mod/assign/feedback/offline/importgradeslib.php`` finds "Identifier" ("Participant 12"), "Grade"
@@ -11,8 +11,8 @@ changed: a platform reads an empty cell as "delete", and zero as a grade.
 - Canvas: "How do I import grades in the Gradebook?", Instructor Guide: the exported gradebook, with
   Student, ID, SIS User ID, SIS Login ID, Section, and ``Title (12345)`` for an assignment. Columns
   marked "(read only)" in the row "Points Possible" are ignored.
-- Others: a table with a column of ids, logins, emails or names, and a grade column, with the given
-  title or one of :data:`GRADE_TITLES`.
+- Other platforms: a table with a column of ids, logins, emails or names, and a grade column with
+  the title of ``--column`` or one of :data:`GRADE_TITLES`.
 """
 
 import html
@@ -32,27 +32,27 @@ from px4fuse.assignment.roster import (
     normalise_text,
     read_student,
 )
-from px4fuse.assignment.sheet import Sheet, decimal, number, read_sheet
+from px4fuse.assignment.sheet import Sheet, format_cell_number, parse_decimal, read_sheet
 from px4fuse.errors import SettingsError
-from px4fuse.grading.checks import text_of
+from px4fuse.grading.checks import shorten_text
 from px4fuse.grading.class_page import html_text
 from px4fuse.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
-from px4fuse.grading.model import TOTAL, Entry, GradedReport, columns
-from px4fuse.grading.records import RECORDS, REDRAWN_SUFFIX
-from px4fuse.input_files import own_files
+from px4fuse.grading.model import TOTAL_TITLE, Entry, GradedReport, list_titles
+from px4fuse.grading.records import RECORDS_FOLDER, REDRAWN_SUFFIX
+from px4fuse.input_files import inputs_not_registered
 from px4fuse.results.reading import one_line
 from px4fuse.spreadsheet import neutralise_formulas, neutralise_id
 from px4fuse.text import join_first
 from px4fuse.webpage.safe import load_template
 from px4fuse.writing import write_all
 
-# folder of the reports redrawn from the logs, to be read instead of the handed-in PDFs
-REPORTS = "reports"
-FEEDBACK = "feedback"
-GRADES = "grades"
-NAMES = "names.csv"
-NAMES_HEAD = ("pseudonym", "id", "name")
-# columns of the class table before and after those of items and numbers
+# folder of the reports that px4fuse drew from the logs; read them instead of the submitted PDFs
+REPORTS_FOLDER = "reports"
+FEEDBACK_FOLDER = "feedback"
+GRADES_FOLDER = "grades"
+NAMES_FILE = "names.csv"
+NAMES_TITLES = ("pseudonym", "id", "name")
+# columns of the class table, before and after the columns of items and numbers
 FIRST_COLUMNS = (
     "file",
     "student",
@@ -75,23 +75,23 @@ LAST_COLUMNS = (
     "log SHA-256",
 )
 LIST_SEPARATOR = " | "
-# number of reasons in a sentence
+# maximum number of verification reasons in the feedback
 MAX_REASONS = 4
-# column titles of platform tables
+# titles of grade columns in platform tables, as letters and digits
 GRADE_TITLES = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
 MAX_GRADE_TITLES = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
-# column titles of feedback: read as HTML, or as text
+# titles of feedback columns: the platform reads the cells as HTML, or as text
 HTML_COMMENT_TITLES = ("feedbackcomments", "feedbackalskommentar")
 COMMENT_TITLES = (*HTML_COMMENT_TITLES, "feedbacktolearner", "feedback", "comment")
-ASSIGNMENT_NUMBER = re.compile(r" \(\d+\)$")
-# mark of columns that Canvas computes; never changed
-READ_ONLY = "(read only)"
+_ASSIGNMENT_NUMBER = re.compile(r" \(\d+\)$")
+# mark of columns that Canvas computes; px4fuse does not change them
+READ_ONLY_MARK = "(read only)"
 
 
 def write_class(
     entries: Sequence[Entry], course: Course, output: Path
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
-    """Write all output files; return them, and notes on grades that could not be entered.
+    """Write all output files; return their paths, and notes about grades that were not entered.
 
     ``overrides.csv`` is created if it does not exist, and never overwritten.
 
@@ -113,112 +113,122 @@ def write_class(
     title = course.title or course.rubric.title or "Class"
     stems = file_names([_identity(entry, stem=True) for entry in entries])
     page_entries = [
-        _add_file_names(entry, stem, output) for entry, stem in zip(entries, stems, strict=True)
+        _copy_redrawn(entry, stem, output) for entry, stem in zip(entries, stems, strict=True)
     ]
-    has_redrawn = any(entry.counting and entry.counting.redrawn_name for entry in page_entries)
-    texts = [feedback_text(entry, title) for entry in entries]
+    has_redrawn = any(
+        entry.counted_report and entry.counted_report.redrawn_path for entry in page_entries
+    )
+    feedback_texts = [feedback_text(entry, title) for entry in entries]
     contents = {"class.csv": csv_text(entries).encode()}
     if course.anonymous:
-        page_entries, names_table = _pseudonyms(page_entries, output / NAMES)
-        contents[NAMES] = names_table.encode()
+        page_entries, names_table = _anonymise(page_entries, output / NAMES_FILE)
+        contents[NAMES_FILE] = names_table.encode()
     made_with = f"px4fuse {metadata.version('px4fuse')}"
     contents["class.html"] = html_text(page_entries, title, made_with).encode()
     if not (output / OVERRIDES_NAME).exists():
         contents[OVERRIDES_NAME] = OVERRIDES_TEMPLATE.encode()
-    for stem, text in zip(stems, texts, strict=True):
-        contents[f"{FEEDBACK}/{stem}.txt"] = text.encode()
+    for stem, text in zip(stems, feedback_texts, strict=True):
+        contents[f"{FEEDBACK_FOLDER}/{stem}.txt"] = text.encode()
     notes: list[str] = []
     names = make_unique((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
     for sheet, name in zip(course.worksheets, names, strict=True):
         filled_sheet, sheet_notes = fill_grades(
-            sheet, entries, course.register, course.column, texts
+            sheet, entries, course.register, course.column, feedback_texts
         )
-        contents[f"{GRADES}/{name}"] = filled_sheet.content()
+        contents[f"{GRADES_FOLDER}/{name}"] = filled_sheet.content()
         notes += sheet_notes
     write_all({output / name: content for name, content in contents.items()})
-    folders = [REPORTS] * has_redrawn + [FEEDBACK] + [GRADES] * bool(course.worksheets)
+    folders = (
+        [REPORTS_FOLDER] * has_redrawn
+        + [FEEDBACK_FOLDER]
+        + [GRADES_FOLDER] * bool(course.worksheets)
+    )
     written = tuple(output / name for name in ("class.csv", "class.html", *folders, OVERRIDES_NAME))
     return written, tuple(notes)
 
 
 def _identity(entry: Entry, stem: bool = False) -> str:
-    """Return id, name or file: an identity that stays the same in later runs."""
-    file = entry.counting.submission if entry.counting else ""
+    """Return id, else name, else file name of a row: the same text in each run."""
+    file = entry.counted_report.submission if entry.counted_report else ""
     return entry.student_id or (Path(file).stem if stem else entry.student or file)
 
 
-def _add_file_names(entry: Entry, stem: str, output: Path) -> Entry:
-    """Copy the redrawn report of an entry to the output folder, and add its path."""
-    one = entry.counting
-    if one is None or not one.sha256:
+def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
+    """Copy the redrawn report of a row to the folder ``reports``, and add the path to the row."""
+    report = entry.counted_report
+    if report is None or not report.sha256:
         return entry
-    redrawn = output / RECORDS / f"{one.sha256}{REDRAWN_SUFFIX}"
+    redrawn = output / RECORDS_FOLDER / f"{report.sha256}{REDRAWN_SUFFIX}"
     if not redrawn.exists():
         return entry
-    name = f"{REPORTS}/{stem}.pdf"
+    name = f"{REPORTS_FOLDER}/{stem}.pdf"
     write_all({output / name: redrawn.read_bytes()})
-    return replace(entry, counting=replace(one, redrawn_name=name))
+    return replace(entry, counted_report=replace(report, redrawn_path=name))
 
 
-def _pseudonyms(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
-    """Replace names by pseudonyms, and sort by them; return the entries and the list of names.
+def _anonymise(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
+    """Replace names by pseudonyms and sort by pseudonym; also return the list of names as CSV.
 
-    A later run keeps the pseudonyms. Their order is random.
+    Pseudonyms are assigned in random order. A later run reads them from the list at ``path``.
     """
     names_by_identity: dict[str, tuple[str, str]] = {}
     if path.exists():
-        with own_files():
+        with inputs_not_registered():
             sheet = read_sheet(path)
         for row in sheet.rows:
-            name, identity, student = (sheet.cell(row, (t,)).removeprefix("'") for t in NAMES_HEAD)
+            name, identity, student = (
+                sheet.cell(row, (t,)).removeprefix("'") for t in NAMES_TITLES
+            )
             names_by_identity[identity] = name, student
     used_names = {name for name, _ in names_by_identity.values()}
-    numbered = (f"Student {number:03}" for number in itertools.count(1))
-    free = (name for name in numbered if name not in used_names)
-    new = {
+    numbered_names = (f"Student {number:03}" for number in itertools.count(1))
+    free_names = (name for name in numbered_names if name not in used_names)
+    student_by_new_identity = {
         identity: entry.student
         for entry in entries
         if (identity := _identity(entry)) not in names_by_identity
     }
-    for identity in random.SystemRandom().sample(list(new), len(new)):
-        names_by_identity[identity] = next(free), new[identity]
-    ordered = sorted(names_by_identity.items(), key=lambda pair: pair[1])
+    for identity in random.SystemRandom().sample(
+        list(student_by_new_identity), len(student_by_new_identity)
+    ):
+        names_by_identity[identity] = next(free_names), student_by_new_identity[identity]
+    ordered_names = sorted(names_by_identity.items(), key=lambda pair: pair[1])
     rows = (
         (name, neutralise_id(identity), neutralise_formulas(student))
-        for identity, (name, student) in ordered
+        for identity, (name, student) in ordered_names
     )
     anonymous_entries = [
         anonymise_entry(entry, names_by_identity[_identity(entry)][0]) for entry in entries
     ]
-    names_table = "\ufeff" + Sheet(path, NAMES_HEAD, tuple(rows)).text
+    names_table = "\ufeff" + Sheet(path, NAMES_TITLES, tuple(rows)).text
     return sorted(anonymous_entries, key=lambda entry: entry.student), names_table
 
 
 def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
-    """Reduce an entry to status, points and form, without texts, under a pseudonym."""
-    one = entry.counting
-    if one is not None:
-        one = GradedReport(
+    """Return a row with pseudonym, status, points and form, but without texts of the student."""
+    report = entry.counted_report
+    if report is not None:
+        report = GradedReport(
             "",
             "",
             "",
-            replace(one.verdict, reasons=(), differences=()),
-            tuple(replace(item, comment="") for item in one.items),
-            pending=one.pending and "Points are pending.",
-            form=one.form,
-            numbers=one.numbers,
-            mistakes=one.mistakes,
+            replace(report.verdict, reasons=(), differences=()),
+            tuple(replace(item, comment="") for item in report.items),
+            pending_action=report.pending_action and "Points are pending.",
+            form=report.form,
+            numbers=report.numbers,
+            mistakes=report.mistakes,
         )
     return Entry(
         pseudonym,
         "",
-        one,
+        report,
         (),
-        entry.handed_in,
+        entry.submission_time,
         entry.late_s,
         entry.deduction,
         total=entry.total,
-        of=entry.of,
+        max_points=entry.max_points,
         flags=("Flagged.",) * bool(entry.flags),
     )
 
@@ -227,69 +237,69 @@ def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
 
 
 def csv_text(entries: Sequence[Entry]) -> str:
-    """Format the class as CSV, for Excel and LibreOffice; points include overrides.
+    """Format the class table as CSV, for Excel and LibreOffice; points include overrides.
 
     Returns
     -------
     str
-        Begins with the byte order mark by which Excel detects UTF-8; lines end with CRLF. Write
-        without translating line ends.
+        Starts with the byte order mark, by which Excel detects UTF-8. Lines end with CRLF, so write
+        the text without conversion of line ends.
     """
-    items, numbers = columns(entries)
-    head = tuple(map(neutralise_formulas, (*FIRST_COLUMNS, *items, *numbers, *LAST_COLUMNS)))
+    items, numbers = list_titles(entries)
+    titles = tuple(map(neutralise_formulas, (*FIRST_COLUMNS, *items, *numbers, *LAST_COLUMNS)))
     rows = []
     for entry in entries:
-        one = entry.counting
-        points = {item.title: item.points for item in one.items} if one else {}
+        report = entry.counted_report
+        points_by_title = {item.title: item.points for item in report.items} if report else {}
         row: list[str | float | None] = [
-            one.submission if one else "",
+            report.submission if report else "",
             entry.student,
             None,
-            one.status if one else "missing",
-            one.counted if one else None,
-            one.points if one and one.counted is None else None,
-            entry.of,
+            report.status if report else "missing",
+            report.counted_points if report else None,
+            report.points if report and report.counted_points is None else None,
+            entry.max_points,
             entry.deduction or None,
             entry.total,
-            *map(points.get, items),
-            *(one.numbers.get(title) if one else None for title in numbers),
-            entry.handed_in,
+            *map(points_by_title.get, items),
+            *(report.numbers.get(title) if report else None for title in numbers),
+            entry.submission_time,
             None if entry.late_s is None else entry.late_s / 3600.0,
-            one.pending if one else "",
+            report.pending_action if report else "",
             entry.comment,
             LIST_SEPARATOR.join(entry.flags),
-            LIST_SEPARATOR.join(other.submission for other in entry.others),
-            LIST_SEPARATOR.join(one.verdict.reasons) if one else "",
-            one.log_sha256 if one else "",
+            LIST_SEPARATOR.join(other.submission for other in entry.other_reports),
+            LIST_SEPARATOR.join(report.verdict.reasons) if report else "",
+            report.log_sha256 if report else "",
         ]
         cells = [
-            neutralise_formulas(part) if isinstance(part, str) else number(part) for part in row
+            neutralise_formulas(value) if isinstance(value, str) else format_cell_number(value)
+            for value in row
         ]
         cells[FIRST_COLUMNS.index("id")] = neutralise_id(entry.student_id)
         rows.append(tuple(cells))
-    return "\ufeff" + Sheet(Path(), head, tuple(rows)).text
+    return "\ufeff" + Sheet(Path(), titles, tuple(rows)).text
 
 
 # ------------------------------------------------------------------ feedback
 
 
 def feedback_text(entry: Entry, class_name: str = "") -> str:
-    """Format the feedback for one student: points, late deduction, instructor's comment.
-
-    Flags are not included.
-    """
-    graded = entry.counting
+    """Format the feedback for one student, without flags, which are for the instructor."""
+    graded = entry.counted_report
     reasons = (
-        (text_of(one).rstrip(".") for one in graded.verdict.reasons[:MAX_REASONS]) if graded else ()
+        (shorten_text(reason).rstrip(".") for reason in graded.verdict.reasons[:MAX_REASONS])
+        if graded
+        else ()
     )
     text = load_template("grading/feedback.j2").render(
         entry=entry,
         graded=graded,
         class_name=class_name,
         reasons="; ".join(filter(None, reasons)),
-        final=TOTAL in entry.overrides,
-        line=text_of,
-        number=number,
+        is_total_set=TOTAL_TITLE in entry.overrides,
+        line=shorten_text,
+        number=format_cell_number,
         wrapped=_wrap_text,
     )
     return text.rstrip("\n") + "\n"
@@ -309,109 +319,121 @@ def _wrap_text(text: str, indent: str = "") -> str:
 # ------------------------------------------------------------------ platform tables
 
 
-def grade_column(sheet: Sheet, wanted: str) -> int:
+def find_grade_column(sheet: Sheet, column_title: str) -> int:
     """Find the grade column of a platform table.
 
     Parameters
     ----------
-    wanted : str
-        Title of the column, in Canvas without its number; "" if there is only one.
+    column_title : str
+        Title of the column, for Canvas without the number in brackets; "" if the table has only one
+        grade column.
 
     Raises
     ------
     SettingsError
-        No column matches, or several without a given title.
+        No column matches, or several match.
     """
-    titles = {
-        at: title
-        for at, title in enumerate(sheet.head)
-        if not any(READ_ONLY in row[at] for row in sheet.rows[:3])
+    title_by_index = {
+        index: title
+        for index, title in enumerate(sheet.head)
+        if not any(READ_ONLY_MARK in row[index] for row in sheet.rows[:3])
     }
     grade_index = sheet.column(GRADE_TITLES)
-    assignments = [at for at in titles if ASSIGNMENT_NUMBER.search(titles[at])]
-    matching_columns = [
-        at
-        for at, title in titles.items()
-        if normalise_text(wanted)
-        in (normalise_text(title), normalise_text(ASSIGNMENT_NUMBER.sub("", title)))
+    assignment_indices = [
+        index for index in title_by_index if _ASSIGNMENT_NUMBER.search(title_by_index[index])
     ]
-    candidates = assignments if grade_index is None else [grade_index]
-    # for Moodle a title that does not match is ignored: it may be of another table
-    if wanted and (matching_columns or sheet.column(("identifier",)) is None):
-        candidates = matching_columns
+    matching_indices = [
+        index
+        for index, title in title_by_index.items()
+        if normalise_text(column_title)
+        in (normalise_text(title), normalise_text(_ASSIGNMENT_NUMBER.sub("", title)))
+    ]
+    candidates = assignment_indices if grade_index is None else [grade_index]
+    # the title may be for another table, and Moodle's worksheets have one grade column, so a title
+    # that does not match is ignored for Moodle
+    if column_title and (matching_indices or sheet.column(("identifier",)) is None):
+        candidates = matching_indices
     if len(candidates) == 1:
         return candidates[0]
     problem = "several grade columns" if candidates else "no grade column"
-    shown = (ASSIGNMENT_NUMBER.sub("", titles[at]) for at in assignments or titles)
-    others = one_line(", ".join(one_line(title, 40) for title in shown), 300)
-    raise SettingsError(f"{sheet.path}: {problem}.", f"Name one with --column: {others}.")
+    candidate_titles = (
+        _ASSIGNMENT_NUMBER.sub("", title_by_index[index])
+        for index in assignment_indices or title_by_index
+    )
+    titles_text = one_line(", ".join(one_line(title, 40) for title in candidate_titles), 300)
+    raise SettingsError(f"{sheet.path}: {problem}.", f"Name one with --column: {titles_text}.")
 
 
 def fill_grades(
     sheet: Sheet, entries: Sequence[Entry], register: Register, column: str, feedback: Sequence[str]
 ) -> tuple[Sheet, tuple[str, ...]]:
-    """Enter the grades of a class into a platform table; return notes on those that do not fit.
+    """Enter grades and feedback into a platform table; also return notes about missing grades.
 
     Parameters
     ----------
     entries : sequence of Entry
         Entries of the students in ``register`` first, in its order.
     column : str
-        See :func:`grade_column`.
+        See :func:`find_grade_column`.
     feedback : sequence of str
         Feedback of each entry.
 
     Raises
     ------
     SettingsError
-        From :func:`grade_column`.
+        From :func:`find_grade_column`.
     """
-    student_index, comments = grade_column(sheet, column), sheet.column(COMMENT_TITLES)
-    as_read = neutralise_formulas if sheet.column(HTML_COMMENT_TITLES) is None else as_html
+    grade_index, feedback_index = find_grade_column(sheet, column), sheet.column(COMMENT_TITLES)
+    format_feedback = (
+        neutralise_formulas if sheet.column(HTML_COMMENT_TITLES) is None else escape_html
+    )
     cells = [list(row) for row in sheet.rows]
     names = [one_line(entry.student or entry.student_id, 40) for entry in entries]
-    comma = any(re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells for cell in row)
+    has_decimal_comma = any(re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells for cell in row)
     notes, found_people = [], set()
     for row in cells:
         person = read_student(sheet, row)
-        at = register.student_index(person) if person else None
-        if at is None:
+        student_index = register.student_index(person) if person else None
+        if student_index is None:
             continue
-        found_people.add(at)
-        total = entries[at].total
+        found_people.add(student_index)
+        total = entries[student_index].total
         if total is None:
             continue
-        max_points = _max_points(sheet, row, student_index)
+        max_points = _max_points(sheet, row, grade_index)
         if max_points is not None and total > max_points:
             notes.append(
-                f"{sheet.path.name}: {names[at]} has {number(total)} points, above the maximum of "
-                f"the platform ({number(max_points)}). Increase the maximum on the platform."
+                f"{sheet.path.name}: {names[student_index]} has {total:.10g} points, above the "
+                f"maximum of {max_points:.10g} on the platform. Increase the maximum there."
             )
-        row[student_index] = number(total).replace(".", "," if comma else ".")
-        if comments is not None and comments != student_index:
-            row[comments] = as_read(feedback[at])
+        row[grade_index] = format_cell_number(total).replace(".", "," if has_decimal_comma else ".")
+        if feedback_index is not None and feedback_index != grade_index:
+            row[feedback_index] = format_feedback(feedback[student_index])
     missing_names = [
-        names[at]
-        for at in range(len(register.people))
-        if at not in found_people and entries[at].total is not None
+        names[student_index]
+        for student_index in range(len(register.people))
+        if student_index not in found_people and entries[student_index].total is not None
     ]
     if missing_names:
-        notes.append(f"{sheet.path.name}: no row for {join_first(missing_names, 4)}.")
+        notes.append(
+            f"{sheet.path.name} has no row for {join_first(missing_names, 4)}. These grades were "
+            "not entered."
+        )
     return replace(sheet, rows=tuple(map(tuple, cells))), tuple(notes)
 
 
-def _max_points(sheet: Sheet, row: Sequence[str], student_index: int) -> float | None:
+def _max_points(sheet: Sheet, row: Sequence[str], grade_index: int) -> float | None:
     """Return the maximum points of the platform, if the table contains them."""
-    possible = (
-        one[student_index] for one in sheet.rows[:3] if "points possible" in one[0].casefold()
+    maximum_texts = (
+        cells[grade_index] for cells in sheet.rows[:3] if "points possible" in cells[0].casefold()
     )
-    return decimal(next(possible, sheet.cell(row, MAX_GRADE_TITLES)))
+    return parse_decimal(next(maximum_texts, sheet.cell(row, MAX_GRADE_TITLES)))
 
 
-def as_html(text: str) -> str:
-    r"""Escape plain text for a field that is shown as HTML, with line breaks and indentation.
+def escape_html(text: str) -> str:
+    r"""Escape plain text for a field that the platform displays as HTML; keep the line breaks.
 
-    >>> as_html("a <b>\n 1")
+    >>> escape_html("a <b>\n 1")
     'a &lt;b&gt;<br>&nbsp;1'
     """
     lines = html.escape(text, quote=False).rstrip("\n").split("\n")

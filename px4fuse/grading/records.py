@@ -1,7 +1,8 @@
-"""Stored verifications: reports are verified again only if the report, a log or a version changed.
+"""Stored verifications: a report is verified again only if the report, a log or a version changed.
 
-A record is found by the SHA-256 of the PDF. It is valid for the versions that made it and the files
-that were available. It is independent of rubric, answer key, class list and overrides.
+The SHA-256 of the PDF identifies its record. A record is valid as long as library versions and
+available files are those of the verification. It does not depend on the points of rubric, answer
+key and overrides.
 """
 
 import hashlib
@@ -13,7 +14,7 @@ from pathlib import Path
 import msgspec
 
 from px4fuse.errors import ResultsError
-from px4fuse.results.contract import Reported, file_hashes_in, to_json
+from px4fuse.results.contract import ReportedResults, file_hashes_in, to_json
 from px4fuse.results.model import provenance
 from px4fuse.results.reading import read_results
 from px4fuse.verification.model import Verdict
@@ -21,9 +22,9 @@ from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import log_sha256, verify
 from px4fuse.writing import write_all
 
-# subfolder of the output folder
-RECORDS = "records"
-# file name of a redrawn report: SHA-256 of the handed-in PDF with this suffix; record: ".json"
+# subfolder of the output folder, for the records
+RECORDS_FOLDER = "records"
+# suffix of a redrawn report; its name is the SHA-256 of the submitted PDF, as that of the record
 REDRAWN_SUFFIX = ".pdf"
 
 
@@ -33,37 +34,39 @@ class VerificationRecord:
 
     Attributes
     ----------
-    rests_on : dict
+    dependencies : dict
         Versions and files for which the record is valid: see :func:`_dependencies`.
     results : str
-        Attached results.
+        Results attached to the PDF, as JSON.
     """
 
-    rests_on: dict[str, str]
+    dependencies: dict[str, str]
     results: str
     verdict: Verdict
 
 
 def load_or_verify(
-    records: Path, pdf: bytes, logs: Mapping[str, Path], handed_out: frozenset[str]
-) -> tuple[Reported, Verdict, bool]:
-    """Read and verify a report, or load the stored verification.
+    records: Path, pdf: bytes, logs: Mapping[str, Path], assigned_hashes: frozenset[str]
+) -> tuple[ReportedResults, Verdict, bool]:
+    """Read and verify a report, or load its stored verification.
 
     Parameters
     ----------
+    records : Path
+        Folder of the records.
     pdf : bytes
-        Content of the file.
+        Content of the submitted file.
     logs : mapping
         Files by SHA-256.
-    handed_out : frozenset of str
-        SHA-256 of the logs in the answer key. If such a log is not available, the verdict is
-        "cannot verify", not "other log".
+    assigned_hashes : frozenset of str
+        SHA-256 of the logs in the answer key. A report on one of these logs gets the verdict
+        "cannot verify", not "other log", if the log is not in ``logs``.
 
     Returns
     -------
     results, verdict
-    recalled : bool
-        True if the verification was loaded.
+    is_loaded : bool
+        True if the stored verification was loaded.
 
     Raises
     ------
@@ -71,28 +74,30 @@ def load_or_verify(
         The file is not a report.
     """
     sha256 = hashlib.sha256(pdf).hexdigest()
-    if loaded := _load_record(records, sha256, logs, handed_out):
+    if loaded := _load_record(records, sha256, logs, assigned_hashes):
         return *loaded, True
     results = read_report(pdf, "The file")
     attached = to_json(results)
-    rests_on = _dependencies(attached, logs, handed_out)
-    gap = rests_on.get(log_sha256(results)) == "handed out"
-    verdict = verify(results, pdf, {} if gap else logs)
+    dependencies = _dependencies(attached, logs, assigned_hashes)
+    is_log_missing = dependencies.get(log_sha256(results)) == "assigned"
+    verdict = verify(results, pdf, {} if is_log_missing else logs)
     files = {REDRAWN_SUFFIX: verdict.redrawn} if verdict.redrawn else {}
     stored_verdict = replace(verdict, redrawn=b"")
-    _write_record(records, sha256, VerificationRecord(rests_on, attached, stored_verdict), files)
+    _write_record(
+        records, sha256, VerificationRecord(dependencies, attached, stored_verdict), files
+    )
     return results, stored_verdict, False
 
 
 def _dependencies(
-    results: str, logs: Mapping[str, Path], handed_out: frozenset[str]
+    results: str, logs: Mapping[str, Path], assigned_hashes: frozenset[str]
 ) -> dict[str, str]:
-    """Return the library versions, and the availability of each file of a report by SHA-256.
+    """Return the library versions, and the availability of each input file by SHA-256.
 
-    Availability: "here", "handed out" (in the answer key, but not available), or "away".
+    Availability: "available", "assigned" (in the answer key, but not available), or "missing".
     """
     return _versions() | {
-        name: "here" if name in logs else "handed out" if name in handed_out else "away"
+        name: "available" if name in logs else "assigned" if name in assigned_hashes else "missing"
         for name in sorted(set(file_hashes_in(results)))
     }
 
@@ -106,25 +111,25 @@ def _versions() -> dict[str, str]:
 def _write_record(
     records: Path, sha256: str, record: VerificationRecord, files: Mapping[str, bytes]
 ) -> None:
-    for earlier in records.glob(f"{sha256}.*"):
-        # keep the record: another process may read it for an identical file
-        if earlier.suffix != ".json":
-            earlier.unlink(missing_ok=True)
+    for old_file in records.glob(f"{sha256}.*"):
+        # the record is replaced, not deleted: another process may read it for an identical PDF
+        if old_file.suffix != ".json":
+            old_file.unlink(missing_ok=True)
     contents = {**files, ".json": msgspec.json.encode(record)}
-    write_all({records / f"{sha256}{end}": content for end, content in contents.items()})
+    write_all({records / f"{sha256}{suffix}": content for suffix, content in contents.items()})
 
 
 def _load_record(
-    records: Path, sha256: str, logs: Mapping[str, Path], handed_out: frozenset[str]
-) -> tuple[Reported, Verdict] | None:
-    """Load a record if all of its dependencies are unchanged; else None."""
+    records: Path, sha256: str, logs: Mapping[str, Path], assigned_hashes: frozenset[str]
+) -> tuple[ReportedResults, Verdict] | None:
+    """Load the record of a PDF; None if there is none, or its dependencies have changed."""
     try:
         content = (records / f"{sha256}.json").read_bytes()
         record = msgspec.json.decode(content, type=VerificationRecord)
-        if record.rests_on != _dependencies(record.results, logs, handed_out):
+        if record.dependencies != _dependencies(record.results, logs, assigned_hashes):
             return None
         results = read_results(record.results.encode())
-    # no record, or not readable: verify again
+    # without a readable record, the report is verified again
     except (OSError, msgspec.MsgspecError, ResultsError):
         return None
-    return (results, record.verdict) if isinstance(results, Reported) else None
+    return (results, record.verdict) if isinstance(results, ReportedResults) else None

@@ -1,7 +1,7 @@
-"""Rubric: reading the TOML file of an instructor, and scoring a report with it.
+"""Rubric: reading of the instructor's TOML file, and scoring of a report.
 
-The rubric has items, each with title, points, a check of :mod:`px4fuse.grading.checks` and its
-parameters. A number that a report does not contain gives no points and a comment.
+An item of the rubric has a title, points, a check of :mod:`px4fuse.grading.checks` and parameters
+of the check. A number that a report does not contain gives no points and a comment.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from px4fuse.answer_form import Answers
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.assignment.roster import make_unique
 from px4fuse.errors import SettingsError
-from px4fuse.grading.checks import Evidence, RubricItem, Text, in_brackets, text_of
-from px4fuse.grading.flags import own_flags, page_flags
-from px4fuse.grading.model import TOTAL, GradedReport, Item
+from px4fuse.grading.checks import Evidence, RubricItem, Text, format_reason, shorten_text
+from px4fuse.grading.flags import flag_pages, flag_settings
+from px4fuse.grading.model import TOTAL_TITLE, GradedReport, Item
 from px4fuse.reading import read_text
-from px4fuse.results.contract import Reported
+from px4fuse.results.contract import ReportedResults
 from px4fuse.results.reading import one_line
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import cannot_verify, log_sha256
@@ -32,8 +32,8 @@ DEFAULT_NAME = "rubric.toml"
 MAX_RUBRIC_BYTES = 1_000_000
 RUBRIC_HELP = "Write a commented example with px4fuse grade --write-rubric FILE.toml."
 
-# numbers of the class table: column title, and path in the results
-NUMBERS = (
+# numbers of a report in the class table: column title, and path in the results
+TABLE_NUMBERS = (
     ("SIGMA_A (m/s²)", "settings.sigma_a_m_s2"),
     ("SIGMA_Z (m)", "settings.sigma_z_m"),
     ("mean NIS north", "axes.north.filters.kf.nis_mean"),
@@ -48,14 +48,14 @@ NUMBERS = (
 if TYPE_CHECKING:
     AnyItem = RubricItem
 else:
-    # items of all checks, distinguished by their tag
+    # items of all checks; the field "check" of the TOML file selects the class
     AnyItem = Union[tuple(RubricItem.__subclasses__())]  # noqa: UP007
-# points of a report that is not fully verified: left to the instructor, zero, or counted
-Doubtful = Literal["pending", "zero", "count"]
+# rule for the points of a report: the instructor decides, zero points, or the points count
+PointsRule = Literal["pending", "zero", "count"]
 
 
 class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Items of a grade, and rules for reports that are not fully verified.
+    """Items, and rules for reports that are not fully verified.
 
     Attributes
     ----------
@@ -69,18 +69,18 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     title: Text = ""
     unverified: Literal["pending", "zero"] = "pending"
-    others_log: Doubtful = "pending"
-    pages: Doubtful = "count"
+    others_log: PointsRule = "pending"
+    pages: PointsRule = "count"
     items: Annotated[tuple[AnyItem, ...], Meta(min_length=1, max_length=100)] = msgspec.field(
         name="item"
     )
 
     def __post_init__(self) -> None:
-        titles = [TOTAL, *(item.title for item in self.items)]
+        titles = [TOTAL_TITLE, *(item.title for item in self.items)]
         for title, unique_title in zip(titles, make_unique(titles), strict=True):
             if title != unique_title:
-                owner = "the sum" if title.casefold() == TOTAL else "another item"
-                raise ValueError(f"the title {title!r} is used by {owner}; use unique titles")
+                use = "reserved for the sum" if title.casefold() == TOTAL_TITLE else "not unique"
+                raise ValueError(f"the title {title!r} is {use}. Give each item another title")
 
 
 def rubric_text() -> str:
@@ -94,12 +94,12 @@ def read_rubric(path: Path | None) -> Rubric:
     Parameters
     ----------
     path : Path or None
-        None is the default one.
+        None for the default rubric.
 
     Raises
     ------
     SettingsError
-        It cannot be read, or something in it is not what it should be: the text says which item.
+        The file cannot be read or is not a rubric; the message names the item and the field.
     """
     if path is None:
         return parse_rubric(rubric_text(), DEFAULT_NAME)
@@ -110,40 +110,44 @@ def parse_rubric(text: str, source_name: str) -> Rubric:
     """Parse and check the text of a rubric; ``source_name`` names it in errors."""
     try:
         return msgspec.convert(tomllib.loads(text.replace("\r\n", "\n")), Rubric)
-    # ValueError: not TOML, or an integer of a million digits
+    # ValueError: not TOML, or an integer with more digits than Python parses
     except (msgspec.ValidationError, ValueError, RecursionError) as error:
         message = re.sub(r"`\$\.item\[(\d+)\]\.?([^`]*)`", _describe_place, str(error))
         raise SettingsError(f"{source_name}: {one_line(message, 300)}", RUBRIC_HELP) from error
 
 
 def _describe_place(path: re.Match[str]) -> str:
-    """Format the place of an error: item number (from 1) and field."""
+    """Replace msgspec's path of an error by the item number (from 1) and the field."""
     return f"item {int(path[1]) + 1}{f', {path[2]}' * bool(path[2])}"
 
 
 # ------------------------------------------------------------------ points
 
 
-def assess(
-    results: Reported, verdict: Verdict, rubric: Rubric, key: AnswerKey | None, owner_id: str = ""
+def score_report(
+    results: ReportedResults,
+    verdict: Verdict,
+    rubric: Rubric,
+    key: AnswerKey | None,
+    owner_id: str = "",
 ) -> GradedReport:
-    """Score a report, and state whether its points count and what the instructor has to do.
+    """Score a report, and add flags and the action that the instructor has to take.
 
-    Items for other commands are left out; items on the form also without an answer key. The caller
-    adds the file names. ``owner_id`` is the student id according to the learning platform, which
-    takes precedence over the id in the report.
+    Items for the other command are omitted, and without an answer key also the items that need one.
+    The caller adds the file name. ``owner_id`` is the student id according to the learning
+    platform; it takes precedence over the id in the report.
     """
     evidence = Evidence(results, verdict, key, owner_id)
-    points_status, why = _points_status(evidence, rubric)
-    student, kind = results.student, "compare" if evidence.comparison else "loop"
+    points_rule, rule_text = _points_rule(evidence, rubric)
+    student, command = results.student, "compare" if evidence.comparison else "loop"
     graded_items = []
     for item in rubric.items:
-        if not item.applies(kind, key):
+        if not item.applies(command, key):
             continue
-        share, comment = 0.0, f"No points: {why}."
-        if points_status != "zero":
+        share, comment = 0.0, f"No points: {rule_text}."
+        if points_rule != "zero":
             share, comment = item.score(evidence)
-        awaits_points = item.by_hand and bool(student.notes.strip()) and points_status != "zero"
+        awaits_points = item.by_hand and bool(student.notes.strip()) and points_rule != "zero"
         points = round(item.points * min(max(share, 0.0), 1.0), 2)
         graded_items.append(
             Item(item.title, points, item.points, comment, item.by_hand, awaits_points)
@@ -156,69 +160,74 @@ def assess(
         verdict,
         tuple(graded_items),
         flags=(
-            *page_flags(verdict),
-            *own_flags(results, key is not None),
+            *flag_pages(verdict),
+            *flag_settings(results, key is not None),
             *([] if evidence.is_own_log else [_foreign_log_advice(evidence)]),
         ),
-        pending=why if points_status == "pending" else "",
+        pending_action=rule_text if points_rule == "pending" else "",
         mistakes={}
         if isinstance(form_result, str) or not evidence.is_own_log
-        else form_result.named,
+        else form_result.is_named_by_mistake,
         form=evidence.form if isinstance(evidence.form, Answers) else None,
-        numbers={title: float(values[path]) for title, path in NUMBERS if path in values},
+        numbers={title: float(values[path]) for title, path in TABLE_NUMBERS if path in values},
         log_sha256=log_sha256(results),
         version=results.provenance.px4fuse,
         notes=student.notes,
     )
 
 
-def _points_status(evidence: Evidence, rubric: Rubric) -> tuple[Doubtful, str]:
-    """Return the rule for the points and its reason; for "pending" the action required."""
+def _points_rule(evidence: Evidence, rubric: Rubric) -> tuple[PointsRule, str]:
+    """Return the rule for the points, and the reason; for "pending" the required action."""
     verdict = evidence.verdict
-    reason = in_brackets("".join(verdict.reasons[:1]))
+    reason = format_reason("".join(verdict.reasons[:1]))
     if verdict.status == "numbers differ":
         return "zero", f"the numbers of your report differ from those of its log{reason}"
-    # rule of the rubric, reason for the student, action for the instructor
-    doubts: list[tuple[Doubtful, str, str]] = []
+    # each doubt: rule of the rubric, reason for the student, action for the instructor
+    doubts: list[tuple[PointsRule, str, str]] = []
     if verdict.status != "verified":
-        todo = verdict.remedy or f"Check the report by hand: it was not verified{reason}."
-        doubts.append((rubric.unverified, f"your report could not be verified{reason}", todo))
+        action = verdict.remedy or f"Check the report by hand: it was not verified{reason}."
+        doubts.append((rubric.unverified, f"your report could not be verified{reason}", action))
     elif verdict.page_status == "differ":
-        why = "pages of your PDF differ from those that px4fuse draws from the log"
-        doubts.append((rubric.pages, why, "Compare the pages with the redrawn report."))
+        reason_text = "pages of your PDF differ from those that px4fuse draws from the log"
+        doubts.append((rubric.pages, reason_text, "Compare the pages with the redrawn report."))
     if not evidence.is_own_log:
-        why = "your report is not about the log that you were given"
-        doubts.append((rubric.others_log, why, _foreign_log_advice(evidence)))
+        reason_text = "your report is not about the log that you were given"
+        doubts.append((rubric.others_log, reason_text, _foreign_log_advice(evidence)))
     if evidence.key is not None and getattr(evidence.results.request, "position", None):
-        todo = "Ask where the position file (--position) is from: none was handed out."
-        doubts.append(("pending", "", todo))
-    for rule, why, _ in doubts:
+        action = (
+            "Ask for the origin of the position file (--position): the assignment contains no "
+            "position files."
+        )
+        doubts.append(("pending", "", action))
+    for rule, reason_text, _ in doubts:
         if rule == "zero":
-            return "zero", why
-    todo = " ".join(todo for rule, _, todo in doubts if rule == "pending")
-    return ("pending", todo) if todo else ("count", "")
+            return "zero", reason_text
+    action = " ".join(action for rule, _, action in doubts if rule == "pending")
+    return ("pending", action) if action else ("count", "")
 
 
 def _foreign_log_advice(evidence: Evidence) -> str:
-    """Format the action of the instructor for a report on a log of another student."""
-    student_id = text_of(evidence.results.student.id)
+    """Format the instructor's action for a report on a log of another student."""
+    student_id = shorten_text(evidence.results.student.id)
     id_text = f"the id in the report is {student_id}" if student_id else "the report has no id"
     if evidence.owner_id:
-        id_text += f", and {text_of(evidence.owner_id)} handed it in"
+        id_text += f", and {shorten_text(evidence.owner_id)} handed it in"
     if evidence.answer is None:
         return "The report is not about a log of the answer key. Ask for a report on that log."
-    given_to = text_of(evidence.answer.student_id)
-    return f"Find the author of the report: its log was given to {given_to}, {id_text}."
+    given_to = shorten_text(evidence.answer.student_id)
+    return f"Find out who wrote the report: its log was given to student {given_to}, but {id_text}."
 
 
-def refused_report(
-    rubric: Rubric, key: AnswerKey | None, why: str, remedy: str = ""
+def grade_unreadable(
+    rubric: Rubric, key: AnswerKey | None, reason: str, remedy: str = ""
 ) -> GradedReport:
     """Return a graded report with zero points, for a file that is not a report."""
-    comment = f"No points: the file is not a px4fuse report ({text_of(why).rstrip('.')})."
+    comment = f"No points: the file is not a px4fuse report ({shorten_text(reason).rstrip('.')})."
     items = (
         Item(item.title, 0.0, item.points, comment)
         for item in rubric.items
         if item.applies("compare", key)
     )
-    return GradedReport("", "", "", cannot_verify(why, remedy), tuple(items), pending=remedy)
+    return GradedReport(
+        "", "", "", cannot_verify(reason, remedy), tuple(items), pending_action=remedy
+    )

@@ -1,10 +1,10 @@
 """Submissions: PDFs in folders and in zip files of learning platforms, with student and time.
 
-Zip files are not unpacked to disk, and names in them are never used as paths. Students choose the
-names of their files, but not the beginning of the path, which the platform writes: the first match
-in a path counts.
+Zip files are not unpacked to disk, and the names in them are never used as paths. The platform
+writes the beginning of a path, and students choose the rest. Therefore the first part of a path
+that matches a pattern identifies the student.
 
-Sources of the file names:
+Sources of the patterns:
 
 - Moodle: ``mod/assign/feedback/file/importziplib.php`` of its repository, which reads the names:
   ``{full name}_{participant}_assignsubmission_{plugin}_``, since 4.1 without the last ``_``.
@@ -42,66 +42,71 @@ from px4fuse.results.reading import clean_text, one_line
 from px4fuse.verification.model import BAD_VALUES
 from px4fuse.verification.pdf_input import MAX_BYTES
 
+# entries of a zip file
 MAX_ENTRIES = 10_000
-# bytes; zipfile reads the whole table of contents before entries can be counted
+# bytes of the table of contents of a zip file, which zipfile reads before entries can be counted
 MAX_DIRECTORY_BYTES = 4_000_000
-# bytes; sum of the unpacked sizes of a zip file, whose entries may overlap
+# bytes; sum of the unpacked sizes of the entries, which may refer to the same data
 MAX_TOTAL_BYTES = 4_000_000_000
-# compression ratio; PDFs are compressed already and do not shrink 100 times
-MAX_RATIO = 100
-MAX_NAME = 200
-# year of zip entries without a time
-ZIP_EPOCH = 1980
+# unpacked over packed size of an entry; a PDF is already compressed and does not shrink 100 times
+MAX_COMPRESSION_RATIO = 100
+# characters of a file name in messages
+MAX_NAME_LENGTH = 200
+# year that zip programs write if they do not know the time of an entry
+ZIP_EPOCH_YEAR = 1980
 
-_TOO_LARGE = f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."
-_ENCRYPTED = 1
-_UTF8 = 0x800
-METADATA = "submission_metadata.yml"
-# patterns of the file names, by platform
+_TOO_LARGE_REASON = f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."
+# general purpose bit flags of a zip entry (APPNOTE.TXT of PKWARE, 4.4.4)
+_ENCRYPTED_FLAG = 1
+_UTF8_FLAG = 0x800
+GRADESCOPE_METADATA = "submission_metadata.yml"
+# pattern of the paths in an export, by platform
 PLATFORMS = {
     name: re.compile(pattern)
     for name, pattern in table(__file__, "platforms.toml", dict[str, str]).items()
 }
-# parts of names that a platform writes once, and that students do not write by accident
+# parts of a path that a platform writes once; a second one was written by the student
 _PLATFORM_MARKS = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
-TIME_IN_NAMES = "%Y-%m-%d-%H-%M-%S"
-_SUBMISSION = re.compile(r"^(?:submission_)?(\d+)(?:\.pdf)?:\s*\n((?:[ -].*\n?)*)", re.MULTILINE)
-_SUBMITTERS = re.compile(r"^  :submitters:\s*\n((?:  - .*\n?|    .*\n?)*)", re.MULTILINE)
+BLACKBOARD_TIME_FORMAT = "%Y-%m-%d-%H-%M-%S"
+_SUBMISSION_BLOCK = re.compile(
+    r"^(?:submission_)?(\d+)(?:\.pdf)?:\s*\n((?:[ -].*\n?)*)", re.MULTILINE
+)
+_SUBMITTERS_BLOCK = re.compile(r"^  :submitters:\s*\n((?:  - .*\n?|    .*\n?)*)", re.MULTILINE)
 
 
 class _EntryError(Exception):
     """Reason why an entry of a zip file is not read."""
 
 
-_BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryError)
-# BAD_VALUES contains RuntimeError, and with it NotImplementedError of zipfile
-_UNREADABLE = (_EntryError, *_BROKEN_ZIP, *BAD_VALUES)
+_BROKEN_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryError)
+# RuntimeError in BAD_VALUES includes the NotImplementedError that zipfile raises
+_UNREADABLE_ERRORS = (_EntryError, *_BROKEN_ZIP_ERRORS, *BAD_VALUES)
 
 
 def _unread_reason(error: Exception) -> str:
-    """Format the reason why a file could not be read, as the end of a sentence."""
+    """Format the reason why a file was not read, for a message after the file name and a colon."""
     if isinstance(error, _EntryError):
         return str(error)
-    why = error.strerror if isinstance(error, OSError) and error.strerror else "damaged"
-    return f"it cannot be read ({why})."
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else "damaged"
+    return f"it cannot be read ({reason})."
 
 
 def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
-    """Find the PDFs in files, folders and zip files, and their students by the file names.
+    """Find the PDFs in files, folders and zip files, and identify the students by the file names.
 
     Parameters
     ----------
     paths : sequence of Path
         PDFs, folders (searched with their subfolders), and zip files exported by platforms. A zip
-        file inside of a folder or zip file is a student's and not opened. Gradescope's
-        ``submission_metadata.yml`` is read beside the submissions, never inside of one.
+        file inside a folder or a zip file was written by a student and is not opened. Gradescope's
+        ``submission_metadata.yml`` is read unless it is inside a submission.
 
     Returns
     -------
     submissions : tuple of Submission
-        Sorted by name, including unreadable PDFs: :func:`read` gives the reason.
+        Sorted by name. Unreadable PDFs are included: :func:`read` raises an error with the reason.
     notes : tuple of str
-        Ignored files, one sentence each.
+        Sentences about ignored files.
 
     Raises
     ------
@@ -109,23 +114,23 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
         A path does not exist, or no PDF was found.
     """
     notes: list[str] = []
-    submissions_by_place: dict[tuple[Path, str], Submission] = {}
-    people: dict[str, ExportOrigin] = {}
+    submission_by_path: dict[tuple[Path, str], Submission] = {}
+    origin_by_number: dict[str, ExportOrigin] = {}
     other_count = zip_count = 0
     for path in paths:
-        export = path.is_file() and path.name.lower().endswith(".zip")
-        for place in (_zip_submissions if export else _folder_submissions)(path, notes):
-            add_input(place.file)
-            end = place.name.lower()[-4:]
-            if end in (".pdf", ".zip"):
-                submissions_by_place.setdefault((place.file, place.entry), place)
-                zip_count += end == ".zip"
-            elif not _is_metadata(place.name):
+        is_export = path.is_file() and path.name.lower().endswith(".zip")
+        for submission in (_zip_submissions if is_export else _folder_submissions)(path, notes):
+            add_input(submission.file)
+            suffix = submission.name.lower()[-4:]
+            if suffix in (".pdf", ".zip"):
+                submission_by_path.setdefault((submission.file, submission.zip_entry), submission)
+                zip_count += suffix == ".zip"
+            elif not _is_metadata(submission.name):
                 other_count += 1
             else:
                 try:
-                    text = read(place).decode("utf-8", errors="replace")
-                    people |= gradescope_metadata(text)
+                    text = read(submission).decode("utf-8", errors="replace")
+                    origin_by_number |= read_gradescope_metadata(text)
                 except ResultsError as error:
                     notes.append(str(error))
     if other_count:
@@ -134,47 +139,57 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
         notes.append(
             f"Zip files not opened: {zip_count}. Name the export of a platform on the command line."
         )
-    if not submissions_by_place:
+    if not submission_by_path:
         raise SettingsError(one_line(" ".join(["No PDF found.", *notes]), 500))
-    order = sorted(
-        submissions_by_place.values(),
-        key=lambda one: (one.name.casefold(), one.name, one.file, one.entry),
+    ordered = sorted(
+        submission_by_path.values(),
+        key=lambda submission: (
+            submission.name.casefold(),
+            submission.name,
+            submission.file,
+            submission.zip_entry,
+        ),
     )
-    names = make_unique(_short_name(one.name) for one in order)
-    named_submissions = [replace(one, name=name) for one, name in zip(order, names, strict=True)]
-    return tuple(with_origins(named_submissions, people)), tuple(notes)
+    names = make_unique(_short_name(submission.name) for submission in ordered)
+    named_submissions = [
+        replace(submission, name=name) for submission, name in zip(ordered, names, strict=True)
+    ]
+    return tuple(add_origins(named_submissions, origin_by_number)), tuple(notes)
 
 
-def with_origins(
-    submissions: Sequence[Submission], people: Mapping[str, ExportOrigin]
+def add_origins(
+    submissions: Sequence[Submission], origin_by_number: Mapping[str, ExportOrigin]
 ) -> Iterator[Submission]:
     """Add student and platform to submissions.
 
-    All files of an export are of the platform that matches most of them. A file that a student
-    named like those of another platform is not assigned to it.
+    All files of an export (zip file or top-level folder) are from the platform whose pattern
+    matches most of them. A student who names a file as another platform does has no effect.
 
     Parameters
     ----------
-    people : mapping
-        Gradescope's metadata, by submission number.
+    origin_by_number : mapping
+        Students and times of Gradescope, by submission number.
     """
-    exports = [one.file if one.entry else one.name.partition("/")[0] for one in submissions]
+    exports = [
+        submission.file if submission.zip_entry else submission.name.partition("/")[0]
+        for submission in submissions
+    ]
     platform_counts: dict[object, Counter[str]] = defaultdict(Counter)
-    for export, one in zip(exports, submissions, strict=True):
-        platform_counts[export].update(filter(None, [origin_of(one.name).platform]))
-    for export, one in zip(exports, submissions, strict=True):
-        origin = origin_of(
-            one.name, [platform for platform, _ in platform_counts[export].most_common(1)]
+    for export, submission in zip(exports, submissions, strict=True):
+        platform_counts[export].update(filter(None, [parse_origin(submission.name).platform]))
+    for export, submission in zip(exports, submissions, strict=True):
+        origin = parse_origin(
+            submission.name, [platform for platform, _ in platform_counts[export].most_common(1)]
         )
         if origin.platform in ("gradescope", ""):
             # PDF assignments are exported as 123456.pdf
-            stem = one.name.rpartition("/")[2].casefold().removesuffix(".pdf")
-            origin = people.get(origin.person.numbers.get("gradescope", stem), origin)
-        yield replace(one, origin=origin)
+            stem = submission.name.rpartition("/")[2].casefold().removesuffix(".pdf")
+            origin = origin_by_number.get(origin.person.numbers.get("gradescope", stem), origin)
+        yield replace(submission, origin=origin)
 
 
 def read(submission: Submission) -> bytes:
-    """Bytes of a submission, at most :data:`~px4fuse.verification.pdf_input.MAX_BYTES` of them.
+    """Read a submission of at most :data:`~px4fuse.verification.pdf_input.MAX_BYTES` bytes.
 
     Raises
     ------
@@ -183,27 +198,29 @@ def read(submission: Submission) -> bytes:
     """
     try:
         with submission.file.open("rb") as file:
-            if submission.entry:
-                with _archive(file) as archive:
-                    content = _read_entry(archive, submission.entry)
+            if submission.zip_entry:
+                with _open_zip(file) as archive:
+                    content = _read_entry(archive, submission.zip_entry)
             else:
                 content = file.read(MAX_BYTES + 1)
         if len(content) > MAX_BYTES:
-            raise _EntryError(_TOO_LARGE)
-    except _UNREADABLE as error:
+            raise _EntryError(_TOO_LARGE_REASON)
+    except _UNREADABLE_ERRORS as error:
         raise ResultsError(
-            f"{one_line(submission.name, MAX_NAME)}: {_unread_reason(error)}"
+            f"{one_line(submission.name, MAX_NAME_LENGTH)}: {_unread_reason(error)}"
         ) from error
     return content
 
 
 def _is_metadata(name: str) -> bool:
     *folders, last = name.split("/")
-    return last == METADATA and not any(one.startswith("submission_") for one in folders)
+    return last == GRADESCOPE_METADATA and not any(
+        folder.startswith("submission_") for folder in folders
+    )
 
 
 class _LimitedFile:
-    """File that does not return more than MAX_DIRECTORY_BYTES at once."""
+    """File whose ``read`` returns at most MAX_DIRECTORY_BYTES."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -213,12 +230,12 @@ class _LimitedFile:
     def read(self, size: int = -1) -> bytes:
         if size > MAX_DIRECTORY_BYTES:
             raise zipfile.BadZipFile("table of contents too large")
-        # zipfile reads without size only to find the end of the archive
+        # zipfile calls read() without a size only to find the end of the archive
         return self._file.read(size if size >= 0 else MAX_DIRECTORY_BYTES)
 
 
 @contextmanager
-def _archive(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
+def _open_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
     with zipfile.ZipFile(_LimitedFile(file)) as archive:
         if len(archive.infolist()) > MAX_ENTRIES:
             raise _EntryError(f"it has more than {MAX_ENTRIES} entries.")
@@ -226,27 +243,32 @@ def _archive(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
 
 
 def _zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
-    """Return the entries of a zip file; none, and a note, if it cannot be read."""
+    """Return the files in a zip file; if it cannot be read, return none and add a note."""
     try:
-        with path.open("rb") as file, _archive(file) as archive:
-            entries = [one for one in archive.infolist() if not one.is_dir()]
-        # zipfile returns at most the declared size
-        if sum(one.file_size for one in entries) > MAX_TOTAL_BYTES:
+        with path.open("rb") as file, _open_zip(file) as archive:
+            entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+        # the declared sizes are reliable limits: zipfile never returns more than the declared size
+        if sum(entry.file_size for entry in entries) > MAX_TOTAL_BYTES:
             raise _EntryError(f"it unpacks to more than {MAX_TOTAL_BYTES // 10**9} GB.")
-    except _UNREADABLE as error:
+    except _UNREADABLE_ERRORS as error:
         notes.append(f"{_short_name(path.name)}: ignored: {_unread_reason(error)}")
         return []
-    last = {one.filename: one for one in entries}
-    if len(last) < len(entries):
+    last_by_name = {entry.filename: entry for entry in entries}
+    if len(last_by_name) < len(entries):
+        duplicate_count = len(entries) - len(last_by_name)
         notes.append(
-            f"{_short_name(path.name)}: {len(entries) - len(last)} entries have duplicate names; "
+            f"{_short_name(path.name)}: {duplicate_count} entries have duplicate names; "
             "only the last entry of each name was read."
         )
-    places = (
-        Submission(path.resolve(), name, _entry_label(one), _entry_time(one))
-        for name, one in last.items()
+    submissions = (
+        Submission(path.resolve(), name, _entry_label(entry), _entry_time(entry))
+        for name, entry in last_by_name.items()
     )
-    return [place for place in places if not any(map(_is_hidden, place.name.split("/")))]
+    return [
+        submission
+        for submission in submissions
+        if not any(map(_is_hidden, submission.name.split("/")))
+    ]
 
 
 def _folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
@@ -255,9 +277,9 @@ def _folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
         yield Submission(path.resolve(), "", path.name)
         return
     if not path.is_dir():
-        raise SettingsError(f"{one_line(str(path), MAX_NAME)} is not a file or folder.")
+        raise SettingsError(f"{one_line(str(path), MAX_NAME_LENGTH)} is not a file or folder.")
     root = path.resolve()
-    outside = 0
+    outside_count = 0
     for file in files_below(root):  # symbolic links to folders are not entered
         name = file.relative_to(root)
         if any(map(_is_hidden, name.parts)):
@@ -265,16 +287,16 @@ def _folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
         try:
             resolved = file.resolve(strict=True)
             # reading a named pipe would wait forever
-            inside = resolved.is_relative_to(root) and resolved.is_file()
+            is_inside = resolved.is_relative_to(root) and resolved.is_file()
         except (OSError, RuntimeError):  # link without target, or circular
-            inside = False
-        if inside:
+            is_inside = False
+        if is_inside:
             yield Submission(resolved, "", name.as_posix())
-        outside += not inside
-    if outside:
+        outside_count += not is_inside
+    if outside_count:
         notes.append(
-            f"{one_line(path.name, MAX_NAME)}: {outside} links out of the folder, special files or "
-            "unreadable folders were ignored."
+            f"{one_line(path.name, MAX_NAME_LENGTH)}: {outside_count} links out of the folder, "
+            "special files or unreadable folders were ignored."
         )
 
 
@@ -283,18 +305,18 @@ def _is_hidden(name: str) -> bool:
 
 
 def _entry_time(entry: zipfile.ZipInfo) -> datetime | None:
-    """Return the time of a zip entry, in an unknown time zone; None if it is not valid."""
+    """Return the time of a zip entry, in an unknown time zone; None without a valid time."""
     try:
         time = datetime(*entry.date_time)
     except ValueError:
         return None
-    return time if time.year > ZIP_EPOCH else None
+    return time if time.year > ZIP_EPOCH_YEAR else None
 
 
 def _entry_label(entry: zipfile.ZipInfo) -> str:
-    """Return folders and name of a zip entry for messages, without '.', '..' and drives."""
+    """Return the path of a zip entry for messages, without '.', '..' and drive letters."""
     name = entry.filename
-    if not entry.flag_bits & _UTF8:
+    if not entry.flag_bits & _UTF8_FLAG:
         # zipfile decodes names without UTF-8 flag as code page 437; most programs write UTF-8
         try:
             name = name.encode("cp437").decode("utf-8")
@@ -309,50 +331,51 @@ def _entry_label(entry: zipfile.ZipInfo) -> str:
 
 
 def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
-    """Read an entry that is of a kind that learning platforms write."""
+    """Read an entry of a zip file; refuse kinds of entries that learning platforms do not write."""
     entry = archive.getinfo(name)
-    is_small = entry.file_size <= max(1_000_000, MAX_RATIO * entry.compress_size)
+    is_small = entry.file_size <= max(1_000_000, MAX_COMPRESSION_RATIO * entry.compress_size)
     is_known_method = entry.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-    for has_problem, why in (
-        (entry.flag_bits & _ENCRYPTED, "the zip entry is encrypted."),
+    for has_problem, reason in (
+        (entry.flag_bits & _ENCRYPTED_FLAG, "the zip entry is encrypted."),
         (
             stat.S_ISLNK(entry.external_attr >> 16),
             "the zip entry is a symbolic link.",
         ),
         (not is_known_method, "the compression method of the zip entry is not supported."),
-        (entry.file_size > MAX_BYTES, _TOO_LARGE),
+        (entry.file_size > MAX_BYTES, _TOO_LARGE_REASON),
         (
             not is_small,
-            f"the zip entry is compressed more than {MAX_RATIO} times, so it is not a report.",
+            f"the zip entry is compressed more than {MAX_COMPRESSION_RATIO} times, unlike reports.",
         ),
     ):
         if has_problem:
-            raise _EntryError(why)
+            raise _EntryError(reason)
     # zipfile returns at most the declared size
     return archive.read(entry)
 
 
 def _short_name(name: str) -> str:
-    """Format a name on one line; of a long name the start and the end."""
-    line = " ".join(clean_text(name[-10 * MAX_NAME :]).split())
-    if len(line) > MAX_NAME:
-        line = f"{line[: MAX_NAME // 2]}…{line[-(MAX_NAME - MAX_NAME // 2 - 1) :]}"
+    """Format a name on one line; shorten a long name in the middle."""
+    line = " ".join(clean_text(name[-10 * MAX_NAME_LENGTH :]).split())
+    if len(line) > MAX_NAME_LENGTH:
+        head_length = MAX_NAME_LENGTH // 2
+        line = f"{line[:head_length]}…{line[head_length + 1 - MAX_NAME_LENGTH :]}"
     return line or "no name"
 
 
 # ------------------------------------------------------------------ student and time in exports
 
 
-def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportOrigin:
-    """Return the student of a file, by its path in the export.
+def parse_origin(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportOrigin:
+    """Return student and time of a file, from its path in the export.
 
-    >>> origin_of("Doe Jane_4711_assignsubmission_file_/report.pdf").person.name
+    >>> parse_origin("Doe Jane_4711_assignsubmission_file_/report.pdf").person.name
     'Doe Jane'
-    >>> origin_of("doejane_LATE_12345_67890_report-1.pdf").person.numbers
+    >>> parse_origin("doejane_LATE_12345_67890_report-1.pdf").person.numbers
     {'canvas': '12345'}
-    >>> origin_of("Lab 3_jdoe_attempt_2026-11-20-12-34-56_report.pdf").time
+    >>> parse_origin("Lab 3_jdoe_attempt_2026-11-20-12-34-56_report.pdf").time
     datetime.datetime(2026, 11, 20, 12, 34, 56)
-    >>> origin_of("report.pdf") == ExportOrigin()
+    >>> parse_origin("report.pdf") == ExportOrigin()
     True
     """
     path_parts = name.split("/")
@@ -363,10 +386,10 @@ def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportO
             if match is None:
                 continue
             fields = {key: value or "" for key, value in match.groupdict().items()}
-            stamp = fields.get("time", "")
+            time_text = fields.get("time", "")
             try:
-                time = datetime.strptime(stamp, TIME_IN_NAMES) if stamp else None
-            except ValueError:  # not a valid time: the student chose the name
+                time = datetime.strptime(time_text, BLACKBOARD_TIME_FORMAT) if time_text else None
+            except ValueError:  # a platform writes valid times, so a student wrote this name
                 continue
             full_name = (
                 fields.get("name") or f"{fields.get('first', '')} {fields.get('last', '')}".strip()
@@ -380,40 +403,40 @@ def origin_of(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportO
     return UNKNOWN_SUBMITTER
 
 
-def gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
+def read_gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
     r"""Read students and times from Gradescope's ``submission_metadata.yml``, by submission number.
 
-    Only keys at the depth of Gradescope's own are read; texts of students are deeper. The student
-    of a group is its first member.
+    Only keys at the indentation of Gradescope's own keys are read; texts of students are indented
+    further. A group submission belongs to its first member.
 
     >>> text = "submission_7:\n  :submitters:\n  - :name: Ada\n    :sid: '12'\n"
-    >>> gradescope_metadata(text)["7"].person.student_id
+    >>> read_gradescope_metadata(text)["7"].person.student_id
     '12'
     """
     origins = {}
-    for number, block in _SUBMISSION.findall(text.replace("\r\n", "\n")):
-        people = _SUBMITTERS.search(block)
+    for number, block in _SUBMISSION_BLOCK.findall(text.replace("\r\n", "\n")):
+        submitters = _SUBMITTERS_BLOCK.search(block)
         name, student_id, email = (
-            _value(people[1] if people else "", rf"  (?:- |  ):{key}")
+            _yaml_value(submitters[1] if submitters else "", rf"  (?:- |  ):{key}")
             for key in ("name", "sid", "email")
         )
         person = Person(student_id, name, email, "", {"gradescope": number})
         origins[number] = ExportOrigin(
-            "gradescope", person, _time_of(_value(block, "  :created_at"))
+            "gradescope", person, _parse_time(_yaml_value(block, "  :created_at"))
         )
     return origins
 
 
-def _value(block: str, key: str) -> str:
-    """Return the first value of a key, without quotes."""
+def _yaml_value(block: str, key: str) -> str:
+    """Return the value at the first occurrence of a key, without quotes."""
     match = re.search(rf"^{key}: *(['\"]?)(.*)\1 *$", block, re.MULTILINE)
     return match[2] if match else ""
 
 
-def _time_of(value: str) -> datetime | None:
-    """Read a time of Gradescope's YAML, with its time zone.
+def _parse_time(value: str) -> datetime | None:
+    """Parse a time in Gradescope's YAML; UTC if it has no time zone. None if it is not valid.
 
-    >>> _time_of("2026-11-20 12:34:56.123456000 Z").isoformat()
+    >>> _parse_time("2026-11-20 12:34:56.123456000 Z").isoformat()
     '2026-11-20T12:34:56.123456+00:00'
     """
     try:

@@ -8,13 +8,19 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.flight_events import longest_s
+from px4fuse.comparison.flight_events import max_interval_s
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.preparation import flight_for_source
+from px4fuse.comparison.preparation import select_innovations
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.inputs import prepare_inputs
 from px4fuse.errors import MissingDataError, Px4FuseError
-from px4fuse.filter.signals import IMU_GAP_INTERVALS, IMU_GAP_S, Segment, ned_acceleration, within
+from px4fuse.filter.signals import (
+    IMU_GAP_INTERVALS,
+    IMU_GAP_S,
+    Segment,
+    cut_to_segment,
+    ned_acceleration,
+)
 from px4fuse.findings import ekf2_not_fusing, finding_title, imu, missing, recording
 from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable, sample_rate
 from px4fuse.inspect.tables import NO_POSITION, unavailable_parts
@@ -24,10 +30,10 @@ from px4fuse.text import capitalise_first, to_json_types, utc_time
 
 SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"
-# Fields of Flight that are written without change
+# Fields of Flight that the JSON output contains unchanged
 FLIGHT_FIELDS = ("log", "airborne", "clocks", "missing", "unused", "inputs")
 # Displayed names of the parts of a flight, by their names in Flight.streams
-PART_NAMES = {
+PART_LABELS = {
     "imu": "IMU",
     "attitude": "attitude",
     "position": "position",
@@ -38,20 +44,20 @@ PART_NAMES = {
     "truth": "ground truth",
     "airborne": "land detector",
 }
-# Analyses of compare that need EKF2 or ground truth, with the part of the flight that they need
+# Analyses of compare, with the part of the flight (EKF2 or ground truth) that each requires
 PARTS_OF_COMPARE = {
     "EKF2 states": "ekf2_state",
     "EKF2 variances": "ekf2_variance",
     "EKF2 consistency": "ekf2_innovations",
     "error": "truth",
 }
-NO_AXIS = Unavailable("comparison", "the log contains no position to compare with", "")
-Spans = tuple[tuple[float, float], ...]
+NO_COMPARISON = Unavailable("comparison", "the log contains no position to compare with", "")
+TimeSpans = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
 class AnalysisOption:
-    """Analysis of px4fuse, with the data that it uses or the reason why it is not possible."""
+    """Analysis of px4fuse; ``reason``: used data, or the reason why it is not possible."""
 
     name: str
     possible: bool
@@ -60,7 +66,7 @@ class AnalysisOption:
 
 @dataclass(frozen=True)
 class LoggingAdvice:
-    """Action before the next flight, and the data that it improves."""
+    """Action before the next flight, and the analyses or data that the action improves."""
 
     remedy: str
     improves: tuple[str, ...]
@@ -68,7 +74,7 @@ class LoggingAdvice:
 
 @dataclass(frozen=True)
 class Gaps:
-    """Gaps: intervals between samples that are longer than ``limit_s``.
+    """Gaps of a part of the flight: intervals between samples above ``limit_s``.
 
     Attributes
     ----------
@@ -76,8 +82,8 @@ class Gaps:
     total_s, longest_s : float
         Sum and maximum of the gaps; 0 without gaps.
     limit_s : float
-        IMU: 0.1 s or five median intervals, whichever is longer (as in KF). Others: 1 s or five
-        intervals, whichever is longer.
+        IMU: the longer of 0.1 s and five median intervals, as in KF. Other parts: the longer of 1 s
+        and five intervals.
     """
 
     count: int
@@ -93,16 +99,16 @@ class Source:
     Attributes
     ----------
     part : str
-        "IMU", "attitude", "position", "EKF2 state", ..., see :data:`PART_NAMES`.
+        "IMU", "attitude", "position", "EKF2 state", ..., see :data:`PART_LABELS`.
     name : str
         Name of a position track, else the first topic; empty if unavailable.
     topics : tuple of str
     clock, log : str
         Clock of its timestamps, and name of the file.
     samples : int or None
-        None if the reader keeps no samples of it (land detector).
+        None for the land detector, of which the reader keeps no samples.
     rate_hz : float or None
-        Rate between gaps; None with less than two samples.
+        Median rate, so that gaps have no effect; None with less than two samples.
     gaps : Gaps or None
     start_s, end_s : float or None
         First and last sample, in seconds after the first data.
@@ -136,20 +142,20 @@ class Inventory:
     Attributes
     ----------
     flight : Flight
-        With the EKF2 innovations of the position that compare uses.
+        Flight with the EKF2 innovations of the position source that compare selects.
     start_utc : str or None
         UTC of the first data, ISO 8601.
     sources : tuple of Source
-        All parts of the flight and all position tracks, most direct track first.
+        All parts of the flight, including all position tracks; the most direct track is first.
     source_reason : str
-        Reason for the position source of compare, or for its absence.
+        Reason why compare selects its position source, or finds none.
     segment : Segment or None
         Segment that compare analyses.
     abilities : tuple of AnalysisOption
     advice : tuple of LoggingAdvice
-        Most important first, each action once.
+        Each action once, the most important first.
     notes : tuple of str
-        Notes of the reader about damage, clocks and the estimator.
+        Sentences of the reader about damage, clocks and the estimator.
     """
 
     flight: Flight
@@ -170,32 +176,36 @@ def take_inventory(flight: Flight) -> Inventory:
     flight : Flight
         May lack any part.
     """
-    compared, reason, remedy = None, "", ""
+    comparison, reason, remedy = None, "", ""
     try:
-        compared = compare(flight)
-        reason = compared.source_reason
+        comparison = compare(flight)
+        reason = comparison.source_reason
     except Px4FuseError as error:
         reason = with_options(error.reason).removeprefix(f"{flight.log.name}: ")
         remedy = with_options(error.remedy)
         if not isinstance(error, MissingDataError):
             remedy = "Record the whole flight: set SDLOG_MODE to 0 (logging from arming)."
-    if compared is not None:
-        flight = flight_for_source(flight, compared.source)
+    if comparison is not None:
+        flight = select_innovations(flight, comparison.source)
     log = flight.log
-    is_cut = log.ends_in_flight and not log.damage
+    is_incomplete = log.ends_in_flight and not log.damage
     return Inventory(
         flight=flight,
         start_utc=utc_time(log.start_unix_s),
-        sources=tuple(_sources(flight, compared, reason)),
+        sources=tuple(_sources(flight, comparison, reason)),
         source_reason=reason,
-        segment=None if compared is None else compared.segment,
-        abilities=tuple(_abilities(flight, compared, reason)),
-        advice=_logging_advice(flight, compared, remedy),
+        segment=None if comparison is None else comparison.segment,
+        abilities=tuple(_analysis_options(flight, comparison, reason)),
+        advice=_logging_advice(flight, comparison, remedy),
         notes=(
             *log.damage,
-            *(("the log ends in flight and does not contain the landing",) if is_cut else ()),
+            *(
+                ("the log ends in flight and does not contain the landing",)
+                if is_incomplete
+                else ()
+            ),
             *log.notes,
-            *(() if compared is None else compared.source.notes),
+            *(() if comparison is None else comparison.source.notes),
             *(flight.ekf2.notes if isinstance(flight.ekf2, Ekf2) else ()),
         ),
     )
@@ -212,71 +222,84 @@ def to_plain(inventory: Inventory) -> dict[str, Any]:
     return {"schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION}, **data}
 
 
-def _data_by_part(flight: Flight) -> dict[str, pd.DataFrame | Spans | Unavailable]:
-    """Return all parts except positions, by their names in Flight.streams.
+def _data_by_part(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unavailable]:
+    """Return all parts of a flight except positions, by their names in Flight.streams.
 
-    Without EKF2, its state stands for all of its parts. Innovations are of the axis with the most.
+    If the log contains no EKF2 data, only the EKF2 state is returned as unavailable. The EKF2
+    innovations are those of the axis with the most samples.
     """
     ekf2, truth = flight.ekf2, flight.truth
     data_by_part = {"imu": flight.imu, "attitude": flight.attitude}
     if isinstance(ekf2, Unavailable):
         data_by_part["ekf2_state"] = ekf2
     else:
-        axes = ekf2.innovations.values()
-        frames = [frame for frame in axes if isinstance(frame, pd.DataFrame)]
-        longest_frame = max(frames, key=len) if frames else next(iter(axes))
+        innovations_by_axis = ekf2.innovations.values()
+        innovation_tables = [
+            innovations
+            for innovations in innovations_by_axis
+            if isinstance(innovations, pd.DataFrame)
+        ]
+        longest_innovations = (
+            max(innovation_tables, key=len)
+            if innovation_tables
+            else next(iter(innovations_by_axis))
+        )
         data_by_part |= {"ekf2_state": ekf2.state, "ekf2_variance": ekf2.variance}
-        data_by_part |= {"ekf2_innovations": longest_frame, "ekf2_fusing": ekf2.fusing}
+        data_by_part |= {"ekf2_innovations": longest_innovations, "ekf2_fusing": ekf2.fusing}
     samples = truth if isinstance(truth, Unavailable) else truth.samples
     return {**data_by_part, "truth": samples, "airborne": flight.airborne}
 
 
-def _sources(flight: Flight, compared: Comparison | None, reason: str) -> Iterator[Source]:
+def _sources(flight: Flight, comparison: Comparison | None, reason: str) -> Iterator[Source]:
     data_by_part = _data_by_part(flight)
-    for key, name in PART_NAMES.items():
+    for key, name in PART_LABELS.items():
         if key in data_by_part:
             yield _source(name, data_by_part[key], flight.streams.get(key))
         for track in flight.positions if key == "position" else ():
-            chosen = compared is not None and track.name == compared.source.name
-            about = {"name": track.name, "description": track.description, "chosen": chosen}
-            yield _source(name, track.samples, track, **about)
+            is_chosen = comparison is not None and track.name == comparison.source.name
+            track_fields = {
+                "name": track.name,
+                "description": track.description,
+                "chosen": is_chosen,
+            }
+            yield _source(name, track.samples, track, **track_fields)
         if key == "position" and not flight.positions:
             yield Source(name, unavailable=reason)
 
 
 def _source(
     part: str,
-    data: pd.DataFrame | Spans | Unavailable,
+    data: pd.DataFrame | TimeSpans | Unavailable,
     stream: Stream | PositionTrack | None,
-    **about: Any,
+    **source_fields: Any,
 ) -> Source:
-    """Describe a part of the flight: samples, rate, gaps, topics and clock."""
+    """Describe a part of the flight by samples, rate, gaps, topics and clock."""
     if isinstance(data, Unavailable):
         return Source(part, unavailable=data.reason)
     if stream is not None:
-        about = {"name": stream.topics[0] if stream.topics else "", **about}
-        about |= {"topics": stream.topics, "clock": stream.clock, "log": stream.log}
+        source_fields = {"name": stream.topics[0] if stream.topics else "", **source_fields}
+        source_fields |= {"topics": stream.topics, "clock": stream.clock, "log": stream.log}
     if isinstance(data, pd.DataFrame):
-        about["samples"] = len(data)
+        source_fields["samples"] = len(data)
         times_s = data.index.tolist()
     else:
         times_s = [time_s for span in data for time_s in span]
     if times_s:
-        about |= {"start_s": times_s[0], "end_s": times_s[-1]}
+        source_fields |= {"start_s": times_s[0], "end_s": times_s[-1]}
     if isinstance(data, pd.DataFrame) and len(data) > 1:
-        about |= {
+        source_fields |= {
             "rate_hz": sample_rate(data),
-            "gaps": _gaps(data, of_imu=part == PART_NAMES["imu"]),
+            "gaps": _gaps(data, is_imu=part == PART_LABELS["imu"]),
         }
-    return Source(part, **about)
+    return Source(part, **source_fields)
 
 
-def _gaps(frame: pd.DataFrame, *, of_imu: bool) -> Gaps:
-    intervals = np.diff(frame.index.to_numpy())
+def _gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
+    intervals = np.diff(samples.index.to_numpy())
     limit_s = (
         max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(intervals)))
-        if of_imu
-        else float(longest_s(1.0 / sample_rate(frame)))
+        if is_imu
+        else float(max_interval_s(1.0 / sample_rate(samples)))
     )
     long_intervals = intervals[intervals > limit_s]
     return Gaps(
@@ -287,71 +310,76 @@ def _gaps(frame: pd.DataFrame, *, of_imu: bool) -> Gaps:
     )
 
 
-def _abilities(
-    flight: Flight, compared: Comparison | None, reason: str
+def _analysis_options(
+    flight: Flight, comparison: Comparison | None, reason: str
 ) -> Iterator[AnalysisOption]:
-    """Yield the analyses of compare, aids and what-if, each with its data or reason."""
+    """Yield all analyses with their data, or the reason why they are not possible."""
     acceleration: object = ned_acceleration(flight)
     rows_by_name: dict[str, tuple[object, str]] = {}
-    if compared is None:
+    if comparison is None:
         yield AnalysisOption("compare", False, reason)
     else:
-        source, segment = compared.source, compared.segment
-        count, span = len(within(source.samples, segment)), (segment.start_s, segment.end_s)
+        source, segment = comparison.source, comparison.segment
+        count, span = len(cut_to_segment(source.samples, segment)), (segment.start_s, segment.end_s)
         description = "KF with {}, {} samples, {:.1f} s to {:.1f} s"
         yield AnalysisOption("compare", True, description.format(source.name, count, *span))
-        acceleration, rows_by_name = compared.lines[0].acceleration, _ekf2_and_truth_rows(compared)
-    slow = " ".join(finding.message for finding in imu.rates(flight))
+        acceleration, rows_by_name = (
+            comparison.lines[0].acceleration,
+            _ekf2_and_truth_rows(comparison),
+        )
+    imu_reason = " ".join(finding.message for finding in imu.detect_low_rates(flight))
     if isinstance(acceleration, Unavailable):
-        slow = f"{acceleration.reason}; KF assumes constant velocity"
+        imu_reason = f"{acceleration.reason}; KF assumes constant velocity"
     acceleration_text = "IMU rotated into NED with the attitude, gravity removed"
-    yield AnalysisOption("acceleration", not slow, slow or acceleration_text)
+    yield AnalysisOption("acceleration", not imu_reason, imu_reason or acceleration_text)
     data_by_part = _data_by_part(flight)
     for name, key in PARTS_OF_COMPARE.items():
-        logged, (used_part, description) = (
+        logged, (result, description) = (
             data_by_part.get(key, flight.ekf2),
-            rows_by_name.get(name, (NO_AXIS, "")),
+            rows_by_name.get(name, (NO_COMPARISON, "")),
         )
-        yield _ability(name, logged if isinstance(logged, Unavailable) else used_part, description)
+        yield _analysis_option(
+            name, logged if isinstance(logged, Unavailable) else result, description
+        )
     aids, ekf2 = evaluate_aids(flight), flight.ekf2
     if isinstance(aids, dict) and isinstance(ekf2, Ekf2):
-        rates = (f"{a.label} {_rate_text(ekf2.aids[n].samples)}" for n, a in aids.items())
+        rates = (f"{aid.label} {_rate_text(ekf2.aids[name].samples)}" for name, aid in aids.items())
         description = ", ".join(rates)
-    yield _ability("aids", aids, description)
+    yield _analysis_option("aids", aids, description)
     inputs = prepare_inputs(flight)
     if not isinstance(inputs, Unavailable):
-        replayed_s = sum(float(np.ptp(stretch.time_s)) for stretch in inputs.stretches)
+        replayed_s = sum(float(np.ptp(segment.time_s)) for segment in inputs.segments)
         description = f"EKF2 replay with {inputs.aid.label}, {replayed_s:.0f} s"
-    yield _ability("what-if", inputs, description)
+    yield _analysis_option("what-if", inputs, description)
 
 
 def _rate_text(samples: pd.DataFrame) -> str:
-    """Format the rate of samples (Hz); "1 sample" for a single one."""
+    """Format the rate (Hz) of samples; "1 sample" if there is only one."""
     return f"{sample_rate(samples):.2g} Hz" if len(samples) > 1 else "1 sample"
 
 
-def _ability(name: str, part: object, description: str) -> AnalysisOption:
-    """Return an analysis with its description, or with the reason if the part is missing."""
+def _analysis_option(name: str, part: object, description: str) -> AnalysisOption:
+    """Return an analysis with its description, or with the reason if its part is unavailable."""
     if isinstance(part, Unavailable):
         return AnalysisOption(name, False, part.reason)
     return AnalysisOption(name, True, description)
 
 
-def _ekf2_and_truth_rows(compared: Comparison) -> dict[str, tuple[object, str]]:
-    """Return result and description of each analysis with EKF2 or ground truth."""
-    first, truth = next(iter(compared.axes.values())), compared.flight.truth
-    innovations = {name: axis.ekf2_innovations for name, axis in compared.axes.items()}
+def _ekf2_and_truth_rows(comparison: Comparison) -> dict[str, tuple[object, str]]:
+    """Return result and description of each analysis in PARTS_OF_COMPARE."""
+    first_axis, truth = next(iter(comparison.axes.values())), comparison.flight.truth
+    innovations = {name: axis.ekf2_innovations for name, axis in comparison.axes.items()}
     counts = [f"{n} {len(f)}" for n, f in innovations.items() if isinstance(f, pd.DataFrame)]
-    summaries = [axis.filters["ekf2"] for axis in compared.axes.values()]
+    summaries = [axis.filters["ekf2"] for axis in comparison.axes.values()]
     quantities_text = "position only"
     if isinstance(truth, Truth) and truth.samples[Columns.VELOCITY].notna().any(axis=None):
         quantities_text = "position and velocity"
     return {
         "EKF2 states": (
-            first.difference,
-            f"{_count_text(first.ekf2_state)} of position and velocity",
+            first_axis.difference,
+            f"{_count_text(first_axis.ekf2_state)} of position and velocity",
         ),
-        "EKF2 variances": (first.ekf2_variance, _count_text(first.ekf2_variance)),
+        "EKF2 variances": (first_axis.ekf2_variance, _count_text(first_axis.ekf2_variance)),
         "EKF2 consistency": (
             next(
                 (summary for summary in summaries if not isinstance(summary, Unavailable)),
@@ -360,7 +388,7 @@ def _ekf2_and_truth_rows(compared: Comparison) -> dict[str, tuple[object, str]]:
             f"innovations: {', '.join(counts)}",
         ),
         "error": (
-            first.truth,
+            first_axis.truth,
             f"RMSE and NEES of {quantities_text} against {getattr(truth, 'name', '')}",
         ),
     }
@@ -371,25 +399,37 @@ def _count_text(part: pd.DataFrame | Unavailable) -> str:
 
 
 def _logging_advice(
-    flight: Flight, compared: Comparison | None, remedy: str
+    flight: Flight, comparison: Comparison | None, remedy: str
 ) -> tuple[LoggingAdvice, ...]:
-    """Collect the actions of findings about the recording and of missing data, each once."""
-    findings = [*recording.loss(flight), *recording.clocks_set_back(flight)]
-    needs = [(remedy, "position")] if remedy else []
-    if compared is not None:
-        findings += [*missing.source_as_sent(compared), *ekf2_not_fusing.detect(compared)]
-        findings += [*missing.innovations(compared), *recording.dropouts(compared)]
-    findings += imu.rates(flight)
-    needs += [(finding.remedy, finding_title(finding.id)) for finding in findings]
-    # advice about the estimator's log is for PX4 only
+    """Collect the actions of findings about the recording, and of unavailable parts, each once."""
+    findings = [*recording.detect_lost_data(flight), *recording.detect_clocks_set_back(flight)]
+    actions_and_purposes = [(remedy, "position")] if remedy else []
+    if comparison is not None:
+        findings += [
+            *missing.detect_source_not_logged(comparison),
+            *ekf2_not_fusing.detect(comparison),
+        ]
+        findings += [
+            *missing.detect_missing_innovations(comparison),
+            *recording.detect_dropouts(comparison),
+        ]
+    findings += imu.detect_low_rates(flight)
+    actions_and_purposes += [
+        (finding.remedy, finding_title(finding.id))
+        for finding in findings
+        if not finding.remedy.startswith(missing.NOTHING_TO_SET)
+    ]
+    # other unavailable parts can be logged by PX4 only, so their advice is for ULogs
     main_parts = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
-    needs += [
+    actions_and_purposes += [
         (part.remedy, part.what)
         for part in unavailable_parts(flight)
         if part is not NO_POSITION
         and (flight.log.has_ulog or any(part is main_part for main_part in main_parts))
     ]
-    improves: dict[str, dict[str, None]] = {}
-    for action, what in needs:
-        improves.setdefault(capitalise_first(action), {})[what] = None
-    return tuple(LoggingAdvice(action, tuple(purposes)) for action, purposes in improves.items())
+    purposes_by_action: dict[str, dict[str, None]] = {}
+    for action, purpose in actions_and_purposes:
+        purposes_by_action.setdefault(capitalise_first(action), {})[purpose] = None
+    return tuple(
+        LoggingAdvice(action, tuple(purposes)) for action, purposes in purposes_by_action.items()
+    )

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.comparison.preparation import choose_source, flight_for_source
+from px4fuse.comparison.preparation import choose_source, select_innovations
 from px4fuse.errors import MissingDataError
 from px4fuse.filter.signals import ned_acceleration
 from px4fuse.flight import Ekf2, Flight, PositionTrack, Truth, Unavailable
@@ -20,9 +20,10 @@ from px4fuse.text import to_json_types
 SCHEMA_NAME = "px4fuse-flight"
 SCHEMA_VERSION = "1.0"
 DICTIONARY_COLUMNS = ["table", "column", "unit", "frame", "meaning", "source_topic", "clock"]
-# Characters that are not allowed or need quotes in a file name
-_UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")
-MAX_NAME = 80
+# Characters that are not allowed in file names, or need quotes on the command line
+_UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9_-]+")
+# Characters of a table name, which is a file name
+MAX_NAME_LENGTH = 80
 NO_POSITION = Unavailable(
     "external position",
     "the log contains no position track. px4fuse info LOG lists how to log one",
@@ -32,7 +33,7 @@ NO_POSITION = Unavailable(
 
 @dataclass(frozen=True)
 class DescribedTable:
-    """Table with its rows of the data dictionary."""
+    """Table, with one row of the data dictionary (``columns``) per column."""
 
     name: str
     data: pd.DataFrame
@@ -40,15 +41,15 @@ class DescribedTable:
 
 
 def with_best_source(flight: Flight) -> Flight:
-    """Return the flight with the EKF2 innovations of the position that compare uses."""
+    """Return the flight with the EKF2 innovations of the position source of compare."""
     try:
-        return flight_for_source(flight, choose_source(flight)[0])
+        return select_innovations(flight, choose_source(flight)[0])
     except MissingDataError:
         return flight
 
 
 def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:
-    """Return a flight as tables with one row per sample and one documented unit per column.
+    """Return the tables of a flight: one row per sample, one unit per column.
 
     Returns
     -------
@@ -65,17 +66,16 @@ def data_dictionary(flight: Flight) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        Columns table, column, unit (ASCII, readable by every spreadsheet), frame, meaning,
-        source_topic, clock.
+        Columns table, column, unit (ASCII), frame, meaning, source_topic, clock.
     """
-    frames = [table.columns for table in _tables(flight)]
-    if not frames:
+    descriptions = [table.columns for table in _tables(flight)]
+    if not descriptions:
         return pd.DataFrame(columns=DICTIONARY_COLUMNS)
-    return pd.concat(frames, ignore_index=True)[DICTIONARY_COLUMNS]
+    return pd.concat(descriptions, ignore_index=True)[DICTIONARY_COLUMNS]
 
 
 def unavailable_parts(flight: Flight) -> tuple[Unavailable, ...]:
-    """List the parts of the flight without a table, with reasons."""
+    """List the parts of the flight that have no table, with the reasons."""
     ekf2 = flight.ekf2
     sections: list[object] = [flight.imu, flight.attitude, ekf2]
     if isinstance(ekf2, Ekf2):
@@ -90,7 +90,7 @@ def unavailable_parts(flight: Flight) -> tuple[Unavailable, ...]:
 
 
 def description(flight: Flight) -> dict[str, Any]:
-    """Return information about the log and the missing data as JSON types."""
+    """Describe log, topics, clocks and missing data, in JSON types for ``flight.json``."""
     ekf2 = flight.ekf2
     description_fields: dict[str, Any] = {
         "schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION},
@@ -111,7 +111,7 @@ def description(flight: Flight) -> dict[str, Any]:
 
 @cache
 def _column_descriptions() -> pd.DataFrame:
-    """Read unit, frame and meaning of every column, by table."""
+    """Read unit, frame and meaning of all columns from columns.csv, by table."""
     with files("px4fuse.inspect").joinpath("columns.csv").open(encoding="utf-8") as file:
         return pd.read_csv(file, index_col="table", keep_default_na=False)
 
@@ -120,10 +120,10 @@ def _table(
     name: str,
     data: pd.DataFrame,
     origin: tuple[tuple[str, ...], str] = ((), ""),
-    of: str = "",
+    described_name: str = "",
     **values: str,
 ) -> DescribedTable:
-    """Make a table with the columns that columns.csv lists for ``name``, or for ``of``.
+    """Make a table with the columns that columns.csv lists for ``name``, or for ``described_name``.
 
     Parameters
     ----------
@@ -132,7 +132,9 @@ def _table(
     **values
         Values for the names in braces in the descriptions.
     """
-    columns = _column_descriptions().loc[of or name].map(lambda cell: cell.format(**values))
+    columns = (
+        _column_descriptions().loc[described_name or name].map(lambda cell: cell.format(**values))
+    )
     topics, clock = origin
     columns = columns.assign(table=name, source_topic=" ".join(topics), clock=clock)
     return DescribedTable(name, data.reindex(columns=columns["column"].tolist()), columns)
@@ -141,9 +143,9 @@ def _table(
 def _stream_table(
     flight: Flight, name: str, data: pd.DataFrame | Unavailable
 ) -> Iterator[DescribedTable]:
-    """Yield the table of a time series; nothing if it is unavailable."""
+    """Yield the table of a time series, unless it is unavailable."""
     if isinstance(data, pd.DataFrame):
-        yield _table(name, _with_time_column(data), _origin(flight, name))
+        yield _table(name, _with_time_column(data), _topics_and_clock(flight, name))
 
 
 def _with_time_column(data: pd.DataFrame) -> pd.DataFrame:
@@ -156,7 +158,10 @@ def _tables(flight: Flight) -> Iterator[DescribedTable]:
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, pd.DataFrame):
         data = acceleration.set_axis(["north_m_s2", "east_m_s2", "down_m_s2"], axis=1)
-        (imu, clock), (attitude, _) = _origin(flight, "imu"), _origin(flight, "attitude")
+        (imu, clock), (attitude, _) = (
+            _topics_and_clock(flight, "imu"),
+            _topics_and_clock(flight, "attitude"),
+        )
         yield _table("acceleration_ned", _with_time_column(data), ((*imu, *attitude), clock))
     for name, track in _named_tracks(flight):
         values = {"frame": track.frame, "description": track.description}
@@ -172,13 +177,13 @@ def _tables(flight: Flight) -> Iterator[DescribedTable]:
                 **values,
             )
     if isinstance(flight.ekf2, Ekf2):
-        yield from _ekf2(flight, flight.ekf2)
+        yield from _ekf2_tables(flight, flight.ekf2)
     if isinstance(flight.truth, Truth):
         yield from _stream_table(flight, "truth", flight.truth.samples)
     log = flight.log
     if not isinstance(flight.airborne, Unavailable):
         spans = _numeric_table(["time_s", "end_s"], flight.airborne)
-        yield _table("airborne", spans, _origin(flight, "airborne"))
+        yield _table("airborne", spans, _topics_and_clock(flight, "airborne"))
     if log.dropouts:
         rows = [(dropout.start_s, dropout.duration_s) for dropout in log.dropouts]
         yield _table("dropouts", _numeric_table(["time_s", "duration_s"], rows))
@@ -191,7 +196,7 @@ def _tables(flight: Flight) -> Iterator[DescribedTable]:
 
 
 def _parameters(flight: Flight) -> dict[str, float]:
-    """Return the logged parameters that any analysis uses."""
+    """Return the PX4 parameters of log, EKF2 replay and aids."""
     logged_values = dict(flight.log.parameters)
     if isinstance(flight.ekf2, Ekf2):
         for record_or_aid in (flight.ekf2.record, *flight.ekf2.aids.values()):
@@ -205,37 +210,37 @@ def _numeric_table(columns: list[str], rows: Iterable[tuple[float, ...]]) -> pd.
     return pd.DataFrame(list(rows), columns=columns, dtype=np.float64)
 
 
-def _ekf2(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
+def _ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
     yield from _stream_table(flight, "ekf2_state", ekf2.state)
     yield from _stream_table(flight, "ekf2_variance", ekf2.variance)
-    frames = [
-        frame.assign(axis=axis)
-        for axis, frame in ekf2.innovations.items()
-        if isinstance(frame, pd.DataFrame)
+    axis_tables = [
+        axis_innovations.assign(axis=axis)
+        for axis, axis_innovations in ekf2.innovations.items()
+        if isinstance(axis_innovations, pd.DataFrame)
     ]
-    if frames:
-        tidy = pd.concat(frames).sort_index(kind="stable")
-        yield from _stream_table(flight, "ekf2_innovations", tidy)
+    if axis_tables:
+        innovation_table = pd.concat(axis_tables).sort_index(kind="stable")
+        yield from _stream_table(flight, "ekf2_innovations", innovation_table)
     yield from _stream_table(flight, "ekf2_fusing", ekf2.fusing)
-    origin = _origin(flight, "ekf2_state")
-    jumps = [reset.delta for reset in ekf2.resets]
-    resets = _numeric_table(["delta_north", "delta_east", "delta_down"], jumps)
+    origin = _topics_and_clock(flight, "ekf2_state")
+    deltas = [reset.delta for reset in ekf2.resets]
+    resets = _numeric_table(["delta_north", "delta_east", "delta_down"], deltas)
     resets["time_s"] = np.array([reset.time_s for reset in ekf2.resets], np.float64)
     resets["quantity"] = np.array([reset.quantity for reset in ekf2.resets], object)
     yield _table("resets", resets, origin)
-    # readers give the first instance the time minus infinity
-    begin = min(float(ekf2.state.index[0]), 0.0)
-    rows = [(max(time, begin), number) for time, number in ekf2.instances]
-    instances = _numeric_table(["time_s", "instance"], rows).astype({"instance": np.int64})
+    # the reader sets the start time of the first EKF2 instance to minus infinity
+    first_time_s = min(float(ekf2.state.index[0]), 0.0)
+    instance_rows = [(max(time_s, first_time_s), instance) for time_s, instance in ekf2.instances]
+    instances = _numeric_table(["time_s", "instance"], instance_rows).astype({"instance": np.int64})
     yield _table("instances", instances, origin)
 
 
 def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
-    """Yield each position track with a unique table name, ignoring case."""
+    """Yield each position track with a table name; names differ in more than case."""
     used_names: set[str] = set()
     for track in flight.positions:
         # the prefix avoids file names that Windows reserves (con, aux, ...)
-        stem = _UNSAFE.sub("_", f"position_{track.name}")[:MAX_NAME].rstrip("_")
+        stem = _UNSAFE_CHARACTERS.sub("_", f"position_{track.name}")[:MAX_NAME_LENGTH].rstrip("_")
         name, number = stem, 1
         while name.lower() in used_names:
             number += 1
@@ -244,7 +249,7 @@ def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
         yield name, track
 
 
-def _origin(flight: Flight, part: str) -> tuple[tuple[str, ...], str]:
+def _topics_and_clock(flight: Flight, part: str) -> tuple[tuple[str, ...], str]:
     """Return topics and clock of a part."""
     stream = flight.streams.get(part)
     return ((), "") if stream is None else (stream.topics, stream.clock)

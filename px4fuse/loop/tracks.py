@@ -21,8 +21,8 @@ from px4fuse.readers.trajectory import read_trajectory
 from px4fuse.reading import display_name, read_head
 from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
-FlightPart = Literal["vio", "ekf2", "kf", "truth"]
-FLIGHT_PARTS: tuple[FlightPart, ...] = get_args(FlightPart)
+TrackName = Literal["vio", "ekf2", "kf", "truth"]
+TRACK_NAMES: tuple[TrackName, ...] = get_args(TrackName)
 _HEAD_BYTES = 4096
 _G2O_TAGS = (b"VERTEX_", b"EDGE_", b"FIX")
 
@@ -43,13 +43,13 @@ def find_odometry(flight: Flight) -> PositionTrack | Unavailable:
     )
 
 
-def trajectory_of(flight: Flight, part: FlightPart) -> Trajectory:
+def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
     """Return a track of a flight as trajectory.
 
     Parameters
     ----------
     flight : Flight
-    part : {"vio", "ekf2", "kf", "truth"}
+    track_name : {"vio", "ekf2", "kf", "truth"}
         "kf": KF along north, east and down, with the attitude of the autopilot.
 
     Raises
@@ -57,31 +57,33 @@ def trajectory_of(flight: Flight, part: FlightPart) -> Trajectory:
     MissingDataError
         The log does not contain the track; the message has an action to log it.
     """
-    if part == "kf":
+    if track_name == "kf":
         return _make_kf_trajectory(flight)
-    part_data = {"vio": find_odometry(flight), "truth": flight.truth, "ekf2": flight.ekf2}[part]
-    if isinstance(part_data, PositionTrack):
+    track_data = {"vio": find_odometry(flight), "truth": flight.truth, "ekf2": flight.ekf2}[
+        track_name
+    ]
+    if isinstance(track_data, PositionTrack):
         # if the log does not name the frame, x is assumed to be forward at the start
-        frame: Frame = "NED" if part_data.frame == "NED" else "FRD"
-        note = f"{part_data.name}: {part_data.description}"
+        frame: Frame = "NED" if track_data.frame == "NED" else "FRD"
+        note = f"{track_data.name}: {track_data.description}"
         return _make_trajectory(
-            flight, part, part_data.samples, part_data.orientation, (note,), frame
+            flight, track_name, track_data.samples, track_data.orientation, (note,), frame
         )
-    if isinstance(part_data, Truth):
+    if isinstance(track_data, Truth):
         return _make_trajectory(
-            flight, part, part_data.samples, part_data.attitude, (part_data.name,)
+            flight, track_name, track_data.samples, track_data.attitude, (track_data.name,)
         )
-    if not isinstance(part_data, Ekf2):
+    if not isinstance(track_data, Ekf2):
         raise MissingDataError(
-            f"{flight.log.name}:{part}: {part_data.reason}", f"{part_data.remedy}"
+            f"{flight.log.name}:{track_name}: {track_data.reason}", f"{track_data.remedy}"
         )
-    state, notes = part_data.state, ["EKF2 position as published"]
+    state, notes = track_data.state, ["EKF2 position as published"]
     source = next((t for t in flight.positions if t.origin.is_vision), None)
     if source is not None:
         log_segment = Segment(0.0, flight.log.duration_s, "the whole log")
-        state, resets = continuous_state(part_data, source, log_segment)
+        state, resets = continuous_state(track_data, source, log_segment)
         notes += [resets] if resets else []
-    return _make_trajectory(flight, part, state, flight.attitude, tuple(notes))
+    return _make_trajectory(flight, track_name, state, flight.attitude, tuple(notes))
 
 
 def _make_kf_trajectory(flight: Flight) -> Trajectory:
@@ -96,7 +98,7 @@ def _make_kf_trajectory(flight: Flight) -> Trajectory:
 
 def _make_trajectory(
     flight: Flight,
-    part: Kind,
+    track_name: Kind,
     samples: pd.DataFrame,
     orientation: pd.DataFrame | Unavailable | None,
     notes: tuple[str, ...],
@@ -124,11 +126,12 @@ def _make_trajectory(
                 rotation_variance = np.column_stack(columns)
     if len(samples) < MIN_POSES:
         raise MissingDataError(
-            f"{flight.log.name}:{part}: only {len(samples)} poses (at least {MIN_POSES} needed)."
+            f"{flight.log.name}:{track_name}: only {len(samples)} poses (at least {MIN_POSES} are "
+            "needed)."
         )
     return Trajectory(
-        name=f"{flight.log.name}:{part}",
-        kind=part,
+        name=f"{flight.log.name}:{track_name}",
+        kind=track_name,
         time_s=samples.index.to_numpy(np.float64),
         position_m=samples[Columns.POSITION].to_numpy(np.float64),
         rotation=rotation,
@@ -159,11 +162,11 @@ class LoopSource:
 
 def file_name(source: Path) -> str:
     """Return the stem for names of output files: ``flight_vio`` for ``flight.ulg:vio``."""
-    path, part = split_part(str(source))
-    return path.stem if part is None else f"{path.stem}_{part}"
+    path, track_name = split_part(str(source))
+    return path.stem if track_name is None else f"{path.stem}_{track_name}"
 
 
-def split_part(argument: str) -> tuple[Path, FlightPart | None]:
+def split_part(argument: str) -> tuple[Path, TrackName | None]:
     """Split ``FILE`` or ``LOG:vio``, ``LOG:ekf2``, ``LOG:kf``, ``LOG:truth`` into file and track.
 
     Raises
@@ -172,15 +175,15 @@ def split_part(argument: str) -> tuple[Path, FlightPart | None]:
         The text after the colon is not a track.
     """
     full_path = Path(argument)
-    path, colon, part = argument.rpartition(":")
+    path, colon, track_name = argument.rpartition(":")
     if full_path.exists() or not colon:
         return full_path, None
-    if part in FLIGHT_PARTS:
-        return Path(path), part
+    if track_name in TRACK_NAMES:
+        return Path(path), track_name
     if Path(path).is_file():
         raise TrajectoryError(
-            f"{display_name(Path(path))}:{part}: {part!r} is not a track of a flight.",
-            f"Use one of {', '.join(FLIGHT_PARTS)}.",
+            f"{display_name(Path(path))}:{track_name}: {track_name!r} is not a track of a flight.",
+            f"Use one of {', '.join(TRACK_NAMES)}.",
         )
     return full_path, None
 
@@ -202,7 +205,7 @@ def is_g2o(path: Path) -> bool:
 def read_source(
     argument: str,
     *,
-    default: FlightPart | None = None,
+    default: TrackName | None = None,
     frame: Frame | None = None,
     system: int | None = None,
 ) -> LoopSource:
@@ -226,7 +229,7 @@ def read_source(
     SettingsError
         ``frame`` is given for a flight log.
     """
-    path, part = split_part(argument)
+    path, track_name = split_part(argument)
     head = read_head(path, _HEAD_BYTES, TrajectoryError)
     if not head:
         raise TrajectoryError(f"{display_name(path)} is empty.", "Copy or export the file again.")
@@ -236,9 +239,10 @@ def read_source(
             f"Optimise it with px4fuse loop {display_name(path)}.",
         )
     if decode_text(head) is not None:  # flight logs are binary
-        if part is not None:
+        if track_name is not None:
             raise TrajectoryError(
-                f"{display_name(path)} is a trajectory file and has no track {part!r}.", "Omit it."
+                f"{display_name(path)} is a trajectory file and has no track {track_name!r}.",
+                "Omit it.",
             )
         trajectory = read_trajectory(path)
         return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)
@@ -249,7 +253,7 @@ def read_source(
             "Omit --frame.",
         )
     flight = read_log(path, system=system)
-    chosen = part or default
+    chosen = track_name or default
     if chosen is None:
         odometry, chosen = find_odometry(flight), "vio"
         if isinstance(odometry, Unavailable):

@@ -169,8 +169,8 @@ def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
 def _parse(rows: Rows, tag: str) -> tuple[np.ndarray[Any, np.dtype[np.int64]], Array]:
     """Return the vertex ids (n, 1 or 2) and the numbers of all lines of one tag."""
     vertex_count, value_count = _TAGS[tag]
-    words, numbers = rows.parse(1 + vertex_count, value_count)
-    is_invalid_id = np.array([_VERTEX_ID.fullmatch(word) is None for word in words[:, 1:].flat])
+    cells, numbers = rows.parse(1 + vertex_count, value_count)
+    is_invalid_id = np.array([_VERTEX_ID.fullmatch(word) is None for word in cells[:, 1:].flat])
     fault = "the vertex number is not an integer of at most 18 digits"
     rows.raise_where(is_invalid_id.reshape(-1, vertex_count), fault, "Give an integer.")
     remedy = "Correct or remove the line."
@@ -178,7 +178,7 @@ def _parse(rows: Rows, tag: str) -> tuple[np.ndarray[Any, np.dtype[np.int64]], A
     # The first three numbers are the position (m) or, in SE2, x, y (m) and the angle (rad)
     is_too_large = np.abs(numbers[:, :3]) >= MAX_COORDINATE_M
     rows.raise_where(is_too_large, f"a value is outside ±{MAX_COORDINATE_M:.0e}", remedy)
-    return words[:, 1:].astype(np.int64), numbers
+    return cells[:, 1:].astype(np.int64), numbers
 
 
 def _normalise_quaternions(rows: Rows, poses: Array) -> Array:

@@ -10,9 +10,15 @@ from types import MappingProxyType
 import numpy as np
 import pandas as pd
 
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, REPORTED, settings_in_force, valid_parameters
+from px4fuse.ekf2_parameters import (
+    EV_POS,
+    GNSS_POS,
+    REPORTED,
+    effective_settings,
+    replace_invalid_parameters,
+)
 from px4fuse.flight import AXIS_NAMES, Columns, Ekf2, Flight, FlightMode, Unavailable
-from px4fuse.log import LogInfo, Unused
+from px4fuse.log import LogInfo, UnusedData
 from px4fuse.readers import common
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import mavlink_senders as senders
@@ -63,13 +69,15 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     address, autopilot = senders.choose_autopilot(frames, system)
     recording = read_recording(frames, address)
     clock_mappings = senders.map_senders(recording)
-    parameters, parameter_faults = valid_parameters(_read_parameters(recording, autopilot))
+    parameters, parameter_faults = replace_invalid_parameters(
+        _read_parameters(recording, autopilot)
+    )
     remedies, _ = messages.remedies_of_autopilot(autopilot)
     imu = _read_imu(recording, remedies["imu"])
     attitude = _read_attitude(recording, remedies["attitude"])
     ekf2 = _read_ekf2(recording, parameters, autopilot)
     # Only PX4 has a parameter for the delay between a GNSS fix and its timestamp
-    delay_parameters = settings_in_force(parameters, GNSS_POS) if autopilot == "PX4" else {}
+    delay_parameters = effective_settings(parameters, GNSS_POS) if autopilot == "PX4" else {}
     delay_s = 1e-3 * delay_parameters.get(GNSS_POS.delay, 0.0)
     positions, missing_positions = read_positions(
         recording, clock_mappings, remedies["position"], delay_s
@@ -94,7 +102,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
         streams=MappingProxyType(recording.streams),
         clocks=senders.clock_maps(recording, clock_mappings),
         unused=tuple(
-            Unused(name, count, reason)
+            UnusedData(name, count, reason)
             for name, reason in messages.UNUSED.items()
             if (count := int(np.count_nonzero(frames.message_id == MESSAGE_IDS[name])))
         ),
@@ -222,7 +230,7 @@ def _read_ekf2(
         ),
         resets=(),
         instances=NO_SELECTOR,
-        gate=settings_in_force(parameters)[EV_POS.gate],
+        gate=effective_settings(parameters)[EV_POS.gate],
         notes=tuple(notes),
         record=replay_unavailable,
     )

@@ -42,7 +42,9 @@ DECODE_BATCH_SIZE = 1 << 12
 MIN_VALID_FRACTION = 0.01
 # µs; a receive time further than this from the median is damaged (limit of pymavlink)
 MAX_RECEIVE_TIME_DISTANCE_US = 3 * 24 * 3600 * 1_000_000
-MESSAGE_IDS: Mapping[str, int] = {one.msgname: at for at, one in dialect.mavlink_map.items()}
+MESSAGE_IDS: Mapping[str, int] = {
+    message.msgname: at for at, message in dialect.mavlink_map.items()
+}
 # CRC_EXTRA byte by message id, the last input of the checksum; -1 for unknown messages
 _CRC_EXTRA = np.full(
     max(1 << 16, *(number + 1 for number in dialect.mavlink_map)), -1, dtype=np.int16

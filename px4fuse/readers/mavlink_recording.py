@@ -173,9 +173,9 @@ class Recording:
             np.where(is_boot_time, timestamp_s, self.receipt_boot_s(rows)), dtype=np.float64
         )
 
-    def record_stream(self, part: str, *messages: str, clock: str = BOOT_CLOCK) -> None:
+    def record_stream(self, flight_part: str, *messages: str, clock: str = BOOT_CLOCK) -> None:
         """Record the source of a part of the flight."""
-        self.streams[part] = Stream(messages, clock, self.frames.name)
+        self.streams[flight_part] = Stream(messages, clock, self.frames.name)
 
 
 def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:

@@ -94,9 +94,9 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
                 f"{frames.name}: no autopilot has MAVLink system id {system}. Autopilots in "
                 f"this file: {system_ids}."
             )
-    best = max(candidates, key=lambda address: counts.get(address, 0))
-    name = messages.AUTOPILOTS.get(vehicles[best][1]) if best in vehicles else None
-    return best, name or "unknown autopilot"
+    best_address = max(candidates, key=lambda address: counts.get(address, 0))
+    name = messages.AUTOPILOTS.get(vehicles[best_address][1]) if best_address in vehicles else None
+    return best_address, name or "unknown autopilot"
 
 
 def senders_of(recording: Recording, message: str) -> list[Address]:

@@ -86,7 +86,7 @@ class PositionRecording:
 class _Table:
     """Table in a text file: column names and rows."""
 
-    file: str
+    file_name: str
     separator: str
     names: list[str]  # of the columns
     body: str  # complete lines after the header
@@ -118,7 +118,7 @@ class _Table:
             )
         except ValueError as error:
             raise LogError(
-                f"{self.file} contains no table of numbers.",
+                f"{self.file_name} contains no table of numbers.",
                 "Export the positions as CSV again.",
             ) from error
         return texts.dropna(how="all")
@@ -197,8 +197,8 @@ def read_position_csv(
         )
     if len(kept_rows) < MIN_ROWS:
         raise LogError(
-            f"{table.file} contains {len(kept_rows)} usable rows; at least {MIN_ROWS} are needed"
-            f"{''.join('; ' + note for note in notes)}",
+            f"{table.file_name} contains {len(kept_rows)} usable rows; at least {MIN_ROWS} are "
+            f"needed{''.join('; ' + note for note in notes)}",
             f"Export the file with decimal points, or name the columns with {_COLUMNS_OPTION}.",
         )
     numbers = numbers.iloc[kept_rows].set_index(pd.Index(seconds[kept_rows], name="time_s"))
@@ -222,7 +222,7 @@ def read_position_csv(
     axis_names = frame.upper() if frame else "x, y, z"
     height_text = "" if len(axes) == 3 else " without height"
     return PositionRecording(
-        name=table.file,
+        name=table.file_name,
         sha256=hashlib.sha256(content).hexdigest(),
         size_bytes=len(content),
         samples=samples,
@@ -270,13 +270,13 @@ def _split_line(line: str, separator: str) -> list[str]:
 
 
 def _find_table(
-    file: str, content: bytes, columns: tuple[str, ...] | None
+    file_name: str, content: bytes, columns: tuple[str, ...] | None
 ) -> tuple[_Table, list[str]]:
     """Find the table in a text file; return also a note if the last line was dropped."""
     text = decode_text(content)
     if text is None:
         raise LogError(
-            f"{file} is a binary file, not a text table",
+            f"{file_name} is a binary file, not a text table",
             "Give the CSV file of the positioning system. A flight log is given as LOG, without "
             "--position.",
         )
@@ -298,7 +298,7 @@ def _find_table(
     if not names:
         title_list = ", ".join(map(quote, sorted(wanted_names))) or "time, x, y, z"
         raise LogError(
-            f"{file}: the first {len(lines)} lines contain no header with the columns "
+            f"{file_name}: the first {len(lines)} lines contain no header with the columns "
             f"{title_list}. The first line is {quote(lines[0])}.",
             f"Give a CSV file with a header, or name its columns with {_COLUMNS_OPTION}.",
         )
@@ -307,10 +307,10 @@ def _find_table(
     row_width = len(_split_line(first_row, separator))
     if row_width > len(names):
         raise LogError(
-            f"{file}: the header has {len(names)} columns, but the rows have {row_width}.",
+            f"{file_name}: the header has {len(names)} columns, but the rows have {row_width}.",
             "Export the file with decimal points and a name for each column.",
         )
-    return _Table(file, separator, names, body, header_line), notes
+    return _Table(file_name, separator, names, body, header_line), notes
 
 
 def _is_header(fields: list[str], wanted_names: set[str]) -> bool:
@@ -331,7 +331,7 @@ def _column_indices(table: _Table, columns: tuple[str, ...]) -> list[int]:
         wanted_name = column.strip().casefold()
         if wanted_name not in names + numbers:
             raise SettingsError(
-                f"{table.file} has no column {quote(column)} (its columns are "
+                f"{table.file_name} has no column {quote(column)} (its columns are "
                 f"{table.label(*range(len(names)))})",
                 f"Name the columns with {_COLUMNS_OPTION}.",
             )

@@ -15,10 +15,14 @@ Position = tuple[int, int, int | None]
 
 _TABLE = table(__file__, "position_names.toml", dict[str, dict[str, str]])
 _UNITS, _AXES = (
-    {word: meaning for meaning, words in _TABLE[group].items() for word in words.split()}
+    {
+        word: meaning
+        for meaning, column_words in _TABLE[group].items()
+        for word in column_words.split()
+    }
     for group in ("units", "axes")
 )
-_ROLES = {role: {*words.split()} for role, words in _TABLE["roles"].items()}
+_ROLES = {role: {*column_words.split()} for role, column_words in _TABLE["roles"].items()}
 _TIME_ROLES = _ROLES["time"] | _ROLES["measured"] | _ROLES["recorded"] | _ROLES["context"]
 # Kinds of time columns, in order of preference
 TIME_KINDS = ["time of measurement", "time", "time of recording"]
@@ -47,17 +51,17 @@ def read_column_name(name: str) -> ColumnMeaning:
     """Return the kind, axis, unit and group that a column name contains."""
     plain_name = unicodedata.normalize("NFKC", name).replace("μ", "u")
     plain_name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", plain_name).lower()
-    words = re.findall(r"[^\W_]+", plain_name)
-    unit = _UNITS.get(words[-1], "") if len(words) > 1 else ""
-    words = words[:-1] if unit else words
-    word_set = {*words}
+    column_words = re.findall(r"[^\W_]+", plain_name)
+    unit = _UNITS.get(column_words[-1], "") if len(column_words) > 1 else ""
+    column_words = column_words[:-1] if unit else column_words
+    word_set = {*column_words}
     if word_set & _ROLES["time"] and word_set <= _TIME_ROLES and unit not in LENGTH_UNITS:
         kinds = [bool(word_set & _ROLES["measured"]), not word_set & _ROLES["recorded"], True]
         return ColumnMeaning("time", TIME_KINDS[kinds.index(True)], unit)
     if word_set and word_set <= _ROLES["tag"]:
         return ColumnMeaning("tag")
     parts: list[str] = []
-    for word in words:
+    for word in column_words:
         glued_match = (
             None if word in _ROLES["sigma"] | _ROLES["context"] else _GLUED_NAMES.fullmatch(word)
         )
@@ -88,9 +92,13 @@ def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, Positi
             groups.setdefault(column.group, {}).setdefault(column.key, index)
     for needs_height in (True, False):
         for axes in groups.values():
-            for frame, (first, second, third) in _FRAMES:
-                if first in axes and second in axes and (third in axes or not needs_height):
-                    return frame, (axes[first], axes[second], axes.get(third))
+            for frame, (first_axis, second_axis, third_axis) in _FRAMES:
+                if (
+                    first_axis in axes
+                    and second_axis in axes
+                    and (third_axis in axes or not needs_height)
+                ):
+                    return frame, (axes[first_axis], axes[second_axis], axes.get(third_axis))
     return None
 
 

@@ -64,8 +64,8 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     if not logged_flags and topics.find(px4.LAYOUTS["control_bits"]) is not None:
         bits = topics.primary_samples(px4.LAYOUTS["control_bits"], step=True)["bits"].dropna()
         for aid in all_aids if len(bits) else ():
-            if aid.bit is not None:
-                is_enabled = bits.to_numpy().astype(np.int64) >> aid.bit & 1
+            if aid.status_bit is not None:
+                is_enabled = bits.to_numpy().astype(np.int64) >> aid.status_bit & 1
                 enabled[aid.name] = pd.Series(is_enabled.astype(float), index=bits.index)
     return enabled
 
@@ -112,9 +112,9 @@ def _read_common_topics(
             )
         ]
     )
-    if aid.before:
-        fields = _columns("innovation", aid, aid.before)
-        variance_fields = (field.replace("innov", "innov_var") for field in aid.before)
+    if aid.old_fields:
+        fields = _columns("innovation", aid, aid.old_fields)
+        variance_fields = (field.replace("innov", "innov_var") for field in aid.old_fields)
         fields |= _columns("variance", aid, variance_fields)
         layouts.append((Layout(px4.OLD_INNOVATIONS, fields),) * 2)
     for values, variances in layouts:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from px4fuse import flight
 from px4fuse.arrays import Array, IntArray
-from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, EV_POS, FLOW, settings_in_force
+from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, EV_POS, FLOW, effective_settings
 from px4fuse.flight import Columns, Ekf2, FusionRecord, Reset, Unavailable, step_values_at
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.field_maps import Layout, expand_columns
@@ -77,7 +77,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     topics.record_stream("ekf2_state", px4.LOCAL_POSITION.topic)
     enabled = read_enabled_aids(topics)
     fusing = _read_fusing(topics, enabled)
-    gate = settings_in_force(parameters)[EV_POS.gate]
+    gate = effective_settings(parameters)[EV_POS.gate]
     aids = read_aids(topics, enabled)
     innovations, innovation_topics = innovations_by_axis(aids, fusing, gate)
     if innovation_topics:
@@ -388,7 +388,7 @@ def _read_flow(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> pd.Da
     if FLOW.name in enabled:
         rows = rows[step_values_at(enabled[FLOW.name], times[rows]) > 0.0]
     sample_count = np.rint((times[rows] - times[rows - 1]) / interval_s)
-    filter_memory = ((1.0 - flight.FLOW_SHARE) ** sample_count)[:, None]
+    filter_memory = ((1.0 - flight.FLOW_FILTER_WEIGHT) ** sample_count)[:, None]
     low_passed = velocity[["forward_m_s", "right_m_s"]].to_numpy()
     forward, right = (
         (low_passed[rows] - filter_memory * low_passed[rows - 1]) / (1.0 - filter_memory)

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from px4fuse.ekf2_parameters import GNSS_POS, TABLE
+from px4fuse.ekf2_parameters import GNSS_POS, TABLES
 from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Ekf2, Unavailable
 
 Innovations = dict[AxisName, pd.DataFrame | Unavailable]
@@ -29,7 +29,7 @@ class Ekf2Source:
 
 
 VISION, GNSS, GNSS_AND_BAROMETER = (
-    msgspec.convert(TABLE["sources"][name], Ekf2Source)
+    msgspec.convert(TABLES["sources"][name], Ekf2Source)
     for name in ("vision", "gnss", "gnss_and_barometer")
 )
 

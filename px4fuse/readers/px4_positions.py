@@ -10,7 +10,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.arrays import Array
-from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, settings_in_force
+from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, effective_settings
 from px4fuse.flight import (
     Columns,
     Ekf2,
@@ -114,7 +114,7 @@ def _make_ulog_track(
     """Make a ULog track; ``turns`` is True if the source has a changing orientation."""
     source = px4.TRACKS[name]
     origin = with_orientation(source.origin, turns=turns)
-    arm_parameters = ("", "", "") if origin.aid is None else origin.aid.place
+    arm_parameters = ("", "", "") if origin.aid is None else origin.aid.lever_arm
     default_fields = {
         "description": source.description,
         "topics": topic_names,
@@ -343,7 +343,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     has_driver_times = GNSS_MODE in parameters and bool(
         np.any(published_s - gps.index > MAX_ARRIVAL_DELAY_US * 1e-6)
     )
-    delay_ms = 0.0 if has_driver_times else settings_in_force(parameters, GNSS_POS)[GNSS_POS.delay]
+    delay_ms = 0.0 if has_driver_times else effective_settings(parameters, GNSS_POS)[GNSS_POS.delay]
     clock = "autopilot boot clock, measurement times of the receiver driver"
     if not has_driver_times:
         gps = gps.set_axis(pd.Index(published_s - delay_ms * 1e-3, name="time_s"))

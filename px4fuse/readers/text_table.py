@@ -67,19 +67,19 @@ class Rows:
 
     Attributes
     ----------
-    file : str
+    file_name : str
         File name for messages.
     lines : list of (int, str)
         Line number in the file, and text of the line.
     """
 
-    file: str
+    file_name: str
     lines: list[tuple[int, str]] = field(default_factory=list)
 
     def row_error(self, row: int, description: str, remedy: str) -> TrajectoryError:
         """Return an error that names the line of a row."""
         return TrajectoryError(
-            format_line_error(self.file, self.lines[row][0], description, remedy)
+            format_line_error(self.file_name, self.lines[row][0], description, remedy)
         )
 
     def raise_where(self, is_invalid: BoolArray, description: str, remedy: str) -> None:

@@ -250,8 +250,8 @@ def _convert_timestamps(rows: Rows, timestamps: list[str]) -> tuple[Array, str]:
                 unit_note,
             )
     raise TrajectoryError(
-        f"{rows.file}: the median interval of the timestamps, {median_interval:.3g}, is not valid "
-        "in any unit from seconds to nanoseconds",
+        f"{rows.file_name}: the median interval of the timestamps, {median_interval:.3g}, is not "
+        "valid in any unit from seconds to nanoseconds",
         "Give timestamps in seconds.",
     )
 

@@ -6,7 +6,7 @@ from msgspec import structs
 
 from px4fuse.ekf2_parameters import BAROMETER
 from px4fuse.flight import MODES_NOT_LOGGED, Columns, Flight, FlightMode, Truth, Unavailable
-from px4fuse.log import Unused
+from px4fuse.log import UnusedData
 from px4fuse.readers import common
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.field_maps import Layout
@@ -69,7 +69,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
         missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *missing_positions),
         streams=topics.streams,
         unused=tuple(
-            Unused(name, len(table["timestamp"]), reason)
+            UnusedData(name, len(table["timestamp"]), reason)
             for name, reason in px4.UNUSED.items()
             for table in topics.of(name)[:1]
         ),

@@ -22,7 +22,7 @@ from pyulog import ULog
 from pyulog.exceptions import ULogException
 
 from px4fuse.arrays import IntArray
-from px4fuse.ekf2_parameters import REPORTED, valid_parameters
+from px4fuse.ekf2_parameters import REPORTED, replace_invalid_parameters
 from px4fuse.errors import LogError
 from px4fuse.log import Dropout, LogInfo, Stream
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
@@ -294,17 +294,17 @@ class Topics:
         joined_frames = pd.concat(primary_frames).sort_index()
         return joined_frames[~joined_frames.index.duplicated()]
 
-    def record_stream(self, part: str, *topics: str) -> None:
+    def record_stream(self, flight_part: str, *topics: str) -> None:
         """Record the source of a part of the flight, with measurement or publication time."""
         # The timestamp of sensor_combined is the gyro's measurement time
-        has_measurement_time = part == "imu" or any(
+        has_measurement_time = flight_part == "imu" or any(
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
             for table in self.of(topics[0])
         )
         clock = (
             f"autopilot boot clock, at {'measurement' if has_measurement_time else 'publication'}"
         )
-        self.streams[part] = Stream(topics, clock, self.log.name)
+        self.streams[flight_part] = Stream(topics, clock, self.log.name)
 
 
 def _empty_frame(layout: Layout) -> pd.DataFrame:
@@ -405,7 +405,7 @@ def read_topics(name: str, content: bytes) -> Topics:
     zero_us, end_us = _data_span(time_tables, name)
     parameter_items = ulog.initial_parameters.items()
     numbers = {name: float(v) for name, v in parameter_items if isinstance(v, int | float)}
-    parameter_values, parameter_faults = valid_parameters(numbers)
+    parameter_values, parameter_faults = replace_invalid_parameters(numbers)
     log = LogInfo(
         name=name,
         sha256=hashlib.sha256(content).hexdigest(),

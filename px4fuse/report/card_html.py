@@ -26,6 +26,7 @@ from px4fuse.report.card_text import (
     format_target,
     rerun_columns,
     rerun_start,
+    with_typed_path,
 )
 from px4fuse.webpage.safe import load_template, read_asset
 
@@ -48,13 +49,14 @@ HALF_HEIGHT = 5  # pixels; of the end ticks of an interval
 
 
 def card_of(analysis: Analysis) -> Card:
-    """Return the card of an analysis that has a request."""
+    """Return the card of an analysis that has a request, with the path of the log as typed."""
     if analysis.request is None:
         raise SettingsError(
             "This analysis contains no request, so its command is unknown.",
             "Create it with px4fuse.compare.",
         )
-    return build_card(analysis, find(analysis), analysis.request)
+    card = build_card(analysis, find(analysis), analysis.request)
+    return with_typed_path(card, analysis.request.log)
 
 
 def card_html(

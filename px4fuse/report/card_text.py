@@ -3,9 +3,12 @@
 Commands and the headline never wrap; other texts wrap with a hanging indent.
 """
 
+import shlex
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
+
+from msgspec.structs import replace
 
 from px4fuse.card.model import (
     AXIS_TICKS,
@@ -19,6 +22,7 @@ from px4fuse.card.model import (
 )
 from px4fuse.card.numbers import axis_fraction, format_metres, format_ratio
 from px4fuse.filter.consistency import Reference
+from px4fuse.request import quote_command
 
 WIDTH = 100
 AXIS_WIDTH = 37
@@ -60,14 +64,41 @@ CONSOLE = "Console: MAVLink Console of QGroundControl."
 
 
 class Line(NamedTuple):
-    """Line of a card with its style of rich."""
+    """Paragraph of a card.
+
+    Attributes
+    ----------
+    text : str
+    style : str
+        Style of rich.
+    first, indent : str
+        Before the first line, and before the others.
+    wraps : bool
+        False for the headline, commands and tables.
+    """
 
     text: str
     style: str = ""
+    first: str = ""
+    indent: str = ""
+    wraps: bool = False
+
+    def wrapped(self, width: int) -> list[str]:
+        """Return the lines of the paragraph at a width in columns."""
+        if not self.wraps:
+            return [f"{self.first}{self.text}"]
+        return textwrap.wrap(
+            self.text,
+            width,
+            initial_indent=self.first,
+            subsequent_indent=self.indent,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
 
 
 def card_lines(card: Card) -> Iterator[Line]:
-    """Yield the lines of a card in their order, wrapped at :data:`WIDTH`."""
+    """Yield the paragraphs of a card in their order."""
     if card.severity == "refused":
         yield Line(f"error[{card.id}]: {card.headline}", STYLES["error"])
         for label, text in card.facts.items():
@@ -100,6 +131,40 @@ def closing_lines(card: Card) -> Iterator[Line]:
     sentences += [CONSOLE] if has_console else []
     sentences += [f"Meaning: px4fuse explain {card.id}"] if card.id else []
     yield from _wrapped(" ".join(sentences), "", "")
+
+
+def with_typed_path(card: Card, path: str | None) -> Card:
+    """Replace the file name of the log in all commands by the path as typed.
+
+    >>> from px4fuse.card.model import Identity
+    >>> action = Action("KF", commands=("px4fuse compare a.ulg --sigma-z 1",), where="shell")
+    >>> cause = Cause(id="x", severity="error", title="", why="", actions=(action,))
+    >>> card = Card(severity="error", headline="", causes=(cause,), identity=Identity(file="a.ulg"))
+    >>> with_typed_path(card, "my logs/a.ulg").causes[0].actions[0].commands
+    ("px4fuse compare 'my logs/a.ulg' --sigma-z 1",)
+    """
+    if path is None or path == card.identity.file:
+        return card
+    name = card.identity.file
+
+    def typed(action: Action) -> Action:
+        commands = tuple(
+            quote_command([path if word == name else word for word in shlex.split(command)])
+            if action.where == "shell"
+            else command
+            for command in action.commands
+        )
+        return replace(action, commands=commands)
+
+    causes = tuple(
+        replace(
+            cause,
+            actions=tuple(map(typed, cause.actions)),
+            alternatives=tuple(tuple(map(typed, each)) for each in cause.alternatives),
+        )
+        for cause in card.causes
+    )
+    return replace(card, causes=causes)
 
 
 def to_ascii(text: str) -> str:
@@ -144,10 +209,15 @@ def _identity(card: Card) -> Iterator[Line]:
     yield Line("")
 
 
-def _headline(card: Card) -> Iterator[Line]:
+def headline(card: Card) -> Iterator[Line]:
+    """Yield the line with severity, id and headline."""
     label = SEVERITY_LABELS.get(card.severity, card.severity)
     name = f"{label}[{card.id}]" if card.id else label
     yield Line(f"{name}: {card.headline}", STYLES[card.severity])
+
+
+def _headline(card: Card) -> Iterator[Line]:
+    yield from headline(card)
     yield from _labelled("effect", card.effect_text)
     for place, text in enumerate(card.do_this):
         yield from _labelled("" if place else "do this", text)
@@ -244,6 +314,8 @@ def _verdict_axis(card: Card) -> Iterator[Line]:
     sides = f"{'σ too large':<{AXIS_WIDTH // 2}}{'σ too small':>{AXIS_WIDTH - AXIS_WIDTH // 2}}"
     yield Line(f"{'':{AXIS_INDENT}}{sides}")
     yield Line(f"{legend:{AXIS_INDENT}}{_ticks()}")
+    if any(verdict.is_explained for verdict in card.verdicts):
+        yield Line("  In brackets: explained below, nothing has to be changed.")
     for verdict in card.verdicts:
         yield _verdict_line(verdict)
 
@@ -254,7 +326,7 @@ def _verdict_line(verdict: Verdict) -> Line:
     head = f"  {owner:4} {quantity:25}"
     if verdict.ratio is None:
         return Line(f"{head}{'–':>7}  not evaluated: {verdict.reason}")
-    word = f"{verdict.word}{' (explained)' if verdict.is_explained else ''}"
+    word = f"({verdict.word})" if verdict.is_explained else verdict.word
     text = f"{head}{format_ratio(verdict.ratio):>7}  {word}"
     is_loud = verdict.word != "consistent" and not verdict.is_explained
     style = "bold" if is_loud else ""
@@ -305,15 +377,8 @@ def _labelled(label: str, text: str) -> Iterator[Line]:
 
 
 def _wrapped(text: str, first: str, indent: str) -> Iterator[Line]:
-    for line in textwrap.wrap(
-        text,
-        WIDTH,
-        initial_indent=first,
-        subsequent_indent=indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-    ):
-        yield Line(line)
+    if text:
+        yield Line(text, "", first, indent, wraps=True)
 
 
 def _all_actions(card: Card) -> Iterator[Action]:

@@ -7,7 +7,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import aid_of, delay_ms
 from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
 from px4fuse.findings import Finding
-from px4fuse.findings.source_clock import typed_offset_s
+from px4fuse.findings.source_clock import clock_offset_option_s
 from px4fuse.flight import Unavailable
 from px4fuse.report.page import Page, draw_legend_above
 from px4fuse.report.style import KF_BAND_COLOUR, KF_LINE, Axes
@@ -58,7 +58,7 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
     if not (low <= 0.0 <= high or abs(offset) < NEGLIGIBLE_OFFSET_S):
         side = "late" if offset < 0.0 else "early"
         advice["Result"] = f"The position timestamps are {abs(offset):.3f} s {side}."
-        typed_offset = typed_offset_s(comparison, clock)
+        typed_offset = clock_offset_option_s(comparison, clock)
         advice["Re-run"] = f"px4fuse compare LOG --clock-offset {typed_offset:.3f}"
     configured_delay_ms, delay_name = delay_ms(comparison), aid_of(comparison).delay
     age_s = comparison.source.age_s

@@ -10,7 +10,7 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import Statistic
-from px4fuse.comparison.model import AxisComparison, FilterSummary, UnjudgedFilter
+from px4fuse.comparison.model import AxisComparison, FilterSummary, UntestedFilter
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
 from px4fuse.findings.cause_text import format_change, format_explained_share
 from px4fuse.flight import Unavailable
@@ -56,7 +56,7 @@ class FilterSeries(NamedTuple):
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw one page: three panels of the main axis, and a table of all axes."""
     result = analysis.main
-    axis_text = result.axis.called
+    axis_text = result.axis.label
     page = Page(
         "Appendix: consistency",
         (
@@ -125,7 +125,7 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
             )
     if not rows:
         return
-    page.heading(f"Tested causes along {axis.called}", above=12.0)
+    page.heading(f"Tested causes along {axis.label}", above=12.0)
     head = ["filter", "change", "quantity", "as flown", "with change", "explains"]
     page.table(head, rows, right=(3, 4))
     page.write(
@@ -272,7 +272,7 @@ def _whiteness_sentence(series: list[FilterSeries]) -> str:
 
 
 def _statistic_cells(
-    _: AxisComparison, __: str, consistency: FilterSummary | UnjudgedFilter
+    _: AxisComparison, __: str, consistency: FilterSummary | UntestedFilter
 ) -> list[str]:
     if isinstance(consistency, Unavailable):
         return [""] * 5

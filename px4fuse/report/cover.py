@@ -8,11 +8,11 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.causal_replays import error_beyond_reported_sigma
+from px4fuse.comparison.causal_replays import error_above_reported_sigma
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.signals import AISLE, Axis, within
-from px4fuse.findings import Finding, by_root, finding_title
+from px4fuse.filter.signals import AISLE, Axis, cut_to_segment
+from px4fuse.findings import Finding, finding_title, group_by_root
 from px4fuse.flight import Ekf2, Truth, Unavailable
 from px4fuse.log import LogInfo
 from px4fuse.report.event_marks import LANDING_MARK, TAKE_OFF_MARK
@@ -53,8 +53,7 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     page = Page("EKF2 check: comparison with a two-state Kalman filter (KF)")
     page.add_foot(_map_and_facts(analysis, facts(analysis)))
     page.write(flight_line(results.student, analysis.flight.log), colour=MUTED_COLOUR, above=-4.0)
-    for sentence in results.summary:
-        page.write(sentence, size=10.5, above=2.0)
+    page.write(results.card.headline, size=10.5, above=2.0)
     _write_verdict(page, analysis)
     write_errors(page, analysis)
     write_findings(page, results.findings)
@@ -77,21 +76,21 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
     page.heading("Findings", 10.5, above=12.0)
     if not findings:
         page.write("None.")
-    for findings_of_cause in by_root(findings):
+    for findings_of_cause in group_by_root(findings):
         write_finding(page, findings_of_cause)
 
 
 def _write_verdict(page: Page, analysis: Analysis) -> None:
     """Write the verdicts along the main axis in large letters: KF left, EKF2 right."""
     result, columns = analysis.main, []
-    axis_text = result.axis.called
+    axis_text = result.axis.label
     for (name, consistency), colour in zip(
         filters_by_name(result).items(), (KF_COLOUR, EKF2_COLOUR), strict=False
     ):
         is_judged = isinstance(consistency, Consistency)
         column, _ = halves()
         large_text = format_verdict(consistency)
-        if excess := error_beyond_reported_sigma(consistency):
+        if excess := error_above_reported_sigma(consistency):
             rmse, sigma = (
                 format_number(value_m, 2) for value_m in (excess.rmse_m, excess.reported_sigma_m)
             )
@@ -227,7 +226,7 @@ def _tracks(comparison: Comparison) -> dict[str, Coordinates]:
     segment, flight = comparison.segment, comparison.flight
 
     def cut(frame: pd.DataFrame) -> Coordinates:
-        inside = within(frame, segment)
+        inside = cut_to_segment(frame, segment)
         return inside["north_m"].to_numpy(), inside["east_m"].to_numpy()
 
     tracks = {"measurement": cut(comparison.source.samples)}

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.findings import Finding, by_root
+from px4fuse.findings import Finding, group_by_root
 from px4fuse.flight import Unavailable
 from px4fuse.loop import corrections
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
@@ -165,7 +165,7 @@ def summary(loop: Loop, findings: tuple[Finding, ...]) -> Page:
     page = Page()
     write_loop(page, loop)
     write_scores(page, loop)
-    for group in by_root(findings):
+    for group in group_by_root(findings):
         write_finding(page, group)
     return page
 
@@ -189,7 +189,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
     single_loop_note = SINGLE_LOOP_REASON if len(loop.closures) == 1 else ""
     for text in (by_distance_sentence(loop), single_loop_note, *missing_corrections(loop)):
         page.write(text, colour=MUTED_COLOUR, above=2.0)
-    for group in by_root(findings):
+    for group in group_by_root(findings):
         write_finding(page, group)
     names = [reference.name for reference in loop.references]
     page.table(

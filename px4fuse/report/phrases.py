@@ -10,7 +10,7 @@ from px4fuse.comparison.model import (
     Comparison,
     Difference,
     FilterSummary,
-    UnjudgedFilter,
+    UntestedFilter,
 )
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import Settings
@@ -61,7 +61,7 @@ def format_sigma_verdict(verdict: str, factor: float) -> str:
     return f"{verdict}, σ {format_factor(factor)}× {SIGMA_VERDICTS[verdict]}"
 
 
-def filters_by_name(result: AxisComparison) -> dict[str, FilterSummary | UnjudgedFilter]:
+def filters_by_name(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
     """Return KF and EKF2 of an axis by their display names; KF only if EKF2 is not logged."""
     filters = {"KF": result.filters["kf"]}
     if not isinstance(result.ekf2_state, Unavailable):
@@ -74,7 +74,7 @@ VERDICT_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
 
 def verdict_rows(
     axes: Iterable[AxisComparison],
-    extra_cells: Callable[[AxisComparison, str, FilterSummary | UnjudgedFilter], Sequence[str]],
+    extra_cells: Callable[[AxisComparison, str, FilterSummary | UntestedFilter], Sequence[str]],
 ) -> list[list[Cell]]:
     """Return a table row per axis and filter: the cells of VERDICT_HEAD, then the extra cells."""
     rows: list[list[Cell]] = []
@@ -114,7 +114,7 @@ def write_errors(page: Page, analysis: Analysis) -> None:
     has_truth = isinstance(analysis.flight.truth, Truth)
 
     def rms_cells(
-        result: AxisComparison, name: str, consistency: FilterSummary | UnjudgedFilter
+        result: AxisComparison, name: str, consistency: FilterSummary | UntestedFilter
     ) -> list[str]:
         difference = result.difference if name == "KF" else None
         cells = [_format_rms(difference, field) for field in RMS_FIELDS if has_ekf2]

@@ -16,6 +16,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from px4fuse.card.model import Card
+from px4fuse.report.card_text import WIDTH, card_lines, headline, to_ascii, with_typed_path
 from px4fuse.report.page import Block, Cell
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.request import (
@@ -27,6 +29,8 @@ from px4fuse.request import (
     command_line,
 )
 
+# Encodings of terminals that can print all characters of a card
+UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
 INDENT = 9  # columns; width of the labels
 COLUMN_POINTS = 6.0  # points of an indent on paper per terminal column
 # Terminal styles of text colours; the other colours belong to plots
@@ -68,9 +72,23 @@ def show(console: Console, blocks: Iterable[Block], request: Request | None = No
                 print_line(console, block["label"], block["text"])
             case "blank":
                 console.print()
+            case "card":
+                _show_card(console, block["card"], request, headline_only=block["headline_only"])
             case "columns":
                 for column in block["columns"]:
                     show(console, column, request)
+
+
+def _show_card(
+    console: Console, card: Card, request: Request | None, *, headline_only: bool
+) -> None:
+    """Print a card; commands contain the path as typed instead of the file name."""
+    is_limited = console.encoding.lower() not in UNICODE_ENCODINGS
+    typed = None if request is None else getattr(request, "log", None)
+    lines = headline(card) if headline_only else card_lines(with_typed_path(card, typed))
+    for line in lines:
+        for text in line.wrapped(min(console.width, WIDTH)):
+            console.print(Text(to_ascii(text) if is_limited else text, line.style), soft_wrap=True)
 
 
 def _show_labelled(console: Console, block: Block, request: Request | None) -> None:
@@ -129,7 +147,7 @@ def rerun_command(request: Request, command: str, changes: Mapping[str, float]) 
             new_request = WhatIfRequest(
                 log=request.log, mavlink=request.mavlink, system=request.system
             )
-    return command_line(replace(new_request, **changes), command, typed=True)
+    return command_line(replace(new_request, **changes), command, for_shell=True)
 
 
 def _styled_text(block: Block) -> Text:

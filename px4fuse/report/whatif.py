@@ -6,7 +6,7 @@ from typing import Any
 
 from px4fuse.analysis import WhatIfAnalysis
 from px4fuse.ekf2.replay import HORIZONTAL
-from px4fuse.ekf2.whatif import DISTURBED_M, HEIGHT_TIMEOUT_S, MAX_REJECTED_SHARE, Summary
+from px4fuse.ekf2.whatif import DISTURBANCE_M, HEIGHT_TIMEOUT_S, MAX_REJECTED_SHARE, Summary
 from px4fuse.ekf2_parameters import AIDS, PARAMETERS
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
@@ -155,7 +155,7 @@ def sweep_notes(analysis: WhatIfAnalysis) -> list[str]:
     if not all(summary.is_predictable for summary in analysis.whatif.whatif):
         sentences.append(
             f"Not predictable: more than {MAX_REJECTED_SHARE:.0%} of the samples would "
-            f"be rejected, {1000.0 * DISTURBED_M:.0f} mm of position noise would change "
+            f"be rejected, {1000.0 * DISTURBANCE_M:.0f} mm of position noise would change "
             f"the result, or heights would be rejected for {HEIGHT_TIMEOUT_S:g} s. The "
             "result then depends on single rejections."
         )

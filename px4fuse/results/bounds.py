@@ -16,15 +16,15 @@ from msgspec.structs import fields, replace
 from px4fuse.errors import ResultsError
 from px4fuse.record import Unavailable
 
-# m and 1; larger than any length, and any ratio of two quantities, of a flight
-LONGEST_M, LARGEST_RATIO = 1e9, 1e6
-# Bounds by a pattern for the name of the field; the first match applies
+# Upper bounds of lengths (m) and of ratios of two quantities in a flight
+MAX_LENGTH_M, MAX_RATIO = 1e9, 1e6
+# Bounds by pattern of the field name; the first match applies
 BOUNDS = {
-    r"(^|_)(nis|nees)($|_)": (0.0, LARGEST_RATIO),
+    r"(^|_)(nis|nees)($|_)": (0.0, MAX_RATIO),
     r"(enabled|fused|lost|rejected)_fraction($|_)": (0.0, 1.0),
     r"(^|_)correlation$": (-1.0, 1.0),
-    r"(^|_)(ratio|factor)($|_)": (-LARGEST_RATIO, LARGEST_RATIO),
-    r"_m$": (-LONGEST_M, LONGEST_M),
+    r"(^|_)(ratio|factor)($|_)": (-MAX_RATIO, MAX_RATIO),
+    r"_m$": (-MAX_LENGTH_M, MAX_LENGTH_M),
 }
 REMEDY = "Check the values in the log."
 T = TypeVar("T", bound=msgspec.Struct)
@@ -57,7 +57,7 @@ def within_bounds(results: T) -> T:
     """
     reasons: list[str] = []
     try:
-        checked: T = _checked(results, None, "", reasons)
+        checked: T = _check_value(results, None, "", reasons)
     except _OutsideError as error:
         raise ResultsError(f"no results: {error}", REMEDY) from error
     if not reasons:
@@ -79,8 +79,8 @@ def types_of(kind: Any) -> tuple[Any, ...]:
     return getattr(kind, "kinds", (kind,))
 
 
-def _checked(value: Any, kind: Any, path: str, reasons: list[str]) -> Any:
-    """Return a value without numbers outside their bounds; raise if it is such a number itself."""
+def _check_value(value: Any, kind: Any, path: str, reasons: list[str]) -> Any:
+    """Remove numbers outside their bounds from a value; raise an error if it is such a number."""
     if isinstance(value, float):
         low, high = bounds_of(path.rpartition(".")[2])
         if not math.isfinite(value):
@@ -89,72 +89,75 @@ def _checked(value: Any, kind: Any, path: str, reasons: list[str]) -> Any:
             raise _OutsideError(f"{path} is {value:.3g} (allowed: {low:g} to {high:g})")
         return value
     if isinstance(value, msgspec.Struct):
-        return _struct(value, path, reasons)
+        return _check_struct(value, path, reasons)
     if isinstance(value, Mapping):
-        return _mapping(value, kind, path, reasons)
-    return _tuple(value, path, reasons) if isinstance(value, tuple) else value
+        return _check_mapping(value, kind, path, reasons)
+    return _check_tuple(value, path, reasons) if isinstance(value, tuple) else value
 
 
-def _struct(value: msgspec.Struct, path: str, reasons: list[str]) -> msgspec.Struct:
+def _check_struct(value: msgspec.Struct, path: str, reasons: list[str]) -> msgspec.Struct:
     changes: dict[str, Any] = {}
     for field in fields(value):
-        old, name = getattr(value, field.name), f"{path}.{field.name}".lstrip(".")
+        value_before, name = getattr(value, field.name), f"{path}.{field.name}".lstrip(".")
         try:
-            new = _checked(old, field.type, name, reasons)
+            value_after = _check_value(value_before, field.type, name, reasons)
         except _OutsideError as error:
             if field.default is None:
                 reasons.append(str(error))
-                new = None
+                value_after = None
             else:
-                new = _unavailable(old, field.type, name, error, reasons)
-        if new is not old:
-            changes[field.name] = new
+                value_after = _make_unavailable(value_before, field.type, name, error, reasons)
+        if value_after is not value_before:
+            changes[field.name] = value_after
     return replace(value, **changes) if changes else value
 
 
-def _mapping(value: Mapping[str, Any], kind: Any, path: str, reasons: list[str]) -> Any:
-    of_values = next(
+def _check_mapping(value: Mapping[str, Any], kind: Any, path: str, reasons: list[str]) -> Any:
+    value_type = next(
         (get_args(member)[1] for member in types_of(kind) if len(get_args(member)) == 2), Any
     )
     checked: dict[str, Any] = {}
     for key, old in value.items():
         name = f"{path}.{key}"
         try:
-            checked[key] = _checked(old, of_values, name, reasons)
+            checked[key] = _check_value(old, value_type, name, reasons)
         except _OutsideError as error:
             try:
-                checked[key] = _unavailable(old, of_values, name, error, reasons)
+                checked[key] = _make_unavailable(old, value_type, name, error, reasons)
             except _OutsideError:
                 reasons.append(str(error))
     if not checked and any(getattr(meta, "min_length", 0) for meta in get_args(kind)[1:]):
         raise _OutsideError(reasons[-1])
-    same = len(checked) == len(value) and all(checked[key] is value[key] for key in value)
-    return value if same else checked
+    is_unchanged = len(checked) == len(value) and all(checked[key] is value[key] for key in value)
+    return value if is_unchanged else checked
 
 
-def _tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple[Any, ...]:
-    """Leave out single records of a tuple; a tuple of numbers (a vector) is left out as a whole."""
+def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple[Any, ...]:
+    """Remove records with numbers outside their bounds from a tuple.
+
+    For a tuple of numbers (a vector) the error is raised, so that the whole vector is left out.
+    """
     checked = []
     for old in value:
         try:
-            checked.append(_checked(old, Any, path, reasons))
+            checked.append(_check_value(old, Any, path, reasons))
         except _OutsideError as error:
             if not isinstance(old, msgspec.Struct):
                 raise
             reasons.append(str(error))
-    same = len(checked) == len(value) and all(map(is_, value, checked))
-    return value if same else tuple(checked)
+    is_unchanged = len(checked) == len(value) and all(map(is_, value, checked))
+    return value if is_unchanged else tuple(checked)
 
 
-def _unavailable(
+def _make_unavailable(
     old: Any, kind: Any, path: str, error: _OutsideError, reasons: list[str]
 ) -> Unavailable:
-    """Return the Unavailable that replaces a record; raise the error if its type allows none."""
+    """Return the Unavailable that replaces a record; raise the error if the type has none."""
     for member in types_of(kind):
         if isinstance(member, type) and issubclass(member, Unavailable):
             texts = {"what": path, "reason": str(error), "remedy": REMEDY}
             other_fields = {
-                field.name: _checked(getattr(old, field.name), field.type, path, reasons)
+                field.name: _check_value(getattr(old, field.name), field.type, path, reasons)
                 for field in fields(member)
                 if field.name not in texts and hasattr(old, field.name)
             }

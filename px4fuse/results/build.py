@@ -68,7 +68,7 @@ def results(
 def outcome_results(
     request: ComparisonRequest, outcome: Analysis | AidsOnlyAnalysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults | contract.AidsResults:
-    """Return the results of ``px4fuse compare``; without a position source, of EKF2's aids only."""
+    """Return the results of ``px4fuse compare``: the comparison, or EKF2's aids only."""
     if isinstance(outcome, Analysis):
         return results(request, outcome, student)
     return within_bounds(
@@ -104,7 +104,7 @@ def whatif_results(
     request: WhatIfRequest, counterfactual: WhatIfAnalysis
 ) -> contract.WhatIfResults:
     """Return the results of ``px4fuse whatif``."""
-    whatif_result, first = counterfactual.whatif, counterfactual.first
+    whatif_result, sweep_start = counterfactual.whatif, counterfactual.first
     return within_bounds(
         contract.WhatIfResults(
             **_common_fields(contract.WHATIF, request, counterfactual.flight),
@@ -113,8 +113,8 @@ def whatif_results(
             asked=counterfactual.asked,
             logged=whatif_result.logged,
             replayed=whatif_result.replayed,
-            whatif=whatif_result.whatif[0] if first else None,
-            sweep=whatif_result.whatif[first:],
+            whatif=whatif_result.whatif[0] if sweep_start else None,
+            sweep=whatif_result.whatif[sweep_start:],
             notes=whatif_result.notes,
         )
     )
@@ -161,7 +161,7 @@ def graph_results(solved: SolvedGraph, command: str) -> contract.GraphResults:
 
 
 def log_record(flight: Flight) -> Log:
-    """Return the record of a flight's log, with joined files and clocks."""
+    """Describe a flight's log, with joined files and clocks."""
     return Log(**msgspec.structs.asdict(flight.log), joined=flight.inputs, clocks=flight.clocks)
 
 
@@ -186,7 +186,7 @@ def _flight_fields(
     """Return the fields that all results of a comparison have, with source and settings."""
     track, segment, settings = comparison.source, comparison.segment, comparison.settings
     origin, parameters = track.origin, comparison.flight.log.parameters
-    placed_s = 0.0 if track.alignment is None else track.alignment.clock_offset_s
+    file_offset_s = 0.0 if track.alignment is None else track.alignment.clock_offset_s
     source = PositionSource(
         **track.description_fields(),
         ekf2_parameters={} if origin.aid is None else origin.aid.logged_parameters(parameters),
@@ -205,7 +205,7 @@ def _flight_fields(
         missing=tuple(part for part in comparison.missing if part.source),
     )
     setting_values: dict[str, Any] = asdict(settings) | {
-        "clock_offset_s": settings.clock_offset_s + placed_s
+        "clock_offset_s": settings.clock_offset_s + file_offset_s
     }
     return _common_fields(name, request, comparison.flight, command) | {
         "source": source,

@@ -103,13 +103,13 @@ class ChosenSettings(Record, frozen=True, kw_only=True):
 TUNED_FIELDS = {"sigma_a_m_s2": "sigma_a_two_state_m_s2", "sigma_z_m": "sigma_z_m"}
 
 
-Which = Literal["A", "B"]
+DiffSide = Literal["A", "B"]
 # 95 % interval; the upper end is None if there is no upper bound
 Interval = tuple[float, float | None]
 
 
-class Compared(Record, frozen=True, kw_only=True):
-    """One of the two inputs of diff: the given file and its log."""
+class DiffInput(Record, frozen=True, kw_only=True):
+    """One of the two inputs of ``px4fuse diff``: the given file, and the log it belongs to."""
 
     given: str
     kind: Literal["log", "report", "results"]
@@ -119,18 +119,18 @@ class Compared(Record, frozen=True, kw_only=True):
 
 
 class NumberChange(Record, frozen=True, kw_only=True):
-    """Number that differs.
+    """Numeric result that differs between the inputs A and B.
 
     Attributes
     ----------
     path : str
-        Path in the results of both: ``axes.aisle.filters.ekf2.nis_mean``.
+        Path in the results: ``axes.aisle.filters.ekf2.nis_mean``.
     label, unit : str
-        The unit "share" means 0 to 1.
+        Name for the user, and unit; "share" is a fraction of 0 to 1.
     a, b : float
-        Absent if only the other side has the number.
+        Values; one is absent if only the other input has the number.
     a_interval, b_interval : (float, float or None)
-        95 %; absent if none is recorded.
+        95 % intervals; absent if the results contain none.
     """
 
     path: str
@@ -143,7 +143,7 @@ class NumberChange(Record, frozen=True, kw_only=True):
 
 
 class SettingChange(Record, frozen=True):
-    """Setting, PX4 parameter or flight data that differ; a value is absent if unknown."""
+    """Setting, PX4 parameter or property of the flight that differs; absent values are unknown."""
 
     name: str
     a: float | str | None = None
@@ -151,12 +151,12 @@ class SettingChange(Record, frozen=True):
 
 
 class FindingChange(Record, frozen=True):
-    """Finding that only one of the two inputs has."""
+    """Finding that only one of the inputs A and B has."""
 
     id: str
     severity: Literal["error", "warning", "note"]
     message: str
-    only_in: Which
+    only_in: DiffSide
 
 
 class _FlightResults(Record, frozen=True):
@@ -312,18 +312,18 @@ class ChangeResults(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     schema : Schema
-    a, b : Compared
+    a, b : DiffInput
     settings : tuple of SettingChange
     numbers : tuple of NumberChange
     findings : tuple of FindingChange
     worse : tuple of str
-        Verdicts that are worse in B, one sentence each; with any, the exit code is 1.
+        Verdicts that are worse in B, one sentence each; if there are any, the exit code is 1.
     provenance : Provenance
     """
 
     schema: Schema
-    a: Compared
-    b: Compared
+    a: DiffInput
+    b: DiffInput
     settings: tuple[SettingChange, ...]
     numbers: tuple[NumberChange, ...]
     findings: tuple[FindingChange, ...]
@@ -331,9 +331,9 @@ class ChangeResults(Record, frozen=True, kw_only=True):
     provenance: Provenance
 
 
-Reported = ComparisonResults | LoopResults
+ReportedResults = ComparisonResults | LoopResults
 Results = (
-    Reported
+    ReportedResults
     | AidsResults
     | TuningResults
     | SyncResults
@@ -361,15 +361,16 @@ def schema() -> dict[str, Any]:
     kinds: dict[type, None] = dict.fromkeys(KINDS.values())
     components: dict[str, Any] = {}
 
-    def either(kind: Any) -> dict[str, Any]:
+    def describe_union(kind: Any) -> dict[str, Any]:
         kinds.update(dict.fromkeys(kind.kinds))
         return {"anyOf": [{"$ref": f"#/$defs/{member.__name__}"} for member in kind.kinds]}
 
     count = 0
-    while count < len(kinds):  # msgspec does not resolve the types inside a RecordOrUnavailable
+    # each pass adds the types inside RecordOrUnavailable, which msgspec does not resolve
+    while count < len(kinds):
         count = len(kinds)
         _, components = msgspec.json.schema_components(
-            list(kinds), schema_hook=either, ref_template="#/$defs/{name}"
+            list(kinds), schema_hook=describe_union, ref_template="#/$defs/{name}"
         )
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
@@ -444,5 +445,5 @@ def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
 
 
 def file_hashes_in(text: str) -> list[str]:
-    """Return the SHA-256 of all input files in results (JSON text), in their order."""
+    """Return the SHA-256 of all input files named in results (JSON text), in order."""
     return re.findall(r'"([0-9a-f]{64})"', text)

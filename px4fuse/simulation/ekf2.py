@@ -1,12 +1,14 @@
 """EKF2 topics of a simulated flight, computed with px4fuse's model of EKF2, as PX4 v1.16 logs them.
 
 The model :mod:`px4fuse.ekf2` starts with PX4's initial variances and levelling at rest, then runs
-on the simulated IMU and positions. It is linear about the true attitude: a gyro rotation that
-differs from it enters as a rotation, so the estimate does not depend on the true attitude.
+on the simulated IMU and positions. Its error states are linearised about the true attitude. The
+difference between integrated gyro and true attitude is an input of the model, so the estimate does
+not depend on the true attitude.
 
-Outdoors EKF2 fuses magnetometer and barometer, and vehicle_attitude is estimated by EKF2. Indoors a
-slow error replaces both sensors, and vehicle_attitude is simulated without the model, so that KF's
-input does not depend on EKF2 parameters; the estimated attitude is in estimator_states.
+Outdoors, EKF2 fuses magnetometer and barometer, and vehicle_attitude is the estimate of the model.
+Indoors, heading and height of EKF2 have a simulated slow error instead. vehicle_attitude is then
+simulated without the model, so that the input of KF does not depend on EKF2 parameters; the
+estimated attitude is in estimator_states.
 """
 
 from collections.abc import Mapping
@@ -20,7 +22,7 @@ from px4fuse.ekf2.filter_recursion import (
     HEADING,
     NORTH,
     POSITION_COLUMNS,
-    StretchRun,
+    SegmentRun,
     Variant,
 )
 from px4fuse.ekf2.heights import barometer_samples_inside
@@ -35,12 +37,12 @@ from px4fuse.ekf2.replay_segments import (
     THETA,
     VELOCITY,
     HeightSamples,
-    Stretch,
+    ReplaySegment,
     add_field_states,
-    down_sampled,
+    downsample_imu,
     step_ends,
 )
-from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid, settings_in_force
+from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid, effective_settings
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ekf2_topics import VEHICLE_AID_SOURCE_HZ, TopicTrack, ekf2_topics
 from px4fuse.simulation.mistakes import Mistakes
@@ -56,56 +58,57 @@ from px4fuse.trajectory.rotation import (
     to_vector,
 )
 
-PREDICT_US = 10_000  # µs, EKF2_PREDICT_US
-# gauss, initial σ of each axis of both fields after alignment on the ground
-FIELD_SD_GAUSS = 0.03
-# Rules of v1.14 to main: EV_MAX_INTERVAL (ev_control.cpp), reset_timeout_max (common.h)
-RULES = FusionRules(0.2, 0.4, 1.0, 5, None, horizon_by_delay=False)
-# Rules of v1.16: gps_control.cpp, and no_aid_timeout_max (common.h)
+PREDICTION_STEP_US = 10_000  # µs, EKF2_PREDICT_US
+# gauss; initial σ of each axis of earth field and magnetometer bias, after alignment on the ground
+FIELD_SIGMA_GAUSS = 0.03
+# Rules of external vision, v1.14 to main: EV_MAX_INTERVAL (ev_control.cpp), reset_timeout_max
+# (common.h)
+VISION_RULES = FusionRules(0.2, 0.4, 1.0, 5, None, horizon_by_delay=False)
+# Rules of GNSS, v1.16: gps_control.cpp, and no_aid_timeout_max (common.h)
 GNSS_RULES = FusionRules(
     np.inf, np.inf, 7.0, UNLIMITED_RESETS, None, False, reset_scale=2.0, with_velocity=True
 )
-# s, EKF2_NOAID_TOUT; without an aid for longer EKF2 holds its position (fake_pos_control.cpp)
-NO_AIDING_S = 5.0
+# s, EKF2_NOAID_TOUT; after this time without an aid EKF2 holds its position (fake_pos_control.cpp)
+NO_AID_TIMEOUT_S = 5.0
 # σ from EKF2_ANGERR_INIT, _GPS_V_NOISE, _GPS_P_NOISE, _GBIAS_INIT and _ABIAS_INIT (covariance.cpp)
-INITIAL_SD = np.repeat([0.1, 0.3, 0.5, 0.1, 0.2], 3)
-# Time (s) at rest before the log begins, and σ of the zero-motion measurements. They reproduce the
-# values of v1.16 on the ground: 0.0005 rad/s, 0.06 m/s and 0.17 m/s² (horizontal)
+INITIAL_SIGMA = np.repeat([0.1, 0.3, 0.5, 0.1, 0.2], 3)
+# Time (s) at rest before the log, and σ of specific force, angular rate and velocity at rest. They
+# reproduce σ of v1.16 on the ground: 0.0005 rad/s, 0.06 m/s and 0.17 m/s² (horizontal)
 REST_S = 10.0
-REST_SD = np.repeat([0.05, 0.0005, 0.06], 3)
+REST_SIGMA = np.repeat([0.05, 0.0005, 0.06], 3)
 # rad and m; σ of heading and height as logged by v1.16 in flight
-HEADING_SD_RAD, HEIGHT_SD_M = 0.03, 0.15
-# s; small enough that variances between UWB samples are logged
-MAX_INTERVAL_S = 0.1
+HEADING_SIGMA_RAD, HEIGHT_SIGMA_M = 0.03, 0.15
+# s; longest interval between two times at which the model provides variances for estimator_states
+MAX_EVENT_INTERVAL_S = 0.1
 
 
 def _fused_aids(scenario: Scenario) -> tuple[Aid, ...]:
-    """Return the fused aids that have parameters in the model."""
+    """Return the aids that EKF2 fuses and whose parameters the model uses."""
     return (scenario.aid, MAG, BAROMETER) if scenario.aid == GNSS_POS else (scenario.aid,)
 
 
 def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]:
-    """Return the flown value of all EKF2 parameters in the model, by PX4 name."""
+    """Return the values of all EKF2 parameters of the model in this flight, by PX4 name."""
     aid = scenario.aid
-    gnss = aid == GNSS_POS
-    known = settings_in_force({}, *_fused_aids(scenario))
-    delay_ms = known[aid.delay] if mistakes.ekf2_delay_s is None else 1e3 * mistakes.ekf2_delay_s
-    of_aid: dict[str, float] = {aid.noise_mode: 1}
-    if gnss:
+    is_gnss = aid == GNSS_POS
+    defaults = effective_settings({}, *_fused_aids(scenario))
+    delay_ms = defaults[aid.delay] if mistakes.ekf2_delay_s is None else 1e3 * mistakes.ekf2_delay_s
+    aid_values: dict[str, float] = {aid.noise_mode: 1}
+    if is_gnss:
         # EKF2_MAG_TYPE 1 fuses the magnetic heading only, 0 all axes
-        only_heading = int(bool(mistakes.heading_deg))
-        of_aid = {GNSS_VEL.noise: scenario.sigma_gnss_m_s, MAG.switch: only_heading}
-        of_aid |= {BAROMETER.noise: sensors.SIGMA_BAROMETER_M}
+        mag_type = int(bool(mistakes.heading_deg))
+        aid_values = {GNSS_VEL.noise: scenario.sigma_gnss_m_s, MAG.switch: mag_type}
+        aid_values |= {BAROMETER.noise: sensors.SIGMA_BAROMETER_M}
     return (
-        known
-        | of_aid
+        defaults
+        | aid_values
         | {
             aid.noise: mistakes.ekf2_noise_m or sensors.reported_sigma_m(scenario, mistakes),
             aid.gate: mistakes.ekf2_gate,
             aid.delay: delay_ms,
-            # EKF2_DELAY_MAX is set for a source that arrives late
-            "EKF2_DELAY_MAX": max(known["EKF2_DELAY_MAX"], 100.0 + 1e3 * mistakes.clock_jump_s),
-            "EKF2_PREDICT_US": PREDICT_US,
+            # samples older than EKF2_DELAY_MAX would not be fused
+            "EKF2_DELAY_MAX": max(defaults["EKF2_DELAY_MAX"], 100.0 + 1e3 * mistakes.clock_jump_s),
+            "EKF2_PREDICT_US": PREDICTION_STEP_US,
         }
     )
 
@@ -115,127 +118,138 @@ def simulate_ekf2(
     mistakes: Mistakes,
     motion: Motion,
     imu: Topic,
-    source: sensors.SensedPositions,
-    others: tuple[Topic, ...],
+    source: sensors.SimulatedPositions,
+    other_sensors: tuple[Topic, ...],
     log_parameters: Mapping[str, int | float],
 ) -> tuple[Topic, ...]:
     """Return the EKF2 topics of a flight, without empty ones.
 
     Parameters
     ----------
-    imu, source, others : Topic, SensedPositions, tuple of Topic
-        As EKF2 received them, before logging; outdoors ``others`` are magnetometer and barometer.
+    imu, source, other_sensors : Topic, SimulatedPositions, tuple of Topic
+        As EKF2 received them, before logging. Outdoors ``other_sensors`` are magnetometer and
+        barometer.
     log_parameters : mapping
-        Parameters of the log.
+        Parameters in the log, by PX4 name.
     """
     aid, aids = scenario.aid, _fused_aids(scenario)
-    stretch, time_us, nominal = _stretch(scenario, mistakes, motion, imu)
-    known = {name: float(np.float32(v)) for name, v in log_parameters.items()}
-    if others:
-        magnetometer, barometer = others
-        stretch = replace(stretch, heights=_barometer_heights(stretch, barometer))
-        if not known[MAG.switch]:
-            stretch = _with_field(stretch, magnetometer)
-    settings = settings_in_force(known, *aids)
-    rules = GNSS_RULES if aid == GNSS_POS else RULES
-    step_s = float(np.median(stretch.step_s))
-    length = int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICT_US))
+    segment, time_us, true_quaternions = _make_segment(scenario, mistakes, motion, imu)
+    logged_values = {name: float(np.float32(v)) for name, v in log_parameters.items()}
+    if other_sensors:
+        magnetometer, barometer = other_sensors
+        segment = replace(segment, heights=_barometer_heights(segment, barometer))
+        if not logged_values[MAG.switch]:
+            segment = _with_field(segment, magnetometer)
+    settings = effective_settings(logged_values, *aids)
+    rules = GNSS_RULES if aid == GNSS_POS else VISION_RULES
+    step_s = float(np.median(segment.step_s))
+    buffer_length = int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICTION_STEP_US))
     inputs = Inputs(
         settings=settings,
-        stretches=(stretch,),
-        received=_arrived_samples(source),
+        segments=(segment,),
+        received=_received_positions(source),
         # ev_pos_control.cpp: without bit 0 samples are evaluated but not fused
         rules=rules
         if int(log_parameters[aid.switch]) & 1
         else replace(rules, start_interval_s=0.0),
         step_s=step_s,
-        horizon_s=(length - 1) * step_s,
-        predict_s=PREDICT_US * 1e-6,
+        horizon_s=(buffer_length - 1) * step_s,
+        predict_s=PREDICTION_STEP_US * 1e-6,
         vision_height=False,
         imu_offset_m=np.zeros(3),
         aid=aid,
-        max_interval_s=MAX_INTERVAL_S,
+        max_interval_s=MAX_EVENT_INTERVAL_S,
     )
     model_run = run_variants(inputs, [Variant(settings)], {})[0]
-    track = _topic_track(inputs, model_run, time_us, nominal)
+    track = _make_topic_track(inputs, model_run, time_us, true_quaternions)
     aid_source_hz = VEHICLE_AID_SOURCE_HZ if mistakes.no_vvo else 0.0
     return ekf2_topics(inputs, model_run, track, scenario.attitude_rate_hz, aid_source_hz)
 
 
-def _stretch(
+def _make_segment(
     scenario: Scenario, mistakes: Mistakes, motion: Motion, imu: Topic
-) -> tuple[Stretch, IntArray, Array]:
-    """Return the flight in prediction steps about the true attitude, step times (µs), attitude."""
+) -> tuple[ReplaySegment, IntArray, Array]:
+    """Return the flight in prediction steps, times (µs) of the step ends, and true quaternions."""
     time_us = imu.fields["timestamp"].astype(np.int64) - sensors.START_US
-    interval = np.diff(time_us) * 1e-6
-    ends = step_ends(interval, np.array([], dtype=np.intp), PREDICT_US * 1e-6)
-    rate, force = (
-        imu.fields[name][1:].astype(np.float64) * interval[:, None]
+    interval_s = np.diff(time_us) * 1e-6
+    step_end_indices = step_ends(interval_s, np.array([], dtype=np.intp), PREDICTION_STEP_US * 1e-6)
+    rotation_steps_rad, velocity_steps_m_s = (
+        imu.fields[name][1:].astype(np.float64) * interval_s[:, None]
         for name in ("gyro_rad", "accelerometer_m_s2")
     )
-    turn, gain = down_sampled(rate, force, ends)
-    step_us = time_us[np.concatenate([[0], ends])]
-    time = step_us * 1e-6
-    rotation = attitude(motion.at(time)).body_to_ned
-    nominal = sensors.quaternions(rotation)
-    gyro = cumulative_product(np.concatenate([nominal[:1], from_vector(turn)]))
-    attitude_difference = multiply(nominal, conjugate(gyro))
-    error = np.zeros((len(time), 3))
-    error[:, HEADING] = sensors.attitude_error(scenario, mistakes, time).as_rotvec()[:, HEADING]
-    mean_imu_at_rest = sensors.mean_imu_at_rest(scenario, mistakes, motion, REST_S)
+    rotation_rad, velocity_increment_m_s = downsample_imu(
+        rotation_steps_rad, velocity_steps_m_s, step_end_indices
+    )
+    step_us = time_us[np.concatenate([[0], step_end_indices])]
+    time_s = step_us * 1e-6
+    rotation = attitude(motion.at(time_s)).body_to_ned
+    true_quaternions = sensors.quaternions(rotation)
+    integrated_attitude = cumulative_product(
+        np.concatenate([true_quaternions[:1], from_vector(rotation_rad)])
+    )
+    attitude_difference = multiply(true_quaternions, conjugate(integrated_attitude))
+    attitude_error_rad = np.zeros((len(time_s), 3))
+    attitude_error_rad[:, HEADING] = sensors.attitude_error(scenario, mistakes, time_s).as_rotvec()[
+        :, HEADING
+    ]
+    mean_at_rest = sensors.mean_imu_at_rest(scenario, mistakes, motion, REST_S)
     state, covariance = _initial_state_at_rest(
-        rotation[0], *mean_imu_at_rest, float(error[0, HEADING])
+        rotation[0], *mean_at_rest, float(attitude_error_rad[0, HEADING])
     )
     variance = np.diagonal(covariance).copy()
-    deviation = np.sqrt(variance)
+    sigma = np.sqrt(variance)
     return (
-        Stretch(
-            time_s=time,
-            step_s=np.diff(time),
+        ReplaySegment(
+            time_s=time_s,
+            step_s=np.diff(time_s),
             rotation=rotation,
             correction_rad=to_vector(
                 multiply(attitude_difference[1:], conjugate(attitude_difference[:-1]))
             ),
-            force_m_s2=gain / np.diff(time)[:, None],
+            force_m_s2=velocity_increment_m_s / np.diff(time_s)[:, None],
             accelerometer_bias_m_s2=np.zeros(3),
             state=state,
             variance=variance,
-            down_m=motion.at(time).position_m[:, 2] + sensors.height_error(scenario, time),
-            # only the positions correct the tilt
-            attitude_variance_rad2=np.tile([np.inf, np.inf, HEADING_SD_RAD**2], (len(time), 1)),
-            down_variance_m2=np.full(len(time), HEIGHT_SD_M**2),
-            attitude_error_rad=error,
-            correlation=covariance / deviation[:, None] / deviation,
+            down_m=motion.at(time_s).position_m[:, 2] + sensors.height_error(scenario, time_s),
+            # infinite variance: no logged tilt is used, only positions correct the tilt
+            attitude_variance_rad2=np.tile(
+                [np.inf, np.inf, HEADING_SIGMA_RAD**2], (len(time_s), 1)
+            ),
+            down_variance_m2=np.full(len(time_s), HEIGHT_SIGMA_M**2),
+            attitude_error_rad=attitude_error_rad,
+            correlation=covariance / sigma[:, None] / sigma,
             fusing=False,
         ),
         step_us,
-        nominal,
+        true_quaternions,
     )
 
 
-def _with_field(stretch: Stretch, magnetometer: Topic) -> Stretch:
-    """Add the magnetic fields to the states, aligned on the ground."""
-    taken_s = sensors.time_s(magnetometer) - 0.5 * float(np.median(stretch.step_s))
+def _with_field(segment: ReplaySegment, magnetometer: Topic) -> ReplaySegment:
+    """Add earth field and magnetometer bias to the states, as aligned on the ground."""
+    measured_at_s = sensors.time_s(magnetometer) - 0.5 * float(np.median(segment.step_s))
     gauss = magnetometer.fields["magnetometer_ga"].astype(np.float64)
     fields = np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)])
-    return add_field_states(stretch, taken_s, gauss, 1.0, fields, np.full(6, FIELD_SD_GAUSS**2))
+    return add_field_states(
+        segment, measured_at_s, gauss, 1.0, fields, np.full(6, FIELD_SIGMA_GAUSS**2)
+    )
 
 
-def _barometer_heights(stretch: Stretch, barometer: Topic) -> HeightSamples:
-    """Return the barometer heights; the barometer is EKF2's only height sensor here."""
-    taken_s = sensors.time_s(barometer) - 0.5 * float(np.median(stretch.step_s))
+def _barometer_heights(segment: ReplaySegment, barometer: Topic) -> HeightSamples:
+    """Return the barometer heights; the barometer is the only height sensor in these flights."""
+    measured_at_s = sensors.time_s(barometer) - 0.5 * float(np.median(segment.step_s))
     down_m = sensors.HOME[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
-    samples = barometer_samples_inside(stretch, taken_s, down_m, np.zeros(len(down_m)))
+    samples = barometer_samples_inside(segment, measured_at_s, down_m, np.zeros(len(down_m)))
     return HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *samples, 1.0)
 
 
 def _initial_state_at_rest(
     rotation: Array, force_m_s2: Array, rate_rad_s: Array, heading_error_rad: float
 ) -> tuple[Array, Array]:
-    """Return state and covariance at the start, after zero-motion updates of PX4's initial state.
+    """Return state and covariance at the start: PX4's initial state, updated at rest.
 
-    At rest specific force is -g and angular rate 0, except for the biases. Levelling correlates
-    tilt with the accelerometer bias.
+    At rest the specific force is -g, and angular rate and velocity are 0, except for the biases.
+    The update correlates tilt error and accelerometer bias.
     """
     H = np.zeros((9, STATES))
     H[0:3, THETA] = -skew(rotation @ force_m_s2)
@@ -243,95 +257,102 @@ def _initial_state_at_rest(
     H[3:6, GYRO_BIAS] = np.eye(3)
     H[6:9, VELOCITY] = np.eye(3)
     measured = np.concatenate([-GRAVITY_M_S2 - rotation @ force_m_s2, rate_rad_s, np.zeros(3)])
-    P = np.diag(INITIAL_SD**2)
+    P = np.diag(INITIAL_SIGMA**2)
     x = np.zeros(STATES)
-    P[HEADING, HEADING], x[HEADING] = HEADING_SD_RAD**2, heading_error_rad
-    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(REST_SD**2))
+    P[HEADING, HEADING], x[HEADING] = HEADING_SIGMA_RAD**2, heading_error_rad
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(REST_SIGMA**2))
     x += K @ (measured - H @ x)
     x[HEADING] = heading_error_rad
     P -= K @ H @ P
     return x, 0.5 * (P + P.T)
 
 
-def _arrived_samples(source: sensors.SensedPositions) -> ReceivedPositions:
-    """Return the samples in order of arrival, without those older than an earlier one.
+def _received_positions(source: sensors.SimulatedPositions) -> ReceivedPositions:
+    """Return the samples in order of arrival, without samples older than a preceding one.
 
-    EKF2 ignores samples older than the last (estimator_interface.cpp).
+    EKF2 ignores such samples (estimator_interface.cpp).
     """
     fields = source.topic.fields
-    stamp, arrival = (
+    timestamp_s, arrival_s = (
         sensors.seconds(fields[name].astype(np.int64) - sensors.START_US)
         for name in ("timestamp_sample", "timestamp")
     )
-    newest = np.maximum.accumulate(np.concatenate([[-np.inf], stamp[:-1]]))
-    is_newer = stamp > newest
+    latest_timestamp_s = np.maximum.accumulate(np.concatenate([[-np.inf], timestamp_s[:-1]]))
+    is_newer = timestamp_s > latest_timestamp_s
     velocity = source.velocity_m_s
     if velocity is not None:
-        accuracy = np.stack([fields["eph"], fields["eph"], fields["epv"]], axis=1)[is_newer] ** 2
-        speed = np.repeat(fields["s_variance_m_s"][is_newer, None] ** 2, 3, axis=1)
+        position_variance = (
+            np.stack([fields["eph"], fields["eph"], fields["epv"]], axis=1)[is_newer] ** 2
+        )
+        velocity_variance = np.repeat(fields["s_variance_m_s"][is_newer, None] ** 2, 3, axis=1)
     else:
-        accuracy, speed = fields["position_variance"][is_newer], None
+        position_variance, velocity_variance = fields["position_variance"][is_newer], None
     return ReceivedPositions(
-        stamp_s=stamp[is_newer],
-        arrival_s=arrival[is_newer],
+        stamp_s=timestamp_s[is_newer],
+        arrival_s=arrival_s[is_newer],
         position_m=source.position_m[is_newer].astype(np.float32).astype(np.float64),
-        variance_m2=accuracy.astype(np.float64),
+        variance_m2=position_variance.astype(np.float64),
         rejected=np.full(int(is_newer.sum()), np.nan),
         reset=np.zeros(int(is_newer.sum()), dtype=bool),
         source=source.topic.name,
         velocity_m_s=None if velocity is None else velocity[is_newer],
-        velocity_variance_m2_s2=speed,
+        velocity_variance_m2_s2=velocity_variance,
     )
 
 
-def _topic_track(
-    inputs: Inputs, model_run: StretchRun, time_us: IntArray, nominal: Array
+def _make_topic_track(
+    inputs: Inputs, model_run: SegmentRun, time_us: IntArray, true_quaternions: Array
 ) -> TopicTrack:
-    stretch = model_run.stretch
-    lag = round(inputs.horizon_s / inputs.step_s)
+    segment = model_run.segment
+    lag_steps = round(inputs.horizon_s / inputs.step_s)
     state, _ = delayed_states(model_run, 0)
-    resets, aided = _hold_without_aiding(model_run, state)
+    resets, is_aided = _hold_without_aiding(model_run, state)
     reset_sum_m = np.zeros((len(state), 3))
-    for step, jump in resets:
-        reset_sum_m[step:, :2] += jump
+    for step, reset_m in resets:
+        reset_sum_m[step:, :2] += reset_m
     # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
-    gyro = np.einsum("nij,nj->ni", stretch.rotation[1:], delay_by(state[:, GYRO_BIAS], lag)[1:])
-    attitude_steps = -stretch.correction_rad - gyro * stretch.step_s[:, None]
+    gyro_bias_ned = np.einsum(
+        "nij,nj->ni", segment.rotation[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:]
+    )
+    attitude_steps = -segment.correction_rad - gyro_bias_ned * segment.step_s[:, None]
     gyro_attitude_error = state[0, THETA] + np.concatenate(
         [np.zeros((1, 3)), np.cumsum(attitude_steps, axis=0)]
     )
     attitude_error = gyro_attitude_error + follow_attitude(
-        state[:, THETA] - gyro_attitude_error, lag, inputs.step_s, inputs.horizon_s
+        state[:, THETA] - gyro_attitude_error, lag_steps, inputs.step_s, inputs.horizon_s
     )
-    velocity, position = publish(stretch, state, reset_sum_m, attitude_error, lag, inputs.settings)
+    velocity, position = publish(
+        segment, state, reset_sum_m, attitude_error, lag_steps, inputs.settings
+    )
     return TopicTrack(
         time_us=time_us,
-        lag=lag,
-        delayed_attitude=multiply(from_vector(state[:, THETA]), nominal),
-        delayed=state[:, 3:],
+        lag_steps=lag_steps,
+        delayed_attitude=multiply(from_vector(state[:, THETA]), true_quaternions),
+        delayed_states=state[:, 3:],
         velocity_m_s=velocity,
         position_m=position,
-        attitude=multiply(from_vector(attitude_error), nominal),
-        resets=tuple((step + lag, jump) for step, jump in resets),
-        aided=aided,
+        attitude=multiply(from_vector(attitude_error), true_quaternions),
+        resets=tuple((step + lag_steps, reset_m) for step, reset_m in resets),
+        is_aided=is_aided,
     )
 
 
 def _hold_without_aiding(
-    model_run: StretchRun, state: Array
+    model_run: SegmentRun, state: Array
 ) -> tuple[list[tuple[int, Array]], BoolArray]:
-    """Return resets by step and times with an aid; without one hold the position of ``state``.
+    """Return position resets (step, size in m) and True for steps with an aid; change ``state``.
 
-    EKF2 then fuses a fake position, which the model does not contain.
+    Without an aid EKF2 fuses a fake position, which is not part of the model. Here the position in
+    ``state`` is held instead, with velocity zero.
     """
-    events, run, time = model_run.events[0], model_run, model_run.stretch.time_s
+    events, run, time = model_run.events[0], model_run, model_run.segment.time_s
     horizontal = slice(NORTH, EAST + 1)
-    used = np.flatnonzero(run.fused[:, 0] | run.reset[:, 0])
-    last = np.zeros(len(time))
-    last[events.end[used]] = time[events.end[used]]
-    aided = time - np.maximum.accumulate(last) <= NO_AIDING_S
-    aiding_ends = np.flatnonzero(np.diff(aided.astype(int)) == -1) + 1
-    aiding_starts = np.flatnonzero(np.diff(aided.astype(int)) == 1) + 1
+    aid_events = np.flatnonzero(run.fused[:, 0] | run.reset[:, 0])
+    last_aid_s = np.zeros(len(time))
+    last_aid_s[events.end_step[aid_events]] = time[events.end_step[aid_events]]
+    is_aided = time - np.maximum.accumulate(last_aid_s) <= NO_AID_TIMEOUT_S
+    aiding_ends = np.flatnonzero(np.diff(is_aided.astype(int)) == -1) + 1
+    aiding_starts = np.flatnonzero(np.diff(is_aided.astype(int)) == 1) + 1
     for start, end in zip(
         aiding_ends, [*aiding_starts, len(time)][: len(aiding_ends)], strict=True
     ):
@@ -339,9 +360,9 @@ def _hold_without_aiding(
         state[start:end, VELOCITY.start : VELOCITY.start + 2] = 0.0
     resets = []
     for event in np.flatnonzero(run.reset[:, 0]):
-        step = int(events.end[event])
-        jump = run.innovation[event, 0, POSITION_COLUMNS]
-        if not aided[step - 1]:
-            jump = state[step, horizontal] - state[step - 1, horizontal]
-        resets.append((step, jump))
-    return resets, aided
+        step = int(events.end_step[event])
+        reset_m = run.innovation[event, 0, POSITION_COLUMNS]
+        if not is_aided[step - 1]:
+            reset_m = state[step, horizontal] - state[step - 1, horizontal]
+        resets.append((step, reset_m))
+    return resets, is_aided

@@ -1,4 +1,4 @@
-"""Simulated flights as topics, ULog and Flight, and the answer key for the instructor."""
+"""Simulated flights as topics, ULog and Flight, and the answer file for the instructor."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -21,25 +21,26 @@ from px4fuse.simulation.ulog_writer import Topic, encode
 from px4fuse.text import to_json_types
 
 NO_MISTAKES = Mistakes()
-# Parameter values that fuse horizontal positions; for GNSS also velocity (bit 2)
-SWITCHED_ON = {EV_POS.switch: 1, GNSS_POS.switch: 5}
+# Parameter values with which EKF2 fuses horizontal positions; with GNSS also velocity (bit 2)
+FUSION_ON_VALUES = {EV_POS.switch: 1, GNSS_POS.switch: 5}
+# SDLOG_PROFILE with and without the vision topics
 PROFILE_WITH_VISION, PROFILE_DEFAULT = 129, 1
-RELEASE = 1 << 24 | 16 << 16 | 255  # v1.16.0, the release of the simulated topics
+PX4_RELEASE = 1 << 24 | 16 << 16 | 255  # v1.16.0, the release of the simulated topics
 HARDWARE = "px4fuse simulation"
 ANSWER_SCHEMA = {"name": "px4fuse-answer", "version": 1}
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """Simulated flight: logged topics, and truth for the instructor.
+    """Simulated flight: logged topics, and true values for the instructor.
 
     Attributes
     ----------
     scenario : Scenario
     mistakes : Mistakes
     motion : Motion
-        True motion at any time.
-    positions : SensedPositions
+        True motion as a function of time.
+    positions : SimulatedPositions
         Position source with its outliers and errors.
     topics : tuple of Topic
         All logged topics.
@@ -49,7 +50,7 @@ class Simulation:
     scenario: Scenario
     mistakes: Mistakes
     motion: Motion
-    positions: sensors.SensedPositions
+    positions: sensors.SimulatedPositions
     topics: tuple[Topic, ...]
     parameters: Mapping[str, int | float]
 
@@ -60,19 +61,19 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
     Raises
     ------
     SettingsError
-        A mistake does not fit the scenario.
+        A mistake is not possible in this scenario.
     """
     for name in active_mistakes(mistakes):
         if scenario.kind not in (kinds := MISTAKES[name].kinds):
             raise SettingsError(f"--mistake {name} requires --kind {' or '.join(kinds)}.")
-        if MISTAKES[name].of_ekf2 and not scenario.ekf2:
+        if MISTAKES[name].changes_ekf2 and not scenario.ekf2:
             raise SettingsError(f"--mistake {name} changes EKF2: omit --no-ekf2.")
     if scenario.aid == GNSS_POS and 0.0 < mistakes.ekf2_noise_m < (
-        stated_m := sensors.reported_sigma_m(scenario, mistakes)
+        reported_m := sensors.reported_sigma_m(scenario, mistakes)
     ):
         raise SettingsError(
             f"--mistake ekf2-noise={mistakes.ekf2_noise_m:g} has no effect outdoors: "
-            f"EKF2 uses the larger of {GNSS_POS.noise} and the receiver's accuracy ({stated_m:g} "
+            f"EKF2 uses the larger of {GNSS_POS.noise} and the receiver's accuracy ({reported_m:g} "
             "m). Use a larger value."
         )
     motion = plan(scenario, mistakes, sensors.random_stream(scenario, sensors.Stream.WANDER))
@@ -86,20 +87,24 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
     ]
     if not mistakes.no_vvo:
         topics.append(positions.topic)
-    others: tuple[Topic, ...] = ()
+    other_sensors: tuple[Topic, ...] = ()
     if scenario.aid == GNSS_POS:
         barometer = sensors.barometer(scenario, motion)
-        others = (sensors.magnetometer(scenario, mistakes, motion), barometer)
-        topics += [sensors.limit_rate(others[0], MAGNETOMETER_HZ), barometer]
+        other_sensors = (sensors.magnetometer(scenario, mistakes, motion), barometer)
+        topics += [sensors.limit_rate(other_sensors[0], MAGNETOMETER_HZ), barometer]
     if scenario.truth:
         topics.append(sensors.ground_truth(scenario, motion))
     for topic in topics:
         if len(topic.fields["timestamp"]) < 2:
-            raise SettingsError(f"These mistakes leave no data in {topic.name}. Reduce them.")
+            raise SettingsError(
+                f"With these mistakes {topic.name} contains no data. Reduce the mistakes."
+            )
     if scenario.ekf2:
-        own = ekf2.simulate_ekf2(scenario, mistakes, motion, imu, positions, others, parameters)
-        names = {topic.name for topic in own}
-        topics = [*(topic for topic in topics if topic.name not in names), *own]
+        ekf2_topics = ekf2.simulate_ekf2(
+            scenario, mistakes, motion, imu, positions, other_sensors, parameters
+        )
+        names = {topic.name for topic in ekf2_topics}
+        topics = [*(topic for topic in topics if topic.name not in names), *ekf2_topics]
     if scenario.truth:
         topics.append(sensors.true_attitude(scenario, motion))
     return Simulation(scenario, mistakes, motion, positions, tuple(topics), parameters)
@@ -111,28 +116,28 @@ def simulate_flight(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Fli
 
 
 def to_ulog(simulation: Simulation) -> bytes:
-    """Return the flight as a ULog file, without information about the mistakes."""
+    """Encode the flight as a ULog file, which contains no information about the mistakes."""
     info: dict[str, int | str] = {
         "sys_name": "PX4",
         "ver_hw": HARDWARE,
-        "ver_sw_release": RELEASE,
+        "ver_sw_release": PX4_RELEASE,
         **({NOTE_KEY: MODEL_NOTE} if simulation.scenario.ekf2 else {}),
     }
     return encode(simulation.topics, simulation.parameters, info, sensors.START_US)
 
 
 def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
-    """Return the flight as :func:`px4fuse.read_log` reads it from its ULog."""
+    """Encode the flight as ULog, and read it as :func:`px4fuse.read_log` does."""
     return read_ulog(name, to_ulog(simulation))
 
 
 def _parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]:
-    used = 0 if mistakes.ekf2_off else SWITCHED_ON[scenario.aid.switch]
+    switch_value = 0 if mistakes.ekf2_off else FUSION_ON_VALUES[scenario.aid.switch]
     return {
         **ekf2.parameters(scenario, mistakes),
         "EKF2_EN": int(scenario.ekf2),
-        **dict.fromkeys(SWITCHED_ON, 0),
-        scenario.aid.switch: used,
+        **dict.fromkeys(FUSION_ON_VALUES, 0),
+        scenario.aid.switch: switch_value,
         "EKF2_HGT_REF": 0,
         "SDLOG_PROFILE": PROFILE_DEFAULT
         if mistakes.no_vvo or scenario.aid == GNSS_POS
@@ -141,23 +146,23 @@ def _parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float
 
 
 def answer(simulation: Simulation) -> dict[str, Any]:
-    """Return the answer key of the instructor, which the log does not contain, as plain data.
+    """Return the answers for the instructor, which the log does not contain, as JSON types.
 
     Keys
     ----
     mistakes
-        Name to help and expected finding.
+        Help text and expected finding of each mistake, by name.
     truth
-        Biases, noises, time offset to *add* to the timestamps of the source, outliers by index and
-        time in the logged topic, and loop closure error.
+        Biases, noises, time offset to *add* to the timestamps of the source, outliers (index and
+        time in the logged topic), and loop closure error.
     """
     scenario, mistakes = simulation.scenario, simulation.mistakes
     motion, source = simulation.motion, simulation.positions
     accelerometer, gyro = sensors.biases(scenario, mistakes)
-    first, last = motion.at(np.array([0.0, motion.duration_s])).position_m
-    stamps = source.topic.fields["timestamp_sample"].astype(np.int64) - sensors.START_US
-    outlier = np.flatnonzero(source.outlier)
-    found: dict[str, Any] = to_json_types(
+    first_m, last_m = motion.at(np.array([0.0, motion.duration_s])).position_m
+    timestamps_us = source.topic.fields["timestamp_sample"].astype(np.int64) - sensors.START_US
+    outlier_indices = np.flatnonzero(source.is_outlier)
+    answer_data: dict[str, Any] = to_json_types(
         {
             "schema": ANSWER_SCHEMA,
             "scenario": asdict(scenario),
@@ -179,12 +184,12 @@ def answer(simulation: Simulation) -> dict[str, Any]:
                 "accelerometer_bias_m_s2": accelerometer.tolist(),
                 "gyro_bias_rad_s": gyro.tolist(),
                 "clock_offset_to_add_s": 0.0 - mistakes.clock_offset_s,
-                "outlier_index": outlier.tolist(),
-                "outlier_time_s": (stamps[outlier] * 1e-6).tolist(),
+                "outlier_index": outlier_indices.tolist(),
+                "outlier_time_s": (timestamps_us[outlier_indices] * 1e-6).tolist(),
                 "path_length_m": source.distance_m,
-                "closure_error_m": float(np.linalg.norm((last - first)[:2])),
+                "closure_error_m": float(np.linalg.norm((last_m - first_m)[:2])),
                 "source_drift_m": source.drift_m.tolist(),
             },
         }
     )
-    return found
+    return answer_data

@@ -1,6 +1,7 @@
-"""Mistakes of a simulated flight; ``mistakes.toml`` has one row for each.
+"""Mistakes of a simulated flight; ``mistakes.toml`` describes each.
 
-Values are given with unit (``0.08``, ``80ms``, ``5%``, ``8s,40s``), or omitted for a clear example.
+Examples of values on the command line: ``0.08``, ``80ms``, ``5%``, ``8s,40s``. Without a value, the
+mistake has a default size that px4fuse detects easily.
 """
 
 from collections.abc import Iterable, Mapping
@@ -9,19 +10,19 @@ from dataclasses import dataclass
 from px4fuse.errors import SettingsError, suggest_name
 from px4fuse.record import table
 from px4fuse.simulation.scenario import KINDS, Kind, bounded_number, quantities
-from px4fuse.units import NAMES, in_unit
+from px4fuse.units import NAMES, convert_to_unit
 
 
 @dataclass(frozen=True)
 class Mistakes:
     """Sizes of all mistakes; the defaults are a flight without mistakes.
 
-    :data:`MISTAKES` explains each. Outliers come in bursts, each in one horizontal direction;
-    ``nlos_size_m`` is their mean size. By default a gap is in the middle, a jump at two thirds, and
-    a heading error starts with the flight. Rate 0: unchanged; EKF2 noise 0: as reported by the
-    source; EKF2 delay None: correct. ``r_scale`` multiplies the variance. ``yaw_deg`` rotates about
-    the start, clockwise seen from above. ``vibration_m_s2`` is the standard deviation of the 0.1 s
-    mean.
+    :data:`MISTAKES` explains each. Outliers occur in bursts; all outliers of a burst have the same
+    horizontal direction, and ``nlos_size_m`` is their mean size. Default times: gaps in the middle
+    of the flight, jumps at two thirds, heading errors from the start. A rate of 0 means unchanged,
+    an EKF2 noise of 0 as reported by the source, and an EKF2 delay of None correct. ``r_scale``
+    multiplies the reported variance. ``yaw_deg`` rotates the positions about the start, clockwise
+    seen from above. ``vibration_m_s2`` is the standard deviation of the mean over 0.1 s.
     """
 
     clock_offset_s: float = bounded_number(0.0, -5.0, 5.0, "s", "SECONDS")
@@ -70,17 +71,18 @@ class Mistake:
     Attributes
     ----------
     fields : tuple of str
-        Fields of :class:`Mistakes`: the first is required, the others optional.
+        Fields of :class:`Mistakes` that the mistake sets. The value of the first one is required on
+        the command line, the others are optional.
     default : float or True
-        Default size; True for a switch.
+        Default of the first field; True for a mistake without a size.
     help : str
         Description of the mistake, for instructors.
     finding : str
         Finding that a student is expected to report.
     kinds : tuple of str
-        Kinds of flight to which it applies.
-    of_ekf2 : bool
-        True if it changes EKF2 parameters.
+        Kinds of flight in which the mistake is possible.
+    changes_ekf2 : bool
+        True if the mistake changes EKF2 parameters.
     """
 
     fields: tuple[str, ...]
@@ -88,18 +90,18 @@ class Mistake:
     help: str
     finding: str
     kinds: tuple[Kind, ...] = KINDS
-    of_ekf2: bool = False
+    changes_ekf2: bool = False
 
     @property
     def sizes(self) -> tuple[str, ...]:
-        """Numeric fields; empty for a switch."""
+        """Numeric fields; empty for a mistake without a size."""
         return () if self.default is True else self.fields
 
     @property
     def usage(self) -> str:
-        """Syntax after the name, such as ``=PERCENT[,SIZE]``."""
-        first, *rest = [f"={QUANTITIES[name].typed}" for name in self.sizes] or [""]
-        return first + "".join(f"[,{name[1:]}]" for name in rest)
+        """Syntax of the values after the name, such as ``=PERCENT[,SIZE]``."""
+        required, *optional = [f"={QUANTITIES[name].cli_name}" for name in self.sizes] or [""]
+        return required + "".join(f"[,{name[1:]}]" for name in optional)
 
 
 MISTAKES: Mapping[str, Mistake] = table(__file__, "mistakes.toml", dict[str, Mistake])
@@ -114,7 +116,7 @@ def parse(texts: Iterable[str]) -> Mistakes:
     Parameters
     ----------
     texts : iterable of str
-        ``NAME``, ``NAME=VALUE`` or ``NAME=VALUE,VALUE``; the last one of a name counts.
+        ``NAME``, ``NAME=VALUE`` or ``NAME=VALUE,VALUE``; of repeated names the last one counts.
 
     Raises
     ------
@@ -135,22 +137,22 @@ def parse(texts: Iterable[str]) -> Mistakes:
             raise SettingsError(f"--mistake {text}: give {name}{mistake.usage}.")
         value_by_field[mistake.fields[0]] = mistake.default
         for field, value in zip(mistake.sizes, typed_values, strict=False):
-            bounds, size = QUANTITIES[field], in_unit(value, QUANTITIES[field].unit)
+            bounds, size = QUANTITIES[field], convert_to_unit(value, QUANTITIES[field].unit)
             if size is None:
-                wanted = f"{NAMES[bounds.unit]}, as in {name}{mistake.usage}"
-                raise SettingsError(f"--mistake {text}: {value!r}: give {wanted}.")
-            bounds.check(size, f"--mistake {text}: {bounds.typed}")
+                value_text = f"{NAMES[bounds.unit]}, as in {name}{mistake.usage}"
+                raise SettingsError(f"--mistake {text}: {value!r}: give {value_text}.")
+            bounds.check(size, f"--mistake {text}: {bounds.cli_name}")
             value_by_field[field] = size
     return Mistakes(**value_by_field)  # type: ignore[arg-type]
 
 
 def active_mistakes(mistakes: Mistakes) -> tuple[str, ...]:
-    """Return the names of the mistakes that differ from a flight without mistakes."""
-    clean = Mistakes()
+    """Return the names of the mistakes that the flight has."""
+    defaults = Mistakes()
     return tuple(
         name
         for name, mistake in MISTAKES.items()
-        if getattr(mistakes, mistake.fields[0]) != getattr(clean, mistake.fields[0])
+        if getattr(mistakes, mistake.fields[0]) != getattr(defaults, mistake.fields[0])
     )
 
 

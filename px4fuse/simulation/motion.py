@@ -1,9 +1,10 @@
 """True motion in closed form: a smooth path, and the attitude that a quadrotor needs for it.
 
-Velocity changes by ramps Δv · S(x), x = (t - start) / length, with the quintic S = 6x⁵ - 15x⁴ +
-10x³, so acceleration is continuous and jerk bounded. A slow deviation of a few sines is added in
-the air. Thrust is along the body z axis and there is no drag, so the direction of the specific
-force a - g determines the attitude (Mellinger and Kumar 2011, eq. 6 to 8).
+Each change Δv of the velocity is a ramp Δv · S(x), x = (t - start) / length, with the quintic
+S = 6x⁵ - 15x⁴ + 10x³, so that the acceleration is continuous and the jerk bounded. In the air, a
+slow deviation (sum of a few sines) is added to the path. Thrust is along the body z axis and there
+is no drag, so the direction of the specific force a - g determines roll and pitch (Mellinger and
+Kumar 2011, eq. 6 to 8).
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ from px4fuse.simulation.scenario import CORNER_S, START_STOP_S, Scenario
 GROUND_S = 6.0
 CLIMB_M_S = 0.75
 CLIMB_RAMP_S = 1.5
-# s; a log of this length has 70 MB
+# s; the log of a flight of this length has 70 MB
 MAX_FLIGHT_S = 3600.0
 # s; fade-in and fade-out of the slow deviation after take-off and before landing
 FADE_S = 3.0
 # s; time of a 180° turn at the end of the aisle with --yaw follow
 TURN_ROUND_S = 4.0
-WANDER_PERIODS_S = (3.0, 20.0)
-WANDER_SINES = 4
+DEVIATION_PERIODS_S = (3.0, 20.0)
+DEVIATION_SINE_COUNT = 4
 
 
 def _quintic(x: Array) -> tuple[Array, Array, Array, Array]:
@@ -47,50 +48,58 @@ def _quintic(x: Array) -> tuple[Array, Array, Array, Array]:
 
 @dataclass(frozen=True)
 class Ramps:
-    """Sequence of velocity changes.
+    """Sequence of n velocity changes on k axes.
 
     Attributes
     ----------
     start_s, length_s : ndarray, shape (n,)
-    change : ndarray, shape (n, k)
-        Velocity change of each ramp.
+        Start and duration of each ramp.
+    velocity_change : ndarray, shape (n, k)
     """
 
     start_s: Array
     length_s: Array
-    change: Array
+    velocity_change: Array
 
     @classmethod
     def of(cls, ramps: Sequence[tuple[float, float, Array]]) -> Ramps:
         """Return ramps from tuples of start, length and change."""
-        start, length, change = zip(*ramps, strict=True)
-        return cls(np.array(start), np.array(length), np.array(change))
+        start_s, length_s, velocity_change = zip(*ramps, strict=True)
+        return cls(np.array(start_s), np.array(length_s), np.array(velocity_change))
 
     def at(self, time_s: Array) -> tuple[Array, Array, Array, Array]:
-        """Return position, velocity, acceleration and jerk, shape (n, k), starting at rest at 0."""
-        velocity_before = np.cumsum(self.change, axis=0) - self.change
-        # displacement of a whole ramp: half its length times its change, plus the previous velocity
+        """Return position, velocity, acceleration and jerk at given times, each of shape (t, k).
+
+        Position and velocity are 0 before the first ramp.
+        """
+        velocity_before = np.cumsum(self.velocity_change, axis=0) - self.velocity_change
+        # distance between two ramp starts: initial velocity times the interval, plus velocity
+        # change times the interval without half of the ramp
         position_gained = (
             velocity_before[:-1] * np.diff(self.start_s)[:, None]
-            + self.change[:-1] * (np.diff(self.start_s) - self.length_s[:-1] / 2.0)[:, None]
+            + self.velocity_change[:-1]
+            * (np.diff(self.start_s) - self.length_s[:-1] / 2.0)[:, None]
         )
         position_before = np.vstack(
-            [np.zeros((1, self.change.shape[1])), np.cumsum(position_gained, 0)]
+            [np.zeros((1, self.velocity_change.shape[1])), np.cumsum(position_gained, 0)]
         )
-        at = np.maximum(np.searchsorted(self.start_s, time_s, side="right") - 1, 0)
-        length = self.length_s[at]
-        time_in_ramp = time_s - self.start_s[at]
+        ramp_index = np.maximum(np.searchsorted(self.start_s, time_s, side="right") - 1, 0)
+        length = self.length_s[ramp_index]
+        time_in_ramp = time_s - self.start_s[ramp_index]
         x = np.clip(time_in_ramp / length, 0.0, 1.0)
         integral = length * (x * x) ** 2 * (x * x - 3.0 * x + 2.5)
         integral += np.maximum(time_in_ramp - length, 0.0)
-        step, first, second, _ = _quintic(x)
-        # take() is several times faster than indexing
-        change, before = self.change.take(at, axis=0), velocity_before.take(at, axis=0)
+        value, first, second, _ = _quintic(x)
+        # take() is several times faster than indexing with an array
+        change, initial_velocity = (
+            self.velocity_change.take(ramp_index, axis=0),
+            velocity_before.take(ramp_index, axis=0),
+        )
         return (
-            position_before.take(at, axis=0)
-            + before * time_in_ramp[:, None]
+            position_before.take(ramp_index, axis=0)
+            + initial_velocity * time_in_ramp[:, None]
             + change * integral[:, None],
-            before + change * step[:, None],
+            initial_velocity + change * value[:, None],
             change * (first / length)[:, None],
             change * (second / length**2)[:, None],
         )
@@ -98,16 +107,16 @@ class Ramps:
 
 @dataclass(frozen=True)
 class Sines:
-    """Sums of sines with the same angular frequencies on every axis.
+    """Sum of m sines on each of k axes; the angular frequencies are the same on all axes.
 
     Attributes
     ----------
-    pulsation_rad_s : ndarray, shape (m,)
+    angular_frequency_rad_s : ndarray, shape (m,)
     sine, cosine : ndarray, shape (m, k)
         Amplitudes.
     """
 
-    pulsation_rad_s: Array
+    angular_frequency_rad_s: Array
     sine: Array
     cosine: Array
 
@@ -115,19 +124,19 @@ class Sines:
     def draw(
         cls, rng: np.random.Generator, rms: Array, periods_s: tuple[float, float], count: int
     ) -> Sines:
-        """Draw sines with log-uniform periods and random phases, and a given RMS per axis."""
+        """Draw ``count`` sines with log-uniform periods, random phases, and an RMS per axis."""
         low, high = np.log(periods_s)
-        pulsation = 2.0 * np.pi / np.exp(rng.uniform(low, high, count))
+        angular_frequency = 2.0 * np.pi / np.exp(rng.uniform(low, high, count))
         phase = rng.uniform(0.0, 2.0 * np.pi, (count, len(rms)))
         amplitude = rms * np.sqrt(2.0 / count)
-        return cls(pulsation, amplitude * np.cos(phase), amplitude * np.sin(phase))
+        return cls(angular_frequency, amplitude * np.cos(phase), amplitude * np.sin(phase))
 
     def at(self, time_s: Array, orders: int = 1) -> list[Array]:
-        """Return the value and ``orders`` - 1 derivatives, each of shape (n, k)."""
-        angle = np.outer(time_s, self.pulsation_rad_s)
+        """Return the value and its first ``orders`` - 1 derivatives, each of shape (t, k)."""
+        angle = np.outer(time_s, self.angular_frequency_rad_s)
         basis = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
         amplitudes = [np.concatenate([self.sine, self.cosine])]
-        omega = self.pulsation_rad_s[:, None]
+        omega = self.angular_frequency_rad_s[:, None]
         for _ in range(orders - 1):
             # d/dt (s sin ωt + c cos ωt) = -ωc sin ωt + ωs cos ωt
             sine, cosine = np.split(amplitudes[-1], 2)
@@ -160,58 +169,69 @@ class Motion:
     Attributes
     ----------
     path, yaw : Ramps
-        Position, shape (n, 3); yaw, whose "velocity" is the angle, shape (m, 1).
-    wander : Sines
+        Position on 3 axes (NED), and yaw on one axis. The "velocity" of the yaw ramps is the yaw
+        angle (rad).
+    deviation : Sines
         Slow deviation from the path.
     take_off_s, touch_down_s, duration_s : float
     """
 
     path: Ramps
     yaw: Ramps
-    wander: Sines
+    deviation: Sines
     take_off_s: float
     touch_down_s: float
     duration_s: float
 
     def at(self, time_s: Array) -> State:
-        """Return the true state at given times (s from the first data)."""
+        """Return the true state at given times, in seconds from the first data."""
         position, velocity, acceleration, jerk = self.path.at(time_s)
-        w = self.wander.at(time_s, 4)
-        e, inside = self._wander_fade(time_s)
-        # product rule (Leibniz) while the deviation fades in or out
-        d = [part[inside] for part in w]
-        velocity[inside] += e[1] * d[0]
-        acceleration[inside] += 2 * e[1] * d[1] + e[2] * d[0]
-        jerk[inside] += 3 * e[1] * d[2] + 3 * e[2] * d[1] + e[3] * d[0]
+        deviation = self.deviation.at(time_s, 4)
+        fade, fading_indices = self._fade_factors(time_s)
+        # derivatives of the product fade · deviation (Leibniz), where the fade factor changes
+        fading = [part[fading_indices] for part in deviation]
+        velocity[fading_indices] += fade[1] * fading[0]
+        acceleration[fading_indices] += 2 * fade[1] * fading[1] + fade[2] * fading[0]
+        jerk[fading_indices] += (
+            3 * fade[1] * fading[2] + 3 * fade[2] * fading[1] + fade[3] * fading[0]
+        )
         yaw, yaw_rate = self.yaw.at(time_s)[1:3]
         return State(
-            position_m=position + e[0] * w[0],
-            velocity_m_s=velocity + e[0] * w[1],
-            acceleration_m_s2=acceleration + e[0] * w[2],
-            jerk_m_s3=jerk + e[0] * w[3],
+            position_m=position + fade[0] * deviation[0],
+            velocity_m_s=velocity + fade[0] * deviation[1],
+            acceleration_m_s2=acceleration + fade[0] * deviation[2],
+            jerk_m_s3=jerk + fade[0] * deviation[3],
             yaw_rad=yaw[:, 0],
             yaw_rate_rad_s=yaw_rate[:, 0],
         )
 
-    def _wander_fade(self, time_s: Array) -> tuple[tuple[Array, Array, Array, Array], IntArray]:
-        """Return the fade factor, (n, 1), its derivatives at m indices, (m, 1), and the indices."""
-        rise = np.clip((time_s - self.take_off_s) / FADE_S, 0.0, 1.0)
-        fall = np.clip((time_s - self.touch_down_s) / FADE_S + 1.0, 0.0, 1.0)
-        inside = np.flatnonzero((rise * (1.0 - rise) > 0.0) | (fall * (1.0 - fall) > 0.0))
-        # at most one of fade-in and fade-out is active
-        down = fall[inside] > 0.0
-        sign = np.where(down, -1.0, 1.0)
-        _, *derivatives = _quintic(np.where(down, fall[inside], rise[inside]))
+    def _fade_factors(self, time_s: Array) -> tuple[tuple[Array, Array, Array, Array], IntArray]:
+        """Return the fade factor of the deviation, its derivatives, and the indices of these.
+
+        The factor is 1 in the air and 0 on the ground, shape (t, 1). Its first three derivatives,
+        shape (m, 1), are for the m indices at which the factor changes.
+        """
+        fade_in = np.clip((time_s - self.take_off_s) / FADE_S, 0.0, 1.0)
+        fade_out = np.clip((time_s - self.touch_down_s) / FADE_S + 1.0, 0.0, 1.0)
+        fading_indices = np.flatnonzero(
+            (fade_in * (1.0 - fade_in) > 0.0) | (fade_out * (1.0 - fade_out) > 0.0)
+        )
+        # fade-in and fade-out do not overlap
+        is_fading_out = fade_out[fading_indices] > 0.0
+        sign = np.where(is_fading_out, -1.0, 1.0)
+        _, *derivatives = _quintic(
+            np.where(is_fading_out, fade_out[fading_indices], fade_in[fading_indices])
+        )
         first, second, third = (
             (sign * part / FADE_S**order)[:, None] for order, part in enumerate(derivatives, 1)
         )
-        size = _quintic(rise)[0] - _quintic(fall)[0]
-        return (size[:, None], first, second, third), inside
+        factor = _quintic(fade_in)[0] - _quintic(fade_out)[0]
+        return (factor[:, None], first, second, third), fading_indices
 
 
 @dataclass(frozen=True)
 class Attitude:
-    """Attitude, and the angular rate and specific force that an ideal IMU measures.
+    """Attitude, with the angular rate and specific force that an ideal IMU measures.
 
     Attributes
     ----------
@@ -220,7 +240,7 @@ class Attitude:
     angular_rate_rad_s : ndarray, shape (n, 3)
         Body FRD.
     specific_force_m_s2 : ndarray, shape (n, 3)
-        Body FRD: along the z axis only.
+        Body FRD; along the z axis only.
     """
 
     body_to_ned: Array
@@ -229,12 +249,12 @@ class Attitude:
 
 
 def attitude(state: State) -> Attitude:
-    """Return the attitude whose thrust gives the acceleration, and its closed-form rates."""
+    """Return the attitude in which the thrust causes the acceleration, and the angular rates."""
     gravity = np.array([0.0, 0.0, constants.g])
-    down = gravity - state.acceleration_m_s2  # opposite to thrust
-    size = np.sqrt(np.einsum("ij,ij->i", down, down))[:, None]
-    z = down / size
-    z_rate = -state.jerk_m_s3 / size
+    thrust_opposite = gravity - state.acceleration_m_s2  # opposite to thrust
+    thrust_m_s2 = np.sqrt(np.einsum("ij,ij->i", thrust_opposite, thrust_opposite))[:, None]
+    z = thrust_opposite / thrust_m_s2
+    z_rate = -state.jerk_m_s3 / thrust_m_s2
     z_rate -= z * np.einsum("ij,ij->i", z, z_rate)[:, None]
     c, s = np.cos(state.yaw_rad), np.sin(state.yaw_rad)
     zx, zy, zz = z.T
@@ -256,7 +276,7 @@ def attitude(state: State) -> Attitude:
         axis=1,
     )
     force = np.zeros_like(z)
-    force[:, 2] = -size[:, 0]
+    force[:, 2] = -thrust_m_s2[:, 0]
     return Attitude(np.stack([x, y, z], axis=2), rate, force)
 
 
@@ -268,28 +288,30 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
     SettingsError
         The open end of the loop is too large, or the flight would be too long.
     """
-    ramps = _Plan(GROUND_S, scenario.heading_deg)
-    climb = min(CLIMB_M_S, scenario.altitude_m / 2.0)
-    rise_s = scenario.altitude_m / climb
-    up = np.array([0.0, 0.0, -climb])
-    ramps.change(up, CLIMB_RAMP_S, rise_s)
-    ramps.change(-up, CLIMB_RAMP_S, CLIMB_RAMP_S / 2.0 + scenario.pause_s)
+    flight_plan = _Plan(GROUND_S, scenario.heading_deg)
+    climb_m_s = min(CLIMB_M_S, scenario.altitude_m / 2.0)
+    rise_s = scenario.altitude_m / climb_m_s
+    up = np.array([0.0, 0.0, -climb_m_s])
+    flight_plan.add_velocity_change(up, CLIMB_RAMP_S, rise_s)
+    flight_plan.add_velocity_change(-up, CLIMB_RAMP_S, CLIMB_RAMP_S / 2.0 + scenario.pause_s)
     if scenario.kind == "aisle":
-        _fly_aisle(ramps, scenario, 0.0 if mistakes.no_motion else scenario.speed_m_s)
+        _fly_aisle(flight_plan, scenario, 0.0 if mistakes.no_motion else scenario.speed_m_s)
     else:
-        _fly_loop(ramps, scenario, mistakes)
-    ramps.change(-up, CLIMB_RAMP_S, rise_s)
-    touch_down_s = ramps.centre_s + CLIMB_RAMP_S / 2.0
+        _fly_loop(flight_plan, scenario, mistakes)
+    flight_plan.add_velocity_change(-up, CLIMB_RAMP_S, rise_s)
+    touch_down_s = flight_plan.centre_s + CLIMB_RAMP_S / 2.0
     if touch_down_s > MAX_FLIGHT_S:
         raise SettingsError(
             f"This flight would take {touch_down_s:.0f} s; the simulation is limited to "
             f"{MAX_FLIGHT_S:g} s. Reduce --passes or --length."
         )
-    ramps.change(up, CLIMB_RAMP_S, 0.0)
+    flight_plan.add_velocity_change(up, CLIMB_RAMP_S, 0.0)
     return Motion(
-        path=Ramps.of(ramps.path),
-        yaw=Ramps.of(ramps.yaw),
-        wander=Sines.draw(rng, np.full(3, scenario.wander_m), WANDER_PERIODS_S, WANDER_SINES),
+        path=Ramps.of(flight_plan.path),
+        yaw=Ramps.of(flight_plan.yaw),
+        deviation=Sines.draw(
+            rng, np.full(3, scenario.wander_m), DEVIATION_PERIODS_S, DEVIATION_SINE_COUNT
+        ),
         take_off_s=GROUND_S,
         touch_down_s=touch_down_s,
         duration_s=float(np.ceil(touch_down_s + GROUND_S)),
@@ -297,60 +319,66 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
 
 
 class _Plan:
-    """Ramps under construction, placed by their centres: speed × time between centres is exact."""
+    """Ramps of a flight; distance is velocity times the time between ramp centres."""
 
     def __init__(self, start_s: float, heading_deg: float) -> None:
         self.centre_s = start_s + CLIMB_RAMP_S / 2.0
         self.path: list[tuple[float, float, Array]] = []
-        # the nose points along the heading before the first data
+        # the first yaw ramp ends before the first data, so the nose points along the heading
         self.yaw = [(-1.0, 1.0, np.radians([heading_deg]))]
 
-    def change(self, velocity: Array, length_s: float, then_s: float) -> None:
-        """Change velocity about the current time, then advance to the next centre."""
+    def add_velocity_change(self, velocity: Array, length_s: float, until_next_s: float) -> None:
+        """Add a ramp about the current centre, then move the centre by ``until_next_s``."""
         self.path.append((self.centre_s - length_s / 2.0, length_s, velocity))
-        self.centre_s += then_s
+        self.centre_s += until_next_s
 
-    def turn(self, angle_rad: float, start_s: float, length_s: float) -> None:
+    def add_turn(self, angle_rad: float, start_s: float, length_s: float) -> None:
         self.yaw.append((start_s, length_s, np.array([angle_rad])))
 
 
 def direction(heading_deg: float) -> Array:
-    """Return a horizontal unit vector, NED, shape (3,)."""
+    """Return the horizontal unit vector with this heading, NED, shape (3,)."""
     heading = np.radians(heading_deg)
     return np.array([np.cos(heading), np.sin(heading), 0.0])
 
 
-def _fly_aisle(ramps: _Plan, scenario: Scenario, speed_m_s: float) -> None:
+def _fly_aisle(flight_plan: _Plan, scenario: Scenario, speed_m_s: float) -> None:
     velocity = speed_m_s * direction(scenario.heading_deg)
     nose_follows_path = scenario.nose_follows_path and speed_m_s > 0.0
     pause_s = max(scenario.pause_s, TURN_ROUND_S) if nose_follows_path else scenario.pause_s
-    ramps.centre_s += START_STOP_S / 2.0
+    flight_plan.centre_s += START_STOP_S / 2.0
     for number in range(scenario.passes):
-        way = velocity if number % 2 == 0 else -velocity
-        ramps.change(way, START_STOP_S, scenario.length_m / scenario.speed_m_s)
-        stopped_s = ramps.centre_s + START_STOP_S / 2.0
-        ramps.change(-way, START_STOP_S, START_STOP_S + pause_s)
+        pass_velocity = velocity if number % 2 == 0 else -velocity
+        flight_plan.add_velocity_change(
+            pass_velocity, START_STOP_S, scenario.length_m / scenario.speed_m_s
+        )
+        stop_s = flight_plan.centre_s + START_STOP_S / 2.0
+        flight_plan.add_velocity_change(-pass_velocity, START_STOP_S, START_STOP_S + pause_s)
         if nose_follows_path and number < scenario.passes - 1:
-            ramps.turn(np.pi, stopped_s, TURN_ROUND_S)
+            flight_plan.add_turn(np.pi, stop_s, TURN_ROUND_S)
 
 
-def _fly_loop(ramps: _Plan, scenario: Scenario, mistakes: Mistakes) -> None:
+def _fly_loop(flight_plan: _Plan, scenario: Scenario, mistakes: Mistakes) -> None:
     speed = 0.0 if mistakes.no_motion else scenario.speed_m_s
-    last_m = scenario.length_m - mistakes.open_end_m
-    if last_m < scenario.speed_m_s * CORNER_S:
+    last_side_m = scenario.length_m - mistakes.open_end_m
+    if last_side_m < scenario.speed_m_s * CORNER_S:
         raise SettingsError(
-            f"--mistake open-end={mistakes.open_end_m:g}: the last side would be {last_m:g} m. "
+            f"--mistake open-end={mistakes.open_end_m:g}: the last side is {last_side_m:g} m long. "
             f"Use at most {scenario.length_m - scenario.speed_m_s * CORNER_S:g} m."
         )
-    sides = 4 * scenario.passes
-    before = np.zeros(3)
-    ramps.centre_s += START_STOP_S / 2.0
-    for side in range(sides):
+    side_count = 4 * scenario.passes
+    previous_velocity = np.zeros(3)
+    flight_plan.centre_s += START_STOP_S / 2.0
+    for side in range(side_count):
         velocity = speed * direction(scenario.heading_deg + 90.0 * side)
         length_s = CORNER_S if side else START_STOP_S
         if side and scenario.nose_follows_path and speed > 0.0:
-            ramps.turn(np.pi / 2.0, ramps.centre_s - CORNER_S / 2.0, CORNER_S)
-        metres = last_m if side == sides - 1 else scenario.length_m
-        ramps.change(velocity - before, length_s, metres / scenario.speed_m_s)
-        before = velocity
-    ramps.change(-before, START_STOP_S, START_STOP_S + scenario.pause_s)
+            flight_plan.add_turn(np.pi / 2.0, flight_plan.centre_s - CORNER_S / 2.0, CORNER_S)
+        side_m = last_side_m if side == side_count - 1 else scenario.length_m
+        flight_plan.add_velocity_change(
+            velocity - previous_velocity, length_s, side_m / scenario.speed_m_s
+        )
+        previous_velocity = velocity
+    flight_plan.add_velocity_change(
+        -previous_velocity, START_STOP_S, START_STOP_S + scenario.pause_s
+    )

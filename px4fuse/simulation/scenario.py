@@ -13,12 +13,12 @@ Yaw = Literal["fixed", "follow"]
 KINDS: tuple[Kind, ...] = ("aisle", "loop", "outdoor")
 YAWS: tuple[Yaw, Yaw] = ("fixed", "follow")
 
-# s; DT to which SIGMA_A refers (px4fuse.filter.kalman)
+# s; averaging time of the accelerometer noise SIGMA_A, as DT in px4fuse.filter.kalman
 DT_S = 0.1
-# s; time to start or stop along the aisle, and to fly a corner of the loop
+# s; duration of the acceleration and braking along the aisle, and of a corner of the loop
 START_STOP_S = 1.5
 CORNER_S = 2.0
-# Defaults that differ by kind of flight
+# Defaults of the scenario that depend on the kind of flight
 DEFAULTS_OF_KIND: Mapping[Kind, Mapping[str, float]] = {
     "aisle": {},
     "loop": {"passes": 1},
@@ -35,38 +35,38 @@ class Bounds:
     low, high : float
     unit : str
         As in :data:`px4fuse.units.NAMES`.
-    typed : str
-        Option name, or placeholder in the usage of a mistake.
+    cli_name : str
+        Name of the option, or placeholder in the syntax of a mistake.
     meaning : str
-        Help of the option; empty without an option.
+        Help text of the option; empty for a field without option.
     """
 
     low: float
     high: float
     unit: str = ""
-    typed: str = ""
+    cli_name: str = ""
     meaning: str = ""
 
     def check(self, value: float, name: str) -> None:
-        """Raise SettingsError for a value out of range."""
+        """Raise SettingsError if the value is out of range; ``name`` starts the message."""
         if not self.low <= value <= self.high:  # false for NaN too
             allowed = f"give {self.low:g} to {self.high:g} {self.unit}".rstrip()
             raise SettingsError(f"{name} {value:g} is out of range: {allowed}.")
 
 
 def bounded_number(default: Any, *bounds: Any) -> Any:
-    """Return a numeric dataclass field with default and :class:`Bounds`."""
+    """Return a dataclass field with a default, and with :class:`Bounds` made of ``bounds``."""
     return field(default=default, metadata={"quantity": Bounds(*bounds)})
 
 
 def quantities(record: type) -> dict[str, Bounds]:
-    """Return the bounds of all fields that :func:`bounded_number` made."""
+    """Return the bounds of all fields of a dataclass that :func:`bounded_number` made."""
     return {item.name: item.metadata["quantity"] for item in fields(record) if item.metadata}
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """Flight without mistakes.
+    """Flight and sensors, without mistakes.
 
     Attributes
     ----------
@@ -81,8 +81,8 @@ class Scenario:
         Direction of the aisle or of the square's first side, clockwise from north.
     altitude_m : float
     yaw : {"fixed", "follow"} or None
-        Constant nose heading, or nose along the direction of flight; None: fixed in the aisle,
-        follow around the square.
+        "fixed": constant heading of the nose; "follow": nose along the direction of flight. None:
+        fixed in the aisle, follow around the square.
     pause_s : float
         Hover at each end of the aisle.
     wander_m : float
@@ -96,30 +96,31 @@ class Scenario:
     vio_walk_m : float
         Random walk of the VIO drift, m per √m flown, on each axis.
     gnss_rate_hz, sigma_gnss_m, sigma_gnss_m_s : float
-        GNSS rate, and horizontal noise of position and velocity; vertical noise is 1.5 times that.
+        GNSS rate, and horizontal noise of position and velocity; the vertical noise is 1.5 times
+        the horizontal one.
     sigma_a_m_s2 : float
-        White noise of the accelerometer, as standard deviation of its 0.1 s mean: the SIGMA_A of
-        KF. A single sample has √(0.1 s · ``imu_rate_hz``) times that.
+        White noise of the accelerometer, as standard deviation of the mean over 0.1 s: the SIGMA_A
+        of KF. The noise of a single sample is larger by the factor √(0.1 s · ``imu_rate_hz``).
     accel_bias_sigma_m_s2, gyro_bias_sigma_rad_s : float
         Standard deviations of the random constant biases, per body axis.
     gyro_noise_rad_s : float
-        White noise of a single sample.
+        White noise of a single gyro sample.
     tilt_error_deg, yaw_error_deg : float
-        RMS of the slow error (periods of 20 to 60 s) of the logged attitude. Without a magnetometer
-        EKF2 gets this heading.
+        RMS of the slow error (periods of 20 to 60 s) of the logged attitude. Indoors, EKF2 has this
+        heading error.
     imu_rate_hz, attitude_rate_hz, truth_rate_hz : float
     truth : bool
         True if the ground truth is logged.
     ekf2 : bool
         True if the log contains the output of px4fuse's EKF2 model.
     seed : int
-        Seed of all random numbers. Each sensor has a separate stream, so a mistake in one sensor
-        does not change the noise of the others.
+        Seed of all random numbers. Each sensor has a separate stream of random numbers, so a
+        mistake in one sensor does not change the noise of the others.
 
     Raises
     ------
     SettingsError
-        A value is out of range, or the speed is not reached within the length.
+        A value is out of range, or the length is too short to reach the speed.
     """
 
     kind: Kind = "aisle"
@@ -190,12 +191,12 @@ class Scenario:
         if self.yaw is not None and self.yaw not in YAWS:
             raise SettingsError(f"--yaw {self.yaw}: give {' or '.join(YAWS)}.")
         for name, bounds in quantities(Scenario).items():
-            bounds.check(getattr(self, name), bounds.typed or name)
-        needed = self.speed_m_s * (START_STOP_S if self.kind == "aisle" else CORNER_S)
-        if self.length_m < needed:
+            bounds.check(getattr(self, name), bounds.cli_name or name)
+        min_length_m = self.speed_m_s * (START_STOP_S if self.kind == "aisle" else CORNER_S)
+        if self.length_m < min_length_m:
             raise SettingsError(
                 f"--length {self.length_m:g} m is too short for --speed {self.speed_m_s:g} "
-                f"m/s: acceleration, braking and corners need {needed:g} m. Increase "
+                f"m/s: acceleration, braking and corners need {min_length_m:g} m. Increase "
                 "--length or reduce --speed."
             )
 
@@ -218,7 +219,7 @@ class Scenario:
 
     @property
     def aid(self) -> Aid:
-        """Aid as which EKF2 fuses the positions."""
+        """EKF2 aid that fuses the positions."""
         return GNSS_POS if self.kind == "outdoor" else EV_POS
 
     @property
@@ -227,6 +228,6 @@ class Scenario:
         return self.sigma_a_m_s2 * math.sqrt(DT_S * self.imu_rate_hz)
 
 
-def make_scenario(kind: Kind, **chosen: Any) -> Scenario:
+def make_scenario(kind: Kind, **field_values: Any) -> Scenario:
     """Return a scenario with the defaults of its kind, except for the given fields."""
-    return Scenario(kind=kind, **{**DEFAULTS_OF_KIND[kind], **chosen})
+    return Scenario(kind=kind, **{**DEFAULTS_OF_KIND[kind], **field_values})

@@ -1,4 +1,4 @@
-"""Encoding of topics as a ULog file.
+"""Encoding of PX4 topics as a ULog file.
 
 Source: ULog file format, version 1, https://docs.px4.io/main/en/dev_log/ulog_file_format
 """
@@ -14,24 +14,24 @@ from numpy.typing import ArrayLike, NDArray
 from px4fuse.readers import ULOG_MAGIC
 from px4fuse.record import table
 
-_VERSION = b"\x01"
+_ULOG_VERSION = b"\x01"
 # ULog names of numpy types; integer types only add "_t"
-_TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
-_FLAG_BITS = bytes(40)
-# Type and default of each field by topic; a field without default is optional
+_ULOG_TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
+_FLAG_BITS_MESSAGE = bytes(40)
+# [type, default] of each field, by topic; a field without default is optional
 FIELDS = table(__file__, "topics.toml", dict[str, dict[str, list[Any]]])
 
 
 @dataclass(frozen=True)
 class Topic:
-    """One instance of a PX4 topic with its fields.
+    """Messages of one instance of a PX4 topic, as arrays by field.
 
     Attributes
     ----------
     name : str
     fields : mapping from PX4 field name to ndarray
-        Shape (n,) or (n, k), in the logged types. The first is ``timestamp``, µs since boot, not
-        decreasing.
+        Shape (n,) or (n, k) for n messages, in the logged types. The first field is ``timestamp``
+        (µs since boot), which must not decrease.
     instance : int
     """
 
@@ -41,20 +41,22 @@ class Topic:
 
 
 def topic(name: str, field_values: Mapping[str, ArrayLike], table_row: str = "") -> Topic:
-    """Return a topic with PX4's fields and types.
+    """Make a topic with the fields and types of PX4, and defaults for missing fields.
 
     Parameters
     ----------
     name : str
     field_values : mapping
-        Fields with one row per message; a scalar applies to all messages.
+        Values by field, one per message; a scalar is used for all messages.
     table_row : str
-        Row of the table, if it differs from the topic name.
+        Name in topics.toml, if it differs from the topic name.
     """
-    rows, count = FIELDS[table_row or name], np.size(field_values["timestamp"])
-    assert field_values.keys() <= rows.keys(), f"{name} has no {field_values.keys() - rows.keys()}"
+    default_by_field, count = FIELDS[table_row or name], np.size(field_values["timestamp"])
+    assert field_values.keys() <= default_by_field.keys(), (
+        f"{name} has no {field_values.keys() - default_by_field.keys()}"
+    )
     fields = {}
-    for field, (kind, *default_values) in rows.items():
+    for field, (kind, *default_values) in default_by_field.items():
         values = (
             field_values[field]
             if field in field_values
@@ -76,75 +78,84 @@ def encode(
     start_us: int,
     dropouts_ms: Sequence[int] = (),
 ) -> bytes:
-    """Encode a ULog file; the same input gives the same bytes.
+    """Encode a ULog file; equal input gives equal bytes.
 
     Parameters
     ----------
     topics : sequence of Topic
-        Messages are sorted by timestamp; the order within a topic is kept.
+        All messages are sorted by timestamp; messages of one topic keep their order.
     parameters : mapping
-        int becomes int32, float becomes float32.
+        An int is written as int32, a float as float32.
     info : mapping
-        int becomes uint32.
+        An int is written as uint32.
     start_us : int
         Boot time at which logging starts.
     dropouts_ms : sequence of int
-        Durations of the dropouts, written after the data.
+        Durations of the dropouts, whose messages are written after the data.
     """
-    out = [ULOG_MAGIC + _VERSION, struct.pack("<Q", start_us), _message("B", _FLAG_BITS)]
-    formats = dict.fromkeys(_format(topic) for topic in topics)
-    out += [_message("F", each.encode()) for each in formats]
-    for name, word in info.items():
-        if isinstance(word, str):
-            text = word.encode()
-            out.append(_keyed("I", f"char[{len(text)}] {name}", text))
+    parts = [
+        ULOG_MAGIC + _ULOG_VERSION,
+        struct.pack("<Q", start_us),
+        _message("B", _FLAG_BITS_MESSAGE),
+    ]
+    formats = dict.fromkeys(_format_text(topic) for topic in topics)
+    parts += [_message("F", format_text.encode()) for format_text in formats]
+    for name, info_value in info.items():
+        if isinstance(info_value, str):
+            text = info_value.encode()
+            parts.append(_keyed_message("I", f"char[{len(text)}] {name}", text))
         else:
-            out.append(_keyed("I", f"uint32_t {name}", struct.pack("<I", word)))
+            parts.append(_keyed_message("I", f"uint32_t {name}", struct.pack("<I", info_value)))
     for name, value in parameters.items():
         kind, code = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
-        out.append(_keyed("P", f"{kind} {name}", struct.pack(code, value)))
-    for number, topic in enumerate(topics):
-        out.append(_message("A", struct.pack("<BH", topic.instance, number) + topic.name.encode()))
+        parts.append(_keyed_message("P", f"{kind} {name}", struct.pack(code, value)))
+    for topic_id, topic in enumerate(topics):
+        parts.append(
+            _message("A", struct.pack("<BH", topic.instance, topic_id) + topic.name.encode())
+        )
     messages: list[bytes] = []
-    for number, topic in enumerate(topics):
-        messages += _data(topic, number)
-    stamps = [np.maximum.accumulate(topic.fields["timestamp"]) for topic in topics]
-    out += [messages[at] for at in np.argsort(np.concatenate(stamps), kind="stable").tolist()]
-    out += [_message("O", struct.pack("<H", length)) for length in dropouts_ms]
-    return b"".join(out)
+    for topic_id, topic in enumerate(topics):
+        messages += _data_messages(topic, topic_id)
+    timestamps_us = [np.maximum.accumulate(topic.fields["timestamp"]) for topic in topics]
+    parts += [
+        messages[index]
+        for index in np.argsort(np.concatenate(timestamps_us), kind="stable").tolist()
+    ]
+    parts += [_message("O", struct.pack("<H", length)) for length in dropouts_ms]
+    return b"".join(parts)
 
 
 def _message(kind: str, content: bytes) -> bytes:
     return struct.pack("<HB", len(content), ord(kind)) + content
 
 
-def _keyed(kind: str, key: str, value: bytes) -> bytes:
+def _keyed_message(kind: str, key: str, value: bytes) -> bytes:
     return _message(kind, bytes([len(key)]) + key.encode() + value)
 
 
-def _format(topic: Topic) -> str:
+def _format_text(topic: Topic) -> str:
     field_types = []
     for name, values in topic.fields.items():
         size = f"[{values.shape[1]}]" if values.ndim == 2 else ""
-        kind = _TYPES.get(values.dtype.name, f"{values.dtype.name}_t")
+        kind = _ULOG_TYPES.get(values.dtype.name, f"{values.dtype.name}_t")
         field_types.append(f"{kind}{size} {name};")
     return f"{topic.name}:{''.join(field_types)}"
 
 
-def _data(topic: Topic, number: int) -> list[bytes]:
-    """Return one complete message per sample."""
-    head = [("size", "<u2"), ("kind", "u1"), ("number", "<u2")]
-    body = [
+def _data_messages(topic: Topic, topic_id: int) -> list[bytes]:
+    """Return the data messages of a topic, with headers."""
+    header_fields = [("size", "<u2"), ("kind", "u1"), ("number", "<u2")]
+    topic_fields = [
         (name, values.dtype.newbyteorder("<"), values.shape[1:])
         for name, values in topic.fields.items()
     ]
     # the underscore avoids name conflicts with PX4 fields
-    dtype = np.dtype([(f"_{name}", kind) for name, kind in head] + body)
+    dtype = np.dtype([(f"_{name}", kind) for name, kind in header_fields] + topic_fields)
     records = np.zeros(len(topic.fields["timestamp"]), dtype)
     records["_size"] = dtype.itemsize - 3  # excludes the header bytes of size and kind
     records["_kind"] = ord("D")
-    records["_number"] = number
+    records["_number"] = topic_id
     for name, values in topic.fields.items():
         records[name] = values
     content, width = records.tobytes(), dtype.itemsize
-    return [content[at : at + width] for at in range(0, len(content), width)]
+    return [content[start : start + width] for start in range(0, len(content), width)]

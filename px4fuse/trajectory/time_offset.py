@@ -120,30 +120,32 @@ def _search_offset(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
             "flights)"
         )
     coarse_fits = [_refine_offset(sparse, dense, lag, SEARCH_WINDOW_S) for lag in candidates]
-    fits = [fit for fit in coarse_fits if fit is not None and fit.misfit <= MAX_MISFIT]
-    fits.sort(key=lambda fit: fit.misfit)
-    if not fits:
+    accepted_fits = [fit for fit in coarse_fits if fit is not None and fit.misfit <= MAX_MISFIT]
+    accepted_fits.sort(key=lambda fit: fit.misfit)
+    if not accepted_fits:
         return _not_determinable(
             "the offsets with correlated speeds do not fit the positions, or the overlap is "
             "too short"
         )
-    best = fits[0]
-    similar_fits = [fit for fit in fits if fit.misfit <= MIN_SECOND_PEAK_RATIO * best.misfit]
+    best_fit = accepted_fits[0]
+    similar_fits = [
+        fit for fit in accepted_fits if fit.misfit <= MIN_SECOND_PEAK_RATIO * best_fit.misfit
+    ]
     distant_fits = [
-        fit for fit in similar_fits if abs(fit.offset_s - best.offset_s) > MIN_PEAK_DISTANCE_S
+        fit for fit in similar_fits if abs(fit.offset_s - best_fit.offset_s) > MIN_PEAK_DISTANCE_S
     ]
     if clock_offset_s is not None:
         # UNIX time decides between offsets that fit equally well
-        best = min(similar_fits, key=lambda fit: abs(fit.offset_s - clock_offset_s))
+        best_fit = min(similar_fits, key=lambda fit: abs(fit.offset_s - clock_offset_s))
     elif distant_fits:
         return _not_determinable(
             "the motion is periodic: with an offset that differs by "
-            f"{abs(distant_fits[0].offset_s - best.offset_s):.1f} s the ATE is "
-            f"{distant_fits[0].rms_m:.3g} m instead of {best.rms_m:.3g} m"
+            f"{abs(distant_fits[0].offset_s - best_fit.offset_s):.1f} s the ATE is "
+            f"{distant_fits[0].rms_m:.3g} m instead of {best_fit.rms_m:.3g} m"
         )
     # the fit is repeated with the poses that overlap around the result
-    best = _refine_offset(sparse, dense, best.offset_s, FINE_SEARCH_WINDOW_S) or best
-    half_interval_s = _half_interval(sparse, dense, best)
+    best_fit = _refine_offset(sparse, dense, best_fit.offset_s, FINE_SEARCH_WINDOW_S) or best_fit
+    half_interval_s = _half_interval(sparse, dense, best_fit)
     if not half_interval_s <= MAX_HALF_INTERVAL_S:
         interval_text = f" (95 %: ±{half_interval_s:.2g} s)" if np.isfinite(half_interval_s) else ""
         return _not_determinable(
@@ -151,11 +153,11 @@ def _search_offset(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
             f"position offset{interval_text}"
         )
     return TimeOffset(
-        offset_s=best.offset_s,
-        interval_s=(best.offset_s - half_interval_s, best.offset_s + half_interval_s),
+        offset_s=best_fit.offset_s,
+        interval_s=(best_fit.offset_s - half_interval_s, best_fit.offset_s + half_interval_s),
         is_determinable=True,
         reason="Maximum speed correlation over all lags, refined by minimum ATE "
-        f"({best.rms_m:.3g} m after a similarity alignment, {len(best.time_s)} poses).",
+        f"({best_fit.rms_m:.3g} m after a similarity alignment, {len(best_fit.time_s)} poses).",
     )
 
 

@@ -20,12 +20,12 @@ PageStatus = Literal["same", "differ", "not compared"]
 
 @dataclass(frozen=True)
 class Mismatch:
-    """Number or text of a report that differs from a new run of the analysis.
+    """Value in a report that differs from the value of a new run of the analysis.
 
     Attributes
     ----------
     path : str
-        Place in the results: ``axes.north.filters.kf.nis_mean``.
+        Path in the results, for example ``axes.north.filters.kf.nis_mean``.
     recorded, recomputed : str
         Values; "absent" if missing.
     """
@@ -44,18 +44,18 @@ class PageDifference:
     page : int
         Page number from 1; 0 for the document.
     what : str
-        Difference, as the end of a sentence.
-    structural : bool
-        Parts of the PDF are added or missing: another program wrote or changed it.
+        Difference, as the end of a sentence that begins with the page.
+    is_structural : bool
+        True if parts of the PDF are added or missing, because another program wrote the file.
     """
 
     page: int
     what: str
-    structural: bool = False
+    is_structural: bool = False
 
     @property
     def sentence(self) -> str:
-        """Page and difference."""
+        """Sentence with page and difference."""
         return f"{f'page {self.page}' if self.page else 'document'}: {self.what}"
 
 

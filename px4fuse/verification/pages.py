@@ -1,16 +1,16 @@
 """Comparison of a handed-in PDF with the report that px4fuse draws again from the log.
 
-Both files are walked in parallel from each page, the document information and the catalogue. They
-have to be equal in keys, names, numbers, texts and decoded streams: content, fonts with widths,
-encodings and ToUnicode, bookmarks, structure tree, metadata. This is an allow-list: whatever
-px4fuse does not write is a difference, without a list of what a forger may add.
+Starting from each page, the document information and the catalogue, all objects of both files are
+compared in parallel. They have to be equal in keys, names, numbers, texts and decoded streams:
+content, fonts with widths, encodings and ToUnicode, bookmarks, structure tree, metadata. Anything
+that px4fuse does not write is a difference, so no list of possible forgeries is needed.
 
 Tolerated, because programs that save a PDF again change it: object numbers, compression, the
 trailer's ``/ID``, the header, unused objects, the spelling of numbers and strings, ``/Producer``
 and dates of the document information, and the same fields and the identifiers of XMP. Tolerated,
-because processors differ in the last digits: coordinates by COORDINATE_PT, and numbers in texts
-that are the rounded twins of numbers in the results. The attached results are compared as numbers,
-see :mod:`px4fuse.verification.verification`.
+because processors differ in the last digits: coordinates by COORDINATE_TOLERANCE_PT, and numbers in
+texts if they are roundings of results that are equal within the tolerances. The attached results
+are compared as numbers, see :mod:`px4fuse.verification.verification`.
 """
 
 import math
@@ -37,33 +37,36 @@ from pypdf.generic import (
 
 from px4fuse.results.reading import one_line
 from px4fuse.verification.model import PageDifference
-from px4fuse.verification.pdf_input import BROKEN_PDF_ERRORS, MAX_VALUES, PYPDF_LIMITS, opened
+from px4fuse.verification.pdf_input import (
+    BROKEN_PDF_ERRORS,
+    MAX_VALUES,
+    PYPDF_LIMITS,
+    open_strictly,
+)
 from px4fuse.workers import JobFailure, run_one_bounded
 
-# pt; tolerance of coordinates. Other kernels of OpenBLAS move points by at most 0.07; 0.25 is not
-# visible
-COORDINATE_PT = 0.25
-# relative tolerance of other numbers: programs that save a PDF again write 32-bit floats
-NUMBER = 1e-5
-# 1/1000 em; largest letter distance in texts whose numbers may be rounded differently
-KERNING = 200.0
-# factor on the length of content: each byte of a string may be an escape sequence of four
-SPELLING = 4
+# pt. Results of different OpenBLAS kernels move points by at most 0.07 pt; 0.25 pt is not visible
+COORDINATE_TOLERANCE_PT = 0.25
+# relative and absolute tolerance of other numbers: programs that save a PDF write 32-bit floats
+NUMBER_TOLERANCE = 1e-5
+# 1/1000 em; largest letter distance of a text that is compared up to rounding
+MAX_KERNING = 200.0
+# length of submitted over redrawn content; a byte of a string may be written as four bytes
+MAX_LENGTH_RATIO = 4
 # limits of one comparison, which needs 3 s and 0.3 GB for the largest report
 TIMEOUT_S, MEMORY_BYTES = 12.0, 1_000_000_000
-# number of differences that are listed
-MAX_FOUND = 20
-# not compared: compression of streams, and document information that other programs write
-_PACKED = frozenset(("/Length", "/Filter"))
-_STAMPS = frozenset(("/Producer", "/CreationDate", "/ModDate"))
-_XMP_STAMPS = re.compile(
+MAX_LISTED_DIFFERENCES = 20
+# keys that are not compared: compression of streams, and fields that other programs write
+_COMPRESSION_KEYS = frozenset(("/Length", "/Filter"))
+_WRITER_KEYS = frozenset(("/Producer", "/CreationDate", "/ModDate"))
+_XMP_WRITER_FIELDS = re.compile(
     r"<(pdf:Producer|xmp:(?:Create|Modify|Metadata)Date|xmpMM:(?:Document|Instance)ID"
     r"|stEvt:(?:when|instanceID))( [^>]*)?>[^<]*</\1>"
 )
 MAX_XMP_BYTES = 100_000
 # the Typst version is not compared: 0.15.0 and 0.15.2 produce the same pages
-_TYPST = re.compile(r"Typst \d+(\.\d+)*")
-_END = re.compile(rb"startxref\s+(\d{1,10})\s+%%EOF\s*\Z")
+_TYPST_VERSION = re.compile(r"Typst \d+(\.\d+)*")
+_END_OF_FILE = re.compile(rb"startxref\s+(\d{1,10})\s+%%EOF\s*\Z")
 _PART_NAMES = {
     "/AA": "an action",
     "/AcroForm": "form fields",
@@ -84,21 +87,30 @@ _TOKEN = re.compile(
 )
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)")
 _ESCAPE = re.compile(r"\\([0-7]{1,3}|\r\n?|.)|\r\n?", re.DOTALL)
-_ESCAPED = {"n": "\n", "r": "\r", "t": "\t", "b": "\b", "f": "\f", "\n": "", "\r": "", "\r\n": ""}
+_ESCAPED_CHARACTERS = {
+    "n": "\n",
+    "r": "\r",
+    "t": "\t",
+    "b": "\b",
+    "f": "\f",
+    "\n": "",
+    "\r": "",
+    "\r\n": "",
+}
 # operators with coordinates, and index of their first coordinate
-_COORDINATES = {"m": 0, "l": 0, "c": 0, "v": 0, "y": 0, "re": 0, "cm": 4, "Tm": 4}
-_TEXT = frozenset(("Tj", "TJ"))
+_FIRST_COORDINATE = {"m": 0, "l": 0, "c": 0, "v": 0, "y": 0, "re": 0, "cm": 4, "Tm": 4}
+_TEXT_OPERATORS = frozenset(("Tj", "TJ"))
 # entry of a ToUnicode map: glyph and letters
-_LETTERS = re.compile(r"<([0-9A-Fa-f]{4})> <((?:[0-9A-Fa-f]{4})+)>\n")
+_TO_UNICODE_ENTRY = re.compile(r"<([0-9A-Fa-f]{4})> <((?:[0-9A-Fa-f]{4})+)>\n")
 
-WordsAlike = Callable[[str, str], bool]
+TextComparison = Callable[[str, str], bool]
 # operand of an operation: number, string, or name, bracket and other tokens
 Operand = float | bytes | str
 Operation = tuple[str, tuple[Operand, ...]]
 
 
 def compare_pages(
-    submitted: bytes, redrawn: bytes, words_alike: WordsAlike
+    submitted: bytes, redrawn: bytes, is_same_text: TextComparison
 ) -> tuple[PageDifference, ...]:
     """Compare a handed-in PDF with the redrawn report, in a process with limits.
 
@@ -106,36 +118,38 @@ def compare_pages(
     ----------
     submitted : bytes
         A file that :func:`px4fuse.verification.pdf_input.read_report` accepted.
-    words_alike : callable
+    is_same_text : callable
         Returns True if two texts are equal up to the rounding of a number.
 
     Returns
     -------
     tuple of PageDifference
-        At most MAX_FOUND, in page order; empty if the PDF is what px4fuse writes. If the limits
-        are exceeded, that is the difference.
+        At most MAX_LISTED_DIFFERENCES, in page order; empty if the PDF is as px4fuse writes it. If
+        the comparison exceeds its limits, this is the only difference.
     """
-    job = (submitted, redrawn, words_alike)
-    found = run_one_bounded(_found, job, TIMEOUT_S, MEMORY_BYTES)
-    if isinstance(found, JobFailure):
-        what = f"not compared within the limits ({found.reason.rstrip('.')})"
+    job = (submitted, redrawn, is_same_text)
+    differences = run_one_bounded(_compare_pdfs, job, TIMEOUT_S, MEMORY_BYTES)
+    if isinstance(differences, JobFailure):
+        what = f"not compared within the limits ({differences.reason.rstrip('.')})"
         return (PageDifference(0, what, True),)
-    return found
+    return differences
 
 
-def _found(job: tuple[bytes, bytes, WordsAlike]) -> tuple[PageDifference, ...]:
-    submitted, redrawn, words_alike = job
+def _compare_pdfs(job: tuple[bytes, bytes, TextComparison]) -> tuple[PageDifference, ...]:
+    submitted, redrawn, is_same_text = job
     try:
         with pypdf.apply_configuration(**PYPDF_LIMITS):
-            submitted_pdf, redrawn_pdf = map(opened, (submitted, redrawn))
-            walk = _Walk(words_alike)
-            found = [PageDifference(0, what, True) for what in _tables(submitted)]
-            found += islice(walk.differences(submitted_pdf, redrawn_pdf), MAX_FOUND)
+            submitted_pdf, redrawn_pdf = map(open_strictly, (submitted, redrawn))
+            walk = _Walk(is_same_text)
+            differences = [PageDifference(0, what, True) for what in _ambiguities(submitted)]
+            differences += islice(
+                walk.differences(submitted_pdf, redrawn_pdf), MAX_LISTED_DIFFERENCES
+            )
             producer = (submitted_pdf.metadata or DictionaryObject()).get("/Producer")
-            if producer is not None and any(difference.structural for difference in found):
+            if producer is not None and any(difference.is_structural for difference in differences):
                 what = f"another program wrote this file ({one_line(str(producer), 60)})"
-                found.insert(0, PageDifference(0, what, True))
-            return tuple(found)
+                differences.insert(0, PageDifference(0, what, True))
+            return tuple(differences)
     except (LimitReachedError, RecursionError, SyntaxError, *BROKEN_PDF_ERRORS) as error:
         what = f"cannot be read ({type(error).__name__})"
         return (PageDifference(0, what, True),)
@@ -143,19 +157,19 @@ def _found(job: tuple[bytes, bytes, WordsAlike]) -> tuple[PageDifference, ...]:
 
 @dataclass
 class _Walk:
-    """Parallel walk through two PDFs.
+    """Parallel comparison of all objects of two PDFs.
 
     Attributes
     ----------
     compared : set of tuple
-        Pairs of objects that were compared: number, generation, and px4fuse's number.
+        Compared pairs: object number and generation in the submitted file, number in the redrawn.
     parents : list of tuple
-        Parents of pages, left for the walk from the catalogue.
+        Parents of pages, which are compared after the catalogue.
     fonts : mapping
-        Of the page that is compared, by the names that its content uses.
+        Fonts of the current page, by their names in the content of the page.
     """
 
-    words_alike: WordsAlike
+    is_same_text: TextComparison
     compared: set[tuple[int, int, int]] = field(default_factory=set)
     parents: list[tuple[Any, Any, str]] = field(default_factory=list)
     fonts: Mapping[str, Any] = field(default_factory=dict)
@@ -165,7 +179,7 @@ class _Walk:
         self, submitted: pypdf.PdfReader, redrawn: pypdf.PdfReader
     ) -> Iterator[PageDifference]:
         """Yield the differences of pages, document information and catalogue."""
-        pages = [_sheets(reader) for reader in (submitted, redrawn)]
+        pages = [_page_references(reader) for reader in (submitted, redrawn)]
         for number, (one, other) in enumerate(zip_longest(*pages), start=1):
             if one is None or other is None:
                 what = "missing" if one is None else f"px4fuse draws only {len(pages[1])} pages"
@@ -185,9 +199,9 @@ class _Walk:
         self, submitted: Any, redrawn: Any, key: str, page: int
     ) -> Iterator[PageDifference]:
         """Yield the differences of two values and of all that they contain."""
-        left = [(submitted, redrawn, key)]
-        while left:
-            submitted, redrawn, key = left.pop()
+        remaining = [(submitted, redrawn, key)]
+        while remaining:
+            submitted, redrawn, key = remaining.pop()
             self.steps += 1
             if self.steps > MAX_VALUES:
                 raise LimitReachedError("too many values")
@@ -204,17 +218,21 @@ class _Walk:
             if _kind(submitted) is not _kind(redrawn):
                 yield PageDifference(page, f"{key} is of another type", True)
             elif isinstance(redrawn, DictionaryObject):
-                yield from self._dictionaries(submitted, redrawn, key, page, left)
+                yield from self._dictionaries(submitted, redrawn, key, page, remaining)
             elif isinstance(redrawn, ArrayObject):
                 if len(submitted) != len(redrawn):
                     what = f"{key} has {len(submitted)} parts; px4fuse writes {len(redrawn)}"
                     yield PageDifference(page, what, True)
                     continue
-                both = zip(list.__iter__(submitted), list.__iter__(redrawn), strict=True)
-                left += [(one, other, key) for one, other in both][::-1]
-            elif not self._same(submitted, redrawn):
-                found, drawn = (one_line(str(each), 60) for each in (submitted, redrawn))
-                yield PageDifference(page, f"{key} is {found!r}; px4fuse writes {drawn!r}")
+                pairs = zip(list.__iter__(submitted), list.__iter__(redrawn), strict=True)
+                remaining += [(one, other, key) for one, other in pairs][::-1]
+            elif not self._is_same_value(submitted, redrawn):
+                submitted_text, redrawn_text = (
+                    one_line(str(each), 60) for each in (submitted, redrawn)
+                )
+                yield PageDifference(
+                    page, f"{key} is {submitted_text!r}; px4fuse writes {redrawn_text!r}"
+                )
 
     def _dictionaries(
         self,
@@ -222,27 +240,29 @@ class _Walk:
         redrawn: DictionaryObject,
         key: str,
         page: int,
-        left: list[tuple[Any, Any, str]],
+        remaining: list[tuple[Any, Any, str]],
     ) -> Iterator[PageDifference]:
-        """Yield the differences of keys and streams; the values are put on the list."""
-        found, drawn = (_keys(each, key) for each in (submitted, redrawn))
-        for name in sorted(found ^ drawn):
-            part = _PART_NAMES.get(name, f"an entry {one_line(name, 40)}")
-            what = "that px4fuse does not write" if name in found else "is missing"
-            yield PageDifference(page, f"{part} {what}", True)
-        for name in sorted(found & drawn, reverse=True):
+        """Yield the differences of keys and streams; add the values to ``remaining``."""
+        submitted_keys, redrawn_keys = (_keys(each, key) for each in (submitted, redrawn))
+        for name in sorted(submitted_keys ^ redrawn_keys):
+            part_name = _PART_NAMES.get(name, f"an entry {one_line(name, 40)}")
+            what = "that px4fuse does not write" if name in submitted_keys else "is missing"
+            yield PageDifference(page, f"{part_name} {what}", True)
+        for name in sorted(submitted_keys & redrawn_keys, reverse=True):
             pair = submitted.raw_get(name), redrawn.raw_get(name), name
-            (self.parents if page and name == "/Parent" else left).append(pair)
+            (self.parents if page and name == "/Parent" else remaining).append(pair)
         if isinstance(submitted, StreamObject) and isinstance(redrawn, StreamObject):
             yield from self._streams(submitted, redrawn, key, page)
 
-    def _same(self, submitted: Any, redrawn: Any) -> bool:
+    def _is_same_value(self, submitted: Any, redrawn: Any) -> bool:
         if _kind(redrawn) is float:
-            return math.isclose(submitted, redrawn, rel_tol=NUMBER, abs_tol=NUMBER)
+            return math.isclose(
+                submitted, redrawn, rel_tol=NUMBER_TOLERANCE, abs_tol=NUMBER_TOLERANCE
+            )
         if (
             _kind(redrawn) is str
-            and _TYPST.fullmatch(str(submitted))
-            and _TYPST.fullmatch(str(redrawn))
+            and _TYPST_VERSION.fullmatch(str(submitted))
+            and _TYPST_VERSION.fullmatch(str(redrawn))
         ):
             return True
         if _kind(redrawn) is str:
@@ -250,7 +270,7 @@ class _Walk:
                 str(each) if isinstance(each, str) else each.decode("latin-1")
                 for each in (submitted, redrawn)
             )
-            return one == other or self.words_alike(one, other)
+            return one == other or self.is_same_text(one, other)
         return bool(submitted == redrawn)
 
     def _streams(
@@ -259,42 +279,54 @@ class _Walk:
         kind = redrawn.get("/Type")
         if kind == "/EmbeddedFile":  # results.json, which intake has read
             return
-        packed = _resolved(submitted.get("/Filter"))
-        if packed not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf does not decode JPEG
+        filters = _resolved(submitted.get("/Filter"))
+        if filters not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf does not decode JPEG
             yield PageDifference(page, f"{key} has another compression", True)
             return
         one, other = submitted.get_data(), redrawn.get_data()
         if one == other or (kind == "/Metadata" and _xmp(one) == _xmp(other)):
             return
-        if (key != "/Contents" and kind != "/Pattern") or len(one) > SPELLING * len(other):
+        if (key != "/Contents" and kind != "/Pattern") or len(one) > MAX_LENGTH_RATIO * len(other):
             yield PageDifference(page, f"{key}: the content differs from px4fuse's")
-        elif what := self._other_operation(one, other):
+        elif what := self._describe_operation_difference(one, other):
             yield PageDifference(page, what)
 
-    def _other_operation(self, submitted: bytes, redrawn: bytes) -> str:
-        """Describe the first operation that differs; empty if none does."""
-        both = [_operations(each) for each in (submitted, redrawn)]
+    def _describe_operation_difference(self, submitted: bytes, redrawn: bytes) -> str:
+        """Describe the first drawing operation that differs; "" if there is none."""
+        operation_lists = [_operations(each) for each in (submitted, redrawn)]
         font = ""
-        for number, pair in enumerate(zip_longest(*both, fillvalue=("", ())), start=1):
-            (one, found), (other, drawn) = pair
-            if other == "Tf":
-                font = str(drawn[0])
-            if pair[0] == pair[1] or (one == other and _near(one, found, drawn)):
+        for number, pair in enumerate(zip_longest(*operation_lists, fillvalue=("", ())), start=1):
+            (submitted_operator, submitted_operands), (redrawn_operator, redrawn_operands) = pair
+            if redrawn_operator == "Tf":
+                font = str(redrawn_operands[0])
+            if pair[0] == pair[1] or (
+                submitted_operator == redrawn_operator
+                and _has_near_operands(submitted_operator, submitted_operands, redrawn_operands)
+            ):
                 continue
-            if {one, other} <= _TEXT:
-                texts = [self._text(operands, font) for operands in (found, drawn)]
-                widest = max((abs(each) for each in found if isinstance(each, float)), default=0.0)
-                if texts[0] != texts[1] and widest < KERNING and self.words_alike(*texts):
+            if {submitted_operator, redrawn_operator} <= _TEXT_OPERATORS:
+                texts = [
+                    self._text(operands, font)
+                    for operands in (submitted_operands, redrawn_operands)
+                ]
+                max_kerning = max(
+                    (abs(each) for each in submitted_operands if isinstance(each, float)),
+                    default=0.0,
+                )
+                if texts[0] != texts[1] and max_kerning < MAX_KERNING and self.is_same_text(*texts):
                     continue
-                shown = [one_line(text, 60) for text in texts]
-                return f"text {shown[0]!r}; px4fuse prints {shown[1]!r}"
-            return f"drawing operation {number} differs from px4fuse's ({one_line(other, 9)})"
+                shortened_texts = [one_line(text, 60) for text in texts]
+                return f"text {shortened_texts[0]!r}; px4fuse prints {shortened_texts[1]!r}"
+            expected = one_line(redrawn_operator, 9)
+            return f"drawing operation {number} differs from px4fuse's ({expected})"
         return ""
 
     def _text(self, operands: tuple[Operand, ...], font: str) -> str:
-        """Return the letters of Tj or TJ by the ToUnicode of its font; ? for other glyphs."""
+        """Decode the text of Tj or TJ with the font's ToUnicode map; ? for unknown glyphs."""
         cmap = self.fonts[font].get_object()["/ToUnicode"].get_data().decode("latin-1")
-        letters = {int(glyph, 16): bytes.fromhex(text) for glyph, text in _LETTERS.findall(cmap)}
+        letters = {
+            int(glyph, 16): bytes.fromhex(text) for glyph, text in _TO_UNICODE_ENTRY.findall(cmap)
+        }
         glyphs = b"".join(each for each in operands if isinstance(each, bytes))
         numbers = struct.unpack(f">{len(glyphs) // 2}H", glyphs[: len(glyphs) // 2 * 2])
         return b"".join(letters.get(each, b"\0?") for each in numbers).decode(
@@ -302,9 +334,9 @@ class _Walk:
         )
 
 
-def _tables(pdf: bytes) -> Iterator[str]:
-    """Yield reasons why programs may read different objects of the PDF."""
-    end = _END.search(pdf[-1024:])
+def _ambiguities(pdf: bytes) -> Iterator[str]:
+    """Yield structures of the PDF in which different programs may read different objects."""
+    end = _END_OF_FILE.search(pdf[-1024:])
     if end is None:
         yield "bytes after its end"
     elif b"/Linearized" in pdf[:1024]:
@@ -314,8 +346,8 @@ def _tables(pdf: bytes) -> Iterator[str]:
             yield "a second table of objects"
 
 
-def _sheets(reader: pypdf.PdfReader) -> list[Any]:
-    """References to the pages, in order, of a page tree with one level, as px4fuse writes it."""
+def _page_references(reader: pypdf.PdfReader) -> list[Any]:
+    """Return references to the pages of a page tree with one level, as px4fuse writes it."""
     tree: Any = reader.root_object["/Pages"]
     return list(list.__iter__(tree["/Kids"]))
 
@@ -336,10 +368,12 @@ def _kind(value: Any) -> type:
 
 def _keys(value: DictionaryObject, key: str) -> set[str]:
     """Return the keys of a dictionary that are compared; a null counts as absent."""
-    left_out = set(_PACKED) if isinstance(value, StreamObject) else set()
-    left_out |= _STAMPS if key == "/Info" else set()
-    left_out |= {"/Params"} if value.get("/Type") == "/EmbeddedFile" else set()
-    return {each for each in value if not isinstance(value.raw_get(each), NullObject)} - left_out
+    ignored_keys = set(_COMPRESSION_KEYS) if isinstance(value, StreamObject) else set()
+    ignored_keys |= _WRITER_KEYS if key == "/Info" else set()
+    ignored_keys |= {"/Params"} if value.get("/Type") == "/EmbeddedFile" else set()
+    return {
+        each for each in value if not isinstance(value.raw_get(each), NullObject)
+    } - ignored_keys
 
 
 def _xmp(data: bytes) -> str:
@@ -349,12 +383,12 @@ def _xmp(data: bytes) -> str:
     ):  # document types may contain entities that expand
         return data.decode("latin-1")
     packet = re.sub(r"<\?.*?\?>", "", data.decode("utf-8", "replace"))
-    spelt = ElementTree.canonicalize(packet.strip(), strip_text=True)
-    return _TYPST.sub("Typst", _XMP_STAMPS.sub("", spelt))
+    canonical_text = ElementTree.canonicalize(packet.strip(), strip_text=True)
+    return _TYPST_VERSION.sub("Typst", _XMP_WRITER_FIELDS.sub("", canonical_text))
 
 
 def _operations(content: bytes) -> Iterator[Operation]:
-    """Read content as operators with their operands."""
+    """Parse page content: yield each operator with its operands."""
     operands: list[Operand] = []
     for match in _TOKEN.finditer(content.decode("latin-1")):
         literal, digits, token = match.groups("")
@@ -380,19 +414,24 @@ def _unescaped(match: re.Match[str]) -> str:
         return "\n"
     if escaped[0] in "01234567":
         return chr(int(escaped, 8) & 255)
-    return _ESCAPED.get(escaped, escaped)
+    return _ESCAPED_CHARACTERS.get(escaped, escaped)
 
 
-def _near(operator: str, submitted: Sequence[Operand], redrawn: Sequence[Operand]) -> bool:
-    """Return True if operands are equal, coordinates within COORDINATE_PT."""
-    first = _COORDINATES.get(operator, len(redrawn))
+def _has_near_operands(
+    operator: str, submitted: Sequence[Operand], redrawn: Sequence[Operand]
+) -> bool:
+    """Return True if operands are equal, coordinates within COORDINATE_TOLERANCE_PT."""
+    first = _FIRST_COORDINATE.get(operator, len(redrawn))
     return len(submitted) == len(redrawn) and all(
         one == other
         or (
             isinstance(one, float)
             and isinstance(other, float)
             and math.isclose(
-                one, other, rel_tol=NUMBER, abs_tol=COORDINATE_PT if at >= first else NUMBER
+                one,
+                other,
+                rel_tol=NUMBER_TOLERANCE,
+                abs_tol=COORDINATE_TOLERANCE_PT if at >= first else NUMBER_TOLERANCE,
             )
         )
         for at, (one, other) in enumerate(zip(submitted, redrawn, strict=True))

@@ -1,8 +1,8 @@
-"""Reading of handed-in PDFs without trusting them: results of a report, or an error.
+"""Reading of the results from submitted PDFs, which may be malicious.
 
-Nothing in the file is executed, followed or written. Sizes are limited here before pypdf reads the
-file, and by the limits of pypdf. Files that are slow within these limits are stopped by the time
-and memory limits of :mod:`px4fuse.workers`.
+Nothing in the file is executed, no link is followed, and nothing is written to disk. This module
+checks sizes before pypdf reads the file, and sets the limits of pypdf. :mod:`px4fuse.workers`
+limits time and memory.
 
 Only the attached results are read. The pages are counted, because the report is drawn again. A file
 that another program saved again is therefore accepted if the results are still attached.
@@ -21,34 +21,34 @@ from pypdf.generic import ArrayObject, DictionaryObject, IndirectObject, StreamO
 
 from px4fuse.errors import ResultsError
 from px4fuse.report.pdf import RESULTS_NAME
-from px4fuse.results.contract import AidsResults, Reported, Results
+from px4fuse.results.contract import AidsResults, ReportedResults, Results
 from px4fuse.results.reading import MAX_BYTES as MAX_ATTACHMENT_BYTES
 from px4fuse.results.reading import one_line, read_results
 from px4fuse.verification.model import BAD_VALUES
 
 MAX_BYTES = 25_000_000
 MAX_PAGES = 100
-# bytes; of one stream, and of all streams
+# bytes of one inflated stream, and of all inflated streams
 MAX_CONTENT_BYTES = 20_000_000
 MAX_DOCUMENT_BYTES = 100_000_000
 MAX_OBJECTS = 20_000
 MAX_VALUES = 1_000_000
-# references to missing objects; pypdf searches the whole file for each
-MAX_MISSING = 100
+# references to missing objects; for each of them pypdf would search the whole file
+MAX_MISSING_OBJECTS = 100
 
 _DAMAGED_REASON = "the PDF is damaged. Hand in the file that px4fuse wrote."
 _ENCRYPTED_REASON = "the PDF is encrypted. Hand in the file that px4fuse wrote."
-_COSTLY_REASON = "opening it needs more memory or time than a report can need."
+_COSTLY_REASON = "reading the PDF needs more memory or time than reading a report."
 
-# errors of pypdf on damaged files; AttributeError occurred in a test of 900 files with changed
-# bytes. Other errors are bugs of px4fuse, and are reported as such
+# errors of pypdf for damaged files; AttributeError occurred in a test of 900 files with changed
+# bytes. Other errors are errors of px4fuse and are not caught
 BROKEN_PDF_ERRORS = (*BAD_VALUES, PyPdfError, AttributeError, zlib.error)
 
-# active content: keys of a dictionary ... Links, comments, forms without scripts and the initial
-# view are allowed, because programs add them when they save a report again
-_KEYS = re.compile("/(JS|JavaScript|XFA|RichMediaContent|RichMediaSettings|Collection|RF)")
-# ... and types of actions
-_ACTIONS = re.compile(
+# keys of dictionaries with active content. Links, comments, forms without scripts and the initial
+# view are allowed, because programs add them when they save a report
+_ACTIVE_KEYS = re.compile("/(JS|JavaScript|XFA|RichMediaContent|RichMediaSettings|Collection|RF)")
+# types of actions with active content
+_ACTIVE_ACTIONS = re.compile(
     "/(JavaScript|Launch|SubmitForm|ImportData|GoToR|GoToE|Rendition|RichMediaExecute|Movie|Sound)"
 )
 
@@ -70,17 +70,17 @@ PYPDF_LIMITS: dict[str, Any] = {
     "page_tree_maximum_page_entries": 100 * MAX_PAGES,
 }
 
-# allowed filters of streams; inflating each stream once finds decompression bombs in these
-_FILTERS = frozenset(("/FlateDecode", "/DCTDecode"))
+# filters of streams that _check_file can test for decompression bombs
+_ALLOWED_FILTERS = frozenset(("/FlateDecode", "/DCTDecode"))
 
 _STREAM = re.compile(rb"(?<!end)stream *\r?\n?")
 
 
-# keep pypdf's remarks on damaged files off the terminal
+# pypdf must not print warnings about damaged files on the terminal
 logging.getLogger("pypdf").setLevel(logging.CRITICAL + 1)
 
 
-def read_report(pdf: bytes, name: str) -> Reported:
+def read_report(pdf: bytes, name: str) -> ReportedResults:
     """Read the results of a report that was handed in; ``name`` names the file in errors.
 
     Returns
@@ -90,10 +90,10 @@ def read_report(pdf: bytes, name: str) -> Reported:
     Raises
     ------
     ResultsError
-        From :func:`attached_results`, or the results contain only EKF2 aids.
+        As :func:`attached_results`, or the results contain only EKF2 aids.
     """
     results = attached_results(pdf, name)
-    if not isinstance(results, Reported):
+    if not isinstance(results, ReportedResults):
         content = "no results of compare or loop"
         if isinstance(results, AidsResults):
             content = "only EKF2 aids, no KF results"
@@ -104,25 +104,25 @@ def read_report(pdf: bytes, name: str) -> Reported:
 
 
 def attached_results(pdf: bytes, name: str) -> Results:
-    """Read the results attached to a PDF, with cleaned strings.
+    """Read the results attached to a PDF; control characters are removed from strings.
 
     Raises
     ------
     ResultsError
-        px4fuse cannot have written the PDF.
+        The PDF is not a report of px4fuse, or is damaged or too large.
     """
     remedy = ""
     try:
         _check_file(pdf)
         with pypdf.apply_configuration(**PYPDF_LIMITS):
-            reader = opened(pdf)
+            reader = open_strictly(pdf)
             if reader.is_encrypted:
                 raise ResultsError(_ENCRYPTED_REASON)
             if not 0 < len(reader.pages) <= MAX_PAGES:
                 raise ResultsError(f"the PDF has no pages, or more than {MAX_PAGES}.")
             return read_results(_attachment(reader), f"the attached {RESULTS_NAME}")
-    except ResultsError as refusal:
-        reason, remedy = f"{refusal.reason}.", refusal.remedy
+    except ResultsError as error:
+        reason, remedy = f"{error.reason}.", error.remedy
     except (LimitReachedError, RecursionError, MemoryError):
         reason = _COSTLY_REASON
     except DependencyError:  # pypdf needs a further library for AES
@@ -132,15 +132,15 @@ def attached_results(pdf: bytes, name: str) -> Results:
     raise ResultsError(f"{one_line(name, 200)}: {reason}", remedy)
 
 
-def opened(pdf: bytes) -> pypdf.PdfReader:
-    """Open a PDF within the limits, strictly: programs repair damaged files differently."""
+def open_strictly(pdf: bytes) -> pypdf.PdfReader:
+    """Open a PDF without repair of damaged parts, because programs repair them differently."""
     return pypdf.PdfReader(
         io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=10 * MAX_OBJECTS
     )
 
 
 def _check_file(pdf: bytes) -> None:
-    for has_problem, why in (
+    for has_problem, reason in (
         (
             len(pdf) > MAX_BYTES,
             f"larger than {MAX_BYTES // 1_000_000} MB; reports are smaller than 2 MB.",
@@ -149,14 +149,14 @@ def _check_file(pdf: bytes) -> None:
         (b"%%EOF" not in pdf[-2048:], "the end of the PDF is missing. Hand it in again."),
     ):
         if has_problem:
-            raise ResultsError(why)
+            raise ResultsError(reason)
     # inflate every stream and discard the data, so that no decompression bomb reaches pypdf
     remaining_bytes = MAX_DOCUMENT_BYTES
     for match in _STREAM.finditer(pdf):
-        # the keyword may also occur inside a stream; each attempt counts towards the limit
-        spent = _inflated_bytes(pdf, match.end(), min(remaining_bytes, MAX_CONTENT_BYTES))
-        remaining_bytes -= spent
-        if spent > MAX_CONTENT_BYTES or remaining_bytes < 0:
+        # the keyword may occur inside a stream, so each occurrence counts towards the limit
+        inflated_bytes = _inflated_bytes(pdf, match.end(), min(remaining_bytes, MAX_CONTENT_BYTES))
+        remaining_bytes -= inflated_bytes
+        if inflated_bytes > MAX_CONTENT_BYTES or remaining_bytes < 0:
             raise ResultsError(
                 "a compressed part expands to more than a report can contain: the PDF is not a "
                 "px4fuse report, or was printed to PDF. Hand in the original file."
@@ -164,67 +164,70 @@ def _check_file(pdf: bytes) -> None:
 
 
 def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
-    """Count the input or output bytes of zlib data at ``start``, the larger, up to limit + 1."""
-    head = pdf[start : start + 2]
-    if len(head) < 2 or head[0] & 15 != zlib.DEFLATED or int.from_bytes(head) % 31:
+    """Return the larger of input and output bytes of the zlib data at ``start``, up to limit + 1.
+
+    0 for other data; at least 1000 for zlib data.
+    """
+    header = pdf[start : start + 2]
+    if len(header) < 2 or header[0] & 15 != zlib.DEFLATED or int.from_bytes(header) % 31:
         return 0  # RFC 1950, section 2.2: not zlib data
     inflate = zlib.decompressobj()
     input_bytes = output_bytes = 0
     while not inflate.eof and max(input_bytes, output_bytes) <= limit:
-        if not (feed := inflate.unconsumed_tail):
-            feed = pdf[start + input_bytes : start + input_bytes + 16_384]
-            input_bytes += len(feed)
-        if not feed:
+        if not (chunk := inflate.unconsumed_tail):
+            chunk = pdf[start + input_bytes : start + input_bytes + 16_384]
+            input_bytes += len(chunk)
+        if not chunk:
             break
         try:
-            output_bytes += len(inflate.decompress(feed, 1_000_000))
-        except zlib.error:  # pypdf does not repair this stream either
+            output_bytes += len(inflate.decompress(chunk, 1_000_000))
+        except zlib.error:  # pypdf rejects this stream, because repair is disabled
             break
     input_bytes -= len(inflate.unused_data)
-    # minimum: cost of an attempt
+    # the minimum is the cost of starting to inflate
     return min(max(input_bytes, output_bytes, 1000), limit + 1)
 
 
 def _dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, bool]]:
     """Yield all dictionaries that a viewer can reach, each once, without decoding streams.
 
-    The flag is True if the viewer reaches it only by a click (action of a link or outline).
+    The flag is True if a viewer reaches the dictionary only by a click on a link or bookmark.
     """
     visited: set[tuple[IndirectObject, bool]] = set()
     missing_count = value_count = 0
     remaining: list[tuple[Any, bool]] = [(reader.trailer, False)]
     while remaining:
-        value, clicked = remaining.pop()
+        value, needs_click = remaining.pop()
         value_count += 1
         if isinstance(value, IndirectObject):
-            if (value, clicked) in visited:
+            if (value, needs_click) in visited:
                 continue
-            visited.add((value, clicked))
-            # objects in the cross-reference table are found without a search
+            visited.add((value, needs_click))
+            # pypdf reads objects in the cross-reference table without searching the file
             number, generation = value.idnum, value.generation
             is_packed = generation == 0 and number in reader.xref_objStm
             is_listed = is_packed or number in reader.xref.get(generation, {})
             missing_count += not is_listed
-            if len(visited) > MAX_OBJECTS or missing_count > MAX_MISSING:
+            if len(visited) > MAX_OBJECTS or missing_count > MAX_MISSING_OBJECTS:
                 raise ResultsError(_COSTLY_REASON)
             # ISO 32000-1, 7.3.10: a reference to a missing object is null
             value = value.get_object() if is_listed else None
         if value_count > MAX_VALUES:
             raise ResultsError(_COSTLY_REASON)
         if isinstance(value, DictionaryObject):
-            yield value, clicked
+            yield value, needs_click
             remaining.extend((value.raw_get(key), key == "/A") for key in value)
         elif isinstance(value, ArrayObject):
             remaining.extend((element, False) for element in list.__iter__(value))
 
 
-def _foreign_features(value: DictionaryObject, clicked: bool) -> Iterator[str]:
+def _foreign_features(value: DictionaryObject, needs_click: bool) -> Iterator[str]:
     """Yield the features of a dictionary that reports do not have."""
-    yield from (key[1:] for key in value if _KEYS.fullmatch(key))
+    yield from (key[1:] for key in value if _ACTIVE_KEYS.fullmatch(key))
     action, kind = _name(value.get("/S")) or "", _name(value.get("/Type"))
-    if _ACTIONS.fullmatch(action):
+    if _ACTIVE_ACTIONS.fullmatch(action):
         yield action[1:]
-    if action == "/URI" and not clicked:
+    if action == "/URI" and not needs_click:
         yield "an action that opens an address"
     is_stream = isinstance(value, StreamObject)
     if ("/EF" not in value and kind in {"/Filespec", "/F"}) or (is_stream and "/F" in value):
@@ -233,7 +236,7 @@ def _foreign_features(value: DictionaryObject, clicked: bool) -> Iterator[str]:
         filters = _resolve(value.get("/Filter"))
         names = list(filters) if isinstance(filters, ArrayObject) else [filters]
         used_names = [_name(each) for each in names if each is not None]
-        if not _FILTERS.issuperset(used_names) or len(set(used_names)) != len(used_names):
+        if not _ALLOWED_FILTERS.issuperset(used_names) or len(set(used_names)) != len(used_names):
             filter_names = " ".join(each or "?" for each in used_names[:3])
             yield f"a stream with other compression ({one_line(filter_names, 60)})"
 
@@ -248,12 +251,12 @@ def _name(value: object) -> str | None:
 
 
 def _attachment(reader: pypdf.PdfReader) -> bytes:
-    """Return the bytes of the one attached file, whose name must be RESULTS_NAME."""
+    """Return the content of the attached file; a report has one, with the name RESULTS_NAME."""
     files: list[DictionaryObject] = []
     streams: dict[int, StreamObject] = {}
     features: set[str] = set()
-    for value, clicked in _dictionaries(reader):
-        features.update(_foreign_features(value, clicked))
+    for value, needs_click in _dictionaries(reader):
+        features.update(_foreign_features(value, needs_click))
         candidates: list[object] = [value] if _name(value.get("/Type")) == "/EmbeddedFile" else []
         if "/EF" in value:
             files.append(value)

@@ -17,8 +17,16 @@ from statistics import fmean
 import numpy as np
 from msgspec.structs import replace
 
-from px4fuse.answer_form import CURES, EKF2_DID, MISTAKES, PANELS, VERDICTS, Answers, StudentMistake
-from px4fuse.assignment.assignment import fly
+from px4fuse.answer_form import (
+    CORRECTIONS,
+    EKF2_BEHAVIOURS,
+    MISTAKES,
+    PANELS,
+    VERDICTS,
+    Answers,
+    StudentMistake,
+)
+from px4fuse.assignment.assignment import simulate_assigned
 from px4fuse.assignment.roster import Person
 from px4fuse.assignment.truth import FormTruth, TrueMistake
 from px4fuse.grading.form_points import cures, form_points, panels
@@ -31,7 +39,7 @@ GUESSES = 20
 def truth(number: int) -> FormTruth:
     """Return the correct answers for the flight of one student of a mixed class."""
     student = Person(f"s{number}")
-    _, answer = fly(SECRET, student, "mixed")
+    _, answer = simulate_assigned(SECRET, student, "mixed")
     assert answer.form is not None
     return answer.form
 
@@ -43,7 +51,7 @@ def at_random(rng: np.random.Generator) -> Answers:
     claims = tuple(
         StudentMistake(
             str(kind), float(rng.lognormal(-1.0, 1.5)), when="whole flight",
-            parameter=str(rng.choice(list(CURES))), value=float(rng.lognormal(-1.0, 1.5)),
+            parameter=str(rng.choice(list(CORRECTIONS))), value=float(rng.lognormal(-1.0, 1.5)),
             panel=str(rng.choice(PANELS)),
         )
         for kind in kinds
@@ -53,7 +61,7 @@ def at_random(rng: np.random.Generator) -> Answers:
         mistakes=(StudentMistake("none"),) if rng.random() < 1.0 / 3.0 else claims,
         verdict_kf=str(rng.choice(VERDICTS)),  # type: ignore[arg-type]
         verdict_ekf2=str(rng.choice(VERDICTS)),  # type: ignore[arg-type]
-        ekf2_did=(str(rng.choice(EKF2_DID)),),
+        ekf2_did=(str(rng.choice(EKF2_BEHAVIOURS)),),
         quantities=tuple(rng.normal(0.0, 0.3, 3).tolist()),
     )
 

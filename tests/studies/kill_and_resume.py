@@ -63,7 +63,8 @@ def end_by_signal(process: subprocess.Popen[bytes], rng: random.Random, after_s:
         # SIGTERM may arrive when all is written, or before px4fuse handles it
         expected = (0, 128 + number, -number) if number == signal.SIGTERM else (-number,)
         assert process.returncode in expected, (process.returncode, errors.decode())
-        assert b"Traceback" not in errors, errors.decode()
+        # Python itself prints one for a worker whose parent is killed during its start
+        assert number == signal.SIGKILL or b"Traceback" not in errors, errors.decode()
         return number.name
     _, errors = process.communicate()
     assert process.returncode == 0, errors.decode()

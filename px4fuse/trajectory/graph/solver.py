@@ -250,8 +250,8 @@ def _solve_gnc(
         return 0.5 * float(np.sum(np.where(edge_weights > 0.0, state.chi2, drop_cost)))
 
     iteration_count, solutions = plain_minimum.iterations, []
-    for first in (plain_minimum.state, start):
-        minimum, weights = _descend_graduated(graph, first, bound)
+    for start_state in (plain_minimum.state, start):
+        minimum, weights = _descend_graduated(graph, start_state, bound)
         iteration_count += minimum.iterations
         solutions.append((truncated_cost(minimum.state, weights), minimum, weights))
     lowest_cost, minimum, weights = min(solutions, key=lambda solution: solution[0])
