@@ -120,9 +120,7 @@ def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str
             (_percent(tick), label, tick not in LABELLED_TICKS)
             for tick, label in AXIS_TICKS.items()
         ],
-        limits=", ".join(
-            f"{MARKS[against]} {low:g} to {high:g}" for against, (low, high) in BANDS.items()
-        ),
+        limits=band_limits(),
         names=FILTER_NAMES,
         marks=MARKS,
         quantities=QUANTITIES,
@@ -137,6 +135,15 @@ def axis_figures(analysis: Analysis) -> str:
         axis_html(verdicts(result), describe_axis(analysis, result), name)
         for name, result in analysis.axes.items()
     )
+
+
+def band_limits() -> str:
+    """Format the limits of both bands.
+
+    >>> band_limits()
+    '● 0.8 to 1.25, ◆ 0.67 to 1.5'
+    """
+    return ", ".join(f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in BANDS.items())
 
 
 def card_style() -> str:
