@@ -108,8 +108,8 @@ def of_command(page: Browser, sample_log: Path) -> ComparisonRequest:
     assert words[:2] == ["px4fuse", "compare"]
     with compare_command.make_context("compare", words[2:]) as context:
         given = dict(context.params)
-        for name in ("output", "json_path", "fail_on", "checks"):
-            given.pop(name)
+        for name in ("output", "json_path", "fail_on", "checks", "verbose", "quiet"):
+            given.pop(name, None)
         read_student(given)
         given.pop("log")
         return comparison_request(sample_log, given)

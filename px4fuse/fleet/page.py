@@ -127,11 +127,12 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
 def _cells(log: Log, names: Mapping[str, str]) -> tuple[Cell, ...]:
     finding_titles = [finding_title(finding) for finding in log["findings"]]
     vehicle = log.get("vehicle", "")
-    severity = log["severity"]
+    severity, action = log["severity"], log.get("action", "")
+    style = "command" if action.startswith(("px4fuse ", "param ")) else ""
     return (
         Cell(SIGNS[severity], SEVERITIES.index(severity), style_class=f"sign {severity}"),
         Cell(log["name"], log["name"], log.get("changed", "")),
-        Cell(log["headline"], log["headline"], log.get("action", "")),
+        Cell(log["headline"], log["headline"], action, style_class=style),
         *(
             _ratio_cell(log.get(f"{name}_ratio"), name, word)
             for name, word in zip(RATIOS, log["words"], strict=True)

@@ -178,12 +178,12 @@
   const cell = ([text = "", cellValue = "", below = "", style = "", share = ""], column) => {
     const [, kind, group, visibleFrom] = columns[column];
     const made = make(column === nameColumn ? "th" : "td", "",
-      [...classes(kind, visibleFrom, group), style === "flags" || kind === "ratio" ? style : ""].join(" "));
+      [...classes(kind, visibleFrom, group), style === "flags" || ["ratio", "full"].includes(kind) ? style : ""].join(" "));
     if (kind === "ratio") {
       if (text) made.append(ratioMark(Number(cellValue), style.split(" ")[1]), make("span", text));
     } else if (style === "flags") {
       made.append(list(text ? text.split("\n") : [], false));
-    } else if (style) made.append(make("span", text, "chip " + style));
+    } else if (style && kind !== "full") made.append(make("span", text, "chip " + style));
     else if (text) made.append(makeIsolated("span", text));
     if (share !== "") made.append(bar(share));
     if (below) made.append(makeIsolated("span", below, "file"));
