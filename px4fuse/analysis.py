@@ -61,7 +61,7 @@ from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.notebook_display import one_line_repr
+from px4fuse.notebook_display import display_html, one_line_repr
 from px4fuse.readers import read_log
 from px4fuse.reading import display_name
 from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
@@ -103,6 +103,10 @@ class Analysis(Comparison):
     loop: Loop | Unavailable
     heading: HeadingError | Unavailable
     request: ComparisonRequest | None = None
+
+    def _repr_html_(self) -> str | None:
+        """Return the diagnosis card for notebooks."""
+        return display_html(self)
 
     @property
     def ekf2_replay(self) -> Ekf2Replay | Unavailable:
