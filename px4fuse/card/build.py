@@ -7,7 +7,7 @@ from importlib import metadata
 from msgspec.structs import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.causes import FILTER_NAMES, RankedCause, improvement, make_cause, rank_causes
+from px4fuse.card.causes import FILTER_NAMES, RankedCause, make_cause, rank_causes
 from px4fuse.card.model import (
     MAX_CAUSES,
     MAX_HEADLINE_LENGTH,
@@ -25,6 +25,7 @@ from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.card.verdicts import verdicts as make_verdicts
 from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth
 from px4fuse.comparison.remedy import aid_of
+from px4fuse.comparison.trials import improvement
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning

@@ -6,8 +6,8 @@ KF takes SIGMA_Z from the same parameter on GNSS, so both filters may have the f
 import math
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import Trial, distance_from_one
 from px4fuse.comparison.remedy import aid_of
+from px4fuse.comparison.trials import Trial, distance_from_one
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Findings, Severity, finding, format_percent

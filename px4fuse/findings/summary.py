@@ -11,8 +11,9 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import causal_replays
-from px4fuse.comparison.causal_replays import Intervention, Statistic, find_cause, interventions_for
+from px4fuse.comparison.causal_replays import Intervention, find_cause, interventions_for
 from px4fuse.comparison.model import FILTERS, Difference, ErrorsAgainstTruth, FilterName
+from px4fuse.comparison.trials import Statistic
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2_parameters import AIDS, EV_POS
 from px4fuse.filter.kalman import state_at
