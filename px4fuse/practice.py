@@ -17,7 +17,6 @@ from px4fuse.explore.data import flight_data
 from px4fuse.explore.packing import Packer
 from px4fuse.explore.page import data_scripts, page_text
 from px4fuse.findings import Finding, find
-from px4fuse.findings.summary import summarise
 from px4fuse.record import Record, table
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation import flights
@@ -219,7 +218,7 @@ def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str
             _describe_mistake(mistake, size, findings)
             for mistake, size in zip(practice_flight.mistakes, practice_flight.sizes, strict=True)
         ],
-        "summary": list(summarise(analysis, findings)),
+        "summary": data["summary"],
         "findings": data["findings"],
     }
     data |= {"summary": [], "findings": []}

@@ -11,6 +11,7 @@ import pandas as pd
 from scipy import stats
 
 from px4fuse.analysis import Analysis
+from px4fuse.card.build import build_card
 from px4fuse.comparison.causal_replays import (
     MAX_UNREMARKABLE_NIS,
     MIN_NEES_FINDING,
@@ -33,7 +34,6 @@ from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding, find, finding_title, group_by_root
 from px4fuse.findings.cause_grouping import NOISES
-from px4fuse.findings.summary import summarise
 from px4fuse.flight import Columns, PositionTrack, Unavailable
 from px4fuse.request import ComparisonRequest, command_line
 from px4fuse.text import capitalise_first
@@ -64,7 +64,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
         "source": analysis.source.name,
         # The innovations of a drifting source do not show its error: the page suggests no noises
         "drifts": analysis.source.origin.may_drift,
-        "summary": list(summarise(analysis, findings)),
+        "summary": [build_card(analysis, findings, request).effect_text],
         "settings": _settings_data(analysis.settings),
         "main": analysis.main.axis.name,
         **signals,
