@@ -15,7 +15,7 @@ from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
 from px4fuse.flight import Unavailable
 from px4fuse.record import Span
-from px4fuse.text import capitalise_first, format_factor, format_number
+from px4fuse.text import capitalise_first, format_number, format_ratio
 
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
 # s after take-off; EKF2 does not fuse the barometer while the ground disturbs the pressure
@@ -127,7 +127,7 @@ def detect_in_aids(
                 action = f"increase {noise_parameter}"
             yield warning(
                 "aid_overconfident",
-                f"EKF2 is overconfident about {label}: σ is {format_factor(aid.nis_mean**0.5)} "
+                f"EKF2 is overconfident about {label}: σ is {format_ratio(aid.nis_mean**0.5)} "
                 f"times too small. The mean NIS is {format_number(aid.nis_mean)} (expected 1), and "
                 f"{format_percent(aid.rejected_fraction)} of the samples are rejected. The "
                 f"errors of this aid are larger than R{_format_noise(aid)}, or another aid is "

@@ -85,7 +85,8 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
             else f"Rotate the positions by {turn_deg:+.0f}° before they are sent."
         )
     if (offset_s := change.pop(causal_replays.CLOCK_OFFSET, None)) is not None:
-        actions.append(f"Add {offset_s:+.3f} s to the timestamps at the sender.")
+        verb = f"Subtract {-offset_s:.3f} s from" if offset_s < 0 else f"Add {offset_s:.3f} s to"
+        actions.append(f"{verb} the timestamps at the sender.")
     settings = {name: change.pop(name) for name in causal_replays.SETTING_CHANGES & change.keys()}
     if change:
         actions.append(f"Set {format_settings(change)}.")

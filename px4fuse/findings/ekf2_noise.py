@@ -12,7 +12,7 @@ from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Findings, Severity, finding, format_percent
-from px4fuse.flight import Unavailable
+from px4fuse.flight import Unavailable, source_name
 from px4fuse.text import format_factor
 
 # Ratio of the noises from which the finding is an error; below, EKF2 works nearly as well
@@ -31,7 +31,7 @@ def detect(analysis: Analysis) -> Findings:
     flown_m, estimate_m = analysis.ekf2_model.inputs.settings[aid.noise], trial.change[aid.noise]
     ratio, is_small = estimate_m / flown_m, estimate_m > flown_m
     size, direction = max(ratio, 1.0 / ratio), "small" if is_small else "large"
-    sensor = analysis.source.origin.kind.upper()
+    sensor = source_name(analysis.source)
     is_shared = analysis.source.origin.is_gnss and math.isclose(
         analysis.settings.sigma_z_m, flown_m, rel_tol=1e-2
     )

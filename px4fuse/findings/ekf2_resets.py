@@ -31,6 +31,7 @@ def detect(analysis: Analysis) -> Findings:
         horizontal = [reset for reset in resets if any(reset.delta[:2])]
         counted = horizontal or resets
         sizes_m = [float(np.linalg.norm(reset.delta)) for reset in counted]
+        follows_gap = all(_follows_gap(analysis, reset) for reset in counted)
         at_s = counted[int(np.argmax(sizes_m))].time_s
         _, treatment = continuous_state(ekf2, analysis.source, segment)
         yield finding(
@@ -44,9 +45,7 @@ def detect(analysis: Analysis) -> Findings:
                 "count": len(counted),
                 "largest_m": max(sizes_m),
                 "at_s": at_s,
-                CAUSE: GAP
-                if all(_follows_gap(analysis, reset) for reset in counted)
-                else ELSEWHERE,
+                CAUSE: GAP if follows_gap else ELSEWHERE,
             },
             zero_length_spans(reset.time_s for reset in counted),
         )

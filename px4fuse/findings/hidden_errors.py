@@ -26,9 +26,9 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.cause_grouping import CAUSE
 from px4fuse.findings.cause_text import classify_cause, format_action, is_refuted
 from px4fuse.findings.model import Finding, Findings, error, finding, format_percent, note
-from px4fuse.flight import Unavailable
+from px4fuse.flight import Unavailable, source_name
 from px4fuse.loop.model import Loop
-from px4fuse.text import format_factor
+from px4fuse.text import format_metres, format_ratio
 from px4fuse.trajectory.alignment import fit_alignment
 
 MIN_NEES_ERROR = 16.0  # mean NEES; errors of 4 σ
@@ -38,8 +38,8 @@ MAX_KF_ERROR_RATIO = (
 MAX_ALIGNED_SHARE = 0.5  # RMSE after over RMSE before alignment; below, misalignment dominates
 FILTERS: Mapping[FilterName, str] = {"kf": "KF", "ekf2": "EKF2"}
 DRIFT_REMEDY = (
-    "Next flight: also fuse an absolute source (GNSS, UWB). A loop closure (px4fuse loop) corrects "
-    "the path of this flight, not the filters."
+    "Send an absolute position (GNSS, UWB) as well in the next flight. A loop closure (px4fuse "
+    "loop) corrects the path of this flight, not the filters."
 )
 FRAME_REMEDY = "Rotate and shift the frame of the source into that of the ground truth."
 EKF2_REMEDY = (
@@ -60,6 +60,10 @@ class AlignedError(NamedTuple):
 
     before_m: float
     after_m: float
+
+    def __str__(self) -> str:
+        after = f"{format_metres(self.after_m)} m after the best shift and rotation"
+        return f"{format_metres(self.before_m)} m, {after}"
 
     @property
     def is_misaligned(self) -> bool:
@@ -99,20 +103,21 @@ def make_error_finding(
     ratios, sentences = dict[str, float](), list[str]()
     causes = dict[FilterName, Intervention]()
     for filter_name, label in FILTERS.items():
-        for _, axis, error_ in [entry for entry in hidden if entry[0] == filter_name][:1]:
+        for _, axis, excess in [entry for entry in hidden if entry[0] == filter_name][:1]:
             evidence |= {
-                f"{filter_name}_nis_mean": error_.nis_mean,
-                f"{filter_name}_nees_position_mean": error_.nees,
-                f"{filter_name}_position_rmse_m": error_.rmse_m,
-                f"{filter_name}_sigma_p_m": error_.reported_sigma_m,
+                f"{filter_name}_nis_mean": excess.nis_mean,
+                f"{filter_name}_nees_position_mean": excess.nees,
+                f"{filter_name}_position_rmse_m": excess.rmse_m,
+                f"{filter_name}_sigma_p_m": excess.reported_sigma_m,
             }
             cause = find_cause(analysis.causes, filter_name, axis, "nees")
             if cause is not None and not is_refuted(analysis, filter_name, cause):
                 causes[filter_name] = cause
-            ratios[label] = error_.nees**0.5
+            ratios[label] = excess.nees**0.5
             sentences.append(
-                f"{label}: position RMSE {error_.rmse_m:.2f} m along "
-                f"{analysis.axes[axis].axis.label}, reported σ {error_.reported_sigma_m:.2g} m."
+                f"{label}: position RMSE {format_metres(excess.rmse_m)} m along "
+                f"{analysis.axes[axis].axis.label}, reported σ "
+                f"{format_metres(excess.reported_sigma_m)} m."
             )
     cause = causes.get(worst_filter) or next(iter(causes.values()), None)
     evidence |= {CAUSE: classify_cause(analysis, cause)}
@@ -126,10 +131,7 @@ def make_error_finding(
     if may_drift and not causes and not is_misaligned:
         return _drift_finding(analysis, aligned, worst, evidence)
     if is_misaligned and aligned is not None:
-        sentences.append(
-            f"After the best shift and rotation {aligned.after_m:.2f} m of the horizontal RMSE of "
-            f"{aligned.before_m:.2f} m remain: the frame is misaligned."
-        )
+        sentences.append(f"The frame is misaligned: horizontal position RMSE {aligned}.")
     kf_truth = analysis.axes[main_axis].filters["kf"].truth
     is_kf_better = (
         isinstance(kf_truth, ErrorsAgainstTruth)
@@ -137,14 +139,13 @@ def make_error_finding(
     )
     is_ekf2_alone = is_kf_better and all(filter_name == "ekf2" for filter_name, *_ in hidden)
     remedy = GNSS_REMEDY if analysis.source.origin.is_gnss else SHARED_REMEDY
-    if causes:
-        actions = (format_action(analysis, cause.change) for cause in causes.values())
-        remedy = " ".join(dict.fromkeys(actions))
+    if cause is not None:
+        remedy = format_action(analysis, cause.change)
     elif is_misaligned:
         remedy = FRAME_REMEDY
     elif is_ekf2_alone:
         remedy = EKF2_REMEDY
-    sizes = " and ".join(f"{format_factor(ratio)} ({label})" for label, ratio in ratios.items())
+    sizes = " and ".join(f"{format_ratio(ratio)} ({label})" for label, ratio in ratios.items())
     return finding(
         "error" if worst.nees >= MIN_NEES_ERROR else "warning",
         "error_exceeds_reported_sigma",
@@ -162,20 +163,19 @@ def _drift_finding(
     evidence: Mapping[str, float | str],
 ) -> Finding:
     """Make the finding of a source that drifts, with its closure error if that is known."""
-    sensor, loop = analysis.source.origin.kind.upper(), analysis.loop
-    size = f"position RMSE {worst.rmse_m:.2f} m against ground truth"
+    sensor, loop = source_name(analysis.source), analysis.loop
+    size = f"position RMSE {format_metres(worst.rmse_m)} m against ground truth"
     sentence = ""
     if aligned is not None:
-        size = f"horizontal position RMSE {aligned.after_m:.2f} m after the best alignment"
-        sentence = (
-            f"Horizontal position RMSE {aligned.before_m:.2f} m, {aligned.after_m:.2f} m after the "
-            "best shift and rotation. "
+        size = (
+            f"horizontal position RMSE {format_metres(aligned.after_m)} m after the best alignment"
         )
+        sentence = f"Horizontal position RMSE {aligned}. "
     if isinstance(loop, Loop) and (gap_m := _known_closure_error_m(loop)) is not None:
         length_m = loop.path_length_m
         evidence = {**evidence, "closure_error_m": gap_m, "path_length_m": length_m}
         share = format_percent(gap_m / length_m, 1)
-        size = f"loop closure error {gap_m:.2f} m after {length_m:.0f} m ({share})"
+        size = f"loop closure error {format_metres(gap_m)} m after {length_m:.0f} m ({share})"
     noise_parameter = "" if analysis.source.origin.aid is None else analysis.source.origin.aid.noise
     noises = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))
     return error(
@@ -233,7 +233,7 @@ def _interpolate_ekf2_position(result: AxisComparison, times: Array) -> Array:
 def make_possible_drift_finding(analysis: Analysis) -> Finding:
     """Make the note on a source that may drift, with its short-term noise and closure error."""
     sensor, tuned, loop = (
-        analysis.source.origin.kind.upper(),
+        source_name(analysis.source),
         analysis.tuning.get(HORIZONTAL),
         analysis.loop,
     )
@@ -248,7 +248,9 @@ def make_possible_drift_finding(analysis: Analysis) -> Finding:
         message += f" The noise from sample to sample is {bound}{noise:.2g} m, without the drift."
     if isinstance(loop, Loop) and (gap_m := loop.closure_error_m) is not None:
         evidence |= {"closure_error_m": gap_m, "path_length_m": loop.path_length_m}
-        message += f" The loop closure error is {gap_m:.2f} m after {loop.path_length_m:.0f} m."
+        message += (
+            f" The loop closure error is {format_metres(gap_m)} m after {loop.path_length_m:.0f} m."
+        )
     action = (
         "Measure the drift with a loop (px4fuse loop LOG) or with ground truth (ATT_POS_MOCAP). If "
         "the source is motion capture, give --source-kind mocap."

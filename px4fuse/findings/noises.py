@@ -52,7 +52,7 @@ from px4fuse.findings.model import (
 from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight import Columns, Unavailable, sample_rate
 from px4fuse.request import COMPARISON_OPTIONS
-from px4fuse.text import format_factor, format_number
+from px4fuse.text import format_factor, format_number, format_ratio
 
 MIN_NOISE_RATIO = 1.5  # ratio of σ; below, the tracks hardly change
 MIN_NOISE_RATIO_ERROR = 4.0  # ratio of σ; above, the gain differs clearly
@@ -165,7 +165,10 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
 def _setting_finding(
     analysis: Analysis, axis_tuning: AxisTuning, name: str, deviation: SettingDeviation
 ) -> tuple[float, Finding]:
-    """Return the ratio of a setting to its estimate, and the finding; a note if both are as good."""
+    """Return the ratio of a setting to its estimate, and the finding.
+
+    The finding is a note if a re-run with the estimate is no better.
+    """
     value, size, severity = deviation
     chosen = getattr(analysis.settings, name)
     noise = axis_tuning.sigma_z if name == SIGMA_Z else axis_tuning.sigma_a_two_state
@@ -353,7 +356,7 @@ def _variance_finding(
         severity,
         f"{filter_name}_{confidence}",
         f"{filter_label} is {confidence} along "
-        f"{result.axis.label}: σ is {format_factor(factor)} times too "
+        f"{result.axis.label}: σ is {format_ratio(factor)} times too "
         f"{'large' if is_underconfident else 'small'}. The mean NIS is "
         f"{format_number(summary.nis_mean)}, expected {low:.2f} to {high:.2f} ({group} "
         f"axes).{gate_effect}",
@@ -373,8 +376,8 @@ def _format_excessive_noise(analysis: Analysis) -> str:
     if not parameter_m > NOISE_RATIO_TOLERANCE * reported_m:  # false for NaN too
         return ""
     return (
-        f"{name} is {parameter_m:g} m, and the receiver reports {reported_m:.2g} m: run px4fuse "
-        f"whatif LOG --set {name}={reported_m:.2g}."
+        f"{name} is {parameter_m:g} m, but the receiver reports {reported_m:.2g} m: test this "
+        "value with px4fuse whatif."
     )
 
 
