@@ -27,6 +27,8 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
 WHITE_RATIO = "white_over_assumed"
 # Kinds of cause of findings about an aid: the sensor of the position source, or a shift in flight
 SENSOR, CHANGE = "the source's sensor", "change"
+# Kind of cause of little motion
+GROUND = "never took off"
 
 _KF_VARIANCES = frozenset({"kf_underconfident", "kf_overconfident"})
 SETTINGS = frozenset(
@@ -40,6 +42,7 @@ RECORDING = frozenset(
     {
         "autopilot_restarted",
         "imu_gap",
+        "imu_samples_missing",
         "acceleration_not_logged",
         "log_damaged",
         "logger_dropouts",
