@@ -28,6 +28,8 @@ WHITE_RATIO = "white_over_assumed"
 SENSOR, CHANGE = "the source's sensor", "change"
 # Kind of cause of resets: all of them follow a gap in the source
 GAP = "gap"
+# Kind of cause of little motion
+GROUND = "never took off"
 
 _UNDERCONFIDENT = ("kf_underconfident", "ekf2_underconfident")
 _KF_VARIANCES = ("kf_underconfident", "kf_overconfident")
@@ -190,12 +192,16 @@ CONSEQUENCES: Mapping[str, tuple[str | tuple[str, str], ...]] = {
         ("aid_not_fused", SENSOR),
     ),
     "logger_dropouts": ("imu_gap",),
+    "imu_samples_missing": ("logger_dropouts", "imu_gap"),
+    # without a position PX4 does not take off
+    "ekf2_not_fusing": (("no_motion", GROUND),),
 }
 # Findings about the recording: listed before those about noises, which depend on the recording
 RECORDING = frozenset(
     {
         "autopilot_restarted",
         "imu_gap",
+        "imu_samples_missing",
         "acceleration_not_logged",
         "log_damaged",
         "logger_dropouts",
