@@ -17,7 +17,6 @@ import numpy as np
 
 from px4fuse.comparison.causal_replays import (
     Intervention,
-    Trial,
     planned_variants,
     run_interventions,
 )
@@ -39,6 +38,7 @@ from px4fuse.comparison.flight_events import Events, collect_events
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.preparation import explain_missing_source, prepare
 from px4fuse.comparison.remedy import ml_ekf2_parameters
+from px4fuse.comparison.trials import Trial
 from px4fuse.ekf2.aids import AidResult, evaluate_aids
 from px4fuse.ekf2.filter_recursion import Variant
 from px4fuse.ekf2.inputs import Inputs

@@ -325,6 +325,14 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     )
 
 
+def lost_imu_fraction(time_s: Array) -> float:
+    """Return the samples that the log of the IMU lacks outside gaps, per logged sample."""
+    intervals = np.diff(time_s)
+    regular_intervals = intervals[intervals <= IMU_GAP_S]
+    lost_counts = np.rint(regular_intervals / np.median(intervals)) - 1.0
+    return float(lost_counts.clip(0.0).sum() / len(time_s))
+
+
 def _missing_imu(time_s: Array) -> Unavailable | None:
     """Return Unavailable if IMU samples at these times are too few for predictions."""
     intervals = np.diff(time_s)
@@ -335,10 +343,7 @@ def _missing_imu(time_s: Array) -> Unavailable | None:
             f"the IMU is logged at {1.0 / interval:.0f} Hz, below EKF2's prediction rate",
             "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate.",
         )
-    regular_intervals = intervals[intervals <= IMU_GAP_S]
-    lost_fraction = float(
-        (np.rint(regular_intervals / interval) - 1.0).clip(0.0).sum() / len(time_s)
-    )
+    lost_fraction = lost_imu_fraction(time_s)
     return (
         None
         if lost_fraction <= MAX_LOST_SHARE
