@@ -41,7 +41,7 @@ from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
 from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
 from px4fuse.findings import TITLES, Finding, find, find_aids, find_loop, source_frame  # noqa: E402
-from px4fuse.findings.cause_grouping import CONSEQUENCES, RECORDING, SETTINGS  # noqa: E402
+from px4fuse.findings.cause_grouping import CONSEQUENCES, RECORDING, SETTINGS, effect_ids  # noqa: E402
 from px4fuse.findings.model import CATALOGUE, GROUPS  # noqa: E402
 from px4fuse.flight import Columns, Unavailable  # noqa: E402
 from px4fuse.report.panels import (  # noqa: E402
@@ -205,9 +205,8 @@ def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
     entry = CATALOGUE[name]
     yield f"# {entry.title}\n\n`{name}` ({entry.group})\n"
     yield f"## What it means\n\n{entry.meaning}\n"
-    causes = [cause for cause, effects in CONSEQUENCES.items()
-              if any(each.partition(":")[0] == name for each in effects)]  # fmt: skip
-    effects = [each.partition(":")[0] for each in CONSEQUENCES.get(name, ())]
+    causes = [cause for cause in CONSEQUENCES if name in effect_ids(cause)]
+    effects = effect_ids(name)
     if causes:
         yield "It can be a consequence of: " + links(causes) + ".\n"
     if effects:

@@ -22,7 +22,7 @@ from px4fuse.arrays import Array, BoolArray
 from px4fuse.ekf2_parameters import BAROMETER, Aid
 from px4fuse.log import ClockMap, InputFile, LogInfo, Stream, UnusedData
 from px4fuse.notebook_display import one_line_repr
-from px4fuse.position_source import Origin
+from px4fuse.position_source import Origin, PositionKind
 from px4fuse.record import NotNegative, Record, Vector
 from px4fuse.record import Unavailable as Unavailable  # noqa: PLC0414 - public re-export
 
@@ -32,6 +32,13 @@ MIN_REGULAR_SHARE = 0.8
 # Methods of a ClockMap that do not provide times of measurement
 ARRIVAL_METHODS = ("arrival time", "receive time", "position in the stream")
 AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
+SOURCE_NAMES: Mapping[PositionKind, str] = {
+    "uwb": "UWB",
+    "vio": "VIO",
+    "mocap": "MOCAP",
+    "gnss": "GNSS",
+    "file": "position file",
+}
 
 
 class Columns:
@@ -222,6 +229,18 @@ class PositionTrack:
     def rate_hz(self) -> float:
         """Sample rate (Hz) without gaps; NaN for fewer than two samples."""
         return sample_rate(self.samples)
+
+
+def source_name(source: PositionTrack) -> str:
+    """Return the name of a position source as its users call it, not its topic."""
+    return SOURCE_NAMES[source.origin.kind]
+
+
+def positions_of(source: PositionTrack) -> str:
+    """Return the noun phrase for the positions of a source: "UWB positions"."""
+    if source.origin.kind == "file":
+        return "positions of the file"
+    return f"{source_name(source)} positions"
 
 
 @dataclass(frozen=True)

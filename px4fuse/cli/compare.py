@@ -8,6 +8,7 @@ import click
 
 from px4fuse.cli import options, outputs
 from px4fuse.request import settings_name
+from px4fuse.writing import STANDARD_OUTPUT
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES = get_args(Severity)
@@ -48,7 +49,7 @@ def compare(
     """
     from px4fuse.analysis import failed_checks, run_or_evaluate_aids
     from px4fuse.memory import release_free_memory
-    from px4fuse.report.terminal import summary
+    from px4fuse.report.terminal import closing, summary
     from px4fuse.results.build import outcome_results
 
     student = options.read_student(option_values)
@@ -63,6 +64,8 @@ def compare(
         contents = outputs.result_files(results, json_path, output, outcome, show_progress)
     page = summary(outcome, results, verbose=verbose, quiet=quiet)
     outputs.write_and_print(contents, page, request)
+    if not quiet and STANDARD_OUTPUT not in contents:
+        outputs.show_page(closing(results))
     failed = failed_checks(outcome) if checks else {}
     for name, verdict in failed.items():
         click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)

@@ -331,6 +331,13 @@ def write_and_print(
         click.launch(str(openable[0].resolve()))
 
 
+def show_page(page: Page) -> None:
+    """Print a page on the terminal."""
+    from px4fuse.report.screen import show
+
+    show(terminal(), page.blocks)
+
+
 def terminal() -> Console:
     """Return a console on standard output; it raises BrokenPipeError if the reader has ended.
 

@@ -354,7 +354,8 @@ def _score_tuning(
         reason_text = evidence.missing_reason(f"tuning.{HORIZONTAL}")
         return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
     low, high = interval
-    if name == "sigma_z_m" and evidence.has_finding("source_may_drift"):
+    may_drift = evidence.has_finding("source_may_drift") or evidence.has_finding("source_drift")
+    if name == "sigma_z_m" and may_drift:
         # innovations do not show the drift of a source, so a SIGMA_Z up to the known error is right
         high = max(high, _largest_source_error_m(comparison))
     deviation_factor = max(chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0)

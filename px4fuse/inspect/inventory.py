@@ -415,9 +415,7 @@ def _logging_advice(
         ]
     findings += imu.detect_low_rates(flight)
     actions_and_purposes += [
-        (finding.remedy, finding_title(finding.id))
-        for finding in findings
-        if not finding.remedy.startswith(missing.NOTHING_TO_SET)
+        (finding.remedy, finding_title(finding.id)) for finding in findings if finding.remedy
     ]
     # other unavailable parts can be logged by PX4 only, so their advice is for ULogs
     main_parts = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)

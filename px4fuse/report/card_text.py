@@ -60,6 +60,10 @@ ASCII = {
     "ν": "nu",
     "…": "...",
 }
+AIDS_HEADING = (
+    "Innovation ÷ √S of the aiding sources that EKF2 fused. Below 1: √S is larger than needed. For "
+    "barometer, magnetometer and gravity that is usual and not a fault."
+)
 CONSOLE = "Console: MAVLink Console of QGroundControl."
 
 
@@ -113,6 +117,8 @@ def card_lines(card: Card) -> Iterator[Line]:
         yield from _cause(cause)
     if card.more_causes:
         yield Line(f"and {card.more_causes} more: -v")
+    for label, text in card.facts.items():
+        yield from _labelled(label, text)
     yield from _verdict_axis(card)
     yield from _aid_axis(card.aids)
     for text in (card.reconcile, card.difference):
@@ -226,18 +232,23 @@ def _headline(card: Card) -> Iterator[Line]:
 def _cause(cause: Cause) -> Iterator[Line]:
     yield from _labelled("cause", cause.why)
     yield from _labelled("when", format_spans(cause))
-    rows = [
-        ("EITHER " if not place else "OR ", action)
-        for place, alternative in enumerate(cause.alternatives)
-        for action in alternative
-    ]
-    rows += [("", action) for action in cause.actions]
-    labels = [f"{head}{format_target(action)}" for head, action in rows]
+    rows = marked_actions(cause)
+    labels = [f"{mark}{format_target(action)}" for mark, action in rows]
     width = max(map(len, labels), default=0) + 2
     for label, (_, action) in zip(labels, rows, strict=True):
         yield from _action(label, width, action)
     yield from _rerun_table(cause.reruns)
     yield from _wrapped(cause.after, "  ", "  ")
+
+
+def marked_actions(cause: Cause) -> list[tuple[str, Action]]:
+    """Return the actions of a cause, alternatives first with "EITHER " and "OR "."""
+    alternatives = [
+        ("OR " if place else "EITHER ", action)
+        for place, alternative in enumerate(cause.alternatives)
+        for action in alternative
+    ]
+    return alternatives + [("", action) for action in cause.actions]
 
 
 def format_target(action: Action) -> str:
@@ -346,12 +357,7 @@ def _aid_axis(aids: Sequence[AidRow]) -> Iterator[Line]:
     if not aids:
         return
     yield Line("")
-    yield from _wrapped(
-        "Innovation ÷ √S of the aiding sources that EKF2 fused. Below 1: √S is larger than "
-        "needed. For barometer, magnetometer and gravity that is usual and not a fault.",
-        "",
-        "  ",
-    )
+    yield from _wrapped(AIDS_HEADING, "", "  ")
     indent = 31
     yield Line(f"{'':{indent}}{_ticks()}")
     previous = ""

@@ -3,13 +3,18 @@
 from typing import Any
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
+from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.findings import group_by_root
 from px4fuse.report.aids import write_aids_of_comparison, write_aids_only
-from px4fuse.report.cover import facts, write_finding
 from px4fuse.report.difference_page import write_explanation
 from px4fuse.report.page import Page
-from px4fuse.report.phrases import verdict_notes, write_errors
+from px4fuse.report.phrases import (
+    format_settings,
+    verdict_notes,
+    write_errors,
+    write_finding,
+)
 from px4fuse.report.style import MUTED_COLOUR
 
 ERROR_LEGEND = (
@@ -37,13 +42,12 @@ def summary(
         Print the headline only.
     """
     page = Page()
-    if isinstance(analysis, AidsOnlyAnalysis):
-        log = analysis.flight.log
-        page.write_labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
-        write_aids_only(page, analysis, results.findings)
+    page.add("headline" if quiet else "card", card=results.card)
+    if not verbose:
         return page
-    page.add("card", card=results.card, headline_only=quiet)
-    if verbose:
+    if isinstance(analysis, AidsOnlyAnalysis):
+        write_aids_only(page, analysis, results.findings)
+    else:
         _write_details(page, analysis, results)
     return page
 
@@ -61,3 +65,34 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
     write_aids_of_comparison(page, analysis)
     for group in group_by_root(results.findings):
         write_finding(page, group)
+
+
+def closing(results: Any) -> Page:
+    """Make the lines below the written files: where to read more."""
+    page = Page()
+    page.add("closing", card=results.card)
+    return page
+
+
+def facts(comparison: Comparison) -> dict[str, str]:
+    """Return filter settings, position source and segment as texts by label."""
+    source, segment = comparison.source, comparison.segment
+    position = (
+        f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, "
+        f"{source.frame}; {comparison.source_reason}"
+    )
+    alignment_text = ""
+    if source.alignment is not None:
+        alignment = source.alignment
+        sigma = alignment.clock_offset_sigma_s
+        alignment_text = (
+            f"{alignment.frame}, yaw {alignment.yaw_deg:.1f}°, clock "
+            f"{alignment.clock_offset_s:+.3f}{'' if sigma is None else f' ± {sigma:.3f}'} s"
+        )
+    texts = {
+        "Filter": format_settings(comparison.settings),
+        "Position": position,
+        "Aligned": alignment_text,
+        "Segment": f"{segment.start_s:.2f} s to {segment.end_s:.2f} s, {segment.reason}",
+    }
+    return {label: text for label, text in texts.items() if text}
