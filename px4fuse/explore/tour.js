@@ -127,7 +127,7 @@ const Tour = (() => {
       if (step !== undefined) stepper.go(step);
       $("tour-title").focus({ preventScroll: true });
       // on a phone the sheet covers the lower half
-      if (matchMedia("(max-width: 60rem)").matches) document.querySelector(".stage").scrollIntoView();
+      if (matchMedia("(max-width: 60rem)").matches) document.querySelector("#card figure").scrollIntoView();
     }
     function end() {
       box.hidden = true;

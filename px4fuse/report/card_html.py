@@ -83,8 +83,8 @@ def card_html(
         if card.verdicts and card.effect is not None
         else "",
         more=" and ".join(
-            text for text, parts in (("Causes", card.causes), ("Notes", card.notes)) if parts
-        ),
+            text for text, parts in (("causes", card.causes), ("notes", card.notes)) if parts
+        ).capitalize(),
         first_actions=[row for row in _rows(card.causes[0]) if _is_prominent(row)]
         if card.causes
         else [],
