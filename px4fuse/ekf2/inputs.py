@@ -326,11 +326,12 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
 
 
 def lost_imu_fraction(time_s: Array) -> float:
-    """Return the samples that the log of the IMU lacks outside gaps, per logged sample."""
+    """Return the fraction of the IMU samples that the log lacks, outside gaps."""
     intervals = np.diff(time_s)
     regular_intervals = intervals[intervals <= IMU_GAP_S]
     lost_counts = np.rint(regular_intervals / np.median(intervals)) - 1.0
-    return float(lost_counts.clip(0.0).sum() / len(time_s))
+    lost_count = lost_counts.clip(0.0).sum()
+    return float(lost_count / (lost_count + len(time_s)))
 
 
 def _missing_imu(time_s: Array) -> Unavailable | None:
@@ -349,7 +350,7 @@ def _missing_imu(time_s: Array) -> Unavailable | None:
         if lost_fraction <= MAX_LOST_SHARE
         else Unavailable(
             "EKF2 replay",
-            f"{lost_fraction:.0%} of the IMU samples are missing from the log",
+            f"{100.0 * lost_fraction:.0f} % of the IMU samples are missing from the log",
             "Use a faster SD card, or log fewer topics (SDLOG_PROFILE).",
         )
     )

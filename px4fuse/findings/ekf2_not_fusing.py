@@ -22,7 +22,6 @@ EV_START_INTERVAL_S = 0.2  # EV_MAX_INTERVAL, PX4 v1.14 and later, ev_control.cp
 EV_STOP_INTERVAL_S = 0.4  # two times EV_MAX_INTERVAL, ev_pos_control.cpp
 MAX_LATENESS_S = 0.1  # s after the fusion horizon; EKF2 drops older samples (RingBuffer.h)
 MIN_LIMITING_INTERVAL_S = 0.18  # s; jitter of 10 % prevents a start at EV_START_INTERVAL_S
-MIN_START_POSITIONS = 2  # that EKF2 needs within EV_START_INTERVAL_S to start fusion
 CHECK_SWITCH = "Check EKF2_EV_CTRL (EKF2_AID_MASK before v1.14)."
 
 
@@ -66,32 +65,28 @@ def detect(analysis: Comparison) -> Findings:
 
 
 def _detect_slow_restart(analysis: Comparison, ekf2: Ekf2, fusing: pd.Series) -> Findings:
-    """Detect that EKF2 resumed fusion late, because the positions come too slowly."""
-    source, horizon_s = analysis.source, ekf2.horizon_s
+    """Detect that EKF2 resumed fusion late after a gap, because positions come too slowly."""
+    source = analysis.source
     is_limited = "EKF2_EV_CTRL" in analysis.flight.log.parameters  # v1.14 and later
     is_known = source.origin.is_vision and source.origin.has_all_samples and not source.alignment
     if not (is_limited and is_known) or 1.0 / source.rate_hz < MIN_LIMITING_INTERVAL_S:
         return
-    delay_s = horizon_s if isinstance(horizon_s, float) else 0.0
     time_s = source.samples.index.to_numpy()
-    stops = np.flatnonzero(np.diff(time_s) > EV_STOP_INTERVAL_S)
+    resumed_s = time_s[1:][np.diff(time_s) > EV_STOP_INTERVAL_S]
     late_spans = []
     for start_s, end_s in spans_with_value(0.0, fusing, analysis.segment):
-        resumed_s = time_s[stops + 1]
-        # the stop is reported later than it happens, by the interval and the fusion horizon
-        is_inside = resumed_s > start_s - EV_STOP_INTERVAL_S - delay_s
-        resumed_s = resumed_s[is_inside & (resumed_s < end_s)]
-        if not len(resumed_s):
-            continue
-        waiting_s = time_s[(time_s >= resumed_s[-1]) & (time_s < end_s - delay_s)]
-        if len(waiting_s) > MIN_START_POSITIONS:
+        after_gap_s = resumed_s[(resumed_s > start_s - EV_STOP_INTERVAL_S) & (resumed_s < end_s)]
+        waiting_s = (
+            time_s[(time_s >= after_gap_s[-1]) & (time_s < end_s)] if len(after_gap_s) else []
+        )
+        if len(waiting_s) > 2 and waiting_s[1] - waiting_s[0] >= EV_START_INTERVAL_S:
             late_spans.append((float(waiting_s[0]), end_s))
     if late_spans:
         longest_s = max(end - start for start, end in late_spans)
         yield note(
             "source_rate_at_limit",
             f"{capitalise_first(positions_of(source))} come at {source.rate_hz:.1f} Hz, so EKF2 "
-            f"resumed fusion {longest_s:.1f} s late. After a gap EKF2 (v1.14 and later) starts "
+            f"resumed fusion only {longest_s:.1f} s after a gap. EKF2 (v1.14 and later) starts "
             f"fusion only when two positions come within {EV_START_INTERVAL_S:g} s.",
             "Send the position at 10 Hz.",
             {"rate_hz": source.rate_hz, "longest_s": longest_s, "count": len(late_spans)},

@@ -26,6 +26,7 @@ MIN_IMU_RATE_HZ = 50.0  # Hz; 5 IMU samples per DT of 0.1 s, and a margin agains
 MIN_ATTITUDE_RATE_HZ = 10.0  # Hz; tilt can be interpolated over 0.1 s; PX4 logs 20 Hz by default
 MAX_CLIPPED_S = 0.1  # s; one prediction step; a touch-down clips one or two samples
 MIN_CLIPPING_PAUSE_S = 2.0  # s; clipped samples after a longer pause are a separate span
+HIGH_RATE_BIT = 16  # SDLOG_PROFILE bit 4, logged_topics.cpp
 RATE_MARGIN = 0.98  # measured stream rates are slightly below the requested rate
 
 
@@ -153,18 +154,17 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
     lost_fraction = lost_imu_fraction(samples.index.to_numpy()) if len(samples) > 1 else 0.0
     if lost_fraction <= MAX_LOST_SHARE:
         return
-    share = lost_fraction / (1.0 + lost_fraction)
     profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE))
     action = "Use a faster SD card."
     if other_topics := profile & ~(DEFAULT_PROFILE | VISION_PROFILE_BIT):
         action = f"Use a faster SD card, or set SDLOG_PROFILE to {profile ^ other_topics}."
     yield warning(
         "imu_samples_missing",
-        f"{format_percent(share)} of the IMU samples are missing from the log. The logger lost "
-        "single samples all over the flight. KF raises its process noise in gaps. EKF2 cannot be "
-        "replayed, so no change of a parameter can be predicted.",
+        f"{format_percent(lost_fraction)} of the IMU samples are missing from the log. The logger "
+        "lost single samples all over the flight. KF raises its process noise in gaps. EKF2 cannot "
+        "be replayed, so no change of a parameter can be predicted.",
         action,
-        {"lost_fraction": share, "sdlog_profile": profile},
+        {"lost_fraction": lost_fraction, "sdlog_profile": profile},
     )
 
 
@@ -194,7 +194,8 @@ def detect_low_rates(flight: Flight) -> Findings:
         topic = flight.streams[name].topics[0] if name in flight.streams else default_topic
         if isinstance(samples, pd.DataFrame) and is_rate_too_low(samples, needed_hz):
             rate_hz, requested_hz = sample_rate(samples), 2.0 * needed_hz
-            action = f"Set bit 4 of SDLOG_PROFILE: it logs {topic} at full rate."
+            profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE)) | HIGH_RATE_BIT
+            action = f"Set SDLOG_PROFILE to {profile} (bit 4 logs {topic} at full rate)."
             if log.format.startswith("MAVLink"):
                 action = f"Request {topic} at {requested_hz:g} Hz (MAV_CMD_SET_MESSAGE_INTERVAL)."
                 if log.has_ulog:

@@ -128,7 +128,7 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     return finding(
         "error" if abs(change) >= LARGE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
-        f"EKF2's heading drifts by {change:+.0f}° relative to "
+        f"EKF2's heading drifts by {change:+.0f}° relative to the "
         f"{positions_of(analysis.source)}. It is {first.heading_error_deg:+.0f}° from "
         f"{first.start_s:.0f} to {first.end_s:.0f} s and {last.heading_error_deg:+.0f}° from "
         f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, by {basis}). A constant "

@@ -124,8 +124,8 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
         yield note(
             "source_samples_lost",
             f"The recording lacks {format_percent(lost_count / sent_count)} of the "
-            f"{positions_of(source)}. {lost_count} of {sent_count} samples are missing, one per "
-            f"{typical_s:.2f} s is sent. EKF2 may have received them.",
+            f"{positions_of(source)}. {lost_count} of {sent_count} samples are missing (one per "
+            f"{typical_s:.2f} s is expected). EKF2 may have received them.",
             action,
             {"lost": lost_count, "lost_fraction": lost_count / sent_count},
         )
