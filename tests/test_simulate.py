@@ -369,7 +369,7 @@ def test_findings_clean_flight_are_notes_only(scenario):
     settings = Settings(sigma_a_m_s2=0.2, sigma_z_m=scenario.source_sigma_m)
     compared = compare(simulate_flight(scenario), settings)
     findings = find(unexplained(compared))
-    drift = ["error_exceeds_reported_sigma"] if scenario.kind == "loop" else []
+    drift = ["source_drift"] if scenario.kind == "loop" else []
     assert [finding.id for finding in findings] == [*drift, "ekf2_simulated"]
     most_m = 0.12 if scenario.kind == "aisle" else 0.7
     for axis in compared.axes.values():
