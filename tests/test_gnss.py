@@ -194,7 +194,7 @@ def test_prepare_gnss_sigma_z_equals_ekf2_noise(eph_m, least_m, axes, expected_m
     assert prepare_comparison(requested, flight=flight).settings.sigma_z_m == 0.3
 
 
-def test_prepare_gnss_innovations_are_from_gnss(tmp_path):
+def test_prepare_gnss_flight_uses_gnss_innovations(tmp_path):
     flight = flight_of(outdoors(), tmp_path)
     ekf2 = prepare(flight).flight.ekf2
     north, down = ekf2.innovations["north"], ekf2.innovations["down"]
@@ -230,7 +230,7 @@ def with_barometer(log: Log, *, fused: bool = True) -> Log:
     return log
 
 
-def test_prepare_down_uses_fused_barometer(tmp_path):
+def test_prepare_axis_down_uses_fused_barometer(tmp_path):
     flight = flight_of(with_barometer(outdoors()), tmp_path)
     request = ComparisonRequest(log="a.ulg", axes=("down", "north"))
     prepared = prepare_comparison(request, flight=flight)
@@ -248,7 +248,7 @@ def test_prepare_down_uses_fused_barometer(tmp_path):
     assert isinstance(fused_as_gnss.flight.ekf2.innovations["down"], Unavailable)  # type: ignore[union-attr]
 
 
-def test_prepare_down_unfused_barometer_needs_option(tmp_path):
+def test_prepare_axis_down_unfused_barometer_needs_option(tmp_path):
     flight = flight_of(with_barometer(outdoors(), fused=False), tmp_path)
     assert prepare(flight, axes=("down",)).source.barometer is None
     requested = prepare(flight, axes=("down",), height="barometer")
@@ -275,7 +275,7 @@ def test_filter_errors_use_requested_height_source(shared_logs):
 
 
 @pytest.mark.reallogs
-def test_compare_down_v1_13_uses_barometer(shared_logs):
+def test_compare_axis_down_v1_13_uses_barometer(shared_logs):
     """EKF2 of v1.13 uses the barometer height by default."""
     log = shared_logs / "gps" / "v1.13.3_gps_profile1.ulg"
     analysis = px4fuse.compare(log, axes="down")
