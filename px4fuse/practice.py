@@ -201,7 +201,7 @@ def practice_text(
 
 
 def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str, Any], str]:
-    """Return the data of a flight without findings, and the HTML elements with the answer."""
+    """Return the data of a flight without its findings, and its elements with the answer."""
     mistakes = [
         f"{mistake.mistake}={size}"
         for mistake, size in zip(practice_flight.mistakes, practice_flight.sizes, strict=True)

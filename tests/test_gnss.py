@@ -275,7 +275,7 @@ def test_filter_errors_use_requested_height_source(shared_logs):
 
 
 @pytest.mark.reallogs
-def test_compare_axis_down_v1_13_uses_barometer(shared_logs):
+def test_compare_down_v1_13_uses_barometer(shared_logs):
     """EKF2 of v1.13 uses the barometer height by default."""
     log = shared_logs / "gps" / "v1.13.3_gps_profile1.ulg"
     analysis = px4fuse.compare(log, axes="down")

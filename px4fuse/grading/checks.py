@@ -357,8 +357,7 @@ def _score_tuning(
         return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
     low, high = interval
     if name == "sigma_z_m" and evidence.has_finding("source_may_drift"):
-        # the estimate does not contain the drift of the source, which innovations do not show: a
-        # SIGMA_Z up to the error against ground truth or loop closure is right
+        # innovations do not show the drift of a source, so a SIGMA_Z up to the known error is right
         high = max(high, _largest_source_error_m(comparison))
     deviation_factor = max(chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0)
     position_text = (

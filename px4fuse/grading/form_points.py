@@ -288,7 +288,7 @@ def _verdicts_share(answers: Answers, truth: FormTruth) -> float:
     shares = [_ekf2_behaviour_share(answers, truth)]
     for answer, verdict in ((answers.verdict_kf, truth.kf), (answers.verdict_ekf2, truth.ekf2)):
         is_right = answer and answer == verdict.verdict
-        # "consistent" gets half of the points if the reported σ is wrong by a small factor only
+        # "consistent" gets half of the points if σ is wrong by a small factor only
         is_nearly_right = (
             verdict.factor is not None
             and verdict.factor < MIN_FINDING_SIGMA_FACTOR

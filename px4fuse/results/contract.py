@@ -188,7 +188,7 @@ class ComparisonResults(_FlightResults, frozen=True):
     ekf2_replay : Replayed
         Replay of EKF2 from the log, and its agreement with the logged EKF2.
     difference_steps : mapping of axis name to DifferenceSteps
-        Differences between filters in a sequence that changes KF into EKF2, one property at a time.
+        Differences between EKF2 and KF, by filter step.
     causes : tuple of Intervention
         Re-runs with one change each, and how much of an inconsistency each change explains.
     aids : mapping of PX4's name to AidResult
