@@ -99,11 +99,12 @@ def analysis(
         ("clock", "ekf2_model", "loop", "heading", "bias_scale_jump_fit", "smoothing", "coloured"),
         NONE,
     )
-    by_name = {axis.axis.name: axis for axis in axes}
+    by_name = {each.axis.name: each for each in axes}
     return SimpleNamespace(  # type: ignore[return-value]
         flight=SimpleNamespace(log=log, ekf2=ekf2, **flown), source=source, axes=by_name,
-        lines=tuple(axis.axis for axis in axes), segment=SEGMENT, settings=settings, notes=notes,
-        missing=missing, **{"tuning": {}, "difference_steps": {}, "causes": (), **usual, **parts},
+        main=next(iter(axes), axis()), lines=tuple(each.axis for each in axes), segment=SEGMENT,
+        settings=settings, notes=notes, missing=missing,
+        **{"tuning": {}, "difference_steps": {}, "causes": (), "trials": (), **usual, **parts},
     )  # fmt: skip
 
 
@@ -113,7 +114,10 @@ def axis(name: str = "north", **parts: Any) -> Any:
     filters = {
         key: _with_truth(parts.pop(key, NONE), parts.pop(f"{key}_truth", NONE)) for key in FILTERS
     }
-    axis = SimpleNamespace(name=name, label="the aisle" if name == "aisle" else name)
+    axis = SimpleNamespace(
+        name=name, label="the aisle" if name == "aisle" else name,
+        measurement_time_s=np.arange(0.0, 120.0), measurement_m=np.zeros(120),
+    )  # fmt: skip
     return SimpleNamespace(axis=axis, filters=filters, **usual | parts)
 
 

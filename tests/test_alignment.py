@@ -439,7 +439,7 @@ def test_align_almost_periodic_path_warns() -> None:
     alignment, _ = align(flight, uwb_file(flight), frame="enu")
     assert clock_error_s(alignment) < 0.03
     (warning,) = alignment.warnings
-    assert re.match(r"A time offset that differs by [-+]19\.\d s fits nearly as well ", warning)
+    assert re.match(r"A time offset that differs by [-+]19\.\d s fits nearly as well\. ", warning)
 
 
 @pytest.mark.parametrize(("options", "message"), [

@@ -44,4 +44,4 @@ def test_model_missing_imu_samples_states_fraction(shared_logs):
     name = "mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3.ulg"
     found = open_model(read_log(shared_logs / "real" / name))
     assert isinstance(found, Unavailable)
-    assert "30% of the IMU samples are missing" in found.reason
+    assert "23 % of the IMU samples are missing" in found.reason

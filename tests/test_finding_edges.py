@@ -34,7 +34,7 @@ from findings_tools import (
     with_bias,
 )
 
-from px4fuse.comparison import remedy as remedies
+from px4fuse.comparison.trials import Outcome, Trial
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.frame_rotation import HeadingError, HeadingPart
 from px4fuse.filter.frame_rotation import combine_heading_parts as together
@@ -59,6 +59,7 @@ from px4fuse.findings import (
     source_positions,
     source_stamps,
 )
+from px4fuse.findings.cause_grouping import ELSEWHERE, GAP
 from px4fuse.findings.model import fraction_on, spans_with_value, zero_length_spans
 from px4fuse.flight import Columns, FusionRecord, Reset, Unavailable
 from px4fuse.log import Dropout
@@ -115,7 +116,10 @@ def test_by_root_groups_consequences_behind_cause() -> None:
 # ---------------------------------------------------------------- EKF2
 
 
-def test_ekf2_resets_and_dropouts_outside_segment_are_ignored(
+NO_GAP = SimpleNamespace(gaps=())
+
+
+def test_ekf2_resets_outside_segment_are_ignored(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(ekf2_resets, "continuous_state", lambda *_: (None, "resets undone"))
@@ -125,9 +129,37 @@ def test_ekf2_resets_and_dropouts_outside_segment_are_ignored(
         Reset(40.0, "velocity", (9.0, 0.0, 0.0)), Reset(50.0, "position", (0.0, 0.0, 0.0)),
         Reset(110.0, "position", (0.0, 0.0, 1.0)), Reset(110.1, "position", (9.0, 0.0, 0.0)),
     )  # fmt: skip
-    reset, switch = ekf2_resets.detect(analysis(ekf2={"instances": switches, "resets": resets}))
+    one = analysis(ekf2={"instances": switches, "resets": resets}, events=NO_GAP)
+    reset, switch = ekf2_resets.detect(one)
     assert switch.evidence == {"count": 2, "at_s": 10.5}
-    assert reset.evidence == {"count": 2, "largest_m": 5.0, "at_s": 10.5}
+    # the reset of the height alone is not counted
+    assert reset.evidence == {"count": 1, "largest_m": 5.0, "at_s": 10.5, "cause": ELSEWHERE}
+
+
+@pytest.mark.parametrize(
+    ("reset", "gaps", "expected"),
+    [
+        # a height reset within 10 s of take-off is usual
+        (Reset(30.0, "position", (0.0, 0.0, 1.0)), (), None),
+        (Reset(30.1, "position", (0.0, 0.0, 1.0)), (), ("note", ELSEWHERE)),
+        (Reset(19.9, "position", (0.0, 0.0, 1.0)), (), ("note", ELSEWHERE)),
+        (Reset(30.0, "position", (1.0, 0.0, 1.0)), (), ("warning", ELSEWHERE)),
+        # up to 5 s after a gap in the source
+        (Reset(65.0, "position", (1.0, 0.0, 0.0)), ((50.0, 60.0),), ("warning", GAP)),
+        (Reset(65.1, "position", (1.0, 0.0, 0.0)), ((50.0, 60.0),), ("warning", ELSEWHERE)),
+    ],
+)
+def test_ekf2_resets_at_take_off_are_usual_and_gap_is_cause(
+    reset: Reset, gaps: Any, expected: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ekf2_resets, "continuous_state", lambda *_: (None, "resets kept"))
+    one = analysis(ekf2={"instances": (), "resets": (reset,)}, flight={"airborne": ((20.0, 90.0),)},
+                   events=SimpleNamespace(gaps=gaps))  # fmt: skip
+    found = [(each.severity, each.evidence["cause"]) for each in ekf2_resets.detect(one)]
+    assert found == ([] if expected is None else [expected])
+
+
+def test_dropouts_outside_segment_are_ignored() -> None:
     lost = tuple(Dropout(at, 1.0) for at in (8.9, 9.0, 50.0, 110.0, 110.1))
     finding = only(
         recording.detect_dropouts, analysis(log=log(dropouts=(*lost, Dropout(60.0, 0.5))))
@@ -146,10 +178,10 @@ def test_ekf2_not_fusing_severity_follows_share(until_s: float, expected: dict[s
     one = analysis(ekf2=with_fusion((0.0, 1.0), (until_s, 0.0)))
     assert named(ekf2_not_fusing.detect, one) == expected
     for finding in ekf2_not_fusing.detect(one):
-        assert f"only in {until_s - 10.0:.0f} % of the segment" in finding.message
+        assert f"fused the UWB positions only {until_s - 10.0:.0f} % of the time" in finding.title
         if finding.id == "ekf2_fusion_interrupted":
             # earlier releases stop after 7 s
-            assert "EKF2 (v1.14 and later) stops fusion 0.4 s after" in finding.remedy
+            assert "EKF2 (v1.14 and later) stops fusion 0.4 s after" in finding.message
             assert finding.spans_s == ((until_s, 110.0),)
 
 
@@ -171,16 +203,16 @@ UNKNOWN = "The log does not contain the reason"
 @pytest.mark.parametrize(
     ("flight", "reason", "remedy"),
     [
-        (never_fusing(parameters={"EKF2_EV_CTRL": 14.0}), "EKF2_EV_CTRL is 14: bit 0", "to 15."),
+        (never_fusing(parameters={"EKF2_EV_CTRL": 14.0}), "EKF2_EV_CTRL is 14. Bit 0", "to 15."),
         (
             never_fusing(parameters={"EKF2_EV_CTRL": 15.0, "EKF2_AID_MASK": 1.0}),
             UNKNOWN,
             "EKF2_EV_CTRL",
         ),
-        (never_fusing(parameters={"EKF2_AID_MASK": 1.0}), "EKF2_AID_MASK is 1: bit 3", "to 9."),
+        (never_fusing(parameters={"EKF2_AID_MASK": 1.0}), "EKF2_AID_MASK is 1. Bit 3", "to 9."),
         (never_fusing(parameters={"EKF2_AID_MASK": 9.0}), UNKNOWN, "EKF2_EV_CTRL"),
         (never_fusing(2.0), UNKNOWN, "EKF2_EV_CTRL"),  # releases before v1.14 have no limit
-        (never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}), "arrive every 0.50 s", "10 Hz"),
+        (never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}), "they come at 2 Hz", "10 Hz"),
         (
             never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}, origin=LOGGED_BY_EKF2),
             UNKNOWN,
@@ -191,12 +223,12 @@ UNKNOWN = "The log does not contain the reason"
         (never_fusing(age_s=5.0, horizon_s=NONE), UNKNOWN, "Check"),
         (
             never_fusing(age_s=0.31),
-            "arrive 0.31 s after their timestamps, but EKF2 buffers only 0.20 s",
+            "they are 0.31 s old at arrival. EKF2 buffers only 0.20 s",
             "EKF2_DELAY_MAX",
         ),
         (
             never_fusing(age_s=0.28, parameters={"EKF2_EV_DELAY": 50.0}),
-            "arrive 0.33 s",
+            "they are 0.33 s old",
             "EKF2_DELAY_MAX",
         ),
     ],
@@ -204,7 +236,7 @@ UNKNOWN = "The log does not contain the reason"
 def test_ekf2_not_fusing_states_reason_and_action(flight: Any, reason: str, remedy: str) -> None:
     finding = only(ekf2_not_fusing.detect, flight)
     assert finding.severity == "error"
-    assert "in no part of the segment" in finding.message
+    assert finding.title.startswith("EKF2 never fused the UWB positions")
     assert reason in finding.message
     assert remedy in finding.remedy
 
@@ -220,14 +252,14 @@ def rejected(count: int, of: int) -> pd.DataFrame:
     [(1, 100, "warning"), (1, 101, None), (20, 100, "error"), (19, 100, "warning")],
 )
 def test_ekf2_rejecting_severity_follows_share(count: int, of: int, expected: str | None) -> None:
-    """EKF2 rejects the horizontal vector, so the first axis is used."""
+    """EKF2 rejects the horizontal vector, so the main axis is used."""
     axes = axis("north", ekf2_innovations=rejected(count, of)), axis("east")
     axes[1].ekf2_innovations = rejected(9, 9)
     level = analysis(ekf2={"gate": 5.0}, axes=axes)
     down = analysis(ekf2={"gate": 5.0}, axes=(axis("down", ekf2_innovations=rejected(count, of)),))
     for one, quantity, remedy in (
-        (level, "for horizontal position (beyond 5 √S)", "no topic for it."),
-        (down, "for height", "Widen EKF2_EVP_GATE last."),
+        (level, "of the positions. Their innovations are beyond its gate of 5 √S", CHECK_FIRST),
+        (down, "of the heights", CHECK_FIRST),
     ):
         assert severity(ekf2_rejecting.detect, one) == expected
         for finding in ekf2_rejecting.detect(one):
@@ -236,14 +268,40 @@ def test_ekf2_rejecting_severity_follows_share(count: int, of: int, expected: st
             assert finding.remedy.endswith(remedy)
 
 
+def test_ekf2_rejecting_action_is_rerun_with_half_the_rejections() -> None:
+    frame = rejected(20, 100)
+    for after, improves, action in (
+        (0.09, True, "Set EKF2_EVP_NOISE to 0.1 m."), (0.1, True, CHECK_FIRST),
+        (0.09, False, CHECK_FIRST),
+    ):  # fmt: skip
+        trial = Trial(
+            filter="ekf2", kinds=("noise",), change={"EKF2_EVP_NOISE": 0.1},
+            before=Outcome(nis_mean=9.0, rejected_fraction=0.2),
+            after=Outcome(nis_mean=1.0 if improves else 8.0, rejected_fraction=after),
+        )  # fmt: skip
+        one = analysis(ekf2={"gate": 5.0}, axes=(axis("north", ekf2_innovations=frame),),
+                       trials=(trial,))  # fmt: skip
+        assert only(ekf2_rejecting.detect, one).remedy == action
+
+
+CHECK_FIRST = (
+    "Check the line of sight, EKF2_EV_DELAY and EKF2_EVP_NOISE first. Increase EKF2_EVP_GATE last."
+)
+
+
 # ---------------------------------------------------------------- errors and truth
 
 
-def test_hidden_errors_report_worst_axis_and_action() -> None:
+def test_error_beyond_sigma_reports_worst_axis_and_action() -> None:
     ekf2 = axis("east", ekf2=statement(0.49), ekf2_truth=against_truth(25.0, 1.0))
-    finding = only(hidden_errors.detect, analysis(axes=(hiding(), ekf2)))
-    assert "although the innovations are small" in finding.message
+    finding = only(hidden_errors.detect, analysis(axes=(axis(), hiding(name="down"), ekf2)))
+    assert finding.title == (
+        "Position errors are 2.0 (KF) and 5.0 (EKF2) times σ, which innovations do not show"
+    )
     assert finding.evidence["filter"] == "ekf2"
+    # the main axis is preferred
+    main = only(hidden_errors.detect, analysis(axes=(hiding(), ekf2)))
+    assert main.evidence["filter"] == "kf"
     assert finding.evidence["ekf2_sigma_p_m"] == pytest.approx(0.2)
     assert finding.remedy == hidden_errors.SHARED_REMEDY
     # the error is EKF2's own only if the RMSE of KF is below 0.7 of it
@@ -262,7 +320,9 @@ def test_hidden_errors_report_worst_axis_and_action() -> None:
 
 @pytest.mark.parametrize(("left", "frame"), [(0.45, True), (0.55, False)])
 @pytest.mark.parametrize("drifts", [False, True])
-def test_hidden_errors_report_rmse_after_alignment(left: float, frame: bool, drifts: bool) -> None:
+def test_error_beyond_sigma_reports_rmse_after_alignment(
+    left: float, frame: bool, drifts: bool
+) -> None:
     """Circle of 5 m with a shift and an error that changes its sign with each sample."""
     time = np.arange(20.0, 100.0, 0.1)
     angle = 0.2 * np.pi * time
@@ -281,8 +341,13 @@ def test_hidden_errors_report_rmse_after_alignment(left: float, frame: bool, dri
     finding = only(hidden_errors.detect, analysis(axes=tuple(axes), source=track))
     assert finding.evidence["position_rmse_horizontal_m"] == pytest.approx(1.0, rel=0.01)
     assert finding.evidence["position_rmse_aligned_m"] == pytest.approx(left, rel=0.01)
-    assert ("the frame is misaligned" in finding.message) is frame
-    assert ("the source drifts" in finding.message) is (drifts and not frame)
+    assert ("The frame is misaligned: horizontal position RMSE 1.00 m" in finding.message) is frame
+    assert (finding.id == "source_drift") is (drifts and not frame)
+    if finding.id == "source_drift":
+        assert finding.message.startswith(
+            "VIO drifts: horizontal position RMSE 0.55 m after the best alignment. Before the "
+            "alignment: 1.00 m."
+        )
     assert (finding.remedy == hidden_errors.FRAME_REMEDY) is frame
 
 
@@ -312,7 +377,7 @@ def test_imu_gap_spans_are_found_inside_the_segment(ends: Any, segment: Any, spa
 def test_imu_rates_below_98_percent_are_reported(imu_hz, attitude_hz, expected) -> None:
     flight = {"imu": at_rate(imu_hz), "attitude": at_rate(attitude_hz)}
     for info, action in (
-        (log(), "Add 16 to SDLOG_PROFILE"),
+        (log(), "Set SDLOG_PROFILE to 17 "),
         (log(format="MAVLink tlog", has_ulog=False), "at {:g} Hz (MAV_CMD_SET"),
         (log(format="MAVLink tlog"), "at {0:g} Hz (PX4 console: mavlink stream"),
     ):
@@ -347,7 +412,7 @@ def test_source_as_sent_logger_limit_is_reported(
         assert [one.id for one in found] == ["source_not_logged", "source_rate_limited_by_logger"][
             : 1 + decimated
         ]
-        assert "lacks vehicle_visual_odometry (it was disabled)" in found[0].message
+        assert "vehicle_visual_odometry: it was disabled" in found[0].message
         assert all("SDLOG_PROFILE to 130 " in each.remedy for each in found)
         for each in found[1:]:
             assert rate_hz == pytest.approx(each.evidence["logger_limit_hz"], rel=0.35)
@@ -360,9 +425,12 @@ def test_source_as_sent_logger_limit_is_reported(
 
 
 @pytest.mark.parametrize(("rate_hz", "least_s"), [(2.0, 2.5), (10.0, 1.0)])
-def test_gaps_above_five_intervals_and_1_s_are_reported(rate_hz: float, least_s: float) -> None:
+def test_gaps_above_five_intervals_and_1_s_are_reported(
+    rate_hz: float, least_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The limit is five intervals, but at least 1 s."""
     for gap_s, there in ((least_s, False), (least_s + 0.25, True)):
+        monkeypatch.setattr(source_intervals, "_state_errors_after", lambda *_: "Errors.")
         time = np.concatenate([np.arange(10.0, 20.5, 0.5), [20.0 + gap_s, 20.5 + gap_s]])
         one = analysis(axes=(axis(),), source=source(rate_hz=rate_hz))
         one.lines[0].measurement_time_s = time
@@ -389,7 +457,7 @@ def test_placement_conflict_is_error_and_doubt_is_warning() -> None:
     )
     frame, yaw = source_frame.detect_uncertain_alignment(analysis(source=source(alignment=placed)))
     assert (frame.severity, yaw.severity) == ("error", "warning")
-    assert frame.message == "uwb: As good as ned: give --position-frame ned."
+    assert frame.message == "As good as ned: give --position-frame ned."
 
 
 @pytest.mark.parametrize(("until_s", "expected"), [(60.0, "warning"), (60.1, "note")])
@@ -398,7 +466,7 @@ def test_frame_not_north_severity_depends_on_fused_yaw(until_s: float, expected:
     one = analysis(source=frd, ekf2=with_fusion((0.0, 1.0), (until_s, 0.0), column="yaw"))
     finding = only(source_frame.detect, one)
     assert finding.severity == expected
-    assert ("EKF2 fused its yaw" in finding.message) is (expected == "note")
+    assert ("EKF2 fused the yaw of UWB" in finding.message) is (expected == "note")
     assert ("Send the position in NED" in finding.remedy) is (expected == "warning")
     assert severity(source_frame.detect, analysis(source=frd)) == "warning"
     assert severity(source_frame.detect, analysis()) is None
@@ -406,7 +474,7 @@ def test_frame_not_north_severity_depends_on_fused_yaw(until_s: float, expected:
         one = analysis(source=frd, ekf2={"fusing": NONE}, log=log(has_ulog=has_ulog))
         finding = only(source_frame.detect, one)
         assert finding.severity == "note"
-        assert ("The ULog shows" in finding.remedy) is has_ulog
+        assert ("Add the ULog" in finding.remedy) is has_ulog
 
 
 def heading_error(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> HeadingError:
@@ -417,19 +485,23 @@ def heading_error(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> He
 def test_misalignment_reports_interval_and_opposite_rotation() -> None:
     finding = only(source_frame.detect, analysis(heading=heading_error(20.0, sigma_deg=2.0)))
     assert finding.id == "source_frame_misaligned"
-    assert "rotated by +20° ± 4° (clockwise" in finding.message
+    assert finding.title == "UWB positions are rotated by +20° relative to the IMU"
+    assert "± 4°; the rotation is clockwise" in finding.message
     assert "Rotate the positions by -20°" in finding.remedy
     aligned = source(name="estimator_visual_odometry_aligned")
-    for has_ulog in (True, False):
-        one = analysis(heading=heading_error(20.0), source=aligned, log=log(has_ulog=has_ulog))
-        assert only(source_frame.detect, one).id == "ekf2_heading_error"
-        assert ("EKF2_EV_CTRL bit 3" in only(source_frame.detect, one).remedy) is has_ulog
+    one = analysis(heading=heading_error(20.0), source=aligned)
+    assert only(source_frame.detect, one).id == "ekf2_heading_error"
 
 
 def test_misalignment_heading_drift_reports_both_ends() -> None:
-    finding = only(source_frame.detect, analysis(heading=heading_error(2.0, 30.0, p=0.0)))
+    drifting = heading_error(2.0, 30.0, p=0.0)
+    for has_ulog in (True, False):
+        one = analysis(heading=drifting, log=log(has_ulog=has_ulog))
+        finding = only(source_frame.detect, one)
+        assert ("EKF2_EV_CTRL bit 3" in finding.remedy) is has_ulog
+    assert finding.title == "EKF2's heading drifts by +28° relative to the UWB positions"
     assert finding.id == "ekf2_heading_error"
-    assert "+2° from 0 to 10 s, +30° from 10 to 20 s" in finding.message
+    assert "+2° from 0 to 10 s and +30° from 10 to 20 s" in finding.message
     assert "by the positions and the IMU" in finding.message
     assert (finding.evidence["from_deg"], finding.evidence["p"]) == (2.0, 1e-300)
 
@@ -437,9 +509,11 @@ def test_misalignment_heading_drift_reports_both_ends() -> None:
 # ---------------------------------------------------------------- limits
 
 
-def with_innovations(logged: int) -> Any:
-    frame = pd.DataFrame(index=range(logged))
-    axes = (axis(ekf2_innovations=frame, replay=SimpleNamespace(updates=range(100))),)
+def with_innovations(logged: int, nis: float | None = None) -> Any:
+    frame, filters = pd.DataFrame(index=range(logged)), {}
+    if nis is not None:
+        filters = {"ekf2": statement(nis)}
+    axes = (axis(ekf2_innovations=frame, replay=SimpleNamespace(updates=range(100)), **filters),)
     return analysis(ekf2={"innovation_topics": ("topic",)}, axes=axes)
 
 
@@ -457,6 +531,11 @@ FUSED, FRAME = ekf2_not_fusing.detect, source_frame.detect
 EDGES = [
     (missing.detect_missing_innovations, with_innovations(75), None),
     (missing.detect_missing_innovations, with_innovations(74), "note"),
+    # the interval of √(mean NIS) reaches from 0.91 to 1.12 times its value
+    *(
+        (missing.detect_missing_innovations, with_innovations(74, nis), expected)
+        for nis, expected in ((1.0, None), (0.7, "note"), (0.4, None), (1.6, "note"), (9.0, None))
+    ),
     # motion capture is an independent reference if EKF2 fuses external vision
     (FUSED, motion_capture_flight("vehicle_mocap_odometry", 0.0), "warning"),
     (FUSED, motion_capture_flight("vehicle_mocap_odometry", 1.0), None),
@@ -578,11 +657,6 @@ def stating(reported: float, noise: float, interval: Any = None, **parts: Any) -
 def delayed(delay_ms: float | None, clock: Any, **parts: Any) -> Any:
     flown = {} if delay_ms is None else {"EKF2_EV_DELAY": delay_ms}
     return analysis(log=log(parameters=flown), clock=clock, **parts)
-
-
-@pytest.fixture(autouse=True)
-def no_truth(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remedies, "filter_errors_m", lambda *_: None)
 
 
 BIAS, JUMPS, SCALE = (
@@ -776,10 +850,12 @@ def test_jumps_report_count_and_largest() -> None:
 def test_scale_and_reported_variance_state_direction() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
         finding = only(source_positions.detect_scale_error, scaled(signed))
-        assert f"20 % too {word} (± 2 %)" in finding.message
+        assert finding.title == f"UWB distances are 20 % too {word}"
+        assert "± 2 % (95 %)" in finding.message
     for reported, word in ((2.0, "large"), (0.5, "small")):
         finding = only(source_positions.detect_wrong_variance, stating(reported, 1.0))
-        assert f"4 times too {word}{', unless it covers' * (word == 'large')}" in finding.message
+        assert finding.title == f"The variance that UWB reports is 4 times too {word}"
+        assert ("may cover time-correlated errors" in finding.message) is (word == "large")
 
 
 @pytest.mark.parametrize(("error_m", "expected"), [(1.41, "error"), (1.42, None)])
@@ -797,17 +873,46 @@ def test_stated_variance_covering_true_errors_is_accepted(error_m, expected):
 
 
 @pytest.mark.parametrize(
-    ("jumps", "count", "times_text"),
+    ("jumps", "times_s"),
     [
-        ((), 5, "; first at 18.9, 19.0, 25.9 s)"),
-        ((jump(1.0, 0.0, at_s=20.0),), 3, "; at 18.9, 26.0, 27.0 s)"),
+        ((), (18.9, 19.0, 25.9, 26.0, 27.0)),
+        ((jump(1.0, 0.0, at_s=20.0),), (18.9, 26.0, 27.0)),
     ],
 )
-def test_outliers_next_to_a_jump_are_ignored(jumps, count, times_text):
+def test_outliers_next_to_a_jump_are_ignored(jumps, times_s):
     outliers = tuned(outlier_time_s=np.array([18.9, 19.0, 25.9, 26.0, 27.0]), count=100)
     finding = only(source_positions.detect_outliers, jumping(*jumps, tuning=outliers))
-    assert (finding.evidence["count"], finding.evidence["first_s"]) == (count, 18.9)
-    assert times_text in finding.message
+    assert finding.evidence["count"] == len(times_s)
+    assert finding.spans_s == tuple((time_s, time_s) for time_s in times_s)
+
+
+def test_outlier_sizes_are_distances_to_truth_or_neighbours() -> None:
+    time = np.arange(0.0, 120.0)
+    truth = pd.DataFrame({"position_m": 0.0 * time}, index=time)
+    for known, north_m, reference in (
+        (truth, 3.0, "ground truth"),
+        (NONE, 2.0, "the positions around them"),
+    ):
+        axes = tuple(axis(name, truth=known) for name in ("north", "east"))
+        axes[0].axis.measurement_m = np.ones(120)
+        axes[0].axis.measurement_m[[20, 30, 40]] = 3.0
+        axes[1].axis.measurement_m[30] = 4.0
+        outliers = tuned(outlier_time_s=np.array([20.0, 30.0, 40.0]), count=120)
+        finding = only(source_positions.detect_outliers, analysis(axes=axes, tuning=outliers))
+        assert finding.evidence["max_m"] == pytest.approx(np.hypot(north_m, 4.0))
+        assert finding.title.startswith("3 of 120 UWB positions are outliers of up to ")
+        assert f"distance of {north_m:.2f} m to {reference}" in finding.message
+
+
+def test_outliers_state_number_that_ekf2_rejected() -> None:
+    innovations = pd.DataFrame({"rejected": np.zeros(120)}, index=np.arange(0.05, 120.0))
+    innovations.iloc[[20, 40, 50], 0] = 1.0
+    outliers = tuned(outlier_time_s=np.array([20.0, 30.0, 40.0]), count=120)
+    one = analysis(axes=(axis(ekf2_innovations=innovations),), tuning=outliers)
+    finding = only(source_positions.detect_outliers, one)
+    assert finding.message.endswith("EKF2's gate rejected 2 of the 3.")
+    one.main.ekf2_innovations = innovations[::2]
+    assert "gate rejected" not in only(source_positions.detect_outliers, one).message
 
 
 # ---------------------------------------------------------------- clock and delay
@@ -818,13 +923,16 @@ APPLIED = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0, clock_offset_s=-0.05)
 def test_clock_offset_action_includes_offset_in_use() -> None:
     one = analysis(clock=late(-0.1, applied_s=-0.05), settings=APPLIED)
     finding = only(source_clock.detect, one)
-    assert "0.100 s late relative to the IMU (95 % 0.080 to 0.110 s)" in finding.message
+    assert finding.title == "Position timestamps are 0.10 s late"
+    assert "0.100 s (95 % 0.080 to 0.110 s)" in finding.message
     assert "a position error of 0.10 m" in finding.message
-    assert "--clock-offset -0.150." in finding.remedy
+    assert finding.remedy == "Subtract 0.100 s from the timestamp (usec) of each position."
     expected = {"offset_s": -0.15, "interval_low_s": -0.16, "interval_high_s": -0.13}
     assert finding.evidence == pytest.approx(expected)
     early = only(source_clock.detect, analysis(clock=late(0.1)))
-    assert "0.100 s early relative to the IMU (95 % 0.090 to 0.120 s)" in early.message
+    assert early.title == "Position timestamps are 0.10 s early"
+    assert "0.100 s (95 % 0.090 to 0.120 s)" in early.message
+    assert early.remedy.startswith("Add 0.100 s to ")
     placed = source(alignment=SimpleNamespace(clock_offset_s=2.0))
     finding = only(source_clock.detect, analysis(clock=late(0.1), source=placed))
     assert "--clock-offset 2.100." in finding.remedy
@@ -835,20 +943,21 @@ def test_clock_offset_change_below_p_limit_is_reported(p: float | None, there: b
     found = only(source_clock.detect, analysis(clock=late(0.1, change_p_value=p)))
     assert found.id == ("source_time_offset_changes" if there else "source_time_offset")
     if there:
-        assert "from -0.10 s at the beginning to +0.30 s at the end" in found.message
+        assert "from -0.10 s to +0.30 s" in found.title
         assert found.evidence["change_p_value"] == p
 
 
 @pytest.mark.parametrize(("after_m", "there"), [(1.005, True), (1.0051, False), (0.5, True)])
-def test_clock_offset_contradicted_by_truth_has_no_finding(monkeypatch, after_m, there) -> None:
-    def errors_m(_: Any, shifted: Settings) -> tuple[float, float]:
-        assert shifted.clock_offset_s == 0.123  # rounded as printed
-        return 1.0, after_m
+def test_clock_offset_contradicted_by_truth_has_no_finding(after_m, there) -> None:
+    shifted = rerun("kf", "time offset", {"clock_offset_s": 0.123}, after_m)
+    one = analysis(clock=late(0.12345), trials=(shifted,))
+    assert severity(source_clock.detect, one) == ("error" if there else None)
 
-    monkeypatch.setattr(remedies, "filter_errors_m", errors_m)
-    found = list(source_clock.detect(analysis(clock=late(0.12345))))
-    effect = f"KF position RMSE 1.000 → {after_m:.3f} m (re-run)"
-    assert [effect in each.remedy for each in found] == [True] * there
+
+def rerun(owner: Any, kind: str, change: dict[str, float], after_m: float) -> Trial:
+    """Make a re-run that changes the position RMSE from 1 m."""
+    before, after = Outcome(position_rmse_m=1.0), Outcome(position_rmse_m=after_m)
+    return Trial(filter=owner, kinds=(kind,), change=change, before=before, after=after)
 
 
 @pytest.mark.parametrize(
@@ -858,40 +967,40 @@ def test_clock_offset_contradicted_by_truth_has_no_finding(monkeypatch, after_m,
         (
             late(-0.1, applied_s=-0.02),
             0.0,
-            "the estimated delay is 120 ms (95 % 100 to 130 ms)",
-            "Set EKF2_EV_DELAY to 120 ms. ",
+            "the positions are 120 ms late. The 95 % interval is 100 to 130 ms",
+            "Check EKF2_EV_DELAY.",
         ),
         (
             late(0.0, interval_s=(-0.01, 0.01)),
             50.0,
-            "is not significant (95 % -10 to 10 ms)",
-            "Set EKF2_EV_DELAY to 0 ms. ",
+            "no significant delay. The 95 % interval is -10 to 10 ms",
+            "Check EKF2_EV_DELAY.",
         ),
         (
             late(-0.02, interval_s=(-0.04, 0.0)),
             100.0,
-            "is not significant",
-            "EKF2_EV_DELAY to 0 ms",
+            "no significant delay",
+            "Check EKF2_EV_DELAY.",
         ),
         (
             late(0.02, interval_s=(0.0, 0.04)),
             100.0,
-            "not significant (95 % -40 to 0 ms)",
-            "DELAY to 0 ms",
+            "no significant delay. The 95 % interval is -40 to 0 ms",
+            "Check EKF2_EV_DELAY.",
         ),
         (
             late(0.05, interval_s=(0.04, 0.07)),
             0.0,
-            "50 ms early (95 % 40 to 70 ms)",
             "does not correct early timestamps",
+            "Correct the timestamps at the sender.",
         ),
         (
             late(-0.301, interval_s=(-0.4, -0.2)),
             0.0,
-            "delay is 301 ms",
             "PX4 allows at most 300 ms",
+            "Correct the timestamps at the sender.",
         ),
-        (late(-0.3, interval_s=(-0.4, -0.2)), 0.0, "delay is 300 ms", "EKF2_EV_DELAY to 300 ms"),
+        (late(-0.3, interval_s=(-0.4, -0.2)), 0.0, "300 ms late", "Check EKF2_EV_DELAY."),
     ],
 )
 def test_delay_remedy_stays_in_px4_range(
@@ -899,8 +1008,26 @@ def test_delay_remedy_stays_in_px4_range(
 ) -> None:
     finding = only(wrong_delay, delayed(delay_ms, clock))
     assert text in finding.message
-    assert remedy in finding.remedy
+    assert finding.remedy == remedy
     assert finding.evidence["asked_ms"] == pytest.approx(-1e3 * clock.offset_s)
+
+
+@pytest.mark.parametrize(
+    ("after_m", "remedy"),
+    [(0.5, "Set EKF2_EV_DELAY to 120 ms."), (1.0, "Correct the timestamps at the sender.")],
+)
+def test_delay_is_named_only_if_its_rerun_improves(after_m: float, remedy: str) -> None:
+    trials = (rerun("ekf2", "delay", {"EKF2_EV_DELAY": 120.0}, after_m),)
+    finding = only(wrong_delay, delayed(0.0, late(-0.12), trials=trials))
+    assert finding.remedy == remedy
+
+
+def test_time_offset_names_the_delay_of_a_gnss_receiver() -> None:
+    parameters = {"EKF2_GPS_DELAY": 110.0}
+    one = analysis(clock=late(-0.05), source=source(origin=GNSS), log=log(parameters=parameters))
+    finding = only(source_clock.detect, one)
+    assert finding.message.endswith(" EKF2_GPS_DELAY is 110 ms; the estimate is 160 ms.")
+    assert finding.remedy == "Check the delay of the GNSS receiver (EKF2_GPS_DELAY)."
 
 
 @pytest.mark.parametrize(("detect", "one", "expected"), EDGES + SOURCE_EDGES)

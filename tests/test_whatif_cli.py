@@ -154,7 +154,7 @@ class TestFlownFlights:
             ("simulated/v1.16.1_no_uwb", "innovations do not show the slow errors of"),
             ("gps/v1.13.3_gps_profile1", "below the rate that EKF2 fused"),
             ("real/mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3",
-             "30% of the IMU samples are missing"),
+             "23 % of the IMU samples are missing"),
             ("real/vladimireganov_ROS_PX4_MOCAP_square2", "EKF2 may have fused more samples"),
         ],
     )  # fmt: skip

@@ -271,7 +271,7 @@ def _find_height_conflicts(flight: Flight, aligned_samples: pd.DataFrame) -> Ite
         and np.corrcoef(file_down_m, ekf2_down_m)[0, 1] <= -MIN_MIRRORED_CORRELATION
     ):
         yield (
-            "The heights of file and EKF2 change in opposite directions: the z axis of the file is "
+            "The heights of file and EKF2 change in opposite directions. The z axis of the file is "
             "inverted. Give another --position-frame."
         )
 
@@ -298,7 +298,7 @@ def _find_frame_conflicts(
         shift_m = np.hypot(*match.free_yaw_fit.origin_m[:2])
         shift_text = f" and shifted by {shift_m:.1f} m" if comparison else ""
         yield (
-            f"The frame of the file is rotated by {yaw_deg:.1f}°{shift_text} relative to the "
+            f"The frame of the file is rotated by {yaw_deg:.1f}°{shift_text} against the "
             f"{name}. Give --position-yaw auto."
         )
 
@@ -317,19 +317,20 @@ def _find_warnings(
         name, fit = match.reference.name, match.time_offset_fit
         if fit.concordance < matching.GOOD_CONCORDANCE[name]:
             yield (
-                f"The position file matches the {name} only roughly (concordance correlation "
-                f"{fit.concordance:.2f})."
+                f"The position file matches the {name} only roughly. The concordance "
+                f"correlation is {fit.concordance:.2f}."
             )
         if fit.second_peak_ratio < MAX_SIMILAR_RESIDUAL_RATIO[name]:
             yield (
-                f"A time offset that differs by {fit.second_peak_s:+.1f} s fits nearly as well "
-                f"(residual {fit.second_peak_ratio:.1f} times larger). If the estimated offset is "
-                "wrong, give --clock-offset SECONDS."
+                f"A time offset that differs by {fit.second_peak_s:+.1f} s fits nearly as well. "
+                f"Its residual is {fit.second_peak_ratio:.1f} times larger. If the estimated "
+                "offset is wrong, give --clock-offset SECONDS."
             )
         if is_yaw_free and name == IMU:
             yield (
-                "With the IMU as reference the yaw is accurate to a few degrees (1° to 6° on "
-                "simulated flights). The origin of the file's frame is unknown and set to 0."
+                "With the IMU as reference the yaw is accurate to a few degrees. On simulated "
+                "flights the error is 1° to 6°. The origin of the file's frame is unknown and set "
+                "to 0."
             )
     if not is_yaw_free and correlation is not None and correlation < MIN_CONCORDANCE[EKF2_POSITION]:
         yield (

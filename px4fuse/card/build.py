@@ -10,7 +10,6 @@ from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.card.causes import (
     FILTER_NAMES,
     RankedCause,
-    improvement,
     make_cause,
     make_plain_cause,
     rank_causes,
@@ -33,6 +32,7 @@ from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.card.verdicts import verdicts as make_verdicts
 from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth
 from px4fuse.comparison.remedy import aid_of
+from px4fuse.comparison.trials import improvement
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning

@@ -325,6 +325,15 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     )
 
 
+def lost_imu_fraction(time_s: Array) -> float:
+    """Return the fraction of the IMU samples that the log lacks, outside gaps."""
+    intervals = np.diff(time_s)
+    regular_intervals = intervals[intervals <= IMU_GAP_S]
+    lost_counts = np.rint(regular_intervals / np.median(intervals)) - 1.0
+    lost_count = lost_counts.clip(0.0).sum()
+    return float(lost_count / (lost_count + len(time_s)))
+
+
 def _missing_imu(time_s: Array) -> Unavailable | None:
     """Return Unavailable if IMU samples at these times are too few for predictions."""
     intervals = np.diff(time_s)
@@ -335,16 +344,13 @@ def _missing_imu(time_s: Array) -> Unavailable | None:
             f"the IMU is logged at {1.0 / interval:.0f} Hz, below EKF2's prediction rate",
             "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate.",
         )
-    regular_intervals = intervals[intervals <= IMU_GAP_S]
-    lost_fraction = float(
-        (np.rint(regular_intervals / interval) - 1.0).clip(0.0).sum() / len(time_s)
-    )
+    lost_fraction = lost_imu_fraction(time_s)
     return (
         None
         if lost_fraction <= MAX_LOST_SHARE
         else Unavailable(
             "EKF2 replay",
-            f"{lost_fraction:.0%} of the IMU samples are missing from the log",
+            f"{100.0 * lost_fraction:.0f} % of the IMU samples are missing from the log",
             "Use a faster SD card, or log fewer topics (SDLOG_PROFILE).",
         )
     )

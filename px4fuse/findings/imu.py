@@ -4,9 +4,18 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
+from px4fuse.ekf2.inputs import MAX_LOST_SHARE, lost_imu_fraction
 from px4fuse.filter.hypotheses import MIN_BIAS_M_S2, BiasScaleJumpFit
 from px4fuse.filter.signals import Segment, cut_to_segment, imu_gaps
-from px4fuse.findings.model import MIN_SPAN_S, Findings, error, finding, warning
+from px4fuse.findings.missing import DEFAULT_PROFILE, VISION_PROFILE_BIT
+from px4fuse.findings.model import (
+    MIN_SPAN_S,
+    Findings,
+    error,
+    finding,
+    format_percent,
+    warning,
+)
 from px4fuse.flight import Columns, Ekf2, Flight, sample_rate
 from px4fuse.record import Span
 
@@ -17,6 +26,7 @@ MIN_IMU_RATE_HZ = 50.0  # Hz; 5 IMU samples per DT of 0.1 s, and a margin agains
 MIN_ATTITUDE_RATE_HZ = 10.0  # Hz; tilt can be interpolated over 0.1 s; PX4 logs 20 Hz by default
 MAX_CLIPPED_S = 0.1  # s; one prediction step; a touch-down clips one or two samples
 MIN_CLIPPING_PAUSE_S = 2.0  # s; clipped samples after a longer pause are a separate span
+HIGH_RATE_BIT = 16  # SDLOG_PROFILE bit 4, logged_topics.cpp
 RATE_MARGIN = 0.98  # measured stream rates are slightly below the requested rate
 
 
@@ -25,6 +35,7 @@ def detect(analysis: Analysis) -> Findings:
     yield from detect_tumbling(analysis)
     yield from detect_bias(analysis)
     yield from detect_clipping(analysis)
+    yield from detect_missing_imu_samples(analysis)
     yield from detect_imu_gaps(analysis)
     yield from detect_low_rates(analysis.flight)
 
@@ -40,21 +51,20 @@ def detect_bias(analysis: Analysis) -> Findings:
         forward, right, size = fit.forward_bias, fit.right_bias, fit.bias.value
         message = (
             f"The accelerometer is biased by {forward.value:+.2f} m/s² forward and "
-            f"{right.value:+.2f} m/s² right. The bias is estimated from the positions "
-            f"(± {1.96 * forward.sigma:.2f} m/s²); a tilt error of "
-            f"{size * TILT_DEG_PER_M_S2:.1f}° has the same effect. KF has no state for it."
+            f"{right.value:+.2f} m/s² right. Estimated from the positions "
+            f"(± {1.96 * forward.sigma:.2f} m/s², 95 %); a tilt error of "
+            f"{size * TILT_DEG_PER_M_S2:.1f}° has the same effect. KF has no state for it"
         )
         if ekf2_bias is not None:
             message += (
-                f" EKF2 estimates {ekf2_bias[0]:+.2f} m/s² forward and {ekf2_bias[1]:+.2f} m/s² "
-                "right."
+                f"; EKF2 estimates {ekf2_bias[0]:+.2f} m/s² forward and {ekf2_bias[1]:+.2f} m/s² "
+                "right"
             )
         yield finding(
             "error" if size >= BIAS_ERROR_M_S2 else "warning",
             "accelerometer_bias",
-            message,
-            "Calibrate the accelerometers and the level horizon at the temperature of the flight. "
-            "A larger SIGMA_A only hides the bias.",
+            f"{message}.",
+            "Calibrate the accelerometers and the level horizon at the temperature of the flight.",
             {"bias_m_s2": size, "sigma_m_s2": fit.bias.sigma},
         )
     elif ekf2_bias is not None:
@@ -65,9 +75,9 @@ def detect_bias(analysis: Analysis) -> Findings:
         if size >= MIN_BIAS_M_S2:
             yield warning(
                 "accelerometer_bias",
-                f"EKF2 estimates an accelerometer bias of {size:.2f} m/s² ({ekf2_bias[0]:+.2f} "
-                f"forward, {ekf2_bias[1]:+.2f} right, {ekf2_bias[2]:+.2f} down). KF has no state "
-                "for it and needs a larger SIGMA_A.",
+                f"EKF2 estimates an accelerometer bias of {size:.2f} m/s². It is "
+                f"{ekf2_bias[0]:+.2f} m/s² forward, {ekf2_bias[1]:+.2f} right and "
+                f"{ekf2_bias[2]:+.2f} down. KF has no state for it.",
                 "Calibrate the accelerometers at the temperature of the flight.",
                 {"bias_m_s2": size},
             )
@@ -88,10 +98,9 @@ def detect_tumbling(analysis: Analysis) -> Findings:
         end_s = max(spans[0][0] - 1.0, 0.0)
         yield error(
             "attitude_failure",
-            "Roll or pitch exceeded the limits of PX4's failure detector (FD_FAIL_R, FD_FAIL_P) at "
-            f"{spans[0][0]:.1f} s. Data after that time do not represent normal flight.",
-            f"Analyse only the time before: --end {end_s:.1f}. Check the other findings for the "
-            "cause.",
+            f"Roll or pitch exceeded PX4's failure-detector limits at {spans[0][0]:.1f} s. "
+            "Data after that time do not represent normal flight (FD_FAIL_R, FD_FAIL_P).",
+            f"Analyse only the time before (--end {end_s:.1f}).",
             {"total_s": sum(end - start for start, end in spans)},
             spans,
         )
@@ -109,7 +118,7 @@ def detect_clipping(analysis: Analysis) -> Findings:
         bursts = np.split(time_s, np.flatnonzero(np.diff(time_s) > MIN_CLIPPING_PAUSE_S) + 1)
         yield warning(
             "accelerometer_clipping",
-            f"The accelerometer was clipped in {len(time_s)} samples ({total_s:.2f} s). Motion "
+            f"The accelerometer was clipped for {total_s:.2f} s ({len(time_s)} samples). Motion "
             "beyond its range is lost. Height and vertical velocity are affected first, and the "
             "error looks like a bias.",
             "Check propellers, motors and mounting for vibration or impacts. Analyse a segment "
@@ -127,13 +136,36 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
         is_mavlink = analysis.flight.log.format.startswith("MAVLink")
         yield warning(
             "imu_gap",
-            f"IMU samples are missing for {gap_s:.2f} s of the segment. In the gap KF increases Q "
-            "to the variance of the measured acceleration.",
-            f"{'Record on a link without message loss' if is_mavlink else 'Use a faster SD card'}, "
-            "or analyse a segment without the gap (--start, --end).",
+            f"No IMU samples for {gap_s:.2f} s. In the gap KF increases Q to the variance of the "
+            "measured acceleration.",
+            f"{'Record on a link without message loss' if is_mavlink else 'Use a faster SD card'}. "
+            "Or analyse a segment without the gap (--start, --end).",
             {"total_s": gap_s},
             _gap_spans(imu, analysis.segment) if isinstance(imu, pd.DataFrame) else (),
         )
+
+
+def detect_missing_imu_samples(analysis: Analysis) -> Findings:
+    """Detect single IMU samples that the logger lost all over the flight."""
+    imu, log = analysis.flight.imu, analysis.flight.log
+    if not isinstance(imu, pd.DataFrame) or log.format.startswith("MAVLink"):
+        return
+    samples = cut_to_segment(imu, analysis.segment)
+    lost_fraction = lost_imu_fraction(samples.index.to_numpy()) if len(samples) > 1 else 0.0
+    if lost_fraction <= MAX_LOST_SHARE:
+        return
+    profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE))
+    action = "Use a faster SD card."
+    if other_topics := profile & ~(DEFAULT_PROFILE | VISION_PROFILE_BIT):
+        action = f"Use a faster SD card, or set SDLOG_PROFILE to {profile ^ other_topics}."
+    yield warning(
+        "imu_samples_missing",
+        f"{format_percent(lost_fraction)} of the IMU samples are missing from the log. The logger "
+        "lost single samples all over the flight. KF raises its process noise in gaps. EKF2 cannot "
+        "be replayed, so no change of a parameter can be predicted.",
+        action,
+        {"lost_fraction": lost_fraction, "sdlog_profile": profile},
+    )
 
 
 def _gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
@@ -155,14 +187,15 @@ def is_rate_too_low(samples: pd.DataFrame, needed_hz: float) -> bool:
 def detect_low_rates(flight: Flight) -> Findings:
     """Detect IMU or attitude below the rate that the acceleration in NED needs."""
     log = flight.log
-    for samples, name, default_topic, needed_hz in (
-        (flight.imu, "imu", "sensor_combined", MIN_IMU_RATE_HZ),
-        (flight.attitude, "attitude", "vehicle_attitude", MIN_ATTITUDE_RATE_HZ),
+    for samples, name, label, default_topic, needed_hz in (
+        (flight.imu, "imu", "IMU", "sensor_combined", MIN_IMU_RATE_HZ),
+        (flight.attitude, "attitude", "attitude", "vehicle_attitude", MIN_ATTITUDE_RATE_HZ),
     ):
         topic = flight.streams[name].topics[0] if name in flight.streams else default_topic
         if isinstance(samples, pd.DataFrame) and is_rate_too_low(samples, needed_hz):
             rate_hz, requested_hz = sample_rate(samples), 2.0 * needed_hz
-            action = f"Add 16 to SDLOG_PROFILE (bit 4, high rate: {topic} at full rate)."
+            profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE)) | HIGH_RATE_BIT
+            action = f"Set SDLOG_PROFILE to {profile} (bit 4 logs {topic} at full rate)."
             if log.format.startswith("MAVLink"):
                 action = f"Request {topic} at {requested_hz:g} Hz (MAV_CMD_SET_MESSAGE_INTERVAL)."
                 if log.has_ulog:
@@ -172,8 +205,8 @@ def detect_low_rates(flight: Flight) -> Findings:
                     )
             yield warning(
                 "imu_rate_too_low",
-                f"{topic} was logged at {rate_hz:.1f} Hz, but the acceleration needs "
-                f"{needed_hz:g} Hz. Motion between samples is lost, and vibration is aliased.",
+                f"The {label} was logged at {rate_hz:.1f} Hz, but {needed_hz:g} Hz are needed. "
+                "Motion between samples is lost, and vibration is aliased.",
                 action,
                 {"rate_hz": rate_hz, "needed_hz": needed_hz, "topic": topic},
             )

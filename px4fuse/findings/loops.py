@@ -75,9 +75,12 @@ def detect_assumptions(loop: Loop) -> Findings:
 
 def _false_closure(closure: Closure, is_end_assumed: bool) -> Finding:
     is_landing = closure.source == LANDING
-    fault = f"False loop closure: {closure}"
+    fault = f"False loop closure of {closure.distance_m:.2f} m: {closure}"
     if is_landing and is_end_assumed:
-        fault = "False loop closure: the vehicle did not land at the take-off place"
+        fault = (
+            f"False loop closure of {closure.distance_m:.2f} m: the landing place is not the "
+            "take-off place"
+        )
     action = "Remove this closure; px4fuse does not use it."
     if is_landing:
         action = (
@@ -86,9 +89,9 @@ def _false_closure(closure: Closure, is_end_assumed: bool) -> Finding:
         )
     return error(
         "false_loop_closure",
-        f"{fault}. The closure error is {closure.distance_m:.2f} m (d² {closure.d2:.0f}, "
-        f"{closure.degrees_of_freedom} degrees of freedom, p {closure.p:.1g}), which the stated "
-        "drift does not explain. Enforcing the closure would deform the whole path.",
+        f"{fault}. The stated drift does not explain the closure error (d² {closure.d2:.0f}, "
+        f"{closure.degrees_of_freedom} degrees of freedom, p {closure.p:.1g}). Enforcing the "
+        "closure would deform the whole path.",
         f"{action} If the odometry really drifts this much, increase --drift and --heading-drift.",
         _evidence(closure),
     )

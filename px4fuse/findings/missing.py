@@ -3,13 +3,15 @@
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import Comparison
-from px4fuse.ekf2_parameters import BAROMETER
-from px4fuse.findings.model import Findings, format_percent, note, warning
-from px4fuse.flight import Ekf2, Unavailable
+from px4fuse.comparison.model import FILTERS, Comparison, FilterName, FilterSummary
+from px4fuse.filter.consistency import CONSISTENT_RATIOS, ratio_interval
+from px4fuse.findings.model import Findings, note, warning
+from px4fuse.flight import Ekf2, Unavailable, positions_of
 from px4fuse.position_source import RECEIVED
+from px4fuse.text import capitalise_first
 
 RECEIVED_TOPIC = "vehicle_visual_odometry"
+DEFAULT_PROFILE = 1  # SDLOG_PROFILE bit 0, logged_topics.cpp
 VISION_PROFILE_BIT = 128  # SDLOG_PROFILE bit 7, logged_topics.cpp
 LOGGER_TOLERANCE = 0.25  # of the interval; jitter of PX4's logger on flights
 # s; intervals at which PX4's default profile decimates these topics (logged_topics.cpp)
@@ -18,7 +20,6 @@ LOGGER_INTERVALS_S = {
     "estimator_aid_src_ev_pos": (0.5,),
     "ekf2_state_plus_innovation": (0.5, 0.2),  # 0.2 in v1.11
 }
-NOTHING_TO_SET = "Nothing to set"  # first words of a remedy without an action
 MIN_INNOVATION_SHARE = 0.75  # of the source's samples; missing a quarter does not bias the test
 
 
@@ -33,13 +34,14 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
     """Detect a missing EKF2 state, a missing acceleration, and too few innovations."""
     ekf2, acceleration = analysis.flight.ekf2, analysis.lines[0].acceleration
     if isinstance(ekf2, Unavailable):
-        message = f"The log contains no EKF2 state: {ekf2.reason}. The report contains KF only."
+        reason = capitalise_first(ekf2.reason)
+        message = f"The log contains no EKF2 state. {reason}. The report contains KF only."
         yield warning("ekf2_not_logged", message, ekf2.remedy)
     if isinstance(acceleration, Unavailable):
         yield warning(
             "acceleration_not_logged",
-            f"The acceleration is missing ({acceleration.what}: {acceleration.reason}). KF assumes "
-            "constant velocity.",
+            "The acceleration is missing, so KF assumes constant velocity. No "
+            f"{acceleration.what}: {acceleration.reason}.",
             acceleration.remedy,
         )
     for result in analysis.axes.values():
@@ -60,30 +62,53 @@ def detect_source_not_logged(analysis: Comparison) -> Findings:
     is_logged = any(track.origin.preference == preference for track in analysis.flight.positions)
     if source.origin.has_all_samples or is_logged:
         return
-    rate_hz, profile = source.rate_hz, int(analysis.flight.log.parameters.get("SDLOG_PROFILE", 1))
+    rate_hz, parameters = source.rate_hz, analysis.flight.log.parameters
+    profile = int(parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE))
     reasons = (
         missing_data.reason
         for missing_data in analysis.missing
         if missing_data.source == RECEIVED_TOPIC
     )
-    action = f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} and fly again."
+    action = f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} (bit 7) and fly again."
     yield warning(
         "source_not_logged",
-        f"The log lacks {RECEIVED_TOPIC} ({next(reasons, 'it is not in this log')}). px4fuse uses "
-        f"{source.name} ({source.description}) at {rate_hz:.1f} Hz instead.",
+        f"The log lacks the {positions_of(source)} as PX4 received them. {RECEIVED_TOPIC}: "
+        f"{next(reasons, 'it is not in this log')}. px4fuse uses {source.name} "
+        f"({source.description}) at {rate_hz:.1f} Hz instead.",
         action,
         {"rate_hz": rate_hz, "sdlog_profile": profile},
     )
     for interval in LOGGER_INTERVALS_S.get(source.name, ()):
-        if abs(1.0 / rate_hz / interval - 1.0) < LOGGER_TOLERANCE:
-            yield warning(
+        is_limited = abs(1.0 / rate_hz / interval - 1.0) < LOGGER_TOLERANCE
+        weak = next(filter(None, (_weak_verdict(analysis, owner) for owner in FILTERS)), None)
+        if is_limited and weak:
+            yield note(
                 "source_rate_limited_by_logger",
-                f"{source.name} is logged at {rate_hz:.1f} Hz, the logger's limit for this topic "
-                f"({1.0 / interval:g} Hz). If the source is faster, the log lacks its other "
-                "samples.",
+                f"{capitalise_first(positions_of(source))} are logged at {rate_hz:.1f} Hz, the "
+                f"limit of the logger. {weak}",
                 action,
                 {"rate_hz": rate_hz, "logger_limit_hz": 1.0 / interval},
             )
+
+
+def _weak_verdict(analysis: Comparison, owner: FilterName) -> str | None:
+    """State that more innovations could change a verdict; None if they could not.
+
+    They could if the 95 % interval of innovation ÷ √S contains a limit of the consistent band, or
+    if there are too few innovations for a verdict.
+    """
+    summary, limits = analysis.main.filters[owner], CONSISTENT_RATIOS["source"]
+    name = owner.upper()
+    if not isinstance(summary, FilterSummary):
+        return f"The consistency of {name} cannot be tested with so few."
+    low, high = ratio_interval(summary.nis_mean, summary.nis_band)
+    for limit in limits:
+        if low <= limit <= high:
+            return (
+                f"The 95 % interval of innovation ÷ √S of {name} ({low:.2f} to {high:.2f}) "
+                f"contains the limit {limit:g} of its verdict."
+            )
+    return None
 
 
 def detect_missing_innovations(analysis: Comparison) -> Findings:
@@ -99,14 +124,12 @@ def detect_missing_innovations(analysis: Comparison) -> Findings:
     if not axis or analysis.source.origin.reconstructed or not isinstance(ekf2, Ekf2):
         return
     count = len(next(iter(axes)).replay.updates)
-    if logged / count < MIN_INNOVATION_SHARE:
-        is_barometer = analysis.source.aid(axis) == BAROMETER
-        topic = (ekf2.aids[BAROMETER.name].topics if is_barometer else ekf2.innovation_topics)[0]
+    weak = _weak_verdict(analysis, "ekf2")
+    if logged / count < MIN_INNOVATION_SHARE and weak:
+        # no profile of PX4's logger records innovations at a higher rate, so there is no action
         yield note(
             "ekf2_innovations_decimated",
-            f"The log contains {logged} EKF2 innovations for {count} measurements; "
-            f"{format_percent(1.0 - logged / count)} are missing. Rejections between logged "
-            "samples are not visible.",
-            f"{NOTHING_TO_SET}: no profile of PX4's logger records {topic} at a higher rate.",
+            f"The log contains {logged} EKF2 innovations for {count} measurements. {weak}",
+            "",
             {"logged": logged, "measurements": count},
         )

@@ -188,8 +188,11 @@ def spans_with_value(value: float, steps: pd.Series, segment: Segment) -> tuple[
     """
     edges = np.clip(np.append(steps.index.to_numpy(), np.inf), segment.start_s, segment.end_s)
     edges[0] = segment.start_s
-    has_value = (steps.to_numpy() == value) & (np.diff(edges) > 0.0)
-    return tuple(zip(edges[:-1][has_value].tolist(), edges[1:][has_value].tolist(), strict=True))
+    is_inside = np.diff(edges) > 0.0
+    has_value = np.concatenate([[False], steps.to_numpy()[is_inside] == value, [False]])
+    edges = np.append(edges[:-1][is_inside], segment.end_s)
+    changes = edges[np.flatnonzero(np.diff(has_value.astype(np.int8)))].tolist()
+    return tuple(zip(changes[::2], changes[1::2], strict=True))
 
 
 def fraction_on(steps: pd.Series, segment: Segment) -> float:

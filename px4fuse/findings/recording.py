@@ -7,7 +7,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.findings.model import Findings, finding, format_count, note, warning
 from px4fuse.flight import Ekf2, Flight
-from px4fuse.text import capitalise_first
+from px4fuse.text import capitalise_first, format_number
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -32,8 +32,9 @@ def detect_dropouts(analysis: Comparison) -> Findings:
         longest_s = max(dropout.duration_s for dropout in dropouts)
         yield warning(
             "logger_dropouts",
-            f"The logger lost data {format_count(len(dropouts))}, {total_s:.2f} s in total, at "
-            f"most {longest_s:.2f} s at once. All topics are missing in these intervals.",
+            f"The logger lost {total_s:.2f} s of data in {len(dropouts)} "
+            f"dropout{'s' if len(dropouts) > 1 else ''}. The longest lasted {longest_s:.2f} s. All "
+            "topics are missing in these intervals.",
             "Use a faster SD card, or log fewer topics (SDLOG_PROFILE).",
             {"count": len(dropouts), "total_s": total_s},
             tuple((dropout.start_s, dropout.start_s + dropout.duration_s) for dropout in dropouts),
@@ -44,9 +45,12 @@ def detect_lost_data(flight: Flight) -> Findings:
     """Detect bytes that cannot be read, a log that ends in flight, and dropped samples."""
     log = flight.log
     if log.damage or log.ends_in_flight:
-        notes = log.damage or (
-            f"the log ends in flight after {log.duration_s:.1f} s; the landing is missing",
-        )
+        fault = f"The log ends in flight after {log.duration_s:.1f} s. The landing is missing."
+        if log.damage:
+            lost_fraction = 1.0 - log.bytes_read / log.bytes if log.bytes else 0.0
+            size = f": {format_number(100.0 * lost_fraction, 2)} % of it cannot be read"
+            damage = "the log is damaged" + (size if lost_fraction else "")
+            fault = " ".join(f"{_sentence(note)}." for note in (damage, *log.damage))
         action = "Copy the log again. If this does not help, replace the SD card."
         if not log.damage:
             action = "Log until after the landing. If the file was cut off, copy it again."
@@ -55,7 +59,7 @@ def detect_lost_data(flight: Flight) -> Findings:
         yield finding(
             "warning" if log.damage else "note",
             "log_damaged",
-            "".join(f"{_sentence(note)}. " for note in notes).rstrip(),
+            fault,
             action,
             {"lost_bytes": log.bytes - log.bytes_read, "ends_in_flight": float(log.ends_in_flight)},
         )
@@ -68,10 +72,10 @@ def detect_lost_data(flight: Flight) -> Findings:
         )
         yield note(
             "samples_out_of_order",
-            f"{count} samples of {topic} were dropped: their timestamps are zero or go "
-            f"back{other_topics}.",
-            "The file is complete: a clock was set back, or messages overtook each other. If this "
-            "is the position source, synchronise its clock before take-off (TIMESYNC).",
+            f"{count} samples of {topic} have wrong timestamps. They are zero or go "
+            f"back{other_topics}, so px4fuse dropped the samples. Possible cause: a clock was set "
+            "back, or messages overtook each other.",
+            "Synchronise the clock of the sender before take-off (TIMESYNC).",
             {"notes": other_count + 1},
         )
 
@@ -90,8 +94,9 @@ def detect_clocks_set_back(flight: Flight) -> Findings:
     if reversals := log.receive_time_reversals:
         yield note(
             "receive_time_went_back",
-            f"The receive time went back {format_count(reversals)}: the recording computer's clock "
-            "was set, or recordings were joined. The senders' timestamps are not affected.",
+            f"The receive time went back {format_count(reversals)}. Possible cause: the recording "
+            "computer's clock was set, or recordings were joined. The senders' timestamps are not "
+            "affected.",
             "Switch off time synchronisation of the recording computer while recording.",
             {"count": reversals},
         )
@@ -103,7 +108,8 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
     if MODEL_NOTE in log.notes:
         yield note(
             "ekf2_simulated",
-            f"{MODEL_NOTE}.",
+            "EKF2 in this log is px4fuse's model of EKF2, not PX4's code. It was run on the "
+            "simulated sensors.",
             "Use a real flight to assess PX4's EKF2.",
         )
     if not isinstance(ekf2, Ekf2):
@@ -111,8 +117,8 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
     if log.autopilot != "PX4":
         yield note(
             "not_px4",
-            f"This log is from {log.autopilot}. EKF2 in this report means the estimator of "
-            f"{log.autopilot}. The PX4 parameters named do not exist there.",
+            f"This log is from {log.autopilot}, not PX4. EKF2 in this report means the estimator "
+            f"of {log.autopilot}. The PX4 parameters named do not exist there.",
             'Read "EKF2" in this report as the estimator of this autopilot.',
             {"autopilot": log.autopilot},
         )

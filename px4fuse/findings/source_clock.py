@@ -1,20 +1,19 @@
 """Time offset between source and IMU, its change in flight, and a wrong EKF2_EV_DELAY."""
 
-from dataclasses import replace
-
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
-from px4fuse.comparison.model import Comparison
-from px4fuse.ekf2.whatif import WhatIf, what_if
+from px4fuse.comparison.model import Comparison, FilterName
+from px4fuse.comparison.trials import Trial
 from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS, RECEIVER_DELAYS
 from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
 from px4fuse.findings.model import Findings, error, finding, warning
 from px4fuse.findings.source_positions import find_low_pass
 from px4fuse.findings.source_stamps import find_synchronisation
-from px4fuse.flight import Unavailable
 
 MIN_OFFSET_S = 0.03  # s; at 1 m/s a third of the noise of good UWB (0.1 m)
 MIN_OFFSET_ERROR_S = 0.10  # s; at 1 m/s the noise of good UWB (0.1 m)
+# Minimum ratio of two RMSEs of KF that is significant; its re-run is exact
+MAX_RMSE_RATIO = 1.005
 CORRECT_AT_SENDER = "Correct the timestamps at the sender."
 
 
@@ -28,19 +27,18 @@ def detect(analysis: Analysis) -> Findings:
 
 def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
     """Detect a time offset relative to the IMU, or one that changes in flight."""
-    source = analysis.source
     if find_low_pass(analysis) is not None:  # a low-pass filtered source lags without a time offset
         return
     low, high = clock.interval_s
     evidence = {"offset_s": clock.offset_s, "interval_low_s": low, "interval_high_s": high}
     if clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P:
-        first_part, last_part = clock.parts[0], clock.parts[-1]
+        first_s, last_s = clock.parts[0].offset_s, clock.parts[-1].offset_s
         yield error(
             "source_time_offset_changes",
-            f"The time offset of {source.name} changes from {first_part.offset_s:+.2f} s at the "
-            f"beginning to {last_part.offset_s:+.2f} s at the end (p {clock.change_p_value:.1g}). "
-            "No single --clock-offset corrects it. PX4 uses arrival times until 500 TIMESYNC "
-            "answers have come.",
+            f"The time offset of the positions changes in flight from {first_s:+.2f} s to "
+            f"{last_s:+.2f} s. These are the estimates of the first and the last part "
+            f"(p {clock.change_p_value:.1g}). No single --clock-offset corrects both. Until 500 "
+            "TIMESYNC answers have come, PX4 uses arrival times.",
             "Let the clocks synchronise for one minute before take-off. Analyse one side of the "
             "change (--start, --end).",
             {**evidence, "change_p_value": clock.change_p_value},
@@ -51,55 +49,65 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
     if (
         size_s <= max(MIN_OFFSET_S, clock.three_sigma_s)
         or find_synchronisation(analysis) is not None
+        or _contradicts_truth(_find_trial(analysis, "kf", "time offset"))
     ):
         return
-    action = (
-        f"Re-run with {remedy.COMMAND} --clock-offset {clock_offset_option_s(analysis, clock):.3f}"
-    )
-    shifted_settings = replace(analysis.settings, clock_offset_s=round(clock.offset_s, 3))
-    if errors := remedy.filter_errors_m(analysis, shifted_settings):
-        if errors[1] > remedy.MAX_KF_ERROR_RATIO * errors[0]:
-            return  # ground truth contradicts the offset
-        action += f": KF position RMSE {errors[0]:.3f} → {errors[1]:.3f} m (re-run)"
     interval_s, is_late = (low - clock.applied_s, high - clock.applied_s), clock.remaining_s < 0
     first_s, last_s = (-interval_s[1], -interval_s[0]) if is_late else interval_s
     yield finding(
         "error" if size_s > MIN_OFFSET_ERROR_S else "warning",
         "source_time_offset",
-        f"The timestamps of {source.name} are {size_s:.3f} s {'late' if is_late else 'early'} "
-        f"relative to the IMU (95 % {first_s:.3f} to {last_s:.3f} s). At 1 m/s this is a position "
-        f"error of {size_s:.2f} m. Innovations hardly show it.",
-        f"{action}.{_format_ekf2_action(analysis, clock)}",
+        f"Position timestamps are {size_s:.2f} s {'late' if is_late else 'early'}. The estimate "
+        f"from IMU and positions is {size_s:.3f} s (95 % {first_s:.3f} to {last_s:.3f} s). At "
+        f"1 m/s this is a position error of {size_s:.2f} m in KF and EKF2, which innovations "
+        f"hardly show.{_assumed_delay(analysis, clock)}",
+        _offset_remedy(analysis, clock),
         evidence,
     )
 
 
-def _format_ekf2_action(analysis: Analysis, clock: ClockOffset) -> str:
-    """Format the action for EKF2's delay parameter; empty if no replay confirms a change."""
-    source, model = analysis.source, analysis.ekf2_model
+def _find_trial(analysis: Analysis, owner: FilterName, kind: str) -> Trial | None:
+    """Return the re-run of one filter with one kind of change, if there is one."""
+    return next(
+        (one for one in analysis.trials if one.filter == owner and one.kinds == (kind,)), None
+    )
+
+
+def _contradicts_truth(trial: Trial | None) -> bool:
+    """Return True if a re-run increases the position RMSE against ground truth."""
+    if trial is None:
+        return False
+    before, after = trial.before.position_rmse_m, trial.after.position_rmse_m
+    return before is not None and after is not None and after > MAX_RMSE_RATIO * before
+
+
+def _receiver_delay(analysis: Analysis) -> str | None:
+    """Return the parameter with the delay of a GNSS receiver, if it is logged."""
     parameters = analysis.flight.log.parameters
-    logged_delays = [name for name in (*RECEIVER_DELAYS, GNSS_POS.delay) if name in parameters]
-    is_receiver_delay = (
-        bool(logged_delays) and logged_delays[0] in RECEIVER_DELAYS
-    )  # the model does not include these
-    if (
-        source.origin.fused_as_gnss
-        and logged_delays
-        and (is_receiver_delay or isinstance(model, Unavailable))
-    ):
-        ml_delay_ms = parameters[logged_delays[0]] - 1e3 * clock.remaining_s
-        return (
-            f" EKF2 assumes fixes {parameters[logged_delays[0]]:g} ms old ({logged_delays[0]}); "
-            f"the estimate is {max(ml_delay_ms, 0.0):.0f} ms (not replayed)."
-        )
-    if isinstance(model, Unavailable) or source.name != model.inputs.received.source:
+    names = (name for name in (*RECEIVER_DELAYS, GNSS_POS.delay) if name in parameters)
+    return next(names, None) if analysis.source.origin.fused_as_gnss else None
+
+
+def _assumed_delay(analysis: Analysis, clock: ClockOffset) -> str:
+    """State the delay that the autopilot assumes of a GNSS receiver; empty for other sources."""
+    name = _receiver_delay(analysis)
+    if name is None:
         return ""
-    changes = remedy.delay_change(model.inputs, 1e3 * (source.age_s - clock.offset_s))
-    replays = what_if(model, [changes]) if changes else None
-    if not isinstance(replays, WhatIf) or not remedy.delay_helps(replays.replayed, *replays.whatif):
-        return ""
-    effect = remedy.format_whatif_effect(replays.replayed, *replays.whatif)
-    return f" For EKF2 set {remedy.format_settings(changes)}: {effect}."
+    assumed_ms = analysis.flight.log.parameters[name]
+    estimate_ms = max(assumed_ms - 1e3 * clock.remaining_s, 0.0)
+    return f" {name} is {assumed_ms:g} ms; the estimate is {estimate_ms:.0f} ms."
+
+
+def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
+    """Return the action at the source; the card adds those of KF and EKF2 from the re-runs."""
+    if name := _receiver_delay(analysis):
+        return f"Check the delay of the GNSS receiver ({name})."
+    if analysis.source.alignment is not None:
+        option_s = clock_offset_option_s(analysis, clock)
+        return f"Run again with --clock-offset {option_s:.3f}."
+    size_s = abs(clock.remaining_s)
+    verb = f"Subtract {size_s:.3f} s from" if clock.remaining_s < 0 else f"Add {size_s:.3f} s to"
+    return f"{verb} the timestamp (usec) of each position."
 
 
 def clock_offset_option_s(comparison: Comparison, clock: ClockOffset) -> float:
@@ -122,33 +130,45 @@ def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
     low_ms, high_ms = (-1e3 * end_s for end_s in reversed(clock.interval_s))
     low, high, size = round(low_ms), round(high_ms), round(abs(ml_delay_ms))
     if low_ms <= 0.0 <= high_ms:
-        estimate = "the estimated delay is not significant"
+        estimate = "the positions have no significant delay"
     elif ml_delay_ms < 0.0:
         estimate, low, high = f"the timestamps are {size} ms early", -high, -low
     else:
-        estimate = f"the estimated delay is {size} ms"
+        estimate = f"the positions are {size} ms late"
+    wanted_ms = 0.0 if low_ms <= 0.0 else ml_delay_ms
     yield warning(
         "ekf2_ev_delay_wrong",
-        f"EKF2_EV_DELAY is {delay_ms:g} ms, but {estimate} (95 % {low} to {high} ms). EKF2 fuses "
-        "each position at the wrong time, so its track leads or lags.",
-        format_delay_remedy(analysis, 0.0 if low_ms <= 0.0 else ml_delay_ms, delay_ms),
+        f"EKF2_EV_DELAY is {delay_ms:g} ms, but {estimate}. The 95 % interval is {low} to {high} "
+        "ms. EKF2 fuses each position at the wrong time, so its track leads or lags."
+        f"{_format_delay_limit(wanted_ms, delay_ms)}",
+        _delay_remedy(analysis, wanted_ms, delay_ms),
         {"ekf2_ev_delay_ms": delay_ms, "asked_ms": ml_delay_ms},
     )
 
 
-def format_delay_remedy(analysis: Analysis, delay_ms: float, current_ms: float) -> str:
-    """Format the action for EKF2_EV_DELAY, within PX4's range; a replay confirms it if possible."""
-    model, max_ms = analysis.ekf2_model, PARAMETERS["EKF2_EV_DELAY"].maximum
-    if delay_ms > max_ms:
-        return f"{CORRECT_AT_SENDER} PX4 allows at most {max_ms:g} ms (EKF2_EV_DELAY)."
-    if round(delay_ms) <= 0.0 and current_ms == 0.0:
-        return (
-            f"{CORRECT_AT_SENDER} EKF2_EV_DELAY cannot be negative, so it does not correct early "
-            "timestamps."
-        )
-    changes = {"EKF2_EV_DELAY": max(float(round(delay_ms)), 0.0)}
-    if not isinstance(model, Unavailable):
-        changes = remedy.delay_change(model.inputs, delay_ms) or changes
-    return remedy.format_ekf2_remedy(
-        model, changes, remedy.delay_helps, fallback_remedy=CORRECT_AT_SENDER
-    )
+def _format_delay_limit(wanted_ms: float, delay_ms: float) -> str:
+    """State that EKF2_EV_DELAY cannot have the wanted value; empty if it can."""
+    maximum_ms = PARAMETERS["EKF2_EV_DELAY"].maximum
+    if wanted_ms > maximum_ms:
+        return f" PX4 allows at most {maximum_ms:g} ms."
+    if round(wanted_ms) <= 0.0 and delay_ms == 0.0:
+        return " EKF2_EV_DELAY cannot be negative, so it does not correct early timestamps."
+    return ""
+
+
+def _delay_remedy(analysis: Analysis, wanted_ms: float, delay_ms: float) -> str:
+    """Return the action: EKF2_EV_DELAY if a re-run with another value is better."""
+    trial = _find_trial(analysis, "ekf2", "delay")
+    if _format_delay_limit(wanted_ms, delay_ms) or (trial is not None and not _improves(trial)):
+        return CORRECT_AT_SENDER
+    if trial is None:
+        return "Check EKF2_EV_DELAY."
+    return f"Set EKF2_EV_DELAY to {trial.change['EKF2_EV_DELAY']:g} ms."
+
+
+def _improves(trial: Trial) -> bool:
+    """Return True if a re-run has a smaller position RMSE, without ground truth a smaller NIS."""
+    before, after = trial.before, trial.after
+    if before.position_rmse_m is not None and after.position_rmse_m is not None:
+        return after.position_rmse_m < before.position_rmse_m
+    return bool(before.nis_mean and after.nis_mean and after.nis_mean < before.nis_mean)

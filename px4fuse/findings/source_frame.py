@@ -4,7 +4,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.filter.frame_rotation import MAX_DRIFT_P_VALUE, HeadingError
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSING_SHARE_ERROR
 from px4fuse.findings.model import Finding, Findings, Severity, finding, fraction_on, note, warning
-from px4fuse.flight import Ekf2, Unavailable
+from px4fuse.flight import Ekf2, Unavailable, positions_of, source_name
 from px4fuse.text import capitalise_first
 
 MIN_HEADING_SIGMAS = 4.0  # standard deviations; clean flights reach 3.2
@@ -13,6 +13,7 @@ LARGE_HEADING_ERROR_DEG = 15.0  # °; a quarter of each axis appears on the othe
 # Topic with the positions after EKF2 rotated them into its frame (EKF2.cpp)
 IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
 CALIBRATE = "Calibrate the magnetometer away from metal and motors."
+CHECK_GNSS_DELAY = "Check EKF2_GPS_DELAY: a wrong delay also rotates the heading."
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -29,76 +30,77 @@ def make_frame_finding(analysis: Analysis) -> Finding:
     """Make the finding of a source in FRD; its severity depends on EKF2's fusion of yaw."""
     ekf2, log = analysis.flight.ekf2, analysis.flight.log
     fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else None
+    name = source_name(analysis.source)
     fault = (
-        "The position source is in FRD: its x axis is the vehicle's heading at start, not north."
+        f"{capitalise_first(positions_of(analysis.source))} are in FRD: their x axis is the "
+        "heading at start, not north."
     )
-    action = "Read 'north' as the source's x axis."
+    action = f"Read north as the x axis of {name}."
     if isinstance(fusing, Unavailable):
         if log.has_ulog:
-            action += " The ULog shows whether EKF2 uses the same frame."
-        detail = "The recording does not show whether EKF2 fused its yaw."
+            action += " Add the ULog, which shows whether EKF2 uses the same frame."
+        detail = f"The recording does not show whether EKF2 fused the yaw of {name}."
         return note("source_frame_frd", f"{fault} {detail}", action)
     if fusing is not None and fraction_on(fusing["yaw"], analysis.segment) > MIN_FUSING_SHARE_ERROR:
-        detail = "EKF2 fused its yaw, so EKF2 uses the same frame."
+        detail = f"EKF2 fused the yaw of {name}, so it uses the same frame."
         return note("source_frame_frd", f"{fault} {detail}", action)
     return warning(
         "source_frame_frd",
-        f"{fault} The IMU is rotated into NED, so the axes of positions and IMU may differ.",
+        f"{fault} EKF2 did not fuse the yaw of {name}. The IMU is rotated into NED, so the axes of "
+        "positions and IMU may differ.",
         "Send the position in NED, or let EKF2 fuse the yaw (EKF2_EV_CTRL bit 3).",
     )
 
 
 def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     """Detect a rotation between the motion measured by the IMU and by the positions."""
-    name, turn_deg, sigma_deg = analysis.source.name, heading.misalignment_deg, heading.sigma_deg
-    is_gnss = analysis.source.origin.is_gnss
+    turn_deg, sigma_deg = heading.misalignment_deg, heading.sigma_deg
     if heading.drifts:
         yield _drift_finding(analysis, heading)
         return
     limit_deg = max(MIN_HEADING_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG)
     if abs(turn_deg) < limit_deg or _is_explained_by_bias(analysis):
         return
-    rotation = f"rotated by {turn_deg:+.0f}° ± {1.96 * sigma_deg:.0f}° (clockwise from above)"
+    positions = capitalise_first(positions_of(analysis.source))
+    title = f"{positions} are rotated by {turn_deg:+.0f}° relative to EKF2's heading"
+    interval = (
+        f"The 95 % interval is ± {1.96 * sigma_deg:.0f}°; the rotation is clockwise from above and "
+        "constant over the flight."
+    )
     finding_id = "ekf2_heading_error"
-    if is_gnss:
+    if analysis.source.origin.is_gnss:
         message = (
-            f"GNSS positions are {rotation} relative to EKF2's heading, constant over the flight. "
-            "GNSS positions refer to true north, so the heading is wrong."
+            f"{title}. {interval} GNSS positions refer to true north, so the heading is wrong."
         )
-        action = f"{CALIBRATE} Check EKF2_GPS_DELAY: a wrong delay also rotates the heading."
-    elif name == IN_EKF2_FRAME:
+        action = f"{CALIBRATE} {CHECK_GNSS_DELAY}"
+    elif analysis.source.name == IN_EKF2_FRAME:
         message = (
-            f"The positions that EKF2 fused ({name}) are {rotation} relative to EKF2's heading, "
-            "constant over the flight. The IMU measures the same motion in another direction."
+            f"{title}. {interval} EKF2 fused the positions in this frame; the IMU measures the "
+            "same motion in another direction."
         )
         action = (
             "Align the positioning frame with north, or calibrate the magnetometer away from metal "
-            f"and motors. {_format_yaw_fusion(analysis.flight.log.has_ulog)}"
+            "and motors."
         )
     else:
         finding_id = "source_frame_misaligned"
         message = (
-            f"The frame of {name} is {rotation} relative to the vehicle's heading. Either the "
-            "positioning frame is not aligned with north, or the heading is wrong (magnetometer)."
+            f"{positions} are rotated by {turn_deg:+.0f}° relative to the IMU. {interval} Either "
+            "the positioning frame is not aligned with north, or the heading is wrong "
+            "(magnetometer)."
         )
         action = (
-            f"Rotate the positions by {-turn_deg:+.0f}° before they are sent (a file: "
-            "--position-yaw), or calibrate the magnetometer."
+            f"Rotate the positions by {-turn_deg:+.0f}° before they are sent, or calibrate the "
+            "magnetometer."
         )
+        if analysis.source.alignment is not None:
+            action = "Run again with --position-yaw auto, or calibrate the magnetometer."
     yield finding(
         "error" if abs(turn_deg) >= LARGE_HEADING_ERROR_DEG else "warning",
         finding_id,
         message,
         action,
         {"misalignment_deg": turn_deg, "sigma_deg": sigma_deg},
-    )
-
-
-def _format_yaw_fusion(has_ulog: bool) -> str:
-    if not has_ulog:
-        return "Or let the autopilot fuse the source's yaw."
-    return (
-        "Or let EKF2 fuse the source's yaw (EKF2_EV_CTRL bit 3; EKF2_AID_MASK bit 4 before v1.14)."
     )
 
 
@@ -113,22 +115,24 @@ def _is_explained_by_bias(analysis: Analysis) -> bool:
 def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     first, last = heading.ends
     change = last.heading_error_deg - first.heading_error_deg
-    basis = "the source's orientation"
+    basis = f"the orientation of {source_name(analysis.source)}"
     if heading.by != "orientation":
         basis = "the positions and the IMU"
     possible_cause = "a magnetometer indoors, or odometry whose heading drifts"
-    action = f"{CALIBRATE} {_format_yaw_fusion(analysis.flight.log.has_ulog)}"
+    action = f"{CALIBRATE} Or let EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
     if analysis.source.origin.is_gnss:
         possible_cause = "a magnetometer near currents or steel"
-        action = f"{CALIBRATE} Check EKF2_GPS_DELAY: a wrong delay also rotates the heading."
+        action = f"{CALIBRATE} {CHECK_GNSS_DELAY}"
+    elif not analysis.flight.log.has_ulog:
+        action = f"{CALIBRATE} Or let the autopilot fuse the yaw of the source."
     return finding(
         "error" if abs(change) >= LARGE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
-        f"EKF2's heading drifts relative to {analysis.source.name}: "
-        f"{first.heading_error_deg:+.0f}° from {first.start_s:.0f} to {first.end_s:.0f} s, "
-        f"{last.heading_error_deg:+.0f}° from {last.start_s:.0f} to {last.end_s:.0f} s (clockwise "
-        f"from above, by {basis}). A constant rotation of the positions cannot correct this. "
-        f"Possible cause: {possible_cause}.",
+        f"EKF2's heading drifts by {change:+.0f}° relative to the "
+        f"{positions_of(analysis.source)}. It is {first.heading_error_deg:+.0f}° from "
+        f"{first.start_s:.0f} to {first.end_s:.0f} s and {last.heading_error_deg:+.0f}° from "
+        f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, by {basis}). A constant "
+        f"rotation of the positions cannot correct this. Possible cause: {possible_cause}.",
         action,
         {
             "from_deg": first.heading_error_deg,
@@ -152,6 +156,6 @@ def detect_uncertain_alignment(analysis: Analysis) -> Findings:
             yield finding(
                 severity,
                 "position_file_alignment",
-                f"{analysis.source.name}: {capitalise_first(sentence.rstrip('.'))}.",
+                f"{capitalise_first(sentence.rstrip('.'))}.",
                 "Give --clock-offset, --position-frame and --position-yaw if you know them.",
             )

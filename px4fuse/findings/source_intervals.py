@@ -4,15 +4,24 @@ If exactly every second or third sample is kept, the intervals equal those of a 
 log can distinguish the two.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
+import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.flight_events import max_interval_s, source_gaps
+from px4fuse.ekf2_parameters import AIDS, EV_POS
+from px4fuse.filter.kalman import state_at, variance_at
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL_S
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
-from px4fuse.position_source import ALIGNED
+from px4fuse.flight import Ekf2, Unavailable, positions_of
+from px4fuse.position_source import ALIGNED, PositionKind
+from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
+from px4fuse.record import Span
+from px4fuse.text import capitalise_first, format_metres
 
 MIN_LOST_SHARE = 0.02  # of the source's samples; flights have 0 to 0.3 %, v1.13 has 8 to 9 %
 MIN_INTERVALS = 50
@@ -23,6 +32,15 @@ MIN_MULTIPLE_SHARE = 0.1  # of the intervals; lost samples alone cause a smaller
 # RMS distance from whole multiples, in intervals: 0.29 if random, 0.03 by jitter of a source
 MAX_MULTIPLE_RMS = 0.06
 MAX_DIVISOR = 4
+SMALLEST_TIME_S = 1e-6  # s; KF at this time before a position does not contain it
+# Checks after a gap
+CHECKS: Mapping[PositionKind, str] = {
+    "uwb": "line of sight to the anchors and the link",
+    "vio": "light and texture in view of the camera and the link",
+    "mocap": "the markers in view of the cameras and the link",
+    "gnss": "the antenna's view of the sky, its cable and radio interference",
+    "file": "the recording of the positions",
+}
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -34,25 +52,61 @@ def detect(analysis: Analysis) -> Findings:
 
 def detect_source_gaps(analysis: Analysis) -> Findings:
     """Detect gaps in the position source."""
-    rate_hz = analysis.source.rate_hz
-    spans = source_gaps(analysis.lines[0].measurement_time_s, rate_hz)
+    spans = source_gaps(analysis.lines[0].measurement_time_s, analysis.source.rate_hz)
     if spans:
-        start_s, end_s = max(spans, key=lambda gap: gap[1] - gap[0])
-        check = "line of sight to the anchors and the link"
-        if analysis.source.origin.is_gnss:
-            check = "the antenna's view of the sky, its cable and radio interference"
-        limit_s, count = max_interval_s(1.0 / rate_hz), len(spans)
-        number = "one gap" if count == 1 else f"{count} gaps"
-        longest = "" if count == 1 else "the longest "
+        start_s, end_s = longest_s = max(spans, key=lambda gap: gap[1] - gap[0])
+        count = len(spans)
+        longest = "" if count == 1 else f", the longest of {count} gaps"
         yield warning(
             "source_gap",
-            f"The position source has {number} of more than {limit_s:.1f} s: "
-            f"{longest}{end_s - start_s:.1f} s from {start_s:.1f} s. In a gap KF uses the IMU "
-            "only, and its error grows.",
-            f"Check {check}. Analyse one side of the gap (--start, --end).",
+            f"No position for {end_s - start_s:.1f} s{longest}. "
+            f"{_state_errors_after(analysis, longest_s)}",
+            f"Check {CHECKS[analysis.source.origin.kind]} at {start_s:.1f} s.",
             {"count": count, "longest_s": end_s - start_s, "at_s": start_s},
             spans,
         )
+
+
+def _state_errors_after(analysis: Analysis, gap_s: Span) -> str:
+    """State the aids used in a gap, and error and reported σ of each filter at its end."""
+    result, (start_s, end_s) = analysis.main, gap_s
+    before_end_s = np.array([start_s, end_s - SMALLEST_TIME_S])
+    axis, ekf2 = result.axis, result.ekf2_state
+    reference_m = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, end_s)])
+    quantity = "Distance to the first position after it"
+    if isinstance(result.truth, pd.DataFrame):
+        true_m = result.truth["position_m"]
+        reference_m, quantity = float(np.interp(end_s, true_m.index, true_m)), "Error at its end"
+    texts = []
+    aiding = "KF relies on the IMU alone."
+    if isinstance(ekf2, pd.DataFrame) and len(before := ekf2["position_m"].loc[:end_s]):
+        aiding = "KF and EKF2 rely on the IMU alone."
+        if other_aids := _continuously_fused_aids(analysis.flight.ekf2, gap_s):
+            aiding = f"KF relies on the IMU alone, EKF2 also on {' and '.join(other_aids)}."
+        variance, at_s = result.ekf2_variance, float(before.index[-1])
+        sigma = ""
+        if isinstance(variance, pd.DataFrame) and len(variance):
+            variance_m2 = np.interp(at_s, variance.index, variance["position_variance_m2"])
+            sigma = f" (σ {format_metres(float(np.sqrt(variance_m2)))} m)"
+        error_m = abs(float(before.iloc[-1]) - reference_m)
+        texts.append(f"EKF2 {format_metres(error_m)} m{sigma}")
+    kf_error_m = abs(float(state_at(result.replay, before_end_s)[0][1]) - reference_m)
+    kf_sigma_m = float(np.sqrt(variance_at(result.replay, before_end_s)[0][1]))
+    texts.append(f"KF {format_metres(kf_error_m)} m (σ {format_metres(kf_sigma_m)} m)")
+    return f"{aiding} {quantity}, along {axis.label}: {', '.join(texts)}."
+
+
+def _continuously_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[str]:
+    """Return the labels of horizontal aids that EKF2 fused without a gap of half the span."""
+    labels, (start_s, end_s) = [], span_s
+    for name in (EV_POS.name, *OTHER_HORIZONTAL_AIDS):
+        log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get(name)
+        if log is not None and "fused" in log.samples:
+            fused = log.samples["fused"].loc[start_s:end_s]
+            times_s = [start_s, *fused.index[fused > 0.0], end_s]
+            if np.diff(times_s).max() < 0.5 * (end_s - start_s):
+                labels.append(AIDS[name].label)
+    return labels
 
 
 def detect_lost_samples(analysis: Analysis) -> Findings:
@@ -66,12 +120,12 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
     if len(intervals) > 1 and lost_count / sent_count > MIN_LOST_SHARE:
         action = "Record on the companion computer or on a link without message loss."
         if analysis.flight.log.has_ulog:
-            action += " The ULog contains the samples that PX4 received (SDLOG_PROFILE 129)."
+            action += " Or set SDLOG_PROFILE to 129: the ULog then contains what PX4 received."
         yield note(
             "source_samples_lost",
-            f"About {format_percent(lost_count / sent_count)} of {source.name} is missing from the "
-            f"recording ({lost_count} of {sent_count} samples, one per {typical_s:.2f} s). EKF2 "
-            "may have received them.",
+            f"The recording lacks {format_percent(lost_count / sent_count)} of the "
+            f"{positions_of(source)}. {lost_count} of {sent_count} samples are missing (one per "
+            f"{typical_s:.2f} s is expected). EKF2 may have received them.",
             action,
             {"lost": lost_count, "lost_fraction": lost_count / sent_count},
         )
@@ -101,19 +155,20 @@ def detect_downsampling(analysis: Analysis) -> Findings:
     interval_s = float(np.mean(intervals))
     is_too_slow = interval_s > EV_START_INTERVAL_S
     message = (
-        f"{source.name} arrives at {1.0 / interval_s:.2g} Hz, at whole multiples of {base_s:.3g} "
-        f"s. Of a {1.0 / base_s:.2g} Hz source {format_percent(lost_share)} is missing."
+        f"{capitalise_first(positions_of(source))} arrive at {1.0 / interval_s:.2g} Hz, "
+        f"downsampled from {1.0 / base_s:.2g} Hz. The intervals are whole multiples of "
+        f"{base_s:.3g} s, so {format_percent(lost_share)} of the positions are missing."
     )
     if is_too_slow:
         message += (
-            " EKF2 (v1.14 and later) starts fusion only below "
-            f"{EV_START_INTERVAL_S:g} s between samples."
+            " EKF2 (v1.14 and later) starts fusion only if two positions come within "
+            f"{EV_START_INTERVAL_S:g} s."
         )
     yield finding(
         "error" if is_too_slow else "warning",
         "source_downsampled",
         message,
-        "Increase the rate of the stream at the sender (MAVROS, bridge, link) and remove any rate "
+        "Increase the rate of the stream at the sender (MAVROS, bridge, link), and remove any rate "
         "limit.",
         {"rate_hz": 1.0 / interval_s, "source_rate_hz": 1.0 / base_s, "lost_fraction": lost_share},
     )

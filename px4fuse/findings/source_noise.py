@@ -10,6 +10,8 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array, BoolArray
+from px4fuse.comparison.model import ErrorsAgainstTruth
+from px4fuse.filter.consistency import CONSISTENT_RATIOS
 from px4fuse.filter.correlated_noise import TimeCorrelatedNoise
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.signals import cut_to_segment
@@ -18,8 +20,8 @@ from px4fuse.findings.cause_grouping import WHITE_RATIO
 from px4fuse.findings.model import Findings, error, format_percent, note, warning
 from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_NATS, hardly_moved
-from px4fuse.flight import Columns, Unavailable
-from px4fuse.text import format_number
+from px4fuse.flight import Columns, Unavailable, positions_of, source_name
+from px4fuse.text import capitalise_first, format_number
 
 MIN_CORRELATION_GAIN_NATS = 5.0  # likelihood ratio 150; 1 of 400 clean flights exceeds it
 MIN_REPEAT_SHARE = 0.05  # of the positions
@@ -53,27 +55,38 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     if noise.lag_nats >= MIN_LAG_NATS:
         return  # low-pass filtered: source_positions reports it
     low, high = (format_number(end, 1) for end in (noise.low_s, noise.high_s))
-    correlation_time = f"{low} to {high} s" if np.isfinite(noise.high_s) else f"at least {low} s"
-    is_gnss = analysis.source.origin.is_gnss
+    correlation_time, interval = f"{format_number(noise.tau_s, 1)} s", f"95 % {low} to {high} s"
+    if not np.isfinite(noise.high_s):
+        correlation_time, interval = f"at least {low} s", "95 %"
+    is_gnss, name = analysis.source.origin.is_gnss, source_name(analysis.source)
     evidence = {name: value for name, value in asdict(noise).items() if np.isfinite(value)}
     assumed_m = [analysis.settings.sigma_z_m, *map(ekf2_noise_m, analysis.axes.values())]
     if (ratio := noise.white_m / float(np.nanmin(assumed_m))) > NOISE_RATIO_TOLERANCE:
         evidence[WHITE_RATIO] = ratio
-    hint = "Set R to cover both parts; GNSS errors are usually time-correlated."
-    if not is_gnss:
-        hint = (
-            "Check multipath, anchor geometry and filters in the sender, or use positions at "
-            "intervals longer than the correlation time."
-        )
-    make_finding = note if is_gnss else warning
+    action = "Check multipath, anchor geometry and filters in the sender."
+    if is_gnss:
+        action = "Use RTK, or give the antenna a free view of the sky."
+    # GNSS errors are usually time-correlated, so only an effect on σ is reported as a fault
+    make_finding = note if is_gnss and not _exceeds_sigma(analysis) else warning
     yield make_finding(
         "source_noise_time_correlated",
-        f"The errors of {analysis.source.name} are correlated over {correlation_time}. A "
-        f"time-correlated part of {noise.slow_m:.2g} m (1 σ) adds to white noise of "
-        f"{noise.white_m:.2g} m. KF and EKF2 assume independent errors: they follow the correlated "
-        "part and report a σ that is too small. Innovations do not show this part.",
-        f"Do not lower SIGMA_Z or the EKF2 measurement noise to the white part. {hint}",
+        f"Time-correlated {name} error of {noise.slow_m:.2g} m, correlation time "
+        f"{correlation_time} ({interval}). It adds to white noise of {noise.white_m:.2g} m (1 σ). "
+        "KF and EKF2 assume independent errors: they follow the correlated part and report a σ "
+        "that is too small. Innovations do not show this part.",
+        action,
         evidence,
+    )
+
+
+def _exceeds_sigma(analysis: Analysis) -> bool:
+    """Return True if an error against ground truth is larger than σ covers."""
+    truths = [summary.truth for summary in analysis.main.filters.values()]
+    return any(
+        isinstance(truth, ErrorsAgainstTruth)
+        and truth.nees_position_mean is not None
+        and truth.nees_position_mean > CONSISTENT_RATIOS["truth"][1] ** 2
+        for truth in truths
     )
 
 
@@ -93,9 +106,9 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
     make_finding = error if share >= MIN_REPEAT_SHARE_ERROR else warning
     yield make_finding(
         "source_samples_repeated",
-        f"{count} of {len(is_repeated)} positions of {analysis.source.name} "
-        f"({format_percent(share)}) repeat the previous one. KF and EKF2 use each repetition as a "
-        "new, independent measurement, although nothing was measured at that time.",
+        f"{count} of {len(is_repeated)} {positions_of(analysis.source)} repeat the previous one. "
+        f"KF and EKF2 use each repetition ({format_percent(share)}) as a new, independent "
+        "measurement, although nothing was measured at that time.",
         "Send each position once, with its time of measurement.",
         {"count": count, "share": share},
     )
@@ -130,11 +143,11 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
         return
     yield warning(
         "source_noise_unequal_axes",
-        f"The noise of {analysis.source.name} is {large:.2g} m along {noisier_axis} and "
-        f"{small:.2g} m along {quieter_axis}. One SIGMA_Z, or one EKF2 measurement noise, does not "
-        "fit both axes.",
-        f"Analyse each axis separately (--axis {noisier_axis} --sigma-z {large:.2g}). For EKF2 use "
-        "the larger value. Place the anchors on all sides of the flight area.",
+        f"{capitalise_first(source_name(analysis.source))} noise is {large:.2g} m along "
+        f"{noisier_axis} and {small:.2g} m along {quieter_axis}. One SIGMA_Z, or one EKF2 "
+        "measurement noise, does not fit both axes.",
+        "Place the anchors on all sides of the flight area. Analyse each axis separately "
+        f"(--axis {noisier_axis} --sigma-z {large:.2g}).",
         {f"{quieter_axis}_sigma_z_m": small, f"{noisier_axis}_sigma_z_m": large},
     )
 
@@ -196,9 +209,9 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
         check = "satellites in view, walls, trees and radio interference"
     yield (error if ratio >= MIN_PART_RATIO_ERROR else warning)(
         "source_noise_varies",
-        f"The noise of {analysis.source.name} is {ratio:.1f} times larger from {start:.0f} s to "
-        f"{end:.0f} s than in the rest of the flight. Most samples are affected, not single "
-        "outliers. No single SIGMA_Z fits the whole flight.",
+        f"{capitalise_first(source_name(analysis.source))} noise is {ratio:.1f} times larger from "
+        f"{start:.0f} to {end:.0f} s. Most samples of that time are affected, not single outliers. "
+        "No single SIGMA_Z fits the whole flight.",
         f"Check {check} in that time. Let the sender report a variance with each position, or "
         "analyse the parts separately (--start, --end).",
         {"ratio": ratio, "first_s": start, "until_s": end},

@@ -5,19 +5,23 @@ Detectability of a scale factor error: six passes at 5 Hz with noise 0.10 m dete
 distance or ground truth.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
 import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
+from px4fuse.arrays import Array
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.findings.cause_grouping import CAUSE, GROUND
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
+from px4fuse.findings.missing import MIN_INNOVATION_SHARE
 from px4fuse.findings.model import (
     Findings,
     error,
@@ -28,8 +32,9 @@ from px4fuse.findings.model import (
     zero_length_spans,
 )
 from px4fuse.findings.source_stamps import detect_arrival_times
-from px4fuse.flight import Columns, Unavailable
-from px4fuse.text import format_factor
+from px4fuse.flight import Columns, Unavailable, positions_of, source_name
+from px4fuse.position_source import PositionKind
+from px4fuse.text import capitalise_first, format_factor, format_metres
 
 MIN_MOTION_RANGE_M = 0.5  # m, 5 to 95 %; a hovering vehicle with UWB noise of 0.1 m stays below
 NOISE_RANGE_FACTOR = 1.25 * 3.29  # 5 to 95 % range of white noise in σ, with a margin of 25 %
@@ -49,6 +54,27 @@ MIN_OUTLIER_SHARE_ERROR = 0.02  # of the measurements; one each 10 s at 5 Hz
 MIN_OUTLIERS = 3
 MIN_VARIANCE_RATIO = 2.0  # reported over actual variance, or its inverse
 MIN_VARIANCE_RATIO_ERROR = 3.0  # reported over actual variance, or its inverse
+# Possible cause of outliers, and action
+OUTLIER_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
+    "uwb": (
+        "reflections without line of sight (NLOS)",
+        "Give the tag line of sight to the anchors, or drop these positions before they are sent.",
+    ),
+    "vio": (
+        "lost visual tracking",
+        "Check light and texture in view of the camera, or drop these positions before they are "
+        "sent.",
+    ),
+    "mocap": (
+        "hidden or confused markers",
+        "Check the markers in view of the cameras, or drop these positions before they are sent.",
+    ),
+    "gnss": (
+        "multipath, or a change of the GNSS solution (fix type)",
+        "Keep the antenna in free view of the sky, away from walls and interference.",
+    ),
+    "file": ("lost or ambiguous tracking", "Remove these rows from the file."),
+}
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -96,12 +122,12 @@ def detect_low_pass(analysis: Analysis) -> Findings:
         make_finding = error if low_pass.lag_s >= MIN_LAG_ERROR_S else warning
         yield make_finding(
             "source_low_pass_filtered",
-            f"{analysis.source.name} is low-pass filtered before it is sent. Successive errors "
-            f"correlate by {low_pass.correlation:.1f}, and positions lag the motion by "
-            f"{low_pass.lag_s:.2f} s. The noise before filtering is {low_pass.sigma_z_m:.2g} m. KF "
-            "and EKF2 assume independent errors, so both are overconfident and lag.",
+            f"{capitalise_first(positions_of(analysis.source))} are low-pass filtered and lag by "
+            f"{low_pass.lag_s:.2f} s. Successive errors correlate by {low_pass.correlation:.1f}; "
+            f"the noise before filtering is {low_pass.sigma_z_m:.2g} m. KF and EKF2 assume "
+            "independent errors, so both are overconfident and lag.",
             "Switch off smoothing in the positioning system and send raw positions. Leave the "
-            "timestamps as they are: this is not a time offset.",
+            "timestamps as they are.",
             asdict(low_pass),
         )
 
@@ -121,19 +147,24 @@ def detect_jumps(analysis: Analysis) -> Findings:
     if large:
         largest = max(large, key=lambda jump: jump.size_m)
         size_m, at_s, sigma = largest.size_m, largest.time_s, max(s.sigma for s in largest.step_m)
-        causes = "a false map match, another set of anchors, or a new origin"
+        positions, causes = (
+            capitalise_first(positions_of(analysis.source)),
+            "a false map match, another set of anchors, or a new origin",
+        )
         action = "Keep one origin and one set of anchors in flight."
         if analysis.source.origin.is_gnss:
             causes = "another set of satellites, multipath, or a change of the RTK status"
             action = "Wait for a steady fix (RTK) before take-off and keep the antenna uncovered."
+        extent = f"by {size_m:.2f} m"
+        if len(large) > 1:
+            extent = f"{format_count(len(large))}, by up to {size_m:.2f} m"
         yield finding(
             "error" if size_m >= MIN_JUMP_ERROR_M else "warning",
             "source_position_jump",
-            f"{analysis.source.name} jumps {format_count(len(large))} and stays there, by "
-            f"{size_m:.2f} m (± {1.96 * sigma:.2f} m) at {at_s:.1f} s. The IMU measures no such "
-            f"motion. Possible causes: {causes}. After the jump KF and EKF2 are wrong by its size, "
-            "with consistent innovations.",
-            f"Analyse one side of the jump (--start, --end). {action}",
+            f"{positions} jump {extent} at {at_s:.1f} s and stay there. The IMU measures no such "
+            f"motion (± {1.96 * sigma:.2f} m, 95 %). Possible causes: {causes}. After the jump KF "
+            "and EKF2 are wrong by its size, with consistent innovations.",
+            f"{action} Analyse one side of the jump (--start, --end).",
             {"count": len(large), "size_m": size_m, "at_s": at_s, "sigma_m": sigma},
             zero_length_spans(jump.time_s for jump in large),
         )
@@ -157,11 +188,12 @@ def detect_scale_error(analysis: Analysis) -> Findings:
         yield finding(
             "error" if abs(excess) >= MIN_SCALE_ERROR else "warning",
             "source_scale_error",
-            f"Distances of {analysis.source.name} are {format_percent(abs(excess))} too "
-            f"{'long' if excess > 0 else 'short'} (± {format_percent(1.96 * sigma)}) compared with "
-            "the IMU. Innovations do not show a scale factor error.",
-            "Measure a known distance with the source. Survey the anchors again, and check unit "
-            "and calibration.",
+            f"{capitalise_first(source_name(analysis.source))} distances are "
+            f"{format_percent(abs(excess))} too {'long' if excess > 0 else 'short'}. Compared with "
+            f"the IMU, ± {format_percent(1.96 * sigma)} (95 %). Innovations do not show a scale "
+            "factor error.",
+            "Measure a known distance with the source. Then survey the anchors again, and check "
+            "unit and calibration.",
             {"scale": 1.0 + excess, "sigma": sigma},
         )
 
@@ -184,27 +216,53 @@ def detect_outliers(analysis: Analysis) -> Findings:
     count, share = len(times_s), len(times_s) / axis_tuning.count
     if share < MIN_OUTLIER_SHARE or count < MIN_OUTLIERS:
         return
-    first_times, origin = (
-        ", ".join(f"{time_s:.1f}" for time_s in times_s[:3]),
-        analysis.source.origin,
-    )
-    noises = "SIGMA_Z" if origin.aid is None else f"SIGMA_Z or {origin.aid.noise}"
-    likely_cause = "no line of sight (NLOS)"
-    action = "Restore line of sight to the anchors there, or reject these positions before sending."
-    if origin.is_gnss:
-        likely_cause = "multipath, or a change of the GNSS solution (fix type)"
-        action = "Keep the antenna in free view of the sky, away from walls and interference."
+    possible_cause, action = OUTLIER_CAUSES[analysis.source.origin.kind]
+    sizes_m, reference = outlier_sizes_m(analysis, np.array(times_s))
     yield finding(
         "error" if share >= MIN_OUTLIER_SHARE_ERROR else "warning",
         "source_outliers",
-        f"{count} of {axis_tuning.count} positions ({format_percent(share, 1)}) are outliers "
-        f"({axis_tuning.name}; {'first ' if count > 3 else ''}at {first_times} s). Likely cause: "
-        f"{likely_cause}. Outliers shift the estimates of KF and EKF2, and increase the estimated "
-        "noise unless they are removed.",
-        f"{action} Do not increase {noises} for outliers.",
-        {"count": count, "share": share, "first_s": times_s[0]},
+        f"{count} of {axis_tuning.count} {positions_of(analysis.source)} are outliers of up to "
+        f"{format_metres(float(sizes_m.max()))} m. These {format_percent(share, 1)} have a median "
+        f"distance of {format_metres(float(np.median(sizes_m)))} m to {reference}. Possible cause: "
+        f"{possible_cause}. KF has no gate and follows each one.{_rejected(analysis, times_s)}",
+        action,
+        {"count": count, "share": share, "first_s": times_s[0], "max_m": float(sizes_m.max())},
         zero_length_spans(times_s),
     )
+
+
+def outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[Array, str]:
+    """Return the horizontal distances (m) of outliers, and the name of the reference.
+
+    The reference is ground truth, else the line between the positions before and after.
+    """
+    axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
+    axes = axes or [analysis.main]
+    has_truth = all(isinstance(result.truth, pd.DataFrame) for result in axes)
+    squares_m2 = np.zeros(len(outlier_time_s))
+    for result in axes:
+        time_s, measured_m = result.axis.measurement_time_s, result.axis.measurement_m
+        is_outlier = np.isin(time_s, outlier_time_s)
+        reference_time_s, reference_m = time_s[~is_outlier], measured_m[~is_outlier]
+        if has_truth and isinstance(result.truth, pd.DataFrame):
+            true_m = result.truth["position_m"].dropna()
+            reference_time_s, reference_m = true_m.index.to_numpy(), true_m.to_numpy()
+        expected_m = np.interp(outlier_time_s, reference_time_s, reference_m)
+        squares_m2 += (np.interp(outlier_time_s, time_s, measured_m) - expected_m) ** 2
+    return np.sqrt(squares_m2), "ground truth" if has_truth else "the positions around them"
+
+
+def _rejected(analysis: Analysis, times_s: Sequence[float]) -> str:
+    """State the number of outliers that EKF2 rejected; empty if the log does not show it."""
+    innovations = analysis.main.ekf2_innovations
+    if not isinstance(innovations, pd.DataFrame) or innovations["rejected"].isna().any():
+        return ""
+    if len(innovations) < MIN_INNOVATION_SHARE * len(analysis.main.axis.measurement_time_s):
+        return ""
+    rejected_s = innovations.index[innovations["rejected"] > 0.0].to_numpy()
+    tolerance_s = 0.5 / analysis.source.rate_hz
+    count = sum(bool(np.any(np.abs(rejected_s - time_s) < tolerance_s)) for time_s in times_s)
+    return f" EKF2's gate rejected {count} of the {len(times_s)}."
 
 
 def detect_wrong_variance(analysis: Analysis) -> Findings:
@@ -234,20 +292,17 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     if error_m is not None and reported_m**2 < MIN_VARIANCE_RATIO * error_m**2:
         return
     if ratio >= MIN_VARIANCE_RATIO and not low <= reported_m <= high:
-        direction = "small"
-        if variance_ratio >= 1.0:
-            direction = "large"
-            if error_m is None:
-                direction += ", unless it covers time-correlated errors"
+        direction, doubt = "small" if variance_ratio < 1.0 else "large", ""
+        if direction == "large" and error_m is None:
+            doubt = " It may cover time-correlated errors."
         yield finding(
             "error" if ratio >= MIN_VARIANCE_RATIO_ERROR else "warning",
             "source_reported_variance_wrong",
-            f"{source.name} reports σ {reported_m:.3g} m, but its noise is {noise_m:.3g} m (95 % "
-            f"{low:.3g} to {high:.3g} m). The reported variance is {format_factor(ratio)} times "
-            f"too {direction}. EKF2 takes R from it (EKF2_EV_NOISE_MD 0), but not less than "
-            "EKF2_EVP_NOISE.",
-            f"Report a variance of {noise_m**2:.2g} m² at the sender, or set EKF2_EV_NOISE_MD to 1 "
-            f"and EKF2_EVP_NOISE to {noise_m:.2g} m.",
+            f"The variance that {source_name(source)} reports is {format_factor(ratio)} times too "
+            f"{direction}. Reported σ {reported_m:.3g} m; noise {noise_m:.3g} m (95 % {low:.3g} to "
+            f"{high:.3g} m). EKF2 takes R from the report (EKF2_EV_NOISE_MD 0), but not less than "
+            f"EKF2_EVP_NOISE.{doubt}",
+            f"Report a variance of {noise_m**2:.2g} m² with each position.",
             {
                 "reported_sigma_m": reported_m,
                 "sigma_z_m": noise_m,
@@ -294,8 +349,9 @@ def detect_little_motion(analysis: Analysis) -> Findings:
     if hardly_moved(analysis):
         yield warning(
             "no_motion",
-            f"The vehicle moved only {extent_m:.2f} m horizontally (5 to 95 % of the positions). "
-            "Velocity, heading and time offset cannot be estimated from this flight.",
+            f"The vehicle moved only {extent_m:.2f} m horizontally. That is the range of 5 to 95 % "
+            "of the positions. Velocity, heading and time offset cannot be estimated from this "
+            "flight.",
             "Fly several passes of 5 m or more, with clear starts and stops.",
-            {"range_m": extent_m},
+            {"range_m": extent_m} | ({CAUSE: GROUND} if analysis.flight.airborne == () else {}),
         )

@@ -5,9 +5,10 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.findings.model import Findings, error, warning
-from px4fuse.flight import ARRIVAL_METHODS, Ekf2, FusionRecord
+from px4fuse.findings.model import Findings, error, note, warning
+from px4fuse.flight import ARRIVAL_METHODS, Ekf2, FusionRecord, Unavailable, positions_of
 from px4fuse.log import ClockMap
+from px4fuse.text import format_metres
 
 MAX_RECEIPT_JITTER_S = 0.010  # s; 1 cm at 1 m/s, a tenth of the noise of good UWB (0.1 m)
 MAX_ARRIVAL_AGE_S = 0.001  # s; from receiving a message to publishing it
@@ -23,29 +24,29 @@ ANSWER_TIMESYNC = (
 
 def detect(analysis: Analysis) -> Findings:
     """Detect wrong timestamps, by the clock map of a recording or the ages in a ULog."""
-    clock, name = analysis.source.clock_map, analysis.source.name
+    clock, positions = analysis.source.clock_map, positions_of(analysis.source)
     if clock is None:
         yield from detect_arrival_times(analysis)
     elif clock.distinct_stamps is not None:
-        yield from detect_constant_timestamps(name, clock, clock.distinct_stamps)
+        yield from detect_constant_timestamps(positions, clock, clock.distinct_stamps)
     elif clock.method in ARRIVAL_METHODS:
         kf_times = f"the sender's timestamps, mapped by the {clock.method}"
         if clock.method == "arrival time":
             kf_times = "arrival times too, so the KF track is late by the age of the positions"
         yield warning(
             "companion_not_synchronised",
-            f"The sender of {name} was never synchronised with the autopilot (TIMESYNC). EKF2 "
-            f"used arrival times as times of measurement. KF uses {kf_times}.",
+            f"The sender of the {positions} never synchronised its clock (TIMESYNC). EKF2 used "
+            f"arrival times as times of measurement. KF uses {kf_times}.",
             ANSWER_TIMESYNC,
             {"jitter_s": clock.jitter_s},
         )
 
 
-def detect_constant_timestamps(name: str, clock: ClockMap, distinct_count: int) -> Findings:
+def detect_constant_timestamps(positions: str, clock: ClockMap, distinct_count: int) -> Findings:
     """Make the findings of constant timestamps and of the jitter of the receive times."""
     yield error(
         "source_timestamps_constant",
-        f"The {clock.pairs} timestamps of {name} have only {distinct_count} distinct "
+        f"The timestamps of {clock.pairs} {positions} have only {distinct_count} distinct "
         f"value{'s' if distinct_count > 1 else ''}. The time of measurement is unknown; px4fuse "
         "uses the receive time instead.",
         "Send the time of measurement in the message (usec, time_usec), in microseconds and as a "
@@ -55,9 +56,9 @@ def detect_constant_timestamps(name: str, clock: ClockMap, distinct_count: int) 
     if (jitter_s := clock.jitter_s) > MAX_RECEIPT_JITTER_S:
         yield warning(
             "source_timestamp_jitter",
-            f"The receive times of {name}, used instead of its timestamps, jitter by "
-            f"{jitter_s * 1e3:.0f} ms (1 σ). At 1 m/s this is a position error of "
-            f"{jitter_s:.3f} m.",
+            f"The receive times of the {positions} jitter by {jitter_s * 1e3:.0f} ms (1 σ). They "
+            "replace the timestamps. At 1 m/s this is a position error of "
+            f"{format_metres(jitter_s)} m.",
             "Send the time of measurement in the message, and record close to the sender.",
             {"jitter_s": jitter_s},
         )
@@ -69,32 +70,39 @@ def detect_arrival_times(analysis: Analysis) -> Findings:
     Without TIMESYNC, PX4 uses the arrival time as timestamp (Timesync.cpp). The log shows this
     directly: publication minus timestamp of the positions is zero instead of the latency.
     """
-    age, name = _age_s(analysis), analysis.source.name
+    age = _age_s(analysis)
     if age is None:
         return
     synchronisation = find_synchronisation(analysis)
     if synchronisation is not None:
         until_s, latency_s = synchronisation
         make_finding = error if latency_s >= MIN_LATENCY_ERROR_S else warning
+        if _is_on_ground_until(analysis, until_s):
+            make_finding = note
         yield make_finding(
             "source_timestamps_are_arrival_times",
-            f"The timestamps of {name} are arrival times until {until_s:.1f} s: until then "
-            "TIMESYNC had not converged (PX4 needs 500 answers). Later timestamps are times of "
-            f"measurement, {latency_s:.3f} s before arrival. One time offset cannot correct both "
-            "parts.",
-            f"Analyse the second part: px4fuse compare LOG --start {until_s:.0f}. Let the clocks "
-            "synchronise for one minute before take-off.",
+            f"Position timestamps are arrival times until {until_s:.1f} s. Until then TIMESYNC had "
+            "not converged (PX4 needs 500 answers). Later timestamps are times of measurement, "
+            f"{latency_s:.3f} s before arrival; one time offset cannot correct both parts.",
+            "Let the clocks synchronise for one minute before take-off. Analyse the second part "
+            f"(--start {until_s:.0f}).",
             {"until_s": until_s, "latency_s": latency_s},
             ((float(age.index[0]), until_s),),
         )
     elif np.mean(age.abs() < MAX_ARRIVAL_AGE_S) >= MIN_CONSISTENT_SHARE:
         yield warning(
             "source_timestamps_are_arrival_times",
-            f"The timestamps of {name} are arrival times. The sender was never synchronised with "
-            "the autopilot (TIMESYNC), so every position is late by its latency.",
+            "Position timestamps are arrival times in the whole flight. The sender was never "
+            "synchronised with the autopilot (TIMESYNC), so every position is late by its latency.",
             ANSWER_TIMESYNC,
             {"until_s": float(age.index[-1])},
         )
+
+
+def _is_on_ground_until(analysis: Analysis, time_s: float) -> bool:
+    """Return True if the vehicle does not fly before a time."""
+    airborne = analysis.flight.airborne
+    return not isinstance(airborne, Unavailable) and all(start >= time_s for start, _ in airborne)
 
 
 def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:

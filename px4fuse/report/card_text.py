@@ -27,7 +27,7 @@ from px4fuse.request import quote_command
 WIDTH = 100
 AXIS_WIDTH = 37
 # Columns before the axis, and before the texts beside a label
-AXIS_INDENT, TEXT_INDENT = 56, 11
+AXIS_INDENT, TEXT_INDENT = 57, 11
 # A longer command stands on a line of its own
 MAX_COMMAND_LENGTH = 74
 # Ticks that have room for a label
@@ -233,7 +233,7 @@ def _cause(cause: Cause) -> Iterator[Line]:
     yield from _labelled("cause", cause.why)
     yield from _labelled("when", format_spans(cause))
     rows = marked_actions(cause)
-    labels = [f"{mark}{_target(action)}" for mark, action in rows]
+    labels = [f"{mark}{format_target(action)}" for mark, action in rows]
     width = max(map(len, labels), default=0) + 2
     for label, (_, action) in zip(labels, rows, strict=True):
         yield from _action(label, width, action)
@@ -251,7 +251,8 @@ def marked_actions(cause: Cause) -> list[tuple[str, Action]]:
     return alternatives + [("", action) for action in cause.actions]
 
 
-def _target(action: Action) -> str:
+def format_target(action: Action) -> str:
+    """Format the target of an action with the place where its commands are typed."""
     return f"{action.target} ({action.where})" if action.where else action.target
 
 
@@ -276,31 +277,29 @@ def _rerun_table(reruns: Sequence[Rerun]) -> Iterator[Line]:
     for row in zip(*columns, strict=True):
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
         yield Line(f"  {'  '.join(cells)}".rstrip())
-    if start := prediction_start(reruns):
+    if start := rerun_start(reruns):
         yield Line(f"  {start}")
 
 
-def rerun_columns(reruns: Sequence[Rerun]) -> list[list[str]]:
-    """Return the columns of the table of re-runs, each with its head; none of them is empty."""
-    if not reruns:
-        return []
-    columns = [
-        ["re-run of this log", *(rerun.label for rerun in reruns)],
-        [
+def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
+    """Return the columns of the table of re-runs, headings first; empty columns are absent."""
+    columns = (
+        ("re-run of this log", [rerun.label for rerun in reruns]),
+        (
             "position RMSE",
-            *(_change(rerun.position_rmse_m, format_metres, " m") for rerun in reruns),
-        ],
-        ["● innovation ÷ √S", *(_change(rerun.source_ratio, format_ratio) for rerun in reruns)],
-        ["◆ error ÷ σ", *(_change(rerun.truth_ratio, format_ratio) for rerun in reruns)],
-        ["rejected", *(_change(rerun.rejected_fraction, _percent, " %") for rerun in reruns)],
-        ["improves", *(rerun.improves for rerun in reruns)],
-    ]
-    return [column for column in columns if any(column[1:])]
+            [_change(rerun.position_rmse_m, format_metres, " m") for rerun in reruns],
+        ),
+        ("● innovation ÷ √S", [_change(rerun.source_ratio, format_ratio) for rerun in reruns]),
+        ("◆ error ÷ σ", [_change(rerun.truth_ratio, format_ratio) for rerun in reruns]),
+        ("rejected", [_change(rerun.rejected_fraction, _percent, " %") for rerun in reruns]),
+        ("improves", [rerun.improves for rerun in reruns]),
+    )
+    return [(head, *cells) for head, cells in columns if any(cells)]
 
 
-def prediction_start(reruns: Sequence[Rerun]) -> str:
-    """Return the sentence on the start of EKF2's replays; "" without one."""
-    starts = [rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None]
+def rerun_start(reruns: Sequence[Rerun]) -> str:
+    """Return the sentence with the start of predicted re-runs, or ""."""
+    starts = {rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None}
     return f"EKF2 (replay): predicted from this log, from {min(starts):.0f} s on." if starts else ""
 
 
@@ -371,7 +370,7 @@ def _aid_axis(aids: Sequence[AidRow]) -> Iterator[Line]:
 
 
 def format_spans(cause: Cause) -> str:
-    """Format first and last time of a cause; "" for the whole flight."""
+    """Format the time from the first to the last span of a cause, "" for the whole flight."""
     if not cause.spans_s:
         return ""
     first, last = cause.spans_s[0][0], cause.spans_s[-1][1]

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import Statistic
 from px4fuse.comparison.model import AxisComparison, FilterSummary, UntestedFilter
+from px4fuse.comparison.trials import Statistic
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
 from px4fuse.findings.cause_text import format_change, format_explained_share
 from px4fuse.flight import Unavailable

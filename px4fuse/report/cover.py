@@ -28,8 +28,8 @@ from px4fuse.report.card_text import (
     QUANTITIES,
     format_spans,
     marked_actions,
-    prediction_start,
     rerun_columns,
+    rerun_start,
 )
 from px4fuse.report.cover_panels import write_panels
 from px4fuse.report.page import Block, Page, to_typst_data
@@ -215,7 +215,7 @@ def _cause(number: int, cause: Cause) -> dict[str, Any]:
         "why": cause.why,
         "actions": [_action(mark, action) for mark, action in marked_actions(cause)],
         "reruns": {"head": head, "rows": rows},
-        "after": " ".join(filter(None, (prediction_start(cause.reruns), cause.after))),
+        "after": " ".join(filter(None, (rerun_start(cause.reruns), cause.after))),
         "id": cause.id,
     }
 
