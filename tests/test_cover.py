@@ -10,9 +10,10 @@ import pandas as pd
 import pytest
 from cards import SMALL_SIGMA_A, verdicts
 from flights import Estimator, Uwb, aisle_flight, unexplained, with_noises
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from msgspec.structs import replace
-from page_tools import axes_of, pdf_of, set_by_typst, smallest_type
+from page_tools import axes_of, every, pdf_of, set_by_typst, smallest_type
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import Action, AidRow, Card, Cause, Note
@@ -42,6 +43,10 @@ def drawn(analysis: Analysis) -> Page:
     with report_style():
         (page,) = cover.draw(analysis, made)
     return page
+
+
+def panels_by_title(page: Page) -> dict[str, Axes]:
+    return {block["title"]: block["axes"] for block in every(page.blocks) if "axes" in block}
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +169,8 @@ def test_cover_has_four_panels_on_one_page_and_no_small_type(eventful: Analysis)
 
 
 def test_error_strips_share_one_scale(eventful: Analysis) -> None:
-    limits = {axes.get_ylim() for axes in axes_of(drawn(eventful))[1:3]}
+    panels = panels_by_title(drawn(eventful))
+    limits = {axes.get_ylim() for title, axes in panels.items() if " error (m)" in title}
     assert len(limits) == 1
 
 
@@ -179,20 +185,11 @@ def test_error_strips_share_one_scale(eventful: Analysis) -> None:
 )
 def test_cover_with_missing_data_has_strips_of_the_rest(changes, titles) -> None:
     page = drawn(unexplained(compare(aisle_flight(**changes))))
-    blocks = [b for b in _panels(page.blocks) if b["title"]]
-    found = [block["title"] for block in blocks]
+    found = [*panels_by_title(page)]
     assert found[0].startswith("Map")
     assert found[-1].startswith("Innovations")
     assert [title.partition(" 0")[0] for title in found[1:-1]] == list(titles)
     assert len(set_by_typst(page)) == 1
-
-
-def _panels(blocks: Any) -> Any:
-    for block in blocks:
-        if block["kind"] == "panel":
-            yield block
-        for inner in (*block.get("columns", ()), block.get("blocks", ())):
-            yield from _panels(inner)
 
 
 def test_track_outside_the_map_has_triangles_and_distance() -> None:
@@ -213,7 +210,7 @@ def test_innovations_beyond_scale_are_triangles_in_title(eventful: Analysis) -> 
     largest = float(normalised.abs().max())
     assert largest > cover_panels.MAX_NORMALISED
     assert f"beyond ±4, up to KF {largest:.0f}" in strip.title
-    axes = axes_of(drawn(eventful))[-1]
+    axes = panels_by_title(drawn(eventful))[strip.title]
     edges = [line for line in axes.lines if line.get_marker() in "^v" and len(line.get_xdata())]
     assert edges
     assert {abs(value) for line in edges for value in line.get_ydata()} == {4.0}
