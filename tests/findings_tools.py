@@ -113,7 +113,7 @@ def axis(name: str = "north", **parts: Any) -> Any:
     filters = {
         key: _with_truth(parts.pop(key, NONE), parts.pop(f"{key}_truth", NONE)) for key in FILTERS
     }
-    axis = SimpleNamespace(name=name, called="the aisle" if name == "aisle" else name)
+    axis = SimpleNamespace(name=name, label="the aisle" if name == "aisle" else name)
     return SimpleNamespace(axis=axis, filters=filters, **usual | parts)
 
 

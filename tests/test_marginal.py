@@ -175,7 +175,7 @@ def stretch_normal(
     # position and velocity for the signals of data and constants
     means = [np.zeros((2, 4))]
     cross = {(0, 0): np.diag(1.0 / WEAK)}  # covariance of each state with all earlier ones
-    for k, row in enumerate(rows[1:], segment_starts=1):
+    for k, row in enumerate(rows[1:], start=1):
         length = part.length_s[row - 1]
         f = np.array([[1.0, length], [0.0, 1.0]])
         legs = part.delta_position_m, part.delta_velocity_m_s

@@ -375,6 +375,6 @@ def test_axis_called_depends_on_elongation_and_heading(across_m, heading_deg, ca
     round_trip = replace(track, samples=samples)
     axes = make_axes(flight, round_trip, ALL, heading_deg=heading_deg)
     north, aisle = (next(one for one in axes if one.name == name) for name in ("north", "aisle"))
-    assert (north.called, aisle.called) == ("north", called)
+    assert (north.label, aisle.label) == ("north", called)
     longer = None if heading_deg else pytest.approx(10.0 / across_m, rel=0.02)
     assert aisle.elongation == longer

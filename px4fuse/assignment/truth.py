@@ -175,7 +175,7 @@ def quantity_truth(
 ) -> float | tuple[float, ...] | None:
     """Answer a question by a replay of KF with the settings of the question.
 
-    None if the flight has too few measurements. The answer to "silence" is the position σ after
+    None if the flight has too few measurements. The answer about a gap is the position σ after
     predictions with F and Q (steps of DT), without an update.
     """
     settings = Settings(question.sigma_a_m_s2, question.sigma_z_m)

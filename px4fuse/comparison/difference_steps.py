@@ -74,7 +74,7 @@ def explain_ekf2_difference(
             explanation, outside=_unreplayed_part(results[name], explanation.spans_s)
         )
         sentences_by_axis[name] = add_sentences(
-            with_unreplayed_part, comparison.axes[name].axis.called, reasons
+            with_unreplayed_part, comparison.axes[name].axis.label, reasons
         )
     return sentences_by_axis
 

@@ -171,7 +171,7 @@ class Replayed(Record, frozen=True, kw_only=True, omit_defaults=False):
     settings : mapping
         All parameters of the model, by PX4 name, in PX4's units.
     late, lost : int
-        Samples that arrived behind the fusion horizon: fused late, and never fused.
+        Samples received behind the fusion horizon: fused late, and never fused.
     agreement : Agreement or None
         Agreement of the replay as flown with the log; None while it is computed.
     """

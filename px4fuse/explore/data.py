@@ -204,7 +204,7 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
     """Return the axis description, NIS bands, EKF2 and ground truth of one axis."""
     name = result.axis.name
     return {
-        "called": result.axis.called,
+        "called": result.axis.label,
         "heading": result.axis.heading_deg,
         "note": result.axis.note,
         "direction": result.axis.direction.tolist(),

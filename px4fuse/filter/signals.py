@@ -110,7 +110,7 @@ class Axis:
     __repr__ = one_line_repr
 
     @property
-    def called(self) -> str:
+    def label(self) -> str:
         """Name in messages; "the aisle" only for an elongated track or with --heading."""
         if self.name != AISLE:
             return self.name

@@ -97,7 +97,7 @@ def make_error_finding(
                 f"{filter_name}_sigma_p_m": error.reported_sigma_m,
             }
             causes[filter_name] = cause = find_cause(analysis.causes, filter_name, axis, "nees")
-            along = analysis.axes[axis].axis.called
+            along = analysis.axes[axis].axis.label
             sentences.append(
                 f"{label} along {along}: position RMSE {error.rmse_m:.2f} m, reported σ "
                 f"{error.reported_sigma_m:.2g} m (mean NEES {format_factor(error.nees)}, mean NIS "

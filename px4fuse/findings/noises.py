@@ -243,7 +243,7 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
             "process_noise_near_zero",
             f"SIGMA_A {sigma_a:g} m/s² makes Q almost zero. The position variance grows by only "
             f"{format_percent(growth, 1)} between updates, and the gain falls to {gain:.3f}. KF "
-            f"needs {response_s:.0f} s to follow a change (along {result.axis.called}).",
+            f"needs {response_s:.0f} s to follow a change (along {result.axis.label}).",
             f"Increase SIGMA_A.{remedy_text}",
             {"relative_growth": growth, "gain": gain, "response_s": response_s, "axis": name},
         )
@@ -325,7 +325,7 @@ def _variance_finding(
         severity,
         f"{filter_name}_{confidence}",
         f"{filter_label} is {confidence} along "
-        f"{result.axis.called}: σ is {format_factor(factor)} times too "
+        f"{result.axis.label}: σ is {format_factor(factor)} times too "
         f"{'large' if is_underconfident else 'small'}. The mean NIS is "
         f"{format_number(summary.nis_mean)}, expected {low:.2f} to {high:.2f} ({group} "
         f"axes).{gate_effect}",

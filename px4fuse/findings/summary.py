@@ -139,7 +139,7 @@ def _verdict_paragraph(
 ) -> str:
     """Format error and consistency of EKF2 and KF along the main axis, each with its re-run."""
     result, source = analysis.main, analysis.source
-    along = f"Along {result.axis.called}"
+    along = f"Along {result.axis.label}"
     sentences = [_limited_flight(analysis)]
     filters: tuple[FilterName, ...] = ("ekf2", "kf")
     if isinstance(result.ekf2_state, Unavailable):
@@ -175,7 +175,7 @@ def _filter_sentence(analysis: Analysis, filter_name: FilterName) -> str:
     name, summary, axis_label = (
         NAMES[filter_name],
         analysis.main.filters[filter_name],
-        analysis.main.axis.called,
+        analysis.main.axis.label,
     )
     if isinstance(summary, Unavailable):
         verdict = "is not tested for consistency: the log has no innovations or too few"

@@ -70,8 +70,8 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
     if settings.input == "zero" and not without_imu:
         yield "The IMU was not used (--input zero)."
     source = results.source
-    tracks_as_received = [track.name for track in source.available if track.path == "as it arrived"]
-    if tracks_as_received and source.path != "as it arrived":
+    tracks_as_received = [track.name for track in source.available if track.path == "as received"]
+    if tracks_as_received and source.path != "as received":
         yield (
             f"The position source is {source.name} ({source.path}), not "
             f"{tracks_as_received[0]}, the positions as received by PX4."

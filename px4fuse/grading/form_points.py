@@ -1,8 +1,8 @@
 """Points of an answer form (of 100), by comparison with the answer key.
 
 The weights and shares reproduce grading by hand. A student who guesses loses points: each false
-claim (named mistake that the flight does not have) costs points, and a mistake that can be guessed
-without a measurement counts only with the right size. ``form_points.toml`` contains the tables.
+answer (named mistake that the flight does not have) costs points, and a mistake that can be guessed
+without a measurement counts only with the correct size. ``form_points.toml`` contains the tables.
 """
 
 import math
@@ -16,12 +16,12 @@ from px4fuse.assignment.truth import FormTruth, TrueMistake
 from px4fuse.filter.consistency import MIN_FINDING_SIGMA_FACTOR
 from px4fuse.record import table
 
-# points that each false claim costs, and number of false claims from which no mistake has points
+# points that each false answer costs, and number of false answers from which no mistake has points
 FALSE_CLAIM_POINTS, MAX_FALSE_CLAIMS = 10.0, 3
 # shares of the points for naming another mistake: a related one, one with the same effect on
 # EKF2's noise, and a consequence
 NEIGHBOUR_SHARE, SAME_NUMBER_SHARE, EFFECT_SHARE = 0.4, 2.0 / 3.0, 0.15
-# mistakes that can be guessed without a measurement: only the right size has points. A close size
+# mistakes that can be guessed without a measurement: only the correct size has points. A close size
 # has none, because the assigned sizes are close to each other
 GUESSABLE_KINDS = frozenset(("open-end",))
 ANY_BOUNDS = (-math.inf, math.inf)
@@ -125,7 +125,7 @@ Match = tuple[TrueMistake, StudentMistake | None, float]
 def _mistake_feedback(
     matches: list[Match], false_claims: list[StudentMistake], is_clean_named: bool
 ) -> Iterator[str]:
-    """Yield a phrase for each right or missed mistake, and one for all false claims."""
+    """Yield a phrase for each right or missed mistake, and one for all false answers."""
     if not matches:
         yield f"your flight has no mistake{', as your form states' * is_clean_named}"
     for mistake, claim, _ in matches:
@@ -141,7 +141,7 @@ def _mistake_feedback(
 
 
 def _match_claims(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[StudentMistake]]:
-    """Match each mistake of the flight with one of the form; also return the false claims.
+    """Match each mistake of the flight with one of the form; also return the false answers.
 
     Pairs with the largest share are matched first: equal mistakes, then related mistakes, then
     consequences.
@@ -194,7 +194,7 @@ def _mistake_shares(matches: list[Match], truth: FormTruth) -> dict[str, float]:
 def size_share(mistake: TrueMistake, claim: StudentMistake) -> float:
     """Return the share for a size: 1 (right), 1/2 (close), or 1/3.
 
-    1/3 is for a size with the wrong sign, and for the right size of a related mistake.
+    1/3 is for a size with the wrong sign, and for the correct size of a related mistake.
     """
     size = claim.size_in_first_unit()
     if mistake.size is None or mistake.low is None or mistake.high is None or size is None:

@@ -71,7 +71,7 @@ class PositionInput:
     @property
     def origin(self) -> Origin:
         """Origin of the position."""
-        return find_origin(self.kind, "as it arrived")
+        return find_origin(self.kind, "as received")
 
     @property
     def message(self) -> str:

@@ -19,7 +19,7 @@ from px4fuse.readers.common import join_nearest
 from px4fuse.readers.field_maps import Layout
 from px4fuse.readers.ulog_topics import Topics
 
-# s; innovations and variances are logged up to one interval of the default profile (0.5 s) apart,
+# s; innovations and variances are logged up to one interval of the default profile (0.5 s),
 # and S changes little in that time
 JOIN_TOLERANCE_S = 0.6
 

@@ -9,7 +9,7 @@ from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.readers.ulog_topics import Topics
 
-# s; times closer than this belong to the same fix (fixes are at least 0.05 s apart)
+# s; times closer than this belong to the same fix (the interval of fixes is at least 0.05 s)
 MAX_SAME_FIX_S = 0.01
 # degrees, about 100 km; a larger distance from the logged latitude shows that the unit is m
 MAX_LATITUDE_DISTANCE_DEG = 1.0

@@ -25,7 +25,7 @@ MAX_FILE_BYTES = 500_000_000
 TUM_COLUMNS = 8
 MAX_USUAL_INTERVAL_S = 10.0
 EUROC_COLUMNS = (8, 17)  # pose only, or also velocity and biases of gyro and accelerometer
-# s; plausible median intervals: key frames may be minutes apart, frame rates are below 1 kHz
+# s; plausible median intervals: intervals of key frames may be minutes, frame rates are below 1 kHz
 MAX_INTERVAL_S, MIN_INTERVAL_S = 1000.0, 1e-3
 UNITS_PER_SECOND = {"nanoseconds": 10**9, "microseconds": 10**6, "milliseconds": 10**3}
 MAX_NORM_ERROR = 0.1

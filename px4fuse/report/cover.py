@@ -84,7 +84,7 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
 def _write_verdict(page: Page, analysis: Analysis) -> None:
     """Write the verdicts along the main axis in large letters: KF left, EKF2 right."""
     result, columns = analysis.main, []
-    axis_text = result.axis.called
+    axis_text = result.axis.label
     for (name, consistency), colour in zip(
         filters_by_name(result).items(), (KF_COLOUR, EKF2_COLOUR), strict=False
     ):

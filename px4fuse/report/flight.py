@@ -29,7 +29,7 @@ ZOOM_HEIGHT = 125.0  # points; height of the axes
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the page on position and velocity along the main axis."""
     result = analysis.main
-    page = Page(f"Position and velocity along {result.axis.called}")
+    page = Page(f"Position and velocity along {result.axis.label}")
     _write_legend(page, analysis)
     reference = panels.error_reference(result)
     shown_panels = [panels.POSITION, panels.VELOCITY]
@@ -69,7 +69,7 @@ def _write_legend(page: Page, analysis: Analysis) -> None:
 def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the page on innovations, σ_p and σ_v along the main axis, with a zoom."""
     result = analysis.main
-    page = Page(f"Innovations and variances along {result.axis.called}")
+    page = Page(f"Innovations and variances along {result.axis.label}")
     for panel in (panels.INNOVATIONS, panels.SIGMA_P, panels.SIGMA_V):
         is_last, is_first = panel is panels.SIGMA_V, panel is panels.INNOVATIONS
         panel.draw_on_page(

@@ -47,7 +47,7 @@ LIMIT_NOTE = (
 )
 NO_LOG_REASON = "no log was given, so the analysis could not be repeated"
 # Tolerance for another processor. Sums over a flight differ in the last few of 16 digits, and
-# differences of such sums in the last 8. Four OpenBLAS kernels differ by at most 3e-8 (six flights)
+# differences of sums in the last 8. Four OpenBLAS kernels differ by at most 3e-8 (six flights)
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-6, 1e-9
 # Tolerance of estimates. Minima are flat: if a likelihood or cost differs in its 12th digit, its
 # minimum differs in the 6th, and the ends of its interval in the 4th digit. Pages print up to three
