@@ -220,9 +220,9 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     ----------
     flight : Flight
     doubtful : mapping from PX4's name of an aid to str
-        Aids with a replay that disagrees with the log, and the reasons. The logged EKF2 height is
-        used instead of such a height sensor. Without optical flow the replay is interrupted in gaps
-        of the source. Vision in addition to GNSS is omitted.
+        Aids with a replay that disagrees with the log, and the reasons. Height sensors among them
+        are replaced by the logged EKF2 height. Without optical flow the replay is interrupted in
+        gaps of the source. Vision in addition to GNSS is omitted.
     """
     imu, attitude, ekf2 = flight.imu, flight.attitude, flight.ekf2
     if isinstance(imu, Unavailable):

@@ -1,4 +1,4 @@
-"""What-if table of EKF2: logged, replayed with logged parameters, replayed with other parameters.
+"""EKF2 with other parameters: what-if table with columns logged, replayed, and changed.
 
 All columns of the table are evaluated over the same times.
 """
@@ -196,7 +196,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
 
 @dataclass(frozen=True)
 class WhatIf:
-    """What-if table: EKF2 logged, replayed, and replayed with other parameters.
+    """Comparison of EKF2 logged, replayed, and replayed with other parameters (what-if table).
 
     Attributes
     ----------
