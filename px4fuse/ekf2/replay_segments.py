@@ -223,7 +223,7 @@ class ReplaySegment:
 
     @cached_property
     def imu_displacement_m(self) -> Array:
-        """Displacement since the start, from the IMU and initial velocity 0 (m, NED), (n + 1, 3)."""
+        """Displacement since the start by the IMU, initially at rest (m, NED), shape (n + 1, 3)."""
         speed = self.imu_velocity_m_s
         path = np.cumsum(0.5 * (speed[1:] + speed[:-1]) * self.step_s[:, None], axis=0)
         return np.concatenate([np.zeros((1, 3)), path])
