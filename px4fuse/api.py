@@ -79,7 +79,7 @@ def compare(
     axes : str or sequence of str
         "north", "east", "down" or "aisle"; default: all axes of the source.
     heading_deg : float, optional
-        Heading of the aisle axis.
+        Heading of the main horizontal axis ("aisle"), clockwise from north.
     start_s, end_s : float, optional
         Segment to analyse, seconds from the first data.
     position_source : str, optional

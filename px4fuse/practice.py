@@ -29,8 +29,8 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-# Choices that can occur in one flight: one affects the whole motion, the other single samples. A
-# wrong noise is not combined, because it would hide another mistake
+# Groups of mistakes that one flight can combine: one affects the whole motion, the other single
+# samples. A wrong noise would hide another mistake, so it is not combined
 COMBINABLE_GROUPS = ({"clock", "source"}, {"clock", "gate"}, {"frame", "source"}, {"frame", "gate"})
 MAX_LEVEL = 3
 MAX_SEED = 2**32 - 1
@@ -46,8 +46,8 @@ SCENARIO_VALUES: dict[str, Any] = {
     "tilt_error_deg": 0.02,
     "yaw_error_deg": 0.2,
 }
-LENGTH_M = (8.0, 12.0)  # m; range of the aisle length
-# Finding from which the time span of a mistake is taken
+LENGTH_M = (8.0, 12.0)  # m; range of the length of a pass
+# Finding that contains the time span of a mistake
 FINDING_WITH_TIME = {
     "nlos": "source_outliers",
     "jump": "source_position_jump",

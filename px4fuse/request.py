@@ -100,7 +100,7 @@ class ComparisonRequest(
     axes : tuple of str
         Empty for all axes with a position.
     heading_deg : float or None
-        Heading of the aisle axis, clockwise from north; None for the main direction of the track.
+        Heading of the axis "aisle", clockwise from north; None for the main direction of the track.
     start_s, end_s : float or None
         Segment in seconds after the first data; None for take-off and landing.
     clock_offset_s : float, "auto" or None
@@ -189,7 +189,7 @@ class LoopRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", 
 
 
 class Sweep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Range of values of one parameter, ends included; equal ratios above 0, else equal steps."""
+    """Range of one parameter, ends included; equal ratios of values above 0, else equal steps."""
 
     parameter: str
     low: float

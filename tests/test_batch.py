@@ -176,7 +176,7 @@ def test_batch_table_has_numbers_or_reason_of_each_log(tmp_path):
     pd.testing.assert_frame_equal(written, table, rtol=1e-9)
 
 
-def test_batch_terminal_counts_reasons_of_logs(capsys):
+def test_batch_terminal_counts_logs_by_failure_reason(capsys):
     table = made_up(60).fillna({"axis": "", "change": ""})
     show(terminal(), format_summary(BatchResult(table, 3, frozenset(), ())).blocks)
     said = " ".join(capsys.readouterr().out.split())

@@ -257,6 +257,12 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
             "are needed)",
             "Fly longer on external vision, and record with SDLOG_PROFILE bit 0 (default).",
         )
+    if not inside_spans(ekf2.state.index, replay.evaluated_s).any():
+        return Unavailable(
+            "EKF2 replay",
+            "EKF2's position is not logged in the replayed time",
+            "Record vehicle_local_position during the whole flight.",
+        )
     if _has_constant_innovations(log, model, HORIZONTAL):
         return Unavailable(
             "EKF2 replay",

@@ -46,6 +46,7 @@ CONSEQUENCES: Mapping[str, tuple[str | tuple[str, str], ...]] = {
     "sigma_z_too_small": (("kf_overconfident", NOISE),),
     "sigma_a_too_large": (("kf_underconfident", PROCESS),),
     "sigma_z_too_large": (("kf_underconfident", NOISE),),
+    "error_exceeds_reported_sigma": _UNDERCONFIDENT,
     # rejected samples do not correct EKF2, so it drifts and resets
     "ekf2_rejects_positions": (("ekf2_resets", ELSEWHERE),),
     # the width of the gate is proportional to √S
@@ -74,7 +75,6 @@ CONSEQUENCES: Mapping[str, tuple[str | tuple[str, str], ...]] = {
         ("ekf2_resets", ELSEWHERE),
         ("aid_not_fused", SENSOR),
     ),
-    "error_exceeds_reported_sigma": _UNDERCONFIDENT,
     "source_drift": _UNDERCONFIDENT,
     "ekf2_gate_too_small": (
         "ekf2_rejects_positions",

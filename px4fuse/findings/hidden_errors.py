@@ -146,11 +146,16 @@ def make_error_finding(
     elif is_ekf2_alone:
         remedy = EKF2_REMEDY
     sizes = " and ".join(f"{format_ratio(ratio)} ({label})" for label, ratio in ratios.items())
+    title = f"Position errors are {sizes} times σ, which innovations do not show"
+    if len(ratios) == 1:
+        ((label, ratio),) = ratios.items()
+        title = (
+            f"{label}: position error {format_ratio(ratio)} times σ, which innovations do not show"
+        )
     return finding(
         "error" if worst.nees >= MIN_NEES_ERROR else "warning",
         "error_exceeds_reported_sigma",
-        f"Position errors are {sizes} times σ, which innovations do not show. "
-        f"{' '.join(sentences)}",
+        f"{title}. {' '.join(sentences)}",
         remedy,
         evidence,
     )
@@ -170,11 +175,12 @@ def _drift_finding(
         size = (
             f"horizontal position RMSE {format_metres(aligned.after_m)} m after the best alignment"
         )
-        sentence = f"Horizontal position RMSE {aligned}. "
+        sentence = f"Before the alignment: {format_metres(aligned.before_m)} m. "
     if isinstance(loop, Loop) and (gap_m := _known_closure_error_m(loop)) is not None:
         length_m = loop.path_length_m
         evidence = {**evidence, "closure_error_m": gap_m, "path_length_m": length_m}
         share = format_percent(gap_m / length_m, 1)
+        sentence = "" if aligned is None else f"Horizontal position RMSE {aligned}. "
         size = f"loop closure error {format_metres(gap_m)} m after {length_m:.0f} m ({share})"
     noise_parameter = "" if analysis.source.origin.aid is None else analysis.source.origin.aid.noise
     noises = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))

@@ -239,7 +239,7 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
     Without motion a slow filter is correct, so the innovations must also be correlated and too
     large. The main axis is reported, else the first axis with a long response time.
     """
-    for result in (analysis.main, *analysis.others):
+    for result in sorted(analysis.axes.values(), key=lambda each: each is not analysis.main):
         updates, summary = result.replay.updates, result.filters["kf"]
         if isinstance(summary, Unavailable) or summary.verdict != "overconfident":
             continue

@@ -27,7 +27,7 @@ from px4fuse.request import quote_command
 WIDTH = 100
 AXIS_WIDTH = 37
 # Columns before the axis, and before the texts beside a label
-AXIS_INDENT, TEXT_INDENT = 56, 11
+AXIS_INDENT, TEXT_INDENT = 57, 11
 # A longer command stands on a line of its own
 MAX_COMMAND_LENGTH = 74
 # Ticks that have room for a label

@@ -68,7 +68,7 @@ def results(
 def outcome_results(
     request: ComparisonRequest, outcome: Analysis | AidsOnlyAnalysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults | contract.AidsResults:
-    """Return the results of ``px4fuse compare``: the comparison, or EKF2's aids only."""
+    """Return the results of ``px4fuse compare``; only EKF2's aids without position source."""
     if isinstance(outcome, Analysis):
         return results(request, outcome, student)
     findings = find_aids(outcome.aids)

@@ -86,7 +86,7 @@ class Row:
     tags : tuple of str
         Values that the filters select.
     details, side_sections : tuple of Section
-        Left and right column of the unfolded row, made by :func:`list_part` and the other
+        Left and right column of the unfolded row, made by :func:`list_section` and the other
         functions below; empty sections are omitted.
     """
 

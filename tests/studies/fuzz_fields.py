@@ -449,7 +449,7 @@ def impossible(value: Any, path: str = "") -> Iterator[str]:
 
 def impossible_text(text: str) -> Iterator[str]:
     """Yield a description of each NaN, None, huge number or impossible percentage in a text."""
-    for found in re.finditer(r"(?<![\w-])(nan|[+-]?inf|NaN|None|NaT)(?![\w-])", text):
+    for found in re.finditer(r"(?<![\w-])(nan|[+-]?inf|NaN|None(?!\.)|NaT)(?![\w-])", text):
         yield f"says {found[0]}: {text[max(found.start() - 60, 0) : found.end() + 20]!r}"
     for line in text.splitlines():
         # a value that is reported as outside its range is no statement about the flight
