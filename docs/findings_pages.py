@@ -65,6 +65,8 @@ SIMULATED: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
     "accelerometer_bias": (("accel-bias",), {}),
     "ekf2_ev_delay_wrong": (("ekf2-delay=250ms",), {}),
     "ekf2_gate_too_small": (("ekf2-gate",), {}),
+    "ekf2_noise_too_large": (("ekf2-noise=50cm",), {}),
+    "ekf2_noise_too_small": (("ekf2-noise=2cm",), {}),
     "source_time_offset": (("clock-offset",), {}),
     "source_time_offset_changes": (("clock-drift=8000ppm",), {}),
     "source_timestamps_are_arrival_times": (("clock-jump",), {}),

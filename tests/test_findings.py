@@ -193,7 +193,7 @@ FAULTS = [
     Fault("source_frame_frd", "note", flight={"uwb": Uwb(frame="FRD")}),
     Fault("source_gap", "warning", {"longest_s": about(8.0, 1e-9), "at_s": about(40.0, 1e-9)},
           {"uwb": Uwb(gap_s=(40.0, 48.0))}),
-    Fault("error_exceeds_reported_sigma", "error",
+    Fault("source_drift", "error",
           {"filter": "ekf2", "ekf2_nees_position_mean": about(400, 0.2)},
           change=lambda f: as_odometry(with_offset_truth(f, grows=True))),
     Fault("error_exceeds_reported_sigma", "error",
@@ -225,6 +225,7 @@ FAULTS = [
 TESTED_ELSEWHERE = {
     "accelerometer_bias", "aid_innovation_bias", "aid_innovation_shift", "aid_not_fused",
     "aid_overconfident", "ekf2_ev_delay_wrong", "ekf2_gate_too_small", "ekf2_heading_error",
+    "ekf2_noise_too_large", "ekf2_noise_too_small",
     "false_loop_closure", "loop_closure_inconsistent", "loop_drift_too_small",
     "loop_landing_assumed", "loop_on_absolute_positions", "sigma_a_too_large",
     "sigma_a_too_small", "sigma_z_too_large", "sigma_z_too_small", "source_downsampled",
