@@ -162,14 +162,16 @@ def detectors() -> dict[str, str]:
     """File of the detector of each finding, without ``.py``."""
     found: dict[str, str] = {}
     for path in sorted(FINDINGS.glob("*.py")):
-        if path.stem in ("causes", "since", "summary", "model", "__init__"):
+        if path.stem in ("cause_grouping", "cause_text", "summary", "model", "__init__"):
             continue
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(tree):
             if isinstance(node, ast.Constant) and node.value in TITLES:
                 found.setdefault(str(node.value), path.stem)
     # noises.py composes these ids of filter or option and direction
-    composed = (name for name in TITLES if name.startswith(("sigma_", "kf_var", "ekf2_var")))
+    composed = (
+        name for name in TITLES if name.startswith(("sigma_", "kf_", "ekf2_over", "ekf2_under"))
+    )
     return found | dict.fromkeys(composed, "noises")
 
 

@@ -292,7 +292,7 @@ CHECK_FIRST = (
 # ---------------------------------------------------------------- errors and truth
 
 
-def test_hidden_errors_report_worst_axis_and_action() -> None:
+def test_error_beyond_sigma_reports_worst_axis_and_action() -> None:
     ekf2 = axis("east", ekf2=statement(0.49), ekf2_truth=against_truth(25.0, 1.0))
     finding = only(hidden_errors.detect, analysis(axes=(axis(), hiding(name="down"), ekf2)))
     assert finding.title == (
@@ -320,7 +320,9 @@ def test_hidden_errors_report_worst_axis_and_action() -> None:
 
 @pytest.mark.parametrize(("left", "frame"), [(0.45, True), (0.55, False)])
 @pytest.mark.parametrize("drifts", [False, True])
-def test_hidden_errors_report_rmse_after_alignment(left: float, frame: bool, drifts: bool) -> None:
+def test_error_beyond_sigma_reports_rmse_after_alignment(
+    left: float, frame: bool, drifts: bool
+) -> None:
     """Circle of 5 m with a shift and an error that changes its sign with each sample."""
     time = np.arange(20.0, 100.0, 0.1)
     angle = 0.2 * np.pi * time

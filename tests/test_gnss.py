@@ -192,7 +192,7 @@ def test_prepare_gnss_sigma_z_equals_ekf2_noise(eph_m, least_m, axes, expected_m
     assert prepare_comparison(requested, flight=flight).settings.sigma_z_m == 0.3
 
 
-def test_prepare_gnss_innovations_are_from_gnss(tmp_path):
+def test_prepare_gnss_flight_uses_gnss_innovations(tmp_path):
     flight = flight_of(outdoors(), tmp_path)
     ekf2 = prepare(flight).flight.ekf2
     north, down = ekf2.innovations["north"], ekf2.innovations["down"]
@@ -228,7 +228,7 @@ def with_barometer(log: Log, *, fused: bool = True) -> Log:
     return log
 
 
-def test_prepare_down_uses_fused_barometer(tmp_path):
+def test_prepare_axis_down_uses_fused_barometer(tmp_path):
     flight = flight_of(with_barometer(outdoors()), tmp_path)
     request = ComparisonRequest(log="a.ulg", axes=("down", "north"))
     prepared = prepare_comparison(request, flight=flight)
@@ -246,7 +246,7 @@ def test_prepare_down_uses_fused_barometer(tmp_path):
     assert isinstance(fused_as_gnss.flight.ekf2.innovations["down"], Unavailable)  # type: ignore[union-attr]
 
 
-def test_prepare_down_unfused_barometer_needs_option(tmp_path):
+def test_prepare_axis_down_unfused_barometer_needs_option(tmp_path):
     flight = flight_of(with_barometer(outdoors(), fused=False), tmp_path)
     assert prepare(flight, axes=("down",)).source.barometer is None
     requested = prepare(flight, axes=("down",), height="barometer")

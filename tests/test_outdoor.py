@@ -174,7 +174,7 @@ def test_outdoor_mistake_is_cause_of_ekf2_error(
     assert found.is_sufficient
 
 
-def test_what_if_gnss_delay_matches_correct_flight() -> None:
+def test_what_if_gnss_delay_equals_flight_without_mistake() -> None:
     wrong, right = (flown(*texts).ekf2_model for texts in (("ekf2-delay=0",), ()))
     result, other = what_if(wrong, [{"EKF2_GPS_DELAY": 110.0}]), what_if(right, [])
     (predicted,), true = result.whatif, other.logged

@@ -30,7 +30,7 @@ from px4fuse.comparison.trials import (
 )
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.findings.model import CATALOGUE, Finding
-from px4fuse.flight import Unavailable
+from px4fuse.flight import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 
 # Kinds of change that re-run a finding, by its id
@@ -175,6 +175,18 @@ def make_cause(
     )
 
 
+def make_plain_cause(finding: Finding) -> Cause:
+    """Make the cause of a finding without re-runs."""
+    return Cause(
+        id=finding.id,
+        severity="error" if finding.severity == "error" else "warning",
+        title=finding.title,
+        why=_reason(finding),
+        spans_s=finding.spans_s,
+        actions=(Action(_target(finding), finding.remedy),) if finding.remedy else (),
+    )
+
+
 def _reason(finding: Finding) -> str:
     """Return the message without its first sentence, which is the title."""
     return finding.message.removeprefix(finding.title).lstrip(". ")
@@ -191,7 +203,7 @@ def _actions(
     by_kind = {(trial.filter, trial.kinds[0]): trial for trial in useful}
     alternatives: tuple[tuple[Action, ...], ...] = ()
     actions: list[Action] = []
-    general = Action(_target(finding), finding.remedy) if finding.remedy else None
+    general = Action(_target(finding, analysis.source), finding.remedy) if finding.remedy else None
     delay = by_kind.get(("ekf2", "delay"))
     if offset := by_kind.get(("ekf2", "time offset")) or by_kind.get(("kf", "time offset")):
         shift = offset.change[CLOCK_OFFSET] - analysis.settings.clock_offset_s * (
@@ -247,8 +259,11 @@ def _no_change(finding: Finding, owner: FilterName, verdicts: Sequence[Verdict])
     return "no setting corrects this" if owner == "kf" else "no parameter corrects this"
 
 
-def _target(finding: Finding) -> Target:
-    return TARGETS[CATALOGUE[finding.id].group]
+def _target(finding: Finding, source: PositionTrack | None = None) -> Target:
+    """Return the device or person that the remedy of a finding concerns."""
+    target = TARGETS[CATALOGUE[finding.id].group]
+    is_receiver = target == "sender" and source is not None and source.origin.is_gnss
+    return "receiver" if is_receiver else target
 
 
 def run_again(request: ComparisonRequest, change: Mapping[str, float]) -> Action:

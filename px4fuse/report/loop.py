@@ -13,9 +13,9 @@ from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.loop.corrections import SINGLE_LOOP_REASON
 from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Loop
 from px4fuse.report import style
-from px4fuse.report.cover import student_line, write_finding
 from px4fuse.report.evaluation import describe_method, format_interval, plot_path
 from px4fuse.report.page import AXIS_LABEL_HEIGHT, TICKS_HEIGHT, Cell, Page, appendix_title
+from px4fuse.report.phrases import student_line, write_finding
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, MUTED_COLOUR, Axes, set_map_axes
 from px4fuse.results.contract import LoopResults
 from px4fuse.text import capitalise_first, format_p_value
@@ -247,7 +247,7 @@ def write_scores(page: Page, loop: Loop) -> None:
             score.reason for score in scores.values() if isinstance(score, Unavailable)
         )
         for reason in dict.fromkeys(missing_reasons):
-            page.write(reason, size=7.5)
+            page.write(reason)
         if not evaluations:
             continue
         first_evaluation = next(iter(evaluations.values()))

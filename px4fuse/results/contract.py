@@ -236,6 +236,7 @@ class AidsResults(Record, frozen=True):
     request: ComparisonRequest
     log: Log
     aids: Annotated[dict[str, AidResult], Meta(min_length=1)]
+    card: Card
     findings: tuple[Finding, ...]
     missing: tuple[Unavailable, ...]
     student: Student
