@@ -412,7 +412,7 @@ def test_source_as_sent_logger_limit_is_reported(
         assert [one.id for one in found] == ["source_not_logged", "source_rate_limited_by_logger"][
             : 1 + decimated
         ]
-        assert "vehicle_visual_odometry: it was disabled" in found[0].message
+        assert "Reason: it was disabled." in found[0].message
         assert all("SDLOG_PROFILE to 130 " in each.remedy for each in found)
         for each in found[1:]:
             assert rate_hz == pytest.approx(each.evidence["logger_limit_hz"], rel=0.35)

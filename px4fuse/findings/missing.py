@@ -72,8 +72,8 @@ def detect_source_not_logged(analysis: Comparison) -> Findings:
     action = f"Set SDLOG_PROFILE to {profile | VISION_PROFILE_BIT} (bit 7) and fly again."
     yield warning(
         "source_not_logged",
-        f"The log lacks the {positions_of(source)} as PX4 received them. {RECEIVED_TOPIC}: "
-        f"{next(reasons, 'it is not in this log')}. px4fuse uses {source.name} "
+        f"The log lacks the {positions_of(source)} as PX4 received them. Reason: "
+        f"{next(reasons, f'{RECEIVED_TOPIC} is not in this log')}. px4fuse uses {source.name} "
         f"({source.description}) at {rate_hz:.1f} Hz instead.",
         action,
         {"rate_hz": rate_hz, "sdlog_profile": profile},
@@ -84,8 +84,8 @@ def detect_source_not_logged(analysis: Comparison) -> Findings:
         if is_limited and weak:
             yield note(
                 "source_rate_limited_by_logger",
-                f"{capitalise_first(positions_of(source))} are logged at {rate_hz:.1f} Hz, the "
-                f"limit of the logger. {weak}",
+                f"{capitalise_first(positions_of(source))} are logged at only {rate_hz:.1f} Hz, "
+                f"{weak}",
                 action,
                 {"rate_hz": rate_hz, "logger_limit_hz": 1.0 / interval},
             )
@@ -94,19 +94,21 @@ def detect_source_not_logged(analysis: Comparison) -> Findings:
 def _weak_verdict(analysis: Comparison, owner: FilterName) -> str | None:
     """State that more innovations could change a verdict; None if they could not.
 
+    The text completes a sentence.
+
     They could if the 95 % interval of innovation ÷ √S contains a limit of the consistent band, or
     if there are too few innovations for a verdict.
     """
     summary, limits = analysis.main.filters[owner], CONSISTENT_RATIOS["source"]
     name = owner.upper()
     if not isinstance(summary, FilterSummary):
-        return f"The consistency of {name} cannot be tested with so few."
+        return f"too few to test {name}."
     low, high = ratio_interval(summary.nis_mean, summary.nis_band)
     for limit in limits:
         if low <= limit <= high:
             return (
-                f"The 95 % interval of innovation ÷ √S of {name} ({low:.2f} to {high:.2f}) "
-                f"contains the limit {limit:g} of its verdict."
+                f"and the verdict of {name} is near its limit. The 95 % interval of innovation ÷ √S "
+                f"({low:.2f} to {high:.2f}) contains the limit {limit:g}."
             )
     return None
 
@@ -129,7 +131,7 @@ def detect_missing_innovations(analysis: Comparison) -> Findings:
         # no profile of PX4's logger records innovations at a higher rate, so there is no action
         yield note(
             "ekf2_innovations_decimated",
-            f"The log contains {logged} EKF2 innovations for {count} measurements. {weak}",
+            f"Only {logged} of {count} EKF2 innovations are logged, {weak}",
             "",
             {"logged": logged, "measurements": count},
         )

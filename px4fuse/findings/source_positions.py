@@ -54,6 +54,23 @@ MIN_OUTLIER_SHARE_ERROR = 0.02  # of the measurements; one each 10 s at 5 Hz
 MIN_OUTLIERS = 3
 MIN_VARIANCE_RATIO = 2.0  # reported over actual variance, or its inverse
 MIN_VARIANCE_RATIO_ERROR = 3.0  # reported over actual variance, or its inverse
+# Possible causes of a jump, and action
+JUMP_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
+    "uwb": (
+        "another set of anchors, or a new origin",
+        "Keep one origin and one set of anchors in flight.",
+    ),
+    "vio": (
+        "a false map match, or relocalisation in the map",
+        "Keep one map and one origin in flight.",
+    ),
+    "mocap": ("confused markers, or a new origin", "Keep one origin and one body in flight."),
+    "gnss": (
+        "another set of satellites, multipath, or a change of the RTK status",
+        "Wait for a steady fix (RTK) before take-off and keep the antenna uncovered.",
+    ),
+    "file": ("a false map match, or a new origin", "Use one origin for the whole file."),
+}
 # Possible cause of outliers, and action
 OUTLIER_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
     "uwb": (
@@ -147,14 +164,8 @@ def detect_jumps(analysis: Analysis) -> Findings:
     if large:
         largest = max(large, key=lambda jump: jump.size_m)
         size_m, at_s, sigma = largest.size_m, largest.time_s, max(s.sigma for s in largest.step_m)
-        positions, causes = (
-            capitalise_first(positions_of(analysis.source)),
-            "a false map match, another set of anchors, or a new origin",
-        )
-        action = "Keep one origin and one set of anchors in flight."
-        if analysis.source.origin.is_gnss:
-            causes = "another set of satellites, multipath, or a change of the RTK status"
-            action = "Wait for a steady fix (RTK) before take-off and keep the antenna uncovered."
+        positions = capitalise_first(positions_of(analysis.source))
+        causes, action = JUMP_CAUSES[analysis.source.origin.kind]
         extent = f"by {size_m:.2f} m"
         if len(large) > 1:
             extent = f"{format_count(len(large))}, by up to {size_m:.2f} m"
