@@ -203,12 +203,12 @@ def test_what_if_without_magnetometer_keeps_heading(tmp_path: Path) -> None:
 def test_clock_remedy_receiver_delay_is_named() -> None:
     analysis = flown("clock-offset=0.25")
     log = analysis.flight.log
-    assert "SENS_GPS0_DELAY" not in next(source_clock.detect(analysis)).remedy
+    assert "SENS_GPS0_DELAY" not in next(source_clock.detect(analysis)).message
     since_v1_17 = structs.replace(log, parameters={**log.parameters, "SENS_GPS0_DELAY": 110.0})
     changed = replace(analysis, flight=replace(analysis.flight, log=since_v1_17))
-    remedy = next(source_clock.detect(changed)).remedy
-    delay_ms = max(int(number) for number in re.findall(r"(\d+) ms", remedy))
-    assert "SENS_GPS0_DELAY" in remedy
+    finding = next(source_clock.detect(changed))
+    delay_ms = max(int(number) for number in re.findall(r"(\d+) ms", finding.message))
+    assert finding.remedy == "Check the delay of the GNSS receiver (SENS_GPS0_DELAY)."
     assert delay_ms == pytest.approx(110 + 250, abs=60)
 
 

@@ -241,7 +241,7 @@ def only(name: str, analysis: Analysis) -> Finding:
 def test_delay_remedy_worse_replay_is_not_proposed(sample: Analysis) -> None:
     """The timestamps of the sample are correct; a replay with 150 ms is worse."""
     finding = only("ekf2_ev_delay_wrong", offset(sample, -0.15))
-    assert finding.remedy.startswith("Correct the timestamps at the sender. EKF2_EV_DELAY 150 ")
+    assert finding.remedy == "Correct the timestamps at the sender."
     # ground truth contradicts --clock-offset too
     found = [finding.id for finding in source_clock.detect(offset(sample, -0.15))]
     assert found == ["ekf2_ev_delay_wrong"]
@@ -253,6 +253,4 @@ def test_delay_remedy_better_replay_is_proposed(sample: Analysis) -> None:
     wrong = replace(flight, log=replace(flight.log, parameters=parameters))
     late = flown_with(offset(sample, 0.0), EKF2_EV_DELAY=150.0)
     late = replace(late, flight=wrong)
-    remedy = only("ekf2_ev_delay_wrong", late).remedy
-    assert remedy.startswith("Set EKF2_EV_DELAY to 0 ms: mean NIS")
-    assert re.search(r"\((replayed|re-run)\)\.$", remedy)
+    assert only("ekf2_ev_delay_wrong", late).remedy == "Set EKF2_EV_DELAY to 0 ms."
