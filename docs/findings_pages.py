@@ -41,7 +41,7 @@ from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
 from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
 from px4fuse.findings import TITLES, Finding, find, find_aids, find_loop, source_frame  # noqa: E402
-from px4fuse.findings.cause_grouping import CONSEQUENCES, RECORDING, SETTINGS  # noqa: E402
+from px4fuse.findings.cause_grouping import CONSEQUENCES, RECORDING, SETTINGS, effect_ids  # noqa: E402
 from px4fuse.findings.model import CATALOGUE, GROUPS  # noqa: E402
 from px4fuse.flight import Columns, Unavailable  # noqa: E402
 from px4fuse.report.panels import (  # noqa: E402
@@ -160,14 +160,16 @@ def detectors() -> dict[str, str]:
     """File of the detector of each finding, without ``.py``."""
     found: dict[str, str] = {}
     for path in sorted(FINDINGS.glob("*.py")):
-        if path.stem in ("causes", "since", "summary", "model", "__init__"):
+        if path.stem in ("cause_grouping", "cause_text", "summary", "model", "__init__"):
             continue
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(tree):
             if isinstance(node, ast.Constant) and node.value in TITLES:
                 found.setdefault(str(node.value), path.stem)
     # noises.py composes these ids of filter or option and direction
-    composed = (name for name in TITLES if name.startswith(("sigma_", "kf_var", "ekf2_var")))
+    composed = (
+        name for name in TITLES if name.startswith(("sigma_", "kf_", "ekf2_over", "ekf2_under"))
+    )
     return found | dict.fromkeys(composed, "noises")
 
 
@@ -205,9 +207,8 @@ def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
     entry = CATALOGUE[name]
     yield f"# {entry.title}\n\n`{name}` ({entry.group})\n"
     yield f"## What it means\n\n{entry.meaning}\n"
-    causes = [cause for cause, effects in CONSEQUENCES.items()
-              if any(each.partition(":")[0] == name for each in effects)]  # fmt: skip
-    effects = [each.partition(":")[0] for each in CONSEQUENCES.get(name, ())]
+    causes = [cause for cause in CONSEQUENCES if name in effect_ids(cause)]
+    effects = effect_ids(name)
     if causes:
         yield "It can be a consequence of: " + links(causes) + ".\n"
     if effects:

@@ -17,12 +17,15 @@ import numpy as np
 
 from px4fuse.comparison.causal_replays import (
     Intervention,
-    Trial,
     planned_variants,
     run_interventions,
 )
 from px4fuse.comparison.comparison import compare, compare_prepared
-from px4fuse.comparison.difference_steps import explain_ekf2_difference, explanation_variants
+from px4fuse.comparison.difference_steps import (
+    corrected_settings,
+    explain_ekf2_difference,
+    explanation_variants,
+)
 from px4fuse.comparison.estimates import (
     Progress,
     Tuning,
@@ -35,6 +38,7 @@ from px4fuse.comparison.flight_events import Events, collect_events
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.preparation import explain_missing_source, prepare
 from px4fuse.comparison.remedy import ml_ekf2_parameters
+from px4fuse.comparison.trials import Trial
 from px4fuse.ekf2.aids import AidResult, evaluate_aids
 from px4fuse.ekf2.filter_recursion import Variant
 from px4fuse.ekf2.inputs import Inputs
@@ -57,7 +61,7 @@ from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Flight, Unavailable
-from px4fuse.notebook_display import one_line_repr
+from px4fuse.notebook_display import display_html, one_line_repr
 from px4fuse.readers import read_log
 from px4fuse.reading import display_name
 from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
@@ -99,6 +103,10 @@ class Analysis(Comparison):
     loop: Loop | Unavailable
     heading: HeadingError | Unavailable
     request: ComparisonRequest | None = None
+
+    def _repr_html_(self) -> str | None:
+        """Return the diagnosis card for notebooks."""
+        return display_html(self)
 
     @property
     def ekf2_replay(self) -> Ekf2Replay | Unavailable:
@@ -504,7 +512,8 @@ def run_what_if(
             raise
     if comparison is not None:
         tuning, clock = estimate_noises_and_clock(comparison, progress)
-        difference_steps = explain_ekf2_difference(comparison, model, clock)
+        corrected = corrected_settings(comparison, tuning)
+        difference_steps = explain_ekf2_difference(comparison, model, clock, corrected)
         if is_default_change:
             changes = ml_ekf2_parameters(comparison, model, tuning, clock)
             if not changes:
@@ -548,13 +557,14 @@ def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Ana
     tuning, clock = estimate_noises_and_clock(comparison, progress, names)
     heading = estimate_frame_rotation(comparison, tuning, clock, progress)
     progress("replaying EKF2")
+    corrected = corrected_settings(comparison, tuning)
 
     def requested_variants(inputs: Inputs) -> list[Variant]:
         cause_variants = planned_variants(comparison, tuning, clock, heading, inputs)
-        return [*explanation_variants(comparison, inputs), *cause_variants]
+        return [*explanation_variants(comparison, inputs, corrected), *cause_variants]
 
     model = open_model(comparison.flight, requested_variants)
-    difference_steps = explain_ekf2_difference(comparison, model, clock)
+    difference_steps = explain_ekf2_difference(comparison, model, clock, corrected)
     progress("searching for a loop closure")
     from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 (tune and sync have none)
 

@@ -19,7 +19,8 @@ from px4fuse.errors import SettingsError
 from px4fuse.reading import read_text
 from px4fuse.record import Record, Sha256, table
 
-# characters; tomllib takes seconds and gigabytes for one dotted key of 64 kB
+# maximum bytes of a form and characters of a line: tomllib takes seconds and gigabytes for one
+# dotted key of 64 kB
 MAX_BYTES, MAX_LINE_LENGTH = 20_000, 500
 MAX_MISTAKES = 20
 NONE = "none"
@@ -115,7 +116,7 @@ class Answers(Record, frozen=True, kw_only=True):
     Attributes
     ----------
     log_sha256 : str
-        SHA-256 of the log of the form.
+        SHA-256 of the log that the form is about.
     verdict_kf, verdict_ekf2 : str
         Verdict on the reported σ of KF and EKF2, one of :data:`VERDICTS`.
     quantities : tuple of (float, tuple of float, or None)
@@ -150,7 +151,7 @@ class FormQuestion(Record, frozen=True):
     Attributes
     ----------
     kind : str
-        Requested quantity along the aisle.
+        Requested quantity along the main horizontal axis of the flight ("aisle").
     update : int
         Number of the update, from 1; the first measurement sets the state and is not counted.
     sigma_a_m_s2, sigma_z_m : float
@@ -237,7 +238,7 @@ def _as_record(form: dict[str, Any]) -> dict[str, Any]:
 
 
 def update_renamed_values(value: Any) -> Any:
-    """Replace the names and values of forms and answer keys from before schema 4."""
+    """Replace old names and values in forms and answer keys from before schema version 4."""
     if isinstance(value, dict):
         return {
             _FORM.renamed.get(key, key): update_renamed_values(part) for key, part in value.items()

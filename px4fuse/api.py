@@ -18,6 +18,7 @@ from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.model import Loop
 from px4fuse.loop.tracks import LoopSource, read_source
+from px4fuse.notebook_display import display_html
 from px4fuse.readers import read_log
 from px4fuse.trajectory import evaluation
 from px4fuse.trajectory.evaluation import Evaluation
@@ -78,7 +79,7 @@ def compare(
     axes : str or sequence of str
         "north", "east", "down" or "aisle"; default: all axes of the source.
     heading_deg : float, optional
-        Heading of the aisle axis.
+        Heading of the main horizontal axis ("aisle"), clockwise from north.
     start_s, end_s : float, optional
         Segment to analyse, seconds from the first data.
     position_source : str, optional
@@ -302,6 +303,14 @@ def write_page(analysis: Analysis, path: Pathlike) -> Path:
     _require_request(analysis)
     write_all({target: html_text(analysis).encode()})
     return target
+
+
+@display_html.register
+def _display_card(analysis: Analysis) -> str | None:
+    """Return the diagnosis card of an analysis as HTML; None without a request."""
+    from px4fuse.report.card_html import card_of, notebook_html  # noqa: PLC0415 - slow import
+
+    return None if analysis.request is None else notebook_html(card_of(analysis))
 
 
 def _require_suffix(path: Pathlike, suffix: str) -> Path:

@@ -72,17 +72,17 @@ class Aid:
         return frozenset((self.noise, self.gate, self.delay, self.noise_mode))
 
     def logged_parameters(self, logged: Mapping[str, float]) -> dict[str, float]:
-        """Return the logged parameters of this aid, with its switch."""
+        """Return the logged parameters of this aid and the parameter that enables it."""
         names = (self.noise, self.delay, self.gate, self.noise_mode, self.switch, AID_MASK)
         return {name: float(logged[name]) for name in names if name in logged}
 
 
 AID_MASK = "EKF2_AID_MASK"
-# exists from main of 2026 on, in which EKF2 uses the measurement time of a fix from the driver
+# only in logs of PX4 main since 2026, where EKF2 uses the measurement time of a fix from the driver
 GNSS_MODE = "EKF2_GPS_MODE"
-# relative tolerance of range limits; the rounding error of a float32 is 6e-8
+# relative tolerance of the limits of a range, because logged values are float32 (rounding 6e-8)
 FLOAT32_TOLERANCE = 1e-6
-# parameters of the age of a fix of the first receiver from v1.17 on, which EKF2 subtracts
+# age of a fix of the first receiver from v1.17 on: EKF2 subtracts it from the timestamp
 RECEIVER_DELAYS = ("SENS_GNSS0_DELAY", "SENS_GPS0_DELAY")
 
 

@@ -27,9 +27,9 @@ from px4fuse.record import NotNegative, Record, Vector
 from px4fuse.record import Unavailable as Unavailable  # noqa: PLC0414 - public re-export
 
 AxisName = Literal["north", "east", "down"]
-# Minimum fraction of regular intervals (up to 3 medians); below, the samples arrive in bursts
+# Minimum fraction of sample intervals up to 3 medians; below it, the samples arrive in bursts
 MIN_REGULAR_SHARE = 0.8
-# Methods of a ClockMap that do not provide times of measurement
+# Values of ClockMap.method for which the timestamps are not times of measurement
 ARRIVAL_METHODS = ("arrival time", "receive time", "position in the stream")
 AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
 SOURCE_NAMES: Mapping[PositionKind, str] = {
@@ -417,7 +417,7 @@ class Ekf2:
     gate : float
         EKF2_EVP_GATE (in √S).
     notes : tuple of str
-        Sentences on dropped samples and on the times.
+        Sentences on dropped samples and on the origin of the timestamps.
     accelerometer_bias : DataFrame, shape (n, 3), or Unavailable
         Estimated bias (m/s², body FRD) that EKF2 subtracts from the specific force.
     step_s : float
@@ -497,9 +497,9 @@ class Flight:
     airborne : tuple of (float, float), or Unavailable
         Intervals (s) in which the land detector reports flight; empty if none.
     missing : tuple of Unavailable
-        Missing parts, with reason and action.
+        Missing data, with reason and action.
     streams : mapping from part to Stream
-        Source of each available part: "imu", "attitude", "ekf2_state", "ekf2_variance",
+        Source of each available kind of data: "imu", "attitude", "ekf2_state", "ekf2_variance",
         "ekf2_innovations", "ekf2_fusing", "truth", "airborne".
     clocks : tuple of ClockMap
         Maps from other clocks to the boot clock.

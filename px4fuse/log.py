@@ -1,4 +1,4 @@
-"""Description of a recording: log file, senders, clocks, and source of each part."""
+"""Description of a recording: log file, senders, clocks, and topics of each kind of data."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -79,7 +79,7 @@ class ClockMap(Record, frozen=True):
 
 @dataclass(frozen=True)
 class Stream:
-    """Source of one part of a flight.
+    """Topics, clock and file of one kind of data (IMU, attitude, ...).
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
     damage : tuple of str
         Sentences on unreadable parts of the file.
     bytes_read : int
-        Part of ``bytes`` that was read as complete messages.
+        Number of bytes that were read as complete messages.
     ends_in_flight : bool
         True if the land detector reports flight at the end of the data.
     restarts : int or None

@@ -1,9 +1,19 @@
-"""Short text (repr) of records that contain tables or arrays."""
+"""Display of results in notebooks: short text of records with tables or arrays, and HTML."""
 
 from collections.abc import Mapping
+from functools import singledispatch
 from typing import Any
 
 MAX_TEXT = 60  # characters; a longer text is cut
+
+
+@singledispatch
+def display_html(result: object) -> str | None:
+    """Return a result as HTML for notebooks, or None to display its text.
+
+    Modules above that of a type register its function, because they format the results.
+    """
+    return None
 
 
 def one_line_repr(result: Any) -> str:

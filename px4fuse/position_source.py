@@ -9,7 +9,7 @@ from px4fuse.record import Record
 
 PositionKind = Literal["uwb", "vio", "mocap", "gnss", "file"]
 DataPath = Literal[
-    "given file", "as it arrived", "aligned by EKF2", "kept by EKF2", "rebuilt from innovations"
+    "given file", "as received", "aligned by EKF2", "kept by EKF2", "rebuilt from innovations"
 ]
 
 
@@ -50,7 +50,7 @@ class Origin(Record, frozen=True):
     @property
     def has_all_samples(self) -> bool:
         """True if the track contains all samples of the sender."""
-        return self.path in ("given file", "as it arrived")
+        return self.path in ("given file", "as received")
 
     @property
     def is_vision(self) -> bool:
@@ -79,12 +79,12 @@ class Origin(Record, frozen=True):
 
 
 POSITION_FILE = Origin("file", "given file", EV_POS)
-RECEIVED = Origin("uwb", "as it arrived", EV_POS)
-MOTION_CAPTURE = Origin("mocap", "as it arrived", None)
+RECEIVED = Origin("uwb", "as received", EV_POS)
+MOTION_CAPTURE = Origin("mocap", "as received", None)
 ALIGNED = Origin("uwb", "aligned by EKF2", EV_POS)
 LOGGED_BY_EKF2 = Origin("uwb", "kept by EKF2", EV_POS)
 FROM_INNOVATIONS = Origin("uwb", "rebuilt from innovations", EV_POS)
-GNSS = Origin("gnss", "as it arrived", GNSS_POS, is_automatic=False)
+GNSS = Origin("gnss", "as received", GNSS_POS, is_automatic=False)
 # In order of preference. A position file is assumed to be from the system that EKF2 fused
 ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS, GNSS)
 

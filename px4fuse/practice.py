@@ -5,27 +5,32 @@ It is not an exam: the page contains the answers, compressed so they are not rea
 
 import base64
 import json
+import re
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 
 from px4fuse.analysis import run
+from px4fuse.card.build import build_card
+from px4fuse.card.model import Card
+from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.explore.data import flight_data
 from px4fuse.explore.packing import Packer
 from px4fuse.explore.page import data_scripts, page_text
 from px4fuse.findings import Finding, find
-from px4fuse.findings.summary import summarise
 from px4fuse.record import Record, table
+from px4fuse.report.card_html import card_html
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-# Choices that can occur in one flight: one affects the whole motion, the other single samples. A
-# wrong noise is not combined, because it would hide another mistake
+# Groups of mistakes that one flight can combine: one affects the whole motion, the other single
+# samples. A wrong noise would hide another mistake, so it is not combined
 COMBINABLE_GROUPS = ({"clock", "source"}, {"clock", "gate"}, {"frame", "source"}, {"frame", "gate"})
 MAX_LEVEL = 3
 MAX_SEED = 2**32 - 1
@@ -41,13 +46,14 @@ SCENARIO_VALUES: dict[str, Any] = {
     "tilt_error_deg": 0.02,
     "yaw_error_deg": 0.2,
 }
-LENGTH_M = (8.0, 12.0)  # m; range of the aisle length
-# Finding from which the time span of a mistake is taken
+LENGTH_M = (8.0, 12.0)  # m; range of the length of a pass
+# Finding that contains the time span of a mistake
 FINDING_WITH_TIME = {
     "nlos": "source_outliers",
     "jump": "source_position_jump",
     "dropout": "source_gap",
 }
+NO_MISTAKE = "No mistake: about 5 % of the innovations are outside ±2√S, and they are white."
 NOISY_UWB = "noisy-uwb"  # the log is correct, but SIGMA_Z of KF is too small
 
 
@@ -64,8 +70,10 @@ class HiddenMistake(Record, frozen=True):
         Size for each level, as on the command line.
     view : str
         View of the page that shows the mistake.
-    description : str
-        Description of the mistake, with a placeholder for the size.
+    fault : str
+        Name of the mistake.
+    size_text : str
+        Text of its size; {0} and {1} are the parts of the size.
     symptom : str
         Effect on the plots, and the setting that confirms the mistake.
     either_sign : bool
@@ -76,7 +84,8 @@ class HiddenMistake(Record, frozen=True):
     mistake: str
     sizes: tuple[str, str, str]
     view: str
-    description: str
+    fault: str
+    size_text: str
     symptom: str
     either_sign: bool = False
 
@@ -193,15 +202,15 @@ def practice_text(
         "\n".join(scripts),
         data,
         command="practice",
-        heading="Find the mistakes in this flight",
-        title=f"seed {seed}, level {level}",
+        title="simulated flights with known faults",
+        about=f"seed {seed}, level {level}",
         flight_count=count,
         choices=CHOICES,
     )
 
 
 def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str, Any], str]:
-    """Return the data of a flight without its findings, and its elements with the answer."""
+    """Return the data of a flight, and its elements with the compressed answer."""
     mistakes = [
         f"{mistake.mistake}={size}"
         for mistake, size in zip(practice_flight.mistakes, practice_flight.sizes, strict=True)
@@ -212,17 +221,17 @@ def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
     analysis = run(request, flight=flight)
     findings, packer = find(analysis), Packer()
-    data = flight_data(analysis, packer)
+    data, card = flight_data(analysis, packer), build_card(analysis, findings, request)
+    described = [
+        _describe_mistake(mistake, size, findings)
+        for mistake, size in zip(practice_flight.mistakes, practice_flight.sizes, strict=True)
+    ]
     key = {
         "right": practice_flight.correct_answers,
-        "mistakes": [
-            _describe_mistake(mistake, size, findings)
-            for mistake, size in zip(practice_flight.mistakes, practice_flight.sizes, strict=True)
-        ],
-        "summary": list(summarise(analysis, findings)),
-        "findings": data["findings"],
+        "mistakes": described,
+        "rerun": _rerun_sentence(card) if described else NO_MISTAKE,
+        "card": card_html(_name_mistakes(card, described), has_apply=True),
     }
-    data |= {"summary": [], "findings": []}
     compressed_key = base64.b64encode(zlib.compress(json.dumps(key).encode())).decode()
     scripts = data_scripts(data, analysis, packer, f"-{number}")
     return data, f'{scripts}\n<script type="text/plain" id="key-{number}">{compressed_key}</script>'
@@ -231,13 +240,56 @@ def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str
 def _describe_mistake(
     mistake: HiddenMistake, size: str, findings: tuple[Finding, ...]
 ) -> dict[str, Any]:
-    """Return description, symptom, view and time span (s) of a mistake for the page."""
+    """Return fault, size, time, symptom and view of a mistake for the page, in words."""
     finding_id = FINDING_WITH_TIME.get(mistake.mistake)
-    spans = [finding.spans_s[0] for finding in findings if finding.id == finding_id]
+    spans = [span for one in findings if one.id == finding_id for span in one.spans_s]
+    time = f"{spans[0][0]:.1f} to {spans[-1][1]:.1f} s" if spans else "whole flight"
     return {
-        "choice": mistake.choice,
-        "description": mistake.description.format(size=size),
+        "fault": mistake.fault,
+        "size": mistake.size_text.format(*size_in_words(size)),
+        "time": time,
         "symptom": mistake.symptom,
         "view": mistake.view,
         "span": list(spans[0]) if spans else None,
     }
+
+
+def size_in_words(size: str) -> list[str]:
+    """Split a size of the command line into its parts, with a blank before each unit.
+
+    >>> size_in_words("5%,2m"), size_in_words("-400ms"), size_in_words("0.3")
+    (['5 %', '2 m'], ['-400 ms'], ['0.3'])
+    """
+    return [re.sub(r"(?<=\d)(?=[^\d.])", " ", part).replace("deg", "°") for part in size.split(",")]
+
+
+def _rerun_sentence(card: Card) -> str:
+    """Return the re-run that improves most, in one sentence."""
+    reruns = [
+        rerun for cause in card.causes for rerun in cause.reruns if rerun.improves != "nothing"
+    ]
+    if not reruns:
+        return "No re-run with one change corrects this flight."
+    best = reruns[0]
+    changes = [
+        f"{name} {format_value(pair[0])} → {format_value(pair[1])}{unit}"
+        for name, pair, format_value, unit in (
+            ("position RMSE", best.position_rmse_m, format_metres, " m"),
+            ("innovation ÷ √S", best.source_ratio, format_ratio, ""),
+        )
+        if pair is not None
+    ]
+    return f"Re-run, {best.label}: {', '.join(changes)}."
+
+
+def _name_mistakes(card: Card, described: Sequence[Mapping[str, Any]]) -> Card:
+    """Replace the headline of a card that found no cause on a flight with a mistake."""
+    if card.causes or not described:
+        return card
+    fault = "; ".join(f"{one['fault']}: {one['size']}" for one in described)
+    return structs.replace(
+        card,
+        severity="warning",
+        headline=fault[0].upper() + fault[1:],
+        do_this=("None of the automatic checks finds this mistake. Compare the plots.",),
+    )

@@ -1,7 +1,7 @@
 """Base class of the records in results: immutable, strictly typed, and written without change.
 
-Field names contain the unit. A number that could not be computed is absent, or its part is an
-:class:`Unavailable`; it is never replaced by zero.
+Field names contain the unit. A number that could not be computed is absent, or its record is
+replaced by an :class:`Unavailable`; it is never replaced by zero.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
 
 
 def to_serializable(value: Any) -> Any:
-    """Return the written fields of a record and its parts, without arrays and tables."""
+    """Return the written fields of a record and of records in it, without arrays and tables."""
     if isinstance(value, Record):
         kind = value.schema_type or type(value)
         return kind(

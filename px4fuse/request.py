@@ -8,7 +8,7 @@ import os
 import re
 import shlex
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import PurePath
 from typing import Annotated, Any, Literal, Self
 
@@ -100,7 +100,7 @@ class ComparisonRequest(
     axes : tuple of str
         Empty for all axes with a position.
     heading_deg : float or None
-        Heading of the aisle axis, clockwise from north; None for the main direction of the track.
+        Heading of the axis "aisle", clockwise from north; None for the main direction of the track.
     start_s, end_s : float or None
         Segment in seconds after the first data; None for take-off and landing.
     clock_offset_s : float, "auto" or None
@@ -189,7 +189,7 @@ class LoopRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", 
 
 
 class Sweep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Range of values of one parameter, ends included; equal ratios above 0, else equal steps."""
+    """Range of one parameter, ends included; equal ratios of values above 0, else equal steps."""
 
     parameter: str
     low: float
@@ -358,8 +358,13 @@ def command_line(
             arguments += ["--without", name]
         for since in {*shown_request.without.values()} - {0.0}:
             arguments += ["--from", _option_text(since)]
-    quote = subprocess.list2cmdline if for_shell and os.name == "nt" else shlex.join
-    return quote(["px4fuse", *arguments])
+    words = ["px4fuse", *arguments]
+    return quote_command(words) if for_shell else shlex.join(words)
+
+
+def quote_command(words: Sequence[str]) -> str:
+    """Join the words of a command, quoted for the shell of this system."""
+    return subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)
 
 
 def settings_name(request: ComparisonRequest | EvaluationRequest | LoopRequest) -> str:

@@ -28,7 +28,7 @@ Result = TypeVar("Result")
 # A worker is replaced after this number of jobs, because caches of libraries grow. More frequent
 # replacement would cost time: the imports of a new process take 2 s
 JOBS_PER_WORKER = 80
-# s; one report of a 10-minute flight takes about 60 s
+# maximum time of a job (s); one report of a 10-minute flight takes about 60 s
 TIMEOUT_S = 120.0
 MEMORY_BYTES = 4_000_000_000
 # s for the imports of a new process on a slow and busy computer

@@ -14,7 +14,7 @@ from px4fuse.errors import OutputError
 from px4fuse.input_files import check_outputs
 
 STANDARD_OUTPUT = Path("-")
-# s to wait for a reader of a named pipe
+# maximum time (s) to wait for a reader of a named pipe
 READER_TIMEOUT_S = 5.0
 # True on Windows, which does not replace a file that another program has open
 LOCKS_OPEN_FILES = sys.platform == "win32"
@@ -35,7 +35,7 @@ def write_all(
     ----------
     contents : mapping from Path to bytes
         Missing folders are created. :data:`STANDARD_OUTPUT` is standard output.
-    placed : callable
+    on_written : callable
         Called with each path after the output is written.
 
     Raises

@@ -25,8 +25,8 @@ SMALL_SIGMA_A = Card(
         rejected_fraction=0.0,
         horizontal_resets=0,
     ),
-    effect_text="KF: position RMSE 2.11 m against ground truth along the aisle (7.00 m horizontal), "
-    "128 times its reported σ. EKF2, with the same positions: 0.063 m, consistent.",
+    effect_text="KF: position RMSE 2.11 m against ground truth along the aisle (7.00 m "
+    "horizontal), 128 times its reported σ. EKF2, with the same positions: 0.063 m, consistent.",
     do_this=("Run KF again with --sigma-a 0.363, or without --sigma-a (default 0.5).",),
     verdicts=verdicts(
         (21.0, "overconfident"),
@@ -40,8 +40,8 @@ SMALL_SIGMA_A = Card(
             id="process_noise_near_zero",
             severity="error",
             title="SIGMA_A is 360 times too small: KF ignores new positions",
-            why="SIGMA_A 0.001 m/s²; maximum-likelihood estimate 0.363 m/s², 95 % interval 0.322 to "
-            "0.412 m/s². The process noise is almost zero. σ stops growing between updates, the "
+            why="SIGMA_A 0.001 m/s²; maximum-likelihood estimate 0.363 m/s², 95 % interval 0.322 "
+            "to 0.412 m/s². The process noise is almost zero. σ stops growing between updates, the "
             "gain falls to 0.02, and KF needs 9 s to follow a change.",
             actions=(
                 Action(

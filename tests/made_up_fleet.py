@@ -7,7 +7,7 @@ import pandas as pd
 
 VEHICLES = ("000200000000373731353237510500260033", "bench-2", "")
 FIRMWARE = ("v1.13.3", "v1.14.0", "v1.16.1")
-STORY = "Along the aisle EKF2 was 6 cm from the truth.\nThe clock of the source is late."
+STORY = "Position timestamps are 0.26 s late"
 NOT_LOGGED = ("position: the log has no vehicle_visual_odometry", "Set SDLOG_PROFILE to 129.")
 DAMAGED = ("not a ULog file", "Give the log as the flight controller wrote it.")
 
@@ -66,7 +66,12 @@ def made_up(count: int, seed: int = 1) -> pd.DataFrame:
                     "sigma_a_m_s2": 0.3, "sigma_a_low_m_s2": 0.2, "sigma_a_high_m_s2": 0.4,
                     "clock_offset_s": offset, "clock_offset_low_s": offset - 0.006,
                     "clock_offset_high_s": offset + 0.006, "rejected_fraction": 0.01,
-                    "model_correlation": 0.97, "summary": STORY, "findings": ";".join(findings),
+                    "model_correlation": 0.97, "findings": ";".join(findings),
+                    "severity": "error" if sigma > 0.2 else "clean", "headline": STORY,
+                    "action": "param set EKF2_EVP_NOISE 0.3" if sigma > 0.2 else "",
+                    "verdicts": "overconfident;consistent;consistent;not evaluated",
+                    "kf_source_ratio": sigma / 0.1, "kf_truth_ratio": 12.0,
+                    "ekf2_source_ratio": 0.9, "position_rmse_m": error, "difference_rms_m": error,
                     "results": f"results/flight {number:04d}.json",
                     "report": f"reports/flight {number:04d}.pdf",
                 }

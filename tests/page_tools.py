@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from pypdf import PdfReader
 
 from px4fuse.report import fonts
 from px4fuse.report.page import Block, Page, to_typst_data
-from px4fuse.report.pdf import compile_pdf
+from px4fuse.report.typesetting import compile_pdf
 
 
 def every(blocks: Sequence[Block]) -> Iterator[Block]:
@@ -26,12 +28,27 @@ def texts(*pages: Page) -> list[str]:
     found = []
     for page in pages:
         for block in every(page.blocks):
+            if block["kind"] == "cover":
+                found += list(_strings({**block, "blocks": ()}))
+                continue
             label = block["label"]["text"].split("\n") if "label" in block else ()
             cells = [cell for row in block.get("rows", ()) for cell in row]
             found += [block[key] for key in ("title", "text", "lead", "caption") if block.get(key)]
             found += [*label, *(part["text"] for part in block.get("texts", ()))]
             found += [*block.get("head", ()), *(c if isinstance(c, str) else c[0] for c in cells)]
     return found
+
+
+def _strings(value: Any) -> Iterator[str]:
+    """Yield all texts of nested mappings and sequences."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping):
+        for inner in value.values():
+            yield from _strings(inner)
+    elif isinstance(value, Iterable):
+        for inner in value:
+            yield from _strings(inner)
 
 
 def words(*pages: Page) -> str:
@@ -52,9 +69,28 @@ def axes_of(*pages: Page) -> list[Axes]:
 
 def set_by_typst(*pages: Page) -> list[str]:
     """Set the pages as PDF and return the text of each sheet."""
+    return [sheet.extract_text() for sheet in PdfReader(io.BytesIO(pdf_of(*pages))).pages]
+
+
+def pdf_of(*pages: Page) -> bytes:
+    """Set pages as PDF."""
     blocks = to_typst_data([block for page in pages for block in page.blocks])
     report = {
         "title": "t", "author": "a", "head": "", "student": "", "foot": "", "results": None,
         "fonts": [fonts.FONT], "blocks": blocks,
     }  # fmt: skip
-    return [sheet.extract_text() for sheet in PdfReader(io.BytesIO(compile_pdf(report))).pages]
+    return compile_pdf(report)
+
+
+def smallest_type(pdf: bytes) -> float:
+    """Return the smallest size (points) of the letters on the pages of a PDF."""
+    sizes = []
+    for sheet in PdfReader(io.BytesIO(pdf)).pages:
+
+        def visit(text: str, cm: list[float], tm: list[float], _: Any, size: float) -> None:
+            if text.strip():
+                matrix = np.array([cm[:2], cm[2:4]]) @ np.array([tm[:2], tm[2:4]])
+                sizes.append(size * float(np.sqrt(abs(np.linalg.det(matrix)))))
+
+        sheet.extract_text(visitor_text=visit)
+    return min(sizes)

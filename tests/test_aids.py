@@ -105,7 +105,7 @@ def outage_free(log: AidLog, start_s: float, end_s: float) -> pd.DataFrame:
     return log.samples[(times <= start_s) | (times >= end_s)]
 
 
-def test_aid_verdict_never_enabled_is_idle() -> None:
+def test_aid_verdict_states_disabled_not_fused_or_too_few() -> None:
     log = aid_log()
     assert evaluate(replace(log, enabled=steps((0.0, 0.0)))).verdict == "disabled"
     few = evaluate(replace(log, samples=log.samples.iloc[::80], enabled=steps((0.0, 1.0))))

@@ -84,7 +84,7 @@ def test_read_answers_invalid_form_names_place_in_one_line(
     assert "\n" not in str(error.value).replace("\\n", "")
 
 
-def test_quantities_depend_on_log_and_match_replay() -> None:
+def test_form_questions_depend_on_log_and_match_replay() -> None:
     drawn = {draw_questions(f"{n:064x}") for n in range(200)}
     assert len(drawn) == 200
     kinds = {quantity.kind for each in drawn for quantity in each}

@@ -84,7 +84,7 @@ class TestDraw:
         # the id as another platform may spell it
         assert draw(SECRET, "S1 ", "aisle") == draw(SECRET, "s1", "aisle")
 
-    def test_draw_of_pinned_secret_is_unchanged(self):
+    def test_draw_fixed_secret_is_unchanged(self):
         drawn = draw(SECRET, "s1", "aisle", 2)
         scenario = drawn.scenario
         # a loop contains no ground truth, which would show the landing
@@ -171,7 +171,7 @@ class TestDraw:
 @pytest.mark.parametrize(
     ("kind", "number", "count"), [("aisle", 0, 2), ("aisle", 1, 2), ("aisle", 2, 1), ("loop", 0, 1)]
 )
-def test_fly_log_has_finding_of_each_mistake_in_key(tmp_path, kind, number, count):
+def test_simulate_assigned_log_shows_each_mistake_of_key(tmp_path, kind, number, count):
     log, answer = assignment.simulate_assigned(SECRET, CLASS[number], kind, count, True)
     path = tmp_path / answer.file
     path.write_bytes(log)

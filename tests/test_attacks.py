@@ -318,7 +318,7 @@ LOOPS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], float, int]] = {
 
 
 @pytest.mark.parametrize("name", LOOPS)
-def test_loop_item_points_and_flags(name: str) -> None:
+def test_grade_loop_gives_expected_points_and_flags(name: str) -> None:
     truth, request, loop, points, flags = LOOPS[name]
     graded = grade_loop(truth, request, loop)
     assert graded.points == pytest.approx(points), graded.items

@@ -117,7 +117,7 @@ def test_read_log_mistyped_name_suggests_file(tmp_path):
     assert read_error(tmp_path / "aisle_uvb.ulg").endswith("Did you mean aisle_uwb.ulg?")
 
 
-def test_read_log_without_used_topics_has_no_parts(tmp_path):
+def test_read_log_without_known_topics_has_no_data(tmp_path):
     at = stamps(2.0, 10.0)
     log = Log([topic("battery_status", at, {"voltage_v": np.full(len(at), 16.0)})])
     flight = read_or_error(log.write(tmp_path / "battery.ulg"))
@@ -135,7 +135,7 @@ def test_read_log_without_used_topics_has_no_parts(tmp_path):
         choose_source(flight)
 
 
-def test_read_log_recursive_format_ends(tmp_path):
+def test_read_log_format_containing_itself_ends(tmp_path):
     """A format that contains itself must not cause infinite recursion."""
     path = tmp_path / "nested.ulg"
     content = make_log("v1.16", 1.0).encode()
@@ -150,7 +150,7 @@ def test_read_log_recursive_format_ends(tmp_path):
 
 @pytest.mark.parametrize("key", ["char[4] ver_sw_release", "uint32_t[1] ver_sw_release",
                                  "float ver_sw_release"])  # fmt: skip
-def test_read_log_release_of_other_type_is_read(tmp_path, key):
+def test_read_log_firmware_version_of_wrong_type_is_ignored(tmp_path, key):
     """A damaged type name makes the release number another type."""
     content = make_log("v1.16", 1.0).encode()
     old = b"uint32_t ver_sw_release"
@@ -182,7 +182,7 @@ def write_and_read(log: Log, tmp_path: Path) -> Flight:
         ("vehicle_land_detected", "airborne"),
     ],
 )
-def test_read_log_missing_topic_makes_one_part_unavailable(tmp_path, topic, part):
+def test_read_log_missing_topic_makes_its_data_unavailable(tmp_path, topic, part):
     """Only the part of the missing topic is unavailable."""
     flight = write_and_read(make_log("v1.16", 2.0).drop(topic), tmp_path)
     for name in ("imu", "attitude", "ekf2", "airborne"):
@@ -411,7 +411,7 @@ def truth_impossible(log: Log) -> None:
     "damage", [flags_at_largest_time, flags_late, one_state, source_frozen, truth_impossible],
     ids=lambda one: one.__name__,
 )  # fmt: skip
-def test_compare_of_damaged_part_writes_finite_results(tmp_path, damage):
+def test_compare_damaged_data_gives_finite_results(tmp_path, damage):
     """Warnings are errors in these tests."""
     log = make_log("v1.16", 20.0)
     damage(log)

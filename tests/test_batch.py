@@ -143,7 +143,11 @@ def test_batch_table_has_numbers_or_reason_of_each_log(tmp_path):
     assert (first["status"] == "done").all()
     results = read_results((output / first.loc[0, "results"]).read_bytes())
     assert results.request.log == "f1.ulg"
-    assert results.summary == tuple(first.loc[0, "summary"].split("\n"))
+    card = results.card
+    assert first.loc[0, ["severity", "headline"]].tolist() == [card.severity, card.headline]
+    ratios = [verdict.ratio for verdict in card.verdicts[:2]]
+    assert first.loc[0, ["kf_source_ratio", "kf_truth_ratio"]].tolist() == ratios
+    assert first["ekf2_source_ratio"].isna().all()
     assert (output / first.loc[0, "report"]).read_bytes().startswith(b"%PDF")
     # a log whose clock is out of range has no date
     beyond = structs.replace(results.log, start_unix_s=1e18)
@@ -172,7 +176,7 @@ def test_batch_table_has_numbers_or_reason_of_each_log(tmp_path):
     pd.testing.assert_frame_equal(written, table, rtol=1e-9)
 
 
-def test_batch_terminal_counts_reasons_of_logs(capsys):
+def test_batch_terminal_counts_logs_by_failure_reason(capsys):
     table = made_up(60).fillna({"axis": "", "change": ""})
     show(terminal(), format_summary(BatchResult(table, 3, frozenset(), ())).blocks)
     said = " ".join(capsys.readouterr().out.split())

@@ -296,7 +296,7 @@ def test_class_page_redrawn_report_is_linked() -> None:
     assert made["rows"][1][3] == []
 
 
-def test_tenths_count_values_by_lower_edge() -> None:
+def test_count_tenths_returns_counts_and_lower_edges() -> None:
     assert count_tenths([0, 5, 5.5, 9, 99], 10) == [
         (count, f"{edge}") for edge, count in enumerate((1, 0, 0, 0, 0, 2, 0, 0, 0, 2))
     ]

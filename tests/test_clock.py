@@ -88,7 +88,7 @@ def level_signals(
     return make_signals(imu, attitude_table(time, spoiled), (0.5, 19.0))
 
 
-def test_signals_level_vehicle_at_rest_have_no_acceleration() -> None:
+def test_sensitivities_level_vehicle_at_rest_match_theory() -> None:
     signals = level_signals()
     t, g = signals.time_s - signals.time_s[0], GRAVITY[2]
     _, speed, value = np.moveaxis(signals.table, 1, 0)
@@ -105,7 +105,7 @@ def test_signals_level_vehicle_at_rest_have_no_acceleration() -> None:
     np.testing.assert_allclose(value[:, :, 7:10], np.tile(-np.eye(3), (len(t), 1, 1)), atol=1e-12)
 
 
-def test_signals_constant_yaw_rate_give_a_circle() -> None:
+def test_integrated_imu_constant_yaw_rate_gives_a_circle() -> None:
     """Yaw rate ω with a body acceleration s to the right: a = s (-sin ωt, cos ωt)."""
     omega, sideways = 0.5, 2.0
     signals = level_signals((0.0, sideways, 0.0), turn=omega, interval=0.004)
@@ -244,7 +244,7 @@ def exact_imu() -> tuple[Flight, ClockOffset, list[tuple[Array, Array]]]:
     return flight, found, segments
 
 
-def test_clock_profile_equals_joint_normal_density(exact_imu) -> None:
+def test_time_offset_likelihood_equals_joint_normal_density(exact_imu) -> None:
     """Both noises are maximised at each offset."""
     _, found, segments = exact_imu
     profile, best = [], []
@@ -289,7 +289,7 @@ def test_clock_parabola_gives_vertex_sigma_interval() -> None:
 
 @pytest.mark.parametrize("offset_s", [0.0, -0.2, -0.21, 0.333])
 @pytest.mark.parametrize("factor", [1.0, 2.5])
-def test_clock_parts_and_change_follow_profiles(monkeypatch, offset_s, factor) -> None:
+def test_time_offset_of_parts_follows_their_likelihood(monkeypatch, offset_s, factor) -> None:
     """Use parabolas as profiles of the parts."""
     shift, sigma = np.array([-0.05, 0.025, 0.0, 0.0]), np.array([0.03, 0.02, 0.03, 0.5])
 
@@ -315,7 +315,7 @@ def test_clock_parts_and_change_follow_profiles(monkeypatch, offset_s, factor) -
     assert p == pytest.approx(chi2.sf(ratio, 2), abs=0.03)
 
 
-def test_clock_variance_inflation_simulates_imu_noise(monkeypatch) -> None:
+def test_variance_inflation_simulates_imu_and_source_noise(monkeypatch) -> None:
     """Increments and measurements have the variance of the noises; velocities match."""
     given: list[Array] = []
 
@@ -426,7 +426,7 @@ def test_clock_excludes_outliers_and_keeps_applied_offset() -> None:
     assert clock_advice(compared, found)["Offset"].startswith("-0.")
 
 
-def test_largest_step_p_value_is_bonferroni_t_test() -> None:
+def test_largest_step_p_value_equals_bonferroni_t_test() -> None:
     """Compare with scipy's two-sample t for equal weights and a scatter above the stated σ."""
     offset = np.array([0.0, 0.03, -0.02, 0.01, 0.2, 0.24, 0.19, 0.22, 0.2])
     weight = np.full(len(offset), 1e6)
@@ -493,12 +493,12 @@ def test_widen_for_drift_scatter_widens_interval() -> None:
     assert found.is_determinable
 
 
-def test_widen_for_drift_small_scatter_changes_nothing() -> None:
+def test_widen_for_drift_small_scatter_keeps_interval() -> None:
     found = widen_for_drift(stated(0.01, -0.01, 0.015, -0.02, 0.0))
     assert (found.interval_s, found.sigma_s) == (pytest.approx((-0.021, 0.019)), 0.01)
 
 
-def test_widen_for_drift_keeps_step_and_flags_wide_interval() -> None:
+def test_widen_for_drift_keeps_jump_and_rejects_wide_interval() -> None:
     step = widen_for_drift(stated(-0.41, -0.36, 0.03, -0.04, 0.02, 0.05, -0.03, 0.0))
     assert step.change_p_value < 1e-3
     wide = widen_for_drift(replace(stated(-0.4, 0.4, -0.3, 0.3), interval_s=(-0.05, 0.05)))

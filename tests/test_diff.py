@@ -201,7 +201,7 @@ def test_measures_of_aids_leave_out_position_source(clean):
     assert "ev_pos" in {path.split(".")[1] for path in found}
 
 
-def test_changes_without_an_axis_list_its_numbers(clean):
+def test_changes_axis_in_one_input_lists_its_numbers(clean):
     part = as_input(replace(clean.results, axes={"north": clean.results.axes["north"]}))
     found = by_path(list_changes(clean, part))
     assert found["axes.down.filters.kf.nis_mean"][1] is None

@@ -40,7 +40,7 @@ def test_metres_of_latitude_uses_ekf2_curvature_radii(latitude_deg: float) -> No
     assert np.subtract(higher, (north, east, down)) == pytest.approx([1e-4, 1e-4, 0.0], abs=1e-12)
 
 
-def test_metres_of_record_in_metres_is_one() -> None:
+def test_ekf2_metres_per_metre_is_one_for_logs_in_metres() -> None:
     assert ekf2_metres_per_metre(record(45.0, north_m=3.0)) == (1.0, 1.0, 1.0)
     assert ekf2_metres_per_metre(record(np.nan)) == (1.0, 1.0, 1.0)
 

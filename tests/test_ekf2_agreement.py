@@ -164,8 +164,13 @@ def test_heading_error_without_evaluated_state_is_none():
     assert _heading_error_deg(ekf2, replay) is None
 
 
-def compared(count: int, *, varying: bool = True) -> Agreement | Unavailable:
-    """Return the agreement of a log and its own replay with this many evaluated samples."""
+def compared(
+    count: int, *, varying: bool = True, states: int | None = None
+) -> Agreement | Unavailable:
+    """Return the agreement of a log and its own replay with this many evaluated samples.
+
+    ``states``: number of logged states, from the start; None for one per innovation.
+    """
     time = 10.0 + np.arange(count + 5.0)
     rng = np.random.default_rng(2)
     nu = rng.normal(0.0, 0.1, len(time)) if varying else np.full(len(time), 0.1)
@@ -175,7 +180,7 @@ def compared(count: int, *, varying: bool = True) -> Agreement | Unavailable:
     frame.loc[frame.index[-2:], "rejected"] = 1.0
     state = pd.DataFrame(0.0, index=time, columns=Columns.STATE)
     innovations = {"north": frame, "east": frame}
-    ekf2 = made(Ekf2, aids={}, innovations=innovations, innovation_topics=AID, state=state)
+    ekf2 = made(Ekf2, aids={}, innovations=innovations, innovation_topics=AID, state=state[:states])
     updates = pd.DataFrame({"rejected": 0.0, "fused_at_s": time}, index=time)
     for axis in ("north", "east"):
         updates[f"innovation_{axis}_m"] = nu
@@ -202,6 +207,11 @@ def test_agreement_needs_20_varying_innovations():
     assert "only 19 logged innovations to compare with (at least 20" in few.reason
     assert isinstance(same := compared(20, varying=False), Unavailable)
     assert "are constant" in same.reason
+
+
+def test_agreement_without_evaluated_state_is_unavailable():
+    assert isinstance(unknown := compared(20, states=1), Unavailable)
+    assert unknown.reason == "EKF2's position is not logged in the replayed time"
 
 
 def test_logged_innovations_missing_axis_is_empty():

@@ -62,7 +62,7 @@ AID = ("estimator_aid_src_ev_pos",)
 # ---------------------------------------------------------------- parameters
 
 
-def test_settings_in_force_use_px4_defaults():
+def test_effective_settings_default_to_px4_values():
     """Defaults of PX4's module.yaml and params_*.yaml, by fused aid."""
     vision, gnss = effective_settings({}), effective_settings({}, GNSS_POS)
     for names, other_names, begin in ((vision, gnss, "EKF2_EV"), (gnss, vision, "EKF2_GPS")):
@@ -131,7 +131,7 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     return prepared
 
 
-def test_rules_depend_on_release(flown):
+def test_fusion_rules_depend_on_release(flown):
     """EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h."""
     new = flown(EKF2_DELAY_MAX=200.0, EKF2_IMU_POS_Y=0.25)
     assert new.rules == FusionRules(0.2, 0.4, 1.0, 5, None, False)
@@ -282,7 +282,7 @@ def test_step_ends_by_count_duration_or_log(interval_ms, known, ends):
     assert found.tolist() == ends
 
 
-def test_down_sampled_gain_is_in_final_frame():
+def test_downsample_imu_rotates_velocity_to_final_frame():
     """With 1 mrad per sample, earlier velocity changes are rotated by the later rotation."""
     turn = np.tile([0.0, 0.0, 0.001], (3, 1))
     gain = np.tile([1.0, 0.0, 0.0], (3, 1))
@@ -317,7 +317,7 @@ def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, Fusio
     return imu, attitude, made(Ekf2, state=state), record
 
 
-def test_stretch_rotating_vehicle_has_expected_fields():
+def test_make_segment_rotating_vehicle_has_expected_fields():
     flown = turning(10.0 + 0.1 * np.arange(21))
     found = _make_segment(*flown, 5, 11.5)
     steps = 10.5 + 0.01 * np.arange(101)
@@ -371,7 +371,7 @@ def without(times: np.ndarray, low: float, high: float) -> np.ndarray:
     return times[(times < low + 1e-6) | (times > high - 1e-6)]
 
 
-def test_find_stretches_applies_limits(monkeypatch):
+def test_find_replay_segments_applies_limits(monkeypatch):
     imu, vision = np.arange(0.0, 60.0, 0.01), np.arange(0.0, 60.0, 0.1)
     assert segments(monkeypatch) == [(1.0, 59.99)]
     # 1 s of fusion, 4 s in the air

@@ -33,7 +33,7 @@ def vision_of(flight: Flight) -> pd.DataFrame:
     return next(t for t in flight.positions if t.name == "vehicle_visual_odometry").samples
 
 
-def test_interval_equals_product_of_steps(model: Model) -> None:
+def test_interval_transition_equals_product_of_steps(model: Model) -> None:
     segment, made = model.inputs.segments[0], next(iter(model.intervals.values()))[0]
     end = made.events.end_step
     starts = np.concatenate([[0], end[:-1]])
@@ -117,7 +117,7 @@ def test_replay_settings_together_equal_separate_runs(model: Model) -> None:
     pd.testing.assert_frame_equal(together[3].published, model.flown.published, rtol=0.0, atol=1e-9)
 
 
-def test_replay_delayed_arrival_is_late_or_lost(model: Model) -> None:
+def test_replay_counts_late_and_lost_samples(model: Model) -> None:
     vision = model.inputs.received
     assert (model.flown.late, model.flown.lost) == (0, 0)
     # the horizon is 214 ms, and samples may be 100 ms later

@@ -140,7 +140,7 @@ def test_fusion_decision_matches_ekf2_rules(case, expected):
     ({"EKF2_EV_DELAY": 50.0}, True, Timing(0.05, 0.12)),
     ({"EKF2_EV_DELAY": 200.0}, True, Timing(0.2, 0.19)),
 ])  # fmt: skip
-def test_variant_timing_horizon_is_buffer_length(settings, by_delay, timing):
+def test_timing_horizon_is_length_of_ekf2_buffer(settings, by_delay, timing):
     usual = {"EKF2_EV_DELAY": 0.0, "EKF2_DELAY_MAX": 200.0}
     rules = replace(RULES, horizon_by_delay=by_delay)
     inputs = made(Inputs, rules=rules, settings=usual, horizon_s=0.12, step_s=0.01, predict_s=0.01)
@@ -244,7 +244,7 @@ def test_recursion_gate_limit_uses_published_motion(north_m, share, fused):
     assert bool(done.fused[10, 0]) is (north_m < 2.515)
 
 
-def test_settled_correlation_matches_kalman_filter():
+def test_correlation_at_rest_matches_kalman_filter():
     """Reference: a plain Kalman filter of a vehicle at rest for one minute, facing east."""
     turn = Rotation.from_euler("z", 110.0, degrees=True).as_matrix()
     count = 6000
@@ -399,7 +399,7 @@ def test_recursion_source_jump_resets_after_1_s():
 
 
 @pytest.mark.parametrize("n", [4, 200])
-def test_interval_unit_noise_matches_steps(n):
+def test_interval_unit_noise_equals_sum_over_steps(n):
     """Step by step: θ gains unit noise · dt, v depends on θ, p on v."""
     dt = 0.008
     tilt = -skew(np.array([[0.3, -0.2, -9.8]]))[0] * dt
@@ -438,7 +438,7 @@ def acting(stamps: list[float], *, fusing: bool = True, rules: FusionRules = RUL
     return action.tolist()
 
 
-def test_actions_start_and_stop_by_sample_interval():
+def test_fusion_starts_and_stops_by_sample_interval():
     assert acting([10.1, 10.3, 10.45], fusing=False) == [IDLE, IDLE, START]
     assert acting([10.1, 10.29, 10.45], fusing=False) == [IDLE, START, FUSE]
     assert acting([10.1, 10.29, 10.45]) == [FUSE, FUSE, FUSE]
@@ -458,7 +458,7 @@ def events(
     return _events(inputs, stretch_of(100), Timing(delay_s, horizon_s))
 
 
-def test_events_sample_is_fused_at_its_step_end():
+def test_intervals_end_at_the_step_that_fuses_a_sample():
     """Half a step and the delay before its timestamp; additional events in gaps of vision."""
     found = events([10.2, 10.305, 10.9])
     has_sample = found.sample >= 0
@@ -482,7 +482,7 @@ def test_events_sample_is_fused_at_its_step_end():
 @pytest.mark.parametrize(("age_s", "late", "lost"), [
     (0.22, False, False), (0.24, True, False), (0.28, True, False), (0.31, False, True),
 ])  # fmt: skip
-def test_events_late_arrival_is_late_or_lost(age_s, late, lost):
+def test_intervals_arrival_age_decides_late_or_lost(age_s, late, lost):
     """Due 0.2 s after its timestamp: late by more than 0.03 s, lost from 0.1 s on."""
     found = events([10.2, 10.4], age_s=age_s, horizon_s=0.2)
     assert (bool(found.late[0]), bool(found.lost[0])) == (late, lost)

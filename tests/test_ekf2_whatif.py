@@ -75,7 +75,7 @@ def test_what_if_without_agreement_is_unavailable(model):
         assert "no reason" in result.reason
 
 
-def test_steps_add_up_to_total_difference(model):
+def test_difference_steps_add_up_to_total_difference(model):
     for axis in explain_by_steps(model).values():
         assert axis.longest_rejection is None
         assert tuple(step.name for step in axis.steps) == STEPS
@@ -94,7 +94,7 @@ def test_steps_add_up_to_total_difference(model):
         assert last == pytest.approx(axis.position_rmse_to_truth_m["ekf2"], abs=0.003)
 
 
-def test_steps_without_common_time_are_unavailable(model):
+def test_difference_steps_without_common_time_are_unavailable(model):
     axis, steps = made(Axis, direction=np.eye(3)[0]), pd.DataFrame(index=[1e4, 1e4 + 1.0])
     result = explain_by_steps(model, Settings(), {"north": made(Replay, axis=axis, steps=steps)})
     assert isinstance(result, Unavailable)
@@ -250,7 +250,7 @@ def test_what_if_delay_without_fusion_is_rejected(model, monkeypatch):
         what_if(model, [changed])
 
 
-def test_what_if_most_rejected_is_unpredictable(model):
+def test_what_if_many_rejections_are_unpredictable(model):
     unpredictable, some, none = what_if(
         model, [{"EKF2_EVP_NOISE": 0.02}, {"EKF2_EVP_NOISE": 0.05}, {"EKF2_EVP_NOISE": 0.2}]
     ).whatif

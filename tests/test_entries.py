@@ -94,7 +94,7 @@ def test_class_entries_deduction_ends_at_zero_points(due, rule, late_s, off) -> 
     assert ada.total == 0.0
 
 
-def test_class_entries_zip_time_orders_without_deduction() -> None:
+def test_class_entries_zip_time_sorts_but_deducts_nothing() -> None:
     first, second = "hoppergrace_7_8_b.pdf", "hoppergrace_7_9_a.pdf"
     packed = {first: datetime(2026, 11, 24), second: datetime(2026, 11, 25)}
     files = {second: graded_report("", 7.0), first: graded_report("", 9.0)}
@@ -108,7 +108,7 @@ def test_class_entries_zip_time_orders_without_deduction() -> None:
     assert "Canvas marks the file as late" in grace.flags[0]
 
 
-def test_class_entries_other_pdf_counts_only_without_report() -> None:
+def test_class_entries_non_report_counts_only_if_alone() -> None:
     essay = replace(
         graded_report("", 0.0), version="", verdict=Verdict("cannot verify", ("x",), False)
     )
@@ -169,7 +169,7 @@ def test_class_entries_imitated_platform_name_is_flagged() -> None:
     )
 
 
-def test_class_entries_better_file_of_submission_counts() -> None:
+def test_class_entries_best_file_of_one_submission_counts() -> None:
     files = {blackboard("ada", "19-10-00-00", "a.pdf"): graded_report("", 8.0),
              blackboard("ada", "19-10-00-00", "b.pdf"): graded_report("", 2.0)}  # fmt: skip
     for attempt in ("first", "latest", "best"):
@@ -269,7 +269,7 @@ def test_overrides_excess_or_duplicate_row_is_noted(rows, points, told, tmp_path
     assert notes == tuple(f"overrides.csv: {one}." for one in told)
 
 
-def test_overrides_class_page_download_is_complete(tmp_path) -> None:
+def test_overrides_from_class_page_include_all_students(tmp_path) -> None:
     """Includes students without a submission, because the download replaces the file."""
     rows = write_overrides(
         tmp_path, "1,A,9.5,Good.", "1,,,Come.", "1,total,8,Agreed.", "2,total,5,Shown."

@@ -37,14 +37,14 @@ def test_report_ignores_backend_of_notebooks(tmp_path) -> None:
 
 
 @posix
-def test_info_ignores_date_that_is_not_a_number(tmp_path) -> None:
+def test_info_ignores_invalid_source_date_epoch(tmp_path) -> None:
     code, out, err = started(f"info {LOG}", folder=tmp_path, SOURCE_DATE_EPOCH="abc")
     assert (code, err) == (0, "")
     assert out.startswith(LOG.name)
 
 
 @pytest.mark.parametrize("columns", ["0", "00", "abc", ""])
-def test_output_ignores_width_that_is_not_positive(monkeypatch, capsys, columns) -> None:
+def test_output_ignores_invalid_columns_variable(monkeypatch, capsys, columns) -> None:
     monkeypatch.delenv("COLUMNS", raising=False)
     usual = run_main(monkeypatch, capsys, "info", LOG)
     monkeypatch.setenv("COLUMNS", columns)
@@ -62,7 +62,7 @@ def test_terminal_ignores_width_of_zero(monkeypatch, capsys) -> None:
 
 @posix
 @pytest.mark.parametrize("command", ["compare {log} -o r.pdf", "info {log} --json i.json"])
-def test_deleted_current_folder_is_named(tmp_path, command) -> None:
+def test_deleted_current_folder_is_reported(tmp_path, command) -> None:
     gone = tmp_path / "gone"
     gone.mkdir()
     code, out, err = started(command.format(log=LOG), before='rmdir "$PWD";', folder=gone)
@@ -71,7 +71,7 @@ def test_deleted_current_folder_is_named(tmp_path, command) -> None:
 
 
 @linux
-def test_small_memory_limit_is_named(tmp_path) -> None:
+def test_small_memory_limit_is_reported(tmp_path) -> None:
     for command in (f"compare {LOG} -o r.pdf", f"explore {LOG} -o r.html", f"info {LOG}"):
         code, out, err = started(command, before="ulimit -v 400000;", folder=tmp_path)
         assert (code, out) == (2, "")

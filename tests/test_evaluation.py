@@ -279,7 +279,7 @@ def test_rpe_scale_error_is_proportional_to_distance() -> None:
     steps=st.lists(st.sampled_from([0.0, 0.1, 0.25, 1.0, 3.0]), min_size=3, max_size=40),
     value=st.sampled_from([0.1, 0.3, 0.5, 1.0, 2.0]),
 )
-def test_pairs_equal_their_definition(steps: list[float], value: float) -> None:
+def test_rpe_pairs_equal_their_definition(steps: list[float], value: float) -> None:
     along = np.concatenate(([0.0], np.cumsum(steps)))
     position, time = along[:, None] * [1.0, 0.0, 0.0], np.arange(len(along), dtype=float)
     expected = []

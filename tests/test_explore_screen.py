@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,13 @@ from browser import Browser
 from explore_tools import ask, axe, open_view, serious, settle, show
 
 from px4fuse.analysis import Analysis, run, run_comparison
-from px4fuse.comparison.causal_replays import error_above_reported_sigma
+from px4fuse.card.numbers import axis_fraction, format_metres, format_ratio
+from px4fuse.card.verdicts import verdicts
 from px4fuse.explore.page import html_text
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import find
+from px4fuse.report.card_html import card_of
 from px4fuse.request import ComparisonRequest
-from px4fuse.text import format_number
 
 pytestmark = pytest.mark.usefixtures("cached_analyses")
 
@@ -41,11 +42,6 @@ def nis_with(analysis: Analysis, settings: Settings) -> float:
     return float(np.mean(updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]))
 
 
-def format_metres(metres: float) -> str:
-    """Format a length as on the page: two decimals, three below 0.1 m."""
-    return f"{metres:.{3 if metres < 0.0995 else 2}f} m"
-
-
 def put(page: Browser, **values: float) -> None:
     """Set settings by their names in the page's script."""
     ask(page, f"Explore.then((e) => {{ e.set({json.dumps(values)}); }})")
@@ -64,31 +60,49 @@ def key(page: Browser, name: str) -> None:
 # ------------------------------------------------------------------ one screen
 
 
-def test_desktop_settings_plots_and_gauge_are_visible(page: Browser) -> None:
-    wanted = [*SLIDERS, "#innovation", "#sigma_p", "#sigma_v", "#needle", "#live"]
+def test_desktop_settings_card_and_plot_are_visible(page: Browser) -> None:
+    wanted = [*SLIDERS, "#innovation", "#card h2", "#card figure", "#tabs", ".legend", "#flown"]
     assert page.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
 
 
-@pytest.mark.parametrize("share", [0.0, 1.0])
-def test_phone_settings_and_one_plot_stay_visible(
-    browser: Browser, explored: tuple[Path, Analysis], share: float
+def test_phone_card_plot_and_sheet_are_on_one_screen(
+    browser: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     show(browser, explored[0], width=390)
     browser.resize(390, 844)
     settle(browser)
-    height = browser.ask("document.documentElement.scrollHeight")
-    assert height <= 3 * 844
-    browser.ask(f"scrollTo(0, {share * height})")
-    settle(browser)
-    wanted = [*SLIDERS, "#innovation"]
+    sheet = ["#sigma-a", "#sigma-z", "#likely", "aside .tour-start", "#all"]
+    wanted = ["#card h2", "#card figure", "#tabs", ".legend", "#innovation", *sheet]
     assert browser.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
+    heights = "['likely', 'all'].map((id) => document.getElementById(id).offsetHeight)"
+    assert min(browser.ask(heights)) >= 44
+    # "All" opens the sheet with all settings
+    assert not browser.ask("document.getElementById('dt').checkVisibility()")
+    browser.click("#all")
+    settle(browser)
+    assert browser.ask("document.getElementById('dt').checkVisibility()")
+    assert browser.ask("document.getElementById('whatif').checkVisibility()")
+    browser.click("#all")
     # the tabs select the plot
     browser.ask("document.getElementById('tab-sigma_v').click()")
     settle(browser)
-    wanted = [*SLIDERS, "#sigma_v"]
-    assert browser.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
+    assert browser.ask("document.querySelector('#sigma_v').checkVisibility()")
     assert not browser.ask("document.querySelector('#innovation').checkVisibility()")
     assert browser.complaints() == []
+
+
+def test_phone_swipe_opens_and_closes_sheet(
+    browser: Browser, explored: tuple[Path, Analysis]
+) -> None:
+    show(browser, explored[0], width=390)
+    browser.resize(390, 844)
+    settle(browser)
+    for start, end, is_open in ((700, 500, True), (500, 700, False)):
+        for kind, y in (("touchStart", start), ("touchMove", end), ("touchEnd", None)):
+            points = [] if y is None else [{"x": 100, "y": y}]
+            browser.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+        settle(browser)
+        assert browser.ask("document.querySelector('aside').matches('.open')") == is_open
 
 
 def test_innovations_outside_plot_are_marked_at_edge(page: Browser) -> None:
@@ -101,7 +115,7 @@ def test_innovations_outside_plot_are_marked_at_edge(page: Browser) -> None:
 
     ends = "(({start, end}) => [start, end])(e.model('innovation').y_range)"
     low, high = ask(page, f"Explore.then((e) => {ends})")
-    t, nu = drawn("updates", "t", "nu")
+    t, nu = drawn("updates", "t", "x")
     out = (nu < low) | (nu > high)
     assert 50 < out.sum() < len(nu)
     at, y, turn = drawn("beyond", "t", "y", "turn")
@@ -113,62 +127,74 @@ def test_innovations_outside_plot_are_marked_at_edge(page: Browser) -> None:
 # ------------------------------------------------------------------ changed settings
 
 
-def test_sentences_follow_settings_and_name_re_run(
+ROWS = """Object.fromEntries([...document.querySelectorAll('#card [data-filter]')].map((row) => {
+  const text = (name) => row.querySelector(name).textContent;
+  const place = row.querySelector('.mark').getAttribute('x');
+  return [`${row.dataset.filter} ${row.dataset.against}`, [text('.ratio'), text('.word'), place]];
+}))"""
+
+
+def test_card_is_that_of_analysis_until_settings_change(
+    page: Browser, explored: tuple[Path, Analysis]
+) -> None:
+    card = card_of(explored[1])
+    rows = page.ask(ROWS)
+    for verdict in card.verdicts:
+        ratio, word, place = rows[f"{verdict.filter} {verdict.against}"]
+        assert (ratio, word) == (format_ratio(verdict.ratio), verdict.word)
+        at = 100.0 * axis_fraction(verdict.ratio)
+        assert float(place.rstrip("%")) == pytest.approx(at, abs=0.01)
+    assert card.headline in page.ask("document.querySelector('#card h2').textContent")
+    put(page, sigmaA=0.3)
+    assert page.ask(ROWS) != rows
+    put(page, sigmaA=explored[1].settings.sigma_a_m_s2)
+    assert page.ask(ROWS).keys() == rows.keys()
+    assert [row[:2] for row in page.ask(ROWS).values()] == [row[:2] for row in rows.values()]
+    assert card.headline in page.ask("document.querySelector('#card h2').textContent")
+
+
+def test_card_follows_settings_with_ratios_of_python(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     analysis = explored[1]
-    sentence = text(page, "live")
-    kf, ekf2 = (analysis.main.filters[name] for name in ("kf", "ekf2"))
-    assert sentence.startswith(
-        "Along the aisle KF has a position RMSE of "
-        f"{format_metres(kf.truth.position_rmse_m)} and is underconfident: σ is "
-        f"{format_number(kf.nis_mean**-0.5)} times too large. EKF2 has a position RMSE of "
-        f"{format_metres(ekf2.truth.position_rmse_m)} and is consistent."
-    )
-    put(page, sigmaA=0.002, sigmaZ=0.05)
-    sentence = text(page, "live")
-    nis = nis_with(analysis, Settings(sigma_a_m_s2=0.002, sigma_z_m=0.05))
-    assert f"overconfident: σ is {format_number(nis**0.5, 2)} times too small" in sentence
-    best = re.search(r"Best re-run: SIGMA_A ([\d.]+) \(mean NIS ([\d,]+) → ([\d.]+)\)", sentence)
-    assert best[2] == format_number(nis, 2)
-    after = nis_with(analysis, Settings(sigma_a_m_s2=float(best[1]), sigma_z_m=0.05))
-    assert best[3] == format_number(after, 2)
-    assert f"KF {format_number(nis, 2)} (overconfident" in text(page, "read")
-    hand = page.ask("document.querySelector('#needle .hand.kf').style.left")
-    assert hand == "100%"
+    put(page, sigmaA=0.002, sigmaZ=0.05, offset=0.1)
+    request = ComparisonRequest(
+        log="aisle_uwb.ulg", sigma_a_m_s2=0.002, sigma_z_m=0.05, clock_offset_s=0.1,
+        start_s=analysis.segment.start_s, end_s=analysis.segment.end_s,
+        heading_deg=analysis.main.axis.heading_deg,
+    )  # fmt: skip
+    main = run_comparison(request, flight=analysis.flight).main
+    source, truth = verdicts(main)[:2]
+    rows = page.ask(ROWS)
+    for verdict in (source, truth):
+        assert rows[f"kf {verdict.against}"][:2] == [format_ratio(verdict.ratio), verdict.word]
+    assert rows["kf truth"][2] == "100%"
+    headline = page.ask("document.querySelector('#card h2').textContent")
+    assert f"KF overconfident with these settings: σ {format_ratio(truth.ratio)} times" in headline
+    rmse = format_metres(main.filters["kf"].truth.position_rmse_m)
+    assert f"KF {rmse} m (as analysed" in page.ask("document.querySelector('#card').textContent")
+    # the analysed ratio stays as a hollow mark
+    was = "document.querySelector('#card [data-filter=kf] .was').getAttribute('display')"
+    assert page.ask(was) == "inline"
+    label = page.ask("document.querySelector('#card figure').ariaLabel")
+    assert f"{format_ratio(truth.ratio)} overconfident" in label
 
 
-def test_sentence_error_beyond_sigma_states_reported_sigma(
-    page: Browser, explored: tuple[Path, Analysis]
-) -> None:
-    put(page, offset=0.3)
-    shifted = _shifted(explored[1], 0.3)
-    hidden = error_above_reported_sigma(shifted.axes["aisle"].filters["kf"])
-    assert hidden is not None
-    rmse, sigma = format_metres(hidden.rmse_m), format_metres(hidden.reported_sigma_m)
-    assert f"KF has a position RMSE of {rmse}, but reports σ {sigma}." in text(page, "live")
-
-
-def test_changed_settings_mark_dependent_findings(
+def test_apply_button_sets_values_of_command(
     browser: Browser, sample_log: Path, tmp_path: Path
 ) -> None:
-    analysis = run(ComparisonRequest(log=str(sample_log), sigma_z_m=1.0))
-    assert any(one.id == "sigma_z_too_large" for one in find(analysis))
-    file = tmp_path / "large.html"
+    analysis = run(ComparisonRequest(log=str(sample_log), sigma_a_m_s2=0.001))
+    file = tmp_path / "small.html"
     file.write_bytes(html_text(analysis).encode())
     show(browser, file)
-    open_view(browser, "recorded")
-    notes = "[...document.querySelectorAll('.changed-note')].map((one) => one.textContent)"
-    before = browser.ask(notes)
-    assert len(before) >= 1
-    assert set(before) == {""}
-    assert "SIGMA_Z 1 m," in text(browser, "found")
-    put(browser, sigmaZ=0.1)
-    after = browser.ask(notes)
-    assert all(one.startswith("Settings changed since the report: Along the ais") for one in after)
-    stale = browser.ask(notes.replace(".changed-note", ".stale") + ".join(' ')")
-    assert "SIGMA_Z" in stale
-    assert "reset its height" not in stale
+    command = browser.ask("document.querySelector('[data-apply]').dataset.apply")
+    assert shlex.split(command)[:3] == ["px4fuse", "compare", str(sample_log)]
+    browser.click("[data-apply]")
+    settle(browser)
+    value = browser.ask("document.getElementById('sigma-a-value').value")
+    assert f"--sigma-a {value}" in command
+    assert "KF is consistent with these settings" in text(browser, "card")
+    assert "As analysed: ■ ERROR" in text(browser, "card")
     assert browser.complaints() == []
 
 
@@ -177,9 +203,9 @@ def test_ekf2_curves_equal_the_log(page: Browser, explored: tuple[Path, Analysis
     state, variance = result.ekf2_state.dropna(), result.ekf2_variance.dropna()
     for view, name, column, logged in (
         ("track", "position:state", "p", state["position_m"]),
-        ("track", "velocity:state", "v", state["velocity_m_s"]),
-        ("filter", "sigma_p:variance", "sp", variance["position_variance_m2"].pow(0.5)),
-        ("filter", "sigma_v:variance", "sv", variance["velocity_variance_m2_s2"].pow(0.5)),
+        ("speed", "velocity:state", "v", state["velocity_m_s"]),
+        ("sigma", "sigma_p:variance", "sp", variance["position_variance_m2"].pow(0.5)),
+        ("sigma", "sigma_v:variance", "sv", variance["velocity_variance_m2_s2"].pow(0.5)),
     ):
         open_view(page, view)
         data = f"e.model('{name}-source').data"
@@ -269,7 +295,7 @@ def test_tour_shows_numbers_of_flight_in_each_station(
     analysis = explored[1]
     put(page, sigmaA=0.8, sigmaZ=0.2)
     before = page.ask("location.hash")
-    page.click("#tour-start")
+    page.click("header .tour-start")
     settle(page)
     assert page.ask("document.getElementById('tour-back').disabled")
     shown = []
@@ -277,7 +303,7 @@ def test_tour_shows_numbers_of_flight_in_each_station(
     for _ in STATIONS:
         settle(page)
         a, z, offset = ask(page, settings)
-        assert page.ask(f"({IN_VIEW})('#sigma-a', '#needle').length") == 2
+        assert page.ask(f"({IN_VIEW})('#tour-title', '#card figure').length") == 2
         shown.append((text(page, "tour-title"), text(page, "tour-sentence"), a, z, offset))
         assert text(page, "tour-task").startswith("Task: ")
         assert text(page, "tour-see").startswith("Result: ")
@@ -289,12 +315,12 @@ def test_tour_shows_numbers_of_flight_in_each_station(
     # the sentences contain the numbers of this flight
     _, no_process_noise, a, z, offset = shown[0]
     assert a == 0.002
-    change = re.search(r"mean NIS changes from ([\d.]+) to ([\d.,]+)\.", no_process_noise)
+    change = re.search(r"innovation ÷ √S changes from ([\d.]+) to ([\d.]+)\.", no_process_noise)
     with_clock = _shifted(analysis, offset)
-    assert change[2] == format_number(nis_with(with_clock, Settings(a, z)), 2)
-    scale = re.search(r"NIS from ([\d.]+) to ([\d.]+) \(one ninth\)", shown[3][1])
-    assert float(scale[2]) == pytest.approx(float(scale[1]) / 9.0, rel=0.1)
-    assert shown[6][1].startswith("Mean NIS: EKF2 0.86, KF ")
+    assert change[2] == format_ratio(nis_with(with_clock, Settings(a, z)) ** 0.5)
+    scale = re.search(r"√S from ([\d.]+) to ([\d.]+) \(one third\)", shown[3][1])
+    assert float(scale[2]) == pytest.approx(float(scale[1]) / 3.0, rel=0.1)
+    assert shown[6][1].startswith("Innovation ÷ √S: EKF2 0.93, KF ")
 
 
 def _shifted(analysis: Analysis, offset_s: float) -> Any:
@@ -311,19 +337,19 @@ def _shifted(analysis: Analysis, offset_s: float) -> Any:
 
 
 def test_tabs_and_sliders_work_with_keyboard(page: Browser) -> None:
-    page.ask("document.getElementById('tab-filter').focus()")
+    page.ask("document.getElementById('tab-errors').focus()")
     key(page, "ArrowRight")
     settle(page)
-    assert page.ask("document.activeElement.id") == "tab-track"
-    assert page.ask("document.querySelector('#position').checkVisibility()")
+    assert page.ask("document.activeElement.id") == "tab-sigma"
+    assert page.ask("document.querySelector('#sigma_p').checkVisibility()")
     assert not page.ask("document.querySelector('#innovation').checkVisibility()")
     key(page, "End")
     settle(page)
-    assert page.ask("document.querySelector('#view-recorded').checkVisibility()")
+    assert page.ask("document.querySelector('#view-map').checkVisibility()")
     key(page, "ArrowRight")  # from the last tab to the first one
     settle(page)
     assert page.ask("document.activeElement.ariaSelected") == "true"
-    assert page.ask("document.activeElement.id") == "tab-filter"
+    assert page.ask("document.activeElement.id") == "tab-errors"
     page.ask("document.getElementById('sigma-z').focus()")
     before = float(page.ask("document.getElementById('sigma-z-value').value"))
     for _ in range(5):
@@ -342,9 +368,9 @@ def test_explore_page_has_no_serious_axe_violations(
     browser.scheme(scheme)
     browser.ask(axe())
     assert browser.ask("document.documentElement.scrollWidth") <= width
-    for view in ("filter", "track", "step", "map", "numbers", "recorded"):
+    for view in ("errors", "track", "step", "map", "numbers"):
         open_view(browser, view)
         assert serious(browser) == [], view
-    browser.ask("document.getElementById('tour-start').click()")
+    browser.ask("document.querySelector('.tour-start').click()")
     settle(browser)
     assert serious(browser) == []

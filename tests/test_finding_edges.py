@@ -34,7 +34,7 @@ from findings_tools import (
     with_bias,
 )
 
-from px4fuse.comparison.causal_replays import Outcome, Trial
+from px4fuse.comparison.trials import Outcome, Trial
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.frame_rotation import HeadingError, HeadingPart
 from px4fuse.filter.frame_rotation import combine_heading_parts as together
@@ -59,6 +59,7 @@ from px4fuse.findings import (
     source_positions,
     source_stamps,
 )
+from px4fuse.findings.cause_grouping import ELSEWHERE, GAP
 from px4fuse.findings.model import fraction_on, spans_with_value, zero_length_spans
 from px4fuse.flight import Columns, FusionRecord, Reset, Unavailable
 from px4fuse.log import Dropout
@@ -115,7 +116,10 @@ def test_by_root_groups_consequences_behind_cause() -> None:
 # ---------------------------------------------------------------- EKF2
 
 
-def test_ekf2_resets_and_dropouts_outside_segment_are_ignored(
+NO_GAP = SimpleNamespace(gaps=())
+
+
+def test_ekf2_resets_outside_segment_are_ignored(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(ekf2_resets, "continuous_state", lambda *_: (None, "resets undone"))
@@ -125,9 +129,37 @@ def test_ekf2_resets_and_dropouts_outside_segment_are_ignored(
         Reset(40.0, "velocity", (9.0, 0.0, 0.0)), Reset(50.0, "position", (0.0, 0.0, 0.0)),
         Reset(110.0, "position", (0.0, 0.0, 1.0)), Reset(110.1, "position", (9.0, 0.0, 0.0)),
     )  # fmt: skip
-    reset, switch = ekf2_resets.detect(analysis(ekf2={"instances": switches, "resets": resets}))
+    one = analysis(ekf2={"instances": switches, "resets": resets}, events=NO_GAP)
+    reset, switch = ekf2_resets.detect(one)
     assert switch.evidence == {"count": 2, "at_s": 10.5}
-    assert reset.evidence == {"count": 2, "largest_m": 5.0, "at_s": 10.5}
+    # the reset of the height alone is not counted
+    assert reset.evidence == {"count": 1, "largest_m": 5.0, "at_s": 10.5, "cause": ELSEWHERE}
+
+
+@pytest.mark.parametrize(
+    ("reset", "gaps", "expected"),
+    [
+        # a height reset within 10 s of take-off is usual
+        (Reset(30.0, "position", (0.0, 0.0, 1.0)), (), None),
+        (Reset(30.1, "position", (0.0, 0.0, 1.0)), (), ("note", ELSEWHERE)),
+        (Reset(19.9, "position", (0.0, 0.0, 1.0)), (), ("note", ELSEWHERE)),
+        (Reset(30.0, "position", (1.0, 0.0, 1.0)), (), ("warning", ELSEWHERE)),
+        # up to 5 s after a gap in the source
+        (Reset(65.0, "position", (1.0, 0.0, 0.0)), ((50.0, 60.0),), ("warning", GAP)),
+        (Reset(65.1, "position", (1.0, 0.0, 0.0)), ((50.0, 60.0),), ("warning", ELSEWHERE)),
+    ],
+)
+def test_ekf2_resets_at_take_off_are_usual_and_gap_is_cause(
+    reset: Reset, gaps: Any, expected: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ekf2_resets, "continuous_state", lambda *_: (None, "resets kept"))
+    one = analysis(ekf2={"instances": (), "resets": (reset,)}, flight={"airborne": ((20.0, 90.0),)},
+                   events=SimpleNamespace(gaps=gaps))  # fmt: skip
+    found = [(each.severity, each.evidence["cause"]) for each in ekf2_resets.detect(one)]
+    assert found == ([] if expected is None else [expected])
+
+
+def test_dropouts_outside_segment_are_ignored() -> None:
     lost = tuple(Dropout(at, 1.0) for at in (8.9, 9.0, 50.0, 110.0, 110.1))
     finding = only(
         recording.detect_dropouts, analysis(log=log(dropouts=(*lost, Dropout(60.0, 0.5))))
@@ -220,14 +252,14 @@ def rejected(count: int, of: int) -> pd.DataFrame:
     [(1, 100, "warning"), (1, 101, None), (20, 100, "error"), (19, 100, "warning")],
 )
 def test_ekf2_rejecting_severity_follows_share(count: int, of: int, expected: str | None) -> None:
-    """EKF2 rejects the horizontal vector, so the first axis is used."""
+    """EKF2 rejects the horizontal vector, so the main axis is used."""
     axes = axis("north", ekf2_innovations=rejected(count, of)), axis("east")
     axes[1].ekf2_innovations = rejected(9, 9)
     level = analysis(ekf2={"gate": 5.0}, axes=axes)
     down = analysis(ekf2={"gate": 5.0}, axes=(axis("down", ekf2_innovations=rejected(count, of)),))
     for one, quantity, remedy in (
-        (level, "for horizontal position (beyond 5 √S)", "no topic for it."),
-        (down, "for height", "Widen EKF2_EVP_GATE last."),
+        (level, "of the positions. Their innovations are beyond its gate of 5 √S", CHECK_FIRST),
+        (down, "of the heights", CHECK_FIRST),
     ):
         assert severity(ekf2_rejecting.detect, one) == expected
         for finding in ekf2_rejecting.detect(one):
@@ -236,14 +268,40 @@ def test_ekf2_rejecting_severity_follows_share(count: int, of: int, expected: st
             assert finding.remedy.endswith(remedy)
 
 
+def test_ekf2_rejecting_action_is_rerun_with_half_the_rejections() -> None:
+    frame = rejected(20, 100)
+    for after, improves, action in (
+        (0.09, True, "Set EKF2_EVP_NOISE to 0.1 m."), (0.1, True, CHECK_FIRST),
+        (0.09, False, CHECK_FIRST),
+    ):  # fmt: skip
+        trial = Trial(
+            filter="ekf2", kinds=("noise",), change={"EKF2_EVP_NOISE": 0.1},
+            before=Outcome(nis_mean=9.0, rejected_fraction=0.2),
+            after=Outcome(nis_mean=1.0 if improves else 8.0, rejected_fraction=after),
+        )  # fmt: skip
+        one = analysis(ekf2={"gate": 5.0}, axes=(axis("north", ekf2_innovations=frame),),
+                       trials=(trial,))  # fmt: skip
+        assert only(ekf2_rejecting.detect, one).remedy == action
+
+
+CHECK_FIRST = (
+    "Check the line of sight, EKF2_EV_DELAY and EKF2_EVP_NOISE first. Increase EKF2_EVP_GATE last."
+)
+
+
 # ---------------------------------------------------------------- errors and truth
 
 
-def test_hidden_errors_report_worst_axis_and_action() -> None:
+def test_error_beyond_sigma_reports_worst_axis_and_action() -> None:
     ekf2 = axis("east", ekf2=statement(0.49), ekf2_truth=against_truth(25.0, 1.0))
-    finding = only(hidden_errors.detect, analysis(axes=(hiding(), ekf2)))
-    assert "although the innovations are small" in finding.message
+    finding = only(hidden_errors.detect, analysis(axes=(axis(), hiding(name="down"), ekf2)))
+    assert finding.title == (
+        "Position errors are 2.0 (KF) and 5.0 (EKF2) times σ, which innovations do not show"
+    )
     assert finding.evidence["filter"] == "ekf2"
+    # the main axis is preferred
+    main = only(hidden_errors.detect, analysis(axes=(hiding(), ekf2)))
+    assert main.evidence["filter"] == "kf"
     assert finding.evidence["ekf2_sigma_p_m"] == pytest.approx(0.2)
     assert finding.remedy == hidden_errors.SHARED_REMEDY
     # the error is EKF2's own only if the RMSE of KF is below 0.7 of it
@@ -262,7 +320,9 @@ def test_hidden_errors_report_worst_axis_and_action() -> None:
 
 @pytest.mark.parametrize(("left", "frame"), [(0.45, True), (0.55, False)])
 @pytest.mark.parametrize("drifts", [False, True])
-def test_hidden_errors_report_rmse_after_alignment(left: float, frame: bool, drifts: bool) -> None:
+def test_error_beyond_sigma_reports_rmse_after_alignment(
+    left: float, frame: bool, drifts: bool
+) -> None:
     """Circle of 5 m with a shift and an error that changes its sign with each sample."""
     time = np.arange(20.0, 100.0, 0.1)
     angle = 0.2 * np.pi * time
@@ -281,8 +341,13 @@ def test_hidden_errors_report_rmse_after_alignment(left: float, frame: bool, dri
     finding = only(hidden_errors.detect, analysis(axes=tuple(axes), source=track))
     assert finding.evidence["position_rmse_horizontal_m"] == pytest.approx(1.0, rel=0.01)
     assert finding.evidence["position_rmse_aligned_m"] == pytest.approx(left, rel=0.01)
-    assert ("the frame is misaligned" in finding.message) is frame
-    assert ("the source drifts" in finding.message) is (drifts and not frame)
+    assert ("The frame is misaligned: horizontal position RMSE 1.00 m" in finding.message) is frame
+    assert (finding.id == "source_drift") is (drifts and not frame)
+    if finding.id == "source_drift":
+        assert finding.message.startswith(
+            "VIO drifts: horizontal position RMSE 0.55 m after the best alignment. Before the "
+            "alignment: 1.00 m."
+        )
     assert (finding.remedy == hidden_errors.FRAME_REMEDY) is frame
 
 

@@ -16,7 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_fleet import DAMAGED, NOT_LOGGED, STORY, VEHICLES, made_up
 
-from px4fuse.fleet.page import html_text, logs_of
+from px4fuse.fleet.page import html_text, logs_of, sort_logs
+from px4fuse.report.card_html import MARK_PATHS
 from px4fuse.webpage.frame import MAX_PAGE_ROWS
 
 MARKUP = '<img src=x onerror="window.alive=1"><b>bold</b>'
@@ -24,7 +25,8 @@ BREAKOUT = "</script ></noscript\n><script>window.alive=2</script><!-- \u2028 & 
 HOSTILE = (MARKUP, BREAKOUT, "\0\x1b\u202e", "$title", "javascript:alert(1)", "//a.b/c", "; ;")
 TEXTS = (
     "name", "log_sha256", "px4fuse", "settings", "reason", "remedy", "vehicle", "firmware",
-    "firmware_hash", "airframe", "hardware", "source", "kf_verdict", "summary", "results", "report",
+    "firmware_hash", "airframe", "hardware", "source", "kf_verdict", "headline", "action",
+    "changed", "results", "report",
 )  # fmt: skip
 
 
@@ -46,31 +48,46 @@ def test_page_compared_log_lists_its_missing_results() -> None:
     assert f'<option value="remedy:Set it.">Set it. ({count})' in text
 
 
-def test_logs_of_uses_horizontal_axes() -> None:
-    def kf_sigma_ratio(rows: pd.DataFrame) -> float:
-        return float(logs_of(rows)[0]["sigma_ratios"]["kf"])
+def test_logs_are_sorted_by_severity_ratio_and_rmse() -> None:
+    table = made_up(8).drop_duplicates("log").reset_index(drop=True)
+    failed = table["status"] != "done"
+    table = (
+        table[~failed]
+        .iloc[:4]
+        .assign(
+            severity=["clean", "error", "error", "error"],
+            kf_source_ratio=[30.0, 2.0, 0.25, 2.0],
+            kf_truth_ratio=[1.0, 1.0, 1.0, 1.0],
+            ekf2_source_ratio=[1.0, 1.0, 1.0, 1.0],
+            position_rmse_m=[1.0, 0.1, 0.1, 0.3],
+            name=["a", "b", "c", "d"],
+        )
+    )
+    assert [log["name"] for log in sort_logs(logs_of(table))] == ["c", "d", "b", "a"]
 
-    first = made_up(3).iloc[:3].copy()
-    north, east, _ = first["kf_nis_mean"]
-    # equal numbers of updates
-    assert kf_sigma_ratio(first) == pytest.approx(((north + east) / 2.0) ** 0.5)
-    # weighted by the number of updates
-    first["updates"] *= pd.Series((3, 1, 1))
-    assert kf_sigma_ratio(first) == pytest.approx(((3.0 * north + east) / 4.0) ** 0.5)
-    aisle = first.iloc[:1].assign(axis="aisle", kf_nis_mean=4.0, position_rms_m=9.0)
-    both = pd.concat([aisle, first])
-    assert kf_sigma_ratio(both) == pytest.approx(2.0)
-    assert logs_of(both)[0]["position_rms_m"] == 9.0
+
+def test_page_row_has_sign_diagnosis_action_and_ratios() -> None:
+    table = made_up(30)
+    rows = [row[0] for row in content(html_text(table, "Bench", "px4fuse 1"))["rows"]]
+    first = rows[0]
+    assert first[0][0] == "■ ERROR"
+    assert first[2][:3] == [STORY, True, "param set EKF2_EVP_NOISE 0.3"]
+    assert first[4] == ["12", 12.0, "", "kf truth"]
+    assert first[3][3] == "kf source loud"
+    assert first[6] == []  # not evaluated
+    assert rows[-1][0][0] == "✕ REFUSED"
+    assert rows[-1][2][0] in (f"refused: {DAMAGED[0]}", f"not compared: {NOT_LOGGED[0]}")
 
 
 def test_logs_of_column_without_numbers_is_absent() -> None:
     table = made_up(4)
-    for name in ("clock_offset_s", "sigma_z_m", "ekf2_nis_mean", "position_rms_m"):
+    for name in ("clock_offset_s", "sigma_z_m", "kf_truth_ratio", "difference_rms_m"):
         table[name] = np.nan
     table["updates"] = table["updates"].astype("Int64")
     text = html_text(table, "Bench", "px4fuse 1")
     made = content(text)
-    assert made["rows"][0][0][6:9] == [[], [], []]
+    cells = made["rows"][0][0]
+    assert [cells[place] for place in (4, 7, 11, 12)] == [[], [], [], []]
     assert "NaN" not in json.dumps(made)
     assert "nan" not in text.split("<script")[0].split("</style>")[1]
 
@@ -129,7 +146,7 @@ def page(browser: Browser, tmp_path: Path) -> Browser:
 
 
 def head(title: str) -> str:
-    titles = ("Log", "Date", "Vehicle", "Firmware", "Status", "KF", "EKF2", "SIGMA_Z")
+    titles = ("Sign", "Log", "Diagnosis", "KF", "KF truth", "EKF2", "EKF2 truth", "KF − EKF2")
     return f".list > thead th:nth-child({titles.index(title) + 1}) button"
 
 
@@ -137,18 +154,19 @@ COUNT = "document.querySelector('.count').textContent"
 
 
 def test_page_sorts_filters_and_opens_rows(page: Browser) -> None:
-    # the column shows "3 × too small" and is sorted by the σ ratio
     page.click(head("KF"))
     page.click("tbody tr:first-child .name")
     ratios = {
-        log["name"]: log["sigma_ratios"]["kf"]
-        for log in logs_of(made_up(240))
-        if log["sigma_ratios"]
+        log["name"]: log["kf_source_ratio"]
+        for log in sort_logs(logs_of(made_up(240)))
+        if "kf_source_ratio" in log
     }
     assert page.names()[:3] == sorted(ratios, key=lambda name: ratios[name])[:3]
-    assert STORY.splitlines()[0] in page.ask("document.querySelector('.more').innerText")
+    # a ratio beyond the axis is a triangle at its end
+    mark = "document.querySelector('td.ratio.truth svg path').getAttribute('d')"
+    assert page.ask(mark) == MARK_PATHS["above"]
     assert "flight%20" in page.ask("document.querySelector('.more a').href")
-    page.choose("#filter-0", "status:failed")
+    page.choose("#filter-1", "status:failed")
     assert page.ask(COUNT) == "Showing 24 of 240"
     page.click("#all")
     page.click("#text")
@@ -160,14 +178,14 @@ def test_page_sorts_filters_and_opens_rows(page: Browser) -> None:
 
 def test_filters_of_fleet_page_combine(page: Browser) -> None:
     table = made_up(240).drop_duplicates("log")
-    page.choose("#filter-3", "finding:ekf2_rejects_positions")
+    page.choose("#filter-4", "finding:ekf2_rejects_positions")
     rejecting = table["findings"].fillna("").str.contains("ekf2_rejects_positions")
     assert page.ask(COUNT) == f"Showing {rejecting.sum()} of 240"
-    page.choose("#filter-1", f"vehicle:{VEHICLES[1]}")
+    page.choose("#filter-2", f"vehicle:{VEHICLES[1]}")
     both = rejecting & (table["vehicle"] == VEHICLES[1])
     assert page.ask(COUNT) == f"Showing {both.sum()} of 240"
     page.click("#all")
-    page.choose("#filter-4", f"remedy:{NOT_LOGGED[1]}")
+    page.choose("#filter-5", f"remedy:{NOT_LOGGED[1]}")
     assert page.ask(COUNT) == f"Showing {(table['remedy'] == NOT_LOGGED[1]).sum()} of 240"
     assert page.complaints() == []
 
@@ -179,7 +197,7 @@ def test_page_5000_logs_shows_100_rows(browser: Browser, tmp_path: Path) -> None
     assert browser.ask(rows) == MAX_PAGE_ROWS
     assert browser.ask(everything) < 8000
     assert browser.ask(COUNT) == "Showing 5000 of 5000"
-    browser.click(head("SIGMA_Z"))
+    browser.click(head("KF − EKF2"))
     browser.click("#text")
     browser.write("v1.14")
     assert browser.ask(rows) == MAX_PAGE_ROWS
@@ -202,8 +220,9 @@ def test_page_without_scripts_is_a_table(browser: Browser, tmp_path: Path) -> No
     text = browser.ask("document.body.innerText")
     assert "The first 300 of 400 logs." in text
     assert "All rows are in fleet.csv." in text
-    assert "flight 0299.ulg" in text
-    assert "flight 0300.ulg" not in text.split("Sorting, searching")[1]
+    names = [log["name"] for log in sort_logs(logs_of(made_up(400)))]
+    table = text.split("Sorting, searching")[1]
+    assert [name in table for name in names] == [True] * 300 + [False] * 100
 
 
 @pytest.mark.parametrize(("scheme", "width"), [("light", 360), ("dark", 1400)])

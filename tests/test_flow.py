@@ -161,7 +161,7 @@ def stretches_s(flight: Flight) -> list[tuple[float, float]]:
     return [(float(one.time_s[0]), float(one.time_s[-1])) for one in segments]
 
 
-def test_stretches_split_at_height_resets_and_clipping():
+def test_segments_split_at_height_resets_and_clipping():
     flight = model().flight
     ((start, end),) = stretches_s(flight)
     for delta, parted in (((0.0, 0.0, 1.0), True), ((1.0, 0.0, 0.0), False)):
@@ -199,7 +199,7 @@ def test_read_gnss_while_disabled_omits_fixes():
     np.testing.assert_array_equal(found.stamp_s, every.stamp_s[remaining])  # type: ignore[union-attr]
 
 
-def test_stretch_start_correlation_is_from_earlier_flight():
+def test_segment_start_correlation_is_from_earlier_flight():
     """Six seconds at rest and the climb correlate tilt and accelerometer bias."""
     (segment,) = model().inputs.segments
     assert segment.history is not None
@@ -240,7 +240,7 @@ def test_model_real_flow_flights_agree_with_log(name, shared_logs, model_of):
 
 
 @pytest.mark.reallogs
-def test_model_flow_beyond_limit_splits_stretch(shared_logs, monkeypatch):
+def test_model_flow_beyond_limit_splits_segment(shared_logs, monkeypatch):
     monkeypatch.setattr("px4fuse.ekf2.replay.MAX_FLOW_ONLY_DIFFERENCE_M", 0.3)
     found = opened(read_log(shared_logs / "gps" / "main202603_gps_outage_flow.ulg"))
     assert set(found.agreement.doubtful) == {"optical_flow"}

@@ -84,7 +84,7 @@ def parts(answers: Answers, truth: FormTruth = TRUTH) -> list[float]:
     return [round(found[name], 2) for name in PART_NAMES]
 
 
-def test_each_simulated_mistake_has_kind_panel_and_cure() -> None:
+def test_each_simulated_mistake_has_kind_panel_and_correction() -> None:
     assert set(SIMULATED) == set(MISTAKES) - {"none", "vio-drift"}
     assert set(TABLE["shows"]) | {"cover"} == set(PANELS)
     for name in SIMULATED:
@@ -147,7 +147,7 @@ def test_form_points_flight_without_mistake_expects_none() -> None:
     assert parts(RIGHT, CLEAN)[:4] == [0.0] * 4
 
 
-def test_form_points_open_end_cure_counts_only_with_size() -> None:
+def test_form_points_open_end_needs_size_for_all_points() -> None:
     landed = TrueMistake("open-end", 5.0, 4.25, 5.75, 60.0, None)
     truth = replace(CLEAN, mistakes=(landed,), quantities=())
     claim = StudentMistake("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")

@@ -11,6 +11,7 @@ writes them again. Review the differences and the pages before committing.
 from __future__ import annotations
 
 import re
+import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -232,6 +233,6 @@ def test_explore_plots_match_golden_file(sample_log: Path) -> None:
     ]
     drawn = [rounded(line[:200]) for line in lines if " id" not in line]
     drawn = [re.sub(r"data: H4s.*", "data: packed", line) for line in drawn]
-    assert_matches_golden(
-        "explore", [*drawn, *(line[:200] for line in of_values(to_json_types(data)))]
-    )
+    path = shlex.quote(str(sample_log))
+    values = [line.replace(path, "LOG") for line in of_values(to_json_types(data))]
+    assert_matches_golden("explore", [*drawn, *(line[:200] for line in values)])

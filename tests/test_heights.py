@@ -290,7 +290,7 @@ def test_add_heights_insufficient_log_returns_reason() -> None:
     assert "before PX4 v1.14" in add_heights(flight, ekf2, log, segments)
 
 
-def test_recursion_bad_acceleration_noise_is_4_9() -> None:
+def test_recursion_bad_acceleration_noise_is_4_9_m_s2() -> None:
     """The noise is BADACC_BIAS_PNOISE of covariance.cpp."""
     inputs = opened_once().inputs
     (segment,) = inputs.segments
@@ -308,7 +308,7 @@ def test_recursion_bad_acceleration_noise_is_4_9() -> None:
     np.testing.assert_allclose(ran(clipped).variance, expected, rtol=1e-9)
 
 
-def test_stretch_clipped_axes_increase_noise_share() -> None:
+def test_segment_clipped_axes_increase_noise_share() -> None:
     flight = outdoors()
     (plain,) = opened_once().inputs.segments
     clipped = pd.Series(0, flight.imu.index)

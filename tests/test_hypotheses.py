@@ -202,7 +202,7 @@ def test_find_simulated_mistake_has_command(name, mistake, settings, severity, r
     assert any(part in named[name].remedy for part in remedy.split("|"))
 
 
-def test_scale_estimate_noise_does_not_bias_it() -> None:
+def test_scale_estimate_is_not_biased_by_imu_noise() -> None:
     """Plain regression on a noisy acceleration would be 8 % too small."""
     scales = []
     for seed in range(5):

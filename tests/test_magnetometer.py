@@ -53,7 +53,7 @@ def test_fuse_field_corrects_heading_error() -> None:
     assert np.linalg.eigvalsh(P[0]).min() > -1e-15
 
 
-def test_fuse_field_rotation_separates_body_field() -> None:
+def test_fuse_field_turning_vehicle_determines_body_field() -> None:
     body = np.array([0.05, -0.03, 0.02])
     x, P = known_field_state()
     deviation = np.full(21, 1e-6)
@@ -80,7 +80,7 @@ def test_fuse_field_weighted_sample_equals_repeats() -> None:
     np.testing.assert_allclose(once[1], P, atol=1e-9)
 
 
-def test_fuse_field_variants_use_separate_noise_and_gate() -> None:
+def test_fuse_field_parameter_sets_use_own_noise_and_gate() -> None:
     x, P = known_field_state(4)
     seen = field_samples(Rotation.identity(), np.array([0.3, 0.0, 0.0]), size=4)
     seen = seen._replace(sample_count=np.array([1.0, 1.0, 0.0, 1.0]))
@@ -99,7 +99,7 @@ def test_fuse_field_variants_use_separate_noise_and_gate() -> None:
     np.testing.assert_allclose(after[3], least[0])
 
 
-def test_mean_by_event_assigns_next_event() -> None:
+def test_mean_by_event_assigns_samples_to_next_event() -> None:
     rotation = Rotation.from_rotvec(0.1 * np.eye(3)[2] * np.arange(10)[:, None]).as_matrix()
     gauss = np.arange(12.0).reshape(4, 3)
     step = np.array([2, 3, 6, 9])
@@ -151,7 +151,7 @@ def test_read_field_prefers_topic_with_more_samples(tmp_path: Path) -> None:
     assert field.index[0] - stamped_s == pytest.approx(0.02 + 0.5 * 0.01, abs=1e-6)
 
 
-def test_read_field_filtered_innovations_are_kept(tmp_path: Path) -> None:
+def test_read_field_reads_logged_filtered_innovations(tmp_path: Path) -> None:
     """EKF2's copy at a low rate is used, except if the sensor topic contains all samples."""
     log = magnetic()
     remaining = log["estimator_aid_src_mag"]

@@ -60,7 +60,7 @@ def matrices(elements: Array) -> Array:
 
 @settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_system_equals_dense_normal_equations(seed: int) -> None:
+def test_banded_system_equals_dense_normal_equations(seed: int) -> None:
     """Two stretches and one unmeasured state, compared with lstsq, slogdet and inv."""
     rng = np.random.default_rng(seed)
     count = int(rng.integers(6, 14))
@@ -105,7 +105,7 @@ def test_system_equals_dense_normal_equations(seed: int) -> None:
     np.testing.assert_allclose(system.position_variance(), variance, rtol=1e-6)
 
 
-def test_factorise_single_steps_outside_search_range() -> None:
+def test_factorise_singular_q_of_one_step_stays_accurate() -> None:
     """Q of a single step has rank one, so the term that makes it invertible is below rounding."""
     step, joined = np.full(19, 0.09755900000000004), np.ones(19, dtype=bool)
     unit = 0.1 * step * np.stack([step**2 / 4.0, step / 2.0, np.ones(19)])
@@ -175,7 +175,7 @@ def stretch_normal(
     # position and velocity for the signals of data and constants
     means = [np.zeros((2, 4))]
     cross = {(0, 0): np.diag(1.0 / WEAK)}  # covariance of each state with all earlier ones
-    for k, row in enumerate(rows[1:], segment_starts=1):
+    for k, row in enumerate(rows[1:], start=1):
         length = part.length_s[row - 1]
         f = np.array([[1.0, length], [0.0, 1.0]])
         legs = part.delta_position_m, part.delta_velocity_m_s
@@ -210,7 +210,7 @@ def joint_normal(
     return signals[:, 0], covariance + block_diag(*(each[2] for each in made)), made
 
 
-def test_fit_positions_constants_act_as_covariance() -> None:
+def test_fit_positions_unknown_constants_add_covariance() -> None:
     """Equal at all offsets and noises, except for a constant."""
     part = with_constants()
 
@@ -252,7 +252,7 @@ def test_fit_positions_single_measurement_has_no_effect(start_known: bool) -> No
         np.testing.assert_allclose(one.constants(), none.constants(), rtol=1e-9, atol=1e-12)
 
 
-def test_constants_and_squares_equal_conditional_normal() -> None:
+def test_fitted_constants_and_squares_equal_dense_solution() -> None:
     part = with_constants(offsets=1)
     # without the third axis, which has too few measurements
     part = replace(part, measurement_m=part.measurement_m * [1.0, 1.0, np.nan])
@@ -279,7 +279,7 @@ def test_constants_and_squares_equal_conditional_normal() -> None:
         np.testing.assert_array_equal(count, np.isfinite(part.measurement_m).sum(axis=1))
 
 
-def test_products_by_stretch_equal_dense_covariance() -> None:
+def test_products_by_segment_equal_dense_covariance() -> None:
     part, noises = with_constants(offsets=1), Noises(0.5, 0.1)
     signal = np.random.default_rng(8).normal(0.0, 1.0, (COUNT, 3, 2))
     still = np.zeros((3, 2, COUNT - 1))

@@ -426,7 +426,7 @@ def test_map_clock_timesync_of_other_clock_is_ignored():
     np.testing.assert_allclose(found.to_boot.at(stamps), received, atol=1e-6)
 
 
-def test_map_clock_statement_equals_map():
+def test_clock_map_record_gives_the_same_times():
     """boot = timestamp + offset + drift · (timestamp - middle of the timestamps)."""
     received = 20.0 + 1.0001 * np.arange(0.0, 100.0, 0.1)
     stamps, found = map_unix_timestamps(received, *NO_EXCHANGES)

@@ -77,7 +77,7 @@ def delay_boot(log, by_us):
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)
-def test_read_ulog_every_generation_reads_external_vision(read, generation):
+def test_read_ulog_every_release_reads_external_vision(read, generation):
     (track, *_) = read(make_log(generation)).positions
     assert (track.name, track.origin) == ("vehicle_visual_odometry", RECEIVED)
     assert_equals_external_vision(track)
@@ -139,7 +139,7 @@ def test_innovations_unlogged_rejection_follows_from_gate(read, generation):
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)
-def test_read_ulog_every_generation_reads_state_and_imu(read, generation):
+def test_read_ulog_every_release_reads_state_and_imu(read, generation):
     flight = read(make_log(generation))
     state = flight.ekf2.state
     np.testing.assert_allclose(times(state), seconds_of(stamps(10.0, 10.0)), atol=1e-9)

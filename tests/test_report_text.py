@@ -26,8 +26,8 @@ from px4fuse.flight import Unavailable
 from px4fuse.report import clock, fonts, notes
 from px4fuse.report.notes import write
 from px4fuse.report.page import Block, Page, replace_unprintable
-from px4fuse.report.pdf import compile_pdf
 from px4fuse.report.sensitivity import GAIN_GROUPS, SETTINGS, _second_half_median
+from px4fuse.report.typesetting import compile_pdf
 from px4fuse.results.model import Student
 
 THAI, HAN, ARABIC = "สมชาย", "王小明", "محمد"

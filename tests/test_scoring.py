@@ -363,7 +363,7 @@ class TestFeedback:
         ({"source__path": "kept by EKF2"}, ("kept by EKF2",)),
     ],
 )
-def test_own_flags_suspicious_report_lists_each_flag(values, said):
+def test_flag_settings_suspicious_report_has_each_flag(values, said):
     found = list(flag_settings(decode_results(changed_results(**values))))
     assert len(found) == len(said)
     assert all(word in flag for word, flag in zip(said, found, strict=True))
@@ -379,7 +379,7 @@ def test_own_flags_suspicious_report_lists_each_flag(values, said):
         ("heading_drift_deg", 90.0, "--heading-drift is 90 ° per 100 m (default 3 °)."),
     ],
 )
-def test_own_flags_stated_drift_far_from_usual(option, stated, said):
+def test_flag_settings_unusual_drift_is_flagged(option, stated, said):
     found = list(
         flag_settings(decode_results(changed_results(LOOP, **{f"request__{option}": stated})))
     )
@@ -397,10 +397,10 @@ def report(number, **values):
 
 
 class TestClassFlags:
-    def test_class_flags_different_reports_have_none(self):
+    def test_flag_equal_contents_different_reports_have_none(self):
         assert flag_equal_contents([report(n) for n in range(12)]) == {}
 
-    def test_class_flags_shared_log_id_or_file_is_listed(self):
+    def test_flag_equal_contents_shared_log_id_or_file_is_listed(self):
         made = flag_equal_contents(
             [report(1, student="a\n<b>", log_sha256="x"), report(2, log_sha256="x"), report(4),
              report(5),
@@ -415,7 +415,7 @@ class TestClassFlags:
         assert "The id in this report is also in that of" in made["5.pdf"][0]
         assert "identical to that of" in made["8.pdf"][0]
 
-    def test_class_flags_two_reports_of_one_student_name_id(self):
+    def test_flag_equal_contents_same_student_flags_id_only(self):
         two = [
             report(1, log_sha256="x"),
             report(1, log_sha256="x", sha256="z", submission="b.pdf"),
@@ -425,7 +425,7 @@ class TestClassFlags:
             "b.pdf": ["The id in this report is also in that of Student1 Name1, 1001 (1.pdf)."],
         }
 
-    def test_class_flags_similar_form_numbers_are_listed(self):
+    def test_flag_equal_contents_similar_forms_are_flagged(self):
         claims = StudentMistake("yaw", -20.5), StudentMistake("nlos", 1.23)
         mine = Answers(log_sha256=SHA, mistakes=claims, quantities=(0.123, None, 0.45))
         other = (StudentMistake("nlos", 1.24), StudentMistake("yaw", -20.3))

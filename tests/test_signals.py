@@ -365,7 +365,7 @@ def test_continuous_state_ignores_resets_outside_segment(reset_s, said):
     ("across_m", "heading_deg", "called"),
     [(1.0, None, "the aisle"), (4.0, None, "the main direction"), (4.0, 30.0, "the aisle")],
 )
-def test_axis_called_depends_on_elongation_and_heading(across_m, heading_deg, called) -> None:
+def test_axis_label_depends_on_elongation_and_heading(across_m, heading_deg, called) -> None:
     """The track is an ellipse 10 m long; an aisle needs at least three times the width."""
     flight = aisle_flight(uwb=Uwb(sigma_m=0.01))
     (track,) = flight.positions

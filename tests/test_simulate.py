@@ -256,7 +256,7 @@ class TestMistakes:
         noisy = simulate(replace(AISLE, ekf2=False), parse(["smoothed=1s"])).positions.error_m
         assert np.std(noisy[:25]) < 0.07  # on the ground; 0.10 m without the filter
 
-    def test_no_vvo_removes_position_source(self):
+    def test_mistake_no_vvo_removes_position_source(self):
         remaining = to_flight(simulate(AISLE, parse(["no-vvo"]))).positions
         assert [round(track.rate_hz) for track in remaining] == [2, 2]
         flight = to_flight(simulate(replace(AISLE, ekf2=False), parse(["no-vvo"])))
@@ -369,7 +369,7 @@ def test_findings_clean_flight_are_notes_only(scenario):
     settings = Settings(sigma_a_m_s2=0.2, sigma_z_m=scenario.source_sigma_m)
     compared = compare(simulate_flight(scenario), settings)
     findings = find(unexplained(compared))
-    drift = ["error_exceeds_reported_sigma"] if scenario.kind == "loop" else []
+    drift = ["source_drift"] if scenario.kind == "loop" else []
     assert [finding.id for finding in findings] == [*drift, "ekf2_simulated"]
     most_m = 0.12 if scenario.kind == "aisle" else 0.7
     for axis in compared.axes.values():

@@ -172,7 +172,7 @@ def test_samples_per_step_rounds_to_nearest():
     assert samples_per_step(0.01, 0.004 + 1e-12) == samples_per_step(0.01, 0.004 - 1e-12) == 3
 
 
-def test_samples_per_step_half_follows_log():
+def test_samples_per_step_at_half_is_taken_from_log():
     """EKF2 rounds a measured mean: 2.5 samples become two or three."""
     by_two, by_three = 2 * np.arange(0, 60, 7), 3 * np.arange(0, 60, 7)
     ends = by_two, by_three, [5], [0, 25, 50]

@@ -89,11 +89,11 @@ def test_find_submissions_searches_folders_and_sorts(tmp_path):
         ("flight_lab_reports_2026/r.pdf", ("", "")),
     ],
 )  # fmt: skip
-def test_origin_of_uses_platform_part_of_name(name, is_):
+def test_parse_origin_uses_platform_part_of_name(name, is_):
     assert name_and_number(name) == is_
 
 
-def test_origin_of_reads_login_time_and_late_mark():
+def test_parse_origin_reads_login_time_and_late_mark():
     blackboard = parse_origin("Lab 3_roe1_attempt_2026-11-20-12-34-56_Lab_doe1_attempt_x.pdf")
     assert (blackboard.person.login, blackboard.platform) == ("roe1", "blackboard")
     assert parse_origin("Lab_roe1_attempt_2026-99-20-12-34-56_r.pdf").time is None
@@ -120,7 +120,7 @@ submission_31:
 """
 
 
-def test_with_origins_forged_name_keeps_platform_and_time():
+def test_add_origins_forged_name_keeps_platform_and_time():
     """The student's part of the name contains a second time, or a name as from Moodle."""
     usual = [f"Lab_user{n}_attempt_2026-11-20-11-00-0{n}_r.pdf" for n in range(3)]
     forged = [

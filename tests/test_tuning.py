@@ -62,7 +62,7 @@ def test_tune_clean_data_have_no_outliers() -> None:
     assert sum(len(found.outlier_time_s) for found in many()) <= 0.001 * SEEDS * COUNT
 
 
-def test_held_out_true_settings_have_no_gain() -> None:
+def test_held_out_true_settings_have_no_likelihood_gain() -> None:
     gains = np.array([found.held_out.log_likelihood_gain_per_measurement for found in many()])
     assert np.mean(gains) < 0.0
     assert np.median(gains) <= 0.0
@@ -73,7 +73,7 @@ def test_held_out_true_settings_have_no_gain() -> None:
     assert np.mean(seen) == pytest.approx(1.0, abs=2.6 / np.sqrt(SEEDS))
 
 
-def test_held_out_wrong_settings_have_a_gain() -> None:
+def test_held_out_wrong_settings_have_a_likelihood_gain() -> None:
     bad = Settings(sigma_a_m_s2=5.0, sigma_z_m=0.02, input="zero")
     found = tuned(modelled(1), chosen=bad)
     assert found.held_out.log_likelihood_gain_per_measurement > 0.1
@@ -106,7 +106,7 @@ def test_tune_two_axes_narrow_the_interval() -> None:
 # --- the map ---
 
 
-def test_map_equals_likelihood_and_interval_its_profile() -> None:
+def test_tune_map_and_intervals_equal_likelihood_profile() -> None:
     axis = modelled(5)
     found = tuned(axis)
     assert len(found.outlier_time_s) == 0

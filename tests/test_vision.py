@@ -360,7 +360,7 @@ def test_vision_both_rejected_resets_to_vision() -> None:
     np.testing.assert_allclose(-done.vision.bias.value_m[0], FRAME_M[:2], atol=0.7)
 
 
-def test_variant_timing_vision_delay_sets_horizon() -> None:
+def test_timing_vision_delay_sets_fusion_horizon() -> None:
     inputs = flying(sent())
     settings = inputs.settings
     flown = Variant(settings).timing(inputs)
@@ -536,7 +536,7 @@ def test_model_incomplete_vision_is_unavailable() -> None:
     assert "relative vision positions" in refused.reason
 
 
-def test_steps_contain_vision_and_causes_only_kf() -> None:
+def test_difference_steps_contain_vision_causes_only_kf() -> None:
     found = steps.explain_by_steps(model())
     for why in found.values():
         names = [step.name for step in why.steps]

@@ -299,7 +299,7 @@ def test_folder_as_target_is_refused(tmp_path, capsysbinary) -> None:
 
 
 @pytest.mark.parametrize(("name", "said"), [("王小明", True), ("Ångström", False)])
-def test_compare_name_without_font_warns_before_report(
+def test_compare_warns_early_if_name_has_no_font(
     desk, monkeypatch, capsys, name: str, said: bool
 ) -> None:
     warnings = []
@@ -357,7 +357,7 @@ def test_output_to_closed_pipe_exits_with_0(desk, command) -> None:
 # --- --clock-offset auto ---
 
 
-def test_clock_offset_auto_not_significant_adds_nothing(sample_log) -> None:
+def test_clock_offset_auto_insignificant_estimate_adds_zero(sample_log) -> None:
     request = ComparisonRequest(log=str(sample_log), clock_offset_s="auto", axes=("north", "east"))
     found = run_comparison(request)
     assert found.settings.clock_offset_s == 0.0

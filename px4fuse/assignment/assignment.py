@@ -33,7 +33,7 @@ TRUTH_NAMES = (
 def simulate_assigned(
     secret: bytes, student: Person, kind: Kinds, count: int | None = None, truth: bool = True
 ) -> tuple[bytes, Answer]:
-    """Simulate the flight of one student; return the log (ULog) and its answer in the key."""
+    """Simulate the flight of one student; return the log (ULog) and the entry of the answer key."""
     assigned_flight = draw(secret, student.student_id, kind, count, truth)
     simulation = flights.simulate(assigned_flight.scenario, parse(assigned_flight.mistake_options))
     log = flights.to_ulog(simulation)
@@ -84,7 +84,7 @@ def assign(
 
     The key is written before log and form of a student, so that an interrupted run can continue.
     An existing log or form is never replaced: it must be identical. Students can be added to an
-    existing key, but its other answers must be those of this run.
+    existing key; the entries of the other students must be unchanged.
 
     Parameters
     ----------

@@ -86,14 +86,14 @@ class AnswerKey(msgspec.Struct, frozen=True):
         return f"AnswerKey({self.kind!r}, {len(self.answers)} students)"
 
     def of_student(self, student_id: str) -> Answer | None:
-        """Return the answer for a student id; :class:`Register` compares the ids."""
+        """Return the entry of a student id; :class:`Register` compares the ids."""
         student_index = Register(Person(a.student_id) for a in self.answers).student_index(
             Person(student_id)
         )
         return None if student_index is None else self.answers[student_index]
 
     def of_log(self, sha256: str) -> Answer | None:
-        """Return the answer for the SHA-256 of a log."""
+        """Return the entry of the log with this SHA-256."""
         return next((a for a in self.answers if sha256 and a.sha256 == sha256), None)
 
 

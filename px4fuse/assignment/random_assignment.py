@@ -32,7 +32,7 @@ DRAW_LABEL = "px4fuse assignment 2"
 COUNT_FRACTIONS: dict[Kind, tuple[float, ...]] = {"aisle": (0.1, 0.5, 0.4), "loop": (0.4, 0.6)}
 # fraction of loops in a mixed class
 LOOP_FRACTION = 1 / 3
-# range of the difficulty: smallest detectable size of the mistake over its size in the flight
+# range of the drawn difficulty: smallest detectable size of a mistake over the size in the flight
 EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
 
 
@@ -57,7 +57,7 @@ class AssignableMistake(Record, frozen=True):
     start_range_s : (float, float) or None
         Range of the start time (s), for a mistake that has one.
     hidden_groups : tuple of str
-        Groups whose mistakes are not assigned together with this mistake.
+        Groups of mistakes that cannot be detected beside this mistake.
     """
 
     mistake: str
@@ -121,8 +121,9 @@ class AssignedFlight:
     mistake_options : tuple of str
         Values of ``--mistake``.
     difficulty : float
-        Largest difficulty of the mistakes with a size. A flight without a mistake has the largest
-        difficulty, because excluding all mistakes is the most work.
+        Largest difficulty of the mistakes with a size: smallest detectable size over size. A flight
+        without a mistake has the largest difficulty, because excluding all mistakes is the most
+        work.
     """
 
     scenario: Scenario

@@ -16,7 +16,7 @@ from px4fuse.results.reading import one_line
 
 MAX_NAME_LENGTH = 200
 MAX_STUDENTS = 1000
-# characters; file systems limit a name to 255 bytes, and a character has up to 4 bytes
+# maximum characters of a file name: systems allow 255 bytes, and a character has up to 4 bytes
 MAX_STEM_LENGTH = 48
 # names that Windows reserves
 RESERVED_NAMES = {"con", "prn", "aux", "nul"} | {
@@ -159,8 +159,8 @@ class Register:
     def student_index(self, other: Person) -> int | None:
         """Return the index of a person in the class; None if the person is not identified.
 
-        The first of these fields that matches exactly one student decides: number, id, email,
-        login, name. Leading zeros of ids may be missing, because spreadsheets remove them.
+        The first of these fields that matches exactly one student decides: platform number, id,
+        email, login, name. Leading zeros of ids may be missing, because spreadsheets remove them.
         """
         numbers = other.numbers.items()
         criteria: tuple[tuple[Callable[[str, str], bool], Callable[[Person], str], str], ...] = (

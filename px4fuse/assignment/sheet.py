@@ -39,7 +39,7 @@ class Sheet:
     separator: str = ","
 
     def column(self, titles: Sequence[str]) -> int | None:
-        """Return the column index of the first of these titles in the table; None if none is."""
+        """Return the column index of the first of ``titles`` in the table; None without any."""
         plain_titles = [normalise_title(title) for title in self.head]
         return next((plain_titles.index(title) for title in titles if title in plain_titles), None)
 

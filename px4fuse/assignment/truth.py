@@ -26,10 +26,10 @@ from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
 SIZE_TOLERANCE = 0.15
 # m; tolerance of a loop closure error
 CLOSURE_TOLERANCE_M = 0.3
-# fraction of rejected samples above which the form must name the rejections
+# minimum fraction of rejected samples that a right form must name
 MIN_REJECTED_SHARE = 0.005
-# smallest reset (m) that the form must name, and time (s) from the start of the segment in which
-# resets are not counted, because EKF2 resets to its first position
+# minimum size (m) of a reset that a right form must name. Resets in the first seconds (s) of the
+# segment are ignored, because EKF2 resets to its first position
 MIN_RESET_M, EKF2_START_S = 0.2, 5.0
 EKF2_BEHAVIOUR = table(__file__, "did.toml", dict[str, dict[str, set[str]]])
 
@@ -55,7 +55,7 @@ class TrueMistake(Record, frozen=True):
 
 
 class VerdictTruth(Record, frozen=True):
-    """Verdict on the reported σ of a filter ("" without one), and the factor of σ."""
+    """Verdict on the reported σ of a filter ("": none), and the factor by which σ is wrong."""
 
     verdict: str
     factor: float | None = None
@@ -175,7 +175,7 @@ def quantity_truth(
 ) -> float | tuple[float, ...] | None:
     """Answer a question by a replay of KF with the settings of the question.
 
-    None if the flight has too few measurements. The answer to "silence" is the position σ after
+    None if the flight has too few measurements. The answer about a gap is the position σ after
     predictions with F and Q (steps of DT), without an update.
     """
     settings = Settings(question.sigma_a_m_s2, question.sigma_z_m)

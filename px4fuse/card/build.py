@@ -6,12 +6,19 @@ from importlib import metadata
 
 from msgspec.structs import replace
 
-from px4fuse.analysis import Analysis
-from px4fuse.card.causes import FILTER_NAMES, RankedCause, improvement, make_cause, rank_causes
+from px4fuse.analysis import AidsOnlyAnalysis, Analysis
+from px4fuse.card.causes import (
+    FILTER_NAMES,
+    RankedCause,
+    make_cause,
+    make_plain_cause,
+    rank_causes,
+)
 from px4fuse.card.model import (
     MAX_CAUSES,
     MAX_HEADLINE_LENGTH,
     Action,
+    AidRow,
     Card,
     CardSeverity,
     Cause,
@@ -25,18 +32,21 @@ from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.card.verdicts import verdicts as make_verdicts
 from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth
 from px4fuse.comparison.remedy import aid_of
+from px4fuse.comparison.trials import improvement
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Finding, group_by_root
 from px4fuse.flight import Ekf2, Unavailable
-from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
+from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
 
 MAX_NOTES = 3
 MAX_ACTIONS = 3
 # Rejected fraction and resets from which the effect names them
 MIN_NAMED_REJECTION = 0.01
 BETTER_POSITION = ("position and σ", "position")
+# Aiding sources whose √S is larger than needed with PX4's default noises, which is not a fault
+USUALLY_UNDERCONFIDENT = frozenset({"baro_hgt", "mag", "gravity"})
 NO_FAULT = "No fault found: KF and EKF2 are consistent"
 # Findings of a source whose errors the innovations cannot show
 SHIFTED_SOURCE = frozenset(
@@ -85,6 +95,51 @@ def build_card(
         more_causes=max(len(ranked) - MAX_CAUSES, 0),
         notes=_notes(roots),
         identity=_identity(analysis, request, student),
+    )
+
+
+def build_aids_card(
+    analysis: AidsOnlyAnalysis,
+    findings: Sequence[Finding],
+    request: ComparisonRequest,
+    student: tuple[str, str] = ("", ""),
+) -> Card:
+    """Return the card of a flight without positions: EKF2's aiding sources only."""
+    roots = [group[0] for group in group_by_root(findings)]
+    faults = [one for one in roots if one.severity != "note"]
+    causes = tuple(make_plain_cause(one) for one in faults[:MAX_CAUSES])
+    missing = analysis.missing_data
+    log = analysis.flight.log
+    return Card(
+        severity=causes[0].severity if causes else "clean",
+        id=causes[0].id if causes else "",
+        headline=causes[0].title if causes else "No fault found in EKF2's aiding sources",
+        do_this=_do_this(causes),
+        causes=causes,
+        more_causes=max(len(faults) - MAX_CAUSES, 0),
+        notes=_notes(roots),
+        aids=tuple(
+            AidRow(
+                label=aid.label,
+                component=name,
+                ratio=math.sqrt(axis.nis_mean) if axis.nis_mean else None,
+                is_usual=key in USUALLY_UNDERCONFIDENT,
+            )
+            for key, aid in analysis.aids.items()
+            for name, axis in aid.axes.items()
+        ),
+        facts={"KF": f"not run: {missing.reason}. {with_options(missing.remedy)}"},
+        identity=Identity(
+            file=log.name,
+            firmware=log.firmware,
+            hardware=log.hardware,
+            duration_s=log.duration_s,
+            source="no position source",
+            command=command_line(request.without_paths()),
+            student=student[0],
+            student_id=student[1],
+            version=f"px4fuse {metadata.version('px4fuse')}",
+        ),
     )
 
 

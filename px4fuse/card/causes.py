@@ -11,20 +11,26 @@ from typing import NamedTuple
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import Action, Cause, FilterName, Improvement, Rerun, Target, Verdict
+from px4fuse.card.model import Action, Cause, FilterName, Rerun, Target, Verdict
 from px4fuse.comparison.causal_replays import (
     CLOCK_OFFSET,
     OUTLIERS,
     SIGMA_A,
     SIGMA_Z,
-    Outcome,
+)
+from px4fuse.comparison.trials import (
     Trial,
-    distance_from_one,
+    enters_band,
+    halves,
+    has_effect,
+    improvement,
+    preference,
+    ratios,
+    reduction,
 )
 from px4fuse.ekf2_parameters import PARAMETERS
-from px4fuse.filter.consistency import Reference, classify_ratio
 from px4fuse.findings.model import CATALOGUE, Finding
-from px4fuse.flight import Unavailable
+from px4fuse.flight import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 
 # Kinds of change that re-run a finding, by its id
@@ -68,10 +74,6 @@ SETTING_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
 REBOOT_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
 # Rejected fraction from which a re-run table lists it
 MIN_SHOWN_REJECTION = 0.005
-# A re-run that changes ratios and error by less has no effect
-MIN_RATIO_CHANGE, MIN_RMSE_CHANGE = 1.10, 0.05
-# Reduction of the position RMSE from which a re-run improves the position
-POSITION_IMPROVEMENT = 0.20
 TARGETS: Mapping[str, Target] = {
     "position source": "sender",
     "time": "sender",
@@ -105,10 +107,11 @@ def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCaus
         if finding.severity == "note":
             continue
         trials = confirming_trials(analysis.trials, finding)
-        reduction = sum(_reduction(trial) for trial in trials)
         if trials and not any(has_effect(trial) for trial in trials):
             continue
-        ranked.append(RankedCause(finding, _tier(finding, trials), reduction, trials))
+        ranked.append(
+            RankedCause(finding, _tier(finding, trials), sum(map(reduction, trials)), trials)
+        )
     has_cause = any(each.finding.id not in VERDICT_FINDINGS for each in ranked)
     ranked = [each for each in ranked if not (has_cause and each.finding.id in VERDICT_FINDINGS)]
     return sorted(
@@ -129,9 +132,9 @@ def _is_setting(finding: Finding) -> bool:
 def _tier(finding: Finding, trials: Iterable[Trial]) -> int:
     if finding.id in MEANINGLESS:
         return 0
-    if any(_enters_band(trial) for trial in trials):
+    if any(enters_band(trial) for trial in trials):
         return 1
-    if any(_halves(trial) for trial in trials):
+    if any(halves(trial) for trial in trials):
         return 2
     return 3 if finding.severity == "error" else 4
 
@@ -148,88 +151,8 @@ def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial,
     for trial in trials:
         if len(trial.kinds) == 1 and trial.kinds[0] in kinds:
             key = trial.filter, trial.kinds[0]
-            best[key] = min(trial, best.get(key, trial), key=_preference)
+            best[key] = min(trial, best.get(key, trial), key=preference)
     return tuple(best.values())
-
-
-def _preference(trial: Trial) -> tuple[bool, int, float]:
-    """Sort key of re-runs of one kind; the best one is the smallest."""
-    enters = _enters_band(trial)
-    return not enters, len(trial.change) if enters else 0, distance_from_one(trial.after)
-
-
-def ratios(outcome: Outcome) -> dict[Reference, float]:
-    """Return the ratios of actual to reported σ, against source and ground truth."""
-    means: dict[Reference, float | None] = {
-        "source": outcome.nis_mean,
-        "truth": outcome.nees_mean,
-    }
-    return {against: math.sqrt(mean) for against, mean in means.items() if mean}
-
-
-def _reduction(trial: Trial) -> float:
-    return distance_from_one(trial.before) - distance_from_one(trial.after)
-
-
-def _pairs(trial: Trial) -> list[tuple[Reference, float, float]]:
-    before, after = ratios(trial.before), ratios(trial.after)
-    return [(name, before[name], after[name]) for name in before.keys() & after.keys()]
-
-
-def _enters_band(trial: Trial) -> bool:
-    return any(
-        classify_ratio(before, name) != "consistent" and classify_ratio(after, name) == "consistent"
-        for name, before, after in _pairs(trial)
-    )
-
-
-def _halves(trial: Trial) -> bool:
-    return any(
-        classify_ratio(before, name) != "consistent"
-        and abs(math.log(after)) <= 0.5 * abs(math.log(before))
-        for name, before, after in _pairs(trial)
-    )
-
-
-def has_effect(trial: Trial) -> bool:
-    """Return True if a re-run changes a ratio by 10 % or the position RMSE by 5 %."""
-    if any(
-        not 1.0 / MIN_RATIO_CHANGE <= after / before <= MIN_RATIO_CHANGE
-        for _, before, after in _pairs(trial)
-    ):
-        return True
-    before, after = trial.before.position_rmse_m, trial.after.position_rmse_m
-    return bool(before and after and abs(after / before - 1.0) > MIN_RMSE_CHANGE)
-
-
-def improvement(trial: Trial) -> Improvement:
-    """Return which numbers a re-run improves.
-
-    Position: RMSE lower by 20 %. σ: |ln ratio| halves or enters the band, against the source or
-    ground truth, and gets worse against neither.
-    """
-    before_m, after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
-    is_position_better = bool(
-        before_m and after_m is not None and after_m <= (1.0 - POSITION_IMPROVEMENT) * before_m
-    )
-    changes = [
-        (
-            abs(math.log(was)),
-            abs(math.log(becomes)),
-            classify_ratio(was, name),
-            classify_ratio(becomes, name),
-        )
-        for name, was, becomes in _pairs(trial)
-    ]
-    is_sigma_better = any(
-        word != "consistent" and (word_after == "consistent" or becomes <= 0.5 * was)
-        for was, becomes, word, word_after in changes
-    ) and all(
-        becomes <= was or word_after == "consistent" for was, becomes, _, word_after in changes
-    )
-    if is_position_better:
-        return "position and σ" if is_sigma_better else "position"
-    return "σ only" if is_sigma_better else "nothing"
 
 
 def make_cause(
@@ -252,6 +175,18 @@ def make_cause(
     )
 
 
+def make_plain_cause(finding: Finding) -> Cause:
+    """Make the cause of a finding without re-runs."""
+    return Cause(
+        id=finding.id,
+        severity="error" if finding.severity == "error" else "warning",
+        title=finding.title,
+        why=_reason(finding),
+        spans_s=finding.spans_s,
+        actions=(Action(_target(finding), finding.remedy),) if finding.remedy else (),
+    )
+
+
 def _reason(finding: Finding) -> str:
     """Return the message without its first sentence, which is the title."""
     return finding.message.removeprefix(finding.title).lstrip(". ")
@@ -268,7 +203,7 @@ def _actions(
     by_kind = {(trial.filter, trial.kinds[0]): trial for trial in useful}
     alternatives: tuple[tuple[Action, ...], ...] = ()
     actions: list[Action] = []
-    general = Action(_target(finding), finding.remedy) if finding.remedy else None
+    general = Action(_target(finding, analysis.source), finding.remedy) if finding.remedy else None
     delay = by_kind.get(("ekf2", "delay"))
     if offset := by_kind.get(("ekf2", "time offset")) or by_kind.get(("kf", "time offset")):
         shift = offset.change[CLOCK_OFFSET] - analysis.settings.clock_offset_s * (
@@ -324,8 +259,11 @@ def _no_change(finding: Finding, owner: FilterName, verdicts: Sequence[Verdict])
     return "no setting corrects this" if owner == "kf" else "no parameter corrects this"
 
 
-def _target(finding: Finding) -> Target:
-    return TARGETS[CATALOGUE[finding.id].group]
+def _target(finding: Finding, source: PositionTrack | None = None) -> Target:
+    """Return the device or person that the remedy of a finding concerns."""
+    target = TARGETS[CATALOGUE[finding.id].group]
+    is_receiver = target == "sender" and source is not None and source.origin.is_gnss
+    return "receiver" if is_receiver else target
 
 
 def run_again(request: ComparisonRequest, change: Mapping[str, float]) -> Action:

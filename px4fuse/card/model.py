@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
+from px4fuse.comparison.trials import Improvement
 from px4fuse.filter.consistency import CONSISTENT_RATIOS, Reference
 from px4fuse.record import Count, NotNegative, Positive, Record, Share, Span
 
@@ -12,7 +13,6 @@ FilterName = Literal["kf", "ekf2"]
 CardSeverity = Literal["clean", "note", "warning", "error", "refused"]
 VerdictWord = Literal["consistent", "overconfident", "underconfident", "not evaluated"]
 Target = Literal["sender", "receiver", "source", "logging", "flight", "KF", "EKF2"]
-Improvement = Literal["position and σ", "position", "σ only", "nothing"]
 
 # Bands of a consistent ratio: against the source, and against ground truth
 BANDS = CONSISTENT_RATIOS

@@ -145,7 +145,7 @@ def _system_error(error: OSError, written: str) -> Px4FuseError:
 
 
 def _check_memory() -> None:
-    """Reject a memory limit (ulimit -v) below LEAST_BYTES.
+    """Reject a memory limit (ulimit -v) below MIN_ADDRESS_SPACE_BYTES.
 
     With less memory, libraries end the process without a message.
     """

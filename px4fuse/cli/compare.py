@@ -8,6 +8,7 @@ import click
 
 from px4fuse.cli import options, outputs
 from px4fuse.request import settings_name
+from px4fuse.writing import STANDARD_OUTPUT
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES = get_args(Severity)
@@ -26,6 +27,8 @@ SEVERITIES = get_args(Severity)
     is_flag=True,
     help="Exit with 1 if an EKF2 aid is overconfident, biased or not fused for a long time.",
 )
+@click.option("-v", "--verbose", is_flag=True, help="Print all findings, axes and settings.")
+@click.option("-q", "--quiet", is_flag=True, help="Print the diagnosis on one line only.")
 @options.open_option
 def compare(
     log: Path,
@@ -33,6 +36,8 @@ def compare(
     json_path: Path | None,
     fail_on: Severity | None,
     checks: bool,
+    verbose: bool,
+    quiet: bool,
     **option_values: Any,
 ) -> None:
     """Check EKF2 against a two-state Kalman filter and report mistakes.
@@ -44,7 +49,7 @@ def compare(
     """
     from px4fuse.analysis import failed_checks, run_or_evaluate_aids
     from px4fuse.memory import release_free_memory
-    from px4fuse.report.terminal import summary
+    from px4fuse.report.terminal import closing, summary
     from px4fuse.results.build import outcome_results
 
     student = options.read_student(option_values)
@@ -57,7 +62,10 @@ def compare(
         if output is None and json_path is None:
             output = outputs.default_report(log.stem, settings_name(request), results)
         contents = outputs.result_files(results, json_path, output, outcome, show_progress)
-    outputs.write_and_print(contents, summary(outcome, results, output), request)
+    page = summary(outcome, results, verbose=verbose, quiet=quiet)
+    outputs.write_and_print(contents, page, request)
+    if not quiet and STANDARD_OUTPUT not in contents:
+        outputs.show_page(closing(results))
     failed = failed_checks(outcome) if checks else {}
     for name, verdict in failed.items():
         click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)

@@ -15,7 +15,7 @@ from px4fuse.request import EvaluationRequest, settings_name
 if TYPE_CHECKING:
     from px4fuse.trajectory.scores import Delta
 
-MAX_DELTA = 1e6  # m, s or frames
+MAX_DELTA = 1e6  # maximum RPE delta (m, s or frames)
 # Parameters that the function evaluate has under the same name
 SCORE_OPTIONS = ("alignment", "association", "max_gap_s", "time_offset_s")
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")

@@ -37,7 +37,7 @@ def _list_page() -> Page:
 
 
 def _finding_page(finding_id: str) -> Page:
-    from px4fuse.findings.cause_grouping import CONSEQUENCES
+    from px4fuse.findings.cause_grouping import CONSEQUENCES, effect_ids
     from px4fuse.findings.model import CATALOGUE, RENAMED_IDS, load_examples
     from px4fuse.report.page import Page
 
@@ -49,24 +49,19 @@ def _finding_page(finding_id: str) -> Page:
             f"{suggest_name(name, CATALOGUE)}For a list, run px4fuse explain.",
         )
     entry, example = CATALOGUE[name], load_examples()[name]
-    causes = [cause for cause, effects in CONSEQUENCES.items() if _has_id(effects, name)]
-    effects = dict.fromkeys(effect.partition(":")[0] for effect in CONSEQUENCES.get(name, ()))
+    causes = [cause for cause in CONSEQUENCES if name in effect_ids(cause)]
     page = Page()
     page.write(f"{entry.title}  [{name}]", bold=True)
     page.write_labelled("Meaning", entry.meaning)
     page.write_labelled("Example", example.message)
     page.write_labelled("Action", example.remedy)
-    for label, names in {"Causes": causes, "Effects": effects}.items():
+    for label, names in {"Causes": causes, "Effects": effect_ids(name)}.items():
         if names:
             page.write_labelled(label, ", ".join(names))
     page.write_labelled(
         "Rates", *_rates(example.clean_flights, example.false_alarms, example.detection)
     )
     return page
-
-
-def _has_id(effects: tuple[str, ...], name: str) -> bool:
-    return any(effect.partition(":")[0] == name for effect in effects)
 
 
 def _rates(clean_flights: int, false_alarms: int, detection: Mapping[str, float]) -> list[str]:

@@ -31,7 +31,7 @@ GRAPH_PARAMETERS = ("source", "json_path", "g2o", "robust")
 
 
 def _parse_numbers(text: str, expected: str, max_absolute: float) -> list[float]:
-    """Parse two or three comma-separated finite numbers of at most ``most``."""
+    """Parse two or three comma-separated numbers with absolute values up to ``max_absolute``."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:

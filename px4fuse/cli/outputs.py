@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from px4fuse.request import Request
     from px4fuse.results.contract import Results
 
-# Limit for the name of a report (file systems allow 255), and the kept start of a longer name
+# Maximum bytes of a report's name (file systems allow 255), and of the start of a longer name
 MAX_NAME_BYTES, KEPT_STEM_BYTES = 200, 180
 # Name and id on a report without a student
 NO_PERSON = ("", "")
@@ -157,7 +157,7 @@ def _check_default(path: Path, kind: str, is_replaceable: Callable[[bytes], bool
 def _is_same_report(
     results: Results, read: Callable[[bytes, str], Results], content: bytes
 ) -> bool:
-    """Return True if the files are the same, and the old report has no other student."""
+    """Return True if an existing report has the same input files, and no other student."""
     from px4fuse.results.contract import file_hashes_in, to_json
 
     existing = read(content, "report")
@@ -187,7 +187,7 @@ def web_page(output: Path | None, default: Path) -> Path:
 
 
 def report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
-    """Return the paths of a report and its results, which are beside it unless --json names a file.
+    """Return the paths of a report and its results; without --json the results are beside it.
 
     Without -o the list does not contain the report, because its name is determined later.
 
@@ -310,7 +310,7 @@ def write_and_print(
     page : Page, optional
         Results to print.
     request : Request, optional
-        Its files and options complete the commands on the page, so that they can be pasted.
+        Files and options that complete the commands on the page, so that they can be pasted.
     written : iterable of Path
         Files that the command has written already.
     """
@@ -329,6 +329,13 @@ def write_and_print(
     ]
     if click.get_current_context().meta.get(OPEN_KEY) and openable:
         click.launch(str(openable[0].resolve()))
+
+
+def show_page(page: Page) -> None:
+    """Print a page on the terminal."""
+    from px4fuse.report.screen import show
+
+    show(terminal(), page.blocks)
 
 
 def terminal() -> Console:

@@ -11,9 +11,9 @@ is preferred: the setting would only hide the fault.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal, NamedTuple, TypeGuard
+from typing import Any, ClassVar, NamedTuple, TypeGuard
 
 import numpy as np
 import pandas as pd
@@ -34,6 +34,7 @@ from px4fuse.comparison.model import (
 )
 from px4fuse.comparison.projection import project, project_truth
 from px4fuse.comparison.remedy import is_fused_source, ml_delay_change, noise_change
+from px4fuse.comparison.trials import Change, Outcome, Statistic, Trial, distance_from_one
 from px4fuse.ekf2.filter_recursion import Variant
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings, with_misaligned_positions
@@ -55,10 +56,8 @@ from px4fuse.filter.signals import (
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Columns, Unavailable
-from px4fuse.record import Count, NotNegative, Positive, Record, Share
+from px4fuse.record import Positive, Record
 
-Statistic = Literal["nis", "nees", "difference"]
-Change = Mapping[str, float]
 # Mean NEES from which errors count as larger than the reported σ (2 σ); flights without a fault
 # have less than 3
 MIN_NEES_FINDING = 4.0
@@ -119,64 +118,6 @@ MAX_REPLAY_FACTOR = 1.10
 MAX_PAIRS = 4
 # σ; smaller misalignments are not significant
 HEADING_SIGMAS = 3.0
-
-
-class Outcome(Record, frozen=True, kw_only=True):
-    """Statistics of one filter along one axis in one run.
-
-    Attributes
-    ----------
-    innovations : int
-    nis_mean : float or None
-    position_rmse_m, nees_mean : float or None
-        Against ground truth, at the times of EKF2's published state.
-    difference_rms_m : float or None
-        RMS of KF - EKF2 in position.
-    rejected_fraction : float or None
-        Of EKF2; None for KF, which has no gate.
-    """
-
-    innovations: Count = 0
-    nis_mean: Positive | None = None
-    position_rmse_m: NotNegative | None = None
-    nees_mean: NotNegative | None = None
-    difference_rms_m: NotNegative | None = None
-    rejected_fraction: Share | None = None
-
-    def value(self, statistic: Statistic) -> float | None:
-        """Return one of the three statistics."""
-        return {
-            "nis": self.nis_mean,
-            "nees": self.nees_mean,
-            "difference": self.difference_rms_m,
-        }[statistic]
-
-
-class Trial(Record, frozen=True, kw_only=True):
-    """Re-run of one filter along the main axis with one or two changes.
-
-    Attributes
-    ----------
-    filter : {"kf", "ekf2"}
-    kinds : tuple of str
-        Kind of each change: noises, defaults, outliers, time offset, delay, rotation, bias, noise,
-        gate or process noise.
-    change : mapping from name to value
-        See :class:`Intervention`.
-    before : Outcome
-        As flown, of the same samples: KF as run, EKF2 from the log.
-    after : Outcome
-        With the change; EKF2 by its replay.
-    from_s : float or None
-        Start of the replay.
-    """
-
-    filter: FilterName
-    kinds: tuple[str, ...]
-    change: Change
-    before: Outcome
-    after: Outcome
-    from_s: float | None = None
 
 
 class Intervention(Record, frozen=True, kw_only=True):
@@ -499,12 +440,6 @@ def _try_on_main_axis(changed: _FilterRerun) -> list[Trial]:
         return singles
     others = [trial for trial in singles if best.change.keys().isdisjoint(trial.change)]
     return singles + [run({**best.change, **other.change}) for other in others[:MAX_PAIRS]]
-
-
-def distance_from_one(outcome: Outcome) -> float:
-    """Return the sum of |ln ratio| of actual to reported σ, against source and ground truth."""
-    means = [mean for mean in (outcome.nis_mean, outcome.nees_mean) if mean]
-    return sum(0.5 * abs(float(np.log(mean))) for mean in means)
 
 
 def _agrees(logged: Outcome, replayed: Outcome) -> bool:

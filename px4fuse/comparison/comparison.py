@@ -243,28 +243,36 @@ def _errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Array:
 
 def normalise_errors(time_s: Array, error: Array, variance: Frame, column: str) -> Array:
     """Return errors over the reported σ, interpolated to their times; NaN where unknown."""
-    if isinstance(variance, Unavailable):
-        return np.full(len(time_s), np.nan)
-    known = variance[column].dropna()
+    return np.asarray(error / reported_sigma(time_s, variance, column))
+
+
+def reported_sigma(time_s: Array, variance: Frame, column: str) -> Array:
+    """Return the reported σ interpolated to other times (s); NaN where unknown."""
+    known = _known_values(variance, column)
     if known.empty:
         return np.full(len(time_s), np.nan)
     reported = np.interp(time_s, known.index, known, np.nan, np.nan)
-    return np.asarray(error / np.sqrt(np.where(reported > 0.0, reported, np.nan)))
+    return np.asarray(np.sqrt(np.where(reported > 0.0, reported, np.nan)))
 
 
 def _mean_nees(normalised: Array) -> float | None:
     return float(np.nanmean(np.square(normalised))) if np.isfinite(normalised).any() else None
 
 
-def normalised_position_errors(
-    result: AxisComparison, owner: FilterName
-) -> tuple[Array, Array] | Unavailable:
-    """Return times (s) and position errors over the reported σ of one filter along an axis.
+def position_errors(result: AxisComparison, owner: FilterName) -> Frame:
+    """Return position errors (m) and reported σ (m) of one filter along an axis.
 
     Times are those of EKF2's published state, or KF's steps without EKF2.
+
+    Returns
+    -------
+    DataFrame or Unavailable
+        ``error_m`` against ground truth and ``sigma_m``, NaN where one is unknown.
     """
     if isinstance(result.truth, Unavailable):
         return result.truth
+    state: pd.DataFrame
+    variance: Frame
     if owner == "kf":
         times = (
             result.replay.steps if isinstance(result.ekf2_state, Unavailable) else result.ekf2_state
@@ -272,22 +280,31 @@ def normalised_position_errors(
         state, variance = kf_state_and_variance(result.replay, times)
     elif isinstance(result.ekf2_state, Unavailable):
         return result.ekf2_state
-    elif isinstance(result.ekf2_variance, Unavailable):
-        return result.ekf2_variance
     else:
         state, variance = result.ekf2_state, result.ekf2_variance
     time_s = state.index.to_numpy()
-    normalised = normalise_errors(
-        time_s, _errors(state, result.truth, STATE_COLUMNS[0]), variance, VARIANCE_COLUMNS[0]
-    )
-    is_known = np.isfinite(normalised)
-    if not is_known.any():
+    errors = _errors(state, result.truth, STATE_COLUMNS[0])
+    sigma = reported_sigma(time_s, variance, VARIANCE_COLUMNS[0])
+    return pd.DataFrame({"error_m": errors, "sigma_m": sigma}, index=time_s)
+
+
+def normalised_position_errors(
+    result: AxisComparison, owner: FilterName
+) -> tuple[Array, Array] | Unavailable:
+    """Return times (s) and :func:`position_errors` over the reported σ where both are known."""
+    errors = position_errors(result, owner)
+    if isinstance(errors, Unavailable):
+        return errors
+    if owner == "ekf2" and isinstance(result.ekf2_variance, Unavailable):
+        return result.ekf2_variance
+    normalised = (errors["error_m"] / errors["sigma_m"]).dropna()
+    if normalised.empty:
         return Unavailable(
             "error against ground truth",
             "no sample has both a reported σ and ground truth",
             "Choose a segment with both.",
         )
-    return time_s[is_known], normalised[is_known]
+    return normalised.index.to_numpy(), normalised.to_numpy()
 
 
 def _horizontal_nis(frames: Mapping[str, Frame]) -> HorizontalNis | None:

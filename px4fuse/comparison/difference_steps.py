@@ -5,12 +5,15 @@ the largest steps, sentences state the behaviour of KF and EKF2, the share of th
 the time of the largest effect.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from msgspec import structs
 
+from px4fuse.comparison.estimates import Tuning, first_axis_tuning
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.remedy import noise_used_m
 from px4fuse.ekf2 import steps
@@ -19,22 +22,33 @@ from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.replay import Spans, inside_spans
 from px4fuse.ekf2.steps import DifferenceExplanation, Step, UnreplayedPart
-from px4fuse.filter.kalman import state_at
+from px4fuse.filter.fast_replay import quick_replay
+from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
+from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight import Unavailable
+from px4fuse.request import COMPARISON_OPTIONS
 
 # Relative difference of two position RMSEs below which a text calls them equal
 EQUAL_RMSE_TOLERANCE = 0.05
 # Share of the mean square below which a text omits the second step
 MIN_NOTABLE_SHARE = 0.05
+# Ratio of a setting and its maximum-likelihood estimate from which it is corrected first
+MIN_SETTING_RATIO = 4.0
+# m; largest change of the position below which a step has equal settings and is not listed
+MIN_STEP_EFFECT_M = 1e-6
 # Minimum difference outside the replayed parts that is reported: m, and factor on the largest
 # replayed difference
 MIN_UNREPLAYED_M, MIN_UNREPLAYED_RATIO = 0.5, 3.0
 
 
 def explain_ekf2_difference(
-    comparison: Comparison, model: Model | Unavailable, clock: ClockOffset | Unavailable
+    comparison: Comparison,
+    model: Model | Unavailable,
+    clock: ClockOffset | Unavailable,
+    corrected: Mapping[str, float],
 ) -> dict[str, DifferenceExplanation | Unavailable]:
     """Explain the difference KF - EKF2 along each axis of a comparison.
 
@@ -45,6 +59,8 @@ def explain_ekf2_difference(
         EKF2 of the same flight.
     clock : ClockOffset or Unavailable
         Estimated age of the positions.
+    corrected : mapping from field of Settings to value
+        Wrong settings of KF, which are corrected first (:func:`corrected_settings`).
 
     Returns
     -------
@@ -61,17 +77,25 @@ def explain_ekf2_difference(
         }
     if isinstance(model, Unavailable):
         return {name: structs.replace(model, what=steps.ANALYSIS_NAME) for name in results}
-    settings = _settings(comparison, model.inputs)
-    explanations = steps.explain_by_steps(
-        model, settings, {name: axis.replay for name, axis in results.items()}
-    )
+    settings = _settings(comparison, model.inputs, corrected)
+    changed = _with_changes(comparison.settings, corrected)
+    runs = {
+        name: quick_replay(axis.axis, changed) if corrected else axis.replay
+        for name, axis in results.items()
+    }
+    explanations = steps.explain_by_steps(model, settings, runs)
     if isinstance(explanations, Unavailable):
         return dict.fromkeys(results, explanations)
-    reasons = _step_reasons(comparison, model, clock)
+    reasons = _step_reasons(replace(comparison, settings=changed), model, clock)
     sentences_by_axis: dict[str, DifferenceExplanation | Unavailable] = {}
     for name, explanation in explanations.items():
         with_unreplayed_part = structs.replace(
-            explanation, outside=_unreplayed_part(results[name], explanation.spans_s)
+            explanation,
+            corrected=dict(corrected),
+            steps=tuple(
+                step for step in explanation.steps if step.position_moved_m > MIN_STEP_EFFECT_M
+            ),
+            outside=_unreplayed_part(results[name], runs[name], explanation.spans_s),
         )
         sentences_by_axis[name] = add_sentences(
             with_unreplayed_part, comparison.axes[name].axis.label, reasons
@@ -79,25 +103,53 @@ def explain_ekf2_difference(
     return sentences_by_axis
 
 
-def explanation_variants(comparison: Comparison, inputs: Inputs) -> list[Variant]:
+def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, float]:
+    """Return the maximum-likelihood value of each noise of KF that was set far from it.
+
+    A wrong setting is a cause of its own. If it were left, later steps would share its effect: each
+    of them alone would remove nearly the whole difference.
+    """
+    axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
+    if axis_tuning is None or comparison.source.origin.is_gnss:
+        return {}
+    corrected = {}
+    for name, noise in (
+        ("sigma_a_m_s2", axis_tuning.sigma_a_two_state),
+        ("sigma_z_m", axis_tuning.sigma_z),
+    ):
+        chosen = getattr(comparison.settings, name)
+        if noise.value is None or chosen == getattr(Settings(), name):
+            continue
+        if max(chosen / noise.value, noise.value / chosen) >= MIN_SETTING_RATIO:
+            corrected[name] = float(f"{noise.value:.3g}")
+    return corrected
+
+
+def explanation_variants(
+    comparison: Comparison, inputs: Inputs, corrected: Mapping[str, float]
+) -> list[Variant]:
     """Return the EKF2 variants that :func:`explain_ekf2_difference` needs."""
-    return list(steps.step_variants(inputs, _settings(comparison, inputs)).values())
+    return list(steps.step_variants(inputs, _settings(comparison, inputs, corrected)).values())
 
 
-def _settings(comparison: Comparison, inputs: Inputs) -> Settings:
-    """Return KF's settings; without time offset if EKF2 fused another source."""
+def _settings(comparison: Comparison, inputs: Inputs, corrected: Mapping[str, float]) -> Settings:
+    """Return KF's corrected settings; without time offset if EKF2 fused another source."""
+    settings = _with_changes(comparison.settings, corrected)
     is_same_source = comparison.source.name == inputs.received.source
-    return (
-        comparison.settings if is_same_source else replace(comparison.settings, clock_offset_s=0.0)
-    )
+    return settings if is_same_source else replace(settings, clock_offset_s=0.0)
 
 
-def _unreplayed_part(result: AxisComparison, spans: Spans) -> UnreplayedPart | None:
+def _with_changes(settings: Settings, changes: Mapping[str, float]) -> Settings:
+    values: dict[str, Any] = dict(changes)
+    return replace(settings, **values)
+
+
+def _unreplayed_part(result: AxisComparison, kf_run: Replay, spans: Spans) -> UnreplayedPart | None:
     if not isinstance(result.ekf2_state, pd.DataFrame):
         return None
     state = result.ekf2_state[~inside_spans(result.ekf2_state.index, spans)]
     times = state.index.to_numpy()
-    distance_m = np.abs(state_at(result.replay, times)[0] - state["position_m"].to_numpy())
+    distance_m = np.abs(state_at(kf_run, times)[0] - state["position_m"].to_numpy())
     if not np.isfinite(distance_m).any():
         return None
     largest = int(np.nanargmax(distance_m))
@@ -120,10 +172,13 @@ def add_sentences(
     reasons = {**reasons, steps.GATE: f"{reasons[steps.GATE]}{_rejection_text(explanation)}"}
     first, second, *_ = sorted(explanation.steps, key=lambda step: -step.position_mean_square_m2)
     cause = (
-        f"Largest contribution to the difference KF - EKF2 along {axis_label}: {first.name} "
-        f"({_format_share(first, explanation)}). {reasons[first.name]}."
+        f"Largest contribution to the difference KF - EKF2 along {axis_label}: {first.name}. "
+        f"{reasons[first.name]}."
     )
-    sentences = [f"{cause} {_moment_text(first)}"]
+    sentences = [
+        *_corrected_sentences(explanation),
+        f"{cause} {_moment_text(first)} It is {_format_share(first, explanation)}.",
+    ]
     if second.position_mean_square_m2 >= MIN_NOTABLE_SHARE * explanation.position_mean_square_m2:
         sentences.append(
             f"Second: {second.name} ({_format_share(second, explanation)}). "
@@ -141,6 +196,19 @@ def add_sentences(
             f"{explanation.outside.at_s:.0f} s)."
         )
     return structs.replace(explanation, sentences=tuple(sentences), cause=cause)
+
+
+def _corrected_sentences(explanation: DifferenceExplanation) -> list[str]:
+    """State the settings with which KF was run for this explanation."""
+    if not explanation.corrected:
+        return []
+    texts = (
+        f"{COMPARISON_OPTIONS[name]} {value:g}" for name, value in explanation.corrected.items()
+    )
+    return [
+        f"KF was run with {' and '.join(texts)} for this page: the wrong setting is corrected "
+        "first, and the steps explain the rest."
+    ]
 
 
 def _format_share(step: Step, explanation: DifferenceExplanation) -> str:

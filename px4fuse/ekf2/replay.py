@@ -171,7 +171,7 @@ class Replayed(Record, frozen=True, kw_only=True, omit_defaults=False):
     settings : mapping
         All parameters of the model, by PX4 name, in PX4's units.
     late, lost : int
-        Samples that arrived behind the fusion horizon: fused late, and never fused.
+        Samples received behind the fusion horizon: fused late, and never fused.
     agreement : Agreement or None
         Agreement of the replay as flown with the log; None while it is computed.
     """
@@ -256,6 +256,12 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
             f"only {len(log)} logged innovations to compare with (at least {MIN_SAMPLES} "
             "are needed)",
             "Fly longer on external vision, and record with SDLOG_PROFILE bit 0 (default).",
+        )
+    if not inside_spans(ekf2.state.index, replay.evaluated_s).any():
+        return Unavailable(
+            "EKF2 replay",
+            "EKF2's position is not logged in the replayed time",
+            "Record vehicle_local_position during the whole flight.",
         )
     if _has_constant_innovations(log, model, HORIZONTAL):
         return Unavailable(

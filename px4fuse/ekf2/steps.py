@@ -138,6 +138,8 @@ class DifferenceSteps(Record, frozen=True, kw_only=True):
         Longest run of rejections; None without rejections.
     outside : UnreplayedPart or None
         None if the replay covers the analysed segment.
+    corrected : mapping from field of Settings to value
+        Wrong settings of KF that were corrected first.
     sentences : tuple of str
         Explanations of the difference, largest contribution first.
     """
@@ -152,6 +154,7 @@ class DifferenceSteps(Record, frozen=True, kw_only=True):
     spans_s: Spans
     longest_rejection: RejectionRun | None = None
     outside: UnreplayedPart | None = None
+    corrected: Mapping[str, float] = {}
     sentences: tuple[str, ...] = ()
 
     @property

@@ -1,4 +1,4 @@
-"""Data of one flight for the page: input signals of KF, EKF2, ground truth, events and findings.
+"""Data of one flight for the page: input signals of KF, EKF2, ground truth, events and verdicts.
 
 Python projects and integrates the signals and evaluates EKF2. The page runs only KF.
 """
@@ -11,15 +11,15 @@ import pandas as pd
 from scipy import stats
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import (
-    MAX_UNREMARKABLE_NIS,
-    MIN_NEES_FINDING,
-    error_above_reported_sigma,
-)
+from px4fuse.card.build import describe_axis
+from px4fuse.card.model import AXIS_ENDS, BANDS, Verdict
+from px4fuse.card.verdicts import verdicts
 from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth
 from px4fuse.comparison.preparation import choose_source
+from px4fuse.comparison.remedy import aid_of
+from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.explore.packing import COARSE_SCALE, Packer
-from px4fuse.filter.consistency import CONFIDENCE_LEVEL, Consistency, nis_band
+from px4fuse.filter.consistency import CONFIDENCE_LEVEL, Consistency
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import (
     CLOCK_OFFSET_RANGE_S,
@@ -31,19 +31,14 @@ from px4fuse.filter.settings import (
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, cut_to_segment, imu_gaps, weighted_sum
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings import Finding, find, finding_title, group_by_root
-from px4fuse.findings.cause_grouping import NOISES
-from px4fuse.findings.summary import summarise
 from px4fuse.flight import Columns, PositionTrack, Unavailable
-from px4fuse.request import ComparisonRequest, command_line
-from px4fuse.text import capitalise_first
+from px4fuse.report.card_html import MARK_PATHS
+from px4fuse.request import ComparisonRequest, WhatIfRequest, command_line
 
 # Range of the clock offset slider on each side of the analysed value
 OFFSET_HALF_RANGE_S = 0.6
-RUNNING_MEAN_COUNT = 30  # innovations in the running mean NIS
+RUNNING_MEAN_COUNT = 30  # innovations in the running RMS of innovation ÷ √S
 MAX_TRACK_POINTS = 2000  # drawn points of the map
-# Ids of findings that depend on the settings of the page
-SETTING_FINDINGS = frozenset(name for name in NOISES if not name.startswith("ekf2_"))
 
 
 def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
@@ -57,14 +52,10 @@ def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
         Collects the arrays.
     """
     signals = replay_signals(analysis, packer)
-    events, findings, request = analysis.events, find(analysis), analysis.request
+    events, request = analysis.events, analysis.request
     assert request is not None
     return {
         "log": analysis.flight.log.name,
-        "source": analysis.source.name,
-        # The innovations of a drifting source do not show its error: the page suggests no noises
-        "drifts": analysis.source.origin.may_drift,
-        "summary": list(summarise(analysis, findings)),
         "settings": _settings_data(analysis.settings),
         "main": analysis.main.axis.name,
         **signals,
@@ -81,15 +72,9 @@ def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
             "modes": [[mode.start_s, mode.end_s, mode.name] for mode in events.modes],
             "reset": list(events.resets_s),
         },
-        "findings": [
-            {
-                **_finding_data(finding),
-                "more": [_finding_data(consequence) for consequence in followers],
-            }
-            for finding, *followers in group_by_root(findings)
-        ],
         "command": _command_data(request, analysis),
         "offset": _offset_data(request, analysis),
+        "ekf2": _ekf2_settings(request, analysis),
     }
 
 
@@ -112,8 +97,10 @@ def ranges() -> dict[str, Any]:
         "dt": list(DT_RANGE_S),
         "clock-offset": list(CLOCK_OFFSET_RANGE_S),
         "lesson": _settings_data(Settings()),
-        "running": [RUNNING_MEAN_COUNT, *nis_band(RUNNING_MEAN_COUNT)],
-        "hidden": [MIN_NEES_FINDING, MAX_UNREMARKABLE_NIS],
+        "running": RUNNING_MEAN_COUNT,
+        "bands": BANDS,
+        "ends": list(AXIS_ENDS),
+        "marks": MARK_PATHS,
     }
 
 
@@ -205,6 +192,8 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
     name = result.axis.name
     return {
         "called": result.axis.label,
+        "along": describe_axis(analysis, result),
+        "verdicts": [_verdict_data(verdict) for verdict in verdicts(result)],
         "heading": result.axis.heading_deg,
         "note": result.axis.note,
         "direction": result.axis.direction.tolist(),
@@ -247,8 +236,6 @@ def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
             "truthP": consistency.truth.position_rmse_m,
             "truthV": consistency.truth.velocity_rmse_m_s,
         }
-    if excess := error_above_reported_sigma(consistency):
-        ekf2["summary"]["reportedSigma"] = excess.reported_sigma_m
     if isinstance(result.ekf2_variance, pd.DataFrame):
         sigma = result.ekf2_variance.dropna().pow(0.5)
         ekf2["variance"] = _pack_frame(
@@ -329,17 +316,32 @@ def _track_data(comparison: Comparison, packer: Packer) -> list[int] | str:
     return _pack_frame(sampled, Columns.POSITION[:2], packer)
 
 
-def _finding_data(finding: Finding) -> dict[str, Any]:
+def _verdict_data(verdict: Verdict) -> dict[str, Any]:
     return {
-        "severity": finding.severity,
-        "message": finding.message,
-        "remedy": finding.remedy,
-        "id": finding.id,
-        "title": capitalise_first(finding_title(finding.id)),
-        "depends_on_settings": finding.id in SETTING_FINDINGS,
-        "spans": [list(span) for span in finding.spans_s[:20]],
-        "more": [],
+        "ratio": verdict.ratio,
+        "interval": None if verdict.interval is None else list(verdict.interval),
+        "word": verdict.word,
     }
+
+
+def _ekf2_settings(request: ComparisonRequest, analysis: Analysis) -> dict[str, Any]:
+    """Return EKF2's parameters of the source as flown, and the command that replays EKF2."""
+    aid, logged = aid_of(analysis), analysis.flight.log.parameters
+    flown = {
+        name: f"{logged[name]:.4g} {PARAMETERS[name].unit}".rstrip()
+        for name in (aid.noise, aid.delay, aid.gate)
+        if name in logged and name in PARAMETERS
+    }
+    if isinstance(analysis.ekf2_model, Unavailable):
+        return {"flown": flown, "why": analysis.ekf2_model.reason}
+    # half of the noise as flown is an example that changes S and the error visibly
+    parameter = PARAMETERS[aid.noise]
+    flown_m = logged.get(aid.noise, parameter.default)
+    changes = {aid.noise: max(float(f"{0.5 * flown_m:.2g}"), parameter.minimum)}
+    example = WhatIfRequest(
+        log=request.log, mavlink=request.mavlink, system=request.system, changes=changes
+    )
+    return {"flown": flown, "command": command_line(example, for_shell=True)}
 
 
 def _command_data(request: ComparisonRequest, comparison: Comparison) -> dict[str, Any]:
@@ -360,8 +362,8 @@ def _command_data(request: ComparisonRequest, comparison: Comparison) -> dict[st
         heading_deg=heading if base_request.heading_deg is None else base_request.heading_deg,
     )
     return {
-        "base": command_line(base_request),
-        "fixed": command_line(fixed_request),
+        "base": command_line(base_request, for_shell=True),
+        "fixed": command_line(fixed_request, for_shell=True),
         "input": request.input,
         "default_input": "zero"
         if isinstance(comparison.lines[0].acceleration, Unavailable)

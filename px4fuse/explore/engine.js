@@ -145,20 +145,23 @@ const Engine = (() => {
     return { steps, updates, settings };
   }
 
-  /* Position and velocity at other ascending times, NaN outside the run (kalman.state_at) */
+  /* Position, velocity and position variance at other ascending times, NaN outside the run
+     (kalman.state_at and variance_at) */
   function stateAt(run, times) {
-    const { time, p, v, acceleration } = run.steps, n = time.length;
-    const position = new Float64Array(times.length), velocity = new Float64Array(times.length);
+    const { steps: s, settings } = run, { time, p, v, acceleration } = s, n = time.length;
+    const position = new Float64Array(times.length), velocity = position.slice(), variance = position.slice();
     let j = 0;
     for (let i = 0; i < times.length; i++) {
       const t = times[i];
-      if (t < time[0] || t > time[n - 1]) { position[i] = velocity[i] = NaN; continue; }
+      if (t < time[0] || t > time[n - 1]) { position[i] = velocity[i] = variance[i] = NaN; continue; }
       while (j < n - 1 && time[j + 1] <= t) j++;
       const ahead = t - time[j], a = j < n - 1 ? acceleration[j] : 0;
       position[i] = p[j] + v[j] * ahead + a * ahead * ahead / 2;
       velocity[i] = v[j] + a * ahead;
+      const q = (settings.sigmaA * settings.sigmaA + (s.extra[j] ?? 0)) * settings.dt;
+      variance[i] = s.p00[j] + 2 * ahead * s.p01[j] + ahead * ahead * s.p11[j] + q * ahead ** 3 / 4;
     }
-    return { p: position, v: velocity };
+    return { p: position, v: velocity, p00: variance };
   }
 
   /* Statistics of innovations (consistency.assess); null for fewer than MIN_INNOVATIONS */

@@ -15,14 +15,13 @@ from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
 from px4fuse.arrays import Array
+from px4fuse.card.model import BANDS
 from px4fuse.comparison.estimates import Tuning
-from px4fuse.explore.data import RUNNING_MEAN_COUNT
-from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.record import Record, table
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MEASUREMENT_COLOUR, TRUTH_COLOUR
 
-PLOT_HEIGHT, TALL_HEIGHT = 150, 210
+PLOT_HEIGHT = 215
 # KF is dark, solid and round, EKF2 lighter, dashed and square, as in the report
 KF_LINE: dict[str, Any] = {"line_color": KF_COLOUR, "line_width": 1.6, "name": "kf"}
 EKF2_LINE: dict[str, Any] = {
@@ -37,13 +36,11 @@ TRUTH_LINE: dict[str, Any] = {
     "line_dash": [1, 3],
     "name": "truth",
 }
-NIS_BAND: dict[str, Any] = {
-    "level": "underlay",
-    "fill_alpha": 0.15,
-    "fill_color": "#4a8f5a",
-    "line_color": "#4a8f5a",
-}
-LEFT_BORDER = 96  # pixels
+# Bands in which the values of a consistent filter are
+CONSISTENT_BAND: dict[str, Any] = {"level": "underlay", "fill_alpha": 1.0, "name": "consistent"}
+# ±√S in which 95 % of the innovations are, and the range of their plot
+NORMAL_BAND, NORMAL_RANGE = 2.0, 4.6
+LEFT_BORDER = 50  # pixels
 STYLES = {
     "kf": KF_LINE,
     "dotted": KF_LINE | {"line_dash": [2, 2]},
@@ -63,9 +60,7 @@ class Plot(Record, frozen=True):
         Key of :data:`STYLES`, and name in the tooltip ("": no tooltip).
     """
 
-    label: str
     lines: tuple[tuple[str, str, str, str], ...]
-    is_tall: bool = False
     scale: Literal["linear", "log"] = "linear"
     unit: str = ""
 
@@ -108,6 +103,11 @@ def document_json(data: dict[str, Any], tuning: Tuning) -> tuple[Any, dict[str, 
     return document.to_json(deferred=False), {plot.id: name for name, plot in plots.items()}
 
 
+def has_reference(data: dict[str, Any]) -> bool:
+    """Return True if KF can be compared with ground truth or EKF2 along some axis."""
+    return any(isinstance(axis[kind], dict) for axis in data["axes"] for kind in ("truth", "ekf2"))
+
+
 def _plots(data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
     """Return the plots over time by name."""
     missing_kinds = {
@@ -117,12 +117,12 @@ def _plots(data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
     }
     plots: dict[str, Any] = {}
     for name, plot in FIGURES.plots.items():
-        if name == "error" and "truth" in missing_kinds:
+        if name == "error" and not has_reference(data):
             continue
         sources = _Sources(name)
         fig = plots[name] = figure(
             name=name,
-            height=TALL_HEIGHT if plot.is_tall else PLOT_HEIGHT,
+            height=PLOT_HEIGHT,
             sizing_mode="stretch_width",
             x_range=time_range,
             y_range=_page_range(),
@@ -130,7 +130,6 @@ def _plots(data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
             y_axis_type=plot.scale,
             tools="xbox_zoom,xpan,tap",
             active_drag="xbox_zoom",
-            y_axis_label=plot.label,
             lod_threshold=None,
             min_border_left=LEFT_BORDER,
         )
@@ -139,9 +138,13 @@ def _plots(data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
             _draw_arrows(fig, sources["beyond"], MEASUREMENT_COLOUR, "measured")
         if name == "innovation":
             _draw_innovations(fig, sources, with_ekf2="ekf2" not in missing_kinds)
-        if name == "nis":
-            low, high = nis_band(RUNNING_MEAN_COUNT)
-            fig.add_layout(BoxAnnotation(bottom=low, top=high, **NIS_BAND))
+        if name == "error":
+            fig.varea(
+                "t", "minus", "plus", source=sources["error"], fill_alpha=0.25, name="kf_band"
+            )
+        if name == "running":
+            low, high = BANDS["source"]
+            fig.add_layout(BoxAnnotation(bottom=low, top=high, **CONSISTENT_BAND))
         for source, column, style_name, hover_name in plot.lines:
             if style_name in missing_kinds:
                 continue
@@ -181,29 +184,27 @@ def _draw_arrows(fig: Any, source: ColumnDataSource, colour: str, name: str) -> 
 
 
 def _draw_innovations(fig: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: bool) -> None:
-    """Draw the innovations of KF and EKF2 as dots, and ±2√S of KF as a band."""
-    updates = sources["updates"]
-    fig.varea(
+    """Draw innovation ÷ √S of KF and EKF2 as dots, in a band that contains 95 % of them."""
+    fig.y_range = Range1d(start=-NORMAL_RANGE, end=NORMAL_RANGE)
+    fig.add_layout(BoxAnnotation(bottom=-NORMAL_BAND, top=NORMAL_BAND, **CONSISTENT_BAND))
+    kf_dots = fig.scatter(
         "t",
-        "minus",
-        "plus",
-        source=updates,
+        "x",
+        source=sources["updates"],
+        size=4,
         fill_color=KF_COLOUR,
-        fill_alpha=0.15,
-        name="kf_band",
+        line_color=None,
+        name="kf",
     )
+    _add_hover(fig, kf_dots, ("KF", "@x{0.00}"))
+    _draw_arrows(fig, sources["beyond"], KF_COLOUR, "kf")
     if with_ekf2:
         square: dict[str, Any] = {"marker": "square", "name": "ekf2"}
         fused = _draw_dots(fig, sources["fused"], EKF2_COLOUR, 4, **square)
         rejected = _draw_dots(fig, sources["rejected"], None, 7, line_color=EKF2_COLOUR, **square)
-        _add_hover(fig, fused, ("EKF2", "@nu{0.000} m"))
-        _add_hover(fig, rejected, ("EKF2 rejected", "@nu{0.000} m"))
+        _add_hover(fig, fused, ("EKF2", "@x{0.00}"))
+        _add_hover(fig, rejected, ("EKF2 rejected", "@x{0.00}"))
         _draw_arrows(fig, sources["beyond_ekf2"], EKF2_COLOUR, "ekf2")
-    kf_dots = fig.scatter(
-        "t", "nu", source=updates, size=4, fill_color=KF_COLOUR, line_color=None, name="kf"
-    )
-    _add_hover(fig, kf_dots, ("KF", "@nu{0.000} m"), ("2√S", "@plus{0.000} m"))
-    _draw_arrows(fig, sources["beyond"], KF_COLOUR, "kf")
 
 
 def _add_hover(fig: Any, renderer: Any, *rows: tuple[str, str]) -> None:
@@ -258,7 +259,6 @@ def _event_strip(data: dict[str, Any], time_range: Range1d) -> Any:
         tools="xbox_zoom,xpan",
         active_drag="xbox_zoom",
         min_border_left=LEFT_BORDER,
-        x_axis_label="time (s)",
     )
     fig.hbar(
         y="row",

@@ -1,2 +1,2 @@
 /* Replaces practice.js on pages without questions. */
-const Practice = { suffix: "", hidden: false, toAddress: () => ({}), start() {} };
+const Practice = { suffix: "", toAddress: () => ({}), start() {} };

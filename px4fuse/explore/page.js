@@ -31,23 +31,15 @@ const Explore = (async () => {
       },
     })),
   };
-  // the page hides ground truth until the student has answered
-  if (Practice.hidden) {
-    for (const axis of flight.axes) {
-      axis.truth = "shown after your answer";
-      for (const name of ["truthP", "truthV", "reportedSigma"]) delete axis.ekf2.summary?.[name];
-    }
-  }
-
   // ------------------------------------------------------------------ settings
   const SETTINGS = [
     { id: "sigma-a", key: "sigmaA", title: "SIGMA_A", unit: "m/s²", log: [0.001, 100],
-      hint: "process noise" },
+      hint: "process noise", likely: () => mapNow().likely?.[0] },
     { id: "sigma-z", key: "sigmaZ", title: "SIGMA_Z", unit: "m", log: [0.001, 10],
-      hint: "measurement noise" },
+      hint: "measurement noise", likely: () => mapNow().likely?.[1] },
+    { id: "clock-offset", key: "offset", title: "Time offset", unit: "s",
+      hint: "added to timestamps", likely: () => flight.offset.likely },
     { id: "dt", key: "dt", title: "DT", unit: "s", log: [0.01, 1], hint: "prediction step" },
-    { id: "clock-offset", key: "offset", title: "Clock offset", unit: "s",
-      hint: "added to the timestamps" },
   ];
   const TICKS = 600;
   const settings = { ...flight.settings, axis: flight.main };
@@ -67,7 +59,8 @@ const Explore = (async () => {
     return Math.round(Math.min(Math.max(at / (high - low || 1), 0), 1) * TICKS);
   };
   for (const setting of SETTINGS) {
-    const box = make("div", undefined, { className: "setting" });
+    const isMore = ["dt", "offset"].includes(setting.key); // in the opened sheet of a phone
+    const box = make("div", undefined, { className: isMore ? "setting more" : "setting" });
     const label = make("label", `${setting.title} `, { htmlFor: `${setting.id}-value` });
     label.append(make("small", `${setting.unit}, ${setting.hint}`));
     setting.number = make("input", undefined, { type: "number", id: `${setting.id}-value`, step: "any" });
@@ -83,7 +76,8 @@ const Explore = (async () => {
       showMessage(`${setting.title}: enter ${low} to ${high} ${setting.unit}.`);
       show();
     });
-    box.append(label, setting.number, setting.slider);
+    setting.best = make("div", undefined, { className: "best" });
+    box.append(label, setting.number, setting.slider, setting.best);
     if (setting.key === "offset" && why) {
       setting.number.disabled = setting.slider.disabled = true;
       box.append(make("p", why, { className: "note" }));
@@ -104,6 +98,17 @@ const Explore = (async () => {
       radio.disabled = true;
       $("input-note").textContent = imu;
     }
+  }
+  /* Mark the maximum-likelihood estimate on the track of a slider */
+  function markLikely(setting) {
+    const value = setting.likely?.(), text = `maximum likelihood ${value && round(value, 3)}`;
+    setting.best.hidden = value === null || value === undefined;
+    if (setting.best.hidden) return;
+    const share = toSlider(setting, value) / TICKS, line = make("i"), label = make("small", text);
+    line.style.left = `${100 * share}%`;
+    label.style.left = `${100 * share}%`;
+    label.style.transform = `translateX(${-100 * share}%)`;
+    setting.best.replaceChildren(line, label);
   }
   const axisNow = () => flight.axes.find((axis) => axis.name === settings.axis);
   const showMessage = (text) => { $("message").textContent = text; };
@@ -146,7 +151,7 @@ const Explore = (async () => {
     const parts = { axis: settings.axis, input: settings.input };
     for (const setting of SETTINGS) parts[setting.id] = String(settings[setting.key]);
     Object.assign(parts, Practice.toAddress());
-    if (view !== "filter") parts.view = view;
+    if (view !== "errors") parts.view = view;
     if (chosen.step !== null) parts.measurement = String(chosen.step + 1);
     const text = `#${new URLSearchParams(parts)}`;
     if (text !== location.hash) history.replaceState(null, "", text);
@@ -173,16 +178,16 @@ const Explore = (async () => {
   }
 
   // ------------------------------------------------------------------ views
-  const PLOTS = { innovation: "Innovations", sigma_p: "σ position", sigma_v: "σ velocity", position: "Position",
-    velocity: "Velocity", error: "Error", nis: "NIS", gain: "Gain", strip: "Events" };
-  const GROUPS = { filter: ["Innovations and σ", ["innovation", "sigma_p", "sigma_v"]],
-    track: ["Position and ground truth", ["position", "velocity", "error"]],
-    more: ["NIS, gain, events", ["nis", "gain", "strip"]] };
-  const CARDS = { step: "Step by step", map: "Likelihood", numbers: "Numbers", recorded: "Findings" };
+  const PLOTS = { innovation: "Innovations", error: "Error", sigma_p: "σ position", sigma_v: "σ velocity",
+    position: "Position", strip: "Events", velocity: "Velocity", gain: "Gain", running: "Running RMS" };
+  const GROUPS = { errors: ["Innovations and error", ["innovation", "error"]],
+    sigma: ["σ", ["sigma_p", "sigma_v"]], track: ["Position", ["position", "strip"]],
+    speed: ["Velocity", ["velocity"]], gains: ["Gain", ["gain", "running"]] };
+  const CARDS = { numbers: "Numbers", step: "Step by step", map: "Likelihood" };
   const hasPlot = (name) => document.querySelector(`[data-plot=${name}]`) !== null;
   const isView = (name) => Object.hasOwn(GROUPS, name) || Object.hasOwn(CARDS, name)
     || (Object.hasOwn(PLOTS, name) && hasPlot(name));
-  let view = "filter";
+  let view = "errors";
   /* Tab of a view; on a narrow screen each plot has a separate tab */
   function tabOf(name) {
     if (Object.hasOwn(CARDS, name)) return name;
@@ -216,7 +221,6 @@ const Explore = (async () => {
     $("view-plots").setAttribute("aria-labelledby", `tab-${view}`);
     for (const figure of document.querySelectorAll("[data-plot]")) figure.hidden = !plots.includes(figure.dataset.plot);
     for (const card of Object.keys(CARDS)) $(`view-${card}`).hidden = card !== view;
-    document.body.classList.toggle("pinned", plots.length > 0);
     if (draw) { axisShown = null; show(); }
   }
   $("tabs").addEventListener("keydown", (event) => {
@@ -229,14 +233,29 @@ const Explore = (async () => {
     event.preventDefault();
     event.stopPropagation();
   });
-  $("others").open = !NARROW.matches;
   NARROW.addEventListener("change", () => {
     drawTabs();
-    $("others").open = !NARROW.matches;
+    setHeights();
     open(view);
   });
-  // on a small screen the plots stick below the settings
-  new ResizeObserver(() => document.body.style.setProperty("--bar", `${$("bar").offsetHeight}px`)).observe($("bar"));
+  new ResizeObserver(() => document.body.style.setProperty("--sheet", `${document.querySelector("aside").offsetHeight}px`))
+    .observe(document.querySelector("aside"));
+  /* On a phone the settings are a sheet at the bottom; a swipe or a button opens and closes it */
+  function openSheet(isOpen) {
+    document.querySelector("aside").classList.toggle("open", isOpen);
+    $("handle").ariaExpanded = String(isOpen);
+    $("all").textContent = isOpen ? "Less ▾" : "All ▴";
+  }
+  const isSheetOpen = () => $("handle").ariaExpanded === "true";
+  let swipedFrom = null;
+  for (const id of ["handle", "all"]) $(id).addEventListener("click", () => openSheet(!isSheetOpen()));
+  document.querySelector("aside").addEventListener("touchstart", (event) => {
+    swipedFrom = event.target.matches("input") ? null : event.touches[0].clientY;
+  }, { passive: true });
+  document.querySelector("aside").addEventListener("touchend", (event) => {
+    const by = swipedFrom === null ? 0 : event.changedTouches[0].clientY - swipedFrom;
+    if (Math.abs(by) > 30) openSheet(by < 0);
+  });
 
   // ------------------------------------------------------------------ Bokeh
   Bokeh.logger.set_level("off");
@@ -257,8 +276,11 @@ const Explore = (async () => {
     }
   };
   const timeRange = model("time");
-  const figures = ["position", "velocity", "error", "innovation", "sigma_p", "sigma_v",
-    "nis", "gain", "strip"].map(model).filter(Boolean);
+  const figures = Object.keys(PLOTS).map(model).filter(Boolean);
+  function setHeights() {
+    for (const plot of figures) if (plot.name !== "strip") plot.height = NARROW.matches ? 175 : 205;
+  }
+  setHeights();
 
   /* Rows within the visible time range; long series are reduced to the extremes of each bin */
   let pointLimit = MAX_POINTS;
@@ -306,8 +328,8 @@ const Explore = (async () => {
     const rows = (...parts) => parts.flatMap(([part, column]) => part === undefined ? []
       : Array.from(part.t, (t, i) => [t, part[column][i]]));
     for (const [plot, name, points] of [["position", "beyond", rows([drawn.measured, "z"])],
-      ["innovation", "beyond", rows([drawn.updates, "nu"])],
-      ["innovation", "beyond_ekf2", rows([drawn.fused, "nu"], [drawn.rejected, "nu"])]]) {
+      ["innovation", "beyond", rows([drawn.updates, "x"])],
+      ["innovation", "beyond_ekf2", rows([drawn.fused, "x"], [drawn.rejected, "x"])]]) {
       const source = isSeen(plot) ? model(`${plot}:${name}-source`) : null;
       if (source === null) continue;
       const { start: low, end: high } = model(plot).y_range, inside = 0.035 * (high - low);
@@ -324,23 +346,22 @@ const Explore = (async () => {
     }
     return [low, high];
   }
-  const quantile = (values, share) => {
-    const sorted = Float64Array.from(values, Math.abs).sort();
-    return sorted.length ? sorted[Math.min(Math.floor(share * sorted.length), sorted.length - 1)] : 0;
-  };
 
   // ------------------------------------------------------------------ KF run and its numbers
   // run and numbers are null if the segment has too few measurements
   const result = { run: null, axis: null, numbers: null };
-  function replay(quick) {
+  function replay() {
     const axis = axisNow(), run = Engine.replay(flight, axis, settings);
-    Object.assign(result, { run, axis, numbers: run && numbers(axis, run, quick) });
+    Object.assign(result, { run, axis, numbers: run && numbers(axis, run) });
   }
-  /* Statistics of the innovations; unless quick, also differences to EKF2 and ground truth */
-  function numbers(axis, run, quick = false) {
+  /* Statistics of KF: against the source, EKF2 and ground truth, at the times of EKF2's state */
+  function numbers(axis, run) {
     const kf = Engine.assess(run.updates.nu, run.updates.s) ?? { count: run.updates.nu.length };
-    if (kf.nis !== undefined) kf.band = axis.bands.map((ends) => ends[kf.count - 1]);
-    if (quick) return kf;
+    if (kf.nis !== undefined) {
+      kf.source = Math.sqrt(kf.nis);
+      const [low, high] = axis.bands.map((ends) => ends[kf.count - 1]);
+      kf.interval = [Math.sqrt(kf.nis / high), Math.sqrt(kf.nis / low)];
+    }
     let times = run.steps.time;
     if (typeof axis.ekf2 !== "string") {
       const [time, p, v] = axis.ekf2.state, at = Engine.stateAt(run, time);
@@ -349,71 +370,52 @@ const Explore = (async () => {
       times = time;
     }
     if (typeof axis.truth !== "string") {
-      const at = Engine.stateAt(run, times), { p, v } = axis.truth;
-      kf.truthP = Engine.rmse(at.p, Engine.interp(times, p[0], p[1], NaN));
+      const at = Engine.stateAt(run, times), { p, v } = axis.truth, known = Engine.interp(times, p[0], p[1], NaN);
+      kf.truthP = Engine.rmse(at.p, known);
       kf.truthV = v === null ? null : Engine.rmse(at.v, Engine.interp(times, v[0], v[1], NaN));
-      kf.reportedSigma = hiddenErrorSigma(run, p, kf.nis);
+      kf.truth = Engine.rmse(at.p.map((x, i) => (x - known[i]) / Math.sqrt(at.p00[i])), new Float64Array(times.length));
     }
     return kf;
   }
-  /* Median reported σ of position, if ground truth shows an error that the innovations do not
-     show (findings/hidden_errors.py) */
-  function hiddenErrorSigma({ steps }, truth, nis) {
-    const known = Engine.interp(steps.time, truth[0], truth[1], NaN);
-    let sum = 0, count = 0;
-    steps.p.forEach((p, i) => { if (Number.isFinite(known[i])) { sum += (p - known[i]) ** 2 / steps.p00[i]; count++; } });
-    return sum / count >= ranges.hidden[0] && nis < ranges.hidden[1]
-      ? Math.sqrt(steps.p00.toSorted()[steps.p00.length >> 1]) : undefined;
-  }
-  const ekf2Of = (axis) => typeof axis.ekf2 === "string" ? { why: axis.ekf2 } : axis.ekf2.summary;
+  const ekf2Of = (axis) => typeof axis.ekf2 === "string" ? { why: axis.ekf2 }
+    : { ...axis.ekf2.summary, source: axis.verdicts[2].ratio, truth: axis.verdicts[3].ratio };
 
-  // ------------------------------------------------------------------ NIS gauge and sentences
-  const DECADES = [-1.3, 1.3]; // range of log10(mean NIS) on the gauge
-  const place = (nis) => Math.min(Math.max((Math.log10(nis) - DECADES[0]) / (DECADES[1] - DECADES[0]), 0), 1);
-  for (const name of ["band", "hand ekf2", "hand kf"]) $("needle").append(make("span", undefined, { className: name }));
-  for (const nis of [0.1, 0.3, 1, 3, 10]) {
-    const tick = make("small", String(nis));
-    tick.style.left = `${100 * place(nis)}%`;
-    $("needle").append(tick);
-  }
-  function drawNeedle({ axis, numbers: kf }) {
-    const [band, ekf2Hand, kfHand] = $("needle").children, ekf2 = ekf2Of(axis);
-    for (const [hand, one] of [[kfHand, kf], [ekf2Hand, ekf2]]) {
-      hand.hidden = one?.nis === undefined;
-      if (!hand.hidden) hand.style.left = `${100 * place(one.nis)}%`;
+  // ------------------------------------------------------------------ card and table
+  const card = Card.start(ranges, Practice.suffix);
+  function effect({ axis, numbers: kf }) {
+    const value = (now, before) => `KF ${Card.formatMetres(now)}${before ? ` (as analysed ${Card.formatMetres(before)})` : ""}`;
+    const before = axis.name === flight.main ? analysedNumbers : null;
+    if (kf?.truthP) {
+      const { truthP } = ekf2Of(axis);
+      return `Position RMSE against ground truth along ${axis.called}: ${value(kf.truthP, before?.truthP)}`
+        + `${truthP ? `, EKF2 ${Card.formatMetres(truthP)}` : ""}.`;
     }
-    band.hidden = kf?.band === undefined;
-    if (!band.hidden) {
-      band.style.left = `${100 * place(kf.band[0])}%`;
-      band.style.width = `${100 * (place(kf.band[1]) - place(kf.band[0]))}%`;
-    }
-    const values = [["KF", kf], ["EKF2", ekf2]].filter(([, one]) => one?.nis !== undefined)
-      .map(([name, one]) => `${name} ${Summary.formatNumber(one.nis, 2)} (${Summary.verdict(one)})`);
-    $("needle").ariaLabel = $("read").textContent = `mean NIS: ${values.join("; ") || "unknown"}`;
+    return kf?.ekf2P ? `KF − EKF2 along ${axis.called}: ${Card.formatMetres(kf.ekf2P)} RMS.` : "";
   }
-  const rerun = (axis) => (changes) => {
-    const run = Engine.replay(flight, axis, { ...settings, ...changes });
-    return run && numbers(axis, run, true);
-  };
-  function drawSentences({ axis, numbers: kf }) {
-    const map = mapNow(), { likely } = flight.offset;
-    const [sigmaA, sigmaZ] = typeof map === "string" ? [null, null] : map.likely;
-    const candidates = [["SIGMA_A", "sigmaA", sigmaA], ["SIGMA_Z", "sigmaZ", sigmaZ], ["clock offset", "offset", likely]]
-      .filter(([, key, value]) => value !== null && value !== undefined && round(value, 2) !== round(settings[key], 2))
-      .map(([name, key, value]) => [`${name} ${round(value, 2)}${key === "offset" ? " s" : ""}`, { [key]: round(value, 2) }]);
-    const text = Summary.sentence(axis, kf, ekf2Of(axis))
-      + (Practice.hidden || flight.drifts ? "" : Summary.remedy(kf, candidates, rerun(axis)));
-    for (const line of document.querySelectorAll(".changed-note")) {
-      line.textContent = isChanged() ? `Settings changed since the report: ${text}` : "";
-      line.parentElement.classList.toggle("stale", isChanged());
+  let analysedNumbers = null;
+  function drawCard(result) {
+    if (analysedNumbers === null) {
+      const axis = flight.axes.find(({ name }) => name === flight.main);
+      const run = Engine.replay(flight, axis, { ...settings, ...flight.settings });
+      analysedNumbers = run === null ? {} : numbers(axis, run);
     }
-    if ($("live").textContent !== text) $("live").textContent = text;
+    const now = card.verdicts(result.numbers);
+    card.move(now, result.axis, isChanged());
+    card.say(now, effect(result), isChanged());
   }
+  $("card").addEventListener("click", ({ target }) => {
+    if (target.dataset.apply === undefined) return;
+    const changes = {};
+    for (const { id, key } of SETTINGS) {
+      const found = new RegExp(`--${id} (-?[0-9.e-]+)`).exec(target.dataset.apply);
+      if (found) changes[key] = Number(found[1]);
+    }
+    set({ ...flight.settings, ...changes });
+  });
   const isChanged = () => ["sigmaA", "sigmaZ", "dt", "input", "offset"].some((key) => settings[key] !== flight.settings[key]);
   const ROWS = [
-    ["Mean NIS (expected 1)", (x) => x.nis?.toFixed(2)],
-    ["95 % band", (x) => x.band && `${x.band[0].toFixed(2)}–${x.band[1].toFixed(2)}`],
-    ["Verdict", Summary.verdict],
+    ["● innovation ÷ √S, RMS", (x) => x.source && Card.formatRatio(x.source)],
+    ["◆ error ÷ σ, RMS", (x) => x.truth && Card.formatRatio(x.truth)],
     ["Outside ±2√S (expected 5 %)", (x) => x.outside === undefined ? undefined
       : `${(100 * x.outside).toFixed(1)} %`],
     ["Lag-1 autocorrelation of ν", (x) => x.lag1?.toFixed(2)],
@@ -434,7 +436,7 @@ const Explore = (async () => {
       const row = body.rows[i], left = kf && format(kf), right = format(ekf2);
       row.cells[1].textContent = left ?? "–";
       row.cells[2].textContent = right ?? "–";
-      row.hidden = (left ?? right) === undefined && i > 5;
+      row.hidden = (left ?? right) === undefined && i > 4;
     });
     const missing = [];
     if (kf === null) missing.push("KF: the segment has too few measurements.");
@@ -456,29 +458,34 @@ const Explore = (async () => {
       sawtooth.t[k] = steps.time[i]; sawtooth.p[k] = steps.p[i]; sawtooth.v[k] = steps.v[i];
       sawtooth.sp[k] = Math.sqrt(steps.p00[i]); sawtooth.sv[k++] = Math.sqrt(steps.p11[i]);
     }
-    const rows = { t: updates.time, nu: updates.nu,
-      plus: updates.s.map((s) => 2 * Math.sqrt(s)), minus: updates.s.map((s) => -2 * Math.sqrt(s)),
+    const rows = { t: updates.time, x: updates.nu.map((nu, i) => nu / Math.sqrt(updates.s[i])),
       k0: updates.k0, k1: updates.k1, running: running(updates.nu, updates.s) };
-    const seen = { steps: decimate(sawtooth, ["p", "sp"]), updates: decimate(rows, ["nu", "plus"]) };
+    const seen = { steps: decimate(sawtooth, ["p", "sp"]), updates: decimate(rows, ["x"]) };
     setVisibleSources("steps", seen.steps);
     setVisibleSources("updates", seen.updates);
     if (isSeen("position")) {
       seen.measured = decimate({ t: shifted(axis.time, settings.offset), z: axis.z }, ["z"]);
       setVisibleSources("measured", seen.measured);
     }
-    if (isSeen("error") && typeof axis.truth !== "string") {
-      const known = Engine.interp(steps.time, ...axis.truth.p, NaN);
-      seen.error = decimate({ t: steps.time, e: steps.p.map((p, i) => p - known[i]) }, ["e"]);
+    const known = reference(axis, steps.time);
+    if (isSeen("error") && known !== null) {
+      const e = steps.p.map((p, i) => p - known[i]), plus = steps.p00.map((x) => 2 * Math.sqrt(x));
+      seen.error = decimate({ t: steps.time, e, plus, minus: plus.map((x) => -x) }, ["e", "plus"]);
       setVisibleSources("error", seen.error);
     }
     return seen;
   }
+  /* Ground truth at some times, else EKF2, else null */
+  function reference(axis, times) {
+    if (typeof axis.truth !== "string") return Engine.interp(times, ...axis.truth.p, NaN);
+    return typeof axis.ekf2 === "string" ? null : Engine.interp(times, axis.ekf2.state[0], axis.ekf2.state[1], NaN);
+  }
   function running(nu, s) {
-    const over = ranges.running[0], out = new Float64Array(nu.length).fill(NaN);
+    const over = ranges.running, out = new Float64Array(nu.length).fill(NaN);
     for (let i = 0, sum = 0; i < nu.length; i++) {
       sum += nu[i] * nu[i] / s[i];
       if (i >= over) sum -= nu[i - over] * nu[i - over] / s[i - over];
-      if (i >= over - 1) out[i] = sum / over;
+      if (i >= over - 1) out[i] = Math.sqrt(sum / over);
     }
     return out;
   }
@@ -494,9 +501,8 @@ const Explore = (async () => {
       for (const [name, flag] of [["fused", 0], ["rejected", 1]]) {
         const which = [...t.keys()].filter((i) => rows.rejected[i] === flag);
         take(name, { t: Float64Array.from(which, (i) => t[i]),
-          nu: Float64Array.from(which, (i) => rows.nu[i]) }, ["nu"]);
+          x: Float64Array.from(which, (i) => rows.nu[i] / rows.sigma[i]) }, ["x"]);
       }
-      take("limits", { t, plus: rows.sigma.map((s) => 2 * s), minus: rows.sigma.map((s) => -2 * s) }, ["plus"]);
       take("running", { t, running: running(rows.nu, rows.sigma.map((s) => s * s)) }, ["running"]);
     }
     if (typeof axis.truth !== "string") {
@@ -517,19 +523,39 @@ const Explore = (async () => {
     setRange("position", () => extent(steps.p, of(others.state, "p"), of(others.truth_p, "p")));
     setRange("velocity", () => extent(steps.v, of(others.state, "v"), of(others.truth_v, "v")));
     setRange("error", () => extent(of(kf.error, "e"), of(others.error_ekf2, "e")));
-    setRange("innovation", () => { // limited, so that outliers and gaps do not hide the other innovations
-      const reach = 1.3 * Math.max(...[[updates.nu, updates.plus],
-        [of(others.fused, "nu"), of(others.limits, "plus")]].map(([nu, plus]) => {
-          const typical = quantile(plus, 0.5);
-          return Math.max(typical, Math.min(quantile(nu, 0.99), 2.5 * typical));
-        }));
-      return [-reach, reach];
-    });
     setRange("sigma_p", () => extent(steps.sp, of(others.variance, "sp")), true);
     setRange("sigma_v", () => extent(steps.sv, of(others.variance, "sv")), true);
-    setRange("nis", () => extent(updates.running, of(others.running, "running"), ranges.running.slice(1)), true);
+    setRange("running", () => extent(updates.running, of(others.running, "running"), ranges.bands.source), true);
     setRange("gain", () => extent(updates.k0, updates.k1, [0]));
     drawOutsideArrows({ ...others, ...kf });
+  }
+
+  /* Titles of the plots with RMSE and shares */
+  function drawTitles({ axis, run, numbers: kf }) {
+    const title = (name, text) => {
+      const span = document.querySelector(`[data-plot=${name}] figcaption span`);
+      if (span !== null) span.textContent = text && `· ${text}`;
+    };
+    const ekf2 = ekf2Of(axis), percent = (x) => `${(100 * x).toFixed(0)} %`;
+    const both = (format) => [["KF", kf], ["EKF2", ekf2]].flatMap(([name, one]) => {
+      const text = one && format(one);
+      return text ? [`${name} ${text}`] : [];
+    }).join(", ");
+    title("innovation", `outside ±2: ${both((one) => one.outside === undefined ? "" : percent(one.outside))}; expected 5 %`);
+    title("running", `over ${ranges.running} measurements; green: consistent`);
+    title("gain", "solid: position, dotted: velocity (1/s)");
+    if (run === null) return;
+    const sigmas = Array.from(run.steps.p00, Math.sqrt).sort((a, b) => a - b);
+    const at = (share) => sigmas[Math.floor(share * (sigmas.length - 1))], [low, middle, high] = [0.02, 0.5, 1].map(at);
+    const sigma = high < 1.5 * low ? Card.formatMetres(middle) : `${Card.formatMetres(low).slice(0, -2)} to ${Card.formatMetres(high)}`;
+    const gaps = flight.events.gap.length ? "; hatched: no position" : "";
+    const shaded = `shaded: ±2σ as KF reports it (σ ${sigma})${gaps}`;
+    if (typeof axis.truth !== "string") {
+      title("error", `RMSE ${both((one) => one.truthP && Card.formatMetres(one.truthP))} · ${shaded}`);
+    } else if (kf.ekf2P) {
+      document.querySelector("[data-plot=error] b").textContent = "KF − EKF2, position (m)";
+      title("error", `RMS ${Card.formatMetres(kf.ekf2P)} · ${shaded}`);
+    }
   }
 
   // ------------------------------------------------------------------ likelihood map
@@ -583,9 +609,11 @@ const Explore = (async () => {
     if (settings.input !== defaultInput || input !== null) parts.push(`--input ${settings.input}`);
     return parts.join(" ");
   }
-  $("copy").addEventListener("click", async () => {
-    $("copy-note").textContent = await copyText($("command")) ? " copied" : " selected, press Ctrl+C";
-  });
+  for (const button of document.querySelectorAll("[data-copy]")) {
+    button.addEventListener("click", async () => {
+      button.textContent = await copyText($(button.dataset.copy)) ? "copied" : "press Ctrl+C";
+    });
+  }
   async function copyText(node) {
     try {
       await navigator.clipboard.writeText(node.textContent);
@@ -609,10 +637,15 @@ const Explore = (async () => {
     }
     const isNewAxis = axisShown !== settings.axis;
     axisShown = settings.axis;
-    replay(quick);
-    if (isNewAxis) others = drawReferences(result.axis);
+    replay();
+    if (isNewAxis) {
+      others = drawReferences(result.axis);
+      card.showAxis(settings.axis, flight.main);
+      SETTINGS.forEach(markLikely);
+    }
     if (result.run) setRanges(drawKf(result), others);
-    drawNeedle(result);
+    drawCard(result);
+    drawTitles(result);
     if (isSeen("map")) drawMap();
     if (quick) return;
     clearTimeout(finalDraw);
@@ -620,6 +653,7 @@ const Explore = (async () => {
       for (const radio of document.querySelectorAll(`[name=${name}]`)) radio.checked = radio.value === settings[name];
     }
     const { axis } = result, map = mapNow();
+    $("along").textContent = `· ${axis.along}`;
     $("axis-note").textContent = [axis.heading === null ? "" : `heading ${axis.heading.toFixed(1)}°`, axis.note]
       .filter(Boolean).join(", ");
     $("likely").disabled = typeof map === "string" || map.likely.includes(null);
@@ -630,7 +664,6 @@ const Explore = (async () => {
     if (isNewAxis) times.strip(axis);
     times.plan();
     stepper.draw();
-    drawSentences(result);
     toAddress();
   }
   /* Draw the same KF run again after a zoom */
@@ -645,12 +678,17 @@ const Explore = (async () => {
   const keys = { n: () => stepper.go((chosen.step ?? -1) + 1), p: () => stepper.go((chosen.step ?? 1) - 1),
     " ": () => { open("step"); stepper.play(); }, s: () => stepper.faster(-1), f: () => stepper.faster(1) };
   const times = Times.start({ flight, settings, model, setSource, timeRange, figures, redraw, shifted, isSeen, keys, open });
+  const { flown, command: example, why: noReplay } = flight.ekf2;
+  for (const [name, value] of Object.entries(flown)) $("flown").append(make("dt", name), make("dd", value));
+  if (!Object.keys(flown).length) $("flown").append(make("dt", "The log contains none of its parameters."));
+  $("whatif-command").textContent = example ?? "";
+  if (noReplay) $("whatif").replaceChildren(make("p", `No replay: ${noReplay}.`, { className: "note" }));
   drawTabs();
   addEventListener("hashchange", () => { fromAddress(); axisShown = null; show(); });
   open(view, false);
   fromAddress();
   show();
-  const shared = { recorded: times.recorded, look: times.view, settings, set, show, open, result, flight, model,
+  const shared = { look: times.view, settings, set, show, open, result, flight, model,
     numbers, timeRange, chosen, stepper, axisNow, mapNow, ekf2Of, view: () => view };
   Tour.start(shared);
   Practice.start(shared);

@@ -8,12 +8,13 @@ from bokeh.resources import Resources
 
 from px4fuse.analysis import Analysis
 from px4fuse.explore.data import flight_data, ranges
-from px4fuse.explore.figures import FIGURES, document_json
+from px4fuse.explore.figures import FIGURES, document_json, has_reference
 from px4fuse.explore.packing import Packer
+from px4fuse.report.card_html import axis_figures, card_html, card_of, card_style
 from px4fuse.webpage.safe import clean_values, inert_json, load_template, policy_hash, read_asset
 
 MAX_CHARACTERS = 2000  # longer texts from a log are shortened
-SCRIPTS = ("dom", "summary", "step", "times", "tour")
+SCRIPTS = ("dom", "card", "step", "times", "tour")
 PACKAGE = "px4fuse.explore"
 
 
@@ -31,19 +32,21 @@ def html_text(analysis: Analysis) -> str:
         Write it as UTF-8.
     """
     packer = Packer()
-    data = flight_data(analysis, packer)
+    data, card = flight_data(analysis, packer), card_of(analysis)
+    identity = card.identity
     return page_text(
         data_scripts(data, analysis, packer),
         data,
         command="explore",
-        heading="Interactive Kalman filter",
         title=data["log"],
+        about=f"{identity.source}, {identity.firmware}, {identity.duration_s:.1f} s",
+        card=card_html(card, has_apply=True),
         sha256=analysis.flight.log.sha256,
     )
 
 
 def data_scripts(data: dict[str, Any], analysis: Analysis, packer: Packer, suffix: str = "") -> str:
-    """Return the script elements with the data of one flight; none of them is executed.
+    """Return the elements with the data of one flight, which are not executed and not shown.
 
     Parameters
     ----------
@@ -57,7 +60,8 @@ def data_scripts(data: dict[str, Any], analysis: Analysis, packer: Packer, suffi
     """
     document, places = document_json(data, analysis.tuning)
     content = {"flight": data, "ranges": ranges(), "packed": packer.specs, "places": places}
-    return "\n".join(
+    figures = f'<template id="figures{suffix}">{axis_figures(analysis)}</template>\n'
+    return figures + "\n".join(
         f'<script type="{kind}" id="{name}{suffix}">{text}</script>'
         for name, kind, text in (
             ("content", "application/json", inert_json(clean_values(content, MAX_CHARACTERS))),
@@ -72,8 +76,9 @@ def page_text(
     data: dict[str, Any],
     *,
     command: str,
-    heading: str,
     title: str,
+    about: str = "",
+    card: str = "",
     sha256: str = "",
     flight_count: int = 0,
     choices: Mapping[str, str] = {},
@@ -86,7 +91,10 @@ def page_text(
         Script elements from :func:`data_scripts`.
     data : dict
         Data of any flight of the page: either all have ground truth or none has.
-    command, heading, title : str
+    command, title, about : str
+        Command, file, and description of the flight in the header.
+    card : str
+        HTML of the diagnosis card; empty if the page shows it after an answer.
     sha256 : str
         SHA-256 of the log, in the head of the page.
     flight_count : int
@@ -107,15 +115,21 @@ def page_text(
     return load_template("explore/page.html").render(
         {f"{name}_hash": policy_hash(text) for name, text in scripts_by_name.items()},
         **scripts_by_name,
-        style=read_asset("base.css") + read_asset("page.css", PACKAGE),
+        style="".join(map(read_asset, ("colours.css", "base.css")))
+        + card_style()
+        + read_asset("page.css", PACKAGE),
         command=command,
-        heading=heading,
         title=title,
+        about=about,
+        card=card,
         made_from=f"px4fuse {command} {sha256}".rstrip(),
         made_with=f"px4fuse {version('px4fuse')}",
         data=data_elements,
         flight_count=flight_count,
         choices=choices,
-        panels=FIGURES.panels.items(),
-        has_truth=any(isinstance(axis["truth"], dict) for axis in data["axes"]),
+        panels=[
+            (name, title)
+            for name, title in FIGURES.panels.items()
+            if name != "error" or has_reference(data)
+        ],
     )

@@ -122,6 +122,7 @@ const Step = (() => {
 
     function draw() {
       const { run } = result;
+      if (isSeen("step")) chosen.step ??= 0; // opens at the first update
       if (moment === null && chosen.step !== null) {
         const requested = Math.min(chosen.step, (run?.updates.nu.length ?? 1) - 1);
         moment = listNow().findIndex((one) => one.u === requested && one.updated);
@@ -170,8 +171,8 @@ const Step = (() => {
         [band.left, band.right] = [z - 2 * settings.sigmaZ, z + 2 * settings.sigmaZ];
         line.location = z;
       }
-      // constant scale over the run, so that changes of the ellipse are visible
-      const reach = reachOf(run);
+      // constant scale over the run, so that changes of the ellipse are visible; larger at the start
+      const reach = reachOf(run).map((typical, i) => Math.max(typical, 2.2 * Math.sqrt(now[2 + 2 * i])));
       [plot.x_range.start, plot.x_range.end] = [now[0] - reach[0], now[0] + reach[0]];
       [plot.y_range.start, plot.y_range.end] = [now[1] - reach[1], now[1] + reach[1]];
     }

@@ -1,12 +1,7 @@
-/* Time range of the plots, events, map and findings. */
+/* Time range of the plots, events and map. */
 const Times = (() => {
-  // colours by name of the drawn element, in light and dark mode
-  const COLOURS = {
-    light: { kf: "#123f7a", ekf2: "#e0741a", truth: "#111111", measured: "#9a9a9a",
-      paper: "#ffffff", ink: "#1b2027", muted: "#55606c", line: "#d9dee4", event: "#aab3bd" },
-    dark: { kf: "#8ab8ff", ekf2: "#f0a35c", truth: "#f2f2f2", measured: "#7f8892",
-      paper: "#1a1f26", ink: "#e5e9ee", muted: "#a0abb7", line: "#343c46", event: "#55616e" },
-  };
+  // names of the drawn elements, which are names of CSS colours
+  const NAMES = ["kf", "ekf2", "truth", "measured", "paper", "ink", "muted", "line", "band"];
 
   function start(page) {
     const { flight, settings, model, setSource, timeRange, figures, redraw, shifted, isSeen, keys: others } = page;
@@ -99,46 +94,11 @@ const Times = (() => {
       setSource("here", { north: Engine.interp(at, time, north), east: Engine.interp(at, time, east) });
     }
 
-    // ------------------------------------------------------------------ summary and findings
-    $("facts").textContent = `positions from ${flight.source}, ${ends.map((t) => t.toFixed(1)).join(" s to ")} s`;
-    /* Show the summary and the findings of the report */
-    function recorded({ summary, findings }) {
-      const { sigmaA, sigmaZ, dt, offset } = flight.settings;
-      $("found").replaceChildren();
-      if (!summary.length) { $("found").append(make("p", "Hidden until you answer.")); return; }
-      $("found").append(make("p", `Analysed with SIGMA_A ${sigmaA} m/s², SIGMA_Z ${sigmaZ} m, DT ${dt} s, clock `
-        + `offset ${Number(offset.toPrecision(4))} s. The settings of this page do not change it.`, { className: "note" }),
-      make("p", summary.join(" "), { dir: "auto", className: "summary" }));
-      if (!findings.length) $("found").append(make("p", "Findings: none."));
-      for (const finding of findings) $("found").append(findingBox(finding));
-    }
-    recorded(flight);
-    function findingBox(finding) {
-      const box = make("div"), line = make("p", undefined, { dir: "auto" });
-      line.append(make("span", `${finding.severity}: `, { className: `severity ${finding.severity}` }),
-        make("strong", `${finding.title} [${finding.id}]. `), finding.message);
-      box.append(line);
-      if (finding.remedy) box.append(make("p", `Action: ${finding.remedy}`, { className: "note", dir: "auto" }));
-      // the page fills in this text after a change of settings
-      if (finding.depends_on_settings) box.append(make("p", "", { className: "changed-note" }));
-      finding.spans.forEach(([low, high]) => {
-        const text = high - low > 0.05 ? `${low.toFixed(1)} s to ${high.toFixed(1)} s` : `${low.toFixed(1)} s`;
-        const button = make("button", `show ${text}`, { type: "button", className: "jump" });
-        button.addEventListener("click", () => {
-          const margin = Math.max(2, 0.3 * (high - low));
-          view(low - margin, high + margin);
-          page.open("innovation");
-        });
-        box.append(button);
-      });
-      for (const more of finding.more) box.append(findingBox(more));
-      return box;
-    }
-
     // ------------------------------------------------------------------ colours
     const dark = matchMedia("(prefers-color-scheme: dark)");
     function paint() {
-      const colours = COLOURS[dark.matches ? "dark" : "light"];
+      const style = getComputedStyle(document.documentElement);
+      const colours = Object.fromEntries(NAMES.map((name) => [name, style.getPropertyValue(`--${name}`)]));
       for (const plot of [...figures, ...["map", "plan", "step"].map(model)]) {
         plot.background_fill_color = plot.border_fill_color = colours.paper;
         plot.outline_line_color = colours.line;
@@ -151,6 +111,7 @@ const Times = (() => {
           if (one.name === "cursor") one.line_color = colours.ink;
           if (one.name === "measurement") one.line_color = colours.measured;
           if (one.name === "band") one.fill_color = colours.measured;
+          if (one.name === "consistent") one.fill_color = one.line_color = colours.band;
         }
         for (const { name, glyph } of plot.renderers) colour(name, glyph, colours);
       }
@@ -169,7 +130,7 @@ const Times = (() => {
       for (const plot of figures) plot.toolbar.active_drag = null;
     }
     showRange();
-    return { strip, plan, show, view, recorded };
+    return { strip, plan, show, view };
   }
 
   return { start };

@@ -1,7 +1,9 @@
 /* Tour of seven stations on this flight. Each station changes the settings, describes the effect with
    the flight's numbers, and gives one task. The end of the tour restores the previous settings. */
 const Tour = (() => {
-  const { formatNumber: number, formatMetres: length } = Summary;
+  const { formatRatio: ratio, formatMetres: length } = Card;
+  const number = (x, digits) => String(Number(x.toPrecision(digits)));
+  const change = (before, now) => `innovation ÷ √S changes from ${ratio(before.source)} to ${ratio(now.source)}`;
 
   /* Each station returns title, sentence, task, observation, settings and view */
   const STATIONS = [
@@ -9,8 +11,8 @@ const Tour = (() => {
       const sigmaA = 0.002, run = rerun({ ...base, sigmaA });
       return { title: "Q almost zero", set: { ...base, sigmaA }, view: "sigma_p",
         sentence: `SIGMA_A is now ${sigmaA} m/s². The filter treats the acceleration as exact. σ of position falls to `
-          + `${length(run.sigma)}, and mean NIS changes from ${number(rerun(base).nis, 2)} to ${number(run.nis, 2)}.`,
-        task: "Increase SIGMA_A until the mean NIS is within its band.",
+          + `${length(run.sigma)}, and ${change(rerun(base), run)}.`,
+        task: "Increase SIGMA_A until both marks of KF are in the green band.",
         see: "σ grows again between two measurements, and the innovations return into ±2√S." };
     },
     ({ base, rerun }) => {
@@ -20,7 +22,7 @@ const Tour = (() => {
         sentence: `SIGMA_Z is now ${sigmaZ} m, ${divisor} times too small. ${number(100 * run.outside, 2)} % of the innovations `
           + "are outside ±2√S (expected 5 %).",
         task: "Increase SIGMA_Z until about 5 % of the innovations are outside.",
-        see: "The band widens around the dots, and the track becomes smoother." };
+        see: "The dots return into the band, and the track becomes smoother." };
     },
     ({ base, rerun }) => {
       const both = { ...base, sigmaA: roundTo2Digits(3 * base.sigmaA), sigmaZ: roundTo2Digits(3 * base.sigmaZ) };
@@ -36,26 +38,24 @@ const Tour = (() => {
       const [before, now] = [rerun(base), rerun(both)];
       return { title: "The scale determines σ", set: both, view: "sigma_p",
         sentence: `The track is the same, but σ of position changed from ${length(before.sigma)} to ${length(now.sigma)}, and `
-          + `mean NIS from ${number(before.nis, 2)} to ${number(now.nis, 2)} (one ninth).`,
-        task: "Decrease both in the same ratio until the mean NIS is within its band.",
+          + `innovation ÷ √S from ${ratio(before.source)} to ${ratio(now.source)} (one third).`,
+        task: "Decrease both in the same ratio until the marks are in the green band.",
         see: "Check the reported σ with the innovations, not by the smoothness of the track." };
     },
     ({ base, rerun, why, offsets }) => {
       if (why) {
         return { title: "Time offset", set: base, view: "innovation",
-          sentence: `The clock offset of this flight is fixed: ${why}.`,
+          sentence: `The time offset of this flight is fixed: ${why}.`,
           task: "Continue.", see: "px4fuse sync estimates the time offset of a log." };
       }
       const lateOffset = Math.min(base.offset + 0.2, offsets[1]), late = { ...base, offset: lateOffset };
       const [before, now] = [rerun(base), rerun(late)];
-      const isVisible = now.nis / before.nis > 1.1, truth = now.truthP && now.truthP > 1.1 * before.truthP;
+      const truth = now.truthP && now.truthP > 1.1 * before.truthP;
       return { title: "Time offset", set: late, view: truth ? "error" : "innovation",
-        sentence: `The timestamps are now ${number(lateOffset - base.offset, 2)} s later. Mean NIS changes ${isVisible ? "" : "only "}`
-          + `from ${number(before.nis, 2)} to ${number(now.nis, 2)}. `
+        sentence: `The timestamps are now ${number(lateOffset - base.offset, 2)} s later: ${change(before, now)}. `
           + (truth ? `The position RMSE changes from ${length(before.truthP)} to ${length(now.truthP)}.`
             : `The position changes by ${length(now.rmsDifference(before))} RMS.`),
-        task: truth ? "Move the clock offset to the smallest error."
-          : "Move the clock offset to the smallest innovations.",
+        task: `Move the time offset to the smallest ${truth ? "error" : "innovations"}.`,
         see: "The error is proportional to speed: zero at rest, largest at high speed. This is typical of a time offset." };
     },
     ({ base, rerun, worst }) => {
@@ -68,13 +68,13 @@ const Tour = (() => {
     },
     ({ base, rerun, axis, ekf2 }) => {
       const kf = rerun(base);
-      if (ekf2.nis === undefined) {
+      if (!ekf2.source) {
         return { title: "Comparison with EKF2", set: base, view: "position",
           sentence: `EKF2 cannot be tested on this flight: ${ekf2.why || "its innovations are not logged"}.`,
           task: "Continue.", see: "The documentation lists the topics to log." };
       }
       return { title: "Comparison with EKF2", set: base, view: "sigma_p",
-        sentence: `Mean NIS: EKF2 ${number(ekf2.nis, 2)}, KF ${number(kf.nis, 2)}.`
+        sentence: `Innovation ÷ √S: EKF2 ${ratio(ekf2.source)}, KF ${ratio(kf.source)}.`
           + (ekf2.truthP && kf.truthP ? ` Position RMSE: EKF2 ${length(ekf2.truthP)}, KF ${length(kf.truthP)}.` : "")
           + (axis.ekf2.r ? ` EKF2 assumes a measurement σ of ${number(axis.ekf2.r, 2)} m.` : ""),
         task: axis.ekf2.r ? "Press R of EKF2, then change SIGMA_A until both σ coincide."
@@ -86,7 +86,7 @@ const Tour = (() => {
 
   function start(page) {
     const { settings, set, open, result, flight, numbers, chosen, stepper, axisNow, mapNow } = page;
-    const box = $("tour");
+    const box = $("tour"), starters = [...document.querySelectorAll(".tour-start")];
     let at = null, before = null;
 
     /* Initial settings of all stations: maximum-likelihood estimates if known, else those of the report */
@@ -121,22 +121,28 @@ const Tour = (() => {
       $("tour-back").disabled = at === 0;
       $("tour-next").textContent = at === STATIONS.length - 1 ? "Finish" : "Next";
       box.hidden = false;
+      document.body.classList.add("touring");
       open(view);
       set(values);
       if (step !== undefined) stepper.go(step);
       $("tour-title").focus({ preventScroll: true });
+      // on a phone the sheet covers the lower half
+      if (matchMedia("(max-width: 60rem)").matches) document.querySelector("#card figure").scrollIntoView();
     }
     function end() {
       box.hidden = true;
+      document.body.classList.remove("touring");
       at = null;
       chosen.step = before.step;
       open(before.view);
       set(before.settings);
       before = null;
-      $("tour-start").focus();
+      starters.find((one) => one.checkVisibility())?.focus();
     }
-    $("tour-start").hidden = result.run === null;
-    $("tour-start").addEventListener("click", () => go(0));
+    for (const one of starters) {
+      one.hidden = result.run === null;
+      one.addEventListener("click", () => go(0));
+    }
     $("tour-back").addEventListener("click", () => go(at - 1));
     $("tour-next").addEventListener("click", () => at === STATIONS.length - 1 ? end() : go(at + 1));
     $("tour-end").addEventListener("click", end);

@@ -55,12 +55,12 @@ class NisVerdict(Record, frozen=True, kw_only=True):
 
     @property
     def sigma_error_factor(self) -> float:
-        """Factor between reported and actual σ, at least 1; ``verdict`` names the larger σ."""
+        """Larger of reported and actual σ over the smaller; ``verdict`` gives the direction."""
         return float(max(self.nis_mean, 1.0 / self.nis_mean) ** 0.5)
 
 
 class Consistency(NisVerdict, frozen=True, kw_only=True):
-    """Statistics of a filter's innovations compared with its reported variances.
+    """Statistics of a filter's innovations, compared with the innovation variances S.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Consistency(NisVerdict, frozen=True, kw_only=True):
 
 
 class HorizontalNis(NisVerdict, frozen=True, kw_only=True):
-    """NIS of north and east together: two degrees of freedom, divided by two.
+    """NIS of north and east together: sum of both NIS (two degrees of freedom), divided by two.
 
     The covariance between north and east is omitted for both filters: EKF2 does not log it.
     """
@@ -157,9 +157,9 @@ def _verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
 
 
 def autocorrelation(values: Array, lags: int) -> Array:
-    """Return the autocorrelation of a series at lags 1 to ``lags``, without subtracting the mean.
+    """Return the autocorrelation of a series at lags 1 to ``lags``: Σ ν(k) ν(k+l) / Σ ν(k)².
 
-    r(l) = Σ ν(k) ν(k+l) / Σ ν(k)². The mean has a separate test.
+    The mean is not subtracted: it has a separate test (``bias_p``).
     """
     square_sum = float(np.dot(values, values))
     return np.array(
@@ -170,7 +170,7 @@ def autocorrelation(values: Array, lags: int) -> Array:
 def assess(
     innovation_m: Array, innovation_variance_m2: Array, gate: float = DEFAULT_GATE
 ) -> Consistency | Unavailable:
-    """Test innovations against the innovation variances that the filter reports.
+    """Test innovations against the innovation variances S that the filter reports.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def assess(
 def assess_horizontal(
     north: tuple[Array, Array], east: tuple[Array, Array]
 ) -> HorizontalNis | None:
-    """Test the innovations of north and east together, which have the same timestamps.
+    """Test the innovations of north and east together; both have the same timestamps.
 
     Parameters
     ----------

@@ -1,24 +1,24 @@
-"""Time correlation of the source's errors: a low pass, or time-correlated noise.
+"""Time correlation of the errors of a position source: a low pass, or time-correlated noise.
 
-All models are compared by the likelihood of the same positions given the motion from the IMU, with
-biases, tilt and scale factor error marginalised (:mod:`px4fuse.filter.imu_motion`). Each model has
-its own maximum-likelihood noises. The SIGMA_A of KF is not used: it covers the biases and would
-hide slow errors.
+The models (white noise, low pass, time-correlated noise) are compared by the likelihood of the same
+positions given the motion from the IMU. Biases, tilt and scale factor error are marginalised
+(:mod:`px4fuse.filter.imu_motion`), and each model has its own maximum-likelihood noises. The
+SIGMA_A of KF is not used: it includes the effect of biases and would hide slow errors.
 
 A low pass of first order, z_k = (1 - ρ) u_k + ρ z_(k-1), ρ = exp(-Δt/τ), correlates the noise of
-successive positions and makes the positions lag. Its inverse, u_k = (z_k - ρ z_(k-1)) / (1 - ρ),
-gives positions with white noise and without lag. So the likelihood of z is that of u times the
-Jacobian Π 1/(1 - ρ) of the inversion.
+successive positions and makes the positions lag. The inverse, u_k = (z_k - ρ z_(k-1)) / (1 - ρ),
+gives positions with white noise and without lag. So the likelihood of the logged positions z is the
+likelihood of u times the Jacobian Π 1/(1 - ρ) of the inversion.
 
 Time-correlated noise of first order, c_k = ρ c_(k-1) + √(1 - ρ²) σ_c w, is a third state in the
-measurement: z = p + c + v. It correlates the noise, too, but without a lag. Both models use the
-logged timestamps. Time-correlated noise is also fitted with the estimated time offset, which is the
-other explanation of a lag.
+measurement: z = p + c + v. It also correlates the noise, but without a lag. Both models use the
+logged timestamps. Time-correlated noise is also fitted with timestamps shifted by the estimated
+time offset, because a time offset is another explanation of a lag.
 
-Noise with a time constant much above a second cannot be distinguished from an IMU error, so such a
-τ is a lower bound. If ground truth is available, τ is fitted to the errors of the positions. Their
-likelihood excludes the effects of a rotated, shifted or scaled frame and of late timestamps
-(restricted likelihood, Patterson and Thompson 1971).
+Noise with a time constant much above a second cannot be distinguished from an IMU error, so a long
+τ is only a lower bound. If ground truth is available, τ is fitted to the errors of the positions
+against ground truth. The likelihood of these errors excludes the effects of a rotated, shifted or
+scaled frame and of late timestamps (restricted likelihood, Patterson and Thompson 1971).
 """
 
 from collections.abc import Sequence
@@ -40,12 +40,14 @@ from px4fuse.filter.signals import Axis, too_few_measurements
 from px4fuse.flight import Flight, Unavailable
 
 MIN_MEASUREMENTS = 100
-# Of longer flights only the middle is used, to limit the computing time
+# Maximum number of measurements, to limit the computing time: only the middle of a longer flight is
+# used
 MAX_MEASUREMENTS = 2000
-# Number of median intervals; correlation across longer intervals is negligible
+# Maximum interval between measurements for the low pass, in median intervals: correlation across
+# longer intervals is negligible
 MAX_INTERVAL_RATIO = 3.0
-# Coarse search for time-correlated noise: τ, share of the variance SIGMA_Z² that is correlated, and
-# factors on SIGMA_A and on all noises
+# Grid of the coarse search for time-correlated noise: τ, time-correlated share of the variance
+# SIGMA_Z², factors on SIGMA_A, and (COARSE_SCALES) factors on all noises
 COARSE_TAUS_S, COARSE_VARIANCE_SHARES, COARSE_SIGMA_A_FACTORS = (
     (0.2, 0.6, 2.0, 6.0),
     (0.12, 0.35, 0.8),
@@ -53,19 +55,20 @@ COARSE_TAUS_S, COARSE_VARIANCE_SHARES, COARSE_SIGMA_A_FACTORS = (
 )
 COARSE_SCALES = np.geomspace(0.7, 1.6, 12)
 COARSE_MEASUREMENTS = 1000
-# Minimum gain of log-likelihood over white noise in the coarse search, and in the full fit
+# Minimum gain of log-likelihood over white noise, in the coarse search and in the full fit
 MIN_COARSE_GAIN_NATS, MIN_GAIN_NATS = 0.5, 2.0
-# Penalty of time-correlated noise with a time offset compared with a low pass: 1 for each of the
-# two additional parameters (Akaike 1974)
+# Penalty on the log-likelihood of time-correlated noise with a time offset, compared with a low
+# pass: 1 for each of its two additional parameters (Akaike 1974)
 OFFSET_PENALTY_NATS = 2.0
-# Range of the low pass's time constant, and tolerance in ln τ
+# Search range of the low pass's time constant, and tolerance of ln τ
 LOW_PASS_TAU_S, LOG_TAU_TOLERANCE = (0.02, 3.0), 0.05
-# With ground truth: limit of the measurements, minimum gain (likelihood ratio 150 for two more
-# parameters), and largest distance to a sample (s; interpolation error at 2 m/s²: 1 cm)
+# Fit to ground truth: maximum number of measurements; minimum gain of log-likelihood over white
+# noise (likelihood ratio 150, for two more parameters); maximum time from a measurement to a sample
+# of ground truth (s; interpolation error at 2 m/s²: 1 cm)
 MAX_TRUTH_MEASUREMENTS, MIN_TRUTH_GAIN_NATS, MAX_TRUTH_DISTANCE_S = 300, 5.0, 0.1
-# Number of parts of the flight with a separate time offset
+# Fit to ground truth: number of parts of the flight, each with a separate time offset
 OFFSET_PARTS = 12
-# Grid of time constants and variance shares with ground truth
+# Fit to ground truth: grid of time constants (s) and of time-correlated shares of the variance
 TRUTH_TAUS_S, TRUTH_SHARES = np.geomspace(0.3, 80.0, 17), np.linspace(0.05, 0.999, 20)
 
 
@@ -81,9 +84,9 @@ class SourceLowPass:
         Lag of the positions during steady motion, Δt ρ / (1 - ρ): the time constant minus about
         half an interval.
     gain_nats : float
-        Gain of log-likelihood over white noise (timestamps unchanged or shifted).
+        Gain of log-likelihood over white noise with the logged or the shifted timestamps.
     sigma_z_m : float
-        White noise of a position before the low pass.
+        Standard deviation of the white noise of a position before the low pass.
     """
 
     correlation: float
@@ -108,7 +111,7 @@ class TimeCorrelatedNoise:
     gain_nats : float
         Gain of log-likelihood over white noise alone.
     lag_nats : float
-        Further gain of a low-pass filter, which delays the positions; plus
+        Gain of log-likelihood of a low pass over time-correlated noise, plus
         :data:`OFFSET_PENALTY_NATS` if the time-correlated noise is fitted with a time offset.
     """
 
@@ -136,23 +139,23 @@ def fit_time_correlation(
     clock_offset_s: float,
     jumps: Sequence[Jump] = (),
 ) -> tuple[SourceLowPass, TimeCorrelatedNoise | Unavailable] | Unavailable:
-    """Fit a low pass and time-correlated noise of the source.
+    """Fit two models to the errors of the position source: a low pass and time-correlated noise.
 
     Parameters
     ----------
     flight : Flight
     axes : tuple of Axis
-        With the same measurement times.
+        Axes with the same measurement times.
     settings : Settings
-        Its ``dt_s`` defines the unit of SIGMA_A.
+        Only ``dt_s`` is used: SIGMA_A refers to it.
     noises : Noises
-        Initial values: estimates with white noise.
+        Initial values: estimates of the model with white noise.
     outlier_time_s : ndarray
         Timestamps of measurements to exclude.
     clock_offset_s : float
-        Time offset that was estimated with white noise.
+        Time offset estimated with the white-noise model.
     jumps : sequence of Jump
-        Steps of the source along these axes, to be subtracted.
+        Jumps of the source along ``axes``, to be subtracted.
     """
     time_s = axes[0].measurement_time_s
     if len(time_s) < MIN_MEASUREMENTS:
@@ -171,7 +174,7 @@ def fit_time_correlation(
     directions, signals = np.array([axis.direction for axis in axes]), SignalCache()
 
     def undo_low_pass(tau_s: float) -> tuple[PreparedMotion | Unavailable, float]:
-        """Invert a low pass; return the positions and the Jacobian's contribution to -ln p."""
+        """Return the positions before a low pass, and the Jacobian's contribution to -ln p."""
         rho = (
             np.where(is_short_interval, np.exp(-interval_s / tau_s), 0.0)
             if tau_s
@@ -179,7 +182,7 @@ def fit_time_correlation(
         )
         previous_m = np.concatenate([measured_m[:1], measured_m[:-1]])
         unfiltered_m = (measured_m - rho[:, None] * previous_m) / (1.0 - rho)[:, None]
-        # the inversion spreads an outlier to the next position, so all models exclude both
+        # the inversion spreads an outlier to the next position: all models exclude both positions
         is_used_position = ~(
             is_outlier | (is_short_interval & np.concatenate([[False], is_outlier[:-1]]))
         )
@@ -193,7 +196,7 @@ def fit_time_correlation(
         )
         if isinstance(prepared_motion, Unavailable):
             return prepared_motion, 0.0
-        # the first position of a segment is not predicted, so it has no likelihood
+        # the first position of a segment sets the initial state, so it has no likelihood
         is_used = np.isin(time_s, np.delete(prepared_motion.time_s, prepared_motion.edges[:-1]))
         return prepared_motion, len(axes) * float(np.sum(np.log1p(-rho[is_used])))
 
@@ -232,13 +235,14 @@ def fit_time_correlation(
         white_fit.noises,
         _score_of_fit(correlated_fit),
     )
-    # time-correlated noise explains much of the effect of a low pass, so it is tested first
+    # time-correlated noise explains much of the effect of a low pass, so a low pass is only fitted
+    # if time-correlated noise is significant
     if white_full_score - correlated_score < MIN_GAIN_NATS:
         return low_pass, no_correlation
 
     def fit_low_pass(log_tau: float) -> tuple[float, Noises]:
         prepared_motion, jacobian_term = undo_low_pass(float(np.exp(log_tau)))
-        # the same measurements were available above
+        # cannot fail: the same measurements were available for the white-noise model
         assert not isinstance(prepared_motion, Unavailable)
         fit = _fit_noises_at(prepared_motion, 0.0, white_noises)
         return _score_of_fit(fit) + jacobian_term, fit.noises
@@ -277,9 +281,9 @@ def fit_time_correlation_to_truth(
     jumps: Sequence[Jump],
     imu_fit: TimeCorrelatedNoise | Unavailable,
 ) -> TimeCorrelatedNoise | Unavailable:
-    """Fit time-correlated noise to the errors against ground truth.
+    """Fit time-correlated noise to the position errors against ground truth.
 
-    Return ``imu_fit`` if it has the larger gain or the ground truth is insufficient.
+    Return ``imu_fit`` if its log-likelihood gain is larger or the ground truth is insufficient.
 
     Parameters
     ----------
@@ -288,7 +292,7 @@ def fit_time_correlation_to_truth(
     truths : sequence of DataFrame
         True ``position_m`` along each axis.
     imu_fit : TimeCorrelatedNoise or Unavailable
-        Result of :func:`fit_time_correlation`; its ``lag_nats`` is kept.
+        Result of :func:`fit_time_correlation`; its ``lag_nats`` is copied to the result.
     """
     min_gain, lag_nats = MIN_TRUTH_GAIN_NATS, 0.0
     if isinstance(imu_fit, TimeCorrelatedNoise):
@@ -331,7 +335,7 @@ def fit_time_correlation_to_truth(
     if gain.max() < min_gain:
         return imu_fit
     first_tau, last_tau = np.flatnonzero(gain > gain.max() - PROFILE_DROP)[[0, -1]]
-    # the ends of the interval are between grid points
+    # the 95 % interval ends between grid points, so the next outer grid points are returned
     tau_s = np.append(TRUTH_TAUS_S, np.inf)[[tau_index, max(first_tau - 1, 0), last_tau + 1]]
     sizes_m = np.sqrt(
         mean_square[tau_index, share_index]
@@ -355,9 +359,9 @@ def _score_of_fit(fit: NoiseFit) -> float:
 def _best_of_grid(
     prepared_motion: PreparedMotion, offsets_s: Sequence[float], candidates: Sequence[Noises]
 ) -> tuple[float, Noises]:
-    """Return the lowest -ln p over candidates with scaled noises, and the noises with that score.
+    """Return the lowest -ln p over all time offsets, candidates and scales, and its noises.
 
-    SIGMA_A and then all noises together are scaled.
+    First SIGMA_A and then all noises together are scaled.
     """
     results = []
     for positions in map(prepared_motion.at, offsets_s):

@@ -1,7 +1,8 @@
-"""Maximum-likelihood noises of positions, SIGMA_A and SIGMA_Z, and the outliers.
+"""Maximum-likelihood estimates of SIGMA_A and SIGMA_Z, and outliers among the positions.
 
-The innovations of a filter with correct noises are white and have the expected variance; these
-noises maximise their likelihood (Schweppe 1965). Outliers are measurements from a normal
+The innovations of a filter with correct noises are white and have the expected variance. The
+correct noises maximise the likelihood of the innovations (Schweppe 1965). Outliers are modelled as
+measurements from a normal
 distribution that is many times wider (Tukey 1960). Expectation maximisation estimates the share of
 outliers, their width (σ of outliers over SIGMA_Z) and the probability that a measurement is an
 outlier. This probability uses the errors of all axes of a measurement given all data.
@@ -28,37 +29,38 @@ from px4fuse.filter.marginal_likelihood import (
 from px4fuse.filter.model import INITIAL_COVARIANCE
 
 SIGMA_A_SEARCH_M_S2 = (1e-3, 30.0)
-# The lower end is better than any positioning system
+# The lower end (1 mm) is better than any positioning system
 SIGMA_Z_SEARCH_M = (1e-3, 10.0)
 RANDOM_WALK_SEARCH_M = (1e-4, 1.0)
 CORRELATED_SIGMA_SEARCH_M, CORRELATION_TIME_SEARCH_S = (1e-3, 10.0), (0.05, 60.0)
 MAX_OUTLIER_ITERATIONS = 12
-# Iterations of the maximisation in the last run, and while the outliers still change
+# Maximum iterations of L-BFGS-B: in the last run, and while the outlier probabilities still change
 MAX_STEPS, COARSE_MAX_STEPS = 50, 3
-# Ratio of the outliers' σ to SIGMA_Z; outliers with a smaller ratio cannot be distinguished
+# Minimum ratio of the outliers' σ to SIGMA_Z: outliers with a smaller σ cannot be distinguished
 MIN_OUTLIER_WIDTH = 3.0
 START_OUTLIER_SHARE, START_OUTLIER_WIDTH, MAX_OUTLIER_SHARE = 0.005, 10.0, 0.4
 # Upper limit of SIGMA_Z relative to its estimate from the median square
 MAX_SIGMA_Z_RATIO = 1.2
 MAX_PROBABILITY_CHANGE = 0.01
-# -ln p per measurement if it cannot be computed; larger than any computed value
+# Substitute for -ln p per measurement if it cannot be computed: larger than any computed value
 UNCOMPUTABLE_SCORE = 1e6
 # Step in ln σ for derivatives
 DERIVATIVE_LOG_STEP = 1e-4
-# Interpolation nodes and their distance in ln σ; fewer while the outliers still change
+# Number of interpolation nodes and their distance in ln σ: in the last run, and while the outlier
+# probabilities still change
 NODES, COARSE_NODES = (10, 0.25), (6, 0.2)
-# 1/m² and s²/m²; precision of a known initial state (1 µm, 1 µm/s)
+# Precision (1/m², s²/m²) of a known initial state: 1 µm, 1 µm/s
 KNOWN_START_PRECISION = 1e12
 
 
 @dataclass(frozen=True)
 class Noises:
-    """Parameters of the random errors.
+    """Noise parameters of the IMU and of the position source.
 
     Attributes
     ----------
     sigma_a_m_s2, sigma_z_m : float
-        Noise of the acceleration (as KF's SIGMA_A) and of each measurement.
+        Noise of the acceleration (defined as KF's SIGMA_A) and of each measurement.
     random_walk_m : float
         Random walk of the source (m/√s); 0 for a source that does not drift.
     correlated_sigma_m, tau_s : float
@@ -93,10 +95,10 @@ class Likelihood:
     Parameters
     ----------
     axis_positions : sequence of Positions
-        With one time offset.
+        Positions with one time offset only.
     weight : ndarray, shape (m,)
     sigma_z_m : float
-        Approximate SIGMA_Z, to which the limits for a known or unknown initial state are relative.
+        Approximate SIGMA_Z. The limits that decide if an initial state is known are relative to it.
     is_coarse : bool
         True if an approximate maximum is enough.
     """
@@ -128,7 +130,7 @@ class Likelihood:
 
         @cache
         def scores_at_nodes(ratio_index: int, z_index: int) -> Array:
-            """Return -ln p at all nodes, beginning with the given indices."""
+            """Return -ln p at all interpolation nodes from the given indices on."""
             return np.array([scores_at_ratio(ratio_index + node, z_index) for node in range(nodes)])
 
         self._scores_at_nodes = scores_at_nodes
@@ -231,10 +233,10 @@ class NoiseFit:
     outlier_probability : ndarray, shape (m,)
         Probability that the measurement is an outlier.
     score : Likelihood
-        With these weights.
+        -ln p as a function of the noises, with these weights.
     sigma_z_variance_factor : float
-        Factor on the variance of ln SIGMA_Z from the curvature of the likelihood, because the
-        outliers are estimated, too.
+        Factor, at least 1, on the variance of ln SIGMA_Z from the curvature of the likelihood. The
+        outliers are also estimated, which adds uncertainty.
     """
 
     noises: Noises
@@ -245,7 +247,7 @@ class NoiseFit:
 
 
 def filter_positions(intervals: Preintegrated) -> Positions:
-    """Return the input of KF as positions; the constants are the errors of KF's initial state."""
+    """Convert the input of KF; the unknown constants are the errors of KF's initial state."""
     count = len(intervals.measurement_m)
     prior_precision = np.zeros((count + 1, 2))
     prior_precision[0] = KNOWN_START_PRECISION
@@ -279,7 +281,7 @@ def maximise_likelihood(
     Parameters
     ----------
     axis_positions : sequence of Positions
-        With the same measurements.
+        Axes of the same measurements.
     start : Noises
         Initial values. Random walk and time-correlated noise are only fitted if not zero.
     weight : ndarray, shape (m,)
@@ -295,7 +297,7 @@ def maximise_likelihood(
             likelihood, noises, COARSE_MAX_STEPS if iteration else MAX_STEPS
         )
         square, count = _expected_squares_of_axes(axis_positions, noises, weight)
-        # outliers increase the estimated noise, which hides them; the median is robust
+        # outliers increase the estimated SIGMA_Z, which would hide them; the median is robust
         median_square = float(np.median(square / count) / (chdtri(count[0], 0.5) / count[0]))
         if (
             median_square > SIGMA_Z_SEARCH_M[1] ** 2
@@ -332,7 +334,7 @@ def maximise_likelihood(
 def _expected_squares_of_axes(
     axis_positions: Sequence[Positions], noises: Noises, weight: Array
 ) -> tuple[Array, Array]:
-    """Return :func:`expected_squares` summed over axes, at the maximum-likelihood constants."""
+    """Return :func:`expected_squares` summed over axes, with the maximum-likelihood constants."""
     results = []
     for positions in axis_positions:
         constants = fit_noises([positions], noises, weight).constants()[:, 0]
@@ -352,11 +354,11 @@ def _outlier_probability(square: Array, count: Array, share: float, width: float
 def outlier_variance_factor(
     square: Array, count: Array, outlier_probability: Array, width: float
 ) -> float:
-    """Return the ratio of the variance of ln σ to its variance if the outliers were known.
+    """Return the variance of ln σ, relative to the variance if the outliers were known.
 
-    The information with known outliers minus the missing information is the information of the data
-    (Louis 1982). The missing information is the covariance of the score over the possible sets of
-    outliers. Parameters are ln σ, ln width and the log odds of the share of outliers.
+    The Fisher information with known outliers minus the missing information is the information of
+    the data (Louis 1982). The missing information is the covariance of the score over the possible
+    sets of outliers. Parameters are ln σ, ln width and the log odds of the share of outliers.
 
     Parameters
     ----------
@@ -366,7 +368,7 @@ def outlier_variance_factor(
         Number of axes.
     outlier_probability : ndarray, shape (m,)
     width : float
-        Outliers' σ / σ.
+        σ of the outliers over σ.
     """
     share = float(np.mean(outlier_probability))
     sigma_information, outlier_information = (
@@ -390,7 +392,7 @@ def outlier_variance_factor(
     )
     missing_information = (scores * (outlier_probability * (1.0 - outlier_probability))) @ scores.T
     observed_information = complete_information - missing_information
-    # with hardly any outlier the estimate of the outliers adds no uncertainty
+    # singular with hardly any outlier: estimating the outliers then adds no uncertainty
     if np.linalg.eigvalsh(observed_information)[0] <= 0.0:
         return 1.0
     return max(1.0, sigma_information * float(np.linalg.inv(observed_information)[0, 0]))

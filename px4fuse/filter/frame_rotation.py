@@ -1,11 +1,11 @@
-"""Misalignment in yaw of the source's frame against the logged heading, over the flight.
+"""Misalignment in yaw between the position source's frame and EKF2's heading, over the flight.
 
-Indoors a magnetometer may rotate EKF2's heading by tens of degrees within one flight, so one angle
-for the flight is not enough. If the source has an orientation, both headings are compared.
-Otherwise the positions are filtered along north and east together, with the IMU acceleration
-rotated by the logged attitude. The state is [p, v, b, η]: position, velocity, acceleration error in
-NED (m/s²), and rotation (rad) relative to the angle of linearisation. A likelihood ratio test
-decides if the rotation is constant or a random walk.
+Indoors a disturbed magnetometer may rotate EKF2's heading by tens of degrees within one flight, so
+one angle for the flight is not enough. If the source measures an orientation, its heading is
+compared with EKF2's. Otherwise the positions are filtered along north and east together, with the
+IMU acceleration rotated by EKF2's logged attitude. The state is [p, v, b, η]: position, velocity,
+acceleration error in NED (m/s²), and rotation (rad) relative to the angle of linearisation. A
+likelihood ratio test decides if the rotation is constant or a random walk.
 """
 
 from itertools import product
@@ -26,23 +26,26 @@ from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import NotNegative, Record, Share
 
-# s; length of the parts of the flight, over which the heading error is averaged
+# Length (s) of the parts of the flight over which the heading error is averaged
 PART_LENGTH_S = 2.0
 MIN_PARTS = 3
 MIN_MEASUREMENTS = 50
 MIN_PART_SAMPLES = 3
-# Longer tracks are downsampled: more measurements hardly improve the heading and take time
+# Maximum number of measurements; longer tracks are downsampled: more measurements take time and
+# hardly improve the heading
 MAX_MEASUREMENTS = 1000
-# The heading error changes if its p value is below the first and its range (°) above the second
+# The heading error counts as changing if the p-value of a constant error is below the first limit
+# and its range over the flight (°) is above the second
 MAX_DRIFT_P_VALUE = 0.002
 MIN_DRIFT_DEG = 5.5
-# At higher yaw rates samples are ignored: 0.2 s of delay would look like a heading error of 2°
+# Maximum yaw rate of used samples: at a higher rate, a delay of 0.2 s would look like a heading
+# error of more than 2°
 MAX_YAW_RATE_DEG_S = 10.0
-# Lower limit of σ of a heading difference, for mounting, vibration and rounding
+# Minimum σ of a heading difference, for mounting, vibration and rounding
 MIN_SIGMA_DEG = 0.5
 MAX_ATTITUDE_INTERVAL_S = 0.11
 MAX_LINEARISATIONS = 3
-# The iteration stops if the angle of linearisation changes by less
+# Maximum change of the angle of linearisation at which the iteration stops
 MAX_FINAL_STEP_RAD = 0.01
 STATES = 7
 ROTATION_INDEX = 6  # index of the rotation in the state
@@ -50,7 +53,8 @@ ADJUGATE_SIGNS = np.array([[1.0, -1.0], [-1.0, 1.0]])
 # Initial σ: position (m), velocity (m/s), acceleration error (m/s²) and rotation (rad)
 INITIAL_SIGMAS = np.repeat([INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, 0.3, 0.6], [2, 2, 2, 1])
 GAP_SIGMA = 5.0  # m and m/s; process noise in a gap of the IMU
-# Grid: random walks in 1 s of rotation (rad) and acceleration error (m/s²), and SIGMA_A (m/s²)
+# Grid of noises: random walk in 1 s of the rotation (rad) and of the acceleration error (m/s²), and
+# SIGMA_A (m/s²)
 ROTATION_RANDOM_WALKS = np.radians([0.0, 0.3, 1.0, 3.0])
 BIAS_RANDOM_WALKS = np.array([0.003, 0.03])
 SIGMA_A_GRID = np.array([0.03, 0.1, 0.3, 1.0])
@@ -66,23 +70,23 @@ class HeadingPart(Record, frozen=True):
 
 
 class HeadingError(Record, frozen=True):
-    """Misalignment of the source's frame in yaw against the logged attitude, over the flight.
+    """Misalignment in yaw between the source's frame and the logged attitude, over the flight.
 
     Attributes
     ----------
     misalignment_deg : float
         Mean over the flight.
     sigma_deg : float
-        Standard deviation of the mean; not reduced by averaging, because errors are common to all
-        parts.
+        Standard deviation of ``misalignment_deg``. Averaging over the parts does not reduce it,
+        because they share their errors.
     drifts : bool
         True if the angle changes significantly and by at least ``MIN_DRIFT_DEG``.
     parts : tuple of HeadingPart
-        Consecutive parts; angles clockwise from above, including the constant misalignment.
+        Consecutive parts. Angles are clockwise from above and include the constant misalignment.
     drift_p : float
-        p-value of a constant angle.
+        p-value of the hypothesis that the angle is constant.
     by : {"orientation", "positions"}
-        Data from which the angle is estimated.
+        Data of the source from which the angle is estimated.
     """
 
     misalignment_deg: float
@@ -96,7 +100,7 @@ class HeadingError(Record, frozen=True):
 
     @property
     def ends(self) -> tuple[HeadingPart, HeadingPart]:
-        """Parts with the smallest and the largest angle, in time order."""
+        """The two parts with the smallest and the largest angle, in time order."""
         angles_deg = [heading_part.heading_error_deg for heading_part in self.parts]
         first_index, last_index = sorted((int(np.argmin(angles_deg)), int(np.argmax(angles_deg))))
         return self.parts[first_index], self.parts[last_index]
@@ -133,11 +137,11 @@ def estimate_heading_error(
     track : PositionTrack
     segment : Segment
     settings : Settings
-        Its ``dt_s`` defines the unit of SIGMA_A.
+        Only ``dt_s`` is used: SIGMA_A refers to it.
     sigma_z_m : float
         Noise of the positions.
     offset_s : float
-        Added to the timestamps of the track.
+        Time offset added to the timestamps of the track.
 
     Returns
     -------
@@ -179,15 +183,16 @@ def estimate_heading_error(
         )
     samples = samples.iloc[:: int(np.ceil(len(samples) / MAX_MEASUREMENTS))]
     result = _estimate_from_positions(acceleration, samples, settings.dt_s, sigma_z_m)
-    # the mounting angle of the source is unknown but constant, so the orientations exclude a change
+    # the orientations give no absolute angle, because the mounting angle of the source is unknown,
+    # but a constant orientation difference shows that the angle is constant
     return (
         result if orientation_result is None else structs.replace(result, drift_p=1.0, drifts=False)
     )
 
 
 def _mean_per_part(time_s: Array, rotation_rad: Array, sigma_rad: Array) -> tuple[HeadingPart, ...]:
-    """Average rotation and σ (rad) over parts of equal length, in degrees."""
-    # long tracks are downsampled, which limits the number of parts
+    """Average rotation and σ (rad) over parts of equal duration; return them in degrees."""
+    # long tracks are downsampled, so parts may have to be longer to contain enough samples
     count = max(
         int(min((time_s[-1] - time_s[0]) / PART_LENGTH_S, len(time_s) / (2 * MIN_PART_SAMPLES))), 1
     )
@@ -215,7 +220,7 @@ def heading_rad(quaternions: pd.DataFrame) -> Array:
 def _compare_orientations(
     attitude: pd.DataFrame, orientation: pd.DataFrame, segment: Segment, offset_s: float
 ) -> HeadingError | None:
-    """Return heading of the source minus heading of the attitude; None with too few samples."""
+    """Return the source's heading minus the attitude's heading; None with too few samples."""
     samples = cut_to_segment(orientation, segment)
     time_s = samples.index.to_numpy() + offset_s
     attitude_s = attitude.index.to_numpy()
@@ -230,7 +235,7 @@ def _compare_orientations(
     if np.count_nonzero(is_calm) < MIN_PARTS * MIN_PART_SAMPLES:
         return None
     time_s, rotation_rad = time_s[is_calm], rotation_rad[is_calm]
-    # noise from differences of neighbours; not reduced by averaging, because errors are correlated
+    # σ from differences of neighbours; not reduced by averaging, because errors are correlated
     noise_rad = 1.4826 * np.median(np.abs(np.diff(rotation_rad))) / np.sqrt(2.0)
     sigma_rad = np.full(len(time_s), max(float(noise_rad), np.radians(MIN_SIGMA_DEG)))
     heading_parts = _mean_per_part(time_s, rotation_rad, sigma_rad)
@@ -246,10 +251,10 @@ def _compare_orientations(
 def _estimate_from_positions(
     acceleration: pd.DataFrame, samples: pd.DataFrame, dt_s: float, sigma_z: float
 ) -> HeadingError:
-    """Estimate the rotation as a state, constant or a random walk, by filters on a noise grid."""
+    """Estimate the rotation as a filter state, with the most likely noises of a grid."""
     time, measured_m = samples.index.to_numpy(), samples.to_numpy()
     interval_inputs = _interval_inputs(acceleration, time)
-    # √DT converts SIGMA_A, a σ over one DT, to a random walk in 1 s
+    # √DT converts SIGMA_A, a σ over one DT, to the velocity random walk in 1 s
     grid = np.array(
         list(product(ROTATION_RANDOM_WALKS, BIAS_RANDOM_WALKS, SIGMA_A_GRID * np.sqrt(dt_s)))
     )
@@ -294,7 +299,7 @@ def _interval_inputs(acceleration: pd.DataFrame, time: Array) -> tuple[Array, Ar
 
 
 def _transitions(increments: Array, dt_s: Array, rotation_rad: float) -> tuple[Array, Array]:
-    """Return F and the input of every interval, linearised about the rotation ``rotation_rad``."""
+    """Return F and the input vector of every interval, linearised about ``rotation_rad``."""
     count, dt = len(dt_s), dt_s[:, None, None]
     cosine, sine = np.cos(rotation_rad), np.sin(rotation_rad)
     rotation = np.array([[cosine, -sine], [sine, cosine]])
@@ -310,11 +315,11 @@ def _transitions(increments: Array, dt_s: Array, rotation_rad: float) -> tuple[A
 
 
 def _process_noise(dt_s: Array, has_gap: Array, noises: Array) -> Array:
-    """Return Q of every interval for each of k rows of noises, shape (n, k, 7, 7)."""
+    """Return Q of every interval for each of k sets of noises, shape (n, k, 7, 7)."""
     position, velocity, bias = (slice(axis, axis + 2) for axis in (0, 2, 4))
     identity, count = np.eye(2), len(noises)
     sigma_a_block = (noises[:, 2] ** 2)[:, None, None] * identity
-    # Q per unit of q00, q01, q11, per second and per gap
+    # unit matrices of Q: for q00, q01, q11, for the random walks per second, and for an IMU gap
     unit_00, unit_01, unit_11, unit_second, unit_gap = unit_noises = np.zeros(
         (5, count, STATES, STATES)
     )
@@ -328,7 +333,7 @@ def _process_noise(dt_s: Array, has_gap: Array, noises: Array) -> Array:
 
 
 class _FilterStep(NamedTuple):
-    """F of one interval, with states and covariances of k filters before and after the update."""
+    """F of one interval, and states and covariances of k filters before and after the update."""
 
     F: Array
     x_prior: Array
@@ -344,9 +349,10 @@ def _run_filters(
     noises: Array,
     sigma_z: float,
 ) -> tuple[Array, Array, list[_FilterStep]]:
-    """Run k filters; return ln p with all noises scaled optimally, the squared scale, and steps.
+    """Run k filters with different noises; return ln p, the squared scale, and the filter steps.
 
-    The first step is the initial state.
+    ln p is for all noises multiplied by the maximum-likelihood scale. The first step is the initial
+    state.
     """
     increments, length_s, has_gap = interval_inputs
     count = len(noises)

@@ -1,15 +1,15 @@
 """Biases, scale factor error and jumps that explain the innovations better than noise.
 
-KF is linear: a signal added to the measurements or to the acceleration adds the response of KF to
-the innovations. Each hypothesis is therefore a column of a design matrix: the response of the
+KF is linear, so an error in the measurements or in the acceleration adds its response to the
+innovations. Each hypothetical error is therefore a column of a design matrix: the response of the
 innovations to an error of size 1. Generalised least squares (whitened by √S) gives the size of the
 error, its standard deviation and its likelihood (generalised likelihood ratio, Willsky and Jones
 1976). Effects that could be confused with each other are fitted together: constant accelerometer
 biases, a rotation of the frame, and a slow acceleration error as caused by tilt.
 
-A scale factor also multiplies the noise of the acceleration, which would bias the regression
-(errors in variables). So the residuals are weighted with their variance at each scale (Deming
-1943).
+A scale factor multiplies the noise of the acceleration, too, which would bias the regression
+(errors in variables). So the residuals at each scale are weighted with their variance at that scale
+(Deming 1943).
 """
 
 from __future__ import annotations
@@ -43,32 +43,34 @@ from px4fuse.notebook_display import one_line_repr
 
 ANALYSIS_NAME = "causes beyond noise"
 MIN_MEASUREMENTS = 50
-# Slow error of the logged attitude (rad, RMS), and spacing (s) of its independent values
+# Slow error of the logged attitude (rad, RMS), and spacing (s) of the knots between which it is
+# interpolated
 TILT_SIGMA_RAD = 0.002
 KNOT_SPACING_S = 15.0
 MAX_KNOTS = 40
 FORWARD, RIGHT, ROTATION = range(3)
 CONSTANT_COUNT = 3
-# Factors on KF's SIGMA_A; less acceleration noise remains after biases and tilt are fitted
+# Grid of factors on KF's SIGMA_A: less acceleration noise remains after biases and tilt are fitted
 SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
 SCALE_GRID = np.linspace(0.7, 1.3, 7)
-# Limit of the number of times at which a step is tested
+# Maximum number of times at which a jump is tested. A jump is modelled as a lasting step
 MAX_TESTED_TIMES = 800
-# Step times per batch; limits the memory of the responses
+# Number of step times per batch, to limit the memory of the responses
 STEP_BATCH_SIZE = 200
-# s; measurements in this time after a step are ignored, so that a burst of outliers is not a step
+# Time (s) after a step in which measurements are ignored, so that a burst of outliers is not
+# detected as a step
 OUTLIER_BURST_S = 1.0
-# s; outliers in this time after a step are tested again as measurements after the step
+# Time (s) after a step in which outliers are tested again: they may be good measurements after it
 OUTLIERS_AFTER_STEP_S = 6.0
-# Probability of a detected step in a flight without one
+# Maximum probability of a false detection of a step, per flight
 MAX_STEP_FALSE_ALARM_P = 1e-3
-# Probability that a good measurement near a step is taken for an outlier, and number of times that
-# are tested for a step
+# Maximum probability that a good measurement near a step is classified as an outlier, and maximum
+# number of candidate times per step
 MAX_FALSE_OUTLIER_P, MAX_CANDIDATE_TIMES = 1e-3, 6
 MAX_JUMPS = 3
-MIN_BIAS_M_S2 = 0.2  # half of EKF2's own limit, EKF2_ABL_LIM
-MIN_BIAS_SIGMAS = 4.0  # false alarm probability 6e-5
-# Measurements required on each side of a step
+MIN_BIAS_M_S2 = 0.2  # minimum bias for a finding: half of EKF2's limit, EKF2_ABL_LIM
+MIN_BIAS_SIGMAS = 4.0  # minimum bias in σ: false alarm probability 6e-5
+# Minimum number of measurements on each side of a step
 MIN_SIDE_MEASUREMENTS = 8
 
 
@@ -82,7 +84,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Jump:
-    """Lasting step of the source: time (s), size along each axis (m), and χ² of the step."""
+    """Lasting jump of the source: time (s), size along each axis (m), and its χ²."""
 
     time_s: float
     step_m: tuple[Estimate, ...]
@@ -90,7 +92,7 @@ class Jump:
 
     @property
     def size_m(self) -> float:
-        """Length of the step (m)."""
+        """Length of the jump vector (m)."""
         return float(np.hypot.reduce([step.value for step in self.step_m]))
 
 
@@ -107,10 +109,10 @@ class BiasScaleJumpFit:
         Rotation of the source's frame relative to the attitude (rad, clockwise from above),
         fitted together with the biases.
     scale : Estimate
-        Ratio of the source's distances to the IMU's distances, minus 1.
+        Distances of the source over distances from the IMU, minus 1.
     jumps : tuple of Jump
     sigma_a_m_s2 : float
-        White noise of the acceleration after the fit.
+        White noise of the acceleration that remains after the fit.
     """
 
     forward_bias: Estimate
@@ -154,7 +156,7 @@ def fit_bias_scale_jumps(
     axes : tuple of Axis
         Horizontal axes with the same measurement times.
     settings : Settings
-        Its ``dt_s`` defines the unit of SIGMA_A.
+        Only ``dt_s`` is used: SIGMA_A refers to it.
     sigma_a_m_s2, sigma_z_m : float
         KF's maximum-likelihood noises.
     outlier_time_s : ndarray
@@ -205,11 +207,11 @@ def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
 
 
 def _fit_scale(design: DesignMatrix, sigma_a: float, is_skipped: BoolArray) -> Estimate:
-    """Estimate the scale factor error from the likelihood on a grid, corrected for rotation."""
+    """Estimate the scale factor error on a grid of scales, corrected for the frame's rotation."""
     fit_at = cache(
         lambda grid_index: design.fit(sigma_a, is_skipped, float(SCALE_GRID[grid_index]))
     )
-    # ln S is omitted: it grows with the scale and would bias the estimate towards zero
+    # the term ln S is omitted: it grows with the scale and would bias the estimate towards zero
     lowest_index = _index_of_minimum(
         lambda grid_index: fit_at(grid_index).square_sum, len(SCALE_GRID)
     )
@@ -235,10 +237,10 @@ def _find_jumps(
 ) -> tuple[tuple[Jump, ...], BoolArray]:
     """Detect lasting jumps of the source; return the jumps in time order, and an outlier mask.
 
-    Candidate times are from a scan over all times and from the starts of outlier runs, because the
-    first measurements after a jump look like outliers. Each candidate is tested without the
-    measurements of the next second, so that a burst of outliers is not a jump. The exact time, on
-    which the size depends, is determined last.
+    Candidate times are from a scan over all times, and the starts of runs of outliers: the first
+    measurements after a jump look like outliers. Each candidate is tested without the measurements
+    of the next second, so that a burst of outliers is not detected as a jump. The exact time is
+    determined last; the size of the jump depends on it.
     """
     jumps: list[Jump] = []
     for _ in range(MAX_JUMPS):
@@ -289,7 +291,7 @@ def _significant_step_times(
 def _step_chi_squares(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, times: Array
 ) -> Array:
-    """Compute χ² of a step at each time: reduction of the residual squares, summed over axes."""
+    """Return χ² of a step at each time: reduction of the residual squares, summed over axes."""
     data, columns, log_s_sum = design.whitened_design(sigma_a, is_skipped)
     base_fit = design.regress(data, columns, log_s_sum, is_skipped)
     chi_square = np.zeros(len(times))
@@ -316,9 +318,9 @@ def _step_chi_squares(
 def _locate_jump(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, jump: Jump
 ) -> tuple[Jump, BoolArray]:
-    """Find the exact time and size of a jump near its candidate time; return also the outliers."""
+    """Find the time and size of a jump near its candidate time; also return an outlier mask."""
     is_near = np.abs(design.time_s - jump.time_s) <= OUTLIER_BURST_S
-    # measurements close to the step are excluded; later ones that fit the step are not outliers
+    # exclude measurements close to the step; later outliers that agree with the step are used again
     chi_square = design.with_step(jump.time_s)[0].residual_squares(sigma_a, is_skipped | is_near)
     is_after = is_near | _is_in_window(design.time_s, jump.time_s, OUTLIERS_AFTER_STEP_S)
     is_skipped = np.where(
@@ -345,7 +347,7 @@ def _locate_jump(
                 ),
             )
         )
-    # an outlier near a step looks like a step, so the time with the fewest outliers is chosen
+    # a wrong step time makes good measurements outliers: choose the time with the fewest outliers
     time_s, is_skipped = min(candidates, key=lambda candidate: np.count_nonzero(candidate[1]))
     stepped_design, columns = design.with_step(time_s)
     design_fit = stepped_design.fit(sigma_a, is_skipped)
@@ -356,7 +358,7 @@ def _locate_jump(
 def _test_step(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, time_s: float, false_alarm_p: float
 ) -> Jump | None:
-    """Return the jump at a time if it is significant without the data of the next second."""
+    """Return the jump at ``time_s`` if it is significant without the data of the next second."""
     is_skipped_with_burst = is_skipped | _is_in_window(design.time_s, time_s, OUTLIER_BURST_S)
     design, columns = design.with_step(time_s)
     count_before = np.count_nonzero(~is_skipped_with_burst & (design.time_s < time_s))
@@ -384,9 +386,9 @@ class DesignFit:
     Attributes
     ----------
     axis : ndarray of int, shape (n,)
-        Axis of each row, sorted by axis.
+        Axis index of each row; rows are sorted by axis.
     residual : ndarray, shape (n,)
-        Residual of the whitened innovations.
+        Whitened innovations minus the fit.
     coefficients, covariance : ndarray, shape (k,) and (k, k)
     square_sum : float
         Residual sum of squares, including the term of the prior.
@@ -411,7 +413,7 @@ class DesignFit:
         return np.sqrt(np.maximum(mean_square, 1.0))
 
     def estimate(self, column: int) -> Estimate:
-        """Return one coefficient with σ, which is larger if the residual exceeds the noise."""
+        """Return one coefficient with its σ, multiplied by ``residual_rms`` if this exceeds 1."""
         sigma = float(np.sqrt(self.covariance[column, column])) * max(self.residual_rms, 1.0)
         return Estimate(float(self.coefficients[column]), sigma)
 
@@ -427,15 +429,16 @@ class DesignMatrix:
     time_s : ndarray, shape (m,)
         Timestamps of the measurements.
     intervals : tuple of Preintegrated
-        Signals of each axis: the data, then the effect of each constant.
+        Each axis integrated between measurements. Columns: the data, then the effect of a unit bias
+        forward, a unit bias right, and a unit rotation of the frame.
     hat_signals : (ndarray, ndarray), shape (m, h)
-        Position and velocity increments by slow accelerations (hat functions of time), with
-        separate coefficients per axis.
+        Position and velocity increments by a slow acceleration error, interpolated between knots
+        (hat functions of time); each axis has separate coefficients.
     prior_sigma : ndarray, shape (k,)
         Prior standard deviations of the coefficients, without the steps.
     sigma_z_m : float
     step_columns : ndarray, shape (m, j)
-        Unit steps added to the measurements: j more columns per axis.
+        Unit steps of the measurements: j more columns per axis.
     """
 
     time_s: Array
@@ -455,7 +458,7 @@ class DesignMatrix:
 
     @cached_property
     def axis_groups(self) -> list[list[int]]:
-        """Groups of axes with equal filters: one group, unless IMU gaps affect axes differently."""
+        """Groups of axes with equal gains: one group, unless IMU gaps affect axes differently."""
         shares_filter = all(
             np.array_equal(intervals.noise_fixed, self.intervals[0].noise_fixed)
             for intervals in self.intervals
@@ -466,7 +469,7 @@ class DesignMatrix:
     def whitened(
         self, intervals: Preintegrated, sigma_a: float, is_skipped: BoolArray
     ) -> tuple[Array, float]:
-        """Return innovations divided by √S for k signals, (m, k), and Σ ln S of the fused ones."""
+        """Return innovations over √S of k signals, (m, k), and Σ ln S of fused measurements."""
         nu, s = innovations(intervals, sigma_a, self.sigma_z_m, is_skipped)
         nu /= np.sqrt(s)[:, None]
         return nu, float(np.sum(np.log(s[~is_skipped])))
@@ -504,7 +507,7 @@ class DesignMatrix:
         return DesignFit(axis, residual, coefficients, covariance, square_sum, score, residual_rms)
 
     def residual_squares(self, sigma_a: float, is_skipped: BoolArray) -> Array:
-        """Return the squared residual of each measurement over its variance, summed over axes."""
+        """Return residual² / variance of each measurement, summed over axes."""
         data, columns, log_s_sum = self.whitened_design(sigma_a, is_skipped)
         fit = self.regress(data, columns, log_s_sum, is_skipped)
         residual = data - columns @ fit.coefficients
@@ -522,7 +525,7 @@ class DesignMatrix:
         column_count = len(self.prior_sigma)
         data = np.empty((axes, len(is_skipped)))
         columns = np.zeros((axes, len(is_skipped), column_count + axes * step_count))
-        # the scale multiplies the measured and the rotated acceleration
+        # the scale multiplies the measured acceleration and its rotation, but not the biases
         scale_factors = np.ones(1 + CONSTANT_COUNT)
         scale_factors[[0, 1 + ROTATION]] = scale
         zero_signal, log_s_sum = np.zeros_like(self.hat_signals[0]), 0.0
@@ -575,15 +578,15 @@ def make_design_matrix(
     sigma_z: float,
     clock_offset_s: float,
 ) -> DesignMatrix | Unavailable:
-    """Build the design matrix of the columns that all hypotheses share.
+    """Build the design matrix without steps.
 
     Parameters
     ----------
     flight : Flight
     axes : tuple of Axis
-        Horizontal, with the same measurement times.
+        Horizontal axes with the same measurement times.
     settings : Settings
-        Its ``dt_s`` defines the unit of SIGMA_A.
+        Only ``dt_s`` is used: SIGMA_A refers to it.
     sigma_z : float
         Measurement noise (m).
     clock_offset_s : float
@@ -614,7 +617,7 @@ def make_design_matrix(
         ]
         dp, dv = (np.stack(arrays, axis=1) for arrays in zip(*columns, strict=True))
         measured_m = np.zeros_like(dp)
-        # KF starts at the first measurement
+        # positions relative to the first measurement, at which KF starts
         measured_m[:, 0] = interval_input.measurement_m - interval_input.initial.position_m
         initial = replace(interval_input.initial, position_m=0.0)
         intervals.append(
@@ -645,7 +648,10 @@ def _integrate_signal(
 def _common_accelerations(
     attitude: pd.DataFrame, acceleration: pd.DataFrame
 ) -> list[tuple[pd.Index, Array]]:
-    """Return times and NED accelerations of unit biases forward and right, and of a rotation."""
+    """Return the NED accelerations of unit biases forward and right and of a unit rotation.
+
+    Each is a pair of times and accelerations.
+    """
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
     biases = [(attitude.index, body_to_ned.apply(np.eye(3)[axis])) for axis in (FORWARD, RIGHT)]
@@ -654,7 +660,7 @@ def _common_accelerations(
 
 
 def _hat_functions(start_s: float, end_s: float) -> tuple[Array, Array]:
-    """Return times (s) and hat functions (h, n) that interpolate a slow signal between knots."""
+    """Return times (s), shape (n,), and the hat functions of a linear interpolation, (h, n)."""
     knot_count = int(np.clip(np.ceil((end_s - start_s) / KNOT_SPACING_S), 1, MAX_KNOTS)) + 1
     time = np.linspace(start_s, end_s, 20 * (knot_count - 1) + 1)
     knots = np.linspace(start_s, end_s, knot_count)

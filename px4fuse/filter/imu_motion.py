@@ -1,16 +1,17 @@
-"""Motion from the IMU alone, and the effect of every constant IMU error on the motion.
+"""Motion from the IMU alone, and the sensitivity of this motion to every constant IMU error.
 
-A segment is a part of at most 30 s that IMU and attitude cover without a gap. The attitude is
-integrated from the gyroscopes, starting at the logged attitude of each segment. EKF2's later
-attitude is not used: EKF2 corrected it with the positions to be tested, so it contains their delay.
+A segment is a part of the flight, at most 30 s long, without a gap in IMU or attitude. The attitude
+is integrated from the gyroscopes, starting at EKF2's logged attitude at the start of each segment.
+EKF2's later attitude is not used: EKF2 corrected it with the positions to be tested, so it contains
+the delay of the positions.
 
-To first order the acceleration is linear in ten constants of each segment: errors of the initial
-attitude (rad, NED), gyro biases (rad/s, body), accelerometer biases (m/s², body) and the scale of
-the positions. The signal of a constant is its effect on the motion. It is integrated once; a time
-offset only changes the times at which the integrals are read. The signal of the scale is the
-acceleration of the smooth path of :func:`px4fuse.filter.marginal_likelihood.centre_on_path`. The
-acceleration of the IMU would not do: much of its noise would be explained as scale (errors in
-variables, Fuller 1987).
+To first order the acceleration is linear in ten unknown constants of each segment: errors of the
+initial attitude (rad, NED), gyro biases (rad/s, body), accelerometer biases (m/s², body) and the
+scale of the positions. The signal of a constant is the sensitivity of the motion to it. The signals
+are integrated once; a time offset only changes the times at which the integrals are read. The
+signal of the scale is the acceleration of the smooth path of
+:func:`px4fuse.filter.marginal_likelihood.centre_on_path`. The acceleration of the IMU is not
+suitable: much of its noise would be explained as scale (errors in variables, Fuller 1987).
 """
 
 from __future__ import annotations
@@ -31,45 +32,45 @@ from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.trajectory.rotation import cumulative_product, from_vector, multiply, to_matrix
 
-# Prior σ of the constants, wide for consumer sensors: tilt and heading (rad), gyro bias (rad/s),
-# accelerometer bias (m/s²), scale of the positions (1)
+# Prior σ of the unknown constants, wide for consumer sensors: initial tilt and heading (rad), gyro
+# bias (rad/s), accelerometer bias (m/s²), scale of the positions (1)
 CONSTANT_SIGMAS = np.repeat([0.05, 0.004, 0.3, 0.1], [3, 3, 3, 1])
-# s; the linearisation needs small angles: a gyro bias of 0.004 rad/s rotates by 0.12 rad in a
-# segment, with a second-order error of 0.07 m/s²
+# Maximum length (s) of a segment: the linearisation needs small angles. In 30 s a gyro bias of
+# 0.004 rad/s rotates the attitude by 0.12 rad, with a second-order error of 0.07 m/s²
 MAX_SEGMENT_S = 30.0
-# s; largest time offset of the search
+# Largest time offset (s) of the search
 MAX_OFFSET_S = 0.6
 # Coarse search: number of offsets, and approximate number of measurements
 COARSE_OFFSETS, COARSE_MEASUREMENTS = 25, 600
-# Limit of the signal values per batch, and minimum number of offsets in it
+# Maximum number of signal values per batch (memory), and minimum number of offsets per batch
 SIGNALS_PER_BATCH, MIN_BATCH_OFFSETS = 2**16, 3
-# Measurements required in all segments together, and in each segment
+# Minimum number of measurements in all segments together, and in each segment
 MIN_MEASUREMENTS, MIN_SEGMENT_MEASUREMENTS = 30, 15
-# Measurements required in a segment after downsampling
+# Minimum number of measurements in a segment after downsampling
 MIN_KEPT_MEASUREMENTS = 5
-# s; the IMU is averaged over this interval before integration
+# Interval (s) over which the IMU is averaged before integration
 INTEGRATION_STEP_S = 0.02
 # Prior precision of position (1/m²) and velocity (s²/m²) at the start of a segment: negligible, but
-# enough for an axis with hardly any measurement
+# the equations stay regular for an axis with hardly any measurement
 START_PRECISION = 1e-6, 1e-4
-# s; above this IMU interval the motion between samples is unknown
+# Maximum median interval (s) of the IMU: with a longer one, motion between samples is unknown
 MAX_IMU_INTERVAL_S = 0.025
 
 
 @dataclass(frozen=True)
 class Signals:
-    """Motion of one segment by the IMU, and the effect of each constant on the motion.
+    """Motion of one segment from the IMU, and its sensitivity to each unknown constant.
 
-    ``table`` has shape (n, 3, 3, constants): position, velocity and acceleration along each axis of
-    NED. The first column is the motion with all constants zero; the others are the effects of each
-    constant except the scale. Each acceleration holds until the next time.
+    ``table`` has shape (n, 3, 3, 1 + constants): at each time position, velocity and acceleration,
+    along each axis of NED. Its last index is 0 for the motion with all constants zero, then one per
+    constant except the scale. Each acceleration applies until the next time.
     """
 
     time_s: Array
     table: Array
 
     def at(self, time_s: Array) -> tuple[Array, Array]:
-        """Return position and velocity at other times, shape (..., 3, constants)."""
+        """Return position and velocity at other times, shape (..., 3, 1 + constants)."""
         last_index = len(self.time_s) - 1
         row = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
         elapsed_s = (time_s - self.time_s[row])[..., None, None]
@@ -85,7 +86,7 @@ SignalCache = dict[tuple[float, float], Signals]
 
 @dataclass(frozen=True)
 class PreparedMotion:
-    """Positions of one source with the motion by the IMU, in segments, for any time offset.
+    """Positions of one source and the motion from the IMU, in segments, for any time offset.
 
     Attributes
     ----------
@@ -96,13 +97,13 @@ class PreparedMotion:
     weight : ndarray, shape (m,)
         Weight of each measurement.
     edges : ndarray of int, shape (s + 1,)
-        First measurement of each segment, and the number of measurements.
+        Index of the first measurement of each segment; last, the number of measurements.
     signals : tuple of Signals
-        Signals of each segment.
+        Motion and sensitivities of each segment.
     directions : ndarray, shape (a, 3)
-        Unit vectors in NED.
+        Unit vectors of the axes in NED.
     dt_s : float
-        DT, which defines the unit of SIGMA_A.
+        DT, to which SIGMA_A refers.
     imu_interval_s : float
     heading_sigma_rad : float
         Prior σ of the heading at the start of a segment.
@@ -119,7 +120,7 @@ class PreparedMotion:
     heading_sigma_rad: float = float(CONSTANT_SIGMAS[2])
 
     def downsample(self, count: int) -> PreparedMotion:
-        """Return about ``count`` of the measurements; all if no segment keeps enough."""
+        """Keep about ``count`` of the measurements; all if no segment would have enough left."""
         is_kept = np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / count)) == 0
         counts = np.add.reduceat(is_kept.astype(int), self.edges[:-1])
         keeps_enough = counts >= MIN_KEPT_MEASUREMENTS
@@ -137,7 +138,7 @@ class PreparedMotion:
         return replace(self, **arrays, edges=np.cumsum([0, *counts[keeps_enough]]), signals=signals)
 
     def positions(self, offset_s: Array) -> Positions:
-        """Return positions and increments for T time offsets; the signal of the scale is zero.
+        """Return positions and integrated IMU data for T time offsets, without a scale error.
 
         Parameters
         ----------
@@ -174,11 +175,11 @@ class PreparedMotion:
         )
 
     def at(self, offset_s: float) -> Positions:
-        """Return positions at one time offset relative to a smooth path, with scale as constant."""
+        """Return positions relative to a smooth path, at one time offset, with unknown scale."""
         return next(self.position_batches(np.array([offset_s])))
 
     def position_batches(self, offset_s: Array, *, scaled: bool = True) -> Iterator[Positions]:
-        """Yield positions for given time offsets in batches, with or without scale as constant."""
+        """Yield positions for time offsets in batches, with or without an unknown scale."""
         signal_count = len(self.time_s) * len(self.directions) * (1 + len(CONSTANT_SIGMAS))
         batch_size = max(MIN_BATCH_OFFSETS, SIGNALS_PER_BATCH // signal_count)
         for batch in np.split(offset_s, range(batch_size, len(offset_s), batch_size)):
@@ -194,9 +195,9 @@ class PreparedMotion:
         ----------
         noises : Noises
         factors : sequence of float
-            Factors on SIGMA_A that are tried.
+            Factors on SIGMA_A of the grid.
         scaled : bool
-            True if the scale of the positions is one of the constants.
+            True if the scale of the positions is unknown.
         """
         offsets = np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSETS)
         sigma = noises.sigma_z_m
@@ -223,7 +224,7 @@ def prepare_motion(
     signals: SignalCache | None = None,
     heading_sigma_rad: float = float(CONSTANT_SIGMAS[2]),
 ) -> PreparedMotion | Unavailable:
-    """Cut measurements into segments that IMU and attitude cover without a gap.
+    """Cut measurements into segments without a gap in IMU or attitude.
 
     Parameters
     ----------
@@ -233,7 +234,7 @@ def prepare_motion(
     directions, dt_s, weight, heading_sigma_rad
         See :class:`PreparedMotion`; weights are 1 by default.
     signals : dict, optional
-        Signals of this flight to reuse; new ones are added.
+        Signals of this flight to reuse. Newly computed signals are added.
 
     Returns
     -------
@@ -276,7 +277,7 @@ def prepare_motion(
             "Analyse a longer segment.",
         )
     edges = np.cumsum([0, *map(len, rows_by_segment)])
-    # positions relative to the first of each segment are small; its position is unknown anyway
+    # relative positions are small, which limits rounding; the initial position is unknown anyway
     measured_m = pd.DataFrame(measurement_m[used_rows])
     first_m = measured_m.groupby(
         np.repeat(np.arange(len(rows_by_segment)), np.diff(edges))
@@ -295,7 +296,7 @@ def prepare_motion(
 
 
 def _covered_spans(imu_s: Array, attitude_s: Array) -> list[tuple[float, float]]:
-    """Return the time spans (s) that IMU and attitude cover; none if the IMU rate is too low."""
+    """Return the spans (s) without a gap in IMU or attitude; none if the IMU rate is too low."""
     if len(imu_s) < 2 or np.median(np.diff(imu_s)) > MAX_IMU_INTERVAL_S:
         return []
     gaps = np.flatnonzero(imu_gaps(imu_s))
@@ -305,7 +306,7 @@ def _covered_spans(imu_s: Array, attitude_s: Array) -> list[tuple[float, float]]
 
 
 def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float]) -> Signals:
-    """Compute the motion in NED from IMU data alone, and the effect of each constant on it."""
+    """Compute the motion in NED from the IMU, and its sensitivity to each unknown constant."""
     time = imu.index.to_numpy()
     first_row, end_row = np.searchsorted(
         time, [span[0] - 2 * INTEGRATION_STEP_S, span[1] + 2 * INTEGRATION_STEP_S], side="left"
@@ -317,7 +318,7 @@ def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, f
     integrals = np.column_stack([np.interp(step_times_s, time, column) for column in integral.T])
     force, angle = integrals[:, :3], integrals[:, 3:]
     attitude_quaternion = _integrate_gyros(step_times_s, angle, attitude)
-    # rotation by the attitude in the middle of each step
+    # the mean specific force of each step is rotated by the attitude in the middle of the step
     mean_force = np.diff(force, axis=0) / INTEGRATION_STEP_S
     body_to_ned = to_matrix(
         multiply(attitude_quaternion[:-1], from_vector(np.diff(angle, axis=0) / 2.0))
@@ -327,7 +328,8 @@ def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, f
     position, velocity, acceleration = np.moveaxis(table, 1, 0)
     acceleration[:, :, 0] = force_ned
     acceleration[:, 2, 0] += constants.g
-    # a small rotation θ of the attitude adds θ × f; a gyro bias b rotates it by -∫ R b dt
+    # a rotation of the attitude by a small θ adds θ × f to the acceleration; for a gyro bias b,
+    # θ = -∫ R b dt
     gyro_bias_rotation = -INTEGRATION_STEP_S * (np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0)
     for axis in range(3):
         next_axis, last_axis = (axis + 1) % 3, (axis + 2) % 3

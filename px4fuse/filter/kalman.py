@@ -7,8 +7,8 @@ State x = [position, velocity] along one axis; the input u is the acceleration o
                x = x + Ky         P = (I - KH)P
 
 F, B, Q and H are defined in :mod:`px4fuse.filter.model`, the steps in :mod:`px4fuse.filter.steps`.
-:mod:`~px4fuse.filter.fast_replay` and the likelihoods run many times and have faster recursions,
-with the same results to 1e-9.
+:mod:`~px4fuse.filter.fast_replay` and :mod:`~px4fuse.filter.likelihood` run KF many times; their
+faster recursions have the same results to 1e-9.
 """
 
 from collections.abc import Sequence
@@ -133,7 +133,7 @@ def make_replay(
     states: Sequence[StateRow],
     updates: Sequence[StateRow],
 ) -> Replay:
-    """Build a replay from the rows of its steps (state and covariance) and updates."""
+    """Build a replay from the rows of its tables ``steps`` (state, covariance) and ``updates``."""
     time_arrays = timeline.time_s, timeline.time_s[timeline.measurement_index >= 0]
     time, update_index = (pd.Index(times_s, name="time_s") for times_s in time_arrays)
     steps = pd.DataFrame(states, index=time, columns=model.STATES + model.COVARIANCES)
@@ -154,7 +154,7 @@ def _state_row(x: Array, P: Array) -> StateRow:
 
 
 def _step_before(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
-    """Return the last step before each time, the time since (s), and a mask of times outside."""
+    """Return the last step before each time, the time since it (s), and a mask of outside times."""
     step_times_s = run.steps.index.to_numpy()
     step_index = np.clip(
         np.searchsorted(step_times_s, times_s, side="right") - 1, 0, len(step_times_s) - 1
@@ -167,7 +167,7 @@ def _step_before(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArra
 
 
 def state_at(run: Replay, times_s: Array) -> tuple[Array, Array]:
-    """Predict position (m) and velocity (m/s) at other times from the last step before.
+    """Predict position (m) and velocity (m/s) at each time from the last step before that time.
 
     Interpolation between two steps would use a measurement before it is received. The result is NaN
     outside the replay.
@@ -181,7 +181,7 @@ def state_at(run: Replay, times_s: Array) -> tuple[Array, Array]:
 
 
 def variance_at(run: Replay, times_s: Array) -> tuple[Array, Array]:
-    """Return the variances (m², m²/s²) of :func:`state_at`: FPFᵀ + Q from the last step before."""
+    """Return the variances (m², m²/s²) of the results of :func:`state_at`: FPFᵀ + Q."""
     index, elapsed_s, is_outside = _step_before(run, times_s)
     p00, p01, p11 = run.steps[model.COVARIANCES].to_numpy()[index].T
     gap_variance = run.steps["input_variance_m2_s4"].to_numpy()[index]

@@ -1,8 +1,8 @@
 """KF for grids of settings: innovations, likelihood and 95 % intervals.
 
-The input is integrated between position measurements, so there is one step per measurement instead
-of one per DT, with an array element for every setting. The result equals that of
-:func:`px4fuse.filter.kalman.replay` to 1e-9 for SIGMA_A and SIGMA_Z from 1e-3.
+The input is integrated between position measurements, so KF needs one step per measurement instead
+of one per DT. Each step handles all settings of a grid as an array. For SIGMA_A and SIGMA_Z of at
+least 1e-3 the results equal those of :func:`px4fuse.filter.kalman.replay` to 1e-9.
 """
 
 from __future__ import annotations
@@ -30,24 +30,25 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import Timeline, make_timeline
 
-# nats; drop of the log-likelihood at the ends of a 95 % interval: half of the 95 % point of χ²(1)
+# Drop of the log-likelihood (nats) at the ends of a 95 % interval: half of the 95 % point of χ²(1)
 PROFILE_DROP = float(chdtri(1, 0.05)) / 2.0
 # Distance in ln σ from the maximum at which the search for the end of an interval starts
 START_LOG_DISTANCE = 0.05
-# Step in ln σ for second differences; limits of the steps per iteration, and of the iterations
+# Minimisation by parabolas: step in ln σ of the second differences, maximum number of these steps
+# per iteration, and maximum number of iterations
 CURVATURE_STEP = 0.05
 MAX_PARABOLA_STEPS, MAX_PARABOLA_ITERATIONS = 6.0, 4
 
 
 @dataclass(frozen=True)
 class Preintegrated:
-    """Input of KF integrated between consecutive measurements; arrays of shape (m,).
+    """Input of KF, integrated over each interval between measurements; arrays of shape (m,).
 
     Attributes
     ----------
     length_s : ndarray
     delta_position_m, delta_velocity_m_s : ndarray
-        Δp (m) and Δv (m/s) due to the acceleration.
+        Δp and Δv due to the acceleration.
     noise_unit : ndarray, shape (m, 3)
         Elements 00, 01, 11 of Q for SIGMA_A = 1 m/s².
     noise_fixed : ndarray, shape (m, 3)
@@ -65,13 +66,13 @@ class Preintegrated:
     initial: InitialState
 
     def first_measurements(self, count: int) -> Preintegrated:
-        """Return the first ``count`` measurements only."""
+        """Keep only the first ``count`` measurements."""
         arrays = {name: values[:count] for name, values in vars(self).items() if name != "initial"}
         return replace(self, **arrays)
 
 
 def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
-    """Integrate the input of one axis over the prediction steps of the replay.
+    """Integrate the input of one axis between measurements, over the prediction steps of KF.
 
     Raises
     ------
@@ -129,9 +130,10 @@ def integrate_acceleration(timeline: Timeline, acceleration_m_s2: Array) -> tupl
 
 
 def _interval_index(timeline: Timeline) -> tuple[IntArray, IntArray, Array]:
-    """Return the last step of each interval, and of each step the interval and time to its end.
+    """Return the last step of each interval between measurements.
 
-    Times are in s.
+    Return also, for each step, its interval and the time from the step to the end of the interval
+    (s).
     """
     last_steps = np.flatnonzero(timeline.measurement_index >= 0)
     interval_index = np.searchsorted(last_steps, np.arange(1, len(timeline.time_s)))
@@ -161,7 +163,7 @@ def innovations(
     Returns
     -------
     innovation_m, innovation_variance_m2 : ndarray, shape (m, ...)
-        For k signals with one pair of settings: shapes (m, k) and (m,).
+        With k columns of input (:func:`run_filter`) and one pair of settings: (m, k) and (m,).
     """
     steps = run_filter(intervals, sigma_a_m_s2, sigma_z_m, is_skipped)
     nu, s = zip(*(step[:2] for step in steps), strict=True)
@@ -170,7 +172,7 @@ def innovations(
 
 @dataclass(frozen=True)
 class FilterStates:
-    """KF after each measurement; arrays of shape (m, ...) for a grid of settings."""
+    """State and statistics of KF after each measurement; shape (m, ...) for a grid of settings."""
 
     gain: Array
     velocity_m_s: Array
@@ -206,8 +208,8 @@ def run_filter(
 ) -> Iterator[tuple[Array, Array, Array, Array, Array, Symmetric[Array]]]:
     """Run KF over a grid of settings, measurement by measurement.
 
-    KF is linear in its signals. With one pair of settings, Δp, Δv and measurements may therefore
-    have shape (m, k): k signals are filtered with the same gains.
+    With one pair of settings, Δp, Δv and measurements may have k columns, shape (m, k): KF is
+    linear, so all columns (data, or the effect of an error) are filtered with the same gains.
 
     Parameters
     ----------
@@ -232,7 +234,7 @@ def run_filter(
     p, v = (
         intervals.initial.position_m,
         intervals.initial.velocity_m_s + 0.0 * q,
-    )  # of the grid's shape
+    )  # shape of the grid
     covariance: Symmetric[Any] = INITIAL_COVARIANCE
     sigma_z_squared = r
     for dt, dp, dv, noise_unit, noise_fixed, z, skips_update, weight_k in zip(
@@ -261,7 +263,7 @@ def run_filter(
 
 
 def _values_by_measurement(values: Array) -> list[Any]:
-    """Return the values of each measurement: a number, or an array of several signals."""
+    """Return the values of each measurement: a number, or an array with several columns."""
     return values.tolist() if values.ndim == 1 else list(values)
 
 
@@ -293,7 +295,7 @@ def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
     profile : ndarray, shape (n,)
         Values at equal steps.
     index : int
-        Index of the middle one, 1 to n - 2.
+        Index of the middle point, 1 to n - 2.
 
     Returns
     -------
@@ -347,14 +349,14 @@ def profile_ends(
     Parameters
     ----------
     score : callable
-        -ln p as a function of ln of the parameter and ln of the other parameter, which is
-        optimised at each value.
+        -ln p as a function of the logarithms of the parameter and of one other parameter. The other
+        parameter is optimised at each value.
     best_logs : (float, float)
-        Logarithms at the minimum.
+        Both logarithms at the minimum.
     bounds : (float, float)
         Bounds of the parameter (not of its logarithm).
     variance_factor : float
-        Factor on the variance for uncertainty that the score does not contain.
+        Factor on the parameter's variance, for uncertainty that ``score`` does not include.
     """
     best_score, max_root_drop = score(*best_logs), float(np.sqrt(PROFILE_DROP * variance_factor))
 
@@ -363,7 +365,7 @@ def profile_ends(
 
         @cache  # the search for the other parameter starts at the previous result
         def excess(distance: float) -> float:
-            """Return √drop minus √drop at the end of the interval; √drop is nearly linear."""
+            """Return √(likelihood drop) minus its value at the interval's end; nearly linear."""
             nonlocal other_log
             if distance == 0.0:
                 return -max_root_drop
@@ -390,7 +392,7 @@ def profile_ends(
 
 
 def _minimise_by_parabolas(score: Callable[[float], float], position: float) -> tuple[float, float]:
-    """Return the minimum of a score and its position, by parabolas from a nearby ``position``."""
+    """Return the minimum of a score and its position, by parabolas that start at ``position``."""
     for _ in range(MAX_PARABOLA_ITERATIONS):
         profile = np.array([score(position + k * CURVATURE_STEP) for k in (-1.0, 0.0, 1.0)])
         middle_score = float(profile[1])

@@ -1,17 +1,20 @@
-"""Likelihood of positions along a few axes, with the constants of each segment marginalised.
+"""Likelihood of positions along a few axes, with constant errors of each segment marginalised.
 
-A segment is a part of the flight without a gap of the IMU. It has its own initial state and its own
-constants (biases and other constant errors).
+A segment is a part of the flight without a gap in the IMU data. It has its own initial state and
+its own unknown constants: biases and other constant errors.
 
 Given the acceleration, -2 ln p of the states x_k = [p, v] at the measurements is a sum of squares:
 x_{k+1} - Fx_k - [Δp, Δv] of each interval over its Q, and z - p of each measurement over its
-variance. Its matrix A has three bands below the diagonal, so LAPACK factorises a flight in a
-millisecond. The marginal likelihood of the measurements equals that of KF's innovations (Schweppe
-1965) and follows from log|A| and the residual squares at the minimum. Signals that enter linearly
-(data, or the effect of a bias) are columns; the factorisation does not depend on them. Constants
-have a prior and are marginalised by the Schur complement of their inner products. Time-correlated
-noise of the source is a third state, c_{k+1} = ρ c_k + noise, in the measurement: z - p - c. It is
-independent in each segment.
+variance. The matrix A of this quadratic form has three bands below the diagonal, so LAPACK
+factorises a flight in a millisecond. The marginal likelihood of the measurements equals the
+likelihood of KF's innovations (Schweppe 1965). It follows from log|A| and the residual squares at
+the minimum.
+
+Signals are inputs that enter linearly: the data, and the sensitivity of the data to each unknown
+constant. Each signal is a column; the factorisation does not depend on the signals. The constants
+have a prior and are marginalised by the Schur complement of the signals' inner products.
+Time-correlated noise of the source is a third state, c_{k+1} = ρ c_k + noise, in the measurement:
+z - p - c. It is independent in each segment.
 
 Symbols in shapes: m measurements, a axes, s segments, T time offsets, c constants.
 """
@@ -29,16 +32,16 @@ from scipy.linalg import lapack
 from px4fuse.arrays import Array, BoolArray, IntArray
 
 UNIT_SCALE = np.ones(1)
-# SIGMA_A (m/s²) and SIGMA_Z (m) for the smooth path that is subtracted
+# SIGMA_A (m/s²) and SIGMA_Z (m) of the smoother for the path that is subtracted
 PATH_NOISES = 0.5, 0.1
-# 1/m²; precision above which the initial position counts as known
+# Minimum precision (1/m²) of an initial position that counts as known
 MIN_KNOWN_START_PRECISION = 1e-3
-# Minimum position noise of an interval, relative to the measurement noise and to the Q of the
-# interval. It makes Q invertible for a single step (rank one) or without process noise
+# Minimum position noise of an interval, relative to the measurement noise and to the interval's Q:
+# it makes Q invertible if Q is from a single step (rank one) or zero
 MIN_NOISE_SHARE = 1e-5
 # Signals per batch; larger batches need more memory and are not faster
 SIGNAL_BATCH_SIZE = 8
-# Determinants below this fraction of their terms are rounding errors
+# Minimum determinant of Q, relative to its terms: smaller values are rounding errors
 MIN_DETERMINANT_SHARE = 1e-12
 
 
@@ -51,18 +54,18 @@ class Positions:
     measurement_m : ndarray, shape (m, a)
         NaN if an axis has no measurement.
     segment_starts : ndarray of int, shape (s,)
-        First state of each segment.
+        Index of the first measurement of each segment.
     length_s : ndarray, shape (m - 1,)
         Intervals between successive measurements, also between segments.
     noise_unit, noise_fixed : ndarray, shape (3, m - 1)
-        Elements 00, 01, 11 of Q of each interval for SIGMA_A = 1 m/s², and the part that does not
-        depend on SIGMA_A.
+        Elements 00, 01, 11 of each interval's Q: for SIGMA_A = 1 m/s², and the part of Q that does
+        not depend on SIGMA_A.
     prior_precision : ndarray, shape (m, 2)
         Prior precision of position and velocity; 0 without a prior.
     constant_sigma : ndarray, shape (c,)
-        Prior standard deviations of the constants of each segment.
+        Prior standard deviations of the unknown constants of each segment.
     delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + c, m - 1)
-        Δp and Δv of each interval, and the effect of each constant on Δp and Δv, for T time
+        Δp and Δv of each interval, then their sensitivity to each unknown constant, for T time
         offsets; ignored between segments.
     correlated_noise : (float, float) or None
         Standard deviation (m) and time constant (s) of the source's time-correlated noise.
@@ -81,7 +84,7 @@ class Positions:
 
     @cached_property
     def segments(self) -> list[tuple[int, int]]:
-        """First state of each segment, and the state after its last."""
+        """Index of each segment's first measurement, and of the measurement after its last."""
         return list(pairwise([*self.segment_starts.tolist(), len(self.measurement_m)]))
 
     @cached_property
@@ -100,7 +103,7 @@ class Positions:
         random_walk : float
             Random walk of the source / SIGMA_Z, per √s.
         weight : ndarray
-            Weight of each measurement; without that of KF's initial state, if this is the first.
+            Weight of each measurement, except a first measurement that is KF's initial state.
         """
         noise_fixed = self.noise_fixed / sigma_z_m**2
         noise_fixed[0] += self.length_s * random_walk**2
@@ -134,7 +137,8 @@ class Positions:
             ]
             axes_left = [axis for axis in axes_left if axis not in axes]
             precision = self.prior_precision.copy()
-            # a segment with fewer than two measurements gets a prior and has no likelihood
+            # fewer than two measurements in a segment do not determine its initial state: the
+            # segment gets a prior and has no likelihood
             has_too_few = np.add.reduceat(is_axis_measured.astype(int), self.segment_starts) < 2
             is_used = is_axis_measured & ~np.repeat(
                 has_too_few, np.diff([*self.segment_starts, len(is_measured)])
@@ -148,7 +152,7 @@ class Positions:
             system = factorise(
                 self.length_s, noise, self.is_joined, precision, self.correlated_noise
             )
-            # a practically unknown initial state does not count in the likelihood
+            # the weak prior of a practically unknown initial state must not count in the likelihood
             log_unknown_precision = float(np.sum(np.log(precision[(precision > 0.0) & ~is_known])))
             system = replace(system, log_determinant=system.log_determinant + log_unknown_precision)
             yield axes, system, int(np.count_nonzero(is_known)) - 2 * len(self.segment_starts)
@@ -161,12 +165,12 @@ class FittedPositions:
     Attributes
     ----------
     gram : ndarray, shape (s, T, 1 + c, 1 + c)
-        Inner products of the data and of the signals of the constants, weighted with the inverse
-        covariance.
+        Inner products of the data and of their sensitivities to the unknown constants, weighted
+        with the inverse covariance.
     log_determinant : float
     degrees_of_freedom : int
-        Number of measured positions minus the number that determines initial states. It is the
-        factor of ln(scale of all noises) in -ln p.
+        Number of measured positions minus the number needed for initial states: -ln p contains this
+        number times ln(scale of all noises).
     constant_sigma : ndarray, shape (c,)
     """
 
@@ -188,7 +192,7 @@ class FittedPositions:
         return np.asarray(-np.linalg.solve(information, self.gram[..., 1:, :1])[..., 0])
 
     def scores_by_segment(self, scales: Array = UNIT_SCALE) -> Array:
-        """Return -ln p of each segment without the determinant of the noises, shape (k, s, T).
+        """Return -ln p of each segment without the log-determinant, shape (k, s, T).
 
         Parameters
         ----------
@@ -207,7 +211,7 @@ class FittedPositions:
         )
 
     def scores(self, scales: Array = UNIT_SCALE) -> Array:
-        """Return -ln p of all segments (without a constant) for scaled noises, shape (k, T)."""
+        """Return -ln p of all segments for scaled noises, except a constant, shape (k, T)."""
         determinant_terms = 0.5 * self.log_determinant + self.degrees_of_freedom * np.log(scales)
         return np.asarray(self.scores_by_segment(scales).sum(axis=1) + determinant_terms[:, None])
 
@@ -215,7 +219,7 @@ class FittedPositions:
 def fit_positions(
     positions: Positions, sigma_a_m_s2: float, variance_m2: Array, measured_m: Array | None = None
 ) -> FittedPositions:
-    """Fit positions with one pair of noises.
+    """Fit positions with one SIGMA_A and given measurement variances.
 
     Parameters
     ----------
@@ -224,8 +228,8 @@ def fit_positions(
     variance_m2 : ndarray, shape (m,)
         Variance of each measurement.
     measured_m : ndarray, shape (a, 1 or T, 1 + c, m), optional
-        Signals of the data and of each constant; ``positions.measurement_m`` then only gives the
-        axes and times that are measured.
+        Measured positions, then their sensitivity to each unknown constant. By default
+        ``positions.measurement_m``; otherwise that only gives the axes and times with measurements.
     """
     if measured_m is None:
         states, axes = positions.measurement_m.shape
@@ -256,14 +260,15 @@ def fit_positions(
 def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
     """Subtract a smooth path through the positions from measurements and increments.
 
-    The likelihood is unchanged, but no longer the small difference of large squares, so rounding
-    errors are smaller. The path starts at zero in each segment.
+    The likelihood is unchanged in theory. Its rounding errors are smaller, because it is no longer
+    the small difference of large squares. The path starts at zero in each segment.
 
     Parameters
     ----------
     positions : Positions
     scaled : bool
-        True if the last constant is a scale of the positions: the path becomes its signal.
+        True if the last unknown constant is the scale of the positions. The path becomes the
+        sensitivity to this constant.
     """
     measured = positions.measurement_m.copy()
     dp, dv = positions.delta_position_m.copy(), positions.delta_velocity_m_s.copy()
@@ -277,7 +282,8 @@ def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
         path, speed = state[..., 0], state[..., 1]
         measured[:, axes] -= path[:, 0].T
         path_increment = np.diff(path) - positions.length_s * speed[..., :-1]
-        # the path of the first time offset is subtracted for all; a scale has the path of each
+        # the path of the first time offset is subtracted at all offsets; the sensitivity to the
+        # scale is the path of each offset
         for array, increment in ((dp, path_increment), (dv, np.diff(speed))):
             array[axes, :, 0] -= increment[:, :1]
             if scaled:
@@ -293,11 +299,11 @@ def expected_squares(
     Parameters
     ----------
     positions : Positions
-        For one time offset.
+        Positions with one time offset only.
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
     constants : ndarray, shape (s, c)
-        Maximum-likelihood estimates of the constants.
+        Maximum-likelihood estimates of the unknown constants of each segment.
 
     Returns
     -------
@@ -328,12 +334,12 @@ def products_by_segment(
     signals: Sequence[Array],
     measured_m: Array,
 ) -> Array:
-    """Return inner products of two sets of k signals by segment, with marginalised constants.
+    """Return inner products of two sets of k signals in each segment, constants marginalised.
 
     Parameters
     ----------
     positions : Positions
-        For one time offset; ``measurement_m`` only gives the axes and times that are measured.
+        One time offset only; ``measurement_m`` only gives the axes and times with measurements.
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
     signals : three ndarray, shape (a, k, m) and twice (a, k, m - 1)
@@ -350,7 +356,7 @@ def products_by_segment(
     results = []
     for begin in range(0, measured_m.shape[1], SIGNAL_BATCH_SIZE):
         batch = np.s_[:, begin : begin + SIGNAL_BATCH_SIZE]
-        # first set of signals, second set, signals of the constants
+        # columns: first set of signals, second set, sensitivities to the constants
         dp, dv = (
             np.concatenate([increment[batch], 0.0 * increment[batch], constant_signal], axis=1)[
                 :, None
@@ -382,7 +388,7 @@ def products_by_segment(
 
 @dataclass(frozen=True)
 class BandedSystem:
-    """Factorised normal equations of the states at all measurements.
+    """Factorised normal equations of the states at all measurement times.
 
     Attributes
     ----------
@@ -394,11 +400,11 @@ class BandedSystem:
     inverse_q : ndarray, shape (3, m - 1)
         Elements 00, 01, 11 of Q⁻¹; zero between segments.
     inverse_sqrt_q11 : ndarray, shape (m - 1,)
-        1/√Q₁₁, without the rounding of Q⁻¹; zero between segments.
+        1/√Q₁₁, without the rounding errors of Q⁻¹; zero between segments.
     bands, lower : ndarray, shape (2 + states, states · m)
         Bands of A and of its Cholesky factor.
     log_determinant : float
-        ln|A| + Σ ln|Q| - Σ ln precision: twice the part of -ln p without signals.
+        ln|A| + Σ ln|Q| - Σ ln precision: twice the part of -ln p that does not depend on signals.
     """
 
     precision: Array
@@ -415,10 +421,10 @@ class BandedSystem:
         return len(self.bands) - 2
 
     def whiten(self, measured_m: Array, dp: Array, dv: Array) -> tuple[tuple[Array, Array], Array]:
-        """Whiten signals, so that their inner products under the inverse covariance are simple.
+        """Whiten signals, which makes their inner products under the inverse covariance simple.
 
-        These are the products of ``intervals``, minus the products of ``explained``, plus the
-        products of the measurements over their σ (zero for most signals).
+        An inner product is the product of ``intervals``, minus the product of ``explained``, plus
+        the product of the measurements over their σ (zero for most signals).
 
         Parameters
         ----------
@@ -431,7 +437,7 @@ class BandedSystem:
         intervals : two ndarray, shape (..., m - 1)
             Whitened Δp and Δv; zero between segments.
         explained : ndarray, shape (..., states · m)
-            Part of the signals that the states explain.
+            Part of the signals that is explained by the states.
         """
         intervals, right_side = self._interval_sides(measured_m, dp, dv)
         explained, _ = lapack.dtbtrs(self.lower, right_side.T, uplo="L", overwrite_b=1)
@@ -446,7 +452,10 @@ class BandedSystem:
     def _interval_sides(
         self, measured_m: Array, dp: Array, dv: Array
     ) -> tuple[tuple[Array, Array], Array]:
-        """Return whitened intervals, and the right side of the equations, (columns, states · m)."""
+        """Return whitened intervals, and the right side of the normal equations.
+
+        The right side has shape (columns, states · m).
+        """
         i00, i01, _ = self.inverse_q
         # Q⁻¹ = UᵀU; zero between segments
         u00 = np.sqrt(i00)
@@ -468,8 +477,9 @@ class BandedSystem:
     def position_variance(self) -> Array:
         """Return the variance of each state's position given all data (m²), shape (m,).
 
-        The information about a state is the sum of the information from all earlier and from all
-        later states: blocks of the Cholesky factors from both ends (Fraser and Potter 1969).
+        The information about a state is the sum of the information from all earlier and all later
+        states. Both are blocks of Cholesky factors: of A, and of A in reversed order (Fraser and
+        Potter 1969).
         """
         # A with reversed rows and columns
         reversed_bands, size = np.zeros_like(self.bands), self.bands.shape[1]
@@ -503,9 +513,10 @@ def factorise(
     is_joined : ndarray of bool, shape (m - 1,)
         False between segments, which are independent.
     precision : ndarray, shape (m, 2)
-        Precision of the measured positions (1/m², 0 if not used), and of the prior velocity zero.
+        Precision of the measured positions (1/m², 0 if not used), and of the prior velocity zero
+        (s²/m²).
     correlated_noise : (float, float), optional
-        See :class:`Positions`; positions must then have measurements only, without priors.
+        See :class:`Positions`; ``precision`` must then not contain priors.
 
     Raises
     ------
@@ -517,7 +528,7 @@ def factorise(
     min_noise = MIN_NOISE_SHARE**2 * (
         1.0 / np.median(measured_precision[measured_precision > 0.0]) + q00
     )
-    # Q of a single step has rank one: only min_noise, which rounding can hide, makes it invertible
+    # Q of a single step has rank one and is invertible by min_noise only, which rounding can hide
     product = q00 * q11
     raw_determinant = product - q01**2
     determinant = (
@@ -547,7 +558,7 @@ def factorise(
         rho = np.where(is_joined, np.exp(-length_s / tau_s), 0.0)
         correlated_variance = correlated_sigma_m**2 * np.append(
             1.0, 1.0 - rho**2
-        )  # variance of the new part in each state
+        )  # variance of the noise that is new at each time
         correlated = columns[:, 2]
         position[:, 2] = measured_precision
         correlated[:, 0] = measured_precision + 1.0 / correlated_variance

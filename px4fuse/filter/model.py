@@ -5,11 +5,11 @@ State x = [position, velocity]; input a, the acceleration averaged over the step
     F = [[1, dt], [0, 1]]    B = [dt²/2, dt]    H = [1, 0]    R = SIGMA_Z²
     Q(dt) = SIGMA_A² · DT · [[dt³/4, dt²/2], [dt²/2, dt]]
 
-With dt = DT, Q equals the lesson's SIGMA_A² · [[dt⁴/4, dt³/2], [dt³/2, dt²]]. For other steps the
-velocity noise per second is the same, so SIGMA_A does not depend on the rate.
+With dt = DT, Q equals the lesson's SIGMA_A² · [[dt⁴/4, dt³/2], [dt³/2, dt²]]. For any other dt the
+velocity noise per second is the same, so SIGMA_A does not depend on the measurement rate.
 
-The functions accept floats (one filter, fifty times faster than arrays of one element) and arrays
-(many filters). A covariance is the tuple of its elements 00, 01, 11.
+The functions accept floats (one filter) and arrays (many filters); floats are fifty times faster
+than arrays of one element. A covariance is the tuple of its elements 00, 01, 11.
 """
 
 from typing import TypeVar
@@ -20,7 +20,7 @@ from px4fuse.arrays import Array
 
 STATES = ["position_m", "velocity_m_s"]
 COVARIANCES = ["position_variance_m2", "covariance_m2_s", "velocity_variance_m2_s2"]
-# m and m/s; the lesson's initial standard deviations, P₀ = diag(0.5², 1.0²)
+# Initial standard deviations (m, m/s) of the lesson: P₀ = diag(0.5², 1.0²)
 INITIAL_SIGMA_P_M = 0.5
 INITIAL_SIGMA_V_M_S = 1.0
 INITIAL_COVARIANCE = (INITIAL_SIGMA_P_M**2, 0.0, INITIAL_SIGMA_V_M_S**2)
@@ -53,10 +53,10 @@ def process_noise_unit(dt_s: T) -> Symmetric[T]:
 
 
 def continuous_noise_unit(dt_s: T) -> Symmetric[T]:
-    """Return the process noise of many short steps of total ``dt_s``, per SIGMA_A² · DT.
+    """Return the process noise of many short steps with the total length ``dt_s``.
 
-    Limit of ΣFQFᵀ: the position element dt³/4 of one step becomes dt³/3, because the acceleration
-    may change within the interval.
+    Unit: SIGMA_A² · DT. In the limit of ΣFQFᵀ, the position element dt³/4 of one step becomes
+    dt³/3, because the acceleration may change within the interval.
     """
     return dt_s**3 / 3.0, dt_s**2 / 2.0, dt_s
 

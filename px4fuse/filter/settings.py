@@ -8,13 +8,13 @@ from px4fuse.request import DT_S, SIGMA_A_M_S2, SIGMA_Z_M, InputName
 
 INPUT_NAMES: tuple[InputName, ...] = get_args(InputName)
 
-# Ranges of the settings: values outside are typing errors
+# Valid ranges of the settings: values outside are typing errors
 SIGMA_A_RANGE_M_S2 = (1e-4, 100.0)
 SIGMA_Z_RANGE_M = (1e-4, 100.0)
 DT_RANGE_S = (1e-3, 1.0)
 CLOCK_OFFSET_RANGE_S = (-10.0, 10.0)
 _RANGES = (SIGMA_A_RANGE_M_S2, SIGMA_Z_RANGE_M, DT_RANGE_S, CLOCK_OFFSET_RANGE_S)
-# Unit of each setting that is a number
+# Unit of each numeric setting
 UNITS = {"sigma_a_m_s2": "m/s²", "sigma_z_m": "m", "dt_s": "s", "clock_offset_s": "s"}
 
 
@@ -33,7 +33,7 @@ class Settings:
     input : {"imu", "zero"}
         Acceleration measured by the IMU, or zero: the lesson's constant-velocity model.
     clock_offset_s : float
-        Added to the timestamps of the position source.
+        Time offset added to the timestamps of the position source.
 
     Raises
     ------

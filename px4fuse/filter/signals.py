@@ -1,4 +1,6 @@
-"""Positions and acceleration of a flight along its axes.
+"""Positions and acceleration of a flight along its axes: north, east, down and aisle.
+
+The aisle is the main horizontal direction of the flight.
 
 NED acceleration = R(q) · specific force + [0, 0, g] (Groves 2013, eq. 5.52 without earth rate).
 """
@@ -19,9 +21,9 @@ from px4fuse.flight import AXIS_NAMES, Columns, Flight, PositionTrack, Unavailab
 from px4fuse.notebook_display import one_line_repr
 
 AISLE = "aisle"
-# Ratio of length to width from which a track counts as flown along an aisle
+# Minimum ratio of length to width of a track that counts as flown along an aisle
 MIN_AISLE_ELONGATION = 3.0
-# s, and number of median intervals: a longer IMU interval is a gap
+# Maximum IMU interval, in s and in median intervals: a longer interval is a gap
 IMU_GAP_S = 0.1
 IMU_GAP_INTERVALS = 5.0
 MIN_MEASUREMENTS = 3
@@ -49,13 +51,14 @@ class Acceleration:
     ----------
     time_s : ndarray, shape (n,)
     ned_m_s2 : ndarray, shape (n, 3)
-        Without gravity, for the whole flight; shared by all axes.
+        Acceleration without gravity, for the whole flight; shared by all axes.
     direction : ndarray, shape (3,)
         Unit vector in NED.
     integral_m_s : ndarray, shape (n,)
-        Integral along the axis (trapezoidal, from the first sample), for step averages.
+        Integral along the axis (trapezoidal, from the first sample); differences give the mean
+        acceleration of a prediction step.
     gap_time_s, gap_integral_s : ndarray, shape (k,)
-        Start and end times of the gaps and of the data, and accumulated gap time (s) at each.
+        Start and end times of the IMU gaps and of the IMU data; total gap time until each.
     rms_m_s2 : float
         Root mean square of the acceleration: standard deviation of the input in a gap.
     """
@@ -83,13 +86,13 @@ class Axis:
     Attributes
     ----------
     name : str
-        "north", "east", "down" or "aisle".
+        "north", "east", "down" or "aisle" (main horizontal direction of the flight).
     direction : ndarray, shape (3,)
         Unit vector in NED.
     heading_deg : float or None
         Heading of a horizontal axis, clockwise from north.
     note : str
-        Origin of the direction of the aisle; else empty.
+        Explanation of the aisle's direction; empty for other axes.
     measurement_time_s, measurement_m : ndarray, shape (n,)
         Position measurements along the axis; n ≥ 3.
     acceleration : Acceleration or Unavailable
@@ -121,8 +124,9 @@ class Axis:
 def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     """Return the acceleration in NED without gravity, at the IMU's timestamps.
 
-    Default logs contain the attitude at a tenth of the IMU's rate, so it is interpolated (slerp,
-    Shoemake 1985). The result is cached as long as the flight exists.
+    Logs with PX4's default profile contain the attitude at a tenth of the IMU's rate, so the
+    attitude is interpolated (slerp, Shoemake 1985). The result is cached as long as the flight
+    exists.
 
     Returns
     -------
@@ -163,7 +167,7 @@ def aisle_heading(track: PositionTrack, segment: Segment) -> tuple[float, float]
     Returns
     -------
     heading_deg : float
-        In [0, 180): both directions along an aisle are equivalent.
+        Heading in [0, 180): both directions along an aisle are equivalent.
     elongation : float
         Ratio of the standard deviations along and across this direction; 1 without a main
         direction.
@@ -275,14 +279,14 @@ def _axis_direction(
 def project_acceleration(
     acceleration: pd.DataFrame | Unavailable, direction: Array, segment: Segment
 ) -> Acceleration | Unavailable:
-    """Project the acceleration onto a direction, with integrals for step averages.
+    """Project the acceleration onto a direction.
 
     Parameters
     ----------
     acceleration : DataFrame, shape (n, 3), m/s², NED, or Unavailable
     direction : ndarray, shape (3,)
     segment : Segment
-        Segment over which the root mean square is computed.
+        Time span of the root mean square.
     """
     if isinstance(acceleration, Unavailable):
         return acceleration

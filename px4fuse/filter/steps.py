@@ -1,4 +1,4 @@
-"""Prediction steps of KF: the DT grid and the measurement times, with the input of each step."""
+"""Prediction steps of KF, which end at each time of the DT grid and at each measurement time."""
 
 from dataclasses import dataclass
 
@@ -10,20 +10,20 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis, step_means
 from px4fuse.flight import Unavailable
 
-# s; times within this distance are one step: timestamps have a resolution of 1 µs
+# Maximum difference (s) of times that count as equal: timestamps have a resolution of 1 µs
 MAX_SAME_TIME_S = 5e-7
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """Prediction steps of KF: the DT grid and every measurement time.
+    """Times of the DT grid and of the measurements, and the input of each step between them.
 
     Attributes
     ----------
     time_s : ndarray, shape (n,)
-        Strictly increasing; the first is the time of the initial state.
+        Strictly increasing times; the first is the time of the initial state.
     measurement_index : ndarray of int, shape (n,)
-        Index of the measurement at that time, -1 without one.
+        Index of the measurement at each time; -1 without a measurement.
     acceleration_m_s2 : ndarray, shape (n - 1,)
         Mean acceleration over each step.
     input_variance_m2_s4 : ndarray, shape (n - 1,)
@@ -40,13 +40,13 @@ class Timeline:
 
 
 def make_timeline(axis: Axis, settings: Settings, initial: InitialState | None = None) -> Timeline:
-    """Lay out the prediction steps of KF along an axis.
+    """Return the prediction steps of KF along an axis.
 
     Raises
     ------
     SettingsError
-        ``settings.input`` is "imu" and the axis has no acceleration, or no measurement follows
-        the start.
+        ``settings.input`` is "imu" and the axis has no acceleration, or no measurement is later
+        than the initial state.
     """
     start_s = axis.measurement_time_s[0] if initial is None else initial.time_s
     is_usable = axis.measurement_time_s > start_s + MAX_SAME_TIME_S

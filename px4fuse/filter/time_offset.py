@@ -1,14 +1,15 @@
 """Time offset between position source and IMU, by joint maximum likelihood.
 
-Positions with timestamps that are wrong by τ lag or lead the measured acceleration. Innovations
-hardly grow, because KF follows the positions; the difference from the acceleration shows the
-offset. So the likelihood of the positions is maximised over τ. The constants of
-:mod:`px4fuse.filter.imu_motion` that could be confused with τ are marginalised, and the likelihood
-is maximised over the noises at every τ.
+Positions with timestamps that are wrong by τ lag or lead the measured acceleration. KF follows the
+positions, so innovations hardly grow with τ. Only the comparison of positions and acceleration
+shows the offset. So the likelihood of the positions given the acceleration is maximised over τ, and
+at every τ over the noises. Constant errors that could be confused with τ (biases, tilt, scale; see
+:mod:`px4fuse.filter.imu_motion`) are marginalised.
 
-The noise of the IMU looks like motion that the positions do not follow, and is shifted by τ, too.
-It does not bias the estimate, but increases the variance of the estimate beyond the curvature of
-the likelihood. The factor is simulated and widens the interval (sandwich estimate, White 1982).
+The noise of the IMU looks like motion that the positions do not contain, and τ shifts this noise,
+too. The noise does not bias the estimate of τ, but increases its variance above the value from the
+curvature of the likelihood. The ratio of both variances is simulated and widens the interval
+(sandwich estimate, White 1982).
 """
 
 from collections.abc import Callable
@@ -39,16 +40,16 @@ from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record, Share, Span
 
 FINE_OFFSETS, CURVE_OFFSETS = 11, 121
-# Prior σ of the heading. With a wrong GNSS delay, EKF2 rotates its heading to fit the positions, by
-# 5° for 0.2 s: a narrow prior with GNSS would hide the time offset
+# Prior σ (rad) of EKF2's heading, by default and with GNSS. With a GNSS delay that is wrong by
+# 0.2 s, EKF2 rotates its heading by 5° to fit the positions: a narrow prior would hide the offset
 HEADING_SIGMA_RAD, GNSS_HEADING_SIGMA_RAD = float(CONSTANT_SIGMAS[2]), 0.2
-# s; with a wider half-interval the time offset is not determined
+# Maximum half-width (s) of the 95 % interval of a time offset that counts as determined
 MAX_HALF_INTERVAL_S = 0.15
-# s; parts with a larger σ are not used to detect a change of the offset
+# Maximum σ (s) of the offset in a part of the flight that is used to detect a change of the offset
 MAX_PART_SIGMA_S = 0.15
-# p value below which the offset changes significantly
+# Maximum p-value of a constant offset at which the offset counts as changing
 MAX_CHANGE_P = 0.005
-# Significance limit of an offset in σ: false alarm probability 0.3 %
+# Minimum significant offset, in σ: false alarm probability 0.3 %
 OFFSET_SIGMAS = 3.0
 # Number of simulations of the IMU noise
 SIMULATION_COUNT = 96
@@ -66,28 +67,29 @@ class PartOffset(Record, frozen=True):
 
 
 class Clock(Record, frozen=True, kw_only=True):
-    """Time offset to add to the timestamps of the position source, including the applied offset.
+    """Time offset to add to the logged timestamps of the position source.
 
     Attributes
     ----------
     offset_s : float
-        Maximum-likelihood estimate; negative if the timestamps are late.
+        Maximum-likelihood estimate, including ``applied_s``; negative if the timestamps are late.
     interval_s : (float, float)
-        95 % profile-likelihood interval, widened by the IMU's noise.
+        95 % profile-likelihood interval, widened for the noise of the IMU.
     sigma_s : float
-        Standard deviation from the curvature at the maximum, widened by the noise of the IMU.
+        Standard deviation from the curvature at the maximum, widened for the noise of the IMU.
     applied_s : float
         Offset already added to the timestamps.
     is_determinable : bool
-        True if the interval is closed and narrow enough.
+        True if the 95 % interval ends inside the search range and is narrow enough.
     reason : str
-        Reason if not determinable, else empty.
+        Reason why the offset is not determinable; empty if determinable.
     parts : tuple of PartOffset
-        Offsets of consecutive parts.
+        Offsets of consecutive parts of the flight.
     drift_ppm, drift_sigma_ppm : float or None
         Drift of the source's clock relative to the autopilot's; None with fewer than three parts.
     change_p_value : float or None
-        p-value of a constant offset (likelihood ratio test); None with fewer than two parts.
+        p-value of the hypothesis that the offset is constant (likelihood ratio test); None with
+        fewer than two parts.
     count : int
         Number of measurements.
     """
@@ -106,7 +108,7 @@ class Clock(Record, frozen=True, kw_only=True):
 
     @property
     def remaining_s(self) -> float:
-        """Offset that remains to be added beyond the applied one (s)."""
+        """Offset that remains to be added to the shifted timestamps: estimate minus applied (s)."""
         return self.offset_s - self.applied_s
 
     @property
@@ -121,9 +123,9 @@ class ClockOffset(Clock, frozen=True, kw_only=True, eq=False):
     Attributes
     ----------
     curve_s, curve_drop : ndarray, shape (n,)
-        Offsets, and the drop of the log-likelihood at each from its maximum.
+        Offsets, and at each offset the maximum log-likelihood minus the log-likelihood.
     sigma_a_m_s2, sigma_z_m : float
-        Noises at the maximum.
+        Noises at the maximum of the likelihood.
     """
 
     schema_type = Clock
@@ -151,12 +153,12 @@ def estimate_time_offset(
     ----------
     flight : Flight
     track : PositionTrack
-        As logged.
+        Track with the logged timestamps.
     segment : Segment
     settings : Settings
-        Its ``dt_s`` defines the unit of SIGMA_A.
+        Only ``dt_s`` and the applied offset are used: SIGMA_A refers to ``dt_s``.
     noises : Noises
-        Initial values, for a model with biases; with a random walk for a source that may drift
+        Initial values for a model with biases. The random walk is not zero if the source may drift
         (odometry).
     outlier_time_s : ndarray, optional
         Timestamps of measurements to exclude.
@@ -211,7 +213,7 @@ def estimate_time_offset(
             break
         half_width_s *= 2.0
     offset_s = _minimum_and_sigma(curve_s, scores)[0]
-    # an IMU sample is the mean over its interval, and its timestamp may be anywhere in the interval
+    # an IMU sample is the mean over an interval, and its timestamp may be anywhere in the interval
     resolution_s = 0.5 * prepared_motion.imu_interval_s
     ends_s = curve_s[0] if low_s is None else low_s, curve_s[-1] if high_s is None else high_s
     half_intervals_s = np.hypot(np.array(ends_s) - offset_s, 1.96 * resolution_s)
@@ -249,7 +251,7 @@ def estimate_time_offset(
 
 
 def _offset_grid(centre_s: float, half_width_s: float, count: int) -> Array:
-    """Return offsets from ``offset - width`` to ``offset + width``, within the search range."""
+    """Return equally spaced offsets around ``centre_s``, within the search range."""
     low, high = np.clip(
         [centre_s - half_width_s, centre_s + half_width_s], -MAX_OFFSET_S, MAX_OFFSET_S
     ).tolist()
@@ -299,11 +301,11 @@ def _profile_over_noises(
 def _simulate_variance_factor(
     prepared_motion: PreparedMotion, offset_s: float, noises: Noises, information: float
 ) -> float:
-    """Simulate noise to compute the ratio of the offset's variance to that from the curvature.
+    """Return the simulated variance of the offset over its variance from the curvature.
 
-    The score of τ is eᵀM(v + n), with e the residuals, v the velocity, n the velocity noise of the
-    IMU, M the inverse covariance with the constants marginalised. The term eᵀMn is random even
-    without motion, because e contains the same noise.
+    The score of τ is eᵀM(v + n): e are the residuals, v the velocity, n the velocity noise of the
+    IMU, and M the inverse covariance with constant errors marginalised. The term eᵀMn is random
+    even without motion, because e contains the same noise n.
     """
     positions = prepared_motion.at(offset_s)
     is_joined, count, axes = (
@@ -326,7 +328,7 @@ def _simulate_variance_factor(
     velocity_noise = np.zeros_like(error_m)
     for begin, end in positions.segments:
         np.cumsum(dv[..., begin : end - 1], axis=-1, out=velocity_noise[..., begin + 1 : end])
-    if noises.random_walk_m:  # random walk of the source: in the residuals, not in the IMU
+    if noises.random_walk_m:  # random walk of the source: only in the residuals, not in the IMU
         dp[..., is_joined] += (
             noises.random_walk_m
             * np.sqrt(positions.length_s[is_joined])
@@ -342,7 +344,7 @@ def _simulate_variance_factor(
 
 
 def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
-    """Return the minimum of a profile by a parabola, and σ from the curvature."""
+    """Return the position of a profile's minimum by a parabola, and σ from its curvature."""
     index = int(np.clip(np.argmin(profile), 1, len(grid) - 2))
     step = grid[1] - grid[0]
     shift, curvature = parabola_vertex(profile, index)

@@ -1,9 +1,9 @@
 """Maximum-likelihood SIGMA_A and SIGMA_Z with 95 % intervals, and a held-out check.
 
-Constant errors are not noise. With IMU data, biases, tilt and time offset are therefore fitted, too
-(:mod:`px4fuse.filter.imu_motion`): SIGMA_A is then the noise of the acceleration, and SIGMA_Z the
-noise of the source. KF has no states for biases, so KF needs a larger SIGMA_A, which is estimated
-separately.
+Constant errors are not noise. With IMU data, biases, tilt and time offset are therefore also fitted
+(:mod:`px4fuse.filter.imu_motion`). SIGMA_A is then the noise of the acceleration alone, and SIGMA_Z
+the noise of the position source. KF has no states for biases and needs a larger SIGMA_A, which is
+estimated separately.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ from px4fuse.record import Count, NotNegative, OrUnavailable, Record
 
 HORIZONTAL = "horizontal"
 NoiseInterval = tuple[NotNegative, NotNegative | None]
-# Points per side of the likelihood map
+# Number of grid points along each side of the likelihood map
 GRID_SIZE = 40
 # Extent of the likelihood map on each side, in σ of the estimate
 MAP_SIGMAS = 4.5
 MIN_MEASUREMENTS = 30
 MAX_OUTLIER_SHARE = 0.3
-# Initial values: factors on KF's SIGMA_A, and random walk of a drifting source (m/√s)
+# Initial values of the fit: factors on KF's SIGMA_A, and random walk of a drifting source (m/√s)
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 START_RANDOM_WALK_M = 0.02
-# Factor; a value within this factor of an end of the search range counts as at the end
+# Maximum ratio of a value to an end of the search range at which it counts as at the end
 MAX_SEARCH_END_RATIO = 1.001
 
 
@@ -63,8 +63,8 @@ class Noise(Record, frozen=True):
     value : float or None
         Estimate; None if the likelihood has its maximum at zero or beyond the search range.
     low, high : float or None
-        Ends of the 95 % profile-likelihood interval; ``low`` is None if the value may be zero,
-        ``high`` None without an upper bound.
+        Ends of the 95 % profile-likelihood interval. ``low`` is None if the parameter may be zero;
+        ``high`` is None if the likelihood gives no upper bound.
     """
 
     value: float | None
@@ -86,7 +86,7 @@ class Noise(Record, frozen=True):
 
 @dataclass(frozen=True)
 class LikelihoodMap:
-    """Drop of the log-likelihood from its maximum, shape (n, m), for n SIGMA_A and m SIGMA_Z."""
+    """Maximum minus value of the log-likelihood, shape (n, m), for n SIGMA_A and m SIGMA_Z."""
 
     sigma_a_m_s2: Array
     sigma_z_m: Array
@@ -96,17 +96,17 @@ class LikelihoodMap:
 
 
 class HeldOutCheck(Record, frozen=True):
-    """Held-out check: noises estimated on the first half, evaluated on the second.
+    """Held-out check: noises estimated on the first half of the flight, tested on the second.
 
     Attributes
     ----------
     sigma_a_m_s2, sigma_z_m : float
         Estimates from the first half.
     count : int
-        Measurements of the second half.
+        Number of measurements in the second half.
     log_likelihood_gain_per_measurement : float
-        Gain of log-likelihood per measurement of the second half over the chosen settings; positive
-        if tuning improves data that were not used for it.
+        Log-likelihood per measurement of the second half with the estimates, minus that with the
+        chosen settings. Positive if tuning also improves data that were not used for it.
     """
 
     sigma_a_m_s2: NotNegative
@@ -119,27 +119,28 @@ class NoiseEstimate(Record, frozen=True, kw_only=True):
     """Noises of one axis, or of the horizontal axes together, with 95 % intervals.
 
     A value is None if the likelihood has its maximum at an end of the search range; the interval
-    then contains the bound. The lower end of an interval is 0 if the noise may be zero, the upper
-    end None without a bound.
+    then gives the bound. The lower end of an interval is 0 if the noise may be zero. The upper end
+    is None without an upper bound.
 
     Attributes
     ----------
     sigma_a_m_s2, sigma_z_m : float or None
-        Noise without biases and tilt, if the IMU data are sufficient to estimate these.
+        Noise without the effect of biases and tilt, if the IMU data are sufficient to fit biases
+        and tilt.
     sigma_a_two_state_m_s2 : float or None
-        SIGMA_A that KF needs at this SIGMA_Z, because KF has no states for biases.
+        SIGMA_A that KF needs with ``sigma_z_m``; larger, because KF has no states for biases.
     log_likelihood_gain_per_measurement : float
-        Gain of log-likelihood per measurement of KF with ``sigma_a_two_state`` and ``sigma_z`` over
-        the chosen settings.
+        Log-likelihood of KF per measurement with ``sigma_a_two_state`` and ``sigma_z``, minus that
+        with the chosen settings.
     before, after : Consistency or Unavailable
-        Consistency of KF with the chosen and with the estimated settings, without outliers; along
-        the first axis of several.
+        Consistency of KF with the chosen and with the estimated settings, without outliers. With
+        several axes, only along the first.
     count, outliers : int
-        Measurements, and those with an outlier probability above 0.5.
+        Number of measurements, and of measurements with an outlier probability above 0.5.
     held_out : HeldOutCheck or Unavailable
     biases_fitted : bool
-        True if biases and tilt were fitted; if the IMU rate is too low for that, KF's SIGMA_A is an
-        upper bound of the noise.
+        True if biases and tilt were fitted. False if the IMU rate is too low; KF's SIGMA_A is then
+        an upper bound of the noise.
     """
 
     sigma_a_m_s2: NotNegative | None = None
@@ -180,9 +181,9 @@ class AxisTuning(NoiseEstimate, frozen=True, kw_only=True, eq=False, dict=True):
     name : str
     outlier_time_s : ndarray, shape (k,)
     noises : Noises
-        Maximum-likelihood noises, with the random walk of a drifting source.
+        Maximum-likelihood noises, including the random walk of a drifting source.
     make_map : callable
-        Computes :attr:`map` on demand; it takes as long as a fit.
+        Function that computes :attr:`map` on demand, because the map takes as long as a fit.
     """
 
     schema_type = NoiseEstimate
@@ -195,7 +196,7 @@ class AxisTuning(NoiseEstimate, frozen=True, kw_only=True, eq=False, dict=True):
 
     @cached_property
     def map(self) -> LikelihoodMap:
-        """Likelihood of KF around its maximum."""
+        """Map of KF's likelihood around the maximum."""
         return self.make_map()
 
 
@@ -214,7 +215,7 @@ def tune(
     ----------
     axes : tuple of Axis
     settings : Settings
-        ``dt_s`` and ``input`` are used; the estimates are compared with the chosen noises.
+        ``dt_s`` and ``input`` are used. The estimates are compared with its SIGMA_A and SIGMA_Z.
     names : tuple of str, optional
         Axis names and "horizontal"; default: all.
     progress : callable
@@ -260,9 +261,9 @@ def tune_axes(
     ----------
     name : str
     axes : tuple of Axis
-        With the same measurement times.
+        Axes with the same measurement times.
     settings : Settings
-        ``dt_s`` and ``input`` are used; the estimates are compared with the chosen noises.
+        ``dt_s`` and ``input`` are used. The estimates are compared with its SIGMA_A and SIGMA_Z.
     flight : Flight, optional
         Its IMU data separate biases and tilt from noise.
     drifts : bool
@@ -277,10 +278,10 @@ def tune_axes(
     axis_positions = [filter_positions(interval_input) for interval_input in intervals]
     chosen_noises = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
     kf_fit = maximise_likelihood(axis_positions, chosen_noises, np.ones(count))
-    motion_fit = None  # with the IMU's constants and the time offset
+    motion_fit = None  # fit with biases, tilt and time offset
     if flight is not None and settings.input == "imu":
         measured_m = np.column_stack([axis.measurement_m for axis in axes])
-        # KF starts at the first measurement, so the fit of KF has no weight for it
+        # KF starts at the first measurement, so the fit of KF has no weight for that measurement
         weight = np.concatenate([np.ones(len(measured_m) - count), kf_fit.weight])
         axis_directions = np.array([axis.direction for axis in axes])
         time_s, dt_s = axes[0].measurement_time_s, settings.dt_s
@@ -378,7 +379,7 @@ def _noise_with_interval(
     search_range: tuple[float, float],
     variance_factor: float = 1.0,
 ) -> Noise:
-    """Return a noise with its interval; the value is None if the maximum is at an end."""
+    """Return a noise with its interval; the value is None at an end of the search range."""
     value = float(np.exp(best_logs[0]))
     low, high = profile_ends(score, best_logs, search_range, variance_factor)
     is_inside = (
@@ -395,7 +396,7 @@ def _make_map(
     sigma_z: Noise,
     best_noises: Noises,
 ) -> LikelihoodMap:
-    """Compute the likelihood of KF around its maximum."""
+    """Compute the map of KF's likelihood around the maximum."""
     grids = []
     for noise, best_value, (low, high) in (
         (sigma_a, best_noises.sigma_a_m_s2, SIGMA_A_SEARCH_M_S2),
@@ -423,7 +424,7 @@ def _assess_innovations(
 def _check_held_out(
     name: str, intervals: list[Preintegrated], chosen_noises: Noises, fit: NoiseFit
 ) -> HeldOutCheck | Unavailable:
-    """Estimate the noises on the first half and evaluate them on the second."""
+    """Estimate the noises on the first half of the measurements and test them on the second."""
     half_count = len(fit.weight) // 2
     if half_count < MIN_MEASUREMENTS:
         return Unavailable(
@@ -438,7 +439,7 @@ def _check_held_out(
     ]
     first_fit = maximise_likelihood(first_half, fit.noises, fit.weight[:half_count], outliers=False)
     tuned_noises = first_fit.noises
-    # -ln p of the second half given the first
+    # -ln p of the second half given the first: -ln p of all minus -ln p of the first half
     scores = [
         fit.score(noises) - first_fit.score(noises) for noises in (chosen_noises, tuned_noises)
     ]

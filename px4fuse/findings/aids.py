@@ -3,27 +3,59 @@
 Position and height of external vision are tested by the other detectors, which replay EKF2.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.ekf2.aids import NOT_FUSED_LIMIT_S, WINDOW_S, AidResult
 from px4fuse.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
-from px4fuse.findings.model import Findings, format_percent, note, warning
+from px4fuse.findings.model import Findings, finding, format_percent, note, warning
 from px4fuse.flight import Unavailable
-from px4fuse.text import format_factor, format_number
+from px4fuse.record import Span
+from px4fuse.text import capitalise_first, format_number, format_ratio
 
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
+# s after take-off; EKF2 does not fuse the barometer while the ground disturbs the pressure
+TAKE_OFF_S = 10.0
+# Ratio of the largest height error in a gap to the RMSE of the rest, from which the gap matters
+MIN_HEIGHT_ERROR_RATIO = 3.0
+# Possible causes by switch of the sensor
+CHECKS = {
+    "EKF2_BARO_CTRL": "Shield the barometer from propeller wash and light.",
+    "EKF2_GPS_CTRL": "Give the antenna a free view of the sky.",
+    "EKF2_RNG_CTRL": "Fly within the range of the distance sensor.",
+    "EKF2_OF_CTRL": "Fly over a textured and lit floor.",
+    "EKF2_MAG_TYPE": "Mount the magnetometer away from motors and power cables.",
+    "EKF2_EV_CTRL": "Restore line of sight and link of the position source.",
+}
+OTHER_CHECK = "Check mounting and power supply of the sensor."
 
 
 def detect(analysis: Analysis) -> Findings:
     """Detect faults of the aids of a compared flight."""
-    if not isinstance(analysis.aids, Unavailable):
-        source_aid = analysis.source.origin.aid
-        yield from detect_in_aids(analysis.aids, "" if source_aid is None else source_aid.name)
+    if isinstance(analysis.aids, Unavailable):
+        return
+    aid = analysis.source.origin.aid
+    airborne = analysis.flight.airborne
+    take_off_s = [] if isinstance(airborne, Unavailable) else [start for start, _ in airborne]
+    barometer = analysis.aids.get(BAROMETER.name)
+    height_error_m = (
+        None if barometer is None else _height_error_in(analysis, barometer.longest_gap_s)
+    )
+    yield from detect_in_aids(
+        analysis.aids, "" if aid is None else aid.name, take_off_s, height_error_m
+    )
 
 
-def detect_in_aids(aids: Mapping[str, AidResult], source_aid: str = "") -> Findings:
+def detect_in_aids(
+    aids: Mapping[str, AidResult],
+    source_aid: str = "",
+    take_off_s: Sequence[float] = (),
+    height_error_m: float | None = None,
+) -> Findings:
     """Yield at most one finding per aid; aids of one sensor that are not fused share one finding.
 
     Parameters
@@ -31,30 +63,39 @@ def detect_in_aids(aids: Mapping[str, AidResult], source_aid: str = "") -> Findi
     aids : mapping from aid name to AidResult
     source_aid : str
         Aid whose positions KF also uses; the other detectors test its variance.
+    take_off_s : sequence of float
+        Times of take-off.
+    height_error_m : float or None
+        Height error that grew while the barometer was not fused; None if it did not, or is unknown.
     """
     tested_aids = {name: aid for name, aid in aids.items() if name not in AIDS_OF_OTHER_DETECTORS}
     not_fused: dict[str, list[AidResult]] = {}
     for name, aid in tested_aids.items():
-        if aid.verdict == "not_fused":
+        is_usual = name == BAROMETER.name and any(
+            start <= aid.longest_gap_s[0] <= start + TAKE_OFF_S for start in take_off_s
+        )
+        if aid.verdict == "not_fused" and not is_usual:
             not_fused.setdefault(AIDS[name].switch or name, []).append(aid)
     for switch, aids_of_sensor in not_fused.items():
         longest_unfused = max(aids_of_sensor, key=lambda aid: aid.longest_gap_duration_s)
         labels = ", ".join(_aid_label(aid) for aid in aids_of_sensor)
         has_change = any(axis.change for aid in aids_of_sensor for axis in aid.axes.values())
-        cause = _sensor_cause(switch, source_aid) or (CHANGE if has_change else "")
-        yield warning(
+        is_barometer, effect = switch == BAROMETER.switch, ""
+        if is_barometer and height_error_m is not None:
+            effect = f": height error {height_error_m:.2f} m"
+        yield finding(
+            "note" if is_barometer and not effect else "warning",
             "aid_not_fused",
-            f"EKF2 fused no sample of {labels} for {longest_unfused.longest_gap_duration_s:.0f} s, "
-            f"although fusion was enabled. The limit is {NOT_FUSED_LIMIT_S:g} s; "
-            f"{format_percent(longest_unfused.rejected_fraction, 1)} of the samples were rejected. "
-            "EKF2 relied on its other aids and the IMU, so its error grew.",
-            "Check the sensor at that time (reception, range, light). Check whether EKF2 rejected "
-            "its samples.",
+            f"EKF2 fused no sample of {labels} for {longest_unfused.longest_gap_duration_s:.0f} s"
+            f"{effect}. Fusion was enabled; the limit is {NOT_FUSED_LIMIT_S:g} s, and "
+            f"{format_percent(longest_unfused.rejected_fraction)} of the samples were rejected. "
+            "EKF2 relied on its other aids and the IMU.",
+            CHECKS.get(switch, OTHER_CHECK),
             {
                 "aid": labels,
                 "longest_gap_s": longest_unfused.longest_gap_duration_s,
                 "rejected_fraction": longest_unfused.rejected_fraction,
-                CAUSE: cause,
+                CAUSE: _sensor_cause(switch, source_aid) or (CHANGE if has_change else ""),
             },
             (longest_unfused.longest_gap_s,),
         )
@@ -64,16 +105,17 @@ def detect_in_aids(aids: Mapping[str, AidResult], source_aid: str = "") -> Findi
             for axis, axis_result in aid.axes.items()
             if axis_result.change is not None
         }
-        label = _aid_label(aid)
-        if changes and not _sensor_cause(AIDS[name].switch, source_aid):
+        label, switch = _aid_label(aid), AIDS[name].switch
+        if changes and not _sensor_cause(switch, source_aid):
             axis, (time_s, shift) = max(changes.items(), key=lambda item: abs(item[1][1]))
+            s_sqrt = aid.axes[axis].s_sqrt_median
             yield warning(
                 "aid_innovation_shift",
-                f"The mean innovation of {label} shifts by {abs(shift):.1f} √S at about "
-                f"{time_s:.0f} s ({axis}). From then on this aid and the other aids contradict "
-                "each other, until the EKF2 states absorb the difference.",
-                "Check for a disturbance of the sensor at that time (current, metal, propeller "
-                "wash, heat).",
+                f"{capitalise_first(label)}: the {axis} innovation shifts by "
+                f"{format_number(abs(shift) * s_sqrt, 2)} {aid.unit} at {time_s:.0f} s. The mean "
+                f"before and after differs by {abs(shift):.1f} √S (√S {format_number(s_sqrt, 2)} "
+                f"{aid.unit}). EKF2 changes its states until the innovation is small again.",
+                f"Check what was switched, moved or passed near the sensor at {time_s:.0f} s.",
                 {"aid": name, "axis": axis, "time_s": time_s, "moved": shift},
                 ((time_s, time_s + WINDOW_S),),
             )
@@ -85,18 +127,17 @@ def detect_in_aids(aids: Mapping[str, AidResult], source_aid: str = "") -> Findi
                 action = f"increase {noise_parameter}"
             yield warning(
                 "aid_overconfident",
-                f"EKF2 is overconfident about {label}: σ is {format_factor(aid.nis_mean**0.5)} "
-                f"times too small. The mean NIS is {format_number(aid.nis_mean)} (expected 1); "
-                f"{format_percent(aid.rejected_fraction, 1)} of the samples were rejected. The "
+                f"EKF2 is overconfident about {label}: σ is {format_ratio(aid.nis_mean**0.5)} "
+                f"times too small. The mean NIS is {format_number(aid.nis_mean)} (expected 1), and "
+                f"{format_percent(aid.rejected_fraction)} of the samples are rejected. The "
                 f"errors of this aid are larger than R{_format_noise(aid)}, or another aid is "
                 "wrong.",
-                "First check outliers, delay and mounting of the sensor, and the other aids. If "
-                f"the sensor is noisier than assumed, {action}.",
+                f"Check delay and mounting of the sensor first. Then {action}.",
                 {
                     "aid": name,
                     "nis_mean": aid.nis_mean,
                     "rejected_fraction": aid.rejected_fraction,
-                    CAUSE: _sensor_cause(AIDS[name].switch, source_aid),
+                    CAUSE: _sensor_cause(switch, source_aid),
                 },
             )
         elif aid.verdict == "biased":
@@ -105,12 +146,11 @@ def detect_in_aids(aids: Mapping[str, AidResult], source_aid: str = "") -> Findi
             )
             yield note(
                 "aid_innovation_bias",
-                f"The innovations of {label} have a mean of "
-                f"{format_number(worst_axis.innovation_mean)} {aid.unit} ({axis}; √S is "
+                f"{capitalise_first(label)}: the {axis} innovation has a mean of "
+                f"{format_number(worst_axis.innovation_mean)} {aid.unit} (√S "
                 f"{format_number(worst_axis.s_sqrt_median)} {aid.unit}). This aid and another one "
                 "contradict each other.",
-                "Find the wrong aid: check calibration, mounting and interference. Changing noises "
-                "does not correct a bias.",
+                "Calibrate the sensor. Changing noises does not correct a bias.",
                 {
                     "aid": name,
                     "axis": axis,
@@ -118,6 +158,24 @@ def detect_in_aids(aids: Mapping[str, AidResult], source_aid: str = "") -> Findi
                     "s_sqrt_median": worst_axis.s_sqrt_median,
                 },
             )
+
+
+def _height_error_in(analysis: Analysis, span_s: Span) -> float | None:
+    """Return EKF2's largest height error (m) in a span; None if unknown, or usual in the flight."""
+    down = analysis.axes.get("down")
+    if down is None or isinstance(down.ekf2_state, Unavailable):
+        return None
+    if not isinstance(down.truth, pd.DataFrame):
+        return None
+    height_m, true = down.ekf2_state["position_m"], down.truth["position_m"]
+    error_m = np.abs(height_m - np.interp(height_m.index, true.index, true, np.nan, np.nan))
+    is_inside = (error_m.index >= span_s[0]) & (error_m.index <= span_s[1])
+    inside, outside = error_m[is_inside].dropna(), error_m[~is_inside].dropna()
+    if not len(inside) or not len(outside):
+        return None
+    rmse_m = float(np.sqrt(np.mean(outside**2)))
+    largest_m = float(inside.max())
+    return largest_m if largest_m > MIN_HEIGHT_ERROR_RATIO * rmse_m else None
 
 
 def _aid_label(aid: AidResult) -> str:

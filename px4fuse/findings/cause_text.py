@@ -1,35 +1,26 @@
-"""Text of a cause that a re-run has shown: the change, its effect, and the action."""
+"""Text of a change that a re-run tests: the kind of cause, the change, and the action."""
 
 from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison import causal_replays, remedy
+from px4fuse.comparison import causal_replays
 from px4fuse.comparison.causal_replays import Intervention
+from px4fuse.comparison.model import FilterName
+from px4fuse.comparison.remedy import aid_of, format_settings
+from px4fuse.comparison.trials import improvement
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import UNITS
 from px4fuse.findings import cause_grouping as kinds
 from px4fuse.flight import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
-from px4fuse.text import capitalise_first, format_number
-
-# Findings that state the same fault as a re-run, by kind of cause; the summary omits them
-FINDINGS_OF_CAUSE: Mapping[str, frozenset[str]] = {
-    kinds.OUTLIERS: frozenset(("source_outliers",)),
-    kinds.CLOCK: frozenset(("source_time_offset", "ekf2_ev_delay_wrong")),
-    kinds.FRAME: frozenset(("source_frame_misaligned", "ekf2_heading_error")),
-    kinds.GATE: frozenset(("ekf2_gate_too_small",)),
-    kinds.ACCELEROMETER: frozenset(("accelerometer_bias",)),
-}
-# Test of a re-run by kind of cause; for other kinds the mean NIS must be nearer to 1
-REMEDY_TESTS = {kinds.CLOCK: remedy.delay_helps, kinds.GATE: remedy.rejects_less}
 
 
 def classify_cause(analysis: Analysis, cause: Intervention | None) -> str:
     """Return the kind of a cause; of several changes, that of the source determines the kind."""
     if cause is None:
         return kinds.ELSEWHERE
-    aid = remedy.aid_of(analysis)
+    aid = aid_of(analysis)
     kind_by_change = {
         causal_replays.OUTLIERS: kinds.OUTLIERS,
         causal_replays.CLOCK_OFFSET: kinds.CLOCK,
@@ -45,9 +36,12 @@ def classify_cause(analysis: Analysis, cause: Intervention | None) -> str:
     )
 
 
-def format_rerun(analysis: Analysis, cause: Intervention) -> str:
-    """Format a re-run: "re-run with SIGMA_Z 0.4 m instead of 0.1 m: mean NIS 16 → 1 ..."."""
-    return f"re-run with {format_change(analysis, cause)}: {format_effect(cause)}"
+def is_refuted(analysis: Analysis, owner: FilterName, cause: Intervention) -> bool:
+    """Return True if the re-run of a cause along the main axis improves nothing."""
+    return any(
+        (trial.filter, trial.change) == (owner, cause.change) and improvement(trial) == "nothing"
+        for trial in analysis.trials
+    )
 
 
 def format_change(analysis: Analysis, cause: Intervention) -> str:
@@ -73,54 +67,41 @@ def format_explained_share(cause: Intervention) -> str:
     )
 
 
-def format_remedy(analysis: Analysis, cause: Intervention) -> str:
-    """Format the action against a cause, one sentence per change."""
-    actions, change = [], dict(cause.change)
+def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
+    """Format the action that a re-run with a change confirms, one sentence per change."""
+    actions, change = [], dict(change)
     is_gnss = analysis.source.origin.is_gnss
     if change.pop(causal_replays.OUTLIERS, None):
-        check = "place of the antenna" if is_gnss else "line of sight, anchor survey"
-        actions.append(f"Remove the outliers ({check}). Do not increase a noise for outliers.")
+        place = "Give the antenna a free view of the sky" if is_gnss else "Restore line of sight"
+        actions.append(f"{place}, or remove the outliers at the sender.")
     if change.pop(causal_replays.FORWARD_BIAS, None) is not None:
         actions.append("Calibrate the accelerometer and the level horizon.")
         change.pop(causal_replays.RIGHT_BIAS)
     if turn_deg := change.pop(causal_replays.ROTATION, None):
         # GNSS positions refer to true north, so EKF2's heading is wrong
         actions.append(
-            f"Calibrate the magnetometer (heading error {turn_deg:+.0f}°), away from metal."
+            "Calibrate the magnetometer, away from metal."
             if is_gnss
             else f"Rotate the positions by {turn_deg:+.0f}° before they are sent."
         )
-    settings = (causal_replays.SIGMA_Z, causal_replays.SIGMA_A, causal_replays.CLOCK_OFFSET)
-    options = [
-        f"{COMPARISON_OPTIONS[name]} {change.pop(name):g}" for name in settings if name in change
-    ]
+    if (offset_s := change.pop(causal_replays.CLOCK_OFFSET, None)) is not None:
+        verb = f"Subtract {-offset_s:.3f} s from" if offset_s < 0 else f"Add {offset_s:.3f} s to"
+        actions.append(f"{verb} the timestamps at the sender.")
+    settings = {name: change.pop(name) for name in causal_replays.SETTING_CHANGES & change.keys()}
     if change:
-        actions.append(f"Set {remedy.format_settings(change)}.")
-    if options:
-        actions.append(f"Re-run with {remedy.COMMAND} {' '.join(options)}.")
+        actions.append(f"Set {format_settings(change)}.")
+    if settings:
+        actions.append(format_kf_settings(settings))
     return " ".join(actions)
 
 
-def format_effect(cause: Intervention) -> str:
-    """Format the statistic before and after a re-run."""
-    if cause.statistic == "difference":
-        return f"difference KF - EKF2 {cause.before:.2f} → {cause.after:.2f} m RMS"
-    power = 1.0 if cause.statistic == "nis" else 0.5
-    before, after = (format_number(value**power, 2) for value in (cause.before, cause.after))
-    label = "mean NIS" if cause.statistic == "nis" else "RMS of error / reported σ"
-    return f"{label} {before} → {after} (expected 1)"
-
-
-def format_remedy_of_ekf2(analysis: Analysis, cause: Intervention) -> str:
-    """Format the action against a cause in EKF2, with its replayed effect on the whole flight."""
-    if not cause.change.keys() <= PARAMETERS.keys():
-        return format_remedy(analysis, cause)
-    return remedy.format_ekf2_remedy(
-        analysis.ekf2_model,
-        cause.change,
-        REMEDY_TESTS.get(classify_cause(analysis, cause), remedy.noise_helps),
-        fallback_remedy=f"{capitalise_first(format_rerun(analysis, cause))}.",
+def format_kf_settings(settings: Mapping[str, float]) -> str:
+    """Format settings of KF as an action, with their options."""
+    texts = (
+        f"{name[:7].upper()} to {value:g} {UNITS[name]} ({COMPARISON_OPTIONS[name]} {value:g})"
+        for name, value in sorted(settings.items())
     )
+    return f"Set {' and '.join(texts)}."
 
 
 def _format_one_change(analysis: Analysis, cause: Intervention, name: str) -> str:

@@ -6,12 +6,13 @@ KF takes SIGMA_Z from the same parameter on GNSS, so both filters may have the f
 import math
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import Trial, distance_from_one
-from px4fuse.comparison.remedy import aid_of
+from px4fuse.comparison.remedy import aid_of, format_settings
+from px4fuse.comparison.trials import Trial, find_trial, ratio_pairs
+from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Findings, Severity, finding, format_percent
-from px4fuse.flight import Unavailable
+from px4fuse.flight import Unavailable, source_name
 from px4fuse.text import format_factor
 
 # Ratio of the noises from which the finding is an error; below, EKF2 works nearly as well
@@ -23,52 +24,48 @@ MIN_NAMED_REJECTION = 0.05
 def detect(analysis: Analysis) -> Findings:
     """Detect a measurement noise whose change brings EKF2's innovations into their band."""
     aid = aid_of(analysis)
-    trials = [
-        trial
-        for trial in analysis.trials
-        if trial.filter == "ekf2" and trial.kinds == ("noise",) and _corrects_innovations(trial)
-    ]
-    if not trials:
+    trial = find_trial(analysis.trials, "ekf2", "noise", aid.noise)
+    if trial is None or not _corrects_innovations(trial):
         return
-    best = min(trials, key=lambda trial: distance_from_one(trial.after))
     assert not isinstance(analysis.ekf2_model, Unavailable)  # a trial of EKF2 needs its model
-    flown_m, estimate_m = analysis.ekf2_model.inputs.settings[aid.noise], best.change[aid.noise]
+    flown_m, estimate_m = analysis.ekf2_model.inputs.settings[aid.noise], trial.change[aid.noise]
     ratio, is_small = estimate_m / flown_m, estimate_m > flown_m
-    size = max(ratio, 1.0 / ratio)
-    rejected = best.before.rejected_fraction or 0.0
-    effect = (
-        f": EKF2 rejects {format_percent(rejected)} of the positions"
-        if rejected >= MIN_NAMED_REJECTION
-        else ""
+    size, direction = max(ratio, 1.0 / ratio), "small" if is_small else "large"
+    sensor = source_name(analysis.source)
+    is_shared = analysis.source.origin.is_gnss and math.isclose(
+        analysis.settings.sigma_z_m, flown_m, rel_tol=1e-2
     )
-    direction = "small" if is_small else "large"
-    tuned = analysis.tuning.get(HORIZONTAL)
-    interval = ""
+    rejected = analysis.main.rejected_fraction or 0.0
+    if rejected >= MIN_NAMED_REJECTION:
+        effect = f": EKF2 rejects {format_percent(rejected)} of the positions"
+        reason = f"EKF2 takes ordinary {sensor} noise for outliers, rejects it and uses the IMU."
+    else:
+        effect, reason = "", f"The gain and the σ of EKF2 are too {direction}."
+        if is_small:
+            reason = "The gain of EKF2 is too large, and its σ too small."
+    title = f"{aid.noise} is {format_factor(size)} times too {direction}{effect}"
+    if is_small and flown_m == PARAMETERS[aid.noise].default:  # nobody chose it: name the sensor
+        who = "both filters assume" if is_shared else "EKF2 assumes"
+        title = f"{sensor} noise is {format_factor(size)} times what {who}{effect}"
+    interval, tuned = "", analysis.tuning.get(HORIZONTAL)
     if isinstance(tuned, AxisTuning) and tuned.sigma_z.low and tuned.sigma_z.high:
         interval = f" (95 % {tuned.sigma_z.low:.3g} to {tuned.sigma_z.high:.3g} m)"
-    consequence = (
-        "EKF2 takes ordinary noise of the source for outliers, rejects it and relies on the IMU."
-        if is_small and effect
-        else "EKF2 weights the positions too much and reports a σ that is too small."
-        if is_small
-        else "EKF2 weights the positions too little and reports a σ that is too large."
-    )
     severity: Severity = "error" if size >= MIN_RATIO_ERROR else "warning"
     yield finding(
         severity,
         f"ekf2_noise_too_{direction}",
-        f"{aid.noise} is {format_factor(size)} times too {direction}{effect}. {aid.noise} is "
-        f"{flown_m:g} m; the maximum-likelihood estimate is {estimate_m:.3g} m{interval}. "
-        f"{consequence}",
-        f"Set {aid.noise} to {estimate_m:g} m.",
+        f"{title}. {aid.noise} {flown_m:g} m; maximum-likelihood estimate {estimate_m:.3g} m"
+        f"{interval}. {reason}{f' KF takes SIGMA_Z from {aid.noise}.' if is_shared else ''}",
+        f"Set {format_settings(trial.change)}.",
         {"flown_m": flown_m, "estimate_m": estimate_m, "factor": ratio},
     )
 
 
 def _corrects_innovations(trial: Trial) -> bool:
     """Return True if the change brings the ratio against the source into its band."""
-    before, after = trial.before.nis_mean, trial.after.nis_mean
-    if before is None or after is None:
-        return False
-    words = [classify_ratio(math.sqrt(mean), "source") for mean in (before, after)]
-    return words[0] != "consistent" and words[1] == "consistent"
+    return any(
+        classify_ratio(before, against) != "consistent"
+        and classify_ratio(after, against) == "consistent"
+        for against, before, after in ratio_pairs(trial)
+        if against == "source"
+    )

@@ -3,24 +3,17 @@
 import math
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison import remedy
-from px4fuse.comparison.causal_replays import find_cause
-from px4fuse.ekf2_parameters import GNSS_POS, Aid
-from px4fuse.findings.cause_text import format_remedy_of_ekf2
+from px4fuse.comparison.model import AxisComparison
+from px4fuse.comparison.remedy import aid_of
+from px4fuse.comparison.trials import Trial, improvement, preference
+from px4fuse.ekf2_parameters import GNSS_POS
+from px4fuse.findings.cause_text import format_action
 from px4fuse.findings.model import Finding, Findings, finding, format_percent, zero_length_spans
 from px4fuse.flight import Ekf2, Unavailable
 
 REJECTED_SHARE_WARNING = 0.01  # of the innovations; a gate of 5 √S rejects 6e-7 if consistent
 REJECTED_SHARE_ERROR = 0.20  # of the innovations; usually R or the time offset is wrong
-
-
-def format_default_remedy(aid: Aid) -> str:
-    """Format the action if no replay shows which change helps."""
-    return (
-        f"First set {aid.noise} to the source's noise. Then remove outliers"
-        f"{'' if aid == GNSS_POS else ' (line of sight)'} and check the time offset ({aid.delay}). "
-        f"Widen {aid.gate} last."
-    )
+MAX_REJECTED_RATIO = 0.5  # rejected share after over before a change that prevents rejections
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -37,50 +30,55 @@ def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> F
         # EKF2 accepts a sample if the normal innovations of both axes are inside: erf(gate/√2)²
         expected = 1.0 - math.erf(ekf2.gate / math.sqrt(2.0)) ** 2
         if expected >= REJECTED_SHARE_WARNING:
-            aid = remedy.aid_of(analysis)
+            aid = aid_of(analysis)
             rejected = float(rejections[0].evidence["rejected_fraction"])
             yield finding(
                 rejections[0].severity,
                 "ekf2_gate_too_small",
-                f"{aid.gate} is {ekf2.gate:g}. This gate rejects {format_percent(expected)} of the "
-                "samples of a source with the assumed noise; in this flight EKF2 rejected "
-                f"{format_percent(rejected)}. Rejected samples do not correct EKF2.",
-                f"Set {aid.gate} to {aid.default_gate:g} (PX4's default), then check the other "
-                "findings again.",
+                f"{aid.gate} {ekf2.gate:g} is too small: EKF2 rejects {format_percent(rejected)} "
+                f"of the positions. This gate rejects {format_percent(expected)} of the samples of "
+                "a source with the assumed noise. Rejected samples do not correct EKF2.",
+                f"Set {aid.gate} to {aid.default_gate:g} (PX4's default).",
                 {"gate": ekf2.gate, "rejected_by_gate": expected},
             )
 
 
 def _detect_rejections(analysis: Analysis) -> Findings:
-    """Detect rejections; EKF2 rejects north and east together, so one of them is enough."""
-    ekf2, axes = analysis.flight.ekf2, analysis.axes.values()
-    horizontal = [result for result in axes if result.axis.name != "down"][:1]
-    for result in (*horizontal, *(result for result in axes if result.axis.name == "down")):
-        axis_name, frame = result.axis.name, result.ekf2_innovations
+    """Detect rejections; EKF2 rejects north and east together, so one axis is enough."""
+    ekf2, down = analysis.flight.ekf2, analysis.axes.get("down")
+    for result in {id(each): each for each in (analysis.main, down) if each}.values():
+        frame = result.ekf2_innovations
         if isinstance(frame, Unavailable) or not isinstance(ekf2, Ekf2):
             continue
         rejected_flags = frame["rejected"].dropna()
         share = float(rejected_flags.mean())  # NaN if the log has no rejections
         if share >= REJECTED_SHARE_WARNING:
-            quantity = "height" if axis_name == "down" else "horizontal position"
+            quantity = "heights" if result is down else "positions"
             yield finding(
                 "error" if share >= REJECTED_SHARE_ERROR else "warning",
                 "ekf2_rejects_positions",
-                f"EKF2 rejected {format_percent(share, 1)} of the samples for {quantity} (beyond "
-                f"{ekf2.gate:g} √S). Possible causes: outliers, measurement noise set too small, "
-                "or late timestamps.",
-                _remedy(analysis, axis_name),
-                {"rejected_fraction": share, "count": len(frame), "axis": axis_name},
+                f"EKF2 rejects {format_percent(share)} of the {quantity}. Their innovations are "
+                f"beyond its gate of {ekf2.gate:g} √S. Possible causes: outliers, measurement "
+                "noise set too small, or late timestamps.",
+                _remedy(analysis, result),
+                {"rejected_fraction": share, "count": len(frame), "axis": result.axis.name},
                 zero_length_spans(rejected_flags.index[rejected_flags > 0.0]),
             )
 
 
-def _remedy(analysis: Analysis, axis: str) -> str:
-    """Format the action against the cause of large innovations, or a general action."""
-    fallback, model = format_default_remedy(remedy.aid_of(analysis, axis)), analysis.ekf2_model
-    if axis == "down":
-        return fallback
-    if isinstance(model, Unavailable):
-        return f"{fallback} {remedy.format_not_replayed(model)}"
-    cause = find_cause(analysis.causes, "ekf2", axis)
-    return fallback if cause is None else format_remedy_of_ekf2(analysis, cause)
+def _remedy(analysis: Analysis, result: AxisComparison) -> str:
+    """Format the change whose re-run prevents most rejections, or a check."""
+    aid = aid_of(analysis, result.axis.name)
+    trials = [trial for trial in analysis.trials if _prevents_rejections(trial)]
+    if trials and result is analysis.main:
+        return format_action(analysis, min(trials, key=preference).change)
+    place = "the reception" if aid == GNSS_POS else "the line of sight"
+    return f"Check {place}, {aid.delay} and {aid.noise} first. Increase {aid.gate} last."
+
+
+def _prevents_rejections(trial: Trial) -> bool:
+    """Return True if a change of EKF2 improves EKF2 and halves its rejected share."""
+    before, after = trial.before.rejected_fraction, trial.after.rejected_fraction
+    if before is None or after is None or improvement(trial) == "nothing":
+        return False
+    return len(trial.kinds) == 1 and after < MAX_REJECTED_RATIO * before

@@ -4,8 +4,14 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.projection import continuous_state
+from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, GAP
 from px4fuse.findings.model import Findings, finding, format_count, warning, zero_length_spans
-from px4fuse.flight import Ekf2
+from px4fuse.flight import Ekf2, Reset, Unavailable
+
+# s after take-off, in which EKF2 usually resets its height
+TAKE_OFF_S = 10.0
+# s after a gap in the source, in which EKF2 resets its position to the first positions
+AFTER_GAP_S = 5.0
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -14,29 +20,34 @@ def detect(analysis: Analysis) -> Findings:
     if not isinstance(ekf2, Ekf2):
         return
     resets = [
-        r
-        for r in ekf2.resets
-        if segment.start_s < r.time_s <= segment.end_s and r.quantity == "position" and any(r.delta)
+        reset
+        for reset in ekf2.resets
+        if segment.start_s < reset.time_s <= segment.end_s
+        and reset.quantity == "position"
+        and any(reset.delta)
+        and not _is_usual(analysis, reset)
     ]
     if resets:
-        sizes_m = [float(np.linalg.norm(r.delta)) for r in resets]
-        at_s = resets[int(np.argmax(sizes_m))].time_s
-        horizontal_count = sum(any(r.delta[:2]) for r in resets)
+        horizontal = [reset for reset in resets if any(reset.delta[:2])]
+        counted = horizontal or resets
+        sizes_m = [float(np.linalg.norm(reset.delta)) for reset in counted]
+        follows_gap = all(_follows_gap(analysis, reset) for reset in counted)
+        at_s = counted[int(np.argmax(sizes_m))].time_s
         _, treatment = continuous_state(ekf2, analysis.source, segment)
-        count_text = format_count(len(resets))
-        if 0 < horizontal_count < len(resets):
-            count_text += f" ({horizontal_count} horizontally)"
         yield finding(
-            "warning" if horizontal_count else "note",
+            "warning" if horizontal else "note",
             "ekf2_resets",
-            f"EKF2 reset its {'position' if horizontal_count else 'height'} {count_text}, by up to "
-            f"{max(sizes_m):.2f} m at {at_s:.1f} s. In the comparison: {treatment}.",
-            "Check the gap or the rejections at that time."
-            if horizontal_count
-            else "A height reset at take-off is normal. In flight, check for a change of the "
-            "height source.",
-            {"count": len(resets), "largest_m": max(sizes_m), "at_s": at_s},
-            zero_length_spans(r.time_s for r in resets),
+            f"EKF2 reset its {'horizontal position' if horizontal else 'height'} "
+            f"{format_count(len(counted))}, by up to {max(sizes_m):.2f} m. The largest reset is at "
+            f"{at_s:.1f} s. In the comparison: {treatment}.",
+            f"Run px4fuse explore LOG and compare position and innovation at {at_s:.1f} s.",
+            {
+                "count": len(counted),
+                "largest_m": max(sizes_m),
+                "at_s": at_s,
+                CAUSE: GAP if follows_gap else ELSEWHERE,
+            },
+            zero_length_spans(reset.time_s for reset in counted),
         )
     switches = [time for time, _ in ekf2.instances if segment.start_s < time <= segment.end_s]
     if switches:
@@ -48,3 +59,16 @@ def detect(analysis: Analysis) -> Findings:
             {"count": len(switches), "at_s": switches[0]},
             zero_length_spans(switches),
         )
+
+
+def _is_usual(analysis: Analysis, reset: Reset) -> bool:
+    """Return True for a reset of the height alone, soon after take-off."""
+    airborne = analysis.flight.airborne
+    return not any(reset.delta[:2]) and any(
+        start <= reset.time_s <= start + TAKE_OFF_S
+        for start, _ in (() if isinstance(airborne, Unavailable) else airborne)
+    )
+
+
+def _follows_gap(analysis: Analysis, reset: Reset) -> bool:
+    return any(start <= reset.time_s <= end + AFTER_GAP_S for start, end in analysis.events.gaps)

@@ -6,6 +6,7 @@ filter follows. NEES: squared error against ground truth divided by the reported
 """
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -23,38 +24,51 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.cause_grouping import CAUSE
-from px4fuse.findings.cause_text import classify_cause, format_remedy, format_rerun
-from px4fuse.findings.model import Finding, Findings, finding, note
+from px4fuse.findings.cause_text import classify_cause, format_action, is_refuted
+from px4fuse.findings.model import Finding, Findings, error, finding, format_percent, note
+from px4fuse.flight import Unavailable, source_name
 from px4fuse.loop.model import Loop
-from px4fuse.text import capitalise_first, format_factor, format_number
+from px4fuse.text import format_metres, format_ratio
 from px4fuse.trajectory.alignment import fit_alignment
 
 MIN_NEES_ERROR = 16.0  # mean NEES; errors of 4 σ
-MAX_SMALL_NIS = 0.5  # mean NIS; innovations are 30 % smaller than expected
 MAX_KF_ERROR_RATIO = (
     0.7  # RMSE of KF over EKF2; below, the source causes less than half of the squares
 )
 MAX_ALIGNED_SHARE = 0.5  # RMSE after over RMSE before alignment; below, misalignment dominates
 FILTERS: Mapping[FilterName, str] = {"kf": "KF", "ekf2": "EKF2"}
 DRIFT_REMEDY = (
-    "Do not take SIGMA_Z or EKF2_EVP_NOISE from these innovations. Correct the drift with a loop "
-    "(px4fuse loop LOG), or add a second, absolute source."
+    "Send an absolute position (GNSS, UWB) as well in the next flight. A loop closure (px4fuse "
+    "loop) corrects the path of this flight, not the filters."
 )
-FRAME_REMEDY = (
-    "Rotate and shift the source's frame into that of the ground truth. Do not take noises from "
-    "these innovations."
-)
+FRAME_REMEDY = "Rotate and shift the frame of the source into that of the ground truth."
 EKF2_REMEDY = (
-    "KF has a smaller error with the same source. Check EKF2's delay, heading and other aids."
+    "Check EKF2's delay, heading and other aids: KF has a smaller error with the same source."
 )
 SHARED_REMEDY = (
-    "Check errors that source and filter share: time offset (px4fuse sync LOG), low-pass filtering "
-    "in the source, multipath, anchor geometry and survey, scale."
+    "Check the time offset (px4fuse sync LOG). Then check multipath, the anchor survey and filters "
+    "in the sender."
 )
 GNSS_REMEDY = (
-    "Check errors that receiver and filter share: age of a fix (px4fuse sync LOG), time-correlated "
-    "reception errors, EKF2's heading, lever arm of the antenna."
+    "Check the age of a fix (px4fuse sync LOG). Then check reception, EKF2's heading and the lever "
+    "arm of the antenna."
 )
+
+
+class AlignedError(NamedTuple):
+    """Horizontal RMSE (m) against ground truth, before and after the best shift and rotation."""
+
+    before_m: float
+    after_m: float
+
+    def __str__(self) -> str:
+        after = f"{format_metres(self.after_m)} m after the best shift and rotation"
+        return f"{format_metres(self.before_m)} m, {after}"
+
+    @property
+    def is_misaligned(self) -> bool:
+        """True if a misaligned frame causes most of the error."""
+        return self.after_m < MAX_ALIGNED_SHARE * self.before_m
 
 
 def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, ErrorAboveSigma]]:
@@ -76,79 +90,118 @@ def detect(analysis: Analysis) -> Findings:
     if hidden := find_hidden_errors(analysis):
         yield make_error_finding(analysis, hidden)
     elif analysis.source.origin.may_drift:
-        yield make_drift_finding(analysis)
+        yield make_possible_drift_finding(analysis)
 
 
 def make_error_finding(
     analysis: Analysis, hidden: list[tuple[FilterName, str, ErrorAboveSigma]]
 ) -> Finding:
-    """Make the finding of large errors, with numbers of the worst axis of each filter."""
+    """Make the finding of large errors, with numbers of the main axis, else of the worst one."""
+    hidden = sorted(hidden, key=lambda entry: entry[1] != analysis.main.axis.name)
     (worst_filter, main_axis, worst), may_drift = hidden[0], analysis.source.origin.may_drift
     evidence: dict[str, float | str] = {"axis": main_axis, "filter": worst_filter}
-    size = "small" if worst.nis_mean < MAX_SMALL_NIS else "consistent"
-    sentences = [f"Position errors exceed the reported σ, although the innovations are {size}."]
-    causes = dict[FilterName, Intervention | None]()
+    ratios, sentences = dict[str, float](), list[str]()
+    causes = dict[FilterName, Intervention]()
     for filter_name, label in FILTERS.items():
-        for _, axis, error in [entry for entry in hidden if entry[0] == filter_name][:1]:
+        for _, axis, excess in [entry for entry in hidden if entry[0] == filter_name][:1]:
             evidence |= {
-                f"{filter_name}_nis_mean": error.nis_mean,
-                f"{filter_name}_nees_position_mean": error.nees,
-                f"{filter_name}_position_rmse_m": error.rmse_m,
-                f"{filter_name}_sigma_p_m": error.reported_sigma_m,
+                f"{filter_name}_nis_mean": excess.nis_mean,
+                f"{filter_name}_nees_position_mean": excess.nees,
+                f"{filter_name}_position_rmse_m": excess.rmse_m,
+                f"{filter_name}_sigma_p_m": excess.reported_sigma_m,
             }
-            causes[filter_name] = cause = find_cause(analysis.causes, filter_name, axis, "nees")
-            along = analysis.axes[axis].axis.label
+            cause = find_cause(analysis.causes, filter_name, axis, "nees")
+            if cause is not None and not is_refuted(analysis, filter_name, cause):
+                causes[filter_name] = cause
+            ratios[label] = excess.nees**0.5
             sentences.append(
-                f"{label} along {along}: position RMSE {error.rmse_m:.2f} m, reported σ "
-                f"{error.reported_sigma_m:.2g} m (mean NEES {format_factor(error.nees)}, mean NIS "
-                f"{format_number(error.nis_mean, 2)}; expected 1)."
+                f"{label}: position RMSE {format_metres(excess.rmse_m)} m along "
+                f"{analysis.axes[axis].axis.label}, reported σ "
+                f"{format_metres(excess.reported_sigma_m)} m."
             )
-            if cause is not None:
-                sentences.append(f"{capitalise_first(format_rerun(analysis, cause))}.")
+    cause = causes.get(worst_filter) or next(iter(causes.values()), None)
+    evidence |= {CAUSE: classify_cause(analysis, cause)}
+    aligned = None if causes else _rmse_after_alignment(analysis, worst_filter)
+    if aligned is not None:
+        evidence |= {
+            "position_rmse_horizontal_m": aligned.before_m,
+            "position_rmse_aligned_m": aligned.after_m,
+        }
+    is_misaligned = aligned is not None and aligned.is_misaligned
+    if may_drift and not causes and not is_misaligned:
+        return _drift_finding(analysis, aligned, worst, evidence)
+    if is_misaligned and aligned is not None:
+        sentences.append(f"The frame is misaligned: horizontal position RMSE {aligned}.")
     kf_truth = analysis.axes[main_axis].filters["kf"].truth
     is_kf_better = (
         isinstance(kf_truth, ErrorsAgainstTruth)
         and kf_truth.position_rmse_m < MAX_KF_ERROR_RATIO * worst.rmse_m
     )
     is_ekf2_alone = is_kf_better and all(filter_name == "ekf2" for filter_name, *_ in hidden)
-    shared_remedy = GNSS_REMEDY if analysis.source.origin.is_gnss else SHARED_REMEDY
-    remedy = DRIFT_REMEDY if may_drift else EKF2_REMEDY if is_ekf2_alone else shared_remedy
-    available_causes = filter(None, (causes[worst_filter], *causes.values()))
-    evidence |= {CAUSE: classify_cause(analysis, next(available_causes, None))}
-    if cause_remedies := {
-        format_remedy(analysis, cause): None for cause in causes.values() if cause is not None
-    }:
-        remedy = " ".join(cause_remedies)
-    elif alignment_rmse_m := _rmse_after_alignment(analysis, worst_filter):
-        horizontal_rmse_m, aligned_rmse_m = alignment_rmse_m
-        evidence |= {
-            "position_rmse_horizontal_m": horizontal_rmse_m,
-            "position_rmse_aligned_m": aligned_rmse_m,
-        }
-        is_misaligned = aligned_rmse_m < MAX_ALIGNED_SHARE * horizontal_rmse_m
-        if is_misaligned:
-            remedy = FRAME_REMEDY
-        if is_misaligned or may_drift:
-            sentences.append(
-                f"After the best shift and rotation {aligned_rmse_m:.2f} m of the horizontal RMSE "
-                f"of {horizontal_rmse_m:.2f} m remain: "
-                f"{'the frame is misaligned' if is_misaligned else 'the source drifts'}."
-            )
-    sentences.append(
-        "Innovations compare a filter with its source; only ground truth, a loop or a second "
-        "source shows the error."
-    )
+    remedy = GNSS_REMEDY if analysis.source.origin.is_gnss else SHARED_REMEDY
+    if cause is not None:
+        remedy = format_action(analysis, cause.change)
+    elif is_misaligned:
+        remedy = FRAME_REMEDY
+    elif is_ekf2_alone:
+        remedy = EKF2_REMEDY
+    sizes = " and ".join(f"{format_ratio(ratio)} ({label})" for label, ratio in ratios.items())
+    title = f"Position errors are {sizes} times σ, which innovations do not show"
+    if len(ratios) == 1:
+        ((label, ratio),) = ratios.items()
+        title = (
+            f"{label}: position error {format_ratio(ratio)} times σ, which innovations do not show"
+        )
     return finding(
         "error" if worst.nees >= MIN_NEES_ERROR else "warning",
         "error_exceeds_reported_sigma",
-        " ".join(sentences),
+        f"{title}. {' '.join(sentences)}",
         remedy,
         evidence,
     )
 
 
-def _rmse_after_alignment(comparison: Comparison, filter_name: str) -> tuple[float, float] | None:
-    """Return the horizontal RMSE (m) against ground truth, before and after alignment in yaw."""
+def _drift_finding(
+    analysis: Analysis,
+    aligned: AlignedError | None,
+    worst: ErrorAboveSigma,
+    evidence: Mapping[str, float | str],
+) -> Finding:
+    """Make the finding of a source that drifts, with its closure error if that is known."""
+    sensor, loop = source_name(analysis.source), analysis.loop
+    size = f"position RMSE {format_metres(worst.rmse_m)} m against ground truth"
+    sentence = ""
+    if aligned is not None:
+        size = (
+            f"horizontal position RMSE {format_metres(aligned.after_m)} m after the best alignment"
+        )
+        sentence = f"Before the alignment: {format_metres(aligned.before_m)} m. "
+    if isinstance(loop, Loop) and (gap_m := _known_closure_error_m(loop)) is not None:
+        length_m = loop.path_length_m
+        evidence = {**evidence, "closure_error_m": gap_m, "path_length_m": length_m}
+        share = format_percent(gap_m / length_m, 1)
+        sentence = "" if aligned is None else f"Horizontal position RMSE {aligned}. "
+        size = f"loop closure error {format_metres(gap_m)} m after {length_m:.0f} m ({share})"
+    noise_parameter = "" if analysis.source.origin.aid is None else analysis.source.origin.aid.noise
+    noises = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))
+    return error(
+        "source_drift",
+        f"{sensor} drifts: {size}. {sentence}Both filters follow {sensor}: innovations are small, "
+        f"errors are not. Do not lower {noises}.",
+        DRIFT_REMEDY,
+        evidence,
+    )
+
+
+def _known_closure_error_m(loop: Loop) -> float | None:
+    """Return the closure error (m) of odometry, or None if the landing place is only assumed."""
+    if isinstance(loop.true_end, Unavailable) or loop.is_end_assumed or loop.is_absolute_track:
+        return None
+    return loop.closure_error_m
+
+
+def _rmse_after_alignment(comparison: Comparison, filter_name: str) -> AlignedError | None:
+    """Return the horizontal RMSE before and after alignment in yaw, or None if unknown."""
     axes = [comparison.axes[name] for name in ("north", "east") if name in comparison.axes]
     truths = [result.truth for result in axes if isinstance(result.truth, pd.DataFrame)]
     if len(truths) < 2:
@@ -173,7 +226,7 @@ def _rmse_after_alignment(comparison: Comparison, filter_name: str) -> tuple[flo
     rmse_m, aligned_rmse_m = (
         float(np.linalg.norm(error)) / len(true_track) ** 0.5 for error in errors
     )
-    return rmse_m, aligned_rmse_m
+    return AlignedError(rmse_m, aligned_rmse_m)
 
 
 def _interpolate_ekf2_position(result: AxisComparison, times: Array) -> Array:
@@ -183,23 +236,29 @@ def _interpolate_ekf2_position(result: AxisComparison, times: Array) -> Array:
     return np.asarray(np.interp(times, state.index, state, left=np.nan, right=np.nan))
 
 
-def make_drift_finding(analysis: Analysis) -> Finding:
-    """Make the finding of a source that may drift, with its short-term noise and closure error."""
-    name, tuned, loop = analysis.source.name, analysis.tuning.get(HORIZONTAL), analysis.loop
-    evidence: dict[str, float | str] = {"source": name}
+def make_possible_drift_finding(analysis: Analysis) -> Finding:
+    """Make the note on a source that may drift, with its short-term noise and closure error."""
+    sensor, tuned, loop = (
+        source_name(analysis.source),
+        analysis.tuning.get(HORIZONTAL),
+        analysis.loop,
+    )
+    evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (
-        f"{name} may drift: the source sends a heading, as odometry (VIO, SLAM) does. Innovations "
-        "show how well a filter follows the source, not the position error."
+        f"{sensor} may drift: it sends a heading, as odometry does. Innovations show how well a "
+        f"filter follows {sensor}, not the position error."
     )
     if isinstance(tuned, AxisTuning) and (noise := tuned.sigma_z.value or tuned.sigma_z.high):
         bound = "at most " if tuned.sigma_z.value is None else ""
         evidence |= {"short_term_noise_m": noise}
-        message += f" The short-term noise is {bound}{noise:.2g} m; it does not include the drift."
+        message += f" The noise from sample to sample is {bound}{noise:.2g} m, without the drift."
     if isinstance(loop, Loop) and (gap_m := loop.closure_error_m) is not None:
         evidence |= {"closure_error_m": gap_m, "path_length_m": loop.path_length_m}
-        message += f" The loop closure error is {gap_m:.2f} m after {loop.path_length_m:.0f} m."
+        message += (
+            f" The loop closure error is {format_metres(gap_m)} m after {loop.path_length_m:.0f} m."
+        )
     action = (
-        "Check the error with a loop (px4fuse loop LOG) or with ground truth (ATT_POS_MOCAP). If "
+        "Measure the drift with a loop (px4fuse loop LOG) or with ground truth (ATT_POS_MOCAP). If "
         "the source is motion capture, give --source-kind mocap."
     )
     return note("source_may_drift", message, action, evidence)

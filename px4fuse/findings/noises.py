@@ -1,8 +1,8 @@
 """SIGMA_Z or SIGMA_A that contradicts the innovations, and KF or EKF2 that is not consistent.
 
 The mean NIS alone cannot separate SIGMA_A from SIGMA_Z: both increase S. The likelihood can: a
-wrong SIGMA_A correlates successive innovations, a wrong SIGMA_Z hardly does. Both are estimated and
-proposed together, the larger deviation first. For a default setting the severity is one level lower
+wrong SIGMA_A correlates successive innovations, a wrong SIGMA_Z hardly does. Both are estimated,
+and a re-run shows which change improves KF. For a default setting the severity is one level lower
 than for a setting chosen by the user.
 """
 
@@ -12,9 +12,7 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison import remedy
 from px4fuse.comparison.causal_replays import (
-    SETTING_CHANGES,
     SIGMA_A,
     SIGMA_Z,
     SMALLEST_SIGMA_Z_M,
@@ -27,7 +25,8 @@ from px4fuse.comparison.causal_replays import (
 from px4fuse.comparison.estimates import first_axis_tuning
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
-from px4fuse.comparison.remedy import aid_of
+from px4fuse.comparison.remedy import aid_of, format_settings, noise_change
+from px4fuse.comparison.trials import find_trial
 from px4fuse.ekf2_parameters import BAROMETER, PARAMETERS
 from px4fuse.filter.settings import UNITS, Settings
 from px4fuse.filter.signals import cut_to_segment
@@ -35,12 +34,13 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, NOISE
 from px4fuse.findings.cause_text import (
     classify_cause,
-    format_remedy,
-    format_remedy_of_ekf2,
-    format_rerun,
+    format_action,
+    format_kf_settings,
+    is_refuted,
 )
 from px4fuse.findings.hidden_errors import find_hidden_errors
 from px4fuse.findings.model import (
+    SEVERITIES,
     Finding,
     Findings,
     Severity,
@@ -51,7 +51,8 @@ from px4fuse.findings.model import (
 )
 from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight import Columns, Unavailable, sample_rate
-from px4fuse.text import format_factor, format_number
+from px4fuse.request import COMPARISON_OPTIONS
+from px4fuse.text import format_factor, format_number, format_ratio
 
 MIN_NOISE_RATIO = 1.5  # ratio of σ; below, the tracks hardly change
 MIN_NOISE_RATIO_ERROR = 4.0  # ratio of σ; above, the gain differs clearly
@@ -61,36 +62,35 @@ MIN_LAG1_AUTOCORRELATION = 0.3  # of white innovations below 2/√n, which is 0.
 
 MIN_SIGMA_RATIO_ERROR = 2.0  # reported over actual σ, or its inverse
 NOISE_RATIO_TOLERANCE = 1.25  # 2 σ of the median for n = 100 (σ of the median: 1.17/√n)
+# Actions, if no re-run explains a deviation
 NOT_EXPLAINED = (
-    "No tested change of noise, time offset, frame or outliers explains half of the deviation. "
-    "Check the IMU (rate, gaps, vibration) and the other findings."
+    "No tested change of noise, time offset, frame or outliers explains this. Check the IMU "
+    "(rate, gaps, vibration)."
 )
-UNKNOWN_NOISE = "The noise could not be estimated; px4fuse tune prints the reason."
+UNKNOWN_NOISE = "The noise could not be estimated: run px4fuse tune LOG for the reason."
+NO_IMPROVEMENT = "No change: a re-run with the estimate improves neither position nor σ."
 
 
 AXIS_GROUPS = {"horizontal": ("north", "east", "aisle"), "vertical": ("down",)}
-ONLY_HORIZONTAL = Unavailable(
-    "EKF2 replay", "the EKF2 replay covers horizontal position only", "None."
-)
-KEEP_NOISES_DRIFT = (
-    "Do not reduce the noises. The source may drift, and innovations do not show this error."
-)
+KEEP_NOISES_DRIFT = "Do not reduce the noises: innovations do not show the drift of the source."
 KEEP_NOISES_CORRELATED = (
-    "Do not reduce the noises. Most of the error of {} is time-correlated. R has to cover this "
-    "error, which innovations do not show."
+    "Do not reduce the noises: R has to cover the time-correlated error of {}, which innovations "
+    "do not show."
 )
 KEEP_NOISES_TRUTH = (
-    "Do not reduce the noises. The reported σ would become smaller than the errors against ground "
-    "truth."
+    "Do not reduce the noises: σ would become smaller than the errors against ground truth."
 )
-# Effect of a wrong setting, by option and direction
+# Effect and mechanism of a wrong setting, by option and direction
 SETTING_EFFECTS = {
-    (SIGMA_Z, "small"): "The gain is too large, so KF follows the measurement noise.",
-    (SIGMA_Z, "large"): "The gain is too small, so KF corrects slowly.",
-    (SIGMA_A, "small"): "P grows too little between updates, the gain is too small, and KF lags.",
+    (SIGMA_Z, "small"): ("KF follows the measurement noise", "The gain is too large."),
+    (SIGMA_Z, "large"): ("KF corrects slowly", "The gain is too small."),
+    (SIGMA_A, "small"): (
+        "KF lags",
+        "P grows too little between updates, so the gain is too small.",
+    ),
     (SIGMA_A, "large"): (
-        "P grows too much between updates, the gain is too large, and KF follows the measurement "
-        "noise."
+        "KF follows the measurement noise",
+        "P grows too much between updates, so the gain is too large.",
     ),
 }
 
@@ -122,7 +122,10 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_wrong_settings(analysis: Analysis) -> Findings:
-    """Detect settings outside their (widened) 95 % interval, the larger deviation first."""
+    """Detect settings outside their (widened) 95 % interval.
+
+    The larger deviation is the cause of the other one, if its re-run improves KF.
+    """
     axis_tuning = first_axis_tuning(analysis.tuning, HORIZONTAL, "aisle", "down")
     if axis_tuning is None:
         return
@@ -149,45 +152,67 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
             for name, deviation in wrong_settings.items()
             if chosen[name] < deviation.value and not (may_drift and deviation.severity == "note")
         }
-    if not wrong_settings:
-        return
-    worst_first = sorted(wrong_settings, key=lambda name: -wrong_settings[name].size)
-    values = {name: wrong_settings[name].value for name in worst_first}
-    if SIGMA_Z in values and axis_tuning.sigma_z.value is None:
-        values[SIGMA_Z] = max(values[SIGMA_Z], SMALLEST_SIGMA_Z_M)
-    held_out_gain = (
-        None
-        if isinstance(axis_tuning.held_out, Unavailable)
-        else axis_tuning.held_out.log_likelihood_gain_per_measurement
+    found = [
+        _setting_finding(analysis, axis_tuning, name, deviation)
+        for name, deviation in wrong_settings.items()
+    ]
+    found.sort(key=lambda each: (SEVERITIES.index(each[1].severity), -each[0]))
+    for index, (_, setting_finding) in enumerate(found):
+        cause = found[0][1].id if index else None
+        yield structs.replace(setting_finding, caused_by=cause)
+
+
+def _setting_finding(
+    analysis: Analysis, axis_tuning: AxisTuning, name: str, deviation: SettingDeviation
+) -> tuple[float, Finding]:
+    """Return the ratio of a setting to its estimate, and the finding.
+
+    The finding is a note if a re-run with the estimate is no better.
+    """
+    value, size, severity = deviation
+    chosen = getattr(analysis.settings, name)
+    noise = axis_tuning.sigma_z if name == SIGMA_Z else axis_tuning.sigma_a_two_state
+    direction, is_bound = "small" if chosen < value else "large", noise.value is None
+    effect, mechanism = SETTING_EFFECTS[name, direction]
+    action = format_setting_action(analysis, name, value)
+    return size, finding(
+        "note" if action == NO_IMPROVEMENT else severity,
+        f"{name[:7]}_too_{direction}",
+        f"{name[:7].upper()} is {'at least ' if is_bound else ''}{format_factor(size)} times "
+        f"too {direction}: {effect}. {format_estimate(name, chosen, noise)}. {mechanism}",
+        action,
+        {
+            "chosen": chosen,
+            "most_likely": value,
+            "factor": chosen / value,
+            "lag1_autocorrelation": getattr(
+                axis_tuning.before, "lag1_autocorrelation", float("nan")
+            ),
+        },
     )
-    remedy_text, first_id = (
-        remedy.format_kf_remedy(analysis, values, held_out_nats=held_out_gain),
-        None,
-    )
-    for name in worst_first:
-        (value, size, severity), noise = wrong_settings[name], ml_noises[name]
-        direction, unit = "small" if chosen[name] < value else "large", UNITS[name]
-        is_bound = noise.value is None
-        interval = f"; 95 % {noise.low or 0.0:.3g} to {noise.high:.3g} {unit}" if noise.high else ""
-        setting_finding = finding(
-            severity,
-            f"{name[:7]}_too_{direction}",
-            f"{name[:7].upper()} {chosen[name]:g} {unit} is {'at least ' if is_bound else ''}"
-            f"{format_factor(size)} times too {direction}. The maximum-likelihood estimate is "
-            f"{'at most ' if is_bound else ''}{value:.3g} {unit} ({axis_tuning.name}"
-            f"{'' if is_bound else interval}). {SETTING_EFFECTS[name, direction]}",
-            remedy_text,
-            {
-                "chosen": chosen[name],
-                "most_likely": value,
-                "factor": chosen[name] / value,
-                "lag1_autocorrelation": getattr(
-                    axis_tuning.before, "lag1_autocorrelation", float("nan")
-                ),
-            },
-        )
-        yield structs.replace(setting_finding, caused_by=first_id)
-        first_id = first_id or setting_finding.id
+
+
+def format_estimate(name: str, chosen: float, noise: Noise) -> str:
+    """Format a setting with its maximum-likelihood estimate and 95 % interval."""
+    label, unit = name[:7].upper(), UNITS[name]
+    estimate = f"{label} {chosen:g} {unit}; maximum-likelihood estimate"
+    if noise.value is None:
+        return f"{estimate} at most {noise.high:.3g} {unit}"
+    interval = f" (95 % {noise.low or 0.0:.3g} to {noise.high:.3g} {unit})" if noise.high else ""
+    return f"{estimate} {noise.value:.3g} {unit}{interval}"
+
+
+def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
+    """Format the action for a wrong setting of KF: the change whose re-run improves KF.
+
+    Without a re-run, the estimate is proposed as the next re-run.
+    """
+    if trial := find_trial(analysis.trials, "kf", "noises", name):
+        return format_kf_settings(trial.change)
+    if any(trial.filter == "kf" and trial.change.keys() == {name} for trial in analysis.trials):
+        return NO_IMPROVEMENT
+    value = max(value, SMALLEST_SIGMA_Z_M) if name == SIGMA_Z else value
+    return f"Compare with a run with {COMPARISON_OPTIONS[name]} {value:.3g}."
 
 
 def setting_deviation(name: str, chosen: float, ml_noise: Noise) -> SettingDeviation | None:
@@ -212,9 +237,9 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
     """Detect SIGMA_A so small that σ hardly grows between updates and KF ignores measurements.
 
     Without motion a slow filter is correct, so the innovations must also be correlated and too
-    large. The first axis with a long response time is reported.
+    large. The main axis is reported, else the first axis with a long response time.
     """
-    for name, result in analysis.axes.items():
+    for result in sorted(analysis.axes.values(), key=lambda each: each is not analysis.main):
         updates, summary = result.replay.updates, result.filters["kf"]
         if isinstance(summary, Unavailable) or summary.verdict != "overconfident":
             continue
@@ -231,21 +256,26 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
         growth = float(
             np.median((variance_before[1:] / variance_after[:-1] - 1.0)[len(variance_after) // 2 :])
         )
-        axis_tuning = tuning_of_axis(analysis.tuning, name)
-        ml_sigma_a = None if axis_tuning is None else axis_tuning.sigma_a_two_state.value
-        remedy_text = (
-            ""
-            if ml_sigma_a is None
-            else f" {remedy.format_kf_remedy(analysis, {SIGMA_A: ml_sigma_a})}"
-        )
         sigma_a = analysis.settings.sigma_a_m_s2
+        axis_tuning = tuning_of_axis(analysis.tuning, result.axis.name)
+        title, estimate = f"SIGMA_A {sigma_a:g} m/s² makes Q almost zero", ""
+        action = "Increase SIGMA_A (--sigma-a)."
+        if axis_tuning is not None and (ml_sigma_a := axis_tuning.sigma_a_two_state.value):
+            title = f"SIGMA_A is {format_factor(ml_sigma_a / sigma_a)} times too small"
+            estimate = f"{format_estimate(SIGMA_A, sigma_a, axis_tuning.sigma_a_two_state)}. "
+            action = format_setting_action(analysis, SIGMA_A, ml_sigma_a)
         yield error(
             "process_noise_near_zero",
-            f"SIGMA_A {sigma_a:g} m/s² makes Q almost zero. The position variance grows by only "
-            f"{format_percent(growth, 1)} between updates, and the gain falls to {gain:.3f}. KF "
-            f"needs {response_s:.0f} s to follow a change (along {result.axis.label}).",
-            f"Increase SIGMA_A.{remedy_text}",
-            {"relative_growth": growth, "gain": gain, "response_s": response_s, "axis": name},
+            f"{title}: KF ignores new positions. {estimate}The process noise is almost zero: the "
+            f"position variance grows by {format_percent(growth, 1)} between updates, and the gain "
+            f"falls to {gain:.2g}. KF needs {response_s:.0f} s to follow a change.",
+            action,
+            {
+                "relative_growth": growth,
+                "gain": gain,
+                "response_s": response_s,
+                "axis": result.axis.name,
+            },
         )
         return
 
@@ -275,8 +305,11 @@ def detect_inconsistent_variances(analysis: Analysis) -> Findings:
 def _variance_finding(
     analysis: Analysis, filter_name: FilterName, group: str, members: list[Member]
 ) -> Finding:
-    """Make the finding of a group of axes, with numbers of the axis with the worst mean NIS."""
-    result, summary = max(members, key=lambda pair: abs(np.log(pair[1].nis_mean)))
+    """Make the finding of a group of axes, with numbers of the main axis, else of the worst."""
+    result, summary = max(
+        members,
+        key=lambda pair: (pair[0] is analysis.main, abs(np.log(pair[1].nis_mean))),
+    )
     is_underconfident, factor = summary.sigma_ratio < 1.0, summary.sigma_error_factor
     severity: Severity = "error" if factor >= MIN_SIGMA_RATIO_ERROR else "warning"
     if _has_default_noises(analysis, filter_name, result):
@@ -299,10 +332,8 @@ def _variance_finding(
         remedy_text, cause = KEEP_NOISES_TRUTH, ELSEWHERE
     else:
         rerun = find_cause(analysis.causes, filter_name, result.axis.name)
-        cause, remedy_text = (
-            classify_cause(analysis, rerun),
-            _remedy(analysis, filter_name, result, axis_tuning, rerun),
-        )
+        cause = classify_cause(analysis, rerun)
+        remedy_text = _remedy(analysis, filter_name, result, axis_tuning, rerun)
         severity = "note" if remedy_text == KEEP_NOISES_TRUTH else severity
     evidence: dict[str, float | str] = {
         "axis": result.axis.name,
@@ -325,7 +356,7 @@ def _variance_finding(
         severity,
         f"{filter_name}_{confidence}",
         f"{filter_label} is {confidence} along "
-        f"{result.axis.label}: σ is {format_factor(factor)} times too "
+        f"{result.axis.label}: σ is {format_ratio(factor)} times too "
         f"{'large' if is_underconfident else 'small'}. The mean NIS is "
         f"{format_number(summary.nis_mean)}, expected {low:.2f} to {high:.2f} ({group} "
         f"axes).{gate_effect}",
@@ -344,13 +375,9 @@ def _format_excessive_noise(analysis: Analysis) -> str:
     reported_m = float(np.sqrt(reported_variance.median()))
     if not parameter_m > NOISE_RATIO_TOLERANCE * reported_m:  # false for NaN too
         return ""
-    prefix = f"{name} {parameter_m:g} m exceeds the accuracy reported by GNSS ({reported_m:.2g} m)"
-    return remedy.format_ekf2_remedy(
-        analysis.ekf2_model,
-        {name: float(f"{reported_m:.2g}")},
-        remedy.noise_helps,
-        prefix=f"{prefix}. If the reported accuracy is right, ",
-        fallback_remedy=f"{prefix}.",
+    return (
+        f"{name} is {parameter_m:g} m, but the receiver reports {reported_m:.2g} m: test this "
+        "value with px4fuse whatif."
     )
 
 
@@ -385,71 +412,44 @@ def _remedy(
     axis_tuning: AxisTuning | None,
     cause: Intervention | None,
 ) -> str:
-    """Format the action against the cause, or a note if no cause is known."""
-    if cause is None:
-        return _remedy_without_cause(analysis, filter_name, result, axis_tuning)
-    if filter_name == "ekf2":
-        return format_remedy_of_ekf2(analysis, cause)
-    if not cause.change.keys() <= SETTING_CHANGES:
-        return format_remedy(analysis, cause)
-    is_bounded = (
-        axis_tuning is not None and axis_tuning.sigma_z.value is None and SIGMA_Z in cause.change
-    )
-    if not is_bounded:
-        return remedy.format_kf_remedy(analysis, cause.change)
-    return (
-        "The noise of the source is too small to be estimated at this rate. "
-        f"{remedy.format_kf_remedy(analysis, cause.change, ', and a smaller SIGMA_A')}"
-    )
-
-
-def _remedy_without_cause(
-    analysis: Analysis,
-    filter_name: FilterName,
-    result: AxisComparison,
-    axis_tuning: AxisTuning | None,
-) -> str:
-    """Format the action if no re-run explains the deviation, with the closest re-run."""
+    """Format the action against the cause, or a check if no cause is known."""
+    if cause is not None and not is_refuted(analysis, filter_name, cause):
+        return format_action(analysis, cause.change)
     reruns = interventions_for(analysis.causes, filter_name, result.axis.name)
     if any(rerun.contradicts_truth for rerun in reruns):
         return KEEP_NOISES_TRUTH
-    if reruns:
-        closest = min(reruns, key=lambda rerun: abs(rerun.explained_fraction - 1.0))
-        return f"{NOT_EXPLAINED} Closest: {format_rerun(analysis, closest)}."
-    if filter_name == "ekf2":
+    if axis_tuning is None:
+        return UNKNOWN_NOISE
+    if filter_name == "ekf2" and not reruns:
         return _remedy_without_replay(analysis, result, axis_tuning)
-    return UNKNOWN_NOISE if axis_tuning is None else NOT_EXPLAINED
+    return NOT_EXPLAINED
 
 
 def _remedy_without_replay(
-    analysis: Analysis, result: AxisComparison, axis_tuning: AxisTuning | None
+    analysis: Analysis, result: AxisComparison, axis_tuning: AxisTuning
 ) -> str:
-    """Format the action if no replay is possible: comparison of EKF2's R with the estimate."""
-    aid, model = aid_of(analysis, result.axis.name), analysis.ekf2_model
-    reason: Unavailable | None = model if isinstance(model, Unavailable) else None
-    if result.axis.name == "down":
-        reason = ONLY_HORIZONTAL
-    elif not isinstance(model, Unavailable) and not model.agreement.good:
-        reason = model.agreement.as_unavailable("EKF2 replay")
-    ml_noise_m = None if axis_tuning is None else _value_or_bound(axis_tuning.sigma_z)
-    if ml_noise_m is None or reason is None:
-        return UNKNOWN_NOISE if axis_tuning is None else NOT_EXPLAINED
-    noise_m, ekf2_m = max(ml_noise_m, EKF2_MIN_NOISE_M), ekf2_noise_m(result)
-    prefix = f"The noise of the source is {noise_m:.2g} m, EKF2 uses {ekf2_m:.2g} m"
+    """Format the action if EKF2 cannot be replayed: its R against the estimated noise."""
+    aid, ml_noise_m = aid_of(analysis, result.axis.name), _value_or_bound(axis_tuning.sigma_z)
     summary = result.filters["ekf2"]
     assert not isinstance(summary, Unavailable)
+    if ml_noise_m is None:
+        return NOT_EXPLAINED
+    noise_m, ekf2_m = max(ml_noise_m, EKF2_MIN_NOISE_M), ekf2_noise_m(result)
     ratio = noise_m / ekf2_m
-    if not (
+    if (
         ratio < 1.0 / NOISE_RATIO_TOLERANCE
         if summary.sigma_ratio < 1.0
         else ratio > NOISE_RATIO_TOLERANCE
     ):
+        changes = noise_change(aid, analysis.flight.log.parameters, ekf2_m, noise_m)
         return (
-            f"{prefix}: this does not explain the deviation. Check the time offset ({aid.delay}) "
-            f"and EKF2's process noise (EKF2_ACC_NOISE). {remedy.format_not_replayed(reason)}"
+            f"Set {format_settings(changes)} (EKF2 uses {ekf2_m:.2g} m). No replay of this log "
+            "confirms it: fly again and compare."
         )
-    changes = remedy.noise_change(aid, analysis.flight.log.parameters, ekf2_m, noise_m)
-    return f"{prefix}. Set {remedy.format_settings(changes)}. {remedy.format_not_replayed(reason)}"
+    return (
+        f"The noise of EKF2 ({ekf2_m:.2g} m) is right: check {aid.delay} and EKF2_ACC_NOISE "
+        "instead."
+    )
 
 
 def ekf2_noise_m(result: AxisComparison) -> float:

@@ -2,8 +2,8 @@
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
-from px4fuse.comparison.causal_replays import Trial
 from px4fuse.comparison.model import Comparison, FilterName
+from px4fuse.comparison.trials import Trial
 from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS, RECEIVER_DELAYS
 from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
 from px4fuse.findings.model import Findings, error, finding, warning

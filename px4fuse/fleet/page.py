@@ -1,20 +1,27 @@
 """Web page of ``px4fuse batch``: a sortable table with one row per log."""
 
+import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Any
 
 import pandas as pd
 
+from px4fuse.card.model import AXIS_ENDS, BANDS
+from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.findings import finding_title
 from px4fuse.fleet.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, RESULT_PATHS
-from px4fuse.text import format_factor, format_number, join_first
+from px4fuse.report.card_html import MARK_PATHS, SIGNS, band_limits
+from px4fuse.report.card_text import FILTER_NAMES, MARKS
+from px4fuse.text import format_number, join_first
 from px4fuse.webpage import frame
 from px4fuse.webpage.frame import Cell, Column, Row, Section
-from px4fuse.webpage.safe import clean, local_link
+from px4fuse.webpage.safe import clean, load_template, local_link
 
-STATUS_STYLES = {DONE: "good", NOT_COMPARED: "open", FAILED: "bad"}
+# Columns of the four ratios, in the order of the verdicts of a card
+RATIOS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
+SEVERITIES = ("error", "warning", "note", "clean", "refused")
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
 # Columns that the page shows if the user opens a row: one value per axis, and one per log
 AXIS_COLUMNS = [name for name, path in RESULT_PATHS.items() if "{" in path]
@@ -28,27 +35,32 @@ LOG_COLUMNS = [
         "status",
         "reason",
         "remedy",
-        "summary",
+        "severity",
+        "headline",
+        "action",
+        "changed",
+        "verdicts",
         "findings",
         "results",
         "report",
     )
 ]
+# Group of the columns that are hidden at first
+MORE = "numbers"
 FILTERS = (
+    ("Diagnosis", "severity", "All"),
     ("Status", "status", "All"),
     ("Vehicle", "vehicle", "All"),
     ("Firmware", "firmware", "All"),
     ("Finding", "finding", "All"),
     ("Action", "remedy", "All"),
 )
-# Maximum ratio of actual to reported σ, or of reported to actual σ, of a consistent filter
-MAX_CONSISTENT_RATIO = 1.25
 # Axes whose numbers are shown for the log: the aisle if it exists, else north and east, else down
 MAIN_AXES = (("aisle",), ("north", "east"), ("down",))
 
 #: Entry of one log: the non-empty columns of its rows, of the main axes if present, and
-#: ``sigma_ratios`` (by "kf" and "ekf2": actual over reported σ, √(mean NIS) of the main axes),
-#: ``status`` ("done" if one axis is), ``lacking`` (reasons for missing results, with actions),
+#: ``severity`` (also of logs without a result), ``words`` (of the four verdicts), ``status``
+#: ("done" if one axis is), ``lacking`` (reasons for missing results, with actions),
 #: ``axes`` (rows with an axis), ``findings`` (ids) and ``tags`` (label by page filter value)
 Log = Mapping[str, Any]
 
@@ -69,53 +81,91 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     str
         HTML to write as UTF-8; equal for equal input, because it does not contain the date.
     """
-    logs = logs_of(table)
+    logs = sort_logs(logs_of(table))
     names = short_names(logs)
-    rows = []
-    for log in logs:
-        finding_titles = [finding_title(finding) for finding in log["findings"]]
-        vehicle = log.get("vehicle", "")
-        cells = (
-            Cell(log["name"], log["name"], log["log"].rpartition("/")[0]),
-            frame.text_cell(log.get("date", "")[:10]),
-            frame.text_cell(names.get(vehicle, str(vehicle))),
-            frame.text_cell(log.get("firmware", "")),
-            Cell(log["status"], log["status"], style_class=STATUS_STYLES[log["status"]]),
-            *(
-                _value_cell(log["sigma_ratios"].get(filter_name), describe_sigma_ratio)
-                for filter_name in ("kf", "ekf2")
-            ),
-            *(
-                _value_cell(log.get(name), format_number)
-                for name in ("sigma_z_m", "clock_offset_s", "position_rms_m")
-            ),
-            Cell()
-            if log["status"] == FAILED
-            else frame.number_cell(float(len(finding_titles)), below=join_first(finding_titles, 2)),
-        )
-        rows.append(Row(cells, tuple(log["tags"]), _details(log), _side_sections(log)))
+    rows = [
+        Row(_cells(log, names), tuple(log["tags"]), _details(log), _side_sections(log))
+        for log in logs
+    ]
+    counts = Counter(log["severity"] for log in logs)
+    parts = (
+        ("error", "with an error"),
+        ("warning", "with a warning"),
+        ("clean", "without a fault"),
+        ("refused", "refused"),
+    )
+    count_text = ", ".join(f"{counts[name]} {text}" for name, text in parts if counts[name])
     return frame.page(
         title=title,
-        subtitle=f"{len(logs)} log{'' if len(logs) == 1 else 's'}, compared with {made_with}",
+        subtitle=f"{len(logs)} log{'' if len(logs) == 1 else 's'}"
+        f"{f': {count_text}' if count_text else ''}. Compared with {made_with}.",
+        html_above=load_template("fleet/axis.html").render(limits=band_limits()),
         noun=("log", "logs"),
         columns=(
-            Column("Log"),
-            Column("Date (UTC)", "line", visible_from="tablet"),
-            Column("Vehicle", "line", visible_from="desk"),
-            Column("Firmware", "line", visible_from="desk"),
-            Column("Status"),
-            Column("σ of KF", "number"),
-            Column("σ of EKF2", "number", visible_from="tablet"),
-            Column("SIGMA_Z estimate (m)", "number", visible_from="tablet"),
-            Column("Time offset (s)", "number", visible_from="desk"),
-            Column("KF - EKF2, RMS (m)", "number", visible_from="desk"),
-            Column("Findings", "rank", visible_from="desk"),
+            Column("Sign", "rank"),
+            Column("Log", "name"),
+            Column("Diagnosis and first action", "full"),
+            *(
+                Column(f"{FILTER_NAMES[owner]} {MARKS[against]}", "ratio", visible_from="tablet")
+                for owner, against in (name.split("_") for name in RATIOS)
+            ),
+            Column("KF − EKF2 (m)", "number", visible_from="tablet"),
+            *(Column(label, "line", MORE) for label in ("Date (UTC)", "Vehicle", "Firmware")),
+            Column("SIGMA_Z estimate (m)", "number", MORE),
+            Column("Time offset (s)", "number", MORE),
+            Column("Findings", "rank", MORE),
         ),
         rows=rows,
         filters=_filters(logs),
+        groups=[(MORE, "more columns")],
         placeholder="name, vehicle, firmware, finding",
         full_table_note="All rows are in fleet.csv.",
+        ratio_axis={"bands": BANDS, "ends": AXIS_ENDS, "marks": MARK_PATHS},
     )
+
+
+def _cells(log: Log, names: Mapping[str, str]) -> tuple[Cell, ...]:
+    finding_titles = [finding_title(finding) for finding in log["findings"]]
+    vehicle = log.get("vehicle", "")
+    severity, action = log["severity"], log.get("action", "")
+    style = "command" if action.startswith(("px4fuse ", "param ")) else ""
+    return (
+        Cell(SIGNS[severity], SEVERITIES.index(severity), style_class=f"sign {severity}"),
+        Cell(log["name"], log["name"], log.get("changed", "")),
+        Cell(log["headline"], log["headline"], action, style_class=style),
+        *(
+            _ratio_cell(log.get(f"{name}_ratio"), name, word)
+            for name, word in zip(RATIOS, log["words"], strict=True)
+        ),
+        _value_cell(log.get("difference_rms_m"), format_metres),
+        frame.text_cell(log.get("date", "")[:10]),
+        frame.text_cell(names.get(vehicle, str(vehicle))),
+        frame.text_cell(log.get("firmware", "")),
+        _value_cell(log.get("sigma_z_m"), format_number),
+        _value_cell(log.get("clock_offset_s"), format_number),
+        Cell()
+        if log["status"] == FAILED
+        else frame.number_cell(float(len(finding_titles)), below=join_first(finding_titles, 2)),
+    )
+
+
+def _ratio_cell(ratio: float | None, name: str, word: str) -> Cell:
+    owner, _, against = name.partition("_")
+    loud = " loud" if word in ("overconfident", "underconfident") else ""
+    if ratio is None:
+        return Cell()
+    return Cell(format_ratio(ratio), ratio, style_class=f"{owner} {against}{loud}")
+
+
+def sort_logs(logs: Iterable[Log]) -> list[Log]:
+    """Sort logs by severity, then by their largest |ln ratio|, then by position RMSE."""
+
+    def rank(log: Log) -> tuple[float, ...]:
+        ratios = [log[key] for name in RATIOS if log.get(key := f"{name}_ratio")]
+        largest = max((abs(math.log(ratio)) for ratio in ratios), default=0.0)
+        return SEVERITIES.index(log["severity"]), -largest, -log.get("position_rmse_m", 0.0)
+
+    return sorted(logs, key=rank)
 
 
 def _value_cell(value: float | None, format_value: Callable[[float], str]) -> Cell:
@@ -134,7 +184,6 @@ def _details(log: Log) -> tuple[Section, ...]:
             "Missing results", [reason for reason, _ in log["lacking"] if reason], is_warning=True
         ),
         frame.list_section("Actions", list(dict.fromkeys(r for _, r in log["lacking"] if r))),
-        frame.list_section("Summary", list(filter(None, log.get("summary", "").splitlines()))),
         frame.list_section(
             "Findings", [f"{finding_title(id_)} ({id_})" for id_ in log["findings"]]
         ),
@@ -203,28 +252,26 @@ def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
     reasons_and_remedies = ((row.get("reason", ""), row.get("remedy", "")) for row in rows)
     log |= {
         "name": log.get("name") or PurePosixPath(log["log"]).name or "unnamed",
-        "sigma_ratios": {
-            filter_name: ratio
-            for filter_name in ("kf", "ekf2")
-            if (ratio := _mean_sigma_ratio(main_rows, f"{filter_name}_nis_mean")) is not None
-        },
         "status": DONE if any(row["status"] == DONE for row in rows) else rows[0]["status"],
         "lacking": tuple(dict.fromkeys(pair for pair in reasons_and_remedies if any(pair))),
         "axes": axes,
         "findings": [id_ for id_ in log.get("findings", "").split(FINDING_SEPARATOR) if id_],
     }
+    refused = log["status"] if log["status"] == NOT_COMPARED else "refused"
+    log |= {
+        "severity": log.get("severity", "refused"),
+        "headline": log.get("headline", f"{refused}: {log.get('reason', '')}"),
+        "action": log.get("action") or log.get("remedy", "") * ("headline" not in log),
+        "words": (log.get("verdicts", "").split(FINDING_SEPARATOR) + [""] * 4)[:4],
+    }
     return log | {"tags": _tags(log)}
 
 
-def _mean_sigma_ratio(axes: Sequence[Mapping[str, Any]], name: str) -> float | None:
-    nis_and_updates = [(row[name], row.get("updates", 1)) for row in axes if name in row]
-    total = sum(nis * updates for nis, updates in nis_and_updates)
-    updates_total = sum(updates for _, updates in nis_and_updates)
-    return float(total / updates_total) ** 0.5 if total > 0.0 else None
-
-
 def _tags(log: Log) -> dict[str, str]:
-    tags = {f"status:{log['status']}": log["status"]}
+    tags = {
+        f"severity:{log['severity']}": log["severity"],
+        f"status:{log['status']}": log["status"],
+    }
     for name in ("vehicle", "firmware"):
         tags[f"{name}:{log.get(name, '')}"] = log.get(name, f"{name} unknown")
     tags |= {f"finding:{finding}": finding_title(finding) for finding in log["findings"]}
@@ -236,15 +283,3 @@ def short_names(logs: Sequence[Log]) -> dict[str, str]:
     long_ids = {vehicle for log in logs if len(vehicle := log.get("vehicle", "")) > 20}
     short_ids = {vehicle: f"…{vehicle[-8:]}" for vehicle in long_ids}
     return short_ids if len(set(short_ids.values())) == len(short_ids) else {}
-
-
-def describe_sigma_ratio(ratio: float) -> str:
-    """Describe the reported σ of a filter; ``ratio``: actual σ over reported σ.
-
-    >>> [describe_sigma_ratio(ratio) for ratio in (1.2, 3.2, 0.25)]
-    ['consistent', '3.2 × too small', '4 × too large']
-    """
-    factor = max(ratio, 1.0 / ratio)
-    if factor <= MAX_CONSISTENT_RATIO:
-        return "consistent"
-    return f"{format_factor(factor)} × too {'small' if ratio > 1.0 else 'large'}"

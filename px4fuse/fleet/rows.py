@@ -1,6 +1,7 @@
 """Rows of the table of ``px4fuse batch``: one per axis of a log, made of the results."""
 
 import csv
+import shlex
 from collections.abc import Iterable, Mapping
 from functools import reduce
 from importlib.resources import files
@@ -8,9 +9,11 @@ from typing import Any
 
 import pandas as pd
 
+from px4fuse.card.model import Card
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.findings import Finding
 from px4fuse.record import Unavailable
+from px4fuse.request import quote_command
 from px4fuse.results.contract import ComparisonResults, Log
 from px4fuse.spreadsheet import neutralise_formulas
 from px4fuse.text import utc_time
@@ -55,7 +58,7 @@ def axis_rows(results: ComparisonResults) -> list[Row]:
     common estimate. A time offset that the flight does not determine is absent.
     """
     common = log_columns(results.log) | finding_columns(results.findings, results.aids)
-    common["summary"] = results.card.headline
+    common |= card_columns(results.card)
     has_time_offset = bool(value_at(results, "clock.is_determinable"))
     rows = []
     for name, axis in results.axes.items():
@@ -83,6 +86,51 @@ def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) 
         "findings": FINDING_SEPARATOR.join(finding.id for finding in causes),
         "severities": sorted({finding.severity for finding in causes}),
     }
+
+
+def card_columns(card: Card) -> Row:
+    """Return the columns of the diagnosis card, which are the same for all axes of a log."""
+    rmse_m = card.effect.position_rmse_m.values() if card.effect else ()
+    return {
+        "severity": card.severity,
+        "headline": card.headline,
+        "action": first_action(card),
+        "changed": "; ".join((*card.identity.changed, *card.identity.parameters)),
+        "verdicts": FINDING_SEPARATOR.join(
+            f"{verdict.word}, explained" if verdict.is_explained else verdict.word
+            for verdict in card.verdicts
+        ),
+        **{f"{verdict.filter}_{verdict.against}_ratio": verdict.ratio for verdict in card.verdicts},
+        "position_rmse_m": max(rmse_m, default=None),
+        "difference_rms_m": card.effect.difference_rms_m if card.effect else None,
+    }
+
+
+def first_action(card: Card) -> str:
+    """Return the commands of the first action against the first cause, else its sentence."""
+    if not card.causes:
+        return ""
+    first = card.causes[0]
+    for action in (*(first.alternatives[0] if first.alternatives else ()), *first.actions):
+        if action.commands:
+            return "\n".join(action.commands)
+        if not action.sentence.startswith("no "):
+            break
+    return card.do_this[0] if card.do_this else ""
+
+
+def typed_action(row: Row, path: str) -> Row:
+    """Replace the file name in the command of a row by the path of the log.
+
+    >>> row = {"name": "a.ulg", "action": "px4fuse compare a.ulg --sigma-a 0.4"}
+    >>> typed_action(row, "my logs/a.ulg")["action"]
+    "px4fuse compare 'my logs/a.ulg' --sigma-a 0.4"
+    """
+    action = row.get("action", "")
+    if not action.startswith("px4fuse "):
+        return row
+    words = [path if word == row["name"] else word for word in shlex.split(action)]
+    return row | {"action": quote_command(words)}
 
 
 def log_columns(log: Log) -> Row:

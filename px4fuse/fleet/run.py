@@ -22,7 +22,15 @@ from px4fuse.fleet.engine import connect_cluster, run_jobs
 from px4fuse.fleet.job import Job, Outcome, analyse, failure_row, file_stem
 from px4fuse.fleet.logs import FoundLog, find_logs
 from px4fuse.fleet.page import html_text
-from px4fuse.fleet.rows import FAILED, NOT_COMPARED, Row, clean_row, csv_bytes, make_table
+from px4fuse.fleet.rows import (
+    FAILED,
+    NOT_COMPARED,
+    Row,
+    clean_row,
+    csv_bytes,
+    make_table,
+    typed_action,
+)
 from px4fuse.input_files import check_output_folder
 from px4fuse.reading import max_log_bytes
 from px4fuse.request import ComparisonRequest, command_line
@@ -304,7 +312,7 @@ def _write_table(state: _RunState, logs: Iterable[FoundLog]) -> BatchResult:
             common |= {"px4fuse": state.px4fuse, "settings": state.settings}
             for row in rows_of_log(log):
                 severities.update(row.get("severities", ()))
-                yield row | common
+                yield typed_action(row, log.log) | common
 
     table = make_table(rows())
     page = html_text(table, state.output.resolve().name, f"px4fuse {state.px4fuse}")

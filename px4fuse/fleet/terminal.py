@@ -4,25 +4,28 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from px4fuse.findings import finding_title
+from px4fuse.card.numbers import format_ratio
 from px4fuse.fleet.measures import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
-from px4fuse.fleet.rows import FAILED, FINDING_SEPARATOR
-from px4fuse.report.page import Page, styled_text
+from px4fuse.fleet.page import RATIOS, Log, logs_of, sort_logs
+from px4fuse.fleet.rows import FAILED
+from px4fuse.report.card_html import SIGNS
+from px4fuse.report.page import Cell, Page, styled_text
 from px4fuse.report.style import MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.contract import ChangeResults, Interval
-from px4fuse.text import format_factor, format_number
+from px4fuse.text import format_number
 
 if TYPE_CHECKING:
     from px4fuse.fleet.run import BatchResult
 
-# Maximum number of reasons, and of findings, in the summary
-MAX_LISTED = 8
+# Maximum number of reasons, and of logs, in the summary
+MAX_LISTED, MAX_DIAGNOSES = 8, 40
+RATIO_NOTE = "Actual ÷ reported: ● innovation ÷ √S, ◆ error ÷ σ (ground truth)"
 RED, YELLOW = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warning"]
 NUMBER_HEADS = ("number", "A", "95 %", "B", "95 %", "unit")
 
 
 def format_summary(batch_result: BatchResult) -> Page:
-    """Format the reasons for failed logs, the σ factors of both filters by axis, and findings."""
+    """Format the reasons for failed logs, and a diagnosis with four ratios for each log."""
     page, logs = Page(), batch_result.table.drop_duplicates("log")
     uncompared = logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)["log"]
     causes = uncompared.agg(["count", "first"]).reset_index()
@@ -34,32 +37,31 @@ def format_summary(batch_result: BatchResult) -> Page:
     if len(sorted_causes) > MAX_LISTED:
         remaining_count = len(sorted_causes) - MAX_LISTED
         page.write(f"fleet.html lists {remaining_count} further reasons for logs without a result.")
-    heads = [
-        f"{filter_name}\n{title}" for filter_name in ("KF", "EKF2") for title in ("logs", "σ ratio")
-    ]
-    lines = []
-    for axis, rows in batch_result.table[batch_result.table["axis"] != ""].groupby(
-        "axis", sort=False
-    ):
-        cells = []
-        for ratios in (rows["kf_sigma_ratio"].dropna(), rows["ekf2_sigma_ratio"].dropna()):
-            cells += [f"{len(ratios)}", format_factor(ratios.median()) if len(ratios) else "–"]
-        lines.append((str(axis), *cells))
-    if lines:
-        page.table(("axis", *heads), lines, right=(1, 2, 3, 4))
-        ratio_note = (
-            "σ ratio: median over the logs of actual σ / reported σ (above 1: overconfident)"
-        )
-        page.write(ratio_note, colour=MUTED_COLOUR)
-    finding_ids = logs["findings"].str.split(FINDING_SEPARATOR).explode()
-    for finding, count in finding_ids[finding_ids != ""].value_counts().head(MAX_LISTED).items():
-        page.write(f"{count} × {finding_title(str(finding))}")
+    entries = sort_logs(logs_of(batch_result.table))
+    if entries:
+        rows = [_diagnosis(log) for log in entries[:MAX_DIAGNOSES]]
+        page.table(("", "log", "diagnosis", "KF ●", "◆", "EKF2 ●", "◆"), rows, right=(3, 4, 5, 6))
+        page.write(RATIO_NOTE, colour=MUTED_COLOUR)
+    if len(entries) > MAX_DIAGNOSES:
+        page.write(f"and {len(entries) - MAX_DIAGNOSES} more: fleet.html")
     counts = logs["status"].value_counts()
     status_counts = ", ".join(f"{count} {status}" for status, count in counts.items())
     retry_note = " Run the same command to repeat failed logs." if FAILED in counts else ""
     reused = f"{batch_result.reused_count} reused from an earlier run"
     page.write(f"{len(logs)} logs: {status_counts}; {reused}.{retry_note}")
     return page
+
+
+def _diagnosis(log: Log) -> tuple[Cell, ...]:
+    """Return sign, name, headline and the four ratios of a log."""
+    colour = SEVERITY_COLOURS.get(log["severity"], MUTED_COLOUR)
+    ratios = (log.get(f"{name}_ratio") for name in RATIOS)
+    return (
+        (SIGNS[log["severity"]][0], colour),
+        log["name"],
+        log["headline"],
+        *("–" if ratio is None else format_ratio(ratio) for ratio in ratios),
+    )
 
 
 def format_differences(results: ChangeResults) -> Page:

@@ -1,7 +1,8 @@
 """Checks of a rubric: each check is a class of items; its fields are the parameters of the check.
 
-A check scores the :class:`Evidence` of a report. ``rubric.toml`` describes all checks: of the
-report (verified, number, answers, text), the filter (tuning, consistent, clock) and the loop.
+A check scores one report by its results, the verdict of the verification and the answer key.
+``rubric.toml`` describes all checks: of the report (verified, number, answers, text), the filter
+(tuning, consistent, clock) and the loop.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ Text = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN}*$")]
 Title = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN}*[^\s\x00-\x1f\x7f]{_PLAIN}*$")]
 Bound = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Factor = Annotated[float, Meta(ge=1.0, le=1000.0)]
-# share of the points (0 to 1), and the reason as a sentence for the student
+# fraction of the maximum points (0 to 1), and the reason as a sentence for the student
 ShareAndReason = tuple[float, str]
 
 
@@ -60,9 +61,9 @@ class RubricItem(
     points : float
         Maximum points.
     report : {"any", "compare", "loop"}
-        Command whose reports have this item.
+        Command whose reports are scored by this item.
     needs_key : bool
-        True if reports have the item only with an answer key.
+        True if the item is used only with an answer key.
     by_hand : bool
         True if the instructor scores the item.
     """
@@ -75,18 +76,19 @@ class RubricItem(
     report: Literal["any", "compare", "loop"] = "any"
 
     def score(self, evidence: Evidence) -> ShareAndReason:
-        """Return the share of the points (0 to 1), and a sentence with the reason."""
+        """Return the fraction of the maximum points (0 to 1), and a sentence with the reason."""
         raise NotImplementedError
 
     def applies(self, kind: str, key: AnswerKey | None) -> bool:
-        """Return True if reports of this command have the item."""
+        """Return True if the item scores reports of the command ``kind``."""
         return self.report in ("any", kind) and (key is not None or not self.needs_key)
 
 
 def share_for_deviation(deviation_factor: float, factor: float) -> float:
-    """Return the share of the points for a deviation: 1 at a factor of 1, 0 from ``factor`` on.
+    """Return the fraction of the points for a value that is wrong by ``deviation_factor``.
 
-    Between them the share decreases linearly with the logarithm of the deviation.
+    The fraction is 1 for a factor of 1, and 0 from ``factor`` on. In between it decreases linearly
+    with the logarithm of the deviation.
 
     >>> [round(share_for_deviation(off, 4.0), 2) for off in (1.0, 2.0, 4.0, 9.0)]
     [1.0, 0.5, 0.0, 0.0]
@@ -120,12 +122,12 @@ class Evidence:
 
     @cached_property
     def answer(self) -> Answer | None:
-        """Answer for the log of the report; None if the log is not in the answer key."""
+        """Entry of the answer key for the log of the report; None if there is no such entry."""
         return None if self.key is None else self.key.of_log(log_sha256(self.results))
 
     @cached_property
     def assigned_answer(self) -> Answer | None:
-        """Answer for the student, found by the id on the platform, else by the id in the report."""
+        """Entry of the answer key for the student, by the id on the platform or in the report."""
         if self.key is None:
             return None
         answer_by_stated_id = self.key.of_student(shorten_text(self.results.student.id))
@@ -141,7 +143,7 @@ class Evidence:
 
     @cached_property
     def form(self) -> Answers | str:
-        """Completed answer form about the log of the report, or the reason why it is missing."""
+        """Student's answer form about the log of the report, or the reason why it is missing."""
         answers = self.results.student.answers
         if not isinstance(answers, Answers):
             return "your report contains no answer form. Make the report with --answers FILE"
@@ -174,7 +176,7 @@ class Evidence:
         )
 
     def names_mistake(self, *kinds: str) -> bool:
-        """Return True if the student's form names a mistake of one of these kinds."""
+        """Return True if the student's answer form names a mistake of one of these kinds."""
         form = self.form
         return isinstance(form, Answers) and any(mistake.kind in kinds for mistake in form.mistakes)
 
@@ -253,7 +255,7 @@ class NumberItem(RubricItem, frozen=True, kw_only=True, tag="number"):
             )
 
     def _width(self) -> float:
-        """Return the distance from the nearer bound to ``zero_at``; negative if it is inside."""
+        """Return the distance from the nearer bound to ``zero_at``; negative within the bounds."""
         zero = self.zero_at
         return 0.0 if zero is None else max(self.at_least - zero, zero - self.at_most)
 
@@ -264,7 +266,7 @@ class NumberItem(RubricItem, frozen=True, kw_only=True, tag="number"):
         return max(1.0 - excess / self._width(), 0.0) if self._width() > 0.0 else 0.0
 
     def score(self, evidence: Evidence) -> ShareAndReason:
-        """Return 1 within the bounds, decreasing to 0 at ``zero_at``."""
+        """Return 1 within the bounds; outside, the score decreases linearly to 0 at ``zero_at``."""
         values = values_at(evidence.values, self.path)
         values_by_path = {name: float(value) for name, value in values if is_number(value)}
         if not values_by_path:
@@ -288,7 +290,7 @@ class AnswersItem(RubricItem, frozen=True, kw_only=True, tag="answers"):
     needs_key: ClassVar[bool] = True
 
     def score(self, evidence: Evidence) -> ShareAndReason:
-        """Return the share of the points of :mod:`px4fuse.grading.form_points`."""
+        """Return the fraction of the points that :mod:`px4fuse.grading.form_points` gives."""
         form_result = evidence.form_points
         if isinstance(form_result, str):
             return 0.0, f"{capitalise_first(form_result)}."
@@ -320,10 +322,10 @@ class TextItem(RubricItem, frozen=True, kw_only=True, tag="text"):
 # ------------------------------------------------------------------ the filter
 
 
-# findings about timestamps whose time offset is not constant
+# ids of the findings that report a time offset which is not constant
 CHANGING_CLOCK_FINDINGS = ("source_time_offset_changes", "source_timestamps_are_arrival_times")
 Sigma = Literal["sigma_z_m", "sigma_a_m_s2"]
-# name in messages, unit and option of each noise
+# name in messages, unit and command-line option of both noises of KF
 NOISE_SETTINGS: dict[Sigma, tuple[str, str, str]] = {
     "sigma_z_m": ("SIGMA_Z", "m", "--sigma-z"),
     "sigma_a_m_s2": ("SIGMA_A", "m/s²", "--sigma-a"),
@@ -331,13 +333,13 @@ NOISE_SETTINGS: dict[Sigma, tuple[str, str, str]] = {
 
 
 class TuningItem(RubricItem, frozen=True, kw_only=True, tag="tuning"):
-    """Check that SIGMA_A or SIGMA_Z is within the 95 % interval of its estimate."""
+    """Check that SIGMA_A or SIGMA_Z is within the 95 % interval of the estimate."""
 
     setting: Sigma
     factor: Factor = 2.0
 
     def score(self, evidence: Evidence) -> ShareAndReason:
-        """Return 1 within the 95 % interval, decreasing to 0 at ``factor`` times its end."""
+        """Return 1 within the 95 % interval, and 0 for a value that is outside by ``factor``."""
         if evidence.comparison is None:
             return NO_COMPARISON
         return _score_tuning(evidence, evidence.comparison, self.setting, self.factor)
@@ -354,7 +356,8 @@ def _score_tuning(
         reason_text = evidence.missing_reason(f"tuning.{HORIZONTAL}")
         return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
     low, high = interval
-    if name == "sigma_z_m" and evidence.has_finding("source_may_drift"):
+    may_drift = evidence.has_finding("source_may_drift") or evidence.has_finding("source_drift")
+    if name == "sigma_z_m" and may_drift:
         # innovations do not show the drift of a source, so a SIGMA_Z up to the known error is right
         high = max(high, _largest_source_error_m(comparison))
     deviation_factor = max(chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0)
@@ -373,7 +376,7 @@ def _score_tuning(
 
 
 def _largest_source_error_m(comparison: ComparisonResults) -> float:
-    """Return the largest error (m) by ground truth or loop closure; 0 if both are missing."""
+    """Return the largest error (m) against ground truth or loop closure; 0 without both."""
     truths = [axis.filters["kf"].truth for axis in comparison.axes.values()]
     errors_m = [truth.position_rmse_m for truth in truths if isinstance(truth, ErrorsAgainstTruth)]
     if isinstance(comparison.loop, LoopResult):
@@ -384,7 +387,7 @@ def _largest_source_error_m(comparison: ComparisonResults) -> float:
 class ConsistencyItem(RubricItem, frozen=True, kw_only=True, tag="consistent"):
     """Check that KF is consistent, or that no other SIGMA_A and SIGMA_Z would make it consistent.
 
-    From a σ that is too small or too large by ``factor`` on, there are no points.
+    A reported σ that is too small or too large by ``factor`` or more has no points.
     """
 
     factor: Factor = 2.0
@@ -415,10 +418,10 @@ class ConsistencyItem(RubricItem, frozen=True, kw_only=True, tag="consistent"):
 
 
 class ClockItem(RubricItem, frozen=True, kw_only=True, tag="clock"):
-    """Check that the applied time offset agrees with the estimated one.
+    """Check that the applied time offset of the position source agrees with the estimated one.
 
-    ``undeterminable``: share of the points if the flight does not determine the offset. An assigned
-    log gives all points in this case, because the student could not choose the flight.
+    ``undeterminable``: fraction of the points if the flight does not determine the offset. An
+    assigned log gives all points in this case, because the student could not choose the flight.
     """
 
     margin_s: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.03
@@ -453,21 +456,22 @@ class ClockItem(RubricItem, frozen=True, kw_only=True, tag="clock"):
 # ------------------------------------------------------------------ a loop
 
 
-# m; largest distance between landing and take-off of a closed loop (accuracy of a measuring tape)
+# m; maximum distance between take-off and landing place of a closed loop, for students who measure
+# it with a tape
 MAX_CLOSED_LOOP_M = 0.5
-# share of the quarter for a reduced ATE, if the path was corrected but has no reference for an ATE
+# fraction of the points for a reduced ATE, if there is no reference to compute the ATE
 NO_REFERENCE_SHARE = 0.5
 
 
 class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
-    """Check a loop: closure error measured, closure accepted, path corrected, ATE reduced.
+    """Check four conditions: closure error measured, closure accepted, path corrected, ATE reduced.
 
-    Each gives a quarter of the points. If the vehicle did not land at the take-off place (answer
-    key), a report without an accepted closure gets all points.
+    Each condition gives a quarter of the points. If the vehicle did not land at the take-off place
+    (according to the answer key), a report without an accepted closure gets all points.
     """
 
     def score(self, evidence: Evidence) -> ShareAndReason:
-        """Return the share of the points, and sentences with closure error and ATE."""
+        """Return the fraction of the points, and sentences with closure error and ATE."""
         loop = evidence.results.loop
         is_accepted = isinstance(loop, LoopResult) and any(
             closure.accepted for closure in loop.closures
@@ -508,7 +512,7 @@ class LoopItem(RubricItem, frozen=True, kw_only=True, tag="loop"):
 def _score_corrections(
     corrections: Mapping[CorrectionName, OrUnavailable[Correction]],
 ) -> ShareAndReason:
-    """Return 1 for a corrected path, plus 1 if the correction reduces the ATE."""
+    """Return the number of quarters: 1 for a corrected path, 1 more if its ATE is smaller."""
     ways: tuple[CorrectionName, ...] = ("by_distance_plain", "by_distance", "pose_graph_gated")
     corrected_paths = [
         correction

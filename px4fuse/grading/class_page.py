@@ -22,7 +22,7 @@ from px4fuse.webpage.safe import load_template, local_link
 
 BIN_COUNT = 10
 MISSING = "no submission"
-# style and symbol of each status, in the order in which the table sorts them
+# CSS style and symbol of each verification status, in the order in which the table sorts them
 STATUS_STYLES: dict[str, tuple[str, str]] = {
     "verified": ("good", "✓"),
     "numbers differ": ("bad", "≠"),
@@ -125,7 +125,7 @@ def _item_statistics(reports: Sequence[GradedReport]) -> Iterator[tuple[Any, ...
 def count_tenths(values: Sequence[float], maximum: float) -> list[tuple[int, str]]:
     """Count the values in each tenth from 0 to ``maximum``; return counts and lower edges.
 
-    >>> tenths([0.0, 5.0, 5.5, 9.0], 10.0)[5]
+    >>> count_tenths([0.0, 5.0, 5.5, 9.0], 10.0)[5]
     (2, '5')
     """
     counts, edges = np.histogram(np.clip(values, 0.0, maximum), BIN_COUNT, (0.0, maximum))
@@ -167,7 +167,7 @@ def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
         *(frame.number_cell(points_by_title.get(name)) for name in items),
         *(frame.number_cell(number_values.get(name)) for name in numbers),
     )
-    # a row with pseudonym has neither id nor file, by which overrides.csv identifies students
+    # overrides.csv identifies students by id or file; a row with pseudonym has neither
     box_parts = (_point_boxes(entry),) if entry.student_id or file else ()
     # a row with pseudonym has no link, because the file name may contain the student's name
     redrawn_links = (

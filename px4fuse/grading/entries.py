@@ -1,8 +1,8 @@
 """Rows of the class table: the report that counts, late deduction, and the instructor's overrides.
 
-``overrides.csv`` takes precedence over all rules. A late deduction is a percentage of the maximum
-points for each started day (or hour) after the due time, at most the maximum that the rule states.
-The total is never negative.
+Points that the instructor writes into ``overrides.csv`` replace all computed points. A late
+deduction is a percentage of the maximum points for each started day (or hour) after the due time,
+at most the maximum that the rule states. The total is never negative.
 """
 
 import math
@@ -102,7 +102,7 @@ class Course:
     due : datetime or None
         Due time, with time zone.
     include_pending : bool
-        True to count proposed points of pending reports.
+        True to count the proposed points of pending reports, on which the instructor has to decide.
     late_rule : LateRule or None
     anonymous : bool
         True to show pseudonyms instead of names on the class page.
@@ -132,8 +132,8 @@ class Course:
         )
 
 
-# submitted report: sort key (submission time, time of the zip entry), report, and the row that the
-# student would have with this report only
+# one submitted report: sort key (submission time, time of the zip entry), graded report, and the
+# row of the class table if the student had submitted this report only
 Attempt = tuple[tuple[float, float], GradedReport, Entry]
 
 
@@ -226,7 +226,7 @@ def _make_attempt(
     student_index: int | None,
     register: Register,
 ) -> Attempt:
-    """Make the row that a student would have with this report only, and its sort key."""
+    """Make the row of a student as if this were the only report, with the sort key."""
     origin, due = submission.origin, course.due
     platform = origin.platform.capitalize()
     person = Person(report.student_id) if student_index is None else register.people[student_index]
@@ -282,19 +282,20 @@ def _make_attempt(
 
 
 def _points_after_deduction(attempt: Attempt) -> float:
-    """Return points minus deduction; proposed points if the report is pending."""
+    """Return the points, proposed or final, minus the late deduction."""
     _, report, entry = attempt
     return max(report.points - entry.deduction, 0.0)
 
 
 def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
     """Choose the attempt that counts, and add flags if the choice is ambiguous."""
-    # several reports of one submission have the same time and are sorted by their points
+    # several reports of one submission have the same time; points are the second sort key
     ordered_attempts = sorted(
         attempts,
         key=lambda attempt: (attempt[0], _points_after_deduction(attempt), attempt[1].submission),
     )
-    # a pending report, or a file that is not a report, counts only if there is no other report
+    # reports that need no decision of the instructor come first, then pending reports, then other
+    # files
     report_attempts = [attempt for attempt in ordered_attempts if attempt[1].version]
     eligible_attempts = (
         [attempt for attempt in report_attempts if not attempt[1].pending_action]
@@ -432,7 +433,7 @@ def match_overrides(
     Returns
     -------
     matched_overrides : list of dict
-        For each entry, by the title of an item, "total", or "" (the whole report).
+        Overrides of each entry, by the title of an item, "total", or "" (the whole report).
     notes : tuple of str
     """
     matched_overrides: list[dict[str, Override]] = [{} for _ in entries]

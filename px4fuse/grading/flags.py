@@ -21,16 +21,16 @@ from px4fuse.simulation import flights
 from px4fuse.text import capitalise_first, join_first
 from px4fuse.verification.model import Verdict
 
-# number of equal values from which two forms are flagged, and relative tolerance of an equal value,
-# so that small changes to a copy are detected
+# minimum number of equal numbers in two answer forms that are flagged, and relative tolerance of
+# equal numbers, which detects a copy with small changes
 MIN_SAME_NUMBERS, SAME_NUMBER_TOLERANCE = 3, 0.02
-# fraction of the log below which a segment from --start and --end is flagged
+# minimum fraction of the log in the segment of --start and --end; a shorter segment is flagged
 MIN_SEGMENT_FRACTION = 0.5
-# factor between a setting and its maximum-likelihood estimate above which the setting is flagged
+# maximum factor between SIGMA_A or SIGMA_Z and its maximum-likelihood estimate, in both directions
 MAX_SETTING_FACTOR = 30.0
-# factor between --drift (or --heading-drift) and its default above which the option is flagged
+# maximum factor between --drift or --heading-drift and its default, in both directions
 MAX_DRIFT_FACTOR = 4.0
-# reports that the sentence of a flag lists
+# maximum number of reports that a flag lists
 MAX_LISTED_REPORTS = 4
 # pairs of reports with the same contents
 Pairs = Iterator[tuple[GradedReport, GradedReport]]
@@ -70,8 +70,8 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
     if settings.input == "zero" and not without_imu:
         yield "The IMU was not used (--input zero)."
     source = results.source
-    tracks_as_received = [track.name for track in source.available if track.path == "as it arrived"]
-    if tracks_as_received and source.path != "as it arrived":
+    tracks_as_received = [track.name for track in source.available if track.path == "as received"]
+    if tracks_as_received and source.path != "as received":
         yield (
             f"The position source is {source.name} ({source.path}), not "
             f"{tracks_as_received[0]}, the positions as received by PX4."
@@ -94,9 +94,9 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
 
 
 def _flag_drift(request: LoopRequest) -> Iterator[str]:
-    """Flag a stated drift that differs from the default by more than the factor MAX_DRIFT_FACTOR.
+    """Flag a drift of the odometry, stated by an option, that is far from the default.
 
-    The chi-square test of a loop closure uses this drift.
+    The chi-square test of a loop closure uses this drift; the limit is MAX_DRIFT_FACTOR.
     """
     defaults = LoopRequest(source="")
     for option, unit, drift, default in (
@@ -111,7 +111,7 @@ def _flag_drift(request: LoopRequest) -> Iterator[str]:
 
 
 def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
-    """Return the numbers of a form, by (mistake, "size" or "value") or ("", question)."""
+    """Return the numbers of an answer form, by (mistake, "size" or "value") or ("", question)."""
     if report.form is None:
         return {}
     values_by_place: dict[tuple[str, str], object] = {
@@ -143,8 +143,9 @@ def _student_key(report: GradedReport) -> str:
     return normalise_text(report.student_id) or normalise_text(report.student) or report.submission
 
 
-# contents that the reports of two owners must not share: sentence, content (an empty content is not
-# compared), and owner. Example: two reports of one student may be about the same log
+# checks for equal contents: sentence of the flag, function for the content (empty contents are not
+# compared), and function for the owner. Only reports of different owners are flagged: for example,
+# two reports of one student may be about the same log
 COMMON_CHECKS: tuple[
     tuple[str, Callable[[GradedReport], object], Callable[[GradedReport], str]], ...
 ] = (
@@ -169,7 +170,7 @@ COMMON_CHECKS: tuple[
 
 
 def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequence[str]]:
-    """Return flags for reports with the same contents, by name of the submission."""
+    """Return the flags of :data:`COMMON_CHECKS` and of copied forms, by name of the submission."""
     flags_by_submission: dict[str, list[str]] = defaultdict(list)
     for sentence, pairs in (
         *(
@@ -205,7 +206,7 @@ def _same_pairs(
 
 
 def _copied_forms(reports: Sequence[GradedReport]) -> Pairs:
-    """Yield pairs of reports of different students whose forms have the same numbers."""
+    """Yield pairs of reports of different students whose answer forms have the same numbers."""
     numbers_by_report = [(report, _form_numbers(report)) for report in reports]
     for (report, numbers), (other, other_numbers) in combinations(numbers_by_report, 2):
         if _count_same_numbers(numbers, other_numbers) >= MIN_SAME_NUMBERS and _student_key(

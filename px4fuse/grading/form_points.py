@@ -1,8 +1,9 @@
-"""Points of an answer form (of 100), by comparison with the answer key.
+"""Points of a student's answer form (0 to 100), by comparison with the answer key.
 
-The weights and shares reproduce grading by hand. A student who guesses loses points: each false
-claim (named mistake that the flight does not have) costs points, and a mistake that can be guessed
-without a measurement counts only with the right size. ``form_points.toml`` contains the tables.
+The constants reproduce points that an instructor gave by hand. Guessing is not rewarded: each false
+mistake (named in the form, but not in the flight) costs points, and a mistake that can be guessed
+without a measurement has points only with the correct size. ``form_points.toml`` contains the
+tables.
 """
 
 import math
@@ -15,31 +16,32 @@ from px4fuse.answer_form import MISTAKES, Answers, QuantityAnswer, StudentMistak
 from px4fuse.assignment.truth import FormTruth, TrueMistake
 from px4fuse.record import table
 
-# points that each false claim costs, and number of false claims from which no mistake has points
+# deduction (points) for each false mistake, and number of false mistakes from which the right ones
+# have no points either
 FALSE_CLAIM_POINTS, MAX_FALSE_CLAIMS = 10.0, 3
-# shares of the points for naming another mistake: a related one, one with the same effect on
-# EKF2's noise, and a consequence
+# fractions of the points if the form names another mistake instead: a related one, one with the
+# same effect on EKF2's noise, and a consequence
 NEIGHBOUR_SHARE, SAME_NUMBER_SHARE, EFFECT_SHARE = 0.4, 2.0 / 3.0, 0.15
-# mistakes that can be guessed without a measurement: only the right size has points. A close size
+# mistakes that can be guessed without a measurement: only the correct size has points. A close size
 # has none, because the assigned sizes are close to each other
 GUESSABLE_KINDS = frozenset(("open-end",))
 ANY_BOUNDS = (-math.inf, math.inf)
-# a time is right within the larger of these tolerances: seconds, and fraction of the time
+# tolerances of a time, the larger one applies: seconds, and fraction of the time
 TIME_TOLERANCE_S, TIME_TOLERANCE_SHARE = 2.0, 0.05
-# relative tolerances of a computed number, for all of its points and for half of them
+# relative tolerances of a computed number for all points and for half of the points
 FULL_TOLERANCE, HALF_TOLERANCE = 0.02, 0.10
-# relative tolerance of the size of a mistake, for half of its points
+# relative tolerance of the size of a mistake for half of the points
 HALF_SIZE_TOLERANCE = 0.4
 
 
 @dataclass(frozen=True)
 class _Cure:
-    """Correction of mistakes: a parameter with its right values, as in ``form_points.toml``.
+    """Correction that the form may name: parameter and right values, from ``form_points.toml``.
 
     Attributes
     ----------
     of : mapping
-        Share of the points, by mistake.
+        Fraction of the points for this correction, by mistake.
     to : (float, float) or str
         Bounds of the right values, or the name of a rule in :func:`cures`.
     late : bool
@@ -60,14 +62,14 @@ PART_NAMES = tuple(TABLE["weights"])
 
 @dataclass(frozen=True)
 class FormPoints:
-    """Points of a form.
+    """Points of an answer form.
 
     Attributes
     ----------
     points_by_part : mapping
-        Points of each part.
+        Points of each part of the form: "mistakes", "sizes", "correction", ....
     max_points_by_part : mapping
-        Maximum points of each part.
+        Maximum points of each part of the form.
     feedback : tuple of str
         Phrases about right, missed and false mistakes, for the student.
     is_named_by_mistake : mapping
@@ -81,7 +83,7 @@ class FormPoints:
 
     @property
     def share(self) -> float:
-        """Fraction of all points."""
+        """Points divided by the maximum points."""
         return sum(self.points_by_part.values()) / sum(self.max_points_by_part.values())
 
 
@@ -94,13 +96,13 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     if truth.mistakes and len(false_claims) < MAX_FALSE_CLAIMS:
         shares |= _mistake_shares(matches, truth)
     shares["numbers"] = quantities_share = _quantities_share(answers, truth)
-    # half of the points if no number is right: the verdicts of most flights can be guessed
+    # half of the points if no computed number is right, because most verdicts can be guessed
     shares["verdicts"] = _verdicts_share(answers, truth) * (1.0 if quantities_share else 0.5)
     points_by_part = {name: weights[name] * share for name, share in shares.items()}
     if is_clean_named:
         points_by_part["mistakes"] = weights["mistakes"]
     elif truth.mistakes and all(mistake.size is None for mistake in truth.mistakes):
-        # no mistake of this flight has a size, so the points for sizes are given for the mistakes
+        # no mistake of this flight has a size, so "mistakes" gets the points of "sizes" in addition
         points_by_part["mistakes"] += weights["sizes"] * shares["mistakes"]
     points_by_part["mistakes"] = max(
         points_by_part["mistakes"] - FALSE_CLAIM_POINTS * len(false_claims), 0.0
@@ -117,14 +119,14 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     )
 
 
-# mistake of the flight, mistake of the form that matches it best, and share of the points
+# mistake of the flight, best matching mistake in the form, and fraction of the points
 Match = tuple[TrueMistake, StudentMistake | None, float]
 
 
 def _mistake_feedback(
     matches: list[Match], false_claims: list[StudentMistake], is_clean_named: bool
 ) -> Iterator[str]:
-    """Yield a phrase for each right or missed mistake, and one for all false claims."""
+    """Yield a phrase for each right or missed mistake, and one for all false mistakes."""
     if not matches:
         yield f"your flight has no mistake{', as your form states' * is_clean_named}"
     for mistake, claim, _ in matches:
@@ -140,10 +142,9 @@ def _mistake_feedback(
 
 
 def _match_claims(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[StudentMistake]]:
-    """Match each mistake of the flight with one of the form; also return the false claims.
+    """Match each mistake of the flight with one of the form; also return the false mistakes.
 
-    Pairs with the largest share are matched first: equal mistakes, then related mistakes, then
-    consequences.
+    Equal mistakes are matched first, then related mistakes, then consequences.
     """
     unmatched = [claim for claim in answers.mistakes if claim.kind != "none"]
     claim_by_kind: dict[str, tuple[StudentMistake, float]] = {}
@@ -162,7 +163,7 @@ def _match_claims(answers: Answers, truth: FormTruth) -> tuple[list[Match], list
 
 
 def kind_share(kind: str, claimed_kind: str) -> float:
-    """Return the share of the points for naming ``claimed_kind`` instead of ``kind``."""
+    """Return the fraction of the points if the form names ``claimed_kind`` instead of ``kind``."""
     if kind == claimed_kind:
         return 1.0
     if (kind, claimed_kind) == ("r-scale", "ekf2-noise"):
@@ -173,7 +174,7 @@ def kind_share(kind: str, claimed_kind: str) -> float:
 
 
 def _mistake_shares(matches: list[Match], truth: FormTruth) -> dict[str, float]:
-    """Return the shares of the four parts about mistakes: means over the mistakes."""
+    """Return the fraction of the points of the parts about mistakes: the mean over the mistakes."""
     sized_count = sum(mistake.size is not None for mistake, _, _ in matches)
     shares = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
     for mistake, claim, share in matches:
@@ -191,9 +192,9 @@ def _mistake_shares(matches: list[Match], truth: FormTruth) -> dict[str, float]:
 
 
 def size_share(mistake: TrueMistake, claim: StudentMistake) -> float:
-    """Return the share for a size: 1 (right), 1/2 (close), or 1/3.
+    """Return the fraction of the points for a size: 1 (right), 1/2 (close), 1/3, or 0.
 
-    1/3 is for a size with the wrong sign, and for the right size of a related mistake.
+    1/3 is for the wrong sign, and for the correct size of a related mistake.
     """
     size = claim.size_in_first_unit()
     if mistake.size is None or mistake.low is None or mistake.high is None or size is None:
@@ -208,7 +209,7 @@ def size_share(mistake: TrueMistake, claim: StudentMistake) -> float:
 
 
 def when_share(mistake: TrueMistake, claim: StudentMistake) -> float:
-    """Return the share for time and panel: one half for each."""
+    """Return the fraction of the points for the time and the report panel: half for each."""
     if mistake.from_s is None and mistake.until_s is None:
         is_time_right = claim.when == "whole flight"
     else:
@@ -230,7 +231,7 @@ def panels(kind: str) -> list[str]:
 
 
 def cure_share(mistake: TrueMistake, claim: StudentMistake, truth: FormTruth) -> float:
-    """Return the share for a correction and its value."""
+    """Return the fraction of the points for a correction and its value."""
     value = claim.value_in_first_unit()
     shares = [
         share
@@ -249,12 +250,12 @@ def _value_share(value: float, low: float, high: float, fallback: float) -> floa
     return 1.0 / 3.0 if low <= -value <= high else fallback
 
 
-# parameter, bounds of the right values, and share of the points
+# parameter, bounds of the right values, and fraction of the points
 Cure = tuple[str, tuple[float, float], float]
 
 
 def cures(mistake: TrueMistake, truth: FormTruth) -> tuple[Cure, ...]:
-    """Return the corrections of a mistake, with bounds in the unit of the parameter."""
+    """Return the right corrections of a mistake, with bounds of their right values."""
     size, low, high = (
         0.0 if value is None else value for value in (mistake.size, mistake.low, mistake.high)
     )
@@ -282,7 +283,7 @@ def cures(mistake: TrueMistake, truth: FormTruth) -> tuple[Cure, ...]:
 
 
 def _verdicts_share(answers: Answers, truth: FormTruth) -> float:
-    """Return the mean share for the verdicts on KF and EKF2, and for the behaviour of EKF2."""
+    """Return the fraction of the points for both verdicts (KF, EKF2) and the behaviour of EKF2."""
     shares = [_ekf2_behaviour_share(answers, truth)]
     for answer, known in ((answers.verdict_kf, truth.kf), (answers.verdict_ekf2, truth.ekf2)):
         shares.append(1.0 if answer and answer == known.verdict else 0.0)
@@ -290,7 +291,7 @@ def _verdicts_share(answers: Answers, truth: FormTruth) -> float:
 
 
 def _ekf2_behaviour_share(answers: Answers, truth: FormTruth) -> float:
-    """Return the share for the behaviour of EKF2: 1 if complete, 1/2 with one error.
+    """Return the fraction of the points for EKF2's behaviour: 1 if complete, 1/2 with one error.
 
     An error is a missing or a false statement.
     """
@@ -306,8 +307,8 @@ def _ekf2_behaviour_share(answers: Answers, truth: FormTruth) -> float:
 
 
 def _quantities_share(answers: Answers, truth: FormTruth) -> float:
-    """Return the mean share for the numbers that can be computed from the flight."""
-    # an empty list has no points, because it is the right answer on most flights
+    """Return the fraction of the points for the numbers that can be computed from the flight."""
+    # an empty list is the right answer on most flights, so it has no points
     known_count = sum(value not in (None, ()) for value in truth.quantities)
     pairs = zip(answers.quantities, truth.quantities, strict=False)
     return sum(_quantity_share(*pair) for pair in pairs) / max(known_count, 1)

@@ -1,4 +1,4 @@
-"""Grading of a class: submissions are verified in parallel and within limits."""
+"""Grading of a class: submissions are verified in parallel, with limits of time and memory."""
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
@@ -45,7 +45,7 @@ class GradeOutcome:
 
     @property
     def reports(self) -> tuple[GradedReport, ...]:
-        """All reports, by entry; the first report of an entry counts."""
+        """All reports, grouped by student; the first one of each student counts."""
         return tuple(report for entry in self.entries for report in entry.reports)
 
 
@@ -64,7 +64,7 @@ def grade(
     paths : sequence of Path
         PDFs, folders and zip files.
     output : Path
-        Folder for the class table (``class.csv``, ``class.html``), ``reports/`` drawn again,
+        Folder for the class table (``class.csv``, ``class.html``), redrawn ``reports/``,
         ``feedback/``, ``grades/`` for learning platforms, and ``records/``: stored verifications,
         which make a second run fast. ``overrides.csv`` in this folder is read.
     processes : int, optional

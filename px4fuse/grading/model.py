@@ -25,14 +25,14 @@ class ExportOrigin:
     platform : str
         One of :data:`px4fuse.grading.submissions.PLATFORMS`; "" if no platform wrote the file name.
     person : Person
-        Student. Its number on the platform is that of the participant (Moodle), the user (Canvas,
+        Student. ``numbers`` contains the number of the participant (Moodle), the user (Canvas,
         ILIAS) or the submission (Gradescope).
     time : datetime or None
         Submission time; without time zone if the platform omits it.
     is_late : bool
-        The platform marks the file as late.
+        True if the platform marks the file as late.
     is_imitated : bool
-        The part of the file name that the student chose looks like the file names of a platform.
+        True if the part of the file name that the student chose imitates a platform's file names.
     """
 
     platform: str = ""
@@ -59,7 +59,7 @@ class Submission:
         Name in messages: one line of at most 200 characters, without folders of this computer. A
         number at the end makes it unique in a run.
     time : datetime or None
-        Time of the zip entry, in an unknown time zone; the time of submission or of the download.
+        Time of the zip entry, in an unknown time zone: time of the submission or of the download.
     origin : ExportOrigin
         Student and time according to a platform.
     """
@@ -146,7 +146,7 @@ class GradedReport:
 
     @property
     def counted_points(self) -> float | None:
-        """Points that count; None if the report is pending or an item is not scored yet."""
+        """Points that count; None while the instructor has to act or to score an item."""
         return None if self.pending_action or self.awaits_points else self.points
 
     @property
@@ -191,11 +191,11 @@ class Entry:
     comment : str
         Comment of the instructor on the whole report.
     total : float or None
-        Grade in points; None while pending or missing.
+        Grade in points; None without a submission, and while the instructor has to act.
     max_points : float
         Maximum points.
     flags : tuple of str
-        Sentences about the student, the submission, the report, and equal contents of reports.
+        Sentences for the instructor about suspicious submissions and reports.
     """
 
     student: str

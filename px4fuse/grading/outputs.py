@@ -1,8 +1,9 @@
 """Output files of grading: class table and page, redrawn reports, feedback, platform tables.
 
 px4fuse enters grades into copies of the tables that platforms export, and feedback if a table has a
-column for it. All other cells stay unchanged. The row of a student without a grade (pending, or no
-submission) is not changed: platforms delete a grade if the cell is empty, and read 0 as a grade.
+column for it. All other cells stay unchanged. The row of a student without a grade (no submission,
+or points not decided yet) is not changed: platforms delete a grade if the cell is empty, and read 0
+as a grade.
 
 - Moodle: "Using Assignment", Offline grading worksheet, docs.moodle.org.
   ``mod/assign/feedback/offline/importgradeslib.php`` finds "Identifier" ("Participant 12"), "Grade"
@@ -52,7 +53,7 @@ FEEDBACK_FOLDER = "feedback"
 GRADES_FOLDER = "grades"
 NAMES_FILE = "names.csv"
 NAMES_TITLES = ("pseudonym", "id", "name")
-# columns of the class table, before and after the columns of items and numbers
+# columns of the class table, before and after the columns of rubric items and report numbers
 FIRST_COLUMNS = (
     "file",
     "student",
@@ -148,7 +149,7 @@ def write_class(
 
 
 def _identity(entry: Entry, stem: bool = False) -> str:
-    """Return id, else name, else file name of a row: the same text in each run."""
+    """Return id, else name, else file name of a row, which identify it in each run."""
     file = entry.counted_report.submission if entry.counted_report else ""
     return entry.student_id or (Path(file).stem if stem else entry.student or file)
 
@@ -349,8 +350,7 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
         in (normalise_text(title), normalise_text(_ASSIGNMENT_NUMBER.sub("", title)))
     ]
     candidates = assignment_indices if grade_index is None else [grade_index]
-    # the title may be for another table, and Moodle's worksheets have one grade column, so a title
-    # that does not match is ignored for Moodle
+    # Moodle's worksheets have only one grade column: a title that differs is for another table
     if column_title and (matching_indices or sheet.column(("identifier",)) is None):
         candidates = matching_indices
     if len(candidates) == 1:

@@ -1,8 +1,8 @@
 """Stored verifications: a report is verified again only if the report, a log or a version changed.
 
-The SHA-256 of the PDF identifies its record. A record is valid as long as library versions and
-available files are those of the verification. It does not depend on the points of rubric, answer
-key and overrides.
+The SHA-256 of the PDF identifies its record. A record is valid while library versions and available
+input files are unchanged. It contains no points, so a change of the rubric or of overrides needs no
+new verification.
 """
 
 import hashlib
@@ -24,7 +24,8 @@ from px4fuse.writing import write_all
 
 # subfolder of the output folder, for the records
 RECORDS_FOLDER = "records"
-# suffix of a redrawn report; its name is the SHA-256 of the submitted PDF, as that of the record
+# suffix of a redrawn report; record and redrawn report have the SHA-256 of the submitted PDF as
+# name
 REDRAWN_SUFFIX = ".pdf"
 
 

@@ -133,9 +133,9 @@ def score_report(
 ) -> GradedReport:
     """Score a report, and add flags and the action that the instructor has to take.
 
-    Items for the other command are omitted, and without an answer key also the items that need one.
-    The caller adds the file name. ``owner_id`` is the student id according to the learning
-    platform; it takes precedence over the id in the report.
+    Items for reports of another command are omitted. Without an answer key, items that need one are
+    omitted too. The caller adds the file name of the report. ``owner_id`` is the student id
+    according to the learning platform; it takes precedence over the id in the report.
     """
     evidence = Evidence(results, verdict, key, owner_id)
     points_rule, rule_text = _points_rule(evidence, rubric)
@@ -182,7 +182,7 @@ def _points_rule(evidence: Evidence, rubric: Rubric) -> tuple[PointsRule, str]:
     reason = format_reason("".join(verdict.reasons[:1]))
     if verdict.status == "numbers differ":
         return "zero", f"the numbers of your report differ from those of its log{reason}"
-    # each doubt: rule of the rubric, reason for the student, action for the instructor
+    # reasons for doubt: rule of the rubric, sentence for the student, action for the instructor
     doubts: list[tuple[PointsRule, str, str]] = []
     if verdict.status != "verified":
         action = verdict.remedy or f"Check the report by hand: it was not verified{reason}."

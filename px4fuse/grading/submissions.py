@@ -42,15 +42,16 @@ from px4fuse.results.reading import clean_text, one_line
 from px4fuse.verification.model import BAD_VALUES
 from px4fuse.verification.pdf_input import MAX_BYTES
 
-# entries of a zip file
+# maximum number of entries of a zip file
 MAX_ENTRIES = 10_000
-# bytes of the table of contents of a zip file, which zipfile reads before entries can be counted
+# maximum bytes of a zip file's table of contents, which zipfile reads before entries are counted
 MAX_DIRECTORY_BYTES = 4_000_000
-# bytes; sum of the unpacked sizes of the entries, which may refer to the same data
+# bytes; maximum sum of the unpacked sizes of the entries, which may refer to the same data
 MAX_TOTAL_BYTES = 4_000_000_000
-# unpacked over packed size of an entry; a PDF is already compressed and does not shrink 100 times
+# maximum ratio of unpacked to packed size of an entry: a PDF is compressed already, so its ratio is
+# near 1
 MAX_COMPRESSION_RATIO = 100
-# characters of a file name in messages
+# maximum characters of a file name in messages
 MAX_NAME_LENGTH = 200
 # year that zip programs write if they do not know the time of an entry
 ZIP_EPOCH_YEAR = 1980
@@ -163,7 +164,7 @@ def add_origins(
     """Add student and platform to submissions.
 
     All files of an export (zip file or top-level folder) are from the platform whose pattern
-    matches most of them. A student who names a file as another platform does has no effect.
+    matches most of them. So a student cannot change the platform by imitating its file names.
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"
 # Fields of Flight that the JSON output contains unchanged
 FLIGHT_FIELDS = ("log", "airborne", "clocks", "missing", "unused", "inputs")
-# Displayed names of the parts of a flight, by their names in Flight.streams
+# Displayed name of each part of a flight (kind of data), by its name in Flight.streams
 PART_LABELS = {
     "imu": "IMU",
     "attitude": "attitude",
@@ -44,7 +44,7 @@ PART_LABELS = {
     "truth": "ground truth",
     "airborne": "land detector",
 }
-# Analyses of compare, with the part of the flight (EKF2 or ground truth) that each requires
+# Analyses of compare, with the data (EKF2 or ground truth) that each requires
 PARTS_OF_COMPARE = {
     "EKF2 states": "ekf2_state",
     "EKF2 variances": "ekf2_variance",
@@ -57,7 +57,7 @@ TimeSpans = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class AnalysisOption:
-    """Analysis of px4fuse; ``reason``: used data, or the reason why it is not possible."""
+    """Analysis of px4fuse; ``reason``: data that it uses, or the reason why it is not possible."""
 
     name: str
     possible: bool
@@ -74,7 +74,7 @@ class LoggingAdvice:
 
 @dataclass(frozen=True)
 class Gaps:
-    """Gaps of a part of the flight: intervals between samples above ``limit_s``.
+    """Gaps in one kind of data: intervals between samples that are longer than ``limit_s``.
 
     Attributes
     ----------
@@ -82,8 +82,8 @@ class Gaps:
     total_s, longest_s : float
         Sum and maximum of the gaps; 0 without gaps.
     limit_s : float
-        IMU: the longer of 0.1 s and five median intervals, as in KF. Other parts: the longer of 1 s
-        and five intervals.
+        IMU: the longer of 0.1 s and five median intervals, as in KF. Other data: the longer of 1 s
+        and five median intervals.
     """
 
     count: int
@@ -94,14 +94,14 @@ class Gaps:
 
 @dataclass(frozen=True)
 class Source:
-    """Part of the flight with its topics, or the reason why it is missing.
+    """Kind of data in the flight with its topics, or the reason why it is missing.
 
     Attributes
     ----------
     part : str
         "IMU", "attitude", "position", "EKF2 state", ..., see :data:`PART_LABELS`.
     name : str
-        Name of a position track, else the first topic; empty if unavailable.
+        Name of a position track, else of the first topic; empty if unavailable.
     topics : tuple of str
     clock, log : str
         Clock of its timestamps, and name of the file.
@@ -117,7 +117,7 @@ class Source:
     description : str
         Description of a position track.
     unavailable : str
-        Reason why the part is missing; empty if it is available.
+        Reason why the data are missing; empty if they are available.
     """
 
     part: str
@@ -146,7 +146,7 @@ class Inventory:
     start_utc : str or None
         UTC of the first data, ISO 8601.
     sources : tuple of Source
-        All parts of the flight, including all position tracks; the most direct track is first.
+        All kinds of data in the flight and all position tracks, of which the most direct is first.
     source_reason : str
         Reason why compare selects its position source, or finds none.
     segment : Segment or None
@@ -174,7 +174,7 @@ def take_inventory(flight: Flight) -> Inventory:
     Parameters
     ----------
     flight : Flight
-        May lack any part.
+        Flight in which any data may be missing.
     """
     comparison, reason, remedy = None, "", ""
     try:
@@ -223,7 +223,7 @@ def to_plain(inventory: Inventory) -> dict[str, Any]:
 
 
 def _data_by_part(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unavailable]:
-    """Return all parts of a flight except positions, by their names in Flight.streams.
+    """Return all data of a flight except positions, by their names in Flight.streams.
 
     If the log contains no EKF2 data, only the EKF2 state is returned as unavailable. The EKF2
     innovations are those of the axis with the most samples.
@@ -273,7 +273,7 @@ def _source(
     stream: Stream | PositionTrack | None,
     **source_fields: Any,
 ) -> Source:
-    """Describe a part of the flight by samples, rate, gaps, topics and clock."""
+    """Describe one kind of data by samples, rate, gaps, topics and clock."""
     if isinstance(data, Unavailable):
         return Source(part, unavailable=data.reason)
     if stream is not None:
@@ -359,7 +359,7 @@ def _rate_text(samples: pd.DataFrame) -> str:
 
 
 def _analysis_option(name: str, part: object, description: str) -> AnalysisOption:
-    """Return an analysis with its description, or with the reason if its part is unavailable."""
+    """Return an analysis with its description, or with the reason if its data are unavailable."""
     if isinstance(part, Unavailable):
         return AnalysisOption(name, False, part.reason)
     return AnalysisOption(name, True, description)
@@ -401,7 +401,7 @@ def _count_text(part: pd.DataFrame | Unavailable) -> str:
 def _logging_advice(
     flight: Flight, comparison: Comparison | None, remedy: str
 ) -> tuple[LoggingAdvice, ...]:
-    """Collect the actions of findings about the recording, and of unavailable parts, each once."""
+    """Collect the actions of findings about the recording, and of unavailable data, each once."""
     findings = [*recording.detect_lost_data(flight), *recording.detect_clocks_set_back(flight)]
     actions_and_purposes = [(remedy, "position")] if remedy else []
     if comparison is not None:
@@ -417,7 +417,7 @@ def _logging_advice(
     actions_and_purposes += [
         (finding.remedy, finding_title(finding.id)) for finding in findings if finding.remedy
     ]
-    # other unavailable parts can be logged by PX4 only, so their advice is for ULogs
+    # other missing data can be logged by PX4 only, so advice about them is for ULogs only
     main_parts = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
     actions_and_purposes += [
         (part.remedy, part.what)

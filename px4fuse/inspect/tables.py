@@ -22,7 +22,7 @@ SCHEMA_VERSION = "1.0"
 DICTIONARY_COLUMNS = ["table", "column", "unit", "frame", "meaning", "source_topic", "clock"]
 # Characters that are not allowed in file names, or need quotes on the command line
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9_-]+")
-# Characters of a table name, which is a file name
+# Maximum characters of a table name, which is a file name
 MAX_NAME_LENGTH = 80
 NO_POSITION = Unavailable(
     "external position",
@@ -41,7 +41,7 @@ class DescribedTable:
 
 
 def with_best_source(flight: Flight) -> Flight:
-    """Return the flight with the EKF2 innovations of the position source of compare."""
+    """Return the flight with the EKF2 innovations of the position source that compare selects."""
     try:
         return select_innovations(flight, choose_source(flight)[0])
     except MissingDataError:
@@ -54,8 +54,8 @@ def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:
     Returns
     -------
     mapping from table name to DataFrame
-        The first column of a time series is ``time_s``. Names are valid file names. Parts that
-        are unavailable have no table; see :func:`unavailable_parts`.
+        The first column of a time series is ``time_s``. Names are valid file names. Unavailable
+        data have no table; see :func:`unavailable_parts`.
     """
     return {table.name: table.data for table in _tables(flight)}
 
@@ -75,7 +75,7 @@ def data_dictionary(flight: Flight) -> pd.DataFrame:
 
 
 def unavailable_parts(flight: Flight) -> tuple[Unavailable, ...]:
-    """List the parts of the flight that have no table, with the reasons."""
+    """List the data of the flight that have no table, with the reasons."""
     ekf2 = flight.ekf2
     sections: list[object] = [flight.imu, flight.attitude, ekf2]
     if isinstance(ekf2, Ekf2):
@@ -250,6 +250,6 @@ def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
 
 
 def _topics_and_clock(flight: Flight, part: str) -> tuple[tuple[str, ...], str]:
-    """Return topics and clock of a part."""
+    """Return topics and clock of one kind of data."""
     stream = flight.streams.get(part)
     return ((), "") if stream is None else (stream.topics, stream.clock)

@@ -8,7 +8,7 @@ from px4fuse.reading import display_name, read_head, read_log_bytes
 
 _SNIFF_BYTES = 16
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
-# Files that users give by mistake: first bytes, suffixes, description, action
+# Unsupported files that users often give by mistake: first bytes, suffixes, description, action
 _FOREIGN_FORMATS = (
     # Header bytes of ArduPilot, libraries/AP_Logger/LogStructure.h
     (
@@ -50,7 +50,7 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
         The file is missing, empty, not a regular file, larger than
         :data:`px4fuse.reading.max_log_bytes`, of an unknown format, or contains no usable data.
     SettingsError
-        ``system`` is not a system id in the recording, or the log is a ULog.
+        ``system`` is not a system id in the recording, or is given for a ULog.
     """
     path = Path(path)
     name = display_name(path)

@@ -1,4 +1,4 @@
-"""Common functions of all readers: valid rows, time intervals, missing parts."""
+"""Common functions of all readers: valid rows, time intervals, missing data."""
 
 from typing import Any
 
@@ -8,15 +8,16 @@ import pandas as pd
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.flight import Columns, Ekf2, FlightMode, Unavailable
 
-# SI units; larger positions, velocities, accelerations and angles are damaged
+# Limit (SI units) of valid positions, velocities, accelerations, angles: larger values are damage
 MAX_VALID_VALUE = 1e9
-# m/s² and rad/s; above the range of accelerometers (400 g) and gyros (4000 °/s)
+# Limit (m/s², rad/s) of valid IMU data: above the range of accelerometers (400 g) and gyros
+# (4000 °/s)
 MAX_IMU_VALUE = 1e4
-MIN_QUATERNION_NORM = 0.5  # quaternions with a smaller norm mean "no attitude"
+MIN_QUATERNION_NORM = 0.5  # a quaternion with a smaller norm means "no attitude"
 
 
 def collect_unavailable(*flight_parts: object) -> tuple[Unavailable, ...]:
-    """Return the unavailable parts of a flight, including the unavailable parts of EKF2."""
+    """Return the unavailable data of a flight, including the unavailable data of EKF2."""
     for flight_part in flight_parts:
         if isinstance(flight_part, Ekf2):
             flight_parts += (
@@ -38,7 +39,7 @@ def constant_spans(values: pd.Series, end_s: float) -> list[tuple[float, float, 
 
 
 def flight_spans(landed: pd.Series, duration_s: float) -> tuple[tuple[float, float], ...]:
-    """Return the intervals (s) in which ``landed`` is 0 or False."""
+    """Return the intervals (s) in flight, in which ``landed`` is 0 or False."""
     return tuple(
         (start, end)
         for start, end, is_landed in constant_spans(landed, duration_s)
@@ -49,32 +50,32 @@ def flight_spans(landed: pd.Series, duration_s: float) -> tuple[tuple[float, flo
 def ends_in_flight(
     airborne: tuple[tuple[float, float], ...] | Unavailable, duration_s: float
 ) -> bool:
-    """Return True if the last interval in flight (s) lasts until the end of the data."""
+    """Return True if the last interval in flight lasts until the end of the data."""
     last_span = () if isinstance(airborne, Unavailable) else airborne[-1:]
     return any(span_end_s >= duration_s for _, span_end_s in last_span)
 
 
 def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
-    """Format the sentence on a file that ends within a ``unit``: a frame or a message."""
+    """Format the sentence on a file that ends within a ``unit`` ("frame" or "message")."""
     flying = ", in flight" if in_flight else ""
     return f"the file ends within a {unit} after {duration_s:.1f} s{flying}; later data are missing"
 
 
 def mode_spans(names: pd.Series, end_s: float) -> tuple[FlightMode, ...]:
-    """Convert a time series of flight mode names to intervals (s)."""
+    """Convert a time series of flight mode names to intervals with one mode (s)."""
     return tuple(FlightMode(*span) for span in constant_spans(names, end_s))
 
 
 def finite_rows(
     samples: pd.DataFrame, columns: list[str], limit: float = MAX_VALID_VALUE
 ) -> pd.DataFrame:
-    """Return the rows whose absolute values in ``columns`` are all below ``limit`` (not NaN)."""
+    """Return the rows with all absolute values in ``columns`` below ``limit``, without NaN."""
     is_valid: BoolArray = (np.abs(samples[columns].to_numpy()) < limit).all(axis=1)
     return samples[is_valid]
 
 
 def join_nearest(samples: pd.DataFrame, others: pd.DataFrame, tolerance_s: float) -> pd.DataFrame:
-    """Join each row with the row of ``others`` that is nearest in time; NaN if too far away."""
+    """Join each row with the nearest row of ``others`` in time; NaN beyond ``tolerance_s``."""
     return pd.merge_asof(
         samples,
         others,
@@ -92,7 +93,7 @@ def with_attitude(samples: pd.DataFrame) -> pd.DataFrame:
 
 
 def read_orientation(samples: pd.DataFrame) -> pd.DataFrame | None:
-    """Extract the orientations of samples; None without two different ones.
+    """Extract the orientations of samples; None without two different orientations.
 
     Parameters
     ----------
@@ -111,6 +112,6 @@ def read_orientation(samples: pd.DataFrame) -> pd.DataFrame | None:
 
 
 def read_attitude(samples: pd.DataFrame | None) -> pd.DataFrame | None:
-    """Return the quaternions of :func:`read_orientation` without variances."""
+    """Return the quaternions from :func:`read_orientation`, without variances."""
     orientation = None if samples is None else read_orientation(samples)
     return None if orientation is None else orientation[Columns.QUATERNION]

@@ -1,6 +1,6 @@
-"""Mapping of message fields to columns: row format of the PX4 topic and MAVLink message tables.
+"""Mapping of message fields to DataFrame columns: row format of two tables.
 
-The tables are ``px4_topics.toml`` and ``mavlink_messages.toml``.
+The tables are ``px4_topics.toml`` (PX4 topics) and ``mavlink_messages.toml`` (MAVLink messages).
 """
 
 from collections.abc import Mapping
@@ -11,25 +11,26 @@ import msgspec
 
 from px4fuse.flight import Columns
 
-# Larger values are damaged: the largest valid fields are UNIX times in µs (1.8e15)
+# Limit of valid fields: larger values are damage. The largest valid values are UNIX times in µs
+# (1.8e15)
 MAX_FIELD_VALUE = 1e17
 GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Fields of one topic or message with the columns that they become.
+    """Fields of one topic or message, and the DataFrame columns to which they are converted.
 
     Attributes
     ----------
     topic : str
-        PX4 topic or MAVLink message; empty if another row of the table names it.
+        PX4 topic or MAVLink message; empty if another row of the table contains the name.
     columns : mapping from column name to field name
         Required fields; ``name[i]`` is an array element.
     optional : mapping from column name to field name
         Fields that are read if the topic contains them.
     scale : mapping from column name to float
-        Column unit per field unit; 1 if absent.
+        Factor from field value to column value; 1 if absent.
     """
 
     topic: str = ""
@@ -52,14 +53,14 @@ def expand_layouts(rows: Mapping[str, Any]) -> dict[str, Layout]:
 
 
 def expand_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Expand a row that names several columns at once to one entry per column.
+    """Expand a row with abbreviated columns to one entry per column.
 
     Parameters
     ----------
     fields : mapping
-        Keys are column names separated by blanks, or the name of a list of :class:`Columns`.
-        Values are field names separated by blanks, elements of one field (``name[]`` from the
-        first on, ``name[0 6 11]``), or one number for all columns.
+        Keys are column names separated by blanks, or the name of a list in :class:`Columns`.
+        Values are field names separated by blanks, elements of one array field (``name[]`` for
+        consecutive elements from 0, or ``name[0 6 11]``), or one number for all columns.
 
     Examples
     --------

@@ -15,7 +15,7 @@ from px4fuse.trajectory.graph.initialisation import initialise
 from px4fuse.trajectory.graph.model import FROM_FILE, PoseGraph
 
 MAX_FILE_BYTES = 500_000_000
-# Tag: (count of vertex ids, count of numbers after them)
+# By tag: number of vertex ids, and number of values after the ids
 _TAGS = {
     "VERTEX_SE2": (1, 3),
     "VERTEX_SE3:QUAT": (1, 7),
@@ -29,11 +29,13 @@ _REMEDY = (
     "EDGE_SE3:QUAT). Remove other lines; convert TORO files to g2o."
 )
 _VERTEX_ID = re.compile("[+-]?[0-9]{1,18}")
-# Ratio of a negative to the largest eigenvalue that rounding of the printed digits can cause
+# Maximum ratio of a negative eigenvalue to the largest eigenvalue that is a rounding error of the
+# printed digits
 _EIGENVALUE_TOLERANCE = 1e-9
-# Deviation from norm 1 that is not corrected, because it is the rounding error of float64
+# Maximum deviation from norm 1 that is not corrected: it is a rounding error of float64
 _UNIT_NORM_TOLERANCE = 1e-15
-# 1/m² or 1/rad²; real measurements are inside these limits, and squares inside do not overflow
+# Limits (1/m², 1/rad²) of valid information: real measurements are inside, and their squares do not
+# overflow
 _MIN_INFORMATION, _MAX_INFORMATION = 1e-50, 1e50
 
 
@@ -48,9 +50,9 @@ def read_g2o(path: str | Path) -> PoseGraph:
     Raises
     ------
     TrajectoryError
-        The file is not a g2o file, or contains a number that is not finite, an edge to a missing
+        The file is not a g2o file, or it contains a number that is not finite, an edge to a missing
         vertex, a repeated vertex, an invalid information matrix, or both SE2 and SE3 poses. The
-        message names the file and the line.
+        error message contains the file name and the line number.
     """
     path_object = Path(path)
     text = decode_text(read_bytes_limited(path_object, TrajectoryError, MAX_FILE_BYTES))
@@ -119,7 +121,7 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
 
 
 def g2o_text(graph: PoseGraph) -> str:
-    """Return the pose graph as the text of a g2o file, with all digits.
+    """Return the pose graph as the text of a g2o file, with all digits of float64.
 
     The text contains the vertices, a FIX of the first vertex, and the edges.
     """
@@ -167,7 +169,7 @@ def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
 
 
 def _parse(rows: Rows, tag: str) -> tuple[np.ndarray[Any, np.dtype[np.int64]], Array]:
-    """Return the vertex ids (n, 1 or 2) and the numbers of all lines of one tag."""
+    """Return the vertex ids, shape (n, 1 or 2), and the numbers of all lines with one tag."""
     vertex_count, value_count = _TAGS[tag]
     cells, numbers = rows.parse(1 + vertex_count, value_count)
     is_invalid_id = np.array([_VERTEX_ID.fullmatch(word) is None for word in cells[:, 1:].flat])
@@ -196,7 +198,7 @@ def _normalise_quaternions(rows: Rows, poses: Array) -> Array:
 
 
 def _information(rows: Rows, numbers: Array, size: int) -> Array:
-    """Return the information matrices (n, size, size) from their upper triangles by rows."""
+    """Return the information matrices, (n, size, size), from upper triangles in row order."""
     row, column = np.triu_indices(size)
     matrices = np.empty((len(numbers), size, size))
     matrices[:, row, column] = matrices[:, column, row] = numbers

@@ -1,7 +1,7 @@
 """Reader of MAVLink recordings (``.tlog`` and raw streams); returns a flight.
 
 Meaning, direction and clock of each message follow PX4's ``src/modules/mavlink`` (v1.13 to v1.16)
-and MAVLink's ``common.xml``; ``mavlink_messages`` contains them as tables.
+and MAVLink's ``common.xml``. They are tabulated in ``mavlink_messages.toml``.
 """
 
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ from px4fuse.readers.px4_positions import barometer
 from px4fuse.readers.ulog_topics import NO_SELECTOR, dropped_note
 
 VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
-# MAV_PARAM_TYPE_REAL32; smaller values of MAV_PARAM_TYPE are integer types
+# MAV_PARAM_TYPE_REAL32: smaller numbers of MAV_PARAM_TYPE are integer types
 REAL32_PARAMETER_TYPE = 9
 
 
@@ -56,14 +56,14 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     Returns
     -------
     Flight
-        Missing parts are ``Unavailable``.
+        Missing data are ``Unavailable``.
 
     Raises
     ------
     LogError
         The content is not MAVLink.
     SettingsError
-        No autopilot in the recording has this system id.
+        No autopilot in the recording has the id ``system``.
     """
     frames = read_frames(name, content)
     address, autopilot = senders.choose_autopilot(frames, system)
@@ -88,7 +88,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     pressure_hpa = recording.read(messages.LAYOUTS["pressure"])["pressure_hpa"]
     modes = _read_modes(recording) if autopilot == "PX4" else messages.NO_MODES
     return Flight(
-        # Must come after all reads, because it lists the dropped samples
+        # After all other reads, because the description lists the samples that they dropped
         log=_describe_log(recording, parameters, parameter_faults, autopilot, in_flight),
         imu=imu,
         attitude=attitude,
@@ -111,7 +111,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
 
 def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
     candidates = [(layout, recording.rows(layout.topic)) for layout in messages.IMU_LAYOUTS]
-    # HIGHRES_IMU is preferred (SI units, µs timestamps); otherwise the message with most samples
+    # HIGHRES_IMU is preferred (SI units, µs timestamps), otherwise the message with most samples
     layout, rows = (
         candidates[0]
         if len(candidates[0][1]) > 1
@@ -156,7 +156,7 @@ def _read_attitude(recording: Recording, remedy: str) -> pd.DataFrame | Unavaila
 def _read_ekf2(
     recording: Recording, parameters: Mapping[str, float], autopilot: str
 ) -> Ekf2 | Unavailable:
-    """Read EKF2's position, velocity and variances as sent by the autopilot."""
+    """Read EKF2's position, velocity and variances from the autopilot's messages."""
     remedies, replay_unavailable = messages.remedies_of_autopilot(autopilot)
     counts = {layout.topic: len(recording.rows(layout.topic)) for layout in messages.STATE_LAYOUTS}
     # ODOMETRY has variances, so it is preferred unless its rate is below half of the highest rate
@@ -239,7 +239,8 @@ def _read_ekf2(
 def _variance_from_accuracy(recording: Recording) -> pd.DataFrame:
     """Compute position variances (m²) from the accuracies (1 σ, m) in ESTIMATOR_STATUS.
 
-    PX4's horizontal accuracy is the root of the sum over both axes (``get_ekf_lpos_accuracy``).
+    PX4's horizontal accuracy is the square root of the sum of both axes' variances
+    (``get_ekf_lpos_accuracy``).
     """
     accuracy = recording.read(messages.LAYOUTS["accuracy"])
     variance = pd.DataFrame(np.nan, index=accuracy.index, columns=VARIANCE_COLUMNS)
@@ -251,7 +252,7 @@ def _variance_from_accuracy(recording: Recording) -> pd.DataFrame:
 def _read_airborne(
     recording: Recording, remedy: str
 ) -> tuple[tuple[float, float], ...] | Unavailable:
-    """Read the intervals (s) from take-off to touch-down, as the land detector reports them."""
+    """Read the intervals (s) from take-off to touch-down according to the land detector."""
     rows = recording.rows("EXTENDED_SYS_STATE")
     states = recording.frames.table("EXTENDED_SYS_STATE", rows)
     is_known = states["landed_state"] > 0
@@ -279,7 +280,7 @@ def _read_modes(recording: Recording) -> tuple[FlightMode, ...] | Unavailable:
 
 
 def _read_parameters(recording: Recording, autopilot: str) -> dict[str, float]:
-    """Read the first value of each parameter; PX4 sends integers as bytes in the float field."""
+    """Read the first value of each parameter; PX4 sends integers as raw bytes in a float field."""
     table = recording.frames.table("PARAM_VALUE", recording.rows("PARAM_VALUE"))
     is_sent_as_bytes = (autopilot == "PX4") & (table["param_type"] < REAL32_PARAMETER_TYPE)
     raw_values = np.ascontiguousarray(table["param_value"])
@@ -351,7 +352,10 @@ def _describe_log(
 
 
 def _start_unix_s(recording: Recording) -> float | None:
-    """Return the UNIX time (s) of time zero, by the autopilot or else the recording computer."""
+    """Return the UNIX time (s) at flight time zero.
+
+    The autopilot's clock is preferred to the clock of the recording computer.
+    """
     if recording.zero_s >= MIN_UNIX_TIME_S:
         return recording.zero_s
     unix_line = map_boot_to_unix(recording)

@@ -1,9 +1,9 @@
 """Clock mapping of a MAVLink recording: boot clock, sender clocks and receive time.
 
-A message is received after its timestamp, with a delay that is never negative and often large.
-Two clocks are therefore mapped by the messages with the smallest delay: the lower envelope of
-receive time minus timestamp. TIMESYNC pairs (MAVLink "Time Synchronization Protocol v2") are mapped
-in the same way.
+The delay between a message's timestamp and its receive time is never negative and often large.
+Only the messages with the smallest delay therefore determine the map between two clocks: the lower
+envelope of receive time minus timestamp. The pairs of clock readings in TIMESYNC messages (MAVLink
+"Time Synchronization Protocol v2") are used in the same way.
 """
 
 from __future__ import annotations
@@ -16,25 +16,28 @@ from scipy.stats import theilslopes
 from px4fuse.arrays import Array
 from px4fuse.log import ClockMap
 
-# s; timestamps within this median distance from the boot time of receipt are boot times
+# Maximum median difference (s) between timestamps and the boot time of receipt, for timestamps that
+# count as boot time
 MAX_BOOT_CLOCK_DISTANCE_S = 10.0
-# s; if TIMESYNC reduces the distance to the receive time by more, the sender has its own clock
+# Minimum reduction (s) of the difference to the receive time by TIMESYNC, for a sender that counts
+# as having a separate clock
 MIN_TIMESYNC_IMPROVEMENT_S = 0.1
-# s; 2001-09-09. Smaller times count from boot, larger times from 1970
+# Minimum UNIX time (s), 2001-09-09: smaller times count from boot
 MIN_UNIX_TIME_S = 1e9
-# s; the envelope uses the message with the smallest delay in each interval of this length
+# Interval (s) of which the envelope uses only the message with the smallest delay
 ENVELOPE_INTERVAL_S = 2.0
 MAX_ENVELOPE_INTERVALS = 200
-# s; drift is estimated from this time span on; below, both clocks are assumed to run equally fast
+# Minimum time span (s) to estimate a drift; below, both clocks are assumed to have the same rate
 MIN_DRIFT_SPAN_S = 30.0
-# Ratio of clock rates minus 1; a larger difference is from a replayed link and always estimated
+# Maximum ratio of clock rates minus 1 of two real clocks: a larger difference is from a replayed
+# link, and is estimated for any time span
 MAX_RATE_DIFFERENCE = 0.01
-# Ratio of clock rates; larger than any replay speed or wrong unit of time (s for ns: 1e9)
+# Maximum ratio of clock rates: above any replay speed or wrong unit of time (s for ns: 1e9)
 MAX_RATE_RATIO = 1e12
 MIN_TIMESYNC_PAIRS = 3
-# Fraction of distinct values; timestamps with a smaller fraction are not a clock
+# Minimum fraction of distinct timestamps of a clock
 MIN_DISTINCT_FRACTION = 0.1
-# s; a longer interval between positions is a gap
+# Maximum interval (s) between positions; a longer interval is a gap
 MAX_REGULAR_INTERVAL_S = 1.0
 
 
@@ -42,8 +45,8 @@ MAX_REGULAR_INTERVAL_S = 1.0
 class Line:
     """Linear map between two clocks: y = y0 + slope · (x - x0).
 
-    ``jitter`` (unit of y) is the standard deviation of the ``pairs`` clock readings about the
-    line, 1.4826 · median absolute deviation.
+    ``pairs`` is the number of clock readings, and ``jitter`` (unit of y) their standard deviation
+    about the line, 1.4826 · median absolute deviation.
     """
 
     x0: float
@@ -62,12 +65,12 @@ class Line:
 
 
 def fit_least_delay(x: Array, y: Array) -> Line:
-    """Fit the lower envelope of clock pairs, in which y is read after x with a varying delay.
+    """Fit the lower envelope of pairs of clock readings; y is read a varying delay after x.
 
     Parameters
     ----------
     x, y : ndarray, shape (n,), s
-        Readings of the earlier and of the later clock; n ≥ 1.
+        Readings of the clock that is read first and of the clock that is read later; n ≥ 1.
 
     Returns
     -------
@@ -93,7 +96,7 @@ def fit_least_delay(x: Array, y: Array) -> Line:
     residual = y - slope * (x - x0)
     envelope_rows = [rows[np.argmin(residual[rows])] for rows in interval_rows]
     if span_s >= MIN_DRIFT_SPAN_S and len(envelope_rows) > 1:
-        # Repeated, because a better slope changes which messages have the smallest delay
+        # Repeated, because other messages have the smallest delay with a better slope
         for _ in range(2):
             corrected_slope = slope + _median_slope(x[envelope_rows], residual[envelope_rows])
             slope = corrected_slope if _is_rate_ratio(corrected_slope) else 1.0
@@ -128,7 +131,8 @@ def robust_std(values: Array) -> float:
 class ClockMapping:
     """Map from a sender's timestamps to the boot clock, with its description.
 
-    ``to_boot`` is None if the timestamps are not a clock; the receive time is used instead.
+    ``to_boot`` is None if the timestamps are not from a running clock; the receive time is then
+    used instead.
     """
 
     to_boot: Line | None
@@ -157,13 +161,15 @@ def map_clock(
     boot_of_receipt : Line
         Map from receive time to boot clock.
     replies : tuple of ndarray, shape (n,), s
-        TIMESYNC requests of the autopilot: its clock at the request, the sender's at the reply.
+        TIMESYNC requests of the autopilot: autopilot's clock at the request, sender's clock at the
+        reply.
     answers : tuple of ndarray, shape (m,), s
-        TIMESYNC requests of the sender: its clock at the request, the autopilot's at the reply.
+        TIMESYNC requests of the sender: sender's clock at the request, autopilot's clock at the
+        reply.
     map_boot_to_unix : Line or None
         Map from boot clock to UNIX time by the autopilot's SYSTEM_TIME.
     has_receipt : bool
-        True if the recording has receive times, False if it has only the order of messages.
+        True if the recording contains receive times; False if only the order of messages is known.
     """
     time_source = "receive time" if has_receipt else "position in the stream"
     boot_at_receipt = boot_of_receipt.at(received_s)
@@ -171,7 +177,7 @@ def map_clock(
         distinct_count = len(np.unique(stamp_s))
         few_values = f"its {len(stamp_s)} timestamps have only {distinct_count} distinct values"
         note = f"{few_values}; the {time_source} is used instead"
-        # Jitter of the receive time, assuming evenly sent samples; gaps are excluded
+        # Jitter of the receive time if samples are sent at regular intervals; gaps are excluded
         intervals_s = np.diff(received_s)
         regular_intervals_s = intervals_s[intervals_s < MAX_REGULAR_INTERVAL_S]
         jitter_s = (
@@ -185,7 +191,8 @@ def map_clock(
         )
     timesync_line = _fit_timesync(replies, answers)
     unmapped_distance_s = abs(float(np.median(boot_at_receipt - stamp_s)))
-    # A separate clock may have started only seconds after the autopilot's
+    # A separate clock that started only seconds after the autopilot's clock looks like the boot
+    # clock; only TIMESYNC distinguishes them
     improvement_s = 0.0
     if timesync_line is not None:
         improvement_s = unmapped_distance_s - abs(
@@ -205,7 +212,7 @@ def map_clock(
         unix_note = "assumes the same UNIX time at sender and autopilot"
         candidates.append(("SYSTEM_TIME", map_boot_to_unix.inverse(), unix_note))
     for method, line, note in candidates:
-        # If messages are mapped far from their receive time, the map belongs to another clock
+        # A map that moves messages far from their receive time belongs to another clock
         if abs(float(np.median(line.at(stamp_s) - boot_at_receipt))) <= MAX_BOOT_CLOCK_DISTANCE_S:
             return ClockMapping(line, _clock_map(clock_name, method, line, stamp_s, note))
     receipt_line = fit_least_delay(stamp_s, received_s)
@@ -219,13 +226,13 @@ def map_clock(
 
 
 def _fit_timesync(replies: tuple[Array, Array], answers: tuple[Array, Array]) -> Line | None:
-    """Map the sender's clock to the boot clock by TIMESYNC: mean of the maps by both directions.
+    """Map the sender's clock to the boot clock by TIMESYNC, averaged over both directions.
 
-    ``replies`` and ``answers`` are those of :func:`map_clock`; None if both have too few pairs.
+    For ``replies`` and ``answers`` see :func:`map_clock`. None if both have too few pairs.
     """
     lines = []
     if len(replies[0]) >= MIN_TIMESYNC_PAIRS:
-        # The sender reads its clock after the autopilot, so the delay is in the reply
+        # The sender reads its clock later than the autopilot: the map is fitted in this order
         lines.append(fit_least_delay(*replies).inverse())
     if len(answers[0]) >= MIN_TIMESYNC_PAIRS:
         lines.append(fit_least_delay(*answers))

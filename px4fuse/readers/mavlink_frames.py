@@ -1,8 +1,8 @@
-"""Decoder of the MAVLink wire format: bytes to frames, and frames to columns.
+"""Decoder of the MAVLink wire format: bytes to frames (packets), and frames to columns.
 
-Every byte position at which a frame of a known message could begin is verified by the checksum.
-Invalid bytes and incomplete frames are skipped and counted, without loss of valid frames. All
-frames of one message type are decoded at once with the field tables of pymavlink's dialect.
+At every byte at which a frame of a known message could begin, the checksum is tested. Invalid bytes
+and incomplete frames are skipped and counted, without loss of valid frames. All frames of one
+message type are decoded at once with the field tables of pymavlink's dialect.
 
 Sources: MAVLink developer guide, "Packet Serialization"; pymavlink's generated dialects.
 """
@@ -33,19 +33,20 @@ SIGNED_FLAG = 0x01
 MAX_FRAME_BYTES = HEADER_BYTES_2 + 255 + CHECKSUM_BYTES + SIGNATURE_BYTES
 # Receive time that QGroundControl and MAVProxy write before each frame: µs, big-endian
 RECEIVE_TIME_BYTES = 8
-# Bytes scanned at once; limits the memory for malicious files
+# Number of bytes scanned at once, to limit the memory for malicious files
 BLOCK_BYTES = 1 << 16
-# Frames per batch; limits the memory
+# Number of frames decoded at once, to limit the memory
 DECODE_BATCH_SIZE = 1 << 12
-# Fraction of the file's bytes in valid frames; a file with less is not a MAVLink recording. Random
-# data contain one valid frame in about eight million bytes.
+# Minimum fraction of a MAVLink recording's bytes that are in valid frames. Random data contain one
+# valid frame in about eight million bytes.
 MIN_VALID_FRACTION = 0.01
-# µs; a receive time further than this from the median is damaged (limit of pymavlink)
+# Maximum difference (µs) of a receive time from the median (limit of pymavlink): a receive time
+# with a larger difference is damaged
 MAX_RECEIVE_TIME_DISTANCE_US = 3 * 24 * 3600 * 1_000_000
 MESSAGE_IDS: Mapping[str, int] = {
     message.msgname: at for at, message in dialect.mavlink_map.items()
 }
-# CRC_EXTRA byte by message id, the last input of the checksum; -1 for unknown messages
+# CRC_EXTRA by message id, the last byte in the checksum; -1 for unknown messages
 _CRC_EXTRA = np.full(
     max(1 << 16, *(number + 1 for number in dialect.mavlink_map)), -1, dtype=np.int16
 )
@@ -71,11 +72,11 @@ class Frames:
     payload_start : ndarray of int64, shape (n,)
     payload_length : ndarray of uint8, shape (n,)
     received_us : ndarray of int64, shape (n,), or None
-        Receive time (UNIX, µs), with damaged ones interpolated; None for a raw stream.
+        Receive times (UNIX, µs); damaged values are interpolated. None for a raw stream.
     unknown_frame_count : int
-        Complete frames of messages that are not in the dialect.
+        Number of complete frames with messages that are not in the dialect.
     bad_bytes : int
-        Bytes that are not part of a frame.
+        Number of bytes that are not part of a frame.
     ends_in_frame : bool
         True if the file ends within a frame.
     damaged_receive_times : int
@@ -123,8 +124,8 @@ class Frames:
         Returns
         -------
         structured ndarray, shape (n,)
-            One field per MAVLink field, in MAVLink units. The trailing zeros that MAVLink 2 omits
-            from the payload are restored.
+            One field per MAVLink field, in MAVLink units. MAVLink 2 omits trailing zeros from the
+            payload; they are restored.
         """
         layout = wire_layout(MESSAGE_IDS[message])
         payload = np.zeros((len(rows), layout.itemsize), dtype=np.uint8)
@@ -135,7 +136,7 @@ class Frames:
             if byte_count:
                 rows_of_length = np.flatnonzero(lengths == length)
                 windows = np.lib.stride_tricks.sliding_window_view(source, byte_count)
-                # Indexing copies the payloads, so the number of frames per step is limited
+                # Indexing copies the payloads, so frames are decoded in batches
                 for batch_start in range(0, len(rows_of_length), DECODE_BATCH_SIZE):
                     batch_rows = rows_of_length[batch_start : batch_start + DECODE_BATCH_SIZE]
                     payload[batch_rows, :byte_count] = windows[starts[batch_rows]]
@@ -151,7 +152,7 @@ def message_name(message_id: int) -> str:
 def wire_layout(message_id: int) -> np.dtype[Any]:
     """Return the payload layout of a message id as a packed structured dtype."""
     message = dialect.mavlink_map[message_id]
-    type_codes = message.native_format.decode().removeprefix("<")  # struct codes, same as in numpy
+    type_codes = message.native_format.decode().removeprefix("<")  # numpy has the same type codes
     fields: list[Any] = []
     for name, type_code, length in zip(
         message.ordered_fieldnames, type_codes, message.array_lengths, strict=True
@@ -189,7 +190,7 @@ def read_frames(name: str, content: bytes) -> Frames:
         )
     source = np.frombuffer(content, dtype=np.uint8)
     is_version_2 = source[start] == MAGIC_BYTE_2
-    # Header order: sequence, system, component
+    # Three consecutive header bytes: sequence, system, component
     sequence_offset = start + np.where(is_version_2, 4, 2)
     unknown_frame_count, bad_bytes, ends_in_frame = _count_other_bytes(
         content, start - time_bytes, end, time_bytes
@@ -217,7 +218,7 @@ def read_frames(name: str, content: bytes) -> Frames:
 
 
 def _find_valid_frames(content: bytes) -> Integers:
-    """Return start, end and message id, shape (n, 3), of all valid frames; they may overlap."""
+    """Return start, end and message id, shape (n, 3), of all valid frames. Frames may overlap."""
     source, view = np.frombuffer(content, dtype=np.uint8), memoryview(content)
     valid_frames = [np.zeros((0, 3), dtype=np.int64)]
     for block_start in range(0, len(source), BLOCK_BYTES):
@@ -236,7 +237,7 @@ def _remove_overlapping(frames: Integers) -> Integers:
     """Remove frames that begin inside the previous frame.
 
     The payload of one frame may contain another frame (TUNNEL). A receive time can look like the
-    beginning of a frame; such a false frame must not remove the true frame after it.
+    beginning of a frame. Such a false frame must not remove the true frame after the receive time.
     """
     if not np.any(frames[1:, 0] < frames[:-1, 1]):
         return frames
@@ -253,7 +254,7 @@ def _remove_overlapping(frames: Integers) -> Integers:
 
 
 def _find_candidates(source: NDArray[np.uint8], block_start: int) -> tuple[Integers, Integers]:
-    """Return start, end and message id of possible frames in one block, and checksum offsets."""
+    """Return start, end and message id of possible frames in a block, and checksum offsets."""
     block = source[block_start : block_start + BLOCK_BYTES]
     start = (
         np.flatnonzero((block == MAGIC_BYTE_1) | (block == MAGIC_BYTE_2)).astype(np.int64)
@@ -294,16 +295,17 @@ def _count_other_bytes(
 ) -> tuple[int, int, bool]:
     """Count frames and bytes between the valid frames.
 
-    ``start`` is the offset of each frame's receive time, which has ``time_bytes`` bytes or none.
+    ``start`` is the offset of each frame including its receive time of ``time_bytes`` bytes (0 in a
+    raw stream).
 
     Returns
     -------
     int
-        Complete frames of messages that are not in the dialect.
+        Number of complete frames with messages that are not in the dialect.
     int
-        Bytes that are not part of a frame.
+        Number of bytes that are not part of a frame.
     bool
-        True if the last of these bytes are the beginning of a frame.
+        True if the file ends within a frame.
     """
     unknown_frame_count, bad_bytes, last_bytes = 0, 0, b""
     gap_starts, gap_ends = np.append(0, end), np.append(start, len(content))
@@ -349,15 +351,15 @@ def _unknown_frames(content: bytes, offset: int, gap_end: int, time_bytes: int) 
 def _read_receive_times(
     source: NDArray[np.uint8], start: Integers, end: Integers
 ) -> tuple[Integers, int]:
-    """Return the receive times (UNIX, µs) and the number of damaged ones."""
+    """Return the receive times (UNIX, µs) and the number of damaged receive times."""
     is_usable = start >= RECEIVE_TIME_BYTES
     is_usable[1:] &= start[1:] - end[:-1] >= RECEIVE_TIME_BYTES
     windows = np.lib.stride_tricks.sliding_window_view(source, RECEIVE_TIME_BYTES)
-    # There may be no receive time before the first frame
+    # The file may begin without the receive time of the first frame
     raw_us = np.ascontiguousarray(windows[np.maximum(start - RECEIVE_TIME_BYTES, 0)]).view(">u8")[
         :, 0
     ]
-    received_us = raw_us.astype(np.int64)  # values above 1 << 63 become negative
+    received_us = raw_us.astype(np.int64)  # values above 1 << 63 become negative: invalid
     is_usable &= (received_us >= 0) & (received_us < 1 << 62)
     median_us = int(np.median(received_us[is_usable])) if np.any(is_usable) else 0
     is_usable &= np.abs(received_us - median_us) <= MAX_RECEIVE_TIME_DISTANCE_US

@@ -1,4 +1,4 @@
-"""MAVLink messages that px4fuse reads: fields, units, frames, directions.
+"""MAVLink messages that px4fuse reads: fields, units, coordinate frames, directions.
 
 To support another message with a position, add a row to ``mavlink_messages.toml``.
 """
@@ -29,7 +29,7 @@ ARDUPILOT_REPLAY = Unavailable(
     "px4fuse has no model of ArduPilot's estimator (EKF3)",
     "Use its logged state.",
 )
-# Messages whose time_usec is the boot clock; in other messages it may be another clock
+# Messages with the boot clock in time_usec; in other messages time_usec may be of another clock
 STAMPED_BY_BOOT_CLOCK = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
 # Messages that only an autopilot sends; they identify the autopilot among the senders
 AUTOPILOT_MESSAGES = (
@@ -48,11 +48,12 @@ AUTOPILOT_MESSAGES = (
 
 @dataclass(frozen=True)
 class PositionInput:
-    """Message with which an external position is sent to the autopilot.
+    """Message that sends an external position to the autopilot.
 
     ``name`` is the track name for ``--position-source``, ``row`` the key in LAYOUTS, ``stamp`` the
-    field with the sender's time (µs), ``estimator`` the required MAV_ESTIMATOR_TYPE, if any. PX4
-    ignores the covariance of a naive estimator (``mavlink_receiver.cpp``).
+    field with the sender's time (µs), ``estimator`` the required MAV_ESTIMATOR_TYPE, if any.
+    ``drops_covariance`` is True for a naive estimator, because PX4 ignores its covariance
+    (``mavlink_receiver.cpp``).
     """
 
     row: str
@@ -71,7 +72,7 @@ class PositionInput:
     @property
     def origin(self) -> Origin:
         """Origin of the position."""
-        return find_origin(self.kind, "as it arrived")
+        return find_origin(self.kind, "as received")
 
     @property
     def message(self) -> str:
@@ -81,7 +82,7 @@ class PositionInput:
 
 @dataclass(frozen=True)
 class FrameOfReference:
-    """MAV_FRAME: order and signs of the components along the axes of frame ``name`` (NED, FRD)."""
+    """MAV_FRAME: order and signs of its components along the axes of ``name`` ("NED", "FRD")."""
 
     name: str
     order: tuple[int, int, int] = (0, 1, 2)
@@ -101,17 +102,17 @@ UNUSED: Mapping[str, str] = _TABLE["unused"]
 POSITION_INPUTS = tuple(replace(row, name=name) for name, row in _INPUTS.items())
 _SCALED_IMU = (replace(LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{n}") for n in ("", "2", "3"))
 IMU_LAYOUTS = (LAYOUTS["highres_imu"], *_SCALED_IMU)
-# In order of preference for equal message counts
+# Attitude messages, in order of preference for equal message counts
 ATTITUDE_LAYOUTS = (LAYOUTS["quaternion"], LAYOUTS["angles"], LAYOUTS["attitude_of_odometry"])
-# EKF2's state; ODOMETRY is first because it has variances
+# Messages with EKF2's state; ODOMETRY is first because it contains variances
 STATE_LAYOUTS = (LAYOUTS["odometry"], LAYOUTS["local_position"])
-# Ground truth of a simulation
+# Messages with ground truth of a simulation
 TRUTH_LAYOUTS = (LAYOUTS["truth"], LAYOUTS["sim_state"])
 GNSS_LAYOUTS = (LAYOUTS["gnss"], replace(LAYOUTS["gnss"], topic="GPS2_RAW"))
 
 
 def remedies_of_autopilot(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
-    """Return the actions to record each missing part, and the reason for no EKF2 replay.
+    """Return the action to record each kind of missing data, and the reason for no EKF2 replay.
 
     The texts for PX4 are returned for all autopilots except ArduPilot.
     """

@@ -21,9 +21,11 @@ from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Recordi
 from px4fuse.readers.mavlink_senders import senders_of
 from px4fuse.readers.px4_positions import GeodeticPosition, project_to_ned, unproject
 
-# s; with a larger median distance to the boot time of receipt, a timestamp is not boot time
+# Maximum median difference (s) between GNSS timestamps and the boot time of receipt, for timestamps
+# that count as boot time
 MAX_BOOT_CLOCK_DISTANCE_S = 5.0
-# s; limit for joining global and local positions to the origin: 5 cm error at 1 m/s
+# Maximum time difference (s) between a global and a local position that give the origin: error of
+# 5 cm at 1 m/s
 MAX_STATE_DISTANCE_S = 0.05
 
 
@@ -85,7 +87,7 @@ def _read_track(
     samples = recording.read(source.layout, rows, boot_s, name)
     frame = "NED"
     if "frame_id" in samples and len(samples):
-        # One frame per track: that of the last sample, which PX4 would have used
+        # A track has one coordinate frame: the frame of the last sample, as PX4 uses
         reference = messages.FRAMES_OF_REFERENCE.get(int(samples["frame_id"].iloc[-1]))
         frame = "unknown" if reference is None else reference.name
     if source.drops_covariance:
@@ -113,10 +115,11 @@ def _read_track(
 def _read_gnss(
     recording: Recording, layout: Layout, delay_s: float
 ) -> PositionTrack | Unavailable | None:
-    """Read the fixes of a GNSS receiver as NED about the autopilot's origin; None without fixes.
+    """Read the fixes of a GNSS receiver as NED positions from the autopilot's origin.
 
-    PX4 and ArduPilot give a fix the timestamp of their boot clock, and repeat it until the next
-    fix. The track is chosen automatically if the autopilot sends a global position.
+    None without fixes. PX4 and ArduPilot give a fix the timestamp of their boot clock, and repeat
+    the fix until the next one. The track may be chosen by default only if the autopilot sends a
+    global position.
     """
     rows = recording.rows(layout.topic)
     timestamp_us = recording.frames.table(layout.topic, rows)["time_usec"]
@@ -124,7 +127,7 @@ def _read_gnss(
     boot_s = recording.frames.table(layout.topic, rows)["time_usec"] * 1e-6
     receipt_s = recording.receipt_boot_s(rows)
     if len(rows) and np.median(np.abs(receipt_s - boot_s)) > MAX_BOOT_CLOCK_DISTANCE_S:
-        boot_s = receipt_s  # timestamps are UNIX time, or the recording has no boot clock
+        boot_s = receipt_s  # the timestamps are UNIX time, or the recording has no boot clock
     fixes = recording.read(layout, rows, boot_s - delay_s)
     fixes = fixes[fixes["fix_type"] >= px4_positions.GPS_3D_FIX]
     if len(fixes) < px4_positions.MIN_TRACK_SAMPLES:
@@ -154,7 +157,7 @@ def pressure_altitude(pressure_hpa: pd.Series[float]) -> pd.Series[float]:
 def local_origin(recording: Recording) -> GeodeticPosition | None:
     """Return latitude, longitude (degrees) and altitude (m) of the autopilot's local origin.
 
-    The origin is as sent, or else computed from global and local positions; None if unknown.
+    The origin is from a message, or else computed from global and local positions. None if unknown.
     """
     sent_origin = recording.read(messages.LAYOUTS["origin"]).dropna()
     if len(sent_origin):
@@ -182,8 +185,9 @@ def read_truth(
     """Read ground truth from the simulation, or from motion capture if EKF2 uses another source.
 
     Simulation ground truth has no usable timestamps (``HIL_STATE_QUATERNION.time_usec`` is 0 in
-    PX4), so receive times are used. Its geodetic positions are projected about the autopilot's
-    origin for a GNSS source, otherwise about its first sample, the start of the simulated vehicle.
+    PX4), so receive times are used. The ground truth's geodetic positions are projected from the
+    autopilot's origin for a GNSS source. Otherwise the origin is the first sample of ground truth,
+    the start of the simulated vehicle.
     """
     for layout in messages.TRUTH_LAYOUTS:
         rows = recording.rows(layout.topic)
@@ -195,7 +199,7 @@ def read_truth(
             continue
         samples = samples.reindex(columns=[*GLOBAL_COLUMNS, *Columns.VELOCITY, *Columns.QUATERNION])
         if not samples[Columns.VELOCITY].to_numpy().any():
-            # Velocities that are all zero were not sent
+            # Velocities that are zero in all samples were not sent
             samples[Columns.VELOCITY] = np.nan
         recording.record_stream("truth", layout.topic, clock=RECEIPT_CLOCK)
         origin = local_origin(recording) if positions and positions[0].origin.is_gnss else None

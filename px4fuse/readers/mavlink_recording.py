@@ -26,23 +26,24 @@ from px4fuse.readers.ulog_topics import longest_increasing_run
 
 BOOT_CLOCK = "autopilot boot clock"
 RECEIPT_CLOCK = "receive time minus minimum link delay"
-# s; a larger backward step of the boot clock is a restart, not a late packet
+# Minimum backward step (s) of the boot clock at a restart; a smaller step is a late packet
 MIN_RESTART_STEP_S = 5.0
-# Messages before and after a suspected restart whose boot times are compared to confirm it
+# Distance (messages) before and after a suspected restart at which boot times are compared to
+# confirm the restart
 RESTART_CHECK_MESSAGES = 20
-# Fraction of the largest group of timestamps; a smaller separate group is invalid
+# Minimum size of a valid separate group of timestamps, relative to the largest group
 MIN_GROUP_FRACTION = 0.01
-# s; timestamps further than this from all others, or outside the session, are invalid
+# Maximum distance (s) of valid timestamps from all others, and from the session
 MAX_OUTSIDE_S = 60.0
-# Fraction of bytes outside of frames, above which the file is damaged
+# Maximum fraction of bytes outside of frames in a file that is not damaged
 MAX_LOST_FRACTION = 0.002
-# Number of boot timestamps from which constant values show that the field is not a clock
+# Minimum number of equal boot timestamps that show that the field is not a clock
 MIN_CONSTANT_TIMESTAMPS = 10
 
 
 @dataclass(frozen=True)
 class Recording:
-    """MAVLink recording with the clock map of its autopilot.
+    """MAVLink recording with the map from receive time to the autopilot's boot clock.
 
     Attributes
     ----------
@@ -50,24 +51,24 @@ class Recording:
     address : Address
         Address of the autopilot of this flight.
     session : slice
-        Frames between two restarts of the autopilot: the longest such part of the recording.
+        Analysed frames: the longest part of the recording between two restarts of the autopilot.
     received_s : ndarray, shape (n,)
         Receive time (s) of every frame since the first frame. In a stream without receive times:
         boot time of the last autopilot message before the frame.
     boot_of_receipt : Line
         Map from receive time (s) to boot clock (s).
     zero_s, duration_s : float
-        Boot time (s) at which the session starts, and duration of the session. Times of the flight
+        Boot time (s) at the start of the session, and duration of the session. Times of the flight
         count from ``zero_s``.
     damage : tuple of str
-        Sentences on unreadable parts.
+        Sentences on unreadable parts of the file.
     notes : list of str
     restarts, receive_time_reversals : int or None
-        As in :class:`~px4fuse.log.LogInfo`.
+        See :class:`~px4fuse.log.LogInfo`.
     dropped : dict
-        Samples dropped because of an invalid timestamp, by message; filled by :meth:`read`.
+        Number of samples with an invalid timestamp, by message; filled by :meth:`read`.
     streams : dict
-        Source of each part of the flight; filled by :meth:`record_stream`.
+        Messages and clock of each kind of data in the flight; filled by :meth:`record_stream`.
     """
 
     frames: Frames
@@ -109,11 +110,11 @@ class Recording:
         Parameters
         ----------
         layout : Layout
-            Euler angles become quaternions; MAV_FRAMEs are converted to NED (or FRD).
+            Fields to read. Euler angles are converted to quaternions, MAV_FRAMEs to NED (or FRD).
         rows : ndarray, shape (n,), optional
             Frame indices from :meth:`rows`; by default all from the autopilot.
         boot_s : ndarray, shape (n,), optional
-            Boot times; NaN drops the sample. By default the timestamps of the messages.
+            Boot times; a sample with NaN is dropped. By default the timestamps of the messages.
         name : str, optional
             Key in :attr:`dropped`; by default the message name.
         """
@@ -123,7 +124,7 @@ class Recording:
         selected_rows = self._select_rows(name or layout.topic, boot_s)
         if len(selected_rows) < len(table):
             table = table[selected_rows]
-        # One hour of IMU data has hundreds of megabytes, so copies are avoided
+        # One hour of IMU data has hundreds of megabytes, so fields are copied only once
         values = np.empty((len(selected_rows), len(layout.columns)))
         for column_index, (column, field_name) in enumerate(layout.columns.items()):
             array_name, _, index = field_name.removesuffix("]").partition("[")
@@ -141,13 +142,13 @@ class Recording:
         return _to_ned(samples) if "frame_id" in samples else samples
 
     def _select_rows(self, name: str, boot_s: Array) -> IntArray:
-        """Return the indices of valid, strictly increasing boot times; count the others."""
+        """Return the indices of valid, strictly increasing boot times; count the dropped ones."""
         # Comparisons with NaN are False, so NaN is dropped
         time_s = boot_s - self.zero_s
         is_inside = (time_s >= -MAX_OUTSIDE_S) & (time_s <= self.duration_s + MAX_OUTSIDE_S)
         rows = np.flatnonzero(is_inside & (boot_s > 0.0))
         time_us = np.rint(boot_s[rows] * 1e6).astype(np.int64)
-        # The same message received over two links is one sample
+        # A message that is received twice, over two links, is one sample
         first_copies = np.sort(np.unique(time_us, return_index=True)[1])
         selected_rows: IntArray = rows[first_copies[longest_increasing_run(time_us[first_copies])]]
         dropped_count = len(boot_s) - len(rows) + len(first_copies) - len(selected_rows)
@@ -156,11 +157,11 @@ class Recording:
         return selected_rows
 
     def receipt_boot_s(self, rows: IntArray) -> Array:
-        """Return the boot time (s) at which frames were received, minus the minimum link delay."""
+        """Return the boot time (s) of receipt, minus the minimum link delay."""
         return self.boot_of_receipt.at(self.received_s[rows])
 
     def boot_s(self, table: NDArray[Any], rows: IntArray) -> Array:
-        """Return the boot time (s) of autopilot messages from timestamps, else receive time."""
+        """Return the boot time (s) of autopilot messages: timestamps, or else receive times."""
         if not self.boot_of_receipt.pairs:  # no message contains the boot clock
             return self.receipt_boot_s(rows)
         if "time_boot_ms" in (table.dtype.names or ()):
@@ -174,14 +175,14 @@ class Recording:
         )
 
     def record_stream(self, flight_part: str, *messages: str, clock: str = BOOT_CLOCK) -> None:
-        """Record the source of a part of the flight."""
+        """Record the messages and the clock of one kind of data, such as "imu"."""
         self.streams[flight_part] = Stream(messages, clock, self.frames.name)
 
 
 def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     """Convert ODOMETRY samples to NED (or FRD); values in unsupported frames become NaN.
 
-    The velocity is in the child frame, which is the body frame in PX4 up to v1.13 and NED later
+    The velocity is in the child frame of the message: the body frame in PX4 up to v1.13, NED later
     (``streams/ODOMETRY.hpp``). Orientations in frames other than NED or FRD are dropped, because
     the sender's body axes are unknown.
     """
@@ -251,12 +252,12 @@ def _read_boot_times(frames: Frames, address: Address) -> tuple[IntArray, Array]
 
 
 def read_recording(frames: Frames, address: Address) -> Recording:
-    """Choose the longest session and map the receive time to the boot clock."""
+    """Choose the longest session between restarts, and map the receive time to the boot clock."""
     notes: list[str] = []
     rows, boot_s = _read_boot_times(frames, address)
     session = slice(0, len(frames))
     restarts = np.flatnonzero(np.diff(boot_s) < -MIN_RESTART_STEP_S) + 1
-    # A single late or early packet is not a restart, so its neighbours are compared too
+    # A single late or early packet is not a restart, so packets before and after are compared, too
     boot_before_s = boot_s[np.maximum(restarts - 1 - RESTART_CHECK_MESSAGES, 0)]
     boot_after_s = boot_s[np.minimum(restarts + RESTART_CHECK_MESSAGES, len(boot_s) - 1)]
     restarts = restarts[
@@ -293,7 +294,7 @@ def read_recording(frames: Frames, address: Address) -> Recording:
         if len(rows):
             line = fit_least_delay(boot_s, received_s[rows]).inverse()
     elif len(rows):
-        # A raw stream has no receive time; the last boot time before each frame replaces it
+        # A raw stream has no receive times; the last boot time before each frame is used instead
         previous_row = np.clip(
             np.searchsorted(rows, np.arange(len(frames)), side="right") - 1, 0, None
         )
@@ -312,13 +313,13 @@ def read_recording(frames: Frames, address: Address) -> Recording:
     lost_text = (
         f"{frames.bad_bytes:,} bytes ({lost_fraction:.2%}) are not part of a complete MAVLink frame"
     )
-    # An incomplete first and last frame are not damage
+    # An incomplete first or last frame does not count as damage
     bytes_inside = frames.bad_bytes - 2 * MAX_FRAME_BYTES
     is_damaged = bytes_inside > MAX_LOST_FRACTION * len(frames.content)
     damage = (f"the file is damaged: {lost_text}",) if is_damaged else ()
     if frames.bad_bytes and not is_damaged:
         notes.append(lost_text)
-    # Without a boot clock, time is receive time
+    # Without a boot clock, flight time is receive time
     data_span_s = boot_s if len(boot_s) else np.array([0.0, received_s.max()])
     zero_s, end_s = float(data_span_s[0]), float(data_span_s[-1])
     return Recording(
@@ -343,7 +344,7 @@ def _format_times(count: int) -> str:
 def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
     """Remove small groups of timestamps at either end that are far from all others.
 
-    A group is small below MIN_GROUP_FRACTION of the largest group, and far beyond MAX_OUTSIDE_S.
+    Small is below MIN_GROUP_FRACTION of the largest group; far is more than MAX_OUTSIDE_S.
     """
     groups = np.split(rows, np.flatnonzero(np.diff(times_s[rows]) > MAX_OUTSIDE_S) + 1)
     min_count = MIN_GROUP_FRACTION * max(len(group) for group in groups)
@@ -352,7 +353,7 @@ def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
 
 
 def map_boot_to_unix(recording: Recording) -> Line | None:
-    """Map the boot clock to UNIX time by SYSTEM_TIME; None if its UNIX time is not set."""
+    """Map the boot clock to UNIX time by SYSTEM_TIME; None if SYSTEM_TIME has no UNIX time."""
     table = recording.frames.table("SYSTEM_TIME", recording.rows("SYSTEM_TIME"))
     boot_s, unix_s = table["time_boot_ms"] * 1e-3, table["time_unix_usec"] * 1e-6
     is_known = unix_s > MIN_UNIX_TIME_S

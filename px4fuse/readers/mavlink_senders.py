@@ -20,13 +20,15 @@ from px4fuse.readers.mavlink_clocks import (
 from px4fuse.readers.mavlink_frames import Address, Frames
 from px4fuse.readers.mavlink_recording import MIN_RESTART_STEP_S, Recording, map_boot_to_unix
 
-# Number of senders that are read and described: those with most messages
+# Maximum number of senders that are read and described: the senders with most messages
 MAX_SENDERS = 32
-# Lost fraction above which the sender does not count its messages; the numbers are then ignored
+# Maximum fraction of lost messages: with a larger fraction, the sender does not set sequence
+# numbers, and they are ignored
 MAX_LOST_FRACTION = 0.9
-# Sequence numbers; a message late by up to this number was received over a slower link, not lost
+# Maximum lateness, in sequence numbers, of a message that counts as received over a slower link
 MAX_LATE_MESSAGES = 16
-# s; a larger difference between timestamps of one sender shows that they are from two clocks
+# Maximum difference (s) between timestamps of one clock: a sender with a larger difference uses two
+# clocks
 MAX_SAME_CLOCK_DISTANCE_S = 1e5
 
 
@@ -57,9 +59,9 @@ def _is_vehicle(vehicle_type: int, autopilot: int) -> bool:
 
 
 def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
-    """Return address and type of the autopilot with ``system`` as system id.
+    """Return address and type of the autopilot with the system id ``system``.
 
-    By default the autopilot with most messages is chosen.
+    Without ``system``, choose the autopilot with most messages.
 
     Raises
     ------
@@ -71,8 +73,9 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
     vehicle_addresses = [s for s in counts if s in vehicles and _is_vehicle(*vehicles[s])]
     rows = np.concatenate([frames.rows(name) for name in messages.AUTOPILOT_MESSAGES])
     autopilot_counts = dict(_count_frames(frames, rows))
-    # Companion computers may have autopilot heartbeats, so messages that only autopilots send
-    # count first. Without a heartbeat, these messages or the component id identify the autopilot
+    # Companion computers may send autopilot heartbeats, so senders of messages that only autopilots
+    # send are preferred. Without a heartbeat, these messages or the component id identify the
+    # autopilot
     candidates = (
         [s for s in vehicle_addresses if s in autopilot_counts]
         or [s for s in autopilot_counts if s not in vehicles]
@@ -100,7 +103,7 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
 
 
 def senders_of(recording: Recording, message: str) -> list[Address]:
-    """Return the senders of one message, without this vehicle's autopilot and other vehicles."""
+    """Return the senders of a message, except this vehicle's autopilot and other vehicles."""
     frames, own_address = recording.frames, recording.address
     other_vehicles = {
         s[0] for s, vehicle_type in _vehicle_types(frames).items() if _is_vehicle(*vehicle_type)
@@ -131,11 +134,12 @@ def _map_sender_clock(
     rows = recording.rows("TIMESYNC", sender)
     timesync = frames.table("TIMESYNC", rows)
     reply_s, request_s = timesync["tc1"] * 1e-9, timesync["ts1"] * 1e-9
-    # Replies to another sender's request contain another clock
+    # Replies to another sender's request contain that sender's clock, so they are excluded
     is_reply = (reply_s != 0.0) & (
         np.abs(request_s - recording.receipt_boot_s(rows)) <= MIN_RESTART_STEP_S
     )
-    # A TIMESYNC request gets its timestamp when it is sent, so it is hardly delayed
+    # The timestamps of TIMESYNC requests are used, too: requests are sent at their timestamp, so
+    # they have a small delay
     is_request = (
         has_running_clock
         & (reply_s == 0.0)
@@ -208,8 +212,8 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
 def _lost_fraction(frames: Frames, address: Address) -> float | None:
     """Return the fraction of a sender's messages that are missing, from the sequence numbers.
 
-    Repeated or slightly late messages are not lost. None if the sender does not count its
-    messages, or counts them separately on two links.
+    Repeated or slightly late messages do not count as lost. None if the sender does not set
+    sequence numbers, or sets them separately on two links.
     """
     sequence = frames.sequence[frames.sent_by(address)].astype(np.int64)
     step = np.mod(np.diff(sequence) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES

@@ -1,8 +1,8 @@
 """Reader of CSV files from positioning systems (UWB), in the clock and frame of the file.
 
-The documented format is a header and ``time, x, y, z`` in seconds and metres, optionally with
-``sigma`` or ``sigma_x, sigma_y, sigma_z``. Other separators, column names and units are detected.
-The detected format is reported, and options override columns and units.
+The standard format is a header and the columns ``time, x, y, z`` in seconds and metres, optionally
+``sigma`` or ``sigma_x, sigma_y, sigma_z``. Other separators, column names and units are detected
+and reported. Options override the detected columns and units.
 """
 
 import csv
@@ -30,14 +30,15 @@ SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
 
 MAX_FILE_BYTES = 500_000_000  # several days of UWB positions
 MIN_ROWS = 3
-# s; UWB systems have rates of 0.2 Hz to 200 Hz, with 10 % variation of the interval
+# Limits (s) of plausible intervals: UWB systems have rates of 0.2 Hz to 200 Hz, with 10 % variation
 MIN_INTERVAL_S, MAX_INTERVAL_S = 0.9 / 200, 1.1 / 0.2
-# s; distinguishes UNIX time in s from a boot clock in µs, which half an hour after boot is as large
+# Maximum interval (s) of UNIX time in s; distinguishes it from boot time in µs, which has equally
+# large values half an hour after boot
 MAX_UNIX_TIME_INTERVAL_S = 60.0
-# m; largest extent of an indoor flight
+# Maximum extent (m) of an indoor flight, to detect the unit of length
 MAX_SPREAD_M = 200.0
-MAX_COORDINATE = 1e9  # any length unit; larger values are timestamps or damage
-# Beginning of the file in which the header is searched
+MAX_COORDINATE = 1e9  # in any unit of length; larger values are timestamps or damage
+# Length of the part at the beginning of the file in which the header is searched
 MAX_HEADER_LINES, MAX_HEADER_CHARS = 1000, 200_000
 MAX_COLUMNS = 200
 _COLUMNS_OPTION = "`columns` TIME,X,Y,Z"
@@ -46,7 +47,7 @@ _SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "space"}
 
 @dataclass(frozen=True)
 class PositionRecording:
-    """Position file of a positioning system, in the clock and frame of the file.
+    """Content of a position file, in the clock and frame of the file.
 
     Attributes
     ----------
@@ -58,17 +59,18 @@ class PositionRecording:
     samples : DataFrame, shape (n, 6)
         ``x_m, y_m, z_m, sigma_x_m, sigma_y_m, sigma_z_m`` (m); NaN if not in the file. The index
         ``time_s`` (s, clock of the file) is strictly increasing. In frame "ned" x is north, y
-        east, z down; in "enu" x is east, y north, z up, independent of the order of columns.
+        east, z down; in "enu" x is east, y north, z up. The order of columns in the file does not
+        matter.
     clock : "UNIX" or "local"
         "UNIX" if the timestamps are between 2000 and 2100.
     frame : str or None
-        "ned" or "enu" if the column names contain it.
+        "ned" or "enu" according to the column names; None if they do not contain the frame.
     detected : tuple of str
         One sentence per detected property of the format.
     notes : tuple of str
-        Dropped rows with the reason, and warnings.
+        Number of dropped rows with the reason, and warnings.
     dropped : int
-        Rows with an invalid timestamp.
+        Number of rows with an invalid timestamp.
     """
 
     name: str
@@ -88,12 +90,12 @@ class _Table:
 
     file_name: str
     separator: str
-    names: list[str]  # of the columns
+    names: list[str]  # column names
     body: str  # complete lines after the header
     header_line: int
 
     def label(self, *columns: int | None) -> str:
-        """Format the different names of columns for messages; None is skipped."""
+        """Format the names of columns for messages, without repetition; skip None."""
         labels = dict.fromkeys(
             quote(self.names[at]) if self.names[at] else f"column {at + 1}"
             for at in columns
@@ -140,10 +142,10 @@ def read_position_csv(
     Parameters
     ----------
     path : str or Path
-        Text table in the format of the module description.
+        Text table, see :mod:`px4fuse.readers.position_csv`.
     columns : tuple of str, optional
-        TIME, X, Y, Z and optionally SIGMA, each a column name or number (from 1). Without SIGMA, Z
-        may be omitted too.
+        Columns of time, x, y, z and optionally sigma, each a name or number (from 1). Without
+        sigma, z may also be omitted.
     time_unit : {"s", "ms", "us", "ns"}, optional
         Unit of the time column; overrides detection.
     length_unit : {"m", "cm", "mm"}, optional
@@ -152,8 +154,8 @@ def read_position_csv(
     Raises
     ------
     LogError
-        The file cannot be read, is not a text table, has no columns of time and position, more
-        columns than header names, or fewer than three usable rows.
+        The file cannot be read, is not a text table, has no columns of time and position, has more
+        columns than header names, or has fewer than three usable rows.
     SettingsError
         An option has an invalid value or names a column that is not in the file.
     """
@@ -169,7 +171,7 @@ def read_position_csv(
         table, meanings, chosen_columns, numbers
     )
     axes = [at for at in position if at is not None]
-    # Texts such as 1e999 become infinite
+    # Numbers such as 1e999 are read as infinite
     is_usable = np.isfinite(numbers[time])
     is_usable &= (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
     if unusable_count := int(np.count_nonzero(~is_usable)):
@@ -188,7 +190,7 @@ def read_position_csv(
     unit, unit_text = _time_unit(times, name_unit if name_unit in TIME_UNITS else "", time_unit)
     seconds = times / round(1.0 / TIME_UNITS[unit])
     usable_rows = np.flatnonzero(np.abs(seconds) < UNIX_END_S)
-    # Ranks instead of times, because times may be negative
+    # Ranks instead of times, because the function requires positive values
     ranks = np.unique(seconds[usable_rows], return_inverse=True)[1].astype(np.int64)
     kept_rows = usable_rows[longest_increasing_run(ranks + 1)]
     if dropped := len(seconds) - len(kept_rows):
@@ -272,7 +274,7 @@ def _split_line(line: str, separator: str) -> list[str]:
 def _find_table(
     file_name: str, content: bytes, columns: tuple[str, ...] | None
 ) -> tuple[_Table, list[str]]:
-    """Find the table in a text file; return also a note if the last line was dropped."""
+    """Find the table in a text file; also return a note if the last line was dropped."""
     text = decode_text(content)
     if text is None:
         raise LogError(
@@ -314,7 +316,7 @@ def _find_table(
 
 
 def _is_header(fields: list[str], wanted_names: set[str]) -> bool:
-    """Return True if the fields contain the wanted names, or else names of time and position."""
+    """Return True if the fields contain ``wanted_names``; if empty, names of time and position."""
     if wanted_names:
         return wanted_names <= {name.casefold() for name in fields}
     meanings = [read_column_name(name) for name in fields]
@@ -323,7 +325,7 @@ def _is_header(fields: list[str], wanted_names: set[str]) -> bool:
 
 
 def _column_indices(table: _Table, columns: tuple[str, ...]) -> list[int]:
-    """Return the indices of the columns that the option names."""
+    """Return the indices of the columns in the option ``columns``."""
     names = [name.casefold() for name in table.names]
     numbers = [str(at + 1) for at in range(len(names))]
     indices = []
@@ -349,14 +351,14 @@ def _choose_columns(
     chosen_columns: list[int],
     numbers: pd.DataFrame,
 ) -> tuple[int, _Columns, _Columns, str | None, str]:
-    """Choose the columns of time, position and sigma; return also frame and time description.
+    """Choose the columns of time, position and sigma; also return frame and time description.
 
-    The columns that the option names are used, otherwise columns with known names. A column with
-    the time of measurement, unless empty, is preferred to the time of recording.
+    The columns of the option are used, otherwise columns with known names. The time of measurement,
+    if that column is not empty, is preferred to the time of recording.
     """
     if chosen_columns:
         time, time_text = chosen_columns[0], table.label(chosen_columns[0])
-        # The column names may contain the frame and so the order of the axes
+        # The column names may contain the frame, which determines the order of the axes
         chosen_meanings = [
             m if at in chosen_columns[1:4] else ColumnMeaning() for at, m in enumerate(meanings)
         ]

@@ -1,4 +1,4 @@
-"""Meaning of column names in position files: "x_m", "position.x", "East [mm]", "bag_time"."""
+"""Meaning of column names in position files, such as "x_m", "East [mm]" or "bag_time"."""
 
 import re
 import unicodedata
@@ -27,7 +27,7 @@ _TIME_ROLES = _ROLES["time"] | _ROLES["measured"] | _ROLES["recorded"] | _ROLES[
 # Kinds of time columns, in order of preference
 TIME_KINDS = ["time of measurement", "time", "time of recording"]
 _GLUED_NAMES = re.compile(r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)")
-# Frame and names of its axes; the first frame with both horizontal axes in the file is used
+# Coordinate frame and names of its axes; the first row with both horizontal axes in a file is used
 _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
     ("ned", ("north", "east", "down")),
     ("enu", ("east", "north", "up")),
@@ -42,13 +42,13 @@ class ColumnMeaning:
     """Meaning of one column name; all fields are "" for an unknown name."""
 
     kind: str = ""  # "time", "position", "sigma" or "tag"
-    key: str = ""  # axis, or element of `TIME_KINDS`
+    key: str = ""  # axis name, or element of `TIME_KINDS`
     unit: str = ""
-    group: str = ""  # other parts of a position's name, common to its x, y and z
+    group: str = ""  # rest of the name without axis and unit: the same for x, y and z of a position
 
 
 def read_column_name(name: str) -> ColumnMeaning:
-    """Return the kind, axis, unit and group that a column name contains."""
+    """Derive kind, axis, unit and group from a column name."""
     plain_name = unicodedata.normalize("NFKC", name).replace("μ", "u")
     plain_name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", plain_name).lower()
     column_words = re.findall(r"[^\W_]+", plain_name)
@@ -82,9 +82,9 @@ def read_column_name(name: str) -> ColumnMeaning:
 
 
 def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, Position] | None:
-    """Return frame and column indices of the position; None if there is no position.
+    """Return frame and column indices of the position; None if the file has no position.
 
-    The first position with three axes is preferred to a position without height.
+    A position with height is preferred to a position without height.
     """
     groups: dict[str, dict[str, int]] = {}
     for index, column in enumerate(meanings):
@@ -103,7 +103,7 @@ def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, Positi
 
 
 def find_sigma(meanings: Sequence[ColumnMeaning], frame: str | None) -> tuple[int | None, ...]:
-    """Return the sigma column of each axis of a frame; a sigma without axis is used for all."""
+    """Return the sigma column of each axis of a frame; a sigma without axis is for all axes."""
     # Reversed, so that the first of several columns with the same meaning is used
     sigmas = {m.key: at for at, m in [*enumerate(meanings)][::-1] if m.kind == "sigma"}
     axes = next(axes for name, axes in _FRAMES if name == frame)

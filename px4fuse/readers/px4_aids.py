@@ -1,7 +1,7 @@
-"""Innovations, variances and fusion results of all EKF2 aids in a ULog.
+"""Innovations, variances and fusion results of all EKF2 aids (measurement sources) in a ULog.
 
-Source: PX4-Autopilot ``EKF2.cpp`` (PublishInnovations, PublishAidSourceStatus), v1.8 to main; the
-fields are in ``ekf2_parameters.toml``.
+Source: PX4-Autopilot ``EKF2.cpp`` (PublishInnovations, PublishAidSourceStatus), v1.8 to main. The
+field names are in ``ekf2_parameters.toml``.
 """
 
 from __future__ import annotations
@@ -19,23 +19,24 @@ from px4fuse.readers.common import join_nearest
 from px4fuse.readers.field_maps import Layout
 from px4fuse.readers.ulog_topics import Topics
 
-# s; innovations and variances are logged up to one interval of the default profile (0.5 s) apart,
-# and S changes little in that time
+# Maximum time difference (s) between an innovation and its variance S: the default profile logs
+# each topic every 0.5 s, and S changes little in that time
 JOIN_TOLERANCE_S = 0.6
 
 
 def read_aids(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> dict[str, AidLog]:
     """Read all aids with innovations in the log, by PX4 name.
 
-    ``enabled`` is the result of :func:`read_enabled_aids`. The topic ``estimator_aid_src`` of the
-    aid is preferred: it contains each fusion attempt with time and result. The other topics repeat
-    each value until the next fusion; repeated values are removed.
+    ``enabled`` is the result of :func:`read_enabled_aids`. An aid's topic ``estimator_aid_src_...``
+    is preferred: it contains each fusion attempt with time and result. The older common topics
+    repeat each value until the next fusion; repeated values are removed.
     """
     logs = {}
     for name, aid in AIDS.items():
         aid_enabled = enabled.get(name)
         log = _read_aid_topic(topics, aid, aid_enabled)
-        # The other topics contain outdated or foreign values of an aid that was never enabled
+        # For an aid that was never enabled, the common topics contain outdated values or values of
+        # another aid
         if log is None and (name.startswith("ev_") if aid_enabled is None else aid_enabled.any()):
             log = _read_common_topics(topics, aid, aid_enabled)
         if log is not None:
@@ -87,7 +88,7 @@ def _read_aid_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) 
     }
     columns |= {"fused": "fused", "rejected": "innovation_rejected"}
     layout = Layout(f"estimator_aid_src_{aid.name}", columns)
-    if topics.find(layout) is None:  # return early; reading an empty table takes time
+    if topics.find(layout) is None:  # return early: reading an empty table takes time
         return None
     samples = topics.primary_samples(layout).dropna()
     if enabled is not None and aid.name in px4.FLAG_ALWAYS_SET:
@@ -98,7 +99,7 @@ def _read_aid_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) 
 def _read_common_topics(
     topics: Topics, aid: Aid, enabled: pd.Series[float] | None
 ) -> AidLog | None:
-    """Read an aid from the topics that contain the last value of all aids."""
+    """Read an aid from the common topics, which contain the last values of all aids."""
     is_in_gauss = aid.name == "mag_heading" and any(
         "cs_mag" in table for table in topics.of(px4.STATUS_FLAGS)
     )
@@ -133,7 +134,7 @@ def _read_common_topics(
 
 
 def _drop_repeats(frame: pd.DataFrame) -> pd.DataFrame:
-    """Remove repeated rows, and zeros, which mean "not fused yet"."""
+    """Remove repeated rows, and rows of zeros, which mean "not fused yet"."""
     finite_frame = frame.dropna()
     first_column = finite_frame.iloc[:, 0]
     return finite_frame[first_column.ne(first_column.shift()) & (first_column != 0.0)]
@@ -150,9 +151,9 @@ def _make_aid_log(
     enabled: pd.Series[float] | None,
     excluded_count: int = 0,
 ) -> AidLog | None:
-    """Build the log of an aid from rows with positive variance, with the innovations negated.
+    """Build the log of an aid from rows with positive variance; None without such rows.
 
-    PX4 logs predicted minus measured. None without such rows.
+    Innovations are negated, because PX4 logs predicted minus measured.
     """
     samples = samples[(samples[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
     negated = {column: -samples[column] for column in _columns("innovation", aid, aid.axes)}

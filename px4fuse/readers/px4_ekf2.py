@@ -27,11 +27,11 @@ VISION_TOPIC = "vehicle_visual_odometry"
 STATE_COUNT = 22  # attitude, velocity, position, biases, magnetic fields; wind and terrain follow
 MAG_3D_BIT = 5  # filter_control_status_u, common.h
 MIN_COMPLETE_FIELD_HZ = 10.0  # a topic with a higher rate has all samples (EKF2 uses 14 per second)
-# IMU samples; closer to n + 0.5 EKF2 may round up or down
+# Distance (IMU samples) from n + 0.5 below which EKF2 may round up or down
 MAX_HALF_DISTANCE = 0.05
-# s; longest interval between two rows of optical flow
+# Maximum interval (s) between two rows of optical flow
 MAX_FLOW_INTERVAL_S = 0.5
-# Horizontal aiding besides vision position
+# Aids of the horizontal state other than vision position
 OTHER_HORIZONTAL_AIDS = (
     "gnss_pos",
     "gnss_vel",
@@ -118,9 +118,9 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
 
 
 def _state_vector(topics: Topics) -> tuple[str, int]:
-    """Return the topic with EKF2's state vector and its number of attitude variances.
+    """Return the topic with EKF2's state vector and the number of attitude variances in it.
 
-    The topic is "" if it is not logged; the number is 0 if the array lengths are unknown.
+    The topic is "" if it is not logged. The number is 0 if the array lengths are unknown.
     """
     for topic in px4.ESTIMATOR_STATES:
         for table in topics.of(topic)[:1]:
@@ -132,9 +132,9 @@ def _state_vector(topics: Topics) -> tuple[str, int]:
 
 
 def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavailable:
-    """Read EKF2's state and variances at the fusion horizon, in the layout of all releases.
+    """Read EKF2's state and variances at the fusion horizon, in one layout for all releases.
 
-    ``step_s`` is the prediction interval (s). It converts the biases of releases that store bias
+    ``step_s`` is the prediction interval (s). It is needed for releases that log biases as
     increments per prediction.
     """
     topic, attitude = _state_vector(topics)
@@ -162,7 +162,7 @@ def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavail
 
 
 def _variance(delayed: pd.DataFrame | Unavailable) -> pd.DataFrame | Unavailable:
-    """Return the variances of position (m²) and velocity (m²/s²); rows must be all positive."""
+    """Return the rows with positive variances of position (m²) and velocity (m²/s²)."""
     if isinstance(delayed, Unavailable):
         return delayed
     variance = delayed[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
@@ -171,12 +171,12 @@ def _variance(delayed: pd.DataFrame | Unavailable) -> pd.DataFrame | Unavailable
 
 
 def target_step_s(topics: Topics) -> float:
-    """Return EKF2_PREDICT_US in s."""
+    """Return the configured prediction interval, EKF2_PREDICT_US, in s."""
     return topics.log.parameters.get("EKF2_PREDICT_US", flight.EKF2_STEP_S * 1e6) * 1e-6
 
 
 def _step_s(topics: Topics) -> float:
-    """Return the prediction interval (s): a whole number of IMU samples (ImuDownSampler.cpp)."""
+    """Return the actual prediction interval (s): whole IMU samples (ImuDownSampler.cpp)."""
     target_s = target_step_s(topics)
     imu = topics.read(px4.IMU)
     if len(imu) < 2:
@@ -193,7 +193,7 @@ def _step_s(topics: Topics) -> float:
 
 
 def rows_of_timestamps(times_s: Array, known_s: ArrayLike) -> IntArray:
-    """Return the rows of ``times_s`` whose time is in ``known_s``, rounded to 1 µs."""
+    """Return the indices of the ``times_s`` that are also in ``known_s``, rounded to 1 µs."""
     known_us = np.rint(np.asarray(known_s, dtype=float) * 1e6)
     return np.flatnonzero(np.isin(np.rint(times_s * 1e6), known_us))
 
@@ -201,9 +201,9 @@ def rows_of_timestamps(times_s: Array, known_s: ArrayLike) -> IntArray:
 def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -> int:
     """Return the number of IMU samples per EKF2 prediction: the nearest whole number.
 
-    EKF2 rounds a mean of the measured intervals, so n + 0.5 may be rounded up or down. This
-    function rounds up, unless only the smaller number is consistent with ``ends``, the logged ends
-    of predictions in IMU samples.
+    EKF2 divides ``target_s`` by a mean of the measured intervals and rounds, so a ratio near
+    n + 0.5 may be rounded up or down. This function rounds up, unless only the smaller number is
+    consistent with ``ends``, the logged ends of predictions in IMU samples.
 
     >>> samples_per_step(0.010, 0.00375), samples_per_step(0.010, 0.004)
     (3, 3)
@@ -211,7 +211,7 @@ def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -
     2
     """
     rounded_ratio = target_s / interval_s + 0.5
-    # The margin prevents that the rounding of timestamps to µs changes the result
+    # The margin makes the result independent of the rounding of timestamps to µs
     samples = max(int(rounded_ratio + 1e-6), 1)
     gaps = np.diff(np.asarray(ends, dtype=float))
     if samples > 1 and abs(rounded_ratio - samples) < MAX_HALF_DISTANCE and len(gaps):
@@ -236,8 +236,8 @@ def _accelerometer_bias(
 def _horizon_s(topics: Topics, step_s: float) -> float | Unavailable:
     """Return the median delay (s) from fusion horizon to publication.
 
-    Before v1.13 the timestamp is that of the newest IMU sample, so the delay is below one
-    prediction interval and the horizon is unavailable.
+    Before v1.13, timestamp_sample is the time of the newest IMU sample. The delay is then below one
+    prediction interval, and the horizon is unavailable.
     """
     age_s = _publication_age_s(topics, _state_vector(topics)[0])
     if len(age_s) and (median_age_s := float(age_s.median())) > step_s:
@@ -259,7 +259,7 @@ def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
 def _read_fusing(
     topics: Topics, enabled: Mapping[str, pd.Series[float]]
 ) -> pd.DataFrame | Unavailable:
-    """Read the fusion flags of external vision: horizontal, vertical, yaw."""
+    """Read the fusion flags of external vision: horizontal and vertical position, and yaw."""
     vision = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
     if not {*vision.values()} <= enabled.keys():
         return Unavailable(
@@ -306,8 +306,8 @@ def _read_record(
     if usable_state.empty:
         return flight.RECORD_NOT_LOGGED
     horizontal, altitude_m = Columns.POSITION[:2], 0.0
-    # Since v1.16 EKF2 stores latitude and longitude, logged as zero, and altitude above sea level
-    # once it has an origin (ekf_helper.cpp)
+    # Since v1.16 EKF2 stores latitude and longitude, which are logged as zero. Once EKF2 has an
+    # origin, the height is altitude above sea level (ekf_helper.cpp)
     if not usable_state[horizontal].to_numpy().any():
         usable_state[horizontal] = np.nan
         altitude_m = _last_finite(local, "ref_alt", 0.0)
@@ -345,14 +345,15 @@ def _last_finite(frame: pd.DataFrame, column: str, default: float) -> float:
 def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
     """Read the magnetic field from one of the two topics that contain it.
 
-    A topic with all samples is preferred, then a topic with EKF2's low-pass filtered innovation.
+    A topic with all samples that EKF2 uses is preferred, then a topic with EKF2's low-pass filtered
+    innovation.
     """
     candidates = []
     for topic, name in px4.MAGNETOMETER:
         measured_columns = expand_columns({"forward_gauss right_gauss down_gauss": f"{name}[]"})
         innovation_columns = expand_columns({"FIELD_INNOVATION": "innovation_filtered[]"})
         frame = topics.primary_samples(Layout(topic, measured_columns, innovation_columns)).dropna()
-        if name == "observation":  # undo EKF2's shift of the measurement times
+        if name == "observation":  # EKF2 subtracts delay and half a step from measurement times
             delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3
             frame = frame.set_axis(frame.index + delay_s + 0.5 * step_s)
         candidates.append(frame)
@@ -369,7 +370,7 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
 
 
 def _read_flow(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> pd.DataFrame:
-    """Compute mean optical flow velocities between two rows, from EKF2's low-pass filter states."""
+    """Compute the mean flow velocity between consecutive rows of EKF2's low-pass filtered flow."""
     velocity, interval, noise = (
         topics.primary_samples(px4.LAYOUTS[f"flow_{quantity}"]).dropna()
         for quantity in ("velocity", "interval", "noise")
@@ -378,7 +379,7 @@ def _read_flow(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> pd.Da
     if not interval_s > 0.0 or noise.empty:
         return pd.DataFrame()
     times = velocity.index.to_numpy()
-    # After longer intervals the low pass no longer contains the earlier samples
+    # After longer intervals the low-pass filter no longer contains the previous row's samples
     rows = (
         np.flatnonzero(
             (np.diff(times) > 0.5 * interval_s) & (np.diff(times) <= MAX_FLOW_INTERVAL_S)
@@ -413,7 +414,7 @@ def _read_flow(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> pd.Da
 def _attitude_variance(quaternion: Array, variance: Array) -> Array:
     """Convert quaternion variances to variances (rad²) of the attitude error about NED axes.
 
-    δθ = 2 Im(δq ⊗ q*); correlations are not logged and assumed to be zero.
+    δθ = 2 Im(δq ⊗ q*). Correlations of the quaternion elements are not logged; zero is assumed.
     """
     w, x, y, z = quaternion.T
     error_per_quaternion = np.array([[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])

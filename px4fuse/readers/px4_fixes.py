@@ -9,19 +9,21 @@ from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.readers.ulog_topics import Topics
 
-# s; times closer than this belong to the same fix (fixes are at least 0.05 s apart)
+# Maximum time difference (s) of rows of the same fix; the interval of fixes is at least 0.05 s
 MAX_SAME_FIX_S = 0.01
-# degrees, about 100 km; a larger distance from the logged latitude shows that the unit is m
+# Maximum difference (°, about 100 km) of an observation in degrees from the logged latitude; a
+# larger difference shows that the observation is in m
 MAX_LATITUDE_DISTANCE_DEG = 1.0
-# s; candidate intervals of receivers, which send 4 to 20 fixes per second
+# Candidates for the receiver's interval (s): receivers send 4 to 20 fixes per second
 PERIODS_S = np.arange(0.05, 0.26, 0.0005)
-# s; tolerance of fix intervals as multiples of the period: EKF2's step and clock jitter
+# Maximum deviation (s) of a logged interval from a multiple of the receiver's interval, for EKF2's
+# prediction step and clock jitter
 MAX_GRID_ERROR_S = 0.006
 # Minimum number of logged fixes to check the reconstruction
 MIN_LOGGED_FIXES = 10
-# Minimum number of intervals with n and with n + 1 periods, to estimate the period
+# Minimum number of logged intervals of n, and of n + 1, receiver intervals, to estimate the latter
 MIN_REPEATED_INTERVALS = 3
-# m; RMS limit of the reconstruction error, measured at fixes that are also logged
+# Maximum reconstruction error (m, RMS), measured at fixes that are also logged
 MAX_RECONSTRUCTION_ERROR_M = 0.1
 
 
@@ -36,12 +38,12 @@ def read_unlogged_fixes(
     if isinstance(ekf2, Unavailable) or not all(map(topics.find, layouts)):
         return pd.DataFrame()
     position, velocity = map(topics.primary_samples, layouts)
-    # Rows that are neither fused nor rejected have no fix
+    # Rows that are neither fused nor rejected contain no new fix
     is_fix = position[["fused", "rejected"]].any(axis=1)
     position = position.loc[is_fix].drop(columns=["fused", "rejected"])
     # EKF2 shifts GNSS times back by half a prediction step (estimator_interface.cpp)
     fixes = position.join(velocity, how="inner").dropna()
-    # Unless GNSS is the height reference, the observed height includes EKF2's bias estimate
+    # Unless GNSS is the height reference, EKF2's estimate of the GNSS bias is part of the height
     height, reference = px4.LAYOUTS["fused_height"], topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0)
     if topics.find(height) and reference == 1.0:
         fixes = fixes.join(topics.primary_samples(height))
@@ -68,18 +70,20 @@ def reconstruct_fixes(
 ) -> tuple[pd.DataFrame, tuple[str, ...]]:
     """Reconstruct unlogged fixes between logged fixes as EKF2 position plus innovation.
 
-    An innovation belongs to the last fix before its log time (2 Hz up to v1.15). That fix is a
-    whole number n of receiver intervals after a logged fix. For n = 0 the fix is also logged, which
-    gives the reconstruction error. Nothing is returned if it exceeds MAX_RECONSTRUCTION_ERROR_M.
+    Up to v1.15, innovations are logged at 2 Hz. An innovation belongs to the last fix before its
+    log time. That fix is a whole number n of receiver intervals after a logged fix. For n = 0 the
+    fix itself is logged, which gives the reconstruction error. If the reconstruction error exceeds
+    MAX_RECONSTRUCTION_ERROR_M, no fixes are returned.
 
     Parameters
     ----------
     fixes : DataFrame
-        Positions (m, NED) and variances, indexed by the measurement time that EKF2 assumes.
+        Logged fixes: positions (m, NED) and variances, indexed by the measurement time that EKF2
+        assumes.
     ekf2 : Ekf2 or Unavailable
     delay_s : float
-        Delay between fix and timestamp that EKF2 assumes. A fix older than the fusion horizon is
-        fused at the horizon (``RingBuffer.h``).
+        Delay between measurement and timestamp that EKF2 assumes. A fix older than the fusion
+        horizon is fused at the horizon (``RingBuffer.h``).
 
     Returns
     -------
@@ -100,7 +104,7 @@ def reconstruct_fixes(
     is_between_fixes = (previous_fix >= 0) & (previous_fix < len(fix_s) - 1)
     innovation_s, previous_fix = innovation_s[is_between_fixes], previous_fix[is_between_fixes]
     intervals_passed = (innovation_s - delay_beyond_horizon_s - fix_s[previous_fix]) / interval_s
-    # Skip innovations logged within one EKF2 step of a fix: their fix is ambiguous
+    # Skip innovations logged within one EKF2 step of a fix, because they may belong to either fix
     is_unambiguous = intervals_passed % 1.0 > ekf2.step_s / interval_s
     innovation_s, previous_fix, intervals_passed = (
         innovation_s[is_unambiguous],
@@ -144,9 +148,10 @@ def reconstruct_fixes(
 
 
 def _interval_s(times: Array) -> float | None:
-    """Estimate the receiver's interval (s): the longest with the logged intervals as multiples.
+    """Estimate the receiver's interval (s), of which all logged intervals are multiples.
 
-    None if all logged intervals are the same multiple, because that multiple is then unknown.
+    The longest possible interval is returned. None if all logged intervals are equal, because the
+    multiple is then unknown.
     """
     gaps = np.diff(times)[:, None]
     grid_error_s = np.abs(gaps / PERIODS_S - np.round(gaps / PERIODS_S)) * PERIODS_S

@@ -1,4 +1,4 @@
-"""Innovations of a position source along each axis, from the logged EKF2 aids."""
+"""Innovations of a position source along each axis, from EKF2's logged aids."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,9 +15,9 @@ Innovations = dict[AxisName, pd.DataFrame | Unavailable]
 
 @dataclass(frozen=True)
 class Ekf2Source:
-    """Position source of EKF2: name, aids, and actions to enable and log them.
+    """Position source of EKF2: name, aids, and actions to enable and to log these aids.
 
-    ``height`` is the name of a separate height sensor, or "".
+    ``height`` is the name of a separate height sensor; "" if the source also gives the height.
     """
 
     name: str
@@ -35,7 +35,7 @@ VISION, GNSS, GNSS_AND_BAROMETER = (
 
 
 def fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
-    """Return True if EKF2 fused the aid at any time, or enabled it if fusion is not logged."""
+    """Return True if EKF2 fused the aid at any time; if fusion is not logged, if it enabled it."""
     log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get(aid)
     if log is None:
         return False
@@ -70,15 +70,15 @@ def innovations_by_axis(
     gate: float,
     source: Ekf2Source = VISION,
 ) -> tuple[Innovations, tuple[str, ...]]:
-    """Return the innovations along each axis and the topics that contain them.
+    """Return the innovations along each axis, and the topics from which they are read.
 
     Parameters
     ----------
     aids : mapping from PX4 name to AidLog
     fusing : DataFrame or Unavailable
-        Fusion flags, as in :class:`~px4fuse.flight.Ekf2`.
+        Fusion flags, see :class:`~px4fuse.flight.Ekf2`.
     gate : float
-        Innovation gate (in √S), used if rejections are not logged.
+        Innovation gate (√S), used to compute rejections if they are not logged.
     source : Ekf2Source
     """
     innovations: Innovations = {}
@@ -110,7 +110,7 @@ def innovations_by_axis(
 def innovations_along(log: AidLog, axis: AxisName, gate: float) -> pd.DataFrame:
     """Return the fused and rejected innovations of an aid along one axis.
 
-    EKF2 rejects all axes of an aid together.
+    EKF2 rejects all axes of an aid together, so each axis has the rejections of the whole aid.
     """
     samples = log.samples
     nis = {

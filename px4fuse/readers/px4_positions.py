@@ -33,13 +33,13 @@ from px4fuse.readers.ulog_topics import Topics
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 GPS_3D_FIX = 3
-# µs; a sample with a smaller publication delay has the arrival time instead of measurement time
+# Maximum publication delay (µs) of a sample with the arrival time instead of the measurement time
 MAX_ARRIVAL_DELAY_US = 100
-# Fraction of samples with arrival time above which the whole topic has arrival times
+# Minimum fraction of samples with arrival time in a topic that counts as having only arrival times
 MIN_ARRIVAL_FRACTION = 0.9
-# s; largest time difference of height and position: 2.5 cm error at a climb rate of 0.5 m/s
+# Maximum time difference (s) of height and position: 2.5 cm error at a climb rate of 0.5 m/s
 HEIGHT_TOLERANCE_S = 0.05
-# Hz; a lower GNSS rate means that the logger decimated the fixes (receivers send 5 to 20 Hz)
+# GNSS rate (Hz) below which the logger must have decimated the fixes (receivers send 5 to 20 Hz)
 MAX_DOWNSAMPLED_HZ = 4.0
 AUTOPILOT_CLOCK = "autopilot boot clock (PX4 converted the sender's timestamps)"
 # Latitude and longitude in degrees, optionally altitude in m
@@ -49,9 +49,10 @@ GeodeticPosition = tuple[float, ...]
 def read_positions(
     topics: Topics, ekf2: Ekf2 | Unavailable
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
-    """Read all external positions in order of preference, and the reasons for missing ones."""
+    """Read all external positions, in order of preference; return also reasons for missing ones."""
     fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
-    # EKF2's observations contain no orientation, so fused yaw shows that the source is odometry
+    # EKF2's position observations contain no orientation; if EKF2 also fused the source's yaw, the
+    # source is odometry
     turns = isinstance(fusing, pd.DataFrame) and bool((fusing["yaw"] > 0).any())
     tracks_and_missing = [
         *(_read_logged(topics, name) for name in px4.LOGGED),
@@ -66,7 +67,7 @@ def read_positions(
 
 
 def unavailable(name: str, reason: str, remedy: str = "") -> Unavailable:
-    """Describe a missing position source; the default ``remedy`` is that of the ULog track."""
+    """Describe a missing position source; the default ``remedy`` is from ``px4_topics.toml``."""
     remedy = remedy or px4.TRACKS[name].remedy
     return Unavailable(f"position source {name}", reason, remedy, source=name)
 
@@ -80,13 +81,13 @@ def make_track(
     remedy: str = "",
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """Make a track of the samples with valid position; Unavailable with too few.
+    """Make a track of the samples with valid position; Unavailable with too few samples.
 
     Parameters
     ----------
     samples : DataFrame
-        Columns of a track; missing ones become NaN. A variance of 0 becomes NaN, because PX4
-        treats it as "not sent" (``EKF2.cpp``).
+        Columns of a track. Missing columns and variances of 0 become NaN: PX4 treats a variance of
+        0 as "not sent" (``EKF2.cpp``).
     needed_columns : list of str
         Columns in which a valid sample must be finite.
     track_fields
@@ -132,14 +133,14 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
     layout = topics.find(*px4.layouts_of_track(name))
     if layout is None:
         return unavailable(name, f"{name} is not logged")
-    is_ekf2 = layout.topic.startswith("estimator_")  # only these topics have EKF2 instances
+    is_ekf2 = layout.topic.startswith("estimator_")  # topics with one instance per EKF2 instance
     samples = topics.primary_samples(layout) if is_ekf2 else topics.frame(layout)
     frame = "unknown"
     for field, names in px4.FRAMES.items():
         if field in samples and len(samples):
             frame = names.get(int(samples[field].iloc[-1]), "unknown")
     if name == "estimator_visual_odometry_aligned":
-        frame = "NED"  # EKF2 rotates the positions, but the field contains the original frame
+        frame = "NED"  # EKF2 rotated the positions to NED; the field contains the frame before
     orientation = read_orientation(samples)
     return _make_ulog_track(
         topics,
@@ -209,10 +210,10 @@ def _shift_times(samples: pd.DataFrame, by_s: float) -> pd.DataFrame:
 def _with_height(
     samples: pd.DataFrame, height: pd.DataFrame
 ) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Add the nearest height to each horizontal position; note the number of missing heights.
+    """Add the nearest height in time to each horizontal position; note the missing heights.
 
-    Both have the timestamp of one external vision sample, but the logger decimates each topic
-    separately.
+    Height and horizontal position of a vision sample have the same timestamp, but the logger
+    decimates their topics separately.
     """
     joined = join_nearest(samples, height.assign(_found=True), HEIGHT_TOLERANCE_S)
     without_height = int(joined.pop("_found").isna().sum())
@@ -231,9 +232,10 @@ def _delay_s(topics: Topics) -> float:
 def _reconstruct(
     topics: Topics, ekf2: Ekf2 | Unavailable, turns: bool
 ) -> PositionTrack | Unavailable:
-    """Reconstruct the position as EKF2 state plus innovation, at the time of the innovation.
+    """Reconstruct the source's positions as EKF2 position plus innovation.
 
-    The times are late by up to one interval of the source, whose timestamps are not logged.
+    The source's timestamps are not logged. The times of the innovations are used, which are late by
+    up to one interval of the source.
     """
     if isinstance(ekf2, Unavailable):
         return unavailable(px4.RECONSTRUCTION, "the log contains no EKF2 state")
@@ -281,7 +283,7 @@ def project(
 
 
 def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[Array, Array]:
-    """Convert north and east (m) to latitude and longitude (degrees), the inverse of project.
+    """Convert north and east (m) to latitude and longitude (degrees): inverse of :func:`project`.
 
     Source: PX4 ``MapProjection::reproject``, src/lib/geo/geo.cpp (Snyder 1987, equation 20-14).
     """
@@ -299,7 +301,7 @@ def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[
 
 
 def _local_origin(topics: Topics) -> GeodeticPosition | None:
-    """Return EKF2's origin: latitude, longitude (degrees), altitude (m); None if it has none."""
+    """Return EKF2's origin: latitude, longitude (degrees), altitude (m); None without an origin."""
     local = topics.read(px4.LOCAL_POSITION)
     columns = ["ref_lat", "ref_lon", "ref_alt"]
     if not {*columns} <= {*local}:
@@ -314,7 +316,7 @@ def _local_origin(topics: Topics) -> GeodeticPosition | None:
 def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
     """Convert latitude, longitude and altitude to north, east, down (m) from the origin.
 
-    The default origin is the first sample.
+    Without an origin, the first sample is used.
     """
     latitude, longitude, altitude = global_positions[GLOBAL_COLUMNS].to_numpy().T
     origin = origin or (latitude[0], longitude[0], altitude[0])
@@ -326,9 +328,9 @@ def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | No
 def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
     """Read GNSS positions, with the measurement times that EKF2 assumes.
 
-    The measurement times are the timestamps minus EKF2_GPS_DELAY. PX4 main of 2026 and newer uses
-    the measurement times of the driver if they differ from the timestamps (EKF2.cpp
-    UpdateGpsSample, estimator_interface.cpp).
+    The measurement times are the timestamps minus EKF2_GPS_DELAY. PX4 since 2026 uses the driver's
+    measurement times if they differ from the timestamps (EKF2.cpp UpdateGpsSample,
+    estimator_interface.cpp).
     """
     layout = topics.find(*px4.layouts_of_track(px4.GPS_POSITION))
     if layout is None:
@@ -352,7 +354,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     if len(unlogged_fixes):
         gps = pd.concat([gps, unlogged_fixes]).sort_index()
         interpolated = int(gps["altitude_m"].isna().sum())
-        # Fields that these rows do not contain are copied from the previous fix
+        # The reconstructed rows lack some fields: these are copied from the previous fix
         gps = gps.assign(altitude_m=gps["altitude_m"].interpolate("index")).ffill()
     samples = project_to_ned(gps, _local_origin(topics))
     if {"eph_m", "epv_m"} <= set(gps.columns):
@@ -401,7 +403,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
 
 
 def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFrame | None:
-    """Return the barometer height as ``down_m``, ``delay_s`` earlier; None if too few."""
+    """Return the barometer height as ``down_m``, ``delay_s`` earlier; None if few samples."""
     heights = altitude_m[np.isfinite(altitude_m)]
     if len(heights) < MIN_TRACK_SAMPLES:
         return None
@@ -409,7 +411,7 @@ def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFram
 
 
 def _velocity(gps: pd.DataFrame) -> pd.DataFrame:
-    """Return the GNSS velocity (m/s, NED) and the squared accuracy of the receiver per axis."""
+    """Return the GNSS velocity (m/s, NED), and its variance per axis: reported accuracy squared."""
     velocity = gps.reindex(columns=Columns.VELOCITY)
     accuracy = gps.get("speed_accuracy_m_s", np.nan)
     return velocity.assign(**dict.fromkeys(Columns.VELOCITY_VARIANCE, accuracy**2))
@@ -420,8 +422,8 @@ def read_truth(
 ) -> Truth | Unavailable:
     """Read ground truth from the simulation, or from motion capture if EKF2 uses another source.
 
-    Up to v1.13 the simulation logs only latitude and longitude. If EKF2 fused GNSS, EKF2's origin
-    differs from that of the simulation, so the ground truth is shifted to EKF2's origin.
+    Up to v1.13 the simulation logs only latitude and longitude. If EKF2 fused GNSS, its origin
+    differs from the origin of the simulation, so the ground truth is shifted to EKF2's origin.
     """
     attitude = read_attitude(topics.read(px4.LAYOUTS["truth_attitude"]))
     logged_local = topics.read(px4.LAYOUTS["truth_local"])
@@ -463,7 +465,7 @@ def _move_to_origin(local: pd.DataFrame, global_samples: pd.DataFrame) -> pd.Dat
 
 
 def motion_capture(positions: tuple[PositionTrack, ...], topic: str) -> Truth | None:
-    """Return motion capture as ground truth if there is external vision, too; else None."""
+    """Return motion capture as ground truth if the log also has external vision, else None."""
     if any(track.origin.is_vision for track in positions):
         for track in positions:
             if track.topics[0] == topic:

@@ -1,9 +1,9 @@
 """PX4 topic and field names of all supported PX4 releases.
 
-``px4_topics.toml`` contains the layouts of each quantity. A reader uses the first layout whose
-topic contains all ``columns``; ``optional`` columns are read if they exist. Names are from
-PX4-Autopilot's ``msg/*.msg`` at the release tags in the comments. The names of EKF2's aids are in
-``ekf2_parameters.toml``.
+``px4_topics.toml`` contains the layouts (topic, fields and DataFrame columns) of each quantity. A
+reader uses the first layout whose topic contains all ``columns``; ``optional`` columns are read if
+they exist. Names are from PX4-Autopilot's ``msg/*.msg`` at the release tags in the comments of
+``px4_topics.toml``. The names of EKF2's aids are in ``ekf2_parameters.toml``.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ from px4fuse.record import table
 
 @dataclass(frozen=True)
 class TrackSource:
-    """Position track that a ULog may contain; its key is the name for ``--position-source``.
+    """Position track that a ULog may contain. Its key in TRACKS is for ``--position-source``.
 
     ``kind`` and ``path`` define the origin of the track, ``remedy`` is the action to log the
     track, and ``layouts`` are the layouts of its topic, if any.
@@ -55,8 +55,8 @@ MAGNETOMETER = (
     ("vehicle_magnetometer", "magnetometer_ga"),
     ("estimator_aid_src_mag", "observation"),
 )
-# Number of attitude variances by the numbers of states and of variances in the log. 4: quaternion
-# filter, whose biases are increments per prediction; 3: error-state filter
+# Number of attitude variances by the array lengths of states and variances in the log. 4: filter
+# with quaternion states, its biases are increments per prediction. 3: error-state filter
 # (EKF/python/ekf_derivation/generated/state.h at v1.15.4 and v1.16)
 ATTITUDE_VARIANCES: Mapping[tuple[int, int], int] = {
     (24, 24): 4,
@@ -70,21 +70,21 @@ ANTENNA_COLUMNS = ["antenna_forward_m", "antenna_right_m", "antenna_down_m"]
 FUSED_OBSERVATION = "estimator_aid_src_ev_pos"
 RECONSTRUCTION = "ekf2_state_plus_innovation"
 GPS_POSITION = "vehicle_gps_position"
-# Tracks of external vision and motion capture with a logged topic
+# Tracks of external vision and motion capture that have a separate topic
 LOGGED = [name for name, track in TRACKS.items() if track.layouts and name != GPS_POSITION]
 TOPIC_ORIGINS = {name: track.origin for name, track in TRACKS.items()}
-# Aids whose flag "fused" is always set in v1.15 and v1.16; the control bit is used instead
+# Aids with a flag "fused" that is always set in v1.15 and v1.16; the control bit is used instead
 FLAG_ALWAYS_SET = ("gravity", "drag")
-# Aids whose observation is a local position (the GNSS observation is latitude and longitude)
+# Aids that log a local position as observation (the GNSS observation is latitude and longitude)
 WITH_OBSERVATION = ("ev_pos", "ev_hgt")
 STATUS_FLAGS, STATUS = "estimator_status_flags", "estimator_status"
-# Topics with all aids: innovations, variances; before v1.12 one topic for both
+# Topics of innovations and of variances of all aids; before v1.12 one topic for both
 INNOVATIONS = "estimator_innovations", "estimator_innovation_variances"
 OLD_INNOVATIONS = "ekf2_innovations"
 
 
 def layouts_of_track(track: str) -> list[Layout]:
-    """Return the layouts of a track in order of preference; the default topic is its name."""
+    """Return the layouts of a track in order of preference; the default topic is the track name."""
     rows = [LAYOUTS[name] for name in TRACKS[track].layouts]
     return [replace(row, topic=row.topic or track) for row in rows]
 

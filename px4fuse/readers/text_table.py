@@ -1,4 +1,4 @@
-"""Functions for text tables: decoding, numbers, and errors that name the line.
+"""Functions for text tables: decoding, numbers, and errors with the line number.
 
 Used by the readers of position files, trajectories and pose graphs (g2o).
 """
@@ -12,9 +12,9 @@ import numpy as np
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.errors import TrajectoryError
 
-# s; valid UNIX times are between 2000 and 2100
+# Limits (s) of valid UNIX times: 2000 and 2100
 UNIX_START_S, UNIX_END_S = 946_684_800.0, 4_102_444_800.0
-# A file with a control character in its first characters, or NUL anywhere, is binary
+# Number of first characters in which a control character shows a binary file; NUL shows it anywhere
 _CHECKED_CHARS = 100_000
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # byte order marks, written by Windows shells
 _CONTROL = re.compile("[\x00-\x08\x0e-\x1b]")
@@ -32,7 +32,7 @@ def decode_text(content: bytes) -> str | None:
         even_bytes = content[: len(content) // 2 * 2]
         text = even_bytes.decode("utf-16", errors="replace")
     else:
-        content = content.rstrip(b"\0\x1a")  # left at the end by a power loss or by DOS
+        content = content.rstrip(b"\0\x1a")  # NUL at the end after a power loss, 0x1a from DOS
         try:
             text = content.decode("utf-8-sig")
         except UnicodeDecodeError:
@@ -43,7 +43,7 @@ def decode_text(content: bytes) -> str | None:
 
 
 def is_number(text: str) -> bool:
-    """Return True for a number with a decimal point, NaN or infinity."""
+    """Return True for an integer or a number with decimal point or exponent, NaN or infinity."""
     return _NUMBER.fullmatch(text) is not None
 
 
@@ -77,13 +77,13 @@ class Rows:
     lines: list[tuple[int, str]] = field(default_factory=list)
 
     def row_error(self, row: int, description: str, remedy: str) -> TrajectoryError:
-        """Return an error that names the line of a row."""
+        """Return an error with the line number of a row."""
         return TrajectoryError(
             format_line_error(self.file_name, self.lines[row][0], description, remedy)
         )
 
     def raise_where(self, is_invalid: BoolArray, description: str, remedy: str) -> None:
-        """Raise TrajectoryError for the first row in which the mask (n,) or (n, k) is True."""
+        """Raise TrajectoryError for the first row with a True in the mask, (n,) or (n, k)."""
         invalid_indices = np.argwhere(is_invalid)
         if len(invalid_indices):
             raise self.row_error(int(invalid_indices[0, 0]), description, remedy)
@@ -98,7 +98,7 @@ class Rows:
         words, values : int
             Number of word columns and of number columns.
         separator : str, optional
-            White space by default.
+            Column separator; white space by default.
 
         Returns
         -------
@@ -108,7 +108,7 @@ class Rows:
         Raises
         ------
         TrajectoryError
-            A row does not have these columns; the message names the first such row.
+            A row does not have these columns. The message contains the first such line.
         """
         texts = [text for _, text in self.lines]
         columns = [("words", "U80", (words,)), ("values", "f8", (values,))]

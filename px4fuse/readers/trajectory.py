@@ -25,21 +25,23 @@ MAX_FILE_BYTES = 500_000_000
 TUM_COLUMNS = 8
 MAX_USUAL_INTERVAL_S = 10.0
 EUROC_COLUMNS = (8, 17)  # pose only, or also velocity and biases of gyro and accelerometer
-# s; plausible median intervals: key frames may be minutes apart, frame rates are below 1 kHz
+# Limits (s) of plausible median intervals: key frames may have minutes between them, and frame
+# rates are below 1 kHz
 MAX_INTERVAL_S, MIN_INTERVAL_S = 1000.0, 1e-3
 UNITS_PER_SECOND = {"nanoseconds": 10**9, "microseconds": 10**6, "milliseconds": 10**3}
 MAX_NORM_ERROR = 0.1
 MAX_COORDINATE_M = 1e9  # larger values are timestamps or damage
-# Smaller deviations from norm 1 are not corrected, so that a file is read exactly as written
+# Maximum deviation from norm 1 that is not corrected, so that a file is read exactly as written
 UNIT_NORM_TOLERANCE = 1e-15
 MAX_REPEATED_FRACTION = (
-    0.01  # fraction of repeated timestamps; a larger fraction shows missing digits
+    0.01  # of repeated timestamps; a larger fraction shows that timestamps have too few digits
 )
 MAX_IDENTITY_M, MAX_IDENTITY_RAD = 1e-6, 1e-6
-# Limits of level motion: extent (RMS) along the third principal axis over that along the second,
-# second over first, and angle between the third axis and y
+# Level motion, by the RMS extents along the three principal axes: maximum third over second extent,
+# minimum second over first extent, and maximum angle between the third axis and y
 MAX_THICKNESS_RATIO, MIN_WIDTH_RATIO, MAX_TILT_RAD = 1 / 3, 0.1, math.radians(20.0)
-# A frame rate is regular if this fraction of intervals is this close to the median (relative)
+# Regular frame rate: minimum fraction of intervals close to the median, and maximum relative
+# deviation of an interval that counts as close
 MIN_REGULAR_FRACTION, MAX_INTERVAL_DEVIATION = 0.9, 0.5
 MIN_GAP_INTERVALS, MIN_GAP_S = 2.5, 0.3
 
@@ -64,7 +66,8 @@ def read_trajectory(path: str | Path) -> Trajectory:
     Trajectory
         ``time_s`` are the timestamps of the file in s. ``kind`` is "truth" if a comment, the file
         name or the EuRoC columns indicate ground truth, and "slam" if the first pose is the
-        identity. ``frame`` is "camera" for "slam" with level motion and vertical y.
+        identity. ``frame`` is "camera" if ``kind`` is "slam" and the motion is level with y
+        vertical.
 
     Raises
     ------
@@ -123,7 +126,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
 
 
 def tum_text(trajectory: Trajectory) -> str:
-    """Return the trajectory as the text of a TUM file, with all digits.
+    """Return the trajectory as the text of a TUM file, with all digits of float64.
 
     Parameters
     ----------
@@ -147,7 +150,7 @@ def tum_text(trajectory: Trajectory) -> str:
 
 
 def _split_rows(name: str, content: bytes) -> tuple[Rows, str, str]:
-    """Split a file into numeric rows, comments with header, and a note on an incomplete row."""
+    """Split a file into numeric rows and comments (with header); note an incomplete last row."""
     text = decode_text(content)
     if text is None:
         is_ulog = content.startswith(b"ULog")
@@ -217,7 +220,7 @@ def _detect_quaternion_order(rows: Rows, separator: str | None, comments: str) -
 
 
 def _convert_timestamps(rows: Rows, timestamps: list[str]) -> tuple[Array, str]:
-    """Convert the timestamps to s; return also a note if their unit is not certainly seconds."""
+    """Convert the timestamps to s; also return a note if the unit may not be seconds."""
     is_invalid = np.array(
         [not is_number(text.strip()) or not np.isfinite(float(text)) for text in timestamps]
     )
@@ -235,7 +238,7 @@ def _convert_timestamps(rows: Rows, timestamps: list[str]) -> tuple[Array, str]:
             float(values[0]) / units_per_second,
             float(np.abs(values).max()) / units_per_second,
         )
-        # Only nanoseconds are accepted for times that are not UNIX time (ORB-SLAM3 writes these)
+        # Times that are not UNIX time must be in nanoseconds, as ORB-SLAM3 writes them
         is_accepted = first >= UNIX_START_S or unit == "nanoseconds"
         if (
             is_accepted
@@ -244,7 +247,7 @@ def _convert_timestamps(rows: Rows, timestamps: list[str]) -> tuple[Array, str]:
         ):
             counts = np.array([int(Decimal(timestamp)) for timestamp in timestamps], dtype=np.int64)
             unit_note = f"Its timestamps are {unit} and were divided by {units_per_second:.0e}."
-            # Divided in two parts, because float64 cannot represent UNIX time in ns
+            # Seconds and remainder are divided separately: float64 cannot represent UNIX time in ns
             return (
                 counts // units_per_second + counts % units_per_second / units_per_second,
                 unit_note,
@@ -288,7 +291,7 @@ def _detect_kind(
     """Return the kind of trajectory and the reason."""
     if columns == EUROC_COLUMNS[1]:
         return "truth", "Ground truth: it has the 17 columns of EuRoC ground truth."
-    # In EuRoC the file name is always data.csv, and the folder name indicates the kind
+    # EuRoC files are always called data.csv; their folder name indicates the kind
     folder = path.absolute().parent.name if path.name == "data.csv" else ""
     text_by_source = {"a comment": comments, "the file name": path.name, "the folder name": folder}
     for source, text in text_by_source.items():
@@ -300,7 +303,7 @@ def _detect_kind(
 
 
 def _detect_frame(kind: Kind, position: Array) -> tuple[Frame, str]:
-    """Return the axes of the world frame and the reason."""
+    """Return the convention of the world frame's axes, and the reason."""
     if kind != "slam":
         return "unknown", ""
     centred = position - position.mean(axis=0)
@@ -318,7 +321,7 @@ def _detect_frame(kind: Kind, position: Array) -> tuple[Frame, str]:
 
 
 def _describe_gaps(time: Array, kind: Kind) -> str:
-    """Return a note on missing frames or an irregular rate (key frames); "" if all are regular."""
+    """Return a note on missing frames or an irregular rate (key frames); "" if regular."""
     intervals_s = np.diff(time)
     median_s = float(np.median(intervals_s))
     is_regular: BoolArray = np.abs(intervals_s - median_s) <= MAX_INTERVAL_DEVIATION * median_s

@@ -15,9 +15,9 @@ from px4fuse.readers.px4_positions import GPS_3D_FIX, barometer, read_positions,
 from px4fuse.readers.ulog_topics import Topics, dropped_note, longest_increasing_run, read_topics
 
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
-# s; longer intervals between IMU samples count as missing data
+# Minimum interval (s) between IMU samples that counts as missing data
 MIN_IMU_GAP_S = 0.2
-# s; valid UTC of a receiver: PX4's GPS_EPOCH_SECS (gps_helper.h) to 2100
+# Limits (UNIX time, s) of a receiver's valid UTC: PX4's GPS_EPOCH_SECS (gps_helper.h), and 2100
 UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
 
 
@@ -79,7 +79,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
 def _describe_damage(
     topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool
 ) -> tuple[str, ...]:
-    """Return sentences about missing parts of the file."""
+    """Return sentences on missing and damaged parts of the file."""
     end_s = topics.log.duration_s
     damage_sentences = []
     if topics.is_cut:
@@ -97,7 +97,7 @@ def _describe_damage(
 
 
 def _start_unix_s(topics: Topics) -> float | None:
-    """Return the UNIX time (s) of time zero: median over the fixes of the GNSS receiver."""
+    """Return the UNIX time (s) at flight time zero: median over the fixes of the GNSS receiver."""
     gps = topics.read(*px4.layouts_of_track(px4.GPS_POSITION))
     if "utc_us" not in gps:
         return None
@@ -134,7 +134,7 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
 
 
 def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavailable:
-    """Read the intervals (s) from take-off to touch-down, as the land detector reports them."""
+    """Read the intervals (s) from take-off to touch-down according to the land detector."""
     land_detected = topics.read(px4.LAYOUTS["land_detected"], step=True)
     if land_detected.empty:
         return Unavailable(
@@ -147,7 +147,7 @@ def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavaila
 
 
 def _read_tumble_spans(topics: Topics) -> tuple[tuple[float, float], ...]:
-    """Read the intervals (s) in which PX4's failure detector reports roll or pitch."""
+    """Read the intervals (s) with a roll or pitch failure according to PX4's failure detector."""
     is_upright = (
         topics.read(px4.LAYOUTS["failure"], step=True)[["roll", "pitch"]].max(axis=1) == 0.0
     )

@@ -1,7 +1,7 @@
 """Topic tables of a ULog file with valid timestamps; the only module that uses pyulog.
 
-pyulog parses the file. This module removes invalid samples: real logs contain timestamps that are
-zero, go back or jump by hours, and topics with two subscriptions.
+pyulog parses the file. This module removes invalid samples, because real logs contain timestamps
+that are zero, go back or jump by hours. It also merges two subscriptions to the same topic.
 """
 
 import contextlib
@@ -30,17 +30,19 @@ from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
 from px4fuse.text import join_first
 
 _MICROSECOND = 1e-6
-# s; a measurement time further from the publication time is not boot time (GPS topics before v1.16
-# have receiver time, ground truth in v1.13 has 0)
+# Maximum delay (s) from measurement to publication: with a longer delay the measurement time is not
+# boot time (GPS topics before v1.16 have receiver time, ground truth in v1.13 has 0)
 MAX_PUBLICATION_LAG_S = 10.0
-# s; samples further outside the time span of the data are outdated
+# Maximum distance (s) of valid samples from the time span of the data; samples further outside are
+# outdated
 MAX_OUTSIDE_S = 2.0
 RELEASE_TYPE = 255
-# Info message with a note of the log's author to the users of the log
+# ULog info message with a note of the log's author to its users
 NOTE_KEY = "px4fuse_note"
-# s; after a longer gap of the IMU timestamps the samples are from another boot
+# Maximum gap (s) of the IMU timestamps in one flight; after a longer gap samples are from another
+# boot
 MAX_DATA_GAP_S = 600.0
-# Limit on the fields of all subscriptions, 300 bytes of memory each; real logs have up to 3,300
+# Maximum number of fields of all subscriptions (300 bytes of memory each); real logs have 3,300
 MAX_FIELDS = 200_000
 HEADER_BYTES = 3
 # Exceptions that pyulog may raise when it parses damaged bytes as messages
@@ -68,7 +70,7 @@ NO_SELECTOR: Instances = ((-np.inf, 0),)
 
 
 class _Content(io.BytesIO):
-    """Content of a ULog; counts the bytes that pyulog skips.
+    """Content of a ULog that counts the bytes that pyulog skips.
 
     pyulog reads a header of 3 bytes, then the message. After an invalid header it advances by one
     byte, or to the next synchronisation message.
@@ -77,8 +79,8 @@ class _Content(io.BytesIO):
     ----------
     skipped_bytes : int
     start, end, position : int
-        Offsets of the last header, of the end of the last read, and of the next read. The last two
-        may be after the end of the file.
+        Offsets of the last message header, of the end of the last read, and of the next read.
+        ``end`` and ``position`` may be after the end of the file.
     """
 
     skipped_bytes = start = end = position = 0
@@ -93,8 +95,8 @@ class _Content(io.BytesIO):
         return io.BytesIO.read(self, size)
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        # pyulog moves back by the requested length, which may exceed the rest of a damaged file.
-        # The virtual position prevents an endless loop
+        # pyulog moves back by the requested length, although a damaged file may have ended before.
+        # The position after the end of the file prevents an endless loop
         if whence == io.SEEK_CUR:
             offset += self.position
         self.position = super().seek(offset)
@@ -123,7 +125,8 @@ class _MessageData(ULog._MessageData):  # type: ignore[misc]  # pyulog has no ty
 class _Reader(ULog):  # type: ignore[misc]
     """pyulog reader with better recovery from damage and a limit on the number of fields.
 
-    A format of 20 bytes can declare 65,535 fields, and nested formats multiply the number.
+    A format definition of 20 bytes can declare 65,535 fields, and nested formats multiply this
+    number.
     """
 
     fields = 0
@@ -135,7 +138,7 @@ class _Reader(ULog):  # type: ignore[misc]
     MessageLoggingTagged = staticmethod(_skip_if_short(ULog.MessageLoggingTagged))
 
     def _check_packet_corruption(self, header: Any) -> bool:
-        # pyulog accepts unknown types up to 10,000 bytes; valid types are capital letters
+        # pyulog accepts unknown message types up to 10,000 bytes; valid types are capital letters
         is_corrupt: bool = super()._check_packet_corruption(header)
         if not ord("A") <= header.msg_type <= ord("Z"):
             self._file_corrupt = is_corrupt = True
@@ -166,18 +169,18 @@ class Topics:
         Log description, without notes on single topics (see :attr:`dropped`).
     tables : mapping from (topic, instance) to mapping from PX4 field name to array
     zero_us : int
-        Boot time of time zero in µs.
+        Boot time (µs) at flight time zero.
     dropped : dict
-        Samples dropped because of an invalid timestamp, by topic and instance; filled by
+        Number of samples with an invalid timestamp, by topic and instance; filled by
         :meth:`frame`.
     ekf2_parameters : mapping
-        All EKF2_ parameters by PX4 name; ``log`` contains only those used in results.
+        All EKF2_ parameters by PX4 name; ``log`` contains only the parameters used in results.
     is_cut : bool
         True if the file ends within a message.
     is_damaged : bool
         True if pyulog skipped invalid bytes or messages.
     streams : dict
-        Source of each part of the flight; filled by :meth:`record_stream`.
+        Topics and clock of each kind of data in the flight; filled by :meth:`record_stream`.
     """
 
     log: LogInfo
@@ -199,7 +202,7 @@ class Topics:
 
     @cached_property
     def primary(self) -> Instances:
-        """Primary EKF2 instance from each time on (``EKF2Selector.cpp``)."""
+        """Start time (s) and number of each primary EKF2 instance (``EKF2Selector.cpp``)."""
         instances = self.read(LAYOUTS["selector"], step=True)["instance"]
         instances = instances[instances < 255]  # 255: none selected yet
         if instances.empty:
@@ -223,9 +226,9 @@ class Topics:
         layout : Layout
             A layout that :meth:`find` returned.
         instance : int
-            Topic instance; if it does not exist, the lowest one is read.
+            Topic instance; if it does not exist, the lowest instance is read.
         step : bool
-            True for a step function, in which samples before time zero remain valid.
+            True for a step function: samples before time zero are kept, because they remain valid.
 
         Returns
         -------
@@ -258,7 +261,7 @@ class Topics:
         return frame if step else frame[(frame.index >= -MAX_OUTSIDE_S) & (frame.index <= end_s)]
 
     def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
-        """Read the first layout that is in the log, as :meth:`frame`; empty without such."""
+        """Read the first layout that is in the log with :meth:`frame`; empty if none is."""
         layout = self.find(*layouts)
         return _empty_frame(layouts[0]) if layout is None else self.frame(layout, step=step)
 
@@ -276,7 +279,7 @@ class Topics:
         Parameters
         ----------
         layout, step
-            As in :meth:`frame`.
+            See :meth:`frame`.
         select : callable, optional
             Filter for the rows of each instance; by default all rows are used.
         """
@@ -295,7 +298,7 @@ class Topics:
         return joined_frames[~joined_frames.index.duplicated()]
 
     def record_stream(self, flight_part: str, *topics: str) -> None:
-        """Record the source of a part of the flight, with measurement or publication time."""
+        """Record the topics and the clock (measurement or publication time) of one kind of data."""
         # The timestamp of sensor_combined is the gyro's measurement time
         has_measurement_time = flight_part == "imu" or any(
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
@@ -316,7 +319,8 @@ def _empty_frame(layout: Layout) -> pd.DataFrame:
 def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
     """Return the measurement time (µs): ``timestamp_sample`` if it is boot time.
 
-    Otherwise it is the publication time, ``timestamp``, which is up to 0.2 s later in EKF2 topics.
+    Otherwise the publication time ``timestamp`` is returned, which is up to 0.2 s later in EKF2
+    topics.
     """
     published_us = table["timestamp"].astype(np.int64)
     sampled_us = table.get("timestamp_sample")
@@ -324,7 +328,7 @@ def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
         return published_us
     sampled_us = sampled_us.astype(np.int64)
     lag_s = np.abs(published_us - sampled_us) * _MICROSECOND
-    # Single invalid measurement times, such as in the first message, are replaced by publication
+    # Single invalid measurement times, as in the first message, are replaced by publication times
     is_plausible = (sampled_us > 0) & (lag_s <= MAX_PUBLICATION_LAG_S)
     if np.count_nonzero(is_plausible) * 2 < len(is_plausible):
         return published_us
@@ -334,8 +338,8 @@ def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
 def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
     """Return the indices of the longest strictly increasing subsequence of positive timestamps.
 
-    A timestamp hours ahead then costs one sample, while a running maximum would drop all later
-    ones. Patience sorting, Fredman 1975.
+    A timestamp that is hours ahead is removed as a single sample; a running maximum would remove
+    all later samples instead. Method: patience sorting, Fredman 1975.
     """
     indices = np.flatnonzero(time_us > 0)
     times = time_us[indices]
@@ -438,7 +442,7 @@ def read_topics(name: str, content: bytes) -> Topics:
 
 
 def _read_tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:
-    """Return the topic tables; two subscriptions to a topic become one with the common fields."""
+    """Return the topic tables; two subscriptions to a topic are merged to their common fields."""
     tables: dict[tuple[str, int], dict[str, NDArray[Any]]] = {}
     for data in ulog.data_list:
         if "timestamp" not in data.data:
@@ -468,7 +472,7 @@ def _data_span(
         time_us = tables[key]["timestamp"].astype(np.int64)
         increasing_us = time_us[longest_increasing_run(time_us)]
         if len(increasing_us):
-            # Timestamps hours away from the others are outdated, so the longest run is used
+            # Timestamps hours away from the others are outdated, so only the longest run is used
             breaks = np.flatnonzero(np.diff(increasing_us) > MAX_DATA_GAP_S / _MICROSECOND) + 1
             longest_us = max(np.split(increasing_us, breaks), key=len)
             return int(longest_us[0]), int(longest_us[-1])
@@ -479,7 +483,7 @@ def _data_span(
 
 
 def _printable_text(info: dict[str, Any], key: str, default: str) -> str:
-    """Return a text from the log without control characters, which could affect a terminal."""
+    """Return a text from the log without control characters, which could disturb a terminal."""
     text = str(info.get(key, default))
     return "".join(c for c in text if c.isprintable()) or default
 
@@ -491,7 +495,8 @@ def _firmware(info: dict[str, Any]) -> str:
     major, minor, patch, release_type = (release & 0xFFFFFFFF).to_bytes(4, "big")
     if (major, minor, patch) == (0, 0, 0):
         return "PX4 development version"
-    # last byte: 0 development, 64 alpha, 128 beta, 192 release candidate, 255 release
+    # Release type in the last byte: 0 development, 64 alpha, 128 beta, 192 release candidate, 255
+    # release
     suffix = (
         ""
         if release_type == RELEASE_TYPE

@@ -10,12 +10,10 @@ from px4fuse.ekf2.aids import AidResult, flight_span
 from px4fuse.findings import Finding
 from px4fuse.flight import AidLog, Flight, Unavailable, step_values_at
 from px4fuse.report import style
-from px4fuse.report.cover import flight_line, write_findings
 from px4fuse.report.event_marks import GROUND_BAND
 from px4fuse.report.page import Cell, Page, appendix_title
-from px4fuse.report.phrases import format_sigma_verdict
+from px4fuse.report.phrases import format_sigma_verdict, write_findings
 from px4fuse.request import with_options
-from px4fuse.results.contract import AidsResults
 from px4fuse.text import format_number
 
 TITLE = "Aids of EKF2"
@@ -53,11 +51,10 @@ def write_aids_of_comparison(page: Page, analysis: Analysis) -> Mapping[str, Aid
     return aid_results
 
 
-def draw_aids_only(analysis: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
+def draw_aids_only(analysis: AidsOnlyAnalysis, _: object) -> Iterator[Page]:
     """Draw the page of a flight without a position source."""
     page = Page(TITLE, LEAD)
-    page.write(flight_line(results.student, analysis.flight.log), colour=style.MUTED_COLOUR)
-    write_aids_only(page, analysis, results.findings)
+    write_aids(page, analysis.aids)
     _draw_aid_panels(page, analysis.flight, analysis.aids)
     yield page
 
@@ -68,6 +65,7 @@ def write_aids_only(page: Page, analysis: AidsOnlyAnalysis, findings: tuple[Find
     page.write(f"No comparison with KF: {missing_data.reason}.", above=2.0)
     page.write(with_options(missing_data.remedy), colour=style.MUTED_COLOUR)
     write_aids(page, analysis.aids)
+    page.heading("Findings", 10.5, above=12.0)
     write_findings(page, findings)
 
 
@@ -121,14 +119,12 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
         ],
         rows,
         right=(2, 3, 4, 5, 7, 8, 10),
-        size=6.8,
     )
     disabled_labels = [aid.label for aid in aids.values() if aid.verdict == "disabled"]
     if disabled_labels:
         page.write(
             f"Disabled in flight (logged, never fused): {', '.join(disabled_labels)}.",
             colour=style.MUTED_COLOUR,
-            size=7.0,
         )
 
 

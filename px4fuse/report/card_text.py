@@ -3,9 +3,12 @@
 Commands and the headline never wrap; other texts wrap with a hanging indent.
 """
 
+import shlex
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
+
+from msgspec.structs import replace
 
 from px4fuse.card.model import (
     AXIS_TICKS,
@@ -19,11 +22,12 @@ from px4fuse.card.model import (
 )
 from px4fuse.card.numbers import axis_fraction, format_metres, format_ratio
 from px4fuse.filter.consistency import Reference
+from px4fuse.request import quote_command
 
 WIDTH = 100
 AXIS_WIDTH = 37
 # Columns before the axis, and before the texts beside a label
-AXIS_INDENT, TEXT_INDENT = 56, 11
+AXIS_INDENT, TEXT_INDENT = 57, 11
 # A longer command stands on a line of its own
 MAX_COMMAND_LENGTH = 74
 # Ticks that have room for a label
@@ -56,18 +60,49 @@ ASCII = {
     "ν": "nu",
     "…": "...",
 }
+AIDS_HEADING = (
+    "Innovation ÷ √S of the aiding sources that EKF2 fused. Below 1: √S is larger than needed. For "
+    "barometer, magnetometer and gravity that is usual and not a fault."
+)
 CONSOLE = "Console: MAVLink Console of QGroundControl."
 
 
 class Line(NamedTuple):
-    """Line of a card with its style of rich."""
+    """Paragraph of a card.
+
+    Attributes
+    ----------
+    text : str
+    style : str
+        Style of rich.
+    first, indent : str
+        Before the first line, and before the others.
+    wraps : bool
+        False for the headline, commands and tables.
+    """
 
     text: str
     style: str = ""
+    first: str = ""
+    indent: str = ""
+    wraps: bool = False
+
+    def wrapped(self, width: int) -> list[str]:
+        """Return the lines of the paragraph at a width in columns."""
+        if not self.wraps:
+            return [f"{self.first}{self.text}"]
+        return textwrap.wrap(
+            self.text,
+            width,
+            initial_indent=self.first,
+            subsequent_indent=self.indent,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
 
 
 def card_lines(card: Card) -> Iterator[Line]:
-    """Yield the lines of a card in their order, wrapped at :data:`WIDTH`."""
+    """Yield the paragraphs of a card in their order."""
     if card.severity == "refused":
         yield Line(f"error[{card.id}]: {card.headline}", STYLES["error"])
         for label, text in card.facts.items():
@@ -82,6 +117,8 @@ def card_lines(card: Card) -> Iterator[Line]:
         yield from _cause(cause)
     if card.more_causes:
         yield Line(f"and {card.more_causes} more: -v")
+    for label, text in card.facts.items():
+        yield from _labelled(label, text)
     yield from _verdict_axis(card)
     yield from _aid_axis(card.aids)
     for text in (card.reconcile, card.difference):
@@ -100,6 +137,40 @@ def closing_lines(card: Card) -> Iterator[Line]:
     sentences += [CONSOLE] if has_console else []
     sentences += [f"Meaning: px4fuse explain {card.id}"] if card.id else []
     yield from _wrapped(" ".join(sentences), "", "")
+
+
+def with_typed_path(card: Card, path: str | None) -> Card:
+    """Replace the file name of the log in all commands by the path as typed.
+
+    >>> from px4fuse.card.model import Identity
+    >>> action = Action("KF", commands=("px4fuse compare a.ulg --sigma-z 1",), where="shell")
+    >>> cause = Cause(id="x", severity="error", title="", why="", actions=(action,))
+    >>> card = Card(severity="error", headline="", causes=(cause,), identity=Identity(file="a.ulg"))
+    >>> with_typed_path(card, "my logs/a.ulg").causes[0].actions[0].commands
+    ("px4fuse compare 'my logs/a.ulg' --sigma-z 1",)
+    """
+    if path is None or path == card.identity.file:
+        return card
+    name = card.identity.file
+
+    def typed(action: Action) -> Action:
+        commands = tuple(
+            quote_command([path if word == name else word for word in shlex.split(command)])
+            if action.where == "shell"
+            else command
+            for command in action.commands
+        )
+        return replace(action, commands=commands)
+
+    causes = tuple(
+        replace(
+            cause,
+            actions=tuple(map(typed, cause.actions)),
+            alternatives=tuple(tuple(map(typed, each)) for each in cause.alternatives),
+        )
+        for cause in card.causes
+    )
+    return replace(card, causes=causes)
 
 
 def to_ascii(text: str) -> str:
@@ -144,10 +215,15 @@ def _identity(card: Card) -> Iterator[Line]:
     yield Line("")
 
 
-def _headline(card: Card) -> Iterator[Line]:
+def headline(card: Card) -> Iterator[Line]:
+    """Yield the line with severity, id and headline."""
     label = SEVERITY_LABELS.get(card.severity, card.severity)
     name = f"{label}[{card.id}]" if card.id else label
     yield Line(f"{name}: {card.headline}", STYLES[card.severity])
+
+
+def _headline(card: Card) -> Iterator[Line]:
+    yield from headline(card)
     yield from _labelled("effect", card.effect_text)
     for place, text in enumerate(card.do_this):
         yield from _labelled("" if place else "do this", text)
@@ -155,14 +231,9 @@ def _headline(card: Card) -> Iterator[Line]:
 
 def _cause(cause: Cause) -> Iterator[Line]:
     yield from _labelled("cause", cause.why)
-    yield from _labelled("when", _format_spans(cause))
-    rows = [
-        ("EITHER " if not place else "OR ", action)
-        for place, alternative in enumerate(cause.alternatives)
-        for action in alternative
-    ]
-    rows += [("", action) for action in cause.actions]
-    labels = [f"{head}{_target(action)}" for head, action in rows]
+    yield from _labelled("when", format_spans(cause))
+    rows = marked_actions(cause)
+    labels = [f"{mark}{format_target(action)}" for mark, action in rows]
     width = max(map(len, labels), default=0) + 2
     for label, (_, action) in zip(labels, rows, strict=True):
         yield from _action(label, width, action)
@@ -170,7 +241,18 @@ def _cause(cause: Cause) -> Iterator[Line]:
     yield from _wrapped(cause.after, "  ", "  ")
 
 
-def _target(action: Action) -> str:
+def marked_actions(cause: Cause) -> list[tuple[str, Action]]:
+    """Return the actions of a cause, alternatives first with "EITHER " and "OR "."""
+    alternatives = [
+        ("OR " if place else "EITHER ", action)
+        for place, alternative in enumerate(cause.alternatives)
+        for action in alternative
+    ]
+    return alternatives + [("", action) for action in cause.actions]
+
+
+def format_target(action: Action) -> str:
+    """Format the target of an action with the place where its commands are typed."""
     return f"{action.target} ({action.where})" if action.where else action.target
 
 
@@ -190,9 +272,18 @@ def _action(label: str, width: int, action: Action) -> Iterator[Line]:
 
 
 def _rerun_table(reruns: Sequence[Rerun]) -> Iterator[Line]:
-    if not reruns:
-        return
-    columns: list[tuple[str, list[str]]] = [
+    columns = rerun_columns(reruns)
+    widths = [max(map(len, column)) for column in columns]
+    for row in zip(*columns, strict=True):
+        cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
+        yield Line(f"  {'  '.join(cells)}".rstrip())
+    if start := rerun_start(reruns):
+        yield Line(f"  {start}")
+
+
+def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
+    """Return the columns of the table of re-runs, headings first; empty columns are absent."""
+    columns = (
         ("re-run of this log", [rerun.label for rerun in reruns]),
         (
             "position RMSE",
@@ -202,15 +293,14 @@ def _rerun_table(reruns: Sequence[Rerun]) -> Iterator[Line]:
         ("◆ error ÷ σ", [_change(rerun.truth_ratio, format_ratio) for rerun in reruns]),
         ("rejected", [_change(rerun.rejected_fraction, _percent, " %") for rerun in reruns]),
         ("improves", [rerun.improves for rerun in reruns]),
-    ]
-    columns = [(head, cells) for head, cells in columns if any(cells)]
-    widths = [max(map(len, (head, *cells))) for head, cells in columns]
-    for row in zip(*([head, *cells] for head, cells in columns), strict=True):
-        cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
-        yield Line(f"  {'  '.join(cells)}".rstrip())
+    )
+    return [(head, *cells) for head, cells in columns if any(cells)]
+
+
+def rerun_start(reruns: Sequence[Rerun]) -> str:
+    """Return the sentence with the start of predicted re-runs, or ""."""
     starts = {rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None}
-    if starts:
-        yield Line(f"  EKF2 (replay): predicted from this log, from {min(starts):.0f} s on.")
+    return f"EKF2 (replay): predicted from this log, from {min(starts):.0f} s on." if starts else ""
 
 
 def _change(
@@ -267,12 +357,7 @@ def _aid_axis(aids: Sequence[AidRow]) -> Iterator[Line]:
     if not aids:
         return
     yield Line("")
-    yield from _wrapped(
-        "Innovation ÷ √S of the aiding sources that EKF2 fused. Below 1: √S is larger than "
-        "needed. For barometer, magnetometer and gravity that is usual and not a fault.",
-        "",
-        "  ",
-    )
+    yield from _wrapped(AIDS_HEADING, "", "  ")
     indent = 31
     yield Line(f"{'':{indent}}{_ticks()}")
     previous = ""
@@ -284,7 +369,8 @@ def _aid_axis(aids: Sequence[AidRow]) -> Iterator[Line]:
         yield Line(f"{head:{indent}}{axis_text(row.ratio, 'source')}")
 
 
-def _format_spans(cause: Cause) -> str:
+def format_spans(cause: Cause) -> str:
+    """Format the time from the first to the last span of a cause, "" for the whole flight."""
     if not cause.spans_s:
         return ""
     first, last = cause.spans_s[0][0], cause.spans_s[-1][1]
@@ -297,15 +383,8 @@ def _labelled(label: str, text: str) -> Iterator[Line]:
 
 
 def _wrapped(text: str, first: str, indent: str) -> Iterator[Line]:
-    for line in textwrap.wrap(
-        text,
-        WIDTH,
-        initial_indent=first,
-        subsequent_indent=indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-    ):
-        yield Line(line)
+    if text:
+        yield Line(text, "", first, indent, wraps=True)
 
 
 def _all_actions(card: Card) -> Iterator[Action]:

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import Statistic
 from px4fuse.comparison.model import AxisComparison, FilterSummary, UntestedFilter
+from px4fuse.comparison.trials import Statistic
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
 from px4fuse.findings.cause_text import format_change, format_explained_share
 from px4fuse.flight import Unavailable
@@ -134,7 +134,6 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
             "into its band. Otherwise: explained share of the logarithm of the quantity (for "
             "distances: of the mean square). A share of 50 % or more counts as the cause."
         ),
-        size=7.5,
         colour=MUTED_COLOUR,
     )
 
@@ -162,7 +161,7 @@ def _draw_running_nis(axes: Axes, series: list[FilterSeries]) -> None:
     for filter_series in series:
         number = np.arange(1, len(filter_series.values) + 1)
         running = (filter_series.values**2).cumsum() / number
-        draw_curve(axes, running[2:], **LINES[filter_series.name], label=filter_series.name)
+        draw_curve(axes, running.iloc[2:], **LINES[filter_series.name], label=filter_series.name)
         drawn_counts = np.unique(np.geomspace(3, len(number), 60).astype(int))
         low, high = np.array([nis_band(int(count)) for count in drawn_counts]).T
         time = filter_series.values.index[drawn_counts - 1]
@@ -171,7 +170,7 @@ def _draw_running_nis(axes: Axes, series: list[FilterSeries]) -> None:
         else:
             axes.plot(time, low, **_thin_line_style(filter_series))
             axes.plot(time, high, **_thin_line_style(filter_series), label="95 % band EKF2")
-        settled_nis = running[len(running) // 4 :]
+        settled_nis = running.iloc[len(running) // 4 :]
         lowest, highest = (
             min(lowest, 0.7 * settled_nis.min()),
             max(highest, 1.4 * settled_nis.max()),

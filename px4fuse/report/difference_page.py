@@ -28,11 +28,7 @@ from px4fuse.report.style import (
 from px4fuse.text import capitalise_first
 
 TITLE = "Difference between KF and EKF2, step by step"
-ROW_HEIGHT, LABEL_WIDTH, COLUMN_GAP = (
-    12.0,
-    128.0,
-    14.0,
-)  # points; height of a bar, width of the step names, gap between columns
+ROW_HEIGHT, LABEL_WIDTH = 12.0, 140.0  # points; height of a bar, width of the step names
 LEFT_COLUMN_FRACTION = 0.62  # of the page width; this column has the step names
 TIME_HEIGHT = 105.0  # points; height of the axes
 INCREASE_STYLE = {"color": "white", "hatch": "////"}  # bars of steps that increase the difference
@@ -123,7 +119,7 @@ def _draw_axis(
     for sentence in explanation.sentences:
         page.write(sentence, size=8.5, above=1.0)
     names = [step.name for step in explanation.steps]
-    columns = halves(LEFT_COLUMN_FRACTION, gap=COLUMN_GAP)
+    columns = halves(LEFT_COLUMN_FRACTION)
     quantities = (
         ("position", "m", "m2", explanation.unexplained_mean_square_m2),
         ("velocity", "m/s", "m2_s2", explanation.unexplained_velocity_mean_square_m2_s2),
@@ -142,7 +138,7 @@ def _draw_axis(
         axes = column.panel(title, "", height, left=left)
         _draw_waterfall(axes, names, 100.0 * steps / total, 100.0 * unexplained / total)
     axes.set_yticklabels([])
-    page.add_columns(*columns, gap=COLUMN_GAP)
+    page.add_columns(*columns)
     title = "Position difference KF - EKF2 (m, dark) and unexplained part (light)"
     axes = event_marks.panel(
         page,
@@ -176,7 +172,7 @@ def _draw_waterfall(axes: Axes, names: list[str], shares: Array, unexplained_sha
     axes.barh(rows - 1, unexplained_share, **style)
     for row, percent in enumerate((100.0, *shares, unexplained_share)):
         digits = 1 if 0.05 <= abs(percent) < 9.95 else 0
-        axes.text(1.03 * right_end, row, f"{percent:z.{digits}f} %", va="center", size=6.5)
+        axes.text(1.03 * right_end, row, f"{percent:z.{digits}f} %", va="center", size=8.0)
     axes.set_yticks(range(rows), ["KF - EKF2, total", *names, "unexplained"])
     axes.set_ylim(rows - 0.4, -0.6)
     axes.set_xlim(min(0.0, float(bar_ends.min())), 1.2 * right_end)

@@ -192,7 +192,7 @@ def _draw_panels(page: Page, evaluation: Evaluation) -> None:
     if _rpe_statistics(evaluation):
         left, right = halves()
         _draw_rpe(left.panel("RPE per delta (m)", "", PANEL_HEIGHT), evaluation)
-        right.write(rpe_growth_sentence(evaluation.rpe), size=7.0, colour=MUTED_COLOUR, above=24.0)
+        right.write(rpe_growth_sentence(evaluation.rpe), colour=MUTED_COLOUR, above=24.0)
         page.add_columns(left, right)
 
 

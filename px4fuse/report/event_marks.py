@@ -30,13 +30,14 @@ OUTLIER_MARK: dict[str, Any] = {
     "mew": 0.7,
     "ls": "none",
 }
-TAKE_OFF_MARK: dict[str, Any] = {"color": "black", "marker": "^", "ms": 4.5, "mew": 0, "ls": "none"}
-LANDING_MARK: dict[str, Any] = {"color": "black", "marker": "v", "ms": 4.5, "mew": 0, "ls": "none"}
+# No triangles: they mark values beyond the scale
+TAKE_OFF_MARK: dict[str, Any] = {"color": "black", "marker": "*", "ms": 6.0, "mew": 0, "ls": "none"}
+LANDING_MARK: dict[str, Any] = {"color": "black", "marker": "P", "ms": 5.0, "mew": 0, "ls": "none"}
 REJECTED_HEIGHT, OUTLIER_HEIGHT, RESET_HEIGHT = 0.025, 0.075, 0.92
 MODE_NAMES_HEIGHT = 12.0  # points; height above the axes for the names of flight modes
 # Fraction of the segment; of markers closer than this, only the first is drawn
 MIN_MARK_DISTANCE = 1.0 / 300.0
-MODE_NAME_SIZE, MODE_LETTER_WIDTH = 6.5, 4.0  # points
+MODE_NAME_SIZE, MODE_LETTER_WIDTH = 8.0, 5.0  # points
 
 
 class Mark(NamedTuple):

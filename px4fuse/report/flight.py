@@ -16,11 +16,10 @@ from px4fuse.flight import Unavailable
 from px4fuse.record import Span
 from px4fuse.report import event_marks, panels, style
 from px4fuse.report.difference_page import unexplained_note
-from px4fuse.report.page import PAGE_WIDTH, Page
+from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page
 from px4fuse.report.phrases import filters_by_name, format_verdict, verdict_notes
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, Artist, Axes
 
-COLUMN_GAP = 14.0  # points between columns
 ZOOM_UPDATES = 15
 MIN_ZOOM_S = 1.0
 ZOOM_HEIGHT = 125.0  # points; height of the axes
@@ -63,7 +62,7 @@ def _write_legend(page: Page, analysis: Analysis) -> None:
     for name, frame in (("EKF2", result.ekf2_state), ("ground truth", result.truth)):
         if isinstance(frame, pd.DataFrame):
             lines.append(Line2D([], [], **LINES[name], label=name))
-    page.legend(lines, event_marks.legend_entries(analysis))
+    page.legend([*lines, *event_marks.legend_entries(analysis)])
 
 
 def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
@@ -184,7 +183,7 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
         "Appendix: other axes",
         "The same panels for the other axes, with the same lines, bands and marks.",
     )
-    width = (PAGE_WIDTH - COLUMN_GAP * (len(others) - 1)) / max(len(others), 3)
+    width = (PAGE_WIDTH - COLUMN_GAP * (len(others) - 1)) / max(len(others), 2)
     columns = [Page(width=width) for _ in others]
     for column, result in zip(columns, others, strict=True):
         verdicts = "; ".join(
@@ -194,8 +193,9 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
         if isinstance(result.difference, Difference):
             verdicts += f"; KF - EKF2 {result.difference.position_rms_m:.3f} m RMS"
         column.heading(result.axis.name)
-        column.write(f"{verdicts}.", size=7.5)
-    page.add_columns(*columns, gap=COLUMN_GAP)
+        column.write(f"{verdicts}.")
+    first_row = Page()  # one column is not divided, so the headings stay with the first panels
+    first_row.add_columns(*columns)
     shown_panels = [panels.POSITION, panels.VELOCITY, panels.INNOVATIONS, panels.SIGMA_P]
     if any(isinstance(panels.error_reference(axis), pd.DataFrame) for axis in others):
         shown_panels.insert(2, panels.ERROR)
@@ -205,5 +205,7 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
             panel.draw_on_page(
                 column, analysis, result, with_time_label=panel is shown_panels[-1], is_narrow=True
             )
-        page.add_columns(*columns, gap=COLUMN_GAP)
+        (first_row if panel is panels.POSITION else page).add_columns(*columns)
+        if panel is panels.POSITION:
+            page.add_columns(first_row)
     yield page

@@ -30,7 +30,6 @@ INDENT = 12.0  # points
 MAX_INDENTS = 8
 # Each level takes three levels of Python's call stack, which is limited to 1000
 MAX_NESTING = 100
-TABLE_SIZE = 8.0
 # An opening $ has no space after it, a closing $ no space before and no digit after it, so prices
 # such as $5 and $10 are not mathematics
 MATHS_PATTERN = re.compile(r"\$\$(.+?)\$\$|\$(?!\s)((?:\\.|[^$\\])+?)(?<!\s)\$(?!\d)", re.DOTALL)
@@ -69,7 +68,7 @@ def draw(subject: object, results: ComparisonResults | AidsResults | LoopResults
     if isinstance(answers, Answers):
         page.heading("Answer form")
         rows = [list(row) for row in form_rows(answers)]
-        page.table(("Question", "Answer"), rows, column_widths=[3.0, 4.0], size=TABLE_SIZE)
+        page.table(("Question", "Answer"), rows, column_widths=[3.0, 4.0])
     write(page, results.student.notes)
     if len(page.blocks) > 1:
         yield page
@@ -144,11 +143,11 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, mark: str
                 _write_blocks(page, child, indent_level + 1)
             case "fence" | "code_block":
                 code = child.content.rstrip("\n").expandtabs(4).replace(" ", "\N{NO-BREAK SPACE}")
-                page.write(code, size=7.5, colour=MUTED_COLOUR, indent=indent + INDENT)
+                page.write(code, colour=MUTED_COLOUR, indent=indent + INDENT)
             case "table":
                 rows = [row.children for section in child.children for row in section.children]
                 head, *body = ([_inline_text(cell) for cell in row] for row in rows)
-                page.table(head, body, column_widths=[1.0] * len(head), size=TABLE_SIZE)
+                page.table(head, body, column_widths=[1.0] * len(head))
             case "html_block":
                 page.write(
                     TAG_PATTERN.sub("", child.content).strip(), size=BODY_SIZE, indent=indent

@@ -8,13 +8,17 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from px4fuse.report.style import MUTED_COLOUR, Artist, Axes
+from px4fuse.report.style import FONT, MUTED_COLOUR, Artist, Axes
 
 # points; widths of the text, of the tick labels left of axes, of the labels before texts
-PAGE_WIDTH, AXIS_LEFT, LABEL_WIDTH = 512.0, 26.0, 52.0
+PAGE_WIDTH, AXIS_LEFT, LABEL_WIDTH = 178.0 * 72.0 / 25.4, 30.0, 52.0
+# points; gap between two columns of 86.5 mm, margin right of axes
+COLUMN_GAP, AXES_RIGHT = 5.0 * 72.0 / 25.4, 8.0
+# points; of a legend: height of a line, and width of the line and the gaps of an entry
+LEGEND_LINE, LEGEND_HANDLE = 12.0, 30.0
 # points; heights below axes for tick labels, for the axis label, and without tick labels
 TICKS_HEIGHT, AXIS_LABEL_HEIGHT, UNLABELLED_HEIGHT = 12.0, 11.0, 3.0
 ALLOWED_CHARACTERS = "\n\N{NO-BREAK SPACE}"  # printed, although str.isprintable is False
@@ -66,7 +70,7 @@ class Page:
 
     def write_small(self, text: str) -> None:
         """Write a text in small print, such as the numbers of the panel above."""
-        self.write(text, size=7.0, colour=MUTED_COLOUR, above=-1.0)
+        self.write(text, colour=MUTED_COLOUR, above=-1.0)
 
     def write_labelled(
         self,
@@ -97,7 +101,7 @@ class Page:
         *,
         column_widths: Sequence[float] | None = None,
         right: Sequence[int] = (),
-        size: float = 7.4,
+        size: float = 8.0,
     ) -> None:
         """Write a table.
 
@@ -120,8 +124,9 @@ class Page:
         *,
         above: float = 4.0,
         left: float = AXIS_LEFT,
-        right: float = 8.0,
+        right: float = AXES_RIGHT,
         below: float = 0.0,
+        is_compact: bool = False,
     ) -> Axes:
         """Add axes as wide as the column, below a title and a caption; return them.
 
@@ -133,6 +138,8 @@ class Page:
             Height of the axes alone (points).
         above, left, right, below : float
             Margins of the axes (points); the height of tick and axis labels is added below.
+        is_compact : bool
+            Small title and gaps, for the cover.
         """
         # imported here because matplotlib takes 0.3 s, which text-only commands save
         from matplotlib.figure import Figure  # noqa: PLC0415
@@ -152,32 +159,52 @@ class Page:
             height=height,
             width=self.width,
             figure=axes.figure,
+            compact=is_compact,
         )
         _place_axes(block)
         return axes
 
-    def legend(self, *rows: Sequence[Artist]) -> None:
-        """Add a legend for several panels, one line per row of entries."""
+    def legend(self, entries: Iterable[Artist]) -> Block:
+        """Add a legend for several panels, on as many lines as its entries need."""
         from matplotlib.figure import Figure  # noqa: PLC0415
 
-        visible_rows = [row for row in rows if row]
-        figure = Figure(figsize=(self.width / 72.0, 13.0 * len(visible_rows) / 72.0))
-        for row_index, entries in enumerate(visible_rows):
+        rows: list[list[Artist]] = [[]]
+        free = self.width
+        for entry in entries:
+            width = text_width(str(entry.get_label())) + LEGEND_HANDLE
+            if rows[-1] and width > free:
+                rows.append([])
+                free = self.width
+            rows[-1].append(entry)
+            free -= width
+        height = LEGEND_LINE * len(rows)
+        figure = Figure(figsize=(self.width / 72.0, height / 72.0))
+        for row_index, row in enumerate(rows):
             figure.legend(
-                handles=entries,
+                handles=row,
                 loc="upper left",
-                ncols=len(entries),
+                ncols=len(row),
                 borderaxespad=0.0,
                 borderpad=0.0,
-                bbox_to_anchor=(0.0, 1.0 - row_index / len(visible_rows)),
+                bbox_to_anchor=(0.0, 1.0 - row_index / len(rows)),
                 handlelength=2.0,
+                handletextpad=0.5,
                 columnspacing=1.2,
             )
-        labels = ", ".join(str(artist.get_label()) for row in visible_rows for artist in row)
+        labels = ", ".join(str(artist.get_label()) for row in rows for artist in row)
         alt = f"Legend: {labels}"
-        self.add("panel", title="", caption="", alt=alt, width=self.width, figure=figure)
+        return self.add(
+            "panel",
+            title="",
+            caption="",
+            alt=alt,
+            width=self.width,
+            height=height,
+            figure=figure,
+            compact=False,
+        )
 
-    def add_columns(self, *columns: Page, gap: float = 14.0, above: float = 6.0) -> None:
+    def add_columns(self, *columns: Page, gap: float = COLUMN_GAP, above: float = 6.0) -> None:
         """Add columns side by side; `gap` between and space `above` them in points."""
         blocks, widths = [c.blocks for c in columns], [c.width for c in columns]
         self.add("columns", columns=blocks, widths=widths, gap=gap, above=above)
@@ -187,7 +214,7 @@ class Page:
         self.add("foot", blocks=content.blocks)
 
 
-def halves(left_fraction: float = 0.5, gap: float = 14.0) -> tuple[Page, Page]:
+def halves(left_fraction: float = 0.5, gap: float = COLUMN_GAP) -> tuple[Page, Page]:
     """Return two columns that fill the page width; `left_fraction` belongs to the left column."""
     left = left_fraction * (PAGE_WIDTH - gap)
     return Page(width=left), Page(width=PAGE_WIDTH - gap - left)
@@ -196,6 +223,28 @@ def halves(left_fraction: float = 0.5, gap: float = 14.0) -> tuple[Page, Page]:
 def styled_text(text: str, size: float, colour: str = "black", bold: bool = False) -> Block:
     """Return a text with its size (points), colour and weight."""
     return {"text": text, "size": size, "colour": colour, "weight": "bold" if bold else "regular"}
+
+
+def text_width(text: str, size: float = 8.0) -> float:
+    """Return the width (points) of a text in DejaVu Sans."""
+    from matplotlib import font_manager  # noqa: PLC0415 - as in :meth:`Page.panel`
+
+    font = font_manager.get_font(font_manager.findfont(FONT))
+    # at a large size, because glyphs of a small one are rounded to whole points
+    font.set_size(100.0, 72.0)
+    font.set_text(text, 0.0)
+    return float(font.get_width_height()[0]) / 64.0 * size / 100.0
+
+
+def line_count(text: str, width: float, size: float = 8.0) -> int:
+    """Return the number of lines of a text that wraps at a width (points)."""
+    lines, used = 1, 0.0
+    for word in text.split(" "):
+        word_width = text_width(f"{word} ", size)
+        if used and used + text_width(word, size) > width:
+            lines, used = lines + 1, 0.0
+        used += word_width
+    return lines
 
 
 def appendix_title(title: str) -> str:

@@ -82,10 +82,13 @@ class Panel(NamedTuple):
         )
         # this panel already shows the rejected innovations as hollow dots
         rejected = "" if self is INNOVATIONS else result.axis.name
+        title, numbers = self.full_title(result), self.numbers(result)
+        if not is_narrow:
+            title, numbers = ": ".join(filter(None, (title, numbers))), ""
         axes = event_marks.panel(
             page,
             analysis,
-            self.full_title(result),
+            title,
             caption,
             height,
             axis=rejected,
@@ -95,7 +98,7 @@ class Panel(NamedTuple):
         if is_narrow:
             axes.locator_params(axis="x", nbins=4)
         self.draw(axes, result)
-        page.write_small(self.numbers(result))
+        page.write_small(numbers)
 
 
 # ------------------------------------------------------------------------------ position, velocity
@@ -212,7 +215,7 @@ def _error_numbers(result: AxisComparison, quantity: Quantity = POSITIONS) -> st
     errors = ", ".join(
         f"{name} {error:.3f}" for name, error in _rmse_by_filter(result, quantity).items()
     )
-    return f"RMSE against ground truth ({quantity.unit}): {errors}" if errors else ""
+    return f"RMSE to ground truth {errors}" if errors else ""
 
 
 def _position_numbers(result: AxisComparison) -> str:
@@ -228,7 +231,7 @@ def _position_numbers(result: AxisComparison) -> str:
 def _velocity_numbers(result: AxisComparison) -> str:
     texts = [_error_numbers(result, VELOCITIES)]
     if isinstance(result.difference, Difference):
-        texts.append(f"KF - EKF2: RMS {result.difference.velocity_rms_m_s:.3f} m/s")
+        texts.append(f"KF - EKF2 RMS {result.difference.velocity_rms_m_s:.3f}")
     return "; ".join(filter(None, texts))
 
 
@@ -290,16 +293,23 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
 
 
 def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
-    """Caption of the innovations: fraction outside ±2√S, verdict and rejections."""
-    sentences = []
+    """Caption of the innovations: verdict, statistics and rejections."""
+    half_height, sentences = _axis_half_height(result), []
+    innovation_tables = {"KF": result.replay.updates, "EKF2": result.ekf2_innovations}
     for name, consistency in filters_by_name(result).items():
         if isinstance(consistency, Unavailable):
             sentences.append(f"{name}: {consistency.reason}.")
-        else:
-            sentences.append(
-                f"{name}: {consistency.fraction_outside_two_sigma:.1%} of {consistency.count} "
-                f"innovations outside ±2√S (expected 5 %): {format_verdict(consistency)}."
-            )
+            continue
+        table = innovation_tables[name]
+        assert isinstance(table, pd.DataFrame)  # the filter has a verdict
+        outside_count = int((table["innovation_m"].abs() > half_height).sum())
+        outside = f", {outside_count} outside the plot (triangles)" if outside_count else ""
+        sentences.append(
+            f"{name}: {consistency.count} innovations, {format_verdict(consistency)}; mean "
+            f"{consistency.innovation_mean_m:+.3f} m, standard deviation "
+            f"{consistency.innovation_std_m:.3f} m, median √S {consistency.sqrt_s_median_m:.3f} m"
+            f"{outside}."
+        )
     if isinstance(result.ekf2_state, Unavailable):
         sentences.append(f"EKF2: {result.ekf2_state.reason}.")
     elif isinstance(result.ekf2_innovations, pd.DataFrame):
@@ -309,21 +319,12 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
 
 
 def _innovation_numbers(result: AxisComparison) -> str:
-    half_height, texts = _axis_half_height(result), []
-    innovation_tables = {"KF": result.replay.updates, "EKF2": result.ekf2_innovations}
-    for name, consistency in filters_by_name(result).items():
-        table = innovation_tables[name]
-        if isinstance(consistency, Consistency) and isinstance(table, pd.DataFrame):
-            outside_count = int((table["innovation_m"].abs() > half_height).sum())
-            texts.append(
-                (
-                    f"{name}: mean {consistency.innovation_mean_m:+.3f} m, standard deviation "
-                    f"{consistency.innovation_std_m:.3f} m, median √S "
-                    f"{consistency.sqrt_s_median_m:.3f} m"
-                )
-                + (f", {outside_count} outside the plot (triangles)" if outside_count else "")
-            )
-    return "; ".join(texts)
+    shares = ", ".join(
+        f"{name} {consistency.fraction_outside_two_sigma:.1%}"
+        for name, consistency in filters_by_name(result).items()
+        if isinstance(consistency, Consistency)
+    )
+    return f"{shares} outside ±2√S (expected 5 %)" if shares else ""
 
 
 def _draw_sigma(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
@@ -383,7 +384,7 @@ ERROR = Panel(
     lambda result: _error_numbers(result) or _position_numbers(result),
 )
 INNOVATIONS = Panel(
-    "Innovation: measurement - prediction (m)",
+    "Innovations (m)",
     140.0,
     draw_innovations,
     innovation_sentence,

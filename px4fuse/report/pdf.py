@@ -1,17 +1,9 @@
-"""PDF report: pages typeset by Typst, with the results attached.
-
-Standards PDF/A-3a (archives) and PDF/UA-1 (screen readers). Typst reads the template and the data
-only: its root is an empty folder, and its fonts are those of :mod:`px4fuse.report.fonts`.
-"""
+"""PDF report: pages drawn from an analysis and its results, typeset with the results attached."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
 from importlib import metadata
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
-
-import typst
 
 from px4fuse.memory import release_free_memory
 from px4fuse.report import (
@@ -28,14 +20,14 @@ from px4fuse.report import (
     provenance,
     sensitivity,
 )
-from px4fuse.report.cover import student_line
 from px4fuse.report.page import Page, replace_unprintable, to_typst_data
+from px4fuse.report.phrases import student_line
 from px4fuse.report.style import report_style
+from px4fuse.report.typesetting import compile_pdf
 from px4fuse.results import contract
 from px4fuse.results.model import NO_STUDENT
 
 RESULTS_NAME = "results.json"
-STANDARDS: list[Any] = ["a-3a", "ua-1"]
 # Drawing functions of the pages, in order, by type of results
 PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
     contract.ComparisonResults: (
@@ -52,7 +44,12 @@ PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
         notes.draw,
         provenance.draw,
     ),
-    contract.AidsResults: (aids.draw_aids_only, notes.draw, provenance.draw_aids),
+    contract.AidsResults: (
+        cover.draw_aids_only,
+        aids.draw_aids_only,
+        notes.draw,
+        provenance.draw_aids,
+    ),
     contract.LoopResults: (loop.draw_report, notes.draw, provenance.draw_loop),
     contract.EvaluationResults: (evaluation.draw,),
 }
@@ -120,31 +117,3 @@ def _shorten(text: str, max_length: int) -> str:
     """Return the text on one line of at most `max_length` characters."""
     line = " ".join(replace_unprintable(text).split())
     return line if len(line) <= max_length else f"{line[: max_length - 1]}…"
-
-
-def compile_pdf(report: Mapping[str, Any], template: str | None = None) -> bytes:
-    """Typeset data with a Typst template, by default ``report.typ``.
-
-    Raises
-    ------
-    typst.TypstError
-        The template has an error or reads a file.
-    """
-    if template is None:
-        template = Path(__file__).with_name("report.typ").read_text(encoding="utf-8")
-    with TemporaryDirectory() as empty:
-        compiler = typst.Compiler(
-            input=template.encode(),
-            root=empty,
-            font_paths=typst.Fonts(
-                include_system_fonts=False,
-                include_embedded_fonts=False,
-                font_paths=fonts.font_folders(tuple(report["fonts"])),
-            ),
-            package_path=empty,
-            package_cache_path=empty,
-            sys_inputs={"data": json.dumps(report)},
-        )
-        document = compiler.compile(format="pdf", pdf_standards=STANDARDS)
-    assert isinstance(document, bytes)
-    return document

@@ -15,11 +15,13 @@ from px4fuse.comparison.model import (
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings import Finding
+from px4fuse.findings import Finding, finding_title, group_by_root
 from px4fuse.flight import Alignment, Truth, Unavailable
 from px4fuse.log import ClockMap
+from px4fuse.report.page import styled_text
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
-from px4fuse.text import format_factor, format_number
+from px4fuse.results.model import Student
+from px4fuse.text import capitalise_first, format_factor, format_number
 
 if TYPE_CHECKING:
     from px4fuse.analysis import Analysis
@@ -267,3 +269,33 @@ def tuning_advice(
             f"at {tuning.outlier_time_s[0]:.1f} s; excluded from the noise estimates"
         )
     return advice
+
+
+def student_line(student: Student, separator: str) -> str:
+    """Join the student's name and id; either may be empty."""
+    return separator.join(filter(None, (student.name, student.id)))
+
+
+def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
+    """Write all findings, each with its consequences."""
+    if not findings:
+        page.write("None.")
+    for findings_of_cause in group_by_root(findings):
+        write_finding(page, findings_of_cause)
+
+
+def write_finding(page: Page, group: list[Finding]) -> None:
+    """Write severity, time, title with id, message, action and consequences of a finding."""
+    finding, *consequences = group
+    title = f"{capitalise_first(finding_title(finding.id))} [{finding.id}]"
+    texts = [styled_text(title, 8.0, bold=True), styled_text(finding.message, 8.0)]
+    if finding.remedy:
+        texts.append(styled_text(f"Action: {finding.remedy}", 8.0, MUTED_COLOUR))
+    if consequences:
+        texts.append(styled_text(format_consequences(consequences), 8.0, MUTED_COLOUR))
+    page.write_labelled(
+        f"{finding.severity}\n{finding.when}".strip(),
+        *texts,
+        above=2.0,
+        colour=SEVERITY_COLOURS[finding.severity],
+    )

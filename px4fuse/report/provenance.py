@@ -8,21 +8,22 @@ from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.flight import Flight, PositionTrack, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.report import clock, fonts
+from px4fuse.report.cover import ALL_FINDINGS
 from px4fuse.report.page import Page
-from px4fuse.report.phrases import describe_alignment, format_clock_map
+from px4fuse.report.phrases import describe_alignment, format_clock_map, write_findings
 from px4fuse.report.style import MUTED_COLOUR
 from px4fuse.request import with_options
 from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults
 
-LABEL_WIDTH, TEXT_SIZE = 140.0, 7.5  # points
+LABEL_WIDTH = 168.0  # points
 
 
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     """Draw the provenance of a comparison."""
     flight, source = analysis.flight, analysis.source
     alignment = source.alignment
-    page = _start_page("Appendix: provenance", results)
-    _write_log(page, flight, source)
+    yield _findings_page(results)
+    page = Page("Appendix: provenance")
     clocks = map(format_clock_map, flight.clocks)
     _write_section(page, "Clocks, mapped to the autopilot's boot clock", plain_texts=clocks)
     _write_section(
@@ -35,20 +36,33 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     _write_section(page, "Automatic choices", plain_texts=analysis.notes or ["none"])
     _write_missing(page, analysis.missing)
     _write_methods(page, "methods.md")
+    _write_versions(page, results)
+    _write_log(page, flight, source)
     yield page
 
 
 def draw_aids(analysis: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
     """Draw the provenance of a flight without a position source."""
-    flight, page = analysis.flight, _start_page("Provenance", results)
-    _write_log(page, flight)
+    yield _findings_page(results)
+    flight, page = analysis.flight, Page("Provenance")
     _write_section(page, "Automatic choices", plain_texts=flight.log.notes or ["none"])
     _write_missing(page, (analysis.missing_data, *flight.missing))
+    _write_versions(page, results)
+    _write_log(page, flight)
     yield page
 
 
+def _findings_page(results: ComparisonResults | AidsResults) -> Page:
+    page = Page(ALL_FINDINGS)
+    write_findings(page, results.findings)
+    return page
+
+
 def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) -> None:
-    """Write log, position source and parameters, without those of unused position aids."""
+    """Write log, position source and parameters, without those of unused position aids.
+
+    Names and SHA-256 of the files are last, so that they stand on the last page.
+    """
     log, facts = flight.log, dict[str, str]()
     other_positions = (
         f"{t.name} ({t.rate_hz:.1f} Hz)" for t in flight.positions if t is not source
@@ -71,16 +85,18 @@ def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) 
         f"{n} {value:g}" for n, value in log.parameters.items() if n not in unused_parameters
     )
     facts = {
-        "file": f"{log.name}, {log.bytes} bytes, {log.format}",
-        "SHA-256": log.sha256,
-        **{f.role: f"{f.name}, {f.bytes} bytes, SHA-256 {f.sha256}" for f in flight.inputs},
         "firmware": f"{log.firmware}, git {log.firmware_hash}",
         "time zero": f"{log.boot_time_s:.6f} s after boot (first data sample)",
         **facts,
         "other positions": ", ".join(other_positions) or "none",
         "parameters": ", ".join(parameters) or "none",
+        **{f.role: f"{f.name}, {f.bytes} bytes, SHA-256 {f.sha256}" for f in flight.inputs},
+        "file": f"{log.name}, {log.bytes} bytes, {log.format}",
+        "SHA-256": log.sha256,
     }
-    _write_section(page, "Log", facts.items())
+    section = Page()
+    _write_section(section, "Log", facts.items())
+    page.add_columns(section)  # one column is not divided
 
 
 def _write_missing(page: Page, unavailable_parts: Iterable[Unavailable]) -> None:
@@ -97,7 +113,7 @@ def _write_missing(page: Page, unavailable_parts: Iterable[Unavailable]) -> None
 
 def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
     """Draw the provenance of ``px4fuse loop``."""
-    page = _start_page("Provenance", results)
+    page = Page("Provenance")
     tracks = [("track", loop.odometry.trajectory), *(("reference", r) for r in loop.references)]
     file_facts = [
         (
@@ -107,15 +123,16 @@ def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
         )
         for label, track in tracks
     ]
-    _write_section(page, "Files", file_facts)
     _write_section(page, "Automatic choices", plain_texts=loop.notes or ["none"])
     _write_methods(page, "methods_loop.md")
+    _write_versions(page, results)
+    _write_section(page, "Files", file_facts)
     yield page
 
 
-def _start_page(title: str, results: ComparisonResults | AidsResults | LoopResults) -> Page:
-    """Begin the page with command, versions and attached results."""
-    page, student, versions = Page(title), results.student, results.provenance
+def _write_versions(page: Page, results: ComparisonResults | AidsResults | LoopResults) -> None:
+    """Write command, versions and attached results."""
+    student, versions = results.student, results.provenance
     facts = {
         "command": versions.command,
         "px4fuse": f"{versions.px4fuse} on Python {versions.python}",
@@ -128,7 +145,6 @@ def _start_page(title: str, results: ComparisonResults | AidsResults | LoopResul
             "computer; results.json contains the original text"
         )
     _write_section(page, "Made with", facts.items())
-    return page
 
 
 def _write_section(
@@ -145,14 +161,13 @@ def _write_section(
         page.write_labelled(
             label,
             text,
-            size=TEXT_SIZE,
             width=LABEL_WIDTH,
             above=-1.0,
             colour=MUTED_COLOUR,
             bold=False,
         )
     for text in plain_texts:
-        page.write(text, size=TEXT_SIZE)
+        page.write(text)
 
 
 def _write_methods(page: Page, name: str) -> None:

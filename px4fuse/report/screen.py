@@ -7,7 +7,7 @@ prints the command with the path and the options that the user typed.
 """
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import zip_longest
 from typing import Literal
 
@@ -16,6 +16,16 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from px4fuse.card.model import Card
+from px4fuse.report.card_text import (
+    WIDTH,
+    Line,
+    card_lines,
+    closing_lines,
+    headline,
+    to_ascii,
+    with_typed_path,
+)
 from px4fuse.report.page import Block, Cell
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.request import (
@@ -27,6 +37,10 @@ from px4fuse.request import (
     command_line,
 )
 
+# Encodings of terminals that can print all characters of a card
+UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
+# Lines of a card, by kind of block
+CARD_LINES = {"card": card_lines, "closing": closing_lines, "headline": headline}
 INDENT = 9  # columns; width of the labels
 COLUMN_POINTS = 6.0  # points of an indent on paper per terminal column
 # Terminal styles of text colours; the other colours belong to plots
@@ -68,9 +82,25 @@ def show(console: Console, blocks: Iterable[Block], request: Request | None = No
                 print_line(console, block["label"], block["text"])
             case "blank":
                 console.print()
+            case "card" | "closing" | "headline":
+                _show_card(console, CARD_LINES[block["kind"]], block["card"], request)
             case "columns":
                 for column in block["columns"]:
                     show(console, column, request)
+
+
+def _show_card(
+    console: Console,
+    lines_of: Callable[[Card], Iterator[Line]],
+    card: Card,
+    request: Request | None,
+) -> None:
+    """Print lines of a card; commands contain the path as typed instead of the file name."""
+    is_limited = console.encoding.lower() not in UNICODE_ENCODINGS
+    typed = None if request is None else getattr(request, "log", None)
+    for line in lines_of(with_typed_path(card, typed)):
+        for text in line.wrapped(min(console.width, WIDTH)):
+            console.print(Text(to_ascii(text) if is_limited else text, line.style), soft_wrap=True)
 
 
 def _show_labelled(console: Console, block: Block, request: Request | None) -> None:

@@ -12,7 +12,7 @@ from px4fuse.filter.fitting import START_OUTLIER_WIDTH
 from px4fuse.filter.likelihood import FilterStates, filter_states, preintegrate, score_grid
 from px4fuse.filter.tuning import HORIZONTAL, MIN_MEASUREMENTS, AxisTuning, Noise
 from px4fuse.flight import Unavailable
-from px4fuse.report.page import Page, draw_legend_above
+from px4fuse.report.page import Page, draw_legend_above, halves
 from px4fuse.report.style import KF_COLOUR, set_plain_ticks
 from px4fuse.text import format_factor, format_number
 
@@ -31,11 +31,12 @@ GAIN_GROUPS = (("larger gain", (1, 2)), ("smaller gain", (3, 4)))
 REGION_95_NATS = float(-np.log(0.05))
 LEVELS_NATS = (0.0, REGION_95_NATS, 10.0, 100.0, 1000.0, 10_000.0)
 SHADES = ("#0b2a55", "#3f6aa8", "#86a7d3", "#c3d4ea", "#e6edf6")
-SHADE_LABELS = ("95 % region", "10 below", "100", "1,000", "10,000")
+SHADE_LABELS = ("95 %", "10 below", "100", "1,000", "10,000")
 COARSE_POINTS, FINE_POINTS = 14, 11
 # Margin of the map (factor), and reach of the fine grid in half 95 % intervals (log scale)
 MAP_MARGIN_FACTOR, FINE_GRID_REACH = 1.3, 2.3
-MAP_HEIGHT, MAP_LEFT = 140.0, 40.0  # points; height of the axes, margin left of them
+MAP_HEIGHT, MAP_LEFT, LEGEND_HEIGHT = 150.0, 40.0, 42.0  # points; margin left of the axes
+MAP_COLUMN_FRACTION = 0.42  # of the page width
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
@@ -55,8 +56,10 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     chosen = np.array([settings.sigma_a_m_s2, settings.sigma_z_m])
     factors = np.array([(a, z) for _, a, z in SETTINGS]).T
     states = filter_states(preintegrate(result.axis, settings), *(chosen[:, None] * factors))
-    _draw_map(page, analysis)
-    _write_table(page, result, states, chosen)
+    map_column, table_column = halves(MAP_COLUMN_FRACTION)
+    _draw_map(map_column, analysis)
+    _write_table(table_column, result, states, chosen)
+    page.add_columns(map_column, table_column)
     yield page
 
 
@@ -72,7 +75,9 @@ def _draw_map(page: Page, analysis: Analysis) -> None:
     if isinstance(tuned_noises, Unavailable):
         page.write(f"{title}: no map ({tuned_noises.reason}).")
         return
-    axes = page.panel(title, _map_sentence(tuned_noises), MAP_HEIGHT, left=MAP_LEFT, above=14.0)
+    axes = page.panel(
+        title, _map_sentence(tuned_noises), MAP_HEIGHT, left=MAP_LEFT, above=LEGEND_HEIGHT
+    )
     chosen = settings.sigma_a_m_s2, settings.sigma_z_m
     noises = tuned_noises.sigma_a_two_state, tuned_noises.sigma_z
     (a, a_limits), (z, z_limits) = map(_noise_grid, chosen, noises)
@@ -108,7 +113,10 @@ def _draw_map(page: Page, analysis: Analysis) -> None:
         for shade, label in zip(SHADES, SHADE_LABELS, strict=True)
     ]
     draw_legend_above(
-        axes, handles=[*shades, *axes.get_legend_handles_labels()[0]], handlelength=1.2
+        axes,
+        column_count=3,
+        handles=[*shades, *axes.get_legend_handles_labels()[0]],
+        handlelength=1.2,
     )
 
 
@@ -183,7 +191,7 @@ def _write_table(page: Page, result: AxisComparison, states: FilterStates, chose
         _second_half_median(states.sigma_p_m),
         states.nis[second_half].mean(axis=0),
     )
-    head = ["", "SIGMA_A (m/s²)", "SIGMA_Z (m)", "gain", "σ_p (m)", "mean NIS"]
+    head = ["", "SIGMA_A\n(m/s²)", "SIGMA_Z\n(m)", "gain", "σ_p\n(m)", "mean\nNIS"]
     rows = []
     for index, (label, *scale) in enumerate(SETTINGS):
         noises = [format_number(value) for value in chosen * scale]
@@ -197,13 +205,13 @@ def _write_table(page: Page, result: AxisComparison, states: FilterStates, chose
                 states.velocity_m_s[second_half]
                 - np.interp(time, true_velocity.index, true_velocity)[:, np.newaxis]
             )
-            head.append("v RMSE (m/s)")
+            head.append("v RMSE\n(m/s)")
             for row, rmse in zip(rows, np.sqrt((error**2).mean(axis=0)), strict=True):
                 row.append(f"{rmse:.3f}")
     nis_text = ""
     if nis[1] > 0.0:  # zero if the positions never change
         nis_text = f", and the NIS {format_factor(nis[2] / nis[1])} times smaller"
-    page.heading("Same track, different σ", above=10.0)
+    page.heading("Same track, different σ", 9.5, above=9.0)
     page.write(
         f"With SIGMA_A × 4, σ_p is {format_factor(sigmas[1] / sigmas[2])} times larger than with "
         f"SIGMA_Z / 4{nis_text}; the track is nearly the same. All numbers are of the second half "

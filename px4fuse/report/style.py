@@ -29,15 +29,21 @@ FONT = "DejaVu Sans"
 STYLE_SHEET = Path(__file__).with_name("report.mplstyle")
 TIME_LABEL = "time since first data (s)"
 
-KF_COLOUR = "#123f7a"
-KF_BAND_COLOUR = "#b9cbe4"
-EKF2_COLOUR = "#e0741a"
-EKF2_BAND_COLOUR = "#f6c99f"
+KF_COLOUR = "#12407f"
+KF_BAND_COLOUR = "#d0d9e6"
+EKF2_COLOUR = "#b85400"
+EKF2_BAND_COLOUR = "#f0dccd"
 TRUTH_COLOUR = "#111111"
 MEASUREMENT_COLOUR = "#9a9a9a"
-MUTED_COLOUR = "#555555"
-GOOD_COLOUR = "#1f6b3a"
-SEVERITY_COLOURS = {"error": "#a61b1b", "warning": "#8a5a00", "note": "#33556b"}
+MUTED_COLOUR = "#444444"
+GOOD_COLOUR = "#1d5e34"
+SEVERITY_COLOURS = {
+    "error": "#9b1c1c",
+    "warning": "#8a5200",
+    "note": "#1f4e79",
+    "clean": GOOD_COLOUR,
+}
+CONSISTENT_BAND_COLOUR = "#d5dfd8"
 
 KF_LINE: dict[str, Any] = {"color": KF_COLOUR, "lw": 1.0, "ls": "-"}
 EKF2_LINE: dict[str, Any] = {"color": EKF2_COLOUR, "lw": 1.1, "ls": (0, (4, 1.6))}
@@ -63,6 +69,7 @@ MEASUREMENT_DOTS: dict[str, Any] = {
 # Styles by display name
 LINES = {"KF": KF_LINE, "EKF2": EKF2_LINE, "ground truth": TRUTH_LINE}
 DOTS = {"KF": KF_DOTS, "EKF2": EKF2_DOTS}
+BANDS = {"KF": KF_BAND_COLOUR, "EKF2": EKF2_BAND_COLOUR}
 
 # Most drawn points of a series in wide and in narrow axes, and the smallest width of wide axes
 MAX_POINTS, MAX_POINTS_NARROW, MIN_WIDE_INCHES = 1500, 500, 3.0
@@ -87,14 +94,19 @@ def draw_curve(axes: Axes, values: pd.Series[float], **style: Any) -> None:
     )
 
 
-def draw_sigma_band(axes: Axes, centre: pd.Series[float], sigma: pd.Series[float]) -> None:
-    """Draw the ±2σ band of KF about a series."""
+def draw_sigma_band(
+    axes: Axes,
+    centre: pd.Series[float],
+    sigma: pd.Series[float],
+    colour: str = KF_BAND_COLOUR,
+) -> None:
+    """Draw the ±2σ band about a series."""
     time = centre.index.to_numpy()
     drawn_time, upper = decimate_series(
         time, np.asarray(centre + 2.0 * sigma, np.float64), _max_points(axes)
     )
     lower = np.interp(drawn_time, time, (centre - 2.0 * sigma).to_numpy())
-    axes.fill_between(drawn_time, lower, upper, color=KF_BAND_COLOUR, lw=0)
+    axes.fill_between(drawn_time, lower, upper, color=colour, lw=0)
 
 
 def _max_points(axes: Axes) -> int:

@@ -1,67 +1,98 @@
-"""Summary of a comparison on the terminal: result, inputs, verdicts and findings."""
+"""Output of ``px4fuse compare`` on the terminal: the diagnosis card, and details with ``-v``."""
 
 from typing import Any
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
+from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.findings import group_by_root
 from px4fuse.report.aids import write_aids_of_comparison, write_aids_only
-from px4fuse.report.cover import facts, write_finding
 from px4fuse.report.difference_page import write_explanation
 from px4fuse.report.page import Page
-from px4fuse.report.phrases import verdict_notes, write_errors
+from px4fuse.report.phrases import (
+    format_settings,
+    verdict_notes,
+    write_errors,
+    write_finding,
+)
 from px4fuse.report.style import MUTED_COLOUR
 
-MAX_FINDINGS = 4
 ERROR_LEGEND = (
     "KF-EKF2: RMS difference of position and velocity. RMSE: against ground truth. Consistent: "
-    "mean NIS within its 95 % band."
+    "σ ratio 0.8 to 1.25, or its 95 % interval contains 1."
 )
-# Labels of the cover's facts that the terminal prints too
-TERMINAL_FACTS = ("Filter", "Position", "Aligned", "Segment")
 
 
-def summary(analysis: Analysis | AidsOnlyAnalysis, results: Any, report: object = None) -> Page:
-    """Make the terminal page of a comparison, or of EKF2's aids without a position source.
+def summary(
+    analysis: Analysis | AidsOnlyAnalysis,
+    results: Any,
+    *,
+    verbose: bool = False,
+    quiet: bool = False,
+) -> Page:
+    """Make the terminal page of a comparison, or of a flight without a position source.
 
     Parameters
     ----------
     analysis : Analysis or AidsOnlyAnalysis
     results : ComparisonResults or AidsResults
-    report : Path, optional
-        Path of the written report.
+    verbose : bool
+        Add the table of axes, the settings and all findings with their consequences.
+    quiet : bool
+        Print the headline only.
     """
     page = Page()
-    log = analysis.flight.log
-    if isinstance(analysis, AidsOnlyAnalysis):
-        page.write_labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
-        write_aids_only(page, analysis, results.findings)
+    page.add("headline" if quiet else "card", card=results.card)
+    if not verbose:
         return page
-    for sentence in results.summary:
-        page.write(sentence)
+    if isinstance(analysis, AidsOnlyAnalysis):
+        write_aids_only(page, analysis, results.findings)
+    else:
+        _write_details(page, analysis, results)
+    return page
+
+
+def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
+    """Write what the card leaves out."""
     page.add("blank")
-    names = " + ".join([log.name, *(file.name for file in analysis.flight.inputs)])
-    page.write_labelled("Log", f"{names}, {log.firmware}, {log.duration_s:.1f} s")
-    for label, text in facts(analysis).items():
-        if label in TERMINAL_FACTS:
-            page.write_labelled(label, text)
+    page.write_labelled_texts(facts(analysis))
     write_errors(page, analysis)
     for note in (ERROR_LEGEND, *verdict_notes(analysis)):
         page.write(note, colour=MUTED_COLOUR)
     explanation = analysis.difference_steps.get(analysis.main.axis.name)
-    is_in_summary = (
-        isinstance(explanation, DifferenceExplanation) and explanation.cause in results.summary
-    )
-    if explanation is not None and not is_in_summary:
+    if isinstance(explanation, DifferenceExplanation):
         write_explanation(page, explanation)
     write_aids_of_comparison(page, analysis)
-    if not results.findings:
-        page.write("Findings: none.")
-    groups = group_by_root(results.findings)
-    for group in groups[:MAX_FINDINGS]:
+    for group in group_by_root(results.findings):
         write_finding(page, group)
-    if (more_count := len(groups) - MAX_FINDINGS) > 0:
-        place = " in the report" if report else ""
-        noun = "finding" if more_count == 1 else "findings"
-        page.write(f"{more_count} more {noun}{place}.")
+
+
+def closing(results: Any) -> Page:
+    """Make the lines below the written files: where to read more."""
+    page = Page()
+    page.add("closing", card=results.card)
     return page
+
+
+def facts(comparison: Comparison) -> dict[str, str]:
+    """Return filter settings, position source and segment as texts by label."""
+    source, segment = comparison.source, comparison.segment
+    position = (
+        f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, "
+        f"{source.frame}; {comparison.source_reason}"
+    )
+    alignment_text = ""
+    if source.alignment is not None:
+        alignment = source.alignment
+        sigma = alignment.clock_offset_sigma_s
+        alignment_text = (
+            f"{alignment.frame}, yaw {alignment.yaw_deg:.1f}°, clock "
+            f"{alignment.clock_offset_s:+.3f}{'' if sigma is None else f' ± {sigma:.3f}'} s"
+        )
+    texts = {
+        "Filter": format_settings(comparison.settings),
+        "Position": position,
+        "Aligned": alignment_text,
+        "Segment": f"{segment.start_s:.2f} s to {segment.end_s:.2f} s, {segment.reason}",
+    }
+    return {label: text for label, text in texts.items() if text}

@@ -80,7 +80,7 @@ def types_of(kind: Any) -> tuple[Any, ...]:
 
 
 def _check_value(value: Any, kind: Any, path: str, reasons: list[str]) -> Any:
-    """Remove numbers outside their bounds from a value; raise an error if it is such a number."""
+    """Remove numbers outside their bounds from a record; raise an error for a number."""
     if isinstance(value, float):
         low, high = bounds_of(path.rpartition(".")[2])
         if not math.isfinite(value):

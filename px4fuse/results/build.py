@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis, WhatIfAnalysis
-from px4fuse.card.build import build_card
+from px4fuse.card.build import build_aids_card, build_card
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
@@ -68,14 +68,18 @@ def results(
 def outcome_results(
     request: ComparisonRequest, outcome: Analysis | AidsOnlyAnalysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults | contract.AidsResults:
-    """Return the results of ``px4fuse compare``: the comparison, or EKF2's aids only."""
+    """Return the results of ``px4fuse compare``; only EKF2's aids without position source."""
     if isinstance(outcome, Analysis):
         return results(request, outcome, student)
+    findings = find_aids(outcome.aids)
     return within_bounds(
         contract.AidsResults(
             **_common_fields(contract.AIDS, request, outcome.flight),
             aids=dict(outcome.aids),
-            findings=find_aids(outcome.aids),
+            card=build_aids_card(
+                outcome, findings, request.without_paths(), (student.name, student.id)
+            ),
+            findings=findings,
             missing=(outcome.missing_data, *outcome.flight.missing),
             student=student,
         )

@@ -13,8 +13,9 @@ import msgspec
 from msgspec import Meta
 
 from px4fuse.card.model import Card
-from px4fuse.comparison.causal_replays import Intervention, Trial
+from px4fuse.comparison.causal_replays import Intervention
 from px4fuse.comparison.model import AxisResult, FilterName
+from px4fuse.comparison.trials import Trial
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Agreement, Replayed
 from px4fuse.ekf2.steps import DifferenceSteps
@@ -235,6 +236,7 @@ class AidsResults(Record, frozen=True):
     request: ComparisonRequest
     log: Log
     aids: Annotated[dict[str, AidResult], Meta(min_length=1)]
+    card: Card
     findings: tuple[Finding, ...]
     missing: tuple[Unavailable, ...]
     student: Student

@@ -61,10 +61,10 @@ from px4fuse.trajectory.rotation import (
 PREDICTION_STEP_US = 10_000  # µs, EKF2_PREDICT_US
 # gauss; initial σ of each axis of earth field and magnetometer bias, after alignment on the ground
 FIELD_SIGMA_GAUSS = 0.03
-# Rules of external vision, v1.14 to main: EV_MAX_INTERVAL (ev_control.cpp), reset_timeout_max
-# (common.h)
+# Rules by which EKF2 starts, stops and resets fusion of external vision, v1.14 to main:
+# EV_MAX_INTERVAL (ev_control.cpp), reset_timeout_max (common.h)
 VISION_RULES = FusionRules(0.2, 0.4, 1.0, 5, None, horizon_by_delay=False)
-# Rules of GNSS, v1.16: gps_control.cpp, and no_aid_timeout_max (common.h)
+# The same rules for GNSS, v1.16: gps_control.cpp, and no_aid_timeout_max (common.h)
 GNSS_RULES = FusionRules(
     np.inf, np.inf, 7.0, UNLIMITED_RESETS, None, False, reset_scale=2.0, with_velocity=True
 )
@@ -78,7 +78,7 @@ REST_S = 10.0
 REST_SIGMA = np.repeat([0.05, 0.0005, 0.06], 3)
 # rad and m; σ of heading and height as logged by v1.16 in flight
 HEADING_SIGMA_RAD, HEIGHT_SIGMA_M = 0.03, 0.15
-# s; longest interval between two times at which the model provides variances for estimator_states
+# maximum interval (s) between times at which the model computes variances for estimator_states
 MAX_EVENT_INTERVAL_S = 0.1
 
 
@@ -148,7 +148,7 @@ def simulate_ekf2(
         settings=settings,
         segments=(segment,),
         received=_received_positions(source),
-        # ev_pos_control.cpp: without bit 0 samples are evaluated but not fused
+        # ev_pos_control.cpp: samples are evaluated but not fused without bit 0 of EKF2_EV_CTRL
         rules=rules
         if int(log_parameters[aid.switch]) & 1
         else replace(rules, start_interval_s=0.0),
@@ -226,7 +226,7 @@ def _make_segment(
 
 
 def _with_field(segment: ReplaySegment, magnetometer: Topic) -> ReplaySegment:
-    """Add earth field and magnetometer bias to the states, as aligned on the ground."""
+    """Add earth field and magnetometer bias, as EKF2 aligns them on the ground, to the states."""
     measured_at_s = sensors.time_s(magnetometer) - 0.5 * float(np.median(segment.step_s))
     gauss = magnetometer.fields["magnetometer_ga"].astype(np.float64)
     fields = np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)])

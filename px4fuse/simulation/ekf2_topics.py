@@ -26,7 +26,7 @@ PUBLICATION_DELAY_US = 100
 
 @dataclass(frozen=True)
 class TopicTrack:
-    """Results of the model at the start and at the end of each of n steps, shape (n + 1, ...).
+    """Results of the EKF2 model at start and end of each of n prediction steps, shape (n + 1, ...).
 
     Attributes
     ----------
@@ -155,7 +155,8 @@ def _aid_sources(
         values[event_rows, 0, POSITION_COLUMNS] for values in innovation_arrays
     )
     is_not_fused = np.isnan(innovation[:, :1])
-    # the model computes no innovation for samples that it does not evaluate; EKF2 logs one
+    # EKF2 logs an innovation also for samples that it does not evaluate, but the model computes
+    # none
     innovation = np.where(
         is_not_fused, measured_m - track.delayed_states[rows][:, POSITION][:, :2], innovation
     )

@@ -19,10 +19,11 @@ class Mistakes:
 
     :data:`MISTAKES` explains each. Outliers occur in bursts; all outliers of a burst have the same
     horizontal direction, and ``nlos_size_m`` is their mean size. Default times: gaps in the middle
-    of the flight, jumps at two thirds, heading errors from the start. A rate of 0 means unchanged,
-    an EKF2 noise of 0 as reported by the source, and an EKF2 delay of None correct. ``r_scale``
-    multiplies the reported variance. ``yaw_deg`` rotates the positions about the start, clockwise
-    seen from above. ``vibration_m_s2`` is the standard deviation of the mean over 0.1 s.
+    of the flight, jumps at two thirds, heading errors from the start. A rate of 0 means no
+    change, an EKF2 noise of 0 the σ that the source reports, and an EKF2 delay of None the correct
+    delay. ``r_scale`` multiplies the reported variance. ``yaw_deg`` rotates the positions about the
+    start, clockwise seen from above. ``vibration_m_s2`` is the standard deviation of the mean over
+    0.1 s.
     """
 
     clock_offset_s: float = bounded_number(0.0, -5.0, 5.0, "s", "SECONDS")

@@ -328,7 +328,7 @@ class _Plan:
         self.yaw = [(-1.0, 1.0, np.radians([heading_deg]))]
 
     def add_velocity_change(self, velocity: Array, length_s: float, until_next_s: float) -> None:
-        """Add a ramp about the current centre, then move the centre by ``until_next_s``."""
+        """Add a ramp centred at ``centre_s``, then increase ``centre_s`` by ``until_next_s``."""
         self.path.append((self.centre_s - length_s / 2.0, length_s, velocity))
         self.centre_s += until_next_s
 

@@ -33,7 +33,7 @@ TIMESYNC_CONVERGED_S = 50.0
 MEAN_BURST_LENGTH = 3  # mean number of samples per outlier burst
 # Origin of the local frame outdoors: latitude, longitude (degrees) and altitude (m)
 HOME = (47.397742, 8.545594, 488.0)
-# age (s) of a GNSS fix at its timestamp; noise relative to the scenario, north, east and down
+# age (s) of a GNSS fix at its timestamp; noise north, east and down over that of the scenario
 FIX_AGE_S = 1e-3 * PARAMETERS[GNSS_POS.delay].default
 GNSS_SIGMA_FACTORS = np.array([1.0, 1.0, 1.5])
 # magnetic field (gauss, NED) at HOME; noise of magnetometer (gauss) and barometer (m)
@@ -358,7 +358,7 @@ def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
 def outliers(
     scenario: Scenario, mistakes: Mistakes, is_airborne: BoolArray
 ) -> tuple[Array, BoolArray]:
-    """Return the offset of each sample, shape (n, 3), which is 0 except for outliers; and a mask.
+    """Return the offset of each sample, shape (n, 3), 0 except for outliers; and the outlier mask.
 
     Outliers occur in bursts while airborne, as if an anchor had no line of sight. A burst has one
     horizontal direction; the sizes are 0.5 to 1.5 times ``nlos_size_m``.

@@ -13,7 +13,7 @@ BAD_VALUES = (
     TypeError,
     ValueError,
 )
-# status of the numbers; PageStatus: separate result of the comparison of pages
+# results of the comparison of numbers (Status) and of the comparison of pages (PageStatus)
 Status = Literal["verified", "numbers differ", "other log", "cannot verify"]
 PageStatus = Literal["same", "differ", "not compared"]
 
@@ -66,11 +66,12 @@ class Verdict:
     Attributes
     ----------
     status : Status
-        Result for the numbers. "cannot verify" also if the numbers agree, but the structure of the
-        PDF differs from that of the redrawn one, or the pages differ and the report names other
-        library versions.
+        Result of the comparison of numbers. If the numbers agree, it is still "cannot verify" in
+        two cases: the structure of the PDF differs from that of the redrawn report, or pages differ
+        and the report was made with other library versions.
     reasons : tuple of str
-        Sentences: differences, reason for "cannot verify", or for "verified" the checks.
+        Sentences: the differences, the reason for "cannot verify", or the checks of a verified
+        report.
     with_log : bool
         True if the analysis was repeated on the log.
     page_status : {"same", "differ", "not compared"}
@@ -82,7 +83,7 @@ class Verdict:
     remedy : str
         Action if the report was not verified: one sentence.
     missing : str
-        Name of the missing log or other file.
+        Name of the log or other input file that is missing; else empty.
     """
 
     status: Status

@@ -1,7 +1,7 @@
 """Comparison of a handed-in PDF with the report that px4fuse draws again from the log.
 
 Starting from each page, the document information and the catalogue, all objects of both files are
-compared in parallel. They have to be equal in keys, names, numbers, texts and decoded streams:
+compared pairwise. They have to be equal in keys, names, numbers, texts and decoded streams:
 content, fonts with widths, encodings and ToUnicode, bookmarks, structure tree, metadata. Anything
 that px4fuse does not write is a difference, so no list of possible forgeries is needed.
 
@@ -45,13 +45,14 @@ from px4fuse.verification.pdf_input import (
 )
 from px4fuse.workers import JobFailure, run_one_bounded
 
-# pt. Results of different OpenBLAS kernels move points by at most 0.07 pt; 0.25 pt is not visible
+# maximum difference of coordinates (pt): different OpenBLAS kernels move points by at most 0.07 pt,
+# and 0.25 pt is not visible
 COORDINATE_TOLERANCE_PT = 0.25
-# relative and absolute tolerance of other numbers: programs that save a PDF write 32-bit floats
+# relative and absolute tolerance of other numbers, because other programs save 32-bit floats
 NUMBER_TOLERANCE = 1e-5
-# 1/1000 em; largest letter distance of a text that is compared up to rounding
+# maximum letter distance (1/1000 em) of a text in which a number may differ by rounding
 MAX_KERNING = 200.0
-# length of submitted over redrawn content; a byte of a string may be written as four bytes
+# maximum length of submitted over redrawn content: a byte of a string may be written as four bytes
 MAX_LENGTH_RATIO = 4
 # limits of one comparison, which needs 3 s and 0.3 GB for the largest report
 TIMEOUT_S, MEMORY_BYTES = 12.0, 1_000_000_000
@@ -157,7 +158,7 @@ def _compare_pdfs(job: tuple[bytes, bytes, TextComparison]) -> tuple[PageDiffere
 
 @dataclass
 class _Walk:
-    """Parallel comparison of all objects of two PDFs.
+    """Pairwise comparison of all objects of two PDFs.
 
     Attributes
     ----------
@@ -340,7 +341,7 @@ def _ambiguities(pdf: bytes) -> Iterator[str]:
     if end is None:
         yield "bytes after its end"
     elif b"/Linearized" in pdf[:1024]:
-        # the end must refer to the first table in the file
+        # the end of the file must refer to the first cross-reference table
         begin = pdf.find(b"endobj") + len(b"endobj")
         if pdf[begin : int(end[1])].strip():
             yield "a second table of objects"

@@ -4,8 +4,9 @@ Nothing in the file is executed, no link is followed, and nothing is written to 
 checks sizes before pypdf reads the file, and sets the limits of pypdf. :mod:`px4fuse.workers`
 limits time and memory.
 
-Only the attached results are read. The pages are counted, because the report is drawn again. A file
-that another program saved again is therefore accepted if the results are still attached.
+Only the attached results are read. The pages are counted but not read, because px4fuse draws the
+report again. A file that another program saved again is therefore accepted if the results are still
+attached.
 """
 
 import io
@@ -28,12 +29,12 @@ from px4fuse.verification.model import BAD_VALUES
 
 MAX_BYTES = 25_000_000
 MAX_PAGES = 100
-# bytes of one inflated stream, and of all inflated streams
+# maximum bytes of one inflated stream, and of all inflated streams
 MAX_CONTENT_BYTES = 20_000_000
 MAX_DOCUMENT_BYTES = 100_000_000
 MAX_OBJECTS = 20_000
 MAX_VALUES = 1_000_000
-# references to missing objects; for each of them pypdf would search the whole file
+# maximum number of references to missing objects; pypdf would search the whole file for each
 MAX_MISSING_OBJECTS = 100
 
 _DAMAGED_REASON = "the PDF is damaged. Hand in the file that px4fuse wrote."
@@ -164,9 +165,9 @@ def _check_file(pdf: bytes) -> None:
 
 
 def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
-    """Return the larger of input and output bytes of the zlib data at ``start``, up to limit + 1.
+    """Return the bytes of the zlib data at ``start``, compressed or inflated, whichever is more.
 
-    0 for other data; at least 1000 for zlib data.
+    The result is at least 1000 and at most ``limit`` + 1; it is 0 for data that are not zlib data.
     """
     header = pdf[start : start + 2]
     if len(header) < 2 or header[0] & 15 != zlib.DEFLATED or int.from_bytes(header) % 31:

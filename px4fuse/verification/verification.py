@@ -39,7 +39,7 @@ from px4fuse.verification.pages import TextComparison, compare_pages
 ADD_LOGS_ADVICE = "Add {} to --logs."
 ASK_ADVICE = "Ask how the report was made, and for its log and all other input files."
 FOREIGN_REQUEST_REASON = "the recorded command was not written by px4fuse"
-# s; ten minutes of flight have 60,000 such steps, which take half a minute
+# minimum DT (s) of a report: ten minutes of flight then have 60,000 steps, which take half a minute
 MIN_DT_S = 0.01
 ORIGINAL_PDF_ADVICE = "Ask for the PDF that px4fuse wrote."
 LIMIT_NOTE = (
@@ -47,11 +47,11 @@ LIMIT_NOTE = (
 )
 NO_LOG_REASON = "no log was given, so the analysis could not be repeated"
 # Tolerance for another processor. Sums over a flight differ in the last few of 16 digits, and
-# differences of such sums in the last 8. Four OpenBLAS kernels differ by at most 3e-8 (six flights)
+# differences of sums in the last 8. Four OpenBLAS kernels differ by at most 3e-8 (six flights)
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-6, 1e-9
-# Tolerance of estimates. Minima are flat: if a likelihood or cost differs in its 12th digit, its
-# minimum differs in the 6th, and the ends of its interval in the 4th digit. Pages print up to three
-# digits
+# Tolerance of estimates at a minimum of a likelihood or cost. Minima are flat: if a likelihood or
+# cost differs in its 12th digit, its minimum differs in the 6th, and the ends of its interval in
+# the 4th digit. Pages print up to three digits
 ESTIMATE_RELATIVE_TOLERANCE, ESTIMATE_ABSOLUTE_TOLERANCE = 1e-3, 1e-5
 ESTIMATE_PATHS = (
     "tuning",
@@ -71,9 +71,9 @@ MACHINE_PATHS = ("provenance.python", "provenance.libraries")
 MAX_DIFFERENCES = 20
 MAX_LISTED_PAGES = 5
 MAX_TEXT_LENGTH = 120
-# factors of printed numbers: 1, per cent, thousandths
+# factors between a result and the printed number: 1, per cent, thousandths
 PRINTED_SCALES = (1.0, 100.0, 1000.0)
-# lines of notes above which a report is not drawn again; a page has about 60 lines
+# maximum lines of a student's notes in a report that is drawn again; a page has about 60 lines
 MAX_NOTES_LINES = 5_000
 _NUMBER = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
@@ -311,7 +311,7 @@ def _verify_with_log(
         [*page_sentences, *reasons] if status == "cannot verify" else [*reasons, *page_sentences]
     )
     remedy = ORIGINAL_PDF_ADVICE if is_foreign else ""
-    if others:  # they may draw in another way
+    if others:  # other libraries may draw differently
         versions = one_line(", ".join(map(" ".join, others)), 300)
         reasons.append(f"made with {versions}; here are other versions")
         remedy = remedy or f"Verify it with {versions}."
@@ -361,7 +361,7 @@ def compare_results(
         Values that differ by more than the tolerances.
     is_same_number : Rounding
     compared : int
-        Number of values.
+        Number of compared values.
     """
     command = str(recomputed["provenance"]["command"])
     # with these options all numbers depend on an estimated time offset or alignment

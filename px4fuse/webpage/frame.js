@@ -1,7 +1,7 @@
 "use strict";
 (() => {
   const byId = (id) => document.getElementById(id);
-  const { columns, rows, size, nouns } = JSON.parse(byId("content").textContent);
+  const { columns, rows, size, nouns, axis } = JSON.parse(byId("content").textContent);
   const collator = new Intl.Collator(undefined, { numeric: true, sensitivity: "base" });
   const fold = (text) => text.normalize("NFD").replace(/\p{M}/gu, "").toLowerCase();
   const frame = document.querySelector(".frame");
@@ -159,15 +159,31 @@
     return made;
   };
 
+  /* Ratio on a logarithmic axis with its band; a triangle stands for a ratio beyond the ends */
+  const ratioMark = (ratio, against) => {
+    const [low, high] = axis.ends.map(Math.log), width = 70;
+    const at = (value) => (Math.log(value) - low) / (high - low), place = at(ratio);
+    const band = axis.bands[against].map((end) => width * at(end));
+    const made = makeSvg("svg", { width: width + 14, height: 20, viewBox: `-7 -10 ${width + 14} 20`, "aria-hidden": "true" });
+    const path = makeSvg("path", { d: axis.marks[place < 0 ? "below" : place > 1 ? "above" : against],
+      transform: `translate(${width * Math.min(Math.max(place, 0), 1)} 0)` });
+    made.append(makeSvg("rect", { x: band[0], y: -8, width: band[1] - band[0], height: 16, class: "band" }),
+      makeSvg("line", { x1: 0, x2: width, y1: 0, y2: 0, class: "track" }), path);
+    return made;
+  };
+
+  const nameColumn = Math.max(columns.findIndex(([, kind]) => kind === "name"), 0);
   const classes = (kind, visibleFrom, group) =>
-    [{ number: "n", line: "line" }[kind], visibleFrom, group && "g-" + group].filter(Boolean);
-  const cell = ([text = "", , below = "", style = "", share = ""], column) => {
+    [{ number: "n", line: "line", full: "full", ratio: "ratio" }[kind], visibleFrom, group && "g-" + group].filter(Boolean);
+  const cell = ([text = "", cellValue = "", below = "", style = "", share = ""], column) => {
     const [, kind, group, visibleFrom] = columns[column];
-    const made = make(column ? "td" : "th", "",
-      [...classes(kind, visibleFrom, group), style === "flags" ? style : ""].join(" "));
-    if (style === "flags") {
+    const made = make(column === nameColumn ? "th" : "td", "",
+      [...classes(kind, visibleFrom, group), style === "flags" || ["ratio", "full"].includes(kind) ? style : ""].join(" "));
+    if (kind === "ratio") {
+      if (text) made.append(ratioMark(Number(cellValue), style.split(" ")[1]), make("span", text));
+    } else if (style === "flags") {
       made.append(list(text ? text.split("\n") : [], false));
-    } else if (style) made.append(make("span", text, "chip " + style));
+    } else if (style && kind !== "full") made.append(make("span", text, "chip " + style));
     else if (text) made.append(makeIsolated("span", text));
     if (share !== "") made.append(bar(share));
     if (below) made.append(makeIsolated("span", below, "file"));
@@ -195,7 +211,7 @@
     const row = make("tr");
     row.dataset.row = entry.index;
     row.append(...entry.cells.map(cell));
-    const head = row.cells[0];
+    const head = row.cells[nameColumn];
     head.scope = "row";
     const name = head.firstChild;
     name.className = "name";
@@ -251,7 +267,7 @@
     const up = heads[column].getAttribute("aria-sort") !== "ascending";
     for (const head of heads) head.setAttribute("aria-sort", "none");
     heads[column].setAttribute("aria-sort", up ? "ascending" : "descending");
-    const numeric = ["number", "rank"].includes(columns[column][1]);
+    const numeric = ["number", "rank", "ratio"].includes(columns[column][1]);
     const sign = up ? 1 : -1;
     order = order.slice().sort((one, other) => {
       const a = one.values[column];

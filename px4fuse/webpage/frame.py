@@ -5,7 +5,7 @@ scripts the page shows its first rows as a plain table.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -21,8 +21,10 @@ class Column:
 
     Attributes
     ----------
-    kind : {"text", "line", "number", "rank"}
-        Sort order; "line" is text without line breaks, "rank" is text sorted by a number.
+    kind : {"text", "name", "full", "line", "number", "rank", "ratio"}
+        Sort order; "name" is the text that unfolds the row (default: the first column), "full" is
+        text that is never cut, "line" is text without line breaks, "rank" is text sorted by a
+        number, and "ratio" is a number on the axis of the page.
     group : str
         Group whose check box shows the column; "": the column is always shown.
     visible_from : {"always", "tablet", "desk"}
@@ -30,7 +32,7 @@ class Column:
     """
 
     title: str
-    kind: Literal["text", "line", "number", "rank"] = "text"
+    kind: Literal["text", "name", "full", "line", "number", "rank", "ratio"] = "text"
     group: str = ""
     visible_from: Literal["always", "tablet", "desk"] = "always"
 
@@ -84,7 +86,7 @@ class Row:
     tags : tuple of str
         Values that the filters select.
     details, side_sections : tuple of Section
-        Left and right column of the unfolded row, made by :func:`list_part` and the other
+        Left and right column of the unfolded row, made by :func:`list_section` and the other
         functions below; empty sections are omitted.
     """
 
@@ -161,6 +163,7 @@ def page(
     groups: Sequence[tuple[str, str]] = (),
     placeholder: str,
     full_table_note: str,
+    ratio_axis: Mapping[str, Any] | None = None,
 ) -> str:
     """Make the page.
 
@@ -178,13 +181,16 @@ def page(
         Hint in the search field.
     full_table_note : str
         Sentence for readers without scripts: the file with all rows.
+    ratio_axis : mapping, optional
+        Axis of columns with ratios: ``ends``, ``bands`` and ``marks`` (SVG paths) by the second
+        word of a cell's style class.
 
     Returns
     -------
     str
         HTML, identical for the same input; write it as UTF-8.
     """
-    style = read_asset("base.css") + read_asset("frame.css")
+    style = "".join(map(read_asset, ("colours.css", "base.css", "frame.css")))
     script = read_asset("frame.js")
     content = {
         "columns": [(c.title, c.kind, c.group, c.visible_from) for c in columns],
@@ -201,6 +207,7 @@ def page(
         ],
         "size": MAX_PAGE_ROWS,
         "nouns": noun,
+        "axis": ratio_axis or {},
     }
     return load_template("webpage/frame.html").render(
         style_hash=policy_hash(style),

@@ -81,7 +81,7 @@ SCENARIOS: Mapping[str, Flown] = MappingProxyType({
     "0.30 m": Flown("--sigma-uwb 0.3", Settings(0.27, 0.30)),
     "hover": Flown("--passes 2 --pause 30", Settings(0.27, 0.10)),
     "yaw follows": Flown("--yaw follow", Settings(0.27, 0.10)),
-    "loop, VIO": Flown("--kind loop", Settings(0.27, 0.01), ("error_exceeds_reported_sigma",)),
+    "loop, VIO": Flown("--kind loop", Settings(0.27, 0.01), ("source_drift",)),
     # faster, so an attitude error has a larger effect
     "outdoors, GNSS": Flown("--kind outdoor", Settings(0.35, 0.40)),
 })  # fmt: skip

@@ -7,6 +7,15 @@ each log, so a part of the logs is a fair sample of all. Each log is the input o
 results of compare, commands, commands with an error of one line, and faults: exceptions, warnings,
 limits exceeded (:data:`SLOW_S`, :data:`LARGEST_BYTES`) and impossible statements
 (:func:`impossible`). A fault is printed with the number that reproduces it (``--first``).
+
+The last run (seed 1, ``--commands 1 --first 50``) was stopped after 501 of 5,000 logs::
+
+    change       logs   read  compared  commands  one line  exceptions  warnings  limits  statements
+    ULog          398    398       393       796       117           0         1       0           0
+    tlog          103    103        71       206        88           0         0       0           0
+
+The warning (a replay without a logged state in its time) is now an error of one line. Two texts
+"Findings: None." were counted as statements, which :func:`impossible_text` no longer does.
 """
 
 from __future__ import annotations
@@ -55,7 +64,7 @@ from px4fuse.ekf2_parameters import RANGES  # noqa: E402
 from px4fuse.errors import Px4FuseError  # noqa: E402
 from px4fuse.readers import mavlink, read_log, ulog  # noqa: E402
 from px4fuse.report import pdf  # noqa: E402
-from px4fuse.results.bounds import LARGEST_RATIO, LONGEST_M  # noqa: E402
+from px4fuse.results.bounds import MAX_LENGTH_M, MAX_RATIO  # noqa: E402
 from px4fuse.simulation.ulog_writer import Topic  # noqa: E402
 
 REPOSITORY = TESTS.parent
@@ -425,7 +434,7 @@ def impossible(value: Any, path: str = "") -> Iterator[str]:
     elif isinstance(value, list):
         for part in value:
             yield from impossible(part, path)
-    elif isinstance(value, str):
+    elif isinstance(value, str) and not path.endswith("sha256"):
         yield from (f"{path}: {description}" for description in impossible_text(value))
     elif isinstance(value, float | int) and not isinstance(value, bool):
         name = path.rpartition(".")[2]
@@ -441,16 +450,21 @@ def impossible(value: Any, path: str = "") -> Iterator[str]:
             and not -1e-9 <= value <= 1.0 + 1e-9
         ):
             yield f"{path} {value} is no share"
-        elif name.endswith("_m") and abs(value) > LONGEST_M:
+        elif name.endswith("_m") and abs(value) > MAX_LENGTH_M:
             yield f"{path} {value} is no length"
-        elif ("ratio" in name or "nis" in name or "factor" in name) and abs(value) > LARGEST_RATIO:
+        elif ("ratio" in name or "nis" in name or "factor" in name) and abs(value) > MAX_RATIO:
             yield f"{path} {value} is no ratio"
 
 
 def impossible_text(text: str) -> Iterator[str]:
-    """Yield a description of each NaN, None or impossible percentage in a text."""
-    for found in re.finditer(r"(?<![\w-])(nan|[+-]?inf|NaN|None|NaT)(?![\w-])", text):
+    """Yield a description of each NaN, None, huge number or impossible percentage in a text."""
+    for found in re.finditer(r"(?<![\w-])(nan|[+-]?inf|NaN|None(?!\.)|NaT)(?![\w-])", text):
         yield f"says {found[0]}: {text[max(found.start() - 60, 0) : found.end() + 20]!r}"
+    for line in text.splitlines():
+        # a value that is reported as outside its range is no statement about the flight
+        large = re.search(r"(?<![\w.])[-−]?\d[\d.,]*e\+?\d{2,}|(?<![\w.])[-−]?\d[\d,]{19,}", line)
+        if large and not re.search("range|allowed|outside|finite|between|limit|SHA-256", line):
+            yield f"says {large[0]}: {line[max(large.start() - 60, 0) : large.end() + 20]!r}"
     for found in re.finditer(r"(?<![\d.,])([-−]?\d[\d.]*(?:e[+-]?\d+)?) ?%", text):
         if "mean square" in text[max(found.start() - 60, 0) : found.end() + 20]:
             continue  # contributions to a difference have both signs

@@ -5,6 +5,11 @@ flights, ends it by a signal at a random time, and starts it again, until a run 
 of the signals go to the command, half to its workers too, as from a job scheduler. The output must
 then be identical to that of an uninterrupted run, file by file. Prints signals, resumed outputs and
 differences; a difference, or another exit code than that of the signal, ends with exit code 1.
+
+The last run (100 signals, seed 1)::
+
+    batch (21 s): {'SIGTERM': 24, 'SIGKILL': 26, 'resumed': 5}, 0 differences
+    grade (39 s): {'SIGKILL': 23, 'SIGTERM': 27, 'resumed': 7}, 0 differences
 """
 
 from __future__ import annotations
@@ -102,7 +107,10 @@ def main() -> None:
                 shutil.rmtree(place / "out")
                 if not missing:
                     break
-            print(f"{command} ({lasts_s:.0f} s): {dict(counts)}, {differences} differences")
+            print(
+                f"{command} ({lasts_s:.0f} s): {dict(counts)}, {differences} differences",
+                flush=True,
+            )
     sys.exit(differences > 0)
 
 

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -39,7 +38,6 @@ from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
-from px4fuse.findings.summary import summarise
 from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 
@@ -202,9 +200,7 @@ def told(job: tuple[str, str, float, int], *, truth: bool = True) -> tuple[str, 
     if not truth:
         flight = replace(flight, truth=Unavailable("truth", "left out", "Not in this study."))
     analysis = explain(compare(flight, Settings(0.27, sigma_z_m), axes=("north", "east")))
-    told = summarise(analysis, find(analysis))[0].partition(", since ")[2]
-    since = (f"since: {re.sub(r'[-+0-9.]+', '#', told.partition(' (')[0])}",) if told else ()
-    return name, since + tuple(
+    return name, tuple(
         f"{one.id}{'!' if one.severity == 'error' else ''}"
         for one in find(analysis)
         if one.severity != "note" and one.caused_by is None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
@@ -12,7 +14,8 @@ from px4fuse.trajectory.graph.model import PoseGraph
 # relax and panel_size of scipy's SuperLU: with values above the defaults (10 and 20) SuperLU writes
 # outside its workspace (scipy 1.17, shown by valgrind); relax 1 gives the least fill-in
 _RELAX, _PANEL = 1, 4
-Matrix = sparse.csc_array[np.float64]
+if TYPE_CHECKING:  # scipy before 1.16 has no generic arrays
+    Matrix = sparse.csc_array[np.float64]
 
 
 def normal_equations(

@@ -1,0 +1,230 @@
+"""Diagnosis card as HTML, for the web pages and notebooks.
+
+The axis of ratios is drawn with positions in percent, so it fits any width and needs no style
+attributes, which the security policy of the pages forbids.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from markupsafe import Markup
+
+from px4fuse.analysis import Analysis
+from px4fuse.card.build import build_card, describe_axis
+from px4fuse.card.model import AXIS_TICKS, BANDS, Action, Card, Cause, Rerun, Verdict
+from px4fuse.card.numbers import axis_fraction, format_ratio
+from px4fuse.card.verdicts import verdicts
+from px4fuse.errors import SettingsError
+from px4fuse.filter.consistency import Reference
+from px4fuse.findings import find
+from px4fuse.report.card_text import (
+    FILTER_NAMES,
+    LABELLED_TICKS,
+    MARKS,
+    QUANTITIES,
+    format_spans,
+    format_target,
+    rerun_columns,
+    rerun_start,
+    with_typed_path,
+)
+from px4fuse.webpage.safe import load_template, read_asset
+
+SIGNS = {
+    "error": "■ ERROR",
+    "warning": "▲ WARNING",
+    "note": "● NOTE",
+    "clean": "✓ NO FAULT",
+    "refused": "✕ REFUSED",
+}
+# SVG paths around the position of a ratio; triangles for ratios beyond the ends of the axis
+MARK_PATHS = {
+    "source": "M-5.5 0a5.5 5.5 0 1 0 11 0a5.5 5.5 0 1 0-11 0",
+    "truth": "M-6.5 0L0-6.5L6.5 0L0 6.5z",
+    "below": "M5-7L-7 0L5 7z",
+    "above": "M-5-7L7 0L-5 7z",
+}
+SPOKEN_QUANTITIES = {"source": "innovation over root S", "truth": "error over sigma"}
+HALF_HEIGHT = 5  # pixels; of the end ticks of an interval
+
+
+def card_of(analysis: Analysis) -> Card:
+    """Return the card of an analysis that has a request, with the path of the log as typed."""
+    if analysis.request is None:
+        raise SettingsError(
+            "This analysis contains no request, so its command is unknown.",
+            "Create it with px4fuse.compare.",
+        )
+    card = build_card(analysis, find(analysis), analysis.request)
+    return with_typed_path(card, analysis.request.log)
+
+
+def card_html(
+    card: Card,
+    *,
+    is_open: bool = False,
+    has_apply: bool = False,
+) -> str:
+    """Return the card as an HTML element; :func:`card_style` has its style.
+
+    Parameters
+    ----------
+    card : Card
+    is_open : bool
+        True to show causes and notes without a click.
+    has_apply : bool
+        True to add a button to each command of KF; a script has to handle ``data-apply``.
+    """
+    return load_template("report/card.html").render(
+        card=card,
+        open=is_open,
+        apply=has_apply,
+        figure=axis_html(card.verdicts, card.effect.axis)
+        if card.verdicts and card.effect is not None
+        else "",
+        more=" and ".join(
+            text for text, parts in (("causes", card.causes), ("notes", card.notes)) if parts
+        ).capitalize(),
+        first_actions=[row for row in _rows(card.causes[0]) if _is_prominent(row)]
+        if card.causes
+        else [],
+        rows_of=lambda cause: [
+            row for row in _rows(cause) if cause is not card.causes[0] or not _is_prominent(row)
+        ],
+        rerun_rows=_rerun_rows,
+        signs=SIGNS,
+        target=format_target,
+        format_spans=format_spans,
+        rerun_start=rerun_start,
+    )
+
+
+def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
+    """Return the verdicts on their logarithmic axis as an HTML figure.
+
+    Parameters
+    ----------
+    all_verdicts : sequence of Verdict
+    axis : str
+        Direction of the errors with its reference.
+    name : str
+        Name of the axis, for the scripts of pages with several axes.
+    """
+    return load_template("report/card_axis.html").render(
+        verdicts=all_verdicts,
+        axis=axis,
+        name=name,
+        drawn=[_drawing(verdict) for verdict in all_verdicts],
+        alternative=alternative_text(all_verdicts),
+        ticks=[
+            (_percent(tick), label, tick not in LABELLED_TICKS)
+            for tick, label in AXIS_TICKS.items()
+        ],
+        limits=band_limits(),
+        names=FILTER_NAMES,
+        marks=MARKS,
+        quantities=QUANTITIES,
+        format_ratio=format_ratio,
+        is_loud=is_loud,
+    )
+
+
+def axis_figures(analysis: Analysis) -> str:
+    """Return a figure of the verdicts for each analysed axis."""
+    return "".join(
+        axis_html(verdicts(result), describe_axis(analysis, result), name)
+        for name, result in analysis.axes.items()
+    )
+
+
+def band_limits() -> str:
+    """Format the limits of both bands.
+
+    >>> band_limits()
+    '● 0.8 to 1.25, ◆ 0.67 to 1.5'
+    """
+    return ", ".join(f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in BANDS.items())
+
+
+def card_style() -> str:
+    """Return the style of the card; its colours are in ``webpage/colours.css``."""
+    return read_asset("card.css", "px4fuse.report")
+
+
+def notebook_html(card: Card) -> str:
+    """Return the card with its style and colours, for a notebook."""
+    colours = read_asset("colours.css").replace(":root", ".px4fuse-card")
+    return f"<style>{colours}{card_style()}</style>{card_html(card, is_open=True)}"
+
+
+def alternative_text(verdicts: Sequence[Verdict]) -> str:
+    """Describe the axis for screen readers.
+
+    >>> alternative_text([Verdict(filter="kf", against="truth", ratio=7.2, word="overconfident")])
+    'KF, error over sigma: 7.2, overconfident.'
+    """
+    return " ".join(
+        f"{FILTER_NAMES[verdict.filter]}, {SPOKEN_QUANTITIES[verdict.against]}: "
+        + (f"not evaluated, {verdict.reason}." if verdict.ratio is None else f"{_value(verdict)}.")
+        for verdict in verdicts
+    )
+
+
+def is_loud(verdict: Verdict) -> bool:
+    """Return True if a verdict is not consistent and not explained."""
+    return verdict.word in ("overconfident", "underconfident") and not verdict.is_explained
+
+
+def _value(verdict: Verdict) -> str:
+    explained = ", explained" if verdict.is_explained else ""
+    return f"{format_ratio(verdict.ratio or 0.0)}, {verdict.word}{explained}"
+
+
+def _rows(cause: Cause) -> list[tuple[str, Action]]:
+    """Return the actions of a cause, with EITHER and OR before those that exclude each other."""
+    rows = [
+        ("EITHER " if not place else "OR ", action)
+        for place, alternative in enumerate(cause.alternatives)
+        for action in alternative
+    ]
+    return rows + [("", action) for action in cause.actions]
+
+
+def _is_prominent(row: tuple[str, Action]) -> bool:
+    """Return True for commands and alternatives; ``do_this`` contains the other actions."""
+    return bool(row[0] or row[1].commands)
+
+
+def _rerun_rows(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
+    return list(zip(*rerun_columns(reruns), strict=True)) if reruns else []
+
+
+def _percent(ratio: float) -> str:
+    """Return the position of a ratio on the axis, limited to its ends."""
+    return f"{100.0 * min(max(axis_fraction(ratio), 0.0), 1.0):.2f}"
+
+
+def _drawing(verdict: Verdict) -> dict[str, Any]:
+    """Return the SVG attributes of band, interval and mark."""
+    if verdict.ratio is None:
+        return {}
+    low, high = (axis_fraction(end) for end in BANDS[verdict.against])
+    marks = []
+    if verdict.interval is not None:
+        first, last = (_percent(max(end, 1e-9)) for end in verdict.interval)
+        marks.append(f'x1="{first}%" x2="{last}%" y1="10" y2="10"')
+        top, bottom = 10 - HALF_HEIGHT, 10 + HALF_HEIGHT
+        marks += [f'x1="{x}%" x2="{x}%" y1="{top}" y2="{bottom}"' for x in (first, last)]
+    return {
+        "band": Markup(
+            f'x="{100.0 * low:.2f}%" width="{100.0 * (high - low):.2f}%" y="1" height="18"'
+        ),
+        "interval": [Markup(mark) for mark in marks],
+        "mark": Markup(f' x="{_percent(verdict.ratio)}%"'),
+        "path": MARK_PATHS[_shape(verdict.ratio, verdict.against)],
+    }
+
+
+def _shape(ratio: float, against: Reference) -> str:
+    fraction = axis_fraction(ratio)
+    return against if 0.0 <= fraction <= 1.0 else "above" if fraction > 1.0 else "below"

@@ -1,0 +1,66 @@
+"""Typesetting of pages by Typst, which reads the given data and templates only.
+
+The root of Typst is an empty folder, and its fonts are those of :mod:`px4fuse.report.fonts`.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import typst
+
+from px4fuse.report import fonts
+
+# PDF/A-3a (archives) and PDF/UA-1 (screen readers)
+STANDARDS: list[Any] = ["a-3a", "ua-1"]
+TEMPLATES = ("cover.typ", "report.typ")
+
+
+def compile_pdf(report: Mapping[str, Any], template: str | None = None) -> bytes:
+    """Typeset data as PDF, by default with the templates of the report.
+
+    Raises
+    ------
+    typst.TypstError
+        The template has an error or reads a file.
+    """
+    with TemporaryDirectory() as empty:
+        document = _compiler(report, template, empty).compile(format="pdf", pdf_standards=STANDARDS)
+    assert isinstance(document, bytes)
+    return document
+
+
+def measure_free_height(blocks: Any, font_names: Sequence[str]) -> float:
+    """Typeset a cover without panels and return the height (pt) that is left for them.
+
+    Parameters
+    ----------
+    blocks : sequence of Block
+        Blocks as :func:`px4fuse.report.page.to_typst_data` returns them.
+    font_names : sequence of str
+    """
+    report = dict.fromkeys(("title", "author", "head", "student", "foot"), "")
+    data = {**report, "fonts": font_names, "blocks": blocks, "results": None}
+    with TemporaryDirectory() as empty:
+        answer = _compiler(data, None, empty).query("<free>", field="value", one=True)
+    return float(json.loads(answer))
+
+
+def _compiler(report: Mapping[str, Any], template: str | None, empty: str) -> typst.Compiler:
+    if template is None:
+        folder = Path(__file__).parent
+        template = "\n".join((folder / name).read_text(encoding="utf-8") for name in TEMPLATES)
+    return typst.Compiler(
+        input=template.encode(),
+        root=empty,
+        font_paths=typst.Fonts(
+            include_system_fonts=False,
+            include_embedded_fonts=False,
+            font_paths=fonts.font_folders(tuple(report["fonts"])),
+        ),
+        package_path=empty,
+        package_cache_path=empty,
+        sys_inputs={"data": json.dumps(report)},
+    )

@@ -1,0 +1,255 @@
+"""Cover: texts of the card, free height, panels without values that leave unmarked."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from cards import SMALL_SIGMA_A, verdicts
+from flights import Estimator, Uwb, aisle_flight, unexplained, with_noises
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from msgspec.structs import replace
+from page_tools import axes_of, every, pdf_of, set_by_typst, smallest_type
+
+from px4fuse.analysis import Analysis
+from px4fuse.card.model import Action, AidRow, Card, Cause, Note
+from px4fuse.comparison.comparison import compare
+from px4fuse.flight import Reset
+from px4fuse.report import cover, cover_panels
+from px4fuse.report.page import Page
+from px4fuse.report.style import report_style
+from px4fuse.request import ComparisonRequest
+from px4fuse.results.build import results
+
+LIMITS = ((0.0, 10.0), (0.0, 4.0))
+
+
+def page_of(card: Card) -> Page:
+    page = Page()
+    cover.add_card(page, card)
+    return page
+
+
+def text_of(card: Card) -> str:
+    return " ".join(" ".join(set_by_typst(page_of(card))).split())
+
+
+def drawn(analysis: Analysis) -> Page:
+    made = results(ComparisonRequest(log="aisle.ulg"), analysis)
+    with report_style():
+        (page,) = cover.draw(analysis, made)
+    return page
+
+
+def panels_by_title(page: Page) -> dict[str, Axes]:
+    return {block["title"]: block["axes"] for block in every(page.blocks) if "axes" in block}
+
+
+@pytest.fixture(scope="module")
+def eventful() -> Analysis:
+    flight = aisle_flight(
+        duration_s=100.0,
+        uwb=Uwb(gap_s=(60.0, 65.0), outlier_share=0.03),
+        ekf2=Estimator(rejected_fraction=0.1, resets=(Reset(30.0, "position", (1.0, 0.0, 0.0)),)),
+    )
+    return with_noises(compare(flight))
+
+
+def test_cover_of_card_prints_its_texts_and_numbers() -> None:
+    text = text_of(SMALL_SIGMA_A)
+    cause = SMALL_SIGMA_A.causes[0]
+    expected = [
+        "ERROR", SMALL_SIGMA_A.headline, SMALL_SIGMA_A.effect_text, *SMALL_SIGMA_A.do_this,
+        "KF changed: --sigma-a 0.001 (default 0.5)", "128 overconfident", "0.93 consistent",
+        cause.why, *cause.actions[0].commands, "2.11 → 0.060 m", "position and σ", cause.after,
+        "[process_noise_near_zero]", SMALL_SIGMA_A.difference, "note[source_rate_at_limit]",
+        "shell: your computer",
+    ]  # fmt: skip
+    assert [each for each in expected if each not in text] == []
+
+
+def test_alternatives_are_marked_either_and_or() -> None:
+    sender = Action("sender", "subtract 0.264 s")
+    console = Action("EKF2", commands=("param set EKF2_EV_DELAY 264", "reboot"), where="console")
+    cause = Cause(
+        id="source_time_offset", severity="error", title="Late", why="",
+        alternatives=((sender,), (console,)), actions=(Action("KF", "no change"),),
+    )  # fmt: skip
+    text = text_of(replace(SMALL_SIGMA_A, causes=(cause,)))
+    assert "EITHER sender subtract 0.264 s" in text
+    assert "OR EKF2 console param set EKF2_EV_DELAY 264 reboot" in text
+    assert "KF no change" in text
+    assert "console: MAVLink Console of QGroundControl" in text
+
+
+def test_more_than_three_notes_are_counted() -> None:
+    notes = tuple(Note(f"note_{number}", f"Text {number}.") for number in range(5))
+    text = text_of(replace(SMALL_SIGMA_A, notes=notes, more_causes=4))
+    assert "note[note_2]: Text 2." in text
+    assert "note_3" not in text
+    assert "and 2 more: All findings" in text
+    assert "and 4 more: All findings" in text
+
+
+@pytest.mark.parametrize(
+    ("field", "empty"),
+    [("reconcile", ""), ("difference", ""), ("causes", ()), ("notes", ()), ("do_this", ()),
+     ("effect_text", ""), ("verdicts", ())],
+)  # fmt: skip
+def test_empty_row_takes_no_space(field: str, empty: Any) -> None:
+    card = replace(SMALL_SIGMA_A, reconcile="The two verdicts differ.")
+    heights = [cover.free_height(page_of(each)) for each in (card, replace(card, **{field: empty}))]
+    assert heights[1] > heights[0] + 8.0
+
+
+def test_explained_verdict_is_quiet() -> None:
+    card = replace(
+        SMALL_SIGMA_A,
+        verdicts=tuple(replace(each, is_explained=True) for each in SMALL_SIGMA_A.verdicts[:2]),
+    )
+    (block,) = page_of(card).blocks
+    assert [row["word"] for row in block["rows"]] == ["overconfident, explained"] * 2
+    assert all(row["quiet"] and not row["loud"] for row in block["rows"])
+
+
+def test_ratio_beyond_axis_is_a_triangle_without_interval() -> None:
+    ratios = verdicts(
+        (0.05, "underconfident"), (0.1, "underconfident"), (10.0, "overconfident"),
+        (35.0, "overconfident"),
+    )  # fmt: skip
+    marked = [replace(each, interval=(each.ratio, 2.0 * each.ratio)) for each in ratios]
+    (block,) = page_of(replace(SMALL_SIGMA_A, verdicts=tuple(marked))).blocks
+    assert [row["beyond"] for row in block["rows"]] == [-1, 0, 0, 1]
+    assert block["rows"][0]["interval"] is None
+    assert block["rows"][2]["interval"] == [1.0, 1.0]
+
+
+def test_verdict_not_evaluated_prints_its_reason() -> None:
+    missing = replace(
+        SMALL_SIGMA_A.verdicts[3], ratio=None, word="not evaluated", reason="no ground truth"
+    )
+    card = replace(SMALL_SIGMA_A, verdicts=(*SMALL_SIGMA_A.verdicts[:3], missing))
+    assert "ground truth: error ÷ σ not evaluated: no ground truth" in text_of(card)
+
+
+def test_aiding_sources_have_rows_without_words() -> None:
+    aids = (
+        AidRow(label="barometer", component="height", ratio=0.57, is_usual=True),
+        AidRow(label="magnetometer", component="x", ratio=None),
+    )
+    card = replace(SMALL_SIGMA_A, verdicts=(), causes=(), effect=None, aids=aids)
+    text = text_of(card)
+    assert "barometer height 0.57" in text
+    assert "magnetometer x not evaluated" in text
+    assert "that is usual and not a fault" in text
+
+
+def test_right_to_left_name_keeps_the_id_behind_it() -> None:
+    name = "محمد"
+    identity = replace(SMALL_SIGMA_A.identity, student=name, student_id="s123")
+    text = text_of(replace(SMALL_SIGMA_A, identity=identity))
+    assert re.search(f"{name} ?, ?s123", text)
+
+
+def test_cover_has_four_panels_on_one_page_and_no_small_type(eventful: Analysis) -> None:
+    page = drawn(eventful)
+    pdf = pdf_of(page)
+    panels = axes_of(page)
+    assert len(panels) == 4
+    assert all(axes.lines for axes in panels)
+    assert len(set_by_typst(page)) == 1
+    assert smallest_type(pdf) >= 8.0 - 1e-3
+    for axes in panels:
+        for text in (*axes.get_xticklabels(), *axes.get_yticklabels(), axes.xaxis.label):
+            assert text.get_size() >= 8.0
+
+
+def test_error_strips_share_one_scale(eventful: Analysis) -> None:
+    panels = panels_by_title(drawn(eventful))
+    limits = {axes.get_ylim() for title, axes in panels.items() if " error (m)" in title}
+    assert len(limits) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "titles"),
+    [
+        ({"ekf2": None}, ("KF error (m): RMSE",)),
+        ({"truth": False}, ("KF − EKF2 (m): RMS",)),
+        ({"ekf2": None, "truth": False}, ()),
+    ],
+    ids=["no EKF2", "no truth", "neither"],
+)
+def test_cover_with_missing_data_has_strips_of_the_rest(changes, titles) -> None:
+    page = drawn(unexplained(compare(aisle_flight(**changes))))
+    found = [*panels_by_title(page)]
+    assert found[0].startswith("Map")
+    assert found[-1].startswith("Innovations")
+    assert [title.partition(" 0")[0] for title in found[1:-1]] == list(titles)
+    assert len(set_by_typst(page)) == 1
+
+
+def test_track_outside_the_map_has_triangles_and_distance() -> None:
+    x = np.array([1.0, 5.0, 12.0, 13.0, 5.0, 5.0, 5.0])
+    y = np.array([1.0, 1.0, 1.0, 1.0, 1.0, -3.0, 1.0])
+    found = list(cover_panels._exits((x, y), LIMITS))
+    assert [marker for marker, _ in found] == [">", "v"]
+    assert [place for _, place in found] == [(10.0, 1.0), (5.0, 0.0)]
+    inside = np.full(7, 2.0)
+    text = cover_panels._leaving({"KF": (x, y), "EKF2": (inside, inside)}, LIMITS)
+    assert text == "KF 3.00 m"
+
+
+def test_innovations_beyond_scale_are_triangles_in_title(eventful: Analysis) -> None:
+    strip = cover_panels._innovation_strip(eventful.main)
+    updates = eventful.main.replay.updates
+    normalised = updates["innovation_m"] / np.sqrt(updates["innovation_variance_m2"])
+    largest = float(normalised.abs().max())
+    assert largest > cover_panels.MAX_NORMALISED
+    assert f"beyond ±4, up to KF {largest:.0f}" in strip.title
+    axes = panels_by_title(drawn(eventful))[strip.title]
+    edges = [line for line in axes.lines if line.get_marker() in "^v" and len(line.get_xdata())]
+    assert edges
+    assert {abs(value) for line in edges for value in line.get_ydata()} == {4.0}
+
+
+def test_flat_strip_says_so_in_its_title() -> None:
+    errors = pd.DataFrame({"error_m": [0.02, -0.05], "sigma_m": [0.05, 0.06]}, index=[0.0, 9.0])
+    titles = [cover_panels._error_title("ekf2", errors, 0.04, scale) for scale in (0.1, 5.0)]
+    assert titles[0] == "EKF2 error (m): RMSE 0.040, σ 0.060"
+    assert titles[1] == f"{titles[0]}, flat on this scale, at most 0.050"
+
+
+def test_sigma_beyond_scale_has_triangles_and_its_value() -> None:
+    axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
+    axes.set(xlim=(0.0, 9.0), ylim=(-1.0, 1.0))
+    cover_panels._draw_sigma(axes, pd.Series([0.1, 2.0, 0.1], [0.0, 4.0, 9.0]), "KF")
+    marks = {line.get_marker(): (line.get_xdata()[0], line.get_ydata()[0]) for line in axes.lines}
+    assert marks == {"^": (4.0, 1.0), "v": (4.0, -1.0)}
+    assert [text.get_text() for text in axes.texts] == ["±2σ of KF up to ±4.00 m"]
+
+
+def test_same_input_gives_the_same_cover(eventful: Analysis) -> None:
+    assert pdf_of(drawn(eventful)) == pdf_of(drawn(eventful))
+
+
+@pytest.mark.parametrize("count", [3, 6])
+def test_long_causes_move_panels_to_a_second_page(eventful: Analysis, count: int) -> None:
+    page = page_of(replace(SMALL_SIGMA_A, causes=SMALL_SIGMA_A.causes * count))
+    with report_style():
+        cover_panels.write_panels(page.blocks[0], eventful, SMALL_SIGMA_A, cover.free_height(page))
+    first, second = set_by_typst(page)
+    assert "Innovations ÷ √S" not in first
+    assert "Innovations ÷ √S" in second
+
+
+def test_sections_continue_on_a_page_and_keep_their_first_panel() -> None:
+    sections = [Page(f"Section {number}") for number in range(4)]
+    for section in sections:
+        section.panel("Panel", "", 210.0)
+    sheets = set_by_typst(*sections)
+    assert [sheet.count("Section") for sheet in sheets] == [2, 2]
+    assert [sheet.count("Panel") for sheet in sheets] == [2, 2]
