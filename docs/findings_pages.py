@@ -12,7 +12,7 @@ from __future__ import annotations
 import ast
 import json
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -65,6 +65,8 @@ SIMULATED: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
     "accelerometer_bias": (("accel-bias",), {}),
     "ekf2_ev_delay_wrong": (("ekf2-delay=250ms",), {}),
     "ekf2_gate_too_small": (("ekf2-gate",), {}),
+    "ekf2_noise_too_large": (("ekf2-noise=50cm",), {}),
+    "ekf2_noise_too_small": (("ekf2-noise=5cm",), {}),
     "source_time_offset": (("clock-offset",), {}),
     "source_time_offset_changes": (("clock-drift=8000ppm",), {}),
     "source_timestamps_are_arrival_times": (("clock-jump",), {}),
@@ -160,17 +162,23 @@ def detectors() -> dict[str, str]:
     """File of the detector of each finding, without ``.py``."""
     found: dict[str, str] = {}
     for path in sorted(FINDINGS.glob("*.py")):
-        if path.stem in ("cause_grouping", "cause_text", "summary", "model", "__init__"):
+        if path.stem in ("cause_grouping", "cause_text", "model", "__init__"):
             continue
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(tree):
             if isinstance(node, ast.Constant) and node.value in TITLES:
                 found.setdefault(str(node.value), path.stem)
-    # noises.py composes these ids of filter or option and direction
-    composed = (
-        name for name in TITLES if name.startswith(("sigma_", "kf_", "ekf2_over", "ekf2_under"))
-    )
-    return found | dict.fromkeys(composed, "noises")
+    # these files compose ids of filter or option and direction
+    composed = {
+        name: stem
+        for name in TITLES
+        for stem, prefixes in {
+            "noises": ("sigma_", "kf_", "ekf2_over", "ekf2_under"),
+            "ekf2_noise": ("ekf2_noise_",),
+        }.items()
+        if name.startswith(prefixes)
+    }
+    return found | composed
 
 
 def thresholds(stem: str) -> Iterator[str]:
@@ -237,7 +245,7 @@ def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
         yield "\n".join(rows) + "\n"
 
 
-def links(names: list[str]) -> str:
+def links(names: Iterable[str]) -> str:
     """Links to the pages of other findings."""
     return ", ".join(f"[{TITLES[name]}]({name}.md)" for name in dict.fromkeys(names))
 

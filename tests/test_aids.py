@@ -1,6 +1,7 @@
 """EKF2's aids: reading from logs of each release, and consistency of their innovations."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from px4fuse.analysis import AidsOnlyAnalysis, failed_checks
 from px4fuse.ekf2.aids import AidResult, evaluate_aids
 from px4fuse.ekf2_parameters import AIDS
 from px4fuse.errors import MissingDataError
+from px4fuse.findings import aids as aids_detector
 from px4fuse.findings import find_aids
 from px4fuse.findings.aids import detect_in_aids
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
@@ -177,6 +179,43 @@ def test_aid_findings_contain_aid_numbers_and_times() -> None:
     assert "EKF2_BARO_NOISE" in by_id["aid_overconfident"].remedy
     assert by_id["aid_innovation_bias"].evidence["aid"] == "mag"
     assert by_id["aid_innovation_bias"].evidence["innovation_mean"] == pytest.approx(-0.4, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("take_off_s", "height_error_m", "expected"),
+    [
+        ((), None, ("note", "EKF2 fused no sample of the barometer for 21 s")),
+        ((9.9,), None, ("note", "EKF2 fused no sample of the barometer for 21 s")),
+        ((10.1,), None, None),  # usual: the ground disturbs the pressure
+        ((), 0.8, ("warning",
+                   "EKF2 fused no sample of the barometer for 21 s: height error 0.80 m")),
+    ],
+)  # fmt: skip
+def test_barometer_not_fused_is_fault_only_with_height_error(
+    take_off_s: tuple[float, ...], height_error_m: float | None, expected: Any
+) -> None:
+    log = aid_log()
+    with_gap = replace(log, samples=outage_free(log, 20.0, 41.0), enabled=steps((0.0, 1.0)))
+    barometer = {"baro_hgt": evaluate(with_gap, "baro_hgt")}
+    found = detect_in_aids(barometer, take_off_s=take_off_s, height_error_m=height_error_m)
+    assert [(each.severity, each.title) for each in found] == ([expected] if expected else [])
+
+
+@pytest.mark.parametrize(("error_m", "expected_m"), [(0.9, 0.9), (0.2, None)])
+def test_height_error_in_gap_counts_above_three_times_rmse(
+    error_m: float, expected_m: float | None
+) -> None:
+    time_s = np.arange(0.0, 60.0, 0.1)
+    height_m = pd.Series(np.where(np.arange(600) % 2, 0.1, -0.1), time_s)
+    height_m.loc[25.0:26.0] = error_m
+    down = SimpleNamespace(
+        ekf2_state=height_m.to_frame("position_m"),
+        truth=pd.DataFrame({"position_m": 0.0}, index=time_s),
+    )
+    one = SimpleNamespace(axes={"down": down})
+    found = aids_detector._height_error_in(one, (20.0, 30.0))  # type: ignore[arg-type]
+    assert found == (None if expected_m is None else pytest.approx(expected_m))
+    assert aids_detector._height_error_in(SimpleNamespace(axes={}), (0.0, 1.0)) is None  # type: ignore[arg-type]
 
 
 def test_aid_mean_change_is_reported_with_time() -> None:

@@ -329,7 +329,7 @@ FLIGHTS: dict[str, tuple[str | None, dict[str, str], str]] = {
     "v1.16.1_gps_fullrate": (None, {"gnss_pos": "consistent", "gnss_hgt": "consistent"}, ""),
     "v1.16.1_gps_nominal": (None, {"gnss_pos": "consistent", "gravity": "disabled"}, ""),
     "v1.16.1_gps_overconfident":
-        ("ekf2_overconfident",
+        ("ekf2_noise_too_small",
          {"gnss_pos": "overconfident", "gnss_vel": "consistent"}, ""),
     "v1.16.1_gps_stock_flow":
         (None, {"gnss_pos": "underconfident", "rng_hgt": "underconfident"}, ""),
@@ -381,7 +381,7 @@ def as_in_the_log(found: dict[str, AidResult], truth: dict[str, Any]) -> int:
     """Compare the NIS of aids with numbers computed without px4fuse; return their count."""
     stated = {
         # the stated number excludes rejected samples otherwise
-        aid: one["mean_nis" if one["rejected_fraction"] > 0.0 else "mean_nis_fused"]
+        aid: one["mean_nis" if one["rejected_share"] > 0.0 else "mean_nis_fused"]
         for aid, one in truth["aid_sources"].items()
         if aid in found and found[aid].axes
     }

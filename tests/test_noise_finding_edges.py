@@ -31,13 +31,14 @@ from findings_tools import (
 )
 
 from px4fuse.comparison.trials import Outcome, Trial
-from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import Noise
-from px4fuse.findings import cause_text, hidden_errors, loops, noises
+from px4fuse.findings import cause_text, ekf2_noise, hidden_errors, loops, noises
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.noises import _has_default_noises
 from px4fuse.loop.model import Closure, Loop, TrueEnd
+from px4fuse.position_source import find_origin
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
 HOVERING = source(samples=positions(np.arange(0.0, 120.0)))
@@ -362,6 +363,55 @@ def test_variances_smaller_noise_contradicted_by_truth_is_no_action() -> None:
 def test_variances_ekf2_without_replay_compare_noises(one, estimate, parameters, text) -> None:
     flown = analysis(axes=(one,), log=log(parameters=parameters), tuning=tuned(estimate))
     assert only(noises.detect_inconsistent_variances, flown).remedy.startswith(text)
+
+
+# ---------------------------------------------------------------- noise of EKF2
+
+
+@pytest.mark.parametrize(
+    ("flown_m", "kind", "rejected", "expected"),
+    [
+        (0.02, "uwb", 0.55,
+         ("ekf2_noise_too_small", "error",
+          "EKF2_EVP_NOISE is 5 times too small: EKF2 rejects 55 % of the positions")),
+        (0.02, "uwb", 0.04,
+         ("ekf2_noise_too_small", "error", "EKF2_EVP_NOISE is 5 times too small")),
+        (0.06, "uwb", 0.0,
+         ("ekf2_noise_too_small", "warning", "EKF2_EVP_NOISE is 1.67 times too small")),
+        (0.5, "uwb", 0.0, ("ekf2_noise_too_large", "error", "EKF2_EVP_NOISE is 5 times too large")),
+        # PX4's default: nobody chose it, so the title names the sensor
+        (0.1, "uwb", 0.0,
+         ("ekf2_noise_too_small", "error", "UWB noise is 4 times what EKF2 assumes")),
+        (0.5, "gnss", 0.44,
+         ("ekf2_noise_too_small", "error", "GNSS noise is 4 times what both filters assume: EKF2 "
+          "rejects 44 % of the positions")),
+    ],
+)  # fmt: skip
+def test_ekf2_noise_title_names_parameter_or_sensor(
+    flown_m: float, kind: str, rejected: float, expected: tuple[str, str, str]
+) -> None:
+    aid = GNSS_POS if kind == "gnss" else EV_POS
+    estimate_m = 4.0 * flown_m if flown_m == PARAMETERS[aid.noise].default else 0.1
+    outcome = Outcome(nis_mean=16.0 if estimate_m > flown_m else 0.1)
+    change = {aid.noise: estimate_m}
+    rerun = Trial(filter="ekf2", kinds=("noise",), change=change, before=outcome,
+                  after=Outcome(nis_mean=1.0))  # fmt: skip
+    model = SimpleNamespace(inputs=SimpleNamespace(settings={aid.noise: flown_m}))
+    result = axis("north", rejected_fraction=rejected)
+    origin = find_origin(kind, "as it arrived")
+    one = analysis(
+        axes=(result,), trials=(rerun,), ekf2_model=model, source=source(origin=origin),
+        settings=Settings(1.0, flown_m),
+    )  # fmt: skip
+    finding = only(ekf2_noise.detect, one)
+    assert (finding.id, finding.severity, finding.title) == expected
+    assert finding.remedy == f"Set {aid.noise} to {estimate_m:.3g} m."
+    assert finding.message.endswith(f"KF takes SIGMA_Z from {aid.noise}.") is (kind == "gnss")
+    # innovations outside their band after the change, or a change of EKF2_ACC_NOISE
+    worse = replace(rerun, after=Outcome(nis_mean=2.0))
+    other = replace(rerun, kinds=("process noise",))
+    for trials in ((worse,), (other,), ()):
+        assert not [*ekf2_noise.detect(analysis(axes=(result,), trials=trials, ekf2_model=model))]
 
 
 # ---------------------------------------------------------------- the loop and the drift

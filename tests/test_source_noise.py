@@ -62,7 +62,7 @@ def analysed(
 
 def root_findings(analysis: Analysis) -> dict[str, Finding]:
     """Findings by id without infos, KF settings and consequences."""
-    left_out = SETTINGS | {"ekf2_not_logged"}
+    left_out = {*SETTINGS, "ekf2_not_logged"}
     return {
         one.id: one for one in find(analysis)
         if one.severity != "note" and one.caused_by is None and one.id not in left_out
