@@ -146,12 +146,12 @@ def test_inventory_unlogged_source_advises_sdlog_profile(tmp_path, profile, want
     log = make_log().drop("vehicle_visual_odometry")
     log.parameters["SDLOG_PROFILE"] = profile
     inventory = inventory_of(log, tmp_path)
-    assert remedies(inventory)[0] == f"Set SDLOG_PROFILE to {wanted} and fly again."
+    assert remedies(inventory)[0] == f"Set SDLOG_PROFILE to {wanted} (bit 7) and fly again."
     assert source(inventory, "position").name == "estimator_aid_src_ev_pos"
 
 
 @pytest.mark.parametrize(
-    ("imu_hz", "said"), [(4.0, "sensor_combined was logged at 4.0 Hz"), (49.5, None), (100.0, None)]
+    ("imu_hz", "said"), [(4.0, "IMU was logged at 4.0 Hz"), (49.5, None), (100.0, None)]
 )
 def test_inventory_slow_imu_or_attitude_has_no_acceleration(tmp_path, imu_hz, said):
     inventory = inventory_of(make_log(imu_hz=imu_hz), tmp_path)
@@ -161,11 +161,11 @@ def test_inventory_slow_imu_or_attitude_has_no_acceleration(tmp_path, imu_hz, sa
     assert found.possible == (said is None)
     if said is not None:
         assert said in found.reason
-        assert "the acceleration needs 50 Hz" in found.reason
+        assert "50 Hz are needed" in found.reason
     both = (take_inventory(aisle_flight(attitude_hz=rate_hz)) for rate_hz in (5.0, 9.97))
     slow, fast = (ability(one, "acceleration") for one in both)
     assert (slow.possible, fast.possible) == (False, True)
-    assert "vehicle_attitude was logged at 5.0 Hz, but the acceleration needs 10 Hz" in slow.reason
+    assert "attitude was logged at 5.0 Hz, but 10 Hz are needed" in slow.reason
 
 
 def test_inventory_damage_is_first_advice_by_recording_type(tmp_path, sample_log):

@@ -37,7 +37,7 @@ from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Finding, group_by_root
-from px4fuse.flight import Ekf2, Unavailable
+from px4fuse.flight import Ekf2, Unavailable, source_name
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
 
 MAX_NOTES = 3
@@ -210,7 +210,7 @@ def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
         return f"along {called}"
     reference = "north"
     if analysis.source.frame == "FRD":
-        reference = f"the x axis of {analysis.source.name}"
+        reference = f"the {source_name(analysis.source)} x axis"
     return f"along {called}, {heading % 180.0:.0f}° from {reference}"
 
 
@@ -228,6 +228,8 @@ def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
 def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]) -> str:
     """Make the sentences about errors, their ratios to σ, rejections and resets."""
     sentences = []
+    if analysis.flight.airborne == ():
+        return "The vehicle stayed on the ground, so the errors of the filters are not evaluated."
     if effect.position_rmse_m:
         sentences.append(
             f"Position RMSE against ground truth along {analysis.main.axis.label}: "
@@ -411,7 +413,7 @@ def _identity(analysis: Analysis, request: ComparisonRequest, student: tuple[str
         firmware=log.firmware,
         hardware=log.hardware,
         duration_s=log.duration_s,
-        source=f"{source.origin.kind.upper()} {source.rate_hz:.1f} Hz",
+        source=f"{source_name(source)} {source.rate_hz:.1f} Hz",
         settings=_settings(analysis, request),
         changed=_changed_settings(request),
         parameters=_changed_parameters(analysis),

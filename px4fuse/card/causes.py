@@ -211,6 +211,8 @@ def _actions(
         )
         verb = f"subtract {-shift:.3f} s from" if shift < 0 else f"add {shift:.3f} s to"
         sender = Action("sender", f"{verb} the timestamp (usec) of each position")
+        if analysis.source.origin.is_gnss and general is not None:
+            sender = general  # a GNSS receiver does not let the user shift its timestamps
         if delay is not None:
             alternatives = ((sender,), (set_parameters(analysis, delay.change),))
         else:

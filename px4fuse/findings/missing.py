@@ -107,7 +107,7 @@ def _weak_verdict(analysis: Comparison, owner: FilterName) -> str | None:
     for limit in limits:
         if low <= limit <= high:
             return (
-                f"and the verdict of {name} is near its limit. The 95 % interval of innovation ÷ "
+                f"the verdict of {name} is near its limit. The 95 % interval of innovation ÷ "
                 f"√S ({low:.2f} to {high:.2f}) contains the limit {limit:g}."
             )
     return None
