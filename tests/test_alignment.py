@@ -273,7 +273,7 @@ def test_align_misaligned_frame_warns_and_recovers_clock(flight, yaw_deg, origin
     assert alignment.yaw_deg == 0.0
     assert clock_error_s(alignment) < 0.03
     (warning,) = alignment.misplaced
-    seen = re.search(r"rotated by ([-0-9.]+)° and shifted by ([0-9.]+) m relative", warning)
+    seen = re.search(r"rotated by ([-0-9.]+)° and shifted by ([0-9.]+) m against", warning)
     assert seen
     turned, shifted = map(float, seen.groups())
     assert yaw_difference_deg(turned, yaw_deg) < 0.5

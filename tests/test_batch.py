@@ -146,7 +146,7 @@ def test_batch_table_has_numbers_or_reason_of_each_log(tmp_path):
     card = results.card
     assert first.loc[0, ["severity", "headline"]].tolist() == [card.severity, card.headline]
     ratios = [verdict.ratio for verdict in card.verdicts[:2]]
-    assert first.loc[0, ["kf_source_ratio", "kf_truth_ratio"]].tolist() == ratios
+    assert first.loc[0, ["kf_source_ratio", "kf_truth_ratio"]].tolist() == pytest.approx(ratios)
     assert first["ekf2_source_ratio"].isna().all()
     assert (output / first.loc[0, "report"]).read_bytes().startswith(b"%PDF")
     # a log whose clock is out of range has no date

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from px4fuse.grading.model import Entry, GradedReport, Item
 from px4fuse.grading.outputs import FIRST_COLUMNS, LAST_COLUMNS, csv_text
-from px4fuse.spreadsheet import MAX_CHARACTERS, neutralise_formulas, neutralise_id
+from px4fuse.spreadsheet import MAX_CELL_LENGTH, neutralise_formulas, neutralise_id
 from px4fuse.verification.model import Verdict
 
 VERIFIED = Verdict("verified", (), True)
@@ -148,5 +148,5 @@ def test_csv_text_lists_late_pending_and_missing() -> None:
     ]
     assert len(cells(csv_text([]))) == 1
     assert (
-        len(neutralise_formulas("=" * 10**6)) <= MAX_CHARACTERS + 1
+        len(neutralise_formulas("=" * 10**6)) <= MAX_CELL_LENGTH + 1
     )  # maximum length of a cell in Excel

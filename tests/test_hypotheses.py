@@ -185,7 +185,7 @@ def test_find_simulated_mistake_is_first_with_size(mistake, name, severity, evid
 @pytest.mark.parametrize(
     ("name", "mistake", "settings", "severity", "remedy"),
     [
-        ("source_time_offset", "clock-offset=250ms", {}, "error", "--clock-offset -0."),
+        ("source_time_offset", "clock-offset=250ms", {}, "error", "Subtract 0."),
         ("source_time_offset_changes", "clock-jump=400ms", {}, "error", "--start"),
         ("source_frame_misaligned", "yaw=30", {}, "error", "Rotate the positions by -2|by -3"),
         ("source_outliers", "nlos=5%", {}, "error", "line of sight"),

@@ -654,7 +654,7 @@ def rewrite_tokens(content: bytes) -> bytes:
     """Write strings in hexadecimal, numbers with more digits, and other blanks."""
     text = rb"(?<=\[)\((?:[^\\()]|\\.)*\)(?=\]TJ)"
     content = re.sub(text, _hexadecimal, content, flags=re.DOTALL)
-    return re.sub(rb"(?<= )(\d+)\.(\d+)(?= [ml]\b)", rb"\1.\g<2>0 ", content)
+    return re.sub(rb"(?<= )(\d+)\.(\d+)(?= [ml] )", rb"\1.\g<2>0 ", content)
 
 
 def _hexadecimal(match: re.Match[bytes]) -> bytes:

@@ -17,21 +17,22 @@ from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, SampledTr
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_PEAK_RATIO
 
-# frames to try if yaw is estimated; nwu is not tried because it is enu rotated by 90°
+# Frames to try if yaw is estimated; nwu is not tried, because it is enu rotated by 90°
 YAW_FREE_FRAMES = ("ned", "enu")
-MAX_SPAN_S = 86400.0  # a day of positions takes five seconds
-# concordance correlation below which a match gets a warning and does not overrule options
+MAX_SPAN_S = 86400.0  # maximum time span of a file: a day of positions takes five seconds
+# Minimum concordance correlation coefficient (Lin 1989) of a good match, by reference. A match that
+# is not good gets a warning and does not overrule options
 GOOD_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
-MAX_CLOCK_SIGMA_S = 0.5  # a time offset with a larger standard deviation is rejected
-MIN_FRAME_RATIO = 1.3  # smallest ratio of the residuals in the second best and the best frame
-# the frame is misaligned if a free yaw and origin reduce the residual by more than this ratio, and
-# the residual is above this size (m)
+MAX_CLOCK_SIGMA_S = 0.5  # maximum standard deviation of an accepted time offset
+MIN_FRAME_RATIO = 1.3  # minimum ratio of the residuals in the second best frame and the best frame
+# Misaligned frame: minimum ratio of the residual with the given yaw to the residual with estimated
+# yaw and origin, and minimum residual (m) with the given yaw
 MIN_ROTATION_RATIO, MIN_ROTATION_RMS_M = 2.0, 0.3
 
 
 @dataclass(frozen=True)
 class AlignmentProblem:
-    """Position file with the given alignment parameters; parameters that are None are estimated.
+    """Position file with given alignment parameters. Parameters that are None are estimated.
 
     Attributes
     ----------
@@ -61,14 +62,13 @@ class Match:
     residuals_m : dict from frame to float
         Residual in each frame that was tried, best first.
     fit : Fit
-        Fit with the given yaw, or with free yaw if none was given.
+        Fit with the given yaw; with estimated yaw if none was given.
     free_yaw_fit : Fit
-        Fit with free yaw.
+        Fit with estimated yaw.
     is_rotated : bool
-        True if the frame of the file is misaligned; the time offset is then that of
-        ``free_yaw_fit``.
+        True if the frame of the file is misaligned; the time offset is then from ``free_yaw_fit``.
     better_frame : str
-        Frame in which the file fits without rotation; "" if that is the given frame or none.
+        Other frame in which the file fits without rotation; "" if there is none.
     """
 
     reference: SampledTrack
@@ -93,14 +93,14 @@ class Match:
 
 
 def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
-    """Match the file with the first suitable reference.
+    """Match the file with the first suitable reference: EKF2, or else the IMU.
 
-    None if no reference is suitable, and no parameter has to be estimated.
+    Return None if no reference is suitable and no parameter has to be estimated.
 
     Raises
     ------
     NoMatchError
-        A parameter cannot be estimated; the error has a remedy.
+        A parameter cannot be estimated; the error contains an action.
     """
     given_parameters = {
         "clock_offset_s": problem.lag_s,
@@ -109,7 +109,8 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     }
     missing_options = [f"`{name}`" for name, value in given_parameters.items() if value is None]
     reasons = []
-    # given parameters are only checked against EKF2: the band-passed IMU is not sufficient for that
+    # if all parameters are given, they are only checked against EKF2: the band-passed IMU motion is
+    # not sufficient for a check
     reference_kinds = (tracks.make_ekf2_references, tracks.make_imu_references)
     for references in reference_kinds if missing_options else reference_kinds[:1]:
         try:
@@ -172,14 +173,14 @@ def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
 
 
 def needs_rotation(horizontal_rms_m: float, free_yaw_fit: Fit, reference: str) -> bool:
-    """Return True if a free yaw and origin reduce the residual by MIN_ROTATION_RATIO."""
+    """Return True if estimating yaw and origin reduces the residual by MIN_ROTATION_RATIO."""
     return horizontal_rms_m > MIN_ROTATION_RATIO * free_yaw_fit.horizontal_rms_m and (
         horizontal_rms_m > MIN_ROTATION_RMS_M or reference == IMU
     )
 
 
 def is_good_fit(fit: Fit, reference: str) -> bool:
-    """Return True if the fit exceeds GOOD_CONCORDANCE and no other lag fits equally well."""
+    """Return True if the concordance is at least GOOD_CONCORDANCE and no other lag fits as well."""
     return (
         fit.concordance >= GOOD_CONCORDANCE[reference]
         and fit.second_peak_ratio >= MIN_SECOND_PEAK_RATIO
@@ -216,7 +217,7 @@ def _check_match(match: Match) -> None:
 
 
 def _refit_with_corrected_resets(flight: Flight, match: Match, problem: AlignmentProblem) -> Match:
-    """Repeat the fit to EKF2, with EKF2's resets corrected as in the comparison."""
+    """Repeat the fit to EKF2 with EKF2's resets removed as in the comparison with the file."""
     ekf2, clock = flight.ekf2, match.time_offset_fit
     if match.reference.name == IMU or isinstance(ekf2, Unavailable) or not ekf2.resets:
         return match
@@ -237,7 +238,7 @@ def _refit_with_corrected_resets(flight: Flight, match: Match, problem: Alignmen
 def _best_fit(
     problem: AlignmentProblem, reference: SampledTrack, frame: str, yaw_rad: float | None
 ) -> Fit:
-    """Find the lag by correlation, unless the lag is given; then fit by least squares."""
+    """Find the lag by correlation, unless it is given; then fit by least squares."""
     track, lag_s = tracks.convert_to_ned(problem.samples, frame), problem.lag_s
     grid_track = tracks.resample_to_grid(tracks.remove_spikes(track))
     if reference.name == IMU:

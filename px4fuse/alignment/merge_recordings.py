@@ -13,11 +13,12 @@ from px4fuse.flight import Columns, Ekf2, Flight, Unavailable, sort_by_preferenc
 from px4fuse.log import InputFile
 from px4fuse.readers.common import collect_unavailable
 
-# names of record fields that contain times
+# Names of record fields that contain times
 TIME_FIELDS = ("time_s", "start_s", "end_s")
-# s; smallest overlap of the recordings
+# Minimum overlap (s) of the recordings
 MIN_OVERLAP_S = 2.0
-# m; a larger difference of the EKF2 positions is not due to interpolation, but to another flight
+# Maximum difference (m) of the EKF2 positions due to interpolation; a larger difference shows that
+# the recordings are of different flights
 MAX_POSITION_DIFFERENCE_M = 0.5
 MIN_COMMON_SAMPLES = 5
 
@@ -113,12 +114,12 @@ def _format_span(flight: Flight) -> str:
 
 
 def shift_times(part: Any, shift_s: float) -> Any:
-    """Shift all times of a flight or of a part: tables, and times in records.
+    """Shift all times of a flight or of any of its data: table indices, and times in records.
 
     Parameters
     ----------
     part : DataFrame, Series, record, or a tuple or mapping of records
-        Other values are returned unchanged.
+        Data of a flight. Values of other types are returned unchanged.
     """
     if isinstance(part, pd.DataFrame | pd.Series):
         return part.set_axis(pd.Index(part.index.to_numpy() + shift_s, name="time_s"))
@@ -143,7 +144,7 @@ def shift_times(part: Any, shift_s: float) -> Any:
 def _compare_ekf2_positions(flight: Flight, other: Flight) -> str:
     """Compare the EKF2 positions of two recordings; raise MissingDataError if they differ.
 
-    Overlap in time does not prove that the flight is the same, because times count from boot.
+    An overlap in time does not prove that the flight is the same, because times count from boot.
     """
     if isinstance(flight.ekf2, Ekf2) and isinstance(other.ekf2, Ekf2):
         own_state, other_state = flight.ekf2.state, other.ekf2.state

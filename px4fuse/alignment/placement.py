@@ -1,13 +1,13 @@
 """Alignment of an external position file with a flight: time offset, frame, yaw and origin.
 
-A UWB computer records on its own clock and in its own frame. The track of the file is matched with
-a reference in the log: EKF2's position or, if this is not suitable, the acceleration of the IMU
-integrated twice, with track and reference band-passed.
+The computer of a UWB system records with a separate clock and frame. The track of the file is
+matched with a reference in the log: EKF2's position, or, if EKF2's position is not suitable, the
+acceleration of the IMU integrated twice. In the second case both tracks are band-passed.
 
 Horizontal positions are complex numbers, north + i·east, so a rotation in yaw is a factor e^{iψ}.
 The time offset is found by masked cross-correlation over all lags (FFT, Padfield 2012), then
 refined by robust least squares. The time offset is relative to the reference: if EKF2 fused late
-positions, EKF2 is late, and the time offset includes this delay.
+positions, EKF2's position is late, and the time offset includes this delay.
 """
 
 from collections.abc import Iterator
@@ -30,10 +30,10 @@ from px4fuse.position_source import POSITION_FILE
 from px4fuse.readers.common import finite_rows
 from px4fuse.readers.position_csv import PositionRecording
 
-# ratio of residuals below which another lag fits nearly as well (warning)
+# Maximum ratio of another lag's residual to the best lag's residual for a warning, by reference
 MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}  # IMU noise gives ratios of 1.4 to 1.7
 MIN_MIRRORED_CORRELATION = 0.8  # z axes are opposite if the correlation of heights is below -0.8
-MAX_UNIX_DIFFERENCE_S = 60.0  # clocks of computers in a lab differ by less
+MAX_UNIX_DIFFERENCE_S = 60.0  # maximum difference between the clocks of computers in a lab
 
 
 def align_position_file(
@@ -49,20 +49,22 @@ def align_position_file(
     Parameters
     ----------
     frame : {"ned", "enu", "nwu"}, optional
-        Axes x, y, z of the file; by default from the column names, else the frame that fits best.
+        Axes x, y, z of the file; by default from the column names, or else the frame that fits
+        best.
     yaw_deg : float or "auto", optional
         Rotation of the file about down, clockwise seen from above, after the frame conversion. None
-        is 0: the frame of the file equals EKF2's except for its axes. "auto" estimates yaw and
-        origin.
+        means 0 with the same origin: the file's frame differs from EKF2's only in the axes. "auto"
+        estimates yaw and origin.
     clock_offset_s : float, optional
         Boot clock of the autopilot minus clock of the file; by default estimated relative to the
-        reference. If EKF2 fused late positions, its track lags, and the estimate includes this lag.
+        reference. If EKF2 fused late positions, EKF2's track lags, and the estimate includes this
+        lag.
 
     Returns
     -------
     Flight
-        With the track first in ``positions``, the file in ``inputs``, and the notes of its reader
-        in ``log.notes``. The whole file is kept, including samples outside of the flight.
+        Flight with the file's track first in ``positions``, the file in ``inputs``, and the notes
+        of its reader in ``log.notes``. Samples outside of the flight are kept.
 
     Raises
     ------
@@ -225,10 +227,10 @@ def _describe_alignment(
 def _compare_with_ekf2(
     flight: Flight, aligned_samples: pd.DataFrame
 ) -> tuple[Array, float | None] | None:
-    """Return the horizontal distances (m) of the file from EKF2, and the correlation of both.
+    """Return the horizontal distances (m) of the file from EKF2, and their correlation.
 
-    The correlation is None if EKF2 hardly moves; the result is None if EKF2 has no position at the
-    times of the file.
+    The correlation (of both tracks) is None if EKF2 hardly moves. The result is None if EKF2 has no
+    position at the times of the file.
     """
     if isinstance(flight.ekf2, Unavailable):
         return None
@@ -279,7 +281,7 @@ def _find_height_conflicts(flight: Flight, aligned_samples: pd.DataFrame) -> Ite
 def _find_frame_conflicts(
     match: Match | None, comparison: tuple[Array, float | None] | None, yaw_rad: float
 ) -> Iterator[str]:
-    """Yield a message if the frame of the file is misaligned with that of EKF2."""
+    """Yield a message if the frame of the file is misaligned with EKF2's frame."""
     if match is None:
         return
     name, is_rotated = match.reference.name, match.is_rotated
@@ -312,7 +314,7 @@ def _find_warnings(
     correlation: float | None,
     clock_offset_s: float | None,
 ) -> Iterator[str]:
-    """Yield warnings on a poor or ambiguous match, limits of the IMU, and different flights."""
+    """Yield warnings on a poor or ambiguous match, a match with the IMU, and different flights."""
     if match:
         name, fit = match.reference.name, match.time_offset_fit
         if fit.concordance < matching.GOOD_CONCORDANCE[name]:

@@ -11,13 +11,14 @@ from px4fuse.arrays import Array, Complex
 from px4fuse.trajectory.correlation import autocovariance, moments
 from px4fuse.trajectory.time_offset import GRID_STEP_S
 
-MAX_LAG_SHIFT_S = 1.0  # largest distance of the fitted lag from the correlation peak
-# concordance correlation below which a match is rejected
+MAX_LAG_SHIFT_S = 1.0  # maximum distance of the fitted lag from the correlation peak
+# Minimum concordance correlation coefficient (Lin 1989) of an accepted match, by reference
 MIN_CONCORDANCE = {EKF2_POSITION: 0.7, IMU: 0.5}
-MIN_DISCORDANCE = 1e-4  # lower limit of 1 - concordance; of better matches the longest is chosen
-MIN_PEAK_DISTANCE_S = 3.0  # smallest distance of the lags of separate peaks
+# Lower limit of 1 - concordance: of several nearly perfect matches the longest is chosen
+MIN_DISCORDANCE = 1e-4
+MIN_PEAK_DISTANCE_S = 3.0  # minimum distance of the lags of separate peaks
 GRID_RESIDUAL_M = 0.05  # residual of a perfect match, caused by the grid
-MAX_RESIDUAL_M = 1.0  # residuals are limited to this value, because larger ones may be outliers
+MAX_RESIDUAL_M = 1.0  # larger residuals are truncated to this value, because they may be outliers
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,9 @@ class CorrelationPeak:
     lag_s : float
         Flight time of the first sample of the file.
     concordance : float
-        Concordance correlation 2·Re(e^{-iψ}cov) / (sum of both variances): 1 if the tracks are
-        equal up to an offset, smaller if their extents differ. NaN if the lag was given.
+        Lin's concordance correlation coefficient with free means, 2·Re(e^{-iψ}cov) / (sum of both
+        variances): 1 if the tracks are equal up to a position offset, smaller if their extents
+        differ. NaN if the lag was given.
     second_peak_s : float
         Lag of the second peak minus lag of this peak; NaN without a second peak.
     second_peak_ratio : float
@@ -55,12 +57,13 @@ class Fit(CorrelationPeak):
     lag_sigma_s, yaw_sigma_rad : float or None
         Standard deviations; None if the parameter was given.
     origin_m : ndarray, shape (3,)
-        North, east, down.
+        Position of the file's origin: north, east, down.
     coherence : complex
-        Normalised covariance of reference and file before rotation; its angle is the best yaw.
+        Normalised complex covariance of reference and file before rotation; its angle is the best
+        yaw.
     horizontal_rms_m, rms_m : float
-        RMS of the truncated residuals: per horizontal axis, and of the vector (with height if file
-        and reference have a height).
+        RMS of the truncated residuals: per horizontal axis, and of the vector. The vector includes
+        the height if file and reference have a height.
     """
 
     lag_sigma_s: float | None
@@ -78,9 +81,9 @@ def find_correlation_peak(
     """Find the lag with the greatest likelihood gain on the grid; yaw is estimated if None.
 
     With a free origin the residual sum of squares of file f and reference g over an overlap of N
-    grid points is Σ|f - f̄|² + Σ|g - ḡ|² - 2·Re(e^{-iψ}cov). The log-likelihood exceeds that of two
-    independent tracks by -N·ln(1 - concordance), which is maximised. A long overlap with an
-    excellent match is preferred to a short overlap in which two straight lines match equally well.
+    grid points is Σ|f - f̄|² + Σ|g - ḡ|² - 2·Re(e^{-iψ}cov). The log-likelihood minus that of two
+    independent tracks is -N·ln(1 - concordance). This gain is maximised. It prefers a long overlap
+    with an excellent match to a short overlap in which two straight lines match equally well.
 
     Raises
     ------
@@ -115,7 +118,7 @@ def find_correlation_peak(
     def lag_at(index: int) -> float:
         return float(reference.time_s[0]) + (index - len(file_track.is_valid) + 1) * GRID_STEP_S
 
-    # lags on this peak: up to half of its concordance, and at least MIN_PEAK_DISTANCE_S around it
+    # lags of the same peak: down to half of its concordance, at least MIN_PEAK_DISTANCE_S around it
     low_indices = np.flatnonzero(concordance < 0.5 * concordance[best_index])
     peak_start = np.max(low_indices[low_indices < best_index], initial=-1)
     peak_end = np.min(low_indices[low_indices > best_index], initial=len(count))
@@ -152,10 +155,10 @@ def fit_by_least_squares(
 ) -> Fit:
     """Fit origin and, if free, lag and yaw by robust least squares (soft L1).
 
-    The origin is always fitted, even if the result is not used: otherwise an offset of the file
-    would be mistaken for a lag if the vehicle flies mostly in one direction. The covariance is
-    σ²(JᵀJ)⁻¹ at the optimum, with σ from the median residual, times 1 + 2Σρ for autocorrelated
-    residuals (sum to the first zero of ρ).
+    The origin is always fitted, even if the caller does not use it. Otherwise a position offset of
+    the file would be mistaken for a lag if the vehicle flies mostly in one direction. The
+    covariance is σ²(JᵀJ)⁻¹ at the optimum, with σ from the median residual. It is multiplied by
+    1 + 2Σρ for autocorrelated residuals (sum to the first zero of ρ).
 
     Raises
     ------
@@ -271,5 +274,5 @@ def _autocorrelation_factor(residual: Complex) -> float:
 
 
 def truncated_rms(values_m: Array) -> float:
-    """Return the RMS of values that are limited to MAX_RESIDUAL_M."""
+    """Return the RMS of values after truncation to MAX_RESIDUAL_M."""
     return float(np.sqrt(np.mean(np.minimum(np.abs(values_m), MAX_RESIDUAL_M) ** 2)))

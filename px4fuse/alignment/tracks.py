@@ -17,7 +17,7 @@ from px4fuse.readers.common import finite_rows
 from px4fuse.trajectory.association import gap_limit, is_bracketed
 from px4fuse.trajectory.time_offset import GRID_STEP_S
 
-# by frame: indices of north, east, down in x, y, z, and signs
+# By frame: indices of north, east, down in (x, y, z), and their signs
 FRAMES = {
     "ned": ([0, 1, 2], [1.0, 1.0, 1.0]),
     "enu": ([1, 0, 2], [1.0, 1.0, -1.0]),
@@ -25,19 +25,20 @@ FRAMES = {
 }
 EKF2_POSITION, IMU = "EKF2 position", "IMU"
 
-MIN_GAP_LIMIT_S = 0.5  # a gap is longer than this and than three median intervals
+MIN_GAP_LIMIT_S = 0.5  # a gap is longer than this limit and than three median intervals
 MIN_MOTION_M = 0.5
 MIN_SAMPLES = 10
-MIN_OVERLAP_S = 10.0  # smallest overlap; for short tracks half of the shorter track
-# s; σ of the smoothing of steps at EKF2's updates; the smoothing has no delay
+MIN_OVERLAP_S = 10.0  # minimum overlap; for short tracks half of the shorter track
+# σ (s) of the Gaussian filter without delay that smooths EKF2's steps at updates
 SMOOTHING_S = 0.2
-# band in which acceleration integrated twice equals position; the integral drifts below the band
+# Band in which acceleration integrated twice equals position; below the band the integral drifts
 BAND_HZ = (0.1, 1.0)
-TRANSIENT_S, BAND_PADDING_S = 2.0, 10.0  # length of the filter transients, and padding
+# Length (s) of the band-pass filter's transients, and of the padding at both ends
+TRANSIENT_S, BAND_PADDING_S = 2.0, 10.0
 
 
 class NoMatchError(Exception):
-    """Reason why a reference does not match; with a remedy if no other reference can match."""
+    """Reason why a reference does not match; with an action if no other reference can match."""
 
     def __init__(self, reason: str, remedy: str = "") -> None:
         super().__init__(reason)
@@ -51,13 +52,13 @@ class SampledTrack:
     Attributes
     ----------
     time_s : ndarray, shape (n,)
-        Flight time; for the file the time since its first sample.
+        Flight time; for the position file the time since its first sample.
     position_m : ndarray, shape (n, 3)
-        North, east, down; down may be NaN.
+        Positions north, east, down; down may be NaN.
     is_valid : ndarray of bool, shape (n,)
         False inside gaps.
     name : str
-        Name of a reference.
+        Name of the reference; "" for the position file.
     """
 
     time_s: Array
@@ -71,7 +72,7 @@ class SampledTrack:
         return self.position_m[:, 0] + 1j * self.position_m[:, 1]
 
     def at(self, time_s: Array) -> tuple[Array, BoolArray]:
-        """Interpolate the position; return also a mask of the times outside of gaps."""
+        """Interpolate the position; also return a mask of the times outside of gaps."""
         position = [np.interp(time_s, self.time_s, column) for column in self.position_m.T]
         is_valid = np.interp(time_s, self.time_s, self.is_valid.astype(float), 0.0, 0.0) > 0.999
         return np.stack(position, axis=1), is_valid
@@ -98,7 +99,7 @@ def remove_spikes(track: SampledTrack, window_size: int = 3) -> SampledTrack:
 
 
 def band_pass(position_m: Array) -> Array:
-    """Band-pass positions without delay."""
+    """Band-pass filter positions without delay."""
     sos = butter(2, BAND_HZ, "bandpass", fs=1.0 / GRID_STEP_S, output="sos")
     padding = min(round(BAND_PADDING_S / GRID_STEP_S), len(position_m) - 1)
     return sosfiltfilt(sos, position_m, axis=0, padlen=padding)
@@ -118,7 +119,7 @@ def horizontal_range_m(track: SampledTrack) -> float:
 
 
 def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
-    """Return EKF2's position on the grid, smoothed."""
+    """Return EKF2's smoothed position on the grid."""
     finite_state = finite_rows(state, Columns.POSITION[:2])
     if len(finite_state) < MIN_SAMPLES:
         raise NoMatchError("no horizontal EKF2 position in the log")
@@ -129,9 +130,9 @@ def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
 
 
 def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
-    """Return EKF2's position as published and, if there are horizontal resets, without these.
+    """Return EKF2's published position and, with horizontal resets, also a version without them.
 
-    The height is as published: most height resets correct an error from before take-off.
+    Height resets are not removed, because most of them correct an error from before take-off.
     """
     if isinstance(flight.ekf2, Unavailable):
         raise NoMatchError("the log has no EKF2 position")
@@ -151,7 +152,7 @@ def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
 
 
 def make_imu_references(flight: Flight) -> list[SampledTrack]:
-    """Return the acceleration integrated twice, band-passed after each integration."""
+    """Return the IMU acceleration integrated twice, band-pass filtered after each integration."""
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, Unavailable):
         raise NoMatchError("the log has no acceleration in NED")
@@ -188,7 +189,7 @@ def align_samples(
 
 
 def ekf2_track_without_resets(ekf2: Ekf2, aligned_samples: pd.DataFrame) -> SampledTrack:
-    """Return EKF2's track with resets corrected as for a comparison with the aligned file."""
+    """Return EKF2's track with resets removed as in the comparison with the aligned file."""
     track = PositionTrack("", POSITION_FILE, "", aligned_samples, "NED", "", ())
     segment = Segment(float(aligned_samples.index[0]), float(aligned_samples.index[-1]), "")
     return _smooth_ekf2_track(continuous_state(ekf2, track, segment)[0])

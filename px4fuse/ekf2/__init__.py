@@ -1,1 +1,1 @@
-"""EKF2 replayed from an ordinary log: the model, its agreement with the log, and what if."""
+"""EKF2 replay from a default log: model, agreement with the log, and other parameters (what-if)."""

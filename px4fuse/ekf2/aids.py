@@ -1,4 +1,4 @@
-"""Consistency of each EKF2 aid, tested with its logged innovations.
+"""Consistency of each EKF2 aid (measurement source), tested with its logged innovations.
 
 Definitions: :mod:`px4fuse.filter.consistency`. Logged fields: PX4's ``EKF/aid_sources`` and
 ``EKF/ekf_helper.cpp``, v1.13 to main.
@@ -26,12 +26,12 @@ AidVerdict = Literal[
     "disabled",
     "too few samples",
 ]
-# Limits for a biased aid: |mean ν| / RMS ν, and |mean ν| / √S. Above both limits the mean does not
+# Minimum |mean ν| / RMS ν and minimum |mean ν| / √S of a biased aid: above both, the mean does not
 # average out, and EKF2 follows the bias
 MIN_BIAS_SHARE, MIN_BIAS_IN_SIGMA = 0.5, 0.2
-# Change of mean ν/√S in flight: window length (s), minimum number of samples per window, minimum
-# number of windows before the change, minimum change (√S), and minimum ratio of the change to the
-# scatter of the earlier window means
+# Detection of a change of mean ν/√S in flight: window length (s), minimum number of samples per
+# window, minimum number of windows before the change, minimum change (√S), and minimum ratio of the
+# change to the scatter of the earlier window means
 WINDOW_S, MIN_WINDOW_SAMPLES, MIN_WINDOWS_BEFORE, MIN_CHANGE_IN_SIGMA, MIN_CHANGE_SCATTER_RATIO = (
     10.0,
     5,
@@ -39,14 +39,14 @@ WINDOW_S, MIN_WINDOW_SAMPLES, MIN_WINDOWS_BEFORE, MIN_CHANGE_IN_SIGMA, MIN_CHANG
     0.5,
     6.0,
 )
-# s; limit of the time without a fused sample while the aid is enabled. EKF2 resets to an aid after
-# 7 s (reset_timeout_max). The default logging profile records at least 2 Hz
+# Maximum time (s) without a fused sample of an enabled aid, in a log with frequent samples. EKF2
+# resets to an aid after 7 s (reset_timeout_max); the default logging profile records at least 2 Hz
 NOT_FUSED_LIMIT_S = 5.0
-NOT_FUSED_INTERVALS = 10.0  # the same limit in intervals between logged fused samples
-# relative difference below which √R counts as equal to a noise parameter
+NOT_FUSED_INTERVALS = 10.0  # the same maximum in median intervals between logged fused samples
+# Maximum relative difference between √R and a noise parameter that count as equal
 NOISE_TOLERANCE = 0.02
-# m; minimum height above ground at which aids are evaluated, for low flights half of the maximum
-# height. Near the ground rotor downwash disturbs the barometer, and the land detector may be wrong
+# Minimum height (m) above ground at which aids are evaluated; half of the maximum height in a low
+# flight. Near the ground rotor downwash disturbs the barometer, and the land detector may be wrong
 MIN_HEIGHT_M = 2.0
 
 
@@ -61,13 +61,13 @@ class AidAxis(Record, frozen=True, kw_only=True):
     s_sqrt_median : float
         Median of √S.
     nis_mean, nis_band, sigma_ratio
-        As in :class:`~px4fuse.filter.consistency.NisVerdict`.
+        See :class:`~px4fuse.filter.consistency.NisVerdict`.
     rejected_fraction : float
         Share of samples outside the gate along this axis.
     lag1_autocorrelation, ljung_box_p, bias_p : float
-        As in :class:`~px4fuse.filter.consistency.Consistency`.
+        See :class:`~px4fuse.filter.consistency.Consistency`.
     change : (float, float) or None
-        Time (s) and size (√S) of the largest significant change of the mean in flight.
+        Time (s) and size (√S) of the largest significant change of mean ν/√S in flight.
     """
 
     samples: Count
@@ -85,7 +85,7 @@ class AidAxis(Record, frozen=True, kw_only=True):
 
     @property
     def mean_normalised_innovation(self) -> float:
-        """Mean innovation divided by the median √S; the sign is that of the innovation."""
+        """Mean innovation divided by the median √S, with sign."""
         return self.innovation_mean / self.s_sqrt_median
 
 
@@ -98,17 +98,17 @@ class AidResult(Record, frozen=True, kw_only=True):
     enabled_fraction : float or None
         Share of the flight in which EKF2 enabled the aid; None if not logged.
     fused_fraction : float
-        Fused share of the samples received while the aid was enabled.
+        Share of fused samples, of all samples received while the aid was enabled.
     fused_logged : bool
-        True if the log contains for each sample whether EKF2 fused it; False if px4fuse applies the
-        gate instead.
+        True if the log contains EKF2's decision (fused or not) on each sample; False if px4fuse
+        applies the gate instead.
     rejected_fraction : float
-        Share of the samples received while the aid was enabled that were rejected along any axis.
+        Share of samples rejected along any axis, of all samples received while the aid was enabled.
     longest_gap_s : (float, float)
-        Start and end of the longest time without a fused sample that began while the aid was
-        enabled.
+        Start and end of the longest time without a fused sample. Only times that began while the
+        aid was enabled count.
     resets : int
-        Number of resets of EKF2 to the aid; these samples are excluded.
+        Number of resets of EKF2 to the aid; the samples of resets are excluded.
     gate : float
         Innovation gate in √S.
     noise : float or None
@@ -117,7 +117,7 @@ class AidResult(Record, frozen=True, kw_only=True):
         Origin of R: a parameter name, or the reported accuracy; empty if R is not logged.
     verdict : str
     axes : mapping from axis to AidAxis
-        Empty if there are too few samples.
+        Statistics by axis; empty with too few samples.
     """
 
     label: str
@@ -142,7 +142,7 @@ class AidResult(Record, frozen=True, kw_only=True):
 
     @property
     def is_faulty(self) -> bool:
-        """Return True for an aid that is not fused although enabled, biased or overconfident.
+        """Return True if the aid is biased, overconfident, or enabled but not fused.
 
         An underconfident aid is not a fault: PX4's default settings are underconfident.
         """
@@ -155,7 +155,7 @@ class AidResult(Record, frozen=True, kw_only=True):
 
 
 def flight_span(flight: Flight) -> tuple[float, float] | Unavailable:
-    """Return start and end of the flight (s), without the parts close to the ground."""
+    """Return start and end of the flight (s), without take-off and landing close to the ground."""
     if isinstance(flight.airborne, Unavailable):
         return 0.0, flight.log.duration_s
     if not flight.airborne:
@@ -217,7 +217,7 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
     if fused_logged:
         fused, rejected = (samples[flag].to_numpy() > 0.0 for flag in ("fused", "rejected"))
         noise = samples[[f"noise_{axis}" for axis in log.axes]].to_numpy()
-        # after a reset to the aid, EKF2 logs innovation 0 and S = R
+        # for a sample to which EKF2 resets its state, it logs innovation 0 and S = R
         is_reset = ((innovation == 0.0) & np.isclose(variance, noise)).all(axis=1)
         noise_median = float(np.median(np.sqrt(noise[fused, 0]))) if fused.any() else None
     else:
@@ -272,9 +272,9 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
 def _largest_mean_change(time_s: Array, normalised: Array) -> Span | None:
     """Return time (s) and size (√S) of the largest significant change of mean ν/√S, or None.
 
-    The mean of the two windows after each candidate window is compared with the mean of all windows
-    before. The change begins in the candidate window if the mean of the candidate window differs by
-    at least a third of the change.
+    Each window is a candidate: the mean of the two windows after it is compared with the mean of
+    all windows before it. The change begins in the candidate window if the mean of that window
+    differs from the mean before by at least a third of the change.
     """
     window = np.floor((time_s - time_s[0]) / WINDOW_S)
     window_statistics = (
@@ -322,7 +322,7 @@ def _effective_gate(aid: Aid, log: AidLog) -> float:
 
 
 def _noise_origin(aid: Aid, log: AidLog, noise: float | None) -> str:
-    """Return the parameter that R is derived from, or the reported accuracy."""
+    """Return the name of the parameter from which R is derived, or "reported accuracy"."""
     value = log.parameters.get(aid.noise)
     if noise is None or value is None:
         return "" if noise is None else aid.noise_origin
@@ -334,7 +334,7 @@ def _noise_origin(aid: Aid, log: AidLog, noise: float | None) -> str:
 
 
 def _longest_gap(times: Array, fused: BoolArray, log: AidLog, start_s: float, end_s: float) -> Span:
-    """Return the longest time (s) without a fused sample that began while the aid was enabled."""
+    """Return start and end (s) of the longest time without a fused sample, see AidResult."""
     ends = np.concatenate([[start_s], times[fused], [end_s]])
     starts = ends[:-1]
     enabled = np.ones(len(starts), bool)
@@ -348,8 +348,7 @@ def _longest_gap(times: Array, fused: BoolArray, log: AidLog, start_s: float, en
 
 
 def _verdict(axes: dict[str, AidAxis], longest_gap_duration_s: float, fused_s: Array) -> AidVerdict:
-    # topics of old releases repeat samples at a reduced rate and are zero between fusions, so the
-    # limit follows from the logged rate
+    # topics of old releases are logged at a reduced rate, so the limit is in logged intervals
     interval_s = float(np.median(np.diff(fused_s))) if len(fused_s) > 1 else 0.0
     if longest_gap_duration_s > max(NOT_FUSED_LIMIT_S, NOT_FUSED_INTERVALS * interval_s):
         return "not_fused"

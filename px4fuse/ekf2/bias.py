@@ -1,4 +1,4 @@
-"""Bias of a sensor relative to EKF2's reference, estimated by EKF2 outside its Kalman filter.
+"""Bias of a sensor relative to EKF2's reference sensor, estimated outside EKF2's Kalman filter.
 
 Source: PX4-Autopilot ``EKF/bias_estimator`` (``bias_estimator.cpp``; before v1.15
 ``EKF/bias_estimator.cpp``).
@@ -8,21 +8,21 @@ import numpy as np
 
 from px4fuse.arrays import Array, BoolArray
 
-# Noise density of the bias random walk (m/s/√Hz; bias_nsd, common.h), lower limits of the variances
-# of bias and measurement (m²), and gate (√S)
+# Noise density of the bias random walk (m/s/√Hz; bias_nsd, common.h), minimum variance of the bias
+# (m²), minimum measurement variance (m²), and gate (√S)
 BIAS_DENSITY, MIN_VARIANCE_M2, MIN_NOISE_M2, BIAS_GATE = 0.13, 1e-8, 1e-4, 3.0
-# Mean signed test ratio above which the random walk is increased (isOffsetDetected), factor on the
-# variance of the random walk, and averaging time of the test ratio (s)
+# Maximum mean signed test ratio with the normal random walk (isOffsetDetected), factor on the
+# variance of the random walk above it, and averaging time of the test ratio (s)
 MAX_MEAN_SIGNED_RATIO, NOISE_FACTOR, FILTER_S = 0.2, 1e3, 10.0
 
 
 class BiasEstimator:
-    """Bias of one sensor in S filter variants along k axes, updated with each sample.
+    """Bias of one sensor along k axes in S filter configurations, updated with each sample.
 
     Parameters
     ----------
     value_m, variance_m2 : ndarray, shape (S,) or (S, k)
-        Initial bias, added to innovations, and its variance.
+        Initial bias, which is added to innovations, and its variance.
     start_s : float
     step_s : float
         Prediction step of EKF2.
@@ -43,16 +43,16 @@ class BiasEstimator:
         updates_bias: BoolArray,
         weight: float = 1.0,
     ) -> tuple[Array, Array]:
-        """Return innovation and R with the current bias, then update the bias.
+        """Return innovation and R corrected for the current bias, then update the bias.
 
         Parameters
         ----------
         nu, predicted_variance, noise_m2 : ndarray
             Innovation without bias, HPH' and R.
-        time_s, has_sample, learning : ndarray
-            Sample time; True for variants with a sample; True for variants that update the bias.
+        time_s, has_sample, updates_bias : ndarray
+            For each configuration: sample time, True with a sample, True if it updates the bias.
         weight : float
-            Number of samples of EKF2 that the logged sample represents.
+            Number of samples in EKF2 that the logged sample represents.
         """
         updates_now, bounded_noise = has_sample & updates_bias, np.maximum(noise_m2, MIN_NOISE_M2)
         density_factor = np.where(

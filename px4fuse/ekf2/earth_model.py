@@ -1,10 +1,10 @@
 """Earth rotation rate and curvature radii as used by EKF2.
 
-From v1.16 on EKF2 stores latitude and longitude and converts with curvature radii, while positions
-in metres are published on a sphere.
+From v1.16 on EKF2 stores latitude and longitude. EKF2 converts them to metres with curvature radii
+internally, but publishes positions in metres on a sphere.
 
-Sources: PX4-Autopilot ``lib/lat_lon_alt/lat_lon_alt.cpp`` (computeRadiiOfCurvature; its meridian
-radius uses q to the power 2.5, an ellipsoid has 1.5), ``EKF/ekf_helper.cpp`` (calcEarthRateNED),
+Sources: PX4-Autopilot ``lib/lat_lon_alt/lat_lon_alt.cpp`` (computeRadiiOfCurvature; PX4's meridian
+radius uses q to the power 2.5, an ellipsoid's has 1.5), ``EKF/ekf_helper.cpp`` (calcEarthRateNED),
 ``EKF/ekf.cpp`` (predictState).
 """
 
@@ -19,13 +19,13 @@ EQUATORIAL_RADIUS_M, ECCENTRICITY = 6_378_137.0, 0.0818191908425
 
 
 def earth_rate_rad_s(record: FusionRecord) -> Array:
-    """Return the earth rotation rate in EKF2 (rad/s, NED, shape (3,)); 0 without a latitude."""
+    """Return EKF2's earth rotation rate (rad/s, NED, shape (3,)); 0 without a known latitude."""
     latitude = np.radians(record.latitude_deg)
     return np.nan_to_num(EARTH_RATE_RAD_S * np.array([np.cos(latitude), 0.0, -np.sin(latitude)]))
 
 
 def ekf2_metres_per_metre(record: FusionRecord) -> tuple[float, float, float]:
-    """Return metres in EKF2's state per published metre: north, east, down."""
+    """Return the ratio of EKF2's internal metres to published metres: north, east, down."""
     if np.isnan(record.latitude_deg) or not record.stores_latitude:
         return 1.0, 1.0, 1.0
     squared = ECCENTRICITY**2

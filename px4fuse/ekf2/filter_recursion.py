@@ -1,9 +1,9 @@
 """Filter recursion of the EKF2 replay: several variants run through one segment together.
 
-A variant is one configuration of the filter. An event ends an interval without measurements: a
-position sample is fused there or, in a gap of the source, height and heading only. Array shapes:
-E events, S variants, n states. x, P: state and covariance; R: measurement noise; S in an equation:
-innovation variance.
+A variant is one configuration of the filter (parameters, states, aids). An event is the end of an
+interval without measurements: a position sample is fused at this time or, in a gap of the source,
+only height and heading. Array shapes: E events, S variants, n states. x, P: state and covariance;
+R: measurement noise; S in an equation: innovation variance.
 
 Sources: PX4-Autopilot ``EKF/covariance.cpp`` (limits of the biases), ``EKF/position_fusion.cpp``
 and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, resets).
@@ -38,34 +38,35 @@ from px4fuse.ekf2.vision import VisionFilter, set_states, vision_samples
 from px4fuse.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
 from px4fuse.notebook_display import one_line_repr
 
-# s; length of the first pass, which estimates the initial correlations
+# Length (s) of a first pass over the segment that estimates the initial correlations
 CORRELATION_PASS_S = 8.0
-MIN_VARIANCE = 1e-30  # lower limit of a variance before division
-# NIS / gate² from 1/2 to 2: near the gate limit a rejection that is not logged is inferred from the
-# published position
+MIN_VARIANCE = 1e-30  # minimum of a variance before division
+# Samples with NIS / gate² from 1/2 to 2 are near the gate limit. If their rejection is not logged,
+# it is inferred from the published position
 GATE_EDGE_RATIO = 2.0
-# number of events whose intervals are stacked together, to limit memory
+# Number of events whose intervals are stacked together, to limit memory
 EVENT_BATCH_SIZE = 64
-# m² or rad², measurement variance so large that the measurement has no effect
+# Measurement variance (m² or rad²) that is so large that the measurement has no effect
 IGNORED_VARIANCE = 1e9
-# m/s², acceleration noise while EKF2 reports a bad or clipped acceleration (BADACC_BIAS_PNOISE,
+# Acceleration noise (m/s²) while EKF2 reports a bad or clipped acceleration (BADACC_BIAS_PNOISE,
 # common.h; covariance.cpp)
 BAD_ACCELERATION_NOISE = 4.9
 # Variance factors of GNSS velocity: EKF2 multiplies the vertical σ by 1.5 (gps_control.cpp)
 VERTICAL_SCALE = np.array([1.0, 1.0, 2.25])
 HEIGHT_SCALE = 1.5  # factor on EKF2_GPS_P_NOISE for GNSS height (gnss_height_control.cpp)
-# Bias limits in covariance.cpp: σ at most 0.1 g, variance ratio between axes at most 100
+# EKF2's limits of bias variances (covariance.cpp): maximum σ 0.1 g, minimum ratio of the variance
+# of an axis to the largest variance
 MAX_BIAS_SIGMA_M_S2 = 0.1 * 9.80665
 MIN_BIAS_VARIANCE_RATIO = 0.01
 HEADING, NORTH, EAST, DOWN = 2, 6, 7, 8
 BIAS_NORTH, BIAS_EAST = 12, 13  # accelerometer bias rotated to NED
 GRAVITY = float(GRAVITY_M_S2[2])
 MEASURED = np.array([HEADING, DOWN, NORTH, EAST])
-# Rows of states; slices give views, index arrays would copy
+# Indices of states. Slices are used because they give views; index arrays would copy
 LOGGED_STATES = slice(HEADING, DOWN + 1, DOWN - HEADING)
 HORIZONTAL = slice(NORTH, EAST + 1)
-# Rows of the states that a position sample measures (velocity and position), and the columns of
-# velocity and horizontal position within these rows
+# Indices of the states that a position sample measures (velocity and position), and the positions
+# of velocity and horizontal position within them
 MEASURED_STATES, VELOCITY_COLUMNS, POSITION_COLUMNS = slice(3, 9), slice(0, 3), slice(3, 5)
 
 
@@ -92,7 +93,7 @@ class Variant:
     without : mapping from PX4's name of an aid to float
         Time (s) from which the aid is not fused.
     timestamp_offset_s : float or None
-        Seconds to add to the timestamps; None: EKF2's delay parameter is subtracted.
+        Time to add to the timestamps (s); None: EKF2's delay parameter is subtracted instead.
     """
 
     settings: dict[str, float]
@@ -106,13 +107,13 @@ class Variant:
     timestamp_offset_s: float | None = None
 
     def timing(self, inputs: Inputs) -> Timing:
-        """Return the total age of a position at its timestamp, and the fusion horizon (s)."""
+        """Return the age of a position at its timestamp, and the fusion horizon's delay (s)."""
         if self.timestamp_offset_s is not None:
             return Timing(-self.timestamp_offset_s - 0.5 * inputs.step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
         known = self.settings.keys() & {GNSS_POS.delay, EV_POS.delay}
         most_ms = max(self.settings[name] for name in known)
-        if inputs.rules.horizon_by_delay:  # the IMU buffer covers the largest delay
+        if inputs.rules.horizon_by_delay:  # the length of the IMU buffer is the largest delay
             length = math.ceil(most_ms * 1e-3 / inputs.predict_s)
             return Timing(delay_s, max(inputs.horizon_s, (length - 1) * inputs.step_s))
         # at start EKF2 raises EKF2_DELAY_MAX to the largest delay (EKF2.cpp)
@@ -133,29 +134,30 @@ class SegmentRun:
     segment : ReplaySegment
     variants : tuple of Variant
     events : tuple of recarray
-        Events of each variant.
+        Events of each variant, see :data:`~px4fuse.ekf2.intervals.EVENT`.
     innovation : ndarray, shape (E, S, 6)
         Measurement minus state of velocity (m/s) and position (m), NED; NaN without a sample or
         without velocity fusion.
     innovation_variance : ndarray, shape (E, S, 6)
-        P + R.
+        Innovation variance, P + R.
     noise : ndarray, shape (E, S, 6)
         Measurement noise R.
     rejected, fused, reset : ndarray of bool, shape (E, S)
-        Decision on the position sample of each event.
+        Decisions on the position sample of each event.
     position_reset_m : ndarray, shape (E, S, 2)
-        Position reset, north and east.
+        Size of the position reset, north and east.
     state, variance : ndarray, shape (E + 1, S, n)
-        At the start and after each event; n is 15, or 21 with magnetic fields as states.
+        State and its variance at the start and after each event; n is 15, or 21 with magnetic
+        fields as states.
     covariance : ndarray, shape (S, n, n)
         Covariance at the end of the segment.
     field : ndarray, shape (E, 3, S, 3)
         Magnetometer (body FRD): innovation (gauss), its variance for one sample, and 1 if fused;
-        NaN without a sample. No rows if the fields are not states.
+        NaN without a sample. Empty if magnetic fields are not states.
     heights : HeightFilter or None
-        None if the logged EKF2 height is used.
+        Height fusion; None if the logged EKF2 height is used.
     vision : VisionFilter or None
-        Set if vision is fused besides GNSS.
+        Vision fusion in addition to GNSS; None without it.
     """
 
     segment: ReplaySegment
@@ -184,7 +186,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     variants: Sequence[Variant],
     intervals: Sequence[Intervals],
 ) -> SegmentRun:
-    """Run each variant through one segment, with the intervals of its timing."""
+    """Run variants through one segment; ``intervals`` has one element per variant."""
     size, events = len(variants), len(intervals[0].events)
     parameters = {
         name: np.array([v.settings[name] for v in variants]) for name in variants[0].settings
@@ -208,7 +210,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     )
 
     def stacked(name: str, rows: slice = slice(None)) -> Any:
-        """Stack a field of the intervals of all variants, shape (E, S, ...)."""
+        """Stack a field of all variants' intervals, shape (E, S, ...)."""
         return np.stack(
             [getattr(one_interval, name)[rows] for one_interval in distinct_intervals], axis=1
         )[:, variant_intervals]
@@ -227,7 +229,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     is_sequential, has_speed = inputs.aid == GNSS_POS, inputs.received.velocity_m_s is not None
     gates = [parameters.get(GNSS_VEL.gate, np.ones(size)), parameters[inputs.aid.gate]]
     gate2 = np.maximum(np.repeat(np.stack(gates, axis=1), 3, axis=1), MIN_GATE) ** 2
-    # logged EKF2 values serve as measurements of height and, without a magnetometer, of heading
+    # logged EKF2 values are used as measurements of height and, without magnetometer, of heading
     logged_values = np.stack(
         [segment.attitude_error_rad[event_steps, HEADING], segment.down_m[event_steps]], axis=-1
     )
@@ -239,7 +241,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     has_field, has_flow = np.zeros((2, events), bool)
 
     def means(source_aid: Aid, samples_per_interval: Sequence[EventSamples]) -> EventSamples:
-        """Return the samples of an aid for all variants, without those after it was disabled."""
+        """Return the samples of an aid for all variants, until each variant disables the aid."""
         stacked_fields = (
             np.stack(axis_values, axis=1)[:, variant_intervals]
             for axis_values in zip(*samples_per_interval, strict=True)
@@ -382,7 +384,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 R[fused[e], 2:] = noise[e, fused[e], POSITION_COLUMNS]
         if heights is not None:
             x, P = heights.fuse(e, x, P, measured[e, :, 5], noise[e, :, 5])
-        # with magnetic fields only the height is set to the logged one
+        # with magnetic fields as states, only the height is set to its logged value
         elif field_samples is not None:
             K, P = _reduce_variance_to(P, DOWN, logged_variance[e, :, 1])
             x = x + K * (logged_values[e, :, 1] - x[:, DOWN])[:, None]
@@ -414,7 +416,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         if vision is not None:
             vision.bias.value_m = vision.bias.value_m + position_reset_m[e]
             x, P = vision.fuse(e, x, P, True, fusion.last_position_s)
-            if inputs.rules.with_velocity:  # GNSS or vision counts as a fused position
+            if inputs.rules.with_velocity:  # a fused position of GNSS or of vision is sufficient
                 fusion.last_position_s = np.maximum(fusion.last_position_s, vision.fused_s)
         states[e + 1], state_variances[e + 1] = x, _diagonal(P)
     innovations[~is_active], variances[~is_active] = np.nan, np.nan
@@ -452,8 +454,8 @@ def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> tuple[Arra
 def _reduce_variance_to(P: Array, row: int, target: Array) -> tuple[Array, Array]:
     """Apply a scalar update that reduces P[row, row] to ``target``; return gain and P.
 
-    The magnetometer also corrects the tilt in EKF2. It is not always logged, so the tilt itself is
-    not changed.
+    In EKF2 the magnetometer also corrects the tilt. The magnetometer is not always logged, so the
+    tilt state is not changed.
     """
     variance = P[:, row, row]
     R = _noise_to_reach(variance, target)
@@ -466,9 +468,10 @@ def _sequential_update(
 ) -> tuple[Array, Array]:
     """Fuse the components of a sample one after the other, with the initial innovations and S.
 
-    As fuseDirectStateMeasurement (``ekf_helper.cpp``), in Joseph form, which is valid for any gain.
+    Source: fuseDirectStateMeasurement (``ekf_helper.cpp``). The Joseph form is valid for any gain.
     With c = PH' and K = wc: P - KHP - (KHP)' + K(HPH' + R)K' = P - bcc', b = w(2 - w(HPH' + R)).
-    ``components``: measured rows to fuse; ``is_fused``: shape (S, number of components) or (S, 1).
+    ``components`` are the measured components to fuse; ``is_fused`` has shape (S, number of
+    components) or (S, 1).
     """
     nu, S, R = (each[:, components] for each in (nu, S, R))
     weight = is_fused / S
@@ -494,11 +497,11 @@ def _sequential_update(
 def _rejection_by_output(
     observed_correction_m: Array, nu: Array, S: Array, R: Array, gate2: Array
 ) -> tuple[BoolArray, BoolArray]:
-    """Return two flags for each variant: sample near the gate limit, and rejected by EKF2.
+    """Return for each variant: True if the sample is near the gate limit, True if EKF2 rejected it.
 
-    A sample counts as rejected if the correction seen in the published position
-    (``observed_correction_m``, north and east) is less than half of the expected one, (1 - R/S)ν.
-    The other arrays have shape (S, 2).
+    A sample counts as rejected if the correction of the published position
+    (``observed_correction_m``, north and east) is less than half of the expected correction,
+    (1 - R/S)ν. The other arrays have shape (S, 2).
     """
     ratio = (nu * nu / (gate2 * S)).max(axis=1)
     is_near_gate = (
@@ -516,8 +519,8 @@ def _rejection_by_output(
 class _Fusion:
     """State machine for rejection, fusion and reset of each variant, event by event.
 
-    As updateEvPosFusion and startEvPosFusion (``ev_pos_control.cpp``): after a time without fusion
-    the position is reset; after several resets in a row fusion stops until a sample with
+    Source: updateEvPosFusion and startEvPosFusion (``ev_pos_control.cpp``). After a time without
+    fusion the position is reset. After several resets in a row fusion stops until a sample with
     ``can_start``. Arrays have shape (E, S), (S,) or (E,). ``rejected`` and ``reset`` are the logged
     decisions.
     """
@@ -540,7 +543,7 @@ class _Fusion:
             np.zeros(size, bool),
             np.full(size, self.rules.resets),
         )
-        # True for events at which only the gate decides, which needs no state machine
+        # True for events at which the gate alone decides, without the state machine
         self.only_gate_decides = (
             (self.action == FUSE).all(axis=1) & ~self.reset & ~(self.rejected > 0.0)
         )
@@ -548,7 +551,7 @@ class _Fusion:
     def decide(
         self, e: int, is_outside_gate: BoolArray, is_velocity_fused: BoolArray
     ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
-        """Return for each variant: position rejected, fused, reset; and velocity fused.
+        """Return four masks of variants: position rejected, fused, reset; and velocity fused.
 
         Parameters
         ----------
@@ -600,7 +603,7 @@ def _variance_growth(
     biases: BoolArray,
     attitude: BoolArray,
 ) -> tuple[Array, Array]:
-    """Return the variance growth of biases and fields per step, and its upper limit."""
+    """Return the variance that biases and fields gain per step, and the limit of their variance."""
     field_parameters = ("MAG_E", "MAG_B") if segment.field is not None else ()
     noise_density = np.stack(
         [parameters[f"EKF2_{name}_NOISE"] for name in ("GYR_B", "ACC_B", *field_parameters)],
@@ -622,9 +625,9 @@ def _variance_growth(
 def with_correlation(inputs: Inputs, segment: ReplaySegment, intervals: Intervals) -> ReplaySegment:
     """Add the correlations of the initial state to a segment; the log has variances only.
 
-    Without correlations the first updates would divide the error between tilt and accelerometer
-    bias differently than EKF2. The correlations are estimated from the flight before the segment,
-    or else from its first seconds.
+    Without correlations the first updates would divide the error differently between tilt and
+    accelerometer bias than EKF2. The correlations are estimated from the flight before the segment,
+    or else from the first seconds of the segment.
     """
     flown_variant, inputs = Variant(inputs.settings), replace(inputs, vision=None)
     if (history := segment.history) is not None:
@@ -643,7 +646,7 @@ def with_correlation(inputs: Inputs, segment: ReplaySegment, intervals: Interval
             run_segment(inputs, segment, [flown_variant], [first_intervals]).covariance[0]
         )
     if segment.field is not None:
-        # EKF2 has just reset heading and fields, so they are uncorrelated with all other states
+        # EKF2 has just reset heading and fields, so these states are uncorrelated with all others
         correlation = block_diag(correlation[:STATES, :STATES], np.eye(len(segment.state) - STATES))
         correlation[HEADING], correlation[:, HEADING] = 0.0, 0.0
         correlation[HEADING, HEADING] = 1.0
@@ -657,7 +660,7 @@ def _correlation(P: Array) -> Array:
 
 
 def _settled_correlation(segment: ReplaySegment) -> Array:
-    """Return the correlations of a state after a long time of velocity fusion.
+    """Return the correlations of a state that EKF2 has after a long time of velocity fusion.
 
     Errors of tilt and accelerometer bias become correlated, because their effects on the
     acceleration cancel: θ × f = Rb.
@@ -680,7 +683,7 @@ def _diagonal(P: Array) -> Array:
 def _start_state(
     segment: ReplaySegment, biases: BoolArray, attitude: BoolArray
 ) -> tuple[Array, Array]:
-    """Return initial state and covariance; 0 for the states that a variant does not estimate."""
+    """Return initial states and covariances; 0 for states that a variant does not estimate."""
     x = np.tile(segment.state, (len(biases), 1))
     deviation = np.sqrt(segment.variance)
     P = np.tile(deviation[:, None] * segment.correlation * deviation, (len(biases), 1, 1))
@@ -697,10 +700,10 @@ def _start_state(
 
 
 def _noise_to_reach(variance: Array, target: Array) -> Array:
-    """Return the measurement noise that reduces a variance to a target: 1/target - 1/variance.
+    """Return the measurement noise R with which an update reduces a variance to a target.
 
-    Height and heading sensors are logged at a reduced rate. EKF2's published values are fused
-    instead, with a noise that reproduces the logged variances.
+    1/R = 1/target - 1/variance. Height and heading sensors are logged at a reduced rate. EKF2's
+    published values are fused instead, with an R that reproduces the logged variances.
     """
     surplus = variance - target
     noise = np.full(surplus.shape, IGNORED_VARIANCE)
@@ -709,7 +712,7 @@ def _noise_to_reach(variance: Array, target: Array) -> Array:
 
 
 def _limit_bias(P: Array, floor: float, biases: BoolArray) -> None:
-    """Limit the bias variance as PX4 up to v1.14 (fixCovarianceErrors)."""
+    """Limit the bias variance like PX4 up to v1.14 (fixCovarianceErrors)."""
     variance = _diagonal(P)[:, ACCELEROMETER_BIAS]
     min_variance = np.maximum(MIN_BIAS_VARIANCE_RATIO * variance.max(axis=1, keepdims=True), floor)
     variance[biases] = np.clip(variance, min_variance, MAX_BIAS_SIGMA_M_S2**2)[biases]
@@ -723,7 +726,7 @@ def _measurements(
     parameters: dict[str, Array],
     uses_reported_noise: BoolArray,
 ) -> tuple[Array, Array]:
-    """Return measured velocity and position and their variances, both of shape (E, S, 6)."""
+    """Return measured velocity and position, and their variances, each of shape (E, S, 6)."""
     received, aid = inputs.received, inputs.aid
     offset_m = (np.stack([parameters[name] for name in aid.lever_arm], -1) - inputs.imu_offset_m)[
         :, :, None

@@ -1,8 +1,9 @@
 """Fusion of optical flow in the EKF2 replay, as horizontal velocity in the body frame.
 
-The log contains a low-pass filtered velocity, which is converted to means between two rows. Each
-mean is fused at the next event (end of an interval, see :mod:`px4fuse.ekf2.intervals`), after
-adding the velocity change measured by the IMU. The range to the ground is the logged one.
+The log contains a low-pass filtered velocity, which is converted to the mean velocity between two
+rows. Each mean is fused at the next event (end of an interval, see :mod:`px4fuse.ekf2.intervals`).
+The velocity change that the IMU measured until the event is added. The logged range to the ground
+is used.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/optical_flow`` (``optical_flow_control.cpp``: velocity and
 low-pass filter; ``optical_flow_fusion.cpp``: R and gate).
@@ -26,9 +27,9 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     ----------
     segment : ReplaySegment
     flow : DataFrame
-        As :attr:`px4fuse.flight.FusionRecord.flow`.
+        See :attr:`px4fuse.flight.FusionRecord.flow`.
     gate : float
-        In √S.
+        Innovation gate in √S.
     """
     begin_s = flow.index - (flow["samples"] - 1.0) * flow["interval_s"]
     flow = flow[(begin_s > segment.time_s[0]) & (flow.index <= segment.time_s[-1])]
@@ -55,5 +56,5 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
 
 
 def fuse_flow(x: Array, P: Array, flow_samples: EventSamples, gate: float) -> tuple[Array, Array]:
-    """Return state and covariance of all variants after fusing the flow of one event."""
+    """Return state and covariance of all filter configurations after fusing one event's flow."""
     return fuse_mean(x, P, flow_samples, flow_samples.noise, np.full(len(x), gate), VELOCITY)[:2]

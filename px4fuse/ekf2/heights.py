@@ -1,9 +1,9 @@
 """Fusion of GNSS and barometer heights in the EKF2 replay.
 
-EKF2 estimates a bias for the sensor that is not the height reference. Barometer samples between two
-events (ends of intervals, see :mod:`px4fuse.ekf2.intervals`) are fused at the later event; the
-vertical motion in between follows from the state and the IMU. Array shapes: E events, S variants,
-k samples per event.
+EKF2 estimates a bias of the sensor that is not the height reference. Barometer samples between two
+events (ends of intervals, see :mod:`px4fuse.ekf2.intervals`) are fused at the later event. The
+vertical motion from sample to event is computed from the state and the IMU. Array shapes: E events,
+S variants (filter configurations), k samples per event.
 
 Sources: PX4-Autopilot ``EKF/aid_sources`` (``barometer/baro_height_control.cpp``,
 ``gnss/gnss_height_control.cpp``), before v1.16 ``EKF/baro_height_control.cpp`` and
@@ -33,12 +33,12 @@ SENSORS = (BAROMETER, GNSS_HGT)
 HEIGHTS = (*SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
 DEFAULT_DEAD_ZONE_M = 4.0  # m; default of EKF2_GND_EFF_DZ
 HEIGHT_REFERENCES = {0: BAROMETER.name, 1: GNSS_HGT.name}  # values of EKF2_HGT_REF
-# s; start of the replay before the first logged height bias (2 Hz) that is accepted
+# Maximum time (s) from the start of the replay to the first logged height bias (logged at 2 Hz)
 MAX_BIAS_LOG_DELAY_S = 1.0
-# Hz; barometer rate in EKF2 from v1.15 on, the rate before v1.15, and the lowest logged rate that
-# can be replayed. At a lower logged rate one logged sample represents several
+# Barometer rate (Hz) in EKF2 from v1.15 on and before v1.15, and minimum logged rate for a replay.
+# If the logged rate is below EKF2's rate, one logged sample represents several
 BAROMETER_HZ, OLD_BAROMETER_HZ, MIN_BAROMETER_LOG_HZ = 10.0, 15.0, 4.0
-# lower limits of gates (√S) and of the noise of position (m) and velocity (m/s)
+# Minimum gate (√S), and minimum noise of position (m) and velocity (m/s)
 MIN_GATE, MIN_SIGMA = 1.0, 0.01
 
 
@@ -106,11 +106,12 @@ def barometer_samples_inside(
 
 
 def barometer_samples(segment: ReplaySegment, ends: Sequence[IntArray]) -> list[Array]:
-    """Return barometer samples by fusion event, one array per set of event steps.
+    """Return barometer samples by the event at which they are fused, one array per ``ends``.
 
-    Each array has shape (5, k, E). Rows: height (m, down) as in
-    :func:`~px4fuse.ekf2.replay_segments.samples_by_event`, sample age (s), sample time (s), dead
-    zone (m), and 1; all are 0 without a sample.
+    Each element of ``ends`` contains the prediction steps of E events. Each array has shape
+    (5, k, E). Rows: height (m, down), see
+    :func:`~px4fuse.ekf2.replay_segments.samples_by_event`; sample age (s); sample time (s); dead
+    zone (m); and 1. All are 0 without a sample.
     """
     heights = segment.heights
     assert heights is not None
@@ -135,12 +136,12 @@ class HeightFilter:
     ----------
     segment : ReplaySegment
     barometer : ndarray, shape (5, k, E, S) or (5, k, E, 1)
-        From :func:`barometer_samples`.
+        Result of :func:`barometer_samples`.
     fix_s, has_fix : ndarray, shape (E, S) or (E, 1)
-        Measurement time of the GNSS fix of each event; True if there is a fix.
+        Measurement time of the GNSS fix of each event, and mask of the events with a fix.
     enabled : mapping from PX4's name of an aid to ndarray of bool, shape (E, S)
         True while the aid is fused.
-    parameters : mapping from PX4's name to ndarray, shape (S,)
+    parameters : mapping from parameter name to ndarray, shape (S,)
     has_gate : ndarray of bool, shape (S,)
         True for variants that apply the gate.
 
@@ -181,9 +182,9 @@ class HeightFilter:
         self.bias = BiasEstimator(value_m, variance_m2, start_s, step_s)
 
     def updates(self, sensor: str, variant: int, end_s: Array) -> pd.DataFrame:
-        """Return the updates of one variant with a sensor; ``end_s`` is the time of each event.
+        """Return the updates of one variant with one sensor, indexed by EKF2's measurement time.
 
-        The index is the measurement time in EKF2.
+        ``end_s`` is the time of each event.
         """
         rows, slots = [], len(self.down_m)
         for slot in [slots] if sensor == GNSS_HGT.name else range(slots):
@@ -206,7 +207,7 @@ class HeightFilter:
     def fuse(
         self, e: int, x: Array, P: Array, gnss_m: Array, gnss_m2: Array
     ) -> tuple[Array, Array]:
-        """Return state and covariance after fusing both heights at one event.
+        """Return state and covariance after fusing barometer and GNSS height at one event.
 
         ``gnss_m`` and ``gnss_m2`` are the GNSS height (m, down) and its R.
         """
@@ -236,7 +237,7 @@ class HeightFilter:
         nu: Array,
         R: Array,
     ) -> tuple[Array, Array]:
-        """Fuse one innovation with the gain ``column`` (PH') and its variance ``spread`` (HPH')."""
+        """Fuse one innovation; ``column`` is PH', ``predicted_variance`` HPH'."""
         if self.biased[sensor_index]:
             has_sample, time_s = self.has_sample[slot][e], self.time_s[slot][e]
             nu, R = self.bias.remove_bias(

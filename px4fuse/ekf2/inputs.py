@@ -1,4 +1,4 @@
-"""Inputs of the EKF2 replay from a flight, or the reason why the log is not sufficient.
+"""Inputs of the EKF2 replay, read from a flight, or the reason why the log is not sufficient.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/external_vision/ev_pos_control.cpp`` and, before v1.15,
 ``EKF/ev_pos_control.cpp`` (frames), ``logged_topics.cpp`` (logging rates).
@@ -54,27 +54,29 @@ from px4fuse.readers.px4_topics import DEFAULT_PROFILE
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_matrix
 
 ANALYSIS_NAME = "EKF2 replay"
-# Note in simulated logs, whose EKF2 is this model
+# Note in logs that px4fuse simulated: their EKF2 data are from this model
 MODEL_NOTE = (
     "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
 )
-# s, logging interval of the topics with a copy of the vision samples (logged_topics.cpp)
+# Logging interval (s) of the topics with a copy of the vision samples (logged_topics.cpp)
 VISION_COPY_INTERVALS_S = {
     "estimator_visual_odometry_aligned": 0.2,
     "estimator_aid_src_ev_pos": 0.5,
 }
 ROTATE_VISION_BIT = 64  # EKF2_AID_MASK, up to v1.13
-# s; estimator_aid_src topics contain EKF2's measurement time within about 1 ms
+# Maximum time difference (s) of a logged innovation and its sample: estimator_aid_src topics
+# contain EKF2's measurement time within about 1 ms
 SAMPLE_MATCH_TOLERANCE_S = 0.006
 GNSS_VELOCITY_BIT = 4  # bit in EKF2_GPS_CTRL; before v1.14 GNSS velocity is always fused
 GNSS_LABELS = (GNSS_POS.label, GNSS_VEL.label)
-# s; longest time from a reset to its publication: vehicle_local_position is logged every 0.1 s
+# Maximum time (s) from a reset to its publication: vehicle_local_position is logged every 0.1 s
 MAX_RESET_PUBLICATION_S = 0.2
-# s; EKF2 predicts every 8 to 13 ms, and longer IMU intervals lose rotation and vibration
+# Maximum median IMU interval (s): EKF2 predicts every 8 to 13 ms, and longer IMU intervals lose
+# rotation and vibration
 MAX_IMU_INTERVAL_S = 0.012
-# maximum fraction of IMU samples that EKF2 received and the log lacks, outside gaps
+# Maximum fraction of IMU samples that EKF2 received but the log does not contain, outside gaps
 MAX_LOST_SHARE = 0.1
-# first release whose estimator_states have the timestamp of the fusion horizon
+# First release with the time of the fusion horizon in estimator_states
 FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
 UNLIMITED_RESETS = 1_000_000
 MAX_INTERVAL_S = 0.25
@@ -82,7 +84,7 @@ MAX_INTERVAL_S = 0.25
 
 @dataclass(frozen=True)
 class ReceivedPositions:
-    """Position samples as received by EKF2, in time order; m: number of samples.
+    """Position samples that EKF2 received, in time order; m is the number of samples.
 
     Attributes
     ----------
@@ -103,8 +105,8 @@ class ReceivedPositions:
     uses_sender_times : bool
         True if EKF2 uses the measurement times of the sender instead of the delay parameter.
     correction_m : ndarray, shape (m, 2), or None
-        Position correction of EKF2 at each sample (m, north and east), estimated from the published
-        position. None if all rejections are logged, or none occurred.
+        EKF2's position correction by each sample (m, north and east), estimated from the published
+        position. None if it is not needed: all rejections are logged, or none occurred.
     """
 
     stamp_s: Array
@@ -129,22 +131,23 @@ class FusionRules:
     Attributes
     ----------
     start_interval_s : float
-        Fusion starts on a sample at most this long after the previous one.
+        Maximum interval from the previous sample to a sample with which fusion starts.
     stop_s : float
-        Fusion stops after this time without a sample.
+        Time without a sample after which fusion stops.
     reset_s : float
-        The position is reset to the sample after this time of rejections.
+        Time of rejections after which the position is reset to the sample.
     resets : int
-        Number of resets in a row after which fusion stops, until a sample with which it may start.
+        Number of resets in a row after which fusion stops, until a sample with which fusion may
+        start.
     reset_scale : float
         Ratio of the position variance after a reset to the variance of the sample.
     with_velocity : bool
-        True if velocity is reset together with position: after both were rejected for ``reset_s``,
-        or position for twice as long.
+        True if velocity is reset together with position. Both are then reset after both were
+        rejected for ``reset_s``, or after position was rejected for twice that time.
     bias_floor : float or None
-        Lower limit of the accelerometer bias variance (m²/s⁴), if the release has one.
+        Minimum of the accelerometer bias variance (m²/s⁴); None if the release has no minimum.
     horizon_by_delay : bool
-        True if the largest delay parameter sets the fusion horizon; else EKF2_DELAY_MAX (from
+        True if the largest delay parameter sets the fusion horizon; False for EKF2_DELAY_MAX (from
         v1.15).
     """
 
@@ -160,33 +163,35 @@ class FusionRules:
 
 @dataclass(frozen=True)
 class Inputs:
-    """All inputs that the EKF2 replay needs of a flight.
+    """All data of a flight that the EKF2 replay needs.
 
     Attributes
     ----------
     settings : dict
-        Logged values of the parameters in the model, by PX4 name.
+        Logged values of the parameters that the model uses, by PX4 name.
     segments : tuple of ReplaySegment
     received : ReceivedPositions
+        Samples of the horizontal position source.
     aid : Aid
-        Aid as which EKF2 fused the positions.
+        EKF2 aid that fused these positions: GNSS or external vision.
     rules : FusionRules
     step_s : float
         Mean prediction step.
     horizon_s : float
         Delay of the fusion horizon.
     predict_s : float
-        EKF2_PREDICT_US.
+        Configured prediction interval, EKF2_PREDICT_US.
     vision_height : bool
         True if EKF2 fused the height of external vision.
     imu_offset_m : ndarray, shape (3,)
-        EKF2_IMU_POS, body FRD.
+        Position of the IMU, EKF2_IMU_POS, body FRD.
     max_interval_s : float
-        Largest interval between height and heading measurements in a gap of the source.
+        Maximum interval between height and heading measurements in a gap of the source.
     vision : ReceivedPositions or None
-        External vision fused besides GNSS; NaN while disabled.
+        External vision that EKF2 fused in addition to GNSS; NaN while disabled.
     height_reason : str
-        Reason why the logged EKF2 height is used on GNSS; empty if heights are fused.
+        In a flight with GNSS, reason why the logged EKF2 height is used; empty if heights are
+        fused.
     """
 
     settings: dict[str, float]
@@ -215,9 +220,9 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     ----------
     flight : Flight
     doubtful : mapping from PX4's name of an aid to str
-        Aids whose replay disagrees with the log, with the reason. With a height sensor among them
-        the logged EKF2 height is used; with optical flow, flow does not bridge gaps of the source;
-        vision besides GNSS is not fused.
+        Aids with a replay that disagrees with the log, and the reasons. Height sensors among them
+        are replaced by the logged EKF2 height. Without optical flow the replay is interrupted in
+        gaps of the source. Vision in addition to GNSS is omitted.
     """
     imu, attitude, ekf2 = flight.imu, flight.attitude, flight.ekf2
     if isinstance(imu, Unavailable):
@@ -269,7 +274,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     )
     if isinstance(vision, Unavailable):
         return vision
-    # since v1.17 each receiver has its lever arm, logged in its messages
+    # since v1.17 each receiver has a separate lever arm, which is logged in its messages
     track = _gnss_track(flight) if is_gnss else None
     lever_arm = {} if track is None else dict(zip(aid.lever_arm, track.lever_arm_m, strict=True))
     if isinstance(horizon_s, Unavailable):
@@ -335,7 +340,7 @@ def lost_imu_fraction(time_s: Array) -> float:
 
 
 def _missing_imu(time_s: Array) -> Unavailable | None:
-    """Return Unavailable if IMU samples at these times are too few for predictions."""
+    """Return Unavailable if the IMU samples at ``time_s`` are too few for predictions."""
     intervals = np.diff(time_s)
     interval = float(np.median(intervals))
     if interval > MAX_IMU_INTERVAL_S:
@@ -357,12 +362,12 @@ def _missing_imu(time_s: Array) -> Unavailable | None:
 
 
 def _rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules:
-    """Return the rules for starts, stops and resets of the release that wrote the log."""
+    """Return the rules for starts, stops and resets in the PX4 release of the log."""
     bias_floor = 5e-8 / step_s**2 if record.per_step_biases else None
     is_horizon_from_delay = "EKF2_DELAY_MAX" not in record.parameters
     if is_gnss:
-        # resetHorizontalPositionTo, gps_control.cpp: variance doubled from v1.16 on; from main of
-        # 2026 on each aid is checked separately
+        # resetHorizontalPositionTo, gps_control.cpp: variance doubled from v1.16 on. In PX4 main
+        # since 2026 each aid (position, velocity) has a separate timeout and reset
         reset_scale = 2.0 if record.stores_latitude else 1.0
         resets_together = GNSS_MODE not in record.parameters
         return FusionRules(
@@ -390,7 +395,7 @@ def replayed_aid(ekf2: Ekf2) -> Aid:
 
 
 def _enabled_log(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
-    """Return the step function "aid enabled" (1 or 0); None if never enabled or not logged."""
+    """Return the series "aid enabled" (1 or 0); None if never enabled or not logged."""
     log = ekf2.aids.get(aid.name)
     return (
         log.enabled if log is not None and log.enabled is not None and log.enabled.any() else None
@@ -402,7 +407,7 @@ def _gnss_track(flight: Flight) -> PositionTrack | None:
 
 
 def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPositions | Unavailable:
-    """Return the GNSS fixes that EKF2 received, in the form of :func:`read_vision`."""
+    """Return the GNSS fixes that EKF2 received (NED), or the reason why they are incomplete."""
     track = _gnss_track(flight)
     if track is None or track.velocity is None:
         return Unavailable(ANALYSIS_NAME, "no vehicle_gps_position in the log", DEFAULT_PROFILE)
@@ -415,15 +420,16 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
     parameters = record.parameters
     switch = int(parameters.get(GNSS_POS.switch, 7.0))
     samples, velocities = track.samples, track.velocity
-    # fixes while GNSS is disabled are not used
+    # EKF2 does not use fixes while GNSS is disabled
     if (enabled := ekf2.aids[GNSS_POS.name].enabled) is not None:
         is_enabled = step_values_at(enabled, samples.index) > 0.0
         samples, velocities = samples[is_enabled], velocities[is_enabled]
-    # the track is at measurement times; the replay subtracts the delay, which is added here
+    # the track has measurement times; the delay is added to get timestamps, because the replay
+    # subtracts it again
     flown = effective_settings(parameters, GNSS_POS)
     flown_s = flown[GNSS_POS.delay] * 1e-3
     timestamp_s = samples.index.to_numpy() + flown_s
-    # m, upper limit of the GNSS position noise in EKF2 (gps_control.cpp)
+    # maximum GNSS position noise (m) in EKF2 (gps_control.cpp)
     max_noise_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
     reported_variance = samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=max_noise_m**2)
     velocity = velocities[Columns.VELOCITY].to_numpy()
@@ -450,7 +456,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
 def _position_corrections(
     ekf2: Ekf2, measured_s: Array, rejected: Array, tau_s: float
 ) -> Array | None:
-    """Return EKF2's position correction at each sample; None if rejections are fully logged."""
+    """Return EKF2's position correction by each sample; None if all rejections are logged."""
     if not (rejected > 0.0).any() or np.isfinite(rejected).all():
         return None
     if isinstance(ekf2.horizon_s, Unavailable):
@@ -462,7 +468,7 @@ def _position_corrections(
     for reset in ekf2.resets:
         if reset.quantity == "position":
             position = position - (times >= reset.time_s)[:, None] * np.array(reset.delta[:2])
-    # EKF2 uses the fix half a step earlier; its correction shows in the next published row
+    # EKF2 fuses the fix half a step earlier; the correction is in the next published row
     before_sample_s = measured_s + ekf2.horizon_s - 1.5 * ekf2.step_s
     return corrections(times, velocity, position, before_sample_s, tau_s)
 
@@ -478,7 +484,7 @@ def read_vision(
     ekf2 : Ekf2
     record : FusionRecord
     attitude : DataFrame
-        Published attitude, to rotate samples in FRD.
+        Published attitude, with which samples in FRD are rotated to NED.
     """
     track = _vision_track(flight)
     if isinstance(track, Unavailable):
@@ -506,7 +512,7 @@ def read_vision(
         position = np.einsum("nij,nj->ni", rotation, position)
         variance = np.einsum("nij,nj->ni", rotation**2, variance)
     age = record.vision_age_s
-    arrival = np.full(len(timestamp_s), -np.inf)  # unknown: never late
+    arrival = np.full(len(timestamp_s), -np.inf)  # arrival times unknown: no sample counts as late
     if len(age) and "vehicle_visual_odometry" in track.topics:
         arrival = timestamp_s + np.interp(timestamp_s, age.index.to_numpy(), age.to_numpy())
     decisions = _logged_decisions(ekf2, record, timestamp_s)
@@ -516,7 +522,7 @@ def read_vision(
 def _read_vision_besides_gnss(
     flight: Flight, ekf2: Ekf2, record: FusionRecord, attitude: pd.DataFrame
 ) -> ReceivedPositions | Unavailable | None:
-    """Return the vision samples that EKF2 received besides GNSS; None if it fused none."""
+    """Return the vision samples of a flight with GNSS; None if EKF2 did not fuse vision."""
     if (enabled := _enabled_log(ekf2, EV_POS)) is None:
         return None
     if fuses_by_mask(record.parameters):
@@ -551,7 +557,7 @@ def _logged_decisions(
     measured_s = timestamp_s - delay_s - 0.5 * ekf2.step_s
     sample_row = same_sample(innovations.index.to_numpy(), measured_s)
     rejected[sample_row >= 0] = innovations["rejected"].to_numpy()[sample_row[sample_row >= 0]]
-    # a reset shows in the first published row after it, one horizon after the measurement
+    # a reset is visible in the next published row, one fusion horizon later than the measurement
     publication_s = measured_s + horizon_s
     for reset_s in horizontal_resets_s(ekf2):
         earlier_rows = np.flatnonzero((publication_s <= reset_s) & (rejected != 0.0))
@@ -569,7 +575,7 @@ def aid_source(aid: Aid) -> str:
 
 
 def same_sample(sample_s: Array, measurement_s: Array) -> IntArray:
-    """Return the row of the sample at each measurement time; -1 if there is no sample."""
+    """Return the index of the sample at each measurement time; -1 without a sample."""
     row = np.clip(
         np.searchsorted(sample_s, measurement_s - SAMPLE_MATCH_TOLERANCE_S), 0, len(sample_s) - 1
     )
@@ -584,7 +590,7 @@ def horizontal_resets_s(ekf2: Ekf2) -> Array:
 
 
 def _vision_track(flight: Flight) -> PositionTrack | Unavailable:
-    """Return the complete track that EKF2 received."""
+    """Return the track with all vision positions that EKF2 received."""
     reasons = ["no vehicle_visual_odometry"]
     for track in sorted(flight.positions, key=lambda t: t.origin == POSITION_FILE):
         if track.origin.is_vision and track.origin.has_all_samples:

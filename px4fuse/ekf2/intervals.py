@@ -1,16 +1,16 @@
-"""Intervals between events: state transition and process noise, computed once.
+"""Intervals between fusion events: state transition and process noise, the same for all parameters.
 
-An event ends an interval: a position sample or, in a gap of the source, a time at which height and
-heading are fused. E: number of events.
+An event is the end of an interval: the fusion of a position sample or, in a gap of the source, of
+height and heading only. E is the number of events.
 
-Attitude and biases of a replay with changed parameters hardly differ from the logged ones.
-Therefore the transition about the nominal attitude is used for all parameters. All intervals are
-integrated together, one prediction step at a time.
+With changed parameters, attitude and biases of a replay hardly differ from the logged values.
+Therefore the state transition about the nominal (published) attitude is computed once and used for
+all parameters. All intervals are integrated together, one prediction step at a time.
 
 Error state: attitude error δθ (earth frame, estimate = exp(δθ) · nominal), velocity, position,
-errors of gyro bias b_g and accelerometer bias b_a. Equations as in PX4-Autopilot
+errors of gyro bias b_g and accelerometer bias b_a. The equations are from PX4-Autopilot
 ``EKF/python/ekf_derivation/derivation.py`` (predict_covariance), ``EKF/covariance.cpp`` and
-``EKF/ekf.cpp`` (predictState); Δt is the step, a = R f the specific force in NED:
+``EKF/ekf.cpp`` (predictState). Δt is the prediction step, a = R f the specific force in NED:
 
     δθ ← δθ - R Δt δb_g            v ← v - [a]× Δt δθ - R Δt δb_a + (a + g) Δt
     p ← p + (v_before + v_after) Δt / 2
@@ -36,24 +36,24 @@ from px4fuse.ekf2.replay_segments import (
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.trajectory.rotation import skew
 
-# s; EKF2 never fuses a sample that arrives later than this after the fusion horizon has passed it
-# (RingBuffer.h, pop_first_older_than)
+# Maximum time (s) from the passage of the fusion horizon to the arrival of a sample that EKF2 still
+# fuses (RingBuffer.h, pop_first_older_than)
 MAX_LATENESS_S = 0.1
-# s; a sample that is fused later than this counts as late (3 cm at 1 m/s)
+# Minimum delay (s) of the fusion of a sample that counts as late (3 cm at 1 m/s)
 MIN_LATENESS_S = 0.03
-# Action of a sample: none, update of the state, or start of fusion with a reset
+# Action on a sample: none, update of the state, or start of fusion with a reset
 IDLE, FUSE, START = 0, 1, 2
-# Number of columns of the effects in an interval: of initial attitude error, gyro bias and
-# accelerometer bias (3 columns each), correction of the nominal attitude, and acceleration
+# Columns of an interval's sensitivity matrix: initial attitude error, gyro bias and accelerometer
+# bias (3 columns each), correction of the nominal attitude, and acceleration
 EFFECT_COLUMNS = 11
 CORRECTION_COLUMN, INPUT_COLUMN = 9, 10
 
-# Events at the ends of the intervals, in time order
+# Events (ends of intervals) in time order
 Events = np.recarray[Any, Any]
 EVENT = np.dtype(
     [
         ("end_step", np.intp),  # index of the prediction step after which the event occurs
-        ("sample", np.intp),  # index of its position sample, -1 without a sample
+        ("sample", np.intp),  # index of the position sample, -1 without a sample
         ("action", np.intp),
         ("usable", bool),  # sample arrived early enough to be fused
         ("can_start", bool),  # EKF2 may start fusion with this sample after a stop
@@ -71,12 +71,13 @@ class Intervals:
     Attributes
     ----------
     events : recarray, shape (E,)
-        Fields: :data:`EVENT`.
+        Events with the fields of :data:`EVENT`.
     transition : ndarray, shape (E, 15, 15)
     correction_input, acceleration_input : ndarray, shape (E, 15)
-        Change of the state by the correction of the nominal attitude, and by the acceleration.
+        Change of the state due to the correction of the nominal attitude, and due to the
+        acceleration.
     gyro_noise, accelerometer_noise : ndarray, shape (E, 9, 9)
-        Covariance of attitude, velocity and position added by noise of 1 rad/s or 1 m/s².
+        Process noise of attitude, velocity and position for a sensor noise of 1 rad/s or 1 m/s².
     """
 
     events: Events
@@ -91,14 +92,14 @@ class Intervals:
 
 @dataclass(frozen=True)
 class Timing:
-    """Age of a position at its timestamp, and fusion horizon (s)."""
+    """Age of a position at its timestamp, and delay of the fusion horizon (s)."""
 
     delay_s: float
     horizon_s: float
 
 
 def make_intervals(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Intervals:
-    """Compute the intervals of a segment; number and order of events are equal for all delays."""
+    """Compute the intervals of a segment; ``timing`` does not change number and order of events."""
     events = _events(inputs, segment, timing)
     start, end = np.concatenate([[0], events.end_step[:-1]]), events.end_step
     count, duration_s = len(end), segment.time_s[end] - segment.time_s[start]
@@ -123,14 +124,14 @@ def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
     first, last_row = np.searchsorted(received.stamp_s, time_s[[0, -1]])
     stamp, last = received.stamp_s[first:last_row], len(time_s) - 1
     measured_s = stamp - timing.delay_s - 0.5 * inputs.step_s
-    # a sample that arrives after the fusion horizon has passed it is fused late, or never
+    # a sample that arrives after the fusion horizon has passed its time is fused late, or never
     due_s = np.maximum(measured_s, received.arrival_s[first:last_row] - timing.horizon_s)
     end = np.searchsorted(time_s, due_s - 1e-9)
     is_inside = (end > 0) & (end <= last)
     end = np.maximum.accumulate(np.minimum(end, last))
     is_in_time = time_s[end] < measured_s + MAX_LATENESS_S
     is_usable = is_inside & is_in_time
-    is_usable[:-1] &= end[1:] > end[:-1]  # EKF2 fuses the newer of two samples in one step
+    is_usable[:-1] &= end[1:] > end[:-1]  # of two samples in one step EKF2 fuses only the newer
     action, can_start = _actions(inputs, segment, measured_s, end, is_usable)
     # additional events in gaps of the source; their number does not depend on the delay
     gap_s = np.diff(np.concatenate([time_s[:1], stamp, time_s[-1:]]))
@@ -164,14 +165,17 @@ def _actions(
     end: IntArray,
     is_usable: BoolArray,
 ) -> tuple[IntArray, BoolArray]:
-    """Return the action of each sample, and True if fusion may start with it (ev_control.cpp)."""
+    """Return the action on each sample, and a mask of samples that may start fusion.
+
+    Source: ``ev_control.cpp``.
+    """
     rules = inputs.rules
     action = np.full(len(measured_at_s), IDLE)
     can_start = np.zeros(len(measured_at_s), dtype=bool)
     usable_rows = np.flatnonzero(is_usable)
     interval = np.diff(measured_at_s[usable_rows], prepend=-np.inf)
     can_start[usable_rows] = interval < rules.start_interval_s
-    # s, age of the previous usable sample one step before the fusion of each sample
+    # age (s) of the previous usable sample, one step before each sample is fused
     gaps_s = segment.time_s[end[usable_rows] - 1] - np.concatenate(
         [[np.inf], measured_at_s[usable_rows[:-1]]]
     )
@@ -187,13 +191,13 @@ def _actions(
 
 
 def _effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
-    """Return the effects of all columns on attitude, velocity and position at each event.
+    """Return the sensitivities of attitude, velocity and position at each event.
 
     Shape (E, 9, EFFECT_COLUMNS).
     """
     length = end - start
-    # integrate step 1 of all intervals, then step 2, ...: longer intervals stand first, so that
-    # those still running are a prefix
+    # integrate step 1 of all intervals, then step 2, ...: longer intervals are first, so the
+    # intervals that still have a next step are the first rows
     longest_first = np.argsort(-length, kind="stable")
     first = start[longest_first]
     attitude, velocity, position = effects = np.zeros((3, len(end), 3, EFFECT_COLUMNS))
@@ -218,11 +222,11 @@ def _effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
 
 
 def _noises(steps: Array, duration_s: Array, tilt: Array) -> tuple[Array, Array]:
-    """Return covariances at the end of each interval for unit gyro and accelerometer noise.
+    """Return the process noises of each interval for unit gyro noise and unit accelerometer noise.
 
     Closed form for n equal steps with the mean specific force of the interval. Unit noise adds dt²
-    to the variance of attitude or velocity in each step. The effect of gyro noise on velocity and
-    position is small, so only leading terms are used.
+    to the variance of attitude or velocity in each step. Gyro noise has a small effect on velocity
+    and position, so only the leading terms are used.
     """
     n = np.maximum(steps, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n

@@ -1,8 +1,8 @@
-"""Magnetometer fusion of all three axes, with earth and body fields as states.
+"""Fusion of all three magnetometer axes in the EKF2 replay, with earth and body fields as states.
 
-Samples between two events (ends of intervals, see :mod:`px4fuse.ekf2.intervals`) are fused as their
-mean at the later event: the attitude error hardly changes in between. Array shapes: E events, S
-variants.
+The samples between two events (ends of intervals, see :mod:`px4fuse.ekf2.intervals`) are averaged,
+and their mean is fused at the later event, because the attitude error hardly changes in between.
+Array shapes: E events, S variants (filter configurations).
 
 Sources: PX4-Autopilot ``EKF/aid_sources/magnetometer`` (``mag_fusion.cpp``: fuseMag;
 ``mag_control.cpp``: R and its lower limit), ``EKF/covariance.cpp`` (process noise of the fields).
@@ -24,9 +24,9 @@ CROSS = skew(EYE).reshape(3, 9)  # v @ CROSS is the cross product matrix [v]×
 class EventSamples(NamedTuple):
     """Means of the samples that are fused at each event; shape (E, ...), or (E, S, ...).
 
-    ``value`` and ``rotation_to_body`` as in
-    :class:`~px4fuse.ekf2.replay_segments.SensorSamples`, but velocities are those at the event.
-    ``sample_count``: samples that EKF2 received; ``noise``: R of one sample.
+    For ``value`` and ``rotation_to_body`` see
+    :class:`~px4fuse.ekf2.replay_segments.SensorSamples`; velocities refer to the event.
+    ``sample_count`` is the number of samples that EKF2 received, ``noise`` is R of one sample.
     """
 
     value: Array
@@ -38,10 +38,10 @@ class EventSamples(NamedTuple):
 def mean_by_event(
     sensor_samples: SensorSamples, event_steps: IntArray, imu_velocity_m_s: Array | None = None
 ) -> EventSamples:
-    """Return means of the samples fused at each event.
+    """Return the means of the samples fused at each event.
 
-    Pass ``imu_velocity_m_s`` of :class:`~px4fuse.ekf2.replay_segments.ReplaySegment` for velocity
-    samples.
+    For velocity samples, ``imu_velocity_m_s`` of the segment
+    (:class:`~px4fuse.ekf2.replay_segments.ReplaySegment`) is required.
     """
     event = np.searchsorted(event_steps, sensor_samples.step)
     is_inside, size = event < len(event_steps), len(event_steps)
@@ -83,18 +83,18 @@ def fuse_mean(
     rows: slice,
     bias_rows: slice | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Return state, covariance and innovations after fusing a mean, as :func:`fuse_field`.
+    """Return state, covariance and innovations (see :func:`fuse_field`) after fusing a mean.
 
     Parameters
     ----------
     sample_mean : EventSamples
         Mean of one event.
     R, gate : ndarray, shape (S,)
-        Variance of one sample, and gate in units of √innovation variance.
+        Variance of one sample, and innovation gate (in √ of the innovation variance).
     rows : slice
-        NED vector states that the sensor measures in the body frame.
+        Indices of the vector state (NED) that the sensor measures in the body frame.
     bias_rows : slice, optional
-        Body-frame states that add to the measurement.
+        Indices of a body-frame bias state that adds to the measurement.
     """
     state, sample_count = x[:, rows], sample_mean.sample_count
     cross_state, cross_theta = (

@@ -1,13 +1,13 @@
-"""Replay of EKF2 from an ordinary log, as flown and with other parameters.
+"""Replay of EKF2 from a default log, with the logged and with other parameters.
 
 The model contains the part of EKF2 that horizontal positions affect: 15 error states about the
-published attitude, started from the logged ``estimator_states``. Inputs are the logged IMU and
-positions, with velocities on GNSS and the magnetometer (21 states) if logged. Other measurements of
-EKF2 (height; heading without the magnetometer) are replaced by EKF2's published values.
-:mod:`px4fuse.ekf2.replay` tests on each log how well the model agrees with EKF2.
+published attitude. It starts from the logged ``estimator_states``. Inputs are the logged IMU and
+positions; in a flight with GNSS also velocities and, if logged, the magnetometer (21 states). Other
+measurements (height; heading without the magnetometer) are replaced by EKF2's published values.
+:mod:`px4fuse.ekf2.replay` tests for each log if the model agrees with EKF2.
 
 A *variant* is one configuration of the filter: parameters, estimated states, fused aids and gate.
-All variants run together.
+All variants run together, to save time.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -67,9 +67,9 @@ from px4fuse.flight import Columns, Ekf2, Flight, Unavailable
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 
-MAX_HORIZON_S = 1.0  # s, upper limit of EKF2_DELAY_MAX
+MAX_HORIZON_S = 1.0  # maximum delay of the fusion horizon: maximum of EKF2_DELAY_MAX
 
-# Fields of Agreement with other names than the aid
+# Fields of Agreement that do not have the name of the aid, by aid
 AGREEMENT_FIELDS = {FLOW.name: "carried_difference_m"}
 
 RequestVariants = Callable[[Inputs], Sequence[Variant]]
@@ -84,14 +84,15 @@ class Model:
     flight : Flight
     inputs : Inputs
     intervals : mapping from Timing to tuple of Intervals
-        Intervals of each segment for the delay as flown; empty if not yet computed.
+        Intervals of each segment with the logged delay; empty if not yet computed.
     flown : Ekf2Replay
         Replay with the logged parameters.
     agreement : Agreement
         Agreement of ``flown`` with the log.
     runs : list of SegmentRun
-        One run per segment with the variants already computed: as flown, with logged rejections,
-        and those of ``request_variants``.
+        One run per segment, with the filter configurations (variants) already computed: logged
+        parameters, logged parameters with logged rejections, and the result of
+        ``request_variants``.
     """
 
     flight: Flight
@@ -107,13 +108,18 @@ class Model:
 def open_model(
     flight: Flight, request_variants: RequestVariants = lambda _: ()
 ) -> Model | Unavailable:
-    """Prepare a flight for replays and replay it as flown, or return Unavailable.
+    """Prepare a flight for EKF2 replays, and replay it with the logged parameters.
 
     Parameters
     ----------
     flight : Flight
     request_variants : callable
-        Returns variants that are needed later; running all variants together saves time.
+        Function that returns filter configurations (variants) that are needed later. Running all
+        variants together saves time.
+
+    Returns
+    -------
+    Model, or Unavailable with the reason why the flight cannot be replayed.
     """
     failed_agreements: dict[str, Agreement] = {}
     while not isinstance(
@@ -128,7 +134,7 @@ def open_model(
 def _open_without_aids(
     flight: Flight, request_variants: RequestVariants, failed_agreements: Mapping[str, Agreement]
 ) -> Model | Unavailable:
-    """Open the model without the aids in ``failed_agreements``, by name of the aid."""
+    """Prepare the EKF2 replay without the aids in ``failed_agreements``, keyed by aid name."""
     doubtful = {name: doubt.doubtful[name] for name, doubt in failed_agreements.items()}
     inputs = prepare_inputs(flight, doubtful)
     if isinstance(inputs, Unavailable):
@@ -173,7 +179,7 @@ def _open_without_aids(
 
 
 def replay_with_logged_rejections(model: Model) -> Ekf2Replay:
-    """Replay EKF2 as flown with the logged rejections and resets instead of the model's gate."""
+    """Replay EKF2 with logged parameters, and logged rejections and resets instead of the gate."""
     variant = Variant(model.inputs.settings, uses_logged_decisions=True)
     return _make_replay(model.inputs, _run_model(model, [variant]), variant, {})
 
@@ -184,7 +190,7 @@ def replay_settings(
     excluded_s: Array | None = None,
     without: Mapping[str, float] | None = None,
 ) -> tuple[Ekf2Replay, ...]:
-    """Replay several changes of the logged parameters at once.
+    """Replay EKF2 with several sets of changed parameters at once.
 
     Parameters
     ----------
@@ -192,7 +198,7 @@ def replay_settings(
     settings : sequence of mapping
         Changed parameters of each replay, by PX4 name and in PX4's units.
     excluded_s : ndarray, optional
-        Timestamps of samples that are neither fused nor listed as updates.
+        Timestamps of samples that are not fused and not listed as updates.
     without : mapping from PX4's name of an aid to float, optional
         Time (s) from which the aid is not fused.
 
@@ -278,7 +284,7 @@ def _without_updates(inputs: Inputs, replay: Ekf2Replay, excluded_s: Array) -> E
 
 
 def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
-    """Add noise to every position that EKF2 received.
+    """Return the model with noise added to every position that EKF2 received.
 
     Parameters
     ----------
@@ -293,18 +299,18 @@ def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
         if samples is not None:
             noise = rng.normal(scale=sigma_m, size=samples.position_m.shape)
             new_inputs[name] = replace(samples, position_m=samples.position_m + noise)
-    # the noise changes positions only, so the intervals between the samples stay valid
+    # the noise changes positions only, not their times, so the intervals remain valid
     return replace(model, inputs=replace(inputs, **new_inputs))
 
 
 def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float) -> Model:
-    """Rotate every position that EKF2 received, and add a delay to its timestamp.
+    """Return the model with every received position rotated, and its timestamp delayed.
 
     Parameters
     ----------
     model : Model
     rotation_deg : float
-        Clockwise seen from above.
+        Rotation, clockwise seen from above.
     delay_s : float
     """
     if not rotation_deg and not delay_s:
@@ -323,7 +329,7 @@ def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float)
 
 
 def delayed_variants(model: Model, variants: Sequence[Variant]) -> Iterator[pd.DataFrame]:
-    """Yield the track of each variant at its fusion horizon.
+    """Yield the track of each filter configuration (variant) at its fusion horizon.
 
     The tracks are computed one at a time and without the output predictor, to limit memory and
     time.
@@ -334,7 +340,7 @@ def delayed_variants(model: Model, variants: Sequence[Variant]) -> Iterator[pd.D
 
 
 def _run_model(model: Model, variants: Sequence[Variant]) -> list[SegmentRun]:
-    """Run these variants, or return the stored runs of the model that contain them."""
+    """Run filter configurations, or return the model's stored runs if they contain them."""
     if model.runs and all(variant in model.runs[0].variants for variant in variants):
         return model.runs
     return run_variants(model.inputs, variants, model.intervals)
@@ -345,7 +351,7 @@ def run_variants(
     variants: Sequence[Variant],
     computed_intervals: Mapping[Timing, Sequence[Intervals]],
 ) -> list[SegmentRun]:
-    """Run variants through every segment; ``known`` contains intervals already computed."""
+    """Run filter configurations through every segment, with ``computed_intervals`` if available."""
     timings = [variant.timing(inputs) for variant in variants]
     runs = []
     for segment_index, segment in enumerate(inputs.segments):
@@ -361,7 +367,7 @@ def run_variants(
 
 
 def _track(run: SegmentRun, state: Array) -> pd.DataFrame:
-    """Return position and velocity of a state at the end of each step."""
+    """Return position and velocity of a state as a table with one row per prediction step."""
     index = pd.Index(run.segment.time_s, name="time_s")
     position = state[:, POSITION] / run.segment.metres
     return pd.DataFrame(np.hstack([position, state[:, VELOCITY]]), index, Columns.STATE)
@@ -401,7 +407,7 @@ def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[tu
 
 
 def _other_aid_updates(runs: Sequence[SegmentRun], variant_index: int) -> dict[str, pd.DataFrame]:
-    """Return the updates of the aids fused besides the position, by PX4's name."""
+    """Return the updates of all fused aids except the position, by PX4's name of the aid."""
     updates_by_aid: dict[str, list[pd.DataFrame]] = {}
     for run in runs:
         end_s = run.segment.time_s[run.events[variant_index].end_step]
@@ -439,13 +445,13 @@ def _position_updates(run: SegmentRun, variant_index: int) -> pd.DataFrame:
 def _delayed_and_published(
     inputs: Inputs, run: SegmentRun, variant_index: int
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the state at the fusion horizon and the published state, at each step."""
+    """Return the state at the fusion horizon and the published state at each prediction step."""
     segment, variant = run.segment, run.variants[variant_index]
     state, reset = delayed_states(run, variant_index)
     horizon_s = min(variant.timing(inputs).horizon_s, MAX_HORIZON_S)
     lag = max(round(horizon_s / inputs.step_s), 1)
     published_rotation = np.zeros((len(state), 3))
-    if variant.attitude:  # the logged published attitude already follows EKF2's attitude
+    if variant.attitude:  # the nominal (published) attitude already follows EKF2's logged attitude
         attitude_difference = state[:, THETA] - segment.attitude_error_rad
         published_rotation = follow_attitude(attitude_difference, lag, inputs.step_s, horizon_s)
     published = publish(segment, state, reset, published_rotation, lag, variant.settings)
@@ -455,7 +461,7 @@ def _delayed_and_published(
 
 
 def delayed_states(run: SegmentRun, variant_index: int) -> tuple[Array, Array]:
-    """Return the state of one variant at the end of each step, and the sum of position resets.
+    """Return the state of one variant at each prediction step, and the sum of position resets.
 
     Returns
     -------
@@ -470,7 +476,7 @@ def delayed_states(run: SegmentRun, variant_index: int) -> tuple[Array, Array]:
     state = event_states[np.concatenate([[0], interval])]
 
     def sum_since_event(increments: Array) -> Array:
-        """Return the sum of step increments since the beginning of the interval."""
+        """Return the sum of the steps' increments since the last event."""
         total = np.cumsum(increments, axis=0)
         return np.asarray(total - (total - increments)[first_step])
 
@@ -481,7 +487,7 @@ def delayed_states(run: SegmentRun, variant_index: int) -> tuple[Array, Array]:
             (first_step == np.arange(count))[:, None], event_states[interval, rows], shifted
         )
 
-    # equations of px4fuse.ekf2.intervals, evaluated for this state only
+    # the equations in the docstring of px4fuse.ekf2.intervals, evaluated for this state only
     rotation_steps = -np.einsum("nij,nj->ni", rotation, state[1:, GYRO_BIAS]) * dt
     if variant.attitude:
         rotation_steps -= segment.correction_rad

@@ -1,9 +1,10 @@
 """Output predictor of EKF2: from the state at the fusion horizon to the published state.
 
 The output predictor propagates the delayed state to the present with the IMU. In each step it
-compares the buffered output at the fusion horizon with the state, and corrects velocity and
-position of the whole buffer by gain · error + 0.1 · gain² · Σ error, with gain = step / τ. This
-recursion is linear with constant coefficients, so recursive filters compute it for a whole segment.
+compares the buffered output at the fusion horizon with the state. Velocity and position of the
+whole buffer are corrected by gain · error + 0.1 · gain² · Σ error, with gain = step / τ. This
+recursion is linear with constant coefficients, so it is computed as a recursive (IIR) filter for a
+whole segment.
 
 Source: PX4-Autopilot ``EKF/output_predictor/output_predictor.cpp`` (``EKF/ekf.cpp`` before v1.14).
 """
@@ -26,12 +27,13 @@ from px4fuse.ekf2.replay_segments import (
 )
 
 INTEGRAL_GAIN = 0.1
-# time constants after which the effect of a correction is neglected
+# Time after which the effect of a correction is neglected, in time constants τ
 MAX_TIME_CONSTANTS = 5.0
-# weight of the prior "correction 0", which makes two corrections between the same rows solvable
+# Weight of the prior "correction 0", which makes the least squares solvable for two corrections
+# between the same rows
 PRIOR_WEIGHT = 1e-3
-# Interval, in median intervals, above which rows count as missing; and minimum fraction of a
-# correction in the other rows
+# Maximum interval between rows, in median intervals, without missing rows; and minimum fraction of
+# a correction that must be visible in the logged rows
 MAX_ROW_INTERVALS, MIN_VISIBLE_SHARE = 3.0, 0.5
 ATTITUDE_GAIN = 0.5
 
@@ -44,26 +46,26 @@ def publish(
     lag: int,
     settings: Mapping[str, float],
 ) -> tuple[Array, Array]:
-    """Return published velocity and position at the end of each step.
+    """Return the published velocity and position at the end of each prediction step.
 
     Parameters
     ----------
     segment : ReplaySegment
     state : ndarray, shape (n + 1, 15) or more
-        State at the fusion horizon, by its time of validity.
+        State at the fusion horizon; rows are at the time to which the state refers.
     reset_m : ndarray, shape (n + 1, 3)
         Sum of position resets up to each state.
     attitude_difference_rad : ndarray, shape (n + 1, 3)
         Published minus nominal attitude.
     lag : int
-        Steps between fusion horizon and present.
+        Number of steps between fusion horizon and present.
     settings : mapping
         Parameters by PX4 name, among them EKF2_TAU_VEL and EKF2_TAU_POS.
 
     Returns
     -------
     velocity_m_s, position_m : ndarray, shape (n + 1, 3)
-        Dead reckoning from the first state until step ``lag``.
+        Published state. Until step ``lag`` it is dead reckoning from the first state.
     """
     step_s, mean_step = segment.step_s[:, None], float(np.mean(segment.step_s))
     # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
@@ -77,7 +79,7 @@ def publish(
         state[:, VELOCITY] - dead_reckoned, lag, mean_step, settings["EKF2_TAU_VEL"]
     )
     velocity = dead_reckoned + velocity_correction
-    # the IMU changes the velocity within a step; corrections apply at its end
+    # the IMU changes the velocity within a step; corrections apply at the end of the step
     position_increments = (velocity[:-1] + 0.5 * velocity_increments) * step_s
     position_without_resets = state[:, POSITION] - reset_m  # EKF2 shifts the buffer with a reset
     dead_reckoned = np.cumsum(
@@ -90,9 +92,10 @@ def publish(
 
 
 def _follow_offset(offset: Array, lag: int, step_s: float, tau_s: float) -> Array:
-    """Return the sum c of the corrections with which the output follows the state.
+    """Return the sum c of all corrections with which the output follows the state.
 
-    In step k, with gain g and error e_k = offset_(k-lag) - c_k: c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
+    ``offset`` is the state minus the output without corrections. In step k, with gain g and error
+    e_k = offset_(k-lag) - c_k: c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
     """
     g = step_s / np.clip(tau_s, step_s, 10.0)
     h = INTEGRAL_GAIN * g**2
@@ -106,25 +109,26 @@ def _follow_offset(offset: Array, lag: int, step_s: float, tau_s: float) -> Arra
 def corrections(
     time_s: Array, velocity_m_s: Array, position_m: Array, sample_s: Array, tau_s: float
 ) -> Array:
-    """Estimate EKF2's position correction at each sample from the published position.
+    """Estimate EKF2's position correction by each sample from the published position.
 
-    A time t after a correction, the published position contains 1 - exp(-t / τ) of the correction,
-    in addition to the integrated velocity. All corrections are estimated together by least squares.
+    At a time t after a correction, the published position contains the fraction 1 - exp(-t / τ) of
+    the correction, in addition to the integrated velocity. All corrections are estimated together
+    by least squares.
 
     Parameters
     ----------
     time_s : ndarray, shape (n,)
         Times of the published rows.
     velocity_m_s, position_m : ndarray, shape (n, a)
-    known_s : ndarray, shape (m,)
-        One step before each correction starts to show; increasing.
+    sample_s : ndarray, shape (m,)
+        Increasing times, each one step before a correction becomes visible.
     tau_s : float
-        EKF2_TAU_POS.
+        Time constant EKF2_TAU_POS.
 
     Returns
     -------
     ndarray, shape (m, a)
-        Correction along a axes; NaN if rows of the log are missing after the sample.
+        Corrections along a axes; NaN if rows of the log are missing after the sample.
     """
     interval_s = np.diff(time_s)
     dead_reckoned = 0.5 * (velocity_m_s[1:] + velocity_m_s[:-1]) * interval_s[:, None]
@@ -158,12 +162,12 @@ def corrections(
 
 
 def delay_by(values: Array, lag: int) -> Array:
-    """Delay values by ``lag`` steps; earlier values equal the first one."""
+    """Delay values by ``lag`` steps; before, the first value is repeated."""
     return np.concatenate([np.repeat(values[:1], lag, axis=0), values])[: len(values)]
 
 
 def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float) -> Array:
-    """Return the correction of the published attitude that follows an attitude error of the filter.
+    """Return the correction with which the published attitude follows the filter's attitude error.
 
     Each step corrects the newest attitude by 0.5 · step / horizon of the error at the fusion
     horizon.
@@ -171,8 +175,10 @@ def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float)
     Parameters
     ----------
     error_rad : ndarray, shape (n + 1, 3)
-        Rotation vectors, by their time of validity.
+        Attitude error at the fusion horizon (rotation vectors); rows are at the time to which the
+        error refers.
     lag : int
+        Number of steps between fusion horizon and present.
     step_s, horizon_s : float
     """
     gain = ATTITUDE_GAIN * step_s / max(horizon_s, step_s)
@@ -183,7 +189,7 @@ def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float)
 
 
 def _recursive_filter(numerator: Array, denominator: Array, values: Array) -> Array:
-    """Apply a recursive filter by solving a banded triangular system (LAPACK dtbtrs)."""
+    """Apply a recursive (IIR) filter by solving a banded triangular system (LAPACK dtbtrs)."""
     count = len(values)
     driven_values = np.zeros((values.shape[1], count))
     for delay in np.flatnonzero(numerator[:count]).tolist():

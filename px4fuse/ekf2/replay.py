@@ -43,40 +43,44 @@ VELOCITY_UPDATE_COLUMNS = [
 ]
 MIN_SAMPLES = 20
 CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
-# s; topics of old releases repeat a sample with later timestamps until the next fusion
+# Maximum time (s) from an update to its logged innovation: topics of old releases repeat a sample
+# with later timestamps until the next fusion
 MAX_REPEAT_S = 0.5
-# Measured on simulated flights of v1.13 to main: for complete logs the correlation is above 0.997
-# and the median S ratio within 0.3 %. With a downsampled source or IMU dropouts S differs by more
-# than 5 % or the correlation is below 0.9 (tests/benchmarks/bench_ekf2.py)
+# Minimum correlation of replayed and logged innovations, and maximum deviation of the median ratio
+# of S from 1, for agreement. In simulated flights of v1.13 to main with complete logs the
+# correlation is above 0.997 and the S ratio within 0.3 %. With a downsampled source or IMU dropouts
+# S differs by more than 5 % or the correlation is below 0.9 (tests/benchmarks/bench_ekf2.py)
 MIN_CORRELATION = 0.95
 MAX_S_DIFFERENCE = 0.05
-# m RMS of the published position; complete logs are within 0.013 m
+# Maximum difference (m, RMS) of the published position: with complete logs it is below 0.013 m
 MAX_PUBLISHED_DIFFERENCE_M = 0.10
-# m; limit while optical flow is the only horizontal aid, larger because flow is logged at a reduced
-# rate
+# Maximum difference (m) while optical flow is the only horizontal aid: larger, because flow is
+# logged at a reduced rate
 MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
-# Above this rejected share one sample near the gate limit changes many later ones. Then rejected
-# shares and mean NIS must agree, and single innovations only in a replay with logged rejections
+# Maximum rejected share for a comparison of single innovations. With more rejections one sample
+# near the gate limit changes many later samples: then only rejected share and mean NIS must agree,
+# and single innovations are compared in a replay with logged rejections
 MANY_REJECTIONS_SHARE = 0.1
 MAX_REJECTED_DIFFERENCE = 0.05
 MAX_NIS_DIFFERENCE = 0.25
-# factor on MAX_PUBLISHED_DIFFERENCE_M while most samples are rejected
+# Factor on MAX_PUBLISHED_DIFFERENCE_M if most samples are rejected
 REJECTING_TOLERANCE_FACTOR = 3.0
 
 
 class AxisAgreement(Record, frozen=True, kw_only=True):
-    """Agreement of the replay as flown with the log, along one axis.
+    """Agreement of the replay (with logged parameters) with the log, along one axis.
 
     Attributes
     ----------
     innovation_correlation : float
+        Correlation of replayed and logged innovations.
     innovation_rms_difference : float
-        In the unit of the aid: m for a position.
+        RMS of replayed minus logged innovations, in the unit of the aid (m for a position).
     s_ratio_median, s_ratio_p5, s_ratio_p95 : float
-        Replayed over logged innovation variance.
+        Replayed over logged innovation variance: median, and 5 and 95 % quantiles.
     nis_mean_logged, nis_mean_replayed : float
     position_rms_difference_m, velocity_rms_difference_m_s : float
-        Published state, replay minus log.
+        RMS of the difference of the published state, replay minus log.
     """
 
     innovation_correlation: Correlation
@@ -91,35 +95,35 @@ class AxisAgreement(Record, frozen=True, kw_only=True):
 
 
 class Agreement(Record, frozen=True, kw_only=True):
-    """Agreement of the replay as flown with the log of EKF2.
+    """Agreement of the replay (with logged parameters) with the log of EKF2.
 
     Attributes
     ----------
     north, east : AxisAgreement
-        Agreement of the fused position.
+        Agreement of the horizontal position aid: GNSS or, without GNSS, external vision.
     ev_pos, gnss_pos : mapping from "north" and "east" to AxisAgreement
-        The same by name of the aid; also of vision fused besides GNSS.
+        Agreement by aid, including vision that is fused in addition to GNSS.
     gnss_vel : mapping from "north", "east" and "down" to AxisAgreement
-        GNSS velocity; "down" only if GNSS height is fused too.
+        Agreement of the GNSS velocity; "down" only if GNSS height is also fused.
     gnss_hgt, baro_hgt : mapping from "down" to AxisAgreement
-        Heights, if the log contains all fused samples.
+        Agreement of heights, if the log contains all fused samples.
     samples : int
         Number of compared logged innovations, without the first seconds of each segment
         (:data:`~px4fuse.ekf2.replay_segments.SETTLING_S`).
     rejected_fraction_logged, rejected_fraction_replayed : float
-        Share of these samples that EKF2 and the replay rejected.
+        Share of the compared samples that EKF2 rejected, and that the replay rejected.
     decisions_same : float
-        Share of samples rejected in both or in neither.
+        Share of the compared samples that are rejected in both or in neither.
     published_rms_difference_m : float
-        Published horizontal position, replay minus log.
+        RMS of the difference of the published horizontal position, replay minus log.
     heading_rms_difference_deg : float or None
-        Heading of the filter; None if the replay uses the logged heading.
+        RMS of the heading difference, replay minus log; None if the replay uses the logged heading.
     carried_difference_m : float or None
         Largest horizontal difference while optical flow was the only aid; the other numbers exclude
         these times. None if there were no such times.
     doubtful : mapping from PX4's name of an aid to str
-        Aids whose replay does not agree, with the reason. The replay then uses the logged EKF2
-        height, does not bridge gaps with optical flow, and omits vision besides GNSS.
+        Aids with a replay that does not agree with the log, and the reasons. For the effect on the
+        replay see :func:`~px4fuse.ekf2.inputs.prepare_inputs`.
     good : bool
         True if the replay agrees with the log.
     reason : str
@@ -146,11 +150,11 @@ class Agreement(Record, frozen=True, kw_only=True):
 
     @property
     def axes(self) -> Mapping[str, AxisAgreement]:
-        """Agreement of the position by axis."""
+        """Agreement of the horizontal position by axis."""
         return {"north": self.north, "east": self.east}
 
     def as_unavailable(self, what: str) -> Unavailable:
-        """Return the Unavailable for a result that needs an agreeing replay."""
+        """Return Unavailable for the result ``what``, which requires a replay that agrees."""
         profile = "3 (default and full rates)" if self.gnss_pos else "129 (default and vision)"
         return Unavailable(
             what,
@@ -160,20 +164,21 @@ class Agreement(Record, frozen=True, kw_only=True):
 
 
 class Replayed(Record, frozen=True, kw_only=True, omit_defaults=False):
-    """Written fields of an EKF2 replay.
+    """Fields of an EKF2 replay that are written to results.json.
 
     Attributes
     ----------
     source : str
         Position track that was fused.
     stretches_s : tuple of (float, float)
-        Replayed segments of the flight, each started from the log.
+        Replayed segments of the flight, each started from the logged state.
     settings : mapping
         All parameters of the model, by PX4 name, in PX4's units.
     late, lost : int
-        Samples received behind the fusion horizon: fused late, and never fused.
+        Number of samples that arrived after the fusion horizon had passed their time: fused late,
+        and never fused.
     agreement : Agreement or None
-        Agreement of the replay as flown with the log; None while it is computed.
+        Agreement of the replay with logged parameters; None while the agreement is computed.
     """
 
     source: str
@@ -190,24 +195,24 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
     Attributes
     ----------
     changed : mapping
-        Parameters with values other than logged.
+        Parameters with values that differ from the log.
     updates : DataFrame, shape (m, 14), or (m, 20) with velocity
         One row per position sample, at EKF2's measurement time (timestamp - delay - half a step).
-        Columns: :data:`UPDATE_COLUMNS` (variances of position and velocity are those after the
-        update, ``fused_at_s`` is the end of the prediction step), and with velocity
-        :data:`VELOCITY_UPDATE_COLUMNS`. Innovations are measurement minus state.
+        Columns: :data:`UPDATE_COLUMNS`, and with velocity :data:`VELOCITY_UPDATE_COLUMNS`.
+        Variances of position and velocity are after the update. ``fused_at_s`` is the end of the
+        prediction step. Innovations are measurement minus state.
     other_aid_updates : mapping from PX4's name to DataFrame, shape (k, 5), or (k, 8) for vision
-        One row per sample of GNSS height, barometer, and vision besides GNSS: innovation and S
-        (``innovation_down_m``, ``innovation_variance_down_m2``), ``rejected``, ``fused`` and
-        ``fused_at_s``; for vision north and east, and ``reset``. A sample with which only the bias
-        of vision was reset has no row.
+        One row per sample of GNSS height, barometer, and vision that is fused in addition to GNSS:
+        innovation and S (``innovation_down_m``, ``innovation_variance_down_m2``), ``rejected``,
+        ``fused`` and ``fused_at_s``. Vision has innovations north and east, and ``reset``. A sample
+        with which only the bias of vision was reset has no row.
     flow_only_spans_s : tuple of (float, float)
         Times between positions in which optical flow was the only horizontal aid.
     delayed : DataFrame, shape (n, 7)
-        Position and velocity at the fusion horizon at the end of each step (m, m/s, NED), and
-        ``heading_rad``.
+        Position and velocity (m, m/s, NED) and ``heading_rad`` of the state at the fusion horizon,
+        at the end of each prediction step.
     published : DataFrame, shape (n, 6)
-        State published by the output predictor at these times.
+        Position and velocity that the output predictor publishes, at the times of ``delayed``.
     """
 
     schema_type = Replayed
@@ -222,7 +227,7 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
 
     @property
     def evaluated_s(self) -> Spans:
-        """Evaluated spans: each segment without its start and without flow-only times."""
+        """Evaluated spans: each segment without its first seconds and without flow-only times."""
         spans = []
         for start, end in self.stretches_s:
             begin = start + SETTLING_S
@@ -236,7 +241,7 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
 
 
 def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavailable:
-    """Compare a replay as flown with EKF2's logged innovations and published state.
+    """Compare a replay (with logged parameters) with EKF2's logged innovations and state.
 
     Parameters
     ----------
@@ -310,7 +315,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
 
 
 def _flow_only_error_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
-    """Return the largest horizontal difference (m) to the log in flow-only times, or None."""
+    """Return the largest horizontal difference (m) to the log with flow only; None if no flow."""
     times = ekf2.state.index
     is_inside = inside_spans(times, replay.flow_only_spans_s)
     if not is_inside.any():
@@ -324,7 +329,7 @@ def _flow_only_error_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
 
 
 def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
-    """Return the RMS heading difference (deg) of a replay with the magnetometer, or None."""
+    """Return the RMS heading difference (°) of replay and log; None without magnetometer."""
     if MAG.noise not in replay.settings or isinstance(ekf2.record, Unavailable):
         return None
     logged = ekf2.record.delayed
@@ -341,7 +346,7 @@ def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
 def _has_constant_innovations(
     logged: pd.DataFrame, model: pd.DataFrame, axes: Iterable[AxisName]
 ) -> bool:
-    """Return True if logged or replayed innovations of an axis are constant: no correlation."""
+    """Return True if innovations of an axis are constant, so that they have no correlation."""
     columns = [f"innovation_{axis}_m" for axis in axes]
     return not all(np.ptp(frame[columns], axis=0).all() for frame in (logged, model))
 
@@ -359,13 +364,13 @@ def _velocity_agreement(
     logged, model = _matched_samples(replay, replay.updates, log.samples, is_own_topic=is_own_topic)
     if len(logged) < MIN_SAMPLES:
         return {}, False
-    names: dict[str, str] = {}  # map to the column names of a position
+    names: dict[str, str] = {}  # rename velocity columns to the names of position columns
     for axis in AXIS_NAMES:
         nu, S = f"innovation_{axis}_m", f"innovation_variance_{axis}_m2"
         names |= {f"{nu}_s": nu, f"{S}_s2": S, f"innovation_{axis}": nu, f"variance_{axis}": S}
     logged = logged.rename(columns=names)
     model = model[VELOCITY_UPDATE_COLUMNS].rename(columns=names)
-    # down only if the logged EKF2 height is not used
+    # compare down only if heights are fused: else the logged EKF2 height is used
     axes = AXIS_NAMES if GNSS_HGT.name in replay.other_aid_updates else HORIZONTAL
     if _has_constant_innovations(logged, model, axes):
         return {}, True
@@ -373,7 +378,7 @@ def _velocity_agreement(
 
 
 def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the agreement of aids other than the position, and the reason of each disagreement."""
+    """Return the agreement of all aids except the position, and the reason of each disagreement."""
     agreements: dict[str, dict[str, AxisAgreement]] = {}
     doubtful = {}
     for name, updates in replay.other_aid_updates.items():
@@ -398,14 +403,14 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
 
 
 def logged_aid_innovations(name: str, log: AidLog) -> pd.DataFrame:
-    """Return innovations, variances and rejections of an aid, given by PX4's name."""
+    """Return innovations, variances and rejections of the aid with PX4's name ``name``."""
     gate = log.parameters.get(AIDS[name].gate, AIDS[name].default_gate)
     axes = [axis for axis in AXIS_NAMES if axis in log.axes]
     return _columns_by_axis({axis: innovations_along(log, axis, gate) for axis in axes})
 
 
 def axes_of(updates: pd.DataFrame) -> list[AxisName]:
-    """Return the axes with position innovations."""
+    """Return the axes for which ``updates`` has position innovations."""
     return [axis for axis in AXIS_NAMES if f"innovation_{axis}_m" in updates]
 
 
@@ -419,7 +424,7 @@ def _matched_samples(
 
 
 def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
-    """Return innovations, variances and rejections, north and east, one row per logged sample."""
+    """Return the logged innovations, variances and rejections, north and east, by sample."""
     return _columns_by_axis({axis: ekf2.innovations[axis] for axis in HORIZONTAL})
 
 
@@ -444,9 +449,10 @@ def inside_spans(times_s: ArrayLike, spans: Spans) -> BoolArray:
 
 
 def match_updates(updates: pd.DataFrame, times: Array, *, is_own_topic: bool) -> IntArray:
-    """Return the row of the update of each logged innovation; -1 if there is no update.
+    """Return the index of the update of each logged innovation; -1 without an update.
 
-    ``is_own_topic``: True if the log has a topic of this aid, whose times are measurement times.
+    ``is_own_topic`` is True if the innovations are from a separate topic of the aid, which has
+    measurement times.
     """
     if is_own_topic:
         return same_sample(updates.index.to_numpy(), times)
@@ -489,7 +495,7 @@ def along(frame: pd.DataFrame, columns: list[str], direction: Array, times: Arra
 
 
 def rms_to_truth(flight: Flight, position: Array, direction: Array, times: Array) -> float | None:
-    """Return the position RMSE against ground truth along a direction (m), or None."""
+    """Return the position RMSE (m) along a direction; None without ground truth."""
     if not isinstance(flight.truth, Truth):
         return None
     needed = Columns.POSITION[2:] if direction[2] else Columns.POSITION[:2]
@@ -547,25 +553,25 @@ def _agreement_verdict(
 
 
 def _format_beyond(value: float, limit: float) -> str:
-    """Format a value above a limit with as many decimals as show the excess, at least two."""
+    """Format a value with at least two decimals, with more if needed to show it above a limit."""
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 
 
 def with_logged_rejections(
     agreement: Agreement, logged_rejections_agreement: Agreement, *, has_all_decisions: bool
 ) -> Agreement:
-    """Return the agreement, with the verdict from a replay with logged rejections.
+    """Return the agreement with the verdict (good, reason) from a replay with logged rejections.
 
     With many rejections one sample near the gate limit makes the replay differ from the log,
-    although the filter is the same.
+    although the filter equations are the same.
 
     Parameters
     ----------
     agreement, logged_rejections_agreement : Agreement
-        Agreement of the replay with the model's gate, and of that with the logged rejections.
+        Agreement of the replay with the model's gate, and of the replay with logged rejections.
     has_all_decisions : bool
-        True if every decision of EKF2 is known. Then also the numbers are those of the second
-        agreement.
+        True if every decision of EKF2 is logged. Then all numbers are from
+        ``logged_rejections_agreement``.
     """
     good, reason = _agreement_verdict(
         logged_rejections_agreement.axes, 0.0, 0.0, REJECTING_TOLERANCE_FACTOR

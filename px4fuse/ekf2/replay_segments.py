@@ -1,4 +1,4 @@
-"""Segments of a flight for the EKF2 replay, without gaps: prediction steps and initial state.
+"""Segments of a flight without gaps for the EKF2 replay: prediction steps and initial state.
 
 Source: PX4-Autopilot ``EKF/imu_down_sampler/imu_down_sampler.cpp``.
 """
@@ -27,37 +27,40 @@ from px4fuse.trajectory.rotation import (
     to_vector,
 )
 
-# s; after a longer gap in the source or IMU the replay restarts from the log, because EKF2 then
-# fuses gravity, fake positions or zero velocity, which the model does not contain
+# Maximum gap (s) in the source or IMU within a segment. After a longer gap the replay restarts from
+# the logged state: in the gap EKF2 fuses gravity, fake positions or zero velocity, which the model
+# does not contain
 RESTART_GAP_S = 2.0
-# s; PX4 limits a prediction step to 2 EKF2_PREDICT_US, so motion in a longer gap is lost
+# Maximum IMU interval (s): PX4 limits a prediction step to 2 EKF2_PREDICT_US, so EKF2 loses the
+# motion in a longer gap
 IMU_GAP_S = 0.05
-# s; minimum time of fusion before the replay starts
+# Minimum time (s) of fusion before the replay starts
 MIN_FUSION_S = 1.0
-# s; minimum time in the air before the replay starts: on the ground EKF2 fuses zero velocity and
+# Minimum time (s) in the air before the replay starts: on the ground EKF2 fuses zero velocity and
 # gravity, and only the motion after take-off makes tilt and accelerometer bias distinguishable
 MIN_AIRBORNE_S = 4.0
-SETTLING_S = 5.0  # s; time of the replay before it is evaluated
-# s; time from the first logged three-axis sample until the log contains the fields that EKF2 resets
-# after take-off
+SETTLING_S = 5.0  # time (s) from the start of a replay to the start of its evaluation
+# Time (s) from the first logged three-axis magnetometer sample until the log contains the magnetic
+# field states that EKF2 resets after take-off
 FIELD_RESET_S = 1.0
-# s; flight time before the start of the replay, used to estimate the initial correlations
+# Flight time (s) before the start of the replay from which the initial correlations are estimated
 CORRELATION_HISTORY_S = 20.0
-# Hz; rate at which EKF2 fuses the magnetometer (SENS_MAG_RATE 15), so one logged sample represents
-# several; and lowest logged rate that can be replayed
+# Rate (Hz) at which EKF2 fuses the magnetometer (SENS_MAG_RATE 15), and minimum logged rate for a
+# replay. A logged sample may represent several samples in EKF2
 MAG_FUSION_HZ, MIN_MAG_LOG_HZ = 14.0, 1.5
-# s, time constant of EKF2's low-pass filter of innovations (updateAidSourceStatus, ekf_helper.cpp)
+# Time constant (s) of EKF2's low-pass filter of innovations (updateAidSourceStatus, ekf_helper.cpp)
 FILTER_S = 0.5
 MIN_SEGMENT_S = 10.0
-# s; resets are published up to the largest delay plus one row of the log later
+# Maximum delay (s) from a reset to its publication: largest delay of the fusion horizon plus one
+# logging interval
 MAX_RESET_DELAY_S = 0.5
-# fraction of clipped IMU samples within 1 s above which the replay is interrupted
+# Maximum fraction of clipped IMU samples within 1 s; above, the replay is interrupted
 MAX_CLIPPED_SHARE = 0.05
 
 GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # CONSTANTS_ONE_G
 
 
-# Row ranges in ReplaySegment.state
+# Index ranges in ReplaySegment.state
 STATES = 15
 IMU_STATE_COUNT = 9  # states that the IMU propagates: all except the biases
 THETA, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -67,9 +70,9 @@ EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)  # NED and FRD, if fused
 
 @dataclass(frozen=True)
 class SensorSamples:
-    """Magnetometer or optical flow data of one segment: m means of several samples each.
+    """Magnetometer or optical flow data of one segment: m means, each of several samples.
 
-    k: measured components, 3 of a magnetometer and 2 of optical flow.
+    k is the number of measured components: 3 for a magnetometer, 2 for optical flow.
 
     Attributes
     ----------
@@ -81,11 +84,11 @@ class SensorSamples:
     rotation_to_body : ndarray, shape (m, k, 3)
         Mean rotation from NED to the body axes.
     sample_count : ndarray, shape (m,)
-        Number of samples in each mean that EKF2 received.
+        Number of samples that EKF2 received, for each mean.
     noise : ndarray, shape (m,)
-        R of one sample; 0 if it follows from the parameters.
+        R of one sample; 0 if R is given by the parameters.
     gate : float
-        In √S; infinite if it follows from the parameters.
+        Innovation gate in √S; infinite if the gate is given by the parameters.
     """
 
     step: IntArray
@@ -107,17 +110,18 @@ class HeightSamples:
     fused : tuple of str
         PX4's names of the height sensors: barometer, GNSS, or both.
     reference : str
-        PX4's name of the sensor without bias.
+        PX4's name of the reference sensor, which has no bias.
     bias : (float, float)
         Initial bias of the other sensor (m, positive: too high), and its variance (m²).
     step : ndarray of int, shape (m,)
         Prediction step after which EKF2 fuses each barometer sample.
     measured_at_s, down_m : ndarray, shape (m,)
-        EKF2's measurement time, and the height.
+        EKF2's measurement time, and height (positive down) of each barometer sample.
     dead_zone_m : ndarray, shape (m,)
-        Dead zone: in ground effect a height this far below the state is ignored.
+        Dead zone: in ground effect, EKF2 ignores a height that is below the state by up to this
+        distance.
     weight : float
-        Number of EKF2 samples per logged sample.
+        Number of samples in EKF2 per logged sample.
     """
 
     fused: tuple[str, ...]
@@ -136,13 +140,13 @@ class HeightSamples:
 class ReplaySegment:
     """Part of a flight without gaps, replayed in one run of n prediction steps.
 
-    The nominal attitude is the published one. The model estimates the error of the nominal
+    The nominal attitude is EKF2's published attitude. The model estimates the error of the nominal
     attitude, so the equations are linear. Vectors are in NED unless noted.
 
     Attributes
     ----------
     time_s : ndarray, shape (n + 1,)
-        Start, then the end of each step.
+        Time of the start, then of the end of each step.
     step_s : ndarray, shape (n,)
     rotation : ndarray, shape (n + 1, 3, 3)
         Nominal attitude, body FRD to NED.
@@ -150,36 +154,39 @@ class ReplaySegment:
         Rotation of the nominal attitude in each step minus the rotation measured by the gyro, plus
         the rotation of the earth.
     force_m_s2 : ndarray, shape (n, 3)
-        Specific force in each step (body frame at its end), without the nominal bias.
+        Specific force in each step minus the nominal bias, in the body frame at the end of the
+        step.
     accelerometer_bias_m_s2 : ndarray, shape (3,)
-        Nominal bias: the logged one at the start.
+        Nominal bias: logged bias at the start.
     state : ndarray, shape (15,) or (21,)
         Initial attitude error, velocity, position, errors of gyro and accelerometer bias, and with
         21 states the magnetic fields of earth and body.
     variance : ndarray, shape (15,) or (21,)
         Initial variances, in the same order.
     down_m : ndarray, shape (n + 1,)
-        Published height.
+        Published height (positive down).
     attitude_variance_rad2 : ndarray, shape (n + 1, 3)
+        Logged variance of the attitude.
     down_variance_m2 : ndarray, shape (n + 1,)
-        Logged variances.
+        Logged variance of the height.
     attitude_error_rad : ndarray, shape (n + 1, 3)
         Logged attitude at the fusion horizon minus the nominal attitude.
     correlation : ndarray, shape (15, 15) or (21, 21)
-        Correlations of the initial state; estimated, because the log has variances only.
+        Correlations of the initial state; estimated, because the log contains variances only.
     fusing : bool
         True if EKF2 fuses the source at the start.
     field : SensorSamples or None
-        Magnetometer samples, with 21 states; None: the logged EKF2 heading is used.
+        Magnetometer samples (with 21 states); None if the logged EKF2 heading is used.
     heights : HeightSamples or None
-        None: the height of EKF2 or of external vision is used.
+        Height samples; None if the height of EKF2 or of external vision is used.
     bad_acceleration_share : ndarray, shape (n + 1,), or None
-        Share of accelerometer axes with a larger noise in the step before: all axes while EKF2
-        reports a bad vertical acceleration, else the clipped axes. None if there are no such times.
+        Share of accelerometer axes with a larger noise in the step that ends at each time: all axes
+        while EKF2 reports a bad vertical acceleration, else the clipped axes. None if the share is
+        always 0.
     flow : SensorSamples or None
-        Optical flow samples, if EKF2 fused them.
+        Optical flow samples, if EKF2 fused optical flow.
     metres : (float, float, float)
-        Metres in the state per published metre, north, east and down.
+        Ratio of EKF2's internal metres to published metres: north, east and down.
     history : ReplaySegment or None
         Flight before the start, from which the initial correlations are estimated.
     """
@@ -209,14 +216,14 @@ class ReplaySegment:
 
     @cached_property
     def imu_velocity_m_s(self) -> Array:
-        """Velocity change from the IMU since the start (m/s, NED), shape (n + 1, 3)."""
+        """Velocity change since the start, from the IMU (m/s, NED), shape (n + 1, 3)."""
         force = np.einsum("nij,nj->ni", self.rotation[1:], self.force_m_s2) + GRAVITY_M_S2
         velocity_increments = np.cumsum(force * self.step_s[:, None], axis=0)
         return np.concatenate([np.zeros((1, 3)), velocity_increments])
 
     @cached_property
     def imu_displacement_m(self) -> Array:
-        """Displacement from the IMU since the start, from rest (m, NED), shape (n + 1, 3)."""
+        """Displacement since the start by the IMU, initially at rest (m, NED), shape (n + 1, 3)."""
         speed = self.imu_velocity_m_s
         path = np.cumsum(0.5 * (speed[1:] + speed[:-1]) * self.step_s[:, None], axis=0)
         return np.concatenate([np.zeros((1, 3)), path])
@@ -232,27 +239,28 @@ def samples_by_event(
 ) -> Array:
     """Sort position samples by the event at which they are fused, in k slots per event.
 
-    k: largest number of samples between two events; E: events.
+    k is the largest number of samples between two events (ends of intervals), E the number of
+    events.
 
     Parameters
     ----------
     segment : ReplaySegment
-    end : ndarray of int, shape (E,)
-        Step of each event.
-    step : ndarray of int, shape (m,)
+    event_steps : ndarray of int, shape (E,)
+        Prediction step of each event.
+    measurement_step : ndarray of int, shape (m,)
         Prediction step after which each position was measured; increasing.
     position_m : ndarray, shape (m, a)
         Positions along a axes.
     axes : slice
-        These axes within north, east and down.
+        Range of the a axes within north, east and down.
     *more : ndarray, shape (m,)
         Further columns.
 
     Returns
     -------
     ndarray, shape (a + 2 + len(more), k, E)
-        Position plus the IMU displacement up to the event relative to constant velocity; age;
-        ``more``; and 1. All are 0 in empty slots.
+        Position plus the displacement up to the event due to the IMU acceleration; age at the
+        event; ``more``; and 1. All are 0 in empty slots.
     """
     event = np.searchsorted(event_steps, measurement_step)
     event = event[event < len(event_steps)]
@@ -296,15 +304,15 @@ def find_replay_segments(
     Parameters
     ----------
     flight : Flight
-        Provides the times in the air.
+        Flight, for the times in the air.
     imu, attitude : DataFrame
     ekf2 : Ekf2
     record : FusionRecord
     source_s : ndarray
         Timestamps of the position samples.
     is_gnss : bool
-        True if EKF2 fuses GNSS. Then magnetic fields are states if the log contains the
-        magnetometer samples, and a bad or clipped acceleration gets a larger noise.
+        True if EKF2 fuses GNSS. Magnetic fields are then states if the log contains the
+        magnetometer samples, and a bad or clipped acceleration has a larger noise.
     """
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
@@ -320,7 +328,7 @@ def find_replay_segments(
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     field_span = _field_span(record) if is_gnss else None
     cuts += field_span[1:] if field_span else ()
-    # another EKF2 instance has different states
+    # end a segment when the primary EKF2 instance changes, because instances have different states
     cuts += [time_s for time_s, _ in ekf2.instances[1:]]
     segments = []
     for low, high in pairwise(np.unique(np.clip(cuts, first, last))):
@@ -365,7 +373,7 @@ def _make_gnss_segment(
     start_row: int,
     end_s: float,
 ) -> ReplaySegment:
-    """Make a segment with earth rotation and a larger noise of bad accelerations."""
+    """Make a segment with earth rotation and a larger noise of bad or clipped accelerations."""
     segment = _add_earth_rotation(
         _make_segment(imu, attitude, ekf2, record, start_row, end_s), record
     )
@@ -375,7 +383,7 @@ def _make_gnss_segment(
 
 
 def _add_earth_rotation(segment: ReplaySegment, record: FusionRecord) -> ReplaySegment:
-    """Add earth rotation, and convert the position to metres of EKF2's state."""
+    """Add earth rotation, and convert the published position to EKF2's internal metres."""
     metres, state = ekf2_metres_per_metre(record), segment.state.copy()
     state[POSITION] *= metres
     earth_rotation_rad = earth_rate_rad_s(record) * segment.step_s[:, None]
@@ -390,7 +398,7 @@ def _add_earth_rotation(segment: ReplaySegment, record: FusionRecord) -> ReplayS
 def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
     """Return the times (s) at which the replay must be interrupted.
 
-    These are start and end of clipping, in which motion is lost, and of each reset of height or
+    These are the start and end of clipping, which loses motion, and of each reset of height or
     vertical velocity, which is published with a delay.
     """
     breaks = [
@@ -451,7 +459,7 @@ def _make_segment(
     def attitude_beyond(
         frame: pd.DataFrame, early_s: float, end_stamps: Array
     ) -> tuple[Array, Array]:
-        """Return times of a frame, and its rotations relative to attitudes at the steps."""
+        """Return the times of a frame, and its attitudes relative to the attitude of each step."""
         is_inside = (frame.index >= times[0] - early_s) & (frame.index <= times[-1])
         at_s, attitude_samples = (
             frame.index[is_inside].to_numpy(),
@@ -459,7 +467,7 @@ def _make_segment(
         )
         return at_s, multiply(attitude_samples, conjugate(interpolate(at_s, times, end_stamps)))
 
-    # rotation of the published attitude relative to the integrated gyro, earth frame
+    # rotation from the integrated gyro attitude to the published attitude, in the earth frame
     extra_rotation = interpolate(times, *attitude_beyond(attitude, 0.0, gyro))
     nominal = multiply(extra_rotation, gyro)
     states, turned_states = attitude_beyond(record.delayed, 1e-4, nominal)
@@ -524,9 +532,10 @@ def _add_field(
 def _mean_field(
     segment: ReplaySegment, delayed: pd.DataFrame, measured_at_s: Array, filtered_gauss: Array
 ) -> SensorSamples:
-    """Reconstruct the mean field between two rows from EKF2's low-pass filtered innovations.
+    """Reconstruct the mean measured field between two rows from low-pass filtered innovations.
 
-    The logged innovation is predicted minus measured field, and the log contains the prediction.
+    EKF2 logs the low-pass filtered difference of predicted and measured field, and the states from
+    which the field is predicted.
     """
     between_s = np.diff(measured_at_s)
     is_inside = (measured_at_s[:-1] > segment.time_s[0]) & (measured_at_s[1:] <= segment.time_s[-1])
@@ -553,19 +562,19 @@ def _mean_field(
 def low_pass_weights(
     segment: ReplaySegment, newest_s: Array, count: Array, interval_s: Array, share: Array | float
 ) -> tuple[IntArray, Array]:
-    """Return the steps of the samples in each low-pass filtered mean, and the sample weights.
+    """Return the prediction steps and weights of the samples in each low-pass filtered mean.
 
     Parameters
     ----------
     newest_s, count, interval_s : ndarray, shape (m,)
-        Time of the newest sample of each mean, number of samples, and their interval.
+        Of each mean: time of the newest sample, number of samples, and their interval.
     share : float or ndarray, shape (m,)
         Weight of a new sample in the low-pass filter.
 
     Returns
     -------
     step, weight : ndarray, shape (m, k)
-        Newest first, with k the largest number of samples.
+        Newest sample first; k is the largest number of samples in a mean.
     """
     back = np.arange(int(count.max(initial=1.0)))
     weight = np.where(back < count[:, None], (1.0 - np.reshape(share, (-1, 1))) ** back, 0.0)
@@ -582,16 +591,16 @@ def add_field_states(
     fields: Array,
     variance: Array,
 ) -> ReplaySegment:
-    """Add the fields of earth and body to the states, uncorrelated with the others.
+    """Add the magnetic fields of earth and body to the states, uncorrelated with other states.
 
     Parameters
     ----------
     measured_at_s, gauss : ndarray, shape (m,) and (m, 3)
         Magnetometer samples (body FRD) at EKF2's measurement time.
     weight : float
-        Number of EKF2 samples per logged sample.
+        Number of samples in EKF2 per logged sample.
     fields, variance : ndarray, shape (6,)
-        Fields of earth (NED) and body (FRD) at the start, and their variances.
+        Magnetic fields of earth (NED) and body (FRD) at the start, and their variances.
     """
     step, is_inside = sample_steps(segment, measured_at_s)
     rotation_to_body, count = segment.rotation[step].transpose(0, 2, 1), len(step)
@@ -607,14 +616,14 @@ def add_field_states(
 
 
 def sample_steps(segment: ReplaySegment, measured_at_s: Array) -> tuple[IntArray, BoolArray]:
-    """Return the fusion step of each sample inside the segment, and True for these samples."""
+    """Return the fusion step of each sample in the segment, and the mask of these samples."""
     step = np.searchsorted(segment.time_s, measured_at_s - 1e-9)
     is_inside = (step > 0) & (step < len(segment.time_s))
     return step[is_inside], is_inside
 
 
 def predict_s(record: FusionRecord) -> float:
-    """Return EKF2_PREDICT_US in seconds."""
+    """Return the configured prediction interval EKF2_PREDICT_US in s."""
     return record.parameters.get("EKF2_PREDICT_US", 10_000.0) * 1e-6
 
 
@@ -623,24 +632,24 @@ def _interpolate(series: pd.Series, times: Array) -> Array:
 
 
 def step_ends(interval_s: Array, logged_ends: IntArray, target_s: float) -> IntArray:
-    """Return the ends of EKF2's prediction steps, as numbers of IMU intervals from the start.
+    """Return the ends of EKF2's prediction steps, in IMU intervals from the start.
 
-    A step ends after :func:`samples_per_step` samples, or when the step is longer than the target.
-    Each logged end restarts the count of samples.
+    A step ends after :func:`samples_per_step` IMU samples, or when it is longer than the target.
+    The count of samples restarts at each logged end.
 
     Parameters
     ----------
     interval_s : ndarray, shape (n,)
         IMU intervals after the start.
-    known : ndarray of int
-        Logged ends, increasing; may include the start.
+    logged_ends : ndarray of int
+        Logged ends of steps, increasing; may include the start.
     target_s : float
-        EKF2_PREDICT_US.
+        Configured prediction interval, EKF2_PREDICT_US.
 
     Returns
     -------
     ndarray of int
-        The last one is at most n.
+        Ends of steps; the last end is at most n.
     """
     samples_needed = samples_per_step(target_s, float(np.median(interval_s)), logged_ends)
     known_ends = set(logged_ends.tolist())
@@ -657,7 +666,7 @@ def step_ends(interval_s: Array, logged_ends: IntArray, target_s: float) -> IntA
 def downsample_imu(
     rotation_vectors: Array, velocity_increments: Array, ends: IntArray
 ) -> tuple[Array, Array]:
-    """Return rotation and velocity change of each step, in the body frame at its end."""
+    """Return rotation and velocity change of each step, in the body frame at the step's end."""
     starts = np.concatenate([[0], ends[:-1]])
     summed_rotation = np.concatenate([np.zeros((1, 3)), np.cumsum(rotation_vectors, axis=0)])
     step_rotation = summed_rotation[ends] - summed_rotation[starts]

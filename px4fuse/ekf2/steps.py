@@ -1,14 +1,14 @@
-"""Steps from KF to the logged EKF2: difference of both filters explained one change at a time.
+"""Sequence of filters that changes KF into EKF2, one property at a time, to explain KF - EKF2.
 
-Each step is a replay of the whole flight with one more property of EKF2. The order is fixed: sample
-times, noises, estimated states, gate, and output predictor. The mean square difference to the
-logged EKF2 changes with each step, so the steps and the unexplained remainder add up to the whole
-difference. The first step keeps the filter equations of KF, but uses the samples and prediction
-steps of EKF2.
+Each filter of the sequence (step) is a replay of the whole flight with one more property of EKF2.
+The order is fixed: sample times, noises, estimated states, gate, and output predictor. The mean
+square difference from the logged EKF2 changes with each step. The changes of all steps and the
+remainder after the last step add up to the mean square difference KF - EKF2. The first step keeps
+the filter equations of KF, but uses the samples and prediction steps of EKF2.
 
-Biases come before process noise: without bias states EKF2's small process noise would increase the
-error. The last replays use the logged rejections: with many rejections one sample near the gate
-limit would change all later ones.
+Biases precede process noise, because without bias states EKF2's small process noise would increase
+the error. The last replays use the logged rejections, because with many rejections one sample near
+the gate limit would change all later samples.
 """
 
 from collections.abc import Mapping
@@ -37,8 +37,8 @@ OTHER_TIME = Unavailable(
     "ground truth and replay do not overlap in time",
     "Record both at the same time.",
 )
-# Names of the steps. Equal process noise: KF adds SIGMA_A² · DT per second; EKF2 adds
-# EKF2_ACC_NOISE² · Δt² per step Δt, which is EKF2_ACC_NOISE² · Δt per second
+# Names of the steps. For the step PROCESS, velocity variance per second: KF adds SIGMA_A² · DT,
+# EKF2 adds EKF2_ACC_NOISE² · Δt² per prediction step Δt, which is EKF2_ACC_NOISE² · Δt per second
 SAMPLES = "samples and time steps"
 STAMPS = "timestamps and delay"
 NOISE = "measurement noise"
@@ -51,14 +51,14 @@ FLOW_STEP = "optical flow"
 VISION_STEP = "external vision"
 GATE = "gate, missed samples and resets"
 OUTPUT = "output predictor"
-# Steps of every flight; the steps of other aids precede GATE if EKF2 fuses these aids
+# Steps of every flight. Steps of other aids are inserted before GATE if EKF2 fuses these aids
 STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
 class Step(Record, frozen=True, kw_only=True):
-    """One step from KF to EKF2.
+    """One step of the sequence from KF to EKF2: a replay with one more property of EKF2.
 
     Attributes
     ----------
@@ -66,13 +66,13 @@ class Step(Record, frozen=True, kw_only=True):
         One of :data:`STEPS`, :data:`FIELD_STEP`, :data:`VELOCITY_STEP`, :data:`FLOW_STEP` or
         :data:`VISION_STEP`.
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
-        Reduction of the mean square difference to the logged EKF2; below 0: increase.
+        Reduction of the mean square difference from the logged EKF2; negative for an increase.
     position_moved_m : float
-        Largest change of the position along this axis.
+        Largest change of the position by this step.
     moved_at_s : float
-        Time of this change.
+        Time of the largest change.
     position_rmse_to_truth_m : float or None
-        Position RMSE after the step; None without ground truth.
+        Position RMSE against ground truth after the step; None without ground truth.
     """
 
     name: str
@@ -95,7 +95,7 @@ class RejectionRun(Record, frozen=True, kw_only=True):
     duration_s : float
         Time until a sample was fused again.
     distance_m : float
-        Largest distance of EKF2 from the same filter without a gate.
+        Largest position difference between EKF2 and the same filter without a gate.
     """
 
     start_s: float
@@ -105,14 +105,14 @@ class RejectionRun(Record, frozen=True, kw_only=True):
 
 
 class UnreplayedPart(Record, frozen=True):
-    """Largest difference KF - EKF2 in parts without replay (EKF2 starting or not fusing).
+    """Largest difference KF - EKF2 at times without replay (EKF2 starts or does not fuse).
 
     Attributes
     ----------
     maximum_m : float
-        Absolute value.
+        Absolute value of the largest difference.
     at_s : float
-        Time of this difference.
+        Time of the largest difference.
     """
 
     maximum_m: NotNegative
@@ -120,24 +120,25 @@ class UnreplayedPart(Record, frozen=True):
 
 
 class DifferenceSteps(Record, frozen=True, kw_only=True):
-    """Difference KF - EKF2 along one axis, as the sum of the steps and a remainder.
+    """Mean square of KF - EKF2 along one axis: sum over steps (:class:`Step`) and a remainder.
 
     Attributes
     ----------
     count : int
         Number of EKF2 samples over which means are taken.
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
-        Mean square difference of KF to the logged EKF2.
+        Mean square difference between KF and the logged EKF2.
     steps : tuple of Step
     unexplained_mean_square_m2, unexplained_velocity_mean_square_m2_s2 : float
-        Unexplained remainder: mean square difference of the replay to the logged EKF2.
+        Remainder: mean square difference between the complete replay and the logged EKF2.
     position_rmse_to_truth_m : mapping from "kf" and "ekf2" to float or Unavailable
+        Position RMSE against ground truth.
     spans_s : tuple of (float, float)
         Spans of the flight over which means are taken.
     longest_rejection : RejectionRun or None
         Longest run of rejections; None without rejections.
     outside : UnreplayedPart or None
-        None if the replay covers the analysed segment.
+        Largest difference at times without replay; None if the replay covers the analysed segment.
     corrected : mapping from field of Settings to value
         Wrong settings of KF that were corrected first.
     sentences : tuple of str
@@ -159,7 +160,7 @@ class DifferenceSteps(Record, frozen=True, kw_only=True):
 
     @property
     def unexplained_fraction(self) -> float:
-        """Unexplained share of the mean square difference."""
+        """Share of the mean square position difference that the steps do not explain."""
         return self.unexplained_mean_square_m2 / self.position_mean_square_m2
 
 
@@ -171,7 +172,7 @@ class DifferenceExplanation(DifferenceSteps, frozen=True, kw_only=True, eq=False
     times_s, kf_minus_ekf2_m, unexplained_m : ndarray
         EKF2 sample times; position differences KF - EKF2 and replay - EKF2.
     cause : str
-        Sentence about the step with the largest contribution, without its time.
+        Sentence about the step with the largest contribution.
     """
 
     schema_type = DifferenceSteps
@@ -186,16 +187,16 @@ class DifferenceExplanation(DifferenceSteps, frozen=True, kw_only=True, eq=False
 def explain_by_steps(
     model: Model, settings: Settings | None = None, runs: Mapping[str, Replay] | None = None
 ) -> dict[str, DifferenceExplanation] | Unavailable:
-    """Compute the steps from KF to the logged EKF2, without explanatory sentences.
+    """Compute the sequence of filters from KF to EKF2, without explanatory sentences.
 
     Parameters
     ----------
     model : Model
     settings : Settings, optional
-        Settings of KF; its time offset is that of the source that EKF2 fused.
+        Settings of KF. Its time offset must refer to the source that EKF2 fused.
     runs : mapping from axis name to Replay, optional
-        Runs of KF along horizontal axes. Default: along north and east the result of the first
-        step, which has EKF2's samples and prediction steps.
+        Runs of KF along horizontal axes. By default the first step replaces KF, along north and
+        east: KF with EKF2's samples and prediction steps.
 
     Returns
     -------
@@ -213,7 +214,7 @@ def explain_by_steps(
     )
     evaluated_spans, times = model.flown.evaluated_s, ekf2.state.index.to_numpy()
     is_inside = inside_spans(times, evaluated_spans)
-    # only times that the replay and all KF runs cover
+    # compare only at times that the replay and all KF runs cover
     for index in (flown.delayed.index, *(run.steps.index for run in (runs or {}).values())):
         is_inside &= (times >= index[0]) & (times <= index[-1])
     times = times[is_inside]
@@ -242,7 +243,7 @@ def explain_by_steps(
             VELOCITY_STEP,
             FLOW_STEP,
             VISION_STEP,
-        ):  # the last step without a gate
+        ):  # the last step before the gate is added
             without_gate = track
     spans = Segment(*span, "").cut(evaluated_spans)
     longest_rejection = _longest_rejection(flown, without_gate, span, evaluated_spans)
@@ -250,7 +251,7 @@ def explain_by_steps(
     no_truth = OTHER_TIME if isinstance(truth, Truth) else truth
     for axis_index, (axis, direction) in enumerate(directions.items()):
         kf_state = state_at(runs[axis], times) if runs else stages[0][axis_index]
-        # KF, after each step, and the logged EKF2: shape (k + 2, 2, n)
+        # position and velocity of KF, of each step, and of the logged EKF2: shape (k + 2, 2, n)
         positions_by_step = np.array([kf_state, *(stage[axis_index] for stage in stages)])
         difference = positions_by_step - positions_by_step[-1]
         errors = [
@@ -291,7 +292,7 @@ def explain_by_steps(
 
 
 def step_variants(inputs: Inputs, kf_settings: Settings) -> dict[str, Variant]:
-    """Return the variant after each step except the last; each step changes one property."""
+    """Return the filter configuration of each step except the last, the output predictor."""
     flown, aid, received = inputs.settings, inputs.aid, inputs.received
     kf_process_noise = {
         "EKF2_ACC_NOISE": float(
@@ -299,7 +300,7 @@ def step_variants(inputs: Inputs, kf_settings: Settings) -> dict[str, Variant]:
         )
     }
     kf_parameters = {**flown, **kf_process_noise, aid.noise: kf_settings.sigma_z_m}
-    # the delay is already subtracted from the GNSS timestamps of KF
+    # the timestamps of KF's GNSS positions are measurement times: the delay is already subtracted
     applied_delay_s = flown[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     offset_s = kf_settings.clock_offset_s - applied_delay_s
     without_lever_arm = {**kf_parameters, **dict.fromkeys(aid.lever_arm, 0.0)}
@@ -344,7 +345,7 @@ def _longest_rejection(
     rejected, time = updates["rejected"].to_numpy() > 0, updates["fused_at_s"].to_numpy()
     if not rejected.any():
         return None
-    # a run lasts from its first rejected sample to the sample after its last
+    # a run lasts from its first rejected sample to the first sample that is fused again
     change = np.diff(rejected.astype(int), prepend=0, append=0)
     starts, ends = np.flatnonzero(change == 1), np.flatnonzero(change == -1)
     longest = int(np.argmax(ends - starts))

@@ -1,10 +1,10 @@
-"""Fusion of external vision besides GNSS in the EKF2 replay, with a bias of the vision frame.
+"""Fusion of external vision in addition to GNSS in the EKF2 replay, with a vision frame bias.
 
 The bias adapts within seconds, so vision determines the relative motion and GNSS the position.
-Without GNSS there is no bias: EKF2 then resets its position to that of vision. Samples between two
-events (ends of intervals, see :mod:`px4fuse.ekf2.intervals`) are fused at the later event; the
-motion in between follows from the state and the IMU. Array shapes: E events, S variants, k samples
-per event.
+Without GNSS there is no bias: EKF2 then resets its position to the vision position. Samples between
+two events (ends of intervals, see :mod:`px4fuse.ekf2.intervals`) are fused at the later event. The
+motion from sample to event is computed from the state and the IMU. Array shapes: E events, S
+variants (filter configurations), k samples per event.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/external_vision`` (``ev_pos_control.cpp``; before v1.16
 ``EKF/ev_pos_control.cpp``), ``EKF/control.cpp`` (vision is fused after GNSS and heights).
@@ -24,8 +24,9 @@ from px4fuse.ekf2.replay_segments import ReplaySegment, pad_samples, samples_by_
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 
 SPEED, HORIZONTAL = slice(3, 5), slice(6, 8)
-# s; time without a sample after which fusion stops (2 EV_MAX_INTERVAL, ev_control.cpp); time
-# outside the gate after which EKF2 resets the bias or the position (no_aid_timeout_max, common.h)
+# Maximum time (s) without a sample before fusion stops (2 EV_MAX_INTERVAL, ev_control.cpp), and
+# maximum time (s) outside the gate before EKF2 resets bias or position (no_aid_timeout_max,
+# common.h)
 MAX_SAMPLE_GAP_S, MAX_REJECTED_S = 0.4, 1.0
 COLUMNS = [
     "innovation_north_m",
@@ -47,7 +48,7 @@ def vision_samples(
 ) -> Array:
     """Return vision samples by the event at which they are fused, shape (8, k, E).
 
-    Rows: north and east as in :func:`~px4fuse.ekf2.replay_segments.samples_by_event`, age,
+    Rows: north and east (see :func:`~px4fuse.ekf2.replay_segments.samples_by_event`), age,
     measurement time, fusion time, reported variances north and east, and 1.
     """
     vision, time_s = inputs.vision, segment.time_s
@@ -57,7 +58,7 @@ def vision_samples(
     step = np.maximum.accumulate(np.searchsorted(time_s, due_s - 1e-9))
     is_usable = (step > 0) & (step < len(time_s)) & (due_s < measured_at_s + MAX_LATENESS_S)
     is_usable &= np.isfinite(vision.position_m[:, 0])
-    is_usable[:-1] &= step[1:] > step[:-1]  # EKF2 fuses the newer of two samples in one step
+    is_usable[:-1] &= step[1:] > step[:-1]  # of two samples in one step EKF2 fuses only the newer
     step = step[is_usable]
     lever_arm_m = np.array([settings[name] for name in EV_POS.lever_arm]) - inputs.imu_offset_m
     position_m = (vision.position_m[is_usable] - segment.rotation[step] @ lever_arm_m)[:, :2]
@@ -72,20 +73,21 @@ class VisionFilter:
     ----------
     segment : ReplaySegment
     sample_arrays : sequence of S ndarrays, shape (8, k, E)
-        From :func:`vision_samples`.
+        Results of :func:`vision_samples`.
     enabled : mapping from PX4's name of an aid to ndarray of bool, shape (E, S)
         True while the aid is fused.
-    parameters : mapping from PX4's name to ndarray, shape (S,)
+    parameters : mapping from parameter name to ndarray, shape (S,)
     has_gate, reported : ndarray of bool, shape (S,)
-        True if the gate is applied; True if reported variances are used.
+        For each variant: True if the gate is applied, True if reported variances are used.
 
     Attributes
     ----------
     update_log : ndarray, shape (E, k, 7, S)
-        For each sample: innovation (m, measurement minus state) and its variance, north and east;
-        1 if rejected, fused, or followed by a reset. NaN if EKF2 did not evaluate the sample.
+        For each sample: innovation north and east (m, measurement minus state), their variances,
+        and 1 if rejected, 1 if fused, 1 if followed by a reset. NaN if EKF2 did not evaluate the
+        sample.
     position_reset_m : ndarray, shape (E, S, 2)
-        Position reset at each event.
+        Size of the position reset at each event, north and east.
     fused_s : ndarray, shape (S,)
         Time of the last position fusion or reset.
     """
@@ -106,7 +108,7 @@ class VisionFilter:
         self.update_log = np.full((events, count, 7, size), np.nan)
         self.position_reset_m = np.zeros((events, size, 2))
         has_sample = (samples[7] > 0.0) & enabled[EV_POS.name]
-        # samples fused in the last step of the interval follow GNSS, earlier samples precede GNSS
+        # samples of the last step of an interval are fused after GNSS, earlier samples before
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
         self.has_gate, self.without_gnss = has_gate, ~enabled[GNSS_POS.name]
         self.gate2 = np.maximum(parameters[EV_POS.gate], MIN_GATE)[:, None] ** 2
@@ -145,7 +147,7 @@ class VisionFilter:
         e : int
         x, P : ndarray
         at_event : bool
-            True: samples in the last step of the interval; False: earlier samples.
+            True to fuse the samples of the interval's last step, False for earlier samples.
         gnss_fused_s : ndarray, shape (S,)
             Time of the last position fusion from GNSS.
         """
@@ -179,7 +181,7 @@ class VisionFilter:
         )
         reset = restarts & (without_gnss | (is_failing & (now_s - gnss_fused_s > MAX_REJECTED_S)))
         is_evaluated = has_sample & ~has_restarted | reset
-        # the innovation after a reset is 0
+        # EKF2 logs innovation 0 for a sample to which it resets
         update_log = (
             *np.where(reset, 0.0, nu.T),
             *diagonal.T,
@@ -211,7 +213,7 @@ class VisionFilter:
 def set_states(
     x: Array, P: Array, is_selected: BoolArray, rows: slice, value: Array, variance: Array
 ) -> None:
-    """Set states of selected variants to measured values, with their variance."""
+    """Set states of selected filter configurations to measured values, with their variance."""
     x[is_selected, rows] = value[is_selected]
     P[is_selected, :, rows] = 0.0
     P[is_selected, rows, :] = 0.0

@@ -1,4 +1,7 @@
-"""EKF2 with other parameters: results as logged, as replayed and with changes, at equal times."""
+"""EKF2 with other parameters: what-if table with columns logged, replayed, and changed.
+
+All columns of the table are evaluated over the same times.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -32,14 +35,14 @@ from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record, Share
 
 ANALYSIS_NAME = "EKF2 what-if"
-# fraction of the replayed samples that the log must contain to measure the time between fusions
+# Minimum fraction of the replayed samples in the log, to measure the time between logged fusions
 MIN_COMPLETE_SHARE = 0.9
 NO_TRUTH = Unavailable(
     "RMSE against ground truth",
     "the log has no ground truth",
     "Record motion capture (ATT_POS_MOCAP) besides the position source, or fly in simulation.",
 )
-# Notes for flights on GNSS
+# Notes for flights with GNSS
 HEADING_REPLAYED_NOTE = (
     "Heading is replayed with the magnetometer (as flown it differs from the log by {:.1f}° RMS)"
 )
@@ -59,20 +62,21 @@ HEADING_NOT_REPLAYED, HEIGHT_NOT_REPLAYED = (
         "height error", "the replay uses the logged EKF2 height", "Read the height in the log."
     ),
 )
-# s; minimum time to evaluate after an aid is disabled
+# Minimum evaluated time (s) after an aid is disabled
 MIN_EVALUATED_S = 5.0
 SWEEP_VALUES = 9
 MAX_SWEEP_VALUES = 200
-# Additional position noise (m) and number of repeated runs with this noise. A result is predictable
-# if the noise hardly changes the result
+# Test of predictability: position noise (m) added in repeated runs, and number of these runs. A
+# result is predictable if the noise hardly changes it
 DISTURBANCE_M, DISTURBANCE_RUNS = 0.002, 4
-# Rejected share up to which no repeated runs are needed, and above which no result is predictable
+# Minimum rejected share for which the repeated runs are needed, and maximum rejected share of a
+# predictable result
 MIN_REJECTED_SHARE, MAX_REJECTED_SHARE = 0.02, 0.35
-# s; time without height fusion after which EKF2 resets the height (hgt_fusion_timeout_max,
+# Time (s) without height fusion after which EKF2 resets the height (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
-# Limits of predictable results between repeated runs: ratio of mean NIS, difference of the rejected
-# share, ratio of the position RMSE
+# Maximum differences between repeated runs of a predictable result: ratio of mean NIS, difference
+# of the rejected share, and ratio of the position RMSE
 MAX_NIS_RATIO, MAX_REJECTED_SPREAD, MAX_RMSE_RATIO = 1.10, 0.03, 1.15
 
 
@@ -82,14 +86,14 @@ class AxisSummary(Record, frozen=True):
     Attributes
     ----------
     nis_mean : float
-        Mean NIS over all evaluated samples, including rejected ones.
+        Mean NIS over all evaluated samples, including rejected samples.
     nis_band : (float, float)
         95 % band of the mean NIS of a consistent filter.
     innovation_std_m : float
     sigma_p_median_m : float or Unavailable
-        Median reported σ of position.
+        Median reported σ of the position.
     position_rmse_to_truth_m : float or Unavailable
-        RMSE of the published position.
+        RMSE of the published position against ground truth.
     """
 
     nis_mean: NotNegative
@@ -100,7 +104,7 @@ class AxisSummary(Record, frozen=True):
 
 
 class HeightSummary(Record, frozen=True):
-    """Statistics of one height sensor, or of vision besides GNSS.
+    """Statistics of one height sensor, or of vision that is fused in addition to GNSS.
 
     Attributes
     ----------
@@ -119,21 +123,18 @@ class HeightSummary(Record, frozen=True):
 
     @property
     def is_predictable(self) -> bool:
-        """Return True if the result is predictable: no height reset and few rejections.
-
-        The replay does not model a height reset.
-        """
+        """Return True with few rejections and no height reset, which the replay does not model."""
         is_without_reset = self.longest_without_fusion_s <= HEIGHT_TIMEOUT_S
         return is_without_reset and self.rejected_fraction <= MAX_REJECTED_SHARE
 
 
 class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
-    """One column of the what-if table: logged, replayed, or with other parameters.
+    """One column of the what-if table: logged, replayed, or replayed with other parameters.
 
     Attributes
     ----------
     changed : mapping
-        Changed parameters.
+        Changed parameters and their values, by PX4 name.
     without : mapping from PX4's name of an aid to float
         Time (s) from which the aid is not fused.
     north, east : AxisSummary
@@ -141,18 +142,19 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     rejected_fraction : float
     longest_without_fusion_s : float or Unavailable
     resets : int
-        Resets of horizontal position.
+        Number of resets of the horizontal position.
     heading_error_mean_deg : float or Unavailable
-        Heading minus true heading, clockwise seen from above.
+        Mean of heading minus true heading, clockwise seen from above.
     heights : mapping from PX4's name of an aid to HeightSummary
         Replayed height sensors; empty if the logged EKF2 height is used.
     others : mapping from PX4's name of an aid to HeightSummary
-        Vision besides GNSS, north and east together; empty without it.
+        Vision that is fused in addition to GNSS, north and east together; empty without it.
     height_rmse_to_truth_m : float or Unavailable
     late, lost : int
-        Samples that arrived behind the fusion horizon: fused late, and never fused.
+        Number of samples that arrived after the fusion horizon had passed their time: fused late,
+        and never fused.
     is_predictable : bool
-        False if the result is not predictable: single rejections change it.
+        False if single rejections change the result.
     """
 
     changed: Mapping[str, float]
@@ -183,7 +185,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
 
     @property
     def position_rmse_to_truth_m(self) -> float | Unavailable:
-        """Horizontal position RMSE of the published position (m)."""
+        """Horizontal RMSE of the published position against ground truth (m)."""
         squares = 0.0
         for axis in self.axes.values():
             if isinstance(axis.position_rmse_to_truth_m, Unavailable):
@@ -194,18 +196,18 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
 
 @dataclass(frozen=True)
 class WhatIf:
-    """Comparison of EKF2 as logged, as replayed, and with other parameters.
+    """Comparison of EKF2 logged, replayed, and replayed with other parameters (what-if table).
 
     Attributes
     ----------
     agreement : Agreement
-        Agreement of the replay with the log, which all other results require.
+        Agreement of the replay with the log. All other results require it.
     logged, replayed : Summary
-        As flown, from the log and from the model.
+        Column from the log, and column from the replay with the logged parameters.
     whatif : tuple of Summary
-        One per change of parameters.
+        One column per set of changed parameters.
     evaluated_s : tuple of (float, float)
-        Evaluated times (s), equal for all columns.
+        Evaluated times (s), the same for all columns.
     notes : tuple of str
         Limitations of the replay, one sentence each.
     """
@@ -233,7 +235,7 @@ def what_if(
     settings : sequence of mapping
         Changed parameters of each replay, by PX4 name and in PX4's units.
     without : mapping from PX4's name of an aid to float, optional
-        Time (s) from which the aid is not fused; all columns are evaluated from then on.
+        Time (s) from which the aid is not fused; all columns are evaluated from this time on.
 
     Returns
     -------
@@ -252,7 +254,7 @@ def what_if(
     flight, evaluated_s = model.flight, model.flown.evaluated_s
     if without:
         disabled_s = min(without.values())
-        # a later segment would start from a logged state into which the aid was fused
+        # later segments are not used: they start from a logged state that contains the aid
         remaining_spans = [
             (max(start, disabled_s), end)
             for start, end in evaluated_s
@@ -302,7 +304,7 @@ def _heading_and_height_notes(model: Model) -> tuple[str, str]:
 def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) -> list[float]:
     """Return values of a parameter from ``low`` to ``high``, both included.
 
-    Equal ratios above zero, else equal steps.
+    The values have equal ratios if ``low`` is above zero, else equal differences.
 
     Raises
     ------
@@ -328,7 +330,7 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) 
 def _mark_unpredictable(
     model: Model, summaries: Sequence[Summary], evaluated_s: Spans, without: Mapping[str, float]
 ) -> tuple[Summary, ...]:
-    """Mark results as not predictable that change when noise is added to the positions."""
+    """Mark results that change with added position noise as not predictable."""
     runs = [[summary] for summary in summaries]
     uncertain_runs = [
         repeated_runs
@@ -387,7 +389,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
             f"{replay.lost} samples arrive after the fusion horizon",
             "Choose another value.",
         )
-    # the variance grows between two samples; both ends define the interpolation
+    # the variance grows between updates and drops at an update: interpolate with both values
     variance = pd.DataFrame(index=np.column_stack([fused_at_s - 1e-6, fused_at_s]).ravel())
     for axis in HORIZONTAL:
         s, r = (
@@ -468,8 +470,8 @@ def _make_summary(
 ) -> Summary:
     """Compute a column of the what-if table.
 
-    ``variance`` is interpolated at the times of the logged variance; None: the logged variance.
-    ``more`` contains further fields of :class:`Summary`.
+    ``variance`` is interpolated to the times of the logged variance; if None, the logged variance
+    is used. ``more`` contains further fields of :class:`Summary`.
     """
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
@@ -515,7 +517,7 @@ def _make_summary(
 def _innovation_statistics(
     updates: pd.DataFrame, *axes: AxisName
 ) -> tuple[float, tuple[float, float], float]:
-    """Return mean NIS, its band and the innovation standard deviation over some axes."""
+    """Return mean NIS, its 95 % band and the innovation standard deviation over some axes."""
     nu = updates[[f"innovation_{axis}_m" for axis in axes]].to_numpy().ravel()
     s = updates[[f"innovation_variance_{axis}_m2" for axis in axes]].to_numpy().ravel()
     return float(np.mean(nu**2 / s)), nis_band(len(nu)), float(np.std(nu))
@@ -536,7 +538,7 @@ def _summarise_aid(evaluated_updates: pd.DataFrame, evaluated_s: Spans) -> Heigh
 def _heading_error(
     flight: Flight, replay: Ekf2Replay, heading: pd.Series, evaluated_s: Spans
 ) -> float | Unavailable:
-    """Return the mean of a heading (rad) minus the true heading, in degrees."""
+    """Return the mean difference (°) of a heading (rad) and the true heading."""
     if GNSS_POS.noise not in replay.settings:
         return HEADING_NOT_REPLAYED
     true_attitude = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude
@@ -551,7 +553,7 @@ def _heading_error(
 
 
 def _longest_between_fusions(fused_s: Array, evaluated_s: Spans) -> float:
-    """Return the longest time (s) between two fusions or the ends of the evaluated time."""
+    """Return the longest time (s) without a fusion within the evaluated times."""
     ends = [evaluated_s[0][0], evaluated_s[-1][1]]
     return float(np.max(np.diff(np.sort(np.concatenate([fused_s, ends])))))
 
@@ -559,7 +561,7 @@ def _longest_between_fusions(fused_s: Array, evaluated_s: Spans) -> float:
 def _deviation_note(
     model: Model, replay: Ekf2Replay, without: Mapping[str, float], evaluated_s: Spans
 ) -> str:
-    """Describe the position difference between the replays without some aids and as flown."""
+    """Describe the position difference between the replays without and with the disabled aids."""
     flown, changed_position = (
         replay_run.published.loc[
             inside_spans(replay_run.published.index, evaluated_s), Columns.POSITION
@@ -593,7 +595,7 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
         )
     if replay.late or replay.lost:
         remedy = "" if model.inputs.rules.horizon_by_delay else ": raise EKF2_DELAY_MAX"
-        # of two samples in one step EKF2 fuses the newer one, so updates may be fewer than samples
+        # of two samples in one step EKF2 fuses only the newer, so updates may be fewer than samples
         samples = max(len(replay.updates), replay.late) + replay.lost
         yield (
             f"{_change_text(replay)}: {replay.late + replay.lost} of {samples} samples would "
@@ -602,5 +604,5 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
 
 
 def _change_text(replay: Ekf2Replay) -> str:
-    """Return the changed parameters, or "As flown"."""
+    """Return the changed parameters as text, or "As flown"."""
     return ", ".join(f"{name}={value:g}" for name, value in replay.changed.items()) or "As flown"

@@ -194,9 +194,7 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
         "called": result.axis.label,
         "along": describe_axis(analysis, result),
         "verdicts": [_verdict_data(verdict) for verdict in verdicts(result)],
-        "heading": result.axis.heading_deg,
         "note": result.axis.note,
-        "direction": result.axis.direction.tolist(),
         "bands": _nis_bands(len(result.axis.measurement_time_s), packer),
         # horizontal axes share their likelihood map if it exists
         "map": HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name,
@@ -267,8 +265,6 @@ def _summary(consistency: Consistency | Unavailable) -> dict[str, Any]:
     return {
         "why": "",
         "count": consistency.count,
-        "nis": consistency.nis_mean,
-        "band": list(consistency.nis_band),
         "outside": consistency.fraction_outside_two_sigma,
         "lag1": consistency.lag1_autocorrelation,
     }

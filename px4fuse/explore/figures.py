@@ -40,7 +40,7 @@ TRUTH_LINE: dict[str, Any] = {
 CONSISTENT_BAND: dict[str, Any] = {"level": "underlay", "fill_alpha": 1.0, "name": "consistent"}
 # ±√S in which 95 % of the innovations are, and the range of their plot
 NORMAL_BAND, NORMAL_RANGE = 2.0, 4.6
-LEFT_BORDER = 50  # pixels
+LEFT_BORDER, EVENT_BORDER = 50, 82  # pixels; the labels of events are longer
 STYLES = {
     "kf": KF_LINE,
     "dotted": KF_LINE | {"line_dash": [2, 2]},
@@ -258,7 +258,7 @@ def _event_strip(data: dict[str, Any], time_range: Range1d) -> Any:
         toolbar_location=None,
         tools="xbox_zoom,xpan",
         active_drag="xbox_zoom",
-        min_border_left=LEFT_BORDER,
+        min_border_left=EVENT_BORDER,
     )
     fig.hbar(
         y="row",

@@ -279,6 +279,7 @@ const Explore = (async () => {
   const figures = Object.keys(PLOTS).map(model).filter(Boolean);
   function setHeights() {
     for (const plot of figures) if (plot.name !== "strip") plot.height = NARROW.matches ? 175 : 205;
+    model("position").min_border_left = NARROW.matches ? 50 : 82; // aligned with the events below it
   }
   setHeights();
 
@@ -654,8 +655,7 @@ const Explore = (async () => {
     }
     const { axis } = result, map = mapNow();
     $("along").textContent = `· ${axis.along}`;
-    $("axis-note").textContent = [axis.heading === null ? "" : `heading ${axis.heading.toFixed(1)}°`, axis.note]
-      .filter(Boolean).join(", ");
+    $("axis-note").textContent = axis.note;
     $("likely").disabled = typeof map === "string" || map.likely.includes(null);
     $("ekf2-r").disabled = typeof axis.ekf2 === "string" || axis.ekf2.r === null;
     $("map-note").textContent = mapNote();

@@ -251,7 +251,7 @@ def _compare_orientations(
 def _estimate_from_positions(
     acceleration: pd.DataFrame, samples: pd.DataFrame, dt_s: float, sigma_z: float
 ) -> HeadingError:
-    """Estimate the rotation as a filter state, with the most likely noises of a grid."""
+    """Estimate the rotation as a filter state, with the maximum-likelihood noises of a grid."""
     time, measured_m = samples.index.to_numpy(), samples.to_numpy()
     interval_inputs = _interval_inputs(acceleration, time)
     # √DT converts SIGMA_A, a σ over one DT, to the velocity random walk in 1 s

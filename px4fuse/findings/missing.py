@@ -107,8 +107,8 @@ def _weak_verdict(analysis: Comparison, owner: FilterName) -> str | None:
     for limit in limits:
         if low <= limit <= high:
             return (
-                f"and the verdict of {name} is near its limit. The 95 % interval of innovation ÷ √S "
-                f"({low:.2f} to {high:.2f}) contains the limit {limit:g}."
+                f"and the verdict of {name} is near its limit. The 95 % interval of innovation ÷ "
+                f"√S ({low:.2f} to {high:.2f}) contains the limit {limit:g}."
             )
     return None
 

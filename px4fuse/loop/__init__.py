@@ -1,1 +1,1 @@
-"""Loops of odometry: segment, loop closures, and corrections of the path."""
+"""Loop analysis of odometry: segment of the loop, loop closures, and corrections of the path."""

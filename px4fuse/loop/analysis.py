@@ -1,4 +1,4 @@
-"""Loop analysis: segment, landing place, closures, corrections and their scores."""
+"""Loop analysis: segment, landing place, loop closures, corrected paths and their scores."""
 
 from collections.abc import Callable
 
@@ -22,15 +22,16 @@ from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Trajectory, components_by_axis, cumulative_distance
 
-# s; if the timestamps are UNIX time, smaller times of options count from the first pose
+# Minimum time (s) in options that is UNIX time, if the timestamps are UNIX time; smaller times
+# count from the first pose
 MIN_UNIX_TIME_S = 1e6
-# m; shortest path of a loop
+# Minimum path length (m) of a loop
 MIN_PATH_M = 2.0
-# in ``px4fuse compare`` the loop is only analysed if its path (m) is longer, and the distance
-# between its ends is a smaller fraction of the path
+# Conditions for a loop analysis in ``px4fuse compare``: minimum path length (m), and maximum
+# distance between both ends as fraction of the path length
 MIN_FLIGHT_LOOP_PATH_M = 10.0
 MAX_END_DISTANCE_FRACTION = 0.10
-# m or degrees; upper limit of options
+# Maximum value (m or °) of options
 MAX_OPTION_VALUE = 100.0
 
 
@@ -45,18 +46,18 @@ def analyse(
     Parameters
     ----------
     source : LoopSource
-        Trajectory, and the flight that contains it.
+        Trajectory, and its flight, if any.
     request : LoopRequest, optional
         Options. Times are on the clock of the trajectory; with UNIX timestamps, small times count
-        from the first pose. The default landing place is from the ground truth in the log, else the
-        take-off place.
+        from the first pose. The default landing place is from the ground truth in the log, or else
+        the take-off place.
     reference : Trajectory, optional
-        Reference for the scores, in addition to the ground truth in the log.
+        Additional reference for the scores. The ground truth in the log is always used.
 
     Raises
     ------
     TrajectoryError, SettingsError
-        The segment is too short, a closure is outside of the segment, or a number is out of range.
+        The segment is too short, a closure is outside of the segment, or an option is out of range.
     """
     request = request or LoopRequest(source=source.trajectory.name)
     noise = OdometryNoise(request.position_drift_m, request.heading_drift_deg)
@@ -158,7 +159,7 @@ def analyse(
 def _find_true_end(
     path: Trajectory, request: LoopRequest, truth_end: TrueEnd | str | None
 ) -> TrueEnd | Unavailable:
-    """Return the landing place: measured, from ground truth, or the take-off place."""
+    """Return the landing place: measured, else from ground truth, else the take-off place."""
     if request.landed_at is not None:
         if not request.closed_loop:
             raise SettingsError(
@@ -178,7 +179,7 @@ def _is_absolute(trajectory: Trajectory, flight: Flight) -> bool:
 
 
 def _choose_key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
-    """Return the indices of the key frames, and the distance along them at each pose."""
+    """Return the indices of the key frames, and at each pose the distance along the key frames."""
     _require_in_range("key_frames_m", spacing_m, 1e-3)
     frame_indices = choose_key_frames(path.position_m, spacing_m)
     distance_m = cumulative_distance(path.position_m[frame_indices])
@@ -245,7 +246,7 @@ def analyse_flight_loop(
 ) -> Loop | Unavailable:
     """Analyse the loop of a flight's odometry, for ``px4fuse compare``.
 
-    Unavailable without odometry, or if the odometry does not return near its start.
+    Unavailable without odometry, or if the odometry does not end near its start.
     """
     odometry = find_odometry(flight)
     try:

@@ -13,7 +13,8 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Frame, Trajectory, cumulative_distance
 
 DOWN = np.array([0.0, 0.0, 1.0])
-# by frame: indices of forward (or north), right (east), down in x, y, z; signs; new frame; note
+# By frame: indices of forward (or north), right (or east), down in (x, y, z); their signs; new
+# frame; note
 _TO_Z_DOWN: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
     "ENU": (
         [1, 0, 2],
@@ -34,8 +35,8 @@ _TO_Z_DOWN: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
         "the frame is unknown; z is assumed to be up",
     ),
 }
-# key frame spacing as fraction of the extent, and limits of the spacing (m). The curvature of a
-# path scales with its extent, so the spacing scales, too
+# Key frame spacing as fraction of the path's extent, and limits of the spacing (m). The radius of
+# curves grows with the extent of a path, so the spacing may grow, too
 SPACING_FRACTION = 0.02
 MIN_SPACING_M, MAX_SPACING_M = 0.02, 0.5
 
@@ -58,7 +59,7 @@ def to_z_down(trajectory: Trajectory) -> Trajectory:
 
 
 def from_z_down(trajectory: Trajectory, frame: Frame) -> Trajectory:
-    """Convert a trajectory of :func:`to_z_down` back to its original ``frame``."""
+    """Convert a result of :func:`to_z_down` back to the original ``frame``."""
     if frame not in _TO_Z_DOWN or trajectory.frame in _TO_Z_DOWN:
         return trajectory
     order, sign, _, _ = _TO_Z_DOWN[frame]
@@ -66,7 +67,7 @@ def from_z_down(trajectory: Trajectory, frame: Frame) -> Trajectory:
 
 
 def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
-    """Rotate poses to another frame; camera axes are converted to body axes or back."""
+    """Rotate poses to another frame; convert camera axes to body axes or back."""
     rotation = Rotation.from_matrix(matrix)
     rotated = replace(
         trajectory.with_positions(trajectory.position_m @ matrix.T, rotation), frame=frame
@@ -83,10 +84,10 @@ def default_key_frame_spacing_m(position_m: Array) -> float:
 
 
 def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
-    """Return indices of poses with a distance of at least ``spacing_m``, including both ends.
+    """Return indices of poses at distances of at least ``spacing_m``, including both ends.
 
-    The length along all samples of a noisy track is too large: at 30 Hz each step adds the noise of
-    two positions. Steps that are long compared with the noise avoid this error.
+    The length along all samples of a noisy track is too large: at 30 Hz each interval adds the
+    noise of two positions. Key frames at distances above the noise avoid this error.
     """
     frame_indices = [0]
     last_frame_m = position_m[0]
@@ -96,7 +97,7 @@ def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
             frame_indices.append(index)
             last_frame_m = position
     if len(frame_indices) > 1 and np.linalg.norm(position_m[-1] - last_frame_m) < spacing_m / 2.0:
-        frame_indices.pop()  # otherwise the last step would be mostly noise
+        frame_indices.pop()  # too near to the end: the distance would be mostly noise
     return np.array([*frame_indices, len(position_m) - 1])
 
 
@@ -116,7 +117,7 @@ def distribute_by_distance(
     misclosure_m : ndarray, shape (d,)
         Closure error e: measured end minus true end.
     cumulative_m : ndarray, shape (n,), optional
-        Distance s, by default along the positions.
+        Distance s along the path; by default along ``position_m``.
 
     Returns
     -------
@@ -132,9 +133,9 @@ def distribute_by_distance(
 
 
 def heading_change_rad(rotation: Rotation) -> float:
-    """Return the rotation about the vertical (rad) of a rotation in a frame with z down.
+    """Return the part about the vertical (rad) of a rotation in a frame with z down.
 
-    Twist of the swing-twist decomposition about z; positive is clockwise seen from above.
+    It is the twist of the swing-twist decomposition about z; positive is clockwise from above.
     """
     _, _, z, w = rotation.as_quat()
     return float(lie.wrap(2.0 * np.arctan2(z, w)))
@@ -145,20 +146,21 @@ def correct_by_distance(
 ) -> Trajectory:
     """Distribute the closure errors of position and heading by distance.
 
-    Each orientation is corrected by its fraction of the heading error (slerp about the vertical).
-    The steps between poses are rotated by the same correction, which keeps the shape of the path.
-    The remaining position error is distributed by the compass rule.
+    Each orientation is corrected by a fraction of the heading error (slerp about the vertical): the
+    distance up to the pose over the path length. The displacements between poses are rotated by the
+    same angle, which keeps the shape of the path. The remaining position error is distributed by
+    the compass rule.
 
     Parameters
     ----------
     trajectory : Trajectory
-        In a frame with z down.
+        Trajectory in a frame with z down.
     cumulative_m : ndarray, shape (n,)
         Distance along the path at each pose.
     misclosure_m : ndarray, shape (3,)
-        Measured end minus true end.
+        Closure error: measured end minus true end.
     misclosure_heading_rad : float
-        Measured minus true final heading; 0 if unknown.
+        Heading error: measured minus true final heading; 0 if unknown.
     """
     position_m = trajectory.position_m
     fraction = cumulative_m / cumulative_m[-1]

@@ -24,7 +24,7 @@ from px4fuse.trajectory.model import Trajectory
 UNCORRECTED = "uncorrected"
 POSITIONS_ONLY = "by distance, positions only"
 BY_DISTANCE = "by distance, headings too"
-# labels of the corrections
+# Labels of the corrections
 CORRECTION_LABELS: Mapping[str, str] = {
     "uncorrected": UNCORRECTED,
     "by_distance_plain": POSITIONS_ONLY,
@@ -34,7 +34,8 @@ CORRECTION_LABELS: Mapping[str, str] = {
 SINGLE_LOOP_REASON = (
     "A single loop has no redundancy: only the gate can reject it, robust optimisation cannot."
 )
-# corrected path, with the solution if it is from a pose graph; or reason why the path is missing
+# Corrected path with the pose graph solution (None without a pose graph), or reason why it is
+# missing
 Corrected = tuple[Trajectory, Solution | None] | Unavailable
 
 
@@ -45,7 +46,7 @@ def correct_paths_by_distance(
     heading_error_deg: float | Unavailable,
     landing: Closure | None,
 ) -> dict[CorrectionName, Corrected]:
-    """Correct the path by distance: positions only (as in the lesson), and also headings."""
+    """Correct the path by distance: only positions (as in the lesson); positions and headings."""
     if landing is not None and not landing.accepted:
         misclosure_m = _unavailable_by_gate("correction by distance", landing)
     if isinstance(misclosure_m, Unavailable):
@@ -74,7 +75,7 @@ def _unavailable_by_gate(correction_name: str, closure: Closure) -> Unavailable:
 def gate_closures(
     graph: PoseGraph | Unavailable, closures_with_end: Sequence[ClosureWithEnd]
 ) -> tuple[Closure, ...]:
-    """Test each closure (last edges of the graph) against odometry; empty without a graph."""
+    """Test each closure against odometry; closures are the last edges. Empty without a graph."""
     if isinstance(graph, Unavailable):
         return ()
     edges = np.arange(len(graph.first) - len(closures_with_end), len(graph.first))
@@ -98,9 +99,9 @@ def solve_pose_graphs(
     closures: tuple[Closure, ...],
     progress: Callable[[str], None],
 ) -> tuple[dict[CorrectionName, Corrected], tuple[Closure, ...]]:
-    """Optimise the graph with all closures, with the accepted closures, and robustly.
+    """Optimise the graph with all closures, with the closures accepted by the gate, and robustly.
 
-    Return the corrected paths, and the closures with their robust weights.
+    Return the corrected paths, and the closures with their weights from robust optimisation.
     """
     corrections: dict[Any, Corrected] = {}
     if isinstance(graph, Unavailable) or not closures:
@@ -142,7 +143,7 @@ def solve_pose_graphs(
 def _interpolate_corrections(
     path: Trajectory, nodes: IntArray, graph_poses: Array, solved_poses: Array
 ) -> Trajectory:
-    """Correct all poses by interpolating the corrections of the neighbouring nodes."""
+    """Correct all poses by interpolation between the corrections of the neighbouring nodes."""
     rotation = (
         Rotation.from_quat(solved_poses[:, 3:]) * Rotation.from_quat(graph_poses[:, 3:]).inv()
     )
@@ -166,7 +167,7 @@ def score_paths(
     corrected_paths: Mapping[CorrectionName, Corrected],
     references: tuple[Trajectory, ...],
 ) -> dict[CorrectionName, CorrectedPath | Unavailable]:
-    """Score odometry and corrected paths, with the time offset of the odometry for all."""
+    """Score odometry and corrected paths; all use the time offset of the odometry."""
     offsets: dict[str, float] = {}
 
     def score(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:

@@ -1,4 +1,4 @@
-"""Segment of a trajectory that is the loop, and true landing place."""
+"""Segment of a trajectory that is analysed as a loop, and the true landing place."""
 
 from dataclasses import replace
 
@@ -14,17 +14,17 @@ from px4fuse.loop.model import TrueEnd
 from px4fuse.request import Landing
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, components_by_axis
 
-# averaging time (s) of poses on the ground, and largest range (m) of their positions at rest
+# Averaging time (s) of poses on the ground, and maximum range (m) of positions at rest in that time
 REST_TIME_S = 1.0
 MAX_REST_RANGE_M = 0.15
-# if odometry has a smaller heading change, the true heading change is assumed to be zero
+# Maximum heading change (°) from odometry for which the true heading change is assumed to be zero
 MAX_SAME_HEADING_DEG = 15.0
 
 
 def cut_trajectory(
     trajectory: Trajectory, segment: Segment, rests_at_ends: bool = False
 ) -> Trajectory:
-    """Cut a trajectory to a segment; with ``rests_at_ends`` average the poses on the ground.
+    """Cut a trajectory to a segment; average the poses on the ground if ``rests_at_ends``.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def cut_trajectory(
     quaternions = None if segment_track.rotation is None else segment_track.rotation.as_quat()
     for index, rest_start_s in ((0, segment.start_s - REST_TIME_S), (-1, segment.end_s)):
         resting = trajectory[(time >= rest_start_s) & (time <= rest_start_s + REST_TIME_S)]
-        # poses are averaged only if the vehicle is at rest
+        # not at rest: the pose at the end of the segment is kept
         if (
             not len(resting)
             or np.linalg.norm(np.ptp(resting.position_m, axis=0)) > MAX_REST_RANGE_M
@@ -69,7 +69,7 @@ def choose_loop_segment(
     flight : Flight or None
         Flight of the trajectory; without it the segment is the whole trajectory.
     start_s, end_s : float or None
-        Given start or end of the segment.
+        Start or end of the segment; None for take-off or landing.
 
     Raises
     ------
@@ -113,8 +113,8 @@ def heading_change_deg(path: Trajectory) -> float | None:
 def assume_end_at_takeoff(path: Trajectory) -> TrueEnd:
     """Return the take-off place as landing place.
 
-    The final heading is assumed equal to the initial heading if their difference by odometry is
-    small, else unknown.
+    If the heading change from odometry is small, the final heading is assumed equal to the initial
+    heading; else it is unknown.
     """
     change_deg = heading_change_deg(path)
     is_same_heading = change_deg is not None and abs(change_deg) <= MAX_SAME_HEADING_DEG
@@ -152,9 +152,9 @@ def convert_measured_end(path: Trajectory, landing: Landing) -> TrueEnd:
 def read_end_from_truth(
     path: Trajectory, truth: Trajectory, segment: Segment, rests_at_ends: bool
 ) -> TrueEnd | str:
-    """Return the landing place from the ground truth in the log, or why it is unknown.
+    """Return the landing place from the ground truth in the log, or the reason for none.
 
-    The ground truth is rotated into the odometry frame by the difference of the initial headings.
+    The ground truth is rotated to the odometry frame by the difference of the initial headings.
     """
     try:
         true_path = cut_trajectory(truth, segment, rests_at_ends)

@@ -15,7 +15,7 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
 from px4fuse.trajectory.model import AxisComponents, Frame, Kind, Trajectory
 
-# name of a correction; after "pose_graph_" a key of trajectory.graph.analysis.SOLUTIONS
+# Name of a correction; after "pose_graph_" follows a key of trajectory.graph.analysis.SOLUTIONS
 CorrectionName = Literal[
     "uncorrected",
     "by_distance_plain",
@@ -33,15 +33,15 @@ class TrueEnd(Record, frozen=True, kw_only=True):
 
     Attributes
     ----------
-    displacement_m : mapping from the name of an axis to float
+    displacement_m : mapping from axis name to float
     heading_change_deg : float or None
         Final heading minus initial heading, clockwise; None if unknown.
     sigma_m, sigma_heading_deg : float
         Standard deviations of position and heading; None for an unknown heading.
     source : str
-        Origin of the landing place.
+        Description of the data from which the landing place is known.
     assumed : bool
-        True if landing at the take-off place is only assumed.
+        True if landing at the take-off place is assumed without a measurement.
     """
 
     displacement_m: AxisComponents
@@ -68,14 +68,15 @@ class OdometryNoise(Record, frozen=True, omit_defaults=False):
     heading_deg : float
         Standard deviation of the heading after 100 m.
     position_m_per_root_s, heading_deg_per_root_s : float
-        Drift over time, also while hovering (m/√s, °/√s).
+        Random walk over time (m/√s, °/√s), also while hovering.
     tilt_share : float
-        Drift of roll and pitch over drift of heading; small, because gravity is measured.
+        Ratio of the drift of roll and pitch to the drift of heading; small, because gravity is
+        measured.
 
     Notes
     -----
-    The defaults are those of indoor visual-inertial odometry: about 1 % of the distance (Delmerico
-    and Scaramuzza 2018; Intel's data sheet of the T265 states the same).
+    The defaults are for indoor visual-inertial odometry: about 1 % of the distance (Delmerico and
+    Scaramuzza 2018; Intel's data sheet of the T265 states the same).
     """
 
     position_m: NotNegative = 1.0
@@ -86,22 +87,22 @@ class OdometryNoise(Record, frozen=True, omit_defaults=False):
 
 
 class Closure(Record, frozen=True, kw_only=True):
-    """Loop closure: two times at the same place, with gate result and robust weights.
+    """Loop closure (two times at the same place), with gate result and weights of robust methods.
 
     Attributes
     ----------
     time_1_s, time_2_s : float
-        On the clock of the trajectory.
+        Times on the clock of the trajectory.
     sigma_m : float
-        Standard deviation of the displacement between the two times, each axis.
+        Standard deviation of the displacement between the two times, per axis.
     source : str
-        "landing", or "given".
+        "landing" for the landing place, "given" for an option.
     distance_m : float
-        Closure error of the odometry.
+        Closure error of the odometry: odometry minus true displacement.
     d2, degrees_of_freedom, p, accepted
         See :class:`~px4fuse.trajectory.graph.covariance.GateResult`.
     weight_dcs, weight_gnc : float or None
-        Weights of robust optimisation, 0 to 1; None without redundancy.
+        Weights of robust optimisation, 0 to 1; None with a single closure (no redundancy).
     """
 
     time_1_s: float
@@ -123,7 +124,7 @@ class Closure(Record, frozen=True, kw_only=True):
 
 
 class Correction(Record, frozen=True, kw_only=True):
-    """Size of a correction, cost of the pose graph, and scores against each reference."""
+    """Size of a path correction, cost of its pose graph, and scores against each reference."""
 
     correction_max_m: NotNegative
     correction_rms_m: NotNegative
@@ -139,14 +140,14 @@ class CorrectedPath(Correction, frozen=True, kw_only=True, eq=False):
 
     Attributes
     ----------
-    scores : mapping from the name of the reference to Evaluation or Unavailable
+    scores : mapping from reference name to Evaluation or Unavailable
     name : str
     trajectory : Trajectory
         All poses of the segment, corrected.
     moved_m : ndarray, shape (n,)
         Size of the correction of each pose.
     solution : Solution or None
-        Solution of the pose graph.
+        Solution of the pose graph; None for a correction without pose graph.
     """
 
     schema_type = Correction
@@ -160,12 +161,13 @@ class CorrectedPath(Correction, frozen=True, kw_only=True, eq=False):
 
 
 class LoopResult(Record, frozen=True, kw_only=True):
-    """Loop: path, landing place, closure errors and corrections, for the results.
+    """Loop: path, landing place, closure errors and corrections, for results.json.
 
     ``closure_error_m`` is the distance between measured and true end, and ``closure_percent`` this
     distance in per cent of the path length. ``is_absolute_track`` is True if the track follows a
-    positioning system and does not drift. Correction ``by_distance_plain`` changes positions only
-    (Example 2 of the lesson); ``by_distance`` also changes headings, if the heading error is known.
+    positioning system and does not drift. The correction ``by_distance_plain`` changes positions
+    only (Example 2 of the lesson). ``by_distance`` also changes headings, if the heading error is
+    known.
     """
 
     track: str
@@ -193,20 +195,20 @@ class LoopResult(Record, frozen=True, kw_only=True):
 
 
 class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
-    """Result of ``px4fuse loop``, with the paths.
+    """Result of ``px4fuse loop``: :class:`LoopResult` with the paths.
 
     Attributes
     ----------
-    corrections : mapping from name of a correction to CorrectedPath or Unavailable
+    corrections : mapping from correction name to CorrectedPath or Unavailable
     nodes : ndarray of int, shape (k,)
-        Key frames, as indices of poses.
+        Indices of the poses that are key frames.
     distance_m : ndarray, shape (n,)
         Distance along the key frames at each pose.
     graph : PoseGraph or Unavailable
         Pose graph with all closures, before optimisation.
     references : tuple of Trajectory
     original_frame : Frame
-        Frame of the trajectory as given.
+        Frame of the trajectory before the conversion to z down.
     """
 
     schema_type = LoopResult
@@ -226,13 +228,13 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
 
     @property
     def paths(self) -> dict[CorrectionName, CorrectedPath]:
-        """Available paths, first the odometry."""
+        """Available paths by name; the odometry is first."""
         every = self.corrections.items()
         return {name: path for name, path in every if isinstance(path, CorrectedPath)}
 
     @property
     def reported_paths(self) -> tuple[CorrectedPath, ...]:
-        """Paths for reports, without duplicates."""
+        """Paths for reports, without paths that equal another path."""
         duplicates: set[CorrectionName] = set()
         if all(closure.accepted for closure in self.closures):
             duplicates.add("pose_graph_all")
@@ -242,7 +244,7 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
 
     @property
     def best(self) -> CorrectedPath:
-        """Gated solution of the pose graph, else correction by distance, else odometry."""
+        """Pose graph with gated closures, else correction by distance, else odometry."""
         names: tuple[CorrectionName, ...] = ("pose_graph_gated", "by_distance", "uncorrected")
         return next(self.paths[name] for name in names if name in self.paths)
 

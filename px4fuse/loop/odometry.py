@@ -1,4 +1,4 @@
-"""Odometry drift, and the pose graph of a path with its closures."""
+"""Variances of odometry drift, and the pose graph of a path with its loop closures."""
 
 from collections.abc import Sequence
 
@@ -14,35 +14,35 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
-# reported variances are used as drift if the ratio of late to early variances is larger
+# Minimum ratio of late to early reported variances, for variances that are used as drift
 MIN_VARIANCE_GROWTH = 2.0
-# lower limit of reported variances, as fraction of the default drift: a variance must not be zero
+# Minimum variance, as fraction of the default drift, because a reported variance may be zero
 MIN_VARIANCE_FRACTION = 1e-2
-END_FRACTION = 0.1  # fraction of the path whose variances count as early, and as late
-# closure; for the closure by landing also the landing place
+END_FRACTION = 0.1  # fraction of the path at both ends with early and with late variances
+# Loop closure; also the landing place if the closure is from landing
 ClosureWithEnd = tuple[GivenClosure, TrueEnd | None]
 
 
 def odometry_variances(
     path: Trajectory, nodes: IntArray, noise: OdometryNoise
 ) -> tuple[Array, Array, str]:
-    """Compute the variances of the odometry between the nodes of a path.
+    """Compute the variances of the odometry between successive nodes of the pose graph.
 
     Parameters
     ----------
     nodes : ndarray of int, shape (k,)
-        Poses that are nodes of the graph.
+        Indices of the poses that are nodes of the graph.
     noise : OdometryNoise
-        Used if the reported variances of the trajectory do not grow.
+        Drift that is used if the reported variances of the trajectory do not grow.
 
     Returns
     -------
     translation : ndarray, shape (k - 1,)
-        m², each axis.
+        Variance (m²) per axis.
     rotation : ndarray, shape (k - 1, 3)
-        rad², about the body axes.
+        Variances (rad²) about the body axes.
     statement : str
-        Origin of the variances.
+        Sentence on the origin of the variances.
     """
     length_m = np.diff(cumulative_distance(path.position_m[nodes]))
     duration_s = np.diff(path.time_s[nodes])
@@ -70,7 +70,7 @@ def odometry_variances(
 
 
 def _variance_growth(variance: Array | None, nodes: IntArray) -> Array | None:
-    """Return the growth of variances between nodes, shape (k - 1, 3); None if they hardly grow."""
+    """Return the growth of variances between nodes, shape (k - 1, 3); None if it is too small."""
     if variance is None:
         return None
     end_count = max(1, int(END_FRACTION * len(variance)))
@@ -92,20 +92,20 @@ def build_pose_graph(
     Parameters
     ----------
     path : Trajectory
-        In a frame with z down; with orientations.
+        Path in a frame with z down, with orientations.
     frames : ndarray of int, shape (f,)
-        Key frames, as indices of poses.
+        Indices of the poses that are key frames.
     closures_with_end : sequence of ClosureWithEnd
-        Closures; the closure by landing has the landing place.
+        Loop closures; the closure from landing has the landing place.
 
     Returns
     -------
     graph : PoseGraph or Unavailable
-        Odometry edges first, then closures in order.
+        Pose graph; odometry edges are first, then closures in the given order.
     nodes : ndarray of int, shape (k,)
-        Poses that are nodes: key frames, and the poses nearest to the times of closures.
+        Indices of the poses that are nodes: key frames, and poses nearest to the times of closures.
     statement : str
-        Origin of the variances.
+        Sentence on the origin of the variances.
     """
     if path.rotation is None:
         reason = "the trajectory has no orientations"

@@ -1,4 +1,4 @@
-"""Trajectories from files, or tracks of a flight log: odometry, EKF2, KF, ground truth."""
+"""Trajectories from files, or from tracks of a flight log: odometry, EKF2, KF, ground truth."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -50,12 +50,12 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
     ----------
     flight : Flight
     track_name : {"vio", "ekf2", "kf", "truth"}
-        "kf": KF along north, east and down, with the attitude of the autopilot.
+        Name of the track. "kf" is KF along north, east and down, with the attitude of EKF2.
 
     Raises
     ------
     MissingDataError
-        The log does not contain the track; the message has an action to log it.
+        The log does not contain the track. The message contains an action to log it.
     """
     if track_name == "kf":
         return _make_kf_trajectory(flight)
@@ -63,7 +63,7 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
         track_name
     ]
     if isinstance(track_data, PositionTrack):
-        # if the log does not name the frame, x is assumed to be forward at the start
+        # if the log does not contain the frame, FRD is assumed: x is forward at the start
         frame: Frame = "NED" if track_data.frame == "NED" else "FRD"
         note = f"{track_data.name}: {track_data.description}"
         return _make_trajectory(
@@ -104,7 +104,7 @@ def _make_trajectory(
     notes: tuple[str, ...],
     frame: Frame = "NED",
 ) -> Trajectory:
-    """Make a trajectory at the times of the positions, with interpolated orientation (slerp)."""
+    """Make a trajectory with the times of the positions and interpolated orientation (slerp)."""
     samples = finite_rows(samples, Columns.POSITION)
     rotation, rotation_variance = None, None
     if isinstance(orientation, pd.DataFrame):
@@ -154,14 +154,14 @@ def _complete_variances(samples: pd.DataFrame, columns: list[str]) -> Array | No
 
 @dataclass(frozen=True)
 class LoopSource:
-    """Trajectory and, for a track of a flight log, the flight."""
+    """Trajectory, and the flight if the trajectory is a track of a flight log."""
 
     trajectory: Trajectory
     flight: Flight | None
 
 
 def file_name(source: Path) -> str:
-    """Return the stem for names of output files: ``flight_vio`` for ``flight.ulg:vio``."""
+    """Return the start of output file names, such as ``flight_vio`` for ``flight.ulg:vio``."""
     path, track_name = split_part(str(source))
     return path.stem if track_name is None else f"{path.stem}_{track_name}"
 
@@ -216,7 +216,7 @@ def read_source(
     argument : str
         See :func:`split_part`.
     default : FlightPart, optional
-        Track of a log if ``argument`` names none; by default odometry, else EKF2's track.
+        Track of a log if ``argument`` contains none; by default odometry, else EKF2's track.
     frame : Frame, optional
         Frame of a trajectory file; by default detected.
     system : int, optional
@@ -225,7 +225,7 @@ def read_source(
     Raises
     ------
     TrajectoryError, LogError, MissingDataError
-        The source cannot be read, or does not contain the track.
+        The file cannot be read, or does not contain the track.
     SettingsError
         ``frame`` is given for a flight log.
     """

@@ -50,6 +50,7 @@ TERMS = (
     "√S: of the innovation. KF: position and velocity along one axis, IMU acceleration as input, "
     "no gate. Replay: px4fuse's model of EKF2, run on this log."
 )
+AIDS_TERMS = "√S: standard deviation of an innovation as EKF2 reports it. Source: an aiding sensor."
 PLACES = {"shell": "your computer", "console": "MAVLink Console of QGroundControl"}
 ALL_FINDINGS = "All findings"
 
@@ -97,7 +98,7 @@ def add_card(page: Page, card: Card) -> Block:
         more_causes="".join(more),
         difference=card.difference,
         notes=_notes(card),
-        terms=TERMS,
+        terms=AIDS_TERMS if card.aids else TERMS,
         command=identity.command,
         segment=f"analysed {identity.segment}" if identity.segment else "",
         version=identity.version,
@@ -105,11 +106,9 @@ def add_card(page: Page, card: Card) -> Block:
     )
 
 
-def free_height(page: Page) -> float | None:
-    """Return the height (pt) that is left below the card; None if the card fills its page."""
-    data = to_typst_data(page.blocks)
-    free = measure_free_height(data, fonts.font_names(str(page.blocks)))
-    return free.height if free.page == 1 else None
+def free_height(page: Page) -> float:
+    """Return the height (pt) that is left below the card on the page where it ends."""
+    return measure_free_height(to_typst_data(page.blocks), fonts.font_names(str(page.blocks)))
 
 
 def _shorten_middle(name: str) -> str:

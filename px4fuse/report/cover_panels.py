@@ -118,7 +118,7 @@ class FlightMap(NamedTuple):
         return length_m >= MIN_LONG_RATIO * max(width_m, 1e-6)
 
 
-def write_panels(block: Block, analysis: Analysis, card: Card, free: float | None) -> None:
+def write_panels(block: Block, analysis: Analysis, card: Card, free: float) -> None:
     """Draw legend, map and strips into the block of the cover.
 
     Parameters
@@ -126,15 +126,15 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free: float | Non
     block : Block
     analysis : Analysis
     card : Card
-    free : float or None
-        Height (pt) that is left on the page; None if nothing is left.
+    free : float
+        Height (pt) that is left on the page.
     """
     page = Page()
     block["blocks"] = page.blocks
     legend = page.legend(_legend_entries(analysis))
     errors, innovations = _error_strips(analysis, card), _innovation_strip(analysis.main)
     flight_map = _flight_map(analysis, card)
-    rest = (free or 0.0) - legend["height"] - LEGEND_GAP - SPARE
+    rest = free - legend["height"] - LEGEND_GAP - SPARE
     if rest < MIN_THIRDS_HEIGHT:
         rest = NEXT_PAGE_HEIGHT
         page.blocks.insert(0, {"kind": "break"})
@@ -172,7 +172,7 @@ def _draw_strips(
         axes_height = height - _head_height(page, strip.title) - BELOW[is_last]
         axes = page.panel(strip.title, "", axes_height, above=4.0, left=LEFT, is_compact=True)
         axes.set_xlim(analysis.segment.start_s, analysis.segment.end_s)
-        axes.locator_params(axis="x", nbins=6 if page.width > MIN_WIDE else 4)
+        axes.locator_params(axis="x", nbins=_tick_count(page))
         strip.draw(axes)
         style.label_time_axis(axes, is_last)
 
@@ -189,6 +189,10 @@ def _equal_heights(
         extras[-1] += BELOW[True] - BELOW[False]
     axes_height = (total - sum(extras)) / max(len(strips), 1)
     return [axes_height + extra for extra in extras]
+
+
+def _tick_count(page: Page) -> int:
+    return 6 if page.width > MIN_WIDE else 4
 
 
 def _head_height(page: Page, title: str) -> float:
@@ -482,6 +486,7 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
     )
     axes.set(xlim=limits[0], ylim=limits[1], xlabel=right_label, ylabel=flight_map.up_label)
     axes.set_aspect("equal", adjustable="datalim")
+    axes.locator_params(axis="x", nbins=_tick_count(page))
     axes.grid(True, axis="both")
     for name, (right, up) in tracks.items():
         if name == "positions":

@@ -194,7 +194,8 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
             verdicts += f"; KF - EKF2 {result.difference.position_rms_m:.3f} m RMS"
         column.heading(result.axis.name)
         column.write(f"{verdicts}.")
-    page.add_columns(*columns)
+    first_row = Page()  # one column is not divided, so the headings stay with the first panels
+    first_row.add_columns(*columns)
     shown_panels = [panels.POSITION, panels.VELOCITY, panels.INNOVATIONS, panels.SIGMA_P]
     if any(isinstance(panels.error_reference(axis), pd.DataFrame) for axis in others):
         shown_panels.insert(2, panels.ERROR)
@@ -204,5 +205,7 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
             panel.draw_on_page(
                 column, analysis, result, with_time_label=panel is shown_panels[-1], is_narrow=True
             )
-        page.add_columns(*columns)
+        (first_row if panel is panels.POSITION else page).add_columns(*columns)
+        if panel is panels.POSITION:
+            page.add_columns(first_row)
     yield page

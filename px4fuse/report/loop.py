@@ -14,7 +14,7 @@ from px4fuse.loop.corrections import SINGLE_LOOP_REASON
 from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Loop
 from px4fuse.report import style
 from px4fuse.report.evaluation import describe_method, format_interval, plot_path
-from px4fuse.report.page import AXIS_LABEL_HEIGHT, TICKS_HEIGHT, Cell, Page, appendix_title
+from px4fuse.report.page import Cell, Page, appendix_title
 from px4fuse.report.phrases import student_line, write_finding
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, MUTED_COLOUR, Axes, set_map_axes
 from px4fuse.results.contract import LoopResults
@@ -60,7 +60,7 @@ CLOSURE_HEAD = (
 )
 TITLE = "Loop closure"
 MAX_MAP_POINTS = 2000  # drawn points per path
-MAP_HEIGHT, LEGEND_HEIGHT = 290.0, 38.0  # points; heights of the axes and of the legend below them
+MAP_HEIGHT = 290.0  # points; height of the axes
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
@@ -103,12 +103,9 @@ def shown_paths(loop: Loop) -> list[CorrectedPath]:
 
 
 def _draw_map(page: Page, loop: Loop) -> None:
-    axes = page.panel(
-        "Map in the frame of the odometry", "", MAP_HEIGHT, left=36.0, below=LEGEND_HEIGHT
-    )
+    axes = page.panel("Map in the frame of the odometry", "", MAP_HEIGHT, left=36.0)
     draw_map(axes, loop)
-    below = -(TICKS_HEIGHT + AXIS_LABEL_HEIGHT + 2.0) / MAP_HEIGHT
-    axes.legend(loc="upper left", ncols=4, borderaxespad=0.0, bbox_to_anchor=(0.0, below))
+    page.legend(axes.get_legend_handles_labels()[0])
 
 
 def draw_map(axes: Axes, loop: Loop) -> None:

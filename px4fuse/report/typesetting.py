@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 import typst
 
@@ -16,13 +16,6 @@ from px4fuse.report import fonts
 # PDF/A-3a (archives) and PDF/UA-1 (screen readers)
 STANDARDS: list[Any] = ["a-3a", "ua-1"]
 TEMPLATES = ("cover.typ", "report.typ")
-
-
-class FreeHeight(NamedTuple):
-    """Height (pt) that is left for the panels of the cover, and the number of that page."""
-
-    page: int
-    height: float
 
 
 def compile_pdf(report: Mapping[str, Any], template: str | None = None) -> bytes:
@@ -39,8 +32,8 @@ def compile_pdf(report: Mapping[str, Any], template: str | None = None) -> bytes
     return document
 
 
-def measure_free_height(blocks: Any, font_names: Sequence[str]) -> FreeHeight:
-    """Typeset a cover without panels and return the height that is left for them.
+def measure_free_height(blocks: Any, font_names: Sequence[str]) -> float:
+    """Typeset a cover without panels and return the height (pt) that is left for them.
 
     Parameters
     ----------
@@ -52,7 +45,7 @@ def measure_free_height(blocks: Any, font_names: Sequence[str]) -> FreeHeight:
     data = {**report, "fonts": font_names, "blocks": blocks, "results": None}
     with TemporaryDirectory() as empty:
         answer = _compiler(data, None, empty).query("<free>", field="value", one=True)
-    return FreeHeight(**json.loads(answer))
+    return float(json.loads(answer))
 
 
 def _compiler(report: Mapping[str, Any], template: str | None, empty: str) -> typst.Compiler:

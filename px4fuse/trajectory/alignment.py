@@ -1,8 +1,8 @@
-"""Alignment of an estimate with a reference: the transform that does not count as error.
+"""Alignment of an estimate with a reference by a transform that does not count as error.
 
 Estimators that use gravity are aligned in yaw and position (4 degrees of freedom), so tilt counts
 as error (Zhang & Scaramuzza 2018). SLAM with the frame of its first key frame is aligned in
-rotation and position (6), monocular SLAM also in scale (7).
+rotation and position (6 degrees of freedom), monocular SLAM also in scale (7).
 """
 
 from typing import Literal
@@ -17,11 +17,11 @@ from px4fuse.trajectory.model import MIN_POSES
 
 AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 
-# fraction of the extent, and RMS in m; smaller motion does not determine a rotation
+# Minimum motion that determines a rotation: extent as fraction of the largest extent, and RMS (m)
 MIN_EXTENT_FRACTION, MIN_EXTENT_M = 1e-6, 1e-6
-# ratios of residual to extent above which the rotation is not determined. The standard deviation of
-# the rotation is residual / (extent · √n); pure noise has a ratio of √2 in the plane, √6 around a
-# line
+# Maximum ratios of residual to extent for a determined rotation: in the plane, and around a line.
+# The standard deviation of the rotation is residual / (extent · √n). Pure noise has a ratio of √2
+# in the plane and √6 around a line
 MAX_PLANE_RATIO, MAX_LINE_RATIO = 1.0, 2.0
 
 
@@ -31,11 +31,11 @@ class Transform(Record, frozen=True):
     Attributes
     ----------
     quaternion_wxyz : tuple of float
-        R.
+        Rotation R.
     translation_m : tuple of float
-        t, in the frame of the reference.
+        Translation t, in the frame of the reference.
     scale : float
-        Exactly 1 except for Sim(3).
+        Scale; exactly 1 except for Sim(3).
     degrees_of_freedom : int
         Number of fitted parameters: 0, 4, 6 or 7.
     """
@@ -62,7 +62,7 @@ class Transform(Record, frozen=True):
 
 
 def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) -> Transform:
-    """Fit the transform of the estimate with the least squared distance to the reference.
+    """Fit the transform that minimises the squared distance of the estimate to the reference.
 
     "se3" and "sim3" are fitted by Umeyama (1991), eqs. 40 to 43; "yaw" by the closed form of Zhang
     & Scaramuzza (2018), section III-C, about z.
@@ -72,7 +72,7 @@ def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) ->
     estimate_m, reference_m : ndarray, shape (n, 3)
         Positions at the same times.
     kind : {"none", "yaw", "se3", "sim3"}
-        For "yaw" z must be vertical in both frames and have the same direction.
+        Kind of transform. For "yaw", z must be vertical with the same direction in both frames.
 
     Raises
     ------
@@ -94,16 +94,16 @@ def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) ->
         transform = _align_means(Rotation.from_euler("z", heading), estimate_m, reference_m, 1.0, 4)
         _require_determined(transform, estimate_m, reference_m, kind)
         return transform
-    # the test includes a scale, because a scale factor error does not make the rotation uncertain
+    # the test fits a scale, too, because a scale factor error does not make the rotation uncertain
     similarity = umeyama(estimate_m, reference_m, with_scale=True)
     _require_determined(similarity, estimate_m, reference_m, kind)
     return similarity if kind == "sim3" else umeyama(estimate_m, reference_m, with_scale=False)
 
 
 def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Transform:
-    """Fit SE(3) or Sim(3) by least squares, without testing that the motion determines the result.
+    """Fit SE(3) or Sim(3) by least squares, without a test that the motion determines the result.
 
-    For motion along a line the result is one of many transforms with equal residual.
+    For motion along a line the result is one of many transforms with the same residual.
 
     Parameters
     ----------
@@ -124,14 +124,14 @@ def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Trans
 def _align_means(
     rotation: Rotation, estimate_m: Array, reference_m: Array, scale: float, degrees_of_freedom: int
 ) -> Transform:
-    """Return the similarity with given rotation and scale that aligns the means (eq. 41)."""
+    """Return the transform with given rotation and scale that aligns the means (eq. 41)."""
     shift = reference_m.mean(axis=0) - scale * rotation.apply(estimate_m.mean(axis=0))
     w, x, y, z = rotation.as_quat(scalar_first=True).tolist()
     return Transform((w, x, y, z), tuple(shift.tolist()), scale, degrees_of_freedom)
 
 
 def _principal_extents(position_m: Array) -> Array:
-    """Return the RMS (m) about the mean along the principal directions, descending."""
+    """Return the RMS extents (m) about the mean along the principal directions, descending."""
     centred = position_m - position_m.mean(axis=0)
     return np.asarray(np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(centred)))
 
@@ -146,8 +146,8 @@ def _require_determined(
 ) -> None:
     """Raise TrajectoryError if the motion does not determine the rotation.
 
-    Horizontal motion determines yaw; the extent across a line (the second singular value)
-    determines other rotations.
+    Horizontal motion determines yaw. A full rotation also needs an extent across a line (the second
+    singular value).
     """
     estimate_extents, reference_extents = (
         _principal_extents(estimate_m),

@@ -13,9 +13,10 @@ from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
 Method = Literal["interpolate", "nearest"]
 
-# longest interpolated interval: multiple of the median interval, and lower limit (s)
+# Default of the longest interval that is interpolated: number of median intervals, at least the
+# second value (s)
 MAX_GAP_INTERVALS, MIN_GAP_LIMIT_S = 3.0, 0.1
-MAX_NEAREST_DIFFERENCE_S = 0.01  # largest time difference; same default as the evo package
+MAX_NEAREST_DIFFERENCE_S = 0.01  # maximum time difference of a pair; default of the evo package
 
 
 class Association(Record, frozen=True):
@@ -27,16 +28,16 @@ class Association(Record, frozen=True):
     poses : int
         Number of pairs.
     max_gap_s : float
-        Longest interval of the reference that is interpolated; for "nearest" the largest time
-        difference.
+        Longest interval of the reference that is interpolated; for "nearest" the maximum time
+        difference of a pair.
     outside, in_gaps : int
-        Poses of the estimate without a reference: before its start or after its end, and in its
-        gaps.
+        Number of unused poses of the estimate: before or after the reference, and in gaps of the
+        reference.
     coverage_estimate : float
         Fraction of the poses of the estimate that are used.
     coverage_reference : float
-        Fraction of the time of the reference that the used poses cover. Intervals between used
-        poses do not count if they are longer than five median intervals and 0.5 s.
+        Fraction of the time span of the reference that used poses cover. Intervals between used
+        poses that are longer than five median intervals and 0.5 s do not count.
     """
 
     method: Method
@@ -63,18 +64,18 @@ def associate(
     method : {"interpolate", "nearest"}
         "interpolate": interpolate the reference at the times of the estimate, positions linearly
         and rotations by slerp. "nearest": pair each pose of the trajectory with fewer poses with
-        the nearest pose of the other trajectory, as the evo package does; poses of the other
-        trajectory may be used twice.
+        the pose of the other trajectory that is nearest in time, as the evo package does. Poses of
+        the other trajectory may be used twice.
     max_gap_s : float, optional
         See :class:`Association`; by default three median intervals of the reference and at least
         0.1 s, and 0.01 s for "nearest".
     time_offset_s : float
-        Added to the timestamps of the estimate.
+        Time offset added to the timestamps of the estimate.
 
     Raises
     ------
     TrajectoryError
-        Fewer than three poses match; the message contains both time spans.
+        Fewer than three poses match. The message contains the time spans of both trajectories.
     """
     time_s, (first_s, last_s) = estimate.time_s + time_offset_s, reference.time_s[[0, -1]]
     if method == "nearest":
@@ -125,7 +126,10 @@ def gap_limit(time_s: Array, min_limit_s: float = MIN_GAP_LIMIT_S) -> float:
 
 
 def is_bracketed(time_s: Array, reference_s: Array, limit_s: float) -> BoolArray:
-    """Return a mask of the times at a reference time, or between two with at most ``limit_s``."""
+    """Return a mask of the times within an interval of the reference of at most ``limit_s``.
+
+    Times that equal a reference time are included.
+    """
     right = np.clip(np.searchsorted(reference_s, time_s), 1, len(reference_s) - 1)
     previous_s, next_s = reference_s[right - 1], reference_s[right]
     is_between = (previous_s <= time_s) & (time_s <= next_s) & (next_s - previous_s <= limit_s)
@@ -150,11 +154,11 @@ def positions_at(trajectory: Trajectory, time_s: Array) -> Array:
 def _pair_nearest(
     estimate_s: Array, reference_s: Array, limit_s: float, offset_s: float
 ) -> tuple[IntArray, IntArray]:
-    """Pair each time of the series with fewer times with the nearest of the other; return indices.
+    """Return the indices of pairs: each time of the shorter series with the nearest of the longer.
 
-    Pairs with a distance above ``limit_s`` are omitted.
+    Pairs with a time difference above ``limit_s`` are omitted.
     """
-    # the offset is added to the series with more times, for the same rounding as in evo
+    # the offset is added to the longer series, to have the same rounding as evo
     has_more = len(estimate_s) > len(reference_s)
     fewer_s = reference_s if has_more else estimate_s
     more_s = estimate_s + offset_s if has_more else reference_s - offset_s

@@ -14,8 +14,8 @@ Series = TypeVar("Series", Array, Complex)
 class Moments:
     """Second moments of two series a and b over their common samples, for each lag.
 
-    Arrays have shape (n + m - 1,). At index k sample 0 of a coincides with sample k - (n - 1) of b.
-    The sums are over the common samples, and ā and b̄ are the means over these.
+    Arrays have shape (n + m - 1,). At index k, sample 0 of a coincides with sample k - (n - 1) of
+    b. Sums and the means ā and b̄ are over the common samples.
 
     Attributes
     ----------
@@ -34,16 +34,16 @@ class Moments:
 
 
 def moments(a: Series, b: Series, is_known_a: BoolArray, is_known_b: BoolArray) -> Moments:
-    """Compute the moments of two series on one grid at all lags (Padfield 2012, eqs. 3 to 9).
+    """Compute the moments of two series on the same grid at all lags (Padfield 2012, eqs. 3 to 9).
 
     Parameters
     ----------
     a, b : ndarray, shapes (n,) and (m,)
         Real or complex.
     is_known_a, is_known_b : ndarray of bool, shapes (n,) and (m,)
-        Mask of known samples, at least one of each.
+        Mask of known samples, at least one per series.
     """
-    # subtracting the means first improves the numerical precision
+    # the means are subtracted first, which improves the numerical precision
     masked_series = (a, is_known_a), (b, is_known_b)
     a, b = (
         np.where(is_known, values - np.mean(values[is_known]), 0.0)
@@ -69,7 +69,7 @@ def autocovariance(values: Array | Complex) -> Array:
 
 def _correlate(a: Array | Complex, b: Array | Complex) -> Complex:
     """Compute Σ a conj(b) over the overlap, at each lag."""
-    # the import is local because it takes 0.1 s, and most flights need no correlation
+    # local import, because it takes 0.1 s and most flights need no correlation
     from scipy.signal import correlate  # noqa: PLC0415
 
     return np.asarray(correlate(a, b, mode="full", method="fft"))

@@ -1,8 +1,8 @@
 """Evaluation of a trajectory against a reference: ATE and RPE (Sturm 2012) with 95 % intervals.
 
-The absolute trajectory error (ATE) is the distance of each pose to the reference after alignment.
-The relative pose error (RPE) compares motions over a fixed distance or time, so the RPE does not
-accumulate drift.
+The absolute trajectory error (ATE) is the distance of each pose from the reference after alignment.
+The relative pose error (RPE) compares motions over a fixed distance or time, so drift does not
+accumulate in it.
 """
 
 import re
@@ -27,13 +27,14 @@ from px4fuse.trajectory.model import Trajectory, cumulative_distance
 from px4fuse.trajectory.scores import Delta, Interval, RelativeError, Statistics
 from px4fuse.trajectory.time_offset import TimeOffset, clock_difference, estimate_time_offset
 
-MAX_SCALE_ERROR = 0.1  # scale factor error above which a warning is given
-MIN_COVERAGE = 0.5  # fraction of poses or time below which a warning is given
-MIN_DOUBTFUL_OFFSET_S = 0.1  # smallest time offset with a warning; a filter may lag by less
-MAX_INTERVAL_RATIO = 5.0  # ratio of intervals above which estimate and reference seem interchanged
+MAX_SCALE_ERROR = 0.1  # maximum scale factor error without a warning
+MIN_COVERAGE = 0.5  # minimum fraction of used poses or covered time without a warning
+MIN_DOUBTFUL_OFFSET_S = 0.1  # minimum time offset for a warning: the lag of a filter is smaller
+# Maximum ratio of the reference's to the estimate's interval; above, they seem interchanged
+MAX_INTERVAL_RATIO = 5.0
 
 _Z_DOWN_FRAMES, _Z_UP_FRAMES = ("NED", "FRD"), ("ENU",)
-_KINDS_WITHOUT_VERTICAL = ("slam", "unknown")  # kinds whose frame has no known vertical
+_KINDS_WITHOUT_VERTICAL = ("slam", "unknown")  # kinds with a frame of unknown vertical
 _MONOCULAR_NAME = re.compile(r"(?<![a-z])mono(?![a-z])|monocular", re.IGNORECASE)
 
 
@@ -52,16 +53,16 @@ class Score(Record, frozen=True, kw_only=True):
     ----------
     alignment : {"none", "yaw", "se3", "sim3"}
     alignment_reason : str
-        Reason for this alignment, a sentence.
+        Reason for the choice of the alignment, a sentence.
     transform : Transform
-        From the frame of the estimate to the frame of the reference.
+        Transform from the frame of the estimate to the frame of the reference.
     association : Association
     time_offset : TimeOffset
-        ``offset_s`` was added to the timestamps of the estimate.
+        Time offset; its ``offset_s`` was added to the timestamps of the estimate.
     ate : AbsoluteError
     rpe : tuple of RelativeError
     notes, warnings : tuple of str
-        Sentences.
+        Sentences for the user.
     """
 
     alignment: AlignmentKind
@@ -81,7 +82,7 @@ class Evaluation(Score, frozen=True, kw_only=True, eq=False):
     Attributes
     ----------
     estimate, reference : Trajectory
-        Trajectories as given.
+        Complete trajectories, before association and alignment.
     rpe : tuple of PairwiseError
     time_s : ndarray, shape (n,)
         Times of the compared poses, on the clock of the estimate.
@@ -92,8 +93,8 @@ class Evaluation(Score, frozen=True, kw_only=True, eq=False):
     position_error_m : ndarray, shape (n,)
     rotation_error_deg : ndarray, shape (n,), or None
     body_rotation : Rotation or None
-        Constant rotation from the body axes of the reference to the body axes of the estimate,
-        which rotation errors exclude; None if the body axes are the same.
+        Constant rotation from the body axes of the reference to the body axes of the estimate. It
+        does not count as error. None if the body axes are the same.
     """
 
     schema_type = Score
@@ -133,11 +134,11 @@ def evaluate(
     max_gap_s : float, optional
         See :func:`~px4fuse.trajectory.association.associate`.
     time_offset_s : float, "auto" or None
-        Added to the timestamps of the estimate. "auto" estimates the offset from the motion. None
-        uses UNIX time if both trajectories have it, else 0; if the trajectories then do not
-        overlap, the offset is estimated.
+        Time offset added to the timestamps of the estimate. "auto" estimates the offset from the
+        motion. None uses UNIX time if both trajectories have it, else 0. If the trajectories then
+        do not overlap, the offset is estimated.
     rpe_deltas : sequence of Delta, optional
-        By default distances and times that fit the flight.
+        Distances and times of the RPE; by default adapted to length and duration of the flight.
 
     Raises
     ------
@@ -206,7 +207,7 @@ def evaluate(
 
 
 def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[AlignmentKind, str]:
-    """Choose the alignment by the kinds of the trajectories; also return the reason, a sentence.
+    """Choose the alignment by the kinds of the trajectories; also return a sentence of reason.
 
     Ground truth is not aligned. Estimators that use gravity are aligned in yaw and position. SLAM
     is aligned in rotation and position, and in scale if it is monocular or the scale factor error
@@ -215,7 +216,7 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     Parameters
     ----------
     estimate, reference : Trajectory
-        Associated: the same number of poses, at the same times.
+        Associated trajectories: the same number of poses, at the same times.
     """
     same_frame = estimate.frame == reference.frame != "unknown"
     if estimate.kind == "truth" and (same_frame or reference.kind == "truth"):
@@ -327,7 +328,7 @@ def _comparison_warnings(
 ) -> list[str]:
     """Return warnings on low coverage and on a scale factor error."""
     estimate_m, reference_m = estimate.position_m, reference.position_m
-    # the scale is determined even if the motion does not determine the rotation
+    # the scale is known even if the motion does not determine the rotation
     scale = umeyama(estimate_m, reference_m, with_scale=True).scale
     has_motion = (
         min(float(np.ptp(position, axis=0).max()) for position in (estimate_m, reference_m)) > 0.0

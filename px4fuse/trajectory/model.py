@@ -14,9 +14,9 @@ from px4fuse.arrays import Array, BoolArray, IntArray
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, Record
 
-# source of a trajectory; "slam": SLAM with the frame of the first key frame (such as ORB-SLAM3)
+# Source of a trajectory; "slam": SLAM in the frame of its first key frame (such as ORB-SLAM3)
 Kind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
-# world frame: z is down in "NED" and "FRD", up in "ENU"; "camera" has y down and z forward
+# World frame: z is down in "NED" and "FRD", up in "ENU"; "camera" has y down and z forward
 Frame = Literal["NED", "FRD", "ENU", "camera", "unknown"]
 MIN_POSES = 3
 AXES_OF_FRAME: Mapping[Frame, tuple[str, str, str]] = {
@@ -28,11 +28,11 @@ AXES_OF_FRAME: Mapping[Frame, tuple[str, str, str]] = {
 }
 
 
-# components of a vector by the names of the axes
+# Components of a vector by axis name
 AxisComponents = Annotated[dict[str, float], Meta(min_length=3, max_length=3)]
 
 
-# names of the negative directions
+# Name of the opposite of each direction
 OPPOSITE_DIRECTIONS = {
     "north": "south",
     "east": "west",
@@ -58,12 +58,12 @@ def format_vector(vector_m: Mapping[str, float]) -> str:
 
 
 def components_by_axis(frame: Frame, vector_m: Array) -> dict[str, float]:
-    """Return the components of a vector by the names of the axes of its frame."""
+    """Return the components of a vector by the axis names of its frame."""
     return dict(zip(AXES_OF_FRAME[frame], vector_m.tolist(), strict=True))
 
 
 class Track(Record, frozen=True):
-    """Description of a trajectory and its file, for the results."""
+    """Description of a trajectory and its file, for results.json."""
 
     name: str
     sha256: Annotated[str, Meta(pattern="^([0-9a-f]{64})?$")]
@@ -84,21 +84,20 @@ class Trajectory:
     Attributes
     ----------
     name : str
-        File name without folder; for a log with the name of the track ("log.ulg:vio").
+        File name without folder; for a flight log followed by the track name ("log.ulg:vio").
     kind : Kind
     time_s : ndarray, shape (n,)
         Strictly increasing times (s): timestamps of the file, or time since the first data of a
         log.
     position_m : ndarray, shape (n, 3)
-        In ``frame``.
+        Positions in ``frame``.
     rotation : Rotation of n, or None
         Rotates vectors from body (or camera) axes to ``frame``; None without orientation.
     frame : Frame
     unix_offset_s : float or None
         UNIX time minus ``time_s``; None if unknown.
     position_variance_m2, rotation_variance_rad2 : ndarray, shape (n, 3), or None
-        Variances that the estimator reports, of rotation about the body axes; None if it reports
-        none.
+        Variances reported by the estimator, for rotation about the body axes; None if not reported.
     sha256 : str
         SHA-256 of the file.
     size_bytes : int
@@ -164,7 +163,7 @@ class Trajectory:
         return replace(self, position_m=position_m, rotation=rotation, **no_variances)
 
     def track(self) -> Track:
-        """Return the description for the results."""
+        """Return the description for results.json."""
         track_fields = ("name", "sha256", "size_bytes", "kind", "frame", "notes")
         return Track(
             **{name: getattr(self, name) for name in track_fields},
@@ -176,6 +175,6 @@ class Trajectory:
 
 
 def cumulative_distance(position_m: Array) -> Array:
-    """Compute the path length (m) from the start to each position, shape (n, d) to (n,)."""
+    """Return the path length (m) from the start to each of the positions (n, d), shape (n,)."""
     steps = np.linalg.norm(np.diff(position_m, axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])

@@ -40,7 +40,7 @@ def to_vector(q: Array) -> Array:
 
 
 def from_elements(*rows: tuple[Array | float, ...]) -> Array:
-    """Build matrices from their elements, arrays of the same shape or numbers."""
+    """Build matrices from rows of elements, which are arrays of the same shape or numbers."""
     shape = np.broadcast_shapes(*(np.shape(element) for row in rows for element in row))
     matrices = np.empty((*shape, len(rows), len(rows[0])))
     for i, row in enumerate(rows):
@@ -68,8 +68,8 @@ def skew(v: Array) -> Array:
 def cumulative_product(quaternions: Array) -> Array:
     """Compute the products q_0, q_0 ⊗ q_1, q_0 ⊗ q_1 ⊗ q_2, ..., shape (n, 4).
 
-    The quaternions are arranged in about √n columns and rows, so about 2√n vectorised steps are
-    needed.
+    The quaternions are arranged in about √n rows and columns, so about 2√n vectorised products are
+    sufficient.
     """
     n = len(quaternions)
     width = max(1, int(np.sqrt(n)))

@@ -20,17 +20,19 @@ from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 Unit = Literal["frames", "m", "s"]
 
-# relative tolerance of the distance of a pair if all pairs are used; default of the evo package
+# Maximum relative deviation of a pair's distance from delta if all pairs are used; default of the
+# evo package
 DELTA_TOLERANCE = 0.1
-# default deltas of the RPE; used if between the given fractions of path length or duration
+# Default deltas of the RPE, which are used if they are between MIN_DELTA_FRACTION and
+# MAX_DELTA_FRACTION of path length or duration
 DEFAULT_DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
 DEFAULT_TIMES_S = (1.0, 10.0, 60.0)
 MAX_DEFAULT_DISTANCES, MAX_DEFAULT_TIMES = 3, 2
 MIN_DELTA_FRACTION, MAX_DELTA_FRACTION = 1 / 200, 1 / 5
 BOOTSTRAP_RESAMPLES, BOOTSTRAP_SEED, CONFIDENCE_LEVEL = 2000, 20120101, 0.95
 BLOCK_TIMES = 3.0  # block length, in autocorrelation times
-WINDOW_TIMES = 5.0  # summation window, in autocorrelation times (Sokal 1997)
-MIN_BLOCKS = 5.0  # smallest number of blocks for an interval
+WINDOW_TIMES = 5.0  # window of the sum of autocorrelations, in autocorrelation times (Sokal 1997)
+MIN_BLOCKS = 5.0  # minimum number of blocks for an interval
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Delta:
 
 
 class Statistics(Record, frozen=True):
-    """Statistics of ``count`` errors in the unit of the errors; ``std`` divides by n, as in evo."""
+    """Statistics of ``count`` errors, in their unit; ``std`` divides by ``count``, as in evo."""
 
     count: Count
     rmse: NotNegative
@@ -80,9 +82,10 @@ class RelativeError(Record, frozen=True):
     Attributes
     ----------
     delta : float
-        In ``unit``.
+        Distance between the two poses of a pair, in ``unit``.
     all_pairs : bool
-        True if a pair starts at every pose; False if each pair starts at the end of the last pair.
+        True if a pair starts at every pose; False if each pair starts at the end of the previous
+        pair.
     pairs_from : str
         Path along which distances are measured: always the reference.
     translation_m, rotation_deg : Statistics or Unavailable
@@ -105,12 +108,12 @@ class RelativeError(Record, frozen=True):
 
 
 class PairwiseError(RelativeError, frozen=True, kw_only=True, eq=False):
-    """RPE over one delta, with the error of each pair.
+    """:class:`RelativeError` with the error of each pair.
 
     Attributes
     ----------
     start, end : ndarray of int, shape (k,)
-        Poses of each pair, as indices into the arrays of the evaluation.
+        Indices of the two poses of each pair in the arrays of the evaluation.
     translation_error_m, rotation_error_deg : ndarray, shape (k,)
         Empty if the RPE is unavailable.
     """
@@ -140,7 +143,7 @@ def statistics(errors: Array) -> Statistics:
 def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
     """Choose distances and times for the RPE that fit path length and duration of the flight."""
     length_m, span_s = float(distance_m[-1]), float(time_s[-1] - time_s[0])
-    # a delta must contain at least two steps
+    # a delta must be at least two intervals between poses
     median_step_m, median_interval_s = (
         float(np.median(np.diff(distance_m))),
         float(np.median(np.diff(time_s))),
@@ -172,10 +175,11 @@ def find_pairs(
     position_m : ndarray, shape (n, 3)
     time_s : ndarray, shape (n,)
     delta : Delta
-        A distance is measured along the path.
+        Distance of a pair; in m it is measured along the path.
     all_pairs : bool
-        True: from every pose to the pose whose distance is nearest to delta, if within a tenth of
-        delta. False: from the end of the last pair to the first pose that is at least delta away.
+        True: pair every pose with the pose at the distance nearest to delta, if the difference is
+        at most a tenth of delta. False: pair the end of the previous pair with the first pose that
+        is at least delta away.
 
     Returns
     -------
@@ -199,20 +203,20 @@ def find_pairs(
     if not all_pairs:
         return _consecutive_pairs(np.diff(travelled), delta.value)
     start = np.arange(n - 1)
-    # the neighbours are tested, too, because of rounding
+    # the neighbours of the found pose are tested, too, because of rounding errors
     nearest_guess = np.searchsorted(travelled, travelled + delta.value)[:-1]
     candidates = np.clip(nearest_guess[:, None] + np.arange(-2, 2), start[:, None] + 1, n - 1)
     distance_error = np.abs(travelled[candidates] - travelled[start, None] - delta.value)
     best_candidate = np.argmin(distance_error, axis=1)
-    # of several poses at rest with equal distance the first is used
+    # of several poses with equal distance (at rest) the first is used
     first_equal = np.searchsorted(travelled, travelled[candidates[start, best_candidate]])
     is_near = distance_error[start, best_candidate] <= DELTA_TOLERANCE * delta.value
     return start[is_near], np.maximum(first_equal, start + 1)[is_near]
 
 
 def _consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
-    """Return consecutive pairs, each the shortest of at least ``delta``."""
-    # the distance of each pair is summed from zero, for the same rounding as in evo
+    """Return consecutive pairs, each with the shortest distance of at least ``delta``."""
+    # the distance of each pair is summed from zero, to have the same rounding as evo
     ends, travelled = [0], 0.0
     for index, step in enumerate(steps.tolist(), 1):
         travelled += step
@@ -290,7 +294,7 @@ def relative_error(
 def get_rotations(
     aligned: Trajectory, reference: Trajectory, analysis_name: str
 ) -> tuple[Rotation, Rotation] | Unavailable:
-    """Return the rotations of both trajectories, or Unavailable with the name of the analysis."""
+    """Return the rotations of both trajectories; Unavailable if either has none."""
     if aligned.rotation is not None and reference.rotation is not None:
         return aligned.rotation, reference.rotation
     reason = f"the {'estimate' if aligned.rotation is None else 'reference'} has no orientation"
@@ -309,11 +313,11 @@ def rmse_interval(
     Parameters
     ----------
     errors : ndarray, shape (n,)
-        In order of time.
+        Errors in order of time.
     analysis_name : str
         Name of the score, for Unavailable.
     min_block : int
-        Smallest block length: number of overlapping pairs.
+        Minimum block length: the number of pairs that overlap, because overlap correlates errors.
 
     Returns
     -------
@@ -331,7 +335,7 @@ def rmse_interval(
             "Use a longer flight.",
         )
     sums = np.concatenate(([0.0], np.cumsum(np.concatenate((squares, squares[: length - 1])))))
-    block_means = (sums[length:] - sums[:-length]) / length  # one per start, circular
+    block_means = (sums[length:] - sums[:-length]) / length  # one per start of a circular block
     blocks = n / length
     block_starts = np.random.default_rng(BOOTSTRAP_SEED).integers(0, n, (resamples, round(blocks)))
     means = block_means[block_starts].mean(axis=1)
@@ -344,7 +348,7 @@ def rmse_interval(
 def autocorrelation_time(values: Array) -> float:
     """Compute the integrated autocorrelation time (samples) of a series: 1 + 2 Σ ρ, at least 1.
 
-    The sum ends at five autocorrelation times (Sokal 1997, section 3).
+    The sum ends at a lag of five autocorrelation times (Sokal 1997, section 3).
     """
     centred = values - values.mean()
     if not centred.any():

@@ -1,12 +1,13 @@
 """Time offset between two recordings of the same motion: search over all lags, then least squares.
 
 Two series are correlated at all lags (:mod:`~px4fuse.trajectory.correlation`). The best lag is
-refined by least squares, and rejected if another lag has a residual within the factor
-:data:`MIN_SECOND_PEAK_RATIO`. This method is used for trajectories here, and for a position file
-against EKF2 or the IMU in :mod:`px4fuse.alignment.time_and_pose_fit`. Trajectories may have any
-frame and scale: their speeds are correlated, and a similarity transform is fitted. A position file
-is in metres with z vertical, and has outliers: horizontal positions are correlated, and yaw and
-origin are fitted robustly.
+refined by least squares. It is rejected if the residual of another lag is less than
+:data:`MIN_SECOND_PEAK_RATIO` times larger.
+
+This module compares trajectories, which may have any frame and scale: their speeds are correlated,
+and a similarity transform is fitted. :mod:`px4fuse.alignment.time_and_pose_fit` compares a position
+file with EKF2 or the IMU. A position file is in metres with z vertical and has outliers: horizontal
+positions are correlated, and yaw and origin are fitted robustly.
 """
 
 from __future__ import annotations
@@ -27,26 +28,30 @@ from px4fuse.trajectory.association import gap_limit, is_bracketed, positions_at
 from px4fuse.trajectory.correlation import autocovariance, moments
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
-GRID_STEP_S, MAX_GRID_SAMPLES = 0.05, 200_000  # step and size of the search grid
-SMOOTHING_S = 0.25  # smoothing time of speeds; differentiated positions are noisy
-MIN_OVERLAP_S, MIN_OVERLAP_FRACTION = 5.0, 0.5  # overlap: s, and fraction of the shorter trajectory
-MIN_POSES_FRACTION = 0.3  # fraction of the poses in the time of the shorter trajectory
-MAX_CANDIDATES = 12  # number of correlation peaks whose ATE is computed
-# s; half-width of the least-squares search around a peak, and around its result
+GRID_STEP_S, MAX_GRID_SAMPLES = 0.05, 200_000  # step and maximum size of the search grid
+SMOOTHING_S = 0.25  # smoothing time of speeds, because differentiated positions are noisy
+# Minimum overlap of the trajectories, in s and as fraction of the shorter trajectory
+MIN_OVERLAP_S, MIN_OVERLAP_FRACTION = 5.0, 0.5
+MIN_POSES_FRACTION = 0.3  # minimum fraction of the poses in the time of the shorter trajectory
+MAX_CANDIDATES = 12  # maximum number of correlation peaks for which the ATE is computed
+# Half-width (s) of the least-squares search: around a correlation peak, and around the first result
 SEARCH_WINDOW_S, FINE_SEARCH_WINDOW_S = 0.5, 0.1
-MIN_PEAK_DISTANCE_S = 1.0  # smallest distance of two peaks
+MIN_PEAK_DISTANCE_S = 1.0  # minimum distance of two peaks
 MIN_CORRELATION = 0.3
-# ratio of residuals (RMS) below which another offset fits equally well: 95 % limit for two sets of
-# 80 independent residuals, half a minute of flight (F-test, F = 1.2², 80 and 80 degrees of freedom)
+# Minimum ratio of another offset's residual (RMS) to the best offset's residual. Below, both fit
+# equally well: 95 % limit for two sets of 80 independent residuals, half a minute of flight
+# (F-test, F = 1.2², 80 and 80 degrees of freedom)
 MIN_SECOND_PEAK_RATIO = 1.2
-MAX_FITTED_POSES = 2000  # number of poses in the least squares
-# residual over extent: a fit above the first is rejected; fits below the second are equally good
+MAX_FITTED_POSES = 2000  # maximum number of poses in the least squares
+# Ratio of residual to extent: maximum of an accepted fit, and value below which fits are equally
+# good
 MAX_MISFIT, MIN_MISFIT = 0.5, 1e-3
-# velocity that a similarity transform cannot explain: smallest fraction of the speed (RMS), and
-# smallest correlation between the two trajectories, which excludes noise
+# Part of the velocity that a similarity transform cannot explain, which determines the offset:
+# minimum fraction of the speed (RMS), and minimum correlation between the two trajectories, which
+# excludes noise
 MIN_FREE_SPEED_FRACTION, MIN_FREE_CORRELATION = 0.05, 0.5
-WINDOW_CORRELATION_LENGTHS = 4  # window of the variance of the score, in correlation lengths
-MAX_HALF_INTERVAL_S = 0.5  # half-width of the 95 % interval above which the offset is rejected
+WINDOW_CORRELATION_LENGTHS = 4  # window of the score's long-run variance, in correlation lengths
+MAX_HALF_INTERVAL_S = 0.5  # maximum half-width of the 95 % interval of an accepted offset
 CONFIDENCE_LEVEL = 0.95
 
 
@@ -58,7 +63,7 @@ class TimeOffset(Record, frozen=True, kw_only=True):
     offset_s : float or None
         Offset to add to the timestamps of the estimate; None if it cannot be determined.
     interval_s : (float, float) or None
-        95 % interval.
+        95 % interval of the offset.
     is_determinable : bool
     reason : str
         Method, or reason why the offset cannot be determined.
@@ -71,7 +76,10 @@ class TimeOffset(Record, frozen=True, kw_only=True):
 
 
 def clock_difference(estimate: Trajectory, reference: Trajectory) -> float | None:
-    """Return the time offset (s) to the estimate by UNIX time; None if one has no UNIX time."""
+    """Return the offset (s) to add to the estimate's timestamps according to UNIX time.
+
+    None if a trajectory has no UNIX time.
+    """
     if estimate.unix_offset_s is None or reference.unix_offset_s is None:
         return None
     return estimate.unix_offset_s - reference.unix_offset_s
@@ -80,17 +88,18 @@ def clock_difference(estimate: Trajectory, reference: Trajectory) -> float | Non
 def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOffset:
     """Estimate the time offset between two trajectories of the same motion.
 
-    Speeds, and angular speeds if both have orientations, do not depend on the frame. The peaks of
-    their masked correlation over all lags (Padfield 2012; Furrer 2017) are the candidates. The
-    candidate with the smallest ATE after a similarity alignment is refined by minimising the ATE.
-    The interval is that of the linearised least squares, with the long-run variance of the score
-    (Newey & West 1987), because pose errors are correlated.
+    Speeds, and angular speeds if both trajectories have orientations, do not depend on the frame.
+    The peaks of their masked correlation over all lags (Padfield 2012; Furrer 2017) are the
+    candidates. The candidate with the smallest ATE after a similarity alignment is refined by
+    minimising the ATE. The 95 % interval is from linearised least squares, with the long-run
+    variance of the score (Newey & West 1987), because pose errors are correlated.
 
     Returns
     -------
     TimeOffset
-        Not determined without motion, with constant speed along a line or circle (a time offset is
-        then equivalent to a position offset), or if other offsets fit equally well.
+        Not determined without motion, or if other offsets fit equally well. Also not determined
+        with constant speed along a line or circle: a time offset is then equivalent to another
+        position or rotation.
     """
     # the trajectory with the shorter intervals is interpolated
     if _median_step(estimate) >= _median_step(reference):
@@ -135,7 +144,7 @@ def _search_offset(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
         fit for fit in similar_fits if abs(fit.offset_s - best_fit.offset_s) > MIN_PEAK_DISTANCE_S
     ]
     if clock_offset_s is not None:
-        # UNIX time decides between offsets that fit equally well
+        # of several offsets that fit equally well, use the nearest to the UNIX time
         best_fit = min(similar_fits, key=lambda fit: abs(fit.offset_s - clock_offset_s))
     elif distant_fits:
         return _not_determinable(
@@ -143,7 +152,7 @@ def _search_offset(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
             f"{abs(distant_fits[0].offset_s - best_fit.offset_s):.1f} s the ATE is "
             f"{distant_fits[0].rms_m:.3g} m instead of {best_fit.rms_m:.3g} m"
         )
-    # the fit is repeated with the poses that overlap around the result
+    # the fit is repeated with all poses that overlap at offsets near the result
     best_fit = _refine_offset(sparse, dense, best_fit.offset_s, FINE_SEARCH_WINDOW_S) or best_fit
     half_interval_s = _half_interval(sparse, dense, best_fit)
     if not half_interval_s <= MAX_HALF_INTERVAL_S:
@@ -185,7 +194,7 @@ def _velocity(trajectory: Trajectory, time_s: Array) -> Array:
 
 
 def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArray]:
-    """Return speed, and angular speed if known, on a grid, with the mask of known samples."""
+    """Return speed, and angular speed if known, on a grid, and a mask of known samples."""
     time = trajectory.time_s
     grid, velocity = _grid_velocity(trajectory, step_s)
     # interpolate between key frames, but not across lost tracking
@@ -214,7 +223,7 @@ def _find_candidates(sparse: Trajectory, dense: Trajectory) -> list[float]:
     correlations = []
     for a, b in zip(sparse_speeds, dense_speeds, strict=False):  # angular speeds if both have them
         speed_moments = moments(a, b, is_known_sparse, is_known_dense)
-        # exclude parts at rest, in which the variance is only rounding
+        # exclude parts at rest, in which the variance is only rounding error
         is_usable = speed_moments.count >= min_count
         for values, is_known, power in (
             (a, is_known_sparse, speed_moments.power_a),
@@ -247,11 +256,11 @@ class _OffsetFit:
     ----------
     offset_s : float
     transform : Transform
-        From the sparse to the dense trajectory.
+        Transform from the sparse to the dense trajectory.
     time_s : ndarray, shape (n,)
         Times of the used poses of the sparse trajectory.
     aligned_m, target_m : ndarray, shape (n, 3)
-        Positions of the sparse trajectory after alignment, and of the dense one.
+        Positions of the sparse trajectory after alignment, and of the dense trajectory.
     """
 
     offset_s: float
@@ -267,20 +276,23 @@ class _OffsetFit:
 
     @property
     def misfit(self) -> float:
-        """RMS of the residuals over RMS extent of the motion, comparable between fits."""
+        """RMS of the residuals over RMS extent of the motion, to compare fits."""
         # extent of the target, because a bad fit shrinks the estimate to a point
         extent = float(np.sqrt(self.target_m.var(axis=0).sum()))
         return max(self.rms_m / extent, MIN_MISFIT) if extent > 0.0 else float("inf")
 
 
 def _half_interval(sparse: Trajectory, dense: Trajectory, fit: _OffsetFit) -> float:
-    """Return half of the 95 % interval (s); infinite if a position offset explains as much."""
+    """Return the half-width of the 95 % interval (s).
+
+    Infinite if a change of position, rotation or scale has the same effect as a time offset.
+    """
     n, centred_m = len(fit.time_s), fit.aligned_m - fit.aligned_m.mean(axis=0)
     dense_velocity = _velocity(dense, fit.time_s + fit.offset_s)
     sparse_velocity = fit.transform.rotation.apply(
         fit.transform.scale * _velocity(sparse, fit.time_s)
     )
-    # remove the effect of a time offset that equals a translation, small rotation or scale
+    # remove the part of a time offset's effect that equals a translation, small rotation or scale
     columns = [np.tile(axis, (n, 1)) for axis in np.eye(3)]
     columns += [np.cross(axis, centred_m) for axis in np.eye(3)]
     similarity_columns = np.stack([*columns, centred_m], axis=-1).reshape(3 * n, 7)
@@ -342,7 +354,8 @@ def _refine_offset(
         fit = fit_at(shift_s)
         return float(((fit.target_m - fit.aligned_m) ** 2).sum())
 
-    # the shift is optimised, because the tolerance relative to an offset of 50 years is seconds
+    # the shift is optimised instead of the offset: with UNIX time against boot time, the relative
+    # tolerance of the optimiser would be seconds
     shifts_s = window_s * np.linspace(-1.0, 1.0, 21)
     best_index = int(np.argmin([cost(shift) for shift in shifts_s]))
     bracket = (shifts_s[max(best_index - 1, 0)], shifts_s[min(best_index + 1, len(shifts_s) - 1)])

@@ -4,6 +4,9 @@
 to five of its options as click declares them, with values in their range. Options that need another
 one are drawn with it. A table lists runs, runs with results, errors of one line and faults:
 usage errors, other exceptions, warnings and impossible statements (see ``fuzz_fields.py``).
+
+The last run (seed 1) was stopped after 810 of 1,000 runs, without a fault. A run before, with seed
+9, found the traceback of ``whatif --set EKF2_EV_DELAY=300``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Analysis of a pose graph: tests of its closures, least squares and robust optimisation."""
+"""Analysis of a pose graph: tests of its loop closures, least squares and robust optimisation."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -12,20 +12,20 @@ from px4fuse.trajectory.graph.covariance import GateResult, gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import GraphSolution, Robust, Solution, solve
 
-MAX_ROBUST_CLOSURES = 1000  # robust optimisation with more closures takes minutes
-# labels of the solutions
+MAX_ROBUST_CLOSURES = 1000  # by default no robust optimisation with more closures: it takes minutes
+# Labels by solution
 SOLUTIONS: Mapping[str, str] = {
     "all": "pose graph, all closures",
     "gated": "pose graph, gated",
     "dcs": "pose graph, DCS",
     "gnc": "pose graph, GNC",
 }
-# robust methods by solution
+# Robust method by solution
 ROBUST_METHODS: Mapping[str, Robust] = {"dcs": "dcs", "gnc": "gnc"}
 
 
 class Graph(Record, frozen=True, kw_only=True):
-    """Pose graph with the tests of its closures and its solutions, for the results.
+    """Summary of a pose graph, the tests of its closures, and its solutions, for results.json.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Graph(Record, frozen=True, kw_only=True):
         Source of the initial poses.
     gates : tuple of GateResult, or Unavailable
         Tests of all edges that are not odometry.
-    solutions : mapping from name, as in :data:`SOLUTIONS`
+    solutions : mapping from key of :data:`SOLUTIONS` to GraphSolution
     """
 
     name: str
@@ -48,12 +48,12 @@ class Graph(Record, frozen=True, kw_only=True):
 
 
 class SolvedGraph(Graph, frozen=True, kw_only=True, eq=False):
-    """Pose graph with its solutions.
+    """:class:`Graph` with complete poses.
 
     Attributes
     ----------
     graph : PoseGraph
-        With the poses of the solution with all closures.
+        Pose graph with the poses of the solution with all closures.
     """
 
     schema_type = Graph
@@ -68,7 +68,7 @@ def analyse_graph(
     *,
     run_robust: bool | None = None,
 ) -> SolvedGraph:
-    """Test the closures of a graph and optimise the graph by least squares and robustly.
+    """Test the closures of a graph; optimise the graph by least squares and by robust methods.
 
     Edges between successive vertices are odometry, all other edges are closures.
 
@@ -77,7 +77,7 @@ def analyse_graph(
     name : str
         Name of the graph.
     run_robust : bool, optional
-        Also run robust optimisation; by default with up to 1000 closures.
+        True for robust optimisation, too; by default True with up to 1000 closures.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Covariance of relative poses by odometry, and the test of closures against it."""
+"""Covariance of relative poses from odometry, and the test of loop closures against odometry."""
 
 from collections.abc import Sequence
 
@@ -10,9 +10,9 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.record import Count, NotNegative, Record, Share
 from px4fuse.trajectory.graph import lie, model
 
-# probability that the gate rejects a true closure
+# Probability that the gate rejects a true closure
 GATE_ALPHA = 0.001
-# smaller eigenvalues of a correlation matrix are rounding errors
+# Minimum eigenvalue of a correlation matrix; smaller eigenvalues are rounding errors
 _MIN_EIGENVALUE = 1e-13
 
 
@@ -24,11 +24,11 @@ class GateResult(Record, frozen=True):
     first, second : int
         Vertex numbers (as in the file) that the closure connects.
     d2 : float
-        Squared Mahalanobis distance between the closure and the relative pose by odometry.
+        Squared Mahalanobis distance between the closure and the relative pose from odometry.
     degrees_of_freedom : int
-        Number of directions that the closure observes.
+        Number of directions in which the closure has information.
     p : float
-        Probability of this or a larger distance for a true closure.
+        Probability that a true closure has a distance of ``d2`` or more.
     accepted : bool
         True if p is at least :data:`GATE_ALPHA`.
     """
@@ -44,23 +44,23 @@ class GateResult(Record, frozen=True):
 def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -> list[GateResult]:
     """Test closures against odometry alone, before the optimisation uses them.
 
-    ``d2 = r' (J Sigma J' + Omega^-1)^-1 r``, with r the log of the inverse closure times the
-    relative pose by odometry, J the inverse right Jacobian at r, Omega the information of the
-    closure, and Sigma the covariance of the relative pose. For Sigma the error of each step is
+    ``d2 = r' (J Sigma J' + Omega^-1)^-1 r``. r is the log of the inverse closure times the relative
+    pose from odometry, J the inverse right Jacobian at r, Omega the information of the closure, and
+    Sigma the covariance of the relative pose. For Sigma the error of each odometry edge is
     transformed to the second vertex by the adjoint (Barfoot 2017, 8.96 and the first order of
     8.108, with right perturbations). Only directions in which the closure has information are used.
 
     Parameters
     ----------
     graph : PoseGraph
-        Edges between successive poses are odometry, except the tested ones.
+        Edges between successive poses are odometry, except the tested edges.
     edge_indices : sequence of int
-        Edges to test.
+        Indices of the edges to test.
 
     Returns
     -------
     list of GateResult
-        In the order of ``edge_indices``.
+        Test results in the order of ``edge_indices``.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
     step_adjoints = lie.adjoint(poses[1:])
     step_covariances = (
         step_adjoints @ _covariances(graph, chain_edges) @ step_adjoints.transpose(0, 2, 1)
-    )  # in the axes of pose low
+    )  # in the axes of the first pose of the chain
     cumulative_covariance = np.concatenate(
         [np.zeros((1, *step_covariances.shape[1:])), np.cumsum(step_covariances, axis=0)]
     )

@@ -18,19 +18,20 @@ def initialise(graph: PoseGraph) -> PoseGraph:
     """Compute initial poses from the edges; the first pose is kept.
 
     The method is chordal initialisation (Carlone et al. 2015, Initialization techniques for 3D
-    SLAM, section IV-C): rotations by linear least squares without the rotation constraint,
-    projected to rotations, then translations by linear least squares. If odometry connects all
-    poses and its composed edges have a lower cost, these are used instead.
+    SLAM, section IV-C). Rotation matrices are fitted by linear least squares without the rotation
+    constraint and projected to rotations, then translations are fitted by linear least squares. If
+    odometry connects all poses and composing its edges gives a lower cost, that result is used
+    instead.
 
     Parameters
     ----------
     graph : PoseGraph
-        Only its first pose is used.
+        Pose graph. Of its poses, only the first is used.
 
     Returns
     -------
     PoseGraph
-        ``initialised`` names the method.
+        Graph with initial poses; ``initialised`` contains the method.
 
     Raises
     ------
@@ -42,7 +43,7 @@ def initialise(graph: PoseGraph) -> PoseGraph:
     composed_graph = model.compose_odometry(graph)
     try:
         return min(composed_graph, _chordal(graph), key=model.cost)
-    except TrajectoryError:  # the edges determine the rotations only if composed
+    except TrajectoryError:  # some edges have no rotation; composed edges determine all poses
         return composed_graph
 
 
@@ -52,7 +53,8 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
     Raises
     ------
     TrajectoryError
-        Edges with rotation do not connect all poses, or the poses are not determined.
+        Edges with rotation information do not connect all poses, or the edges do not determine all
+        poses.
     """
     d = graph.dimension
     rotation_information = np.trace(graph.information[:, d:, d:], axis1=1, axis2=2)
@@ -94,7 +96,7 @@ def _solve_positions(
     value: Array,
     first_pose: Array,
 ) -> Array:
-    """Solve the least squares of :func:`normal_equations`, shape (n, d, k)."""
+    """Return the least-squares solution of :func:`normal_equations`, shape (n, d, k)."""
     solution = solve_normal_equations(
         *normal_equations(
             graph, first_coefficient, second_coefficient, information, value, first_pose
@@ -106,7 +108,7 @@ def _solve_positions(
 
 
 def _nearest_rotations(matrices: Array) -> Array:
-    """Project matrices, shape (n, d, d), to rotations in the Frobenius norm."""
+    """Return the nearest rotations to matrices, shape (n, d, d), in the Frobenius norm."""
     left, _, right = np.linalg.svd(matrices)
     left[:, :, -1] *= np.sign(np.linalg.det(left @ right))[:, None]
     return np.asarray(left @ right)

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from px4fuse.arrays import Array
 from px4fuse.trajectory.rotation import from_elements, skew
 
-# below this angle power series replace quotients that lose precision; five terms are accurate to
-# 1e-14
+# Maximum angle for power series instead of quotients, which lose precision at small angles. Five
+# terms are accurate to 1e-14
 SMALL_ANGLE_RAD = 0.3
 _COT_SERIES = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
 _COT_SLOPE_SERIES = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
@@ -53,7 +53,7 @@ def compose(a: Array, b: Array) -> Array:
     Parameters
     ----------
     a, b : ndarray, shape (..., 3) or (..., 7)
-        Quaternions of the result are normalised; headings are not wrapped.
+        Poses. Quaternions of the result are normalised; its headings are not wrapped.
     """
     d = _dimension(a)
     rotation = a[..., 2:] + b[..., 2:] if d == 2 else (_rotation_of(a) * _rotation_of(b)).as_quat()
@@ -97,7 +97,7 @@ def log(pose: Array) -> Array:
     Parameters
     ----------
     pose : ndarray, shape (..., 3) or (..., 7)
-        Quaternions normalised; q and -q are the same rotation.
+        Poses with normalised quaternions; q and -q give the same result.
     """
     d = _dimension(pose)
     phi = wrap(pose[..., 2:]) if d == 2 else _rotation_of(pose).as_rotvec()
@@ -105,7 +105,7 @@ def log(pose: Array) -> Array:
 
 
 def adjoint(pose: Array) -> Array:
-    """Return the adjoints, ``X exp(xi) = exp(adjoint(X) xi) X`` (Barfoot 2017, 7.45).
+    """Return the adjoints: ``X exp(xi) = exp(adjoint(X) xi) X`` (Barfoot 2017, 7.45).
 
     Returns
     -------
@@ -161,7 +161,7 @@ def _commutator(tangent: Array) -> Array:
 
 
 def chain(steps: Array) -> Array:
-    """Compute the products of the first 0, 1, ..., n motions, in log2(n) vectorised steps.
+    """Return the products of the first 0, 1, ..., n motions (log2(n) vectorised operations).
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def _cot_term(theta: Array) -> Array:
 
 
 def _cot_term_slope(theta: Array) -> Array:
-    """Return the derivative of :func:`_c` by theta, divided by theta."""
+    """Return the derivative of :func:`_cot_term` by theta, divided by theta."""
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     g_slope = 0.5 / np.tan(0.5 * t) - 0.25 * t / np.sin(0.5 * t) ** 2
     exact = -(g_slope + 2.0 * (1.0 - 0.5 * t / np.tan(0.5 * t)) / t) / t**3

@@ -13,8 +13,8 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.trajectory.graph import lie
 
-# a direction is observed if its eigenvalue of the information matrix, scaled to unit diagonal, is
-# larger
+# Minimum eigenvalue of the information matrix, scaled to unit diagonal, of a direction that counts
+# as measured
 MIN_OBSERVED_EIGENVALUE = 1e-9
 FROM_FILE = "the file's vertices"
 FROM_ODOMETRY = "odometry edges composed"
@@ -35,10 +35,9 @@ class PoseGraph:
         x, y, heading in the plane; x, y, z, qx, qy, qz, qw in space; m and rad, in the frame of the
         graph. Quaternions are normalised.
     first, second : ndarray of int, shape (m,)
-        Indices into ``poses`` of the vertices of each edge. The pose of ``second`` relative to
-        ``first`` is measured.
+        Indices into ``poses`` of the two vertices of each edge.
     measurements : ndarray, shape (m, 3) or (m, 7)
-        Relative poses, in the axes of ``first``.
+        Measured pose of ``second`` relative to ``first``, in the axes of ``first``.
     information : ndarray, shape (m, 3, 3) or (m, 6, 6)
         Inverse covariance of the measurement error in the axes of the measured pose, translation
         before rotation, in 1/m² and 1/rad². Positive semidefinite: zero in directions that are not
@@ -62,7 +61,7 @@ class PoseGraph:
         return len(self.ids)
 
     def select_edges(self, is_selected: BoolArray) -> PoseGraph:
-        """Return the graph with the edges that a mask selects, shape (m,)."""
+        """Return the graph with only the edges in the mask, shape (m,)."""
         edges = ("first", "second", "measurements", "information")
         return replace(self, **{name: getattr(self, name)[is_selected] for name in edges})
 
@@ -110,15 +109,15 @@ def residuals(graph: PoseGraph, poses: Array) -> Residuals:
 
 
 def cost(graph: PoseGraph) -> float:
-    """Return half of the sum of the squared residuals, as GTSAM's ``graph.error``."""
+    """Return half of the sum of the weighted squared residuals, like GTSAM's ``graph.error``."""
     return 0.5 * float(np.sum(residuals(graph, graph.poses).chi2))
 
 
 def information_eigenvectors(information: Array) -> tuple[Array, Array]:
-    """Return the directions that an information matrix observes, and their variances.
+    """Return the directions in which a measurement has information, and their variances.
 
-    Translation and rotation have different units, so the matrix is scaled to unit diagonal before
-    eigenvalues are compared with zero.
+    Translation and rotation have different units, so the information matrix is scaled to unit
+    diagonal before its eigenvalues are compared with zero.
 
     Parameters
     ----------
@@ -127,7 +126,7 @@ def information_eigenvectors(information: Array) -> tuple[Array, Array]:
     Returns
     -------
     directions : ndarray, shape (d, k)
-        ``directions' r`` is observed; k is the rank.
+        Columns; the measurement determines ``directions' r``. k is the rank of the matrix.
     variance : ndarray, shape (k,)
         ``information == directions @ diag(1 / variance) @ directions.T``.
     """
@@ -138,7 +137,7 @@ def information_eigenvectors(information: Array) -> tuple[Array, Array]:
 
 
 def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
-    """Return the roots of the diagonals, and the matrices scaled to unit diagonal.
+    """Return the square roots of the diagonals, and the matrices scaled to unit diagonal.
 
     A zero on the diagonal stays zero.
     """
@@ -153,14 +152,14 @@ def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> 
     Parameters
     ----------
     is_used : ndarray of bool, shape (m,)
-        Edges that may connect poses, if they have information.
+        Mask of the edges that may connect poses. Edges without information never connect poses.
     edges_name : str
-        Name of these edges in the message, for example "the edges".
+        Name of the used edges in the message, for example "the edges".
 
     Raises
     ------
     TrajectoryError
-        The message contains the number of parts and a vertex that is not connected.
+        The message contains the number of separate parts and a vertex that is not connected.
     """
     if not len(graph.first):
         raise TrajectoryError("The pose graph has no edges.", "Give a file with EDGE lines.")
@@ -178,19 +177,21 @@ def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> 
 
 
 def compose_odometry(graph: PoseGraph) -> PoseGraph:
-    """Return the graph with poses composed from odometry, which must connect all poses."""
+    """Return the graph with poses composed from odometry. Odometry must connect all poses."""
     steps = odometry_steps(graph, odometry_chain(graph))
     poses = lie.compose(graph.poses[:1], lie.chain(steps))
     return replace(graph, poses=poses, initialised=FROM_ODOMETRY)
 
 
 def odometry_chain(graph: PoseGraph, excluded_edges: IntArray | None = None) -> IntArray:
-    """Return the odometry edge from each pose to the next, -1 if missing, shape (n - 1,).
+    """Return the index of the odometry edge from each pose to the next, shape (n - 1,).
+
+    -1 without an edge. Of several edges between two poses the first is used.
 
     Parameters
     ----------
     excluded_edges : ndarray of int, optional
-        Edges that are not used. Of several edges between two poses the first is used.
+        Indices of edges that are not used.
     """
     odometry_edges = np.flatnonzero(graph.is_successive)
     if excluded_edges is not None:
@@ -210,7 +211,7 @@ def odometry_steps(graph: PoseGraph, chain: IntArray) -> Array:
     Parameters
     ----------
     chain : ndarray of int, shape (k,)
-        Edges between successive poses, in order.
+        Indices of edges between successive poses, in order.
     """
     steps = graph.measurements[chain].copy()
     is_backward = graph.first[chain] > graph.second[chain]

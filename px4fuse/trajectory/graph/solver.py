@@ -18,41 +18,44 @@ from px4fuse.trajectory.graph.model import PoseGraph, Residuals
 from px4fuse.trajectory.graph.system import normal_equations, solve_normal_equations
 
 Robust = Literal["none", "dcs", "gnc"]
-# function of the squared residuals of all edges; returns weights of the information, and costs
+# Robust kernel: from the squared residuals of all edges, return weights of the information and
+# costs
 Kernel = Callable[[Array], tuple[Array, Array]]
 
 MAX_ITERATIONS = 100
-# defaults of GTSAM's LevenbergMarquardtParams
+# Defaults of GTSAM's LevenbergMarquardtParams
 _INITIAL_DAMPING, _DAMPING_FACTOR, _MAX_DAMPING = 1e-5, 10.0, 1e5
 _MIN_FIDELITY = 1e-3
 _TOLERANCE = 1e-10
 _FLOAT_EPSILON = float(np.finfo(float).eps)
-# wider tolerance and fewer iterations in the intermediate stages of graduated non-convexity
+# Tolerance and iterations in the intermediate stages of graduated non-convexity, which need less
+# precision
 _STAGE_TOLERANCE, _STAGE_ITERATIONS = 1e-6, 20
 
-DCS_PHI = 1.0  # Agarwal 2013, section IV
-GNC_PROBABILITY = 0.99  # probability that a true closure is not truncated
-DROP_PROBABILITY = 0.999  # probability that a true closure costs less than a dropped one (gate)
-_GNC_FACTOR = 1.4  # Yang 2020, section V
+DCS_PHI = 1.0  # parameter Phi of "dcs" (Agarwal 2013, section IV)
+GNC_PROBABILITY = 0.99  # probability that the squared residual of a true closure is not truncated
+DROP_PROBABILITY = 0.999  # probability that keeping a true closure costs less than dropping it
+_GNC_FACTOR = 1.4  # factor on the control parameter per stage (Yang 2020, section V)
 _MAX_GNC_STAGES = 100
-_MAX_RETRIED_CLOSURES = 20  # dropped closures that are tested again; each needs one minimisation
+_MAX_RETRIED_CLOSURES = 20  # maximum dropped closures tested again: each test is a minimisation
 _MAX_TRUNCATION_ROUNDS = 20
 
 
 class GraphSolution(Record, frozen=True, kw_only=True):
-    """Solution of a pose graph, for the results.
+    """Summary of a pose graph's solution, for results.json.
 
     Attributes
     ----------
     cost_initial : float
-        Half of the sum of the squared residuals at the initial poses, with all weights 1.
+        Half of the sum of the squared Mahalanobis distances at the initial poses, with all weights
+        1.
     cost : float
-        Half of the weighted sum of the squared residuals.
+        Half of the weighted sum of the squared Mahalanobis distances at the solution.
     iterations : int
-        Accepted steps, over all starts and stages.
+        Number of accepted steps, over all starts and stages.
     converged : bool
-        False if the limit of the iterations was reached, or if no step decreased the cost although
-        the last step changed the cost by more than the tolerance.
+        False if the maximum number of iterations was reached, or if no further step decreased the
+        cost although the last step still changed it by more than the tolerance.
     dropped : int
         Number of edges with a weight below 0.5.
     """
@@ -70,7 +73,7 @@ class Solution(GraphSolution, frozen=True, kw_only=True, eq=False):
     Attributes
     ----------
     poses : ndarray, shape (n, 3) or (n, 7)
-        The first pose is unchanged.
+        Optimised poses; the first pose is unchanged.
     weights : ndarray, shape (m,)
         Factors on the information of each edge, from 0 (ignored) to 1.
     """
@@ -98,7 +101,7 @@ def solve(
     robust: Robust = "none",
     is_closure: BoolArray | None = None,
 ) -> Solution:
-    """Optimise the poses by Levenberg-Marquardt, with the schedule of GTSAM.
+    """Optimise the poses by Levenberg-Marquardt, as GTSAM does.
 
     The first pose is fixed. Steps, damping (identity, from 1e-5, by factors of 10) and acceptance
     of steps are those of GTSAM's LevenbergMarquardtOptimizer, so px4fuse and GTSAM reach the same
@@ -107,24 +110,25 @@ def solve(
     ``dcs`` multiplies the information of closures by s², s = min(1, 2 Phi / (Phi + chi²)), Phi = 1
     (Agarwal et al. 2013, Robust map optimization using dynamic covariance scaling, eq. 15). This is
     an M-estimator with many minima (MacTavish and Barfoot 2015, At all costs). The optimisation
-    starts from the solution of ``gnc``: if odometry drifts, true closures have a large initial
-    chi², and would be dropped if it started from the initial poses or from the least-squares
-    solution. The lowest of several minima is not better: with Phi = 1 a dropped closure costs at
-    most 1.5, and a true closure with 3 degrees of freedom costs 1.5 on average.
+    starts from the solution of ``gnc``. If odometry drifts, true closures have a large chi² at the
+    initial poses and at the least-squares solution, so a start there would drop them. The lowest of
+    several minima would not be a better choice: with Phi = 1 a dropped closure costs at most 1.5,
+    and a true closure with 3 degrees of freedom costs 1.5 on average.
 
-    ``gnc`` minimises least squares truncated at the 99 % point of chi-square, with the rank of the
-    closure's information as degrees of freedom, by graduated non-convexity (Yang et al. 2020, eq.
-    13 and 14; control parameter from barc² / (2 max r² - barc²), times 1.4 per stage). It is run
-    from the least-squares solution and from the initial poses; the result with the lower cost is
-    used. A dropped closure costs the 99.9 % point of chi-square, the limit of the gate. Then up to
-    20 dropped closures are restored one by one if that lowers the cost. Final weights are 0 or 1.
+    ``gnc`` minimises truncated least squares by graduated non-convexity (Yang et al. 2020, eq. 13
+    and 14; control parameter from barc² / (2 max r² - barc²), times 1.4 per stage). The truncation
+    is at the 99 % point of chi-square, with the rank of the closure's information as degrees of
+    freedom. ``gnc`` runs from the least-squares solution and from the initial poses, and the result
+    with the lower cost is used. In this cost a dropped closure costs the 99.9 % point of
+    chi-square, the limit of the gate. Finally up to 20 dropped closures are restored one by one if
+    that lowers the cost. Final weights are 0 or 1.
 
     Parameters
     ----------
     robust : {"none", "dcs", "gnc"}
     is_closure : ndarray of bool, shape (m,), optional
-        Edges that may be false; all other edges have weight 1. By default the edges between poses
-        that are not successive.
+        Mask of the edges that may be false; all other edges have weight 1. By default all edges
+        between poses that are not successive.
 
     Raises
     ------
@@ -174,7 +178,7 @@ def _minimise(
     tolerance: float = _TOLERANCE,
     max_iterations: int = MAX_ITERATIONS,
 ) -> _Minimum:
-    """Minimise the cost from given poses, as GTSAM's LevenbergMarquardtOptimizer."""
+    """Minimise the cost from given poses like GTSAM's LevenbergMarquardtOptimizer."""
     damping, iterations = _INITIAL_DAMPING, 0
     weights, costs = kernel(state.chi2)
     cost = float(np.sum(costs))
@@ -222,7 +226,7 @@ def _least_squares_kernel(weights: Array) -> Kernel:
 
 
 def _dcs_kernel(is_doubtful: BoolArray) -> Kernel:
-    """Return the kernel of dynamic covariance scaling for the doubtful edges."""
+    """Return the kernel of dynamic covariance scaling for the edges that may be false."""
 
     def kernel(chi2: Array) -> tuple[Array, Array]:
         is_beyond = is_doubtful & (chi2 > DCS_PHI)
@@ -235,7 +239,7 @@ def _dcs_kernel(is_doubtful: BoolArray) -> Kernel:
 def _solve_gnc(
     graph: PoseGraph, start: Residuals, plain_minimum: _Minimum, is_doubtful: BoolArray
 ) -> tuple[_Minimum, Array]:
-    """Solve truncated least squares over the doubtful edges, from two starts."""
+    """Solve least squares, truncated for the edges that may be false, from two starts."""
     _, scaled = model.scale_to_unit_diagonal(graph.information)
     degrees_of_freedom = np.sum(np.linalg.eigvalsh(scaled) > model.MIN_OBSERVED_EIGENVALUE, axis=1)
     bound = np.full(len(is_doubtful), np.inf)
@@ -270,12 +274,12 @@ def _solve_gnc(
 def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tuple[_Minimum, Array]:
     """Run graduated non-convexity from one start (Yang 2020, algorithm 1, eq. 13 and 14)."""
     state, iteration_count = start, 0
-    # edges with an infinite bound are not doubtful
+    # edges that cannot be false have an infinite bound
     excess = 2.0 * state.chi2 / bound - 1.0
     if np.max(excess) > 0.0:
         control = 1.0 / float(np.max(excess))
         for _ in range(_MAX_GNC_STAGES):
-            ratio = np.maximum(state.chi2 / bound, 1e-200)  # lower limit; the weight is 1 there
+            ratio = np.maximum(state.chi2 / bound, 1e-200)  # not 0; the weight is 1 anyway
             weights = np.clip(np.sqrt(control * (control + 1.0) / ratio) - control, 0.0, 1.0)
             stage = _minimise(
                 graph, state, _least_squares_kernel(weights), _STAGE_TOLERANCE, _STAGE_ITERATIONS

@@ -11,8 +11,9 @@ from scipy.sparse.linalg import splu
 from px4fuse.arrays import Array
 from px4fuse.trajectory.graph.model import PoseGraph
 
-# relax and panel_size of scipy's SuperLU: with values above the defaults (10 and 20) SuperLU writes
-# outside its workspace (scipy 1.17, shown by valgrind); relax 1 gives the least fill-in
+# Options relax and panel_size of scipy's SuperLU: with values above the defaults (10 and 20)
+# SuperLU writes outside its workspace (scipy 1.17, shown by valgrind). relax 1 gives the least
+# fill-in
 _RELAX, _PANEL = 1, 4
 if TYPE_CHECKING:  # scipy before 1.16 has no generic arrays
     Matrix = sparse.csc_array[np.float64]
@@ -32,9 +33,10 @@ def normal_equations(
     ----------
     graph : PoseGraph
     first_coefficient, second_coefficient, information : ndarray, shape (m, d, d)
-        A, B, and the weight of each equation.
+        A, B, and the weight matrix of each equation.
     value : ndarray, shape (m, d, k)
     first_value : ndarray, shape (d, k), or 0
+        Value of x_0.
 
     Returns
     -------
@@ -60,7 +62,7 @@ def solve_normal_equations(matrix: Matrix, right_side: Array, damping: float = 0
     try:
         factors = splu(
             matrix + damping * sparse.eye_array(matrix.shape[0], format="csc"),
-            # 1.1 to 1.9 times less fill-in than COLAMD on the graphs of the benchmark
+            # 1.1 to 1.9 times less fill-in than COLAMD on public benchmark graphs
             permc_spec="MMD_AT_PLUS_A",
             diag_pivot_thresh=0.0,
             relax=_RELAX,
