@@ -38,7 +38,7 @@ from px4fuse.findings import cause_text, ekf2_noise, hidden_errors, loops, noise
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.noises import _has_default_noises
 from px4fuse.loop.model import Closure, Loop, TrueEnd
-from px4fuse.position_source import find_origin
+from px4fuse.position_source import GNSS, RECEIVED
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
 HOVERING = source(samples=positions(np.arange(0.0, 120.0)))
@@ -379,12 +379,12 @@ def test_variances_ekf2_without_replay_compare_noises(one, estimate, parameters,
         (0.06, "uwb", 0.0,
          ("ekf2_noise_too_small", "warning", "EKF2_EVP_NOISE is 1.67 times too small")),
         (0.5, "uwb", 0.0, ("ekf2_noise_too_large", "error", "EKF2_EVP_NOISE is 5 times too large")),
-        # PX4's default: nobody chose it, so the title names the sensor
+        # PX4's default: not chosen, so the title names the sensor
         (0.1, "uwb", 0.0,
          ("ekf2_noise_too_small", "error", "UWB noise is 4 times what EKF2 assumes")),
         (0.5, "gnss", 0.44,
          ("ekf2_noise_too_small", "error", "GNSS noise is 4 times what both filters assume: EKF2 "
-          "rejects 44 % of the positions")),
+          "rejects 44 %")),
     ],
 )  # fmt: skip
 def test_ekf2_noise_title_names_parameter_or_sensor(
@@ -398,7 +398,7 @@ def test_ekf2_noise_title_names_parameter_or_sensor(
                   after=Outcome(nis_mean=1.0))  # fmt: skip
     model = SimpleNamespace(inputs=SimpleNamespace(settings={aid.noise: flown_m}))
     result = axis("north", rejected_fraction=rejected)
-    origin = find_origin(kind, "as it arrived")
+    origin = GNSS if kind == "gnss" else RECEIVED
     one = analysis(
         axes=(result,), trials=(rerun,), ekf2_model=model, source=source(origin=origin),
         settings=Settings(1.0, flown_m),

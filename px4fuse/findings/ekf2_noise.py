@@ -37,14 +37,15 @@ def detect(analysis: Analysis) -> Findings:
     )
     rejected = analysis.main.rejected_fraction or 0.0
     if rejected >= MIN_NAMED_REJECTION:
-        effect = f": EKF2 rejects {format_percent(rejected)} of the positions"
+        effect = f": EKF2 rejects {format_percent(rejected)}"
         reason = f"EKF2 takes ordinary {sensor} noise for outliers, rejects it and uses the IMU."
     else:
         effect, reason = "", f"The gain and the σ of EKF2 are too {direction}."
         if is_small:
             reason = "The gain of EKF2 is too large, and its σ too small."
-    title = f"{aid.noise} is {format_factor(size)} times too {direction}{effect}"
-    if is_small and flown_m == PARAMETERS[aid.noise].default:  # nobody chose it: name the sensor
+    of_positions = " of the positions" if effect else ""
+    title = f"{aid.noise} is {format_factor(size)} times too {direction}{effect}{of_positions}"
+    if is_small and flown_m == PARAMETERS[aid.noise].default:  # not chosen: name the sensor
         who = "both filters assume" if is_shared else "EKF2 assumes"
         title = f"{sensor} noise is {format_factor(size)} times what {who}{effect}"
     interval, tuned = "", analysis.tuning.get(HORIZONTAL)
