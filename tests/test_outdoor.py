@@ -210,14 +210,6 @@ def test_clock_message_receiver_delay_is_named() -> None:
     assumed_ms, estimate_ms = delays.groups()  # type: ignore[union-attr]
     assert int(assumed_ms) == 110
     assert int(estimate_ms) == pytest.approx(110 + 250, abs=60)
->>=======
-    finding = next(source_clock.detect(changed))
-    assert "SENS_GPS0_DELAY" in finding.remedy
-    delays = re.search(r"is (\d+) ms; the estimate is (\d+) ms", finding.message)
-    assumed_ms, estimate_ms = delays.groups()  # type: ignore[union-attr]
-    assert int(assumed_ms) == 110
-    assert int(estimate_ms) == pytest.approx(110 + 250, abs=60)
->>>>>>> f2
 
 
 def test_findings_mag_change_causes_rejection_finding() -> None:

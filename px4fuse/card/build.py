@@ -294,7 +294,7 @@ def _sentence(action: Action) -> str:
 
 
 def _mark_explained(verdicts: Sequence[Verdict], causes: Sequence[Cause]) -> tuple[Verdict, ...]:
-    """Mark verdicts that are not consistent, but for which nothing has to be changed."""
+    """Mark verdicts that are not consistent and need no change."""
     unchanged = {
         action.target
         for cause in causes

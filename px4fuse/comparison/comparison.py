@@ -236,7 +236,7 @@ def error_statistics(
 
 
 def _errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Array:
-    """Return state minus ground truth at the times of the state; NaN where one is unknown."""
+    """Return state minus ground truth at the times of the state; NaN if one is unknown."""
     true = np.interp(state.index, truth.index, truth[column], np.nan, np.nan)
     return np.asarray(state[column].to_numpy() - true)
 
@@ -267,7 +267,7 @@ def position_errors(result: AxisComparison, owner: FilterName) -> Frame:
     Returns
     -------
     DataFrame or Unavailable
-        ``error_m`` against ground truth and ``sigma_m``, NaN where one is unknown.
+        ``error_m`` against ground truth and ``sigma_m``, NaN if one is unknown.
     """
     if isinstance(result.truth, Unavailable):
         return result.truth

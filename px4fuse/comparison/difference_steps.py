@@ -106,7 +106,7 @@ def explain_ekf2_difference(
 def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, float]:
     """Return the maximum-likelihood value of each noise of KF that was set far from it.
 
-    A wrong setting is a cause of its own. If it were left, later steps would share its effect: each
+    A wrong setting is a separate cause. If it were left, later steps would share its effect: each
     of them alone would remove nearly the whole difference.
     """
     axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")

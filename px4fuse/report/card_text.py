@@ -28,7 +28,7 @@ WIDTH = 100
 AXIS_WIDTH = 37
 # Columns before the axis, and before the texts beside a label
 AXIS_INDENT, TEXT_INDENT = 57, 11
-# A longer command stands on a line of its own
+# A longer command is printed on a separate line
 MAX_COMMAND_LENGTH = 74
 # Ticks that have room for a label
 LABELLED_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)

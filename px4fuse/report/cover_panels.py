@@ -59,7 +59,7 @@ MIN_WIDE = 200.0  # pt; narrower panels have fewer ticks
 LEFT = 38.0  # pt; tick and axis labels left of the axes
 # Share of the free height for the innovations and for the map
 INNOVATION_SHARE, MAP_SHARE = 0.22, 0.25
-MAX_DRAWN = 400  # innovations per filter; more are thinned evenly, those beyond the scale never
+MAX_DRAWN = 400  # innovations per filter; more are decimated evenly, those beyond the scale never
 MAX_NORMALISED = 4.0
 # pt; height below the axes, without and with labels of the x axis
 BELOW = UNLABELLED_HEIGHT, TICKS_HEIGHT + AXIS_LABEL_HEIGHT
@@ -523,7 +523,7 @@ def _map_limits(tracks: Mapping[str, Coordinates], ratio: float) -> MapLimits:
     """Return the limits of both map axes at equal scales.
 
     They show all ground truth and 98 % of the positions, and the other tracks up to
-    :data:`MAP_REACH` outside of these; a filter that is far off does not shrink the flight.
+    :data:`MAP_REACH` outside of these; a filter with a large error does not shrink the flight.
     """
     spans = []
     for side in (0, 1):
