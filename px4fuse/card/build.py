@@ -13,6 +13,7 @@ from px4fuse.card.causes import (
     make_cause,
     make_plain_cause,
     rank_causes,
+    with_log_name,
 )
 from px4fuse.card.model import (
     MAX_CAUSES,
@@ -93,7 +94,7 @@ def build_card(
         difference=_difference(effect, ranked),
         causes=causes,
         more_causes=max(len(ranked) - MAX_CAUSES, 0),
-        notes=_notes(roots),
+        notes=_notes(roots, request.log),
         identity=_identity(analysis, request, student),
     )
 
@@ -117,7 +118,7 @@ def build_aids_card(
         do_this=_do_this(causes),
         causes=causes,
         more_causes=max(len(faults) - MAX_CAUSES, 0),
-        notes=_notes(roots),
+        notes=_notes(roots, request.log),
         aids=tuple(
             AidRow(
                 label=aid.label,
@@ -400,9 +401,11 @@ def _difference(effect: Effect, ranked: Sequence[RankedCause]) -> str:
     return f"{text}; {format_metres(after_m)} m {predicted}after the fix."
 
 
-def _notes(roots: Sequence[Finding]) -> tuple[Note, ...]:
+def _notes(roots: Sequence[Finding], log: str) -> tuple[Note, ...]:
     notes = [one for one in roots if one.severity == "note"]
-    return tuple(Note(one.id, f"{one.title}.", one.remedy) for one in notes[:MAX_NOTES])
+    return tuple(
+        Note(one.id, f"{one.title}.", with_log_name(one.remedy, log)) for one in notes[:MAX_NOTES]
+    )
 
 
 def _identity(analysis: Analysis, request: ComparisonRequest, student: tuple[str, str]) -> Identity:

@@ -5,6 +5,8 @@ re-run for it. An action on a filter is printed only if its re-run improves that
 """
 
 import math
+import re
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -83,6 +85,8 @@ TARGETS: Mapping[str, Target] = {
     "loops": "source",
     "logging": "logging",
 }
+# Targets of findings whose group has another one
+TARGETS_BY_ID: Mapping[str, Target] = {"source_drift": "source", "ekf2_not_fusing": "sender"}
 FILTER_NAMES: Mapping[FilterName, Target] = {"kf": "KF", "ekf2": "EKF2"}
 
 
@@ -175,6 +179,15 @@ def make_cause(
     )
 
 
+def with_log_name(text: str, log: str) -> str:
+    """Replace the placeholder LOG in commands by the name of the log, quoted for a shell.
+
+    >>> with_log_name("Check the time offset (px4fuse sync LOG).", "my log.ulg")
+    "Check the time offset (px4fuse sync 'my log.ulg')."
+    """
+    return re.sub(r"(px4fuse \w+) LOG\b", lambda match: f"{match[1]} {shlex.quote(log)}", text)
+
+
 def make_plain_cause(finding: Finding) -> Cause:
     """Make the cause of a finding without re-runs."""
     return Cause(
@@ -203,7 +216,10 @@ def _actions(
     by_kind = {(trial.filter, trial.kinds[0]): trial for trial in useful}
     alternatives: tuple[tuple[Action, ...], ...] = ()
     actions: list[Action] = []
-    general = Action(_target(finding, analysis.source), finding.remedy) if finding.remedy else None
+    general = None
+    if finding.remedy:
+        remedy = with_log_name(finding.remedy, request.log)
+        general = Action(_target(finding, analysis.source), remedy)
     delay = by_kind.get(("ekf2", "delay"))
     if offset := by_kind.get(("ekf2", "time offset")) or by_kind.get(("kf", "time offset")):
         shift = offset.change[CLOCK_OFFSET] - analysis.settings.clock_offset_s * (
@@ -253,6 +269,8 @@ def _no_change(finding: Finding, owner: FilterName, verdicts: Sequence[Verdict])
         return ""
     if set(words.values()) == {"consistent"}:
         return "no change: consistent"
+    if finding.id == "source_drift":
+        return "no setting removes drift" if owner == "kf" else "no parameter removes drift"
     if finding.id == "source_outliers":
         if owner == "kf":
             return "no option rejects outliers; do not raise --sigma-z for them"
@@ -263,7 +281,7 @@ def _no_change(finding: Finding, owner: FilterName, verdicts: Sequence[Verdict])
 
 def _target(finding: Finding, source: PositionTrack | None = None) -> Target:
     """Return the device or person that the remedy of a finding concerns."""
-    target = TARGETS[CATALOGUE[finding.id].group]
+    target = TARGETS_BY_ID.get(finding.id) or TARGETS[CATALOGUE[finding.id].group]
     is_receiver = target == "sender" and source is not None and source.origin.is_gnss
     return "receiver" if is_receiver else target
 

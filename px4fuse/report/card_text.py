@@ -3,6 +3,7 @@
 Commands and the headline never wrap; other texts wrap with a hanging indent.
 """
 
+import re
 import shlex
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
@@ -153,6 +154,11 @@ def with_typed_path(card: Card, path: str | None) -> Card:
         return card
     name = card.identity.file
 
+    pattern = re.compile(rf"(px4fuse \w+ ){re.escape(shlex.quote(name))}")
+
+    def with_path(text: str) -> str:
+        return pattern.sub(lambda match: f"{match[1]}{quote_command([path])}", text)
+
     def typed(action: Action) -> Action:
         commands = tuple(
             quote_command([path if word == name else word for word in shlex.split(command)])
@@ -160,7 +166,7 @@ def with_typed_path(card: Card, path: str | None) -> Card:
             else command
             for command in action.commands
         )
-        return replace(action, commands=commands)
+        return replace(action, commands=commands, sentence=with_path(action.sentence))
 
     causes = tuple(
         replace(
@@ -170,7 +176,12 @@ def with_typed_path(card: Card, path: str | None) -> Card:
         )
         for cause in card.causes
     )
-    return replace(card, causes=causes)
+    return replace(
+        card,
+        causes=causes,
+        do_this=tuple(map(with_path, card.do_this)),
+        notes=tuple(replace(note, action=with_path(note.action)) for note in card.notes),
+    )
 
 
 def to_ascii(text: str) -> str:
