@@ -79,7 +79,8 @@ def build_card(
     verdicts = make_verdicts(result)
     ranked = rank_causes(analysis, roots)
     causes = tuple(make_cause(analysis, each, verdicts, request) for each in ranked[:MAX_CAUSES])
-    verdicts = _mark_explained(verdicts, causes)
+    may_drift = analysis.source.origin.may_drift
+    verdicts = _mark_explained(verdicts, causes, may_drift=may_drift)
     effect = _effect(analysis)
     severity: CardSeverity = causes[0].severity if causes else _severity_without_cause(verdicts)
     return Card(
@@ -289,13 +290,18 @@ def _sentence(action: Action) -> str:
         return f"EKF2: set {action.sentence}."
     if action.where == "shell":
         options = action.commands[0].partition(" --")[2]
-        return f"KF: run again with --{options}." if options else f"Run {action.commands[0]}."
+        return f"KF: {action.sentence or 'run again with'} --{options}."
     text = action.sentence.rstrip(".")
     return f"{action.target[0].upper()}{action.target[1:]}: {text[0].lower()}{text[1:]}."
 
 
-def _mark_explained(verdicts: Sequence[Verdict], causes: Sequence[Cause]) -> tuple[Verdict, ...]:
-    """Mark verdicts that are not consistent and need no change."""
+def _mark_explained(
+    verdicts: Sequence[Verdict], causes: Sequence[Cause], *, may_drift: bool
+) -> tuple[Verdict, ...]:
+    """Mark verdicts that are not consistent and need no change.
+
+    If the source may drift, a σ that is too large against the source is not a fault.
+    """
     unchanged = {
         action.target
         for cause in causes
@@ -310,7 +316,11 @@ def _mark_explained(verdicts: Sequence[Verdict], causes: Sequence[Cause]) -> tup
     return tuple(
         replace(verdict, is_explained=True)
         if verdict.word in ("overconfident", "underconfident")
-        and (FILTER_NAMES[verdict.filter] in unchanged or verdict.filter in truth_is_right)
+        and (
+            FILTER_NAMES[verdict.filter] in unchanged
+            or verdict.filter in truth_is_right
+            or (may_drift and (verdict.against, verdict.word) == ("source", "underconfident"))
+        )
         else verdict
         for verdict in verdicts
     )
@@ -398,7 +408,7 @@ def _difference(effect: Effect, ranked: Sequence[RankedCause]) -> str:
     if after_m is None:
         return f"{text}."
     predicted = "predicted " if owner == "ekf2" else ""
-    return f"{text}; {format_metres(after_m)} m {predicted}after the fix."
+    return f"{text}; {format_metres(after_m)} m {predicted}with {FILTER_NAMES[owner]} corrected."
 
 
 def _notes(roots: Sequence[Finding], log: str) -> tuple[Note, ...]:

@@ -31,6 +31,7 @@ from px4fuse.comparison.trials import (
     reduction,
 )
 from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import CATALOGUE, Finding
 from px4fuse.flight import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
@@ -243,7 +244,9 @@ def _actions(
             and kind != "defaults"
             and trial.change.keys() <= COMPARISON_OPTIONS.keys()
         ):
-            actions.append(run_again(request, trial.change))
+            is_default = ("kf", "defaults") in by_kind and kind == "noises"
+            defaults = by_kind["kf", "defaults"].change if is_default else {}
+            actions.append(run_again(request, trial.change, defaults))
         elif (
             owner == "ekf2"
             and kind not in ("delay", "time offset")
@@ -276,7 +279,7 @@ def _no_change(finding: Finding, owner: FilterName, verdicts: Sequence[Verdict])
             return "no option rejects outliers; do not raise --sigma-z for them"
         if words.get("truth", "consistent") == "consistent":
             return "no change: its gate rejects outliers, and σ covers the error"
-    return "no setting corrects this" if owner == "kf" else "no parameter corrects this"
+    return f"no {'setting' if owner == 'kf' else 'parameter'} corrects this fault"
 
 
 def _target(finding: Finding, source: PositionTrack | None = None) -> Target:
@@ -286,9 +289,16 @@ def _target(finding: Finding, source: PositionTrack | None = None) -> Target:
     return "receiver" if is_receiver else target
 
 
-def run_again(request: ComparisonRequest, change: Mapping[str, float]) -> Action:
-    """Return the command that runs KF again with changed settings."""
-    return Action("KF", commands=(command_line(structs.replace(request, **change)),), where="shell")
+def run_again(
+    request: ComparisonRequest, change: Mapping[str, float], defaults: Mapping[str, float]
+) -> Action:
+    """Return the command that runs KF again with changed settings; ``defaults`` are as good."""
+    command = command_line(structs.replace(request, **change))
+    options = " and ".join(
+        f"{COMPARISON_OPTIONS[name]} (default {defaults[name]:g})" for name in defaults
+    )
+    sentence = f"run again without {options}, or with" if options else ""
+    return Action("KF", sentence, (command,), "shell")
 
 
 def set_parameters(analysis: Analysis, change: Mapping[str, float]) -> Action:
@@ -359,8 +369,14 @@ def _closing_sentence(
             "(this log only) is added to the timestamps (s), the delay parameter is the age of a "
             "position (ms)."
         )
-    defaults = next((trial for trial in useful if trial.kinds == ("defaults",)), None)
-    if defaults is not None and len(useful) > 1:
-        options = " and ".join(COMPARISON_OPTIONS[name] for name in defaults.change)
-        return f"Without {options} (default) KF is as good."
+    if any(trial.kinds == ("defaults",) for trial in useful):
+        return "Both values are consistent; the default needs no option."
+    tuned = analysis.tuning.get(HORIZONTAL)
+    for trial in useful:
+        name = next(iter(trial.change))
+        if trial.kinds != ("noise",) or not isinstance(tuned, AxisTuning):
+            continue
+        default = PARAMETERS[name].default
+        if (tuned.sigma_z.low or 0.0) <= default <= (tuned.sigma_z.high or 0.0):
+            return f"PX4's default, {default:g} m, is inside the 95 % interval: it is as good."
     return ""

@@ -220,6 +220,8 @@ def _identity(card: Card) -> Iterator[Line]:
     flight = f"{identity.firmware}, {identity.duration_s:.1f} s, {identity.source}"
     student = ", ".join(filter(None, (identity.student, identity.student_id)))
     yield Line(f"{identity.file}  {flight}{f'  {student}' if student else ''}")
+    if identity.settings:
+        yield from _wrapped(f"KF: {identity.settings}", "  ", "      ")
     changed = (*identity.changed, *identity.parameters)
     if changed:
         yield from _wrapped(f"changed: {'; '.join(changed)}", "  ", "           ")
@@ -311,7 +313,12 @@ def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
 def rerun_start(reruns: Sequence[Rerun]) -> str:
     """Return the sentence with the start of predicted re-runs, or ""."""
     starts = {rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None}
-    return f"EKF2 (replay): predicted from this log, from {min(starts):.0f} s on." if starts else ""
+    if not starts:
+        return ""
+    return (
+        f"EKF2 (replay): a prediction. Both values are of the replayed flight: from "
+        f"{min(starts):.0f} s on, without gaps."
+    )
 
 
 def _change(
@@ -337,7 +344,7 @@ def _verdict_axis(card: Card) -> Iterator[Line]:
     yield Line(f"{'':{AXIS_INDENT}}{sides}")
     yield Line(f"{legend:{AXIS_INDENT}}{_ticks()}")
     if any(verdict.is_explained for verdict in card.verdicts):
-        yield Line("  In brackets: explained below, nothing has to be changed.")
+        yield Line("  In brackets: explained below, not a fault of the filter.")
     for verdict in card.verdicts:
         yield _verdict_line(verdict)
 
