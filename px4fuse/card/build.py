@@ -15,7 +15,6 @@ from px4fuse.card.causes import (
     make_cause,
     make_plain_cause,
     rank_causes,
-    with_log_name,
 )
 from px4fuse.card.model import (
     MAX_CAUSES,
@@ -44,6 +43,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Finding, group_by_root
 from px4fuse.flight import Ekf2, Unavailable, source_name
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
+from px4fuse.text import with_log_name
 
 MAX_NOTES = 3
 MAX_ACTIONS = 3
