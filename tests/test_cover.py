@@ -161,11 +161,15 @@ def test_cover_has_four_panels_on_one_page_and_no_small_type(eventful: Analysis)
     panels = axes_of(page)
     assert len(panels) == 4
     assert all(axes.lines for axes in panels)
+    assert any(axes.get_xlabel() for axes in panels)
     assert len(set_by_typst(page)) == 1
     assert smallest_type(pdf) >= 8.0 - 1e-3
     for axes in panels:
         for text in (*axes.get_xticklabels(), *axes.get_yticklabels(), axes.xaxis.label):
             assert text.get_size() >= 8.0
+        # a figure is cut at its edges
+        axes.figure.draw_without_rendering()
+        assert not axes.get_xlabel() or axes.xaxis.label.get_window_extent().y0 >= 0.0
 
 
 def test_error_strips_share_one_scale(eventful: Analysis) -> None:

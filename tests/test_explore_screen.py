@@ -65,6 +65,30 @@ def test_desktop_settings_card_and_plot_are_visible(page: Browser) -> None:
     assert page.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
 
 
+# Pairs of labels of the card's axis that overlap
+OVERLAPPING = """(() => {
+  const texts = [...document.querySelectorAll('#card figure text')];
+  const boxes = texts.filter((text) => text.checkVisibility())
+    .map((text) => [text.textContent, text.getBoundingClientRect()]);
+  return [boxes.length, boxes.flatMap(([one, a], i) => boxes.slice(i + 1)
+    .filter(([, b]) => a.right > b.left && b.right > a.left && a.bottom - 2 > b.top
+      && b.bottom - 2 > a.top)
+    .map(([other]) => `${one} ${other}`))];
+})()"""
+
+
+@pytest.mark.parametrize("width", [390, 1000, 1100, 1280, 1366, 1920])
+def test_axis_labels_do_not_overlap(
+    browser: Browser, explored: tuple[Path, Analysis], width: int
+) -> None:
+    show(browser, explored[0], width=width)
+    browser.resize(width, 844)
+    settle(browser)
+    count, overlapping = browser.ask(OVERLAPPING)
+    assert count >= 7
+    assert overlapping == []
+
+
 def test_phone_card_plot_and_sheet_are_on_one_screen(
     browser: Browser, explored: tuple[Path, Analysis]
 ) -> None:

@@ -21,7 +21,7 @@ COLUMN_GAP, AXES_RIGHT = 5.0 * 72.0 / 25.4, 8.0
 # points; of a legend: height of a line, and width of the line and the gaps of an entry
 LEGEND_LINE, LEGEND_HANDLE = 12.0, 30.0
 # points; heights below axes for tick labels, for the axis label, and without tick labels
-TICKS_HEIGHT, AXIS_LABEL_HEIGHT, UNLABELLED_HEIGHT = 12.0, 11.0, 3.0
+TICKS_HEIGHT, AXIS_LABEL_HEIGHT, UNLABELLED_HEIGHT = 12.0, 12.5, 3.0
 ALLOWED_CHARACTERS = "\n\N{NO-BREAK SPACE}"  # printed, although str.isprintable is False
 # Words this long are split, because PDF/A limits strings to 32,767 characters
 LONG_WORD = re.compile(r"[^ \n]{100}(?=[^ \n]{400})")
