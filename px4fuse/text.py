@@ -1,6 +1,8 @@
 """Conversion to JSON types, and formatting of numbers and short texts."""
 
 import math
+import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
@@ -119,3 +121,12 @@ def format_metres(length_m: float) -> str:
     size = abs(length_m)
     decimals = 0 if size >= 99.95 else 1 if size >= 9.995 else 2 if size >= 0.0995 else 3
     return f"{length_m:.{decimals}f}"
+
+
+def with_log_name(text: str, log: str) -> str:
+    """Replace the placeholder LOG in commands by the name of the log, quoted for a shell.
+
+    >>> with_log_name("Check the time offset (px4fuse sync LOG).", "my log.ulg")
+    "Check the time offset (px4fuse sync 'my log.ulg')."
+    """
+    return re.sub(r"(px4fuse \w+) LOG\b", lambda match: f"{match[1]} {shlex.quote(log)}", text)

@@ -12,6 +12,7 @@ from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import AxisComparison, Comparison, Difference, UntestedFilter
 from px4fuse.comparison.preparation import prepare
+from px4fuse.comparison.projection import project_horizon
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Flight, Reset, Truth, Unavailable
@@ -82,28 +83,29 @@ class TestSample:
             stated = truth.position_rmse_m, truth.velocity_rmse_m_s
             assert stated == pytest.approx((rms(position), rms(velocity)))
             variance = sample_flight.ekf2.variance.loc[start:end]
-            error = np.interp(variance.index, velocity.index, velocity, np.nan, np.nan)
-            nees = np.nanmean(error**2 / variance[f"{name}_m2_s2"])
-            assert truth.nees_velocity_mean == pytest.approx(nees)
+            for error, nees, unit in (
+                (position, truth.nees_position_mean, "m2"),
+                (velocity, truth.nees_velocity_mean, "m2_s2"),
+            ):
+                column = variance[f"{name}_{unit}"]
+                reported = np.interp(error.index, column.index, column, np.nan, np.nan)
+                assert nees == pytest.approx(np.nanmean(error**2 / reported))
 
-    def test_ekf2_nees_uses_position_at_fusion_horizon(self, sample, sample_flight, sample_log):
+    def test_horizon_contains_position_before_update(self, sample, sample_flight, sample_log):
         """Published positions include the output predictor's lag, which no variance contains."""
         (met,) = ULog(str(sample_log), ["estimator_aid_src_ev_pos"]).data_list
         at = met.data["timestamp_sample"] * 1e-6 - sample_flight.log.boot_time_s
         inside = (at >= sample.segment.start_s) & (at <= sample.segment.end_s)
-        true = sample_flight.truth.samples
         for number, name in enumerate(("north", "east")):
             observed, state_minus, s, r = (
                 met.data[f"{field}[{number}]"][inside].astype(float)
                 for field in ("observation", "innovation", "innovation_variance",
                               "observation_variance")
             )  # fmt: skip
-            error = observed + state_minus - np.interp(at[inside], true.index, true[f"{name}_m"])
-            nees = float(np.mean(error**2 / (s - r)))
-            truth = sample[name].filters["ekf2"].truth
-            assert truth.nees_position_mean == pytest.approx(nees, rel=1e-6)
-            assert 0.6 < nees < 1.1
-            assert truth.position_rmse_m > rms(error)
+            axis = sample[name].axis
+            horizon = project_horizon(sample_flight.ekf2, axis, sample.segment)
+            np.testing.assert_allclose(horizon["position_m"], observed + state_minus, atol=1e-9)
+            np.testing.assert_allclose(horizon["position_variance_m2"], s - r, rtol=1e-9)
 
     def test_kf_errors_use_predictions_at_ekf2_times(self, sample, sample_flight):
         for name in ("north", "east"):
@@ -239,14 +241,17 @@ class TestMissingParts:
             assert result.filters["ekf2"].sigma_p_before_update_m is None
             assert isinstance(result.difference, Difference)
 
-    def test_compare_short_truth_has_rmse_but_no_nees(self, made: Comparison) -> None:
-        """EKF2's variances are logged at 1 Hz: none may be within 0.8 s of ground truth."""
+    def test_compare_short_truth_uses_interpolated_variance(self, made: Comparison) -> None:
+        """EKF2's variances are logged at 1 Hz: none is within these 0.8 s of ground truth."""
         samples = made.flight.truth.samples.loc[40.1:40.9]
         flight = replace(made.flight, truth=Truth("0.8 s", samples))
-        truth = compare(flight, axes=("north",)).main.filters["ekf2"].truth
+        result = compare(flight, axes=("north",)).main
+        truth = result.filters["ekf2"].truth
         assert truth.count == 9
-        assert truth.nees_position_mean is None
-        assert truth.nees_velocity_mean is None
+        variance = result.ekf2_variance["position_variance_m2"]
+        assert truth.nees_position_mean == pytest.approx(
+            truth.position_rmse_m**2 / np.interp(40.5, variance.index, variance), rel=0.1
+        )
 
     def test_horizontal_nis_uses_common_updates_only(self) -> None:
         flight = aisle_flight(ekf2=Estimator(nis=0.5))

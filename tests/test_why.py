@@ -9,8 +9,12 @@ from flights import unexplained
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.difference_steps import add_sentences, explain_ekf2_difference
-from px4fuse.ekf2.steps import SAMPLES, STAMPS, DifferenceExplanation
+from px4fuse.comparison.difference_steps import (
+    add_sentences,
+    corrected_settings,
+    explain_ekf2_difference,
+)
+from px4fuse.ekf2.steps import NOISE, SAMPLES, STAMPS, STEPS, DifferenceExplanation
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Unavailable
@@ -25,7 +29,7 @@ def of(analysis: Analysis, name: str = "aisle") -> DifferenceExplanation:
 def explain_again(analysis: Analysis, settings: Settings, **choices: Any) -> DifferenceExplanation:
     """Explain the difference along the aisle with other settings."""
     comparison = compare(analysis.flight, settings, axes=("aisle",), **choices)
-    return explain_ekf2_difference(comparison, analysis.ekf2_model, analysis.clock)["aisle"]
+    return explain_ekf2_difference(comparison, analysis.ekf2_model, analysis.clock, {})["aisle"]
 
 
 def test_explain_ekf2_difference_total_is_kf_minus_published(sample: Analysis) -> None:
@@ -50,7 +54,8 @@ def test_explain_ekf2_difference_kf_settings_change_their_step(sample: Analysis)
     assert zero.steps[0].position_mean_square_m2 > 10 * plain.steps[0].position_mean_square_m2
     assert "KF uses no acceleration (--input zero)" in " ".join(zero.sentences)
     small = explain_again(sample, Settings(sigma_z_m=0.02))
-    assert small.steps[2].position_moved_m > 0.05
+    assert next(step for step in small.steps if step.name == NOISE).position_moved_m > 0.05
+    assert NOISE not in {step.name for step in plain.steps}  # equal settings
     late = explain_again(sample, Settings(clock_offset_s=-0.3))
     assert STAMPS in late.sentences[0]
     assert "KF 300 ms" in late.sentences[0]
@@ -67,10 +72,10 @@ def test_explain_ekf2_difference_covers_the_segment_only(sample: Analysis) -> No
 
 def test_explain_ekf2_difference_without_model_gives_reason(sample: Analysis) -> None:
     down = compare(sample.flight, axes=("down",))
-    found = explain_ekf2_difference(down, sample.ekf2_model, sample.clock)["down"]
+    found = explain_ekf2_difference(down, sample.ekf2_model, sample.clock, {})["down"]
     assert "horizontal" in found.reason
     none = Unavailable("EKF2 replay", "no IMU", "Record it.")
-    for name, explanation in explain_ekf2_difference(sample, none, sample.clock).items():
+    for name, explanation in explain_ekf2_difference(sample, none, sample.clock, {}).items():
         assert name != "down"
         assert (explanation.reason, explanation.remedy) == ("no IMU", "Record it.")
 
@@ -84,7 +89,7 @@ def test_report_without_agreeing_replay_has_no_why_page(sample: Analysis) -> Non
     model = sample.ekf2_model
     agreement = replace(model.agreement, good=False, reason="they part")
     doubtful = replace(model, agreement=agreement, flown=replace(model.flown, agreement=agreement))
-    explanation = explain_ekf2_difference(sample, doubtful, sample.clock)
+    explanation = explain_ekf2_difference(sample, doubtful, sample.clock, {})
     parted = replace(sample, ekf2_model=doubtful, difference_steps=explanation)
     absent = Unavailable("EKF2 replay", "no IMU", "Record it.")
     without = replace(sample, ekf2_model=absent, difference_steps={"north": absent, "east": absent})
@@ -108,9 +113,23 @@ def test_add_sentences_states_step_share_and_largest_effect(sample, share, text)
     shares = [share, *[1e-3] * (len(explanation.steps) - 1)]
     steps = tuple(replace(one, position_mean_square_m2=of * whole)
                   for one, of in zip(explanation.steps, shares, strict=True))  # fmt: skip
-    reasons = {step.name: f"Reason of {step.name}" for step in steps}
+    reasons = {name: f"Reason of {name}" for name in STEPS}
     explained = add_sentences(replace(explanation, steps=steps), "the aisle", reasons)
-    assert f"along the aisle: {first.name} ({text}" in explained.cause
+    assert f"along the aisle: {first.name}." in explained.cause
+    assert f"It is {text}" in explained.sentences[0]
     assert explained.cause.endswith(f"Reason of {first.name}.")
     assert explained.sentences[0].startswith(explained.cause)
     assert f"Largest effect at {first.moved_at_s:.1f} s" in explained.sentences[0]
+
+
+def test_corrected_settings_replace_a_wrong_setting_first(sample: Analysis) -> None:
+    comparison = compare(sample.flight, Settings(sigma_a_m_s2=0.001), axes=("aisle",))
+    corrected = corrected_settings(comparison, sample.tuning)
+    assert corrected == {"sigma_a_m_s2": pytest.approx(0.363, abs=0.01)}
+    explained = explain_ekf2_difference(comparison, sample.ekf2_model, sample.clock, corrected)[
+        "aisle"
+    ]
+    assert explained.corrected == corrected
+    assert explained.position_mean_square_m2 < 0.01
+    assert "--sigma-a 0.363" in explained.sentences[0]
+    assert corrected_settings(sample, sample.tuning) == {}

@@ -4,6 +4,8 @@ import math
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 
+import numpy as np
+import pandas as pd
 from msgspec.structs import replace
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
@@ -13,7 +15,6 @@ from px4fuse.card.causes import (
     make_cause,
     make_plain_cause,
     rank_causes,
-    with_log_name,
 )
 from px4fuse.card.model import (
     MAX_CAUSES,
@@ -32,14 +33,17 @@ from px4fuse.card.model import (
 from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.card.verdicts import verdicts as make_verdicts
 from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth
+from px4fuse.comparison.projection import project_horizon
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import improvement
 from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Finding, group_by_root
 from px4fuse.flight import Ekf2, Unavailable, source_name
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
+from px4fuse.text import with_log_name
 
 MAX_NOTES = 3
 MAX_ACTIONS = 3
@@ -81,6 +85,9 @@ def build_card(
     causes = tuple(make_cause(analysis, each, verdicts, request) for each in ranked[:MAX_CAUSES])
     may_drift = analysis.source.origin.may_drift
     verdicts = _mark_explained(verdicts, causes, may_drift=may_drift)
+    horizon_ratio = None if causes else _horizon_ratio(analysis)
+    if horizon_ratio is not None:
+        verdicts = (*verdicts[:-1], replace(verdicts[-1], is_explained=True))
     effect = _effect(analysis)
     severity: CardSeverity = causes[0].severity if causes else _severity_without_cause(verdicts)
     return Card(
@@ -91,7 +98,9 @@ def build_card(
         effect_text=_effect_text(analysis, effect, verdicts),
         do_this=_do_this(causes),
         verdicts=verdicts,
-        reconcile=_reconcile(analysis, verdicts, causes, [one.id for one in findings]),
+        reconcile=_horizon_sentence(horizon_ratio)
+        if horizon_ratio is not None
+        else _reconcile(analysis, verdicts, causes, [one.id for one in findings]),
         difference=_difference(effect, ranked),
         causes=causes,
         more_causes=max(len(ranked) - MAX_CAUSES, 0),
@@ -146,7 +155,7 @@ def build_aids_card(
 
 
 def _severity_without_cause(verdicts: Sequence[Verdict]) -> CardSeverity:
-    words = {verdict.word for verdict in verdicts}
+    words = {verdict.word for verdict in verdicts if not verdict.is_explained}
     return "note" if words & {"overconfident", "underconfident"} else "clean"
 
 
@@ -159,7 +168,11 @@ def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
             if other.severity == "error" and len(both) <= MAX_HEADLINE_LENGTH:
                 return both
         return first.title
-    faulty = [each for each in verdicts if each.word in ("overconfident", "underconfident")]
+    faulty = [
+        each
+        for each in verdicts
+        if each.word in ("overconfident", "underconfident") and not each.is_explained
+    ]
     if faulty:
         worst = max(faulty, key=lambda each: abs(math.log(each.ratio or 1.0)))
         size = worst.ratio or 1.0
@@ -323,6 +336,33 @@ def _mark_explained(
         )
         else verdict
         for verdict in verdicts
+    )
+
+
+def _horizon_ratio(analysis: Analysis) -> float | None:
+    """Return the ratio of EKF2's error to σ at the fusion horizon, if that is consistent.
+
+    The published position includes the lag of EKF2's output predictor, which σ does not describe.
+    None if the published position is consistent, or if the horizon is not logged or not consistent.
+    """
+    result, ekf2 = analysis.main, analysis.flight.ekf2
+    published = make_verdicts(result)[-1]
+    if published.word != "overconfident" or not isinstance(ekf2, Ekf2):
+        return None
+    horizon = project_horizon(ekf2, result.axis, analysis.segment)
+    if horizon is None or not isinstance(result.truth, pd.DataFrame):
+        return None
+    truth = result.truth["position_m"]
+    error = horizon["position_m"] - np.interp(horizon.index, truth.index, truth, np.nan, np.nan)
+    nees = float(np.nanmean(np.square(error) / horizon["position_variance_m2"]))
+    ratio = math.sqrt(nees) if math.isfinite(nees) else math.inf
+    return ratio if classify_ratio(ratio, "truth") == "consistent" else None
+
+
+def _horizon_sentence(ratio: float) -> str:
+    return (
+        "EKF2's published position includes the lag of its output predictor, which σ does not "
+        f"describe. At the fusion horizon its error ÷ σ is {format_ratio(ratio)}: consistent."
     )
 
 

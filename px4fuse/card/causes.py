@@ -5,8 +5,6 @@ show its effect. An action on a filter is printed only if its re-run improves th
 """
 
 import math
-import re
-import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -35,6 +33,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import CATALOGUE, Finding
 from px4fuse.flight import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
+from px4fuse.text import with_log_name
 
 # Kinds of change that re-run a finding, by its id
 RERUN_KINDS: Mapping[str, frozenset[str]] = {
@@ -186,15 +185,6 @@ def make_cause(
         reruns=tuple(_rerun(trial, trials) for trial in trials),
         after=_closing_sentence(analysis, useful, alternatives),
     )
-
-
-def with_log_name(text: str, log: str) -> str:
-    """Replace the placeholder LOG in commands by the name of the log, quoted for a shell.
-
-    >>> with_log_name("Check the time offset (px4fuse sync LOG).", "my log.ulg")
-    "Check the time offset (px4fuse sync 'my log.ulg')."
-    """
-    return re.sub(r"(px4fuse \w+) LOG\b", lambda match: f"{match[1]} {shlex.quote(log)}", text)
 
 
 def make_plain_cause(finding: Finding) -> Cause:

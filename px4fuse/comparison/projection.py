@@ -11,6 +11,7 @@ from px4fuse.arrays import Array
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS
 from px4fuse.filter.signals import AISLE, Axis, Segment, cut_to_segment, weighted_sum
 from px4fuse.flight import (
+    AXIS_NAMES,
     Columns,
     Ekf2,
     Flight,
@@ -134,6 +135,35 @@ def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame |
             "EKF2 variances", "no samples in the segment", "Analyse a longer segment."
         )
     return projected
+
+
+def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | None:
+    """Return EKF2's position (m) at the fusion horizon with its variance (m²), or None.
+
+    The output predictor propagates this position to the present and lags; the variance does not
+    include that lag, so the published position does not match the variance. With external vision,
+    the position before the update is observation minus innovation, and its variance P⁻ = S - R.
+    Before v1.16 the log also contains the delayed state. EKF2 logs no covariance between axes, so
+    none is added.
+    """
+    weights = dict(zip(AXIS_NAMES, axis.direction.tolist(), strict=True))
+    aid = ekf2.aids.get("ev_hgt" if axis.name == "down" else "ev_pos")
+    if aid is not None and f"observation_{aid.axes[0]}" in aid.samples:
+        samples = cut_to_segment(aid.samples, segment)
+        position, variance = (
+            sum(
+                weights[name] ** power * (samples[f"{a}_{name}"] - samples[f"{b}_{name}"])
+                for name in aid.axes
+            )
+            for power, a, b in ((1, "observation", "innovation"), (2, "variance", "noise"))
+        )
+        horizon = pd.DataFrame({"position_m": position, "position_variance_m2": variance})
+        return horizon[horizon["position_variance_m2"] > 0.0]
+    if isinstance(ekf2.record, Unavailable):
+        return None
+    projected = project(ekf2.record.delayed, axis, segment)
+    horizon = projected[["position_m", "position_variance_m2"]].dropna()
+    return horizon if len(horizon) else None
 
 
 def project_innovations(

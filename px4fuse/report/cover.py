@@ -108,7 +108,7 @@ def add_card(page: Page, card: Card) -> Block:
 
 def free_height(page: Page) -> float:
     """Return the height (pt) that is left below the card on the page where it ends."""
-    return measure_free_height(to_typst_data(page.blocks), fonts.font_names(str(page.blocks)))
+    return measure_free_height(to_typst_data(page.blocks, ""), fonts.font_names(str(page.blocks)))
 
 
 def _shorten_middle(name: str) -> str:

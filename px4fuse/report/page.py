@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from px4fuse.report.style import FONT, MUTED_COLOUR, Artist, Axes
+from px4fuse.text import with_log_name
 
 # points; widths of the text, of the tick labels left of axes, of the labels before texts
 PAGE_WIDTH, AXIS_LEFT, LABEL_WIDTH = 178.0 * 72.0 / 25.4, 30.0, 52.0
@@ -280,19 +281,19 @@ def replace_unprintable(text: str) -> str:
     )
 
 
-def to_typst_data(block: Any) -> Any:
-    """Convert blocks for Typst: printable text, and figures as SVG."""
+def to_typst_data(block: Any, log: str) -> Any:
+    """Convert blocks for Typst: printable text, commands with the log's name, figures as SVG."""
     if isinstance(block, str):
-        return replace_unprintable(block)
+        return replace_unprintable(with_log_name(block, log))
     if isinstance(block, Mapping):
         fields = {
-            name: to_typst_data(value)
+            name: to_typst_data(value, log)
             for name, value in block.items()
             if name not in ("figure", "axes")
         }
         return fields | ({"svg": _figure_svg(block)} if "figure" in block else {})
     if isinstance(block, Sequence):
-        return [to_typst_data(item) for item in block]
+        return [to_typst_data(item, log) for item in block]
     return block
 
 

@@ -87,13 +87,13 @@ def render(content: Any, results: Any, results_json: str) -> bytes:
     bytes
         Identical for the same input and versions: no dates, no random identifiers.
     """
+    title, name, sha256 = _title_name_hash(results)
     blocks, written_text = list[Any](), ""
     with report_style():
         # each page is converted at once, because the figures of all pages need much memory
         for page in (page for draw in PAGES[type(results)] for page in draw(content, results)):
             written_text += json.dumps(page.blocks, ensure_ascii=False, default=repr)
-            blocks += to_typst_data(page.blocks)
-    title, name, sha256 = _title_name_hash(results)
+            blocks += to_typst_data(page.blocks, name)
     producer = f"px4fuse {metadata.version('px4fuse')}"
     student = student_line(getattr(results, "student", NO_STUDENT), " · ")
     release_free_memory()  # free the memory of the figures before Typst starts
