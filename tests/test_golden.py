@@ -129,7 +129,7 @@ def kept_pages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
         request.getfixturevalue("cached_pages")
         return blocks
 
-    def keep(page_blocks: list[Any]) -> list[Any]:
+    def keep(page_blocks: list[Any], _log: str) -> list[Any]:
         blocks.extend(page_blocks)
         return []
 
