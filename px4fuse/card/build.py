@@ -52,6 +52,11 @@ MIN_NAMED_REJECTION = 0.01
 BETTER_POSITION = ("position and σ", "position")
 # Aiding sources whose √S is larger than needed with PX4's default noises, which is not a fault
 USUALLY_UNDERCONFIDENT = frozenset({"baro_hgt", "mag", "gravity"})
+DRIFT_HIDES_ERROR = (
+    "σ too large against the source is not a fault here: the source may drift, and innovations do "
+    "not show drift. Do not lower the noises for it."
+)
+UNEXPLAINED = "The two verdicts differ, and no tested change explains it."
 NO_FAULT = "No fault found: KF and EKF2 are consistent"
 # Findings of a source whose errors the innovations cannot show
 SHIFTED_SOURCE = frozenset(
@@ -88,6 +93,13 @@ def build_card(
     horizon_ratio = None if causes else _horizon_ratio(analysis)
     if horizon_ratio is not None:
         verdicts = (*verdicts[:-1], replace(verdicts[-1], is_explained=True))
+    reconcile = _reconcile(analysis, verdicts, causes, [one.id for one in findings])
+    if not reconcile and any(verdict.is_explained for verdict in verdicts) and may_drift:
+        reconcile = DRIFT_HIDES_ERROR
+    if horizon_ratio is not None:
+        reconcile = _horizon_sentence(horizon_ratio)
+    elif reconcile == UNEXPLAINED:
+        verdicts = tuple(replace(verdict, is_explained=False) for verdict in verdicts)
     effect = _effect(analysis)
     severity: CardSeverity = causes[0].severity if causes else _severity_without_cause(verdicts)
     return Card(
@@ -98,9 +110,7 @@ def build_card(
         effect_text=_effect_text(analysis, effect, verdicts),
         do_this=_do_this(causes),
         verdicts=verdicts,
-        reconcile=_horizon_sentence(horizon_ratio)
-        if horizon_ratio is not None
-        else _reconcile(analysis, verdicts, causes, [one.id for one in findings]),
+        reconcile=reconcile,
         difference=_difference(effect, ranked),
         causes=causes,
         more_causes=max(len(ranked) - MAX_CAUSES, 0),
@@ -407,7 +417,7 @@ def _reconcile(
         )
     if "source_outliers" in ids and "ekf2" in differing:
         return _gate_sentence(analysis)
-    return "The two verdicts differ, and no tested change explains it."
+    return UNEXPLAINED
 
 
 def _differ(source: Verdict, truth: Verdict, *, is_corrected: bool) -> bool:

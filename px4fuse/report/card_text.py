@@ -28,7 +28,7 @@ from px4fuse.request import quote_command
 WIDTH = 100
 AXIS_WIDTH = 37
 # Columns before the axis, and before the texts beside a label
-AXIS_INDENT, TEXT_INDENT = 57, 11
+AXIS_INDENT, TEXT_INDENT = 58, 11
 # A longer command is printed on a separate line
 MAX_COMMAND_LENGTH = 74
 # Ticks that have room for a label
@@ -354,7 +354,8 @@ def _verdict_line(verdict: Verdict) -> Line:
     quantity = f"{MARKS[verdict.against]} {QUANTITIES[verdict.against]}"
     head = f"  {owner:4} {quantity:25}"
     if verdict.ratio is None:
-        return Line(f"{head}{'–':>7}  not evaluated: {verdict.reason}")
+        text = f"{'–':>7}  not evaluated: {verdict.reason}"
+        return Line(text, "", head, " " * 41, wraps=True)
     word = f"({verdict.word})" if verdict.is_explained else verdict.word
     text = f"{head}{format_ratio(verdict.ratio):>7}  {word}"
     is_loud = verdict.word != "consistent" and not verdict.is_explained
