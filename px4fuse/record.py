@@ -75,7 +75,9 @@ else:
         """
 
         def __class_getitem__(cls, kinds: tuple[type, type]) -> type:
-            either_type = ABCMeta("Or".join(kind.__name__ for kind in kinds), (), {"kinds": kinds})
+            either_type = ABCMeta(
+                "Or".join(kind.__name__ for kind in kinds), (), {"union_members": kinds}
+            )
             for kind in kinds:
                 either_type.register(kind)
             return either_type
@@ -95,7 +97,7 @@ def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
     ValueError
         The value is neither the record nor an Unavailable.
     """
-    record_type, unavailable_type = union_type.kinds
+    record_type, unavailable_type = union_type.union_members
     kind = (
         unavailable_type
         if isinstance(value, dict) and {"what", "reason"} <= value.keys()

@@ -185,6 +185,24 @@ def forge_joined_file(results: dict[str, Any]) -> None:
     ]
 
 
+def forge_outlier_count(results: dict[str, Any]) -> None:
+    """Change one digit of the headline."""
+    headline = results["card"]["headline"]
+    forged_headline = headline.replace("10 of", "11 of")
+    assert forged_headline != headline
+    results["card"]["headline"] = forged_headline
+
+
+def forge_owner(results: dict[str, Any]) -> None:
+    """Change the id of the student in all parts of the results."""
+    results["student"]["id"] = results["card"]["identity"]["student_id"] = "s02"
+
+
+KF_ACTION = {
+    "target": "KF", "where": "shell", "commands": ["px4fuse compare s01.ulg --sigma-z 3"],
+}  # fmt: skip
+
+
 # Change of the attached results, the status of the report, and the text of pending
 FILES: dict[str, tuple[Change, str, str]] = {
     "--position uwb.csv": (forge_position_file, "cannot verify", "Add uwb.csv to --logs."),
@@ -224,8 +242,30 @@ FILES: dict[str, tuple[Change, str, str]] = {
     "ten thousand lines of notes": (
         set_value("a\n" * 10_000, "student", "notes"), "cannot verify", "Ask how",
     ),
-    "the id of another student": (
-        set_value("s02", "student", "id"), "page differs", "given to student s01",
+    # the cover prints the id, and its font contains the letters of the cover only
+    "the id of another student": (forge_owner, "cannot verify", "given to student s01"),
+    "another student on the card": (
+        set_value("Eve", "card", "identity", "student"), "numbers differ", "",
+    ),
+    "another student outside the card": (set_value("Eve", "student", "name"), "numbers differ", ""),
+    "another headline": (
+        set_value("No fault found: KF and EKF2 are consistent", "card", "headline"),
+        "numbers differ", "",
+    ),
+    "another number in the headline": (forge_outlier_count, "numbers differ", ""),
+    "another action": (
+        set_value("Change nothing.", "card", "do_this", 0), "numbers differ", "",
+    ),
+    "another command": (
+        set_value(KF_ACTION, "card", "causes", 0, "actions", 1), "numbers differ", "",
+    ),
+    "another ratio": (set_value(1.0, "card", "verdicts", 0, "ratio"), "numbers differ", ""),
+    "another verdict": (
+        set_value("consistent", "card", "verdicts", 0, "word"), "numbers differ", "",
+    ),
+    "a cause less": (lambda results: results["card"]["causes"].pop(), "numbers differ", ""),
+    "a better re-run": (
+        set_value(1.0, "trials", 0, "after", "nis_mean"), "numbers differ", "",
     ),
 }  # fmt: skip
 
@@ -241,9 +281,7 @@ def test_grade_forged_results_are_not_verified(
     change(results)
     # pages are compared only if the numbers agree
     text = json.dumps(results)
-    pdf = (
-        flight.honest.with_results(results) if status == "page differs" else blank_page(None, text)
-    )
+    pdf = flight.honest.with_results(results) if change is forge_owner else blank_page(None, text)
     try:
         report: ReportedResults | ResultsError = read_report(pdf, "a.pdf")
         verdict = flight.honest.verified(pdf)
@@ -252,7 +290,7 @@ def test_grade_forged_results_are_not_verified(
     graded = flight.graded(report, verdict, rubric)
     assert graded.status != "verified"
     assert not graded.counted_points
-    assert graded.status == status
+    assert graded.status == status, graded.verdict.reasons
     assert not any("Error" in reason for reason in graded.verdict.reasons), graded.verdict.reasons
     assert pending in graded.pending_action
     assert bool(graded.pending_action) == bool(pending)

@@ -51,7 +51,8 @@ def report(tmp_path_factory, sample_log) -> tuple[Path, str]:
 def test_compare_report_attaches_results_without_paths(report):
     folder, said = report
     assert sorted(p.name for p in folder.iterdir()) == ["notes.md", "report.json", "report.pdf"]
-    assert "vehicle_visual_odometry" in said
+    assert "warning[kf_underconfident]: KF is underconfident along the aisle" in said
+    assert f"Wrote    {folder / 'report.pdf'}" in said
     assert len(said.splitlines()) <= 42, "the summary must stay short"
     text = (folder / "report.json").read_bytes()
     assert pypdf.PdfReader(folder / "report.pdf").attachments["results.json"] == [text]
@@ -69,9 +70,11 @@ def test_compare_report_prints_special_characters(report):
 
 
 @pytest.mark.usefixtures("no_drawing")
-@pytest.mark.parametrize(("severity", "code"), [("note", 1), ("error", 0)])
+@pytest.mark.parametrize(("severity", "code"), [("note", 1), ("warning", 1), ("error", 0)])
 def test_compare_fail_on_sets_exit_code(tmp_path, sample_log, severity, code):
-    run_checked("compare", sample_log, "-o", tmp_path / "a.pdf", "--fail-on", severity, code=code)
+    command = "compare", sample_log, "-o", tmp_path / "a.pdf", "--fail-on", severity
+    run_checked(*command, "--sigma-z", "0.12", code=code)  # the finding is a warning
+    run_checked(*command, code=0)  # the flight has no finding
 
 
 def test_help_imports_no_slow_library():

@@ -13,7 +13,7 @@ from unittest.mock import Mock
 import pytest
 from class_tools import in_this_process
 from cli_tools import error_line, run, run_checked
-from conftest import LOG, REPORT
+from conftest import LOG, REPORT, REPORT_PAGES
 from forgery import forged, with_results
 from pypdf import PdfReader, PdfWriter
 
@@ -89,7 +89,7 @@ def test_grade_pages_beyond_limits_cannot_be_verified(tmp_path, monkeypatch) -> 
     folder = tmp_path / "in"
     folder.mkdir()
     (folder / "a.pdf").write_bytes(
-        forged(REPORT.read_bytes(), lambda writer: writer.remove_page(7))
+        forged(REPORT.read_bytes(), lambda writer: writer.remove_page(REPORT_PAGES - 1))
     )
     monkeypatch.setattr(
         pages, "run_one_bounded", lambda *_: JobFailure("it took longer than 10 s.")
@@ -111,7 +111,7 @@ def test_grade_with_log_verifies_unchanged_report_only(tmp_path) -> None:
     results = json.loads(PdfReader(io.BytesIO(pdf)).attachments["results.json"][0])
     results["axes"]["north"]["filters"]["kf"]["nis_mean"] = 1.0
     (folder / "b.pdf").write_bytes(forged(pdf, with_results(json.dumps(results))))
-    (folder / "c.pdf").write_bytes(forged(pdf, lambda writer: writer.remove_page(7)))
+    (folder / "c.pdf").write_bytes(forged(pdf, lambda writer: writer.remove_page(REPORT_PAGES - 1)))
     output = tmp_path / "class"
     outcome = grade([folder], Course(read_rubric(None), logs=[LOG.parent]), output, processes=2)
     first, second, third = outcome.reports
@@ -125,14 +125,14 @@ def test_grade_with_log_verifies_unchanged_report_only(tmp_path) -> None:
     redrawn = [path.read_bytes() for path in (output / "reports").glob("*.pdf")]
     assert len(redrawn) == 3
     assert len(set(redrawn)) == 1
-    assert len(PdfReader(io.BytesIO(redrawn[0])).pages) == 8
+    assert len(PdfReader(io.BytesIO(redrawn[0])).pages) == REPORT_PAGES
     page = (output / "class.html").read_text(encoding="utf-8")
     assert all(f"reports/{name}.pdf" in page for name in ("a", "b", "c"))
     # a missing page is flagged and costs no points
     assert (third.verdict.status, third.verdict.outcome) == ("verified", "page differs")
     assert third.status == "page differs"
     assert third.points == first.points
-    assert any("Page 8: missing." in flag for flag in third.flags)
+    assert any(f"Page {REPORT_PAGES}: missing." in flag for flag in third.flags)
     assert first.flags == ()
     # a second run reuses all results
     again = grade([folder], Course(read_rubric(None), logs=[LOG.parent]), output, processes=2)

@@ -113,6 +113,27 @@ def test_deviating_settings_action_is_improving_rerun(trials: Any, expected: Any
     assert (cause.caused_by, other.caused_by) == (None, cause.id)
 
 
+@pytest.mark.parametrize(
+    ("nis_mean", "rmse_m", "expected"),
+    [
+        (0.78, None, ("error", "Compare with a run with --sigma-a 0.1.")),
+        (0.78, 0.3, ("note", noises.NO_IMPROVEMENT)),
+        (0.5, None, ("note", noises.NO_IMPROVEMENT)),
+    ],
+)
+def test_consistent_kf_without_truth_does_not_refute_estimate(
+    nis_mean: float, rmse_m: float | None, expected: tuple[str, str]
+) -> None:
+    """A re-run shows no improvement if σ is consistent before and the position error unknown."""
+    as_flown = Outcome(innovations=100, nis_mean=nis_mean, position_rmse_m=rmse_m)
+    rerun = replace(trial(SIGMA_A_TO_0_1), before=as_flown, after=as_flown)
+    fitted = tuned(None, Noise(0.1, 0.09, 0.11))
+    finding = only(
+        noises.detect_wrong_settings, analysis(source=MOVING, tuning=fitted, trials=(rerun,))
+    )
+    assert (finding.severity, finding.remedy) == expected
+
+
 def test_deviating_settings_state_size_and_estimate() -> None:
     fitted = tuned(Noise(0.5, 0.45, 0.55), Noise(0.1, 0.09, 0.11))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=fitted))

@@ -70,7 +70,7 @@ def parsed(command: str) -> Request:
     context = made.make_context(name, [*options, "--", file])
     own = (
         "output", "json_path", "fail_on", "checks", "student", "student_id", "notes", "answers",
-        "tum", "g2o",
+        "tum", "g2o", "verbose", "quiet",
     )  # fmt: skip
     values = {key: value for key, value in context.params.items() if key not in own}
     if name == "compare":
@@ -125,7 +125,7 @@ def test_request_has_a_field_for_every_option(command, declared, kinds) -> None:
     """An option that is not in the request would be missing in the results."""
     about_outputs = {
         "-o", "--json", "--student", "--id", "--notes", "--answers", "--fail-on", "--checks",
-        "--tum", "--g2o", "--robust", "--max-size", "--show",
+        "--tum", "--g2o", "--robust", "--max-size", "--show", "-v", "-q",
     }  # fmt: skip
     options = {parameter.opts[0] for parameter in command.params if parameter.opts[0][0] == "-"}
     request_options = {*declared.values()}

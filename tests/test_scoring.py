@@ -86,7 +86,8 @@ NORTH = changed_results(axes={"north": EXAMPLE["axes"]["north"]}, tuning={}, hor
 SIGMA_Z = "tuning__horizontal__sigma_z_m"
 UNCLEAR = changed_results(clock__is_determinable=False, clock__reason="no acceleration.")
 JUMPS = {"clock__applied_s": 0.25, "findings": [finding("source_time_offset_changes")]}
-UNDERSTATED = {"horizontal__kf__verdict": "overconfident", "horizontal__kf__nis_mean": 3.0}
+OVERSTATED = changed_results(horizontal__kf__verdict="underconfident", horizontal__kf__nis_mean=0.5)
+UNDERSTATED = {"horizontal__kf__verdict": "overconfident", "horizontal__kf__nis_mean": 4.4}
 AFTER = "loop__corrections__by_distance"
 WORSE = {"slam.tum": to_plain(correction(0.5, 1.4))["scores"]["slam.tum"]}
 REJECTED = changed_results(
@@ -117,10 +118,13 @@ CHECKED = [
     ("number", NORTH, {"path": f"tuning.horizontal.held_out.{GAIN}", "at_most": 1.0}, 0.0,
      "omit --axis"),
     ("consistent", changed_results(horizontal__kf__verdict="consistent"), {}, 1.0, "is consistent"),
-    ("consistent", EXAMPLE, {}, 0.72, "σ of KF is 1.06 times too large"),
-    ("consistent", changed_results(horizontal__kf__nis_mean=2.0), {}, 0.0, "1.41 times too small"),
+    ("consistent", EXAMPLE, {}, 1.0, "KF is consistent."),
+    ("consistent", OVERSTATED, {}, 0.5, "σ of KF is 1.41 times too large"),
+    ("consistent", OVERSTATED, {"factor": 1.25}, 0.0, "σ of KF is 1.41 times too large"),
+    ("consistent", changed_results(horizontal__kf__verdict="overconfident",
+     horizontal__kf__nis_mean=2.0), {}, 0.5, "1.41 times too small"),
     ("consistent", NORTH, {}, 0.0, "omit --axis"),
-    ("consistent", changed_results(**UNDERSTATED), {}, 0.0, "times too small"),
+    ("consistent", changed_results(**UNDERSTATED), {}, 0.0, "2.1 times too small"),
     ("consistent", changed_results(**UNDERSTATED, settings__sigma_a_m_s2=0.36), {}, 1.0,
      "settings do not make KF consistent"),
     ("clock", EXAMPLE, {}, 1.0, "the estimate is -0.022 to 0.061 s (95 %)"),

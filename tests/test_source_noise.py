@@ -170,11 +170,11 @@ def test_find_slow_errors_with_truth_reports_correlation(tau_s: float, seed: int
     assert evidence["low_s"] < tau_s < 1.1 * evidence.get("high_s", np.inf)
     assert evidence["white_m"] == pytest.approx(0.07, abs=0.015)
     assert 0.03 < evidence["slow_m"] < 0.15
-    assert ("over at least" in finding.title) == ("high_s" not in evidence)
+    assert ("correlation time at least" in finding.title) == ("high_s" not in evidence)
     blind = root_findings(analysed(partial(errors.coloured, tau_s=tau_s), 5.0, seed))
     assert (
         "source_noise_time_correlated" not in blind
-        or "over at least" in blind["source_noise_time_correlated"].title
+        or "correlation time at least" in blind["source_noise_time_correlated"].title
     )
 
 

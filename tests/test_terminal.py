@@ -21,7 +21,8 @@ from px4fuse.analysis import Analysis
 from px4fuse.analysis import run as analyse
 from px4fuse.cli.outputs import default_report, progress, terminal
 from px4fuse.errors import OutputError
-from px4fuse.report import screen
+from px4fuse.report import card_text, screen
+from px4fuse.report.card_text import card_lines, with_typed_path
 from px4fuse.report.screen import expand_commands, print_paragraph
 from px4fuse.report.terminal import summary
 from px4fuse.request import ComparisonRequest, PositionFile, command_line, settings_name
@@ -38,14 +39,14 @@ WIDTH = 80
 
 
 def commands(text: str) -> list[str]:
-    """Return the printed commands."""
-    return re.findall(r"^.{9}(px4fuse .*)$", text, re.MULTILINE)
+    """Return the printed commands, each the last part of a line."""
+    return re.findall(r"^(?:.*  )?(px4fuse .*)$", text, re.MULTILINE)
 
 
 @pytest.fixture(scope="module")
 def flown() -> bytes:
     """Log of a short flight with late timestamps."""
-    scenario = Scenario(passes=2, truth=False, seed=3)
+    scenario = Scenario(passes=2, seed=3)
     return flights.to_ulog(flights.simulate(scenario, parse(("clock-offset=250ms",))))
 
 
@@ -78,22 +79,25 @@ def test_summary_wraps_without_cutting_text(document, monkeypatch) -> None:
             monkeypatch.setenv("COLUMNS", str(width))
         console = terminal()
         with console.capture() as captured:
-            screen.show(console, summary(*document, "r.pdf").blocks, document[0].request)
+            page = summary(*document, verbose=True)
+            screen.show(console, page.blocks, document[0].request)
         summaries[width] = captured.get()
     whole = summaries[None]
+    card = with_typed_path(document[1].card, document[0].request.log)
+    drawn = [f"{line.first}{line.text}" for line in card_lines(card) if not line.wraps]
     for width in (WIDTH, 60):
         assert "…" not in summaries[width]
         assert "--sigma-z" in summaries[width]
-    # cells of the table wrap too, which changes the order of the words
+        # only headline, commands, tables and axes of the card do not wrap
+        long = [line for line in summaries[width].splitlines() if len(line) > width]
+        assert all(line in drawn or commands(line) for line in long)
+    # cells of a table wrap too, which changes the order of the words
     assert sorted(summaries[WIDTH].split()) == sorted(whole.split())
-    long = [line for line in summaries[WIDTH].splitlines() if len(line) > WIDTH]
-    assert all(map(commands, long))  # only commands are longer, so they can be copied
     assert "\x1b" not in whole
-    # in a pipe a paragraph is one line; the summary comes first and is not repeated
-    lines = whole.splitlines()
-    paragraphs = document[1].summary
-    assert lines[: len(paragraphs) + 1] == [*paragraphs, ""]
-    assert all(whole.count(paragraph) == 1 for paragraph in paragraphs)
+    # the card comes first, also in a pipe; below it a paragraph is one line there
+    first = [text for line in card_lines(card) for text in line.wrapped(card_text.WIDTH)]
+    assert whole.splitlines()[: len(first) + 1] == [*first, ""]
+    assert max(map(len, whole.splitlines()[len(first) :])) > card_text.WIDTH
 
 
 def test_paragraph_has_hanging_indent(capsys) -> None:

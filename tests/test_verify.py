@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from class_tools import in_this_process
 from cli_tools import run_checked
-from conftest import LOG, REPORT, SAMPLES
+from conftest import LOG, REPORT, REPORT_PAGES, SAMPLES
 from forgery import (
     Change,
     Edit,
@@ -44,6 +44,7 @@ from pypdf.generic import (
     NameObject,
     TextStringObject,
 )
+from results_tools import finding
 
 from px4fuse.errors import ResultsError
 from px4fuse.reading import files_by_sha256
@@ -270,10 +271,13 @@ def delete_value(*path: Any) -> Change:
     return change
 
 
+CAUSE = {"id": "source_gap", "severity": "error", "title": "No position for 5.2 s", "why": ""}
 STRUCTURE: dict[str, tuple[Change, str]] = {
     "a finding more": (
-        lambda r: r["findings"].append(copy.deepcopy(r["findings"][0])), "numbers differ",
+        lambda r: r["findings"].append(finding("source_outliers")), "numbers differ",
     ),
+    "a cause more": (set_value([CAUSE], "card", "causes"), "numbers differ"),
+    "a re-run less": (lambda r: r["trials"].clear(), "numbers differ"),
     "an axis less": (delete_value("axes", "down"), "numbers differ"),
     "a filter's part as if it were not available": (
         set_value({"what": "a", "reason": "b", "remedy": "c"}, "axes", "north", "filters", "ekf2"),
@@ -432,14 +436,13 @@ DRAWING: dict[str, Edit] = {
     "turned over": lambda c: b"-1 0 0 1 595 0 cm\n" + c,
     "nothing at all": lambda c: b"\n",
 }
-PAGES = 8
 
 # One change on every page, each other change on one page
 PAGE_CASES = [
     (page, name)
     for place, name in enumerate(DRAWING)
-    for page in range(1, PAGES + 1)
-    if name == "another digit" or (page + place) % PAGES == 0
+    for page in range(1, REPORT_PAGES + 1)
+    if name == "another digit" or (page + place) % REPORT_PAGES == 0
 ]
 
 
@@ -453,7 +456,9 @@ def test_verify_changed_page_differs(aisle: VerifiedReport, page: int, name: str
 
 
 DOCUMENT: dict[str, tuple[Forge, str, str]] = {
-    "a page away": (lambda w: w.remove_page(7), "page differs", "page 8: missing"),
+    "a page away": (
+        lambda w: w.remove_page(REPORT_PAGES - 1), "page differs", f"page {REPORT_PAGES}: missing",
+    ),
     "another title": (document_info(Title="my report"), "page differs", "document: /Title is"),
     "a form": (
         catalogue("/AcroForm", dictionary(Fields=array())), "cannot verify", "form fields that",
@@ -507,7 +512,7 @@ def empty_first_page(writer: PdfWriter) -> None:
 def pages_of_another(one: VerifiedReport, other: VerifiedReport) -> bytes:
     """Return a report with the last page of another one."""
     writer = PdfWriter(clone_from=io.BytesIO(one.pdf))
-    writer.remove_page(PAGES - 1)
+    writer.remove_page(REPORT_PAGES - 1)
     writer.add_page(PdfReader(io.BytesIO(other.pdf)).pages[-1])
     return pdf_bytes(writer)
 

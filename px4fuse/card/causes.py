@@ -1,7 +1,7 @@
 """Order of the causes on the card, their actions, and the re-runs that confirm them.
 
-A finding is a numbered cause only if its re-run moves a verdict or the error, or if nothing can be
-re-run for it. An action on a filter is printed only if its re-run improves that filter.
+A finding is a numbered cause only if its re-run moves a verdict or the error, or if no re-run can
+show its effect. An action on a filter is printed only if its re-run improves that filter.
 """
 
 import math
@@ -72,6 +72,8 @@ VERDICT_FINDINGS = frozenset(
     }
 )
 SETTING_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
+# Changes that move both filters with the source: only ground truth shows their effect
+UNSEEN_KINDS = frozenset({"time offset", "delay", "rotation"})
 # Endings of the parameters that PX4 reads at its start only (reboot_required in its metadata)
 REBOOT_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
 # Rejected fraction from which a re-run table lists it
@@ -111,7 +113,7 @@ def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCaus
         if finding.severity == "note":
             continue
         trials = confirming_trials(analysis.trials, finding)
-        if trials and not any(has_effect(trial) for trial in trials):
+        if trials and not any(map(has_effect, trials)):
             continue
         ranked.append(
             RankedCause(finding, _tier(finding, trials), sum(map(reduction, trials)), trials)
@@ -147,16 +149,22 @@ def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial,
     """Return the re-runs that correct a finding: the best one of each kind and filter.
 
     Best: the smallest change that brings a verdict into its band, else the smallest ratios. For KF
-    the default settings are added.
+    the default settings are added. A re-run that could not show the effect is left out.
     """
     kinds = RERUN_KINDS.get(finding.id, frozenset())
     kinds |= {"defaults"} if "noises" in kinds else set()
     best: dict[tuple[FilterName, str], Trial] = {}
     for trial in trials:
-        if len(trial.kinds) == 1 and trial.kinds[0] in kinds:
+        if len(trial.kinds) == 1 and trial.kinds[0] in kinds and _can_show_effect(trial):
             key = trial.filter, trial.kinds[0]
             best[key] = min(trial, best.get(key, trial), key=preference)
     return tuple(best.values())
+
+
+def _can_show_effect(trial: Trial) -> bool:
+    """Return False if innovations are alike and the change can show against ground truth only."""
+    has_truth = trial.before.position_rmse_m is not None
+    return has_truth or UNSEEN_KINDS.isdisjoint(trial.kinds) or has_effect(trial)
 
 
 def make_cause(

@@ -166,6 +166,16 @@ def has_effect(trial: Trial) -> bool:
     return bool(before and after and abs(after / before - 1.0) > MIN_RMSE_CHANGE)
 
 
+def can_improve(trial: Trial) -> bool:
+    """Return True if a re-run could show an improvement.
+
+    The position RMSE must be known, or a ratio be outside its band before.
+    """
+    return trial.before.position_rmse_m is not None or any(
+        classify_ratio(before, name) != "consistent" for name, before, _ in ratio_pairs(trial)
+    )
+
+
 def improvement(trial: Trial) -> Improvement:
     """Return which numbers a re-run improves.
 

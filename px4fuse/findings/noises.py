@@ -26,7 +26,7 @@ from px4fuse.comparison.estimates import first_axis_tuning
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of, format_settings, noise_change
-from px4fuse.comparison.trials import find_trial
+from px4fuse.comparison.trials import can_improve, find_trial
 from px4fuse.ekf2_parameters import BAROMETER, PARAMETERS
 from px4fuse.filter.settings import UNITS, Settings
 from px4fuse.filter.signals import cut_to_segment
@@ -205,11 +205,14 @@ def format_estimate(name: str, chosen: float, noise: Noise) -> str:
 def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
     """Format the action for a wrong setting of KF: the change whose re-run improves KF.
 
-    Without a re-run, the estimate is proposed as the next re-run.
+    Without a re-run that could show an improvement, the estimate is proposed as the next re-run.
     """
     if trial := find_trial(analysis.trials, "kf", "noises", name):
         return format_kf_settings(trial.change)
-    if any(trial.filter == "kf" and trial.change.keys() == {name} for trial in analysis.trials):
+    if any(
+        trial.filter == "kf" and trial.change.keys() == {name} and can_improve(trial)
+        for trial in analysis.trials
+    ):
         return NO_IMPROVEMENT
     value = max(value, SMALLEST_SIGMA_Z_M) if name == SIGMA_Z else value
     return f"Compare with a run with {COMPARISON_OPTIONS[name]} {value:.3g}."

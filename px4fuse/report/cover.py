@@ -115,7 +115,7 @@ def _shorten_middle(name: str) -> str:
     """Cut a long file name in its middle.
 
     >>> _shorten_middle("2026-04-02_14-13-00_" + "x" * 60 + "_issue.ulg")
-    '2026-04-02_14-13-00_xxxxxxx…xxxxxxxxxxxxxxxxx_issue.ulg'
+    '2026-04-02_14-13-00_xxxxxxx…xxxxxxxxxxxxxxxxxx_issue.ulg'
     """
     half = MAX_FILE_LENGTH // 2
     return name if len(name) <= MAX_FILE_LENGTH else f"{name[: half - 1]}…{name[-half:]}"

@@ -76,7 +76,7 @@ def types_of(kind: Any) -> tuple[Any, ...]:
         return types_of(get_args(kind)[0])
     if get_origin(kind) in (Union, UnionType):
         return tuple(member for part in get_args(kind) for member in types_of(part))
-    return getattr(kind, "kinds", (kind,))
+    return getattr(kind, "union_members", (kind,))
 
 
 def _check_value(value: Any, kind: Any, path: str, reasons: list[str]) -> Any:

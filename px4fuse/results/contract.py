@@ -364,8 +364,8 @@ def schema() -> dict[str, Any]:
     components: dict[str, Any] = {}
 
     def describe_union(kind: Any) -> dict[str, Any]:
-        kinds.update(dict.fromkeys(kind.kinds))
-        return {"anyOf": [{"$ref": f"#/$defs/{member.__name__}"} for member in kind.kinds]}
+        kinds.update(dict.fromkeys(kind.union_members))
+        return {"anyOf": [{"$ref": f"#/$defs/{member.__name__}"} for member in kind.union_members]}
 
     count = 0
     # each pass adds the types inside RecordOrUnavailable, which msgspec does not resolve

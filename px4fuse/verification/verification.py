@@ -59,6 +59,8 @@ ESTIMATE_PATHS = (
     "ekf2_replay",
     "difference_steps",
     "findings",
+    "trials",
+    "card.causes",
     "loop.closures",
     "loop.corrections",
     "source.alignment",

@@ -1,0 +1,80 @@
+"""Diagnosis card as text: axis, actions, length, characters, and commands with the typed path."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from cards import SMALL_SIGMA_A, verdicts
+from msgspec.structs import replace
+
+from px4fuse.card.model import Action, Card, Note
+from px4fuse.report import card_text
+from px4fuse.report.card_text import axis_text, to_ascii, with_typed_path
+
+SENDER = Action("sender", "subtract 0.264 s from the timestamp (usec) of each position")
+DELAY = Action("EKF2", "EKF2_EV_DELAY 0 → 264 ms", ("param set EKF2_EV_DELAY 264",), "console")
+
+
+def text_of(card: Card) -> list[str]:
+    return [text for line in card_text.card_lines(card) for text in line.wrapped(100)]
+
+
+@pytest.mark.parametrize(
+    ("ratio", "column", "mark"),
+    [(1.0, 18, "●"), (0.1, 0, "●"), (10.0, 36, "●"), (0.01, 0, "◀"), (128.0, 36, "▶")],
+)
+def test_axis_text_marks_ratio_at_its_column(ratio, column, mark) -> None:
+    drawn = axis_text(ratio, "source")
+    assert (len(drawn), drawn.index(mark)) == (37, column)
+
+
+def test_axis_text_without_ratio_draws_band_only() -> None:
+    assert re.fullmatch("─{16}░{5}─{16}", axis_text(None, "source"))
+    assert re.fullmatch("─{15}░{7}─{15}", axis_text(None, "truth"))
+
+
+def test_card_text_is_short_and_ends_in_columns() -> None:
+    lines = text_of(SMALL_SIGMA_A)
+    assert len(lines) <= 40
+    assert max(map(len, lines)) <= 100
+    whole = " ".join(" ".join(lines).split())
+    assert f"error[{SMALL_SIGMA_A.id}]: {SMALL_SIGMA_A.headline}" in lines
+    for part in (SMALL_SIGMA_A.effect_text, *SMALL_SIGMA_A.do_this, SMALL_SIGMA_A.difference):
+        assert part in whole
+
+
+def test_alternative_actions_are_either_and_or() -> None:
+    cause = replace(SMALL_SIGMA_A.causes[0], alternatives=((SENDER,), (DELAY,)))
+    card = replace(SMALL_SIGMA_A, causes=(cause,))
+    lines = text_of(card)
+    (first,) = (at for at, line in enumerate(lines) if line.startswith("  EITHER sender  "))
+    assert SENDER.sentence in lines[first]
+    assert lines[first + 1].startswith("  OR EKF2 (console)  EKF2_EV_DELAY 0 → 264 ms")
+    assert lines[first + 2].split() == ["param", "set", "EKF2_EV_DELAY", "264"]
+    assert lines[first + 3].startswith("  KF (shell)  ")
+    closing = " ".join(line.text for line in card_text.closing_lines(card))
+    assert "Console: MAVLink Console" in closing
+    assert closing.endswith(f"px4fuse explain {card.id}")
+
+
+def test_card_text_on_limited_terminal_is_ascii() -> None:
+    four = verdicts((0.01, "underconfident"), (128.0, "overconfident"), *[(1.0, "consistent")] * 2)
+    text = "\n".join(map(to_ascii, text_of(replace(SMALL_SIGMA_A, verdicts=four))))
+    assert text.isascii()
+    assert "x ground truth: error / sigma" in text
+    assert "2.11 -> 0.060 m" in text
+    assert "<---" in text
+
+
+def test_typed_path_replaces_file_name_in_commands() -> None:
+    note = Note("x", "Text of aisle_uwb.ulg.", "Check it (px4fuse sync aisle_uwb.ulg).")
+    card = replace(SMALL_SIGMA_A, notes=(note,), do_this=("Run px4fuse tune aisle_uwb.ulg.",))
+    typed = with_typed_path(card, "my logs/aisle_uwb.ulg")
+    shell, ekf2 = typed.causes[0].actions
+    assert shell.commands == ("px4fuse compare 'my logs/aisle_uwb.ulg' --sigma-a 0.363",)
+    assert ekf2 == card.causes[0].actions[1]
+    assert typed.do_this == ("Run px4fuse tune 'my logs/aisle_uwb.ulg'.",)
+    assert typed.notes[0].action == "Check it (px4fuse sync 'my logs/aisle_uwb.ulg')."
+    assert typed.notes[0].text == "Text of aisle_uwb.ulg."
+    assert with_typed_path(card, None) is card
