@@ -26,13 +26,15 @@ sys.path.insert(0, str(REPOSITORY / "tests"))
 
 from browser import BROWSERS  # noqa: E402 - module of the tests
 
-WINDOW = "1360,1010"
+WINDOW = "1360,880"
 REPORTS = REPOSITORY / "reports" / "example"
 AISLE = "compare sample_logs/aisle_uwb.ulg"
+SMALL_Q = f"{AISLE} --sigma-a 0.001"
 EVALUATE = "evaluate sample_logs/loop_vio.ulg:vio sample_logs/loop_slam.tum"
 DPI, COLOURS, MAX_BYTES = 96, 64, 100_000
-# Head and foot of a page (fractions of its height) are cut off; margin (pixels)
-HEAD, FOOT, MARGIN = 0.045, 0.965, 12
+# Fractions of the height of a page: its foot, and the free space above a text
+FOOT, GAP = 0.965, 0.004
+MARGIN = 12  # pixels
 
 
 @dataclass(frozen=True)
@@ -45,25 +47,25 @@ class Picture:
         File name without ``.png``.
     command : str
         Arguments of px4fuse.
-    page : str
-        Text that only the wanted page of the report contains; not used for ``explore``.
-    until : float
-        Lower edge of the part, as a fraction of the page height.
+    first : str
+        Text at the upper edge; the page is the first one with it. Not used for ``explore``.
+    end : str
+        Text below the lower edge; empty for the foot of the page.
     """
 
     name: str
     command: str
-    page: str = ""
-    until: float = FOOT
+    first: str = ""
+    end: str = ""
 
 
 PICTURES = (
-    Picture("aisle_uwb", AISLE, "EKF2 check: comparison with a two-state", 0.5),
+    Picture("aisle_uwb", AISLE, "aisle_uwb.ulg"),
     Picture("explore", "explore sample_logs/aisle_uwb.ulg"),
-    Picture("lab_1", AISLE, "Position and velocity along the aisle", 0.585),
-    Picture("lab_2", f"{AISLE} --sigma-a 0.001", "Innovations and variances"),
-    Picture("lab_3", AISLE, "Difference between KF and EKF2", 0.71),
-    Picture("lab_4", "loop sample_logs/loop_vio.ulg", "Loop closure"),
+    Picture("lab_1", AISLE, "Position and velocity along the aisle"),
+    Picture("lab_2", SMALL_Q, "Innovations and variances along", "Difference between KF and EKF2"),
+    Picture("lab_3", AISLE, "position difference, ", "EKF2 replay: agrees"),
+    Picture("lab_4", "loop sample_logs/loop_vio.ulg", "Loop closure", "Closures and scores"),
     Picture("lab_5", EVALUATE, "Trajectory error"),
 )
 
@@ -79,14 +81,27 @@ def made(picture: Picture, folder: Path) -> Image.Image:
         run([*words, "-o", str(report)])
     with pypdfium2.PdfDocument(report) as document:
         for page in document:
-            if picture.page in page.get_textpage().get_text_bounded():
+            top = distance_from_top(page, picture.first)
+            bottom = distance_from_top(page, picture.end) if picture.end else FOOT
+            if top is not None and bottom is not None:
                 whole = page.render(scale=DPI / 72).to_pil().convert("RGB")
                 break
         else:
-            raise SystemExit(f"{picture.name}: no page of {picture.command} has {picture.page!r}")
-    part = whole.crop((0, int(HEAD * whole.height), whole.width, int(picture.until * whole.height)))
-    left, top, right, bottom = ImageChops.invert(part).getbbox() or (0, 0, *part.size)
-    return ImageOps.expand(part.crop((left, top, right, bottom)), MARGIN, "white")
+            raise SystemExit(f"{picture.name}: no page of {picture.command} has {picture.first!r}")
+    edges = 0, int((top - GAP) * whole.height), whole.width, int((bottom - GAP) * whole.height)
+    part = whole.crop(edges)
+    content = ImageChops.invert(part).getbbox()
+    return ImageOps.expand(part.crop(content), MARGIN, "white")
+
+
+def distance_from_top(page: pypdfium2.PdfPage, text: str) -> float | None:
+    """Return the distance of a text from the top of its page, as a fraction of the height."""
+    characters = page.get_textpage()
+    found = characters.search(text, match_case=True).get_next()
+    if found is None:
+        return None
+    upper_edge = max(characters.get_charbox(found[0] + i)[3] for i in range(found[1]))
+    return float(1.0 - upper_edge / page.get_height())
 
 
 def screenshot(words: list[str], folder: Path) -> Image.Image:
@@ -110,7 +125,7 @@ def screenshot(words: list[str], folder: Path) -> Image.Image:
 
 def smaller(drawn: Image.Image) -> Image.Image:
     """Scale a picture to the common width."""
-    size = int(drawn.width * 0.7), int(drawn.height * 0.7)
+    size = int(drawn.width * 0.66), int(drawn.height * 0.66)
     return drawn.convert("RGB").resize(size, Image.Resampling.LANCZOS)
 
 
