@@ -398,7 +398,7 @@ ODD = {"clock": UNIX_S, "a": Y, "b": X, "c": Z, "d_": SIGMA}
 
 
 BY_NAME = {"time_ms": UNIX_S, "t": UNIX_S, "up_mm": MM[2], "east_mm": MM[0], "north_mm": MM[1]}
-# misleading names: a length for time, a time for a length
+# misleading names: the time column is named like a length, a length column like a time
 MISNAMED = {"x_m": UNIX_S, "time_ms": X, "b": Y, "c": Z, "x": JUNK, "y": JUNK}
 
 

@@ -62,7 +62,6 @@ NO_FAULT = "No fault found: KF and EKF2 are consistent"
 SHIFTED_SOURCE = frozenset(
     {"source_time_offset", "source_scale_error", "source_frame_misaligned", "source_position_jump"}
 )
-DRIFTING_SOURCE = frozenset({"source_drift", "source_may_drift", "loop_drift_too_small"})
 
 
 def build_card(

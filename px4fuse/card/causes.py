@@ -174,12 +174,8 @@ def make_cause(
     finding, trials = ranked.finding, ranked.trials
     useful = [trial for trial in trials if improvement(trial) != "nothing"]
     alternatives, actions = _actions(analysis, finding, useful, verdicts, request)
-    return Cause(
-        id=finding.id,
-        severity="error" if finding.severity == "error" else "warning",
-        title=finding.title,
-        why=_reason(finding),
-        spans_s=finding.spans_s,
+    return structs.replace(
+        make_plain_cause(finding),
         alternatives=alternatives,
         actions=actions,
         reruns=tuple(_rerun(trial, trials) for trial in trials),

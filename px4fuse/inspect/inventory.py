@@ -289,12 +289,12 @@ def _source(
     if isinstance(data, pd.DataFrame) and len(data) > 1:
         source_fields |= {
             "rate_hz": sample_rate(data),
-            "gaps": _gaps(data, is_imu=part == PART_LABELS["imu"]),
+            "gaps": _measure_gaps(data, is_imu=part == PART_LABELS["imu"]),
         }
     return Source(part, **source_fields)
 
 
-def _gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
+def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
     intervals = np.diff(samples.index.to_numpy())
     limit_s = (
         max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(intervals)))

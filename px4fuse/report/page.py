@@ -210,10 +210,6 @@ class Page:
         blocks, widths = [c.blocks for c in columns], [c.width for c in columns]
         self.add("columns", columns=blocks, widths=widths, gap=gap, above=above)
 
-    def add_foot(self, content: Page) -> None:
-        """Set content at the foot of this page; other text continues on the next page."""
-        self.add("foot", blocks=content.blocks)
-
 
 def halves(left_fraction: float = 0.5, gap: float = COLUMN_GAP) -> tuple[Page, Page]:
     """Return two columns that fill the page width; `left_fraction` belongs to the left column."""
