@@ -212,7 +212,11 @@ UNKNOWN = "The log does not contain the reason"
         (never_fusing(parameters={"EKF2_AID_MASK": 1.0}), "EKF2_AID_MASK is 1. Bit 3", "to 9."),
         (never_fusing(parameters={"EKF2_AID_MASK": 9.0}), UNKNOWN, "EKF2_EV_CTRL"),
         (never_fusing(2.0), UNKNOWN, "EKF2_EV_CTRL"),  # releases before v1.14 have no limit
-        (never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}), "they come at 2 Hz", "10 Hz"),
+        (
+            never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}),
+            "the positions come at 2 Hz",
+            "10 Hz",
+        ),
         (
             never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}, origin=LOGGED_BY_EKF2),
             UNKNOWN,
@@ -223,12 +227,12 @@ UNKNOWN = "The log does not contain the reason"
         (never_fusing(age_s=5.0, horizon_s=NONE), UNKNOWN, "Check"),
         (
             never_fusing(age_s=0.31),
-            "they are 0.31 s old at arrival. EKF2 buffers only 0.20 s",
+            "the positions are 0.31 s old at arrival. EKF2 buffers only 0.20 s",
             "EKF2_DELAY_MAX",
         ),
         (
             never_fusing(age_s=0.28, parameters={"EKF2_EV_DELAY": 50.0}),
-            "they are 0.33 s old",
+            "the positions are 0.33 s old",
             "EKF2_DELAY_MAX",
         ),
     ],

@@ -145,8 +145,9 @@ def test_deviating_settings_state_size_and_estimate() -> None:
     )
     small = tuned(Noise(2.0, 1.9, 2.1), Noise(9.0, 8.9, None))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=small))
-    assert "too small: KF lags. SIGMA_A 1 m/s²; maximum-likelihood estimate 9 m/s². P" in (
-        worse.message
+    assert (
+        "too small: KF lags the motion. SIGMA_A 1 m/s²; maximum-likelihood estimate 9 m/s². P"
+        in (worse.message)
     )
     assert named(noises.detect_wrong_settings, analysis(source=MOVING)) == {}
 
@@ -405,7 +406,7 @@ def test_variances_ekf2_without_replay_compare_noises(one, estimate, parameters,
          ("ekf2_noise_too_small", "error", "UWB noise is 4 times what EKF2 assumes")),
         (0.5, "gnss", 0.44,
          ("ekf2_noise_too_small", "error", "GNSS noise is 4 times what both filters assume: EKF2 "
-          "rejects 44 %")),
+          "rejects 44 % of the positions")),
     ],
 )  # fmt: skip
 def test_ekf2_noise_title_names_parameter_or_sensor(

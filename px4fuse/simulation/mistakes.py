@@ -5,7 +5,7 @@ mistake has a default size that px4fuse detects easily.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from px4fuse.errors import SettingsError, suggest_name
 from px4fuse.record import table
@@ -71,9 +71,6 @@ class Mistake:
 
     Attributes
     ----------
-    fields : tuple of str
-        Fields of :class:`Mistakes` that the mistake sets. The value of the first one is required on
-        the command line, the others are optional.
     default : float or True
         Default of the first field; True for a mistake without a size.
     help : str
@@ -84,14 +81,17 @@ class Mistake:
         Kinds of flight in which the mistake is possible.
     changes_ekf2 : bool
         True if the mistake changes EKF2 parameters.
+    fields : tuple of str
+        Fields of :class:`Mistakes` that the mistake sets: those whose name begins with the name of
+        the mistake. The command line requires the first value; the others are optional.
     """
 
-    fields: tuple[str, ...]
     default: float | bool
     help: str
     finding: str
     kinds: tuple[Kind, ...] = KINDS
     changes_ekf2: bool = False
+    fields: tuple[str, ...] = ()
 
     @property
     def sizes(self) -> tuple[str, ...]:
@@ -105,7 +105,15 @@ class Mistake:
         return required + "".join(f"[,{name[1:]}]" for name in optional)
 
 
-MISTAKES: Mapping[str, Mistake] = table(__file__, "mistakes.toml", dict[str, Mistake])
+MISTAKES: Mapping[str, Mistake] = {
+    name: replace(
+        mistake,
+        fields=tuple(
+            field for field in vars(Mistakes()) if field.startswith(name.replace("-", "_"))
+        ),
+    )
+    for name, mistake in table(__file__, "mistakes.toml", dict[str, Mistake]).items()
+}
 
 
 def parse(texts: Iterable[str]) -> Mistakes:

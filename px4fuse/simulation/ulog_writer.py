@@ -18,8 +18,8 @@ _ULOG_VERSION = b"\x01"
 # ULog names of numpy types; integer types only add "_t"
 _ULOG_TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
 _FLAG_BITS_MESSAGE = bytes(40)
-# [type, default] of each field, by topic; a field without default is optional
-FIELDS = table(__file__, "topics.toml", dict[str, dict[str, list[Any]]])
+# One line per field: numpy type, name, and default values; a field without default is optional
+FIELDS: Mapping[str, str] = table(__file__, "topics.toml", dict[str, str])
 
 
 @dataclass(frozen=True)
@@ -51,23 +51,17 @@ def topic(name: str, field_values: Mapping[str, ArrayLike], table_row: str = "")
     table_row : str
         Name in topics.toml, if it differs from the topic name.
     """
-    default_by_field, count = FIELDS[table_row or name], np.size(field_values["timestamp"])
-    assert field_values.keys() <= default_by_field.keys(), (
-        f"{name} has no {field_values.keys() - default_by_field.keys()}"
-    )
-    fields = {}
-    for field, (kind, *default_values) in default_by_field.items():
-        values = (
-            field_values[field]
-            if field in field_values
-            else default_values[0]
-            if len(default_values) == 1
-            else default_values
-        )
-        if field in field_values or default_values:
-            if field not in field_values or not np.ndim(values):
-                values = np.broadcast_to(values, (count, *np.shape(values)))
-            fields[field] = np.asarray(values).astype(kind)
+    rows = [row.split() for row in FIELDS[table_row or name].splitlines()]
+    unknown_fields = field_values.keys() - {field for _, field, *_ in rows}
+    assert not unknown_fields, f"{name} has no {unknown_fields}"
+    count, fields = np.size(field_values["timestamp"]), {}
+    for kind, field, *defaults in rows:
+        if field in field_values or defaults:
+            default = float(defaults[0]) if len(defaults) == 1 else np.array(defaults, float)
+            values = np.asarray(field_values.get(field, default))
+            if field not in field_values or not values.ndim:
+                values = np.broadcast_to(values, (count, *values.shape))
+            fields[field] = values.astype(kind)
     return Topic(name, fields)
 
 
