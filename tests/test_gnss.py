@@ -255,7 +255,7 @@ def test_prepare_axis_down_unfused_barometer_needs_option(tmp_path):
     with pytest.raises(MissingDataError, match="no barometer height in the log"):
         prepare(bare, height="barometer")
     vision = simulate_flight(make_scenario("aisle", seed=1))
-    with pytest.raises(SettingsError, match="`height` needs a GNSS position"):
+    with pytest.raises(SettingsError, match="`height` needs GNSS as position source"):
         prepare(vision, height="gnss")
 
 
