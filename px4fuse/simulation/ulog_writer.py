@@ -1,4 +1,4 @@
-"""Encoding of PX4 topics as a ULog file.
+"""Writer of ULog files.
 
 Source: ULog file format, version 1, https://docs.px4.io/main/en/dev_log/ulog_file_format
 """
@@ -15,7 +15,7 @@ from px4fuse.readers import ULOG_MAGIC
 from px4fuse.record import table
 
 _ULOG_VERSION = b"\x01"
-# ULog names of numpy types; integer types only add "_t"
+# ULog names of numpy types; for integer types ULog adds "_t"
 _ULOG_TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
 _FLAG_BITS_MESSAGE = bytes(40)
 # One line per field: numpy type, name, and default values; a field without default is optional
@@ -41,7 +41,7 @@ class Topic:
 
 
 def topic(name: str, field_values: Mapping[str, ArrayLike], table_row: str = "") -> Topic:
-    """Make a topic with the fields and types of PX4, and defaults for missing fields.
+    """Make a topic with PX4's fields and types, and defaults for missing fields.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def topic(name: str, field_values: Mapping[str, ArrayLike], table_row: str = "")
     field_values : mapping
         Values by field, one per message; a scalar is used for all messages.
     table_row : str
-        Name in topics.toml, if it differs from the topic name.
+        Name in ``topics.toml``, if it differs from the topic name.
     """
     rows = [row.split() for row in FIELDS[table_row or name].splitlines()]
     unknown_fields = field_values.keys() - {field for _, field, *_ in rows}
@@ -83,9 +83,9 @@ def encode(
     info : mapping
         An int is written as uint32.
     start_us : int
-        Boot time at which logging starts.
+        Boot time (µs) at which logging starts.
     dropouts_ms : sequence of int
-        Durations of the dropouts, whose messages are written after the data.
+        Durations (ms) of logger dropouts; their messages are written after the data.
     """
     parts = [
         ULOG_MAGIC + _ULOG_VERSION,
@@ -137,16 +137,15 @@ def _format_text(topic: Topic) -> str:
 
 
 def _data_messages(topic: Topic, topic_id: int) -> list[bytes]:
-    """Return the data messages of a topic, with headers."""
     header_fields = [("size", "<u2"), ("kind", "u1"), ("number", "<u2")]
     topic_fields = [
         (name, values.dtype.newbyteorder("<"), values.shape[1:])
         for name, values in topic.fields.items()
     ]
-    # the underscore avoids name conflicts with PX4 fields
+    # the underscore avoids conflicts of header names with PX4 fields
     dtype = np.dtype([(f"_{name}", kind) for name, kind in header_fields] + topic_fields)
     records = np.zeros(len(topic.fields["timestamp"]), dtype)
-    records["_size"] = dtype.itemsize - 3  # excludes the header bytes of size and kind
+    records["_size"] = dtype.itemsize - 3  # ULog sizes exclude the 3 bytes of size and kind
     records["_kind"] = ord("D")
     records["_number"] = topic_id
     for name, values in topic.fields.items():
