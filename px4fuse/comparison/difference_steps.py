@@ -178,7 +178,7 @@ def add_sentences(
     ]
     if second.position_mean_square_m2 >= MIN_NOTABLE_SHARE * explanation.position_mean_square_m2:
         sentences.append(
-            f"Second: {second.name} ({_format_share(second, explanation)}). "
+            f"Second largest contribution: {second.name} ({_format_share(second, explanation)}). "
             f"{reasons[second.name]}. "
             f"{_moment_text(second)}"
         )
@@ -202,8 +202,8 @@ def _corrected_sentences(explanation: DifferenceExplanation) -> list[str]:
         f"{COMPARISON_OPTIONS[name]} {value:g}" for name, value in explanation.corrected.items()
     )
     return [
-        f"KF was run with {' and '.join(texts)} for this page: the wrong setting is corrected "
-        "first, and the steps explain the remaining difference KF - EKF2."
+        f"KF was run with {' and '.join(texts)} for this explanation: the wrong setting is "
+        "corrected first, and the steps explain the remaining difference KF - EKF2."
     ]
 
 
@@ -286,8 +286,8 @@ def _step_reasons(
             "KF has no gate"
         ),
         steps.OUTPUT: (
-            f"EKF2 runs {1e3 * inputs.horizon_s:.0f} ms behind and predicts to the present with "
-            f"the IMU, smoothed with EKF2_TAU_POS {flown['EKF2_TAU_POS']:g} s; KF has no delay"
+            f"EKF2 fuses {1e3 * inputs.horizon_s:.0f} ms late and predicts to the present with the "
+            f"IMU, smoothed with EKF2_TAU_POS {flown['EKF2_TAU_POS']:g} s; KF has no delay"
         ),
     }
 
@@ -297,7 +297,7 @@ def _velocity_sentence(explanation: DifferenceExplanation) -> str:
     first = max(explanation.steps, key=lambda step: step.velocity_mean_square_m2_s2)
     share = first.velocity_mean_square_m2_s2 / velocity
     # a step with a fraction above 1 compensates an earlier step: it is not the largest contribution
-    largest = f" Largest contribution in velocity: {first.name} ({100 * share:.0f} %)."
+    largest = f" Largest contribution to the velocity: {first.name} ({100 * share:.0f} %)."
     velocity_left_share = explanation.unexplained_velocity_mean_square_m2_s2 / velocity
     return (
         f"RMS difference KF - EKF2 over the replayed times: {np.sqrt(position):.3f} m and "

@@ -153,14 +153,16 @@ def missing_imu_rate(flight: Flight) -> Unavailable | None:
     if rate_hz >= CLOCK_RATE_MARGIN * needed_hz:
         return None
     rate_text = f"{rate_hz:.{1 if rate_hz < 10 else 0}f} Hz"
-    rate_note = f"was logged at {rate_text}"
+    rate_note = f"the IMU was logged at {rate_text}"
     remedy = "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate."
     if is_telemetry:
-        rate_note = f"was received over telemetry at {rate_text}, decimated from a higher rate"
-        remedy = f"Have the IMU sent at {needed_hz:g} Hz."
+        rate_note = (
+            f"the IMU was received over telemetry at {rate_text}, decimated from a higher rate"
+        )
+        remedy = f"Request the IMU message at {needed_hz:g} Hz."
         if flight.log.has_ulog:
             remedy = "Give the ULog of the same flight as LOG, and this recording with --mavlink."
-    reason = f"the IMU {rate_note}; at least {needed_hz:g} Hz are needed"
+    reason = f"{rate_note}; at least {needed_hz:g} Hz are needed"
     return Unavailable("clock offset", reason, remedy)
 
 

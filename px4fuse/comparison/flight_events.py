@@ -8,7 +8,7 @@ import pandas as pd
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import Comparison
-from px4fuse.flight import Ekf2, FlightMode, Unavailable
+from px4fuse.flight import Ekf2, Flight, FlightMode, Unavailable
 from px4fuse.record import Span
 
 # Minimum length of a gap in the position source, in s and in intervals of the source; jitter and
@@ -67,12 +67,17 @@ def source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
     return tuple(zip(time_s[:-1][is_gap].tolist(), time_s[1:][is_gap].tolist(), strict=True))
 
 
+def airborne_spans(flight: Flight) -> tuple[Span, ...]:
+    """Return the spans (s) in the air; empty without land detector."""
+    return () if isinstance(flight.airborne, Unavailable) else flight.airborne
+
+
 def collect_events(comparison: Comparison) -> Events:
     """Collect the events in the segment of a comparison."""
     flight, segment = comparison.flight, comparison.segment
     low, high = segment.start_s, segment.end_s
 
-    airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
+    airborne = airborne_spans(flight)
     edges = [low, *(time for span in airborne for time in span), high]
     modes = () if isinstance(flight.modes, Unavailable) else flight.modes
     resets = flight.ekf2.resets if isinstance(flight.ekf2, Ekf2) else ()

@@ -204,3 +204,8 @@ class Comparison:
     def main(self) -> AxisComparison:
         """Main axis: the aisle, else the first."""
         return self.axes.get(AISLE) or next(iter(self.axes.values()))
+
+
+def north_and_east(comparison: Comparison) -> list[AxisComparison]:
+    """Return the results along north and east, if these axes were analysed."""
+    return [comparison.axes[name] for name in ("north", "east") if name in comparison.axes]

@@ -223,7 +223,7 @@ def _use_barometer_height(
         if height_name == "barometer":
             raise MissingDataError(f"{log_name}: no barometer height in the log.", GNSS.to_log)
         return track
-    zero_m, zero_text = heights["down_m"].iloc[0], "its first height"
+    zero_m, zero_text = heights["down_m"].iloc[0], "the first barometer height"
     if isinstance(ekf2, Ekf2):
         ekf2_down_m = np.interp(
             heights.index, ekf2.state.index, ekf2.state["down_m"], np.nan, np.nan

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.flight_events import airborne_spans
 from px4fuse.ekf2.aids import NOT_FUSED_LIMIT_S, WINDOW_S, AidResult
 from px4fuse.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
@@ -39,15 +40,10 @@ def detect(analysis: Analysis) -> Findings:
     if isinstance(analysis.aids, Unavailable):
         return
     aid = analysis.source.origin.aid
-    airborne = analysis.flight.airborne
-    take_off_s = [] if isinstance(airborne, Unavailable) else [start for start, _ in airborne]
+    take_off_s = [start_s for start_s, _ in airborne_spans(analysis.flight)]
     barometer = analysis.aids.get(BAROMETER.name)
-    height_error_m = (
-        None if barometer is None else _height_error_in(analysis, barometer.longest_gap_s)
-    )
-    yield from detect_in_aids(
-        analysis.aids, "" if aid is None else aid.name, take_off_s, height_error_m
-    )
+    height_error_m = _height_error_in(analysis, barometer.longest_gap_s) if barometer else None
+    yield from detect_in_aids(analysis.aids, aid.name if aid else "", take_off_s, height_error_m)
 
 
 def detect_in_aids(

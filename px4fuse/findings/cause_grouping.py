@@ -78,7 +78,10 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         effect_groups = [
             group
             for group in groups
-            if group is not cause_group and _is_effect(group[0], effects.splitlines())
+            if group is not cause_group
+            and not {group[0].id, f"{group[0].id}: {group[0].evidence.get(CAUSE)}"}.isdisjoint(
+                effects.splitlines()
+            )
         ]
         groups = [group for group in groups if group not in effect_groups]
         for effect, *further_effects in effect_groups:
@@ -96,10 +99,6 @@ def effect_ids(cause: str) -> tuple[str, ...]:
     """Return the ids of the findings that a finding can cause, each once."""
     effects = CONSEQUENCES.get(cause, "").splitlines()
     return tuple(dict.fromkeys(effect.partition(":")[0] for effect in effects))
-
-
-def _is_effect(finding: Finding, effects: list[str]) -> bool:
-    return finding.id in effects or f"{finding.id}: {finding.evidence.get(CAUSE)}" in effects
 
 
 def _report_rank(group: list[Finding]) -> int:

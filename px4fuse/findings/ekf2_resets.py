@@ -3,10 +3,11 @@
 import numpy as np
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.flight_events import airborne_spans
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, GAP
 from px4fuse.findings.model import Findings, finding, format_count, warning, zero_length_spans
-from px4fuse.flight import Ekf2, Reset, Unavailable
+from px4fuse.flight import Ekf2, Reset
 
 # Time (s) after take-off in which EKF2 usually resets its height
 TAKE_OFF_S = 10.0
@@ -62,10 +63,9 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def _is_take_off_height_reset(analysis: Analysis, reset: Reset) -> bool:
-    airborne = analysis.flight.airborne
     return not any(reset.delta[:2]) and any(
-        start <= reset.time_s <= start + TAKE_OFF_S
-        for start, _ in (() if isinstance(airborne, Unavailable) else airborne)
+        start_s <= reset.time_s <= start_s + TAKE_OFF_S
+        for start_s, _ in airborne_spans(analysis.flight)
     )
 
 

@@ -25,6 +25,7 @@ from px4fuse.comparison.model import (
     Comparison,
     ErrorsAgainstTruth,
     FilterName,
+    north_and_east,
 )
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.kalman import state_at
@@ -183,7 +184,7 @@ def _drift_finding(
         size = (
             f"horizontal position RMSE {format_metres(aligned.after_m)} m after the best alignment"
         )
-        sentence = f"Before the alignment: {format_metres(aligned.before_m)} m. "
+        sentence = f"Before the alignment the RMSE is {format_metres(aligned.before_m)} m. "
     if isinstance(loop, Loop) and (gap_m := _known_closure_error_m(loop)) is not None:
         length_m = loop.path_length_m
         evidence = {**evidence, "closure_error_m": gap_m, "path_length_m": length_m}
@@ -210,7 +211,7 @@ def _known_closure_error_m(loop: Loop) -> float | None:
 
 def _rmse_after_alignment(comparison: Comparison, filter_name: str) -> AlignedError | None:
     """Return the horizontal RMSE before and after alignment in yaw; None without truth."""
-    axes = [comparison.axes[name] for name in ("north", "east") if name in comparison.axes]
+    axes = north_and_east(comparison)
     truths = [result.truth for result in axes if isinstance(result.truth, pd.DataFrame)]
     if len(truths) < 2:
         return None

@@ -344,10 +344,9 @@ def _variance_finding(
     low, high = summary.nis_band
     gate_effect = ""
     if filter_name == "ekf2":
-        accepted = (
-            "accept positions with large errors" if is_underconfident else "reject good positions"
-        )
-        gate_effect = f" The gate of EKF2 may then {accepted}."
+        gate_effect = " The gate of EKF2 may then reject good positions."
+        if is_underconfident:
+            gate_effect = " The gate of EKF2 may then accept positions with large errors."
     return finding(
         severity,
         f"{filter_name}_{confidence}",
@@ -381,14 +380,11 @@ def _has_default_noises(
 ) -> bool:
     """Return True if the filter uses the default noises of px4fuse (KF) or PX4 (EKF2)."""
     if filter_name == "kf":
-        settings, defaults = analysis.settings, Settings()
-        return (settings.sigma_z_m, settings.sigma_a_m_s2) == (
-            defaults.sigma_z_m,
-            defaults.sigma_a_m_s2,
-        )
-    name = aid_of(analysis, result.axis.name).noise
-    default = PARAMETERS[name].default
-    is_parameter_default = analysis.flight.log.parameters.get(name, default) == default
+        kf, defaults = analysis.settings, Settings()
+        return all(getattr(kf, name) == getattr(defaults, name) for name in (SIGMA_Z, SIGMA_A))
+    parameter = aid_of(analysis, result.axis.name).noise
+    default = PARAMETERS[parameter].default
+    is_parameter_default = analysis.flight.log.parameters.get(parameter, default) == default
     # a variance that the sender reports is a choice of the user, not a default
     return is_parameter_default and not abs(np.log(ekf2_noise_m(result) / default)) > np.log(
         NOISE_RATIO_TOLERANCE
@@ -428,12 +424,8 @@ def _remedy_without_replay(
     if ml_noise_m is None:
         return NOT_EXPLAINED
     noise_m, ekf2_m = max(ml_noise_m, EKF2_MIN_NOISE_M), ekf2_noise_m(result)
-    ratio = noise_m / ekf2_m
-    if (
-        ratio < 1.0 / NOISE_RATIO_TOLERANCE
-        if summary.sigma_ratio < 1.0
-        else ratio > NOISE_RATIO_TOLERANCE
-    ):
+    ratio = ekf2_m / noise_m if summary.sigma_ratio < 1.0 else noise_m / ekf2_m
+    if ratio > NOISE_RATIO_TOLERANCE:
         changes = noise_change(aid, analysis.flight.log.parameters, ekf2_m, noise_m)
         return (
             f"Set {format_settings(changes)} (EKF2 uses {ekf2_m:.2g} m). No replay of this log "

@@ -48,7 +48,7 @@ def detect_lost_data(flight: Flight) -> Findings:
         fault = f"The log ends in flight after {log.duration_s:.1f} s. The landing is missing."
         if log.damage:
             lost_fraction = 1.0 - log.bytes_read / log.bytes if log.bytes else 0.0
-            size = f": {format_number(100.0 * lost_fraction, 2)} % of it cannot be read"
+            size = f": {format_number(100.0 * lost_fraction, 2)} % of its bytes cannot be read"
             damage = "the log is damaged" + (size if lost_fraction else "")
             fault = " ".join(f"{_sentence(note)}." for note in (damage, *log.damage))
         action = "Copy the log again. If this does not help, replace the SD card."

@@ -10,7 +10,7 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.comparison.model import ErrorsAgainstTruth
+from px4fuse.comparison.model import ErrorsAgainstTruth, north_and_east
 from px4fuse.filter.consistency import CONSISTENT_RATIOS
 from px4fuse.filter.correlated_noise import TimeCorrelatedNoise
 from px4fuse.filter.likelihood import innovations, preintegrate
@@ -117,7 +117,7 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
     """Detect different position noise along north and east."""
     if analysis.source.origin.is_gnss:
         return  # GNSS errors are mostly time-correlated, and SIGMA_Z is their white part
-    axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
+    axes = north_and_east(analysis)
     summaries = [axis.filters["kf"] for axis in axes]
     nis = [summary.nis_mean for summary in summaries if not isinstance(summary, Unavailable)]
     if len(nis) < 2 or max(nis) < MIN_AXIS_NIS_RATIO * min(nis):
@@ -161,7 +161,7 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     if isinstance(axis_tuning, AxisTuning):
         sigma_a, sigma_z = axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value
         outlier_time_s = axis_tuning.outlier_time_s
-    lines = [analysis.axes[name].axis for name in ("north", "east") if name in analysis.axes]
+    lines = [result.axis for result in north_and_east(analysis)]
     if sigma_a is None or sigma_z is None or len(lines) < 2:
         return
     increments_by_axis = [preintegrate(line, settings) for line in lines]

@@ -13,7 +13,7 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import Comparison, north_and_east
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit
 from px4fuse.filter.signals import cut_to_segment
@@ -245,8 +245,7 @@ def outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[Array, s
 
     The reference is ground truth, else the line between the positions before and after.
     """
-    axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
-    axes = axes or [analysis.main]
+    axes = north_and_east(analysis) or [analysis.main]
     has_truth = all(isinstance(result.truth, pd.DataFrame) for result in axes)
     squares_m2 = np.zeros(len(outlier_time_s))
     for result in axes:
@@ -319,7 +318,7 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
 
 def _rmse_per_axis_m(analysis: Analysis) -> float | None:
     squares = []
-    for result in (analysis.axes[name] for name in ("north", "east") if name in analysis.axes):
+    for result in north_and_east(analysis):
         if isinstance(result.truth, Unavailable):
             return None
         true, axis = result.truth["position_m"].dropna(), result.axis

@@ -30,13 +30,13 @@ def detect(analysis: Analysis) -> Findings:
     elif clock.distinct_stamps is not None:
         yield from detect_constant_timestamps(positions, clock, clock.distinct_stamps)
     elif clock.method in ARRIVAL_METHODS:
-        kf_times = f"the sender's timestamps, mapped by the {clock.method}"
+        kf_times = f"KF uses the sender's timestamps, mapped by the {clock.method}."
         if clock.method == "arrival time":
-            kf_times = "arrival times too, so the KF track is late by the age of the positions"
+            kf_times = "KF uses arrival times, too, so its track is late by the position latency."
         yield warning(
             "companion_not_synchronised",
             f"The sender of the {positions} never synchronised its clock (TIMESYNC). EKF2 used "
-            f"arrival times as times of measurement. KF uses {kf_times}.",
+            f"arrival times as times of measurement. {kf_times}",
             ANSWER_TIMESYNC,
             {"jitter_s": clock.jitter_s},
         )

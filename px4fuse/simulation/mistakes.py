@@ -142,13 +142,15 @@ def parse(texts: Iterable[str]) -> Mistakes:
         mistake = MISTAKES[name]
         typed_values = values.split(",") if equals else []
         if len(typed_values) > len(mistake.sizes):
-            raise SettingsError(f"--mistake {text} has too many values: use {name}{mistake.usage}.")
+            raise SettingsError(
+                f"--mistake {text} has too many values: give {name}{mistake.usage}."
+            )
         value_by_field[mistake.fields[0]] = mistake.default
         for field, value in zip(mistake.sizes, typed_values, strict=False):
             bounds, size = QUANTITIES[field], convert_to_unit(value, QUANTITIES[field].unit)
             if size is None:
                 raise SettingsError(
-                    f"--mistake {text}: {value!r} is not {NAMES[bounds.unit]}. Use "
+                    f"--mistake {text}: {value!r}: give {NAMES[bounds.unit]}, as in "
                     f"{name}{mistake.usage}."
                 )
             bounds.check(size, f"--mistake {text}: {bounds.cli_name}")

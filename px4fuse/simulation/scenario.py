@@ -129,7 +129,7 @@ class Scenario:
         12.0, 2.0, 1000.0, "m", "--length", "Length of the aisle, or of one side of the square."
     )
     speed_m_s: float = bounded_number(
-        1.0, 0.1, 10.0, "m/s", "--speed", "Speed on the straight parts."
+        1.0, 0.1, 10.0, "m/s", "--speed", "Speed on the straight segments of the path."
     )
     heading_deg: float = bounded_number(
         30.0,
