@@ -157,7 +157,7 @@ class Intervention(Record, frozen=True, kw_only=True):
 
     @property
     def is_cause(self) -> bool:
-        """True if the explained fraction of ln(statistic) is 0.5 to 1.5."""
+        """True if the change explains 50 to 150 % of the logarithm of the mean NIS or NEES."""
         return (
             MIN_EXPLAINED_SHARE <= self.explained_fraction <= 2.0 - MIN_EXPLAINED_SHARE
             and not self.contradicts_truth
@@ -170,7 +170,7 @@ class Intervention(Record, frozen=True, kw_only=True):
 
     @property
     def is_complete_cause(self) -> bool:
-        """True if the statistic is in its band, or a sensor fault explains nearly all of it."""
+        """True if the mean NIS or NEES is then in its band, or a sensor fault explains it."""
         return self.is_sufficient or (
             self.corrects_sensor and abs(self.explained_fraction - 1.0) <= SENSOR_CAUSE_TOLERANCE
         )
@@ -179,7 +179,7 @@ class Intervention(Record, frozen=True, kw_only=True):
 def interventions_for(
     causes: Iterable[Intervention], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> list[Intervention]:
-    """Return the re-runs that test causes of one discrepancy."""
+    """Return the re-runs that test causes of a mean NIS or NEES outside its limits."""
     return [
         intervention
         for intervention in causes
@@ -191,7 +191,7 @@ def interventions_for(
 def find_cause(
     causes: Iterable[Intervention], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> Intervention | None:
-    """Return the cause of one discrepancy, or None if no re-run explains it."""
+    """Return the cause of a mean NIS or NEES outside its limits; None if no re-run explains it."""
     return min(
         (
             intervention
@@ -314,7 +314,7 @@ def _difference_reduction(
 
 
 def is_inconsistent(statement: FilterSummary | UntestedFilter) -> TypeGuard[FilterSummary]:
-    """Return True if the filter was tested and is not consistent."""
+    """Return True if the filter was tested and is over- or underconfident."""
     return not isinstance(statement, Unavailable) and statement.verdict != "consistent"
 
 
@@ -471,11 +471,11 @@ class _FilterRerun:
     filter_name: ClassVar[FilterName]
 
     def discrepancies(self) -> list[tuple[AxisComparison, Statistic]]:
-        """Return axis and statistic of each discrepancy; the replay of EKF2 is horizontal only."""
+        """Return axis and statistic (mean NIS or NEES) of each discrepancy of the filter."""
         return [
             (result, statistic)
             for result in self.comparison.axes.values()
-            if self.filter_name == "kf" or result.axis.name != "down"
+            if self.filter_name == "kf" or result.axis.name != "down"  # EKF2 replay: horizontal
             for statistic in _find_discrepancies(result.filters[self.filter_name])
         ]
 
@@ -514,14 +514,14 @@ class _FilterRerun:
         return self.outcome(result, {})
 
     def main_axis_candidates(self, result: AxisComparison) -> list[Change]:
-        """Return the candidate changes along the main axis, each once."""
+        """Return the changes to be re-run along the main axis, each once."""
         changes = self.candidates(result, "nis")
         return changes + [
             change for change in self.candidates(result, "nees") if change not in changes
         ]
 
     def candidates(self, result: AxisComparison, statistic: Statistic) -> list[Change]:
-        """Return the candidate changes for a discrepancy along an axis."""
+        """Return the changes that may explain a mean NIS or NEES outside its limits."""
         summary, origin = result.filters[self.filter_name], self.comparison.source.origin
         assert isinstance(summary, FilterSummary)  # else it has no discrepancy
         is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
@@ -543,7 +543,7 @@ class _FilterRerun:
         return changes + self.other_candidates(None if is_underconfident else tuned)
 
     def time_offset_candidates(self) -> list[Change]:
-        """Return the time offset if the part that the filter does not yet apply is significant."""
+        """Return a change of the time offset, if its part not yet applied is significant."""
         if isinstance(self.clock, Unavailable) or not self.clock.is_determinable:
             return []
         applied_s = self.comparison.settings.clock_offset_s
@@ -601,7 +601,7 @@ class _KfRerun(_FilterRerun):
         return changes
 
     def other_candidates(self, tuned: AxisTuning | None) -> list[Change]:
-        """Return the accelerometer biases if they are significant."""
+        """Return the removal of the accelerometer biases, if they are significant."""
         fit = self.bias_scale_jump_fit
         if isinstance(fit, Unavailable) or not fit.has_bias:
             return []
@@ -665,7 +665,7 @@ class _KfRerun(_FilterRerun):
 
 @dataclass(frozen=True)
 class _Ekf2Rerun(_FilterRerun):
-    """Re-runs of EKF2, if EKF2 fused the analysed source; without ``model`` only the changes."""
+    """Re-runs of EKF2, which fused the analysed source; without ``model`` only their changes."""
 
     inputs: Inputs
     model: Model | None = None

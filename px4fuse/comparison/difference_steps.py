@@ -156,7 +156,7 @@ def _unreplayed_part(result: AxisComparison, kf_run: Replay, spans: Spans) -> Un
 def add_sentences(
     explanation: DifferenceExplanation, axis_label: str, reasons: dict[str, str]
 ) -> DifferenceExplanation:
-    """Add sentences on the steps that explain the difference along an axis, largest first.
+    """Add sentences on the EKF2 properties that cause the difference KF - EKF2, largest first.
 
     Parameters
     ----------

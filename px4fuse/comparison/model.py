@@ -202,7 +202,7 @@ class Comparison:
 
     @property
     def main(self) -> AxisComparison:
-        """Main axis: the aisle, else the first."""
+        """Result along the main axis: the aisle, else the first axis."""
         return self.axes.get(AISLE) or next(iter(self.axes.values()))
 
 

@@ -39,7 +39,7 @@ GNSS_AXES = (AISLE, "north", "east")
 
 
 class Choices(TypedDict, total=False):
-    """Optional choices for a comparison.
+    """Optional arguments of :func:`prepare`.
 
     Attributes
     ----------

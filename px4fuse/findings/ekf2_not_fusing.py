@@ -16,8 +16,8 @@ from px4fuse.findings.model import (
 from px4fuse.flight import Ekf2, FusionRecord, Unavailable, positions_of
 from px4fuse.text import capitalise_first
 
-MIN_FUSING_SHARE_ERROR = 0.5  # of the segment; below, EKF2 mostly uses other sensors: error
-MIN_FUSING_SHARE_WARNING = 0.98  # of the segment; below: warning; 2 % of a minute are about 1 s
+MIN_FUSING_SHARE_ERROR = 0.5  # fused fraction of the segment; below, other sensors dominate: error
+MIN_FUSING_SHARE_WARNING = 0.98  # fused fraction of the segment; 2 % of a minute are about 1 s
 EV_START_INTERVAL_S = 0.2  # s; EV_MAX_INTERVAL of PX4 v1.14 and later (ev_control.cpp)
 EV_STOP_INTERVAL_S = 0.4  # s; two times EV_MAX_INTERVAL (ev_pos_control.cpp)
 MAX_LATENESS_S = 0.1  # s after the fusion horizon; EKF2 drops older samples (RingBuffer.h)

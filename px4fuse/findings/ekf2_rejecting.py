@@ -11,8 +11,8 @@ from px4fuse.findings.cause_text import format_action
 from px4fuse.findings.model import Finding, Findings, finding, format_percent, zero_length_spans
 from px4fuse.flight import Ekf2, Unavailable
 
-REJECTED_SHARE_WARNING = 0.01  # of the innovations; a consistent EKF2 rejects 6e-7 with 5 √S
-REJECTED_SHARE_ERROR = 0.20  # of the innovations; usually R or the time offset is wrong
+REJECTED_SHARE_WARNING = 0.01  # rejected fraction for a warning; 6e-7 if consistent, with 5 √S
+REJECTED_SHARE_ERROR = 0.20  # rejected fraction for an error: R or the time offset is wrong
 MAX_REJECTED_RATIO = 0.5  # rejected fraction with over without a change that prevents rejections
 
 

@@ -20,7 +20,7 @@ LOGGER_INTERVALS_S = {
     "estimator_aid_src_ev_pos": (0.5,),
     "ekf2_state_plus_innovation": (0.5, 0.2),  # 0.2 s in v1.11
 }
-MIN_INNOVATION_SHARE = 0.75  # of the positions; a quarter may lack without effect on the test
+MIN_INNOVATION_SHARE = 0.75  # of the positions; with fewer logged innovations, verdicts may differ
 
 
 def detect(analysis: Analysis) -> Findings:

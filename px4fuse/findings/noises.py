@@ -56,12 +56,14 @@ from px4fuse.text import format_factor, format_number, format_ratio
 
 MIN_NOISE_RATIO = 1.5  # setting over estimate (σ) or its inverse; below, the track hardly changes
 MIN_NOISE_RATIO_ERROR = 4.0  # setting over estimate (σ) or its inverse, for an error
-MIN_RESPONSE_TIME_S = 2.5  # s; response time of KF with Q almost zero; a vehicle turns in less
-INTERVAL_WIDENING = 1.5  # factor on the 95 % interval (log scale); 0.3 % of clean flights exceed it
+MIN_RESPONSE_TIME_S = 2.5  # s; minimum response time of KF for Q almost zero: vehicles turn in less
+INTERVAL_WIDENING = (
+    1.5  # factor on the 95 % interval (log scale); 0.3 % of correct settings exceed it
+)
 MIN_LAG1_AUTOCORRELATION = 0.3  # of the innovations; white ones: below 2/√n, 0.2 for n = 100
 
 MIN_SIGMA_RATIO_ERROR = 2.0  # reported over actual σ, or its inverse, for an error
-NOISE_RATIO_TOLERANCE = 1.25  # ratio of two noises (σ) that are equal: 2 σ of a median of n = 100
+NOISE_RATIO_TOLERANCE = 1.25  # maximum ratio of two equal noises (σ): 2 σ of a median of n = 100
 # Actions if no re-run explains an inconsistent variance
 NOT_EXPLAINED = (
     "No tested change of noise, time offset, frame or outliers explains this. Check the IMU "

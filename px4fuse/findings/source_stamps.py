@@ -14,8 +14,8 @@ MAX_RECEIPT_JITTER_S = 0.010  # s; 1 cm at 1 m/s, a tenth of the noise of good U
 MAX_ARRIVAL_AGE_S = 0.001  # s; PX4's time from receiving a message to publishing its position
 MIN_LATENCY_S = 0.02  # s; latency for a warning; at 1 m/s a fifth of the UWB noise (0.1 m)
 MIN_LATENCY_ERROR_S = 0.10  # s; latency for an error; at 1 m/s the UWB noise (0.1 m)
-MIN_SAMPLES = 10  # positions before and after the end of arrival times
-MIN_CONSISTENT_SHARE = 0.95  # of the positions on each side of this end; allows late messages
+MIN_SAMPLES = 10  # minimum number of positions with arrival times, and with measurement times
+MIN_CONSISTENT_SHARE = 0.95  # of these positions have this kind of timestamp; a few come late
 ANSWER_TIMESYNC = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "
     "every request). Send positions only after 500 answers, which take 50 s at 10 Hz."

@@ -57,7 +57,7 @@ class Simulation:
 
 
 def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation:
-    """Simulate a flight.
+    """Simulate a flight with mistakes.
 
     Raises
     ------

@@ -66,7 +66,7 @@ def quantities(record: type) -> dict[str, Bounds]:
 
 @dataclass(frozen=True)
 class Scenario:
-    """Flight and sensors, without mistakes.
+    """Path and sensors of a simulated flight, without mistakes.
 
     Attributes
     ----------
