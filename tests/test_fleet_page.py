@@ -37,7 +37,7 @@ def parts(row: list[Any]) -> dict[str, Any]:
 # ------------------------------------------------------------------ without a browser
 
 
-def test_page_compared_log_lists_its_missing_results() -> None:
+def test_batch_page_compared_log_lists_its_missing_results() -> None:
     table = made_up(30)
     table.loc[table["axis"] == "down", ["reason", "remedy"]] = ("EKF2, down: no heights", "Set it.")
     text = html_text(table, "Bench", "px4fuse 1")
@@ -48,7 +48,7 @@ def test_page_compared_log_lists_its_missing_results() -> None:
     assert f'<option value="remedy:Set it.">Set it. ({count})' in text
 
 
-def test_logs_are_sorted_by_severity_ratio_and_rmse() -> None:
+def test_batch_page_sorts_logs_by_severity_and_rmse() -> None:
     table = made_up(8).drop_duplicates("log").reset_index(drop=True)
     failed = table["status"] != "done"
     table = (
@@ -66,7 +66,7 @@ def test_logs_are_sorted_by_severity_ratio_and_rmse() -> None:
     assert [log["name"] for log in sort_logs(logs_of(table))] == ["c", "d", "b", "a"]
 
 
-def test_page_row_has_sign_diagnosis_action_and_ratios() -> None:
+def test_batch_page_row_has_diagnosis_action_and_ratios() -> None:
     table = made_up(30)
     rows = [row[0] for row in content(html_text(table, "Bench", "px4fuse 1"))["rows"]]
     first = rows[0]
@@ -79,7 +79,7 @@ def test_page_row_has_sign_diagnosis_action_and_ratios() -> None:
     assert rows[-1][2][0] in (f"refused: {DAMAGED[0]}", f"not compared: {NOT_LOGGED[0]}")
 
 
-def test_logs_of_column_without_numbers_is_absent() -> None:
+def test_batch_page_omits_column_without_numbers() -> None:
     table = made_up(4)
     for name in ("clock_offset_s", "sigma_z_m", "kf_truth_ratio", "difference_rms_m"):
         table[name] = np.nan
@@ -92,7 +92,7 @@ def test_logs_of_column_without_numbers_is_absent() -> None:
     assert "nan" not in text.split("<script")[0].split("</style>")[1]
 
 
-def test_page_without_compared_logs_is_complete() -> None:
+def test_batch_page_without_compared_logs_lists_failed_logs() -> None:
     assert "0 logs" in html_text(made_up(0), "Bench", "px4fuse 1")
     table = made_up(30)
     failed = table[table["status"] == "failed"].reset_index(drop=True)
@@ -109,7 +109,7 @@ def hostile_table(word: str, count: int = 2) -> pd.DataFrame:
 
 @settings(max_examples=40)
 @given(text=st.text(max_size=40) | st.sampled_from(HOSTILE))
-def test_page_text_of_logs_is_escaped(text: str) -> None:
+def test_batch_page_escapes_text_from_logs(text: str) -> None:
     def shape(word: str) -> list[tuple[str, list[str]]]:
         made = html_text(hostile_table(f"a{word}z"), word, word)
         made.encode()
@@ -120,7 +120,7 @@ def test_page_text_of_logs_is_escaped(text: str) -> None:
     assert shape(text.replace(";", ",").replace("/", "|")) == shape("x")
 
 
-def test_page_links_stay_beside_the_page() -> None:
+def test_batch_page_links_lead_only_to_relative_paths() -> None:
     bad = ("//example.org/a", "/etc/passwd", "javascript:alert(1)", "https://example.org/")
     table = made_up(4).assign(report=np.repeat(bad, 3), results="")
     rows = content(html_text(table, "a", "b"))["rows"]
@@ -153,7 +153,7 @@ def head(title: str) -> str:
 COUNT = "document.querySelector('.count').textContent"
 
 
-def test_page_sorts_filters_and_opens_rows(page: Browser) -> None:
+def test_batch_page_sorts_filters_and_opens_rows(page: Browser) -> None:
     page.click(head("KF"))
     page.click("tbody tr:first-child .name")
     ratios = {
@@ -176,7 +176,7 @@ def test_page_sorts_filters_and_opens_rows(page: Browser) -> None:
     assert page.requests() <= {"file", "data"}
 
 
-def test_filters_of_fleet_page_combine(page: Browser) -> None:
+def test_batch_page_applies_two_filters_together(page: Browser) -> None:
     table = made_up(240).drop_duplicates("log")
     page.choose("#filter-4", "finding:ekf2_rejects_positions")
     rejecting = table["findings"].fillna("").str.contains("ekf2_rejects_positions")
@@ -190,7 +190,7 @@ def test_filters_of_fleet_page_combine(page: Browser) -> None:
     assert page.complaints() == []
 
 
-def test_page_5000_logs_shows_100_rows(browser: Browser, tmp_path: Path) -> None:
+def test_batch_page_of_5000_logs_shows_100_rows(browser: Browser, tmp_path: Path) -> None:
     shown(browser, tmp_path, made_up(5000))
     rows = "document.querySelectorAll('.list > tbody > tr').length"
     everything = "document.querySelectorAll('*').length"
@@ -214,7 +214,7 @@ def test_page_5000_logs_shows_100_rows(browser: Browser, tmp_path: Path) -> None
     assert browser.requests() <= {"file", "data"}
 
 
-def test_page_without_scripts_is_a_table(browser: Browser, tmp_path: Path) -> None:
+def test_batch_page_without_javascript_shows_a_table(browser: Browser, tmp_path: Path) -> None:
     shown(browser, tmp_path, made_up(400), scripts=False)
     browser.call("Emulation.setScriptExecutionDisabled", value=False)
     text = browser.ask("document.body.innerText")
@@ -226,7 +226,9 @@ def test_page_without_scripts_is_a_table(browser: Browser, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(("scheme", "width"), [("light", 360), ("dark", 1400)])
-def test_page_is_accessible(page: Browser, scheme: str, width: int) -> None:
+def test_batch_page_has_no_serious_accessibility_violation(
+    page: Browser, scheme: str, width: int
+) -> None:
     page.resize(width, 800)
     page.scheme(scheme)
     page.click("tbody tr:nth-child(3) .name")

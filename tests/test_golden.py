@@ -178,7 +178,7 @@ def spread(kind: str, *mistakes: str) -> list[str]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_simulated_flight_matches_golden_file(kind: str) -> None:
+def test_simulated_flight_values_match_golden_file(kind: str) -> None:
     """Flight without mistakes, then the lines that differ with each mistake."""
     clean = spread(kind)
     lines = [*clean]
@@ -190,7 +190,7 @@ def test_simulated_flight_matches_golden_file(kind: str) -> None:
     assert_matches_golden(f"simulated_{kind}", lines)
 
 
-def test_help_matches_golden_file() -> None:
+def test_help_texts_match_golden_file() -> None:
     lines = []
     for command in ("", *CLI_COMMANDS, "lesson kalman"):
         lines += [
@@ -200,7 +200,9 @@ def test_help_matches_golden_file() -> None:
     assert_matches_golden("help", lines)
 
 
-def test_gnss_flight_report_contains_aids(tmp_path: Path, kept_pages: list[Any]) -> None:
+def test_report_on_aiding_sources_matches_golden_file(
+    tmp_path: Path, kept_pages: list[Any]
+) -> None:
     log = gnss_log("v1.16").write(tmp_path / "a.ulg")
     result = run("compare", log, "-o", tmp_path / "a.pdf")
     assert result.exit_code == 0, result.output
