@@ -29,7 +29,7 @@ def run(jobs, processes=2, timeout_s=60.0, memory_bytes=None):
     return [result for _, result in sorted(outcomes, key=lambda outcome: outcome[0])], outcomes
 
 
-def test_run_bounded_failed_job_does_not_affect_others():
+def test_worker_job_that_fails_does_not_affect_other_jobs():
     before = os.environ.get("OMP_NUM_THREADS")
     jobs = [
         ("square", 1),
@@ -57,7 +57,7 @@ def test_run_bounded_failed_job_does_not_affect_others():
     assert os.environ.get("OMP_NUM_THREADS") == before
 
 
-def test_run_bounded_hanging_job_ends_at_time_limit():
+def test_worker_job_that_hangs_ends_at_time_limit():
     results, _ = run([("hang", 0), ("square", 2), ("hang", 0), ("square", 3)], timeout_s=3.0)
     assert results[1::2] == [4, 9]
     late = JobFailure("the time limit of 3 s was exceeded.")
@@ -65,7 +65,7 @@ def test_run_bounded_hanging_job_ends_at_time_limit():
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not enforce the limit")
-def test_run_bounded_large_job_ends_at_memory_limit():
+def test_worker_job_above_memory_limit_is_ended():
     jobs = [("square", 2), ("hog", 10 * MEMORY), ("square", 3)]
     results, _ = run(jobs, processes=1, memory_bytes=MEMORY)
     assert results == [4, JobFailure("the memory limit for one file was exceeded."), 9]
@@ -75,14 +75,14 @@ def test_run_bounded_large_job_ends_at_memory_limit():
     assert before != after
 
 
-def test_run_bounded_replaces_process_after_job_count(monkeypatch):
+def test_worker_process_is_replaced_after_given_number_of_jobs(monkeypatch):
     monkeypatch.setattr(workers, "JOBS_PER_WORKER", 2)
     results, _ = run([("process", 0)] * 5, processes=1)
     assert len(set(results)) == 3
     assert results[0] == results[1] != results[2]
 
 
-def test_run_bounded_unknown_function_fails_each_job(monkeypatch):
+def test_worker_that_cannot_import_the_function_fails_each_job(monkeypatch):
     monkeypatch.setattr(act, "__module__", "test_workers_is_not_here")
     monkeypatch.setitem(sys.modules, "test_workers_is_not_here", sys.modules[__name__])
     results, _ = run([("square", 1), ("square", 2)])
@@ -91,7 +91,7 @@ def test_run_bounded_unknown_function_fails_each_job(monkeypatch):
     )
 
 
-def test_run_bounded_close_ends_all_processes():
+def test_closing_the_worker_pool_ends_all_processes():
     jobs = [("square", 1), ("hang", 0)]
     with closing(run_bounded(act, jobs, processes=2, timeout_s=60, memory_bytes=None)) as work:
         assert next(work) == (0, 1)
@@ -119,7 +119,7 @@ def hanging(folder):
     return subprocess.Popen([sys.executable, script], stdout=pipe, stderr=pipe, text=True)
 
 
-def test_worker_does_not_import_from_current_folder(tmp_path):
+def test_worker_process_does_not_import_from_current_folder(tmp_path):
     """A submitted types.py must not be executed if grade runs in its folder."""
     script = tmp_path / "program" / "script.py"
     script.parent.mkdir()
@@ -135,7 +135,7 @@ def test_worker_does_not_import_from_current_folder(tmp_path):
     assert not (work / "executed").exists()
 
 
-def test_worker_closed_pipe_ends_without_traceback():
+def test_worker_with_closed_pipe_ends_without_traceback():
     script = """if True:
         from multiprocessing import Pipe
         from px4fuse.workers import _serve
@@ -150,7 +150,7 @@ def test_worker_closed_pipe_ends_without_traceback():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
-def test_worker_parent_killed_ends_hanging_job(tmp_path):
+def test_killing_the_parent_process_ends_a_hanging_worker(tmp_path):
     with hanging(tmp_path) as parent:
         parent.stdout.readline()
         parent.kill()
@@ -159,7 +159,7 @@ def test_worker_parent_killed_ends_hanging_job(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process")
-def test_worker_ctrl_c_ends_hanging_job(tmp_path):
+def test_ctrl_c_ends_a_hanging_worker_job(tmp_path):
     with hanging(tmp_path) as parent:
         worker = int(parent.stdout.readline())
         parent.send_signal(signal.SIGINT)
