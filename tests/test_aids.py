@@ -204,7 +204,7 @@ def test_unfused_barometer_is_a_fault_only_with_height_error(
 
 
 @pytest.mark.parametrize(("error_m", "expected_m"), [(0.9, 0.9), (0.2, None)])
-def test_height_error_in_gap_counts_only_above_three_rmse(
+def test_height_error_in_barometer_gap_counts_above_three_rmse(
     error_m: float, expected_m: float | None
 ) -> None:
     time_s = np.arange(0.0, 60.0, 0.1)
@@ -281,7 +281,7 @@ def test_compare_checks_option_exits_with_1_on_bad_verdict(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize(("sigma", "bad"), [(0.5, False), (0.25, False), (1.5, True)])
-def test_failed_checks_list_only_overconfident_sources(sigma: float, bad: bool) -> None:
+def test_compare_checks_fail_only_for_overconfident_sources(sigma: float, bad: bool) -> None:
     """Overconfident aids fail, underconfident ones do not."""
     made = with_aids(gnss_pos=aid_log(sigma=sigma))
     alone = AidsOnlyAnalysis(made, evaluate_aids(made), Unavailable("it", "not there", "Log it."))

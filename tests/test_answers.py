@@ -75,7 +75,7 @@ def test_read_answer_form_returns_filled_in_values(tmp_path: Path) -> None:
         (EMPTY.replace("ekf2_did = []", 'ekf2_did = ["slept"]'), "'slept' is not one of"),
     ],
 )  # fmt: skip
-def test_read_invalid_answer_form_reports_line_in_one_line(
+def test_read_invalid_answer_form_names_line_in_one_line_error(
     tmp_path: Path, text: str, said: str
 ) -> None:
     with pytest.raises(SettingsError) as error:

@@ -162,7 +162,7 @@ class TestDraw:
             larger = [s for s in sizes if (s < choice.detectable_size) == choice.is_smaller_easier]
             assert set(larger) <= {choice.detectable_size, *found}
 
-    def test_assigned_difficulties_are_spread_over_their_range(self):
+    def test_assigned_flights_are_spread_over_difficulty_range(self):
         each = [draw(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]
         counts, _ = np.histogram(each, bins=4, range=(EASIEST_DIFFICULTY, HARDEST_DIFFICULTY))
         assert counts.min() > 90

@@ -157,7 +157,7 @@ def test_grade_unchanged_report_is_verified_and_earns_points(honest: GradedRepor
         "a_" * 90_000,
     ],
 )
-def test_grade_student_notes_of_keywords_earn_no_points(
+def test_grade_gives_no_points_for_keywords_in_student_notes(
     flight: Flight, honest: GradedReport, rubric: Rubric, text: str
 ) -> None:
     graded = flight.with_notes(text, rubric)

@@ -218,7 +218,7 @@ def rich_log() -> Log:
 
 
 @pytest.mark.parametrize("name", sorted(rich_log().names()))
-def test_read_log_without_any_single_field_succeeds(tmp_path, name):
+def test_read_log_succeeds_if_any_one_field_is_missing(tmp_path, name):
     """Fields may be missing in other PX4 releases or in a damaged format."""
     for field in rich_log()[name].keys() - {"timestamp"}:
         log = rich_log()

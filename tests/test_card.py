@@ -91,7 +91,7 @@ def test_time_offset_without_ground_truth_remains_a_cause() -> None:
     assert rank_causes(analysis(trial("noises", outcome(0.98), outcome(1.0))), [NOISE]) == []
 
 
-def test_diagnosis_card_of_clean_flight_says_change_nothing(sample: Analysis) -> None:
+def test_diagnosis_card_of_clean_flight_advises_no_change(sample: Analysis) -> None:
     card = build_card(sample, (), REQUEST)
     assert (card.severity, card.id, card.causes) == ("clean", "", ())
     assert card.headline == "No fault found: KF and EKF2 are consistent"

@@ -45,7 +45,7 @@ def test_diagnosis_card_html_contains_all_fields() -> None:
     assert card_html(SMALL_SIGMA_A, has_apply=True).count("data-apply") == 1
 
 
-def test_sigma_ratio_scale_html_shows_ratio_and_interval() -> None:
+def test_sigma_ratio_html_plot_shows_ratio_and_interval() -> None:
     four = list(verdicts((21.0, "overconfident"), (0.9, "consistent"), (0.05, "underconfident"),
                          (None, "not evaluated")))  # fmt: skip
     four[1] = structs.replace(four[1], interval=(0.8, 1.2))
@@ -100,7 +100,7 @@ def test_diagnosis_card_html_escapes_text_from_logs() -> None:
     assert {tag for tag, _ in Elements(html).found} <= allowed
 
 
-def test_diagnosis_card_of_rejected_log_has_no_ratio_scale() -> None:
+def test_diagnosis_card_of_rejected_log_has_no_sigma_ratio_plot() -> None:
     card = Card(
         severity="refused",
         id="not_px4",

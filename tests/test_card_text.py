@@ -24,12 +24,12 @@ def text_of(card: Card) -> list[str]:
     ("ratio", "column", "mark"),
     [(1.0, 18, "●"), (0.1, 0, "●"), (10.0, 36, "●"), (0.01, 0, "◀"), (128.0, 36, "▶")],
 )
-def test_sigma_ratio_scale_text_marks_ratio_at_its_column(ratio, column, mark) -> None:
+def test_sigma_ratio_text_plot_marks_ratio_at_its_column(ratio, column, mark) -> None:
     drawn = axis_text(ratio, "source")
     assert (len(drawn), drawn.index(mark)) == (37, column)
 
 
-def test_sigma_ratio_scale_text_without_ratio_shows_only_band() -> None:
+def test_sigma_ratio_text_plot_without_ratio_shows_only_band() -> None:
     assert re.fullmatch("─{16}░{5}─{16}", axis_text(None, "source"))
     assert re.fullmatch("─{15}░{7}─{15}", axis_text(None, "truth"))
 

@@ -28,7 +28,7 @@ def test_consequences_of_causes_name_only_existing_findings() -> None:
     assert listed | set(CONSEQUENCES) | NOISES | RECORDING <= set(TITLES)
 
 
-def test_consequences_of_causes_list_inner_causes_first() -> None:
+def test_nested_causes_of_findings_are_listed_inner_first() -> None:
     outer = list(CONSEQUENCES)
     for at, cause in enumerate(outer):
         assert set(effect_ids(cause)) & set(outer) <= set(outer[:at]), cause

@@ -274,7 +274,7 @@ def test_class_page_click_on_row_opens_report_details(page: Browser) -> None:
     assert page.requests() <= {"file", "data"}
 
 
-def test_class_page_keys_step_through_reports(page: Browser) -> None:
+def test_class_page_keyboard_steps_through_reports(page: Browser) -> None:
     opened = "[...document.querySelectorAll('tr.open .name')].map((name) => name.textContent)"
     for key, name in (("j", "Zoë"), ("n", "ada"), ("j", "Émile"), ("k", "ada"), ("p", "Zoë")):
         page.press(key, key)

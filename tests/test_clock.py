@@ -495,7 +495,7 @@ def test_time_offset_interval_is_widened_by_scatter_of_parts() -> None:
     assert found.is_determinable
 
 
-def test_time_offset_interval_is_kept_at_small_scatter() -> None:
+def test_time_offset_interval_is_kept_at_small_scatter_of_parts() -> None:
     found = widen_for_drift(stated(0.01, -0.01, 0.015, -0.02, 0.0))
     assert (found.interval_s, found.sigma_s) == (pytest.approx((-0.021, 0.019)), 0.01)
 

@@ -181,7 +181,9 @@ class TestMadeFlight:
         assert other == pytest.approx(one, rel=0.1)
 
     @pytest.mark.parametrize(("heading", "name"), [(0.0, "north"), (90.0, "east")])
-    def test_aisle_axis_with_cardinal_heading_equals_that_axis(self, made, heading, name) -> None:
+    def test_aisle_axis_with_north_or_east_heading_equals_that_axis(
+        self, made, heading, name
+    ) -> None:
         aisle = compare(made.flight, axes=("aisle",), heading_deg=heading).main
         same = made[name]
         assert asdict(aisle.difference) == pytest.approx(asdict(same.difference))

@@ -117,7 +117,7 @@ def test_horizontal_consistency_uses_mean_nis_of_both_axes() -> None:
     assert result.verdict == "underconfident"
 
 
-def test_horizontal_consistency_of_few_samples_is_none() -> None:
+def test_horizontal_consistency_of_few_samples_is_not_evaluated() -> None:
     def axis(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return white(1, count), np.ones(count)
 

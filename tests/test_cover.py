@@ -59,7 +59,7 @@ def eventful() -> Analysis:
     return with_noises(compare(flight))
 
 
-def test_report_cover_prints_texts_and_numbers_of_card() -> None:
+def test_report_cover_prints_texts_of_the_diagnosis_card() -> None:
     text = text_of(SMALL_SIGMA_A)
     cause = SMALL_SIGMA_A.causes[0]
     expected = [
@@ -136,7 +136,7 @@ def test_report_cover_verdict_not_evaluated_states_reason() -> None:
     assert "ground truth: error ÷ σ not evaluated: no ground truth" in text_of(card)
 
 
-def test_report_cover_lists_aiding_sources_with_their_ratio() -> None:
+def test_report_cover_lists_sigma_ratios_of_aiding_sources() -> None:
     aids = (
         AidRow(label="barometer", component="height", ratio=0.57, is_usual=True),
         AidRow(label="magnetometer", component="x", ratio=None),
@@ -220,7 +220,7 @@ def test_innovations_beyond_plot_scale_are_drawn_as_triangles(eventful: Analysis
     assert {abs(value) for line in edges for value in line.get_ydata()} == {4.0}
 
 
-def test_error_plot_title_states_curve_flat_on_this_scale() -> None:
+def test_error_plot_title_says_if_curve_is_flat_on_its_scale() -> None:
     errors = pd.DataFrame({"error_m": [0.02, -0.05], "sigma_m": [0.05, 0.06]}, index=[0.0, 9.0])
     titles = [cover_panels._error_title("ekf2", errors, 0.04, scale) for scale in (0.1, 5.0)]
     assert titles[0] == "EKF2 error (m): RMSE 0.040, σ 0.060"

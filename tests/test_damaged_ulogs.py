@@ -199,7 +199,7 @@ DAMAGED = {
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", DAMAGED)
-def test_read_really_damaged_log_keeps_most_samples(shared_logs, name: str) -> None:
+def test_read_log_of_damaged_real_flight_keeps_most_samples(shared_logs, name: str) -> None:
     count, lost = DAMAGED[name]
     flight = read_log(shared_logs / "real" / f"{name}.ulg")
     assert count * (1.0 - lost) < len(flight.imu) < count

@@ -36,7 +36,7 @@ def test_false_alarm_rate_on_clean_flights_is_at_most_2_percent() -> None:
 
 
 @pytest.mark.parametrize("finding", sorted({condition.finding for condition in CONDITIONS}))
-def test_each_mistake_is_the_first_finding_in_95_percent(finding) -> None:
+def test_each_simulated_mistake_is_first_finding_in_95_percent(finding) -> None:
     rows = TABLE[(TABLE["finding"] == finding) & (TABLE["condition"] != CLEAN)]
     assert rows["rate" if finding in CONSEQUENCES else "first"].max() >= 0.95
 
@@ -49,7 +49,7 @@ def test_undetectable_mistakes_are_found_in_at_most_10_percent() -> None:
         assert row.rate <= 0.1
 
 
-def test_find_clock_jump_skips_likelihood_lost_in_rounding() -> None:
+def test_clock_jump_is_found_despite_rounded_likelihood() -> None:
     """Time-correlated error of 10 m, SIGMA_Z 1 mm, an interval of 0.5 ms between two positions."""
     jump = Condition("source_time_offset_changes", "--mistake clock-jump=400ms")
     assert found(FAULTY_SEED + 2, jump)[0] == "source_time_offset_changes"

@@ -131,7 +131,7 @@ def test_diff_with_nees_beyond_limit_is_reported_as_worse(clean, value, said):
     assert list_changes(after, before).worse == ()
 
 
-def test_diff_of_nis_with_same_verdict_is_not_worse(clean):
+def test_diff_with_larger_nis_but_same_verdict_is_not_worse(clean):
     before = with_kf(clean, nis_mean=1.0, verdict="consistent")
     for nis_mean, verdict, count in (
         (1.7, "overconfident", 1), (1.7, "consistent", 0), (0.5, "underconfident", 1),

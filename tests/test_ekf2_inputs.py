@@ -143,7 +143,7 @@ def test_ekf2_fusion_rules_depend_on_px4_release(flown):
     assert flown(EKF2_PREDICT_US=8000.0).predict_s == pytest.approx(0.008)
 
 
-def test_replay_without_complete_imu_data_is_unavailable(flown):
+def test_ekf2_replay_without_complete_imu_data_is_unavailable(flown):
     assert isinstance(flown(0.0119), Inputs)
     assert "logged at 80 Hz" in flown(0.0125).reason
     assert isinstance(flown(horizon_s=NONE), Unavailable)
@@ -176,7 +176,7 @@ def track(name: str, origin: Origin, interval_s: float = 0.1, **parts: Any) -> P
     ([track("estimator_aid_src_ev_pos", LOGGED_BY_EKF2, 0.25)], "estimator_aid_src_ev_pos"),
     ([track("estimator_aid_src_ev_pos", LOGGED_BY_EKF2, 0.26)], None),
 ])  # fmt: skip
-def test_replay_selects_the_complete_vision_track(tracks, expected):
+def test_ekf2_replay_selects_the_complete_vision_track(tracks, expected):
     found = _vision_track(made(Flight, positions=tuple(tracks)))
     assert getattr(found, "name", None) == expected
 
@@ -317,7 +317,7 @@ def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, Fusio
     return imu, attitude, made(Ekf2, state=state), record
 
 
-def test_replay_segment_of_rotating_vehicle_equals_known_values():
+def test_ekf2_replay_segment_of_turning_vehicle_has_known_values():
     flown = turning(10.0 + 0.1 * np.arange(21))
     found = _make_segment(*flown, 5, 11.5)
     steps = 10.5 + 0.01 * np.arange(101)
@@ -371,7 +371,7 @@ def without(times: np.ndarray, low: float, high: float) -> np.ndarray:
     return times[(times < low + 1e-6) | (times > high - 1e-6)]
 
 
-def test_replay_segments_end_at_vision_gaps(monkeypatch):
+def test_ekf2_replay_segments_end_at_vision_gaps(monkeypatch):
     imu, vision = np.arange(0.0, 60.0, 0.01), np.arange(0.0, 60.0, 0.1)
     assert segments(monkeypatch) == [(1.0, 59.99)]
     # 1 s of fusion, 4 s in the air

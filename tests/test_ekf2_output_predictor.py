@@ -70,7 +70,7 @@ def test_output_predictor_matches_step_by_step_buffer(lag: int) -> None:
         assert found == pytest.approx(known, abs=1e-9)
 
 
-def test_filter_corrections_are_recovered_from_published_track() -> None:
+def test_ekf2_corrections_are_recovered_from_published_position() -> None:
     """Corrections and rows have an interval of 0.1 s, as GNSS and the log."""
     lag, tau_s, count = 15, 0.25, 60
     rng = np.random.default_rng(3)

@@ -128,7 +128,7 @@ def deciding(
     ({"follows_log": True}, (True, False, False, 9.5, False, 5)),
     ({"logged": 0.0}, (True, False, False, 9.5, False, 5)),
 ])  # fmt: skip
-def test_fusion_decision_matches_ekf2_rules(case, expected):
+def test_replayed_fusion_decision_follows_ekf2_rules(case, expected):
     assert deciding(**case) == expected
 
 
@@ -150,7 +150,7 @@ def test_fusion_horizon_equals_length_of_ekf2_buffer(settings, by_delay, timing)
     assert (shifted.delay_s, shifted.horizon_s) == pytest.approx((-0.035, math.inf))
 
 
-def test_replay_of_ekf2_delay_max_before_v1_15_raises_error():
+def test_ekf2_replay_of_delay_max_before_v1_15_raises_error():
     rules = replace(RULES, horizon_by_delay=True)
     received = made(ReceivedPositions, uses_sender_times=False)
     inputs = made(Inputs, rules=rules, settings={}, aid=EV_POS, received=received)
@@ -177,7 +177,7 @@ def test_gnss_position_is_reset_after_7_or_14_s(gap_s, velocity_gap_s, with_velo
     assert (taken, reset) == (False, resets)
 
 
-def test_sequential_update_uses_initial_innovations():
+def test_ekf2_sequential_update_uses_initial_innovations():
     """The second gain uses the new covariance and the old S, as in EKF2; it is not optimal."""
     rng = np.random.default_rng(6)
     root = rng.normal(size=(2, 15, 15))
@@ -205,7 +205,7 @@ def on_gnss(north_m: list[float], north_m_s: list[float], **more: Any) -> Segmen
     return at_rest(north_m, aid=GNSS_POS, rules=GNSS_RULES, speed_m_s=speed, **more)
 
 
-def test_replay_with_gnss_limits_tilt_variance_to_logged_value():
+def test_ekf2_replay_with_gnss_limits_tilt_variance_to_log():
     """Tilt is corrected as by a measurement to the logged variance, and only with GNSS."""
     fixes = [0.0] * 20
     free, limited = (on_gnss(fixes, fixes, tilt_rad2=tilt) for tilt in (np.inf, 2.5e-5))
@@ -218,7 +218,7 @@ def test_replay_with_gnss_limits_tilt_variance_to_logged_value():
 
 
 @pytest.mark.parametrize(("speed_m_s", "moves"), [(1.0, True), (3.0, False)])
-def test_replay_rejects_gnss_velocity_outside_gate(speed_m_s, moves):
+def test_ekf2_replay_rejects_gnss_velocity_outside_gate(speed_m_s, moves):
     """Five times √(P + 0.09) is 1.5 m/s; the position of the fix is fused nevertheless."""
     done = on_gnss([0.0] * 20, [0.0] * 10 + [speed_m_s] + [0.0] * 9)
     assert done.fused.all()
@@ -232,7 +232,7 @@ def test_replay_rejects_gnss_velocity_outside_gate(speed_m_s, moves):
     (2.0, 0.6, True), (2.0, 0.4, False), (3.3, 0.6, True), (3.3, 0.4, False),
     (1.5, 0.4, True), (4.0, 0.6, False),
 ])  # fmt: skip
-def test_replay_decides_at_gate_limit_by_published_motion(north_m, share, fused):
+def test_ekf2_replay_at_gate_limit_follows_published_motion(north_m, share, fused):
     """The gate is at 2.515 m; ``share`` is the published motion over the full correction."""
     fixes = [0.0] * 10 + [north_m] + [0.0] * 9
     done = on_gnss(fixes, [0.0] * 20)
@@ -244,7 +244,7 @@ def test_replay_decides_at_gate_limit_by_published_motion(north_m, share, fused)
     assert bool(done.fused[10, 0]) is (north_m < 2.515)
 
 
-def test_replay_start_correlation_at_rest_matches_kalman_filter():
+def test_ekf2_replay_start_correlation_equals_kalman_filter():
     """Reference: a plain Kalman filter of a vehicle at rest for one minute, facing east."""
     turn = Rotation.from_euler("z", 110.0, degrees=True).as_matrix()
     count = 6000
@@ -269,7 +269,7 @@ def test_replay_start_correlation_at_rest_matches_kalman_filter():
     assert np.linalg.eigvalsh(found).min() > -1e-9
 
 
-def test_replay_gnss_reset_sets_position_and_velocity():
+def test_ekf2_replay_gnss_reset_sets_position_and_velocity():
     """After 7 s without both: position and velocity are those of the fix, with their variances."""
     done = on_gnss([0.0] * 5 + [300.0] * 80, [0.0] * 5 + [40.0] * 80)
     at = int(np.flatnonzero(done.reset[:, 0])[0])
@@ -279,7 +279,7 @@ def test_replay_gnss_reset_sets_position_and_velocity():
     np.testing.assert_allclose(done.variance[at + 1, 0, 3:5], 0.09)
 
 
-def test_replay_does_not_fuse_a_lost_aiding_source():
+def test_ekf2_replay_does_not_fuse_a_lost_aiding_source():
     """Ten fixes at the origin, then ten 1 m north with 0.5 m/s; the aid is lost at 11.05 s."""
     fixes, speeds = [0.0] * 10 + [1.0] * 10, [0.0] * 10 + [0.5] * 10
     done = {name: on_gnss(fixes, speeds, without=dict.fromkeys(name.split(), 11.05))
@@ -300,7 +300,7 @@ def test_replay_does_not_fuse_a_lost_aiding_source():
 
 
 @pytest.mark.parametrize("speed_m_s", [None, np.zeros((20, 3))])
-def test_replay_with_magnetometer_estimates_heading(speed_m_s):
+def test_ekf2_replay_with_magnetometer_estimates_heading(speed_m_s):
     """The initial heading error is 0.05 rad; the logged heading is not used."""
     done = at_rest([0.0] * 5 + [1.0] * 15, aid=GNSS_POS, rules=GNSS_RULES, speed_m_s=speed_m_s,
                    heading_rad=0.05, down_m=-3.0, field_gauss=(0.21, 0.0, 0.43))  # fmt: skip
@@ -361,7 +361,7 @@ def at_rest(
     return run_segment(inputs, segment, [variant], [intervals])
 
 
-def test_replay_of_vehicle_at_rest_matches_kalman_filter():
+def test_ekf2_replay_of_vehicle_at_rest_matches_kalman_filter():
     done = at_rest([0.0] * 20)
     np.testing.assert_allclose(done.state, 0.0, atol=1e-9)
     assert done.fused.all()
@@ -376,7 +376,7 @@ def test_replay_of_vehicle_at_rest_matches_kalman_filter():
     assert done.variance[-1, 0, 8] == pytest.approx(4e-4, rel=0.01)
 
 
-def test_replay_of_position_jump_resets_after_1_s():
+def test_ekf2_replay_of_position_jump_resets_after_1_s():
     done = at_rest([0.0] * 5 + [3.0] * 15)
     rejected, reset, fused = done.rejected[:, 0], done.reset[:, 0], done.fused[:, 0]
     assert np.flatnonzero(rejected).tolist() == list(range(5, 16))
@@ -458,7 +458,7 @@ def events(
     return _events(inputs, stretch_of(100), Timing(delay_s, horizon_s))
 
 
-def test_replay_interval_ends_at_the_step_that_fuses_a_sample():
+def test_ekf2_replay_interval_ends_at_step_that_fuses_a_sample():
     """Half a step and the delay before its timestamp; additional events in gaps of vision."""
     found = events([10.2, 10.305, 10.9])
     has_sample = found.sample >= 0

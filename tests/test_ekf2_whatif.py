@@ -94,7 +94,7 @@ def test_kf_ekf2_difference_steps_add_up_to_total_difference(model):
         assert last == pytest.approx(axis.position_rmse_to_truth_m["ekf2"], abs=0.003)
 
 
-def test_difference_steps_without_common_time_are_unavailable(model):
+def test_kf_ekf2_difference_without_common_time_is_unavailable(model):
     axis, steps = made(Axis, direction=np.eye(3)[0]), pd.DataFrame(index=[1e4, 1e4 + 1.0])
     result = explain_by_steps(model, Settings(), {"north": made(Replay, axis=axis, steps=steps)})
     assert isinstance(result, Unavailable)
@@ -146,7 +146,7 @@ def test_kf_ekf2_difference_steps_change_one_property_each():
     assert [each.velocity for each in variants.values()] == [False] * 7 + [True] * 3
 
 
-def test_longest_run_of_rejections_has_start_and_duration():
+def test_longest_run_of_ekf2_rejections_has_start_and_duration():
     taken = 20.0 + np.arange(10.0)
     updates = pd.DataFrame(
         {"rejected": [0, 1, 0, 0, 1, 1, 1, 0, 1, 1], "fused_at_s": taken + 0.5}, index=taken
@@ -179,7 +179,7 @@ def test_rmse_to_ground_truth_uses_only_common_times():
     assert rms_to_truth(made(Flight, truth=NONE), there, direction, times) is None
 
 
-def test_longest_time_without_fusion_includes_both_ends():
+def test_longest_time_without_fusion_includes_start_and_end():
     evaluated_spans = ((15.0, 30.0), (40.0, 60.0))
     assert _longest_between_fusions(np.array([16.0, 29.0, 41.0, 59.0]), evaluated_spans) == 18.0
     assert _longest_between_fusions(np.array([40.0]), evaluated_spans) == 25.0

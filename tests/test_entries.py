@@ -55,7 +55,7 @@ THREE = {
 
 
 @pytest.mark.parametrize(("attempt", "points"), [("latest", 7.0), ("first", 4.0), ("best", 9.0)])
-def test_class_entry_attempt_rule_selects_the_counting_report(attempt, points) -> None:
+def test_class_entry_attempt_rule_selects_the_graded_report(attempt, points) -> None:
     (ada, grace), _ = make_entries(THREE, Course(RUBRIC, attempt=attempt))
     assert ada.counted_report.points == ada.total == points
     assert len(ada.other_reports) == 2
@@ -108,7 +108,7 @@ def test_zip_entry_time_orders_reports_but_deducts_no_points() -> None:
     assert "Canvas marks the file as late" in grace.flags[0]
 
 
-def test_file_that_is_no_report_counts_only_if_alone() -> None:
+def test_submitted_file_that_is_no_report_counts_only_if_alone() -> None:
     essay = replace(
         graded_report("", 0.0), version="", verdict=Verdict("cannot verify", ("x",), False)
     )
@@ -139,7 +139,7 @@ def test_class_entry_with_differing_answer_forms_is_pending() -> None:
     assert ada.total == 4.0
 
 
-def test_pending_report_does_not_replace_the_counting_report() -> None:
+def test_pending_report_does_not_replace_the_graded_report() -> None:
     """For example a later report of another student with this student's id."""
     files = {
         "a.pdf": of_form(9.0, "yaw"),
@@ -169,7 +169,7 @@ def test_file_name_that_imitates_platform_names_is_flagged() -> None:
     )
 
 
-def test_best_report_of_one_submission_counts() -> None:
+def test_best_report_in_one_submission_is_the_graded_one() -> None:
     files = {blackboard("ada", "19-10-00-00", "a.pdf"): graded_report("", 8.0),
              blackboard("ada", "19-10-00-00", "b.pdf"): graded_report("", 2.0)}  # fmt: skip
     for attempt in ("first", "latest", "best"):
@@ -269,7 +269,7 @@ def test_instructor_override_with_excess_points_is_noted(rows, points, told, tmp
     assert notes == tuple(f"overrides.csv: {one}." for one in told)
 
 
-def test_overrides_from_class_page_include_all_students(tmp_path) -> None:
+def test_instructor_overrides_from_page_include_all_students(tmp_path) -> None:
     """Includes students without a submission, because the download replaces the file."""
     rows = write_overrides(
         tmp_path, "1,A,9.5,Good.", "1,,,Come.", "1,total,8,Agreed.", "2,total,5,Shown."
@@ -283,7 +283,7 @@ def test_overrides_from_class_page_include_all_students(tmp_path) -> None:
     assert (again, notes) == (rows, ())
 
 
-def test_override_of_total_makes_pending_points_count(tmp_path) -> None:
+def test_instructor_total_makes_pending_points_count(tmp_path) -> None:
     files = {"1.pdf": graded_report("", 4.0, student_id="1", pending_action="Run 0.1.1.")}
     (ada, _), _ = make_entries(files, overrides=write_overrides(tmp_path, "1,A,9,"))
     assert ada.total is None
@@ -291,7 +291,7 @@ def test_override_of_total_makes_pending_points_count(tmp_path) -> None:
     assert ada.total == 9.0
 
 
-def test_override_for_student_without_submission_gives_points(tmp_path) -> None:
+def test_instructor_override_without_submission_gives_points(tmp_path) -> None:
     (_, grace), notes = make_entries(
         {}, overrides=write_overrides(tmp_path, "2,Total,5,Shown in class.")
     )

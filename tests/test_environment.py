@@ -52,7 +52,7 @@ def test_output_ignores_invalid_columns_environment_variable(monkeypatch, capsys
     assert usual[1].startswith(LOG.name)
 
 
-def test_terminal_output_ignores_columns_of_zero(monkeypatch, capsys) -> None:
+def test_terminal_output_ignores_columns_variable_of_zero(monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "0")
     monkeypatch.setenv("TTY_COMPATIBLE", "1")
     code, out, _ = run_main(monkeypatch, capsys, "info", LOG)

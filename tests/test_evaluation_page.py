@@ -114,7 +114,7 @@ def test_rmse_per_quarter_of_growing_error_equals_integral() -> None:
 @pytest.mark.parametrize(("error", "share"), [
     (np.full(2000, 0.3), "10%"), (np.arange(2000) // 100 == 7, "100%"), (np.zeros(2000), "0%"),
 ], ids=["even", "a peak", "none"])  # fmt: skip
-def test_worst_tenth_of_poses_has_stated_share_of_squared_error(error, share) -> None:
+def test_evaluation_page_states_share_of_worst_tenth_of_poses(error, share) -> None:
     sentence = worst_poses_sentence(evaluate_with_error(across(error.astype(np.float64))))
     assert f"contribute {share} of the squared error" in sentence
 

@@ -51,7 +51,7 @@ def test_consecutive_equal_flight_modes_are_merged() -> None:
     )  # fmt: skip
 
 
-def test_position_gap_exceeds_1_s_and_five_intervals() -> None:
+def test_detected_position_gaps_exceed_1_s_and_five_intervals() -> None:
     time_s = np.array([0.0, 0.2, 0.4, 1.4, 1.6, 3.0, 3.2])
     assert source_gaps(time_s, 5.0) == ((1.6, 3.0),)
     assert source_gaps(time_s, 1.0) == ()

@@ -158,7 +158,7 @@ ROWS = """Object.fromEntries([...document.querySelectorAll('#card [data-filter]'
 }))"""
 
 
-def test_explore_page_shows_the_analysed_card_initially(
+def test_explore_page_shows_analysed_card_until_settings_change(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     card = card_of(explored[1])

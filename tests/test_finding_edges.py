@@ -98,7 +98,7 @@ def test_finding_text_lists_times_of_its_occurrence(spans: Any, expected: str) -
     assert replace(make_finding("x"), spans_s=spans).when == expected
 
 
-def test_flag_before_first_sample_has_the_first_value() -> None:
+def test_status_flag_before_first_sample_has_first_value() -> None:
     flag, whole = pd.Series([1.0, 0.0, 1.0], index=[20.0, 30.0, 80.0]), Segment(10.0, 110.0, "")
     assert fraction_on(flag, whole) == 0.5
     assert fraction_on(flag, Segment(25.0, 35.0, "")) == 0.5
@@ -274,7 +274,7 @@ def test_ekf2_rejection_severity_follows_rejected_fraction(
             assert finding.remedy.endswith(remedy)
 
 
-def test_ekf2_rejection_action_must_halve_the_rejections() -> None:
+def test_recommended_action_must_halve_ekf2_rejections() -> None:
     frame = rejected(20, 100)
     for after, improves, action in (
         (0.09, True, "Set EKF2_EVP_NOISE to 0.1 m."), (0.1, True, CHECK_FIRST),
@@ -469,7 +469,9 @@ def test_wrong_frame_of_position_file_is_reported_as_error() -> None:
 
 
 @pytest.mark.parametrize(("until_s", "expected"), [(60.0, "warning"), (60.1, "note")])
-def test_frame_without_north_severity_depends_on_fused_yaw(until_s: float, expected: str) -> None:
+def test_severity_of_frame_without_north_depends_on_fused_yaw(
+    until_s: float, expected: str
+) -> None:
     frd = source(frame="FRD")
     one = analysis(source=frd, ekf2=with_fusion((0.0, 1.0), (until_s, 0.0), column="yaw"))
     finding = only(source_frame.detect, one)
@@ -818,7 +820,7 @@ def test_faulty_timestamps_of_recording_are_reported(clock: Any, expected: list[
     assert list(named(source_stamps.detect, analysis(source=source(clock_map=clock)))) == expected
 
 
-def test_arrival_timestamps_are_reported_until_synchronisation() -> None:
+def test_arrival_times_used_until_clock_sync_are_reported() -> None:
     one = analysis(ekf2=ages(12, 20, 0.05))
     finding = only(source_stamps.detect_arrival_times, one)
     assert finding.evidence == {"until_s": 32.0, "latency_s": 0.05}

@@ -381,7 +381,7 @@ def test_finding_catalogue_entry_has_known_group() -> None:
         assert entry.meaning.endswith(".")
 
 
-def test_explain_examples_contain_measured_detection_rates() -> None:
+def test_explain_command_examples_state_measured_rates() -> None:
     examples = load_examples()
     assert list(examples) == list(CATALOGUE)
     rows = pd.read_csv(Path(__file__).parent / "studies" / "rates.csv")

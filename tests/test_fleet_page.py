@@ -37,7 +37,7 @@ def parts(row: list[Any]) -> dict[str, Any]:
 # ------------------------------------------------------------------ without a browser
 
 
-def test_batch_page_compared_log_lists_its_missing_results() -> None:
+def test_batch_page_lists_missing_results_of_each_log() -> None:
     table = made_up(30)
     table.loc[table["axis"] == "down", ["reason", "remedy"]] = ("EKF2, down: no heights", "Set it.")
     text = html_text(table, "Bench", "px4fuse 1")

@@ -139,7 +139,7 @@ def test_fused_optical_flow_mean_is_weighted_by_sample_count():
     np.testing.assert_array_equal(fuse_flow(x, P, none, 3.0)[0], x)
 
 
-def test_replay_without_gnss_drifts_less_with_optical_flow():
+def test_ekf2_replay_without_gnss_drifts_less_with_optical_flow():
     """Over one minute the drift is about 1 m with flow, above 10 m with the IMU only."""
     lost = dict.fromkeys(("gnss_pos", "gnss_vel"), 40.0)
     off = []
@@ -161,7 +161,7 @@ def stretches_s(flight: Flight) -> list[tuple[float, float]]:
     return [(float(one.time_s[0]), float(one.time_s[-1])) for one in segments]
 
 
-def test_replay_segments_are_split_at_height_resets_and_clipping():
+def test_ekf2_replay_is_split_at_height_resets_and_clipping():
     flight = model().flight
     ((start, end),) = stretches_s(flight)
     for delta, parted in (((0.0, 0.0, 1.0), True), ((1.0, 0.0, 0.0), False)):
@@ -199,7 +199,7 @@ def test_read_gnss_omits_fixes_while_fusion_is_disabled():
     np.testing.assert_array_equal(found.stamp_s, every.stamp_s[remaining])  # type: ignore[union-attr]
 
 
-def test_replay_start_correlation_follows_from_earlier_flight():
+def test_ekf2_replay_start_correlation_uses_earlier_flight():
     """Six seconds at rest and the climb correlate tilt and accelerometer bias."""
     (segment,) = model().inputs.segments
     assert segment.history is not None
@@ -240,7 +240,7 @@ def test_ekf2_model_of_optical_flow_flights_agrees_with_log(name, shared_logs, m
 
 
 @pytest.mark.reallogs
-def test_replay_segment_is_split_if_flow_drift_exceeds_limit(shared_logs, monkeypatch):
+def test_ekf2_replay_is_split_if_flow_drift_exceeds_limit(shared_logs, monkeypatch):
     monkeypatch.setattr("px4fuse.ekf2.replay.MAX_FLOW_ONLY_DIFFERENCE_M", 0.3)
     found = opened(read_log(shared_logs / "gps" / "main202603_gps_outage_flow.ulg"))
     assert set(found.agreement.doubtful) == {"optical_flow"}

@@ -84,7 +84,7 @@ def parts(answers: Answers, truth: FormTruth = TRUTH) -> list[float]:
     return [round(found[name], 2) for name in PART_NAMES]
 
 
-def test_each_mistake_has_creditable_answers_in_the_form() -> None:
+def test_answer_form_offers_correct_answers_for_each_mistake() -> None:
     assert set(SIMULATED) == set(MISTAKES) - {"none", "vio-drift"}
     assert set(TABLE["shows"]) | {"cover"} == set(PANELS)
     for name in SIMULATED:
@@ -147,7 +147,7 @@ def test_answer_form_for_clean_flight_must_name_no_mistake() -> None:
     assert parts(RIGHT, CLEAN)[:4] == [0.0] * 4
 
 
-def test_open_end_answer_needs_its_size_for_all_points() -> None:
+def test_loop_open_end_answer_needs_its_size_for_all_points() -> None:
     landed = TrueMistake("open-end", 5.0, 4.25, 5.75, 60.0, None)
     truth = replace(CLEAN, mistakes=(landed,), quantities=())
     claim = StudentMistake("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")
@@ -177,7 +177,7 @@ def test_same_answer_form_for_all_loops_earns_few_points() -> None:
             assert np.mean([form_points(form, one).share for one in truths]) <= 0.35
 
 
-def test_correct_open_end_size_includes_odometry_drift() -> None:
+def test_correct_loop_open_end_size_includes_odometry_drift() -> None:
     """A student cannot separate the drift from the measured closure error."""
     scenario = Scenario(kind="loop", passes=1, vio_drift=0.02, seed=4, truth=False)
     (wrong,) = form_truth(flights.simulate(scenario, parse(("open-end=5m",))), SHA256).mistakes

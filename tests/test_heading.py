@@ -130,7 +130,7 @@ def test_heading_misalignment_of_real_logs_is_in_known_range(shared_logs, log, d
 # ---- parts and drift ----------------------------------------------------------------------------
 
 
-def test_heading_of_long_downsampled_flight_has_over_100_parts() -> None:
+def test_heading_of_long_flight_is_estimated_in_over_100_parts() -> None:
     """1,000 measurements in 25 minutes: fewer than three per part of ``PART_LENGTH_S``."""
     time = np.linspace(0.0, 1500.0, 1000)
     parts = frame_rotation._mean_per_part(

@@ -66,7 +66,7 @@ def found(analysis: Analysis, detectors: tuple[Any, ...] = DETECTORS) -> dict[st
 # ------------------------------------------------------------------ the regression
 
 
-def test_regression_columns_equal_filter_responses_to_a_step() -> None:
+def test_bias_regression_columns_equal_kf_step_responses() -> None:
     """Compare innovations with and without a step with filterpy replays."""
     north = compare(aisle_flight(duration_s=30.0), RIGHT, axes=("north",))["north"].axis
     step = np.where(north.measurement_time_s >= 12.0, 0.7, 0.0)
@@ -93,7 +93,7 @@ def test_regression_columns_equal_filter_responses_to_a_step() -> None:
     np.testing.assert_allclose([nu[:, 0], s], expected, atol=1e-9)
 
 
-def test_regression_with_imu_gap_equals_filter_innovations() -> None:
+def test_bias_regression_with_imu_gap_equals_kf_innovations() -> None:
     analysis = flown()
     axes = tuple(analysis.axes[name].axis for name in ("north", "east"))
     model = make_design_matrix(analysis.flight, axes, RIGHT, 0.10, 0.0)
@@ -117,7 +117,7 @@ def test_regression_with_imu_gap_equals_filter_innovations() -> None:
             np.testing.assert_allclose(fits.residual[fits.axis == at], residual, atol=1e-9)
 
 
-def test_regression_fit_equals_least_squares_with_prior() -> None:
+def test_bias_regression_equals_least_squares_with_prior() -> None:
     rng = np.random.default_rng(1)
     columns, data = rng.normal(size=(2, 25, 2)), rng.normal(size=(2, 25))
     skip = np.arange(25) % 5 == 0

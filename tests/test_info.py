@@ -168,7 +168,7 @@ def test_info_on_slow_imu_reports_no_acceleration_analysis(tmp_path, imu_hz, sai
     assert "attitude was logged at 5.0 Hz, but 10 Hz are needed" in slow.reason
 
 
-def test_info_on_damaged_log_gives_damage_as_first_advice(tmp_path, sample_log):
+def test_info_on_damaged_log_states_the_damage_first(tmp_path, sample_log):
     path = tmp_path / "damaged.tlog"
     content = Aisle(seconds=10.0).record().tlog()
     path.write_bytes(content[: len(content) // 2] + bytes(5000) + content[len(content) // 2 :])
@@ -316,7 +316,7 @@ def test_info_describes_or_rejects_each_shared_log(shared_logs, monkeypatch, cap
             assert any(remedy in a.remedy for a in inventory.advice), path.name
 
 
-def test_info_on_log_without_any_single_topic_succeeds(sample_log, tmp_path):
+def test_info_succeeds_on_log_that_lacks_any_one_topic(sample_log, tmp_path):
     whole = load(sample_log)
     short = Log([take(t, range(0, len(t.fields["timestamp"]), 40)) for t in whole.topics])
     for name in sorted(short.names()):

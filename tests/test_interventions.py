@@ -46,7 +46,7 @@ def cause(analysis: Analysis, owner: Any, of: Any = "nis") -> Intervention:
     return find_cause(analysis.causes, owner, "aisle", of)
 
 
-def test_consistent_flight_has_no_causes() -> None:
+def test_consistent_flight_has_no_causes_of_inconsistency() -> None:
     assert flown().causes == ()
 
 
@@ -97,7 +97,7 @@ def test_kf_rerun_without_bias_equals_corrected_acceleration() -> None:
     assert found.after == pytest.approx(again.nis_mean, rel=1e-6)
 
 
-def test_vibration_rerun_raises_ekf2_acc_noise_to_px4_limit() -> None:
+def test_filter_rerun_for_vibration_raises_ekf2_acc_noise() -> None:
     analysis = flown("vibration=1.5")
     found = cause(analysis, "ekf2", "nis")
     assert found.change == {"EKF2_ACC_NOISE": 1.0}  # PX4's maximum
@@ -176,7 +176,7 @@ def test_cause_states_position_difference_before_and_after() -> None:
     )
 
 
-def test_rerun_excludes_outliers_at_shifted_timestamps() -> None:
+def test_filter_rerun_excludes_outliers_at_shifted_timestamps() -> None:
     analysis = flown("clock-offset=-0.19", "nlos=7%")
     count = cause(analysis, "ekf2").change[OUTLIERS]
     rows = [one for one in analysis.causes if one.filter == "ekf2" and one.axis == "aisle"]
@@ -206,7 +206,7 @@ def test_ekf2_rerun_candidates_include_non_default_parameters() -> None:
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
 
-def test_cause_must_explain_half_to_150_percent() -> None:
+def test_cause_must_explain_50_to_150_percent_of_inconsistency() -> None:
     def one(change: Any, explains: float, *, into: bool = False) -> Intervention:
         return Intervention(
             statistic="nis", filter="kf", axis="aisle", change=change, before=9.0,
@@ -234,7 +234,7 @@ def test_cause_must_explain_half_to_150_percent() -> None:
     assert find_cause([whole], "ekf2", "aisle") is find_cause([whole], "kf", "north") is None
 
 
-def test_rerun_candidate_without_required_data_is_skipped() -> None:
+def test_filter_rerun_without_required_data_is_skipped() -> None:
     analysis = flown("nlos=7%", sigma_z=0.05)
     missing = Unavailable("it", "not known", "None.")
 

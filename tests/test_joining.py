@@ -121,7 +121,7 @@ def test_shift_times_also_shifts_times_inside_records(sample_flight):
     assert shift_times((FlightMode(1.0, 2.0, "Land"),), 2.5) == (FlightMode(3.5, 4.5, "Land"),)
 
 
-def test_joined_flight_lists_only_data_missing_in_both(record):
+def test_joined_recording_lists_only_data_missing_in_both(record):
     """Parts that the copied EKF2 lacks are listed."""
     bare = record(Aisle(uwb=None), "bare.tlog", "ODOMETRY", "HIGHRES_IMU")
     full = record(Aisle(), "full.tlog")
@@ -137,7 +137,7 @@ def test_joined_flight_lists_only_data_missing_in_both(record):
 
 
 @pytest.mark.parametrize("earlier_s", [0.0, 10.0])
-def test_joined_flight_has_senders_and_shifted_unix_time(record, earlier_s):
+def test_joined_recording_has_senders_and_shifted_unix_time(record, earlier_s):
     ulog = aisle_flight(duration_s=60.0, ekf2=None, attitude_hz=None)
     ulog = replace(ulog, log=replace(ulog.log, boot_time_s=BOOT_S - earlier_s))
     flight = record(Aisle(system_time=True))

@@ -91,7 +91,7 @@ def true_closure_error_m() -> float:
     return float(np.linalg.norm(moved[0] - moved[1]))
 
 
-def test_loop_sample_closure_error_equals_ground_truth(sample_loop: Loop) -> None:
+def test_loop_closure_error_of_sample_flight_equals_ground_truth(sample_loop: Loop) -> None:
     assert sample_loop.closure_error_m == pytest.approx(true_closure_error_m(), abs=0.02)
     assert sample_loop.closure_error_m == pytest.approx(1.42, abs=0.05)  # sample_logs/README.md
     assert sample_loop.path_length_m == pytest.approx(87.7, abs=1.5)
@@ -100,7 +100,7 @@ def test_loop_sample_closure_error_equals_ground_truth(sample_loop: Loop) -> Non
     assert sample_loop.part_reason == "from take-off to landing, by the land detector"
 
 
-def test_loop_sample_corrections_reduce_ate_and_end_error(sample_loop):
+def test_loop_corrections_of_sample_flight_reduce_ate(sample_loop):
     for reference in (0, 1):  # ground truth and SLAM
         before = rmse(sample_loop, "uncorrected", reference)
         for way in ("by_distance", "gated"):

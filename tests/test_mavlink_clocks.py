@@ -68,7 +68,7 @@ def test_clock_fit_with_random_delay_recovers_offset_and_drift(
 
 
 @pytest.mark.parametrize(("span", "slope"), [(100.0, 1.00005), (20.0, 1.0)])
-def test_clock_fit_without_delay_is_exact(span, slope):
+def test_clock_fit_of_messages_without_delay_is_exact(span, slope):
     x = np.linspace(0.0, span, 500)
     line = fit_least_delay(x, 7.0 + 1.00005 * x)
     assert (line.pairs, line.slope) == (500, pytest.approx(slope, abs=1e-12))
@@ -79,7 +79,7 @@ def test_clock_fit_without_delay_is_exact(span, slope):
 
 @pytest.mark.parametrize("speed", [0.04, 0.5, 10.0])
 @pytest.mark.parametrize("span", [10.0, 100.0])
-def test_clock_fit_recovers_replay_speed(speed, span):
+def test_clock_fit_of_replayed_recording_recovers_replay_speed(speed, span):
     x = np.linspace(0.0, span, 600)
     delay = np.random.default_rng(1).exponential(0.01, len(x))
     line = fit_least_delay(x, 5.0 + speed * x + delay)
@@ -229,7 +229,7 @@ def test_mavlink_stream_without_receive_time_uses_timesync(read):
         assert [c.clock for c in flight.clocks] == ["UNIX time of system 1, component 197"]
 
 
-def test_recording_without_boot_clock_starts_at_first_message(read):
+def test_mavlink_without_boot_clock_starts_at_first_message(read):
     """Only messages from the companion were recorded."""
     aisle = Aisle(replies=False)
     recorder = aisle.record()
@@ -426,7 +426,7 @@ def test_timesync_that_contradicts_receive_time_is_ignored():
     np.testing.assert_allclose(found.to_boot.at(stamps), received, atol=1e-6)
 
 
-def test_clock_mapping_from_stated_numbers_gives_same_times():
+def test_clock_mapping_by_reported_offset_gives_same_times():
     """boot = timestamp + offset + drift · (timestamp - middle of the timestamps)."""
     received = 20.0 + 1.0001 * np.arange(0.0, 100.0, 0.1)
     stamps, found = map_unix_timestamps(received, *NO_EXCHANGES)

@@ -104,7 +104,7 @@ SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m":
           ("sigma_a_too_large", "note", noises.NO_IMPROVEMENT)]),
     ],
 )  # fmt: skip
-def test_wrong_noise_action_is_the_rerun_that_improves(trials: Any, expected: Any) -> None:
+def test_wrong_noise_finding_recommends_the_improving_rerun(trials: Any, expected: Any) -> None:
     fitted = tuned(Noise(0.5, 0.45, 0.55), Noise(0.1, 0.09, 0.11))
     cause, other = noises.detect_wrong_settings(
         analysis(source=MOVING, tuning=fitted, trials=trials)
@@ -151,7 +151,7 @@ def test_wrong_noise_finding_states_factor_and_estimate() -> None:
     assert named(noises.detect_wrong_settings, analysis(source=MOVING)) == {}
 
 
-def test_wrong_sigma_z_action_recommends_at_least_5_mm() -> None:
+def test_recommended_sigma_z_is_at_least_5_mm() -> None:
     bounded = tuned(Noise(None, None, 0.0021))
     finding = only(noises.detect_wrong_settings, analysis(source=MOVING, tuning=bounded))
     assert finding.remedy == "Compare with a run with --sigma-z 0.005."
@@ -205,7 +205,7 @@ def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
         (axis(kf=NONE, replay=SimpleNamespace(updates=None)), None),
     ],
 )  # fmt: skip
-def test_near_zero_process_noise_needs_correlated_innovations(
+def test_near_zero_process_noise_finding_requires_correlation(
     one: Any, expected: str | None
 ) -> None:
     assert severity(noises.detect_process_noise_near_zero, analysis(axes=(one,))) == expected
@@ -263,7 +263,7 @@ def test_inconsistent_filter_finding_groups_horizontal_axes() -> None:
     assert group_by_cause(found) == found
 
 
-def test_underconfident_filter_of_drifting_source_keeps_noise() -> None:
+def test_underconfident_filter_on_drifting_source_keeps_noise() -> None:
     for nis, is_kept, level in ((0.2, True, "note"), (5.0, False, "error")):
         finding = only(
             noises.detect_inconsistent_variances, analysis(axes=(kf(nis),), source=ODOMETRY)
@@ -339,7 +339,7 @@ def test_inconsistent_filter_action_follows_from_its_cause(owner, change, kind, 
     assert finding.evidence["cause"] == kind
 
 
-def test_inconsistent_filter_rerun_without_gain_is_no_action() -> None:
+def test_filter_rerun_that_improves_nothing_is_not_advised() -> None:
     change = {"sigma_z_m": 2.0}
     for after, action in ((1.0, "Set SIGMA_Z to 2 m (--sigma-z 2)."), (9.0, noises.NOT_EXPLAINED)):
         one = analysis(axes=(kf(9.0),), causes=(tried("kf", change),), tuning=tuned(),
@@ -357,7 +357,7 @@ def test_inconsistent_filter_without_cause_recommends_a_check() -> None:
     assert unknown.remedy == noises.UNKNOWN_NOISE
 
 
-def test_smaller_noise_that_contradicts_truth_is_no_action() -> None:
+def test_smaller_noise_that_contradicts_truth_is_not_advised() -> None:
     contradicted = replace(tried("kf", {"sigma_z_m": 0.5}, before=0.2), contradicts_truth=True)
     one = analysis(axes=(kf(0.2),), causes=(contradicted,))
     finding = only(noises.detect_inconsistent_variances, one)

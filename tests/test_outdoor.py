@@ -57,7 +57,7 @@ def roots(analysis: Analysis) -> list[str]:
 
 
 @given(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.floats(-75.0, 75.0), st.floats(-180.0, 180.0))
-def test_latitude_longitude_projection_inverts_its_inverse(
+def test_latitude_longitude_to_metres_and_back_is_exact(
     north_m: float, east_m: float, latitude_deg: float, longitude_deg: float
 ) -> None:
     origin = latitude_deg, longitude_deg
@@ -158,7 +158,7 @@ def test_outdoor_flight_without_mistake_is_consistent() -> None:
         ("slow-error=0.5,30", "source_noise_time_correlated"),
     ],
 )
-def test_outdoor_mistake_is_first_finding(mistake: str, root: str) -> None:
+def test_simulated_outdoor_mistake_is_first_finding(mistake: str, root: str) -> None:
     """Mistakes for which GNSS takes other branches in the findings than indoor positions."""
     assert roots(flown(mistake))[0] == root
 
@@ -171,7 +171,7 @@ def test_outdoor_mistake_is_first_finding(mistake: str, root: str) -> None:
         ("r-scale=0.1", "nis", "EKF2_GPS_P_NOISE", 0.4, 0.02),
     ],
 )
-def test_outdoor_mistake_is_cause_of_ekf2_error(
+def test_simulated_outdoor_mistake_is_cause_of_ekf2_error(
     mistake: str, of: Any, name: str, value: float, within: float
 ) -> None:
     analysis = flown(mistake)
@@ -201,7 +201,7 @@ def test_outdoor_vibration_is_partly_explained_by_noise() -> None:
     assert np.nanmean(error_m**2) / variances < 1.5**2 < process_noise.after.nees_mean
 
 
-def test_what_if_correct_gnss_delay_equals_correct_flight() -> None:
+def test_what_if_with_correct_gnss_delay_equals_correct_flight() -> None:
     wrong, right = (flown(*texts).ekf2_model for texts in (("ekf2-delay=0",), ()))
     result, other = what_if(wrong, [{"EKF2_GPS_DELAY": 110.0}]), what_if(right, [])
     (predicted,), true = result.whatif, other.logged
@@ -267,7 +267,7 @@ def test_simulated_correlated_error_has_given_sigma_and_time() -> None:
     assert np.std(first) == pytest.approx(0.5, rel=0.1)
 
 
-def test_simulated_heading_mistake_reaches_attitude_with_lag() -> None:
+def test_simulated_heading_error_builds_up_with_a_lag() -> None:
     time_s = np.array([0.0, 39.9, 43.0, 100.0])
     clean = sensors.attitude_error(OUTDOOR, Mistakes(), time_s).as_rotvec()
     wrong = sensors.attitude_error(OUTDOOR, parse(["heading=25,40"]), time_s).as_rotvec()

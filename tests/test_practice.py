@@ -41,7 +41,7 @@ SEED, COUNT = 5, 3
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3), st.integers(1, 20))
-def test_practice_set_contains_each_mistake_equally_often(
+def test_practice_flights_contain_each_mistake_equally_often(
     seed: int, level: int, count: int
 ) -> None:
     rounds = draw(seed, level, count)
@@ -313,7 +313,7 @@ def test_practice_page_gives_half_a_point_for_half_an_answer(browser: Browser, q
     assert points == [0.5, 1, 0, 0.5]
 
 
-def test_practice_card_names_mistake_that_was_not_detected() -> None:
+def test_practice_page_card_names_an_undetected_mistake() -> None:
     clean = structs.replace(SMALL_SIGMA_A, severity="clean", causes=(), headline="No fault found")
     described = [{"fault": "gate of EKF2 too small", "size": "EKF2_EVP_GATE 1.4"}]
     named = practice._name_mistakes(clean, described)

@@ -83,7 +83,7 @@ def test_characters_without_any_font_are_printed_as_squares(
 
 
 @pytest.mark.usefixtures("_fresh")
-def test_fonts_with_only_box_glyphs_are_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fonts_that_draw_only_boxes_are_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     own = font_manager.findfont(fonts.FONT)
     entries = [
         SimpleNamespace(name=name, style="normal", weight=400, fname=str(own), index=0)

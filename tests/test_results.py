@@ -45,7 +45,7 @@ def test_results_schema_is_valid_and_contains_each_result_type():
 
 
 @pytest.mark.parametrize("one", [EXAMPLE, LOOP], ids=["compare", "loop"])
-def test_results_schema_rejects_changed_results(one):
+def test_results_schema_rejects_invalid_results(one):
     validator = jsonschema.Draft202012Validator(SCHEMA)
     assert validator.is_valid(json.loads(json.dumps(one)))
     for wrong in (
@@ -145,7 +145,7 @@ def test_read_results_from_invalid_json_file_is_rejected(given, said):
     ],
     ids=str,
 )
-def test_read_results_that_violate_the_schema_is_rejected(values, said):
+def test_results_that_violate_the_schema_are_rejected(values, said):
     with pytest.raises(ResultsError, match=f"does not follow the schema.*{said}|{said}"):
         decode_results(changed_results(**values))
 

@@ -240,7 +240,7 @@ def test_fill_grades_matches_anonymous_row_by_participant_number(tmp_path) -> No
     assert fill_grades(sheet, ENTRIES, people, "", TEXTS)[0].rows[0][5] == "87.5"
 
 
-def test_fill_grades_notes_a_student_without_row(tmp_path) -> None:
+def test_fill_grades_reports_a_student_missing_in_the_table(tmp_path) -> None:
     sheet = table(tmp_path, "\r\n".join(MOODLE.split("\r\n")[:2]) + "\r\n")
     _, notes = fill_grades(sheet, ENTRIES, register(sheet), "", TEXTS)
     assert notes == ("table.csv has no row for Max Roe. These grades were not entered.",)

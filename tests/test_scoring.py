@@ -239,7 +239,7 @@ class TestScore:
         assert all("SIGMA_A is 0.5" in item.comment for item in made.items)
         assert made.pending_action == ""
 
-    def test_unverified_report_is_pending_or_zero_as_rubric_states(self):
+    def test_unverified_report_earns_pending_or_no_points(self):
         verdict = Verdict("other log", ("no log",), False, remedy="Look.")
         made = assess_results(verdict=verdict)
         assert made.items[0].points == 0.0
@@ -367,7 +367,7 @@ class TestFeedback:
         ({"source__path": "kept by EKF2"}, ("kept by EKF2",)),
     ],
 )
-def test_report_with_suspicious_settings_has_each_flag(values, said):
+def test_report_with_suspicious_settings_is_flagged(values, said):
     found = list(flag_settings(decode_results(changed_results(**values))))
     assert len(found) == len(said)
     assert all(word in flag for word, flag in zip(said, found, strict=True))

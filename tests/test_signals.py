@@ -94,7 +94,7 @@ def test_ned_acceleration_of_rotating_body_stays_constant(axis, rate_rad_s):
     np.testing.assert_allclose(acceleration, np.tile(truth, (len(acceleration), 1)), atol=1e-9)
 
 
-def test_ned_acceleration_without_overlap_is_unavailable():
+def test_ned_acceleration_without_attitude_is_unavailable():
     time = np.arange(0.0, 1.0, 0.01)
     level = attitude_table(time, Rotation.identity(len(time)))
     assert ned_acceleration(flight_of(attitude=level)) is ABSENT

@@ -40,7 +40,7 @@ IDEAL = {
 
 
 @pytest.mark.parametrize("record", [Scenario, Mistakes])
-def test_simulation_numbers_have_limits(record) -> None:
+def test_simulation_parameters_all_have_limits(record) -> None:
     numbers = {item.name for item in fields(record) if {"int", "float"} & {*str(item.type).split()}}
     numbers |= {item.name for item in fields(record) if item.type in (int, float)}
     assert set(quantities(record)) == numbers
@@ -256,7 +256,7 @@ class TestMistakes:
         noisy = simulate(replace(AISLE, ekf2=False), parse(["smoothed=1s"])).positions.error_m
         assert np.std(noisy[:25]) < 0.07  # on the ground; 0.10 m without the filter
 
-    def test_mistake_no_vvo_removes_the_received_position_source(self):
+    def test_no_vvo_mistake_removes_vehicle_visual_odometry(self):
         remaining = to_flight(simulate(AISLE, parse(["no-vvo"]))).positions
         assert [round(track.rate_hz) for track in remaining] == [2, 2]
         flight = to_flight(simulate(replace(AISLE, ekf2=False), parse(["no-vvo"])))
@@ -278,7 +278,7 @@ def test_parse_mistake_option_converts_units(text, field, value):
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_mistake_option_text_is_parsed_to_the_same_mistake(name):
+def test_formatted_mistake_option_is_parsed_to_same_mistake(name):
     parsed = parse([name])
     assert active_mistakes(parsed) == (name,)
     assert parse([format_mistake(name, parsed)]) == parsed

@@ -111,7 +111,7 @@ def test_simulated_position_noise_is_found_with_kind_and_size(
         assert found[name].evidence[key] == pytest.approx(value, abs=within)
 
 
-def test_noise_variation_finding_names_the_noisy_third() -> None:
+def test_noise_variation_finding_names_noisy_third_of_flight() -> None:
     analysis = analysed(LOUD)
     ((start, end),) = root_findings(analysis)["source_noise_varies"].spans_s
     time = analysis.axes["north"].axis.measurement_time_s
@@ -220,7 +220,7 @@ def test_low_pass_finding_states_lag_below_time_constant() -> None:
         ("10hz", UNEQUAL, 1107, "source_noise_unequal_axes"),
     ],
 )
-def test_px4_flight_with_added_mistake_has_only_its_finding(
+def test_sitl_flight_with_added_error_has_only_its_finding(
     shared_logs, name, model, seed, finding
 ) -> None:
     log = shared_logs / "simulated" / f"v1.16.1_aisle_{name}.ulg"
@@ -248,7 +248,7 @@ def test_time_correlation_fit_without_imu_is_unavailable() -> None:
     assert fit_time_correlation(blind, (axis,), RIGHT, Noises(0.3, 0.1), **given) == blind.imu
 
 
-def test_time_correlation_fit_tries_two_time_offsets(
+def test_time_correlation_fit_tries_zero_and_estimated_offset(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     analysis, tried = analysed(MIXED), []

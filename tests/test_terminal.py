@@ -147,7 +147,7 @@ def test_printed_commands_contain_typed_files_and_options() -> None:
     ["compare {log} --sigma-z 0.5", "tune {log} --axis north --start 8", "sync {log} --dt 0.05",
      "info {log}"],
 )  # fmt: skip
-def test_printed_commands_run_when_pasted(desk, monkeypatch, typed) -> None:
+def test_printed_command_lines_run_when_pasted_in_a_shell(desk, monkeypatch, typed) -> None:
     monkeypatch.chdir(desk.parent)  # the typed path then contains blanks and a quote
     words = shlex.split(typed.format(log=shlex.quote(f"{desk.name}/l.ulg")))
     printed = commands(run_checked(*words).stdout)
@@ -247,7 +247,7 @@ def test_default_report_does_not_replace_another_file(made, name) -> None:
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_logs_of_same_name_do_not_overwrite_the_first_report(desk, sample_log) -> None:
+def test_second_log_of_same_name_keeps_the_first_report(desk, sample_log) -> None:
     (desk / "b").mkdir()
     shutil.copy(sample_log, desk / "b" / "l.ulg")
     run_checked("compare", "l.ulg")
@@ -287,7 +287,7 @@ def test_html_file_of_user_is_not_overwritten_by_default(desk, command, mine) ->
     run_checked(*command.split())  # an own page is replaced
 
 
-def test_settings_in_default_file_name_use_valid_characters() -> None:
+def test_default_file_name_of_settings_has_valid_characters() -> None:
     request = ComparisonRequest(
         log="a.ulg", axes=("north", "east"), clock_offset_s=-0.12, heading_deg=30.0,
         position=PositionFile(path="/home/x/u wb.csv", columns=("t", "x/y", "*")),

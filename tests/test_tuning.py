@@ -199,7 +199,7 @@ def test_tune_separates_imu_bias_and_tilt_from_noise() -> None:
     assert found.noises.random_walk_m == 0.0
 
 
-def test_tuned_sigma_a_is_not_biased_by_scale_at_weak_motion() -> None:
+def test_tuned_sigma_a_at_weak_motion_is_unbiased() -> None:
     """A scale signal that contains the noise would explain part of it (errors in variables)."""
     ratios = [
         horizontal(made_flight(seed, moving=0.1, sigma_a=0.5)[0]).noises.sigma_a_m_s2 / 0.5

@@ -92,7 +92,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> VerifiedReport:
 # -- unchanged reports -----------------------------------------------------------------------------
 
 
-def test_verify_example_report_is_verified(aisle: VerifiedReport) -> None:
+def test_verify_unchanged_example_report_returns_verified(aisle: VerifiedReport) -> None:
     shipped = REPORT.read_bytes()
     verdict = verify(attached_results(shipped), shipped, aisle.files, recompute=aisle.recompute)
     assert verdict.status == "verified", verdict
@@ -101,7 +101,7 @@ def test_verify_example_report_is_verified(aisle: VerifiedReport) -> None:
     assert LIMIT_NOTE in verdict.reasons
 
 
-def test_verify_loop_report_is_verified(loop: VerifiedReport) -> None:
+def test_verify_unchanged_loop_report_returns_verified(loop: VerifiedReport) -> None:
     verdict = loop.verified(loop.pdf)
     assert verdict.status == "verified", verdict
     text = "".join(page.extract_text() for page in PdfReader(io.BytesIO(loop.pdf)).pages)
@@ -109,7 +109,7 @@ def test_verify_loop_report_is_verified(loop: VerifiedReport) -> None:
     assert "heading drifts most" in text.replace("*", "")
 
 
-def test_verify_report_without_log_says_cannot_verify(
+def test_verify_report_without_log_returns_cannot_verify(
     aisle: VerifiedReport, loop: VerifiedReport
 ) -> None:
     for one in (aisle, loop):
@@ -161,7 +161,7 @@ def test_verify_report_from_other_platform_is_verified(
     assert verdict.redrawn == aside
 
 
-def test_verify_numbers_that_differ_by_1e_12_is_verified(aisle: VerifiedReport) -> None:
+def test_verify_accepts_numbers_that_differ_by_1e_12(aisle: VerifiedReport) -> None:
     """Other kernels of OpenBLAS change results of the sample flights by 3e-8 at most."""
     scaled_results = read_again(scaled(json.loads(to_json(aisle.again[0])), -1e-12))
     elsewhere = (scaled_results, lambda: forged(aisle.pdf))
@@ -451,7 +451,7 @@ PAGE_CASES = [
 
 
 @pytest.mark.parametrize(("page", "name"), PAGE_CASES)
-def test_verify_report_with_changed_page_says_page_differs(
+def test_verify_report_with_changed_page_returns_page_differs(
     aisle: VerifiedReport, page: int, name: str
 ) -> None:
     verdict = aisle.verified(forged(aisle.pdf, on_page(page, DRAWING[name])))
@@ -565,7 +565,7 @@ def test_verify_report_with_changed_pdf_file_is_not_verified(
     assert verdict.redrawn == (b"" if verdict.status == "other log" else aisle.pdf)
 
 
-def test_verify_with_only_another_log_says_other_log(aisle: VerifiedReport) -> None:
+def test_verify_with_log_of_other_flight_returns_other_log(aisle: VerifiedReport) -> None:
     for files in ([LOOP_LOG], [LOOP_LOG, Path(__file__)]):
         verdict = verify(attached_results(aisle.pdf), aisle.pdf, files)
         assert verdict.status == "other log"

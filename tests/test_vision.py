@@ -209,7 +209,7 @@ def update_log(done: SegmentRun, at: int = 0) -> pd.DataFrame:
 @pytest.mark.parametrize(("rate_hz", "late_s", "settings"), [
     (30.0, 0.0, {}), (12.0, 0.1, {"EKF2_EV_DELAY": 100.0}), (30.0, 0.0, {"EKF2_EVP_NOISE": 0.8}),
 ])  # fmt: skip
-def test_vision_with_gnss_replay_matches_plain_filter(
+def test_ekf2_replay_of_vision_and_gnss_matches_plain_filter(
     rate_hz: float, late_s: float, settings: dict[str, float]
 ) -> None:
     inputs = flying(sent(rate_hz, late_s=late_s), **settings)
@@ -536,7 +536,7 @@ def test_ekf2_model_with_incomplete_vision_is_unavailable() -> None:
     assert "relative vision positions" in refused.reason
 
 
-def test_vision_besides_gnss_is_one_of_the_difference_steps() -> None:
+def test_kf_ekf2_difference_steps_include_vision_besides_gnss() -> None:
     found = steps.explain_by_steps(model())
     for why in found.values():
         names = [step.name for step in why.steps]

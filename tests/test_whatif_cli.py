@@ -68,7 +68,7 @@ def test_whatif_command_without_vision_drifts_afterwards(sample_log: Path) -> No
     assert "EKF2 stops providing a position after EKF2_NOAID_TOUT (5 s)" in note
 
 
-def test_what_if_without_unknown_aiding_source_raises_error(estimated: WhatIfAnalysis) -> None:
+def test_what_if_with_unknown_aiding_source_raises_error(estimated: WhatIfAnalysis) -> None:
     model = open_model(estimated.flight)
     for without, said in (
         ({"baro_hgt": 60.0}, "baro_hgt: in this log the replay fuses only ev_pos."),

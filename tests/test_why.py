@@ -32,7 +32,7 @@ def explain_again(analysis: Analysis, settings: Settings, **choices: Any) -> Dif
     return explain_ekf2_difference(comparison, analysis.ekf2_model, analysis.clock, {})["aisle"]
 
 
-def test_explained_difference_equals_kf_minus_published_ekf2(sample: Analysis) -> None:
+def test_explained_kf_ekf2_difference_equals_kf_minus_ekf2(sample: Analysis) -> None:
     explanation = of(sample)
     result = next(r for r in sample.axes.values() if r.axis.name == "aisle")
     position, speed = state_at(result.replay, explanation.times_s)
@@ -47,7 +47,7 @@ def test_explained_difference_equals_kf_minus_published_ekf2(sample: Analysis) -
     )
 
 
-def test_kf_setting_changes_only_its_step_of_the_difference(sample: Analysis) -> None:
+def test_kf_setting_changes_only_its_kf_ekf2_difference_step(sample: Analysis) -> None:
     plain = of(sample)
     zero = explain_again(sample, Settings(input="zero"))
     assert zero.steps[0].name == SAMPLES
@@ -122,7 +122,7 @@ def test_kf_ekf2_difference_sentence_states_largest_step(sample, share, text) ->
     assert f"Largest effect at {first.moved_at_s:.1f} s" in explained.sentences[0]
 
 
-def test_kf_ekf2_difference_is_explained_after_wrong_setting(sample: Analysis) -> None:
+def test_kf_ekf2_difference_names_a_wrong_kf_setting_first(sample: Analysis) -> None:
     comparison = compare(sample.flight, Settings(sigma_a_m_s2=0.001), axes=("aisle",))
     corrected = corrected_settings(comparison, sample.tuning)
     assert corrected == {"sigma_a_m_s2": pytest.approx(0.363, abs=0.01)}

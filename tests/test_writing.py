@@ -176,7 +176,7 @@ def test_output_to_locked_file_advises_to_close_the_program(tmp_path, monkeypatc
 
 @posix
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_signal_while_writing_leaves_only_complete_files(tmp_path, monkeypatch, name) -> None:
+def test_stop_signal_while_writing_leaves_only_complete_files(tmp_path, monkeypatch, name) -> None:
     number = getattr(signal, name)
 
     def stop(number: int, _: object) -> None:
@@ -200,7 +200,7 @@ def test_signal_while_writing_leaves_only_complete_files(tmp_path, monkeypatch, 
 
 @posix
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
-def test_signal_while_writing_lists_the_files_already_written(desk, name, code) -> None:
+def test_stop_signal_while_writing_lists_the_written_files(desk, name, code) -> None:
     os.mkfifo(desk / "pipe")  # without a reader the run waits after writing its other file
     number = getattr(signal, name)
     handler = signal.signal(number, signal.SIG_DFL)  # the new process inherits ignored signals
@@ -235,7 +235,7 @@ main()
 
 
 @posix
-def test_signal_in_a_python_finaliser_still_ends_the_command(tmp_path) -> None:
+def test_stop_signal_in_python_finaliser_ends_the_command(tmp_path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", SIGNAL_IN_FINALISER], capture_output=True, timeout=50, check=False
     )
@@ -243,7 +243,7 @@ def test_signal_in_a_python_finaliser_still_ends_the_command(tmp_path) -> None:
     assert done.stderr == b"px4fuse: interrupted; nothing was written.\n"
 
 
-def test_signal_after_writing_lists_the_written_files(desk, monkeypatch, capsys) -> None:
+def test_stop_signal_after_writing_lists_the_written_files(desk, monkeypatch, capsys) -> None:
     from px4fuse.report import screen
 
     def stopped(*_: object) -> None:
@@ -299,7 +299,7 @@ def test_output_to_existing_folder_name_is_refused(tmp_path, capsysbinary) -> No
 
 
 @pytest.mark.parametrize(("name", "said"), [("王小明", True), ("Ångström", False)])
-def test_compare_warns_first_if_student_name_has_no_font(
+def test_compare_warns_before_drawing_if_name_has_no_font(
     desk, monkeypatch, capsys, name: str, said: bool
 ) -> None:
     warnings = []
