@@ -67,7 +67,7 @@ def test_rank_causes_puts_source_fault_before_wrong_setting() -> None:
         (outcome(0.3, 1.0, 0.29), "nothing"),  # the ratio against the source gets worse
     ],
 )
-def test_rerun_improvement_names_position_or_sigma(after, improves) -> None:
+def test_filter_rerun_improvement_names_position_or_sigma(after, improves) -> None:
     assert improvement(trial("noises", after)) == improves
 
 
@@ -81,7 +81,7 @@ def test_correction_without_improvement_is_not_recommended() -> None:
     assert rank_causes(analysis(trial("time offset", FLOWN), fails), [OFFSET]) == []
 
 
-def test_time_offset_without_ground_truth_remains_a_cause() -> None:
+def test_diagnosis_keeps_time_offset_cause_without_ground_truth() -> None:
     """Innovations hardly show a time offset, so the re-run cannot refute it."""
     flight = analysis(trial("time offset", outcome(0.98), outcome(1.0)))
     (ranked,) = rank_causes(flight, [OFFSET])

@@ -45,7 +45,7 @@ def test_ekf2_position_scale_is_1_if_state_is_logged_in_metres() -> None:
     assert ekf2_metres_per_metre(record(np.nan)) == (1.0, 1.0, 1.0)
 
 
-def test_earth_rate_matches_sidereal_day() -> None:
+def test_earth_rotation_rate_matches_sidereal_day() -> None:
     rate = 2.0 * np.pi / 86_164.1
     for latitude_deg, expected in ((0.0, (rate, 0.0, 0.0)), (90.0, (0.0, 0.0, -rate)),
                                    (-30.0, (rate * 0.75**0.5, 0.0, 0.5 * rate))):  # fmt: skip

@@ -371,7 +371,7 @@ def without(times: np.ndarray, low: float, high: float) -> np.ndarray:
     return times[(times < low + 1e-6) | (times > high - 1e-6)]
 
 
-def test_ekf2_replay_segments_end_at_vision_gaps(monkeypatch):
+def test_ekf2_replay_segments_end_at_vision_and_imu_gaps(monkeypatch):
     imu, vision = np.arange(0.0, 60.0, 0.01), np.arange(0.0, 60.0, 0.1)
     assert segments(monkeypatch) == [(1.0, 59.99)]
     # 1 s of fusion, 4 s in the air

@@ -150,7 +150,7 @@ def test_fusion_horizon_equals_length_of_ekf2_buffer(settings, by_delay, timing)
     assert (shifted.delay_s, shifted.horizon_s) == pytest.approx((-0.035, math.inf))
 
 
-def test_ekf2_replay_of_delay_max_before_v1_15_raises_error():
+def test_ekf2_replay_of_delay_max_for_px4_v1_14_raises_error():
     rules = replace(RULES, horizon_by_delay=True)
     received = made(ReceivedPositions, uses_sender_times=False)
     inputs = made(Inputs, rules=rules, settings={}, aid=EV_POS, received=received)

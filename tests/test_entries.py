@@ -169,7 +169,7 @@ def test_file_name_that_imitates_platform_names_is_flagged() -> None:
     )
 
 
-def test_best_report_in_one_submission_is_the_graded_one() -> None:
+def test_graded_report_is_the_best_of_one_submission() -> None:
     files = {blackboard("ada", "19-10-00-00", "a.pdf"): graded_report("", 8.0),
              blackboard("ada", "19-10-00-00", "b.pdf"): graded_report("", 2.0)}  # fmt: skip
     for attempt in ("first", "latest", "best"):
@@ -283,7 +283,7 @@ def test_instructor_overrides_from_page_include_all_students(tmp_path) -> None:
     assert (again, notes) == (rows, ())
 
 
-def test_instructor_total_makes_pending_points_count(tmp_path) -> None:
+def test_total_points_from_instructor_end_pending_status(tmp_path) -> None:
     files = {"1.pdf": graded_report("", 4.0, student_id="1", pending_action="Run 0.1.1.")}
     (ada, _), _ = make_entries(files, overrides=write_overrides(tmp_path, "1,A,9,"))
     assert ada.total is None

@@ -401,7 +401,9 @@ def test_evaluate_with_doubtful_arguments_gives_warnings() -> None:
 
 @pytest.mark.parametrize("offset_s", [0.0, 0.0371, -2.5, 17.0, 1_795_253_724.3])
 @pytest.mark.parametrize("rate_hz", [7.0, 50.0])
-def test_trajectory_time_offset_is_recovered_at_each_rate(offset_s: float, rate_hz: float) -> None:
+def test_trajectory_time_offset_is_recovered_at_each_sample_rate(
+    offset_s: float, rate_hz: float
+) -> None:
     reference = flight()
     random = np.random.default_rng(4)
     estimate = transformed(flight(40.0, rate_hz), TURN, SHIFT, 1.7, kind="slam", frame="camera")

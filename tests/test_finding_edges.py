@@ -149,7 +149,7 @@ def test_ekf2_resets_outside_evaluated_segment_are_ignored(
         (Reset(65.1, "position", (1.0, 0.0, 0.0)), ((50.0, 60.0),), ("warning", ELSEWHERE)),
     ],
 )
-def test_ekf2_reset_at_take_off_is_not_reported(
+def test_ekf2_height_reset_at_take_off_is_not_reported(
     reset: Reset, gaps: Any, expected: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ekf2_resets, "continuous_state", lambda *_: (None, "resets kept"))

@@ -415,12 +415,12 @@ def test_explain_command_prints_meaning_and_example_of_finding(typed, monkeypatc
         assert text in out
 
 
-def test_explain_finding_without_measured_rate_says_not_measured(monkeypatch, capsys) -> None:
+def test_explain_unmeasured_finding_prints_not_measured(monkeypatch, capsys) -> None:
     _, out, _ = run_main(monkeypatch, capsys, "explain", "not_px4")
     assert "Not measured" in out
 
 
-def test_explain_without_argument_lists_findings_by_group(monkeypatch, capsys) -> None:
+def test_explain_command_without_argument_lists_all_findings(monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "2000")  # no line breaks
     code, out, _ = run_main(monkeypatch, capsys, "explain")
     assert code == 0
@@ -434,7 +434,9 @@ def test_explain_without_argument_lists_findings_by_group(monkeypatch, capsys) -
 @pytest.mark.parametrize(
     ("typed", "suggestion"), [("source_gapp", "Did you mean source_gap? "), ("xyz", "")]
 )
-def test_explain_unknown_finding_exits_with_2(typed, suggestion, monkeypatch, capsys) -> None:
+def test_explain_command_with_unknown_finding_exits_with_2(
+    typed, suggestion, monkeypatch, capsys
+) -> None:
     code, out, err = run_main(monkeypatch, capsys, "explain", typed)
     assert (code, out) == (2, "")
     assert err == (

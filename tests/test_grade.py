@@ -84,7 +84,7 @@ def test_grade_table_lists_every_submitted_file(submitted, tmp_path) -> None:
 
 
 @pytest.mark.usefixtures("jobs_in_process", "cached_pages")
-def test_grade_report_with_too_complex_pages_is_not_verified(tmp_path, monkeypatch) -> None:
+def test_grade_report_beyond_time_limit_cannot_be_verified(tmp_path, monkeypatch) -> None:
     """The comparison of pages exceeds its time limit."""
     folder = tmp_path / "in"
     folder.mkdir()
@@ -186,7 +186,7 @@ def test_grade_with_other_logs_verifies_reports_again(tmp_path) -> None:
 
 
 @pytest.mark.usefixtures("jobs_in_process")
-def test_grade_missing_log_makes_points_pending(tmp_path) -> None:
+def test_grade_report_without_its_log_makes_points_pending(tmp_path) -> None:
     (tmp_path / "in").mkdir()
     shutil.copy(REPORT, tmp_path / "in")
     (tmp_path / "logs").mkdir()

@@ -3,7 +3,7 @@
 The number of fuzz cases is the environment variable PX4FUSE_FUZZ_CASES (default 60); the cases are
 the same in every run::
 
-    PX4FUSE_FUZZ_CASES=20000 python -m pytest tests/test_mavlink.py -k fuzz
+    PX4FUSE_FUZZ_CASES=20000 python -m pytest tests/test_mavlink.py -k malicious
 """
 
 import itertools

@@ -211,7 +211,7 @@ def test_near_zero_process_noise_finding_requires_correlation(
     assert severity(noises.detect_process_noise_near_zero, analysis(axes=(one,))) == expected
 
 
-def test_near_zero_process_noise_finding_names_worst_axis() -> None:
+def test_near_zero_process_noise_finding_states_response_time() -> None:
     slower = following(0.01)
     slower.axis.name = "east"
     finding = only(noises.detect_process_noise_near_zero, analysis(axes=(following(0.05), slower)))
@@ -381,7 +381,9 @@ def test_smaller_noise_that_contradicts_truth_is_not_advised() -> None:
         (fused(0.1), Noise(None, None, 0.2), {}, "Set EKF2_EVP_NOISE to 0.2 m (EKF2 uses 0.1 m)."),
     ],
 )  # fmt: skip
-def test_overconfident_ekf2_without_replay_compares_noise(one, estimate, parameters, text) -> None:
+def test_overconfident_ekf2_without_replay_gets_noise_advice(
+    one, estimate, parameters, text
+) -> None:
     flown = analysis(axes=(one,), log=log(parameters=parameters), tuning=tuned(estimate))
     assert only(noises.detect_inconsistent_variances, flown).remedy.startswith(text)
 

@@ -151,7 +151,7 @@ def test_text_file_in_utf8_or_utf16_is_read(tmp_path, encoding) -> None:
 
 @posix
 @pytest.mark.parametrize("command", READERS)
-def test_error_on_file_name_with_line_feed_is_one_line(
+def test_error_about_file_name_with_line_feed_is_one_line(
     tmp_path, desk, monkeypatch, capsys, command
 ):
     name = "a\nb\x1b[2J"

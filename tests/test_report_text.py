@@ -256,7 +256,7 @@ def test_time_offset_advice_states_result_and_action(
     assert all(text in advice[label] for label, text in expected.items()), advice
 
 
-def test_noises_of_equal_ratio_give_equal_gain_and_track() -> None:
+def test_kf_noises_of_equal_ratio_give_equal_gain_and_track() -> None:
     """Statement of the sensitivity page: the tracks coincide, σ and NIS scale."""
     rng = np.random.default_rng(3)
     axis = random_walk(rng, count=600, interval_s=0.2, sigma_a=0.5, sigma_z=0.1)

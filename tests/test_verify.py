@@ -553,7 +553,7 @@ FILES: dict[str, tuple[Callable[[VerifiedReport, VerifiedReport], bytes], set[st
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_verify_report_with_changed_pdf_file_is_not_verified(
+def test_verify_gives_expected_outcome_for_each_pdf_change(
     aisle: VerifiedReport, loop: VerifiedReport, name: str
 ) -> None:
     forge, expected = FILES[name]
