@@ -298,7 +298,7 @@ def test_compare_without_position_evaluates_aiding_sources(tmp_path: Path) -> No
     assert "contains only EKF2 aids, no KF results" in str(refused)
 
 
-def test_compare_log_without_take_off_raises_missing_data(tmp_path: Path) -> None:
+def test_compare_of_log_without_take_off_raises_missing_data(tmp_path: Path) -> None:
     made = gnss_log("v1.16")
     made["vehicle_land_detected"]["landed"][:] = 1
     done = run("compare", made.write(tmp_path / "a.ulg"), "-o", tmp_path / "a.pdf")

@@ -78,7 +78,7 @@ def files(folder):
 
 
 class TestDraw:
-    def test_assigned_flight_same_secret_and_id_is_reproduced(self):
+    def test_assigned_flight_of_same_secret_and_id_is_reproduced(self):
         given = SECRET, CLASS[0], "aisle", 2, True
         assert simulate_assigned(*given) == assignment.simulate_assigned(*given)
         # the id as another platform may spell it

@@ -112,7 +112,7 @@ def test_read_log_of_other_file_type_suggests_right_command(tmp_path, name, cont
     assert message.endswith(f"px4fuse {command}.")
 
 
-def test_read_log_mistyped_file_name_suggests_existing_file(tmp_path):
+def test_read_log_with_mistyped_name_suggests_existing_file(tmp_path):
     make_log().write(tmp_path / "aisle_uwb.ulg")
     assert read_error(tmp_path / "aisle_uvb.ulg").endswith("Did you mean aisle_uwb.ulg?")
 
@@ -135,7 +135,7 @@ def test_read_log_without_known_topics_reports_no_data(tmp_path):
         choose_source(flight)
 
 
-def test_read_log_recursive_ulog_format_does_not_hang(tmp_path):
+def test_read_log_with_recursive_ulog_format_does_not_hang(tmp_path):
     """A format that contains itself must not cause infinite recursion."""
     path = tmp_path / "nested.ulg"
     content = make_log("v1.16", 1.0).encode()
@@ -150,7 +150,7 @@ def test_read_log_recursive_ulog_format_does_not_hang(tmp_path):
 
 @pytest.mark.parametrize("key", ["char[4] ver_sw_release", "uint32_t[1] ver_sw_release",
                                  "float ver_sw_release"])  # fmt: skip
-def test_read_log_firmware_version_of_wrong_type_is_ignored(tmp_path, key):
+def test_read_log_ignores_firmware_version_of_wrong_type(tmp_path, key):
     """A damaged type name makes the release number another type."""
     content = make_log("v1.16", 1.0).encode()
     old = b"uint32_t ver_sw_release"
@@ -182,7 +182,7 @@ def write_and_read(log: Log, tmp_path: Path) -> Flight:
         ("vehicle_land_detected", "airborne"),
     ],
 )
-def test_read_log_missing_topic_disables_only_its_data(tmp_path, topic, part):
+def test_read_log_without_topic_disables_only_its_data(tmp_path, topic, part):
     """Only the part of the missing topic is unavailable."""
     flight = write_and_read(make_log("v1.16", 2.0).drop(topic), tmp_path)
     for name in ("imu", "attitude", "ekf2", "airborne"):
@@ -229,7 +229,7 @@ def test_read_log_succeeds_if_any_one_field_is_missing(tmp_path, name):
 # ---- impossible values ------------------------------------------------------------------------
 
 
-def test_read_log_all_timestamps_zero_is_rejected(tmp_path):
+def test_read_log_rejects_log_whose_timestamps_are_all_zero(tmp_path):
     log = make_log("v1.16", 2.0)
     for made in log.topics:
         made.fields["timestamp"][:] = 0
@@ -237,7 +237,7 @@ def test_read_log_all_timestamps_zero_is_rejected(tmp_path):
     assert "all timestamps are zero" in read_error(log.write(tmp_path / "zero.ulg"))
 
 
-def test_read_log_topic_with_zero_timestamps_adds_a_note(tmp_path):
+def test_read_log_notes_a_topic_with_zero_timestamps(tmp_path):
     """ekf2_innovations of a real log of 2016 had this fault."""
     log = make_log("v1.9", 2.0)
     log["ekf2_innovations"]["timestamp"][:] = 0
@@ -250,7 +250,7 @@ def test_read_log_topic_with_zero_timestamps_adds_a_note(tmp_path):
     "name", ["sensor_combined", "vehicle_attitude", "vehicle_visual_odometry",
              "vehicle_local_position", "estimator_aid_src_ev_pos"],
 )  # fmt: skip
-def test_read_log_swapped_timestamps_are_dropped_with_note(tmp_path, name):
+def test_read_log_drops_swapped_timestamps_with_a_note(tmp_path, name):
     """Samples out of order are dropped and counted; the others keep their times."""
     log = make_log("v1.16", 4.0)
     index = next(i for i, made in enumerate(log.topics) if made.name == name)
@@ -267,7 +267,7 @@ def test_read_log_swapped_timestamps_are_dropped_with_note(tmp_path, name):
     np.testing.assert_allclose(state["north_m"], position(state.index)[:, 0], rtol=1e-6)
 
 
-def test_read_log_reboot_during_log_keeps_longer_part(tmp_path):
+def test_read_log_with_reboot_keeps_the_longer_part(tmp_path):
     """After a reboot during the log, the longer part is kept."""
     log = make_log("v1.16", 4.0)
     for made in log.topics:
@@ -293,7 +293,7 @@ MISSING_PARTS = {
 
 @pytest.mark.parametrize("value", [np.nan, -np.inf])
 @pytest.mark.parametrize(("name", "field"), MISSING_PARTS)
-def test_read_log_field_without_finite_values_is_unavailable(tmp_path, name, field, value):
+def test_log_field_without_finite_values_is_unavailable(tmp_path, name, field, value):
     """A part without finite values is unavailable, not zero; other parts stay."""
     log = make_log("v1.16", 2.0)
     log[name][field][:] = value
@@ -306,7 +306,7 @@ def test_read_log_field_without_finite_values_is_unavailable(tmp_path, name, fie
 
 
 @pytest.mark.parametrize("value", [7.4e8, -1.1e4])
-def test_read_log_impossible_acceleration_sample_is_dropped(tmp_path, value):
+def test_read_log_drops_impossible_acceleration_sample(tmp_path, value):
     """One such sample made the information matrix of the noises indefinite (found by fuzzing)."""
     log = make_log("v1.16", 10.0)
     log["sensor_combined"]["accelerometer_m_s2"][500, 2] = value
@@ -315,7 +315,7 @@ def test_read_log_impossible_acceleration_sample_is_dropped(tmp_path, value):
     assert flight.imu["down_m_s2"].abs().max() < 10.0
 
 
-def test_read_log_single_nan_samples_are_dropped(tmp_path):
+def test_read_log_drops_single_nan_samples(tmp_path):
     log = make_log("v1.16", 2.0)
     log["sensor_combined"]["accelerometer_m_s2"][[10, 20], 1] = np.nan
     log["vehicle_attitude"]["q"][7, 3] = np.nan
@@ -327,7 +327,7 @@ def test_read_log_single_nan_samples_are_dropped(tmp_path):
 
 @pytest.mark.parametrize("parameter", ["EKF2_EV_DELAY", "EKF2_EVP_GATE"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_read_log_non_finite_parameter_keeps_times_finite(tmp_path, parameter, value):
+def test_read_log_with_non_finite_parameter_keeps_times_finite(tmp_path, parameter, value):
     log = make_log("v1.16", 2.0)
     log.parameters[parameter] = value
     flight = read_and_make_axes(log.write(tmp_path / "made.ulg"))
@@ -411,7 +411,7 @@ def truth_impossible(log: Log) -> None:
     "damage", [flags_at_largest_time, flags_late, one_state, source_frozen, truth_impossible],
     ids=lambda one: one.__name__,
 )  # fmt: skip
-def test_compare_log_with_damaged_values_gives_finite_results(tmp_path, damage):
+def test_compare_of_log_with_damaged_values_gives_finite_results(tmp_path, damage):
     """Warnings are errors in these tests."""
     log = make_log("v1.16", 20.0)
     damage(log)

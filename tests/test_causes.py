@@ -85,20 +85,20 @@ def test_group_findings_lists_consequences_after_their_cause(given: Any, told: A
     assert [(each.id, each.severity, each.caused_by) for each in group_by_cause(given)] == told
 
 
-def test_verdict_notes_list_innovations_that_are_not_white(sample: Analysis) -> None:
+def test_consistency_notes_list_innovations_that_are_not_white(sample: Analysis) -> None:
     (white,) = verdict_notes(sample)
     assert format_verdict(sample.axes["aisle"].filters["kf"]) == "consistent"
     assert "Ljung-Box test, p < 0.001" in white
     assert "KF down, lag-1 autocorrelation" in white
 
 
-def test_verdict_notes_of_white_innovations_are_empty(sample: Analysis) -> None:
+def test_consistency_notes_of_white_innovations_are_empty(sample: Analysis) -> None:
     east = sample.axes["east"]
     fine = replace(east.filters["kf"], ljung_box_p=0.5)
     white = replace(east, filters={**east.filters, "kf": fine})
     assert verdict_notes(replace(sample, axes={"east": white})) == []
 
 
-def test_verdict_notes_name_a_source_that_may_drift(sample: Analysis) -> None:
+def test_consistency_notes_name_a_source_that_may_drift(sample: Analysis) -> None:
     turning = replace(sample.source, origin=replace(sample.source.origin, kind="vio"))
     assert "source may drift" in verdict_notes(replace(sample, source=turning))[0]

@@ -428,7 +428,7 @@ def test_time_offset_estimate_excludes_position_outliers() -> None:
     assert clock_advice(compared, found)["Offset"].startswith("-0.")
 
 
-def test_largest_offset_step_p_value_equals_bonferroni_t_test() -> None:
+def test_time_offset_step_p_value_equals_bonferroni_t_test() -> None:
     """Compare with scipy's two-sample t for equal weights and a scatter above the stated σ."""
     offset = np.array([0.0, 0.03, -0.02, 0.01, 0.2, 0.24, 0.19, 0.22, 0.2])
     weight = np.full(len(offset), 1e6)

@@ -247,7 +247,7 @@ class TestMissingParts:
             assert result.filters["ekf2"].sigma_p_before_update_m is None
             assert isinstance(result.difference, Difference)
 
-    def test_compare_short_ground_truth_interpolates_variance(self, made: Comparison) -> None:
+    def test_compare_with_short_ground_truth_interpolates_variance(self, made: Comparison) -> None:
         """EKF2's variances are logged at 1 Hz: none is within these 0.8 s of ground truth."""
         samples = made.flight.truth.samples.loc[40.1:40.9]
         flight = replace(made.flight, truth=Truth("0.8 s", samples))

@@ -117,7 +117,7 @@ def test_read_ulog_with_invalid_bytes_keeps_valid_messages(content, whole, rubbi
     assert re.search(r"\b0\.0 s of [\d.]+ s of IMU data are missing", flight.log.damage[0])
 
 
-def test_read_ulog_damaged_format_definition_does_not_hang(content) -> None:
+def test_read_ulog_with_damaged_format_does_not_hang(content) -> None:
     """Without the fix, pyulog loops at a definition longer than the rest of the file."""
     cut = content[: content.index(b"vehicle_attitude:")]
     with time_limit(), pytest.raises(LogError, match="contains no data"):

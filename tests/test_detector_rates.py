@@ -36,7 +36,7 @@ def test_false_alarm_rate_on_clean_flights_is_at_most_2_percent() -> None:
 
 
 @pytest.mark.parametrize("finding", sorted({condition.finding for condition in CONDITIONS}))
-def test_each_simulated_mistake_is_first_finding_in_95_percent(finding) -> None:
+def test_each_mistake_is_first_finding_on_95_percent_of_logs(finding) -> None:
     rows = TABLE[(TABLE["finding"] == finding) & (TABLE["condition"] != CLEAN)]
     assert rows["rate" if finding in CONSEQUENCES else "first"].max() >= 0.95
 

@@ -110,7 +110,7 @@ def test_documented_python_examples_run_without_error(page: str, capsys) -> None
 @pytest.mark.parametrize(
     ("page", "max_commands"), [("README.md", 3), ("docs/lab.md", 2)], ids=["readme", "lab"]
 )
-def test_lab_guide_each_step_contains_commands(page: str, max_commands: int) -> None:
+def test_each_step_of_lab_guide_contains_commands(page: str, max_commands: int) -> None:
     steps = re.split(r"\n\*\*\d\. ", PAGES[page].split("The lab in five steps\n")[-1])[1:]
     assert len(steps) == 5
     for number, step in enumerate(steps, 1):

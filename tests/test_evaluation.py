@@ -58,7 +58,9 @@ def evo_aligned(estimate: str, reference: str, kind: AlignmentKind) -> tuple[Any
 @pytest.mark.reallogs
 @pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
 @pytest.mark.parametrize("kind", ["none", "se3", "sim3"])
-def test_ate_equals_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
+def test_trajectory_ate_equals_that_of_the_evo_package(
+    pair: tuple[str, str], kind: AlignmentKind
+) -> None:
     pytest.importorskip("evo")
     from evo.core.metrics import APE, PoseRelation
 
@@ -84,7 +86,9 @@ DELTAS = (Delta(1, "frames"), Delta(10, "frames"), Delta(0.5, "m"), Delta(5.0, "
 @pytest.mark.reallogs
 @pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
 @pytest.mark.parametrize("kind", ["none", "se3", "sim3"])
-def test_rpe_equals_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
+def test_trajectory_rpe_equals_that_of_the_evo_package(
+    pair: tuple[str, str], kind: AlignmentKind
+) -> None:
     pytest.importorskip("evo")
     from evo.core.filters import FilterException
     from evo.core.metrics import RPE, PoseRelation

@@ -949,7 +949,7 @@ def test_time_offset_action_includes_the_offset_already_applied() -> None:
 
 
 @pytest.mark.parametrize(("p", "there"), [(0.005, False), (0.0049, True), (None, False)])
-def test_change_of_time_offset_below_p_limit_is_reported(p: float | None, there: bool) -> None:
+def test_change_of_time_offset_with_small_p_value_is_reported(p: float | None, there: bool) -> None:
     found = only(source_clock.detect, analysis(clock=late(0.1, change_p_value=p)))
     assert found.id == ("source_time_offset_changes" if there else "source_time_offset")
     if there:

@@ -122,7 +122,7 @@ def test_parse_g2o_with_invalid_text_names_the_line(case: str) -> None:
     assert message.endswith(".")
 
 
-def test_read_g2o_binary_or_missing_file_is_rejected(tmp_path: Path) -> None:
+def test_read_g2o_from_binary_or_missing_file_is_rejected(tmp_path: Path) -> None:
     binary = tmp_path / "log.g2o"
     binary.write_bytes(b"ULog\x01\x12\x35\xff\xfe\x00")
     with pytest.raises(TrajectoryError, match=r"^log\.g2o: not a text file"):

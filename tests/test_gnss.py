@@ -151,7 +151,7 @@ def test_read_gnss_from_vehicle_gnss_topic_gives_same_track(tmp_path):
     assert track.lever_arm_m == pytest.approx((0.1, 0.0, -0.2))
 
 
-def test_compare_gnss_subtracts_antenna_lever_arm(tmp_path):
+def test_compare_subtracts_gnss_antenna_lever_arm(tmp_path):
     moved = flight_of(outdoors(EKF2_GPS_POS_X=0.3, EKF2_GPS_POS_Z=-0.2), tmp_path)
     antenna, vehicle = track_of(moved), compare(moved).source
     assert antenna.lever_arm_m == pytest.approx((0.3, 0.0, -0.2))
@@ -194,7 +194,7 @@ def test_default_sigma_z_of_gnss_equals_ekf2_noise(eph_m, least_m, axes, expecte
     assert prepare_comparison(requested, flight=flight).settings.sigma_z_m == 0.3
 
 
-def test_compare_gnss_flight_uses_gnss_innovations(tmp_path):
+def test_compare_of_gnss_flight_uses_gnss_innovations(tmp_path):
     flight = flight_of(outdoors(), tmp_path)
     ekf2 = prepare(flight).flight.ekf2
     north, down = ekf2.innovations["north"], ekf2.innovations["down"]
@@ -344,7 +344,7 @@ OF_OTHERS = ("EKF2_EV", "vision", "anchor", "UWB", "line of sight", " tag ")
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", FLIGHTS)
-def test_compare_real_gnss_flights_match_known_numbers(name, shared_logs):
+def test_compare_of_real_gnss_flights_gives_known_numbers(name, shared_logs):
     folder = shared_logs / "gps"
     analysis = px4fuse.compare(folder / f"{name}.ulg")
     injected = json.loads((folder / f"{name}.json").read_text())

@@ -225,7 +225,7 @@ def test_what_if_without_height_sensor_reports_drift() -> None:
     assert "; the height by at most " in found.notes[-1]
 
 
-def test_what_if_long_height_rejection_is_unpredictable() -> None:
+def test_what_if_with_long_height_rejection_is_unpredictable() -> None:
     """EKF2 resets the height after 5 s, which the model does not contain."""
     flight = outdoors()
     jump = flight.barometer.copy()

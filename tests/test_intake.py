@@ -322,7 +322,7 @@ def test_read_report_pdf_with_broken_structure_is_rejected(pdf):
     assert reason(pdf)
 
 
-def test_read_report_pdf_invalid_object_stream_is_rejected():
+def test_read_report_pdf_with_invalid_object_stream_is_rejected():
     """Object streams that contain themselves or have wrong offsets."""
     for offsets in (b"1 0 2 9 ", b"5 0 5 3 ", b"1 99 ", b"x y "):
         packed = stream(offsets + CATALOG + PAGES, b"/Type /ObjStm /N 2 /First 8")
@@ -333,7 +333,7 @@ def test_read_report_pdf_invalid_object_stream_is_rejected():
         assert reason(pdf)
 
 
-def test_read_report_pdf_undefined_references_are_rejected():
+def test_read_report_pdf_with_undefined_objects_is_rejected():
     refer = b"".join(b"%d 0 R " % number for number in range(100, 20_000))
     pdf = raw_pdf(b"<< /Type /Catalog /Pages 2 0 R /X [%b] >>" % refer, PAGES, PAGE, stream(b""))
     assert "more memory or time" in reason(pdf)

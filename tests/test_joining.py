@@ -91,7 +91,7 @@ def test_joined_recordings_have_equal_times_in_either_order(sample_flight, tlog_
 # ---- made recordings ----------------------------------------------------------------------------
 
 
-def test_join_copies_missing_data_with_shifted_time(record):
+def test_joined_recording_copies_missing_data_with_shifted_time(record):
     """The second recording starts 5 s later."""
     left_out = "HIGHRES_IMU", "ATTITUDE_QUATERNION", "EXTENDED_SYS_STATE", "ODOMETRY"
     bare = record(Aisle(uwb=None), "bare.tlog", *left_out)

@@ -115,7 +115,7 @@ def test_loop_corrections_of_sample_flight_reduce_ate(sample_loop):
         assert robust.reason == SINGLE_LOOP_REASON
 
 
-def test_loop_lesson_example_2_equals_lesson_output() -> None:
+def test_loop_on_lesson_example_2_equals_lesson_output() -> None:
     corners = np.column_stack([np.array(ODOMETRY_M), np.zeros(len(ODOMETRY_M))])
     found = close_loop(Trajectory("corners", "vio", np.arange(5.0), corners, None, "FRD"))
     error, total = closure_error_vector_m(found), found.path_length_m

@@ -210,7 +210,7 @@ def joint_normal(
     return signals[:, 0], covariance + block_diag(*(each[2] for each in made)), made
 
 
-def test_unknown_constants_add_covariance_to_the_likelihood() -> None:
+def test_unknown_imu_constants_add_covariance_to_likelihood() -> None:
     """Equal at all offsets and noises, except for a constant."""
     part = with_constants()
 

@@ -82,7 +82,7 @@ def reason(flight: Flight, what: str) -> str:
 # ---- whole simulated flight ---------------------------------------------------------------------
 
 
-def test_read_mavlink_simulated_flight_equals_closed_form(read):
+def test_read_mavlink_of_simulated_flight_equals_closed_form(read):
     """All parts equal their closed form; HIGHRES_IMU is preferred to a denser SCALED_IMU."""
     aisle = Aisle(asks=True)
     made = aisle.record()

@@ -52,9 +52,7 @@ def clock_error(flight: Flight, aisle: Aisle, track: int = 0) -> np.ndarray:
     scale=st.floats(0.0, 0.3), seed=st.integers(0, 2**32 - 1),
 )  # fmt: skip
 @settings(max_examples=60)
-def test_clock_fit_with_random_delay_recovers_offset_and_drift(
-    offset, drift_ppm, least, scale, seed
-):
+def test_mavlink_clock_fit_with_random_delay_recovers_offset(offset, drift_ppm, least, scale, seed):
     """1200 messages in 120 s: the smallest delay in each 2 s is scale/20 on average."""
     rng = np.random.default_rng(seed)
     x = np.arange(1200) * 0.1
@@ -68,7 +66,7 @@ def test_clock_fit_with_random_delay_recovers_offset_and_drift(
 
 
 @pytest.mark.parametrize(("span", "slope"), [(100.0, 1.00005), (20.0, 1.0)])
-def test_clock_fit_of_messages_without_delay_is_exact(span, slope):
+def test_mavlink_clock_fit_of_messages_without_delay_is_exact(span, slope):
     x = np.linspace(0.0, span, 500)
     line = fit_least_delay(x, 7.0 + 1.00005 * x)
     assert (line.pairs, line.slope) == (500, pytest.approx(slope, abs=1e-12))
@@ -79,7 +77,7 @@ def test_clock_fit_of_messages_without_delay_is_exact(span, slope):
 
 @pytest.mark.parametrize("speed", [0.04, 0.5, 10.0])
 @pytest.mark.parametrize("span", [10.0, 100.0])
-def test_clock_fit_of_replayed_recording_recovers_replay_speed(speed, span):
+def test_mavlink_clock_fit_of_replayed_file_recovers_its_speed(speed, span):
     x = np.linspace(0.0, span, 600)
     delay = np.random.default_rng(1).exponential(0.01, len(x))
     line = fit_least_delay(x, 5.0 + speed * x + delay)
@@ -93,7 +91,7 @@ def test_clock_fit_of_replayed_recording_recovers_replay_speed(speed, span):
 # a slope of 1e321, which is infinite
 @example([(-2.0, 0.0), (-1e-308, 0.0), (1e-308, 1e13), (2e-308, 1e13), (2.0, 1e13)])
 @settings(max_examples=100)
-def test_clock_fit_of_any_time_pairs_is_invertible(pairs):
+def test_mavlink_clock_fit_of_any_time_pairs_is_invertible(pairs):
     x, y = np.array(pairs).T
     line = fit_least_delay(x, y)
     turned = line.inverse()
@@ -426,7 +424,7 @@ def test_timesync_that_contradicts_receive_time_is_ignored():
     np.testing.assert_allclose(found.to_boot.at(stamps), received, atol=1e-6)
 
 
-def test_clock_mapping_by_reported_offset_gives_same_times():
+def test_mavlink_clock_mapping_by_reported_offset_is_equal():
     """boot = timestamp + offset + drift · (timestamp - middle of the timestamps)."""
     received = 20.0 + 1.0001 * np.arange(0.0, 100.0, 0.1)
     stamps, found = map_unix_timestamps(received, *NO_EXCHANGES)

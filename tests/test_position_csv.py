@@ -140,7 +140,7 @@ DIALECTS: dict[str, str | bytes] = {
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
-def test_read_position_csv_every_dialect_gives_equal_samples(read, dialect):
+def test_read_position_csv_of_every_dialect_gives_equal_samples(read, dialect):
     content = DIALECTS[dialect]
     content = content if isinstance(content, bytes) else content.encode()
     file = read(content)
@@ -215,7 +215,7 @@ def test_read_position_csv_with_implausible_rate_adds_note(read, step):
 
 
 @pytest.mark.parametrize("unit", TIME_UNITS)
-def test_read_position_csv_time_unit_option_overrides_name(read, unit):
+def test_read_position_csv_time_unit_overrides_column_name(read, unit):
     texts = [str(10 * i) for i in range(ROWS)]
     file = read(table({"time_us": texts, "x": X, "y": Y, "z": Z}), time_unit=unit)
     assert file.samples.index[1] == pytest.approx(10 * TIME_UNITS[unit])
@@ -282,7 +282,7 @@ def test_read_position_csv_notes_used_position_columns(read, case, words):
 
 
 @pytest.mark.parametrize("unit", LENGTH_UNITS)
-def test_read_position_csv_length_unit_option_overrides_name(read, unit):
+def test_read_position_csv_unit_option_overrides_column_name(read, unit):
     columns = {"time": UNIX_S, "x_cm": X, "y_cm": Y, "z": Z, "sigma_cm": fixed(SIGMA_M, 3)}
     samples = read(table(columns), length_unit=unit).samples
     assert samples["x_m"].to_numpy() == pytest.approx(TRACK_M[:, 0] * LENGTH_UNITS[unit])
@@ -409,7 +409,7 @@ MISNAMED = {"x_m": UNIX_S, "time_ms": X, "b": Y, "c": Z, "x": JUNK, "y": JUNK}
     (BY_NAME, ("t", "north_mm", "east_mm", "up_mm"), "enu"),  # frame from the column names
     (MISNAMED, ("1", "2", "3", "4"), None),
 ])  # fmt: skip
-def test_read_position_csv_option_selects_columns(read, given, columns, frame):
+def test_read_position_csv_columns_option_selects_columns(read, given, columns, frame):
     file = read(PREAMBLE + table(given), columns=columns)
     assert_track(file)
     assert file.frame == frame
@@ -428,7 +428,7 @@ def test_read_position_csv_option_selects_columns(read, given, columns, frame):
     ({"columns": ("1", "2", "3", "9" * 5000)}, "no column '9999"),
     ({"columns": ("time", "2", "x", "y")}, "names one column twice"),
 ])  # fmt: skip
-def test_read_position_csv_invalid_option_raises_error(read, options, words):
+def test_read_position_csv_with_invalid_option_raises_error(read, options, words):
     with pytest.raises(SettingsError) as caught:
         read(table(PLAIN), **options)
     assert words in str(caught.value)
@@ -462,7 +462,7 @@ def test_read_position_csv_names_missing_column_in_error(read):
     ("time,x,y,z\n" + table({"n": JUNK, **PLAIN}, header=False), "4 columns, but the rows have 5"),
     (table({**PLAIN, "time": ["12.5"] * ROWS}), "1 usable rows"),
 ])  # fmt: skip
-def test_read_position_csv_unreadable_file_raises_log_error(read, content, words):
+def test_read_position_csv_of_unreadable_file_raises_log_error(read, content, words):
     line = error_message(read, content)
     assert words in line
     assert line.startswith("uwb.csv")

@@ -212,7 +212,7 @@ def with_clock(found: ClockOffset | Unavailable, delay_ms: float = 0.0) -> Any:
     return SimpleNamespace(clock=found, settings=settings, flight=flight, source=source())
 
 
-def test_time_offset_page_is_printed_only_with_a_result() -> None:
+def test_report_page_on_time_offset_is_printed_only_with_result() -> None:
     whole = offset(parts=())
     fine, unknown = with_clock(whole), replace(whole, is_determinable=False, reason="no motion")
     with_finding = [

@@ -137,7 +137,7 @@ def test_tuned_noise_intervals_equal_likelihood_profile() -> None:
 
 
 @pytest.mark.parametrize("sigma_a", [0.05, 0.5])
-def test_tune_noise_free_positions_gives_upper_bound_of_sigma_z(sigma_a: float) -> None:
+def test_tune_on_noise_free_positions_bounds_sigma_z_from_above(sigma_a: float) -> None:
     found = tuned(modelled(3, 500, sigma_a=sigma_a, sigma_z=0.0))
     assert found.sigma_z.value is found.sigma_z.low is None
     assert SIGMA_Z_SEARCH_M[0] <= found.sigma_z.high < 0.003

@@ -112,7 +112,7 @@ def test_read_ulog_formats_firmware_version(kind, text):
     assert read_topics("made.ulg", log.encode()).log.firmware == text
 
 
-def test_read_ulog_dropout_has_start_and_duration():
+def test_read_ulog_gives_start_and_duration_of_dropout():
     log = make_log("v1.16", 2.0)
     log.dropouts_ms = (250,)
     last = max(int(topic.fields["timestamp"].max()) for topic in log.topics)
