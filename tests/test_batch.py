@@ -16,17 +16,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import bad_jobs
 import batch_tools
+import failing_jobs
 import jsonschema
 import pandas as pd
 import psutil
 import pytest
+from artificial_batch import DAMAGED, artificial_logs
 from batch_tools import environment, start_dask, tiny_log, tiny_logs
 from class_tools import run_in_turn
 from cli_tools import error_line, run_checked
 from cli_tools import run as run_cli
-from made_up_fleet import DAMAGED, made_up
 from msgspec import structs
 from ulog_tools import gnss_log
 
@@ -177,7 +177,7 @@ def test_batch_table_has_numbers_or_failure_reason_per_log(tmp_path):
 
 
 def test_batch_summary_counts_logs_by_failure_reason(capsys):
-    table = made_up(60).fillna({"axis": "", "change": ""})
+    table = artificial_logs(60).fillna({"axis": "", "change": ""})
     show(terminal(), format_summary(BatchResult(table, 3, frozenset(), ())).blocks)
     said = " ".join(capsys.readouterr().out.split())
     failed = table[table["status"] == "failed"]
@@ -504,7 +504,7 @@ def assert_failed_job_does_not_affect_others(address):
 
     # jobs that end at once or never: reporting an exception takes seconds of imports
     jobs = [("square", 3), ("unreadable", 0), ("exit", 3), ("hang", 0), ("square", 4)]
-    work = partial(run_bounded, bad_jobs.act, timeout_s=5.0, memory_bytes=2 * 10**9)
+    work = partial(run_bounded, failing_jobs.run_job, timeout_s=5.0, memory_bytes=2 * 10**9)
     expected = [9, "could not be unpickled (ValueError)", "exit code 3", "limit of 5 s", 16]
     with Client(address) as client, connect_cluster() as same:
         assert same is client

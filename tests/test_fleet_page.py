@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from artificial_batch import DAMAGED, NOT_LOGGED, STORY, VEHICLES, artificial_logs
 from browser import Browser, Elements, content
 from explore_tools import axe, serious
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_up_fleet import DAMAGED, NOT_LOGGED, STORY, VEHICLES, made_up
 
 from px4fuse.fleet.page import html_text, logs_of, sort_logs
 from px4fuse.report.card_html import MARK_PATHS
@@ -38,7 +38,7 @@ def parts(row: list[Any]) -> dict[str, Any]:
 
 
 def test_batch_page_lists_missing_results_of_each_log() -> None:
-    table = made_up(30)
+    table = artificial_logs(30)
     table.loc[table["axis"] == "down", ["reason", "remedy"]] = ("EKF2, down: no heights", "Set it.")
     text = html_text(table, "Bench", "px4fuse 1")
     inside = parts(content(text)["rows"][0])
@@ -49,7 +49,7 @@ def test_batch_page_lists_missing_results_of_each_log() -> None:
 
 
 def test_batch_page_sorts_logs_by_severity_and_rmse() -> None:
-    table = made_up(8).drop_duplicates("log").reset_index(drop=True)
+    table = artificial_logs(8).drop_duplicates("log").reset_index(drop=True)
     failed = table["status"] != "done"
     table = (
         table[~failed]
@@ -67,7 +67,7 @@ def test_batch_page_sorts_logs_by_severity_and_rmse() -> None:
 
 
 def test_batch_page_row_has_diagnosis_action_and_ratios() -> None:
-    table = made_up(30)
+    table = artificial_logs(30)
     rows = [row[0] for row in content(html_text(table, "Bench", "px4fuse 1"))["rows"]]
     first = rows[0]
     assert first[0][0] == "■ ERROR"
@@ -80,7 +80,7 @@ def test_batch_page_row_has_diagnosis_action_and_ratios() -> None:
 
 
 def test_batch_page_omits_column_without_numbers() -> None:
-    table = made_up(4)
+    table = artificial_logs(4)
     for name in ("clock_offset_s", "sigma_z_m", "kf_truth_ratio", "difference_rms_m"):
         table[name] = np.nan
     table["updates"] = table["updates"].astype("Int64")
@@ -93,8 +93,8 @@ def test_batch_page_omits_column_without_numbers() -> None:
 
 
 def test_batch_page_without_compared_logs_lists_failed_logs() -> None:
-    assert "0 logs" in html_text(made_up(0), "Bench", "px4fuse 1")
-    table = made_up(30)
+    assert "0 logs" in html_text(artificial_logs(0), "Bench", "px4fuse 1")
+    table = artificial_logs(30)
     failed = table[table["status"] == "failed"].reset_index(drop=True)
     text = html_text(failed, "B", "px4fuse 1")
     assert text == html_text(failed, "B", "px4fuse 1")  # the same table gives the same page
@@ -102,7 +102,7 @@ def test_batch_page_without_compared_logs_lists_failed_logs() -> None:
 
 
 def hostile_table(word: str, count: int = 2) -> pd.DataFrame:
-    table = made_up(12).iloc[: 3 * count].copy()
+    table = artificial_logs(12).iloc[: 3 * count].copy()
     logs = [f"{place // 3}{word}" for place in range(3 * count)]
     return table.assign(**dict.fromkeys(TEXTS, word), findings=f"{word};x", log=logs)
 
@@ -122,7 +122,7 @@ def test_batch_page_escapes_text_from_logs(text: str) -> None:
 
 def test_batch_page_links_lead_only_to_relative_paths() -> None:
     bad = ("//example.org/a", "/etc/passwd", "javascript:alert(1)", "https://example.org/")
-    table = made_up(4).assign(report=np.repeat(bad, 3), results="")
+    table = artificial_logs(4).assign(report=np.repeat(bad, 3), results="")
     rows = content(html_text(table, "a", "b"))["rows"]
     assert len(rows) == 4
     for row in rows:
@@ -141,7 +141,7 @@ def shown(browser: Browser, folder: Path, table: pd.DataFrame, *titles: str, **h
 
 @pytest.fixture
 def page(browser: Browser, tmp_path: Path) -> Browser:
-    shown(browser, tmp_path, made_up(240))
+    shown(browser, tmp_path, artificial_logs(240))
     return browser
 
 
@@ -158,7 +158,7 @@ def test_batch_page_sorts_filters_and_opens_rows(page: Browser) -> None:
     page.click("tbody tr:first-child .name")
     ratios = {
         log["name"]: log["kf_source_ratio"]
-        for log in sort_logs(logs_of(made_up(240)))
+        for log in sort_logs(logs_of(artificial_logs(240)))
         if "kf_source_ratio" in log
     }
     assert page.names()[:3] == sorted(ratios, key=lambda name: ratios[name])[:3]
@@ -177,7 +177,7 @@ def test_batch_page_sorts_filters_and_opens_rows(page: Browser) -> None:
 
 
 def test_batch_page_applies_two_filters_together(page: Browser) -> None:
-    table = made_up(240).drop_duplicates("log")
+    table = artificial_logs(240).drop_duplicates("log")
     page.choose("#filter-4", "finding:ekf2_rejects_positions")
     rejecting = table["findings"].fillna("").str.contains("ekf2_rejects_positions")
     assert page.ask(COUNT) == f"Showing {rejecting.sum()} of 240"
@@ -191,7 +191,7 @@ def test_batch_page_applies_two_filters_together(page: Browser) -> None:
 
 
 def test_batch_page_of_5000_logs_shows_100_rows(browser: Browser, tmp_path: Path) -> None:
-    shown(browser, tmp_path, made_up(5000))
+    shown(browser, tmp_path, artificial_logs(5000))
     rows = "document.querySelectorAll('.list > tbody > tr').length"
     everything = "document.querySelectorAll('*').length"
     assert browser.ask(rows) == MAX_PAGE_ROWS
@@ -215,12 +215,12 @@ def test_batch_page_of_5000_logs_shows_100_rows(browser: Browser, tmp_path: Path
 
 
 def test_batch_page_without_javascript_shows_a_table(browser: Browser, tmp_path: Path) -> None:
-    shown(browser, tmp_path, made_up(400), scripts=False)
+    shown(browser, tmp_path, artificial_logs(400), scripts=False)
     browser.call("Emulation.setScriptExecutionDisabled", value=False)
     text = browser.ask("document.body.innerText")
     assert "The first 300 of 400 logs." in text
     assert "All rows are in fleet.csv." in text
-    names = [log["name"] for log in sort_logs(logs_of(made_up(400)))]
+    names = [log["name"] for log in sort_logs(logs_of(artificial_logs(400)))]
     table = text.split("Sorting, searching")[1]
     assert [name in table for name in names] == [True] * 300 + [False] * 100
 

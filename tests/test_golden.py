@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from artificial_batch import artificial_logs
 from browser import content
 from class_tools import in_this_process
 from cli_tools import run
 from conftest import REPOSITORY, blank_page
 from golden_tools import assert_matches_golden, numbers, of_blocks, of_values, rounded, written
-from made_up_fleet import made_up
 from scipy.spatial.transform import Rotation
 from ulog_tools import gnss_log
 
@@ -213,7 +213,7 @@ def test_report_on_aiding_sources_matches_golden_file(
 
 
 def test_batch_page_matches_golden_file() -> None:
-    text = html_text(made_up(12), "Bench", "px4fuse 1")
+    text = html_text(artificial_logs(12), "Bench", "px4fuse 1")
     above = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL)
     drawn = [rounded(line) for line in above.splitlines() if line.strip()]
     assert_matches_golden("fleet_page", [*drawn, *of_values(content(text))])

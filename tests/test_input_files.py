@@ -7,10 +7,17 @@ import shutil
 from pathlib import Path
 
 import pytest
-from aimed import RUNS, Aim, aims, file_hashes, make_desk, make_empty_folder
 from class_tools import in_this_process, make_report
 from cli_tools import error_line, run, run_checked
 from conftest import REPORT, SAMPLES
+from overwrite_cases import (
+    RUNS,
+    OverwriteCase,
+    all_cases,
+    file_hashes,
+    make_desk,
+    make_empty_folder,
+)
 
 from px4fuse.errors import OutputError
 
@@ -25,8 +32,8 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_desk(tmp_path_factory.mktemp("desk") / "desk")
 
 
-def group(aim: Aim) -> tuple[str, str, str | None]:
-    return aim.command, aim.option, aim.name
+def group(case: OverwriteCase) -> tuple[str, str, str | None]:
+    return case.command, case.option, case.name
 
 
 @pytest.mark.parametrize("command", [command for command, *_ in RUNS])
@@ -35,14 +42,14 @@ def test_every_command_refuses_to_write_over_its_input(
 ) -> None:
     monkeypatch.chdir(desk)
     before, tried = file_hashes(desk), 0
-    for aim in (aim for aim in aims() if aim.command == command):
-        arguments = aim.arguments(desk, make_empty_folder(tmp_path / "place"))
+    for case in (case for case in all_cases() if case.command == command):
+        arguments = case.arguments(desk, make_empty_folder(tmp_path / "place"))
         if arguments is None:
             continue
         result = run(*arguments)
-        assert isinstance(result.exception, OutputError), (aim, result.output)
+        assert isinstance(result.exception, OutputError), (case, result.output)
         assert result.stdout == ""
-        assert file_hashes(desk) == before, aim
+        assert file_hashes(desk) == before, case
         tried += 1
     assert tried >= 4
 

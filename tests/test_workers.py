@@ -10,7 +10,7 @@ import sys
 from contextlib import closing
 
 import pytest
-from bad_jobs import act
+from failing_jobs import run_job
 
 from px4fuse import workers
 from px4fuse.workers import JobFailure, run_bounded
@@ -20,7 +20,9 @@ MEMORY = 1_500_000_000
 
 def run(jobs, processes=2, timeout_s=60.0, memory_bytes=None):
     outcomes = list(
-        run_bounded(act, jobs, processes=processes, timeout_s=timeout_s, memory_bytes=memory_bytes)
+        run_bounded(
+            run_job, jobs, processes=processes, timeout_s=timeout_s, memory_bytes=memory_bytes
+        )
     )
     assert not multiprocessing.active_children()
     assert [index for index, _ in sorted(outcomes, key=lambda outcome: outcome[0])] == [
@@ -83,7 +85,7 @@ def test_worker_process_is_replaced_after_given_number_of_jobs(monkeypatch):
 
 
 def test_worker_that_cannot_import_the_function_fails_each_job(monkeypatch):
-    monkeypatch.setattr(act, "__module__", "test_workers_is_not_here")
+    monkeypatch.setattr(run_job, "__module__", "test_workers_is_not_here")
     monkeypatch.setitem(sys.modules, "test_workers_is_not_here", sys.modules[__name__])
     results, _ = run([("square", 1), ("square", 2)])
     assert all(
@@ -93,7 +95,7 @@ def test_worker_that_cannot_import_the_function_fails_each_job(monkeypatch):
 
 def test_closing_the_worker_pool_ends_all_processes():
     jobs = [("square", 1), ("hang", 0)]
-    with closing(run_bounded(act, jobs, processes=2, timeout_s=60, memory_bytes=None)) as work:
+    with closing(run_bounded(run_job, jobs, processes=2, timeout_s=60, memory_bytes=None)) as work:
         assert next(work) == (0, 1)
     assert not multiprocessing.active_children()
 
@@ -102,10 +104,10 @@ INTERRUPTED = """
 import os, sys, time
 sys.path.insert(0, {tests!r})
 from px4fuse.workers import run_bounded
-from bad_jobs import act
+from failing_jobs import run_job
 
 if __name__ == "__main__":
-    for _, result in run_bounded(act, [("process", 0), ("hang", 0)], processes=1, timeout_s=500,
+    for _, result in run_bounded(run_job, [("process", 0), ("hang", 0)], processes=1, timeout_s=500,
                                  memory_bytes=None):
         print(result, flush=True)
 """
