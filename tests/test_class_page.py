@@ -117,7 +117,7 @@ def shape(text: str) -> list[tuple[str, list[str]]]:
     return [(tag, sorted(attributes)) for tag, attributes in Elements(text).found]
 
 
-def test_class_page_matches_golden_file() -> None:
+def test_class_page_matches_reference_file() -> None:
     text = html_text(CLASS, "Class", "px4fuse 1")
     above = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL).splitlines()
     lines = [line for line in above if line.strip() and "sha256" not in line]

@@ -55,7 +55,7 @@ def eventful() -> Analysis:
     return with_noises(comparison)
 
 
-def test_event_marks_in_plots_have_a_label_for_each_kind(eventful: Analysis) -> None:
+def test_event_marks_in_plots_have_a_label_for_each_event_type(eventful: Analysis) -> None:
     labels = [artist.get_label() for artist in event_marks.legend_entries(eventful)]
     assert labels == [
         "flight modes (alternating)", "on the ground", "gap in position source", "log dropout",

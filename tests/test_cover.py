@@ -128,7 +128,7 @@ def test_report_cover_ratio_beyond_scale_is_drawn_as_triangle() -> None:
     assert block["rows"][2]["interval"] == [1.0, 1.0]
 
 
-def test_report_cover_verdict_not_evaluated_states_reason() -> None:
+def test_report_cover_states_reason_of_missing_verdict() -> None:
     missing = replace(
         SMALL_SIGMA_A.verdicts[3], ratio=None, word="not evaluated", reason="no ground truth"
     )

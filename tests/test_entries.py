@@ -177,7 +177,7 @@ def test_graded_report_is_the_best_of_one_submission() -> None:
         assert ada.total == 8.0, attempt
 
 
-def test_platform_student_id_overrides_id_in_report() -> None:
+def test_learning_platform_id_overrides_id_in_report() -> None:
     files = {
         blackboard("grace", "19-10-00-00"): graded_report("", 8.0, student="Ada", student_id="1")
     }
@@ -367,7 +367,7 @@ def test_invalid_due_time_or_late_rule_raises_one_line_error(read, said, texts) 
         assert "\n" not in str(caught.value)
 
 
-def test_late_rule_deducts_per_started_day_up_to_limit() -> None:
+def test_late_rule_deducts_points_per_started_day_up_to_limit() -> None:
     for late_s, off in ((0.0, 0), (1.0, 12), (86_400.0, 12), (86_400.5, 24), (1e9, 120)):
         assert parse_late_rule("10%/day").deduction(late_s, 120.0) == off
     # a rule may state a limit, and hours

@@ -77,7 +77,7 @@ def panel(score: Evaluation, title: str) -> Axes:
 # -- captions --------------------------------------------------------------------------------------
 
 
-def test_unaligned_rmse_in_evaluation_page_equals_evo() -> None:
+def test_unaligned_rmse_in_evaluation_report_equals_evo() -> None:
     pytest.importorskip("evo")
     from evo.core import metrics, sync
     from evo.core.trajectory import PoseTrajectory3D
@@ -114,7 +114,7 @@ def test_rmse_per_quarter_of_growing_error_equals_integral() -> None:
 @pytest.mark.parametrize(("error", "share"), [
     (np.full(2000, 0.3), "10%"), (np.arange(2000) // 100 == 7, "100%"), (np.zeros(2000), "0%"),
 ], ids=["even", "a peak", "none"])  # fmt: skip
-def test_evaluation_page_states_share_of_worst_tenth_of_poses(error, share) -> None:
+def test_evaluation_report_states_error_of_worst_tenth_of_poses(error, share) -> None:
     sentence = worst_poses_sentence(evaluate_with_error(across(error.astype(np.float64))))
     assert f"contribute {share} of the squared error" in sentence
 
@@ -156,7 +156,7 @@ def test_flat_trajectory_is_drawn_without_side_view(frame, axes) -> None:
     assert side.is_down == (frame in ("NED", "FRD", "camera"))
 
 
-def test_evaluation_page_without_alignment_omits_its_plot() -> None:
+def test_evaluation_report_without_alignment_omits_its_plot() -> None:
     assert not any(
         "alignment" in title for title in panels(evaluate_with_error(across(np.full(2001, 0.3))))
     )

@@ -208,7 +208,7 @@ def test_explore_page_invalid_input_shows_a_message(page: Browser) -> None:
     assert page.ask(VALUES) == ["0.5", "0.2", "0", "0.1"]
 
 
-def test_explore_step_view_shows_numbers_of_each_measurement(
+def test_explore_page_steps_show_numbers_of_each_measurement(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     result = explored[1].main

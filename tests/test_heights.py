@@ -356,7 +356,7 @@ def test_ekf2_model_heights_of_real_flights_agree_with_log(
 
 
 @pytest.mark.reallogs
-def test_what_if_with_other_height_gate_rejects_more(models: dict[str, Model]) -> None:
+def test_what_if_with_smaller_barometer_gate_rejects_more(models: dict[str, Model]) -> None:
     """EKF2_BARO_NOISE scales NIS; the gate rejects innovations outside it."""
 
     def heights(without: dict[str, float] | None = None, **settings: float) -> Any:

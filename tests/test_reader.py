@@ -451,7 +451,7 @@ def test_unfused_gnss_is_used_as_source_only_on_request(read):
 
 
 @pytest.mark.parametrize("delay_ms", [0.0, 175.0])
-def test_ev_pos_aid_source_times_exclude_ekf2_delay(read, delay_ms):
+def test_estimator_aid_src_ev_pos_times_exclude_ekf2_delay(read, delay_ms):
     """EKF2 subtracts EKF2_EV_DELAY and half its prediction interval from the timestamp."""
     log = make_log("v1.16").drop("vehicle_visual_odometry")
     log.parameters["EKF2_EV_DELAY"] = delay_ms
@@ -462,7 +462,7 @@ def test_ev_pos_aid_source_times_exclude_ekf2_delay(read, delay_ms):
     assert_equals_external_vision(track)
 
 
-def test_ev_pos_height_logged_at_other_time_is_nan(read):
+def test_estimator_aid_src_height_logged_at_other_time_is_nan(read):
     """The logger decimates heights separately, so their times may differ from the positions."""
     log = make_log("v1.16").drop("vehicle_visual_odometry")
     stamped = log["estimator_aid_src_ev_hgt"]["timestamp_sample"]

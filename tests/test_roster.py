@@ -80,7 +80,7 @@ def table(tmp_path: Path, text: str, encoding: str = "utf-8-sig") -> Sheet:
         ("Email\njane@x.edu\n", Person("jane@x.edu", "", "jane@x.edu")),
     ],
 )  # fmt: skip
-def test_read_class_list_finds_columns_of_each_platform(tmp_path, text, is_) -> None:
+def test_read_class_list_finds_columns_of_each_learning_platform(tmp_path, text, is_) -> None:
     for encoding in ("utf-8", "utf-8-sig", "utf-16"):
         assert read_people(table(tmp_path, text, encoding))[0] == is_
 

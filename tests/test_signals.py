@@ -243,7 +243,7 @@ def straight(first_s, last_s):
     (((19.0, 20.0),), (2.0, 18.0)),  # no positions in flight
     (ABSENT, (2.0, 18.0)),  # no land detector
 ])  # fmt: skip
-def test_default_segment_is_airborne_part_of_position_source(airborne, expected):
+def test_default_evaluated_segment_is_airborne_part_of_source(airborne, expected):
     track = straight(2.0, 18.0)
     flight = flight_of(track=track, duration_s=20.0, airborne=airborne)
     segment = choose_segment(flight, track)

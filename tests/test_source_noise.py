@@ -101,7 +101,7 @@ def test_white_position_noise_has_no_finding() -> None:
         (LOUDER, "source_noise_varies", "error", {"ratio": (6.0, 1.3)}),
     ],
 )  # fmt: skip
-def test_simulated_position_noise_is_found_with_kind_and_size(
+def test_simulated_position_noise_is_found_with_type_and_size(
     model, name, severity, evidence
 ) -> None:
     found = root_findings(analysed(model))
