@@ -34,7 +34,7 @@ from findings_tools import (
     with_bias,
 )
 
-from px4fuse.comparison.trials import Outcome, Trial
+from px4fuse.comparison.trials import RunStatistics, Trial
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.frame_rotation import HeadingError, HeadingPart
 from px4fuse.filter.frame_rotation import combine_heading_parts as together
@@ -286,8 +286,8 @@ def test_recommended_action_must_halve_ekf2_rejections() -> None:
     ):  # fmt: skip
         trial = Trial(
             filter="ekf2", kinds=("noise",), change={"EKF2_EVP_NOISE": 0.1},
-            before=Outcome(nis_mean=9.0, rejected_fraction=0.2),
-            after=Outcome(nis_mean=1.0 if improves else 8.0, rejected_fraction=after),
+            before=RunStatistics(nis_mean=9.0, rejected_fraction=0.2),
+            after=RunStatistics(nis_mean=1.0 if improves else 8.0, rejected_fraction=after),
         )  # fmt: skip
         one = analysis(ekf2={"gate": 5.0}, axes=(axis("north", ekf2_innovations=frame),),
                        trials=(trial,))  # fmt: skip
@@ -356,7 +356,7 @@ def test_error_beyond_sigma_finding_states_aligned_rmse(
     if finding.id == "source_drift":
         assert finding.message.startswith(
             "VIO drifts: horizontal position RMSE 0.55 m after the best alignment. Before the "
-            "alignment: 1.00 m."
+            "alignment the RMSE is 1.00 m."
         )
     assert (finding.remedy == hidden_errors.FRAME_REMEDY) is frame
 
@@ -970,7 +970,7 @@ def test_time_offset_that_increases_true_error_has_no_finding(after_m, there) ->
 
 def rerun(owner: Any, kind: str, change: dict[str, float], after_m: float) -> Trial:
     """Make a re-run that changes the position RMSE from 1 m."""
-    before, after = Outcome(position_rmse_m=1.0), Outcome(position_rmse_m=after_m)
+    before, after = RunStatistics(position_rmse_m=1.0), RunStatistics(position_rmse_m=after_m)
     return Trial(filter=owner, kinds=(kind,), change=change, before=before, after=after)
 
 

@@ -34,7 +34,7 @@ from px4fuse.comparison.model import (
 )
 from px4fuse.comparison.projection import project, project_truth
 from px4fuse.comparison.remedy import is_fused_source, ml_delay_change, noise_change
-from px4fuse.comparison.trials import Change, Outcome, Statistic, Trial, distance_from_one
+from px4fuse.comparison.trials import Change, RunStatistics, Statistic, Trial, distance_from_one
 from px4fuse.ekf2.filter_recursion import Variant
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings, with_misaligned_positions
@@ -388,10 +388,10 @@ def _outcome(
     errors: ErrorsAgainstTruth | Unavailable,
     kf_minus_ekf2: Difference | Unavailable,
     rejected_fraction: float | None = None,
-) -> Outcome:
+) -> RunStatistics:
     truth = errors if isinstance(errors, ErrorsAgainstTruth) else None
     has_innovations = len(innovation_m) > 0
-    return Outcome(
+    return RunStatistics(
         innovations=len(innovation_m),
         nis_mean=float(np.mean(innovation_m**2 / variance_m2)) if has_innovations else None,
         position_rmse_m=None if truth is None else truth.position_rmse_m,
@@ -436,7 +436,7 @@ def _try_on_main_axis(changed: _FilterRerun) -> list[Trial]:
     return singles + [run({**best.change, **other.change}) for other in others[:MAX_PAIRS]]
 
 
-def _agrees(logged: Outcome, replayed: Outcome) -> bool:
+def _agrees(logged: RunStatistics, replayed: RunStatistics) -> bool:
     pairs = (
         (logged.position_rmse_m, replayed.position_rmse_m, MAX_REPLAY_FACTOR),
         (logged.nis_mean, replayed.nis_mean, MAX_REPLAY_FACTOR**2),
@@ -490,7 +490,7 @@ class _FilterRerun:
         """Return changes of other settings; ``tuned`` is None if the reported σ is too large."""
 
     @abstractmethod
-    def outcome(self, result: AxisComparison, change: Change) -> Outcome:
+    def outcome(self, result: AxisComparison, change: Change) -> RunStatistics:
         """Return the statistics of the filter along an axis with a change, or as flown without."""
 
     @abstractmethod
@@ -506,7 +506,7 @@ class _FilterRerun:
         """Return the change to the default settings; empty if there is none."""
         return {}
 
-    def flown_outcome(self, result: AxisComparison) -> Outcome | None:
+    def flown_outcome(self, result: AxisComparison) -> RunStatistics | None:
         """Return the statistics as flown, of the same samples as a re-run.
 
         None if a re-run without a change has other statistics, so that nothing is comparable.
@@ -621,7 +621,7 @@ class _KfRerun(_FilterRerun):
             return corrected_ned
         return project_acceleration(corrected_ned, direction, self.comparison.segment)
 
-    def outcome(self, result: AxisComparison, change: Change) -> Outcome:
+    def outcome(self, result: AxisComparison, change: Change) -> RunStatistics:
         source, segment, axis = self.comparison.source, self.comparison.segment, result.axis
         kf_settings: dict[str, Any] = {
             name: change[name] for name in change if name in vars(Settings())
@@ -683,7 +683,7 @@ class _Ekf2Rerun(_FilterRerun):
         """Time (s) from which the replay is evaluated."""
         return None if self.model is None else self.model.flown.evaluated_s[0][0]
 
-    def flown_outcome(self, result: AxisComparison) -> Outcome | None:
+    def flown_outcome(self, result: AxisComparison) -> RunStatistics | None:
         """Return the statistics of the log in the replayed spans; None if the replay differs."""
         logged, innovations = result.ekf2_state, result.ekf2_innovations
         if self.model is None or isinstance(logged, Unavailable):
@@ -763,7 +763,7 @@ class _Ekf2Rerun(_FilterRerun):
             ml_noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
         return [noise_change(self.inputs.aid, self.inputs.settings, self.flown_noise_m, ml_noise_m)]
 
-    def outcome(self, result: AxisComparison, change: Change) -> Outcome:
+    def outcome(self, result: AxisComparison, change: Change) -> RunStatistics:
         """Replay EKF2 with the change; without a change the difference is that of the log."""
         assert self.model is not None
         compared_s, axis = self.model.flown.evaluated_s, result.axis

@@ -18,7 +18,7 @@ MIN_RATIO_CHANGE, MIN_RMSE_CHANGE = 1.10, 0.05
 POSITION_IMPROVEMENT = 0.20
 
 
-class Outcome(Record, frozen=True, kw_only=True):
+class RunStatistics(Record, frozen=True, kw_only=True):
     """Statistics of one filter along one axis in one run (flown, or re-run with a change).
 
     Attributes
@@ -60,9 +60,9 @@ class Trial(Record, frozen=True, kw_only=True):
         noise, for both outliers, time offset or rotation.
     change : mapping from name to value
         See :class:`px4fuse.comparison.causal_replays.Intervention`.
-    before : Outcome
+    before : RunStatistics
         Statistics as flown, of the same samples; for EKF2 from the log.
-    after : Outcome
+    after : RunStatistics
         Statistics with the change; for EKF2 from its replay.
     from_s : float or None
         Start of the evaluated time; None for the whole segment.
@@ -71,12 +71,12 @@ class Trial(Record, frozen=True, kw_only=True):
     filter: FilterName
     kinds: tuple[str, ...]
     change: Change
-    before: Outcome
-    after: Outcome
+    before: RunStatistics
+    after: RunStatistics
     from_s: float | None = None
 
 
-def distance_from_one(outcome: Outcome) -> float:
+def distance_from_one(outcome: RunStatistics) -> float:
     """Return the sum of |ln σ ratio|, against source and ground truth."""
     means = [mean for mean in (outcome.nis_mean, outcome.nees_mean) if mean]
     return sum(0.5 * abs(math.log(mean)) for mean in means)
@@ -88,7 +88,7 @@ def preference(trial: Trial) -> tuple[bool, int, float]:
     return not enters, len(trial.change) if enters else 0, distance_from_one(trial.after)
 
 
-def ratios(outcome: Outcome) -> dict[Reference, float]:
+def ratios(outcome: RunStatistics) -> dict[Reference, float]:
     """Return the σ ratios (actual over reported) against source and ground truth."""
     means: dict[Reference, float | None] = {
         "source": outcome.nis_mean,

@@ -87,36 +87,36 @@ def encode(
     dropouts_ms : sequence of int
         Durations (ms) of logger dropouts; their messages are written after the data.
     """
-    parts = [
+    content = [
         ULOG_MAGIC + _ULOG_VERSION,
         struct.pack("<Q", start_us),
         _message("B", _FLAG_BITS_MESSAGE),
     ]
     formats = dict.fromkeys(_format_text(topic) for topic in topics)
-    parts += [_message("F", format_text.encode()) for format_text in formats]
+    content += [_message("F", format_text.encode()) for format_text in formats]
     for name, info_value in info.items():
         if isinstance(info_value, str):
             text = info_value.encode()
-            parts.append(_keyed_message("I", f"char[{len(text)}] {name}", text))
+            content.append(_keyed_message("I", f"char[{len(text)}] {name}", text))
         else:
-            parts.append(_keyed_message("I", f"uint32_t {name}", struct.pack("<I", info_value)))
+            content.append(_keyed_message("I", f"uint32_t {name}", struct.pack("<I", info_value)))
     for name, value in parameters.items():
         kind, code = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
-        parts.append(_keyed_message("P", f"{kind} {name}", struct.pack(code, value)))
+        content.append(_keyed_message("P", f"{kind} {name}", struct.pack(code, value)))
     for topic_id, topic in enumerate(topics):
-        parts.append(
+        content.append(
             _message("A", struct.pack("<BH", topic.instance, topic_id) + topic.name.encode())
         )
-    messages: list[bytes] = []
+    data_messages: list[bytes] = []
     for topic_id, topic in enumerate(topics):
-        messages += _data_messages(topic, topic_id)
+        data_messages += _data_messages(topic, topic_id)
     timestamps_us = [np.maximum.accumulate(topic.fields["timestamp"]) for topic in topics]
-    parts += [
-        messages[index]
+    content += [
+        data_messages[index]
         for index in np.argsort(np.concatenate(timestamps_us), kind="stable").tolist()
     ]
-    parts += [_message("O", struct.pack("<H", length)) for length in dropouts_ms]
-    return b"".join(parts)
+    content += [_message("O", struct.pack("<H", length)) for length in dropouts_ms]
+    return b"".join(content)
 
 
 def _message(kind: str, content: bytes) -> bytes:
