@@ -53,7 +53,7 @@ def test_draw_uses_all_choices_equally_often(seed: int, level: int, count: int) 
         assert len(one.mistakes) <= (2 if level == 3 else 1)
         for mistake, size in zip(one.mistakes, one.sizes, strict=True):
             assert size.removeprefix("-") == mistake.sizes[level - 1]
-            assert mistake.either_sign or not size.startswith("-")
+            assert mistake.has_either_sign or not size.startswith("-")
 
 
 def test_draw_level_3_has_two_mistakes_in_some_flights() -> None:
