@@ -137,7 +137,7 @@ def test_csv_text_has_bom_and_crlf() -> None:
 def test_csv_text_lists_late_pending_and_missing() -> None:
     one = GradedReport("a.pdf", "A", "1", VERIFIED, (Item("notes", 1.5, 2.0, ""),))
     late = entry(one, late_s=5400.0, deduction=0.4, total=1.1, comment="see me")
-    pending = entry(replace(one, pending_action="Run 0.1.1."), total=None)
+    pending = entry(replace(one, instructor_action="Run 0.1.1."), total=None)
     head, *rest = cells(csv_text([late, pending, Entry("C", "-17", None, max_points=4.0)]))
     asked = ("id", "status", "points", "pending points", "deducted", "total", "hours late",
              "pending", "comment")  # fmt: skip

@@ -131,7 +131,9 @@ def test_class_entries_differing_forms_are_pending() -> None:
     files = {"a.pdf": of_form(4.0, "yaw"), "b.pdf": of_form(9.0, "nlos")}
     (ada, _), _ = make_entries(files)
     assert ada.total is None
-    assert ada.counted_report.pending_action == "Ask which of 2 reports counts: their forms differ."
+    assert (
+        ada.counted_report.instructor_action == "Ask which of 2 reports counts: their forms differ."
+    )
     assert len(ada.other_reports) == 1
     assert make_entries(files, Course(RUBRIC, attempt="best"))[0][0].total == 9.0
     # equal forms are not pending
@@ -143,7 +145,7 @@ def test_class_entries_pending_report_keeps_counting_report() -> None:
     """For example a later report of another student with this student's id."""
     files = {
         "a.pdf": of_form(9.0, "yaw"),
-        "z.pdf": of_form(2.0, "nlos", pending_action="Ask whose."),
+        "z.pdf": of_form(2.0, "nlos", instructor_action="Ask whose."),
     }
     packed = {"a.pdf": datetime(2026, 11, 18), "z.pdf": datetime(2026, 11, 19)}
     for times in (None, packed):
@@ -195,7 +197,7 @@ def test_class_entries_unlisted_student_has_flagged_row() -> None:
     (ada, grace, stranger), _ = make_entries(files)
     assert (ada.total, grace.total) == (3.0, None)
     assert (stranger.student, stranger.student_id, stranger.total) == ("Mallory", "9", 8.0)
-    assert stranger.flags[0] == "Not in the class list."
+    assert stranger.flags[0] == "The student is not in the class list."
 
 
 def test_class_entries_without_roster_one_row_per_student() -> None:
@@ -284,7 +286,7 @@ def test_overrides_from_class_page_include_all_students(tmp_path) -> None:
 
 
 def test_overrides_total_makes_pending_points_count(tmp_path) -> None:
-    files = {"1.pdf": graded_report("", 4.0, student_id="1", pending_action="Run 0.1.1.")}
+    files = {"1.pdf": graded_report("", 4.0, student_id="1", instructor_action="Run 0.1.1.")}
     (ada, _), _ = make_entries(files, overrides=write_overrides(tmp_path, "1,A,9,"))
     assert ada.total is None
     (ada, _), _ = make_entries(files, overrides=write_overrides(tmp_path, "1,total,9,"))

@@ -98,7 +98,7 @@ def test_grade_pages_beyond_limits_cannot_be_verified(tmp_path, monkeypatch) -> 
         [folder], Course(read_rubric(None), logs=[LOG.parent]), tmp_path / "class"
     ).reports
     assert only.status == "cannot verify"
-    assert only.pending_action.startswith("Ask for the PDF that px4fuse wrote")
+    assert only.instructor_action.startswith("Ask for the PDF that px4fuse wrote")
     assert any("not compared within the limits" in flag for flag in only.flags)
 
 
@@ -200,7 +200,7 @@ def test_grade_missing_log_makes_points_pending(tmp_path) -> None:
         assert one.verdict.status == status
         assert one.points > 0
         assert one.counted_points is None
-        assert "aisle_uwb.ulg" in one.pending_action
+        assert "aisle_uwb.ulg" in one.instructor_action
 
 
 @pytest.mark.usefixtures("jobs_in_process")
