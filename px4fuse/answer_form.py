@@ -223,7 +223,7 @@ def read_answers(path: Path) -> Answers:
         answers = msgspec.convert(_as_record(tomllib.loads(text)), Answers)
         check_answers(answers)
     except (tomllib.TOMLDecodeError, RecursionError, msgspec.ValidationError, ValueError) as error:
-        raise SettingsError(f"{path}: {error}", "Correct the form.") from error
+        raise SettingsError(f"{path}: {error}", "Correct the form with the answers.") from error
     return answers
 
 
@@ -233,7 +233,7 @@ def _as_record(form: dict[str, Any]) -> dict[str, Any]:
     quantities = msgspec.convert(filled_form.pop("quantities", {}), dict[str, Any])
     names = [f"q{number}" for number in range(1, len(draw_questions("")) + 1)]
     if unknown := sorted({*quantities, *({"mistakes"} & filled_form.keys())} - set(names)):
-        raise ValueError(f"{unknown[0]} is not one of mistake, {', '.join(names)}")
+        raise ValueError(f"the field {unknown[0]} is not one of mistake, {', '.join(names)}")
     return {
         **filled_form,
         "mistakes": mistakes,

@@ -210,7 +210,12 @@ def test_class_page_anonymous_contains_no_names() -> None:
     parts = [part for one in content(text)["rows"] for part in one[2]]
     points = [part[3] for part in parts if part[1] == "Points (proposed)"]
     assert {tuple(row) for rows in points for row in rows} == {("Settings", "9", "20", "")}
-    assert ["list", "Mistakes of this flight", ["positions that jump: not named"], False] in parts
+    assert [
+        "list",
+        "Mistakes of this flight",
+        ["positions that jump: not named in the answer form"],
+        False,
+    ] in parts
     # no text of students, no link to a PDF, no input boxes without an owner
     assert not {"boxes", "prose", "links"} & {part[0] for part in parts}
     for there in ("Lovelace", ".pdf", "data:image/png"):

@@ -245,7 +245,7 @@ def test_overrides_replace_points_and_add_comments(tmp_path) -> None:
         "": Override(None, "Come and\nsee me."),
     }  # fmt: skip
     assert (ada.counted_report.points, ada.total, grace.total) == (15.5, 8.0, 3.0)
-    told = ("1 has no item 'C'", "2 has no item 'B'", "no student has the id 3")
+    told = ("student 1 has no item 'C'", "student 2 has no item 'B'", "no student has the id 3")
     assert notes == tuple(f"overrides.csv: {one}." for one in told)
     text, reason = feedback_text(ada, "Lab"), "Because. Your instructor: A good idea."
     assert f"9.5 of 10  A\n    {reason} (Your instructor gave 9.5" in text
@@ -257,11 +257,11 @@ def test_overrides_replace_points_and_add_comments(tmp_path) -> None:
     ("rows", "points", "told"),
     [
         (("1,A,95,A slip.", "1,total,200,"), (10.0, 10.0), (
-            "1 cannot have more than 10 points of 'A'",
-            "1 cannot have more than 20 points of 'total'",
+            "student 1 cannot have more than 10 points of 'A'",
+            "student 1 cannot have more than 20 points of 'total'",
         )),
         (("1,A,9,", "1,a,2,", "01,total,12,", "1,Total,3,"), (15.0, 3.0), (
-            "1 has two rows for 'A'", "01 has two rows for 'total'",
+            "student 1 has two rows for 'A'", "student 01 has two rows for 'total'",
         )),
     ], ids=["points above the maximum", "duplicate row"],
 )  # fmt: skip

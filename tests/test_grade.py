@@ -132,7 +132,7 @@ def test_grade_with_log_verifies_unchanged_report_only(tmp_path) -> None:
     assert (third.verdict.status, third.verdict.outcome) == ("verified", "page differs")
     assert third.status == "page differs"
     assert third.points == first.points
-    assert any(f"Page {REPORT_PAGES}: missing." in flag for flag in third.flags)
+    assert any(f"Page {REPORT_PAGES}: the page is missing." in flag for flag in third.flags)
     assert first.flags == ()
     # a second run reuses all results
     again = grade([folder], Course(read_rubric(None), logs=[LOG.parent]), output, processes=2)

@@ -72,7 +72,8 @@ def read_people(sheet: Sheet) -> tuple[Person, ...]:
     """
     if all(sheet.column(titles) is None for titles in COLUMNS.values()):
         raise SettingsError(
-            f"{sheet.path}: no column identifies the student.", "Name one column id, email or name."
+            f"{sheet.path}: no column identifies the student.",
+            "Give one column the title id, email or name.",
         )
     row_by_id: dict[str, int] = {}
     people = []
@@ -103,7 +104,8 @@ def read_roster(path: Path) -> tuple[Person, ...]:
     people = read_people(read_sheet(path))
     if not people or len(people) > MAX_STUDENTS:
         raise SettingsError(
-            f"{path} contains {len(people)} students.", f"Give a list of 1 to {MAX_STUDENTS}."
+            f"{path} contains {len(people)} students.",
+            f"Give a class list with 1 to {MAX_STUDENTS}.",
         )
     stems: dict[str, Person] = {}
     for person in people:

@@ -81,7 +81,7 @@ def read_sheet(path: Path) -> Sheet:
         The file cannot be read, is not text, or has no header.
     """
     content = read_bytes_limited(
-        path, SettingsError, MAX_BYTES, name=str(path), size_remedy="Give a CSV file of one class"
+        path, SettingsError, MAX_BYTES, name=str(path), size_remedy="Give a CSV table of one class"
     )
     if content.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
         raise SettingsError(f"{path} is a spreadsheet, not a CSV file.", "Save it as CSV.")

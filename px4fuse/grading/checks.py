@@ -436,10 +436,10 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
         if low - self.margin_s <= applied <= high + self.margin_s:
             return 1.0, f"{statement}; the estimate is {low:.3f} to {high:.3f} s (95 %)."
         if any(map(check_input.has_finding, CHANGING_CLOCK_FINDINGS)):
-            statement = "The time offset changes in your flight"
-            is_named = check_input.names_mistake("clock-jump", "clock-drift")
-            advice = ", as your form states" if is_named else ". State the time in your form"
-            return 1.0 if is_named else self.undeterminable, f"{statement}{advice}."
+            if check_input.names_mistake("clock-jump", "clock-drift"):
+                return 1.0, "The time offset changes in your flight, as your form states."
+            statement = "The time offset changes in your flight. State the time in your form."
+            return self.undeterminable, statement
         statement = f"{statement}, but the estimate is {low:.3f} to {high:.3f} s (95 %)"
         return 0.0, f"{statement}. Use --clock-offset auto."
 
@@ -480,8 +480,8 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
         if loop.is_absolute_track:
             reason = "The track in your report does not drift. Use odometry, for example LOG:vio."
             return 0.0, reason
-        lengths = map(format_length, (loop.closure_error_m, loop.path_length_m))
-        statement = f"You measured a loop closure error of {' after '.join(lengths)}"
+        error_text, path_text = map(format_length, (loop.closure_error_m, loop.path_length_m))
+        statement = f"You measured a loop closure error of {error_text} after {path_text}"
         if not is_accepted:
             return 0.25, f"{statement}. No closure was accepted."
         quarter_count, comment = _score_corrections(loop.corrections)

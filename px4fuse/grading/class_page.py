@@ -70,7 +70,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
         rows=[_row(entry, items, numbers) for entry in entries],
         filters=[("Status", [("", f"Everyone ({len(entries)})"), *options])],
         groups=(("items", "Points of each item"), ("numbers", "Numbers")),
-        placeholder="name, id, file, flag",
+        placeholder="search for name, id, file or flag",
         full_table_note="All rows are in class.csv.",
     )
 
@@ -180,7 +180,8 @@ def _details(entry: Entry) -> Iterator[Section]:
         for item in report.items
     ]
     named_texts = [
-        f"{name}: {'' if is_named else 'not '}named" for name, is_named in report.mistakes.items()
+        f"{name}: {'named' if is_named else 'not named'} in the answer form"
+        for name, is_named in report.mistakes.items()
     ]
     attempts = [f"{other.submission}: {other.status}" for other in entry.other_reports]
     yield frame.list_section("Flags", entry.flags, is_warning=True)

@@ -412,9 +412,9 @@ def match_overrides(
     for student, override_by_item in overrides.items():
         # the instructor may type an id, with or without leading zeros, or a file name
         student_index = people.student_index(Person(student, login=student))
+        who = one_line(student, 40) or "(empty)"
         if student_index is None:
-            shown_id = one_line(student, 40) or "(empty)"
-            notes.append(f"{OVERRIDES_NAME}: no student has the id {shown_id}.")
+            notes.append(f"{OVERRIDES_NAME}: no student has the id {who}.")
             continue
         max_by_title = {TOTAL_TITLE: max_total, "": MAX_OVERRIDE_POINTS}
         if report := entries[student_index].counted_report:
@@ -424,15 +424,15 @@ def match_overrides(
         for item, override in override_by_item.items():
             title, problem = titles.get(normalise_text(item)), ""
             if title is None:
-                problem = f"has no item {one_line(item, 60)!r}"
+                problem = f"student {who} has no item {one_line(item, 60)!r}"
             elif title in matched_overrides[student_index]:
-                problem = f"has two rows for {title or 'a comment on the whole report'!r}"
+                problem = f"student {who} has two rows for {title or 'the whole report'!r}"
             elif (override.points or 0.0) > max_by_title[title]:
                 limit = f"{max_by_title[title]:g} points of {one_line(title, 60)!r}"
-                problem = f"cannot have more than {limit}"
+                problem = f"student {who} cannot have more than {limit}"
             else:
                 matched_overrides[student_index][title] = override
-            notes += [f"{OVERRIDES_NAME}: {one_line(student, 40)} {problem}."] if problem else []
+            notes += [f"{OVERRIDES_NAME}: {problem}."] if problem else []
     return matched_overrides, tuple(notes)
 
 

@@ -207,7 +207,8 @@ def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
             "",
             replace(report.verdict, reasons=(), differences=()),
             tuple(replace(item, comment="") for item in report.items),
-            instructor_action=report.instructor_action and "Points are pending.",
+            instructor_action=report.instructor_action
+            and "The instructor has to decide on the points.",
             form=report.form,
             numbers=report.numbers,
             mistakes=report.mistakes,
@@ -336,7 +337,7 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
         columns = matches
     if len(columns) == 1:
         return columns[0]
-    problem = "several grade columns" if columns else "no grade column"
+    problem = "the table has several grade columns" if columns else "no grade column matches"
     titles = ", ".join(one_line(plain_titles[at], 40) for at in assignments or title_by_index)
     remedy = f"Name one of them with --column: {one_line(titles, 300)}."
     raise SettingsError(f"{sheet.path}: {problem}.", remedy)

@@ -56,7 +56,7 @@ MAX_NAME_LENGTH = 200
 # Year that zip programs write if an entry has no time
 ZIP_EPOCH_YEAR = 1980
 
-_TOO_LARGE_REASON = f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."
+_TOO_LARGE_REASON = f"the file is larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."
 # General purpose bit flags of a zip entry (APPNOTE.TXT of PKWARE, 4.4.4)
 _ENCRYPTED_FLAG = 1
 _UTF8_FLAG = 0x800
@@ -89,7 +89,7 @@ def _unread_reason(error: Exception) -> str:
     if isinstance(error, _EntryError):
         return str(error)
     reason = error.strerror if isinstance(error, OSError) and error.strerror else "damaged"
-    return f"it cannot be read ({reason})."
+    return f"the file cannot be read ({reason})."
 
 
 def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
@@ -226,7 +226,7 @@ class _LimitedFile:
 def _open_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
     with zipfile.ZipFile(_LimitedFile(file)) as archive:
         if len(archive.infolist()) > MAX_ENTRIES:
-            raise _EntryError(f"it has more than {MAX_ENTRIES} entries.")
+            raise _EntryError(f"the zip file has more than {MAX_ENTRIES} entries.")
         yield archive
 
 
@@ -237,9 +237,9 @@ def _zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
             entries = [entry for entry in archive.infolist() if not entry.is_dir()]
         # zipfile never returns more than the declared size of an entry
         if sum(entry.file_size for entry in entries) > MAX_TOTAL_BYTES:
-            raise _EntryError(f"it unpacks to more than {MAX_TOTAL_BYTES // 10**9} GB.")
+            raise _EntryError(f"the zip file unpacks to more than {MAX_TOTAL_BYTES // 10**9} GB.")
     except _UNREADABLE_ERRORS as error:
-        notes.append(f"{_short_name(path.name)}: ignored: {_unread_reason(error)}")
+        notes.append(f"{_short_name(path.name)} was ignored: {_unread_reason(error)}")
         return []
     last_by_name = {entry.filename: entry for entry in entries}
     if duplicate_count := len(entries) - len(last_by_name):

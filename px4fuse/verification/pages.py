@@ -138,7 +138,7 @@ def compare_pages(
     if not isinstance(differences, JobFailure):
         return differences
     reason = differences.reason.rstrip(".")
-    return (PageDifference(0, f"not compared within the limits ({reason})", True),)
+    return (PageDifference(0, f"the pages were not compared within the limits ({reason})", True),)
 
 
 def _compare_pdfs(job: tuple[bytes, bytes, TextComparison]) -> tuple[PageDifference, ...]:
@@ -218,7 +218,9 @@ class _PdfComparison:
                 raise LimitReachedError("the PDF has too many values")
             if isinstance(submitted, IndirectObject):
                 if submitted.generation:  # some programs ignore the generation
-                    yield PageDifference(page, f"{key} is an object of a later generation", True)
+                    yield PageDifference(
+                        page, f"the PDF entry {key} is an object of a later generation", True
+                    )
                 if isinstance(redrawn, IndirectObject):
                     pair = submitted.idnum, submitted.generation, redrawn.idnum
                     if pair in self.compared:
@@ -226,19 +228,20 @@ class _PdfComparison:
                     self.compared.add(pair)
             submitted, redrawn = map(resolve_reference, (submitted, redrawn))
             if _kind(submitted) is not _kind(redrawn):
-                yield PageDifference(page, f"{key} is of another type", True)
+                yield PageDifference(page, f"the PDF entry {key} is of another type", True)
             elif isinstance(redrawn, DictionaryObject):
                 yield from self._dictionaries(submitted, redrawn, key, page, remaining)
             elif isinstance(redrawn, ArrayObject):
                 if len(submitted) != len(redrawn):
-                    lengths = f"{len(submitted)} elements; px4fuse writes {len(redrawn)}"
-                    yield PageDifference(page, f"the array {key} has {lengths}", True)
+                    expected = f"px4fuse writes {len(redrawn)}"
+                    description = f"the array {key} has {len(submitted)} elements; {expected}"
+                    yield PageDifference(page, description, True)
                     continue
                 pairs = zip(*map(list.__iter__, (submitted, redrawn)), strict=True)
                 remaining += [(*pair, key) for pair in pairs][::-1]
             elif not self._is_same_value(submitted, redrawn):
                 texts = [one_line(str(value), 60) for value in (submitted, redrawn)]
-                description = f"{key} is {texts[0]!r}; px4fuse writes {texts[1]!r}"
+                description = f"the PDF entry {key} is {texts[0]!r}; px4fuse writes {texts[1]!r}"
                 yield PageDifference(page, description)
 
     def _dictionaries(
@@ -253,9 +256,10 @@ class _PdfComparison:
         submitted_keys, redrawn_keys = _keys(submitted, key), _keys(redrawn, key)
         for name in sorted(submitted_keys ^ redrawn_keys):
             feature = _FEATURE_NAMES.get(name, f"an entry {one_line(name, 40)}")
-            is_added = name in submitted_keys
-            problem = "that px4fuse does not write" if is_added else "is missing"
-            yield PageDifference(page, f"{feature} {problem}", True)
+            description = f"{feature} is missing"
+            if name in submitted_keys:
+                description = f"{feature} that px4fuse does not write"
+            yield PageDifference(page, description, True)
         for name in sorted(submitted_keys & redrawn_keys, reverse=True):
             pair = submitted.raw_get(name), redrawn.raw_get(name), name
             (self.parents if page and name == "/Parent" else remaining).append(pair)
@@ -285,7 +289,7 @@ class _PdfComparison:
             return
         filters = resolve_reference(submitted.get("/Filter"))
         if filters not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf does not decode JPEG
-            yield PageDifference(page, f"{key} has another compression", True)
+            yield PageDifference(page, f"the PDF entry {key} has another compression", True)
             return
         data, redrawn_data = submitted.get_data(), redrawn.get_data()
         if data == redrawn_data or (kind == "/Metadata" and _xmp(data) == _xmp(redrawn_data)):

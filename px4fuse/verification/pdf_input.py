@@ -92,10 +92,10 @@ def read_report(pdf: bytes, name: str) -> ReportedResults:
     results = attached_results(pdf, name)
     if isinstance(results, ReportedResults):
         return results
-    content = "no results of compare or loop"
+    reason = f"the attached {RESULTS_NAME} contains no results of compare or loop"
     if isinstance(results, AidsResults):
-        content = "only EKF2 aids, no KF results"
-    raise ResultsError(f"{one_line(name, 200)}: the attached {RESULTS_NAME} contains {content}.")
+        reason = f"the attached {RESULTS_NAME} contains only EKF2 aids, no KF results"
+    raise ResultsError(f"{one_line(name, 200)}: {reason}.")
 
 
 def attached_results(pdf: bytes, name: str) -> Results:
@@ -137,9 +137,12 @@ def _check_file(pdf: bytes) -> None:
     for has_problem, reason in (
         (
             len(pdf) > MAX_BYTES,
-            f"larger than {MAX_BYTES // 1_000_000} MB; reports are smaller than 2 MB.",
+            f"the file is larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB.",
         ),
-        (not pdf.startswith(b"%PDF-"), "not a PDF. Hand in the file that px4fuse wrote."),
+        (
+            not pdf.startswith(b"%PDF-"),
+            "the file is not a PDF. Hand in the file that px4fuse wrote.",
+        ),
         (b"%%EOF" not in pdf[-2048:], "the end of the PDF is missing. Hand it in again."),
     ):
         if has_problem:

@@ -35,7 +35,6 @@ from px4fuse.results.reading import clean_text, one_line
 from px4fuse.verification.model import Mismatch, PageStatus, Status, Verdict
 from px4fuse.verification.pages import TextComparison, compare_pages
 
-ADD_LOGS_ADVICE = "Add {} to --logs."
 ASK_ADVICE = "Ask how the report was made, and for its log and all other input files."
 FOREIGN_REQUEST_REASON = "the recorded command was not written by px4fuse"
 # Minimum KF prediction step DT (s) of a report: for ten minutes of flight, 60,000 steps take half a
@@ -139,7 +138,7 @@ def _link_file(
     if path is None:
         missing_name = one_line(name, 80) or "the file"
         reason = f"none of the given files has the SHA-256 of {role}"
-        raise NotRepeatableError(reason, ADD_LOGS_ADVICE.format(missing_name), missing_name)
+        raise NotRepeatableError(reason, f"Add {missing_name} to --logs.", missing_name)
     if name != Path(name).name or name == ".." or "\\" in name or not name.isprintable():
         reason = f"{FOREIGN_REQUEST_REASON}: it contains a path instead of a file name"
         raise NotRepeatableError(reason, ASK_ADVICE)
@@ -237,11 +236,11 @@ def verify(
     version, own_version = results.provenance.px4fuse, metadata.version("px4fuse")
     if version != own_version:
         version = one_line(version, 40)
-        reason = f"made with px4fuse {version}; this is px4fuse {own_version}"
+        reason = f"the report was made with px4fuse {version}; this is px4fuse {own_version}"
         return cannot_verify(reason, f"Verify it with px4fuse {version}.")
     name = one_line(log_name(results), 80) or "the log"
     if not logs:
-        return cannot_verify(NO_LOG_REASON, ADD_LOGS_ADVICE.format(name), name)
+        return cannot_verify(NO_LOG_REASON, f"Add {name} to --logs.", name)
     sha256 = log_sha256(results)
     if sha256 not in logs:
         expected_hash = one_line(sha256, 64) or "none"
@@ -268,7 +267,7 @@ def _verify_with_log(
 ) -> Verdict:
     redrawn = draw()
     if redrawn == pdf:
-        reason = "the new run on the log gives an identical file"
+        reason = "the new run on the log gives an identical PDF"
         return Verdict("verified", (reason, LIMIT_NOTE), True, page_status="same", redrawn=redrawn)
     mismatches, is_same_number, value_count = compare_results(
         to_plain(submitted), to_plain(recomputed)
@@ -297,7 +296,7 @@ def _verify_with_log(
         status = "numbers differ"
     page_sentences = [difference.sentence for difference in pages[:MAX_LISTED_PAGES]]
     if len(pages) > MAX_LISTED_PAGES:
-        page_sentences.append(f"further differences: {len(pages) - MAX_LISTED_PAGES}")
+        page_sentences.append(f"the PDF has {len(pages) - MAX_LISTED_PAGES} more differences")
     # the class table shows only the first reason, so the decisive reasons are first
     if status == "cannot verify":
         reasons = page_sentences + reasons
@@ -306,7 +305,7 @@ def _verify_with_log(
     remedy = ORIGINAL_PDF_ADVICE if is_foreign else ""
     if other_libraries:  # other library versions may draw other pages
         versions = one_line(", ".join(map(" ".join, sorted(other_libraries))), 300)
-        reasons.append(f"made with {versions}; this computer has other versions")
+        reasons.append(f"the report was made with {versions}; this computer has other versions")
         remedy = remedy or f"Verify it with {versions}."
     reasons += [LIMIT_NOTE] * (status == "verified")
     listed = mismatches[:MAX_DIFFERENCES]
