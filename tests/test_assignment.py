@@ -367,7 +367,7 @@ class TestCommand:
         # without a given secret that of the key is used
         given = "--assignment", "roster.csv", "-o", "g", "--kind", "loop"
         kept = run_checked("simulate", *given).output
-        assert "stored in the answers" in kept
+        assert "stored in the answer key" in kept
         assert read_key(at / "g_answers.json").secret not in kept
         again = run_checked("simulate", *given, "--preview").output
         for answer in read_key(at / "g_answers.json").answers:

@@ -192,7 +192,7 @@ def test_info_log_without_take_off_is_described(tmp_path):
     inventory = inventory_of(log, tmp_path)
     assert inventory.flight.airborne == ()
     assert ability(inventory, "compare").possible
-    assert "never (land detector)" in info(tmp_path / "made.ulg")
+    assert "never, according to the land detector" in info(tmp_path / "made.ulg")
 
 
 def test_inventory_mocap_as_source_is_no_ground_truth(tmp_path):

@@ -129,7 +129,7 @@ REFUSED = {
     "page of three": ("explore a.ulg a.ulg a.ulg", "unexpected extra argument"),
     "page of two and more": ("explore a.ulg a.ulg --mavlink a.tlog", "unexpected extra argument"),
     "too long a name": (f"info a.ulg --json {'x' * 300}.json", "File name too long"),
-    "no name": ("extract a.ulg -o ''", "the name is empty"),
+    "no name": ("extract a.ulg -o ''", "the file name is empty"),
     "no name of a log": ("batch '' -o out", "the name of a log is empty"),
     **{
         f"{name} by {command}": (f"{command} {name}.ulg", f"px4fuse: {name}.ulg")

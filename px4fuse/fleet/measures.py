@@ -1,7 +1,7 @@
-"""Numbers that ``px4fuse diff`` compares, with their 95 % intervals; ``measures.csv`` lists them.
+"""Numbers that ``px4fuse diff`` compares, as listed in ``measures.csv``, with 95 % intervals.
 
-A path leads to a value in the results (keys joined by dots). In a pattern, ``*`` replaces the name
-of an axis, a tuning result or an aid.
+A path consists of the keys that lead to a value in the results, joined by dots. In a pattern, ``*``
+replaces the name of an axis, a tuning result or an aiding source.
 """
 
 from collections.abc import Iterator
@@ -14,18 +14,17 @@ from px4fuse.filter.time_offset import Clock
 from px4fuse.fleet.rows import read_rows, value_at
 from px4fuse.results.contract import AidsResults, ComparisonResults, Interval
 
-# Columns: pattern of the path, label, unit ("share": fraction from 0 to 1), and field with the 95 %
-# interval (empty if the results contain none)
+# Columns of measures.csv: pattern of the path, label, unit ("share": fraction from 0 to 1), and
+# field with the 95 % interval (empty if the results contain none)
 MEASURES = read_rows("measures.csv")
-# Numbers whose difference is within either tolerance are not listed. The absolute tolerance is in
-# the unit of the number
+# Minimum differences that px4fuse diff lists: relative to the number, and in the number's unit
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 0.01, 0.001
 _REJECTED_PATTERN = "axes.*.rejected_fraction"
 
 
 @dataclass(frozen=True)
 class ComparedNumber:
-    """Value in the results, with its 95 % interval; None if the results contain none."""
+    """Value in the results with its label, unit, and 95 % interval if the results contain one."""
 
     label: str
     unit: str
@@ -34,11 +33,11 @@ class ComparedNumber:
 
 
 def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, ComparedNumber]:
-    """Return the numbers of MEASURES by their path; without those that are not determined."""
+    """Return the numbers of MEASURES by path, except estimates that are not determinable."""
     axes = {} if isinstance(results, AidsResults) else results.axes
-    # EKF2 rejects north and east together, so the rejections of one horizontal axis are compared
+    # EKF2 rejects north and east together, so px4fuse diff lists the rejections of one of them
     horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")
-    # the axes contain the numbers of the aid that is the position source
+    # the axes contain the same numbers of the aiding source that is the position source
     source_aids: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
     if value_at(results, "source.kind") == "gnss":
         source_aids = ("gnss_pos",)
@@ -71,7 +70,7 @@ def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, Compa
 def _matching_paths(
     results: ComparisonResults | AidsResults, pattern: str
 ) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield each path in the results that matches the pattern, and the names in place of ``*``."""
+    """Yield each path in the results that matches a pattern, with the names in place of ``*``."""
     head, has_wildcard, tail = pattern.partition(".*")
     if not has_wildcard:
         yield pattern, ()

@@ -19,11 +19,12 @@ from px4fuse.webpage import frame
 from px4fuse.webpage.frame import Cell, Column, Row, Section
 from px4fuse.webpage.safe import clean, load_template, local_link
 
-# Columns of the four ratios, in the order of the verdicts of a card
+# Columns of the four σ ratios (KF and EKF2, against source and ground truth), in the order of the
+# verdicts of a diagnosis card
 RATIOS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
 SEVERITIES = ("error", "warning", "note", "clean", "refused")
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
-# Columns that the page shows if the user opens a row: one value per axis, and one per log
+# Columns that the page shows after a click on a row: one value per axis (AXIS_COLUMNS) or per log
 AXIS_COLUMNS = [name for name, path in RESULT_PATHS.items() if "{" in path]
 LOG_COLUMNS = [
     name
@@ -45,7 +46,7 @@ LOG_COLUMNS = [
         "report",
     )
 ]
-# Group of the columns that are hidden at first
+# Name of the group of columns that the page shows on request
 MORE = "numbers"
 FILTERS = (
     ("Diagnosis", "severity", "All"),
@@ -55,13 +56,13 @@ FILTERS = (
     ("Finding", "finding", "All"),
     ("Action", "remedy", "All"),
 )
-# Axes whose numbers are shown for the log: the aisle if it exists, else north and east, else down
+# Axes whose numbers represent the log in the table: the aisle, else north and east, else down
 MAIN_AXES = (("aisle",), ("north", "east"), ("down",))
 
-#: Entry of one log: the non-empty columns of its rows, of the main axes if present, and
-#: ``severity`` (also of logs without a result), ``words`` (of the four verdicts), ``status``
-#: ("done" if one axis is), ``lacking`` (reasons for missing results, with actions),
-#: ``axes`` (rows with an axis), ``findings`` (ids) and ``tags`` (label by page filter value)
+#: One log on the page: the non-empty columns of its rows, preferably of MAIN_AXES, and
+#: ``severity`` (also of logs without a result), ``words`` (texts of the four verdicts), ``status``
+#: ("done" if one axis is done), ``lacking`` (reasons for missing results, with actions),
+#: ``axes`` (rows with an axis), ``findings`` (ids) and ``tags`` (labels by value of page filters)
 Log = Mapping[str, Any]
 
 
@@ -73,13 +74,10 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     table : DataFrame
         One row per log and axis, with the columns of :data:`px4fuse.fleet.rows.COLUMN_TYPES`; a log
         that could not be read has one row without axis.
+    title : str
+        Title of the page.
     made_with : str
         Name and version of px4fuse.
-
-    Returns
-    -------
-    str
-        HTML to write as UTF-8; equal for equal input, because it does not contain the date.
     """
     logs = sort_logs(logs_of(table))
     names = short_names(logs)
@@ -92,7 +90,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
         ("error", "with an error"),
         ("warning", "with a warning"),
         ("clean", "without a fault"),
-        ("refused", "refused"),
+        ("refused", "not analysed"),
     )
     count_text = ", ".join(f"{counts[name]} {text}" for name, text in parts if counts[name])
     return frame.page(
@@ -158,7 +156,7 @@ def _ratio_cell(ratio: float | None, name: str, word: str) -> Cell:
 
 
 def sort_logs(logs: Iterable[Log]) -> list[Log]:
-    """Sort logs by severity, then by their largest |ln ratio|, then by position RMSE."""
+    """Sort logs by severity, then by the largest |ln(σ ratio)|, then by position RMSE."""
 
     def rank(log: Log) -> tuple[float, ...]:
         ratios = [log[key] for name in RATIOS if log.get(key := f"{name}_ratio")]
@@ -207,7 +205,7 @@ def _format_value(value: str | float) -> str:
 
 
 def _filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Return the selection lists of the page with their options, most frequent option first."""
+    """Return the page filters with their options and log counts, most frequent option first."""
     counts = Counter(tag for log in logs for tag in log["tags"])
     label_by_tag: Mapping[str, str] = {
         tag: label for log in logs for tag, label in log["tags"].items()
@@ -228,7 +226,7 @@ def _filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
 
 
 def logs_of(table: pd.DataFrame) -> list[Log]:
-    """Combine the rows of each log into one :data:`Log`, in the order of the table."""
+    """Combine the table rows of each log into one :data:`Log`, in the order of the table."""
     rows: dict[str, list[dict[str, Any]]] = defaultdict(list)
     present = (table.notna() & (table != "")).to_numpy()
     for row, is_present in zip(table.to_dict("records"), present, strict=True):
@@ -279,7 +277,7 @@ def _tags(log: Log) -> dict[str, str]:
 
 
 def short_names(logs: Sequence[Log]) -> dict[str, str]:
-    """Shorten ids of flight controllers above 20 characters to the last 8 if these are unique."""
+    """Map long ids of flight controllers (above 20 characters) to their last 8, if all differ."""
     long_ids = {vehicle for log in logs if len(vehicle := log.get("vehicle", "")) > 20}
     short_ids = {vehicle: f"…{vehicle[-8:]}" for vehicle in long_ids}
     return short_ids if len(set(short_ids.values())) == len(short_ids) else {}
