@@ -219,12 +219,8 @@ def check_parameters(changes: Mapping[str, float]) -> dict[str, float]:
                 f"{name} is not a parameter of the EKF2 replay",
                 f"{suggest_name(name, PARAMETERS)}Choose from {', '.join(PARAMETERS)}.",
             )
-        if not parameter.minimum <= value <= parameter.maximum or not math.isfinite(value):
-            unit = f" {parameter.unit}" if parameter.unit else ""
-            raise SettingsError(
-                f"{name}={value:g} is outside PX4's range of {parameter.minimum:g} to "
-                f"{parameter.maximum:g}{unit} (default {parameter.default:g})."
-            )
+        if fault := parameter.describe_range_error(value):
+            raise SettingsError(f"{name}{fault} (default {parameter.default:g}).")
         if name == EV_POS.noise_mode and value not in (0.0, 1.0):
             raise SettingsError(f"{name}={value:g} is not possible. Give 0 or 1.")
     return {name: float(value) for name, value in changes.items()}

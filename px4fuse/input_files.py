@@ -76,17 +76,15 @@ def check_outputs(targets: Iterable[Path]) -> None:
 
 
 def check_output_folder(folder: Path) -> None:
-    """Raise an OutputError if the output folder contains an input, also through a link.
+    """Raise an OutputError if the output folder is a file or contains an input, also by a link.
 
     Files in the folder and in its subfolders are checked, because outputs are written to both.
     """
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"-o {folder} is not a folder. Choose another name.")
     register = _register.get() or _Register()
     entries = _entries(folder)
-    for path in (
-        folder,
-        *entries,
-        *(subentry for entry in entries for subentry in _entries(entry)),
-    ):
+    for path in (folder, *entries, *(child for entry in entries for child in _entries(entry))):
         if (identity := _identity(path)) is None:
             continue
         input_path = path if identity in register.inputs else register.input_by_folder.get(identity)

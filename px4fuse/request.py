@@ -267,49 +267,35 @@ _POSITION_OPTIONS = {
     "time_unit": "--position-time-unit",
     "length_unit": "--position-unit",
 }
+
+
+def _option_names(
+    kind: type[msgspec.Struct], excluded: Sequence[str] = (), **exceptions: str
+) -> dict[str, str]:
+    """Return the option of each optional field: its name with hyphens and without the unit."""
+    names = {
+        field.name: "--" + re.sub(r"(_m_s2|_m|_s|_deg)$", "", field.name).replace("_", "-")
+        for field in msgspec.structs.fields(kind)
+        if not field.required and field.name not in excluded
+    }
+    return names | exceptions
+
+
 # Command line option for each field of a request that is not an argument of the command
 OPTION_NAMES: Mapping[type[msgspec.Struct], Mapping[str, str]] = {
-    ComparisonRequest: {
-        "mavlink": "--mavlink",
-        "system": "--system",
-        "position_source": "--position-source",
-        "source_kind": "--source-kind",
-        "height": "--height",
-        "sigma_a_m_s2": "--sigma-a",
-        "sigma_z_m": "--sigma-z",
-        "dt_s": "--dt",
-        "input": "--input",
-        "axes": "--axis",
-        "heading_deg": "--heading",
-        "start_s": "--start",
-        "end_s": "--end",
-        "clock_offset_s": "--clock-offset",
-        **_POSITION_OPTIONS,
-    },
+    ComparisonRequest: _option_names(ComparisonRequest, ["position"], axes="--axis")
+    | _POSITION_OPTIONS,
     PositionFile: _POSITION_OPTIONS,
-    LoopRequest: {
-        "system": "--system",
-        "frame": "--frame",
-        "reference": "--reference",
-        "start_s": "--from",
-        "end_s": "--to",
-        "landed_at": "--landed-at",
-        "closed_loop": "--open",
-        "closures": "--closure",
-        "position_drift_m": "--drift",
-        "heading_drift_deg": "--heading-drift",
-        "key_frames_m": "--key-frames",
-    },
-    WhatIfRequest: {"mavlink": "--mavlink", "system": "--system"},
-    EvaluationRequest: {
-        "system": "--system",
-        "alignment": "--alignment",
-        "association": "--association",
-        "max_gap_s": "--max-gap",
-        "time_offset_s": "--time-offset",
-        "rpe": "--rpe",
-        "consecutive": "--consecutive",
-    },
+    LoopRequest: _option_names(
+        LoopRequest,
+        start_s="--from",
+        end_s="--to",
+        closed_loop="--open",
+        closures="--closure",
+        position_drift_m="--drift",
+    ),
+    WhatIfRequest: _option_names(WhatIfRequest, ["changes", "sweep", "without"]),
+    EvaluationRequest: _option_names(EvaluationRequest),
 }
 COMPARISON_OPTIONS = OPTION_NAMES[ComparisonRequest]
 # Options for names of Python arguments in errors that are not in OPTION_NAMES

@@ -12,7 +12,7 @@ import click
 
 from px4fuse.cli import options, outputs
 from px4fuse.cli.compare import SEVERITIES, Severity
-from px4fuse.errors import OutputError, SettingsError
+from px4fuse.errors import SettingsError
 from px4fuse.fleet import TIMEOUT_S
 
 FAILED = "failed"
@@ -26,6 +26,7 @@ CLUSTERS = ("slurm", "kubernetes")
 @click.option("--reports", is_flag=True, help="Also write a PDF report for each log.")
 @click.option(
     "--timeout",
+    "timeout_s",
     type=click.FloatRange(1.0),
     metavar="SECONDS",
     default=TIMEOUT_S,
@@ -39,6 +40,7 @@ CLUSTERS = ("slurm", "kubernetes")
 )
 @click.option(
     "--memory",
+    "memory_gb",
     type=click.FloatRange(1.0),
     metavar="GB",
     default=4.0,
@@ -60,10 +62,6 @@ def batch(
     logs: tuple[str, ...],
     *,
     output: Path | None,
-    reports: bool,
-    timeout: float,
-    workers: int | None,
-    memory: float,
     scheduler: str | None,
     fail_on: Literal["failed", Severity] | None,
     **option_values: Any,
@@ -79,9 +77,7 @@ def batch(
         return
     if output is None:
         raise SettingsError("batch requires an output folder: -o DIR.")
-    if output.exists() and not output.is_dir():
-        raise OutputError(f"-o {output} is not a folder. Choose another name.")
-    if scheduler is not None and workers is not None:
+    if scheduler is not None and option_values["workers"] is not None:
         raise SettingsError("--workers applies to this computer. Omit --workers with --scheduler.")
     from px4fuse.fleet.run import run
     from px4fuse.fleet.terminal import format_summary
@@ -92,11 +88,7 @@ def batch(
             fleet = run(
                 logs,
                 output,
-                reports=reports,
-                timeout_s=timeout,
                 scheduler=scheduler,
-                workers=workers,
-                memory_gb=memory,
                 progress=partial(_show_rate, show_progress, time.monotonic()),
                 **option_values,
             )

@@ -51,8 +51,6 @@ def extract(
     each column) and flight.json (log information and missing data).
     """
     check_output_folder(output)
-    if output.exists() and not output.is_dir():
-        raise OutputError(f"{output} is a file. Give a folder with -o.")
     if format == "parquet" and importlib.util.find_spec("pyarrow") is None:
         raise OutputError(
             '--format parquet requires pyarrow. Run pip install "px4fuse[parquet]", or '

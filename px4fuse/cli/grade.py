@@ -184,8 +184,6 @@ def grade(
 
 
 def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None:
-    if output.exists() and not output.is_dir():
-        raise OutputError(f"-o {output} is not a folder. Choose another name.")
     resolved = output.resolve()
     parents = [folder for folder in (resolved, *resolved.parents) if folder.is_dir()]
     for path in input_paths:

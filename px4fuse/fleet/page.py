@@ -48,14 +48,15 @@ LOG_COLUMNS = [
 ]
 # Name of the group of columns that the page shows on request
 MORE = "numbers"
-FILTERS = (
-    ("Diagnosis", "severity", "All"),
-    ("Status", "status", "All"),
-    ("Vehicle", "vehicle", "All"),
-    ("Firmware", "firmware", "All"),
-    ("Finding", "finding", "All"),
-    ("Action", "remedy", "All"),
-)
+# Label of each page filter, by the first word of its tags
+FILTERS = {
+    "severity": "Diagnosis",
+    "status": "Status",
+    "vehicle": "Vehicle",
+    "firmware": "Firmware",
+    "finding": "Finding",
+    "remedy": "Action",
+}
 # Axes whose numbers represent the log in the table: the aisle, else north and east, else down
 MAIN_AXES = (("aisle",), ("north", "east"), ("down",))
 
@@ -211,14 +212,14 @@ def _filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
         tag: label for log in logs for tag, label in log["tags"].items()
     }
     filters = []
-    for label, kind, all_label in FILTERS:
+    for kind, label in FILTERS.items():
         options = [
             (tag, f"{clean(label_by_tag[tag], 60)} ({count})")
             for tag, count in counts.most_common()
             if tag.startswith(f"{kind}:")
         ]
         if options:
-            filters.append((label, [("", all_label), *options]))
+            filters.append((label, [("", "All"), *options]))
     return filters
 
 

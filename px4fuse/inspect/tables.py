@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from io import StringIO
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,12 @@ from px4fuse.text import to_json_types
 
 SCHEMA_NAME = "px4fuse-flight"
 SCHEMA_VERSION = "1.0"
+# Components of a vector or quaternion, by the word that represents them in columns.csv
+COMPONENTS = {
+    "AXIS": ("north", "east", "down"),
+    "BODY": ("forward", "right", "down"),
+    "WXYZ": ("w", "x", "y", "z"),
+}
 DICTIONARY_COLUMNS = ["table", "column", "unit", "frame", "meaning", "source_topic", "clock"]
 # Characters of track names that are not used in file names, as some systems do not allow them
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9_-]+")
@@ -112,8 +119,14 @@ def description(flight: Flight) -> dict[str, Any]:
 @cache
 def _column_descriptions() -> pd.DataFrame:
     """Read columns.csv: unit, frame and meaning of each column, indexed by table."""
-    with files("px4fuse.inspect").joinpath("columns.csv").open(encoding="utf-8") as file:
-        return pd.read_csv(file, index_col="table", keep_default_na=False)
+    lines = files("px4fuse.inspect").joinpath("columns.csv").read_text("utf-8").splitlines()
+    for word, names in COMPONENTS.items():
+        lines = [
+            line.replace(word, name)
+            for line in lines
+            for name in (names if word in line else [word])
+        ]
+    return pd.read_csv(StringIO("\n".join(lines)), index_col="table", keep_default_na=False)
 
 
 def _table(
