@@ -457,7 +457,7 @@ class WhatIfAnalysis:
         (if any), and then one replay for each value of the sweep.
     changes : mapping from PX4 name to value
         Changed parameters; empty if only a sweep is requested.
-    asked : bool
+    uses_estimates : bool
         True if the changes are the maximum-likelihood estimates.
     without : mapping from PX4's name of an aiding source to float
         Time (s) from which EKF2 does not fuse the aiding source.
@@ -468,14 +468,14 @@ class WhatIfAnalysis:
     flight: Flight
     whatif: WhatIf
     changes: Mapping[str, float]
-    asked: bool
+    uses_estimates: bool
     difference_steps: Mapping[str, DifferenceExplanation | Unavailable]
     without: Mapping[str, float] = field(default_factory=dict)
 
     __repr__ = one_line_repr
 
     @property
-    def first(self) -> int:
+    def sweep_start(self) -> int:
         """Index of the first replay of the sweep in ``whatif.whatif``."""
         return int(bool(self.changes or self.without))
 

@@ -117,7 +117,7 @@ def to_serializable(value: Any) -> Any:
             **{name: to_serializable(getattr(value, name)) for name in kind.__struct_fields__}
         )
     if isinstance(value, Mapping):
-        return {key: to_serializable(part) for key, part in value.items()}
+        return {key: to_serializable(child) for key, child in value.items()}
     return tuple(map(to_serializable, value)) if isinstance(value, tuple) else value
 
 

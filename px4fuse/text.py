@@ -25,10 +25,10 @@ def to_json_types(value: object) -> Any:
     elif is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in fields(value)}
     if isinstance(value, Mapping):
-        fields_by_name = {str(name): to_json_types(part) for name, part in value.items()}
-        return {name: part for name, part in fields_by_name.items() if part is not None}
+        children = {str(name): to_json_types(child) for name, child in value.items()}
+        return {name: child for name, child in children.items() if child is not None}
     if isinstance(value, list | tuple):
-        return [to_json_types(part) for part in value]
+        return list(map(to_json_types, value))
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

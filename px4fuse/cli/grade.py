@@ -12,6 +12,7 @@ from px4fuse.cli.options import (
     Choice,
     InputPath,
     NonEmptyPath,
+    input_option,
     max_size_option,
     open_option,
     output_option,
@@ -28,34 +29,30 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("submissions", nargs=-1, type=InputPath())
-@click.option(
+@input_option(
     "--logs",
-    type=InputPath(),
-    metavar="DIR",
-    multiple=True,
-    help="Folder with the flight logs, or one log; repeatable. A report without its log is not "
+    "DIR",
+    "Folder with the flight logs, or one log; repeatable. A report without its log is not "
     "verified.",
+    multiple=True,
 )
-@click.option(
+@input_option(
     "--rubric",
-    type=InputPath(),
-    metavar="FILE.toml",
-    help="Grading rubric with the points of each item.  [default: the rubric of px4fuse]",
+    "FILE.toml",
+    "Grading rubric with the points of each item.  [default: the rubric of px4fuse]",
 )
 @max_size_option
-@click.option(
+@input_option(
     "--key",
-    type=InputPath(),
-    metavar="FILE.json",
-    help="Answer key of the class, written by px4fuse simulate --assignment.",
+    "FILE.json",
+    "Answer key of the class, written by px4fuse simulate --assignment.",
 )
 @output_option("DIR", "Output folder for the class table and the feedback.")
 @click.option("--title", help="Title of the class page.  [default: the rubric's title]")
-@click.option(
+@input_option(
     "--roster",
-    type=InputPath(),
-    metavar="FILE.csv",
-    help="Class list with all students.  [default: the students in --key]",
+    "FILE.csv",
+    "Class list with all students.  [default: the students in --key]",
 )
 @click.option(
     "--attempt",
@@ -80,13 +77,12 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Count points that the instructor has not confirmed yet.",
 )
-@click.option(
+@input_option(
     "--worksheet",
-    type=InputPath(),
-    metavar="FILE.csv",
-    multiple=True,
-    help="Moodle grading worksheet, Canvas gradebook, or another table with student ids or names, "
+    "FILE.csv",
+    "Moodle grading worksheet, Canvas gradebook, or another table with student ids or names, "
     "of which a copy with the grades is written; repeatable.",
+    multiple=True,
 )
 @click.option(
     "--column", metavar="TITLE", help="Title of the column of --worksheet for the grades."

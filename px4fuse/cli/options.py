@@ -157,6 +157,11 @@ def _json_option(more_text: str = "") -> Option:
 json_option = _json_option()
 
 
+def input_option(name: str, metavar: str, text: str, **details: Any) -> Option:
+    """Declare an option for an input file or folder."""
+    return click.option(name, type=InputPath(), metavar=metavar, help=text, **details)
+
+
 def output_option(metavar: str, text: str, **details: Any) -> Option:
     """Declare -o for an output file or folder.
 
@@ -198,17 +203,15 @@ person_options = _combine_options(
     click.option(
         "--id", "student_id", metavar="ID", help="Id of the student, printed on the report."
     ),
-    click.option(
+    input_option(
         "--notes",
-        type=InputPath(),
-        metavar="FILE.md",
-        help="Text of the student (Markdown), printed in the report.",
+        "FILE.md",
+        "Text of the student (Markdown), printed in the report.",
     ),
-    click.option(
+    input_option(
         "--answers",
-        type=InputPath(),
-        metavar="FILE.toml",
-        help="Completed answer form of px4fuse answers, which the report contains.",
+        "FILE.toml",
+        "Completed answer form of px4fuse answers, which the report contains.",
     ),
 )
 system_option = click.option(

@@ -12,9 +12,9 @@ import click
 
 from px4fuse.cli.options import (
     Choice,
-    InputPath,
     NonEmptyPath,
     TypedQuantity,
+    input_option,
     output_option,
     typed_parameters,
 )
@@ -90,18 +90,16 @@ class WithMistakes(click.Command):
     "Log to write (ULog); with --assignment, the folder for the logs of the class.",
     required=True,
 )
-@click.option(
+@input_option(
     "--assignment",
-    type=InputPath(),
-    metavar="ROSTER.csv",
-    help="Class list (student id, name): writes one flight per student, with individual noises and "
+    "ROSTER.csv",
+    "Class list (student id, name): writes one flight per student, with individual noises and "
     "mistakes, and the answer key beside the folder.",
 )
-@click.option(
+@input_option(
     "--secret-file",
-    type=InputPath(),
-    metavar="FILE",
-    help="File with the secret for --assignment; the same secret and student id give the same "
+    "FILE",
+    "File with the secret for --assignment; the same secret and student id give the same "
     "flight.  [default: generated, and stored in the answer key]",
 )
 @click.option(

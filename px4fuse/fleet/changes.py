@@ -10,6 +10,7 @@ from px4fuse.comparison.model import FilterSummary
 from px4fuse.fleet.inputs import DiffInput, Progress, Results, read_inputs
 from px4fuse.fleet.measures import (
     ABSOLUTE_TOLERANCE,
+    FILTER_LABELS,
     RELATIVE_TOLERANCE,
     ComparedNumber,
     collect_numbers,
@@ -22,7 +23,6 @@ from px4fuse.text import format_factor, format_number
 # Maximum √(mean NEES) of a consistent filter; the minimum is 1 / maximum. The limits are wide,
 # because errors in a flight are correlated and EKF2's output predictor delays its position
 MAX_NEES_SIGMA_RATIO = 2.0
-FILTER_LABELS = {"kf": "KF", "ekf2": "EKF2"}
 # Label of each setting or property of a flight that px4fuse diff compares, and path in the results
 SETTINGS = {
     "SIGMA_A (m/s²)": "settings.sigma_a_m_s2",
@@ -69,17 +69,17 @@ def list_changes(a: DiffInput, b: DiffInput) -> contract.ChangeResults:
         a=_describe_input(a),
         b=_describe_input(b),
         settings=tuple(_setting_changes(a.results, b.results)),
-        numbers=tuple(number_changes(collect_numbers(a.results), collect_numbers(b.results))),
+        numbers=tuple(compare_numbers(collect_numbers(a.results), collect_numbers(b.results))),
         findings=findings,
         worse=tuple(_worse_verdicts(a.results, b.results, findings)),
-        provenance=provenance(shlex.join(["px4fuse", "diff", a.given, b.given])),
+        provenance=provenance(shlex.join(["px4fuse", "diff", a.file_name, b.file_name])),
     )
 
 
 def _describe_input(diff_input: DiffInput) -> contract.DiffInput:
     log = diff_input.results.log
     return contract.DiffInput(
-        given=diff_input.given,
+        given=diff_input.file_name,
         kind=diff_input.kind,
         log=log.name,
         log_sha256=log.sha256,
@@ -103,7 +103,7 @@ def _parameters(results: Results) -> dict[str, float]:
     return {name: float(f"{parameters[name]:.6g}") for name in sorted(parameters)}
 
 
-def number_changes(
+def compare_numbers(
     numbers_a: Mapping[str, ComparedNumber], numbers_b: Mapping[str, ComparedNumber]
 ) -> Iterator[contract.NumberChange]:
     """Yield the numbers that differ between A and B, or that only one of them contains.

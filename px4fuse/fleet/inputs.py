@@ -29,9 +29,9 @@ _SEGMENT_FIELDS = ("heading_deg", "start_s", "end_s", "position_source", "source
 
 @dataclass(frozen=True)
 class DiffInput:
-    """Results of the input A or B of ``px4fuse diff``; ``given`` is the file name."""
+    """Results of the input A or B of ``px4fuse diff``."""
 
-    given: str
+    file_name: str
     kind: Kind
     results: Results
 

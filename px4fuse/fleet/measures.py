@@ -14,12 +14,17 @@ from px4fuse.filter.time_offset import Clock
 from px4fuse.fleet.rows import read_rows, value_at
 from px4fuse.results.contract import AidsResults, ComparisonResults, Interval
 
+FILTER_LABELS = {"kf": "KF", "ekf2": "EKF2"}
 # Columns of measures.csv: pattern of the path, label, unit ("share": fraction from 0 to 1), and
-# field with the 95 % interval (empty if the results contain none)
-MEASURES = read_rows("measures.csv")
+# field with the 95 % interval (empty if the results contain none). FILTER represents KF and EKF2
+MEASURES = [
+    row
+    | {key: row[key].replace("FILTER", text) for key, text in (("path", name), ("label", label))}
+    for row in read_rows("measures.csv")
+    for name, label in (FILTER_LABELS.items() if "FILTER" in row["path"] else [("", "")])
+]
 # Minimum differences that px4fuse diff lists: relative to the number, and in the number's unit
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 0.01, 0.001
-_REJECTED_PATTERN = "axes.*.rejected_fraction"
 
 
 @dataclass(frozen=True)
@@ -50,11 +55,9 @@ def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, Compa
             value = getattr(record, field, None)
             is_undetermined = isinstance(record, Clock) and not record.is_determinable
             is_undetermined |= isinstance(record, HeadingError) and record.drifts
-            is_duplicate = pattern == _REJECTED_PATTERN and first_name not in (
-                horizontal_axis,
-                "down",
-            )
-            is_duplicate |= pattern.startswith("aids.") and first_name in source_aids
+            is_duplicate = pattern.startswith("aids.") and first_name in source_aids
+            if pattern == "axes.*.rejected_fraction":
+                is_duplicate = first_name not in (horizontal_axis, "down")
             if is_undetermined or is_duplicate or not isinstance(value, int | float):
                 continue
             labels = (AIDS[name].label if name in AIDS else name for name in names)

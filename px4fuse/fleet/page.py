@@ -61,8 +61,8 @@ FILTERS = {
 MAIN_AXES = (("aisle",), ("north", "east"), ("down",))
 
 #: One log on the page: the non-empty columns of its rows, preferably of MAIN_AXES, and
-#: ``severity`` (also of logs without a result), ``words`` (texts of the four verdicts), ``status``
-#: ("done" if one axis is done), ``lacking`` (reasons for missing results, with actions),
+#: ``severity`` (also of logs without a result), ``verdict_texts`` (four verdicts), ``status``
+#: ("done" if one axis is done), ``missing_results`` (reasons for missing results, with actions),
 #: ``axes`` (rows with an axis), ``findings`` (ids) and ``tags`` (labels by value of page filters)
 Log = Mapping[str, Any]
 
@@ -134,7 +134,7 @@ def _cells(log: Log, names: Mapping[str, str]) -> tuple[Cell, ...]:
         Cell(log["headline"], log["headline"], action, style_class=style),
         *(
             _ratio_cell(log.get(f"{name}_ratio"), name, word)
-            for name, word in zip(RATIOS, log["words"], strict=True)
+            for name, word in zip(RATIOS, log["verdict_texts"], strict=True)
         ),
         _value_cell(log.get("difference_rms_m"), format_metres),
         frame.text_cell(log.get("date", "")[:10]),
@@ -180,9 +180,13 @@ def _details(log: Log) -> tuple[Section, ...]:
     titles = ["", *(axis["axis"] for axis in log["axes"])]
     return (
         frame.list_section(
-            "Missing results", [reason for reason, _ in log["lacking"] if reason], is_warning=True
+            "Missing results",
+            [reason for reason, _ in log["missing_results"] if reason],
+            is_warning=True,
         ),
-        frame.list_section("Actions", list(dict.fromkeys(r for _, r in log["lacking"] if r))),
+        frame.list_section(
+            "Actions", list(dict.fromkeys(r for _, r in log["missing_results"] if r))
+        ),
         frame.list_section(
             "Findings", [f"{finding_title(id_)} ({id_})" for id_ in log["findings"]]
         ),
@@ -252,7 +256,7 @@ def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
     log |= {
         "name": log.get("name") or PurePosixPath(log["log"]).name or "unnamed",
         "status": DONE if any(row["status"] == DONE for row in rows) else rows[0]["status"],
-        "lacking": tuple(dict.fromkeys(pair for pair in reasons_and_remedies if any(pair))),
+        "missing_results": tuple(dict.fromkeys(pair for pair in reasons_and_remedies if any(pair))),
         "axes": axes,
         "findings": [id_ for id_ in log.get("findings", "").split(FINDING_SEPARATOR) if id_],
     }
@@ -261,7 +265,7 @@ def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
         "severity": log.get("severity", "refused"),
         "headline": log.get("headline", f"{refused}: {log.get('reason', '')}"),
         "action": log.get("action") or log.get("remedy", "") * ("headline" not in log),
-        "words": (log.get("verdicts", "").split(FINDING_SEPARATOR) + [""] * 4)[:4],
+        "verdict_texts": (log.get("verdicts", "").split(FINDING_SEPARATOR) + [""] * 4)[:4],
     }
     return log | {"tags": _tags(log)}
 
@@ -274,7 +278,9 @@ def _tags(log: Log) -> dict[str, str]:
     for name in ("vehicle", "firmware"):
         tags[f"{name}:{log.get(name, '')}"] = log.get(name, f"{name} unknown")
     tags |= {f"finding:{finding}": finding_title(finding) for finding in log["findings"]}
-    return tags | {f"remedy:{remedy}": remedy or "no action" for _, remedy in log["lacking"]}
+    return tags | {
+        f"remedy:{remedy}": remedy or "no action" for _, remedy in log["missing_results"]
+    }
 
 
 def short_names(logs: Sequence[Log]) -> dict[str, str]:

@@ -227,19 +227,12 @@ def _data_by_part(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unavai
     if isinstance(ekf2, Unavailable):
         data_by_part["ekf2_state"] = ekf2
     else:
-        innovations_by_axis = ekf2.innovations.values()
-        innovation_tables = [
-            innovations
-            for innovations in innovations_by_axis
-            if isinstance(innovations, pd.DataFrame)
-        ]
-        longest_innovations = (
-            max(innovation_tables, key=len)
-            if innovation_tables
-            else next(iter(innovations_by_axis))
+        innovations = max(
+            ekf2.innovations.values(),
+            key=lambda samples: len(samples) if isinstance(samples, pd.DataFrame) else -1,
         )
         data_by_part |= {"ekf2_state": ekf2.state, "ekf2_variance": ekf2.variance}
-        data_by_part |= {"ekf2_innovations": longest_innovations, "ekf2_fusing": ekf2.fusing}
+        data_by_part |= {"ekf2_innovations": innovations, "ekf2_fusing": ekf2.fusing}
     samples = truth if isinstance(truth, Unavailable) else truth.samples
     return {**data_by_part, "truth": samples, "airborne": flight.airborne}
 
@@ -250,13 +243,14 @@ def _sources(flight: Flight, comparison: Comparison | None, reason: str) -> Iter
         if key in data_by_part:
             yield _source(name, data_by_part[key], flight.streams.get(key))
         for track in flight.positions if key == "position" else ():
-            is_chosen = comparison is not None and track.name == comparison.source.name
-            track_fields = {
-                "name": track.name,
-                "description": track.description,
-                "chosen": is_chosen,
-            }
-            yield _source(name, track.samples, track, **track_fields)
+            yield _source(
+                name,
+                track.samples,
+                track,
+                name=track.name,
+                description=track.description,
+                chosen=comparison is not None and track.name == comparison.source.name,
+            )
         if key == "position" and not flight.positions:
             yield Source(name, unavailable=reason)
 
@@ -315,10 +309,8 @@ def _analysis_options(
         count, span = len(cut_to_segment(source.samples, segment)), (segment.start_s, segment.end_s)
         description = "KF with position source {}, {} samples, {:.1f} s to {:.1f} s"
         yield AnalysisOption("compare", True, description.format(source.name, count, *span))
-        acceleration, rows_by_name = (
-            comparison.lines[0].acceleration,
-            _ekf2_and_truth_rows(comparison),
-        )
+        acceleration = comparison.lines[0].acceleration
+        rows_by_name = _ekf2_and_truth_rows(comparison)
     imu_reason = " ".join(finding.message for finding in imu.detect_low_rates(flight))
     if isinstance(acceleration, Unavailable):
         imu_reason = f"{acceleration.reason}; KF assumes constant velocity"
@@ -326,13 +318,11 @@ def _analysis_options(
     yield AnalysisOption("acceleration", not imu_reason, imu_reason or acceleration_text)
     data_by_part = _data_by_part(flight)
     for name, key in PARTS_OF_COMPARE.items():
-        logged, (result, description) = (
-            data_by_part.get(key, flight.ekf2),
-            rows_by_name.get(name, (NO_COMPARISON, "")),
-        )
-        yield _analysis_option(
-            name, logged if isinstance(logged, Unavailable) else result, description
-        )
+        result, description = rows_by_name.get(name, (NO_COMPARISON, ""))
+        logged = data_by_part.get(key, flight.ekf2)
+        if isinstance(logged, Unavailable):
+            result = logged
+        yield _analysis_option(name, result, description)
     aids, ekf2 = evaluate_aids(flight), flight.ekf2
     if isinstance(aids, dict) and isinstance(ekf2, Ekf2):
         rates = (f"{aid.label} {_rate_text(ekf2.aids[name].samples)}" for name, aid in aids.items())

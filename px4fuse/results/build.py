@@ -108,13 +108,13 @@ def whatif_results(
     request: WhatIfRequest, counterfactual: WhatIfAnalysis
 ) -> contract.WhatIfResults:
     """Return the results of ``px4fuse whatif``."""
-    whatif_result, sweep_start = counterfactual.whatif, counterfactual.first
+    whatif_result, sweep_start = counterfactual.whatif, counterfactual.sweep_start
     return within_bounds(
         contract.WhatIfResults(
             **_common_fields(contract.WHATIF, request, counterfactual.flight),
             agreement=whatif_result.agreement,
             evaluated_s=whatif_result.evaluated_s,
-            asked=counterfactual.asked,
+            asked=counterfactual.uses_estimates,
             logged=whatif_result.logged,
             replayed=whatif_result.replayed,
             whatif=whatif_result.whatif[0] if sweep_start else None,

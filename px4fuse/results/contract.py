@@ -412,9 +412,9 @@ def round_number(value: float) -> float:
 
 def _round_numbers(value: Any) -> Any:
     if isinstance(value, dict):
-        return {name: _round_numbers(part) for name, part in value.items()}
+        return {key: _round_numbers(child) for key, child in value.items()}
     if isinstance(value, list | tuple):
-        return [_round_numbers(part) for part in value]
+        return list(map(_round_numbers, value))
     return round_number(value) if isinstance(value, float) else value
 
 

@@ -68,17 +68,19 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
 
 def _known_fields(value: Any, kind: Any) -> Any:
     """Remove fields that a newer minor version of the schema has added from decoded JSON."""
-    kinds = types_of(kind)
+    types = types_of(kind)
     if isinstance(value, dict):
-        records = [one for one in kinds if hasattr(one, "__struct_fields__")]
-        known = {field.encode_name: field.type for one in records for field in fields(one)}
-        if records:
-            return {key: _known_fields(value[key], known[key]) for key in value if key in known}
-        value_type = next((get_args(one)[1] for one in kinds if len(get_args(one)) == 2), Any)
-        return {key: _known_fields(part, value_type) for key, part in value.items()}
+        records = [record for record in types if hasattr(record, "__struct_fields__")]
+        field_types = {field.encode_name: field.type for r in records for field in fields(r)}
+        value_type = next((args[1] for args in map(get_args, types) if len(args) == 2), Any)
+        return {
+            key: _known_fields(child, field_types.get(key, value_type))
+            for key, child in value.items()
+            if key in field_types or not records
+        }
     if isinstance(value, list):
-        item_type = next((get_args(one)[0] for one in kinds if get_args(one)), Any)
-        return [_known_fields(part, item_type) for part in value]
+        item_type = next((args[0] for args in map(get_args, types) if args), Any)
+        return [_known_fields(item, item_type) for item in value]
     return value
 
 
@@ -93,10 +95,10 @@ def _clean_values(value: Any) -> Any:
     if isinstance(value, str):
         return clean_text(value)
     if isinstance(value, dict):
-        return {clean_text(name): _clean_values(part) for name, part in value.items()}
+        return {clean_text(key): _clean_values(child) for key, child in value.items()}
     if isinstance(value, int) and value.bit_length() > INTEGER_BITS:
         raise ValueError("an integer is too large")
-    return [_clean_values(part) for part in value] if isinstance(value, list) else value
+    return list(map(_clean_values, value)) if isinstance(value, list) else value
 
 
 def clean_text(text: str) -> str:
