@@ -230,7 +230,7 @@ class Analysis(Comparison):
         return Unavailable(
             "causes other than noise",
             "the noises along the horizontal axes could not be estimated",
-            "Analyse north and east, or the aisle (--axis).",
+            "Analyse the axes north and east, or the axis aisle (--axis).",
         )
 
 
@@ -368,7 +368,7 @@ def run_comparison(
     Arguments and errors are those of :func:`run`.
     """
     prepared = prepare_comparison(request, progress, flight)
-    return compare_prepared(prepared, lambda name: progress(f"filtering {name}"))
+    return compare_prepared(prepared, lambda name: progress(f"running KF along {name}"))
 
 
 def prepare_comparison(
@@ -406,7 +406,7 @@ def prepare_comparison(
         raise MissingDataError(
             f"{flight.log.name}: the time offset cannot be estimated from this flight "
             f"({clock.reason}).",
-            "Give --clock-offset SECONDS, or omit it.",
+            "Give --clock-offset SECONDS, or omit --clock-offset.",
         )
     low, high = clock.interval_s
     if low <= 0.0 <= high:
@@ -524,7 +524,7 @@ def run_what_if(
                 raise MissingDataError(_explain_missing_change(comparison, model))
     settings = [changes] if changes or request.without else []
     settings += [{**changes, sweep.parameter: value} for value in values] if sweep else []
-    progress("replaying with other parameters")
+    progress("replaying EKF2 with other parameters")
     replays = what_if(model, settings, request.without)
     if isinstance(replays, Unavailable):
         raise MissingDataError(

@@ -307,7 +307,9 @@ def _display_card(analysis: Analysis) -> str | None:
 def _require_suffix(path: Pathlike, suffix: str) -> Path:
     target = Path(path)
     if target.suffix.lower() != suffix:
-        raise OutputError(f"{target} does not end in {suffix}. Give a name that does.")
+        raise OutputError(
+            f"{target}: the name does not end in {suffix}. Give a name ending in {suffix}."
+        )
     return target
 
 

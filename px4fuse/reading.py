@@ -145,7 +145,7 @@ def read_text(
         return content.decode("utf-16" if is_utf16 else "utf-8-sig")
     except UnicodeDecodeError as error:
         raise error_type(
-            f"{name} is not a UTF-8 text file (byte {error.start}).", "Save it as UTF-8."
+            f"{name} is not a UTF-8 text file (byte {error.start}).", "Save the file as UTF-8."
         ) from error
 
 

@@ -152,9 +152,9 @@ def _receive_result(worker: _Worker) -> tuple[bool, Any]:
         message: tuple[bool, Any] = worker.pipe.recv()
     except (EOFError, OSError):
         worker.process.join(5)
-        status = f"exit code {worker.process.exitcode}"
-        phase = "" if worker.is_ready else " during its start"
-        return False, JobFailure(f"the worker process ended{phase} ({status}).")
+        phase = "a job" if worker.is_ready else "its start"
+        code = worker.process.exitcode
+        return False, JobFailure(f"the worker process ended during {phase} (exit code {code}).")
     # unpickling runs code of the classes of the result, which may raise any exception
     except Exception as error:  # noqa: BLE001
         return False, JobFailure(f"the result could not be unpickled ({type(error).__name__}).")

@@ -207,7 +207,7 @@ def test_write_wrong_suffix_or_no_request_is_rejected(
     analysis: px4fuse.Analysis, tmp_path: Path
 ) -> None:
     for function, name in ((px4fuse.write_report, "x.html"), (px4fuse.write_page, "x.pdf")):
-        with pytest.raises(px4fuse.Px4FuseError, match="Give a name that"):
+        with pytest.raises(px4fuse.Px4FuseError, match="Give a name ending in"):
             function(analysis, tmp_path / name)
     bare = dataclasses.replace(analysis, request=None)
     with pytest.raises(px4fuse.Px4FuseError, match="contains no request"):

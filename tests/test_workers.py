@@ -46,14 +46,14 @@ def test_run_bounded_failed_job_does_not_affect_others():
     ]
     results, _ = run(jobs)
     assert [results[n] for n in (0, 3, 10)] == [1, 4, 9]
-    assert results[1] == JobFailure("the worker process ended (exit code 3).")
+    assert results[1] == JobFailure("the worker process ended during a job (exit code 3).")
     assert results[2] == JobFailure("ValueError: a b[2J")
     assert results[4] == JobFailure("x.ulg: empty.")
     assert isinstance(results[5], JobFailure)
     assert results[6] == JobFailure("the result could not be unpickled (ValueError).")
     assert results[7] == bytes(30_000_000)
     assert results[8] == "1"
-    assert results[9] == JobFailure("the worker process ended (exit code 0).")
+    assert results[9] == JobFailure("the worker process ended during a job (exit code 0).")
     assert os.environ.get("OMP_NUM_THREADS") == before
 
 

@@ -20,7 +20,7 @@ from px4fuse.threads import ONE_THREAD
 # Help text of each command; --help does not import the modules of the commands, which is slow
 COMMANDS = {
     "compare": "Check EKF2 against a two-state Kalman filter and report mistakes.",
-    "batch": "Run compare on many logs and collect one table.",
+    "batch": "Compare KF and EKF2 on many logs and write one table.",
     "diff": "List differences between two flights or reports.",
     "answers": "Write the answer form of a student for a flight.",
     "explore": "Write an interactive page with sliders for the filter settings.",

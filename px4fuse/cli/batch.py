@@ -66,7 +66,7 @@ def batch(
     fail_on: Literal["failed", Severity] | None,
     **option_values: Any,
 ) -> None:
-    """Run compare on many logs and collect one table.
+    """Compare KF and EKF2 on many logs and write one table.
 
     LOGS are files, folders, globs and URLs (s3://, gs://, https://, sftp://). Writes
     fleet.html, fleet.csv, fleet.parquet and the results of each log to DIR. A second run processes

@@ -130,7 +130,7 @@ def _log_facts(inventory: Inventory) -> list[tuple[str, str]]:
 
 
 def _duration_text(seconds: float) -> str:
-    return f"{seconds:.{1 if seconds >= 1 else 3}f} s" if seconds else "one sample time"
+    return f"{seconds:.{1 if seconds >= 1 else 3}f} s" if seconds else "data of one time only"
 
 
 def _start_text(inventory: Inventory) -> str:

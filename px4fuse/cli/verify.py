@@ -48,10 +48,12 @@ def verify(
     from px4fuse.verification.verification import verify as verify_report
     from px4fuse.workers import JobFailure, run_one_bounded
 
-    content = read_bytes_limited(report, LogError, MAX_BYTES, size_remedy="Reports are below 2 MB")
+    content = read_bytes_limited(
+        report, LogError, MAX_BYTES, size_remedy="Give a report, which has less than 2 MB"
+    )
     recorded = read_report(content, display_name(report))
     with progress(json_path) as show_progress:
-        show_progress("hashing the logs")
+        show_progress("computing the SHA-256 of the logs")
         files = files_by_sha256(logs)
         check_targets([json_path, output])
         if logs and not files:

@@ -29,9 +29,9 @@ SETTINGS = {
     "SIGMA_Z (m)": "settings.sigma_z_m",
     "DT (s)": "settings.dt_s",
     "input": "settings.input",
-    "time offset added (s)": "settings.clock_offset_s",
-    "start (s)": "settings.start_s",
-    "end (s)": "settings.end_s",
+    "added time offset (s)": "settings.clock_offset_s",
+    "start of the analysis (s)": "settings.start_s",
+    "end of the analysis (s)": "settings.end_s",
     "position source": "source.name",
     "firmware": "log.firmware",
     "firmware hash": "log.firmware_hash",
@@ -156,10 +156,12 @@ def _worse_verdicts(
         if was_consistent and not is_consistent:
             ratio = value_b**0.5
             factor = format_factor(max(ratio, 1.0 / ratio))
-            verdict, size = ("over", "small") if ratio > 1.0 else ("under", "large")
+            verdict, size = (
+                ("overconfident", "small") if ratio > 1.0 else ("underconfident", "large")
+            )
             yield (
                 f"{name}: {format_number(value_a)} (consistent) → {format_number(value_b)} "
-                f"({verdict}confident, σ {factor} times too {size})."
+                f"({verdict}, σ {factor} times too {size})."
             )
     error_ids = [
         finding.id for finding in findings if (finding.only_in, finding.severity) == ("B", "error")

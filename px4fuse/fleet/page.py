@@ -117,7 +117,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
         rows=rows,
         filters=_filters(logs),
         groups=[(MORE, "more columns")],
-        placeholder="name, vehicle, firmware, finding",
+        placeholder="search by name, vehicle, firmware or finding",
         full_table_note="All rows are in fleet.csv.",
         ratio_axis={"bands": BANDS, "ends": AXIS_ENDS, "marks": MARK_PATHS},
     )

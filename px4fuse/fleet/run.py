@@ -219,12 +219,12 @@ def run(
         connect_cluster(scheduler) as client,
         closing(run_jobs(client, run_in_processes, jobs, workers)) as finished_jobs,
     ):
-        progress("comparing", 0, len(jobs))
+        progress("comparing logs", 0, len(jobs))
         try:
             try:
                 for number, (job, outcome) in enumerate(finished_jobs, 1):
                     _cache_outcome(state, log_by_address[job.address], outcome)
-                    progress(f"comparing, {len(state.failed_rows)} failed", number, len(jobs))
+                    progress(f"comparing logs, {len(state.failed_rows)} failed", number, len(jobs))
             finally:
                 batch_result = _write_table(state, logs)
         except Px4FuseError as error:

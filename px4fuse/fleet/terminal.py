@@ -31,9 +31,12 @@ def format_summary(batch_result: BatchResult) -> Page:
     causes = uncompared.agg(["count", "first"]).reset_index()
     sorted_causes = causes.sort_values("count", ascending=False, kind="stable")
     for cause in sorted_causes.head(MAX_LISTED).to_dict("records"):
-        prefix = "" if cause["count"] == 1 else f"{cause['count']} logs, for example "
-        text = "{first}: {status}: {reason}. {remedy}".format_map(cause).rstrip()
-        page.write(prefix + text, colour=RED if cause["status"] == FAILED else YELLOW)
+        template = "{first}: {status}: {reason}. {remedy}"
+        if cause["count"] > 1:
+            template = "{count} logs, for example {first}: {status}: {reason}. {remedy}"
+        page.write(
+            template.format_map(cause).rstrip(), colour=RED if cause["status"] == FAILED else YELLOW
+        )
     if len(sorted_causes) > MAX_LISTED:
         remaining_count = len(sorted_causes) - MAX_LISTED
         page.write(f"fleet.html lists {remaining_count} more reasons for logs without a result.")

@@ -364,7 +364,7 @@ def _ekf2_and_truth_rows(comparison: Comparison) -> dict[str, tuple[object, str]
                 (summary for summary in summaries if not isinstance(summary, Unavailable)),
                 summaries[0],
             ),
-            f"innovations: {', '.join(counts)}",
+            f"number of EKF2 innovations: {', '.join(counts)}",
         ),
         "error": (
             first_axis.truth,
