@@ -120,7 +120,7 @@ class Analysis(Comparison):
         return collect_events(self)
 
     @property
-    def others(self) -> list[AxisComparison]:
+    def secondary_axes(self) -> list[AxisComparison]:
         """Comparisons along all axes except the main axis."""
         return [axis for axis in self.axes.values() if axis is not self.main]
 
@@ -202,11 +202,11 @@ class Analysis(Comparison):
         return low_pass, correlated_noise
 
     @property
-    def smoothing(self) -> SourceLowPass | Unavailable:
+    def source_low_pass(self) -> SourceLowPass | Unavailable:
         return self.time_correlation_fit[0]
 
     @property
-    def coloured(self) -> TimeCorrelatedNoise | Unavailable:
+    def time_correlated_noise(self) -> TimeCorrelatedNoise | Unavailable:
         return self.time_correlation_fit[1]
 
     @cached_property

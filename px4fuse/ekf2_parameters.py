@@ -126,7 +126,7 @@ REPORTED: tuple[str, ...] = tuple(TABLES["reported"])
 
 
 def effective_settings(
-    logged: Mapping[str, float], aid: Aid = EV_POS, *others: Aid
+    logged: Mapping[str, float], aid: Aid = EV_POS, *other_aids: Aid
 ) -> dict[str, float]:
     """Return the parameter values of the EKF2 model: the logged value, else PX4's default.
 
@@ -134,10 +134,10 @@ def effective_settings(
     ----------
     logged : mapping
         Parameter values in the log, by PX4 name.
-    aid, *others : Aid
+    aid, *other_aids : Aid
         Aiding sources that EKF2 fuses; parameters of other aiding sources are omitted.
     """
-    used_switches = {fused_aid.switch for fused_aid in (aid, *others)}
+    used_switches = {fused_aid.switch for fused_aid in (aid, *other_aids)}
     excluded_names = {
         name
         for other in (EV_POS, GNSS_POS, GNSS_VEL, MAG, BAROMETER)

@@ -105,8 +105,8 @@ def read_bytes_limited(
     content = b"" if size > limit_bytes else _read(path, size + 1, error_type, name)
     if len(content) > size:  # the file grows, or is in /proc, in which all sizes are 0
         content = _read(path, limit_bytes + 1, error_type, name)
-    if (size_found := max(size, len(content))) > limit_bytes:
-        raise error_type(_too_large(name, size_found, limit_bytes), f"{size_remedy}.")
+    if (actual_size := max(size, len(content))) > limit_bytes:
+        raise error_type(_too_large(name, actual_size, limit_bytes), f"{size_remedy}.")
     if empty_remedy is not None and not content:
         raise error_type(f"{name}: the file is empty", f"{empty_remedy}.")
     return content

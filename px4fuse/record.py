@@ -121,14 +121,14 @@ def to_serializable(value: Any) -> Any:
     return tuple(map(to_serializable, value)) if isinstance(value, tuple) else value
 
 
-def table(beside: str, name: str, kind: type[T]) -> T:
+def table(module_file: str, name: str, kind: type[T]) -> T:
     """Read a TOML file of px4fuse as the type ``kind``.
 
     Parameters
     ----------
-    beside : str
+    module_file : str
         ``__file__`` of a module in the same folder.
     name : str
         Name of the TOML file.
     """
-    return msgspec.toml.decode(Path(beside).with_name(name).read_bytes(), type=kind)
+    return msgspec.toml.decode(Path(module_file).with_name(name).read_bytes(), type=kind)

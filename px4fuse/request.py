@@ -342,8 +342,8 @@ def command_line(
             arguments += ["--sweep", f"{sweep.parameter}={values}"]
         for name in shown_request.without:
             arguments += ["--without", name]
-        for since in {*shown_request.without.values()} - {0.0}:
-            arguments += ["--from", _option_text(since)]
+        for start_s in {*shown_request.without.values()} - {0.0}:
+            arguments += ["--from", _option_text(start_s)]
     words = ["px4fuse", *arguments]
     return quote_command(words) if for_shell else shlex.join(words)
 

@@ -50,7 +50,9 @@ class _Worker:
         # spawn works on all systems and does not copy the memory of the parent
         context = multiprocessing.get_context("spawn")
         self.pipe, child_pipe = context.Pipe()
-        self.process = context.Process(target=_serve, args=(child_pipe, function, memory_bytes))
+        self.process = context.Process(
+            target=_run_worker, args=(child_pipe, function, memory_bytes)
+        )
         environment = dict(os.environ)
         os.environ.update(_ENVIRONMENT)
         try:
@@ -161,7 +163,7 @@ def _receive_result(worker: _Worker) -> tuple[bool, Any]:
     return message
 
 
-def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int | None) -> None:
+def _run_worker(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int | None) -> None:
     """Run jobs in a worker process in sequence, until its pipe is closed."""
     # the parent process handles Ctrl-C and ends its worker processes
     signal.signal(signal.SIGINT, signal.SIG_IGN)

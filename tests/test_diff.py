@@ -77,7 +77,10 @@ def by_path(found: ChangeResults) -> dict[str, tuple[float | None, float | None]
 def test_changes_of_equal_flights_are_not_worse(clean):
     found = list_changes(clean, flown(503))
     assert found.worse == ()
-    assert {one.name for one in found.settings} <= {"start of the analysis (s)", "end of the analysis (s)"}
+    assert {one.name for one in found.settings} <= {
+        "start of the analysis (s)",
+        "end of the analysis (s)",
+    }
     assert list_changes(clean, clean).numbers == ()
 
 

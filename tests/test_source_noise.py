@@ -83,7 +83,7 @@ def test_find_white_noise_returns_nothing() -> None:
     analysis = analysed(errors.white)
     assert root_findings(analysis) == {}
     assert list(detect(analysis)) == []
-    assert isinstance(analysis.coloured, Unavailable)
+    assert isinstance(analysis.time_correlated_noise, Unavailable)
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_find_separates_correlated_noise_from_low_pass() -> None:
     assert "source_noise_time_correlated" not in {one.id for one in find(smooth)}
     assert "source_low_pass_filtered" in root_findings(smooth)
     for analysis, lags in ((slow, False), (smooth, True)):
-        found = analysis.coloured
+        found = analysis.time_correlated_noise
         assert found.gain_nats > 30.0
         assert (found.lag_nats > 1.0) == lags
         assert 0.5 < found.share <= 1.0

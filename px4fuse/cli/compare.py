@@ -17,7 +17,7 @@ SEVERITIES = get_args(Severity)
 @click.command()
 @click.argument("log", type=options.InputPath())
 @options.analysis_options
-@options.person_options
+@options.student_options
 @options.report_options(
     "Report to write (PDF).  [default: reports/LOG.pdf; the name contains changed settings]"
 )

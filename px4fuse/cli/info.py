@@ -73,7 +73,7 @@ def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
 
     page = Page()
     page.write(inventory.flight.log.name, bold=True)
-    for label, text in _log_facts(inventory):
+    for label, text in _describe_log(inventory):
         page.write_labelled(label, text)
     if inventory.flight.log.senders:
         page.table(("sender", "type", "messages", "lost"), _sender_rows(inventory), right=(2, 3))
@@ -104,13 +104,13 @@ def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
     return page
 
 
-def _log_facts(inventory: Inventory) -> list[tuple[str, str]]:
+def _describe_log(inventory: Inventory) -> list[tuple[str, str]]:
     log = inventory.flight.log
     size = f"{log.bytes / 1e6:.1f} MB" if log.bytes >= 1e5 else f"{log.bytes} bytes"
     version = log.firmware if log.firmware != "unknown" else f"{log.autopilot}, version unknown"
     git = "" if log.firmware_hash == "unknown" else f" (git {log.firmware_hash[:8]})"
     hardware = "hardware unknown" if log.hardware == "unknown" else log.hardware
-    facts = [
+    labelled_texts = [
         ("Log", f"{log.format}, {size}, SHA-256 {log.sha256[:12]}"),
         ("Vehicle", f"{version}{git}, {hardware}"),
         ("Data", f"{_duration_text(log.duration_s)}, {_start_text(inventory)}"),
@@ -121,12 +121,12 @@ def _log_facts(inventory: Inventory) -> list[tuple[str, str]]:
         longest_s = max(dropout.duration_s for dropout in log.dropouts)
         count = len(log.dropouts)
         text = f"{count} logger dropouts, {lost_s:.2f} s in total, the longest {longest_s:.2f} s"
-        facts.append(("Dropouts", text))
-    facts += [
+        labelled_texts.append(("Dropouts", text))
+    labelled_texts += [
         (file.role.capitalize(), f"{file.name}, SHA-256 {file.sha256[:12]}")
         for file in inventory.flight.inputs
     ]
-    return facts
+    return labelled_texts
 
 
 def _duration_text(seconds: float) -> str:

@@ -133,7 +133,7 @@ def parse_closure(text: str) -> GivenClosure:
 )
 @options.system_option
 @options.max_size_option
-@options.person_options
+@options.student_options
 @options.report_options("Report to write (PDF).  [default: reports/SOURCE_loop.pdf]")
 @click.option(
     "--tum",

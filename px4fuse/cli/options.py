@@ -198,7 +198,7 @@ open_option = _open_flag("--open", "--show", "opened")
 #: Option --show of px4fuse loop, whose option --open declares a flight that is not a loop
 show_option = _open_flag("--show", "shown")
 #: Options for the student's name and id, notes and answer form
-person_options = _combine_options(
+student_options = _combine_options(
     click.option("--student", metavar="NAME", help="Name of the student, printed on the report."),
     click.option(
         "--id", "student_id", metavar="ID", help="Id of the student, printed on the report."
@@ -395,7 +395,7 @@ def typed_parameters() -> Iterator[click.Parameter]:
 
 
 def read_student(option_values: dict[str, Any]) -> Student:
-    """Take the values of ``person_options`` out of the option values, and read their files.
+    """Take the values of ``student_options`` out of the option values, and read their files.
 
     Raises
     ------

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 # the first KEPT_STEM_BYTES bytes are used
 MAX_NAME_BYTES, KEPT_STEM_BYTES = 200, 180
 # Name and id of the student in a report without a student
-NO_PERSON = ("", "")
+NO_STUDENT_NAME = ("", "")
 # Line width (characters) in a pipe: longer than any paragraph
 UNWRAPPED_WIDTH = 10_000
 # Key in the context of click for the list of files that this run has written
@@ -163,12 +163,15 @@ def _is_same_report(
 
     existing = read(content, "report")
     same_files = file_hashes_in(to_json(existing)) == file_hashes_in(to_json(results))
-    return same_files and _person(existing) in (NO_PERSON, _person(results))
+    return same_files and _student_name_and_id(existing) in (
+        NO_STUDENT_NAME,
+        _student_name_and_id(results),
+    )
 
 
-def _person(results: Results) -> tuple[str, str]:
+def _student_name_and_id(results: Results) -> tuple[str, str]:
     student = getattr(results, "student", None)
-    return NO_PERSON if student is None else (student.name, student.id)
+    return NO_STUDENT_NAME if student is None else (student.name, student.id)
 
 
 def web_page(output: Path | None, default: Path) -> Path:
@@ -325,11 +328,11 @@ def write_and_print(
             show(console, page.blocks, request)
         for path in files:
             print_line(console, "Wrote", to_one_line(str(path)), "bold")
-    openable = [
+    openable_files = [
         path for suffix in OPENABLE_SUFFIXES for path in files if path.suffix.lower() == suffix
     ]
-    if click.get_current_context().meta.get(OPEN_KEY) and openable:
-        click.launch(str(openable[0].resolve()))
+    if click.get_current_context().meta.get(OPEN_KEY) and openable_files:
+        click.launch(str(openable_files[0].resolve()))
 
 
 def show_page(page: Page) -> None:

@@ -23,7 +23,7 @@ SUFFIXES = (".ulg", ".tlog", ".bin")
 
 
 @dataclass(frozen=True, order=True)
-class FoundLog:
+class LogAddress:
     """Name, address and size of a log, before the log is read.
 
     Attributes
@@ -44,7 +44,7 @@ class FoundLog:
     size_bytes: int | None
 
 
-def find_logs(patterns: Iterable[str]) -> list[FoundLog]:
+def find_logs(patterns: Iterable[str]) -> list[LogAddress]:
     """Find the different logs among files, folders, globs and URLs, sorted by name.
 
     Parameters
@@ -63,7 +63,7 @@ def find_logs(patterns: Iterable[str]) -> list[FoundLog]:
     return sorted(logs_by_address.values())
 
 
-def _logs_in(pattern: str) -> list[FoundLog]:
+def _logs_in(pattern: str) -> list[LogAddress]:
     if not pattern:
         raise SettingsError("the name of a log is empty", "Give files, folders, globs or URLs.")
     file_system, root = _file_system(pattern)
@@ -101,7 +101,7 @@ def _logs_in(pattern: str) -> list[FoundLog]:
         address = path if _is_local(file_system) else file_system.unstrip_protocol(path)
         is_relative = _is_local(file_system) and not Path(pattern).is_absolute()
         log = os.path.relpath(path) if is_relative else address
-        found_logs.append(FoundLog(_file_name(path), log, address, info.get("size")))
+        found_logs.append(LogAddress(_file_name(path), log, address, info.get("size")))
         if _is_local(file_system):
             add_input(Path(path))
     return found_logs

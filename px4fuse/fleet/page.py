@@ -47,7 +47,7 @@ LOG_COLUMNS = [
     )
 ]
 # Name of the group of columns that the page shows on request
-MORE = "numbers"
+EXTRA_COLUMNS = "numbers"
 # Label of each page filter, by the first word of its tags
 FILTERS = {
     "severity": "Diagnosis",
@@ -109,14 +109,17 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
                 for owner, against in (name.split("_") for name in RATIOS)
             ),
             Column("KF − EKF2 (m)", "number", visible_from="tablet"),
-            *(Column(label, "line", MORE) for label in ("Date (UTC)", "Vehicle", "Firmware")),
-            Column("SIGMA_Z estimate (m)", "number", MORE),
-            Column("Time offset (s)", "number", MORE),
-            Column("Findings", "rank", MORE),
+            *(
+                Column(label, "line", EXTRA_COLUMNS)
+                for label in ("Date (UTC)", "Vehicle", "Firmware")
+            ),
+            Column("SIGMA_Z estimate (m)", "number", EXTRA_COLUMNS),
+            Column("Time offset (s)", "number", EXTRA_COLUMNS),
+            Column("Findings", "rank", EXTRA_COLUMNS),
         ),
         rows=rows,
         filters=_filters(logs),
-        groups=[(MORE, "more columns")],
+        groups=[(EXTRA_COLUMNS, "more columns")],
         placeholder="search by name, vehicle, firmware or finding",
         full_table_note="All rows are in fleet.csv.",
         ratio_axis={"bands": BANDS, "ends": AXIS_ENDS, "marks": MARK_PATHS},
@@ -150,10 +153,10 @@ def _cells(log: Log, names: Mapping[str, str]) -> tuple[Cell, ...]:
 
 def _ratio_cell(ratio: float | None, name: str, word: str) -> Cell:
     owner, _, against = name.partition("_")
-    loud = " loud" if word in ("overconfident", "underconfident") else ""
+    emphasis = " loud" if word in ("overconfident", "underconfident") else ""
     if ratio is None:
         return Cell()
-    return Cell(format_ratio(ratio), ratio, style_class=f"{owner} {against}{loud}")
+    return Cell(format_ratio(ratio), ratio, style_class=f"{owner} {against}{emphasis}")
 
 
 def sort_logs(logs: Iterable[Log]) -> list[Log]:

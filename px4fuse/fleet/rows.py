@@ -118,11 +118,11 @@ def first_action(card: Card) -> str:
     return card.do_this[0] if card.do_this else ""
 
 
-def typed_action(row: Row, path: str) -> Row:
+def with_log_path(row: Row, path: str) -> Row:
     """Replace the file name in the command of a table row by the path of the log.
 
     >>> row = {"name": "a.ulg", "action": "px4fuse compare a.ulg --sigma-a 0.4"}
-    >>> typed_action(row, "my logs/a.ulg")["action"]
+    >>> with_log_path(row, "my logs/a.ulg")["action"]
     "px4fuse compare 'my logs/a.ulg' --sigma-a 0.4"
     """
     action = row.get("action", "")

@@ -20,7 +20,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.fleet import TIMEOUT_S
 from px4fuse.fleet.engine import connect_cluster, run_jobs
 from px4fuse.fleet.job import Job, Outcome, analyse, failure_row, file_stem
-from px4fuse.fleet.logs import FoundLog, find_logs
+from px4fuse.fleet.logs import LogAddress, find_logs
 from px4fuse.fleet.page import html_text
 from px4fuse.fleet.rows import (
     FAILED,
@@ -29,7 +29,7 @@ from px4fuse.fleet.rows import (
     clean_row,
     csv_bytes,
     make_table,
-    typed_action,
+    with_log_path,
 )
 from px4fuse.input_files import check_output_folder
 from px4fuse.reading import max_log_bytes
@@ -90,7 +90,7 @@ class _RunState:
     # SHA-256 of the logs that did not fail, by address
     hash_by_address: dict[str, str] = field(default_factory=dict)
     # first of the logs with the same content, by SHA-256; only this log has table rows
-    first_log_by_hash: dict[str, FoundLog] = field(default_factory=dict)
+    first_log_by_hash: dict[str, LogAddress] = field(default_factory=dict)
     # table rows of the logs that failed, by address
     failed_rows: dict[str, Row] = field(default_factory=dict)
     # SHA-256 of the logs whose results are from an earlier run
@@ -164,7 +164,7 @@ def run(
     scheduler: str | None = None,
     workers: int | None = None,
     memory_gb: float = MEMORY_BYTES / 1e9,
-    progress: Progress = lambda what, done, of: None,
+    progress: Progress = lambda *_: None,
     **settings: Any,
 ) -> BatchResult:
     """Compare many logs as :func:`batch` does, and write table and results to a folder.
@@ -254,7 +254,7 @@ def load_cached_rows(folder: Path, px4fuse: str, settings: str) -> Iterator[Cach
             yield cached
 
 
-def _cache_outcome(state: _RunState, log: FoundLog, outcome: Outcome | JobFailure) -> None:
+def _cache_outcome(state: _RunState, log: LogAddress, outcome: Outcome | JobFailure) -> None:
     """Add the outcome of a log to the state of the run, and write its results to the folder."""
     if isinstance(outcome, JobFailure):
         remedy = "Increase --timeout or --memory, or run px4fuse compare on this log."
@@ -271,7 +271,7 @@ def _cache_outcome(state: _RunState, log: FoundLog, outcome: Outcome | JobFailur
     state.first_log_by_hash[outcome.sha256] = first_log
 
 
-def _write_log(state: _RunState, log: FoundLog, outcome: Outcome) -> None:
+def _write_log(state: _RunState, log: LogAddress, outcome: Outcome) -> None:
     stem = f"results/{file_stem(log.name, outcome.sha256)}"
     named_contents = {f"{stem}.json": outcome.results, f"{stem}.pdf": outcome.report}
     files = {
@@ -284,7 +284,7 @@ def _write_log(state: _RunState, log: FoundLog, outcome: Outcome) -> None:
     write_all({state.output / name: content for name, content in contents.items() if content})
 
 
-def _write_table(state: _RunState, logs: Iterable[FoundLog]) -> BatchResult:
+def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
     """Write the table of the logs that are finished so far, as CSV, Parquet and web page."""
     severities: set[str] = set()
     rows_by_hash = {
@@ -292,7 +292,7 @@ def _write_table(state: _RunState, logs: Iterable[FoundLog]) -> BatchResult:
         for cached in load_cached_rows(state.output, state.px4fuse, state.settings)
     }
 
-    def rows_of_log(log: FoundLog) -> Iterable[Row]:
+    def rows_of_log(log: LogAddress) -> Iterable[Row]:
         if log.address not in state.hash_by_address:
             return [state.failed_rows[log.address]] if log.address in state.failed_rows else []
         sha256 = state.hash_by_address[log.address]
@@ -311,7 +311,7 @@ def _write_table(state: _RunState, logs: Iterable[FoundLog]) -> BatchResult:
             common |= {"px4fuse": state.px4fuse, "settings": state.settings}
             for row in rows_of_log(log):
                 severities.update(row.get("severities", ()))
-                yield typed_action(row, log.log) | common
+                yield with_log_path(row, log.log) | common
 
     table = make_table(rows())
     page = html_text(table, state.output.resolve().name, f"px4fuse {state.px4fuse}")
