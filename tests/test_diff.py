@@ -195,7 +195,7 @@ def test_measures_of_aids_leave_out_position_source(clean):
     # external vision is the source itself, and listed by axis
     assert {path.split(".")[1] for path in of_aids} == {"gnss_vel"}
     north = of_aids["aids.gnss_vel.axes.north.nis_mean"]
-    assert (north.label, north.value) == ("mean NIS, GNSS velocity, north", 1.2)
+    assert (north.label, north.value) == ("mean NIS of EKF2, GNSS velocity, north", 1.2)
     share = of_aids["aids.gnss_vel.rejected_fraction"]
     assert (share.label, share.unit) == ("measurements rejected by EKF2, GNSS velocity", "share")
     source = structs.replace(clean.results.source, kind="gnss")

@@ -103,8 +103,8 @@ def test_diff_unsuitable_inputs_are_refused(settings, tmp_path):
     for a, b, said in (
         (usual, usual, "the same file"),
         (usual, link, "the same file"),
-        (usual, loop, "loop.json contains px4fuse-loop"),
-        (loop, usual, "loop.json contains px4fuse-loop"),
+        (usual, loop, "loop.json contains results with the schema px4fuse-loop"),
+        (loop, usual, "loop.json contains results with the schema px4fuse-loop"),
         (usual, old, "uses schema version 1.0"),
         (usual, other, "contains no results of px4fuse"),
         (usual, printed, "o results.json is attached"),

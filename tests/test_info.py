@@ -273,7 +273,7 @@ def test_info_prints_dropouts_and_senders_without_sequence(monkeypatch, tmp_path
     assert take_inventory(flight).start_utc is None
     text = info(tmp_path / "any.tlog")
     assert widest(text) <= WIDTH
-    for words in ("unknown", "2 of the logger", "faster SD card"):
+    for words in ("unknown", "2 logger dropouts", "faster SD card"):
         assert words in text
 
 

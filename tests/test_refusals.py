@@ -177,7 +177,7 @@ REFUSED = {
     "nothing to grade": ("grade", "no submissions were given"),
     "grade to nowhere": ("grade in", "requires an output folder"),
     "grade into what is graded": ("grade in -o in/out", "is inside the input in"),
-    "grade into a report": ("grade in -o in/a.pdf", "is not a folder"),
+    "grade into a report": ("grade in -o in/a.pdf", "is inside the input"),
     "no rubric": ("grade in -o out --rubric missing.toml", "missing.toml"),
     "no key": ("grade in -o out --key missing.json", "missing.json"),
     "no logs": ("grade in -o out --logs missing", "missing: cannot be read"),
