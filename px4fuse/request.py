@@ -327,7 +327,7 @@ def command_line(
         for a POSIX shell.
     """
     shown_request = request if for_shell else request.without_paths()
-    # required fields are files; all other fields are options
+    # required fields of a request are input files, and all other fields are options
     required_names = [
         field.name for field in msgspec.structs.fields(shown_request) if field.required
     ]

@@ -207,5 +207,5 @@ def _limit_memory(memory_bytes: int | None) -> None:
     # no core dump, because it would contain the file of a student
     for resource_kind, limit in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, memory_bytes)):
         if limit is not None:
-            with suppress(ValueError, OSError):  # macOS refuses some values
+            with suppress(ValueError, OSError):  # macOS rejects some limits
                 resource.setrlimit(resource_kind, (limit, limit))

@@ -100,9 +100,9 @@ class LazyGroup(click.Group):
             error.args = (_with_option_names(str(error), ctx.invoked_subcommand),)
             raise
         except BrokenPipeError as error:
-            # The new error has no errno, because click ends with exit code 1 for EPIPE
+            # the new error has no errno, because click ends the command with exit code 1 for EPIPE
             raise BrokenPipeError from error
-        except KeyboardInterrupt as interrupt:  # click itself would print an empty line
+        except KeyboardInterrupt as interrupt:  # otherwise click prints an empty line
             raise Interrupted(interrupt, written_so_far(ctx)) from None
         except MemoryError as error:
             raise _system_error(OSError(errno.ENOMEM, ""), written_so_far(ctx)) from error
@@ -169,9 +169,9 @@ def main() -> None:
         if hasattr(stream, "reconfigure"):  # legacy Windows code pages have no σ and ν
             stream.reconfigure(errors="replace")
     for signal_number in TERMINATION_SIGNALS:
-        if signal.getsignal(signal_number) is signal.SIG_DFL:  # nohup ignores SIGHUP
+        if signal.getsignal(signal_number) is signal.SIG_DFL:  # under nohup, SIGHUP is ignored
             signal.signal(signal_number, _interrupt)
-    if hasattr(signal, "pthread_kill"):  # not on Windows
+    if hasattr(signal, "pthread_kill"):  # Windows has no such function
         sys.unraisablehook = _interrupt_again
     try:
         if not {*HELP_OPTIONS, "--version"} & set(sys.argv):
@@ -190,10 +190,10 @@ def main() -> None:
     except Interrupted as interrupt:
         _print_error(str(interrupt))
         exit_code = interrupt.exit_code
-    except BrokenPipeError:  # the reader of the pipe has ended (| head); the files are written
+    except BrokenPipeError:  # the program that reads the pipe has ended
         _abandon_output()
         exit_code = 0
-    except OSError as error:  # from --help and --version, which click writes
+    except OSError as error:  # click printed --help or --version
         _print_error(f"standard output: cannot be written ({error.strerror}); nothing was written.")
         exit_code = 2
     sys.exit(_flush_output(exit_code if isinstance(exit_code, int) else 0))
@@ -229,7 +229,7 @@ def _redirect_closed_streams() -> None:
             if null_device != number:
                 os.dup2(null_device, number)
                 os.close(null_device)
-            setattr(sys, name, open(number, "w", encoding="utf-8"))  # noqa: SIM115, PTH123 - stays open
+            setattr(sys, name, open(number, "w", encoding="utf-8"))  # noqa: SIM115, PTH123 - must stay open
 
 
 def _with_option_names(text: str, command: str | None) -> str:

@@ -66,7 +66,7 @@ def compare(
     with outputs.progress(json_path) as show_progress:
         outcome = run_or_evaluate_aids(request, show_progress)
         results = outcome_results(request, outcome, student)
-        release_free_memory()  # importing the report modules needs memory
+        release_free_memory()  # the report modules, imported next, need memory
         if output is None and json_path is None:
             output = outputs.default_report(log.stem, settings_name(request), results)
         contents = outputs.result_files(results, json_path, output, outcome, show_progress)

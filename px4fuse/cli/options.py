@@ -410,7 +410,7 @@ def read_student(option_values: dict[str, Any]) -> Student:
     name, student_id = option_values.pop("student") or "", option_values.pop("student_id") or ""
     notes_path, answers_path, notes = option_values.pop("notes"), option_values.pop("answers"), ""
     if notes_path is not None:
-        from px4fuse.report.notes import parse  # slow import
+        from px4fuse.report.notes import parse  # imported on demand, because it is slow
 
         notes = read_text(notes_path, SettingsError, MAX_NOTES_BYTES, name=f"--notes {notes_path}")
         parse(notes, f"--notes {notes_path}")  # report errors in the notes before the analysis

@@ -88,7 +88,7 @@ def _analyse_log(path: Path, other: DiffInput | None, progress: Progress) -> Dif
             request, **{name: getattr(other.results.request, name) for name in fields}
         )
     result = run_or_evaluate_aids(request, progress)
-    text = to_json(outcome_results(request, result))  # rounds numbers as in a report
+    text = to_json(outcome_results(request, result))  # to_json rounds the numbers as in a report
     results = read_results(text.encode())
     assert isinstance(results, Results)
     return DiffInput(display_name(path), "log", results)

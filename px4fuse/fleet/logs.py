@@ -139,12 +139,12 @@ def _file_system(address: str) -> tuple[AbstractFileSystem, str]:
 
     try:
         file_system, path = url_to_fs(address)
-    except ImportError as error:  # the cause contains the name of the missing package
+    except ImportError as error:  # the cause of the error names the missing package
         package = getattr(error.__cause__, "name", None) or "the package of this type of URL"
         raise SettingsError(
             f"{address}: this type of URL requires {package}.", f'Run pip install "{package}".'
         ) from error
-    except ValueError as error:  # unknown protocol
+    except ValueError as error:  # the protocol of the URL is unknown
         raise SettingsError(f"{address}: {error}", "Give a path or another URL.") from error
     return file_system, path
 

@@ -230,7 +230,7 @@ def _filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
     return filters
 
 
-# -------------------- one entry per log
+# -------------------- combination of the table rows of each log
 
 
 def logs_of(table: pd.DataFrame) -> list[Log]:
