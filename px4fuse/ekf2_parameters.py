@@ -97,7 +97,7 @@ class Parameter(NamedTuple):
     maximum: float
 
     def describe_range_error(self, value: float) -> str:
-        """Return a sentence without subject if the value is outside PX4's range, else ""."""
+        """Return " 9 m is outside PX4's range 0.01 to 5" for a value outside the range, else ""."""
         low = self.minimum - FLOAT32_TOLERANCE * abs(self.minimum)
         high = self.maximum + FLOAT32_TOLERANCE * abs(self.maximum)
         if low <= value <= high:
@@ -186,16 +186,16 @@ def replace_invalid_parameters(
         defaults |= OLD_DEFAULTS
     for name, value in logged.items():
         parameter = RANGES.get(name)
-        finite = math.isfinite(value)
         fault = "" if parameter is None else parameter.describe_range_error(value)
-        if finite and not fault:
+        if not math.isfinite(value):
+            fault = " is not a finite number"
+        if not fault:
             valid[name] = value
         elif parameter is None:
-            notes.append(f"{name} is not a finite number and is not used.")
+            notes.append(f"{name}{fault} and is not used.")
         else:
             valid[name] = defaults[name]
-            problem = fault if finite else " is not a finite number"
-            notes.append(f"{name}{problem}; the default {valid[name]:g} is used.")
+            notes.append(f"{name}{fault}; the default {valid[name]:g} is used.")
     return valid, tuple(notes)
 
 

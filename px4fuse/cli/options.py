@@ -158,7 +158,6 @@ json_option = _json_option()
 
 
 def input_option(name: str, metavar: str, text: str, **details: Any) -> Option:
-    """Declare an option for an input file or folder."""
     return click.option(name, type=InputPath(), metavar=metavar, help=text, **details)
 
 

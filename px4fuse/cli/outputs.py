@@ -336,7 +336,6 @@ def write_and_print(
 
 
 def show_page(page: Page) -> None:
-    """Print a page on the terminal."""
     from px4fuse.report.screen import show
 
     show(terminal(), page.blocks)

@@ -91,7 +91,6 @@ def tuning_results(
     comparison: Comparison,
     tuned: Mapping[str, AxisTuning | Unavailable],
 ) -> contract.TuningResults:
-    """Return the results of ``px4fuse tune``."""
     common = _flight_fields("px4fuse-tuning", request, comparison, "tune")
     return within_bounds(contract.TuningResults(**common, tuning=to_serializable(tuned)))
 
@@ -99,7 +98,6 @@ def tuning_results(
 def sync_results(
     request: ComparisonRequest, comparison: Comparison, clock: ClockOffset | Unavailable
 ) -> contract.SyncResults:
-    """Return the results of ``px4fuse sync``."""
     common = _flight_fields("px4fuse-sync", request, comparison, "sync")
     return within_bounds(contract.SyncResults(**common, clock=to_serializable(clock)))
 
@@ -107,7 +105,6 @@ def sync_results(
 def whatif_results(
     request: WhatIfRequest, counterfactual: WhatIfAnalysis
 ) -> contract.WhatIfResults:
-    """Return the results of ``px4fuse whatif``."""
     whatif_result, sweep_start = counterfactual.whatif, counterfactual.sweep_start
     return within_bounds(
         contract.WhatIfResults(
@@ -127,7 +124,6 @@ def whatif_results(
 def loop_results(
     request: LoopRequest, loop: Loop, student: Student = NO_STUDENT
 ) -> contract.LoopResults:
-    """Return the results of ``px4fuse loop``."""
     return within_bounds(
         contract.LoopResults(
             schema=schema_of(contract.LOOP),
@@ -143,7 +139,6 @@ def loop_results(
 
 
 def evaluation_results(request: EvaluationRequest, score: Evaluation) -> contract.EvaluationResults:
-    """Return the results of ``px4fuse evaluate``."""
     return within_bounds(
         contract.EvaluationResults(
             schema=schema_of("px4fuse-evaluation"),

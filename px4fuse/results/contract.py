@@ -53,8 +53,6 @@ class Log(LogInfo, frozen=True, kw_only=True):
 
 
 class AvailableTrack(Record, frozen=True):
-    """Position track that a flight contains."""
-
     name: str
     kind: PositionKind
     path: DataPath

@@ -62,7 +62,6 @@ def schema_of(name: str) -> Schema:
 
 
 def provenance(command: str) -> Provenance:
-    """Return the installed versions, with the command line."""
     return Provenance(
         px4fuse=metadata.version("px4fuse"),
         python=platform.python_version(),
