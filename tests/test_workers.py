@@ -140,10 +140,10 @@ def test_worker_process_does_not_import_from_current_folder(tmp_path):
 def test_worker_with_closed_pipe_ends_without_traceback():
     script = """if True:
         from multiprocessing import Pipe
-        from px4fuse.workers import _serve
+        from px4fuse.workers import _run_worker
         parent, worker = Pipe()
         parent.close()
-        _serve(worker, len, None)
+        _run_worker(worker, len, None)
     """
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, timeout=60, check=False

@@ -125,7 +125,7 @@ def local_file(address: str) -> Iterator[Path]:
     size, limit = file_system.info(path).get("size"), max_log_bytes.get()
     if size is not None and size > limit:
         raise LogError(
-            f"the log has {size / 1e6:,.0f} MB; the limit is {limit / 1e6:,.0f} MB",
+            f"the file has {size / 1e6:,.0f} MB; the limit is {limit / 1e6:,.0f} MB",
             "Increase the limit with --max-size MB.",
         )
     with TemporaryDirectory(prefix="px4fuse-") as folder:
