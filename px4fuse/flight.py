@@ -27,8 +27,9 @@ from px4fuse.record import NotNegative, Record, Vector
 from px4fuse.record import Unavailable as Unavailable  # noqa: PLC0414 - public re-export
 
 AxisName = Literal["north", "east", "down"]
-# Minimum fraction of sample intervals up to 3 medians; below it, the samples arrive in bursts
-MIN_REGULAR_SHARE = 0.8
+# Minimum fraction of sample intervals of up to three times the median for a regular rate; with a
+# smaller fraction, the samples arrive in bursts
+MIN_REGULAR_FRACTION = 0.8
 # Values of ClockMap.method for which the timestamps are not times of measurement
 ARRIVAL_METHODS = ("arrival time", "receive time", "position in the stream")
 AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
@@ -140,7 +141,7 @@ class Alignment(Record, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class PositionTrack:
-    """External position track.
+    """Positions of one external source over time.
 
     Attributes
     ----------
@@ -203,11 +204,11 @@ class PositionTrack:
     __repr__ = one_line_repr
 
     def aid(self, axis: str) -> Aid | None:
-        """Return the EKF2 aid of this source along an axis; None if EKF2 never fuses it."""
+        """Return the aiding source of EKF2 that fuses this track along an axis, if any."""
         return self.origin.aid if axis != "down" or self.barometer is None else BAROMETER
 
     def description_fields(self) -> dict[str, Any]:
-        """Return the descriptive fields of the results (JSON) by name."""
+        """Return the fields that describe the track in results.json, by name."""
         names = (
             "name",
             "kind",
@@ -232,7 +233,7 @@ class PositionTrack:
 
 
 def source_name(source: PositionTrack) -> str:
-    """Return the name of a position source as its users call it, not its topic."""
+    """Return the usual name of a position source, such as "UWB", instead of its topic."""
     return SOURCE_NAMES[source.origin.kind]
 
 
@@ -283,7 +284,7 @@ RECORD_NOT_LOGGED = Unavailable(
 
 
 GROUND_EFFECT, BAD_ACCELERATION = "gnd_effect", "bad_acc_vertical"
-# Weight of a new sample in EKF2's low-pass filter of optical flow (_flow_vel_body_lpf, ekf.h)
+# Weight of a new sample in EKF2's low-pass filter of optical flow (_flow_vel_body_lpf in ekf.h)
 FLOW_FILTER_WEIGHT = 0.1
 
 
@@ -348,7 +349,7 @@ class FusionRecord:
         return not np.isfinite(self.delayed["north_m"]).any()
 
     def was_in_state(self, state: str, times_s: Array) -> BoolArray:
-        """Return a mask of the times in one of :attr:`states`; all False if not logged."""
+        """Return a mask of the times in the state, a key of ``states``; all False if not logged."""
         steps = self.states.get(state)
         return (
             np.zeros(len(times_s), bool) if steps is None else step_values_at(steps, times_s) > 0.0
@@ -357,7 +358,7 @@ class FusionRecord:
 
 @dataclass(frozen=True)
 class AidLog:
-    """Logged data of one EKF2 aid.
+    """Logged innovations, variances and fusion results of one aiding source of EKF2.
 
     Attributes
     ----------
@@ -388,7 +389,7 @@ class AidLog:
 
 
 def step_values_at(steps: pd.Series[float], times: pd.Index[float] | Array) -> Array:
-    """Return the values of a step function; before its first time, the first value."""
+    """Return the values of a step function at times; before its first time, its first value."""
     rows = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
     return np.asarray(steps, dtype=np.float64)[rows]
 
@@ -550,6 +551,6 @@ def sample_rate(samples: pd.DataFrame) -> float:
         return float("nan")
     intervals = samples.index.to_series().diff().dropna()
     regular_intervals = intervals[intervals <= 3.0 * intervals.median()]
-    if len(regular_intervals) < MIN_REGULAR_SHARE * len(intervals):
+    if len(regular_intervals) < MIN_REGULAR_FRACTION * len(intervals):
         regular_intervals = intervals
     return float(1.0 / regular_intervals.mean())

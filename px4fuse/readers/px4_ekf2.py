@@ -24,14 +24,19 @@ from px4fuse.readers.px4_innovations import innovations_by_axis
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
 VISION_TOPIC = "vehicle_visual_odometry"
-STATE_COUNT = 22  # attitude, velocity, position, biases, magnetic fields; wind and terrain follow
-MAG_3D_BIT = 5  # filter_control_status_u, common.h
-MIN_COMPLETE_FIELD_HZ = 10.0  # a topic with a higher rate has all samples (EKF2 uses 14 per second)
-# Distance (IMU samples) from n + 0.5 below which EKF2 may round up or down
+# Number of EKF2 states that are read: attitude, velocity, position, biases and magnetic fields, but
+# not wind and terrain
+STATE_COUNT = 22
+# Bit of filter_control_status_u (common.h) that is set while EKF2 fuses the 3D magnetic field
+MAG_3D_BIT = 5
+# Minimum rate (Hz) of a magnetometer topic that contains all samples: EKF2 uses 14 per second
+MIN_COMPLETE_FIELD_HZ = 10.0
+# Maximum distance (IMU samples) of the prediction interval from n + 0.5 samples, for which EKF2 may
+# round up or down
 MAX_HALF_DISTANCE = 0.05
-# Maximum interval (s) between two rows of optical flow
+# Maximum interval (s) between two optical flow velocities whose difference is used
 MAX_FLOW_INTERVAL_S = 0.5
-# Aids of the horizontal state other than vision position
+# Aiding sources of horizontal position and velocity other than external vision position
 OTHER_HORIZONTAL_AIDS = (
     "gnss_pos",
     "gnss_vel",
@@ -43,7 +48,7 @@ OTHER_HORIZONTAL_AIDS = (
 VARIANCES_NOT_LOGGED = Unavailable(
     "EKF2 variances",
     "estimator_states (estimator_status before v1.12) is not logged or not usable",
-    "Record with SDLOG_PROFILE bit 0 (default). The topic is also missing if EKF2 had not started.",
+    f"{px4.DEFAULT_PROFILE} The topic is also missing if EKF2 had not started.",
 )
 _RESET_FIELDS: tuple[tuple[Literal["position", "velocity"], str, tuple[str, str, str]], ...] = (
     ("position", "xy_reset_counter", ("delta_north_m", "delta_east_m", "")),
@@ -57,11 +62,11 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     """Read EKF2's published state, variances, innovations and fusion flags."""
     parameters = topics.log.parameters
     if parameters.get("EKF2_EN") == 0.0:
-        return Unavailable("EKF2", "EKF2_EN is 0: EKF2 did not run", "Set EKF2_EN to 1.")
+        return Unavailable("EKF2", "EKF2 did not run, because EKF2_EN is 0", "Set EKF2_EN to 1.")
     if (estimator_group := parameters.get("SYS_MC_EST_GROUP", 2.0)) != 2.0:
         return Unavailable(
             "EKF2",
-            f"SYS_MC_EST_GROUP is {estimator_group:.0f}, so another estimator was running",
+            f"another estimator was running, because SYS_MC_EST_GROUP is {estimator_group:.0f}",
             "Set SYS_MC_EST_GROUP to 2.",
         )
     local_position = topics.read(px4.LOCAL_POSITION)
@@ -83,14 +88,14 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     if innovation_topics:
         topics.record_stream("ekf2_innovations", *innovation_topics)
     notes = [
-        f"{topic} has no measurement time in this release: the times of EKF2 innovations are "
-        "publication times, up to 0.2 s later"
+        f"the times of EKF2 innovations are publication times, up to 0.2 s late, because {topic} "
+        "has no measurement time"
         for topic in innovation_topics[:1]
         if not any("timestamp_sample" in table for table in topics.of(topic))
     ]
     notes += [
-        f"{log.excluded_count} samples of {log.topics[0]} ({', '.join(log.axes)}) were dropped: "
-        f"no {log.topics[-1]} within {JOIN_TOLERANCE_S:g} s"
+        f"{log.excluded_count} samples of {log.topics[0]} ({', '.join(log.axes)}) were dropped, "
+        f"because {log.topics[-1]} has no sample within {JOIN_TOLERANCE_S:g} s"
         for log in (aids[name] for name in ("ev_pos", "ev_hgt") if name in aids)
         if log.excluded_count
     ]
@@ -118,7 +123,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
 
 
 def _state_vector(topics: Topics) -> tuple[str, int]:
-    """Return the topic with EKF2's state vector and the number of attitude variances in it.
+    """Return the topic with the state vector of EKF2, and its number of attitude variances.
 
     The topic is "" if it is not logged. The number is 0 if the array lengths are unknown.
     """
@@ -143,7 +148,7 @@ def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavail
     if not attitude:
         return Unavailable(
             "EKF2 variances",
-            f"the array lengths of {topic} are not known to px4fuse",
+            f"{topic} has unknown array lengths",
             "Report the PX4 version in a px4fuse issue.",
         )
     states = [f"states[{i}]" for i in range(STATE_COUNT)]
@@ -152,7 +157,8 @@ def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavail
         Layout(topic, {name: name for name in states + variances})
     ).dropna()
     raw = raw[(raw[variances] >= 0.0).all(axis=1)]
-    state, variance = raw[states].to_numpy(copy=True), raw[variances].to_numpy(copy=True)
+    state = raw[states].to_numpy(copy=True)
+    variance = raw[variances].to_numpy(copy=True)
     if attitude == px4.QUATERNION_FILTER:
         state[:, 10:16] /= step_s
         variance = np.hstack([_attitude_variance(state[:, :4], variance[:, :4]), variance[:, 4:]])
@@ -162,7 +168,6 @@ def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavail
 
 
 def _variance(delayed: pd.DataFrame | Unavailable) -> pd.DataFrame | Unavailable:
-    """Return the rows with positive variances of position (m²) and velocity (m²/s²)."""
     if isinstance(delayed, Unavailable):
         return delayed
     variance = delayed[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
@@ -176,7 +181,7 @@ def target_step_s(topics: Topics) -> float:
 
 
 def _step_s(topics: Topics) -> float:
-    """Return the actual prediction interval (s): whole IMU samples (ImuDownSampler.cpp)."""
+    """Return the actual prediction interval (s): whole IMU intervals (ImuDownSampler.cpp)."""
     target_s = target_step_s(topics)
     imu = topics.read(px4.IMU)
     if len(imu) < 2:
@@ -192,10 +197,10 @@ def _step_s(topics: Topics) -> float:
     )
 
 
-def rows_of_timestamps(times_s: Array, known_s: ArrayLike) -> IntArray:
-    """Return the indices of the ``times_s`` that are also in ``known_s``, rounded to 1 µs."""
-    known_us = np.rint(np.asarray(known_s, dtype=float) * 1e6)
-    return np.flatnonzero(np.isin(np.rint(times_s * 1e6), known_us))
+def rows_of_timestamps(times_s: Array, other_s: ArrayLike) -> IntArray:
+    """Return the indices of the ``times_s`` that are also in ``other_s``, compared in whole µs."""
+    other_us = np.rint(np.asarray(other_s, dtype=float) * 1e6)
+    return np.flatnonzero(np.isin(np.rint(times_s * 1e6), other_us))
 
 
 def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -> int:
@@ -211,7 +216,7 @@ def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -
     2
     """
     rounded_ratio = target_s / interval_s + 0.5
-    # The margin makes the result independent of the rounding of timestamps to µs
+    # The added 1e-6 makes the result independent of the rounding of timestamps to µs
     samples = max(int(rounded_ratio + 1e-6), 1)
     gaps = np.diff(np.asarray(ends, dtype=float))
     if samples > 1 and abs(rounded_ratio - samples) < MAX_HALF_DISTANCE and len(gaps):
@@ -225,7 +230,6 @@ def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -
 def _accelerometer_bias(
     topics: Topics, delayed: pd.DataFrame | Unavailable
 ) -> pd.DataFrame | Unavailable:
-    """Read the accelerometer bias (m/s²) from estimator_sensor_bias or the state vector."""
     if len(bias := topics.primary_samples(px4.LAYOUTS["sensor_bias"]).dropna()):
         return bias
     if isinstance(delayed, Unavailable) or delayed.empty:
@@ -234,7 +238,7 @@ def _accelerometer_bias(
 
 
 def _horizon_s(topics: Topics, step_s: float) -> float | Unavailable:
-    """Return the median delay (s) from fusion horizon to publication.
+    """Return the median delay (s) from EKF2's fusion horizon to publication.
 
     Before v1.13, timestamp_sample is the time of the newest IMU sample. The delay is then below one
     prediction interval, and the horizon is unavailable.
@@ -265,7 +269,7 @@ def _read_fusing(
         return Unavailable(
             "EKF2 fusion flags",
             "estimator_status_flags and estimator_status are not logged",
-            "Record with SDLOG_PROFILE bit 0 (default).",
+            px4.DEFAULT_PROFILE,
         )
     flags = pd.DataFrame({group: enabled[aid] for group, aid in vision.items()}).dropna()
     topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS
@@ -305,7 +309,8 @@ def _read_record(
     usable_state = delayed[np.abs(norm - 1.0) < 0.01].copy()
     if usable_state.empty:
         return flight.RECORD_NOT_LOGGED
-    horizontal, altitude_m = Columns.POSITION[:2], 0.0
+    horizontal = Columns.POSITION[:2]
+    altitude_m = 0.0
     # Since v1.16 EKF2 stores latitude and longitude, which are logged as zero. Once EKF2 has an
     # origin, the height is altitude above sea level (ekf_helper.cpp)
     if not usable_state[horizontal].to_numpy().any():
@@ -337,7 +342,6 @@ def _read_record(
 
 
 def _last_finite(frame: pd.DataFrame, column: str, default: float) -> float:
-    """Return the last finite value of a column, or ``default``."""
     finite_values = frame[column].dropna().to_numpy() if column in frame else np.zeros(0)
     return float(finite_values[-1]) if len(finite_values) else default
 
@@ -379,7 +383,7 @@ def _read_flow(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> pd.Da
     if not interval_s > 0.0 or noise.empty:
         return pd.DataFrame()
     times = velocity.index.to_numpy()
-    # After longer intervals the low-pass filter no longer contains the previous row's samples
+    # After longer intervals the low-pass filter no longer contains the samples of the previous row
     rows = (
         np.flatnonzero(
             (np.diff(times) > 0.5 * interval_s) & (np.diff(times) <= MAX_FLOW_INTERVAL_S)
