@@ -118,7 +118,7 @@ def test_read_ulog_invalid_bytes_inside_keep_the_flight(content, whole, rubbish:
 def test_read_ulog_damaged_definition_ends(content) -> None:
     """Without the fix, pyulog loops at a definition longer than the rest of the file."""
     cut = content[: content.index(b"vehicle_attitude:")]
-    with time_limit(), pytest.raises(LogError, match="contains no data"):
+    with time_limit(), pytest.raises(LogError, match="contains no samples"):
         read_ulog("cut.ulg", cut[:-3] + struct.pack("<HB", 60_000, 0) + bytes(100))
 
 
@@ -140,7 +140,7 @@ def test_read_ulog_huge_formats_are_rejected(definitions: list[bytes]) -> None:
     subscriptions = [
         message("A", struct.pack("<BH", 0, number) + b"a") for number in range(len(definitions))
     ]
-    with time_limit(), pytest.raises(LogError, match=r"its topics have more than 200,000 fields"):
+    with time_limit(), pytest.raises(LogError, match=r"the topics have more than 200,000 fields"):
         read_ulog("huge.ulg", HEAD + b"".join(definitions + subscriptions))
 
 
@@ -181,7 +181,7 @@ def test_info_unreadable_log_exits_with_one_line(tmp_path, monkeypatch, capsys) 
     for command in ("info", "compare"):
         code, out, err = run_main(monkeypatch, capsys, command, path)
         assert (code, out, len(err.splitlines())) == (2, "", 1)
-        assert "contains no data" in err
+        assert "contains no samples" in err
 
 
 # (IMU samples found by a reader with better resynchronisation, fraction that pyulog may lose)

@@ -210,7 +210,7 @@ def test_read_position_csv_rate_at_limit_has_no_note(read, rate):
 def test_read_position_csv_implausible_rate_has_note(read, step):
     texts = [f"{float(step) * i:.6f}" for i in range(ROWS)]
     file = read(table({"time_s": texts, "x": X, "y": Y, "z": Z}))
-    assert_stated(file, "is not a plausible UWB rate", "--position-time-unit")
+    assert_stated(file, "is not plausible for UWB", "--position-time-unit")
     assert file.samples.index[-1] == pytest.approx(float(texts[-1]))
 
 
@@ -219,7 +219,7 @@ def test_read_position_csv_time_unit_option_overrides_name(read, unit):
     texts = [str(10 * i) for i in range(ROWS)]
     file = read(table({"time_us": texts, "x": X, "y": Y, "z": Z}), time_unit=unit)
     assert file.samples.index[1] == pytest.approx(10 * TIME_UNITS[unit])
-    assert_stated(file, f"{unit} from --position-time-unit")
+    assert_stated(file, f"{unit} (given with --position-time-unit)")
 
 
 LATER_S = exact(UNIX_US + TIME_US + 30_000, 6)
@@ -291,8 +291,8 @@ def test_read_position_csv_length_unit_option_overrides_name(read, unit):
 
 
 @pytest.mark.parametrize(("x", "words"), [
-    ([*X[:7], "4000.0", *X[8:]], "in m (no unit in the column names)"),
-    (fixed(np.linspace(0.0, 5e6, ROWS), 1), "no unit gives the size of an indoor flight"),
+    ([*X[:7], "4000.0", *X[8:]], "in m (assumed: the column names contain no unit)"),
+    (fixed(np.linspace(0.0, 5e6, ROWS), 1), "no unit gives the extent of an indoor flight"),
 ])  # fmt: skip
 def test_read_position_csv_outlier_does_not_change_unit(read, x, words):
     file = read(table({**PLAIN, "x": x}))
@@ -336,7 +336,7 @@ def test_read_position_csv_sigma_not_positive_is_nan(read):
     file = read(table({**PLAIN, "sigma": sigma}))
     assert_track(file)
     assert np.flatnonzero(file.samples["sigma_x_m"].isna()).tolist() == [3, 4]
-    assert_stated(file, "sigma is zero or negative in 2 rows")
+    assert_stated(file, "ignored sigmas that are zero or negative: 2")
 
 
 # -- rows ------------------------------------------------------------------------------------------
@@ -352,7 +352,7 @@ def test_read_position_csv_rows_without_position_are_dropped(read, missing):
     x[0] = x[20] = z[21] = missing
     file = read(table({**PLAIN, "x": x, "z": z}, separator=";"))
     assert_track(file, rows=np.setdiff1d(np.arange(ROWS), [0, 20, 21]))
-    assert_stated(file, "3 rows were dropped", "no valid time or position")
+    assert_stated(file, "dropped rows without valid time or position: 3")
 
 
 def test_read_position_csv_short_row_is_dropped(read):
@@ -360,7 +360,7 @@ def test_read_position_csv_short_row_is_dropped(read):
     lines[30] = UNIX_S[29] + ",1.0\n"
     file = read("".join(lines))
     assert_track(file, rows=np.setdiff1d(np.arange(ROWS), [29]))
-    assert_stated(file, "1 row was dropped")
+    assert_stated(file, "dropped rows without valid time or position: 1")
 
 
 def test_read_position_csv_last_line_without_end_is_dropped(read):
@@ -383,13 +383,16 @@ def test_read_position_csv_backward_timestamps_are_dropped(read, shifts_us, drop
         stamps[at] += shift
     file = read(table({**PLAIN, "time": exact(stamps, 6)}))
     assert_track(file, rows=np.setdiff1d(np.arange(ROWS), dropped))
-    assert_stated(file, f"{len(dropped)} row", "dropped: timestamps repeat, go back")
+    assert_stated(
+        file,
+        f"dropped rows with timestamps that repeat, decrease or are after 2100: {len(dropped)}",
+    )
 
 
 @pytest.mark.parametrize("name", ["tag_id", "tagid", "node"])
 def test_read_position_csv_several_tags_have_note(read, name):
     file = read(table({name: ["A1", "B2"] * (ROWS // 2), **PLAIN}))
-    assert_stated(file, "positions of 2 tags (such as 'A1', 'B2')")
+    assert_stated(file, "positions of 2 tags (such as 'A1')")
 
 
 # -- the options -----------------------------------------------------------------------------------
@@ -424,7 +427,7 @@ def test_read_position_csv_columns_option_selects_columns(read, given, columns, 
     ({"columns": ("time", "x", "x", "z")}, "must name four or five different columns"),
     ({"columns": ("time", "x", "y", "")}, "must name four or five different columns"),
     ({"columns": ("1", "2", "3", "9")},
-     "no column '9' (its columns are 'time', 'x', 'y', 'z'). Name the columns with"),
+     "no column '9'; the columns are 'time', 'x', 'y', 'z'. Name the columns with"),
     ({"columns": ("1", "2", "3", "9" * 5000)}, "no column '9999"),
     ({"columns": ("time", "2", "x", "y")}, "names one column twice"),
 ])  # fmt: skip
@@ -445,7 +448,7 @@ def test_read_position_csv_missing_column_is_named(read):
 
 @pytest.mark.parametrize(("content", "words"), [
     (b"", "empty"),
-    (table(PLAIN, separator=";", decimal=","), "0 usable rows; at least 3 are needed; 60 rows"),
+    (table(PLAIN, separator=";", decimal=","), "0 usable rows; at least 3 are needed; dropped rows"),
     ("time,x,y,z,sigma\n1,2\n3,4\n", "no table of numbers"),
     (b"\x00\x01time,x,y,z\n1,2,3,4\n", "binary"),
     ((REPOSITORY / "sample_logs" / "aisle_uwb.ulg").read_bytes(), "binary"),
@@ -525,4 +528,4 @@ def test_read_position_csv_real_uwb_equals_file(pattern, time, count):
         assert_stated(file, f"'{time}'", "of recording" if time == "bag_time" else "of measurement")
         dropped = len(pd.read_csv(path)) - len(truth)
         if dropped:
-            assert_stated(file, f"{dropped} rows were dropped")
+            assert_stated(file, f"dropped rows without valid time or position: {dropped}")

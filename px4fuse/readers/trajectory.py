@@ -103,7 +103,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
     is_w_first, format_name = _detect_quaternion_order(rows, separator, comments)
     timestamps, values = rows.parse(1, columns - 1, separator)
     time, time_note = _convert_timestamps(rows, timestamps[:, 0].tolist())
-    fault = f"a coordinate is not finite, or above {MAX_COORDINATE_M:.0e}"
+    fault = f"a value is not finite, or above {MAX_COORDINATE_M:.0e}"
     rows.raise_where(~(np.abs(values[:, :7]) < MAX_COORDINATE_M), fault, "Remove that line.")
     position = values[:, :3]
     rotation = _read_rotation(rows, values[:, 3:7], is_w_first)

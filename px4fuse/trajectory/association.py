@@ -96,7 +96,7 @@ def associate(
             f"{estimate.name}: {len(pose_indices)} poses match in time. The estimate is from "
             f"{time_s[0]:.3f} to {time_s[-1]:.3f} s{offset_text}, the reference {reference.name} "
             f"from {first_s:.3f} to {last_s:.3f} s.",
-            "Check that both are of the same flight. For different clocks give `time_offset_s` auto.",
+            "Check that both are of the same flight. If clocks differ, give `time_offset_s` auto.",
         )
     outside = int(
         ((time_s < first_s - end_tolerance_s) | (time_s > last_s + end_tolerance_s)).sum()
