@@ -448,7 +448,7 @@ def test_read_position_csv_missing_column_is_named(read):
 
 @pytest.mark.parametrize(("content", "words"), [
     (b"", "empty"),
-    (table(PLAIN, separator=";", decimal=","), "0 usable rows; at least 3 are needed; dropped rows"),
+    (table(PLAIN, separator=";", decimal=","), "0 usable rows; at least 3 are needed; dropped"),
     ("time,x,y,z,sigma\n1,2\n3,4\n", "no table of numbers"),
     (b"\x00\x01time,x,y,z\n1,2,3,4\n", "binary"),
     ((REPOSITORY / "sample_logs" / "aisle_uwb.ulg").read_bytes(), "binary"),
