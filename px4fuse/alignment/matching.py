@@ -231,9 +231,11 @@ def _refit_with_corrected_resets(flight: Flight, match: Match, problem: Alignmen
     frame = match.frame
     aligned = tracks.align_samples(samples, frame, clock.yaw_rad, clock.origin_m, clock.lag_s)
     track = tracks.ekf2_track_without_resets(ekf2, aligned)
-    file_track = tracks.convert_to_ned(samples, frame)
     fit_again = partial(
-        time_and_pose_fit.fit_by_least_squares, file_track, track, is_lag_free=problem.lag_s is None
+        time_and_pose_fit.fit_by_least_squares,
+        tracks.convert_to_ned(samples, frame),
+        track,
+        is_lag_free=problem.lag_s is None,
     )
     free_yaw_fit = fit_again(match.free_yaw_fit, None)
     fit = free_yaw_fit if problem.yaw_rad is None else fit_again(match.fit, problem.yaw_rad)
@@ -250,9 +252,10 @@ def _best_fit(
     if reference.name == IMU:
         if len(grid_track.time_s) * GRID_STEP_S < tracks.MIN_OVERLAP_S:
             raise NoMatchError("the position file is too short for a match with the IMU")
-        band_passed_twice = tracks.band_pass(tracks.band_pass(grid_track.position_m))
         track = grid_track = tracks.mark_transients(
-            replace(grid_track, position_m=band_passed_twice)
+            replace(
+                grid_track, position_m=tracks.band_pass(tracks.band_pass(grid_track.position_m))
+            )
         )
     peak = (
         time_and_pose_fit.find_correlation_peak(grid_track, reference, yaw_rad)

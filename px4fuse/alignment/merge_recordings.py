@@ -9,7 +9,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.errors import MissingDataError
-from px4fuse.flight import Columns, Ekf2, Flight, Unavailable, sort_by_preference
+from px4fuse.flight import Columns, Ekf2, Flight, Unavailable, sort_by_preference, time_index
 from px4fuse.log import InputFile
 from px4fuse.readers.common import collect_unavailable
 
@@ -122,7 +122,7 @@ def shift_times(data: Any, shift_s: float) -> Any:
         Data of a flight. Values of other types are returned unchanged.
     """
     if isinstance(data, pd.DataFrame | pd.Series):
-        return data.set_axis(pd.Index(data.index.to_numpy() + shift_s, name="time_s"))
+        return data.set_axis(time_index(data.index.to_numpy() + shift_s))
     if isinstance(data, tuple):
         return tuple(shift_times(entry, shift_s) for entry in data)
     if isinstance(data, Mapping):

@@ -89,15 +89,15 @@ def align_position_file(
     end_s = float(samples.index[-1])
     boot_s = flight.log.boot_time_s
     spans_text = (
-        f"the log is from {boot_s:.2f} s to {boot_s + flight.log.duration_s:.2f} s on the boot "
-        f"clock, the file from {start_s:.2f} s to {end_s:.2f} s on a {recording.clock} clock"
+        f"log {boot_s:.2f} s to {boot_s + flight.log.duration_s:.2f} s on the boot clock, file "
+        f"{start_s:.2f} s to {end_s:.2f} s on a {recording.clock} clock"
     )
     lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_s
     if lag_s is not None and not start_s - end_s <= lag_s <= flight.log.duration_s:
         raise MissingDataError(
             f"{recording.name}: with --clock-offset {clock_offset_s:.3f} the file does not "
             f"overlap the log ({spans_text})",
-            "Correct --clock-offset, or omit --clock-offset to estimate the time offset.",
+            "Correct or omit --clock-offset.",
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
     try:
@@ -335,13 +335,13 @@ def _find_warnings(
         if fit.second_peak_ratio < MAX_SIMILAR_RESIDUAL_RATIO[name]:
             yield (
                 f"A time offset that differs by {fit.second_peak_s:+.1f} s fits nearly as well: "
-                f"the residual is {fit.second_peak_ratio:.1f} times larger. If the estimated "
-                "offset is wrong, give --clock-offset SECONDS."
+                f"the residual is {fit.second_peak_ratio:.1f} times larger. Check the offset, or "
+                "give --clock-offset."
             )
         if is_yaw_free and name == IMU:
             yield (
-                "The yaw was estimated against the IMU, with an error of 1° to 6° on simulated "
-                "flights. The origin of the file's frame is unknown and set to 0."
+                "The yaw estimated against the IMU has an error of 1° to 6°. The origin of the "
+                "file's frame is unknown and set to 0."
             )
     if not is_yaw_free and correlation is not None and correlation < MIN_CONCORDANCE[EKF2_POSITION]:
         yield (

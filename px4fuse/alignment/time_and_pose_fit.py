@@ -143,9 +143,10 @@ def find_correlation_peak(
     mean_square = np.maximum(power - 2.0 * real_covariance, 0.0) / (2.0 * np.maximum(count, 1.0))
     residual = np.sqrt(mean_square + GRID_RESIDUAL_M**2)
     second_peak = int(np.argmin(np.where(is_other_peak, residual, np.inf)))
-    ratio = float(residual[second_peak] / residual[best_index])
     return replace(
-        peak, second_peak_s=lag_at(second_peak) - lag_at(best_index), second_peak_ratio=ratio
+        peak,
+        second_peak_s=lag_at(second_peak) - lag_at(best_index),
+        second_peak_ratio=float(residual[second_peak] / residual[best_index]),
     )
 
 

@@ -11,7 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 from px4fuse.arrays import Array, BoolArray, Complex
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.filter.signals import Segment, ned_acceleration
-from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Unavailable
+from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Unavailable, time_index
 from px4fuse.position_source import POSITION_FILE
 from px4fuse.readers.common import finite_rows
 from px4fuse.trajectory.association import gap_limit, is_bracketed
@@ -89,7 +89,7 @@ def convert_to_ned(samples: pd.DataFrame, frame: str) -> SampledTrack:
     order, sign = FRAMES[frame]
     time = samples.index.to_numpy()
     position = samples[["x_m", "y_m", "z_m"]].to_numpy()[:, order] * sign
-    return SampledTrack(time - time[0], position, np.ones(len(time), dtype=bool))
+    return SampledTrack(time - time[0], position, np.ones(len(time), bool))
 
 
 def resample_to_grid(track: SampledTrack) -> SampledTrack:
@@ -107,16 +107,18 @@ def remove_spikes(track: SampledTrack, window_size: int = 3) -> SampledTrack:
 def band_pass(position_m: Array) -> Array:
     """Band-pass filter positions on the time grid, without delay."""
     sos = butter(2, BAND_HZ, "bandpass", fs=1.0 / GRID_STEP_S, output="sos")
-    padding = min(round(BAND_PADDING_S / GRID_STEP_S), len(position_m) - 1)
-    return sosfiltfilt(sos, position_m, axis=0, padlen=padding)
+    return sosfiltfilt(
+        sos,
+        position_m,
+        axis=0,
+        padlen=min(round(BAND_PADDING_S / GRID_STEP_S), len(position_m) - 1),
+    )
 
 
 def mark_transients(track: SampledTrack) -> SampledTrack:
     """Mark the transients of the band-pass filter at ends and gaps as invalid."""
     edge = round(TRANSIENT_S / GRID_STEP_S)
-    return replace(
-        track, is_valid=binary_erosion(track.is_valid, np.ones(2 * edge + 1, dtype=bool))
-    )
+    return replace(track, is_valid=binary_erosion(track.is_valid, np.ones(2 * edge + 1, bool)))
 
 
 def horizontal_range_m(track: SampledTrack) -> float:
@@ -128,9 +130,13 @@ def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
     finite_state = finite_rows(state, Columns.POSITION[:2])
     if len(finite_state) < MIN_SAMPLES:
         raise NoMatchError("no horizontal EKF2 position in the log")
-    time = finite_state.index.to_numpy()
-    position = finite_state[Columns.POSITION].to_numpy()
-    grid = resample_to_grid(SampledTrack(time, position, np.ones(len(finite_state), dtype=bool)))
+    grid = resample_to_grid(
+        SampledTrack(
+            finite_state.index.to_numpy(),
+            finite_state[Columns.POSITION].to_numpy(),
+            np.ones(len(finite_state), bool),
+        )
+    )
     smooth = gaussian_filter1d(grid.position_m, SMOOTHING_S / GRID_STEP_S, axis=0, mode="nearest")
     return replace(grid, position_m=smooth, name=EKF2_POSITION)
 
@@ -164,7 +170,7 @@ def make_imu_references(flight: Flight) -> list[SampledTrack]:
         raise NoMatchError("the log has no acceleration in NED")
     time = acceleration.index.to_numpy()
     velocity = cumulative_trapezoid(acceleration.to_numpy(), time, axis=0, initial=0)
-    grid = resample_to_grid(SampledTrack(time, velocity, np.ones(len(time), dtype=bool)))
+    grid = resample_to_grid(SampledTrack(time, velocity, np.ones(len(time), bool)))
     if len(grid.time_s) * GRID_STEP_S < MIN_OVERLAP_S:
         raise NoMatchError("the IMU data are too short")
     position = cumulative_trapezoid(band_pass(grid.position_m), dx=GRID_STEP_S, axis=0, initial=0)
@@ -191,8 +197,10 @@ def align_samples(
         variance[:, :2] = variance[:, :2] @ (rotation**2).T
     columns = Columns.POSITION + Columns.POSITION_VARIANCE
     values = np.hstack([position + origin_m, variance])
-    times = pd.Index(track.time_s + lag_s, name="time_s")
-    return pd.DataFrame(dict(zip(columns, values.T, strict=True)), index=times)
+    return pd.DataFrame(
+        dict(zip(columns, values.T, strict=True)),
+        index=time_index(track.time_s + lag_s),
+    )
 
 
 def ekf2_track_without_resets(ekf2: Ekf2, aligned_samples: pd.DataFrame) -> SampledTrack:

@@ -178,9 +178,9 @@ def _choose_key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Ar
     distance_m = cumulative_distance(path.position_m[frame_indices])
     if not distance_m[-1] >= max(MIN_PATH_M * min(1.0, spacing_m / 0.5), 1e-6):
         raise TrajectoryError(
-            f"{path.name}: the path of {distance_m[-1]:.2f} m, with a key frame spacing of "
-            f"{spacing_m:g} m, is too short for a loop",
-            "Choose a longer segment (--from, --to) or a smaller --key-frames.",
+            f"{path.name}: the path of {distance_m[-1]:.2f} m is too short for key frames every "
+            f"{spacing_m:g} m",
+            "Change --from, --to or --key-frames.",
         )
     return frame_indices, np.interp(path.time_s, path.time_s[frame_indices], distance_m)
 

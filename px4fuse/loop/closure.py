@@ -128,7 +128,7 @@ def distribute_by_distance(
     Bowditch (1808); UAT 366 module 2, Example 2.
     """
     cumulative = cumulative_distance(position_m) if cumulative_m is None else cumulative_m
-    return np.asarray(position_m - (cumulative / cumulative[-1])[:, np.newaxis] * misclosure_m)
+    return np.asarray(position_m - (cumulative / cumulative[-1])[:, None] * misclosure_m)
 
 
 def heading_change_rad(rotation: Rotation) -> float:
@@ -168,8 +168,9 @@ def correct_by_distance(
     middle_rotation = Rotation.from_rotvec(
         np.outer(-middle_fraction * misclosure_heading_rad, DOWN)
     )
-    steps_m = middle_rotation.apply(np.diff(position_m, axis=0))
-    rotated_m = position_m[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(steps_m, axis=0)])
+    rotated_m = position_m[0] + np.concatenate(
+        [np.zeros((1, 3)), np.cumsum(middle_rotation.apply(np.diff(position_m, axis=0)), axis=0)]
+    )
     remaining_m = rotated_m[-1] - (position_m[-1] - misclosure_m)
     return trajectory.with_positions(
         distribute_by_distance(rotated_m, remaining_m, cumulative_m), rotation

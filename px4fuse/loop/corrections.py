@@ -65,9 +65,8 @@ def correct_paths_by_distance(
 def _unavailable_by_gate(correction_name: str, closure: Closure) -> Unavailable:
     return Unavailable(
         correction_name,
-        f"the gate rejects {closure} (d² {closure.d2:.1f}, p {closure.p:.1g}), because enforcing "
-        "this closure would deform the path",
-        "Measure the landing place (--landed-at), omit the landing (--open), or increase --drift.",
+        f"the gate rejects {closure} (d² {closure.d2:.1f}, p {closure.p:.1g})",
+        "Measure the landing place (--landed-at), give --open, or increase --drift.",
     )
 
 
@@ -110,7 +109,7 @@ def solve_pose_graphs(
         return corrections, ()
     edges = np.arange(len(graph.first))
     is_closure = edges >= len(edges) - len(closures)
-    is_rejected = np.zeros(len(edges), dtype=np.bool_)
+    is_rejected = np.zeros(len(edges), bool)
     is_rejected[is_closure] = [not closure.accepted for closure in closures]
     for solution_name, label in SOLUTIONS.items():
         name = f"pose_graph_{solution_name}"
@@ -118,8 +117,9 @@ def solve_pose_graphs(
         is_gated = solution_name == "gated"
         progress(f"optimising: {label}")
         if robust != "none" and len(closures) < 2:
-            action = "Give further closures with --closure."
-            corrections[name] = Unavailable(label, SINGLE_LOOP_REASON, action)
+            corrections[name] = Unavailable(
+                label, SINGLE_LOOP_REASON, "Give further closures with --closure."
+            )
         elif is_gated and is_rejected[is_closure].all():
             corrections[name] = _unavailable_by_gate("pose graph", closures[0])
         elif is_gated and not is_rejected.any():
@@ -157,7 +157,7 @@ def _interpolate_corrections(
         solved_poses[node, :3] + rotation[node].apply(path.position_m - graph_poses[node, :3])
         for node in (previous_node, previous_node + 1)
     ]
-    weight = np.clip(fraction, 0.0, 1.0)[:, np.newaxis]
+    weight = np.clip(fraction, 0.0, 1.0)[:, None]
     position = (1.0 - weight) * corrected[0] + weight * corrected[1]
     return path.with_positions(position, Slerp(time[nodes], rotation)(time))
 
@@ -176,8 +176,9 @@ def score_paths(
         try:
             return evaluate(path, reference, time_offset_s=offset_s)
         except Px4FuseError as error:
-            analysis_name = f"score against {reference.name}"
-            return Unavailable(analysis_name, str(error), "Give another --reference.")
+            return Unavailable(
+                f"score against {reference.name}", str(error), "Give another --reference."
+            )
 
     def score_path(
         name: CorrectionName, path: Trajectory, solution: Solution | None

@@ -12,7 +12,7 @@ from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.closure import DOWN, heading_change_rad
 from px4fuse.loop.model import TrueEnd
 from px4fuse.request import Landing
-from px4fuse.trajectory.model import MIN_POSES, Trajectory, components_by_axis
+from px4fuse.trajectory.model import MIN_POSES, Trajectory, components_by_axis, format_vector
 
 # Time (s) over which poses on the ground are averaged, and maximum range (m) of their positions:
 # with a larger range the vehicle is not at rest
@@ -36,9 +36,8 @@ def cut_trajectory(
     is_inside = (time >= segment.start_s) & (time <= segment.end_s)
     if is_inside.sum() < MIN_POSES:
         raise TrajectoryError(
-            f"{trajectory.name} has {int(is_inside.sum())} poses between {segment.start_s:.2f} s "
-            f"and {segment.end_s:.2f} s; at least {MIN_POSES} are needed. The trajectory is from "
-            f"{time[0]:.2f} s to {time[-1]:.2f} s."
+            f"{trajectory.name}, {time[0]:.2f} s to {time[-1]:.2f} s, has {int(is_inside.sum())} "
+            f"poses between {segment.start_s:.2f} s and {segment.end_s:.2f} s; {MIN_POSES} are needed"
         )
     segment_track = trajectory[is_inside]
     if not rests_at_ends:
@@ -145,9 +144,8 @@ def convert_measured_end(path: Trajectory, landing: Landing) -> TrueEnd:
         heading_change_deg=heading_change_deg,
         sigma_m=0.05,
         sigma_heading_deg=None if heading_change_deg is None else 2.0,
-        source=f"measured: landing {abs(forward_m):g} m "
-        f"{'behind' if forward_m < 0 else 'ahead'} and {abs(right_m):g} m "
-        f"{'left' if right_m < 0 else 'right'} of the take-off place (--landed-at)",
+        source=f"measured: landing {format_vector({'forward': forward_m, 'right': right_m})} of "
+        "the take-off place (--landed-at)",
         assumed=False,
     )
 

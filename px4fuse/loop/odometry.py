@@ -115,8 +115,15 @@ def build_pose_graph(
         Sentence on the origin of the variances.
     """
     if path.rotation is None:
-        reason = "the trajectory has no orientations"
-        return Unavailable("pose graph", reason, "Use a trajectory with orientations."), frames, ""
+        return (
+            Unavailable(
+                "pose graph",
+                "the trajectory has no orientations",
+                "Use a trajectory with orientations.",
+            ),
+            frames,
+            "",
+        )
     closure_times_s = np.array(
         [(closure.time_1_s, closure.time_2_s) for closure, _ in closures_with_end]
     ).reshape(-1, 2)

@@ -81,8 +81,9 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
     notes = ["EKF2 position as published"]
     source = next((t for t in flight.positions if t.origin.is_vision), None)
     if source is not None:
-        log_segment = Segment(0.0, flight.log.duration_s, "the whole log")
-        state, resets = continuous_state(track_data, source, log_segment)
+        state, resets = continuous_state(
+            track_data, source, Segment(0.0, flight.log.duration_s, "the whole log")
+        )
         notes += [resets] if resets else []
     return _make_trajectory(flight, track_name, state, flight.attitude, tuple(notes))
 
@@ -116,8 +117,9 @@ def _make_trajectory(
         ]
         if len(covered_samples) >= MIN_POSES:
             samples = covered_samples
-            quaternions = orientation[Columns.QUATERNION].to_numpy(copy=True)
-            rotations = Rotation.from_quat(quaternions, scalar_first=True)
+            rotations = Rotation.from_quat(
+                orientation[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
+            )
             rotation = Slerp(orientation_s, rotations)(samples.index.to_numpy())
             reported_variance = _complete_variances(orientation, Columns.ROTATION_VARIANCE)
             if reported_variance is not None:
@@ -249,8 +251,7 @@ def read_source(
         return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)
     if frame is not None:
         raise SettingsError(
-            f"--frame {frame.lower()} is only for trajectory files, but {display_name(path)} is a "
-            "flight log",
+            f"--frame is only for trajectory files, but {display_name(path)} is a flight log",
             "Omit --frame.",
         )
     flight = read_log(path, system=system)

@@ -63,9 +63,7 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
     # Imports are local, because importing pyulog or pymavlink takes a noticeable time
     if head.startswith(ULOG_MAGIC):
         if system is not None:
-            raise SettingsError(
-                f"{name}: `system` is only for MAVLink recordings, and this file is a ULog."
-            )
+            raise SettingsError(f"{name}: `system` is only for MAVLink recordings.")
         from px4fuse.readers.ulog import read_ulog  # noqa: PLC0415
 
         return read_ulog(name, read_log_bytes(path))

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.flight import Columns, Ekf2, FlightMode, Unavailable
+from px4fuse.flight import Columns, Ekf2, FlightMode, Spans, Unavailable
 
 # Maximum absolute value (SI units) of valid positions, velocities, accelerations and angles:
 # larger values are from damaged bytes
@@ -34,7 +34,7 @@ def constant_spans(values: pd.Series, end_s: float) -> list[tuple[float, float, 
     return [(start, end, value) for start, end, value in spans if end > start]
 
 
-def flight_spans(landed: pd.Series, duration_s: float) -> tuple[tuple[float, float], ...]:
+def flight_spans(landed: pd.Series, duration_s: float) -> Spans:
     """Return the intervals (s) in flight, in which ``landed`` is 0 or False."""
     return tuple(
         (start, end)
@@ -43,9 +43,7 @@ def flight_spans(landed: pd.Series, duration_s: float) -> tuple[tuple[float, flo
     )
 
 
-def ends_in_flight(
-    airborne: tuple[tuple[float, float], ...] | Unavailable, duration_s: float
-) -> bool:
+def ends_in_flight(airborne: Spans | Unavailable, duration_s: float) -> bool:
     """Return True if the last interval in flight lasts until the end of the data."""
     last_span = () if isinstance(airborne, Unavailable) else airborne[-1:]
     return any(span_end_s >= duration_s for _, span_end_s in last_span)

@@ -57,7 +57,7 @@ def read_g2o(path: str | Path) -> PoseGraph:
     path_object = Path(path)
     text = decode_text(read_bytes_limited(path_object, TrajectoryError, MAX_FILE_BYTES))
     if text is None:
-        raise TrajectoryError(f"{display_name(path_object)}: the file is not a text file", _REMEDY)
+        raise TrajectoryError(f"{display_name(path_object)} is not a text file", _REMEDY)
     return parse_g2o(text, display_name(path_object))
 
 
@@ -89,13 +89,16 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         order = np.argsort(vertex_ids[:, 0], kind="stable")
         ids = vertex_ids[order, 0]
         poses = _normalise_quaternions(vertices, poses)[order]
-        is_repeated = np.zeros(len(ids), dtype=np.bool_)
+        is_repeated = np.zeros(len(ids), bool)
         is_repeated[order[1:]] = ids[1:] == ids[:-1]
         vertices.raise_where(is_repeated, "this vertex id is repeated", "Remove one of the lines.")
     vertex_index = np.minimum(np.searchsorted(ids, edge_vertex_ids), len(ids) - 1)
     fault = "the edge connects a vertex that is not in the file"
-    remedy = "Add the VERTEX line, or remove all VERTEX lines."
-    edges.raise_where(ids[vertex_index] != edge_vertex_ids, fault, remedy)
+    edges.raise_where(
+        ids[vertex_index] != edge_vertex_ids,
+        fault,
+        "Add the VERTEX line, or remove all VERTEX lines.",
+    )
     edges.raise_where(
         edge_vertex_ids[:, 0] == edge_vertex_ids[:, 1],
         "the edge connects a vertex to itself",
@@ -151,9 +154,13 @@ def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
         elif tag == "FIX":
             fixed_ids.update(" ".join(values).split())
             if len(fixed_ids) > 1:
-                remedy = "Remove the line, or connect both vertices by an edge."
                 raise TrajectoryError(
-                    format_line_error(name, line_number, "the line fixes a second vertex", remedy)
+                    format_line_error(
+                        name,
+                        line_number,
+                        "the line fixes a second vertex",
+                        "Remove the line, or connect both vertices by an edge.",
+                    )
                 )
         elif not tag.startswith(_SKIPPED_TAGS):
             raise TrajectoryError(
@@ -169,9 +176,10 @@ def _parse(rows: Rows, tag: str) -> tuple[np.ndarray[Any, np.dtype[np.int64]], A
     vertex_count, value_count = _TAGS[tag]
     cells, numbers = rows.parse(1 + vertex_count, value_count)
     is_invalid_id = np.array([_VERTEX_ID.fullmatch(word) is None for word in cells[:, 1:].flat])
-    fault = "a vertex id is not an integer of at most 18 digits"
     rows.raise_where(
-        is_invalid_id.reshape(-1, vertex_count), fault, "Give an integer as vertex id."
+        is_invalid_id.reshape(-1, vertex_count),
+        "a vertex id is not an integer of at most 18 digits",
+        "Give an integer as vertex id.",
     )
     remedy = "Correct or remove the line."
     rows.raise_where(~np.isfinite(numbers), "a number is not finite", remedy)
@@ -188,9 +196,11 @@ def _normalise_quaternions(rows: Rows, poses: Array) -> Array:
         return poses
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(poses[:, 3:], axis=1)
-    fault = "the quaternion does not have unit length"
-    remedy = "Give the unit quaternion qx qy qz qw after the position."
-    rows.raise_where((norm < 1e-6) | ~(norm < 1e6), fault, remedy)
+    rows.raise_where(
+        (norm < 1e-6) | ~(norm < 1e6),
+        "the quaternion does not have unit length",
+        "Give the unit quaternion qx qy qz qw after the position.",
+    )
     # Unit quaternions are not changed, so that a written file is read back with the same digits
     norm[np.abs(norm - 1.0) <= _UNIT_NORM_TOLERANCE] = 1.0
     return np.hstack([poses[:, :3], poses[:, 3:] / norm[:, None]])

@@ -17,7 +17,16 @@ from px4fuse.ekf2_parameters import (
     effective_settings,
     replace_invalid_parameters,
 )
-from px4fuse.flight import AXIS_NAMES, Columns, Ekf2, Flight, FlightMode, Unavailable
+from px4fuse.flight import (
+    AXIS_NAMES,
+    Columns,
+    Ekf2,
+    Flight,
+    FlightMode,
+    Spans,
+    TableOrUnavailable,
+    Unavailable,
+)
 from px4fuse.log import LogInfo, UnusedData
 from px4fuse.readers import common
 from px4fuse.readers import mavlink_messages as messages
@@ -110,7 +119,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     )
 
 
-def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
+def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
     candidates = [(layout, recording.rows(layout.topic)) for layout in messages.IMU_LAYOUTS]
     # HIGHRES_IMU is preferred (SI units, µs timestamps), otherwise the message with most samples
     layout, rows = (
@@ -144,7 +153,7 @@ def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
     return imu
 
 
-def _read_attitude(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
+def _read_attitude(recording: Recording, remedy: str) -> TableOrUnavailable:
     layout = max(messages.ATTITUDE_LAYOUTS, key=lambda layout: len(recording.rows(layout.topic)))
     attitude = common.with_attitude(recording.read(layout))[Columns.QUATERNION]
     if len(attitude) < 2:
@@ -204,7 +213,7 @@ def _read_ekf2(
                 "the EKF2 position variances are from ESTIMATOR_STATUS (on each horizontal axis "
                 "half of the squared horizontal accuracy); velocity variances are not sent"
             )
-    variance: pd.DataFrame | Unavailable = variance_rows
+    variance: TableOrUnavailable = variance_rows
     if variance_rows.empty:
         variance = Unavailable(
             "EKF2 variances",
@@ -251,9 +260,7 @@ def _variance_from_accuracy(recording: Recording) -> pd.DataFrame:
     return variance[(variance[Columns.POSITION_VARIANCE] > 0.0).all(axis=1)]
 
 
-def _read_airborne(
-    recording: Recording, remedy: str
-) -> tuple[tuple[float, float], ...] | Unavailable:
+def _read_airborne(recording: Recording, remedy: str) -> Spans | Unavailable:
     rows = recording.rows("EXTENDED_SYS_STATE")
     states = recording.frames.table("EXTENDED_SYS_STATE", rows)
     is_known = states["landed_state"] > 0
@@ -321,8 +328,9 @@ def _describe_log(
         uid = bytes(version["uid2"]).hex()
         vehicle = uid if uid.strip("0") else ""
     heartbeats = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))
-    vehicle_type = next(iter(heartbeats["type"].tolist()), -1)
-    vehicle_name = messages.VEHICLE_TYPES.get(vehicle_type, "vehicle")
+    vehicle_name = messages.VEHICLE_TYPES.get(
+        next(iter(heartbeats["type"].tolist()), -1), "vehicle"
+    )
     dropped = sorted(recording.dropped.items())
     return LogInfo(
         name=frames.name,

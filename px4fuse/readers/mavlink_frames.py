@@ -186,7 +186,7 @@ def read_frames(name: str, content: bytes) -> Frames:
         raise LogError(
             f"{name}: the file is neither a PX4 ULog nor a MAVLink recording ({len(start)} frames "
             f"with a valid checksum in {len(content)} bytes).",
-            "Give the .ulg from the vehicle, or a .tlog or raw MAVLink stream.",
+            "Give a .ulg, a .tlog or a raw MAVLink stream.",
         )
     source = np.frombuffer(content, dtype=np.uint8)
     is_version_2 = source[start] == MAGIC_BYTE_2

@@ -53,8 +53,11 @@ def read_positions(
             if source.message == message
             if (track := _read_track(recording, source, sender, clocks[sender], remedy, senders))
         ]
-        reason = f"the recording contains no {message} to the autopilot"
-        tracks_and_missing += tracks or [px4_positions.unavailable(message, reason, remedy)]
+        tracks_and_missing += tracks or [
+            px4_positions.unavailable(
+                message, f"the recording contains no {message} to the autopilot", remedy
+            )
+        ]
     fixes = (_read_gnss(recording, layout, delay_s) for layout in messages.GNSS_LAYOUTS)
     tracks_and_missing += [track for track in fixes if track]
     missing = tuple(item for item in tracks_and_missing if isinstance(item, Unavailable))
@@ -162,9 +165,11 @@ def local_origin(recording: Recording) -> GeodeticPosition | None:
     sent_origin = recording.read(messages.LAYOUTS["origin"]).dropna()
     if len(sent_origin):
         return tuple(sent_origin[GLOBAL_COLUMNS].iloc[-1].tolist())
-    state = recording.read(messages.STATE_LAYOUTS[-1])[Columns.POSITION]
-    global_state = recording.read(messages.LAYOUTS["global_state"])
-    joined = join_nearest(global_state, state, MAX_STATE_DISTANCE_S).dropna()
+    joined = join_nearest(
+        recording.read(messages.LAYOUTS["global_state"]),
+        recording.read(messages.STATE_LAYOUTS[-1])[Columns.POSITION],
+        MAX_STATE_DISTANCE_S,
+    ).dropna()
     joined = joined[joined["latitude_deg"] != 0.0]
     if joined.empty:
         return None

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.flight import Columns
+from px4fuse.flight import Columns, time_index
 from px4fuse.log import Stream
 from px4fuse.readers.common import MIN_QUATERNION_NORM
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
@@ -135,8 +135,12 @@ class Recording:
             )
         del table
         values[~(np.abs(values) < MAX_FIELD_VALUE)] = np.nan
-        times = pd.Index(boot_s[selected_rows] - self.zero_s, name="time_s")
-        samples = pd.DataFrame(values, times, list(layout.columns), copy=False)
+        samples = pd.DataFrame(
+            values,
+            time_index(boot_s[selected_rows] - self.zero_s),
+            list(layout.columns),
+            copy=False,
+        )
         if "roll" in samples:
             attitude = Rotation.from_euler("ZYX", samples[["yaw", "pitch", "roll"]].to_numpy())
             samples[Columns.QUATERNION] = attitude.as_quat(scalar_first=True)
@@ -213,8 +217,9 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
         velocity = child_samples[Columns.VELOCITY].to_numpy()[:, order] * signs
         velocity_variance = child_samples[Columns.VELOCITY_VARIANCE].to_numpy()[:, order]
         if is_body and len(child_samples):
-            quaternion = child_samples[Columns.QUATERNION].to_numpy(copy=True)
-            rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+            rotation = Rotation.from_quat(
+                child_samples[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
+            ).as_matrix()
             velocity = np.einsum("nij,nj->ni", rotation, velocity)
             # Variances: diagonal of R diag(σ²) Rᵀ
             velocity_variance = np.einsum("nij,nj->ni", rotation**2, velocity_variance)

@@ -184,15 +184,21 @@ def clock_maps(
     received_us = recording.frames.received_us
     line = recording.boot_of_receipt
     if received_us is not None and line.pairs:
-        name = "receive time (UNIX time of the recording computer)"
-        note = "the recording was not in real time; the link was probably replayed"
+        note = "the recording was not in real time"
         if abs(line.slope - 1.0) < MAX_RATE_DIFFERENCE:
             note = (
                 "from the messages with least delay, used only to order messages and to map clocks"
             )
         offset_s = line.y0 - line.x0 - float(received_us[0]) * 1e-6
         line_values = line.pairs, offset_s, (line.slope - 1.0) * 1e6, line.jitter
-        clocks.append(ClockMap(name, "receive time", *line_values, note))
+        clocks.append(
+            ClockMap(
+                "receive time (UNIX time of the recording computer)",
+                "receive time",
+                *line_values,
+                note,
+            )
+        )
     return tuple(clocks)
 
 

@@ -17,8 +17,9 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array
+from px4fuse.arrays import Array, median_interval
 from px4fuse.errors import LogError, SettingsError
+from px4fuse.flight import time_index
 from px4fuse.readers import position_names
 from px4fuse.readers.position_names import LENGTH_UNITS, TIME_UNITS, ColumnMeaning, read_column_name
 from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, decode_text, quote
@@ -182,8 +183,7 @@ def read_position_csv(
         tags = sorted({*texts[tag].dropna()})
         if tags[1:]:
             notes.append(
-                f"the file contains positions of {len(tags)} tags (such as {quote(tags[0])}): keep "
-                "the rows of one tag only"
+                f"the file contains {len(tags)} tags (such as {quote(tags[0])}): keep one only"
             )
     numbers = numbers[is_usable]
     times = numbers[time].to_numpy()
@@ -202,10 +202,10 @@ def read_position_csv(
         raise LogError(
             f"{table.file_name} contains {len(kept_rows)} usable rows; at least {MIN_ROWS} are "
             f"needed{''.join('; ' + note for note in notes)}",
-            f"Export the file with decimal points, or name the columns with {_COLUMNS_OPTION}.",
+            f"Use decimal points, or name the columns with {_COLUMNS_OPTION}.",
         )
-    numbers = numbers.iloc[kept_rows].set_index(pd.Index(seconds[kept_rows], name="time_s"))
-    median_interval_s = float(np.median(np.diff(numbers.index)))
+    numbers = numbers.iloc[kept_rows].set_index(time_index(seconds[kept_rows]))
+    median_interval_s = median_interval(numbers.index)
     if not MIN_INTERVAL_S <= median_interval_s <= MAX_INTERVAL_S:
         notes.append(
             f"a median interval of {median_interval_s:.3g} s is not plausible for UWB: check "
@@ -278,13 +278,13 @@ def _find_table(
     if text is None:
         raise LogError(
             f"{file_name} is a binary file, not a text table",
-            "Give the CSV file of the positioning system. Give a flight log without --position.",
+            "Give a CSV file.",
         )
     notes = []
     whole_lines, _, last_line = text.replace('"', "").rpartition("\n")
     text = f"{whole_lines}\n"
     if last_line.strip():
-        notes.append("the last line was dropped, because it has no line end and may be incomplete")
+        notes.append("the last line was dropped, because it has no line end")
     lines = text[: text.rfind("\n", 0, MAX_HEADER_CHARS) + 1].split("\n")[:MAX_HEADER_LINES]
     wanted_names = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
     headers = (
@@ -300,7 +300,7 @@ def _find_table(
         raise LogError(
             f"{file_name}: the first {len(lines)} lines contain no header with the columns "
             f"{title_list}. The first line is {quote(lines[0])}.",
-            f"Give a CSV file with a header, or name its columns with {_COLUMNS_OPTION}.",
+            f"Name the columns with {_COLUMNS_OPTION}.",
         )
     body = re.sub(r"(?m)^[ \t]*[#%].*", "", text.split("\n", header_line)[header_line])
     first_row = body[:MAX_HEADER_CHARS].lstrip("\n").partition("\n")[0].rstrip(f"{separator} ")
@@ -308,7 +308,7 @@ def _find_table(
     if row_width > len(names):
         raise LogError(
             f"{file_name}: the header has {len(names)} columns, but the rows have {row_width}.",
-            "Export the file with decimal points and a name for each column.",
+            "Use decimal points, and name each column.",
         )
     return _Table(file_name, separator, names, body, header_line), notes
 

@@ -6,14 +6,14 @@ field names are in ``ekf2_parameters.toml``.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
 from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, Aid
-from px4fuse.flight import AidLog, step_values_at
+from px4fuse.flight import AidLog, StepFunctions, step_values_at
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import join_nearest
 from px4fuse.readers.field_maps import Layout
@@ -24,7 +24,7 @@ from px4fuse.readers.ulog_topics import Topics
 JOIN_TOLERANCE_S = 0.6
 
 
-def read_aids(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> dict[str, AidLog]:
+def read_aids(topics: Topics, enabled: StepFunctions) -> dict[str, AidLog]:
     """Read all aiding sources with innovations in the log, by PX4 name.
 
     ``enabled`` is the result of :func:`read_enabled_aids`. An aid's topic ``estimator_aid_src_...``

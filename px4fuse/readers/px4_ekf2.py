@@ -4,9 +4,6 @@ Sources: PX4-Autopilot ``EKF2.cpp`` (PublishStates), ``EKF/common.h`` (order of 
 ``msg/EstimatorStatusFlags.msg`` and ``msg/EstimatorStatus.msg`` (horizontal aiding).
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
@@ -14,9 +11,19 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from px4fuse import flight
-from px4fuse.arrays import Array, IntArray
+from px4fuse.arrays import Array, IntArray, median_interval
 from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, EV_POS, FLOW, effective_settings
-from px4fuse.flight import Columns, Ekf2, FusionRecord, Reset, Unavailable, step_values_at
+from px4fuse.flight import (
+    Columns,
+    Ekf2,
+    FusionRecord,
+    Reset,
+    StepFunctions,
+    TableOrUnavailable,
+    Unavailable,
+    step_values_at,
+    time_index,
+)
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.field_maps import Layout, expand_columns
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, read_aids, read_enabled_aids
@@ -48,7 +55,7 @@ OTHER_HORIZONTAL_AIDS = (
 VARIANCES_NOT_LOGGED = Unavailable(
     "EKF2 variances",
     "estimator_states (estimator_status before v1.12) is not logged or not usable",
-    f"{px4.DEFAULT_PROFILE} The topic is also missing if EKF2 had not started.",
+    f"{px4.DEFAULT_PROFILE} Wait until EKF2 has started.",
 )
 _RESET_FIELDS: tuple[tuple[Literal["position", "velocity"], str, tuple[str, str, str]], ...] = (
     ("position", "xy_reset_counter", ("delta_north_m", "delta_east_m", "")),
@@ -136,7 +143,7 @@ def _state_vector(topics: Topics) -> tuple[str, int]:
     return "", 0
 
 
-def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavailable:
+def _read_delayed_state(topics: Topics, step_s: float) -> TableOrUnavailable:
     """Read EKF2's state and variances at the fusion horizon, in one layout for all releases.
 
     ``step_s`` is the prediction interval (s). It is needed for releases that log biases as
@@ -167,7 +174,7 @@ def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavail
     return pd.DataFrame(np.hstack([state, variance]), index=raw.index, columns=columns)
 
 
-def _variance(delayed: pd.DataFrame | Unavailable) -> pd.DataFrame | Unavailable:
+def _variance(delayed: TableOrUnavailable) -> TableOrUnavailable:
     if isinstance(delayed, Unavailable):
         return delayed
     variance = delayed[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
@@ -187,11 +194,12 @@ def _step_s(topics: Topics) -> float:
     if len(imu) < 2:
         return target_s
     imu_s = imu.index.to_numpy()
-    interval_s = float(np.median(np.diff(imu_s)))
+    interval_s = median_interval(imu_s)
     if interval_s >= target_s:
         return target_s
-    layout = Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})
-    step_ends_s = topics.primary_samples(layout).index
+    step_ends_s = topics.primary_samples(
+        Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})
+    ).index
     return (
         samples_per_step(target_s, interval_s, rows_of_timestamps(imu_s, step_ends_s)) * interval_s
     )
@@ -199,8 +207,9 @@ def _step_s(topics: Topics) -> float:
 
 def rows_of_timestamps(times_s: Array, other_s: ArrayLike) -> IntArray:
     """Return the indices of the ``times_s`` that are also in ``other_s``, compared in whole µs."""
-    other_us = np.rint(np.asarray(other_s, dtype=float) * 1e6)
-    return np.flatnonzero(np.isin(np.rint(times_s * 1e6), other_us))
+    return np.flatnonzero(
+        np.isin(np.rint(times_s * 1e6), np.rint(np.asarray(other_s, dtype=float) * 1e6))
+    )
 
 
 def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -> int:
@@ -227,9 +236,7 @@ def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -
     return samples
 
 
-def _accelerometer_bias(
-    topics: Topics, delayed: pd.DataFrame | Unavailable
-) -> pd.DataFrame | Unavailable:
+def _accelerometer_bias(topics: Topics, delayed: TableOrUnavailable) -> TableOrUnavailable:
     if len(bias := topics.primary_samples(px4.LAYOUTS["sensor_bias"]).dropna()):
         return bias
     if isinstance(delayed, Unavailable) or delayed.empty:
@@ -254,15 +261,13 @@ def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
     for table in topics.of(topic)[:1]:
         if "timestamp_sample" in table:
             measured_us = measurement_time_us(table)
-            times = pd.Index((measured_us - topics.zero_us) * 1e-6, name="time_s")
+            times = time_index((measured_us - topics.zero_us) * 1e-6)
             age_us = table["timestamp"].astype(np.int64) - measured_us
             return pd.Series(age_us * 1e-6, index=times)
     return pd.Series(dtype=np.float64)
 
 
-def _read_fusing(
-    topics: Topics, enabled: Mapping[str, pd.Series[float]]
-) -> pd.DataFrame | Unavailable:
+def _read_fusing(topics: Topics, enabled: StepFunctions) -> TableOrUnavailable:
     """Read the fusion flags of external vision: horizontal and vertical position, and yaw."""
     vision = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
     if not {*vision.values()} <= enabled.keys():
@@ -296,9 +301,9 @@ def read_resets(local: pd.DataFrame) -> tuple[Reset, ...]:
 
 def _read_record(
     topics: Topics,
-    delayed: pd.DataFrame | Unavailable,
+    delayed: TableOrUnavailable,
     local: pd.DataFrame,
-    enabled: Mapping[str, pd.Series[float]],
+    enabled: StepFunctions,
     step_s: float,
 ) -> FusionRecord | Unavailable:
     """Read the data for a replay of EKF2; ``local`` is the published local position."""
@@ -355,8 +360,13 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
     candidates = []
     for topic, name in px4.MAGNETOMETER:
         measured_columns = expand_columns({"forward_gauss right_gauss down_gauss": f"{name}[]"})
-        innovation_columns = expand_columns({"FIELD_INNOVATION": "innovation_filtered[]"})
-        frame = topics.primary_samples(Layout(topic, measured_columns, innovation_columns)).dropna()
+        frame = topics.primary_samples(
+            Layout(
+                topic,
+                measured_columns,
+                expand_columns({"FIELD_INNOVATION": "innovation_filtered[]"}),
+            )
+        ).dropna()
         if name == "observation":  # EKF2 subtracts delay and half a step from measurement times
             delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3
             frame = frame.set_axis(frame.index + delay_s + 0.5 * step_s)
@@ -373,7 +383,7 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
     return field.assign(fused_3d=(flags >> MAG_3D_BIT & 1).astype(float))
 
 
-def _read_flow(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> pd.DataFrame:
+def _read_flow(topics: Topics, enabled: StepFunctions) -> pd.DataFrame:
     """Compute the mean flow velocity between consecutive rows of EKF2's low-pass filtered flow."""
     velocity, interval, noise = (
         topics.primary_samples(px4.LAYOUTS[f"flow_{quantity}"]).dropna()

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
-from px4fuse.flight import Columns, Ekf2, Unavailable
+from px4fuse.flight import Columns, Ekf2, Unavailable, time_index
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.readers.ulog_topics import Topics
@@ -125,7 +125,7 @@ def reconstruct_fixes(
             + innovations["innovation_m"].to_numpy()[is_between_fixes][is_unambiguous]
             for column, innovations in zip(Columns.POSITION, (north, east), strict=False)
         },
-        index=pd.Index(fix_time_s, name="time_s"),
+        index=time_index(fix_time_s),
     )
     is_logged = intervals_passed == 0.0
     error = (reconstructed - fixes[reconstructed.columns].to_numpy()[previous_fix])[
@@ -142,9 +142,8 @@ def reconstruct_fixes(
         if column in fixes:
             reconstructed[column] = np.interp(reconstructed.index, fix_s, fixes[column])
     return reconstructed, (
-        f"{len(reconstructed)} GNSS fixes that were not logged are reconstructed as EKF2 position "
-        f"plus innovation, with interpolated heights (RMS error {error_m:.2f} m per axis at "
-        f"{len(error)} logged fixes)",
+        f"{len(reconstructed)} unlogged GNSS fixes are reconstructed as EKF2 position plus "
+        f"innovation (RMS error {error_m:.2f} m per axis at {len(error)} logged fixes)",
     )
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.ekf2_parameters import GNSS_POS, TABLES
-from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Ekf2, Unavailable
+from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Ekf2, TableOrUnavailable, Unavailable
 
-Innovations = dict[AxisName, pd.DataFrame | Unavailable]
+Innovations = dict[AxisName, TableOrUnavailable]
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
         for group, name in (("horizontal", source.horizontal), ("vertical", source.vertical))
         if (log := ekf2.aids.get(name)) is not None and log.enabled is not None
     }
-    fusing: pd.DataFrame | Unavailable = Unavailable(
+    fusing: TableOrUnavailable = Unavailable(
         "EKF2 fusion flags", "the log does not contain the fusion flags of GNSS", GNSS.to_log
     )
     if enabled:
@@ -66,7 +66,7 @@ def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
 
 def innovations_by_axis(
     aids: Mapping[str, AidLog],
-    fusing: pd.DataFrame | Unavailable,
+    fusing: TableOrUnavailable,
     gate: float,
     source: Ekf2Source = VISION,
 ) -> tuple[Innovations, tuple[str, ...]]:

@@ -19,6 +19,7 @@ from px4fuse.flight import (
     Unavailable,
     sample_rate,
     sort_by_preference,
+    time_index,
 )
 from px4fuse.log import ClockMap
 from px4fuse.position_source import Origin, with_orientation
@@ -98,8 +99,11 @@ def make_track(
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
     samples = finite_rows(samples, needed_columns)
     if len(samples) < MIN_TRACK_SAMPLES:
-        reason = f"only {len(samples)} finite samples (at least {MIN_TRACK_SAMPLES} are needed)"
-        return unavailable(name, reason, remedy)
+        return unavailable(
+            name,
+            f"only {len(samples)} finite samples (at least {MIN_TRACK_SAMPLES} are needed)",
+            remedy,
+        )
     variance = samples[Columns.POSITION_VARIANCE]
     samples = samples.assign(**variance.where(variance > 0))
     return PositionTrack(name=name, samples=samples, origin=origin, **track_fields)
@@ -208,7 +212,7 @@ def _read_ev_pos_aid(topics: Topics, turns: bool) -> PositionTrack | Unavailable
 
 
 def _shift_times(samples: pd.DataFrame, by_s: float) -> pd.DataFrame:
-    return samples.set_axis(pd.Index(samples.index.to_numpy() + by_s, name="time_s"))
+    return samples.set_axis(time_index(samples.index.to_numpy() + by_s))
 
 
 def _with_height(
@@ -359,7 +363,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     delay_ms = 0.0 if has_driver_times else effective_settings(parameters, GNSS_POS)[GNSS_POS.delay]
     clock = "autopilot boot clock, measurement times of the receiver driver"
     if not has_driver_times:
-        gps = gps.set_axis(pd.Index(published_s - delay_ms * 1e-3, name="time_s"))
+        gps = gps.set_axis(time_index(published_s - delay_ms * 1e-3))
         clock = f"autopilot boot clock minus {delay_ms:g} ms ({GNSS_POS.delay})"
     unlogged_fixes = read_unlogged_fixes(topics, gps, ekf2)
     if len(unlogged_fixes):
@@ -386,8 +390,8 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
         )
     if rate_hz < MAX_DOWNSAMPLED_HZ:
         notes = (
-            f"GNSS fixes are logged at {rate_hz:.1f} Hz, because the logger dropped fixes. Set "
-            "SDLOG_PROFILE bit 1 to log all fixes",
+            f"the logger dropped GNSS fixes (logged rate {rate_hz:.1f} Hz). Set SDLOG_PROFILE bit "
+            "1 to log all",
             *notes,
         )
     if len(unlogged_fixes):
@@ -446,15 +450,15 @@ def read_truth(
             local = _move_to_origin(local, project_to_ned(global_positions, _local_origin(topics)))
         return Truth(px4.LAYOUTS["truth_local"].topic, local, attitude)
     if len(global_positions):
-        velocity = global_positions.reindex(columns=Columns.VELOCITY)
-        samples = project_to_ned(global_positions, _local_origin(topics)).join(velocity)
+        samples = project_to_ned(global_positions, _local_origin(topics)).join(
+            global_positions.reindex(columns=Columns.VELOCITY)
+        )
         return Truth(px4.LAYOUTS["truth_global"].topic, samples, attitude)
     mocap_truth = motion_capture(positions, "vehicle_mocap_odometry")
     if mocap_truth is None and len(logged_local):
         return Unavailable(
             "ground truth",
-            f"{px4.LAYOUTS['truth_local'].topic} has no sample with finite positions and "
-            "velocities below 1e9 m and m/s",
+            f"{px4.LAYOUTS['truth_local'].topic} has no finite sample",
             "Check the simulation that writes the ground truth.",
         )
     return mocap_truth or Unavailable(
@@ -481,6 +485,9 @@ def motion_capture(positions: tuple[PositionTrack, ...], topic: str) -> Truth | 
     if any(track.origin.is_vision for track in positions):
         for track in positions:
             if track.topics[0] == topic:
-                state = track.samples.reindex(columns=Columns.STATE)
-                return Truth(track.name, state, read_attitude(track.orientation))
+                return Truth(
+                    track.name,
+                    track.samples.reindex(columns=Columns.STATE),
+                    read_attitude(track.orientation),
+                )
     return None

@@ -122,6 +122,9 @@ class Rows:
                 for fields in row_fields
             )
             row = next((row for row, is_row_valid in enumerate(is_valid) if not is_row_valid), 0)
-            description = f"{quote(texts[row])} is not {words + values} columns of numbers"
-            raise self.row_error(row, description, "Correct or remove that line.") from error
+            raise self.row_error(
+                row,
+                f"{quote(texts[row])} is not {words + values} columns of numbers",
+                "Correct or remove that line.",
+            ) from error
         return table["words"], np.ascontiguousarray(table["values"])

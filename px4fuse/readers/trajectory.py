@@ -103,8 +103,11 @@ def read_trajectory(path: str | Path) -> Trajectory:
     is_w_first, format_name = _detect_quaternion_order(rows, separator, comments)
     timestamps, values = rows.parse(1, columns - 1, separator)
     time, time_note = _convert_timestamps(rows, timestamps[:, 0].tolist())
-    fault = f"a value is not finite, or above {MAX_COORDINATE_M:.0e}"
-    rows.raise_where(~(np.abs(values[:, :7]) < MAX_COORDINATE_M), fault, "Remove that line.")
+    rows.raise_where(
+        ~(np.abs(values[:, :7]) < MAX_COORDINATE_M),
+        f"a value is not finite, or above {MAX_COORDINATE_M:.0e}",
+        "Remove that line.",
+    )
     position = values[:, :3]
     rotation = _read_rotation(rows, values[:, 3:7], is_w_first)
     is_kept, dropped_note = _increasing_rows(rows, time)
@@ -195,7 +198,7 @@ def _split_rows(name: str, content: bytes) -> tuple[Rows, str, str]:
     if len(numeric_rows) < MIN_POSES:
         raise TrajectoryError(
             f"{name} contains {len(numeric_rows)} poses; at least {MIN_POSES} are needed",
-            "Export the trajectory again. The file is almost empty if SLAM lost tracking early.",
+            "Export the trajectory again.",
         )
     return Rows(name, numeric_rows), "\n".join(comments), truncation_note
 
@@ -290,9 +293,11 @@ def _increasing_rows(rows: Rows, time: Array) -> tuple[BoolArray, str]:
 
 def _read_rotation(rows: Rows, quaternion: Array, is_w_first: bool) -> Rotation:
     norms = np.linalg.norm(quaternion, axis=1)
-    fault = "columns 5 to 8 are not a quaternion with norm 1"
-    remedy = f"Remove that line, or check the order of the columns. {_REMEDY}"
-    rows.raise_where(np.abs(norms - 1.0) > MAX_NORM_ERROR, fault, remedy)
+    rows.raise_where(
+        np.abs(norms - 1.0) > MAX_NORM_ERROR,
+        "columns 5 to 8 are not a quaternion with norm 1",
+        f"Remove that line, or check the order of the columns. {_REMEDY}",
+    )
     norms[np.abs(norms - 1.0) < UNIT_NORM_TOLERANCE] = 1.0
     quaternion = np.roll(quaternion, -1, axis=1) if is_w_first else quaternion
     return Rotation(quaternion / norms[:, None], normalize=False)
@@ -304,7 +309,7 @@ def _detect_kind(
     if columns == EUROC_COLUMNS[1]:
         return (
             "truth",
-            "The kind is ground truth, because the file has the 17 columns of EuRoC ground truth.",
+            "The kind is ground truth, according to its 17 columns.",
         )
     # EuRoC files are always called data.csv; their folder name indicates the kind
     folder = path.absolute().parent.name if path.name == "data.csv" else ""
@@ -329,8 +334,7 @@ def _detect_frame(kind: Kind, position: Array) -> tuple[Frame, str]:
         return "unknown", ""
     return "camera", (
         "The frame is that of a camera (x right, y down, z forward), because the motion is level "
-        f"and the vertical is {math.degrees(tilt):.0f}° from y. Its RMS extents are {length:.2g}, "
-        f"{width:.2g} and {height:.2g} m."
+        f"and its vertical is {math.degrees(tilt):.0f}° from y."
     )
 
 
@@ -348,10 +352,9 @@ def _describe_gaps(time: Array, kind: Kind) -> str:
     if not len(gaps):
         return ""
     lost_s = intervals_s[gaps] - median_s
-    missing_count = int((np.rint(intervals_s[gaps] / median_s) - 1).sum())
     longest_start_s = time[gaps[np.argmax(lost_s)]] - time[0]
     return (
         f"{'Tracking was lost' if kind == 'slam' else 'Poses are missing'} for "
-        f"{lost_s.sum():.1f} s ({missing_count} poses) in {len(gaps)} gaps, the longest at "
-        f"{longest_start_s:.1f} s after the start."
+        f"{lost_s.sum():.1f} s in {len(gaps)} gaps, the longest at {longest_start_s:.1f} s after "
+        "the start."
     )

@@ -5,7 +5,17 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.ekf2_parameters import BAROMETER
-from px4fuse.flight import MODES_NOT_LOGGED, Columns, Flight, FlightMode, Truth, Unavailable
+from px4fuse.flight import (
+    MODES_NOT_LOGGED,
+    Columns,
+    Flight,
+    FlightMode,
+    Spans,
+    TableOrUnavailable,
+    Truth,
+    Unavailable,
+    time_index,
+)
 from px4fuse.log import UnusedData
 from px4fuse.readers import common
 from px4fuse.readers import px4_topics as px4
@@ -76,9 +86,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
     )
 
 
-def _describe_damage(
-    topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool
-) -> tuple[str, ...]:
+def _describe_damage(topics: Topics, imu: TableOrUnavailable, in_flight: bool) -> tuple[str, ...]:
     end_s = topics.log.duration_s
     damage_sentences = []
     if topics.is_cut:
@@ -89,8 +97,7 @@ def _describe_damage(
             steps_s = np.diff(imu.index.to_numpy())
             missing_s = float(steps_s[steps_s > MIN_IMU_GAP_S].sum())
         damage_sentences.append(
-            f"the file is damaged: {missing_s:.1f} s of {end_s:.1f} s of IMU data are missing, and "
-            "invalid messages were skipped"
+            f"the file is damaged: {missing_s:.1f} s of {end_s:.1f} s of IMU data are missing"
         )
     return tuple(damage_sentences)
 
@@ -109,7 +116,7 @@ def _start_unix_s(topics: Topics) -> float | None:
 
 def _require_samples(
     topics: Topics, samples: pd.DataFrame, name: str, layout: Layout, remedy: str
-) -> pd.DataFrame | Unavailable:
+) -> TableOrUnavailable:
     """Return the samples and record their topic; Unavailable with fewer than two samples."""
     topic = layout.topic
     if topics.find(layout) is None:
@@ -127,12 +134,12 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
         imu = imu[offset_us != ACCELEROMETER_OFFSET_INVALID_US]
         time_us = np.rint(imu.index.to_numpy() * 1e6 + offset_us[imu.index].to_numpy())
         kept_rows = longest_increasing_run(time_us.astype(np.int64) + topics.zero_us)
-        imu = imu.iloc[kept_rows].set_axis(pd.Index(time_us[kept_rows] * 1e-6, name="time_s"))
+        imu = imu.iloc[kept_rows].set_axis(time_index(time_us[kept_rows] * 1e-6))
     columns = Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE
     return common.finite_rows(imu, columns, common.MAX_IMU_VALUE)
 
 
-def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavailable:
+def _read_airborne(topics: Topics) -> Spans | Unavailable:
     land_detected = topics.read(px4.LAYOUTS["land_detected"], step=True)
     if land_detected.empty:
         return Unavailable(
@@ -144,7 +151,7 @@ def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavaila
     return common.flight_spans(land_detected["landed"], topics.log.duration_s)
 
 
-def _read_tumble_spans(topics: Topics) -> tuple[tuple[float, float], ...]:
+def _read_tumble_spans(topics: Topics) -> Spans:
     is_upright = (
         topics.read(px4.LAYOUTS["failure"], step=True)[["roll", "pitch"]].max(axis=1) == 0.0
     )

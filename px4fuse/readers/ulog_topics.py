@@ -24,6 +24,7 @@ from pyulog.exceptions import ULogException
 from px4fuse.arrays import IntArray
 from px4fuse.ekf2_parameters import REPORTED, replace_invalid_parameters
 from px4fuse.errors import LogError
+from px4fuse.flight import time_index
 from px4fuse.log import Dropout, LogInfo, Stream
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
@@ -65,6 +66,9 @@ _PARSE_ERRORS = (
 )
 
 
+# Arrays of one topic instance by PX4 field name, and all topics by name and instance
+Table = dict[str, NDArray[Any]]
+Tables = dict[tuple[str, int], Table]
 # (start time in s, primary EKF2 instance from then on)
 Instances = tuple[tuple[float, int], ...]
 # Without the selector topic there is one EKF2 instance
@@ -186,7 +190,7 @@ class Topics:
     """
 
     log: LogInfo
-    tables: dict[tuple[str, int], dict[str, NDArray[Any]]]
+    tables: Tables
     zero_us: int
     dropped: dict[tuple[str, int], int]
     ekf2_parameters: Mapping[str, float]
@@ -198,7 +202,7 @@ class Topics:
         """Return the sorted instance numbers of a topic with data."""
         return sorted(instance for name, instance in self.tables if name == topic)
 
-    def of(self, topic: str) -> list[dict[str, NDArray[Any]]]:
+    def of(self, topic: str) -> list[Table]:
         """Return the tables of a topic's instances, in order."""
         return [self.tables[topic, number] for number in self.instances(topic)]
 
@@ -256,7 +260,7 @@ class Topics:
                     * layout.scale.get(column, 1.0)
                     for column, field_name in columns.items()
                 },
-                index=pd.Index((time_us[kept_rows] - self.zero_us) * _MICROSECOND, name="time_s"),
+                index=time_index((time_us[kept_rows] - self.zero_us) * _MICROSECOND),
             )
         frame = frame.where(np.abs(frame) < MAX_FIELD_VALUE)  # damaged values become NaN
         end_s = self.log.duration_s + MAX_OUTSIDE_S
@@ -306,18 +310,22 @@ class Topics:
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
             for table in self.of(topics[0])
         )
-        clock = (
-            f"autopilot boot clock, at {'measurement' if has_measurement_time else 'publication'}"
+        self.streams[data_kind] = Stream(
+            topics,
+            f"autopilot boot clock, at {'measurement' if has_measurement_time else 'publication'}",
+            self.log.name,
         )
-        self.streams[data_kind] = Stream(topics, clock, self.log.name)
 
 
 def _empty_frame(layout: Layout) -> pd.DataFrame:
-    times = pd.Index([], dtype=np.float64, name="time_s")
-    return pd.DataFrame(columns=list(layout.columns), index=times, dtype=np.float64)
+    return pd.DataFrame(
+        columns=list(layout.columns),
+        index=time_index(np.zeros(0)),
+        dtype=np.float64,
+    )
 
 
-def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
+def measurement_time_us(table: Table) -> NDArray[np.int64]:
     """Return the measurement time (µs): ``timestamp_sample`` if it is boot time.
 
     Otherwise the publication time ``timestamp`` is returned, which is up to 0.2 s later in EKF2
@@ -366,8 +374,7 @@ def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
 def dropped_notes(topic_counts: Iterable[tuple[str, int]]) -> tuple[str, ...]:
     """Format the notes on samples that were dropped because of invalid timestamps."""
     return tuple(
-        f"samples of {topic} dropped because their timestamps are zero, decrease or are outside of "
-        f"the recording: {count}"
+        f"samples of {topic} dropped because of an invalid timestamp: {count}"
         for topic, count in topic_counts
     )
 
@@ -397,7 +404,7 @@ def read_topics(name: str, content: bytes) -> Topics:
     if not time_tables:
         raise LogError(
             f"{name}: the ULog contains no samples",
-            "If the file is incomplete, copy it again. Otherwise record with SDLOG_PROFILE 129.",
+            "Copy the file again, or record with SDLOG_PROFILE 129.",
         )
     if not tables:
         names = sorted({topic for topic, _ in time_tables})
@@ -441,9 +448,9 @@ def read_topics(name: str, content: bytes) -> Topics:
     )
 
 
-def _read_tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:
+def _read_tables(ulog: ULog) -> Tables:
     """Return the topic tables; two subscriptions to a topic are merged to their common fields."""
-    tables: dict[tuple[str, int], dict[str, NDArray[Any]]] = {}
+    tables: Tables = {}
     for data in ulog.data_list:
         if "timestamp" not in data.data:
             continue
@@ -462,9 +469,7 @@ def _read_tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:
     return tables
 
 
-def _data_span(
-    tables: dict[tuple[str, int], dict[str, NDArray[Any]]], name: str
-) -> tuple[int, int]:
+def _data_span(tables: Tables, name: str) -> tuple[int, int]:
     """Return the first and last time (µs) of the IMU, or else of the topic with most samples."""
     for key in sorted(
         tables, key=lambda key: (key[0] != IMU.topic, -len(tables[key]["timestamp"]))
@@ -478,7 +483,7 @@ def _data_span(
             return int(longest_us[0]), int(longest_us[-1])
     raise LogError(
         f"{name}: all timestamps are zero",
-        "The logger started before the clock of the autopilot. Record again.",
+        "Record again.",
     )
 
 

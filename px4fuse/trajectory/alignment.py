@@ -84,8 +84,7 @@ def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) ->
     if len(estimate_m) < MIN_POSES:
         raise TrajectoryError(
             f"{len(estimate_m)} poses match in time; an alignment needs at least {MIN_POSES}",
-            "Check that both trajectories are of the same flight and use the same clock "
-            "(--time-offset auto).",
+            "Check that both are of the same flight, or give `time_offset_s` auto.",
         )
     if kind == "none":
         return Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0)
@@ -168,7 +167,7 @@ def _require_determined(
         residual_m = rms_m(reference_m - transform.apply(estimate_m))
         limit = MAX_LINE_RATIO
         motion_text = f"motion is along a line: {length:.2g} m (RMS), across it"
-        alternative = "`alignment` yaw if z is vertical in both, or `alignment` none"
+        alternative = "`alignment` yaw or none"
     if extent_m < max(MIN_EXTENT_M, MIN_EXTENT_FRACTION * length) or residual_m > limit * extent_m:
         raise TrajectoryError(
             f"the alignment {kind} cannot be estimated: the {motion_text} {extent_m:.2g} m, and "

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Slerp
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.arrays import Array, BoolArray, IntArray, median_interval
 from px4fuse.errors import TrajectoryError
 from px4fuse.record import Count, NotNegative, Record
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
@@ -102,7 +102,7 @@ def associate(
         ((time_s < first_s - end_tolerance_s) | (time_s > last_s + end_tolerance_s)).sum()
     )
     steps_s = np.diff(time_s[pose_indices])
-    max_step_s = max(5.0 * float(np.median(np.diff(estimate.time_s))), 0.5)
+    max_step_s = max(5.0 * median_interval(estimate.time_s), 0.5)
     covered_fraction = float(steps_s[steps_s <= max_step_s].sum() / (last_s - first_s))
     used_count = len(np.unique(pose_indices))
     all_poses = len(estimate)
@@ -120,7 +120,7 @@ def associate(
 
 def gap_limit(time_s: Array, min_limit_s: float = MIN_GAP_LIMIT_S) -> float:
     """Return the longest interval (s) between successive timestamps that is interpolated."""
-    return max(MAX_GAP_INTERVALS * float(np.median(np.diff(time_s))), min_limit_s)
+    return max(MAX_GAP_INTERVALS * median_interval(time_s), min_limit_s)
 
 
 def is_bracketed(time_s: Array, reference_s: Array, limit_s: float) -> BoolArray:
@@ -140,8 +140,11 @@ def _interpolate_poses(trajectory: Trajectory, time_s: Array) -> Trajectory:
     rotation = trajectory.rotation
     if rotation is not None and len(time_s):
         rotation = Slerp(trajectory.time_s, rotation)(time_s)
-    interpolated = trajectory.with_positions(positions_at(trajectory, time_s))
-    return replace(interpolated, rotation=rotation, time_s=time_s)
+    return replace(
+        trajectory.with_positions(positions_at(trajectory, time_s)),
+        rotation=rotation,
+        time_s=time_s,
+    )
 
 
 def positions_at(trajectory: Trajectory, time_s: Array) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import structs
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array
+from px4fuse.arrays import Array, median_interval
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight import Unavailable
 from px4fuse.notebook_display import one_line_repr
@@ -303,8 +303,8 @@ def _choose_time_offset(
     offset_s, (low_s, high_s) = estimated.offset_s or 0.0, estimated.interval_s or (0.0, 0.0)
     is_doubtful = not low_s <= 0.0 <= high_s and abs(offset_s) >= MIN_DOUBTFUL_OFFSET_S
     warning = (
-        f"The timestamps are used unchanged, but the motions match best with {offset_s:+.3f} s "
-        "added to the estimate. If the clocks are unrelated, give --time-offset auto."
+        f"The timestamps are unchanged, but the motions match best with {offset_s:+.3f} s added "
+        "to the estimate. For unrelated clocks, give --time-offset auto."
     )
     return clock_offset, [warning] if is_doubtful else []
 
@@ -312,8 +312,8 @@ def _choose_time_offset(
 def _swap_warnings(estimate: Trajectory, reference: Trajectory) -> Iterator[str]:
     if reference.kind == "truth" != estimate.kind:
         return
-    estimate_interval_s = float(np.median(np.diff(estimate.time_s)))
-    reference_interval_s = float(np.median(np.diff(reference.time_s)))
+    estimate_interval_s = median_interval(estimate.time_s)
+    reference_interval_s = median_interval(reference.time_s)
     action = "Check the order of the arguments: first the estimate, then the reference."
     if estimate.kind == "truth" != reference.kind:
         yield f"{estimate.name} is ground truth, but {reference.name} is not. {action}"
@@ -329,9 +329,8 @@ def _comparison_warnings(
 ) -> Iterator[str]:
     if matched.coverage_estimate < MIN_COVERAGE:
         yield (
-            f"Only {matched.coverage_estimate:.0%} of the poses of the estimate are evaluated: "
-            f"{matched.outside} are before or after the reference, {matched.in_gaps} in gaps of "
-            "the reference."
+            f"Only {matched.coverage_estimate:.0%} of the poses of the estimate are evaluated; the "
+            "reference has no poses at the other times."
         )
     if matched.coverage_reference < MIN_COVERAGE:
         yield (
@@ -364,7 +363,6 @@ def _estimate_body_rotation(
     # chordal mean (Hartley 2013, section 5.3)
     rotation = (aligned.rotation.inv() * reference.rotation).mean()
     return rotation, (
-        "The body axes of camera and vehicle differ by an estimated constant rotation of "
-        f"{np.degrees(rotation.magnitude()):.1f}°, which is not part of the rotation errors. The "
-        "lever arm between camera and vehicle is part of the position errors.",
+        "Rotation errors exclude the estimated constant rotation from vehicle to camera axes, "
+        f"{np.degrees(rotation.magnitude()):.1f}°. Position errors include their lever arm.",
     )

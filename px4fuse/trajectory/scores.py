@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, stdtrit
 
-from px4fuse.arrays import Array, IntArray
+from px4fuse.arrays import Array, IntArray, median_interval
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Unavailable
 from px4fuse.notebook_display import one_line_repr
@@ -149,8 +149,8 @@ def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
     length_m = float(distance_m[-1])
     span_s = float(time_s[-1] - time_s[0])
     # The minimum distance or time of a pair is two median intervals between poses
-    median_step_m = float(np.median(np.diff(distance_m)))
-    median_interval_s = float(np.median(np.diff(time_s)))
+    median_step_m = median_interval(distance_m)
+    median_interval_s = median_interval(time_s)
     min_distance_m = max(MIN_DELTA_FRACTION * length_m, 2.0 * median_step_m)
     max_distance_m = MAX_DELTA_FRACTION * length_m
     distances = [
@@ -288,8 +288,11 @@ def get_rotations(
     """Return the orientations of both trajectories; Unavailable if either has none."""
     if aligned.rotation is not None and reference.rotation is not None:
         return aligned.rotation, reference.rotation
-    reason = f"the {'estimate' if aligned.rotation is None else 'reference'} has no orientation"
-    return Unavailable(analysis_name, reason, "Give a trajectory with orientation.")
+    return Unavailable(
+        analysis_name,
+        f"the {'estimate' if aligned.rotation is None else 'reference'} has no orientation",
+        "Give a trajectory with orientation.",
+    )
 
 
 def rmse_interval(

@@ -10,8 +10,6 @@ file with EKF2 or the IMU. A position file is in metres with z vertical and has 
 positions are correlated, and yaw and origin are fitted robustly.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +19,7 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Slerp
 from scipy.special import stdtrit
 
-from px4fuse.arrays import Array, BoolArray
+from px4fuse.arrays import Array, BoolArray, median_interval
 from px4fuse.record import Record, Span
 from px4fuse.trajectory.alignment import Transform, rms_m, umeyama
 from px4fuse.trajectory.association import gap_limit, is_bracketed, positions_at
@@ -112,7 +110,7 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
         position or rotation.
     """
     # The trajectory with the shorter pose intervals is interpolated
-    if _median_step(estimate) >= _median_step(reference):
+    if median_interval(estimate.time_s) >= median_interval(reference.time_s):
         return _search_offset(estimate, reference)
     reversed_offset = _search_offset(reference, estimate)
     if reversed_offset.offset_s is None or reversed_offset.interval_s is None:
@@ -121,10 +119,6 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
     return structs.replace(
         reversed_offset, offset_s=-reversed_offset.offset_s, interval_s=(-high_s, -low_s)
     )
-
-
-def _median_step(trajectory: Trajectory) -> float:
-    return float(np.median(np.diff(trajectory.time_s)))
 
 
 def _search_offset(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
@@ -174,8 +168,8 @@ def _search_offset(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
         offset_s=best_fit.offset_s,
         interval_s=(best_fit.offset_s - half_interval_s, best_fit.offset_s + half_interval_s),
         is_determinable=True,
-        reason="The time offset has the maximum speed correlation, refined by minimum ATE "
-        f"({best_fit.rms_m:.3g} m after a similarity alignment, {len(best_fit.time_s)} poses).",
+        reason="The time offset has the maximum speed correlation and the minimum ATE "
+        f"({best_fit.rms_m:.3g} m, {len(best_fit.time_s)} poses).",
     )
 
 
@@ -189,7 +183,7 @@ def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]
     """Return a regular time grid and the smoothed velocities on it."""
     time = trajectory.time_s
     grid = time[0] + step_s * np.arange(int((time[-1] - time[0]) / step_s) + 1)
-    sigma = max(SMOOTHING_S, _median_step(trajectory)) / step_s
+    sigma = max(SMOOTHING_S, median_interval(trajectory.time_s)) / step_s
     smooth: Array = gaussian_filter1d(positions_at(trajectory, grid), sigma, axis=0, order=1)
     return grid, smooth / step_s
 
@@ -206,13 +200,13 @@ def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArr
     time = trajectory.time_s
     grid, velocity = _grid_velocity(trajectory, step_s)
     # Interpolated between key frames, but not across gaps with lost tracking
-    is_known = is_bracketed(grid, time, max(10.0 * _median_step(trajectory), 0.5))
+    is_known = is_bracketed(grid, time, max(10.0 * median_interval(trajectory.time_s), 0.5))
     speeds = [np.linalg.norm(velocity, axis=1)]
     if trajectory.rotation is not None:
         rotations = Slerp(time, trajectory.rotation)(grid)
         rates = (rotations[:-1].inv() * rotations[1:]).as_rotvec() / step_s
         rates = np.concatenate((rates, rates[-1:]))
-        sigma = max(SMOOTHING_S, _median_step(trajectory)) / step_s
+        sigma = max(SMOOTHING_S, median_interval(trajectory.time_s)) / step_s
         speeds.append(np.linalg.norm(gaussian_filter1d(rates, sigma, axis=0), axis=1))
     return speeds, is_known
 

@@ -121,7 +121,7 @@ def _test_edge(graph: model.PoseGraph, edge: int, residual: Array, covariance: A
     ):
         raise TrajectoryError(
             f"The closure from vertex {vertices[0]} to {vertices[1]} cannot be tested: its "
-            "information is zero, or differs too much in magnitude from the odometry information.",
+            "information is zero, or differs too much from the odometry information",
             "Give information matrices of similar magnitude.",
         )
     d2 = float(observed_residual @ np.linalg.solve(residual_covariance, observed_residual))
@@ -137,7 +137,7 @@ def _covariances(graph: model.PoseGraph, chain_edges: IntArray) -> Array:
         edge = chain_edges[int(np.argmin(is_full_rank))]
         raise TrajectoryError(
             f"The odometry edge from vertex {graph.ids[graph.first[edge]]} to "
-            f"{graph.ids[graph.second[edge]]} has no information in one direction.",
+            f"{graph.ids[graph.second[edge]]} has no information in one direction",
             "Give information in all directions.",
         )
     covariance = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])

@@ -1,7 +1,5 @@
 """Initial poses of a pose graph from its edges."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

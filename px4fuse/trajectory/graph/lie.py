@@ -201,11 +201,10 @@ def _left_jacobian_inverse(phi: Array) -> Array:
         skew_matrix = from_elements((0.0, -phi[..., 0]), (phi[..., 0], 0.0))
     else:
         skew_matrix = skew(phi)
-    theta = np.linalg.norm(phi, axis=-1)[..., None, None]
     return (
         np.eye(skew_matrix.shape[-1])
         - 0.5 * skew_matrix
-        + _cot_term(theta) * (skew_matrix @ skew_matrix)
+        + _cot_term(np.linalg.norm(phi, axis=-1)[..., None, None]) * (skew_matrix @ skew_matrix)
     )
 
 

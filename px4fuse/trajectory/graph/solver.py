@@ -1,7 +1,5 @@
 """Pose graph optimisation by Levenberg-Marquardt, optionally robust against false closures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -138,7 +136,7 @@ def solve(
         The graph has no edges, is not connected, contains a number that is not finite, or ``gnc``
         drops all edges to some poses.
     """
-    model.require_connected(graph, np.ones(len(graph.first), dtype=bool), "the edges")
+    model.require_connected(graph, np.ones(len(graph.first), bool), "the edges")
     is_doubtful = ~graph.is_successive if is_closure is None else is_closure
     start = model.residuals(graph, graph.poses)
     cost_initial = 0.5 * float(np.sum(start.chi2))
@@ -205,8 +203,9 @@ def _minimise(
                 # Decrease of the linearised cost
                 predicted_drop = 0.5 * float(np.sum(step * (damping * step + gradient)))
                 tangent = np.concatenate([np.zeros(graph.degrees_of_freedom), step[:, 0]])
-                motion = lie.exp(tangent.reshape(len(graph), -1))
-                trial = model.residuals(graph, lie.compose(state.poses, motion))
+                trial = model.residuals(
+                    graph, lie.compose(state.poses, lie.exp(tangent.reshape(len(graph), -1)))
+                )
                 trial_weights, costs = kernel(trial.chi2)
                 drop = cost - float(np.sum(costs))
                 is_flat = abs(drop) < tolerance * cost
