@@ -370,8 +370,8 @@ def test_loop_slam_file_is_levelled_with_small_closure_error() -> None:
 @pytest.mark.parametrize(("how", "says"), [
     ({"closures": (GivenClosure(-5.0, 50.0),)}, "closure -5,50: the times"),
     ({"closures": (GivenClosure(20.0, 50.0, 200.0),)}, "SIGMA 200 is out of range"),
-    ({"start_s": 500.0, "end_s": 600.0}, "only 0 poses between"),
-    ({"start_s": 96.0, "end_s": 98.0}, "too short for a loop"),
+    ({"start_s": 500.0, "end_s": 600.0}, "has 0 poses between"),
+    ({"start_s": 96.0, "end_s": 98.0}, "is too short for key frames"),
     ({"key_frames_m": 101.0}, "`key_frames_m` 101 is out of range"),
 ])  # fmt: skip
 def test_loop_invalid_segment_or_closure_is_refused(sample, how, says) -> None:

@@ -392,7 +392,7 @@ def test_read_position_csv_backward_timestamps_are_dropped(read, shifts_us, drop
 @pytest.mark.parametrize("name", ["tag_id", "tagid", "node"])
 def test_read_position_csv_several_tags_have_note(read, name):
     file = read(table({name: ["A1", "B2"] * (ROWS // 2), **PLAIN}))
-    assert_stated(file, "positions of 2 tags (such as 'A1')")
+    assert_stated(file, "the file contains 2 tags (such as 'A1')")
 
 
 # -- the options -----------------------------------------------------------------------------------
@@ -456,12 +456,12 @@ def test_read_position_csv_missing_column_is_named(read):
     (b"Dear all,\nplease find attached\nthe log.\n", "The first line is 'Dear all,'"),
     (b"a" * 40 + b"\nb\n", f"The first line is '{'a' * 40}'"),
     (b"a" * 41 + b"\nb\n", f"The first line is '{'a' * 37}...'"),
-    (table(PLAIN, header=False), "Give a CSV file with a header, or name its"),
+    (table(PLAIN, header=False), "Name the columns with"),
     (table({"when": UNIX_S, "x": X, "y": Y}), "The first line is 'when,x,y'"),
     (table({"time": UNIX_S, "x": X, "b": Y}), "no header"),
     (table({"time": UNIX_S, "x [ft]": X, "y [ft]": Y}), "no header"),
     (table({"t": UNIX_S, "lat": X, "lon": Y}), "no header"),
-    (table(PLAIN, decimal=","), "has 4 columns, but the rows have 8. Export the file with"),
+    (table(PLAIN, decimal=","), "has 4 columns, but the rows have 8. Use decimal points"),
     ("time,x,y,z\n" + table({"n": JUNK, **PLAIN}, header=False), "4 columns, but the rows have 5"),
     (table({**PLAIN, "time": ["12.5"] * ROWS}), "1 usable rows"),
 ])  # fmt: skip

@@ -36,8 +36,8 @@ def cut_trajectory(
     is_inside = (time >= segment.start_s) & (time <= segment.end_s)
     if is_inside.sum() < MIN_POSES:
         raise TrajectoryError(
-            f"{trajectory.name}, {time[0]:.2f} s to {time[-1]:.2f} s, has {int(is_inside.sum())} "
-            f"poses between {segment.start_s:.2f} s and {segment.end_s:.2f} s; {MIN_POSES} are needed"
+            f"{trajectory.name} ({time[0]:.2f} s to {time[-1]:.2f} s) has {is_inside.sum()} poses "
+            f"between {segment.start_s:.2f} s and {segment.end_s:.2f} s; {MIN_POSES} are needed"
         )
     segment_track = trajectory[is_inside]
     if not rests_at_ends:
