@@ -155,7 +155,7 @@ def test_align_sample_file_without_options_recovers_placement(
 ) -> None:
     alignment, track = align(sample_flight, external)
     assert alignment.frame == "enu"
-    assert "fits EKF2 position best" in alignment.frame_reason
+    assert "smallest residual against EKF2 position" in alignment.frame_reason
     assert alignment.reference == EKF2_POSITION
     assert alignment.yaw_deg == 0.0
     assert alignment.yaw_sigma_deg is None
@@ -214,7 +214,9 @@ def test_align_frame_is_from_columns_or_best_fit(flight: Flight, frame: str) -> 
     file = uwb_file(flight, frame=frame)
     alignment, track = align(flight, file)
     assert alignment.frame == frame
-    assert alignment.frame_reason.startswith(f"fits EKF2 position best; residuals: {frame} 0.1")
+    assert alignment.frame_reason.startswith(
+        f"smallest residual against EKF2 position ({frame} 0.1"
+    )
     assert_same_track(track, flight.positions[0], 1e-9)
     alignment, _ = align(flight, replace(file, frame=frame))
     assert alignment.frame == frame
@@ -423,7 +425,7 @@ def test_align_file_of_other_flight_is_refused(flight: Flight) -> None:
 def test_align_periodic_path_needs_clock_offset(yaw: Any) -> None:
     flight = replace(aisle_flight(), log=replace(aisle_flight().log, boot_time_s=BOOT_S))
     file = uwb_file(flight)
-    said = r"from this path; offsets that differ by [1-6]0\.\d s fit.*"
+    said = r"cannot be estimated: two offsets that differ by [1-6]0\.\d s fit.*"
     with pytest.raises(MissingDataError, match=said + BOTH_SPANS + r".*Give `clock_offset_s`\.$"):
         align_position_file(flight, file, frame="enu", yaw_deg=yaw)
     alignment, _ = align(flight, file, frame="enu", yaw_deg=yaw, clock_offset_s=OFFSET_S)
@@ -439,11 +441,11 @@ def test_align_almost_periodic_path_warns() -> None:
     alignment, _ = align(flight, uwb_file(flight), frame="enu")
     assert clock_error_s(alignment) < 0.03
     (warning,) = alignment.warnings
-    assert re.match(r"A time offset that differs by [-+]19\.\d s fits nearly as well\. ", warning)
+    assert re.match(r"A time offset that differs by [-+]19\.\d s fits nearly as well: ", warning)
 
 
 @pytest.mark.parametrize(("options", "message"), [
-    ({"frame": "utm"}, "Frame utm is not known. Use one of ned, enu, nwu."),
+    ({"frame": "utm"}, "`frame` utm is not valid. Use one of ned, enu, nwu."),
     ({"yaw_deg": float("nan")}, "`yaw_deg` nan is not a finite number."),
     ({"yaw_deg": "north"}, "`yaw_deg` north is not valid: give degrees or auto."),
     ({"clock_offset_s": float("inf")}, "`clock_offset_s` inf is not a finite number."),

@@ -425,7 +425,7 @@ def test_compare_damaged_data_gives_finite_results(tmp_path, damage):
     results = outcome_results(request, run_or_evaluate_aids(request))
     assert not re.search(r"\b(nan|inf)\b|e\+[23]\d", to_json(results))
     if damage is truth_impossible:
-        reason = "vehicle_local_position_groundtruth has no sample"
+        reason = "vehicle_local_position_groundtruth has no finite sample"
         assert any(reason in missing.reason for missing in results.missing)
 
 
