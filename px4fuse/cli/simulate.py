@@ -33,7 +33,7 @@ from px4fuse.simulation.scenario import (
 )
 
 if TYPE_CHECKING:
-    from px4fuse.assignment.random_assignment import Kinds
+    from px4fuse.assignment.random_assignment import FlightKind
     from px4fuse.report.page import Page
     from px4fuse.simulation.flights import Simulation
 
@@ -186,7 +186,7 @@ def simulate(
     """
     _check_options(assignment)
     if assignment is not None:
-        random_choices = _read_secret(secret_file), cast("Kinds", kind), mistakes
+        random_choices = _read_secret(secret_file), cast("FlightKind", kind), mistakes
         _write_assignment(
             assignment, output, answer, *random_choices, truth=not no_truth, preview=preview
         )
@@ -252,7 +252,7 @@ def _write_assignment(
     folder: Path,
     answer_path: Path | None,
     secret: bytes | None,
-    kind: Kinds,
+    kind: FlightKind,
     count: int | None,
     *,
     truth: bool,
