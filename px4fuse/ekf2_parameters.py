@@ -7,6 +7,7 @@ parameters of external vision and GNSS from the aid (``EV_POS.noise``).
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import msgspec
 
@@ -86,9 +87,8 @@ FLOAT32_TOLERANCE = 1e-6
 RECEIVER_DELAYS = ("SENS_GNSS0_DELAY", "SENS_GPS0_DELAY")
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """One parameter of EKF2.
+class Parameter(NamedTuple):
+    """Unit, default and range of one EKF2 parameter.
 
     Attributes
     ----------

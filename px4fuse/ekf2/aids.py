@@ -160,13 +160,15 @@ def flight_span(flight: Flight) -> tuple[float, float] | Unavailable:
         return 0.0, flight.log.duration_s
     if not flight.airborne:
         return Unavailable("aids of EKF2", "the vehicle never took off", "Record a flight.")
-    start, end = flight.airborne[0][0], flight.airborne[-1][1]
+    start = flight.airborne[0][0]
+    end = flight.airborne[-1][1]
     if isinstance(flight.ekf2, Ekf2):
         down = flight.ekf2.state["down_m"].loc[start:end]
         height = (down.iloc[0] if len(down) else 0.0) - down
         high = height.index[height > min(MIN_HEIGHT_M, height.max() / 2.0)]
         if len(high):
-            start, end = float(high[0]), float(high[-1])
+            start = float(high[0])
+            end = float(high[-1])
     return start, end
 
 
@@ -222,7 +224,9 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
         noise_median = float(np.median(np.sqrt(noise[fused, 0]))) if fused.any() else None
     else:
         rejected = np.max(innovation**2 / variance, axis=1, initial=0.0) > gate**2
-        fused, is_reset, noise_median = ~rejected, np.zeros(len(samples), bool), None
+        fused = ~rejected
+        is_reset = np.zeros(len(samples), bool)
+        noise_median = None
     is_evaluated = (fused | rejected) & enabled & ~is_reset
     unfused_span_s = _longest_gap(times, fused & enabled, log, start_s, end_s)
     axes = {}
@@ -283,7 +287,8 @@ def _largest_mean_change(time_s: Array, normalised: Array) -> Span | None:
         .agg(["mean", "size"])
         .query("size >= @MIN_WINDOW_SAMPLES")
     )
-    mean, largest_change = window_statistics["mean"].to_numpy(), None
+    mean = window_statistics["mean"].to_numpy()
+    largest_change = None
     for window_index in range(MIN_WINDOWS_BEFORE, len(mean) - 2):
         mean_change = float(
             np.mean(mean[window_index + 1 : window_index + 3]) - np.mean(mean[:window_index])

@@ -29,8 +29,10 @@ class BiasEstimator:
     """
 
     def __init__(self, value_m: Array, variance_m2: Array, start_s: float, step_s: float) -> None:
-        self.value_m, self.variance_m2 = value_m, variance_m2
-        self.mean_signed_ratio, self.last_s = np.zeros_like(value_m), np.full_like(value_m, start_s)
+        self.value_m = value_m
+        self.variance_m2 = variance_m2
+        self.mean_signed_ratio = np.zeros_like(value_m)
+        self.last_s = np.full_like(value_m, start_s)
         self.filter_weight = step_s / (FILTER_S + step_s)
 
     def remove_bias(
@@ -54,13 +56,15 @@ class BiasEstimator:
         weight : float
             Number of samples in EKF2 that the logged sample represents.
         """
-        updates_now, bounded_noise = has_sample & updates_bias, np.maximum(noise_m2, MIN_NOISE_M2)
+        updates_now = has_sample & updates_bias
+        bounded_noise = np.maximum(noise_m2, MIN_NOISE_M2)
         density_factor = np.where(
             np.abs(self.mean_signed_ratio) > MAX_MEAN_SIGNED_RATIO, NOISE_FACTOR, 1.0
         )
         variance_growth = BIAS_DENSITY**2 * (time_s - self.last_s) * density_factor * updates_now
         variance = np.minimum(self.variance_m2 + variance_growth, bounded_noise)
-        nu, R = nu + self.value_m, noise_m2 + variance
+        nu = nu + self.value_m
+        R = noise_m2 + variance
         S = variance + np.maximum((noise_m2 + predicted_variance) / weight, MIN_NOISE_M2)
         ratio = nu * nu / (BIAS_GATE**2 * S)
         K = variance / S * (updates_now & (ratio < 1.0))

@@ -187,7 +187,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     intervals: Sequence[Intervals],
 ) -> SegmentRun:
     """Run variants through one segment; ``intervals`` has one element per variant."""
-    size, events = len(variants), len(intervals[0].events)
+    size = len(variants)
+    events = len(intervals[0].events)
     parameters = {
         name: np.array([v.settings[name] for v in variants]) for name in variants[0].settings
     }
@@ -217,8 +218,10 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
 
     event = stacked("events")
     action = np.where(has_gate, event["action"], np.where(event["usable"], FUSE, IDLE))
-    event_steps, is_active = event["end_step"], action > IDLE
-    event_time_s, has_sample = segment.time_s[event_steps], np.any(is_active, axis=1).tolist()
+    event_steps = event["end_step"]
+    is_active = action > IDLE
+    event_time_s = segment.time_s[event_steps]
+    has_sample = np.any(is_active, axis=1).tolist()
     enabled = {
         aid.name: event_time_s < np.array([v.without.get(aid.name, np.inf) for v in variants])
         for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, EV_POS, *SENSORS)
@@ -226,7 +229,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     can_fuse_velocity = (action == FUSE) & enabled[GNSS_VEL.name] & fuses_velocity
     sample = np.maximum(intervals[0].events.sample, 0)
     measured, noise = _measurements(inputs, segment, sample, event_steps, parameters, reported)
-    is_sequential, has_speed = inputs.aid == GNSS_POS, inputs.received.velocity_m_s is not None
+    is_sequential = inputs.aid == GNSS_POS
+    has_speed = inputs.received.velocity_m_s is not None
     gates = [parameters.get(GNSS_VEL.gate, np.ones(size)), parameters[inputs.aid.gate]]
     gate2 = np.maximum(np.repeat(np.stack(gates, axis=1), 3, axis=1), MIN_GATE) ** 2
     # logged EKF2 values are used as measurements of height and, without magnetometer, of heading
@@ -309,7 +313,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     rejected, fused, reset = np.zeros((3, events, size), bool)
     position_reset_m = np.zeros((events, size, 2))
     states, state_variances = np.empty((2, events + 1, size, x.shape[1]))
-    states[0], state_variances[0] = x, _diagonal(P)
+    states[0] = x
+    state_variances[0] = _diagonal(P)
     innovation, R = np.empty((2, size, 4))
     measured_slice = slice(0 if has_speed else POSITION_COLUMNS.start, POSITION_COLUMNS.stop)
     is_component_fused = np.zeros((size, POSITION_COLUMNS.stop), bool)
@@ -336,7 +341,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         bias_variance += (bias_variance < variance_limit) * variance_growth[block_index]
         if floor is not None:
             _limit_bias(P, floor, biases)
-        innovation[:, 2:], R[:, 2:] = 0.0, IGNORED_VARIANCE
+        innovation[:, 2:] = 0.0
+        R[:, 2:] = IGNORED_VARIANCE
         if field_samples is not None and has_field[e]:
             field_now = EventSamples(*(axis_values[e] for axis_values in field_samples))
             x, P, field_record[e] = fuse_field(
@@ -351,7 +357,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         if has_sample[e]:
             nu = measured[e] - x[:, MEASURED_STATES]
             S = _diagonal(P)[:, MEASURED_STATES] + noise[e]
-            innovations[e], variances[e] = nu, S
+            innovations[e] = nu
+            variances[e] = S
             is_outside_gate = nu * nu > gate2 * S
             is_velocity_fused = can_fuse_velocity[e] & ~(
                 is_outside_gate[:, VELOCITY_COLUMNS].any(axis=1) & has_gate
@@ -372,10 +379,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 if field_samples is None:
                     for row in range(HEADING):
                         _, P = _reduce_variance_to(P, row, attitude_variance[e, :, row])
-                is_component_fused[:, VELOCITY_COLUMNS], is_component_fused[:, POSITION_COLUMNS] = (
-                    is_velocity_fused[:, None],
-                    fused[e, :, None],
-                )
+                is_component_fused[:, VELOCITY_COLUMNS] = is_velocity_fused[:, None]
+                is_component_fused[:, POSITION_COLUMNS] = fused[e, :, None]
                 x, P = _sequential_update(
                     x, P, nu, S, noise[e], measured_slice, is_component_fused[:, measured_slice]
                 )
@@ -418,8 +423,10 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             x, P = vision.fuse(e, x, P, True, fusion.last_position_s)
             if inputs.rules.with_velocity:  # a fused position of GNSS or of vision is sufficient
                 fusion.last_position_s = np.maximum(fusion.last_position_s, vision.fused_s)
-        states[e + 1], state_variances[e + 1] = x, _diagonal(P)
-    innovations[~is_active], variances[~is_active] = np.nan, np.nan
+        states[e + 1] = x
+        state_variances[e + 1] = _diagonal(P)
+    innovations[~is_active] = np.nan
+    variances[~is_active] = np.nan
     return SegmentRun(
         segment,
         tuple(variants),
@@ -476,10 +483,8 @@ def _sequential_update(
     nu, S, R = (each[:, components] for each in (nu, S, R))
     weight = is_fused / S
     square = weight * weight
-    b, rows = (
-        2.0 * weight - square * R,
-        slice(MEASURED_STATES.start + components.start, MEASURED_STATES.start + components.stop),
-    )
+    b = 2.0 * weight - square * R
+    rows = slice(MEASURED_STATES.start + components.start, MEASURED_STATES.start + components.stop)
     columns = P[:, rows].copy()
     for j in range(nu.shape[1]):
         column = columns[:, j]
@@ -539,10 +544,8 @@ class _Fusion:
         size = len(self.has_gate)
 
         self.last_position_s, self.last_velocity_s = np.full((2, size), self.start_s)
-        self.is_stopped, self.remaining_resets = (
-            np.zeros(size, bool),
-            np.full(size, self.rules.resets),
-        )
+        self.is_stopped = np.zeros(size, bool)
+        self.remaining_resets = np.full(size, self.rules.resets)
         # True for events at which the gate alone decides, without the state machine
         self.only_gate_decides = (
             (self.action == FUSE).all(axis=1) & ~self.reset & ~(self.rejected > 0.0)
@@ -562,9 +565,13 @@ class _Fusion:
         is_velocity_fused : ndarray of bool, shape (S,)
             True if the velocity innovation is inside its gate.
         """
-        rules, now_s, action = self.rules, self.time_s[e], self.action[e]
-        has_gate, follows_log = self.has_gate, self.uses_logged_decisions
-        may_fuse, is_decision_logged = action == FUSE, math.isfinite(self.rejected[e])
+        rules = self.rules
+        now_s = self.time_s[e]
+        action = self.action[e]
+        has_gate = self.has_gate
+        follows_log = self.uses_logged_decisions
+        may_fuse = action == FUSE
+        is_decision_logged = math.isfinite(self.rejected[e])
         self.last_velocity_s = np.where(is_velocity_fused, now_s, self.last_velocity_s)
         if self.only_gate_decides[e] and not (is_outside_gate.any() or self.is_stopped.any()):
             self.last_position_s = now_s
@@ -629,7 +636,8 @@ def with_correlation(inputs: Inputs, segment: ReplaySegment, intervals: Interval
     accelerometer bias than EKF2. The correlations are estimated from the flight before the segment,
     or else from the first seconds of the segment.
     """
-    flown_variant, inputs = Variant(inputs.settings), replace(inputs, vision=None)
+    flown_variant = Variant(inputs.settings)
+    inputs = replace(inputs, vision=None)
     if (history := segment.history) is not None:
         history = replace(history, correlation=_settled_correlation(history))
         history_intervals = make_intervals(inputs, history, flown_variant.timing(inputs))
@@ -648,7 +656,8 @@ def with_correlation(inputs: Inputs, segment: ReplaySegment, intervals: Interval
     if segment.field is not None:
         # EKF2 has just reset heading and fields, so these states are uncorrelated with all others
         correlation = block_diag(correlation[:STATES, :STATES], np.eye(len(segment.state) - STATES))
-        correlation[HEADING], correlation[:, HEADING] = 0.0, 0.0
+        correlation[HEADING] = 0.0
+        correlation[:, HEADING] = 0.0
         correlation[HEADING, HEADING] = 1.0
     return replace(segment, correlation=correlation)
 
@@ -727,7 +736,8 @@ def _measurements(
     uses_reported_noise: BoolArray,
 ) -> tuple[Array, Array]:
     """Return measured velocity and position, and their variances, each of shape (E, S, 6)."""
-    received, aid = inputs.received, inputs.aid
+    received = inputs.received
+    aid = inputs.aid
     offset_m = (np.stack([parameters[name] for name in aid.lever_arm], -1) - inputs.imu_offset_m)[
         :, :, None
     ]

@@ -33,7 +33,8 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     """
     begin_s = flow.index - (flow["samples"] - 1.0) * flow["interval_s"]
     flow = flow[(begin_s > segment.time_s[0]) & (flow.index <= segment.time_s[-1])]
-    count, interval_s = flow["samples"].to_numpy(), flow["interval_s"].to_numpy()
+    count = flow["samples"].to_numpy()
+    interval_s = flow["interval_s"].to_numpy()
     step, weight = low_pass_weights(
         segment, flow.index.to_numpy(), count, interval_s, FLOW_FILTER_WEIGHT
     )
@@ -41,10 +42,8 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     imu_velocity = np.einsum(
         "ki,kiab,kib->ka", weight, rotation_to_body, segment.imu_velocity_m_s[step]
     )
-    velocity, mean = (
-        flow[["forward_m_s", "right_m_s"]],
-        np.einsum("ki,kiab->kab", weight, rotation_to_body),
-    )
+    velocity = flow[["forward_m_s", "right_m_s"]]
+    mean = np.einsum("ki,kiab->kab", weight, rotation_to_body)
     sample_fields = (
         step[:, 0],
         velocity.to_numpy() - imu_velocity,

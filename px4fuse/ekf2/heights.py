@@ -46,7 +46,8 @@ def add_heights(
     flight: Flight, ekf2: Ekf2, record: FusionRecord, segments: Sequence[ReplaySegment]
 ) -> tuple[ReplaySegment, ...] | str:
     """Add height samples to the segments, or return the reason why the log is not sufficient."""
-    parameters, times = record.parameters, np.concatenate([segment.time_s for segment in segments])
+    parameters = record.parameters
+    times = np.concatenate([segment.time_s for segment in segments])
     if fuses_by_mask(parameters):
         return "EKF2 before PX4 v1.14 fuses only one height sensor"
     enabled = {name: log.enabled for name, log in ekf2.aids.items() if log.enabled is not None}
@@ -71,9 +72,11 @@ def add_heights(
     effect_height_m = parameters.get("EKF2_GND_EFF_DZ", DEFAULT_DEAD_ZONE_M)
     dead_zone_m = np.where(record.was_in_state(GROUND_EFFECT, measured_at_s), effect_height_m, 0.0)
     ekf2_rate_hz = OLD_BAROMETER_HZ if record.per_step_biases else BAROMETER_HZ
-    new_segments, delayed = [], record.delayed["down_m"]
+    new_segments = []
+    delayed = record.delayed["down_m"]
     for segment in segments:
-        start_s, bias = float(segment.time_s[0]), (0.0, 0.0)
+        start_s = float(segment.time_s[0])
+        bias = (0.0, 0.0)
         for aid_name in {*fused} - {reference}:
             logged_bias = record.height_bias.get(aid_name)
             if (
@@ -162,7 +165,8 @@ class HeightFilter:
         parameters: Mapping[str, Array],
         has_gate: BoolArray,
     ) -> None:
-        heights, size = segment.heights, len(has_gate)
+        heights = segment.heights
+        size = len(has_gate)
         assert heights is not None
         self.fused = heights.fused
         self.down_m, self.age_s, measured_at_s, self.dead_zone_m, is_sample = barometer
@@ -176,9 +180,11 @@ class HeightFilter:
         self.gate2 = [np.where(has_gate, gate**2, np.inf) for gate in gates]
         self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SIGMA), MIN_SIGMA) ** 2
         self.biased = [aid.name != heights.reference for aid in SENSORS]
-        self.weight, self.learning = (heights.weight, 1.0), enabled[heights.reference]
+        self.weight = (heights.weight, 1.0)
+        self.learning = enabled[heights.reference]
         value_m, variance_m2 = (np.full(size, part) for part in heights.bias)
-        start_s, step_s = float(segment.time_s[0]), float(np.median(segment.step_s))
+        start_s = float(segment.time_s[0])
+        step_s = float(np.median(segment.step_s))
         self.bias = BiasEstimator(value_m, variance_m2, start_s, step_s)
 
     def updates(self, sensor: str, variant: int, end_s: Array) -> pd.DataFrame:
@@ -186,17 +192,15 @@ class HeightFilter:
 
         ``end_s`` is the time of each event.
         """
-        rows, slots = [], len(self.down_m)
+        rows = []
+        slots = len(self.down_m)
         for slot in [slots] if sensor == GNSS_HGT.name else range(slots):
-            times, has_sample = self.time_s[slot], self.has_sample[slot][:, variant]
+            times = self.time_s[slot]
+            has_sample = self.has_sample[slot][:, variant]
             measured_s = times[has_sample, min(variant, times.shape[1] - 1)]
             rows.append(
                 np.vstack(
-                    [
-                        measured_s,
-                        self.update_log[has_sample, slot, :, variant].T,
-                        end_s[has_sample],
-                    ]
+                    [measured_s, self.update_log[has_sample, slot, :, variant].T, end_s[has_sample]]
                 )
             )
         measured_s, nu, S, fused, end_s = np.hstack(rows)
@@ -221,7 +225,8 @@ class HeightFilter:
                     e, slot, 0, x, P, column, predicted_variance, nu, self.noise_m2
                 )
         if self.any[-1][e]:
-            column, nu = P[:, :, DOWN], gnss_m - x[:, DOWN]
+            column = P[:, :, DOWN]
+            nu = gnss_m - x[:, DOWN]
             x, P = self._fuse_innovation(e, -1, 1, x, P, column, column[:, DOWN], nu, gnss_m2)
         return x, P
 
@@ -239,7 +244,8 @@ class HeightFilter:
     ) -> tuple[Array, Array]:
         """Fuse one innovation; ``column`` is PH', ``predicted_variance`` HPH'."""
         if self.biased[sensor_index]:
-            has_sample, time_s = self.has_sample[slot][e], self.time_s[slot][e]
+            has_sample = self.has_sample[slot][e]
+            time_s = self.time_s[slot][e]
             nu, R = self.bias.remove_bias(
                 nu,
                 predicted_variance,

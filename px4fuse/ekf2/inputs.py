@@ -224,7 +224,9 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         are replaced by the logged EKF2 height. Without optical flow the replay is interrupted in
         gaps of the source. Vision in addition to GNSS is omitted.
     """
-    imu, attitude, ekf2 = flight.imu, flight.attitude, flight.ekf2
+    imu = flight.imu
+    attitude = flight.attitude
+    ekf2 = flight.ekf2
     if isinstance(imu, Unavailable):
         return imu
     if isinstance(attitude, Unavailable):
@@ -232,10 +234,12 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if isinstance(ekf2, Unavailable):
         return ekf2
     aid = replayed_aid(ekf2)
-    is_gnss, logged_ekf2 = aid == GNSS_POS, ekf2
+    is_gnss = aid == GNSS_POS
+    logged_ekf2 = ekf2
     if is_gnss:
         ekf2 = with_gnss_innovations(ekf2)
-    record, horizon_s = ekf2.record, ekf2.horizon_s
+    record = ekf2.record
+    horizon_s = ekf2.horizon_s
     if isinstance(record, Unavailable):
         return record
     if MODEL_NOTE in flight.log.notes:  # the simulated earth is a sphere without rotation
@@ -281,7 +285,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         if not flight.log.firmware.startswith(FIRST_RELEASE_WITH_HORIZON_TIMES):
             return Unavailable(ANALYSIS_NAME, horizon_s.reason, horizon_s.remedy)
         horizon_s = 0.0  # EKF2_EV_DELAY is at most EKF2_PREDICT_US, so the buffer has one step
-    aiding_s, flow = position_samples.stamp_s, record.flow if is_gnss else record.flow.iloc[:0]
+    aiding_s = position_samples.stamp_s
+    flow = record.flow if is_gnss else record.flow.iloc[:0]
     if len(flow) and FLOW.name not in doubtful:
         aiding_s = np.union1d(aiding_s, flow.index)
     segments = find_replay_segments(flight, imu, attitude, ekf2, record, aiding_s, is_gnss=is_gnss)
@@ -419,11 +424,13 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
         )
     parameters = record.parameters
     switch = int(parameters.get(GNSS_POS.switch, 7.0))
-    samples, velocities = track.samples, track.velocity
+    samples = track.samples
+    velocities = track.velocity
     # EKF2 does not use fixes while GNSS is disabled
     if (enabled := ekf2.aids[GNSS_POS.name].enabled) is not None:
         is_enabled = step_values_at(enabled, samples.index) > 0.0
-        samples, velocities = samples[is_enabled], velocities[is_enabled]
+        samples = samples[is_enabled]
+        velocities = velocities[is_enabled]
     # the track has measurement times; the delay is added to get timestamps, because the replay
     # subtracts it again
     flown = effective_settings(parameters, GNSS_POS)
@@ -544,8 +551,10 @@ def _logged_decisions(
     ekf2: Ekf2, record: FusionRecord, timestamp_s: Array, aid: Aid = EV_POS
 ) -> tuple[Array, BoolArray]:
     """Return the logged rejection and reset of each sample, matched by measurement time."""
-    rejected, reset = np.full(len(timestamp_s), np.nan), np.zeros(len(timestamp_s), dtype=bool)
-    innovations, horizon_s = ekf2.innovations["north"], ekf2.horizon_s
+    rejected = np.full(len(timestamp_s), np.nan)
+    reset = np.zeros(len(timestamp_s), dtype=bool)
+    innovations = ekf2.innovations["north"]
+    horizon_s = ekf2.horizon_s
     has_own_topic = aid_source(aid) in ekf2.innovation_topics
     if (
         isinstance(innovations, Unavailable)

@@ -101,28 +101,28 @@ class Timing:
 def make_intervals(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Intervals:
     """Compute the intervals of a segment; ``timing`` does not change number and order of events."""
     events = _events(inputs, segment, timing)
-    start, end = np.concatenate([[0], events.end_step[:-1]]), events.end_step
-    count, duration_s = len(end), segment.time_s[end] - segment.time_s[start]
+    start = np.concatenate([[0], events.end_step[:-1]])
+    end = events.end_step
+    count = len(end)
+    duration_s = segment.time_s[end] - segment.time_s[start]
     transition = np.tile(np.eye(STATES), (count, 1, 1))
     correction_input, acceleration_input = np.zeros((2, count, STATES))
     effects = _effects(segment, start, end)
-    transition[:, :IMU_STATE_COUNT, THETA], transition[:, :IMU_STATE_COUNT, BIASES] = (
-        effects[..., :3],
-        effects[..., 3:9],
-    )
-    correction_input[:, :IMU_STATE_COUNT], acceleration_input[:, :IMU_STATE_COUNT] = (
-        effects[..., CORRECTION_COLUMN],
-        effects[..., INPUT_COLUMN],
-    )
+    transition[:, :IMU_STATE_COUNT, THETA] = effects[..., :3]
+    transition[:, :IMU_STATE_COUNT, BIASES] = effects[..., 3:9]
+    correction_input[:, :IMU_STATE_COUNT] = effects[..., CORRECTION_COLUMN]
+    acceleration_input[:, :IMU_STATE_COUNT] = effects[..., INPUT_COLUMN]
     transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
     noises = _noises((end - start).astype(float), duration_s, transition[:, VELOCITY, THETA])
     return Intervals(events, transition, correction_input, acceleration_input, *noises)
 
 
 def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
-    received, time_s = inputs.received, segment.time_s
+    received = inputs.received
+    time_s = segment.time_s
     first, last_row = np.searchsorted(received.stamp_s, time_s[[0, -1]])
-    stamp, last = received.stamp_s[first:last_row], len(time_s) - 1
+    stamp = received.stamp_s[first:last_row]
+    last = len(time_s) - 1
     measured_s = stamp - timing.delay_s - 0.5 * inputs.step_s
     # a sample that arrives after the fusion horizon has passed its time is fused late, or never
     due_s = np.maximum(measured_s, received.arrival_s[first:last_row] - timing.horizon_s)
@@ -136,21 +136,15 @@ def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
     # additional events in gaps of the source; their number does not depend on the delay
     gap_s = np.diff(np.concatenate([time_s[:1], stamp, time_s[-1:]]))
     extra_events = np.maximum(np.ceil(gap_s / inputs.max_interval_s).astype(int) - 1, 0)
-    sample_places, total = (
-        np.cumsum(extra_events[:-1] + 1) - 1,
-        len(stamp) + int(extra_events.sum()),
-    )
-    known_places, ends = (
-        np.concatenate([[-1], sample_places, [total]]),
-        np.concatenate([[0], end, [last]]),
-    )
+    sample_places = np.cumsum(extra_events[:-1] + 1) - 1
+    total = len(stamp) + int(extra_events.sum())
+    known_places = np.concatenate([[-1], sample_places, [total]])
+    ends = np.concatenate([[0], end, [last]])
     events = np.zeros(total, EVENT)
     events["end_step"] = np.rint(np.interp(np.arange(total), known_places, ends))
     events["sample"], events["time_s"] = -1, time_s[events["end_step"]]
-    late, lost = (
-        is_inside & is_in_time & (due_s - measured_s > MIN_LATENESS_S),
-        is_inside & ~is_in_time,
-    )
+    late = is_inside & is_in_time & (due_s - measured_s > MIN_LATENESS_S)
+    lost = is_inside & ~is_in_time
     samples = np.arange(first, last_row)
     events[sample_places] = np.rec.fromarrays(
         [end, samples, action, is_usable, can_start, late, lost, measured_s], dtype=EVENT
@@ -207,8 +201,10 @@ def _effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
     for step_number, count in zip(
         steps, np.searchsorted(-length[longest_first], -steps), strict=True
     ):
-        step, rows = first[:count] + step_number, slice(count)
-        dt, force = segment.step_s[step][:, None, None], force_m_s2[step]
+        step = first[:count] + step_number
+        rows = slice(count)
+        dt = segment.step_s[step][:, None, None]
+        force = force_m_s2[step]
         rotation_step = -segment.rotation[1:][step] * dt  # ∂δθ/∂b_g and ∂v/∂b_a of one step
         position[rows] += 0.5 * dt * velocity[rows]
         velocity[rows] += (-skew(force) * dt) @ attitude[rows]  # ∂v/∂δθ of one step

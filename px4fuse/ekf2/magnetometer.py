@@ -44,7 +44,8 @@ def mean_by_event(
     (:class:`~px4fuse.ekf2.replay_segments.ReplaySegment`) is required.
     """
     event = np.searchsorted(event_steps, sensor_samples.step)
-    is_inside, size = event < len(event_steps), len(event_steps)
+    is_inside = event < len(event_steps)
+    size = len(event_steps)
     event = event[is_inside]
     count = np.maximum(np.bincount(event, minlength=size), 1)
 
@@ -96,7 +97,8 @@ def fuse_mean(
     bias_rows : slice, optional
         Indices of a body-frame bias state that adds to the measurement.
     """
-    state, sample_count = x[:, rows], sample_mean.sample_count
+    state = x[:, rows]
+    sample_count = sample_mean.sample_count
     cross_state, cross_theta = (
         (vectors @ CROSS).reshape(-1, 3, 3) for vectors in (state, x[:, THETA])
     )
@@ -107,11 +109,13 @@ def fuse_mean(
     if bias_rows is not None:
         H[:, :, bias_rows] = EYE
         predicted += x[:, bias_rows]
-    nu, HP = sample_mean.value - predicted, H @ P
+    nu = sample_mean.value - predicted
+    HP = H @ P
     S = HP @ H.transpose(0, 2, 1)
     diagonal = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]  # a view of the diagonal of S
     innovation_record = np.empty((3, *nu.shape))
-    innovation_record[0], innovation_record[1] = nu, diagonal + R[:, None]
+    innovation_record[0] = nu
+    innovation_record[1] = diagonal + R[:, None]
     has_sample = sample_count > 0.0
     is_fused = has_sample & (nu * nu <= gate[:, None] ** 2 * innovation_record[1]).all(axis=1)
     innovation_record[2] = is_fused[:, None]

@@ -207,7 +207,8 @@ def replay_settings(
     SettingsError
         Unknown parameter or aid, or a value outside PX4's range.
     """
-    changes, inputs = [check_parameters(change) for change in settings], model.inputs
+    changes = [check_parameters(change) for change in settings]
+    inputs = model.inputs
     unmodelled = PARAMETERS.keys() - inputs.settings.keys()
     unused_parameters = dict.fromkeys(unmodelled, f"EKF2 fused {inputs.aid.label} in this log")
     height_text = f"the replay uses the logged EKF2 height ({inputs.height_reason})"
@@ -293,7 +294,8 @@ def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
         Standard deviation of the noise (m), per axis.
     seed : int
     """
-    inputs, rng = model.inputs, np.random.default_rng(seed)
+    inputs = model.inputs
+    rng = np.random.default_rng(seed)
     new_inputs: dict[str, Any] = {}
     for name, samples in {"received": inputs.received, "vision": inputs.vision}.items():
         if samples is not None:
@@ -437,7 +439,8 @@ def _position_updates(run: SegmentRun, variant_index: int) -> pd.DataFrame:
     values = np.hstack(
         [nu, s, flags, variance_after[:, 6:8], variance_after[:, 3:5], r, fused_at_s, *speed]
     )
-    index, columns = pd.Index(events.time_s[sampled_events], name="time_s"), UPDATE_COLUMNS
+    index = pd.Index(events.time_s[sampled_events], name="time_s")
+    columns = UPDATE_COLUMNS
     updates = pd.DataFrame(values, index, [*columns, *VELOCITY_UPDATE_COLUMNS])
     return updates if np.isfinite(speed[0]).any() else updates[columns]
 
@@ -446,7 +449,8 @@ def _delayed_and_published(
     inputs: Inputs, run: SegmentRun, variant_index: int
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return the state at the fusion horizon and the published state at each prediction step."""
-    segment, variant = run.segment, run.variants[variant_index]
+    segment = run.segment
+    variant = run.variants[variant_index]
     state, reset = delayed_states(run, variant_index)
     horizon_s = min(variant.timing(inputs).horizon_s, MAX_HORIZON_S)
     lag = max(round(horizon_s / inputs.step_s), 1)
@@ -468,9 +472,13 @@ def delayed_states(run: SegmentRun, variant_index: int) -> tuple[Array, Array]:
     state : ndarray, shape (n + 1, 15)
     reset_m : ndarray, shape (n + 1, 3)
     """
-    event_steps, variant = run.events[variant_index].end_step, run.variants[variant_index]
-    segment, event_states = run.segment, run.state[:, variant_index]
-    count, rotation, dt = len(segment.step_s), segment.rotation[1:], segment.step_s[:, None]
+    event_steps = run.events[variant_index].end_step
+    variant = run.variants[variant_index]
+    segment = run.segment
+    event_states = run.state[:, variant_index]
+    count = len(segment.step_s)
+    rotation = segment.rotation[1:]
+    dt = segment.step_s[:, None]
     interval = np.searchsorted(event_steps, np.arange(count), side="right")
     first_step = np.searchsorted(interval, interval)
     state = event_states[np.concatenate([[0], interval])]
@@ -501,7 +509,8 @@ def delayed_states(run: SegmentRun, variant_index: int) -> tuple[Array, Array]:
     speed = state[1:, VELOCITY]
     state[1:, POSITION] += sum_since_event(0.5 * dt * (value_before_step(speed, VELOCITY) + speed))
     state[event_steps] = event_states[1:]
-    reset, position_reset_m = np.zeros((count + 1, 3)), run.position_reset_m[:, variant_index]
+    reset = np.zeros((count + 1, 3))
+    position_reset_m = run.position_reset_m[:, variant_index]
     for e in np.flatnonzero(position_reset_m.any(axis=1)):
         reset[event_steps[e] :, :2] += position_reset_m[e]
     return state, reset

@@ -67,7 +67,8 @@ def publish(
     velocity_m_s, position_m : ndarray, shape (n + 1, 3)
         Published state. Until step ``lag`` it is dead reckoning from the first state.
     """
-    step_s, mean_step = segment.step_s[:, None], float(np.mean(segment.step_s))
+    step_s = segment.step_s[:, None]
+    mean_step = float(np.mean(segment.step_s))
     # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
     force = segment.force_m_s2 - delay_by(state[:, ACCELEROMETER_BIAS], lag)[1:]
     force = np.einsum("nij,nj->ni", segment.rotation[1:], force)
@@ -145,7 +146,8 @@ def corrections(
         & (row < len(correction_increments))
         & is_usable[np.clip(row, 0, len(correction_increments) - 1)]
     )
-    row, sample_index = row[is_inside], np.nonzero(is_inside)[1]
+    row = row[is_inside]
+    sample_index = np.nonzero(is_inside)[1]
     decay_start, decay_end = (
         np.exp(-np.maximum(time_s[each] - sample_s[sample_index], 0.0) / tau_s)
         for each in (row, row + 1)
@@ -183,7 +185,8 @@ def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float)
     """
     gain = ATTITUDE_GAIN * step_s / max(horizon_s, step_s)
     numerator, denominator = np.zeros((2, lag + 2))
-    numerator[-1], denominator[:2] = gain, (1.0, -1.0)
+    numerator[-1] = gain
+    denominator[:2] = (1.0, -1.0)
     denominator[-1] += gain
     return _recursive_filter(numerator, denominator, error_rad)
 

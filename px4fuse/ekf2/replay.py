@@ -276,7 +276,8 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
         )
     axes: dict[str, AxisAgreement]
     axes = {axis: _axis_agreement(axis, log, model, ekf2, replay) for axis in HORIZONTAL}
-    north, east = axes["north"], axes["east"]
+    north = axes["north"]
+    east = axes["east"]
     rejected_in_log, rejected_in_model = (
         frame["rejected"].to_numpy() > 0 for frame in (log, model)
     )
@@ -366,7 +367,8 @@ def _velocity_agreement(
         return {}, False
     names: dict[str, str] = {}  # rename velocity columns to the names of position columns
     for axis in AXIS_NAMES:
-        nu, S = f"innovation_{axis}_m", f"innovation_variance_{axis}_m2"
+        nu = f"innovation_{axis}_m"
+        S = f"innovation_variance_{axis}_m2"
         names |= {f"{nu}_s": nu, f"{S}_s2": S, f"innovation_{axis}": nu, f"variance_{axis}": S}
     logged = logged.rename(columns=names)
     model = model[VELOCITY_UPDATE_COLUMNS].rename(columns=names)

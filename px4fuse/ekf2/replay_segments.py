@@ -265,9 +265,11 @@ def samples_by_event(
     event = np.searchsorted(event_steps, measurement_step)
     event = event[event < len(event_steps)]
     count = len(event)
-    measurement_step, event_step = measurement_step[:count], event_steps[event]
+    measurement_step = measurement_step[:count]
+    event_step = event_steps[event]
     age_s = segment.time_s[event_step] - segment.time_s[measurement_step]
-    path, speed = segment.imu_displacement_m[:, axes], segment.imu_velocity_m_s[:, axes]
+    path = segment.imu_displacement_m[:, axes]
+    speed = segment.imu_velocity_m_s[:, axes]
     position_m = (
         position_m[:count]
         + path[event_step]
@@ -316,7 +318,8 @@ def find_replay_segments(
     """
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
-    fused, states = innovations.index.to_numpy(), record.delayed.index.to_numpy()
+    fused = innovations.index.to_numpy()
+    states = record.delayed.index.to_numpy()
     time = imu.index.to_numpy()
     cuts = [time[0], time[-1]]
     for stamps, limit in ((time, IMU_GAP_S), (source_s, RESTART_GAP_S)):
@@ -384,7 +387,8 @@ def _make_gnss_segment(
 
 def _add_earth_rotation(segment: ReplaySegment, record: FusionRecord) -> ReplaySegment:
     """Add earth rotation, and convert the published position to EKF2's internal metres."""
-    metres, state = ekf2_metres_per_metre(record), segment.state.copy()
+    metres = ekf2_metres_per_metre(record)
+    state = segment.state.copy()
     state[POSITION] *= metres
     earth_rotation_rad = earth_rate_rad_s(record) * segment.step_s[:, None]
     return replace(
@@ -440,7 +444,8 @@ def _make_segment(
     time = imu.index.to_numpy()
     first_row = int(np.argmin(np.abs(time - record.delayed.index[start_row])))
     rows = slice(first_row, int(np.searchsorted(time, end_s, side="right")))
-    time, imu = time[rows], imu.iloc[rows]
+    time = time[rows]
+    imu = imu.iloc[rows]
     interval = np.diff(time)
     end_stamps = rows_of_timestamps(time, record.delayed.index)
     ends = step_ends(interval, end_stamps, predict_s(record))
@@ -461,10 +466,8 @@ def _make_segment(
     ) -> tuple[Array, Array]:
         """Return the times of a frame, and its attitudes relative to the attitude of each step."""
         is_inside = (frame.index >= times[0] - early_s) & (frame.index <= times[-1])
-        at_s, attitude_samples = (
-            frame.index[is_inside].to_numpy(),
-            frame.loc[is_inside, Columns.QUATERNION].to_numpy(),
-        )
+        at_s = frame.index[is_inside].to_numpy()
+        attitude_samples = frame.loc[is_inside, Columns.QUATERNION].to_numpy()
         return at_s, multiply(attitude_samples, conjugate(interpolate(at_s, times, end_stamps)))
 
     # rotation from the integrated gyro attitude to the published attitude, in the earth frame
@@ -500,7 +503,8 @@ def _make_segment(
 def _field_span(record: FusionRecord) -> tuple[float, float] | None:
     """Return start and end (s) of continuous three-axis magnetometer fusion, or None."""
     fused = record.field_gauss["fused_3d"] if len(record.field_gauss) else pd.Series(dtype=float)
-    times, is_fused = fused.index.to_numpy(), fused.to_numpy() > 0.0
+    times = fused.index.to_numpy()
+    is_fused = fused.to_numpy() > 0.0
     if not is_fused.any() or 1.0 / np.median(np.diff(times)) < MIN_MAG_LOG_HZ:
         return None
     first, last = np.flatnonzero(is_fused)[[0, -1]]
@@ -513,7 +517,8 @@ def _add_field(
     segment: ReplaySegment, record: FusionRecord, start_row: int, step_s: float
 ) -> ReplaySegment:
     """Add the logged magnetic fields to the states of a segment."""
-    start, frame = record.delayed.iloc[start_row], record.field_gauss
+    start = record.delayed.iloc[start_row]
+    frame = record.field_gauss
     stamps = frame.index.to_numpy()
     age_s = record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     weight = max(MAG_FUSION_HZ * float(np.median(np.diff(stamps))), 1.0)
@@ -540,7 +545,8 @@ def _mean_field(
     between_s = np.diff(measured_at_s)
     is_inside = (measured_at_s[:-1] > segment.time_s[0]) & (measured_at_s[1:] <= segment.time_s[-1])
     rows = np.flatnonzero(is_inside & (between_s > 0.0) & (between_s < RESTART_GAP_S)) + 1
-    measured_at_s, between_s = measured_at_s[rows], between_s[rows - 1]
+    measured_at_s = measured_at_s[rows]
+    between_s = between_s[rows - 1]
     count = np.maximum(np.rint(MAG_FUSION_HZ * between_s), 1.0)
     share = between_s / (between_s + count * FILTER_S)
     decay = ((1.0 - share) ** count)[:, None]
@@ -603,7 +609,8 @@ def add_field_states(
         Magnetic fields of earth (NED) and body (FRD) at the start, and their variances.
     """
     step, is_inside = sample_steps(segment, measured_at_s)
-    rotation_to_body, count = segment.rotation[step].transpose(0, 2, 1), len(step)
+    rotation_to_body = segment.rotation[step].transpose(0, 2, 1)
+    count = len(step)
     return replace(
         segment,
         state=np.concatenate([segment.state, fields]),
@@ -653,13 +660,17 @@ def step_ends(interval_s: Array, logged_ends: IntArray, target_s: float) -> IntA
     """
     samples_needed = samples_per_step(target_s, float(np.median(interval_s)), logged_ends)
     known_ends = set(logged_ends.tolist())
-    ends, count, total = [], 0, 0.0
+    ends = []
+    count = 0
+    total = 0.0
     for sample, interval in enumerate(interval_s.tolist(), start=1):
-        count, total = count + 1, total + interval
+        count = count + 1
+        total = total + interval
         is_complete = count >= samples_needed and total > 0.5 * target_s
         if is_complete or total > target_s or sample in known_ends:
             ends.append(sample)
-            count, total = 0, 0.0
+            count = 0
+            total = 0.0
     return np.array(ends, dtype=np.intp)
 
 

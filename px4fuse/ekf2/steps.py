@@ -208,11 +208,10 @@ def explain_by_steps(
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
     variants = step_variants(model.inputs, settings or Settings())
-    delayed, flown = (
-        delayed_variants(model, list(variants.values())),
-        replay_with_logged_rejections(model),
-    )
-    evaluated_spans, times = model.flown.evaluated_s, ekf2.state.index.to_numpy()
+    delayed = delayed_variants(model, list(variants.values()))
+    flown = replay_with_logged_rejections(model)
+    evaluated_spans = model.flown.evaluated_s
+    times = ekf2.state.index.to_numpy()
     is_inside = inside_spans(times, evaluated_spans)
     # compare only at times that the replay and all KF runs cover
     for index in (flown.delayed.index, *(run.steps.index for run in (runs or {}).values())):
@@ -227,7 +226,8 @@ def explain_by_steps(
     span = float(times[0]), float(times[-1])
     directions = {name: run.axis.direction for name, run in (runs or {}).items()}
     directions = directions or {"north": np.eye(3)[0], "east": np.eye(3)[1]}
-    without_gate, stages = flown.delayed, []
+    without_gate = flown.delayed
+    stages = []
     # one track at a time, to limit memory
     tracks = chain(delayed, (flown.published, ekf2.state))
     for stage, track in zip((*variants, OUTPUT, "EKF2 as logged"), tracks, strict=True):
@@ -247,7 +247,8 @@ def explain_by_steps(
             without_gate = track
     spans = Segment(*span, "").cut(evaluated_spans)
     longest_rejection = _longest_rejection(flown, without_gate, span, evaluated_spans)
-    truth, steps_by_axis = model.flight.truth, {}
+    truth = model.flight.truth
+    steps_by_axis = {}
     no_truth = OTHER_TIME if isinstance(truth, Truth) else truth
     for axis_index, (axis, direction) in enumerate(directions.items()):
         kf_state = state_at(runs[axis], times) if runs else stages[0][axis_index]
@@ -293,7 +294,9 @@ def explain_by_steps(
 
 def step_variants(inputs: Inputs, kf_settings: Settings) -> dict[str, Variant]:
     """Return the filter configuration of each step except the last, the output predictor."""
-    flown, aid, received = inputs.settings, inputs.aid, inputs.received
+    flown = inputs.settings
+    aid = inputs.aid
+    received = inputs.received
     kf_process_noise = {
         "EKF2_ACC_NOISE": float(
             kf_settings.sigma_a_m_s2 * np.sqrt(kf_settings.dt_s / inputs.step_s)
@@ -342,14 +345,17 @@ def _longest_rejection(
 ) -> RejectionRun | None:
     updates = flown.updates[inside_spans(flown.updates.index, spans)]
     updates = updates[updates["fused_at_s"].between(*span)]
-    rejected, time = updates["rejected"].to_numpy() > 0, updates["fused_at_s"].to_numpy()
+    rejected = updates["rejected"].to_numpy() > 0
+    time = updates["fused_at_s"].to_numpy()
     if not rejected.any():
         return None
     # a run lasts from its first rejected sample to the first sample that is fused again
     change = np.diff(rejected.astype(int), prepend=0, append=0)
-    starts, ends = np.flatnonzero(change == 1), np.flatnonzero(change == -1)
+    starts = np.flatnonzero(change == 1)
+    ends = np.flatnonzero(change == -1)
     longest = int(np.argmax(ends - starts))
-    begin, end = time[starts[longest]], time[min(ends[longest], len(time) - 1)]
+    begin = time[starts[longest]]
+    end = time[min(ends[longest], len(time) - 1)]
     rejected_part = flown.delayed.loc[begin:end]
     ungated_difference = [
         rejected_part[column]

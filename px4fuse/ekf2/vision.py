@@ -51,7 +51,8 @@ def vision_samples(
     Rows: north and east (see :func:`~px4fuse.ekf2.replay_segments.samples_by_event`), age,
     measurement time, fusion time, reported variances north and east, and 1.
     """
-    vision, time_s = inputs.vision, segment.time_s
+    vision = inputs.vision
+    time_s = segment.time_s
     assert vision is not None
     measured_at_s = vision.stamp_s - settings[EV_POS.delay] * 1e-3 - 0.5 * inputs.step_s
     due_s = np.maximum(measured_at_s, vision.arrival_s - horizon_s)
@@ -110,7 +111,8 @@ class VisionFilter:
         has_sample = (samples[7] > 0.0) & enabled[EV_POS.name]
         # samples of the last step of an interval are fused after GNSS, earlier samples before
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
-        self.has_gate, self.without_gnss = has_gate, ~enabled[GNSS_POS.name]
+        self.has_gate = has_gate
+        self.without_gnss = ~enabled[GNSS_POS.name]
         self.gate2 = np.maximum(parameters[EV_POS.gate], MIN_GATE)[:, None] ** 2
         reported_variance = samples[5:7] * (reported & (parameters[EV_POS.noise_mode] != 1.0))
         min_variance = np.maximum(parameters[EV_POS.noise], MIN_SIGMA) ** 2
@@ -124,7 +126,8 @@ class VisionFilter:
             np.zeros((size, 2)), unknown_variance, start_s, float(np.median(segment.step_s))
         )
         self.last_sample_s, self.last_attempt_s = np.full((2, size), -np.inf)
-        self.fused_s, self.was_without_gnss = np.full(size, start_s), self.without_gnss[0]
+        self.fused_s = np.full(size, start_s)
+        self.was_without_gnss = self.without_gnss[0]
 
     def updates(self, variant: int, end_s: Array) -> pd.DataFrame:
         """Return the updates of one variant at EKF2's measurement times.
@@ -159,8 +162,10 @@ class VisionFilter:
     def _fuse_sample(
         self, e: int, place: int, has_sample: BoolArray, x: Array, P: Array, gnss_fused_s: Array
     ) -> tuple[Array, Array]:
-        age_s, now_s = self.age_s[place, e][:, None], self.now_s[place, e]
-        without_gnss, noise_m2 = self.without_gnss[e], self.noise_m2[place, e]
+        age_s = self.age_s[place, e][:, None]
+        now_s = self.now_s[place, e]
+        without_gnss = self.without_gnss[e]
+        noise_m2 = self.noise_m2[place, e]
         HP = P[:, HORIZONTAL] - age_s[:, None] * P[:, SPEED]
         S = HP[:, :, HORIZONTAL] - age_s[:, None] * HP[:, :, SPEED]
         diagonal = S.reshape(len(S), -1)[:, ::3]  # a view of the diagonal of S
@@ -175,10 +180,8 @@ class VisionFilter:
             (nu * nu > self.gate2 * diagonal).any(axis=1) & self.has_gate & ~has_restarted
         )
         is_failing = is_outside_gate & (now_s - self.last_attempt_s > MAX_REJECTED_S)
-        restarts, is_fused = (
-            has_sample & (has_restarted | is_failing),
-            has_sample & ~is_outside_gate & ~has_restarted,
-        )
+        restarts = has_sample & (has_restarted | is_failing)
+        is_fused = has_sample & ~is_outside_gate & ~has_restarted
         reset = restarts & (without_gnss | (is_failing & (now_s - gnss_fused_s > MAX_REJECTED_S)))
         is_evaluated = has_sample & ~has_restarted | reset
         # EKF2 logs innovation 0 for a sample to which it resets
@@ -191,14 +194,16 @@ class VisionFilter:
         )
         self.update_log[e, place] = np.where(is_evaluated, np.stack(update_log), np.nan)
         K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
-        x, P = x + (K @ nu[:, :, None])[:, :, 0], P - K @ HP
+        x = x + (K @ nu[:, :, None])[:, :, 0]
+        P = P - K @ HP
         if reset.any():
             position_reset_m = np.where(without_gnss[:, None], distance_m, nu) * reset[:, None]
             variance = np.where(without_gnss[:, None], noise_m2, R)
             set_states(x, P, reset, HORIZONTAL, x[:, HORIZONTAL] + position_reset_m, variance)
             self.position_reset_m[e] += position_reset_m
         if restarts.any():
-            new_bias, no_bias = (restarts & ~reset)[:, None], (reset & without_gnss)[:, None]
+            new_bias = (restarts & ~reset)[:, None]
+            no_bias = (reset & without_gnss)[:, None]
             self.bias.value_m = np.where(
                 new_bias, -distance_m, np.where(no_bias, 0.0, self.bias.value_m)
             )

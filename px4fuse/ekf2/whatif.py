@@ -251,7 +251,8 @@ def what_if(
         return model.agreement.as_unavailable(ANALYSIS_NAME)
     without = without or {}
     replays = replay_settings(model, settings, without=without)
-    flight, evaluated_s = model.flight, model.flown.evaluated_s
+    flight = model.flight
+    evaluated_s = model.flown.evaluated_s
     if without:
         disabled_s = min(without.values())
         # later segments are not used: they start from a logged state that contains the aid
@@ -379,10 +380,8 @@ def _agree(runs: Sequence[Summary]) -> bool:
 
 def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Summary:
     updates = replay.updates
-    evaluated_updates, fused_at_s = (
-        updates[inside_spans(updates.index, evaluated_s)],
-        updates["fused_at_s"].to_numpy(),
-    )
+    evaluated_updates = updates[inside_spans(updates.index, evaluated_s)]
+    fused_at_s = updates["fused_at_s"].to_numpy()
     if evaluated_updates.empty:
         raise SettingsError(
             f"{_change_text(replay)}: {replay.source} would never be fused in the evaluated time; "
@@ -505,7 +504,8 @@ def _make_summary(
     if vision := heights.pop(EV_POS.name, None):
         more["others"] = {EV_POS.name: vision}
     if other_aid_updates.keys() - {EV_POS.name}:
-        more["heights"], more["height_rmse_to_truth_m"] = heights, error_m(np.eye(3)[2])
+        more["heights"] = heights
+        more["height_rmse_to_truth_m"] = error_m(np.eye(3)[2])
     return Summary(
         samples=len(evaluated_updates),
         rejected_fraction=float(evaluated_updates["rejected"].mean()),

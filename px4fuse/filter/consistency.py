@@ -146,7 +146,8 @@ def classify_mean_nis(nis_mean: float, band: tuple[float, float]) -> Verdict:
 
 
 def _verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
-    mean, band = float(np.mean(nis)) / dimensions, nis_band(len(nis), dimensions)
+    mean = float(np.mean(nis)) / dimensions
+    band = nis_band(len(nis), dimensions)
     return {
         "count": len(nis),
         "nis_mean": mean,
@@ -186,7 +187,8 @@ def assess(
     Consistency, or Unavailable with fewer than ten finite innovations.
     """
     is_usable = np.isfinite(innovation_m) & (innovation_variance_m2 > 0)
-    nu_m, variance_m2 = innovation_m[is_usable], innovation_variance_m2[is_usable]
+    nu_m = innovation_m[is_usable]
+    variance_m2 = innovation_variance_m2[is_usable]
     count = len(nu_m)
     if count < MIN_INNOVATIONS:
         return Unavailable(

@@ -162,16 +162,19 @@ def fit_time_correlation(
         return too_few_measurements("time-correlated errors", len(time_s), MIN_MEASUREMENTS)
     first_row = max(0, (len(time_s) - MAX_MEASUREMENTS) // 2)
     rows = slice(first_row, first_row + MAX_MEASUREMENTS)
-    time_s, measured_m = time_s[rows], np.column_stack([axis.measurement_m[rows] for axis in axes])
+    time_s = time_s[rows]
+    measured_m = np.column_stack([axis.measurement_m[rows] for axis in axes])
     for jump in jumps:
         measured_m = measured_m - np.outer(
             time_s >= jump.time_s, [step.value for step in jump.step_m]
         )
-    interval_s, is_outlier = np.diff(time_s, prepend=time_s[0]), np.isin(time_s, outlier_time_s)
+    interval_s = np.diff(time_s, prepend=time_s[0])
+    is_outlier = np.isin(time_s, outlier_time_s)
     is_short_interval = (interval_s < MAX_INTERVAL_RATIO * np.median(interval_s[1:])) & (
         interval_s > 0.0
     )
-    directions, signals = np.array([axis.direction for axis in axes]), SignalCache()
+    directions = np.array([axis.direction for axis in axes])
+    signals = SignalCache()
 
     def undo_low_pass(tau_s: float) -> tuple[PreparedMotion | Unavailable, float]:
         """Return the positions before a low pass, and the Jacobian's contribution to -ln p."""
@@ -204,7 +207,8 @@ def fit_time_correlation(
     if isinstance(prepared_motion, Unavailable):
         return prepared_motion
     offsets = sorted({0.0, clock_offset_s})
-    sigma_z_m, coarse_motion = noises.sigma_z_m, prepared_motion.downsample(COARSE_MEASUREMENTS)
+    sigma_z_m = noises.sigma_z_m
+    coarse_motion = prepared_motion.downsample(COARSE_MEASUREMENTS)
     low_pass = SourceLowPass(0.0, 0.0, 0.0, sigma_z_m)
     correlated_noises = [
         replace(
@@ -230,11 +234,9 @@ def fit_time_correlation(
         )
         for start_noises in (noises, correlated_start)
     )
-    white_full_score, white_noises, correlated_score = (
-        _score_of_fit(white_fit),
-        white_fit.noises,
-        _score_of_fit(correlated_fit),
-    )
+    white_full_score = _score_of_fit(white_fit)
+    white_noises = white_fit.noises
+    correlated_score = _score_of_fit(correlated_fit)
     # time-correlated noise explains much of the effect of a low pass, so a low pass is only fitted
     # if time-correlated noise is significant
     if white_full_score - correlated_score < MIN_GAIN_NATS:
@@ -253,17 +255,16 @@ def fit_time_correlation(
         bounds=(low, high),
         options={"xatol": LOG_TAU_TOLERANCE},
     ).x
-    (score, filtered_noises), tau_s = fit_low_pass(log_tau), float(np.exp(log_tau))
+    (score, filtered_noises) = fit_low_pass(log_tau)
+    tau_s = float(np.exp(log_tau))
     if score < white_full_score:
         correlation = float(np.exp(-np.median(np.diff(time_s)) / tau_s))
         lag_s = float(np.median(np.diff(time_s))) * correlation / (1.0 - correlation)
         low_pass = SourceLowPass(
             correlation, lag_s, white_full_score - score, filtered_noises.sigma_z_m
         )
-    fitted_noises, lag_nats = (
-        correlated_fit.noises,
-        correlated_score - score + (OFFSET_PENALTY_NATS if offset_s else 0.0),
-    )
+    fitted_noises = correlated_fit.noises
+    lag_nats = correlated_score - score + (OFFSET_PENALTY_NATS if offset_s else 0.0)
     values = (
         fitted_noises.correlated_sigma_m,
         fitted_noises.sigma_z_m,
@@ -294,12 +295,11 @@ def fit_time_correlation_to_truth(
     imu_fit : TimeCorrelatedNoise or Unavailable
         Result of :func:`fit_time_correlation`; its ``lag_nats`` is copied to the result.
     """
-    min_gain, lag_nats = MIN_TRUTH_GAIN_NATS, 0.0
+    min_gain = MIN_TRUTH_GAIN_NATS
+    lag_nats = 0.0
     if isinstance(imu_fit, TimeCorrelatedNoise):
-        min_gain, lag_nats = (
-            max(MIN_TRUTH_GAIN_NATS, imu_fit.gain_nats),
-            imu_fit.lag_nats,
-        )
+        min_gain = max(MIN_TRUTH_GAIN_NATS, imu_fit.gain_nats)
+        lag_nats = imu_fit.lag_nats
     true_track = pd.concat([truth["position_m"] for truth in truths], axis=1).dropna()
     time = np.setdiff1d(axes[0].measurement_time_s, outlier_time_s)
     time = time[
@@ -318,7 +318,9 @@ def fit_time_correlation_to_truth(
     residual_basis = np.linalg.qr(nuisance_columns, mode="complete")[0][
         :, nuisance_columns.shape[1] :
     ]
-    residuals, shares, grid_scores = residual_basis.T @ (measured_m - true_m), TRUTH_SHARES, []
+    residuals = residual_basis.T @ (measured_m - true_m)
+    shares = TRUTH_SHARES
+    grid_scores = []
     half_counts = 0.5 * np.array([len(axes), len(residuals)])
     for tau in TRUTH_TAUS_S:
         correlation = (

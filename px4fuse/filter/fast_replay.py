@@ -23,9 +23,13 @@ def quick_replay(axis: Axis, settings: Settings) -> Replay:
         See :func:`~px4fuse.filter.kalman.replay`.
     """
     timeline = make_timeline(axis, settings)
-    measured_m, variance = axis.measurement_m.tolist(), settings.sigma_z_m**2
-    p, v, covariance = measured_m[0], 0.0, INITIAL_COVARIANCE
-    states, updates = [(p, v, *covariance)], []
+    measured_m = axis.measurement_m.tolist()
+    variance = settings.sigma_z_m**2
+    p = measured_m[0]
+    v = 0.0
+    covariance = INITIAL_COVARIANCE
+    states = [(p, v, *covariance)]
+    updates = []
     for dt_s, acceleration, noise_density, measurement_index in zip(
         np.diff(timeline.time_s).tolist(),
         timeline.acceleration_m_s2.tolist(),

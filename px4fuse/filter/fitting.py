@@ -110,7 +110,9 @@ class Likelihood:
         sigma_z_m: float,
         is_coarse: bool = False,
     ) -> None:
-        self.axis_positions, self.weight, self.sigma_z_m = axis_positions, weight, sigma_z_m
+        self.axis_positions = axis_positions
+        self.weight = weight
+        self.sigma_z_m = sigma_z_m
         self.is_tabulated = not any(positions.noise_fixed.any() for positions in axis_positions)
         self.nodes, self.step = nodes, step = COARSE_NODES if is_coarse else NODES
 
@@ -142,7 +144,8 @@ class Likelihood:
         ln_z = log(noises.sigma_z_m) / self.step
         ln_ratio = log(noises.sigma_a_m_s2) / self.step - ln_z
         node_offset = (self.nodes - 1) // 2
-        first_ratio, first_z = floor(ln_ratio) - node_offset, floor(ln_z) - node_offset
+        first_ratio = floor(ln_ratio) - node_offset
+        first_z = floor(ln_z) - node_offset
         ratio_weights = _interpolation_weights(ln_ratio - first_ratio, self.nodes)
         z_weights = _interpolation_weights(ln_z - first_z, self.nodes)
         return float(ratio_weights @ self._scores_at_nodes(first_ratio, first_z) @ z_weights)
@@ -203,7 +206,8 @@ def fit_noises(
 ) -> FittedPositions:
     """Fit positions with given noises and weights."""
     sigma = noises.sigma_z_m
-    ratio, random_walk = noises.sigma_a_m_s2 / sigma, noises.random_walk_m / sigma
+    ratio = noises.sigma_a_m_s2 / sigma
+    random_walk = noises.random_walk_m / sigma
     if noises.correlated_sigma_m:
         position_batches = (
             replace(positions, correlated_noise=(noises.correlated_sigma_m, noises.tau_s))
@@ -255,9 +259,11 @@ def filter_positions(intervals: Preintegrated) -> Positions:
         :, None
     ]
     dp, dv = np.zeros((2, 1, 1, 3, count))
-    dp[0, 0, 0], dv[0, 0, 0] = intervals.delta_position_m, intervals.delta_velocity_m_s
+    dp[0, 0, 0] = intervals.delta_position_m
+    dv[0, 0, 0] = intervals.delta_velocity_m_s
     # an error of the initial state acts as an increment in the first interval
-    dp[0, 0, 1:, 0], dv[0, 0, 2, 0] = (1.0, intervals.length_s[0]), 1.0
+    dp[0, 0, 1:, 0] = (1.0, intervals.length_s[0])
+    dv[0, 0, 2, 0] = 1.0
     return centre_on_path(
         Positions(
             measurement_m=measured_m,
@@ -290,7 +296,9 @@ def maximise_likelihood(
         True to estimate the outliers; False to keep the weights.
     """
     outlier_probability = np.zeros_like(weight)
-    share, width, noises = START_OUTLIER_SHARE, START_OUTLIER_WIDTH, start
+    share = START_OUTLIER_SHARE
+    width = START_OUTLIER_WIDTH
+    noises = start
     for iteration in range(MAX_OUTLIER_ITERATIONS if outliers else 0):
         likelihood = Likelihood(axis_positions, weight, start.sigma_z_m, is_coarse=True)
         noises = _maximise_by_gradient(
@@ -371,11 +379,10 @@ def outlier_variance_factor(
         σ of the outliers over σ.
     """
     share = float(np.mean(outlier_probability))
-    sigma_information, outlier_information = (
-        2.0 * float(np.sum(count)),
-        2.0 * float(np.sum(count * outlier_probability)),
-    )
-    share_information, inverse_square_width = len(square) * share * (1.0 - share), width**-2.0
+    sigma_information = 2.0 * float(np.sum(count))
+    outlier_information = 2.0 * float(np.sum(count * outlier_probability))
+    share_information = len(square) * share * (1.0 - share)
+    inverse_square_width = width**-2.0
     complete_information = np.array(
         [
             [sigma_information, outlier_information, 0.0],

@@ -227,14 +227,16 @@ def _compare_orientations(
     is_covered = (time_s >= attitude_s[0]) & (time_s <= attitude_s[-1])
     if np.count_nonzero(is_covered) < MIN_PARTS * MIN_PART_SAMPLES:
         return None
-    source_yaw_rad, time_s = heading_rad(samples)[is_covered], time_s[is_covered]
+    source_yaw_rad = heading_rad(samples)[is_covered]
+    time_s = time_s[is_covered]
     yaw_rad = np.interp(time_s, attitude_s, heading_rad(attitude))
     rotation_rad = source_yaw_rad - yaw_rad
     rotation_rad -= 2.0 * np.pi * np.round(np.median(rotation_rad) / (2.0 * np.pi))
     is_calm = np.abs(np.gradient(yaw_rad, time_s)) < np.radians(MAX_YAW_RATE_DEG_S)
     if np.count_nonzero(is_calm) < MIN_PARTS * MIN_PART_SAMPLES:
         return None
-    time_s, rotation_rad = time_s[is_calm], rotation_rad[is_calm]
+    time_s = time_s[is_calm]
+    rotation_rad = rotation_rad[is_calm]
     # σ from differences of neighbours; not reduced by averaging, because errors are correlated
     noise_rad = 1.4826 * np.median(np.abs(np.diff(rotation_rad))) / np.sqrt(2.0)
     sigma_rad = np.full(len(time_s), max(float(noise_rad), np.radians(MIN_SIGMA_DEG)))
@@ -252,7 +254,8 @@ def _estimate_from_positions(
     acceleration: pd.DataFrame, samples: pd.DataFrame, dt_s: float, sigma_z: float
 ) -> HeadingError:
     """Estimate the rotation as a filter state, with the maximum-likelihood noises of a grid."""
-    time, measured_m = samples.index.to_numpy(), samples.to_numpy()
+    time = samples.index.to_numpy()
+    measured_m = samples.to_numpy()
     interval_inputs = _interval_inputs(acceleration, time)
     # √DT converts SIGMA_A, a σ over one DT, to the velocity random walk in 1 s
     grid = np.array(
@@ -283,7 +286,8 @@ def _estimate_from_positions(
 
 def _interval_inputs(acceleration: pd.DataFrame, time: Array) -> tuple[Array, Array, Array]:
     """Return Δp (m) and Δv (m/s) north and east, (n, 4), lengths (s), and a mask of IMU gaps."""
-    imu_s, acceleration_m_s2 = acceleration.index.to_numpy(), acceleration.to_numpy()[:, :2]
+    imu_s = acceleration.index.to_numpy()
+    acceleration_m_s2 = acceleration.to_numpy()[:, :2]
     velocity = cumulative_integral(acceleration_m_s2, imu_s)
     integrals = np.hstack([velocity, cumulative_integral(velocity, imu_s)])
     integrals = np.column_stack([np.interp(time, imu_s, column) for column in integrals.T])
@@ -300,8 +304,10 @@ def _interval_inputs(acceleration: pd.DataFrame, time: Array) -> tuple[Array, Ar
 
 def _transitions(increments: Array, dt_s: Array, rotation_rad: float) -> tuple[Array, Array]:
     """Return F and the input vector of every interval, linearised about ``rotation_rad``."""
-    count, dt = len(dt_s), dt_s[:, None, None]
-    cosine, sine = np.cos(rotation_rad), np.sin(rotation_rad)
+    count = len(dt_s)
+    dt = dt_s[:, None, None]
+    cosine = np.cos(rotation_rad)
+    sine = np.sin(rotation_rad)
     rotation = np.array([[cosine, -sine], [sine, cosine]])
     rotation_slope = np.array([[-sine, -cosine], [cosine, -sine]])
     increments = increments.reshape(count, 2, 2)
@@ -317,7 +323,8 @@ def _transitions(increments: Array, dt_s: Array, rotation_rad: float) -> tuple[A
 def _process_noise(dt_s: Array, has_gap: Array, noises: Array) -> Array:
     """Return Q of every interval for each of k sets of noises, shape (n, k, 7, 7)."""
     position, velocity, bias = (slice(axis, axis + 2) for axis in (0, 2, 4))
-    identity, count = np.eye(2), len(noises)
+    identity = np.eye(2)
+    count = len(noises)
     sigma_a_block = (noises[:, 2] ** 2)[:, None, None] * identity
     # unit matrices of Q: for q00, q01, q11, for the random walks per second, and for an IMU gap
     unit_00, unit_01, unit_11, unit_second, unit_gap = unit_noises = np.zeros(
@@ -360,13 +367,15 @@ def _run_filters(
     x[:, :2] = measured_m[0]
     P = np.tile(np.diag(INITIAL_SIGMAS**2), (count, 1, 1))
     steps = [_FilterStep(np.eye(STATES), x, P, x, P)]
-    square_sum, log_s = np.zeros(count), np.zeros(count)
+    square_sum = np.zeros(count)
+    log_s = np.zeros(count)
     R = sigma_z**2 * np.eye(2)
     Q_of = _process_noise(length_s, has_gap, noises)
     for z, F, input_step, Q in zip(
         measured_m[1:], *_transitions(increments, length_s, rotation_rad), Q_of, strict=True
     ):
-        x_prior, P_prior = x @ F.T + input_step, F @ P @ F.T + Q
+        x_prior = x @ F.T + input_step
+        P_prior = F @ P @ F.T + Q
         S = P_prior[:, :2, :2] + R
         # closed form of the 2 × 2 inverse of S
         determinant = S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2
@@ -386,10 +395,12 @@ def _run_filters(
 
 def _smooth_rotation(steps: list[_FilterStep], filter_index: int) -> tuple[Array, Array]:
     """Return the smoothed rotation (rad) and its variance (Rauch, Tung and Striebel 1965)."""
-    state, covariance = steps[-1].x[filter_index], steps[-1].P[filter_index]
+    state = steps[-1].x[filter_index]
+    covariance = steps[-1].P[filter_index]
     rotations = [(state[ROTATION_INDEX], covariance[ROTATION_INDEX, ROTATION_INDEX])]
     for step, next_step in zip(steps[-2::-1], steps[:0:-1], strict=True):
-        P_prior, P = next_step.P_prior[filter_index], step.P[filter_index]
+        P_prior = next_step.P_prior[filter_index]
+        P = step.P[filter_index]
         gain = np.linalg.solve(P_prior, next_step.F @ P).T
         state = step.x[filter_index] + gain @ (state - next_step.x_prior[filter_index])
         covariance = P + gain @ (covariance - P_prior) @ gain.T

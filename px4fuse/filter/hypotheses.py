@@ -127,7 +127,8 @@ class BiasScaleJumpFit:
     @property
     def bias(self) -> Estimate:
         """Magnitude of the horizontal accelerometer bias (m/s²)."""
-        forward, right = self.forward_bias, self.right_bias
+        forward = self.forward_bias
+        right = self.right_bias
         return Estimate(
             math.hypot(forward.value, right.value), math.hypot(forward.sigma, right.sigma)
         )
@@ -302,10 +303,8 @@ def _step_chi_squares(
                 zero_signal = np.broadcast_to(0.0, step_signals.shape)
                 step_interval = _replace_signals(intervals, zero_signal, zero_signal, step_signals)
                 step_response = design.whitened(step_interval, sigma_a, is_skipped)[0][~is_skipped]
-            residual, cross_product = (
-                base_fit.residual[base_fit.axis == axis],
-                columns[axis][~is_skipped].T @ step_response,
-            )
+            residual = base_fit.residual[base_fit.axis == axis]
+            cross_product = columns[axis][~is_skipped].T @ step_response
             information = np.sum(step_response**2, axis=0) - np.sum(
                 cross_product * (base_fit.covariance @ cross_product), axis=0
             )
@@ -368,10 +367,8 @@ def _test_step(
     ):
         return None
     design_fit = design.fit(sigma_a, is_skipped_with_burst)
-    size, covariance = (
-        design_fit.coefficients[columns],
-        design_fit.covariance[np.ix_(columns, columns)],
-    )
+    size = design_fit.coefficients[columns]
+    covariance = design_fit.covariance[np.ix_(columns, columns)]
     size = size / design_fit.axis_rms
     chi_square = float(size @ np.linalg.solve(covariance, size))
     if chi_square < chdtri(len(columns), false_alarm_p):
@@ -453,7 +450,8 @@ class DesignMatrix:
         design = replace(
             self, step_columns=np.hstack([self.step_columns, unit_steps(self.time_s, [time_s])])
         )
-        first_step_column, count = len(self.prior_sigma), design.step_columns.shape[1]
+        first_step_column = len(self.prior_sigma)
+        count = design.step_columns.shape[1]
         return design, first_step_column + count * (1 + np.arange(len(self.intervals))) - 1
 
     @cached_property
@@ -491,13 +489,15 @@ class DesignMatrix:
     ) -> DesignFit:
         """Fit the output of :meth:`whitened_design` without the skipped measurements."""
         axis = np.repeat(np.arange(len(data)), np.count_nonzero(~is_skipped))
-        data, columns = data[:, ~is_skipped].ravel(), columns[:, ~is_skipped].reshape(len(axis), -1)
+        data = data[:, ~is_skipped].ravel()
+        columns = columns[:, ~is_skipped].reshape(len(axis), -1)
         count = columns.shape[1]
         prior_sigma = np.append(self.prior_sigma, np.full(count - len(self.prior_sigma), np.inf))
         information = np.diag(prior_sigma**-2.0) + columns.T @ columns
         # the small diagonal keeps the matrix regular if a column is zero (rotation in hover)
         information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(count)
-        moment, factor = columns.T @ data, cho_factor(information)
+        moment = columns.T @ data
+        factor = cho_factor(information)
         covariance = cho_solve(factor, np.eye(count))
         coefficients = covariance @ moment
         square_sum = float(data @ data - coefficients @ moment)
@@ -517,18 +517,17 @@ class DesignMatrix:
         self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0
     ) -> tuple[Array, Array, float]:
         """Return whitened innovations (a, m) and columns (a, m, k) of all axes, and Σ ln S."""
-        hat_count, step_count, axes = (
-            self.hat_signals[0].shape[1],
-            self.step_columns.shape[1],
-            len(self.intervals),
-        )
+        hat_count = self.hat_signals[0].shape[1]
+        step_count = self.step_columns.shape[1]
+        axes = len(self.intervals)
         column_count = len(self.prior_sigma)
         data = np.empty((axes, len(is_skipped)))
         columns = np.zeros((axes, len(is_skipped), column_count + axes * step_count))
         # the scale multiplies the measured acceleration and its rotation, but not the biases
         scale_factors = np.ones(1 + CONSTANT_COUNT)
         scale_factors[[0, 1 + ROTATION]] = scale
-        zero_signal, log_s_sum = np.zeros_like(self.hat_signals[0]), 0.0
+        zero_signal = np.zeros_like(self.hat_signals[0])
+        log_s_sum = 0.0
         for axis_group in self.axis_groups:
             intervals = [self.intervals[axis] for axis in axis_group]
             dp = [
@@ -553,10 +552,8 @@ class DesignMatrix:
             )
             for axis, signals in zip(axis_group, axis_signals, strict=True):
                 data[axis] = signals[:, 0]
-                first_hat, first_step = (
-                    CONSTANT_COUNT + hat_count * axis,
-                    column_count + step_count * axis,
-                )
+                first_hat = CONSTANT_COUNT + hat_count * axis
+                first_step = column_count + step_count * axis
                 columns[axis][:, :CONSTANT_COUNT] = signals[:, 1:]
                 common_columns = np.r_[
                     first_hat : first_hat + hat_count, first_step : first_step + step_count
@@ -592,7 +589,8 @@ def make_design_matrix(
     clock_offset_s : float
         Time offset added to the timestamps.
     """
-    acceleration, attitude = ned_acceleration(flight), flight.attitude
+    acceleration = ned_acceleration(flight)
+    attitude = flight.attitude
     for input_data in (acceleration, axes[0].acceleration, attitude):
         if isinstance(input_data, Unavailable):
             return input_data

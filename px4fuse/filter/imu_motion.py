@@ -240,14 +240,16 @@ def prepare_motion(
     -------
     PreparedMotion, or Unavailable without IMU or attitude or with too few measurements.
     """
-    imu, attitude = flight.imu, flight.attitude
+    imu = flight.imu
+    attitude = flight.attitude
     if isinstance(imu, Unavailable):
         return imu
     if isinstance(attitude, Unavailable):
         return attitude
     signals = {} if signals is None else signals
     segment_signals: list[Signals] = []
-    imu_s, attitude_s = imu.index.to_numpy(), attitude.index.to_numpy()
+    imu_s = imu.index.to_numpy()
+    attitude_s = attitude.index.to_numpy()
     rows_by_segment: list[IntArray] = []
     for begin, end in _covered_spans(imu_s, attitude_s):
         covered_rows = np.flatnonzero(
@@ -311,12 +313,14 @@ def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, f
     first_row, end_row = np.searchsorted(
         time, [span[0] - 2 * INTEGRATION_STEP_S, span[1] + 2 * INTEGRATION_STEP_S], side="left"
     )
-    samples, time = imu.iloc[first_row:end_row], time[first_row:end_row]
+    samples = imu.iloc[first_row:end_row]
+    time = time[first_row:end_row]
     columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
     integral = cumulative_integral(samples[columns].to_numpy(), time)
     step_times_s = np.arange(time[0], time[-1], INTEGRATION_STEP_S)
     integrals = np.column_stack([np.interp(step_times_s, time, column) for column in integral.T])
-    force, angle = integrals[:, :3], integrals[:, 3:]
+    force = integrals[:, :3]
+    angle = integrals[:, 3:]
     attitude_quaternion = _integrate_gyros(step_times_s, angle, attitude)
     # the mean specific force of each step is rotated by the attitude in the middle of the step
     mean_force = np.diff(force, axis=0) / INTEGRATION_STEP_S
@@ -332,7 +336,8 @@ def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, f
     # θ = -∫ R b dt
     gyro_bias_rotation = -INTEGRATION_STEP_S * (np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0)
     for axis in range(3):
-        next_axis, last_axis = (axis + 1) % 3, (axis + 2) % 3
+        next_axis = (axis + 1) % 3
+        last_axis = (axis + 2) % 3
         acceleration[:, next_axis, 1 + axis] = -force_ned[:, last_axis]
         acceleration[:, last_axis, 1 + axis] = force_ned[:, next_axis]
         acceleration[:, axis, 4:7] = gyro_bias_rotation[:, next_axis] * force_ned[:, [last_axis]]

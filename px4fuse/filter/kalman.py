@@ -100,7 +100,8 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     kalman.H = model.H
     kalman.R = np.array([[settings.sigma_z_m**2]])
     kalman.inv = np.reciprocal  # S is 1 by 1
-    states, updates = [_state_row(kalman.x, kalman.P)], []
+    states = [_state_row(kalman.x, kalman.P)]
+    updates = []
     for dt_s, acceleration, gap_variance, measurement_index in zip(
         np.diff(timeline.time_s),
         timeline.acceleration_m_s2,
@@ -119,8 +120,11 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
         if measurement_index >= 0:
             z = axis.measurement_m[measurement_index]
             kalman.update(z)
-            y, S, K = kalman.y[0, 0], kalman.S[0, 0], kalman.K[:, 0]
-            x, P = kalman.x_prior, kalman.P_prior
+            y = kalman.y[0, 0]
+            S = kalman.S[0, 0]
+            K = kalman.K[:, 0]
+            x = kalman.x_prior
+            P = kalman.P_prior
             updates.append((z, y, S, *K, x[0, 0], P[0, 0], P[1, 1]))
         states.append(_state_row(kalman.x, kalman.P))
     return make_replay(axis, settings, timeline, states, updates)
@@ -186,10 +190,8 @@ def variance_at(run: Replay, times_s: Array) -> tuple[Array, Array]:
     p00, p01, p11 = run.steps[model.COVARIANCES].to_numpy()[index].T
     gap_variance = run.steps["input_variance_m2_s4"].to_numpy()[index]
     noise_density = (run.settings.sigma_a_m_s2**2 + gap_variance) * run.settings.dt_s
-    (p00, _, p11), (q00, _, q11) = (
-        model.propagate_covariance((p00, p01, p11), elapsed_s),
-        model.process_noise_unit(elapsed_s),
-    )
+    (p00, _, p11) = model.propagate_covariance((p00, p01, p11), elapsed_s)
+    (q00, _, q11) = model.process_noise_unit(elapsed_s)
     return np.where(is_outside, np.nan, p00 + noise_density * q00), np.where(
         is_outside, np.nan, p11 + noise_density * q11
     )

@@ -230,7 +230,8 @@ def run_filter(
     squares = (np.square(np.asarray(sigma, float)) for sigma in (sigma_a_m_s2, sigma_z_m))
     q, r = np.broadcast_arrays(*squares)
     if not q.ndim:  # floats are fifty times faster than arrays of a single element
-        q, r = q.item(), r.item()
+        q = q.item()
+        r = r.item()
     p, v = (
         intervals.initial.position_m,
         intervals.initial.velocity_m_s + 0.0 * q,
@@ -250,7 +251,8 @@ def run_filter(
     ):
         r = sigma_z_squared / weight_k
         # x = Fx + Ba, P = FPFᵀ + Q
-        p, v = p + dt * v + dp, v + dv
+        p = p + dt * v + dp
+        v = v + dv
         p00, p01, p11 = propagate_covariance(covariance, dt)
         p00 = p00 + q * noise_unit[0] + noise_fixed[0]
         p01 = p01 + q * noise_unit[1] + noise_fixed[1]
@@ -358,7 +360,8 @@ def profile_ends(
     variance_factor : float
         Factor on the parameter's variance, for uncertainty that ``score`` does not include.
     """
-    best_score, max_root_drop = score(*best_logs), float(np.sqrt(PROFILE_DROP * variance_factor))
+    best_score = score(*best_logs)
+    max_root_drop = float(np.sqrt(PROFILE_DROP * variance_factor))
 
     def find_end(direction: float, bound: float) -> float | None:
         other_log = best_logs[1]

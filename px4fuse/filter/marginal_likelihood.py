@@ -235,9 +235,11 @@ def fit_positions(
         states, axes = positions.measurement_m.shape
         measured_m = np.zeros((axes, 1, 1 + len(positions.constant_sigma), states))
         measured_m[:, 0, 0] = np.nan_to_num(positions.measurement_m.T)
-    dp, dv = positions.delta_position_m, positions.delta_velocity_m_s
+    dp = positions.delta_position_m
+    dv = positions.delta_velocity_m_s
     gram = np.zeros((len(positions.segment_starts), *dp.shape[1:3], dp.shape[2]))
-    log_determinant, degrees_of_freedom = 0.0, 0
+    log_determinant = 0.0
+    degrees_of_freedom = 0
     for axes, system, axis_degrees_of_freedom in positions.factorised_systems(
         sigma_a_m_s2, variance_m2
     ):
@@ -271,7 +273,8 @@ def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
         sensitivity to this constant.
     """
     measured = positions.measurement_m.copy()
-    dp, dv = positions.delta_position_m.copy(), positions.delta_velocity_m_s.copy()
+    dp = positions.delta_position_m.copy()
+    dv = positions.delta_velocity_m_s.copy()
     sigma_a, sigma_z = PATH_NOISES
     for axes, system, _ in positions.factorised_systems(
         sigma_a, np.full(len(measured), sigma_z**2)
@@ -279,7 +282,8 @@ def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
         data = np.nan_to_num(measured[:, axes].T)[:, None]
         state = system.solve(data, dp[axes, :, 0], dv[axes, :, 0])
         state[:, :, positions.segment_starts] = 0.0
-        path, speed = state[..., 0], state[..., 1]
+        path = state[..., 0]
+        speed = state[..., 1]
         measured[:, axes] -= path[:, 0].T
         path_increment = np.diff(path) - positions.length_s * speed[..., :-1]
         # the path of the first time offset is subtracted at all offsets; the sensitivity to the
@@ -367,10 +371,8 @@ def products_by_segment(
         first_rows, second_rows, constant_rows = np.split(
             np.arange(dp.shape[2]), np.array([1, 2]) * first_measured_m[batch].shape[1]
         )
-        measured[:, 0, first_rows], measured[:, 0, second_rows] = (
-            first_measured_m[batch],
-            measured_m[batch],
-        )
+        measured[:, 0, first_rows] = first_measured_m[batch]
+        measured[:, 0, second_rows] = measured_m[batch]
         all_signals = replace(positions, delta_position_m=dp, delta_velocity_m_s=dv)
         gram = fit_positions(all_signals, sigma_a_m_s2, variance_m2, measured).gram[:, 0]
         information = gram[:, constant_rows[:, None], constant_rows] + np.diag(
@@ -460,10 +462,13 @@ class BandedSystem:
         # Q⁻¹ = UᵀU; zero between segments
         u00 = np.sqrt(i00)
         u01 = np.divide(i01, u00, out=np.zeros_like(i01), where=u00 > 0.0)
-        whitened_0, whitened_1 = u00 * dp + u01 * dv, self.inverse_sqrt_q11 * dv
-        g0, g1 = u00 * whitened_0, u01 * whitened_0 + self.inverse_sqrt_q11 * whitened_1
+        whitened_0 = u00 * dp + u01 * dv
+        whitened_1 = self.inverse_sqrt_q11 * dv
+        g0 = u00 * whitened_0
+        g1 = u01 * whitened_0 + self.inverse_sqrt_q11 * whitened_1
         right_side = np.zeros((*dp.shape[:-1], len(self.precision), self.states))
-        right_side[..., 1:, 0], right_side[..., 1:, 1] = g0, g1
+        right_side[..., 1:, 0] = g0
+        right_side[..., 1:, 1] = g1
         right_side[..., :-1, 0] -= g0
         g0 *= self.length_s
         g0 += g1
@@ -482,13 +487,16 @@ class BandedSystem:
         Potter 1969).
         """
         # A with reversed rows and columns
-        reversed_bands, size = np.zeros_like(self.bands), self.bands.shape[1]
+        reversed_bands = np.zeros_like(self.bands)
+        size = self.bands.shape[1]
         for below in range(4):
             reversed_bands[below, : size - below] = self.bands[below, : size - below][::-1]
         reversed_lower, _ = lapack.dpbtrf(reversed_bands, lower=1, overwrite_ab=1)
-        (a, c), b = (self.lower[0, at::2] for at in (0, 1)), self.lower[1, 0::2]
+        (a, c) = (self.lower[0, at::2] for at in (0, 1))
+        b = self.lower[1, 0::2]
         # blocks of the reversed matrix have the velocity first
-        (d, f), e = (reversed_lower[0, at::2][::-1] for at in (0, 1)), reversed_lower[1, 0::2][::-1]
+        (d, f) = (reversed_lower[0, at::2][::-1] for at in (0, 1))
+        e = reversed_lower[1, 0::2][::-1]
         p00 = a**2 + e**2 + f**2 - self.bands[0, 0::2]
         p01 = a * b + d * e - self.bands[1, 0::2]
         p11 = b**2 + c**2 + d**2 - self.bands[0, 1::2]
@@ -542,7 +550,8 @@ def factorise(
     # A = Σ precision + [-F I]ᵀ Q⁻¹ [-F I], by columns as in LAPACK's band storage
     states = 2 if correlated_noise is None else 3
     columns = np.zeros((len(precision), states, states + 2))
-    position, velocity = columns[:, 0], columns[:, 1]
+    position = columns[:, 0]
+    velocity = columns[:, 1]
     position[:, 0], velocity[:, 0] = precision.T
     position[1:, 0] += i00
     position[1:, 1] = i01
@@ -550,8 +559,10 @@ def factorise(
     position[:-1, 0] += i00
     position[:-1, 1] += cross
     velocity[:-1, 0] += (cross + i01) * length_s + i11
-    position[:-1, states], position[:-1, states + 1] = -i00, -i01
-    velocity[:-1, states - 1], velocity[:-1, states] = -cross, -(i01 * length_s + i11)
+    position[:-1, states] = -i00
+    position[:-1, states + 1] = -i01
+    velocity[:-1, states - 1] = -cross
+    velocity[:-1, states] = -(i01 * length_s + i11)
     log_noise = np.sum(np.log(determinant[is_joined]))
     if correlated_noise is not None:
         correlated_sigma_m, tau_s = correlated_noise

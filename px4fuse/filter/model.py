@@ -80,10 +80,8 @@ def predict_step(
 
     ``noise_density`` (m²/s³) is the increase of the velocity variance per second, SIGMA_A² · DT.
     """
-    (p00, p01, p11), (q00, q01, q11) = (
-        propagate_covariance(covariance, dt_s),
-        process_noise_unit(dt_s),
-    )
+    (p00, p01, p11) = propagate_covariance(covariance, dt_s)
+    (q00, q01, q11) = process_noise_unit(dt_s)
     predicted = p00 + noise_density * q00, p01 + noise_density * q01, p11 + noise_density * q11
     position, velocity = propagate_state(position, velocity, acceleration, dt_s)
     return position, velocity, predicted
@@ -100,7 +98,9 @@ def update_step(
         ν (m), S (m²) and the two gains; then position, velocity and covariance after the update.
     """
     p00, p01, p11 = covariance
-    nu, s = measured_m - position, p00 + variance
-    k0, k1 = p00 / s, p01 / s
+    nu = measured_m - position
+    s = p00 + variance
+    k0 = p00 / s
+    k1 = p01 / s
     updated = variance * k0, variance * k1, p11 - k1 * p01
     return (nu, s, k0, k1), (position + k0 * nu, velocity + k1 * nu, updated)

@@ -271,7 +271,8 @@ def _axis_direction(
         axis_heading_deg, elongation = aisle_heading(track, segment)
         note = f"main direction of the track, length / width {elongation:.1f}"
     else:
-        axis_heading_deg, note = heading_deg, "given with --heading"
+        axis_heading_deg = heading_deg
+        note = "given with --heading"
     angle_rad = np.radians(axis_heading_deg)
     return np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0]), axis_heading_deg, note, elongation
 
@@ -301,7 +302,8 @@ def project_acceleration(
             "Choose --start and --end within the IMU data.",
         )
     is_gap = imu_gaps(time_s)
-    gap_rows, gap_sum_s = np.flatnonzero(is_gap), np.cumsum(np.where(is_gap, np.diff(time_s), 0.0))
+    gap_rows = np.flatnonzero(is_gap)
+    gap_sum_s = np.cumsum(np.where(is_gap, np.diff(time_s), 0.0))
     gap_ends = np.unique([0, *gap_rows, *(gap_rows + 1), len(time_s) - 1])
     return Acceleration(
         time_s=time_s,

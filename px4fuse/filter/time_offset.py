@@ -190,7 +190,8 @@ def estimate_time_offset(
     progress("time offset")
     coarse_motion = prepared_motion.downsample(COARSE_MEASUREMENTS)
     offset_s, _ = prepared_motion.search_offset(noises)
-    sigma_s, half_width_s = 0.0, 0.1
+    sigma_s = 0.0
+    half_width_s = 0.1
     for motion in (coarse_motion, prepared_motion):
         noises = maximise_likelihood(
             [motion.at(offset_s)], noises, motion.weight, outliers=False
@@ -217,7 +218,8 @@ def estimate_time_offset(
     resolution_s = 0.5 * prepared_motion.imu_interval_s
     ends_s = curve_s[0] if low_s is None else low_s, curve_s[-1] if high_s is None else high_s
     half_intervals_s = np.hypot(np.array(ends_s) - offset_s, 1.96 * resolution_s)
-    low_s, high_s = float(offset_s - half_intervals_s[0]), float(offset_s + half_intervals_s[1])
+    low_s = float(offset_s - half_intervals_s[0])
+    high_s = float(offset_s + half_intervals_s[1])
     reason = ""
     if not is_closed or (high_s - low_s) / 2.0 > MAX_HALF_INTERVAL_S:
         range_text = (
@@ -266,7 +268,8 @@ def _profile_over_noises(
     The gradient is evaluated at each offset; the Hessian hardly changes and is evaluated at
     ``best_offset_s`` only.
     """
-    sigma_z, sigma_a = noises.sigma_z_m, noises.sigma_a_m_s2
+    sigma_z = noises.sigma_z_m
+    sigma_a = noises.sigma_a_m_s2
     all_offsets_s = np.append(offsets_s, best_offset_s)
     ratios = sigma_a / sigma_z * np.exp(LOG_SIGMA_STEP * np.array([-1.0, 0.0, 1.0]))
 
@@ -308,12 +311,11 @@ def _simulate_variance_factor(
     even without motion, because e contains the same noise n.
     """
     positions = prepared_motion.at(offset_s)
-    is_joined, count, axes = (
-        positions.is_joined,
-        len(prepared_motion.time_s),
-        len(prepared_motion.directions),
-    )
-    interval_count, rng = int(np.count_nonzero(is_joined)), np.random.default_rng(count)
+    is_joined = positions.is_joined
+    count = len(prepared_motion.time_s)
+    axes = len(prepared_motion.directions)
+    interval_count = int(np.count_nonzero(is_joined))
+    rng = np.random.default_rng(count)
 
     def draw_normal(size: int) -> Array:
         return rng.standard_normal((size, axes, SIMULATION_COUNT)).transpose(1, 2, 0)
@@ -364,7 +366,8 @@ def _offset_per_part(
     ).scores_by_segment()[0]
     grid_s = np.linspace(coarse_s[0], coarse_s[-1], CURVE_OFFSETS)
     profiles = CubicSpline(coarse_s, coarse_profiles, axis=1)(grid_s)
-    part_offsets, drops = [], []
+    part_offsets = []
+    drops = []
     for begin, end, profile in zip(
         prepared_motion.edges, prepared_motion.edges[1:], profiles, strict=False
     ):

@@ -284,7 +284,8 @@ def tune_axes(
         # KF starts at the first measurement, so the fit of KF has no weight for that measurement
         weight = np.concatenate([np.ones(len(measured_m) - count), kf_fit.weight])
         axis_directions = np.array([axis.direction for axis in axes])
-        time_s, dt_s = axes[0].measurement_time_s, settings.dt_s
+        time_s = axes[0].measurement_time_s
+        dt_s = settings.dt_s
         prepared_motion = prepare_motion(
             flight,
             time_s,
@@ -321,8 +322,7 @@ def tune_axes(
         # without biases and tilt the noise cannot be estimated; KF's SIGMA_A is an upper bound
         sigma_a = Noise(None, None, kf_sigma_a.high)
     final_noises = Noises(
-        kf_sigma_a.value or kf_sigma_a.high or kf_fit.noises.sigma_a_m_s2,
-        final_sigma_z_m,
+        kf_sigma_a.value or kf_sigma_a.high or kf_fit.noises.sigma_a_m_s2, final_sigma_z_m
     )
     gain_nats = kf_fit.score(chosen_noises) - kf_fit.score(final_noises)
     return AxisTuning(
@@ -402,7 +402,8 @@ def _make_map(
         (sigma_a, best_noises.sigma_a_m_s2, SIGMA_A_SEARCH_M_S2),
         (sigma_z, best_noises.sigma_z_m, SIGMA_Z_SEARCH_M),
     ):
-        interval_low, interval_high = noise.low or low, noise.high or high
+        interval_low = noise.low or low
+        interval_high = noise.high or high
         width_factor = MAP_SIGMAS / 1.96
         ends = (
             best_value * (interval_low / best_value) ** width_factor,
