@@ -603,7 +603,7 @@ def test_model_without_fixes_while_enabled_is_unavailable(tmp_path):
     ]
     found = prepare_replay(flight_of(log, tmp_path))
     assert isinstance(found, Unavailable)
-    assert "no sample of GNSS position at a time at which EKF2 reports its fusion" in found.reason
+    assert "no sample of GNSS position while EKF2 reports its fusion" in found.reason
 
 
 def test_read_gnss_driver_time_replaces_delay(tmp_path):

@@ -1,4 +1,4 @@
-"""Fast replay of KF in plain floats, for re-runs."""
+"""Fast replay of KF with Python floats instead of arrays, for repeated runs."""
 
 import numpy as np
 
@@ -10,17 +10,12 @@ from px4fuse.filter.steps import make_timeline
 
 
 def quick_replay(axis: Axis, settings: Settings) -> Replay:
-    """Run KF as :func:`~px4fuse.filter.kalman.replay`: the same result to 1e-9, much faster.
-
-    Parameters
-    ----------
-    axis : Axis
-    settings : Settings
+    """Run KF along one axis: same result as :func:`~px4fuse.filter.kalman.replay` to 1e-9, faster.
 
     Raises
     ------
     SettingsError
-        See :func:`~px4fuse.filter.kalman.replay`.
+        ``settings.input`` is "imu" and the axis has no acceleration.
     """
     timeline = make_timeline(axis, settings)
     measured_m = axis.measurement_m.tolist()

@@ -22,12 +22,12 @@ from px4fuse.ekf2.filter_recursion import (
     HEADING,
     NORTH,
     POSITION_COLUMNS,
+    FilterConfiguration,
     SegmentRun,
-    Variant,
 )
 from px4fuse.ekf2.heights import barometer_samples_inside
 from px4fuse.ekf2.inputs import UNLIMITED_RESETS, FusionRules, Inputs, ReceivedPositions
-from px4fuse.ekf2.model import delayed_states, run_variants
+from px4fuse.ekf2.model import delayed_states, run_configurations
 from px4fuse.ekf2.output_predictor import delay_by, follow_attitude, publish
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
@@ -160,7 +160,7 @@ def simulate_ekf2(
         aid=aid,
         max_interval_s=MAX_EVENT_INTERVAL_S,
     )
-    model_run = run_variants(inputs, [Variant(settings)], {})[0]
+    model_run = run_configurations(inputs, [FilterConfiguration(settings)], {})[0]
     track = _make_topic_track(inputs, model_run, time_us, true_quaternions)
     aid_source_hz = VEHICLE_AID_SOURCE_HZ if mistakes.no_vvo else 0.0
     return ekf2_topics(inputs, model_run, track, scenario.attitude_rate_hz, aid_source_hz)
