@@ -520,7 +520,7 @@ def read_vision(
     # without arrival times no sample is treated as late
     arrival = np.full(len(timestamp_s), -np.inf)
     if len(age) and "vehicle_visual_odometry" in track.topics:
-        arrival = timestamp_s + np.interp(timestamp_s, age.index.to_numpy(), age.to_numpy())
+        arrival = timestamp_s + np.interp(timestamp_s, age.index, age)
     decisions = _logged_decisions(ekf2, record, timestamp_s)
     return ReceivedPositions(timestamp_s, arrival, position, variance, *decisions, track.name)
 
@@ -606,7 +606,7 @@ def _vision_track(flight: Flight) -> PositionTrack | Unavailable:
         if track.origin.is_vision and track.origin.has_all_samples:
             return track
         if track.name in VISION_COPY_INTERVALS_S:
-            interval = float(np.median(np.diff(track.samples.index.to_numpy())))
+            interval = float(np.median(np.diff(track.samples.index)))
             if interval < 0.9 * VISION_COPY_INTERVALS_S[track.name] and interval <= 0.25:
                 return track
             reasons.append(

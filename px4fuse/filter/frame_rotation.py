@@ -159,7 +159,7 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     """
     if isinstance(flight.attitude, Unavailable):
         return flight.attitude
-    if np.median(np.diff(flight.attitude.index.to_numpy())) > MAX_ATTITUDE_INTERVAL_S:
+    if np.median(np.diff(flight.attitude.index)) > MAX_ATTITUDE_INTERVAL_S:
         return Unavailable(
             "heading error", "the attitude rate is too low", "Log the attitude at 10 Hz or more."
         )

@@ -179,7 +179,7 @@ def estimate_time_offset(
     samples = cut_to_segment(track.samples, segment)[Columns.POSITION[:axes]]
     samples = samples.dropna(subset=Columns.POSITION[:2])
     if outlier_time_s is not None:
-        samples = samples[~np.isin(samples.index.to_numpy(), outlier_time_s)]
+        samples = samples[~np.isin(samples.index, outlier_time_s)]
     prepared_motion = prepare_motion(
         flight,
         samples.index.to_numpy(),
