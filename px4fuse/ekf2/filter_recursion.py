@@ -29,7 +29,7 @@ from px4fuse.ekf2.replay_segments import (
     GRAVITY_M_S2,
     GYRO_BIAS,
     IMU_STATE_COUNT,
-    STATES,
+    STATE_COUNT,
     THETA,
     VELOCITY,
     ReplaySegment,
@@ -195,7 +195,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
 
     ``intervals`` contains the intervals between fusion events, one element per configuration.
     """
-    size = len(configurations)
+    configuration_count = len(configurations)
     events = len(intervals[0].events)
     parameters = {
         name: np.array([configuration.settings[name] for configuration in configurations])
@@ -241,7 +241,10 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     measured, noise = _measurements(inputs, segment, sample, event_steps, parameters, reported)
     is_sequential = inputs.aid == GNSS_POS
     has_speed = inputs.received.velocity_m_s is not None
-    gates = [parameters.get(GNSS_VEL.gate, np.ones(size)), parameters[inputs.aid.gate]]
+    gates = [
+        parameters.get(GNSS_VEL.gate, np.ones(configuration_count)),
+        parameters[inputs.aid.gate],
+    ]
     gate_squared = np.maximum(np.repeat(np.stack(gates, axis=1), 3, axis=1), MIN_GATE) ** 2
     # logged EKF2 values are used as measurements of height and, without magnetometer, of heading
     logged_values = np.stack(
@@ -319,16 +322,18 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         uses_logged_decisions,
     )
     fusion = _Fusion(inputs.rules, segment.time_s[0], *action_inputs, *logged_decisions)
-    innovations, variances = np.full((2, events, size, 6), np.nan)
-    field_record = np.full((0 if field_samples is None else events, 3, size, 3), np.nan)
-    rejected, fused, reset = np.zeros((3, events, size), bool)
-    position_reset_m = np.zeros((events, size, 2))
-    states, state_variances = np.empty((2, events + 1, size, x.shape[1]))
+    innovations, variances = np.full((2, events, configuration_count, 6), np.nan)
+    field_record = np.full(
+        (0 if field_samples is None else events, 3, configuration_count, 3), np.nan
+    )
+    rejected, fused, reset = np.zeros((3, events, configuration_count), bool)
+    position_reset_m = np.zeros((events, configuration_count, 2))
+    states, state_variances = np.empty((2, events + 1, configuration_count, x.shape[1]))
     states[0] = x
     state_variances[0] = _diagonal(P)
-    innovation, R = np.empty((2, size, 4))
+    innovation, R = np.empty((2, configuration_count, 4))
     measured_slice = slice(0 if has_speed else POSITION_COLUMNS.start, POSITION_COLUMNS.stop)
-    is_component_fused = np.zeros((size, POSITION_COLUMNS.stop), bool)
+    is_component_fused = np.zeros((configuration_count, POSITION_COLUMNS.stop), bool)
     for e in range(events):
         batch_index = e % EVENT_BATCH_SIZE
         if not batch_index:  # copy the arrays of a few events at a time, to limit memory
@@ -344,9 +349,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             variance_growth = variance_increment * steps[event_batch]
         phi = transition[batch_index]
         # x = Φx + u, P = ΦPΦ' + Q
-        x[:, :STATES] = (phi @ x[:, :STATES, None])[:, :, 0] + state_input[batch_index]
-        P[:, :STATES] = phi @ P[:, :STATES]
-        P[:, :, :STATES] = P[:, :, :STATES] @ np.swapaxes(phi, 1, 2)
+        x[:, :STATE_COUNT] = (phi @ x[:, :STATE_COUNT, None])[:, :, 0] + state_input[batch_index]
+        P[:, :STATE_COUNT] = phi @ P[:, :STATE_COUNT]
+        P[:, :, :STATE_COUNT] = P[:, :, :STATE_COUNT] @ np.swapaxes(phi, 1, 2)
         P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += added_noise[batch_index]
         bias_variance = _diagonal(P)[:, BIASES.start :]
         bias_variance += (bias_variance < variance_limit) * variance_growth[batch_index]
@@ -555,11 +560,11 @@ class _Fusion:
     reset: BoolArray
 
     def __post_init__(self) -> None:
-        size = len(self.has_gate)
+        configuration_count = len(self.has_gate)
 
-        self.last_position_s, self.last_velocity_s = np.full((2, size), self.start_s)
-        self.is_stopped = np.zeros(size, bool)
-        self.remaining_resets = np.full(size, self.rules.resets)
+        self.last_position_s, self.last_velocity_s = np.full((2, configuration_count), self.start_s)
+        self.is_stopped = np.zeros(configuration_count, bool)
+        self.remaining_resets = np.full(configuration_count, self.rules.resets)
         # True for events at which all configurations fuse or reject by the gate, without a reset
         self.only_gate_decides = (
             (self.action == FUSE).all(axis=1) & ~self.reset & ~(self.rejected > 0.0)
@@ -672,7 +677,9 @@ def with_correlation(inputs: Inputs, segment: ReplaySegment, intervals: Interval
         )
     if segment.field is not None:
         # EKF2 has just reset heading and fields, so these states are uncorrelated with all others
-        correlation = block_diag(correlation[:STATES, :STATES], np.eye(len(segment.state) - STATES))
+        correlation = block_diag(
+            correlation[:STATE_COUNT, :STATE_COUNT], np.eye(len(segment.state) - STATE_COUNT)
+        )
         correlation[HEADING] = 0.0
         correlation[:, HEADING] = 0.0
         correlation[HEADING, HEADING] = 1.0
@@ -691,7 +698,7 @@ def _settled_correlation(segment: ReplaySegment) -> Array:
     Errors of tilt and accelerometer bias become correlated, because their effects on the
     acceleration cancel: θ × f = Rb.
     """
-    to_earth = np.eye(STATES)
+    to_earth = np.eye(STATE_COUNT)
     to_earth[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.rotation[0]
     P = np.diag(np.diagonal(to_earth @ np.diag(segment.variance) @ to_earth.T))
     for tilt, bias, acceleration_per_rad in ((1, BIAS_NORTH, -GRAVITY), (0, BIAS_EAST, GRAVITY)):

@@ -168,12 +168,12 @@ class HeightFilter:
         has_gate: BoolArray,
     ) -> None:
         heights = segment.heights
-        size = len(has_gate)
+        configuration_count = len(has_gate)
         assert heights is not None
         self.fused = heights.fused
         self.down_m, self.age_s, measured_at_s, self.dead_zone_m, is_sample = barometer
         self.time_s = [*measured_at_s, fix_s]
-        self.update_log = np.full((len(fix_s), len(self.time_s), 3, size), np.nan)
+        self.update_log = np.full((len(fix_s), len(self.time_s), 3, configuration_count), np.nan)
         has_fix = has_fix & enabled[GNSS_HGT.name] & (GNSS_HGT.name in heights.fused)
         self.has_sample = [*((is_sample > 0.0) & enabled[BAROMETER.name]), has_fix]
         self.any_sample = [np.any(mask, axis=1).tolist() for mask in self.has_sample]
@@ -184,7 +184,7 @@ class HeightFilter:
         self.biased = [aid.name != heights.reference for aid in SENSORS]
         self.weight = (heights.weight, 1.0)
         self.learning = enabled[heights.reference]
-        value_m, variance_m2 = (np.full(size, value) for value in heights.bias)
+        value_m, variance_m2 = (np.full(configuration_count, value) for value in heights.bias)
         start_s = float(segment.time_s[0])
         step_s = float(np.median(segment.step_s))
         self.bias = BiasEstimator(value_m, variance_m2, start_s, step_s)

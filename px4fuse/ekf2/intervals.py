@@ -28,7 +28,7 @@ from px4fuse.ekf2.replay_segments import (
     GRAVITY_M_S2,
     IMU_STATE_COUNT,
     POSITION,
-    STATES,
+    STATE_COUNT,
     THETA,
     VELOCITY,
     ReplaySegment,
@@ -108,8 +108,8 @@ def make_intervals(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> In
     end = events.end_step
     count = len(end)
     duration_s = segment.time_s[end] - segment.time_s[start]
-    transition = np.tile(np.eye(STATES), (count, 1, 1))
-    correction_input, acceleration_input = np.zeros((2, count, STATES))
+    transition = np.tile(np.eye(STATE_COUNT), (count, 1, 1))
+    correction_input, acceleration_input = np.zeros((2, count, STATE_COUNT))
     effects = _effects(segment, start, end)
     transition[:, :IMU_STATE_COUNT, THETA] = effects[..., :3]
     transition[:, :IMU_STATE_COUNT, BIASES] = effects[..., 3:9]

@@ -45,12 +45,12 @@ def mean_by_event(
     """
     event = np.searchsorted(event_steps, sensor_samples.step)
     is_inside = event < len(event_steps)
-    size = len(event_steps)
+    event_count = len(event_steps)
     event = event[is_inside]
-    count = np.maximum(np.bincount(event, minlength=size), 1)
+    count = np.maximum(np.bincount(event, minlength=event_count), 1)
 
     def mean(rows: Array) -> Array:
-        total = np.zeros((size, *rows.shape[1:]))
+        total = np.zeros((event_count, *rows.shape[1:]))
         np.add.at(total, event, rows[is_inside])
         return np.asarray((total.T / count).T)
 
@@ -59,7 +59,7 @@ def mean_by_event(
     )
     if imu_velocity_m_s is not None:
         value = value + np.einsum("eab,eb->ea", rotation_to_body, imu_velocity_m_s[event_steps])
-    sample_count = np.bincount(event, sensor_samples.sample_count[is_inside], size)
+    sample_count = np.bincount(event, sensor_samples.sample_count[is_inside], event_count)
     return EventSamples(value, rotation_to_body, np.asarray(sample_count, float), noise)
 
 

@@ -154,18 +154,18 @@ def corrections(
     row = row[is_inside]
     sample_index = np.nonzero(is_inside)[1]
     decay_start, decay_end = (
-        np.exp(-np.maximum(time_s[each] - sample_s[sample_index], 0.0) / tau_s)
-        for each in (row, row + 1)
+        np.exp(-np.maximum(time_s[step] - sample_s[sample_index], 0.0) / tau_s)
+        for step in (row, row + 1)
     )
-    shares = csr_array(
+    visible_shares = csr_array(
         (decay_start - decay_end, (row, sample_index)),
         shape=(len(correction_increments), len(sample_s)),
     )
-    normal = shares.T @ shares + PRIOR_WEIGHT * eye_array(len(sample_s))
+    normal = visible_shares.T @ visible_shares + PRIOR_WEIGHT * eye_array(len(sample_s))
     result = np.reshape(
-        spsolve(normal.tocsc(), shares.T @ correction_increments), (len(sample_s), -1)
+        spsolve(normal.tocsc(), visible_shares.T @ correction_increments), (len(sample_s), -1)
     )
-    return np.where(shares.sum(axis=0)[:, None] > MIN_VISIBLE_SHARE, result, np.nan)
+    return np.where(visible_shares.sum(axis=0)[:, None] > MIN_VISIBLE_SHARE, result, np.nan)
 
 
 def delay_by(values: Array, lag: int) -> Array:

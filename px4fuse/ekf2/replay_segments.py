@@ -62,7 +62,7 @@ MAX_CLIPPED_SHARE = 0.05
 
 GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # NED; CONSTANTS_ONE_G in PX4
 
-STATES = 15  # number of states without magnetic fields
+STATE_COUNT = 15  # number of states without magnetic fields
 IMU_STATE_COUNT = 9  # number of states that the IMU propagates: all except the biases
 # Indices in the state
 THETA, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)

@@ -100,9 +100,9 @@ class VisionFilter:
         samples = np.stack(pad_samples(sample_arrays), axis=-1)
         self.position_m = np.moveaxis(samples[:2], 0, -1)
         self.age_s, self.measured_at_s, self.now_s = samples[2:5]
-        _, count, events, size = samples.shape
-        self.update_log = np.full((events, count, 7, size), np.nan)
-        self.position_reset_m = np.zeros((events, size, 2))
+        _, count, events, configuration_count = samples.shape
+        self.update_log = np.full((events, count, 7, configuration_count), np.nan)
+        self.position_reset_m = np.zeros((events, configuration_count, 2))
         has_sample = (samples[7] > 0.0) & enabled[EV_POS.name]
         # EKF2 fuses GNSS before vision in the same prediction step: samples of an interval's last
         # step are fused after GNSS, earlier samples before GNSS
@@ -117,10 +117,10 @@ class VisionFilter:
             np.maximum(reported_variance, np.maximum(min_variance, gnss_variance)), 0, -1
         )
         start_s = float(segment.time_s[0])
-        bias = np.zeros((size, 2))
+        bias = np.zeros((configuration_count, 2))
         self.bias = BiasEstimator(bias, bias + np.inf, start_s, float(np.median(segment.step_s)))
-        self.last_sample_s, self.last_attempt_s = np.full((2, size), -np.inf)
-        self.fused_s = np.full(size, start_s)
+        self.last_sample_s, self.last_attempt_s = np.full((2, configuration_count), -np.inf)
+        self.fused_s = np.full(configuration_count, start_s)
         self.was_without_gnss = self.without_gnss[0]
 
     def updates(self, configuration: int, end_s: Array) -> pd.DataFrame:

@@ -226,8 +226,8 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         for share, tau in product(COARSE_VARIANCE_SHARES, COARSE_TAUS_S)
     ]
     (white_score, _), (correlated_score, correlated_start) = (
-        _best_of_grid(coarse_motion, offsets, candidates)
-        for candidates in ([noises], correlated_noises)
+        _best_of_grid(coarse_motion, offsets, candidate_noises)
+        for candidate_noises in ([noises], correlated_noises)
     )
     label = "time-correlated noise of the source"
     no_correlation = Unavailable(label, "its errors are not time-correlated", "")
@@ -365,7 +365,7 @@ def _score_of_fit(fit: NoiseFit) -> float:
 
 
 def _best_of_grid(
-    prepared_motion: PreparedMotion, offsets_s: Sequence[float], candidates: Sequence[Noises]
+    prepared_motion: PreparedMotion, offsets_s: Sequence[float], candidate_noises: Sequence[Noises]
 ) -> tuple[float, Noises]:
     """Return the lowest -ln p over all time offsets and scaled candidate noises, and its noises.
 
@@ -373,7 +373,7 @@ def _best_of_grid(
     """
     results = []
     for positions in map(prepared_motion.at, offsets_s):
-        for candidate, factor in product(candidates, COARSE_SIGMA_A_FACTORS):
+        for candidate, factor in product(candidate_noises, COARSE_SIGMA_A_FACTORS):
             noises = replace(candidate, sigma_a_m_s2=factor * candidate.sigma_a_m_s2)
             totals = fit_noises([positions], noises, prepared_motion.weight).scores(COARSE_SCALES)[
                 :, 0

@@ -298,7 +298,7 @@ def maximise_likelihood(
         True to estimate the outliers; False to keep the weights.
     """
     outlier_probability = np.zeros_like(weight)
-    share = START_OUTLIER_SHARE
+    outlier_share = START_OUTLIER_SHARE
     width = START_OUTLIER_WIDTH
     noises = start
     for iteration in range(MAX_OUTLIER_ITERATIONS if outliers else 0):
@@ -313,10 +313,12 @@ def maximise_likelihood(
         if median_square > SIGMA_Z_SEARCH_M[1] ** 2:
             break
         variance = min(noises.sigma_z_m**2, MAX_SIGMA_Z_RATIO**2 * median_square)
-        probability = _outlier_probability(square / variance, count, share, width)
+        probability = _outlier_probability(square / variance, count, outlier_share, width)
         if probability.sum() < 1.0 and probability.max() < 0.5 and not outlier_probability.any():
             break
-        share = float(np.clip(probability.mean(), 0.5 / len(probability), MAX_OUTLIER_SHARE))
+        outlier_share = float(
+            np.clip(probability.mean(), 0.5 / len(probability), MAX_OUTLIER_SHARE)
+        )
         outlier_square = np.sum(probability * square) / max(np.sum(probability * count), 1e-9)
         width = max(MIN_OUTLIER_WIDTH, float(np.sqrt(outlier_square / variance)))
         weight = 1.0 - probability * (1.0 - width**-2.0)
@@ -354,8 +356,8 @@ def _expected_squares_of_axes(
     return square, count
 
 
-def _outlier_probability(square: Array, count: Array, share: float, width: float) -> Array:
-    log_odds = np.log(share / (1.0 - share)) - count * np.log(width)
+def _outlier_probability(square: Array, count: Array, outlier_share: float, width: float) -> Array:
+    log_odds = np.log(outlier_share / (1.0 - outlier_share)) - count * np.log(width)
     return np.asarray(expit(log_odds + 0.5 * square * (1.0 - width**-2.0)))
 
 
@@ -378,13 +380,13 @@ def outlier_variance_factor(
     width : float
         σ of the outliers over σ of good measurements.
     """
-    share = np.mean(outlier_probability)
+    outlier_share = np.mean(outlier_probability)
     sigma_information = 2.0 * float(np.sum(count))
     inverse_square_width = width**-2.0
     complete_information = np.zeros((3, 3))
     complete_information[:2, :2] = 2.0 * np.sum(count * outlier_probability)
     complete_information[0, 0] = sigma_information
-    complete_information[2, 2] = len(square) * share * (1.0 - share)
+    complete_information[2, 2] = len(square) * outlier_share * (1.0 - outlier_share)
     scores = np.stack(
         [
             square * (inverse_square_width - 1.0),

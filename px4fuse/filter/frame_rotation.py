@@ -55,7 +55,7 @@ MAX_ATTITUDE_INTERVAL_S = 0.11
 MAX_LINEARISATIONS = 3
 # Maximum change of the rotation by the last linearisation
 MAX_FINAL_STEP_RAD = 0.01
-STATES = 7
+STATE_COUNT = 7
 ROTATION_INDEX = 6  # index of the rotation in the state
 ADJUGATE_SIGNS = np.array([[1.0, -1.0], [-1.0, 1.0]])  # of a symmetric 2 × 2 matrix
 # Initial σ of position (m), velocity (m/s), acceleration error (m/s²) and rotation (rad)
@@ -321,11 +321,11 @@ def _transitions(increments: Array, dt_s: Array, rotation_rad: float) -> ArrayPa
     rotation = np.array([[cosine, -sine], [sine, cosine]])
     rotation_slope = np.array([[-sine, -cosine], [cosine, -sine]])
     increments = increments.reshape(count, 2, 2)
-    F = np.tile(np.eye(STATES), (count, 1, 1))
+    F = np.tile(np.eye(STATE_COUNT), (count, 1, 1))
     F[:, :2, 2:4] = F[:, 2:4, 4:6] = dt * np.eye(2)
     F[:, :2, 4:6] = dt**2 / 2.0 * np.eye(2)
     F[:, :4, ROTATION_INDEX] = (increments @ rotation_slope.T).reshape(count, 4)
-    inputs = np.zeros((count, STATES))
+    inputs = np.zeros((count, STATE_COUNT))
     inputs[:, :4] = (increments @ rotation.T).reshape(count, 4)
     return F, inputs
 
@@ -339,7 +339,7 @@ def _process_noise(dt_s: Array, has_gap: Array, noises: Array) -> Array:
     # matrices that are scaled and added to Q: for the elements 00, 01, 11 of the acceleration
     # noise, for the random walks in 1 s, and for an IMU gap
     unit_00, unit_01, unit_11, unit_second, unit_gap = unit_noises = np.zeros(
-        (5, count, STATES, STATES)
+        (5, count, STATE_COUNT, STATE_COUNT)
     )
     unit_00[:, position, position] = unit_11[:, velocity, velocity] = sigma_a_block
     unit_01[:, position, velocity] = unit_01[:, velocity, position] = sigma_a_block
@@ -374,10 +374,10 @@ def _run_filters(
     """
     increments, length_s, has_gap = interval_inputs
     count = len(noises)
-    x = np.zeros((count, STATES))
+    x = np.zeros((count, STATE_COUNT))
     x[:, :2] = measured_m[0]
     P = np.tile(np.diag(INITIAL_SIGMAS**2), (count, 1, 1))
-    steps = [_FilterStep(np.eye(STATES), x, P, x, P)]
+    steps = [_FilterStep(np.eye(STATE_COUNT), x, P, x, P)]
     square_sum = np.zeros(count)
     log_s = np.zeros(count)
     R = sigma_z**2 * np.eye(2)

@@ -227,8 +227,8 @@ def fit_positions(
         ``positions.measurement_m``, which otherwise only determines the measured axes and times.
     """
     if measured_m is None:
-        states, axes = positions.measurement_m.shape
-        measured_m = np.zeros((axes, 1, 1 + len(positions.constant_sigma), states))
+        measurement_count, axes = positions.measurement_m.shape
+        measured_m = np.zeros((axes, 1, 1 + len(positions.constant_sigma), measurement_count))
         measured_m[:, 0, 0] = np.nan_to_num(positions.measurement_m.T)
     dp = positions.delta_position_m
     dv = positions.delta_velocity_m_s
@@ -245,7 +245,7 @@ def fit_positions(
         signals = (np.sqrt(system.precision[:, 0]) * data, *intervals, explained)
         for segment_index, (begin, end) in enumerate(positions.segments):
             rows = slice(begin, end - 1)
-            states = slice(system.states * begin, system.states * end)
+            states = slice(system.state_count * begin, system.state_count * end)
             for sign, array, columns in zip(
                 (1.0, 1.0, 1.0, -1.0), signals, (slice(begin, end), rows, rows, states), strict=True
             ):
@@ -415,7 +415,7 @@ class BandedSystem:
     log_determinant: float
 
     @property
-    def states(self) -> int:
+    def state_count(self) -> int:
         """Number of states per time: position, velocity and, if any, time-correlated noise."""
         return len(self.bands) - 2
 
@@ -446,7 +446,7 @@ class BandedSystem:
         """Return the estimated states, position and velocity first, shape (..., m, states)."""
         _, right_side = self._interval_sides(measured_m, dp, dv)
         state, _ = lapack.dpbtrs(self.lower, right_side.T, lower=1, overwrite_b=1)
-        return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.states))
+        return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.state_count))
 
     def _interval_sides(self, measured_m: Array, dp: Array, dv: Array) -> tuple[ArrayPair, Array]:
         """Return whitened intervals, and the right-hand side of the normal equations.
@@ -461,7 +461,7 @@ class BandedSystem:
         whitened_1 = self.inverse_sqrt_q11 * dv
         g0 = u00 * whitened_0
         g1 = u01 * whitened_0 + self.inverse_sqrt_q11 * whitened_1
-        right_side = np.zeros((*dp.shape[:-1], len(self.precision), self.states))
+        right_side = np.zeros((*dp.shape[:-1], len(self.precision), self.state_count))
         right_side[..., 1:, 0] = g0
         right_side[..., 1:, 1] = g1
         right_side[..., :-1, 0] -= g0
@@ -472,7 +472,9 @@ class BandedSystem:
             weighted_m = self.precision[:, 0] * measured_m
             right_side[..., 0] += weighted_m
             right_side[..., 2:] += weighted_m[..., None]
-        return (whitened_0, whitened_1), right_side.reshape(-1, self.states * len(self.precision))
+        return (whitened_0, whitened_1), right_side.reshape(
+            -1, self.state_count * len(self.precision)
+        )
 
     def position_variance(self) -> Array:
         """Return the variance of each state's position given all data (m²), shape (m,).
@@ -544,8 +546,8 @@ def factorise(
     slope = i00 * length_s
     cross = slope + i01
     # A = Σ precision + [-F I]ᵀ Q⁻¹ [-F I], by columns as in LAPACK's band storage
-    states = 2 if correlated_noise is None else 3
-    columns = np.zeros((len(precision), states, states + 2))
+    state_count = 2 if correlated_noise is None else 3
+    columns = np.zeros((len(precision), state_count, state_count + 2))
     position = columns[:, 0]
     velocity = columns[:, 1]
     position[:, 0], velocity[:, 0] = precision.T
@@ -555,10 +557,10 @@ def factorise(
     position[:-1, 0] += i00
     position[:-1, 1] += cross
     velocity[:-1, 0] += (cross + i01) * length_s + i11
-    position[:-1, states] = -i00
-    position[:-1, states + 1] = -i01
-    velocity[:-1, states - 1] = -cross
-    velocity[:-1, states] = -(i01 * length_s + i11)
+    position[:-1, state_count] = -i00
+    position[:-1, state_count + 1] = -i01
+    velocity[:-1, state_count - 1] = -cross
+    velocity[:-1, state_count] = -(i01 * length_s + i11)
     log_noise = np.sum(np.log(determinant[is_joined]))
     if correlated_noise is not None:
         correlated_sigma_m, tau_s = correlated_noise
@@ -569,9 +571,9 @@ def factorise(
         position[:, 2] = measured_precision
         correlated[:, 0] = measured_precision + 1.0 / correlated_variance
         correlated[:-1, 0] += rho**2 / correlated_variance[1:]
-        correlated[:-1, states] = -rho / correlated_variance[1:]
+        correlated[:-1, state_count] = -rho / correlated_variance[1:]
         log_noise += np.sum(np.log(correlated_variance))
-    bands = columns.reshape(-1, states + 2).T
+    bands = columns.reshape(-1, state_count + 2).T
     lower, is_singular = lapack.dpbtrf(bands, lower=1)
     if is_singular:
         raise np.linalg.LinAlgError("a segment has too few position measurements")

@@ -33,7 +33,7 @@ from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
     GYRO_BIAS,
-    STATES,
+    STATE_COUNT,
     THETA,
     VELOCITY,
     HeightSamples,
@@ -251,14 +251,14 @@ def _initial_state_at_rest(
     At rest the specific force is -g, and angular rate and velocity are 0, except for the biases.
     The update correlates tilt error and accelerometer bias.
     """
-    H = np.zeros((9, STATES))
+    H = np.zeros((9, STATE_COUNT))
     H[0:3, THETA] = -skew(rotation @ force_m_s2)
     H[0:3, ACCELEROMETER_BIAS] = -rotation
     H[3:6, GYRO_BIAS] = np.eye(3)
     H[6:9, VELOCITY] = np.eye(3)
     measured = np.concatenate([-GRAVITY_M_S2 - rotation @ force_m_s2, rate_rad_s, np.zeros(3)])
     P = np.diag(INITIAL_SIGMA**2)
-    x = np.zeros(STATES)
+    x = np.zeros(STATE_COUNT)
     P[HEADING, HEADING], x[HEADING] = HEADING_SIGMA_RAD**2, heading_error_rad
     K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(REST_SIGMA**2))
     x += K @ (measured - H @ x)
