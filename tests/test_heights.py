@@ -401,7 +401,7 @@ def test_what_if_results_contain_each_height_sensor(models: dict[str, Model]) ->
     request = WhatIfRequest(log=model.flight.log.name, changes=changes, without=without)
     asked = what_if(model, [changes], without)
     found = WhatIfAnalysis(
-        model.flight, asked, changes, asked=False, difference_steps={}, without=without
+        model.flight, asked, changes, uses_estimates=False, difference_steps={}, without=without
     )
     results = json.loads(to_json(whatif_results(request, found)))
     jsonschema.validate(results, schema())
