@@ -187,6 +187,8 @@ class PositionTrack:
         the position of the sensor.
     notes : tuple of str
         Sentences on joined and dropped samples.
+    status : DataFrame
+        ``reset_counter`` and ``quality`` at the times of the source; only those that are logged.
     """
 
     name: str
@@ -205,6 +207,7 @@ class PositionTrack:
     barometer: pd.DataFrame | None = None
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     notes: tuple[str, ...] = ()
+    status: pd.DataFrame = field(default_factory=pd.DataFrame)
 
     __repr__ = one_line_repr
 
@@ -435,6 +438,12 @@ class Ekf2:
         Data at the fusion horizon.
     aids : mapping from PX4 name to AidLog
         Logged data of all aids that EKF2 can fuse.
+    states : mapping from name to Series
+        Step functions, only those that are logged: ``tilt_align``, ``yaw_align``, ``gnss_fault``,
+        the keys of :attr:`FusionRecord.states`, ``xy_valid``, ``xy_global``, and ``failed_checks``,
+        the bits of ``estimator_status.gps_check_fail_flags``.
+    parameters : mapping
+        All EKF2_ parameters at the start of the log, by PX4 name, in PX4 units.
     """
 
     state: pd.DataFrame
@@ -451,6 +460,8 @@ class Ekf2:
     horizon_s: float | Unavailable = HORIZON_NOT_LOGGED
     record: FusionRecord | Unavailable = RECORD_NOT_LOGGED
     aids: Mapping[str, AidLog] = field(default_factory=dict)
+    states: StepFunctions = field(default_factory=dict)
+    parameters: Mapping[str, float] = field(default_factory=dict)
 
     __repr__ = one_line_repr
 

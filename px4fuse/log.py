@@ -7,6 +7,9 @@ from typing import Literal
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record, Sha256, Share
 
+# Clock of timestamps that PX4 converted or replaced
+SENDER_CLOCK = "sender timestamps"
+
 
 class Dropout(Record, frozen=True):
     """Time span (s) in which the logger of the autopilot lost data."""

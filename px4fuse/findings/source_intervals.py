@@ -12,10 +12,10 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.flight_events import max_interval_s, source_gaps
+from px4fuse.ekf2.fusion_conditions import EV_START_INTERVAL_S
 from px4fuse.ekf2_parameters import AIDS, EV_POS
 from px4fuse.filter.kalman import state_at, variance_at
 from px4fuse.filter.signals import cut_to_segment
-from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL_S
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
 from px4fuse.flight import Ekf2, Unavailable, positions_of
 from px4fuse.position_source import ALIGNED, PositionKind

@@ -44,6 +44,7 @@ MIN_ARRIVAL_FRACTION = 0.9
 HEIGHT_TOLERANCE_S = 0.05
 # Maximum logged GNSS rate (Hz) of decimated fixes: receivers send 5 to 20 fixes per second
 MAX_DOWNSAMPLED_HZ = 4.0
+STATUS_COLUMNS = ["reset_counter", "quality"]
 AUTOPILOT_CLOCK = "autopilot boot clock (PX4 converted the sender's timestamps)"
 # Latitude and longitude in degrees, optionally altitude in m
 GeodeticPosition = tuple[float, ...]
@@ -96,6 +97,7 @@ def make_track(
     track_fields
         Other fields of :class:`~px4fuse.flight.PositionTrack`.
     """
+    status = samples[[name for name in STATUS_COLUMNS if name in samples]]
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
     samples = finite_rows(samples, needed_columns)
     if len(samples) < MIN_TRACK_SAMPLES:
@@ -106,7 +108,7 @@ def make_track(
         )
     variance = samples[Columns.POSITION_VARIANCE]
     samples = samples.assign(**variance.where(variance > 0))
-    return PositionTrack(name=name, samples=samples, origin=origin, **track_fields)
+    return PositionTrack(name=name, samples=samples, origin=origin, status=status, **track_fields)
 
 
 def _make_ulog_track(
