@@ -295,7 +295,8 @@ def _check_gnss_quality(attempt: Attempt) -> Unmet | None:
         texts.append(f"{text})")
     return Unmet(
         f"GNSS fails EKF2's check of the {GNSS_CHECKS[failed[0][1]][0]}",
-        f"Failed checks: {'; '.join(texts)}. EKF2 fuses GNSS after 10 s without a failure.",
+        f"Failed checks: {'; '.join(texts)}. EKF2 starts to fuse GNSS after "
+        f"{attempt.parameters.get('EKF2_REQ_GPS_H', 10.0):g} s without a failure.",
         "Give the antenna a free view of the sky and wait for the checks before take-off.",
     )
 
@@ -331,8 +332,9 @@ VISION_CONDITIONS: Conditions = {
 GNSS_CONDITIONS: Conditions = {
     "switch": _check_switch,
     "fault": _check_gnss_fault,
-    "gap": _check_gap,
+    # without a fix the reader has no samples; while none arrive, the flags of the checks stay
     "checks": _check_gnss_quality,
+    "gap": _check_gap,
     "alignment": _check_alignment,
     "gate": _check_gate,
 }

@@ -21,13 +21,14 @@ from px4fuse.findings.model import (
     warning,
 )
 from px4fuse.flight import Ekf2, PositionTrack, Truth, Unavailable, positions_of
-from px4fuse.position_source import MOTION_CAPTURE, POSITION_FILE
+from px4fuse.position_source import POSITION_FILE
 from px4fuse.record import Span
 from px4fuse.text import capitalise_first, format_metres
 
 MIN_FUSING_SHARE_ERROR = 0.5  # of the segment; below, EKF2's track mostly uses other sensors
 MIN_FUSING_SHARE_WARNING = 0.98  # of the segment; 2 % of a minute are about 1 s
 MIN_LIMITING_INTERVAL_S = 0.18  # s; jitter of 10 % prevents a start at EV_START_INTERVAL_S
+MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
 MIN_INVALID_DISTANCE_M = 1.0  # m; less before take-off, where EKF2 needs no position
 UNKNOWN = Unmet(
     "",
@@ -56,7 +57,7 @@ def detect(analysis: Comparison) -> Findings:
         "source_interval_s": 1.0 / source.rate_hz,
     }
     if aid is None:
-        if source.origin == MOTION_CAPTURE and not share:
+        if source.name == MOTION_CAPTURE_TOPIC and not share:
             yield warning(
                 "ekf2_not_fusing",
                 f"EKF2 never fused the {positions}: it does not read {source.name}. PX4 writes "
