@@ -191,7 +191,7 @@ def page(
         HTML, identical for the same input; write it as UTF-8.
     """
     style = "".join(map(read_asset, ("colours.css", "base.css", "frame.css")))
-    script = read_asset("frame.js")
+    script = "".join(map(read_asset, ("dom.js", "frame.js")))
     content = {
         "columns": [(c.title, c.kind, c.group, c.visible_from) for c in columns],
         "rows": [
