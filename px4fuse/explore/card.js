@@ -60,8 +60,7 @@ const Card = (() => {
       if (!evaluated.length) return "KF is not evaluated with these settings: too few measurements";
       if (!wrong.length) return "KF is consistent with these settings";
       const { word, ratio, against } = wrong.reduce((a, b) => factor(b.ratio) > factor(a.ratio) ? b : a);
-      return `KF is ${word} with these settings: σ is ${formatRatio(factor(ratio))} times too `
-        + `${ratio > 1 ? "small" : "large"} against ${NAMES[against]}`;
+      return `KF is ${word} with these settings: σ is ${formatRatio(factor(ratio))} times too ${ratio > 1 ? "small" : "large"} against ${NAMES[against]}`;
     }
     /* Show headline and effect with the changed settings, or those of the analysis */
     function showTexts(now, effect, isChanged) {

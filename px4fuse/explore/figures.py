@@ -1,4 +1,4 @@
-"""Empty Bokeh plots of the page, which the page's script fills with data."""
+"""Bokeh plots of the explore page without data, which the script of the page adds."""
 
 from typing import Any, Literal
 
@@ -92,7 +92,7 @@ def document_json(data: Data, tuning: Tuning) -> tuple[Any, dict[str, str]]:
         "plan": _track_plot(),
         "step": _phase_plot(),
     }
-    with document.models.freeze():  # collect the models of all roots once
+    with document.models.freeze():  # faster: Bokeh collects the models of all plots once
         for plot in plots.values():
             document.add_root(plot)
     return document.to_json(deferred=False), {plot.id: name for name, plot in plots.items()}
@@ -150,7 +150,7 @@ def _plots(data: Data, time_range: Range1d) -> dict[str, Any]:
 
 
 class _Sources(dict[str, ColumnDataSource]):
-    """Data sources of one plot, created on first use."""
+    """Bokeh data sources of one plot, created on first use."""
 
     def __init__(self, plot: str) -> None:
         self.plot = plot
@@ -178,7 +178,7 @@ def _draw_innovations(fig: Any, sources: dict[str, ColumnDataSource], *, with_ek
 
 def _add_hover(fig: Any, renderer: Any, *rows: tuple[str, str]) -> None:
     tips = [("time", "@t{0.00} s"), *rows]
-    # The tooltips are on different sides, so that they do not overlap
+    # Tooltips of KF, EKF2 and ground truth are on different sides, so they do not overlap
     side: Any = {"EKF2": "right", "ground truth": "above"}.get(rows[0][0], "left")
     fig.add_tools(HoverTool(renderers=[renderer], tooltips=tips, mode="vline", attachment=side))
 
@@ -206,7 +206,7 @@ def _empty_source(name: str, columns: str) -> ColumnDataSource:
 
 
 def _event_bands(data: Data) -> list[tuple[float, float, Style]]:
-    """Return the shaded spans behind the plots: modes (alternating), ground, gaps, dropouts."""
+    """Return start, end (s) and style of shaded flight modes, ground times, gaps and dropouts."""
     grey: Style = {"fill_color": "#888888", "line_color": None}
     hatched: Style = {
         "hatch_pattern": "/",
@@ -295,7 +295,7 @@ def _likelihood_map(tuning: Tuning) -> Any:
 
 
 def _draw_dots(fig: Any, source: ColumnDataSource, size: int, **style: Any) -> Any:
-    """Draw dots at the last two columns of a source, without an edge line by default."""
+    """Draw dots without edge lines; x and y are the last two columns of the source."""
     x, y = source.column_names[-2:]
     return fig.scatter(x, y, source=source, size=size, **{"line_color": None} | style)
 
@@ -308,7 +308,7 @@ def _pixel_extent(values: Array) -> tuple[float, float]:
 
 
 def _track_plot() -> Any:
-    """Make the map of the track; a selection on it sets the time range of all plots."""
+    """Make the map of the position source; a box on it sets the time range of all plots."""
     fig = _figure(
         "plan",
         250,
@@ -329,7 +329,7 @@ def _track_plot() -> Any:
 
 
 def _phase_plot() -> Any:
-    """Make the phase plane: position and velocity with their 2σ ellipse, and the measurement."""
+    """Make the phase plane: KF position and velocity, their 2σ ellipse, and the measurement."""
     fig = _figure(
         "step",
         330,

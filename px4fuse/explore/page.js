@@ -107,7 +107,7 @@ const Explore = (async () => {
     setting.best.hidden = value === null;
     if (value === null) return;
     const percent = 100 * toSlider(setting, value) / TICKS, line = make("i");
-    const label = make("small", `maximum likelihood ${round(value, 3)}`);
+    const label = make("small", `maximum-likelihood estimate ${round(value, 3)}`);
     line.style.left = label.style.left = `${percent}%`;
     label.style.transform = `translateX(${-percent}%)`;
     setting.best.replaceChildren(line, label);
@@ -389,8 +389,7 @@ const Explore = (async () => {
     const before = axis.name === flight.main ? analysedNumbers : null;
     if (kf?.truthP) {
       const { truthP } = ekf2Of(axis);
-      return `Position RMSE against ground truth along ${axis.called}: ${value(kf.truthP, before?.truthP)}`
-        + `${truthP ? `, EKF2 ${Card.formatMetres(truthP)}` : ""}.`;
+      return `Position RMSE against ground truth along ${axis.called}: ${value(kf.truthP, before?.truthP)}${truthP ? `, EKF2 ${Card.formatMetres(truthP)}` : ""}.`;
     }
     return kf?.ekf2P ? `The position difference KF − EKF2 along ${axis.called} is ${Card.formatMetres(kf.ekf2P)} RMS.` : "";
   }
@@ -588,9 +587,7 @@ const Explore = (async () => {
     if (isText(map)) return `The likelihood map is missing: ${map}.`;
     const axis = axisNow().map === "horizontal" ? "North and east together" : `Axis ${axisNow().map}`;
     const differs = ["dt", "offset", "input"].some((key) => initial[key] !== settings[key]);
-    return `${axis}, ${map.count} measurements, DT ${initial.dt} s, input ${initial.input}, time offset `
-      + `${round(initial.offset, 4)} s. Darker: higher likelihood. Cross: maximum. Dot: current settings. One shade: `
-      + `0.5 σ.${differs ? " The map is not valid for the current DT, input or time offset." : ""}`;
+    return `${axis}, ${map.count} measurements, DT ${initial.dt} s, input ${initial.input}, time offset ${round(initial.offset, 4)} s. Darker: higher likelihood. Cross: maximum. Dot: current settings. One shade: 0.5 σ.${differs ? " The map is not valid for the current DT, input or time offset." : ""}`;
   }
 
   // ------------------------------------------------------------------ command

@@ -1,8 +1,9 @@
 /* Step-by-step view: 2σ ellipse in the phase plane, which grows in each prediction and shrinks along
-   the measurement in each update, with the lesson's equations in numbers. */
+   the measurement in each update, and the equations of the lesson UAT 366, module 2, with numbers. */
 const Step = (() => {
   const CORNERS = 120;
   const TRAIL = 60; // number of previous KF steps whose positions and velocities are drawn
+  // duration of a prediction or update in the animation, from slow to fast
   const STEP_TIMES_MS = [1600, 800, 400, 200, 100, 50];
 
   /* Points of the 2σ ellipse, from the Cholesky factor of P */
@@ -38,7 +39,7 @@ const Step = (() => {
   const trend = (before, now) => now > before ? "increases" : now < before ? "decreases" : "stays equal";
   const sigma = (before, now) => `σ_p ${trend(before, now)}: ${format(Math.sqrt(before))} to ${format(Math.sqrt(now))} m`;
 
-  /* Equations of the lesson UAT 366, module 2, with numbers: rows [title, text] of prediction and update */
+  /* Equations with numbers: rows [title, text] of prediction and update */
   function equations(run, settings, moment) {
     const { steps: s, updates: m } = run, { i, u, updated } = moment;
     const [, , b00, b01, b11] = stateAfter(run, i - 1), prior = state(run, { i, u, updated: false });

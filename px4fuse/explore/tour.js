@@ -11,8 +11,7 @@ const Tour = (() => {
     ({ base, rerun }) => {
       const set = { ...base, sigmaA: 0.002 }, run = rerun(set);
       return { title: "Q almost zero", set, view: "sigma_p",
-        sentence: `SIGMA_A is now ${set.sigmaA} m/s². KF treats the acceleration as exact. σ of position falls to `
-          + `${length(run.sigma)}, and ${change(rerun(base), run)}.`,
+        sentence: `SIGMA_A is now ${set.sigmaA} m/s². KF treats the acceleration as exact. σ of position falls to ${length(run.sigma)}, and ${change(rerun(base), run)}.`,
         task: "Increase SIGMA_A until both marks of KF are in the green band.",
         see: "σ grows again between two measurements, and the innovations return into ±2√S." };
     },
@@ -20,24 +19,21 @@ const Tour = (() => {
       const divided = (divisor) => ({ ...base, sigmaZ: roundTo2Digits(base.sigmaZ / divisor) });
       const divisor = [10, 30].find((d) => rerun(divided(d)).outside > 0.1) ?? 100, set = divided(divisor);
       return { title: "R too small", set, view: "innovation",
-        sentence: `SIGMA_Z is now ${set.sigmaZ} m, ${divisor} times too small. ${percent(rerun(set).outside)} of the innovations `
-          + "are outside ±2√S (expected 5 %).",
+        sentence: `SIGMA_Z is now ${set.sigmaZ} m, ${divisor} times too small. ${percent(rerun(set).outside)} of the innovations are outside ±2√S (expected 5 %).`,
         task: "Increase SIGMA_Z until about 5 % of the innovations are outside.",
         see: "The dots return into the band, and the estimated position becomes smoother." };
     },
     ({ base, rerun, triple }) => {
       const difference = (settings) => length(rerun(settings).rmsDifference(rerun(base)));
       return { title: "The ratio determines the track", set: triple, view: "position",
-        sentence: `SIGMA_A and SIGMA_Z are both three times larger. The position of KF changes by ${difference(triple)} `
-          + `RMS. With a larger SIGMA_A alone it would change by ${difference({ ...triple, sigmaZ: base.sigmaZ })} RMS.`,
+        sentence: `SIGMA_A and SIGMA_Z are both three times larger. The position of KF changes by ${difference(triple)} RMS. With a larger SIGMA_A alone it would change by ${difference({ ...triple, sigmaZ: base.sigmaZ })} RMS.`,
         task: "Set SIGMA_A or SIGMA_Z back to its previous value.",
         see: "The position depends on the ratio SIGMA_A / SIGMA_Z, hardly on their common scale." };
     },
     ({ base, rerun, triple }) => {
       const [before, now] = [base, triple].map(rerun);
       return { title: "The scale determines σ", set: triple, view: "sigma_p",
-        sentence: `The position is the same, but σ of position changed from ${length(before.sigma)} to ${length(now.sigma)}, and `
-          + `${change(before, now)}: one third.`,
+        sentence: `The position is the same, but σ of position changed from ${length(before.sigma)} to ${length(now.sigma)}, and ${change(before, now)}: one third.`,
         task: "Decrease SIGMA_A and SIGMA_Z in the same ratio until the marks are in the green band.",
         see: "Check the reported σ with the innovations, not by the smoothness of the position." };
     },
@@ -57,8 +53,7 @@ const Tour = (() => {
         see: "The error is proportional to speed: zero at rest, largest at high speed. This is typical of a time offset." };
     },
     ({ largest, outside }) => ({ title: "Outliers", view: "innovation", measurement: largest.measurement,
-      sentence: `The largest innovation is ${roundTo2Digits(largest.normalised)} √S, at ${largest.time.toFixed(1)} s. ${percent(outside)} `
-        + "of the innovations are outside ±2√S (expected 5 %).",
+      sentence: `The largest innovation is ${roundTo2Digits(largest.normalised)} √S, at ${largest.time.toFixed(1)} s. ${percent(outside)} of the innovations are outside ±2√S (expected 5 %).`,
       task: "Press space to step through the filter at this time, and check the gain.",
       see: "The gain does not depend on the innovation: without a gate KF follows an outlier." }),
     ({ base, rerun, axis, ekf2 }) => {
@@ -72,7 +67,7 @@ const Tour = (() => {
         sentence: `The RMS of innovation ÷ √S is ${ratio(ekf2.source)} for EKF2 and ${ratio(kf.source)} for KF.`
           + (ekf2.truthP && kf.truthP ? ` The position RMSE is ${length(ekf2.truthP)} for EKF2 and ${length(kf.truthP)} for KF.` : "")
           + (axis.ekf2.r ? ` EKF2 assumes a measurement σ of ${roundTo2Digits(axis.ekf2.r)} m.` : ""),
-        task: `${axis.ekf2.r ? "Press Use R of EKF2, then change" : "Change"} SIGMA_A until σ of KF and EKF2 are equal.`,
+        task: `${axis.ekf2.r ? "Press the button Use R of EKF2, then change" : "Change"} SIGMA_A until σ of KF and EKF2 are equal.`,
         see: "With the same R and a similar Q, EKF2 reports a similar σ." };
     },
   ];

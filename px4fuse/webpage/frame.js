@@ -176,8 +176,7 @@
     for (const entry of shown) unfold(entry, entry.open);
     const last = Math.ceil(matches.length / size);
     query(".pager").hidden = last < 2;
-    $("place").textContent = `${nouns[1][0].toUpperCase()}${nouns[1].slice(1)} ${firstShown + 1} to `
-      + `${firstShown + shown.length} of ${matches.length}`;
+    $("place").textContent = `${nouns[1][0].toUpperCase()}${nouns[1].slice(1)} ${firstShown + 1} to ${firstShown + shown.length} of ${matches.length}`;
     $("back").disabled = firstShown === 0;
     $("on").disabled = firstShown + size >= matches.length;
     fit();
