@@ -74,6 +74,7 @@ const Card = (() => {
       headlineNode.textContent = shown.headline;
       effectNode.textContent = shown.effect;
       recorded.hidden = !isChanged;
+      query("#card .do")?.toggleAttribute("hidden", isChanged); // its advice is for the analysed settings
       recorded.textContent = `With the analysed settings: ${analysed.sign} ${analysed.headline}`;
     }
     return { showAxis, moveMarks, showTexts, verdicts };
