@@ -407,7 +407,8 @@ def _time_unit(times: Array, name_unit: str, option: str | None) -> tuple[str, s
             plausible_units.append(unit)
     if not plausible_units:
         return "s", (
-            "s (assumed, because no unit gives a plausible UWB rate; --position-time-unit sets another)"
+            "s (assumed, because no unit gives a plausible UWB rate; "
+            "--position-time-unit sets another)"
         )
     unit = plausible_units[0]
     description = f"{unit} (from the median interval {median_step * TIME_UNITS[unit]:.3g} s)"
