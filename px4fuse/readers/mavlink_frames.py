@@ -189,7 +189,7 @@ def read_frames(name: str, content: bytes) -> Frames:
             "Give a .ulg, a .tlog or a raw MAVLink stream.",
         )
     content_bytes = np.frombuffer(content, dtype=np.uint8)
-    is_version_2 = source[start] == MAGIC_BYTE_2
+    is_version_2 = content_bytes[start] == MAGIC_BYTE_2
     # Three consecutive header bytes: sequence, system, component
     sequence_offset = start + np.where(is_version_2, 4, 2)
     unknown_frame_count, bad_bytes, ends_in_frame = _count_other_bytes(
@@ -204,11 +204,11 @@ def read_frames(name: str, content: bytes) -> Frames:
         sha256=hashlib.sha256(content).hexdigest(),
         start=start,
         message_id=message_id.astype(np.int32),
-        system=source[sequence_offset + 1],
-        component=source[sequence_offset + 2],
-        sequence=source[sequence_offset],
+        system=content_bytes[sequence_offset + 1],
+        component=content_bytes[sequence_offset + 2],
+        sequence=content_bytes[sequence_offset],
         payload_start=start + np.where(is_version_2, HEADER_BYTES_2, HEADER_BYTES_1),
-        payload_length=source[start + 1],
+        payload_length=content_bytes[start + 1],
         received_us=received_us,
         unknown_frame_count=unknown_frame_count,
         bad_bytes=bad_bytes,
