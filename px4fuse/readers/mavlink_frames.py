@@ -196,7 +196,7 @@ def read_frames(name: str, content: bytes) -> Frames:
         content, start - time_bytes, end, time_bytes
     )
     received_us, damaged_receive_times = (
-        _read_receive_times(source, start, end) if time_bytes else (None, 0)
+        _read_receive_times(content_bytes, start, end) if time_bytes else (None, 0)
     )
     return Frames(
         name=name,
