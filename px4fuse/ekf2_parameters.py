@@ -104,6 +104,11 @@ class Parameter:
     minimum: float
     maximum: float
 
+    @property
+    def printed_unit(self) -> str:
+        """Unit with superscripts."""
+        return self.unit.replace("^2", "²").replace("^3", "³")
+
     def describe_range_error(self, value: float) -> str:
         """Return a text if a finite value is outside the range, else "".
 

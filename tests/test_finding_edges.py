@@ -506,6 +506,13 @@ def test_misalignment_heading_drift_reports_both_ends() -> None:
     assert (finding.evidence["from_deg"], finding.evidence["p"]) == (2.0, 1e-300)
 
 
+def test_heading_angles_are_printed_within_half_a_turn() -> None:
+    finding = only(source_frame.detect, analysis(heading=heading_error(170.0, 230.0, p=0.0)))
+    assert "It is +170° from 0 to 10 s and -130° from 10 to 20 s" in finding.message
+    finding = only(source_frame.detect, analysis(heading=heading_error(340.0)))
+    assert "rotated by -20°" in finding.title
+
+
 # ---------------------------------------------------------------- limits
 
 

@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from importlib import metadata
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,6 +14,7 @@ from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.card.causes import (
     FILTER_NAMES,
     RankedCause,
+    can_show_effect,
     make_cause,
     make_plain_cause,
     rank_causes,
@@ -37,15 +40,17 @@ from px4fuse.comparison.projection import project_horizon
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import improvement
 from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.errors import LogError, MissingDataError
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.settings import Settings
+from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Finding, group_by_root
 from px4fuse.flight import Ekf2, Unavailable, source_name
+from px4fuse.reading import display_name, file_size, read_head
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
 from px4fuse.text import with_log_name
 
-MAX_NOTES = 3
 MAX_ACTIONS = 3
 # Rejected fraction and resets from which the effect names them
 MIN_NAMED_REJECTION = 0.01
@@ -55,6 +60,12 @@ USUALLY_UNDERCONFIDENT = frozenset({"baro_hgt", "mag", "gravity"})
 DRIFT_HIDES_ERROR = (
     "σ too large against the source is not a fault here: the source may drift, and innovations do "
     "not show drift. Do not lower the noises for it."
+)
+# Bytes of a refused file that its card shows, and the first bytes of each ULog
+SHOWN_BYTES, ULOG_HEAD = 4, "55 4C 6F 67"
+HEADING_HIDES_ERROR = (
+    "Both filters rotate the measured acceleration by the wrong heading and return to the position "
+    "at each update, so the innovations show only a part of the error."
 )
 UNEXPLAINED = "The two verdicts differ, and no tested change explains it."
 NO_FAULT = "No fault found: KF and EKF2 are consistent"
@@ -163,9 +174,26 @@ def build_aids_card(
     )
 
 
+def build_refusal_card(error: LogError | MissingDataError, path: Path) -> Card:
+    """Return the card of a log that cannot be analysed: fault, bytes of the file, and action."""
+    facts = {}
+    with suppress(LogError):  # the file cannot be opened, which the error says
+        head = read_head(path, SHOWN_BYTES, LogError).hex(" ").upper()
+        size = file_size(path, LogError)
+        facts["read"] = f"{size:,} bytes, beginning with {head} (ULog: {ULOG_HEAD})"
+    if error.remedy:
+        facts["fix"] = with_options(with_log_name(error.remedy, str(path)))
+    return Card(
+        severity="refused",
+        id=error.id,
+        headline=with_options(error.reason),
+        facts=facts,
+        identity=Identity(file=display_name(path)),
+    )
+
+
 def _severity_without_cause(verdicts: Sequence[Verdict]) -> CardSeverity:
-    words = {verdict.word for verdict in verdicts if not verdict.is_explained}
-    return "note" if words & {"overconfident", "underconfident"} else "clean"
+    return "note" if any(verdict.is_loud for verdict in verdicts) else "clean"
 
 
 def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
@@ -177,12 +205,7 @@ def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
             if other.severity == "error" and len(both) <= MAX_HEADLINE_LENGTH:
                 return both
         return first.title
-    faulty = [
-        each
-        for each in verdicts
-        if each.word in ("overconfident", "underconfident") and not each.is_explained
-    ]
-    if faulty:
+    if faulty := [verdict for verdict in verdicts if verdict.is_loud]:
         worst = max(faulty, key=lambda each: abs(math.log(each.ratio or 1.0)))
         size = worst.ratio or 1.0
         direction = "small" if size > 1.0 else "large"
@@ -228,14 +251,14 @@ def _effect(analysis: Analysis) -> Effect:
 
 
 def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
-    """Format the axis with its reference: "along the aisle, 30° from north"."""
-    called, heading = result.axis.label, result.heading_deg
-    if result.axis.name != "aisle" or heading is None:
-        return f"along {called}"
+    """Format the axis with its reference: "along the main axis, 30° from north"."""
+    direction, heading = f"along {result.axis.label}", result.heading_deg
+    if result.axis.name != AISLE or heading is None:
+        return direction
     reference = "north"
     if analysis.source.frame == "FRD":
         reference = f"the {source_name(analysis.source)} x axis"
-    return f"along {called}, {heading % 180.0:.0f}° from {reference}"
+    return f"{direction}, {heading % 180.0:.0f}° from {reference}"
 
 
 def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
@@ -309,7 +332,9 @@ def _is_change(action: Action) -> bool:
 
 def _sentence(action: Action) -> str:
     if action.where == "console":
-        return f"EKF2: set {action.sentence}."
+        one_change = action.sentence.partition(" ")[2]  # the command has the name of the parameter
+        change = one_change if len(action.commands) == 1 else action.sentence
+        return f"EKF2: {', '.join(action.commands)} ({change})."
     if action.where == "shell":
         options = action.commands[0].partition(" --")[2]
         return f"KF: {action.sentence or 'run again with'} --{options}."
@@ -325,10 +350,11 @@ def _mark_explained(
     If the source may drift, a σ that is too large against the source is not a fault.
     """
     unchanged = {
-        action.target
+        name
         for cause in causes
         for action in cause.actions
         if action.sentence.startswith("no change")
+        for name in action.target.split(", ")
     }
     truth_is_right = {
         verdict.filter
@@ -337,7 +363,7 @@ def _mark_explained(
     }
     return tuple(
         replace(verdict, is_explained=True)
-        if verdict.word in ("overconfident", "underconfident")
+        if verdict.is_loud
         and (
             FILTER_NAMES[verdict.filter] in unchanged
             or verdict.filter in truth_is_right
@@ -416,7 +442,7 @@ def _reconcile(
         )
     if "source_outliers" in ids and "ekf2" in differing:
         return _gate_sentence(analysis)
-    return UNEXPLAINED
+    return HEADING_HIDES_ERROR if "ekf2_heading_error" in ids else UNEXPLAINED
 
 
 def _differ(source: Verdict, truth: Verdict, *, is_corrected: bool) -> bool:
@@ -448,7 +474,11 @@ def _difference(effect: Effect, ranked: Sequence[RankedCause]) -> str:
         return ""
     text = f"KF − EKF2: {format_metres(effect.difference_rms_m)} m RMS"
     trials = ranked[0].trials
-    owners = {trial.filter for trial in trials if improvement(trial) in BETTER_POSITION}
+    owners = {
+        trial.filter
+        for trial in trials
+        if improvement(trial) in BETTER_POSITION or not can_show_effect(trial)
+    }
     if len(owners) == 2:
         return f"{text}. Both filters have the fault, so this difference does not show it."
     after = {trial.filter: trial.after.difference_rms_m for trial in reversed(trials)}
@@ -461,9 +491,10 @@ def _difference(effect: Effect, ranked: Sequence[RankedCause]) -> str:
 
 
 def _notes(roots: Sequence[Finding], log: str) -> tuple[Note, ...]:
-    notes = [one for one in roots if one.severity == "note"]
     return tuple(
-        Note(one.id, f"{one.title}.", with_log_name(one.remedy, log)) for one in notes[:MAX_NOTES]
+        Note(finding.id, f"{finding.title}.", with_log_name(finding.remedy, log))
+        for finding in roots
+        if finding.severity == "note"
     )
 
 
@@ -497,10 +528,10 @@ def _settings(analysis: Analysis, request: ComparisonRequest) -> str:
         ("dt_s", "DT", "s"),
     ):
         value, origin = getattr(chosen, name), "set by option"
-        if value == getattr(Settings(), name):
-            origin = "default"
-        elif name == "sigma_z_m" and request.sigma_z_m is None:
+        if name == "sigma_z_m" and request.sigma_z_m is None and analysis.source.origin.is_gnss:
             origin = f"from {aid_of(analysis).noise}"
+        elif value == getattr(Settings(), name):
+            origin = "default"
         texts.append(f"{label} {value:g} {unit} ({origin})")
     return ", ".join(texts)
 
@@ -518,16 +549,11 @@ def _changed_parameters(analysis: Analysis) -> tuple[str, ...]:
     """Format noise, delay and gate of EKF2 for the source that differ from PX4's default."""
     if analysis.source.origin.aid is None:
         return ()
-    aid, logged = analysis.source.origin.aid, analysis.flight.log.parameters
-    texts = []
-    for name in (aid.noise, aid.delay, aid.gate):
-        parameter, value = PARAMETERS.get(name), logged.get(name)
-        if (
-            parameter is None
-            or value is None
-            or math.isclose(value, parameter.default, rel_tol=1e-3)
-        ):
-            continue
-        unit = f" {parameter.unit}" if parameter.unit else ""
-        texts.append(f"{name} {value:.4g}{unit} (PX4 default {parameter.default:g})")
-    return tuple(texts)
+    aid, log = analysis.source.origin.aid, analysis.flight.log
+    return tuple(
+        f"{name} {value:.4g} {PARAMETERS[name].unit}".rstrip() + f" (PX4 default {default:g})"
+        for name in (aid.noise, aid.delay, aid.gate)
+        if name in PARAMETERS
+        and (value := log.parameters.get(name)) is not None
+        and not math.isclose(value, default := log.default_of(name), rel_tol=1e-3)
+    )

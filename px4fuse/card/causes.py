@@ -52,6 +52,8 @@ RERUN_KINDS: Mapping[str, frozenset[str]] = {
     "ekf2_rejects_positions": frozenset({"noise", "gate"}),
     "ekf2_noise_too_small": frozenset({"noise", "noises"}),
     "ekf2_noise_too_large": frozenset({"noise", "noises"}),
+    "ekf2_overconfident": frozenset({"process noise"}),
+    "ekf2_underconfident": frozenset({"process noise"}),
 }
 # Findings without which the rest of the card is meaningless; they come first
 MEANINGLESS = (
@@ -113,7 +115,9 @@ def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCaus
         if finding.severity == "note":
             continue
         trials = confirming_trials(analysis.trials, finding)
-        if trials and not any(map(has_effect, trials)):
+        if finding.id in VERDICT_FINDINGS:  # the verdict stands if a re-run does not explain it
+            trials = tuple(filter(is_useful, trials))
+        elif trials and not any(has_effect(each) or not can_show_effect(each) for each in trials):
             continue
         ranked.append(
             RankedCause(finding, _tier(finding, trials), sum(map(reduction, trials)), trials)
@@ -149,22 +153,27 @@ def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial,
     """Return the re-runs that correct a finding: the best one of each kind and filter.
 
     Best: the smallest change that brings a verdict into its band, else the smallest ratios. For KF
-    the default settings are added. A re-run that could not show the effect is left out.
+    the default settings are added.
     """
     kinds = RERUN_KINDS.get(finding.id, frozenset())
     kinds |= {"defaults"} if "noises" in kinds else set()
     best: dict[tuple[FilterName, str], Trial] = {}
     for trial in trials:
-        if len(trial.kinds) == 1 and trial.kinds[0] in kinds and _can_show_effect(trial):
+        if len(trial.kinds) == 1 and trial.kinds[0] in kinds:
             key = trial.filter, trial.kinds[0]
             best[key] = min(trial, best.get(key, trial), key=preference)
     return tuple(best.values())
 
 
-def _can_show_effect(trial: Trial) -> bool:
-    """Return False if innovations are alike and the change can show against ground truth only."""
+def can_show_effect(trial: Trial) -> bool:
+    """Return False if only ground truth, which is missing, could show the effect of a re-run."""
     has_truth = trial.before.position_rmse_m is not None
     return has_truth or UNSEEN_KINDS.isdisjoint(trial.kinds) or has_effect(trial)
+
+
+def is_useful(trial: Trial) -> bool:
+    """Return True unless a re-run shows that its change improves nothing."""
+    return improvement(trial) != "nothing" or not can_show_effect(trial)
 
 
 def make_cause(
@@ -172,13 +181,13 @@ def make_cause(
 ) -> Cause:
     """Make the numbered cause of a finding, with actions for sender, KF and EKF2."""
     finding, trials = ranked.finding, ranked.trials
-    useful = [trial for trial in trials if improvement(trial) != "nothing"]
-    alternatives, actions = _actions(analysis, finding, useful, verdicts, request)
+    useful = [trial for trial in trials if is_useful(trial)]
+    alternatives, actions = _actions(analysis, ranked, useful, verdicts, request)
     return structs.replace(
         make_plain_cause(finding),
         alternatives=alternatives,
         actions=actions,
-        reruns=tuple(_rerun(trial, trials) for trial in trials),
+        reruns=tuple(_rerun(trial, trials) for trial in trials if can_show_effect(trial)),
         after=_closing_sentence(analysis, useful, alternatives),
     )
 
@@ -202,13 +211,13 @@ def _reason(finding: Finding) -> str:
 
 def _actions(
     analysis: Analysis,
-    finding: Finding,
+    ranked: RankedCause,
     useful: Sequence[Trial],
     verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
     """Return alternatives that exclude each other, and the actions that are done in any case."""
-    by_kind = {(trial.filter, trial.kinds[0]): trial for trial in useful}
+    finding, by_kind = ranked.finding, {(each.filter, each.kinds[0]): each for each in useful}
     alternatives: tuple[tuple[Action, ...], ...] = ()
     actions: list[Action] = []
     general = None
@@ -230,7 +239,7 @@ def _actions(
             actions.append(sender)
     elif delay is not None:
         actions.append(set_parameters(analysis, delay.change))
-    elif general is not None and not _is_setting(finding):
+    elif general is not None and not (_is_setting(finding) and ranked.trials):
         actions.append(general)
     for (owner, kind), trial in by_kind.items():
         if (
@@ -247,11 +256,16 @@ def _actions(
             and trial.change.keys() <= PARAMETERS.keys()
         ):
             actions.append(set_parameters(analysis, trial.change))
-    named = {action.target for action in actions}
-    named |= {action.target for alternative in alternatives for action in alternative}
-    for owner, name in FILTER_NAMES.items():
-        if name not in named and (text := _no_change(finding, owner, verdicts)):
-            actions.append(Action(name, text))
+    actions.sort(key=lambda action: action.target == "KF")  # the vehicle first, then this log
+    named = {action.target for group in (actions, *alternatives) for action in group}
+    reasons = {
+        name: reason
+        for owner, name in FILTER_NAMES.items()
+        if name not in named and (reason := _no_change(finding, owner, verdicts))
+    }
+    if len(reasons) == 2 and len(set(reasons.values())) == 1:
+        reasons = {"KF, EKF2": reasons["KF"]}
+    actions += [Action(target, reason) for target, reason in reasons.items()]
     return alternatives, tuple(actions)
 
 
@@ -265,15 +279,17 @@ def _no_change(finding: Finding, owner: FilterName, verdicts: Sequence[Verdict])
     if not words:
         return ""
     if set(words.values()) == {"consistent"}:
+        if "truth" not in words and RERUN_KINDS.get(finding.id, frozenset()) & UNSEEN_KINDS:
+            return "no change tested: only ground truth shows the effect of this fault"
         return "no change: consistent"
-    if finding.id == "source_drift":
-        return "no setting removes drift" if owner == "kf" else "no parameter removes drift"
     if finding.id == "source_outliers":
         if owner == "kf":
             return "no option rejects outliers; do not raise --sigma-z for them"
         if words.get("truth", "consistent") == "consistent":
             return "no change: its gate rejects outliers, and σ covers the error"
-    return f"no {'setting' if owner == 'kf' else 'parameter'} corrects this fault"
+    return (
+        f"no setting {'removes drift' if finding.id == 'source_drift' else 'corrects this fault'}"
+    )
 
 
 def _target(finding: Finding, source: PositionTrack | None = None) -> Target:
@@ -302,8 +318,8 @@ def set_parameters(analysis: Analysis, change: Mapping[str, float]) -> Action:
     texts, commands, needs_reboot = [], [], False
     for name, value in change.items():
         parameter = PARAMETERS[name]
-        unit = f" {parameter.unit}" if parameter.unit else ""
-        texts.append(f"{name} {flown.get(name, math.nan):g} → {value:g}{unit}")
+        change_text = f"{name} {flown.get(name, math.nan):g} → {value:g} {parameter.printed_unit}"
+        texts.append(change_text.rstrip())
         commands.append(f"param set {name} {value:g}")
         needs_reboot |= name.endswith(REBOOT_SUFFIXES)
     return Action(
@@ -370,7 +386,7 @@ def _closing_sentence(
         name = next(iter(trial.change))
         if trial.kinds != ("noise",) or not isinstance(tuned, AxisTuning):
             continue
-        default = PARAMETERS[name].default
+        default = analysis.flight.log.default_of(name)
         if (tuned.sigma_z.low or 0.0) <= default <= (tuned.sigma_z.high or 0.0):
             return f"PX4's default, {default:g} m, is inside the 95 % interval: it is as good."
     return ""

@@ -12,7 +12,7 @@ from px4fuse.record import Count, NotNegative, Positive, Record, Share, Span
 FilterName = Literal["kf", "ekf2"]
 CardSeverity = Literal["clean", "note", "warning", "error", "refused"]
 VerdictWord = Literal["consistent", "overconfident", "underconfident", "not evaluated"]
-Target = Literal["sender", "receiver", "source", "logging", "flight", "KF", "EKF2"]
+Target = Literal["sender", "receiver", "source", "logging", "flight", "KF", "EKF2", "KF, EKF2"]
 
 # Bands of a consistent ratio: against the source, and against ground truth
 BANDS = CONSISTENT_RATIOS
@@ -22,6 +22,8 @@ AXIS_ENDS = (0.1, 10.0)
 AXIS_TICKS = {0.1: "1/10", 0.2: "1/5", 0.5: "1/2", 1.0: "1", 2.0: "2", 5.0: "5", 10.0: "10"}
 # Numbered causes of a card; further ones are counted
 MAX_CAUSES = 3
+# Notes that cover and terminal print; further ones are counted
+MAX_NOTES = 3
 MAX_HEADLINE_LENGTH = 84
 
 
@@ -53,6 +55,11 @@ class Verdict(Record, frozen=True, kw_only=True):
     samples: Count = 0
     reason: str = ""
     is_explained: bool = False
+
+    @property
+    def is_loud(self) -> bool:
+        """True if the ratio is outside its band and the card does not explain it."""
+        return self.word in ("overconfident", "underconfident") and not self.is_explained
 
 
 class Effect(Record, frozen=True, kw_only=True):

@@ -12,7 +12,6 @@ from px4fuse.card.model import FilterName, Verdict
 from px4fuse.comparison.comparison import normalised_position_errors
 from px4fuse.comparison.model import AxisComparison, FilterSummary
 from px4fuse.filter.consistency import (
-    MIN_INNOVATIONS,
     Reference,
     classify_ratio,
     ratio_interval,
@@ -39,9 +38,6 @@ def _against_source(result: AxisComparison, owner: FilterName) -> Verdict:
     statement = result.filters[owner]
     if not isinstance(statement, FilterSummary):
         return _not_evaluated(owner, "source", statement)
-    if statement.count < MIN_INNOVATIONS:
-        few = f"{statement.count} innovations, at least {MIN_INNOVATIONS} are needed"
-        return Verdict(filter=owner, against="source", word="not evaluated", reason=few)
     ratio = statement.sigma_ratio
     interval = ratio_interval(statement.nis_mean, statement.nis_band)
     return Verdict(

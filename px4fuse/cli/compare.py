@@ -7,6 +7,7 @@ from typing import Any, Literal, get_args
 import click
 
 from px4fuse.cli import options, outputs
+from px4fuse.errors import LogError, MissingDataError
 from px4fuse.request import settings_name
 from px4fuse.writing import STANDARD_OUTPUT
 
@@ -49,19 +50,25 @@ def compare(
     """
     from px4fuse.analysis import failed_checks, run_or_evaluate_aids
     from px4fuse.memory import release_free_memory
-    from px4fuse.report.terminal import closing, summary
+    from px4fuse.report.terminal import closing, refusal, summary
     from px4fuse.results.build import outcome_results
 
     student = options.read_student(option_values)
     request = options.comparison_request(log, option_values)
     outputs.report_paths(output, json_path)  # report an impossible output before the long analysis
-    with outputs.progress(json_path) as show_progress:
-        outcome = run_or_evaluate_aids(request, show_progress)
-        results = outcome_results(request, outcome, student)
-        release_free_memory()  # importing the report modules needs memory
-        if output is None and json_path is None:
-            output = outputs.default_report(log.stem, settings_name(request), results)
-        contents = outputs.result_files(results, json_path, output, outcome, show_progress)
+    try:
+        with outputs.progress(json_path) as show_progress:
+            outcome = run_or_evaluate_aids(request, show_progress)
+            results = outcome_results(request, outcome, student)
+            release_free_memory()  # importing the report modules needs memory
+            if output is None and json_path is None:
+                output = outputs.default_report(log.stem, settings_name(request), results)
+            contents = outputs.result_files(results, json_path, output, outcome, show_progress)
+    except (LogError, MissingDataError) as error:
+        if not sys.stderr.isatty():  # other programs read one line
+            raise
+        outputs.show_page(refusal(error, log), is_error=True)
+        sys.exit(2)
     page = summary(outcome, results, verbose=verbose, quiet=quiet)
     outputs.write_and_print(contents, page, request)
     if not quiet and STANDARD_OUTPUT not in contents:

@@ -307,14 +307,14 @@ filter_options = _combine_options(
         "axes",
         type=Choice(get_args(AxisName)),
         multiple=True,
-        help="Axis to analyse; repeatable.  [default: all axes with a position; for GNSS the "
-        "horizontal axes]",
+        help="Axis to analyse, repeatable; aisle is the main axis of the track.  [default: all "
+        "axes with a position; for GNSS the horizontal axes]",
     ),
     click.option(
         "--heading",
         "heading_deg",
         type=TypedQuantity("°", 30.0),
-        help="Heading of the aisle axis, clockwise from north.  [default: main direction of the "
+        help="Heading of the main axis, clockwise from north.  [default: main direction of the "
         "track]",
     ),
     click.option(

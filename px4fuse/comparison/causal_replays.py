@@ -746,9 +746,8 @@ class _Ekf2Rerun(_FilterRerun):
     def other_candidates(self, tuned: AxisTuning | None) -> list[Change]:
         """Return the default gate, other PX4 defaults, and the process noise for vibration."""
         aid, flown = self.inputs.aid, self.inputs.settings
-        default_values = {
-            name: PARAMETERS[name].default for name in (aid.gate, *PARAMETERS_OF_EKF2)
-        }
+        log = self.comparison.flight.log
+        default_values = {name: log.default_of(name) for name in (aid.gate, *PARAMETERS_OF_EKF2)}
         changes: list[Change] = [
             {name: value}
             for name, value in default_values.items()

@@ -144,5 +144,5 @@ def noise_used_m(model: Model) -> float:
 
 def format_settings(changes: Mapping[str, float]) -> str:
     """Format parameters with the values to set: "EKF2_EV_DELAY to 264 ms and ..."."""
-    texts = (f"{name} to {value:.3g} {PARAMETERS[name].unit}" for name, value in changes.items())
+    texts = (f"{n} to {value:.3g} {PARAMETERS[n].printed_unit}" for n, value in changes.items())
     return " and ".join(map(str.rstrip, texts))

@@ -18,6 +18,7 @@ from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Columns, Ekf2, Flight, 
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.readers.px4_innovations import innovations_along
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
+from px4fuse.text import count_noun
 
 Spans = tuple[Span, ...]
 HORIZONTAL: tuple[AxisName, AxisName] = ("north", "east")
@@ -258,8 +259,8 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     if len(log) < MIN_SAMPLES:
         return Unavailable(
             "EKF2 replay",
-            f"only {len(log)} logged innovations to compare with (at least {MIN_SAMPLES} "
-            "are needed)",
+            f"only {count_noun(len(log), 'logged innovation')} to compare with (at least "
+            f"{MIN_SAMPLES} are needed)",
             "Fly longer on external vision, and record with SDLOG_PROFILE bit 0 (default).",
         )
     if not inside_spans(ekf2.state.index, replay.evaluated_s).any():
@@ -387,7 +388,7 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
         rows = logged_aid_innovations(name, log)
         logged, model = _matched_samples(replay, updates, rows, is_own_topic=is_own_topic)
         if len(logged) < MIN_SAMPLES:
-            doubtful[name] = f"only {len(logged)} logged innovations to compare with"
+            doubtful[name] = f"only {count_noun(len(logged), 'logged innovation')} to compare with"
             continue
         if _has_constant_innovations(logged, model, axes_of(updates)):
             doubtful[name] = CONSTANT_INNOVATIONS

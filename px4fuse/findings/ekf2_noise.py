@@ -8,7 +8,6 @@ import math
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.remedy import aid_of, format_settings
 from px4fuse.comparison.trials import Trial, find_trial, ratio_pairs
-from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Findings, Severity, finding, format_percent
@@ -45,7 +44,9 @@ def detect(analysis: Analysis) -> Findings:
             reason = "The gain of EKF2 is too large, and its σ too small."
     of_positions = " of the positions" if effect else ""
     title = f"{aid.noise} is {format_factor(size)} times too {direction}{effect}{of_positions}"
-    if is_small and flown_m == PARAMETERS[aid.noise].default:  # not chosen: name the sensor
+    if is_small and flown_m == analysis.flight.log.default_of(
+        aid.noise
+    ):  # not chosen: name the sensor
         who = "both filters assume" if is_shared else "EKF2 assumes"
         title = f"{sensor} noise is {format_factor(size)} times what {who}{effect}"
     interval, tuned = "", analysis.tuning.get(HORIZONTAL)

@@ -22,7 +22,7 @@ from pyulog import ULog
 from pyulog.exceptions import ULogException
 
 from px4fuse.arrays import IntArray
-from px4fuse.ekf2_parameters import REPORTED, replace_invalid_parameters
+from px4fuse.ekf2_parameters import PARAMETERS, REPORTED, replace_invalid_parameters
 from px4fuse.errors import LogError
 from px4fuse.log import Dropout, LogInfo, Stream
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
@@ -427,6 +427,11 @@ def read_topics(name: str, content: bytes) -> Topics:
         parameters=MappingProxyType(
             {name: parameter_values[name] for name in REPORTED if name in parameter_values}
         ),
+        parameter_defaults={
+            name: value
+            for name, value in sorted(_system_defaults(ulog).items())
+            if name in PARAMETERS
+        },
         notes=(*notes, *parameter_faults),
         bytes_read=source.start - source.skipped_bytes,
         autopilot=_printable_text(ulog.msg_info_dict, "sys_name", "PX4"),
@@ -439,6 +444,10 @@ def read_topics(name: str, content: bytes) -> Topics:
     return Topics(
         log, tables, zero_us, {}, MappingProxyType(parameters), is_cut, ulog.file_corruption
     )
+
+
+def _system_defaults(ulog: ULog) -> dict[str, float]:
+    return ulog.get_default_parameters(0) if ulog.has_default_parameters else {}
 
 
 def _read_tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:

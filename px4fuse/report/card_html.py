@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card, describe_axis
-from px4fuse.card.model import AXIS_TICKS, BANDS, Action, Card, Cause, Rerun, Verdict
+from px4fuse.card.model import AXIS_TICKS, BANDS, Action, Card, Rerun, Verdict
 from px4fuse.card.numbers import axis_fraction, format_ratio
 from px4fuse.card.verdicts import verdicts
 from px4fuse.errors import SettingsError
@@ -24,6 +24,7 @@ from px4fuse.report.card_text import (
     QUANTITIES,
     format_spans,
     format_target,
+    marked_actions,
     rerun_columns,
     rerun_start,
     with_typed_path,
@@ -85,11 +86,13 @@ def card_html(
         more=" and ".join(
             text for text, parts in (("causes", card.causes), ("notes", card.notes)) if parts
         ).capitalize(),
-        first_actions=[row for row in _rows(card.causes[0]) if _is_prominent(row)]
+        first_actions=[row for row in marked_actions(card.causes[0]) if _is_prominent(row)]
         if card.causes
         else [],
         rows_of=lambda cause: [
-            row for row in _rows(cause) if cause is not card.causes[0] or not _is_prominent(row)
+            row
+            for row in marked_actions(cause)
+            if cause is not card.causes[0] or not _is_prominent(row)
         ],
         rerun_rows=_rerun_rows,
         signs=SIGNS,
@@ -125,7 +128,6 @@ def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str
         marks=MARKS,
         quantities=QUANTITIES,
         format_ratio=format_ratio,
-        is_loud=is_loud,
     )
 
 
@@ -170,24 +172,9 @@ def alternative_text(verdicts: Sequence[Verdict]) -> str:
     )
 
 
-def is_loud(verdict: Verdict) -> bool:
-    """Return True if a verdict is not consistent and not explained."""
-    return verdict.word in ("overconfident", "underconfident") and not verdict.is_explained
-
-
 def _value(verdict: Verdict) -> str:
     explained = ", explained" if verdict.is_explained else ""
     return f"{format_ratio(verdict.ratio or 0.0)}, {verdict.word}{explained}"
-
-
-def _rows(cause: Cause) -> list[tuple[str, Action]]:
-    """Return the actions of a cause, with EITHER and OR before those that exclude each other."""
-    rows = [
-        ("EITHER " if not place else "OR ", action)
-        for place, alternative in enumerate(cause.alternatives)
-        for action in alternative
-    ]
-    return rows + [("", action) for action in cause.actions]
 
 
 def _is_prominent(row: tuple[str, Action]) -> bool:

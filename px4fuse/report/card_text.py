@@ -14,6 +14,7 @@ from msgspec.structs import replace
 from px4fuse.card.model import (
     AXIS_TICKS,
     BANDS,
+    MAX_NOTES,
     Action,
     AidRow,
     Card,
@@ -108,13 +109,15 @@ def card_lines(card: Card) -> Iterator[Line]:
         yield Line(f"error[{card.id}]: {card.headline}", STYLES["error"])
         for label, text in card.facts.items():
             yield from _labelled(label, text)
+        yield Line("Nothing was written. Exit code 2.")
         return
     yield from _identity(card)
     yield from _headline(card)
-    for cause in card.causes:
-        if cause is not card.causes[0]:
+    for number, cause in enumerate(card.causes, start=1):
+        if number > 1:
             title = f"{cause.severity}[{cause.id}]: {cause.title}"
             yield Line(title, STYLES[cause.severity])
+        yield from _labelled(f"cause {number}" if len(card.causes) > 1 else "cause", cause.why)
         yield from _cause(cause)
     if card.more_causes:
         yield Line(f"and {card.more_causes} more: -v")
@@ -126,16 +129,24 @@ def card_lines(card: Card) -> Iterator[Line]:
         yield from _wrapped(text, "  ", "  ")
     if card.notes:
         yield Line("")
-    for note in card.notes:
-        text = " ".join(filter(None, (f"note[{note.id}]: {note.text}", note.action)))
+    for text in note_texts(card, "-v"):
         yield from _wrapped(text, "", "  ")
+
+
+def note_texts(card: Card, place: str) -> list[str]:
+    """Format the first notes of a card; ``place`` has the further ones, which are counted."""
+    texts = [
+        " ".join(filter(None, (f"note[{note.id}]: {note.text}", note.action)))
+        for note in card.notes[:MAX_NOTES]
+    ]
+    more = len(card.notes) - MAX_NOTES
+    return texts + ([f"and {more} more: {place}"] if more > 0 else [])
 
 
 def closing_lines(card: Card) -> Iterator[Line]:
     """Yield the lines after the written files: where to read more, and what *console* means."""
     has_console = any(action.where == "console" for action in _all_actions(card))
-    sentences = ["More: -v."] if card.severity != "refused" else []
-    sentences += [CONSOLE] if has_console else []
+    sentences = ["More: -v.", *([CONSOLE] if has_console else [])]
     sentences += [f"Meaning: px4fuse explain {card.id}"] if card.id else []
     yield from _wrapped(" ".join(sentences), "", "")
 
@@ -243,7 +254,6 @@ def _headline(card: Card) -> Iterator[Line]:
 
 
 def _cause(cause: Cause) -> Iterator[Line]:
-    yield from _labelled("cause", cause.why)
     yield from _labelled("when", format_spans(cause))
     rows = marked_actions(cause)
     labels = [f"{mark}{format_target(action)}" for mark, action in rows]
@@ -336,7 +346,7 @@ def _verdict_axis(card: Card) -> Iterator[Line]:
         return
     along = "" if card.effect is None else f", {card.effect.axis}"
     yield Line("")
-    heading = "Reported uncertainty: RMS of actual ÷ reported over all samples"
+    heading = "Reported uncertainty: RMS of actual ÷ reported"
     yield from _wrapped(f"{heading}{along}", "", "  ")
     limits = ", ".join(f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in BANDS.items())
     legend = f"  ░ consistent ({limits})"
@@ -358,8 +368,7 @@ def _verdict_line(verdict: Verdict) -> Line:
         return Line(text, "", head, " " * 41, wraps=True)
     word = f"({verdict.word})" if verdict.is_explained else verdict.word
     text = f"{head}{format_ratio(verdict.ratio):>7}  {word}"
-    is_loud = verdict.word != "consistent" and not verdict.is_explained
-    style = "bold" if is_loud else ""
+    style = "bold" if verdict.is_loud else ""
     return Line(f"{text:{AXIS_INDENT}}{axis_text(verdict.ratio, verdict.against)}", style)
 
 

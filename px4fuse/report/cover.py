@@ -28,6 +28,7 @@ from px4fuse.report.card_text import (
     QUANTITIES,
     format_spans,
     marked_actions,
+    note_texts,
     rerun_columns,
     rerun_start,
 )
@@ -37,7 +38,6 @@ from px4fuse.report.style import SEVERITY_COLOURS
 from px4fuse.report.typesetting import measure_free_height
 from px4fuse.results.contract import AidsResults, ComparisonResults
 
-MAX_NOTES = 3
 # More changed settings are counted in the head; the foot has the command with all of them
 MAX_CHANGED = 3
 MAX_FILE_LENGTH = 56  # characters
@@ -97,7 +97,7 @@ def add_card(page: Page, card: Card) -> Block:
         causes=[_cause(number, cause) for number, cause in enumerate(card.causes, start=1)],
         more_causes="".join(more),
         difference=card.difference,
-        notes=_notes(card),
+        notes=note_texts(card, ALL_FINDINGS),
         terms=AIDS_TERMS if card.aids else TERMS,
         command=identity.command,
         segment=f"analysed {identity.segment}" if identity.segment else "",
@@ -161,7 +161,7 @@ def _verdict_row(verdict: Verdict) -> dict[str, Any]:
         "quantity": quantity,
         "word": word,
         "quiet": verdict.is_explained,
-        "loud": verdict.word in ("overconfident", "underconfident") and not verdict.is_explained,
+        "loud": verdict.is_loud,
         **_mark(verdict.ratio, verdict.against, verdict.interval),
     }
 
@@ -228,12 +228,3 @@ def _action(mark: str, action: Action) -> dict[str, Any]:
         "commands": action.commands,
         "long": any(len(command) > MAX_COMMAND_LENGTH for command in action.commands),
     }
-
-
-def _notes(card: Card) -> list[str]:
-    texts = [
-        " ".join(filter(None, (f"note[{note.id}]: {note.text}", note.action)))
-        for note in card.notes[:MAX_NOTES]
-    ]
-    more = len(card.notes) - MAX_NOTES
-    return texts + ([f"and {more} more: {ALL_FINDINGS}"] if more > 0 else [])

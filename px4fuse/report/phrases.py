@@ -82,7 +82,7 @@ def verdict_rows(
     rows: list[list[Cell]] = []
     for result in axes:
         for name, consistency in filters_by_name(result).items():
-            label = result.axis.name if name == "KF" else ""
+            label = result.axis.label.removeprefix("the ") if name == "KF" else ""
             nis, colour = ("", ""), MUTED_COLOUR
             if isinstance(consistency, Consistency):
                 nis = (

@@ -1,10 +1,13 @@
 """Output of ``px4fuse compare`` on the terminal: the diagnosis card, and details with ``-v``."""
 
+from pathlib import Path
 from typing import Any
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
+from px4fuse.card.build import build_refusal_card
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.steps import DifferenceExplanation
+from px4fuse.errors import LogError, MissingDataError
 from px4fuse.findings import group_by_root
 from px4fuse.report.aids import write_aids_of_comparison, write_aids_only
 from px4fuse.report.difference_page import write_explanation
@@ -71,6 +74,13 @@ def closing(results: Any) -> Page:
     """Make the lines below the written files: where to read more."""
     page = Page()
     page.add("closing", card=results.card)
+    return page
+
+
+def refusal(error: LogError | MissingDataError, log: Path) -> Page:
+    """Make the page of a log that cannot be analysed."""
+    page = Page()
+    page.add("card", card=build_refusal_card(error, log))
     return page
 
 
