@@ -220,9 +220,13 @@ def test_innovations_beyond_scale_are_triangles_in_title(eventful: Analysis) -> 
     assert {abs(value) for line in edges for value in line.get_ydata()} == {4.0}
 
 
-def test_flat_strip_says_so_in_its_title() -> None:
-    errors = pd.DataFrame({"error_m": [0.02, -0.05], "sigma_m": [0.05, 0.06]}, index=[0.0, 9.0])
-    titles = [cover_panels._error_title("ekf2", errors, 0.04, scale) for scale in (0.1, 5.0)]
+def test_flat_strip_says_so_in_its_title(eventful: Analysis) -> None:
+    error, sigma = (pd.Series(pair, [0.0, 9.0]) for pair in ([0.02, -0.05], [0.05, 0.06]))
+    label, sigmas = "EKF2 error (m)", {"EKF2": sigma}
+    titles = [
+        cover_panels._strip(eventful, label, ["RMSE 0.040"], error, sigmas, scale).title
+        for scale in (0.1, 5.0)
+    ]
     assert titles[0] == "EKF2 error (m): RMSE 0.040, σ 0.060"
     assert titles[1] == f"{titles[0]}, flat on this scale, at most 0.050"
 

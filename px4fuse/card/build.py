@@ -5,12 +5,14 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from msgspec.structs import replace
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
+from px4fuse.arrays import Array
 from px4fuse.card.causes import (
     FILTER_NAMES,
     RankedCause,
@@ -39,6 +41,7 @@ from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth
 from px4fuse.comparison.projection import project_horizon
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import improvement
+from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.filter.consistency import classify_ratio
@@ -47,6 +50,7 @@ from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import Finding, group_by_root
 from px4fuse.flight import Ekf2, Unavailable, source_name
+from px4fuse.log import LogInfo
 from px4fuse.reading import display_name, file_size, read_head
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
 from px4fuse.text import with_log_name
@@ -93,12 +97,12 @@ def build_card(
     student : (str, str)
         Name and id.
     """
-    result = analysis.main
+    result, source, segment = analysis.main, analysis.source, analysis.segment
     roots = [group[0] for group in group_by_root(findings)]
     verdicts = make_verdicts(result)
     ranked = rank_causes(analysis, roots)
     causes = tuple(make_cause(analysis, each, verdicts, request) for each in ranked[:MAX_CAUSES])
-    may_drift = analysis.source.origin.may_drift
+    may_drift = source.origin.may_drift
     verdicts = _mark_explained(verdicts, causes, may_drift=may_drift)
     horizon_ratio = None if causes else _horizon_ratio(analysis)
     if horizon_ratio is not None:
@@ -125,7 +129,16 @@ def build_card(
         causes=causes,
         more_causes=max(len(ranked) - MAX_CAUSES, 0),
         notes=_notes(roots, request.log),
-        identity=_identity(analysis, request, student),
+        identity=_identity(
+            analysis.flight.log,
+            request,
+            student,
+            source=f"{source_name(source)} {source.rate_hz:.1f} Hz",
+            settings=_settings(analysis, request),
+            changed=_changed_settings(request),
+            parameters=_changed_parameters(analysis),
+            segment=f"{segment.start_s:.1f} to {segment.end_s:.1f} s, {segment.reason}",
+        ),
     )
 
 
@@ -140,7 +153,6 @@ def build_aids_card(
     faults = [one for one in roots if one.severity != "note"]
     causes = tuple(make_plain_cause(one) for one in faults[:MAX_CAUSES])
     missing = analysis.missing_data
-    log = analysis.flight.log
     return Card(
         severity=causes[0].severity if causes else "clean",
         id=causes[0].id if causes else "",
@@ -160,17 +172,7 @@ def build_aids_card(
             for name, axis in aid.axes.items()
         ),
         facts={"KF": f"not run: {missing.reason}. {with_options(missing.remedy)}"},
-        identity=Identity(
-            file=log.name,
-            firmware=log.firmware,
-            hardware=log.hardware,
-            duration_s=log.duration_s,
-            source="no position source",
-            command=command_line(request.without_paths()),
-            student=student[0],
-            student_id=student[1],
-            version=f"px4fuse {metadata.version('px4fuse')}",
-        ),
+        identity=_identity(analysis.flight.log, request, student, source="no position source"),
     )
 
 
@@ -225,16 +227,7 @@ def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
 
 
 def _effect(analysis: Analysis) -> Effect:
-    result = analysis.main
-    ekf2, segment = analysis.flight.ekf2, analysis.segment
-    resets = None
-    if isinstance(ekf2, Ekf2):
-        resets = sum(
-            reset.quantity == "position"
-            and any(reset.delta[:2])
-            and segment.start_s < reset.time_s <= segment.end_s
-            for reset in ekf2.resets
-        )
+    result, has_ekf2 = analysis.main, isinstance(analysis.flight.ekf2, Ekf2)
     difference = result.difference
     return Effect(
         axis=describe_axis(analysis, result),
@@ -246,8 +239,15 @@ def _effect(analysis: Analysis) -> Effect:
         horizontal_rmse_m=_horizontal_rmse_m(analysis),
         difference_rms_m=None if isinstance(difference, Unavailable) else difference.position_rms_m,
         rejected_fraction=result.rejected_fraction,
-        horizontal_resets=resets,
+        horizontal_resets=len(horizontal_resets(analysis)) if has_ekf2 else None,
     )
+
+
+def horizontal_resets(analysis: Analysis) -> Array:
+    """Return the times (s) of EKF2's horizontal position resets in the segment."""
+    ekf2, segment = analysis.flight.ekf2, analysis.segment
+    times = horizontal_resets_s(ekf2) if isinstance(ekf2, Ekf2) else np.empty(0)
+    return times[(segment.start_s < times) & (times <= segment.end_s)]
 
 
 def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
@@ -498,23 +498,19 @@ def _notes(roots: Sequence[Finding], log: str) -> tuple[Note, ...]:
     )
 
 
-def _identity(analysis: Analysis, request: ComparisonRequest, student: tuple[str, str]) -> Identity:
-    log, source, segment = analysis.flight.log, analysis.source, analysis.segment
-
+def _identity(
+    log: LogInfo, request: ComparisonRequest, student: tuple[str, str], **texts: Any
+) -> Identity:
     return Identity(
         file=log.name,
         firmware=log.firmware,
         hardware=log.hardware,
         duration_s=log.duration_s,
-        source=f"{source_name(source)} {source.rate_hz:.1f} Hz",
-        settings=_settings(analysis, request),
-        changed=_changed_settings(request),
-        parameters=_changed_parameters(analysis),
-        segment=f"{segment.start_s:.1f} to {segment.end_s:.1f} s, {segment.reason}",
         command=command_line(request.without_paths()),
         student=student[0],
         student_id=student[1],
         version=f"px4fuse {metadata.version('px4fuse')}",
+        **texts,
     )
 
 

@@ -16,7 +16,7 @@ from px4fuse.findings.cause_text import format_change, format_explained_share
 from px4fuse.flight import Unavailable
 from px4fuse.report import event_marks
 from px4fuse.report.page import Cell, Page, draw_legend_above, halves
-from px4fuse.report.phrases import VERDICT_HEAD, filters_by_name, format_verdict, verdict_rows
+from px4fuse.report.phrases import VERDICT_HEAD, filters_by_name, verdict_rows
 from px4fuse.report.style import (
     DOTS,
     KF_BAND_COLOUR,
@@ -24,6 +24,7 @@ from px4fuse.report.style import (
     MUTED_COLOUR,
     Axes,
     draw_curve,
+    line_style,
     set_plain_ticks,
 )
 from px4fuse.text import format_number, format_p_value
@@ -72,7 +73,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
             page,
             analysis,
             "Running mean NIS (log scale)",
-            _nis_sentence(series),
+            "",
             RUNNING_HEIGHT,
             above=LEGEND_HEIGHT,
         )
@@ -80,11 +81,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         draw_legend_above(axes)
         left_page, right_page = halves()
         left = left_page.panel(
-            "Distribution of ν/√S",
-            _shape_sentence(series),
-            LOWER_HEIGHT,
-            above=LEGEND_HEIGHT,
-            left=4.0,
+            "Distribution of ν/√S", "", LOWER_HEIGHT, above=LEGEND_HEIGHT, left=4.0
         )
         right = right_page.panel(
             "Autocorrelation", _whiteness_sentence(series), LOWER_HEIGHT, above=LEGEND_HEIGHT
@@ -153,7 +150,7 @@ def _series(result: AxisComparison) -> list[FilterSeries]:
 
 
 def _thin_line_style(filter_series: FilterSeries) -> dict[str, Any]:
-    return {"color": LINES[filter_series.name]["color"], "lw": 0.6, "ls": (0, (1, 1.5))}
+    return line_style(LINES[filter_series.name]["color"], 0.6, (0, (1, 1.5)))
 
 
 def _draw_running_nis(axes: Axes, series: list[FilterSeries]) -> None:
@@ -235,23 +232,6 @@ def _draw_autocorrelation(axes: Axes, series: list[FilterSeries]) -> None:
 def _whiteness_bound(filter_series: FilterSeries) -> float:
     """Return the half width of the 95 % band for the autocorrelation of white innovations."""
     return float(1.96 / np.sqrt(len(filter_series.values)))
-
-
-def _nis_sentence(series: list[FilterSeries]) -> str:
-    return " ".join(
-        f"{name}: final mean NIS {format_number(consistency.nis_mean)} "
-        "(expected {:.2f} to {:.2f}): ".format(*consistency.nis_band)
-        + f"{format_verdict(consistency)}."
-        for name, _, consistency in series
-    )
-
-
-def _shape_sentence(series: list[FilterSeries]) -> str:
-    return "\n".join(
-        f"{name}: {consistency.fraction_outside_two_sigma:.1%} beyond 2√S (expected 4.5 %), "
-        f"mean {consistency.innovation_mean_m:+z.3f} m ({format_p_value(consistency.bias_p)})."
-        for name, _, consistency in series
-    )
 
 
 def _whiteness_sentence(series: list[FilterSeries]) -> str:

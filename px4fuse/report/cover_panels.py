@@ -10,7 +10,8 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.card.model import Card, FilterName
+from px4fuse.card.build import horizontal_resets
+from px4fuse.card.model import Card
 from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.comparison.comparison import kf_state_and_variance, position_errors, reported_sigma
 from px4fuse.comparison.model import FILTERS, AxisComparison
@@ -25,6 +26,7 @@ from px4fuse.report.event_marks import (
     OUTLIER_MARK,
     TAKE_OFF_MARK,
     outlier_times,
+    visible_times,
 )
 from px4fuse.report.page import (
     AXES_RIGHT,
@@ -80,14 +82,8 @@ INNOVATION_DOTS: Mapping[str, dict[str, Any]] = {
 # Fraction of the axes: of marks closer than this, one is drawn
 MIN_MARK_DISTANCE = 1.0 / 150.0
 GAP_HATCH: dict[str, Any] = {**GAP_BAND, "facecolor": "none"}  # σ in the gap stays visible
-RESET_LINE: dict[str, Any] = {"color": style.EKF2_COLOUR, "lw": 1.0, "ls": (0, (1, 1))}
-REJECTED_MARK: dict[str, Any] = {
-    "color": "black",
-    "marker": "|",
-    "ms": 5.0,
-    "mew": 0.7,
-    "ls": "none",
-}
+RESET_LINE = style.line_style(style.EKF2_COLOUR, 1.0, (0, (1, 1)))
+REJECTED_MARK = style.dot_style("black", "|", 5.0, 0.7)
 Coordinates = tuple[Array, Array]
 MapLimits = tuple[tuple[float, float], tuple[float, float]]
 DrawStrip = Callable[[Axes], None]
@@ -205,77 +201,27 @@ def _head_height(page: Page, title: str) -> float:
 
 def _error_strips(analysis: Analysis, card: Card) -> list[Strip]:
     """Return a strip of the errors of each filter, or of KF - EKF2 without ground truth."""
-    result = analysis.main
-    found = {
+    result, effect = analysis.main, card.effect
+    errors_by_filter = {
         owner: errors
         for owner in FILTERS
         if isinstance(errors := position_errors(result, owner), pd.DataFrame)
         and errors["error_m"].notna().any()
     }
-    if not found:
-        return _difference_strip(analysis, card)
-    half_height = 1.1 * max(_shown_height(errors) for errors in found.values())
-    rmse_m = card.effect.position_rmse_m if card.effect else {}
-    return [
-        Strip(
-            _error_title(owner, errors, rmse_m.get(owner), half_height),
-            _error_drawing(analysis, owner, errors, half_height),
-        )
-        for owner, errors in found.items()
-    ]
-
-
-def _shown_height(errors: pd.DataFrame) -> float:
-    """Return the largest error (m), or 2.2 σ if that is not much larger."""
-    largest, sigma = float(errors["error_m"].abs().max()), errors["sigma_m"].median()
-    return max(largest, 1e-3, min(2.2 * sigma, 3.0 * largest) if np.isfinite(sigma) else 0.0)
-
-
-def _error_title(
-    owner: FilterName, errors: pd.DataFrame, rmse_m: float | None, half_height: float
-) -> str:
-    parts = [] if rmse_m is None else [f"RMSE {format_metres(rmse_m)}"]
-    if sigma := _format_sigma(errors["sigma_m"]):
-        parts.append(f"σ {sigma}")
-    largest = float(errors["error_m"].abs().max())
-    if largest < FLAT_SHARE * half_height:
-        parts.append(f"flat on this scale, at most {format_metres(largest)}")
-    return f"{FILTER_NAMES[owner]} error (m): {', '.join(parts)}"
-
-
-def _format_sigma(sigma: pd.Series[float]) -> str:
-    known = sigma.dropna()
-    known = known[known.index >= known.index.min() + SETTLING_S]
-    if known.empty:
-        return ""
-    low, high = float(known.min()), float(known.max())
-    if high < MAX_SIGMA_SPREAD * low:
-        return format_metres(float(known.median()))
-    return f"{format_metres(low)} to {format_metres(high)}"
-
-
-def _error_drawing(
-    analysis: Analysis, owner: FilterName, errors: pd.DataFrame, half_height: float
-) -> DrawStrip:
-    name = FILTER_NAMES[owner]
-
-    def draw(axes: Axes) -> None:
-        axes.set_ylim(-half_height, half_height)
-        _draw_sigma(axes, errors["sigma_m"], name)
-        axes.axhline(0.0, color="black", lw=0.5)
-        draw_curve(axes, errors["error_m"], **LINES[name])
-        _draw_spans(axes, analysis)
-        if owner == "kf":
-            _draw_at_edge(axes, outlier_times(analysis), 0.94, OUTLIER_MARK)
-        else:
-            _draw_ekf2_events(axes, analysis)
-
-    return draw
-
-
-def _difference_strip(analysis: Analysis, card: Card) -> list[Strip]:
-    """Return the strip of KF - EKF2 with ±2σ of both; none without EKF2."""
-    result = analysis.main
+    if errors_by_filter:
+        half_height = 1.1 * max(map(_shown_height, errors_by_filter.values()))
+        rmse_m = effect.position_rmse_m if effect else {}
+        return [
+            _strip(
+                analysis,
+                f"{(name := FILTER_NAMES[owner])} error (m)",
+                _format_size("RMSE", rmse_m.get(owner)),
+                errors["error_m"],
+                {name: errors["sigma_m"]},
+                half_height,
+            )
+            for owner, errors in errors_by_filter.items()
+        ]
     if not isinstance(result.ekf2_state, pd.DataFrame):
         return []
     time_s = result.ekf2_state.index.to_numpy()
@@ -289,21 +235,65 @@ def _difference_strip(analysis: Analysis, card: Card) -> list[Strip]:
     }
     widest = [2.2 * sigma.median() for sigma in sigmas.values() if sigma.notna().any()]
     half_height = 1.1 * max(float(difference.abs().max()), *widest)
+    size = _format_size("RMS", effect.difference_rms_m if effect else None)
+    return [_strip(analysis, "KF − EKF2 (m)", size, difference, sigmas, half_height)]
+
+
+def _format_size(label: str, length_m: float | None) -> list[str]:
+    return [] if length_m is None else [f"{label} {format_metres(length_m)}"]
+
+
+def _strip(
+    analysis: Analysis,
+    label: str,
+    sizes: list[str],
+    curve: pd.Series[float],
+    sigmas: Mapping[str, pd.Series[float]],
+    half_height: float,
+) -> Strip:
+    """Return the strip of an error or a difference (m) with ±2σ of the filters that it concerns."""
     texts = [f"{name} {text}" for name, sigma in sigmas.items() if (text := _format_sigma(sigma))]
-    rms_m = card.effect.difference_rms_m if card.effect else None
-    size = [] if rms_m is None else [f"RMS {format_metres(rms_m)}"]
+    if len(sigmas) == 1:
+        texts = [text.partition(" ")[2] for text in texts]
+    if texts:
+        sizes = [*sizes, f"σ {', '.join(texts)}"]
+    largest = float(curve.abs().max())
+    if largest < FLAT_SHARE * half_height:
+        sizes = [*sizes, f"flat on this scale, at most {format_metres(largest)}"]
+    line = LINES[next(iter(sigmas))] if len(sigmas) == 1 else style.line_style("black", 1.0)
 
     def draw(axes: Axes) -> None:
         axes.set_ylim(-half_height, half_height)
         for name, sigma in sigmas.items():
             _draw_sigma(axes, sigma, name)
         axes.axhline(0.0, color="black", lw=0.5)
-        draw_curve(axes, difference, color="black", lw=1.0)
+        draw_curve(axes, curve, **line)
         _draw_spans(axes, analysis)
-        _draw_ekf2_events(axes, analysis)
+        if "EKF2" in sigmas:
+            for time_s in horizontal_resets(analysis):
+                axes.axvline(time_s, **RESET_LINE)
+            _draw_at_edge(axes, _rejected(analysis), 0.06, REJECTED_MARK)
+        else:
+            _draw_at_edge(axes, outlier_times(analysis), 0.94, OUTLIER_MARK)
 
-    title = ", ".join([*size, *([f"σ {', '.join(texts)}"] if texts else [])])
-    return [Strip(f"KF − EKF2 (m): {title}", draw)]
+    return Strip(f"{label}: {', '.join(sizes)}", draw)
+
+
+def _shown_height(errors: pd.DataFrame) -> float:
+    """Return the largest error (m), or 2.2 σ if that is not much larger."""
+    largest, sigma = float(errors["error_m"].abs().max()), errors["sigma_m"].median()
+    return max(largest, 1e-3, min(2.2 * sigma, 3.0 * largest) if np.isfinite(sigma) else 0.0)
+
+
+def _format_sigma(sigma: pd.Series[float]) -> str:
+    known = sigma.dropna()
+    known = known[known.index >= known.index.min() + SETTLING_S]
+    if known.empty:
+        return ""
+    low, high = float(known.min()), float(known.max())
+    if high < MAX_SIGMA_SPREAD * low:
+        return format_metres(float(known.median()))
+    return f"{format_metres(low)} to {format_metres(high)}"
 
 
 def _draw_sigma(axes: Axes, sigma: pd.Series[float], name: str) -> None:
@@ -342,43 +332,22 @@ def _draw_spans(axes: Axes, analysis: Analysis) -> None:
             axes.axvspan(start, end, **band, zorder=1.5)
 
 
-def _draw_ekf2_events(axes: Axes, analysis: Analysis) -> None:
-    """Draw EKF2's rejections and horizontal resets."""
-    for time_s in horizontal_resets(analysis):
-        axes.axvline(time_s, **RESET_LINE)
-    _draw_at_edge(axes, _rejected(analysis), 0.06, REJECTED_MARK)
-
-
 def _rejected(analysis: Analysis) -> Array:
     return np.asarray(analysis.events.rejected_s.get(analysis.main.axis.name, ()), np.float64)
-
-
-def horizontal_resets(analysis: Analysis) -> list[float]:
-    """Return the times (s) of EKF2's horizontal position resets in the segment."""
-    ekf2, segment = analysis.flight.ekf2, analysis.segment
-    resets = ekf2.resets if isinstance(ekf2, Ekf2) else ()
-    return [
-        reset.time_s
-        for reset in resets
-        if reset.quantity == "position"
-        and any(reset.delta[:2])
-        and segment.start_s < reset.time_s <= segment.end_s
-    ]
 
 
 def _draw_at_edge(axes: Axes, times: Array, height: float, mark: Mapping[str, Any]) -> None:
     """Draw marks at a height of the axes (0 to 1)."""
     if len(times):
-        visible = _distant(np.asarray(times), axes.get_xlim())
+        visible = _distant(axes, times)
         axes.plot(
             visible, np.full(len(visible), height), transform=axes.get_xaxis_transform(), **mark
         )
 
 
-def _distant(values: Array, limits: tuple[float, float]) -> Array:
-    """Return the first value of each interval, so that marks do not overlap."""
-    bins = np.floor(values / (MIN_MARK_DISTANCE * (limits[1] - limits[0])))
-    return np.asarray(values[np.sort(np.unique(bins, return_index=True)[1])])
+def _distant(axes: Axes, times: Array) -> Array:
+    low, high = axes.get_xlim()
+    return visible_times(times, MIN_MARK_DISTANCE * (high - low))
 
 
 # ------------------------------------------------------------------------------------- innovations
@@ -421,7 +390,7 @@ def _innovation_strip(result: AxisComparison) -> Strip:
             for sign, marker in ((1.0, "^"), (-1.0, "v")):
                 times = values.index[sign * values > MAX_NORMALISED].to_numpy()
                 edge = {**dots, "marker": marker, "ms": 3.4, "mew": 0, "mfc": dots["color"]}
-                visible = _distant(times, axes.get_xlim()) if len(times) else times
+                visible = _distant(axes, times)
                 axes.plot(visible, np.full(len(visible), sign * MAX_NORMALISED), **edge)
 
     return Strip(title, draw)

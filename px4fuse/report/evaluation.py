@@ -32,12 +32,12 @@ MAX_PATH_POINTS = 1200
 MIN_ERROR_RANGE_M = 1e-3  # minimum range of an error axis, so that rounding errors look small
 PANEL_HEIGHT, MAP_HEIGHT, MAP_GAP = 76.0, 128.0, 16.0  # points
 MAX_DELTA_LABELS = 12
-REFERENCE_LINE: dict[str, Any] = {"color": TRUTH_COLOUR, "lw": 0.8, "ls": (0, (4, 2))}
-STATISTIC_LINES: tuple[tuple[str, str, dict[str, Any]], ...] = (
-    ("max", "max", {"color": MUTED_COLOUR, "lw": 0.8, "ls": (0, (1, 1.5))}),
-    ("rmse", "RMSE", {"color": EKF2_COLOUR, "lw": 1.4, "ls": "-"}),
-    ("mean", "mean", {"color": "black", "lw": 0.9, "ls": (0, (5, 2))}),
-    ("median", "median", {"color": "black", "lw": 0.9, "ls": (0, (5, 1.5, 1, 1.5))}),
+REFERENCE_LINE = style.line_style(TRUTH_COLOUR, 0.8, (0, (4, 2)))
+STATISTIC_LINES = (
+    ("max", "max", style.line_style(MUTED_COLOUR, 0.8, (0, (1, 1.5)))),
+    ("rmse", "RMSE", style.line_style(EKF2_COLOUR, 1.4)),
+    ("mean", "mean", style.line_style("black", 0.9, (0, (5, 2)))),
+    ("median", "median", style.line_style("black", 0.9, (0, (5, 1.5, 1, 1.5)))),
 )
 NEGLIGIBLE_ERROR_M = 1e-6  # smaller errors are rounding errors
 SHADES_CAPTION = "Darker: larger error. ×: largest error."

@@ -9,30 +9,26 @@ from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.page import Page
-from px4fuse.report.style import EKF2_REJECTED, MUTED_COLOUR, Artist, Axes, label_time_axis
+from px4fuse.report.style import (
+    EKF2_REJECTED,
+    MUTED_COLOUR,
+    Artist,
+    Axes,
+    dot_style,
+    label_time_axis,
+)
 
 # Bands differ in shade and hatching, so they remain distinct in grey. Markers are at the bottom of
 # the axes, those of resets at the top
-GROUND_BAND: dict[str, Any] = {"facecolor": "#e4e4e4", "edgecolor": "none", "lw": 0.0}
-GAP_BAND: dict[str, Any] = {
-    "facecolor": "#fbfbfb",
-    "edgecolor": "#9a9a9a",
-    "lw": 0.0,
-    "hatch": "/////",
-}
-DROPOUT_BAND: dict[str, Any] = {"facecolor": "#a8a8a8", "edgecolor": "none", "lw": 0.0}
-MODE_BAND: dict[str, Any] = {"facecolor": "#f6f0e2", "edgecolor": "none", "lw": 0.0}
-RESET_MARK: dict[str, Any] = {"color": "#8a4508", "marker": 2, "ms": 6.0, "mew": 1.2, "ls": "none"}
-OUTLIER_MARK: dict[str, Any] = {
-    "color": "black",
-    "marker": "x",
-    "ms": 3.0,
-    "mew": 0.7,
-    "ls": "none",
-}
-# No triangles: they mark values beyond the scale
-TAKE_OFF_MARK: dict[str, Any] = {"color": "black", "marker": "*", "ms": 6.0, "mew": 0, "ls": "none"}
-LANDING_MARK: dict[str, Any] = {"color": "black", "marker": "P", "ms": 5.0, "mew": 0, "ls": "none"}
+_FILLED: dict[str, Any] = {"edgecolor": "none", "lw": 0.0}
+GROUND_BAND, DROPOUT_BAND, MODE_BAND = (
+    {"facecolor": colour, **_FILLED} for colour in ("#e4e4e4", "#a8a8a8", "#f6f0e2")
+)
+GAP_BAND = _FILLED | {"facecolor": "#fbfbfb", "edgecolor": "#9a9a9a", "hatch": "/////"}
+RESET_MARK = dot_style("#8a4508", 2, 6.0, 1.2)
+OUTLIER_MARK = dot_style("black", "x", 3.0, 0.7)
+# Take-off and landing are no triangles, which mark values beyond the scale
+TAKE_OFF_MARK, LANDING_MARK = dot_style("black", "*", 6.0), dot_style("black", "P", 5.0)
 REJECTED_HEIGHT, OUTLIER_HEIGHT, RESET_HEIGHT = 0.025, 0.075, 0.92
 MODE_NAMES_HEIGHT = 12.0  # points; height above the axes for the names of flight modes
 # Fraction of the segment; of markers closer than this, only the first is drawn
@@ -96,11 +92,11 @@ def draw_marks(
             bands = PolyCollection(corners, transform=x_transform, zorder=0.1 * order, **style)
             axes.add_collection(bands, autolim=False)
         else:
-            visible_times = _visible_times(
+            times = visible_times(
                 spans_or_times, MIN_MARK_DISTANCE * (segment.end_s - segment.start_s)
             )
             mark_style = {**style, "transform": x_transform, "zorder": 2.6, "clip_on": height > 0.0}
-            markers = Line2D(visible_times, np.full(len(visible_times), height), **mark_style)
+            markers = Line2D(times, np.full(len(times), height), **mark_style)
             axes.add_artist(markers)  # unlike add_line this does not change the limits
     if with_mode_names:
         _draw_mode_names(axes, analysis)
@@ -159,7 +155,7 @@ def legend_entries(analysis: Analysis) -> list[Artist]:
     ]
 
 
-def _visible_times(times: Any, min_interval_s: float) -> Array:
+def visible_times(times: Any, min_interval_s: float) -> Array:
     """Return the first time in each interval, so that markers do not overlap."""
     values = np.asarray(times, dtype=np.float64)
     visible: Array = values[np.unique(np.floor(values / min_interval_s), return_index=True)[1]]

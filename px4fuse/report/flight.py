@@ -12,7 +12,6 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.signals import Segment
-from px4fuse.flight import Unavailable
 from px4fuse.record import Span
 from px4fuse.report import event_marks, panels, style
 from px4fuse.report.difference_page import unexplained_note
@@ -30,21 +29,11 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     result = analysis.main
     page = Page(f"Position and velocity along {result.axis.label}")
     _write_legend(page, analysis)
-    reference = panels.error_reference(result)
-    shown_panels = [panels.POSITION, panels.VELOCITY]
-    if isinstance(reference, pd.DataFrame):
-        shown_panels.append(panels.ERROR)
-    for panel in shown_panels:
-        panel.draw_on_page(
-            page,
-            analysis,
-            result,
-            with_time_label=panel is shown_panels[-1],
-            with_mode_names=panel is shown_panels[0],
-        )
+    panels.POSITION.draw_on_page(
+        page, analysis, result, with_time_label=False, with_mode_names=True
+    )
+    panels.VELOCITY.draw_on_page(page, analysis, result, with_time_label=True)
     page.write(unexplained_note(analysis), above=6.0)
-    if isinstance(reference, Unavailable):
-        page.write(f"No error plot: {reference.reason}. {reference.remedy}", above=6.0)
     yield page
 
 
@@ -196,14 +185,11 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
         column.write(f"{verdicts}.")
     first_row = Page()  # one column is not divided, so the headings stay with the first panels
     first_row.add_columns(*columns)
-    shown_panels = [panels.POSITION, panels.VELOCITY, panels.INNOVATIONS, panels.SIGMA_P]
-    if any(isinstance(panels.error_reference(axis), pd.DataFrame) for axis in others):
-        shown_panels.insert(2, panels.ERROR)
-    for panel in shown_panels:
+    for panel in (panels.POSITION, panels.VELOCITY, panels.INNOVATIONS, panels.SIGMA_P):
         columns = [Page(width=width) for _ in others]
         for column, result in zip(columns, others, strict=True):
             panel.draw_on_page(
-                column, analysis, result, with_time_label=panel is shown_panels[-1], is_narrow=True
+                column, analysis, result, with_time_label=panel is panels.SIGMA_P, is_narrow=True
             )
         (first_row if panel is panels.POSITION else page).add_columns(*columns)
         if panel is panels.POSITION:

@@ -1,7 +1,6 @@
 """Page on a loop: closure error, corrected paths, and their errors against references."""
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -32,13 +31,13 @@ LEAD = (
     "false one would deform the whole path."
 )
 MAX_LISTED_CLOSURES = 10  # on the terminal
-GREEN, RED = "#3a7d5c", style.SEVERITY_COLOURS["error"]
-PATH_STYLES: Mapping[str, dict[str, Any]] = {
-    corrections.UNCORRECTED: {"color": EKF2_COLOUR, "lw": 1.1, "ls": (0, (4, 1.6))},
-    corrections.POSITIONS_ONLY: {"color": "#79b294", "lw": 1.3, "ls": (0, (1.2, 1.2))},
-    corrections.BY_DISTANCE: {"color": GREEN, "lw": 1.0, "ls": (0, (6, 1.2, 1, 1.2))},
-    SOLUTIONS["gated"]: {"color": KF_COLOUR, "lw": 1.2, "ls": "-"},
-    SOLUTIONS["all"]: {"color": "#8d6a9f", "lw": 0.9, "ls": (0, (2, 1))},
+RED = style.SEVERITY_COLOURS["error"]
+PATH_STYLES = {
+    corrections.UNCORRECTED: style.EKF2_LINE,
+    corrections.POSITIONS_ONLY: style.line_style("#79b294", 1.3, (0, (1.2, 1.2))),
+    corrections.BY_DISTANCE: style.line_style("#3a7d5c", 1.0, (0, (6, 1.2, 1, 1.2))),
+    SOLUTIONS["gated"]: style.line_style(KF_COLOUR, 1.2),
+    SOLUTIONS["all"]: style.line_style("#8d6a9f", 0.9, (0, (2, 1))),
 }
 TRACK_KINDS = {
     "vio": "odometry (external vision)",
