@@ -262,14 +262,16 @@ def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
 
 
 def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
-    found: dict[FilterName, float] = {}
     axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
-    for owner in FILTER_NAMES:
-        truths = [axis.filters[owner].truth for axis in axes]
-        known = [truth.position_rmse_m for truth in truths if isinstance(truth, ErrorsAgainstTruth)]
-        if len(known) == 2:
-            found[owner] = math.hypot(*known)
-    return found
+    errors_m = {
+        owner: [
+            truth.position_rmse_m
+            for axis in axes
+            if isinstance(truth := axis.filters[owner].truth, ErrorsAgainstTruth)
+        ]
+        for owner in FILTER_NAMES
+    }
+    return {owner: math.hypot(*pair) for owner, pair in errors_m.items() if len(pair) == 2}
 
 
 def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]) -> str:

@@ -49,8 +49,9 @@ def compare(
     reports/LOG_sigma-z-0.05.pdf and .json.
     """
     from px4fuse.analysis import failed_checks, run_or_evaluate_aids
+    from px4fuse.card.build import build_refusal_card
     from px4fuse.memory import release_free_memory
-    from px4fuse.report.terminal import closing, refusal, summary
+    from px4fuse.report.terminal import card_page, summary
     from px4fuse.results.build import outcome_results
 
     student = options.read_student(option_values)
@@ -67,12 +68,12 @@ def compare(
     except (LogError, MissingDataError) as error:
         if not sys.stderr.isatty():  # other programs read one line
             raise
-        outputs.show_page(refusal(error, log), is_error=True)
+        outputs.show_page(card_page("card", build_refusal_card(error, log)), is_error=True)
         sys.exit(2)
     page = summary(outcome, results, verbose=verbose, quiet=quiet)
     outputs.write_and_print(contents, page, request)
     if not quiet and STANDARD_OUTPUT not in contents:
-        outputs.show_page(closing(results))
+        outputs.show_page(card_page("closing", results.card))
     failed = failed_checks(outcome) if checks else {}
     for name, verdict in failed.items():
         click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)

@@ -13,7 +13,6 @@ from px4fuse.report import style
 from px4fuse.report.event_marks import GROUND_BAND
 from px4fuse.report.page import Cell, Page, appendix_title
 from px4fuse.report.phrases import format_sigma_verdict, write_findings
-from px4fuse.request import with_options
 from px4fuse.text import format_number
 
 TITLE = "Aids of EKF2"
@@ -60,10 +59,7 @@ def draw_aids_only(analysis: AidsOnlyAnalysis, _: object) -> Iterator[Page]:
 
 
 def write_aids_only(page: Page, analysis: AidsOnlyAnalysis, findings: tuple[Finding, ...]) -> None:
-    """Write the reason for the missing comparison, the table of aids and the findings."""
-    missing_data = analysis.missing_data
-    page.write(f"No comparison with KF: {missing_data.reason}.", above=2.0)
-    page.write(with_options(missing_data.remedy), colour=style.MUTED_COLOUR)
+    """Write the table of aids and the findings."""
     write_aids(page, analysis.aids)
     page.heading("Findings", 10.5, above=12.0)
     write_findings(page, findings)

@@ -41,27 +41,9 @@ FILTER_NAMES = {"kf": "KF", "ekf2": "EKF2"}
 SEVERITY_LABELS = {"clean": "ok", "note": "note"}
 STYLES = {"error": "bold red", "warning": "bold yellow", "note": "cyan", "clean": "bold green"}
 # Replacements for terminals whose encoding lacks a character
-ASCII = {
-    "░": ":",
-    "●": "o",
-    "◆": "x",
-    "◀": "<",
-    "▶": ">",
-    "─": "-",
-    "√": "sqrt ",
-    "σ": "sigma",
-    "→": "->",
-    "÷": "/",
-    "−": "-",
-    "–": "-",
-    "²": "2",
-    "³": "3",
-    "°": " deg",
-    "±": "+-",
-    "×": "x",
-    "ν": "nu",
-    "…": "...",
-}
+ASCII = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/--23x") | str.maketrans(
+    {"√": "sqrt ", "σ": "sigma", "→": "->", "°": " deg", "±": "+-", "ν": "nu", "…": "..."}
+)
 AIDS_HEADING = (
     "Innovation ÷ √S of the aiding sources that EKF2 fused. Below 1: √S is larger than needed. For "
     "barometer, magnetometer and gravity that is usual and not a fault."
@@ -201,7 +183,7 @@ def to_ascii(text: str) -> str:
     >>> to_ascii("error ÷ σ 7.2 → 1.2")
     'error / sigma 7.2 -> 1.2'
     """
-    return "".join(ASCII.get(character, character) for character in text)
+    return text.translate(ASCII)
 
 
 def axis_text(ratio: float | None, against: Reference) -> str:

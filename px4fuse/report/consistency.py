@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,10 +16,12 @@ from px4fuse.findings.cause_text import format_change, format_explained_share
 from px4fuse.flight import Unavailable
 from px4fuse.report import event_marks
 from px4fuse.report.page import Cell, Page, draw_legend_above, halves
+from px4fuse.report.panels import normalised_innovations
 from px4fuse.report.phrases import VERDICT_HEAD, filters_by_name, verdict_rows
 from px4fuse.report.style import (
     DOTS,
     KF_BAND_COLOUR,
+    KF_COLOUR,
     LINES,
     MUTED_COLOUR,
     Axes,
@@ -46,12 +48,7 @@ CAUSE_STATISTICS: Mapping[Statistic, tuple[str, float]] = {
 }
 
 
-class FilterSeries(NamedTuple):
-    """Normalised innovations ν/√S of one filter, with their statistics."""
-
-    name: str
-    values: pd.Series[float]
-    consistency: Consistency
+Series = Mapping[str, "pd.Series[float]"]
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
@@ -84,7 +81,10 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
             "Distribution of ν/√S", "", LOWER_HEIGHT, above=LEGEND_HEIGHT, left=4.0
         )
         right = right_page.panel(
-            "Autocorrelation", _whiteness_sentence(series), LOWER_HEIGHT, above=LEGEND_HEIGHT
+            "Autocorrelation",
+            _whiteness_sentence(result, series),
+            LOWER_HEIGHT,
+            above=LEGEND_HEIGHT,
         )
         _draw_histogram(left, series)
         _draw_autocorrelation(right, series)
@@ -135,38 +135,34 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     )
 
 
-def _series(result: AxisComparison) -> list[FilterSeries]:
-    """Return the normalised innovations of each filter with at least MIN_INNOVATIONS."""
-    innovation_tables = {"KF": result.replay.updates, "EKF2": result.ekf2_innovations}
-    series = []
-    for name, consistency in filters_by_name(result).items():
-        table = innovation_tables[name]
-        if isinstance(table, pd.DataFrame) and isinstance(consistency, Consistency):
-            values = table["innovation_m"] / np.sqrt(table["innovation_variance_m2"])
-            finite_values = values[np.isfinite(values)]
-            if len(finite_values) >= MIN_INNOVATIONS:
-                series.append(FilterSeries(name, finite_values, consistency))
-    return series
+def _series(result: AxisComparison) -> Series:
+    """Return the normalised innovations ν/√S of each filter with a verdict."""
+    verdicts = filters_by_name(result)
+    return {
+        name: values
+        for name, values in normalised_innovations(result).items()
+        if isinstance(verdicts.get(name), Consistency) and len(values) >= MIN_INNOVATIONS
+    }
 
 
-def _thin_line_style(filter_series: FilterSeries) -> dict[str, Any]:
-    return line_style(LINES[filter_series.name]["color"], 0.6, (0, (1, 1.5)))
+def _thin_line_style(name: str) -> dict[str, Any]:
+    return line_style(LINES[name]["color"], 0.6, (0, (1, 1.5)))
 
 
-def _draw_running_nis(axes: Axes, series: list[FilterSeries]) -> None:
+def _draw_running_nis(axes: Axes, series: Series) -> None:
     lowest, highest = 0.5, 2.0
-    for filter_series in series:
-        number = np.arange(1, len(filter_series.values) + 1)
-        running = (filter_series.values**2).cumsum() / number
-        draw_curve(axes, running.iloc[2:], **LINES[filter_series.name], label=filter_series.name)
+    for name, values in series.items():
+        number = np.arange(1, len(values) + 1)
+        running = (values**2).cumsum() / number
+        draw_curve(axes, running.iloc[2:], **LINES[name], label=name)
         drawn_counts = np.unique(np.geomspace(3, len(number), 60).astype(int))
         low, high = np.array([nis_band(int(count)) for count in drawn_counts]).T
-        time = filter_series.values.index[drawn_counts - 1]
-        if filter_series.name == "KF":
+        time = values.index[drawn_counts - 1]
+        if name == "KF":
             axes.fill_between(time, low, high, color=BAND_GREY, lw=0, label="95 % band KF")
         else:
-            axes.plot(time, low, **_thin_line_style(filter_series))
-            axes.plot(time, high, **_thin_line_style(filter_series), label="95 % band EKF2")
+            axes.plot(time, low, **_thin_line_style(name))
+            axes.plot(time, high, **_thin_line_style(name), label="95 % band EKF2")
         settled_nis = running.iloc[len(running) // 4 :]
         lowest, highest = (
             min(lowest, 0.7 * settled_nis.min()),
@@ -177,16 +173,16 @@ def _draw_running_nis(axes: Axes, series: list[FilterSeries]) -> None:
     set_plain_ticks(axes.yaxis)
 
 
-def _draw_histogram(axes: Axes, series: list[FilterSeries]) -> None:
+def _draw_histogram(axes: Axes, series: Series) -> None:
     x = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 81)
     normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
     axes.fill_between(x, normal, color=BAND_GREY, lw=0, label="normal")
     highest = 0.4
-    for filter_series in series:
+    for name, values in series.items():
         density, _ = np.histogram(
-            filter_series.values.clip(-MAX_NORMALISED, MAX_NORMALISED), bins=BINS, density=True
+            values.clip(-MAX_NORMALISED, MAX_NORMALISED), bins=BINS, density=True
         )
-        axes.stairs(density, BINS, **LINES[filter_series.name], label=filter_series.name)
+        axes.stairs(density, BINS, **LINES[name], label=name)
         highest = max(highest, float(density.max()))
     axes.set_xlim(-MAX_NORMALISED, MAX_NORMALISED)
     axes.set_ylim(0.0, min(1.15 * highest, MAX_DENSITY))
@@ -194,23 +190,16 @@ def _draw_histogram(axes: Axes, series: list[FilterSeries]) -> None:
     axes.set_xlabel("ν / √S")
 
 
-def _draw_autocorrelation(axes: Axes, series: list[FilterSeries]) -> None:
-    for shift, filter_series in zip((-0.18, 0.18), series, strict=False):
-        lags = min(MAX_LAG, len(filter_series.values) // 3)
-        r = autocorrelation(np.asarray(filter_series.values, np.float64), lags)
+def _draw_autocorrelation(axes: Axes, series: Series) -> None:
+    for shift, (name, values) in zip((-0.18, 0.18), series.items(), strict=False):
+        lags = min(MAX_LAG, len(values) // 3)
+        r = autocorrelation(np.asarray(values, np.float64), lags)
         positions = np.arange(1, lags + 1) + shift
-        axes.vlines(positions, 0.0, r, color=LINES[filter_series.name]["color"], lw=1.2)
-        fill_style = {
-            "mfc": LINES[filter_series.name]["color"] if filter_series.name == "KF" else "white"
-        }
-        axes.plot(
-            positions,
-            r,
-            **DOTS[filter_series.name] | fill_style | {"ms": 3.0, "mew": 0.6},
-            label=filter_series.name,
-        )
-        bound = _whiteness_bound(filter_series)
-        if filter_series.name == "KF":
+        axes.vlines(positions, 0.0, r, color=LINES[name]["color"], lw=1.2)
+        dots = DOTS[name] | {"ms": 3.0, "mew": 0.6, "mfc": KF_COLOUR if name == "KF" else "white"}
+        axes.plot(positions, r, **dots, label=name)
+        bound = _whiteness_bound(values)
+        if name == "KF":
             axes.axhspan(
                 -bound,
                 bound,
@@ -221,7 +210,7 @@ def _draw_autocorrelation(axes: Axes, series: list[FilterSeries]) -> None:
             )
         else:
             for level in (-bound, bound):
-                axes.axhline(level, **_thin_line_style(filter_series))
+                axes.axhline(level, **_thin_line_style(name))
     axes.axhline(0.0, color="black", lw=0.5)
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, -0.3), -1.05), min(max(high, 0.3), 1.05))
@@ -229,22 +218,23 @@ def _draw_autocorrelation(axes: Axes, series: list[FilterSeries]) -> None:
     axes.set_xlabel("lag (measurements)")
 
 
-def _whiteness_bound(filter_series: FilterSeries) -> float:
+def _whiteness_bound(values: pd.Series[float]) -> float:
     """Return the half width of the 95 % band for the autocorrelation of white innovations."""
-    return float(1.96 / np.sqrt(len(filter_series.values)))
+    return float(1.96 / np.sqrt(len(values)))
 
 
-def _whiteness_sentence(series: list[FilterSeries]) -> str:
+def _whiteness_sentence(result: AxisComparison, series: Series) -> str:
     sentences = []
-    for filter_series in series:
-        r, p = filter_series.consistency.lag1_autocorrelation, filter_series.consistency.ljung_box_p
+    for name, values in series.items():
+        consistency = filters_by_name(result)[name]
+        assert isinstance(consistency, Consistency)  # else the filter has no series
+        r, p = consistency.lag1_autocorrelation, consistency.ljung_box_p
         interpretation = "white" if p >= MAX_NON_WHITE_P else "not white"
-        if p < MAX_NON_WHITE_P and abs(r) > _whiteness_bound(filter_series):
-            interpretation = (
-                "the filter lags" if r > 0.0 else "the filter follows measurement noise"
-            )
+        if p < MAX_NON_WHITE_P and abs(r) > _whiteness_bound(values):
+            cause = "lags" if r > 0.0 else "follows measurement noise"
+            interpretation = f"the filter {cause}"
         sentences.append(
-            f"{filter_series.name}: lag 1 {r:+.2f}, Ljung-Box {format_p_value(p)}: "
+            f"{name}: lag-1 autocorrelation {r:+.2f}, Ljung-Box test {format_p_value(p)}: "
             f"{interpretation}."
         )
     return "\n".join(sentences)

@@ -41,6 +41,7 @@ from px4fuse.report.page import (
     line_count,
     text_width,
 )
+from px4fuse.report.panels import normalised_innovations
 from px4fuse.report.style import LINES, Artist, Axes, draw_curve
 
 MM = 72.0 / 25.4
@@ -355,18 +356,13 @@ def _distant(axes: Axes, times: Array) -> Array:
 
 def _innovation_strip(result: AxisComparison) -> Strip:
     """Return the strip of the innovations over √S, with triangles beyond its scale."""
-    series = {
-        name: (frame["innovation_m"] / np.sqrt(frame["innovation_variance_m2"])).dropna()
-        for name, frame in (("KF", result.replay.updates), ("EKF2", result.ekf2_innovations))
-        if isinstance(frame, pd.DataFrame)
-    }
+    series = normalised_innovations(result)
     signs = {"KF": "●", "EKF2": "□"}
     beyond = [
         f"{name} {format_ratio(size)}"
         for name, values in series.items()
         if len(values) and (size := float(values.abs().max())) > MAX_NORMALISED
     ]
-    strides = {name: -(-len(values) // MAX_DRAWN) for name, values in series.items()}
     marks = ", ".join(f"{signs[name]} {name}" for name in series)
     title = f"Innovations ÷ √S ({marks}): 95 % belong inside ±2"
     largest = max(
@@ -386,7 +382,7 @@ def _innovation_strip(result: AxisComparison) -> Strip:
         for name in reversed(series):
             values, dots = series[name], INNOVATION_DOTS[name]
             inside = values[values.abs() <= MAX_NORMALISED]
-            axes.plot(inside.iloc[:: strides[name]], **dots)
+            axes.plot(inside.iloc[:: -(-len(values) // MAX_DRAWN)], **dots)
             for sign, marker in ((1.0, "^"), (-1.0, "v")):
                 times = values.index[sign * values > MAX_NORMALISED].to_numpy()
                 edge = {**dots, "marker": marker, "ms": 3.4, "mew": 0, "mfc": dots["color"]}

@@ -167,6 +167,15 @@ def _axis_half_height(result: AxisComparison) -> float:
     return EDGE_FACTOR * max(limits)
 
 
+def normalised_innovations(result: AxisComparison) -> dict[str, pd.Series[float]]:
+    """Return the finite ν/√S of KF and of EKF2, if logged, by filter name."""
+    return {
+        name: (frame["innovation_m"] / np.sqrt(frame["innovation_variance_m2"])).dropna()
+        for name, frame in (("KF", result.replay.updates), ("EKF2", result.ekf2_innovations))
+        if isinstance(frame, pd.DataFrame)
+    }
+
+
 def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     """Draw the innovations of KF and EKF2 with ±2√S; rejected ones are hollow."""
     half_height, updates, frame = (

@@ -25,8 +25,6 @@ SETTINGS = (
     ("SIGMA_A / 4", 1.0 / NOISE_FACTOR, 1.0),
     ("SIGMA_Z × 4", 1.0, NOISE_FACTOR),
 )
-# Label, and indices of the two SETTINGS with the same gain
-GAIN_GROUPS = (("larger gain", (1, 2)), ("smaller gain", (3, 4)))
 # Contours below the maximum: joint 95 % region of both noises, then decades
 REGION_95_NATS = float(-np.log(0.05))
 LEVELS_NATS = (0.0, REGION_95_NATS, 10.0, 100.0, 1000.0, 10_000.0)
@@ -87,13 +85,10 @@ def _draw_map(page: Page, analysis: Analysis) -> None:
     for factor in (1.0 / NOISE_FACTOR, 1.0, NOISE_FACTOR):
         sigma_a_of_gain = factor * chosen[0] / chosen[1] * z[[0, -1]]
         axes.plot(z[[0, -1]], sigma_a_of_gain, color="black", lw=0.7, ls=(0, (1, 1.5)))
-    scaled = {
-        label: (chosen[1] * z_factor, chosen[0] * a_factor)
-        for label, a_factor, z_factor in SETTINGS
-    }
-    for (label, pair), marker in zip(GAIN_GROUPS, "^v", strict=True):
-        pairs = [scaled[SETTINGS[column][0]] for column in pair]
-        axes.plot(*zip(*pairs, strict=True), marker, color=KF_COLOUR, ms=4.0, label=label)
+    others = [
+        (chosen[1] * z_factor, chosen[0] * a_factor) for _, a_factor, z_factor in SETTINGS[1:]
+    ]
+    axes.plot(*zip(*others, strict=True), "D", color=KF_COLOUR, ms=4.0, label="in the table")
     best = [_best_value(noise) for noise in noises]
     axes.plot(best[1], best[0], "o", color="white", mec="black", ms=6.0, label="maximum")
     axes.plot(chosen[1], chosen[0], "X", color="black", mec="white", ms=8.0, label="chosen")
