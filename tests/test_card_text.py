@@ -63,7 +63,7 @@ def test_causes_are_numbered_and_further_notes_are_counted() -> None:
     card = replace(SMALL_SIGMA_A, causes=2 * SMALL_SIGMA_A.causes, notes=notes)
     lines = text_of(card)
     assert [line.split()[1] for line in lines if line.startswith("  cause")] == ["1", "2"]
-    assert lines[-2:] == ["note[note_2]: Text 2.", "and 2 more: -v"]
+    assert lines[-2:] == ["note[note_2]: Text 2.", "and 2 more notes: -v"]
 
 
 def test_card_text_on_limited_terminal_is_ascii() -> None:

@@ -91,8 +91,8 @@ def test_more_than_three_notes_are_counted() -> None:
     text = text_of(replace(SMALL_SIGMA_A, notes=notes, more_causes=4))
     assert "note[note_2]: Text 2." in text
     assert "note_3" not in text
-    assert "and 2 more: All findings" in text
-    assert "and 4 more: All findings" in text
+    assert "and 2 more notes: All findings" in text
+    assert "and 4 more causes: All findings" in text
 
 
 @pytest.mark.parametrize(
@@ -228,7 +228,7 @@ def test_flat_strip_says_so_in_its_title(eventful: Analysis) -> None:
         for scale in (0.1, 5.0)
     ]
     assert titles[0] == "EKF2 error (m): RMSE 0.040, σ 0.060"
-    assert titles[1] == f"{titles[0]}, flat on this scale, at most 0.050"
+    assert titles[1] == f"{titles[0]}, at most 0.050, flat on this scale"
 
 
 def test_sigma_beyond_scale_has_triangles_and_its_value() -> None:

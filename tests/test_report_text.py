@@ -219,23 +219,26 @@ def test_clock_page_exists_only_with_result_to_report() -> None:
         SimpleNamespace(findings=[Finding(name, "error", "", "")]) for name in clock.CLOCK_FINDINGS
     ]
     nothing: Any = SimpleNamespace(findings=[])
-    assert "No significant time offset" in clock.summary_line(fine, [])
+    assert "no significant time offset" in clock.summary_line(fine, [])
     assert not list(clock.draw(fine, nothing))
     for analysis, results in (
         (with_clock(unknown), nothing), *((fine, each) for each in with_finding)
     ):  # fmt: skip
         line = clock.summary_line(analysis, results.findings)
-        assert line == "see the appendix on the time offset"
+        assert line == "The appendix on the time offset contains the estimate."
         assert len(list(clock.draw(analysis, results))) == 1
     none = with_clock(Unavailable("clock offset", "no IMU", "Give the ULog."))
-    assert clock.summary_line(none, []) == "Cannot be estimated: no IMU. Give the ULog."
+    assert (
+        clock.summary_line(none, [])
+        == "The time offset cannot be estimated: no IMU. Give the ULog."
+    )
     assert not list(clock.draw(none, nothing))
 
 
 @pytest.mark.parametrize(
     ("changes", "delay_ms", "expected"),
     [
-        ({}, 0.0, {"Result": "No significant time offset", "PX4": "0 ms is within"}),
+        ({}, 0.0, {"Result": "no significant time offset", "PX4": "0 ms is within"}),
         ({}, 175.0, {"PX4": "Set EKF2_EV_DELAY to 0 ms (now 175 ms; 95 % 0 to 20 ms)"}),
         ({"offset_s": -0.25, "interval_s": (-0.28, -0.22)}, 250.0,
          {"Result": "0.250 s late", "Re-run": "--clock-offset -0.250", "PX4": "is within"}),

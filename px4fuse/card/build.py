@@ -56,16 +56,16 @@ from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line,
 from px4fuse.text import with_log_name
 
 MAX_ACTIONS = 3
-# Rejected fraction and resets from which the effect names them
+# Minimum fraction of positions rejected by EKF2 that the effect on the card states
 MIN_NAMED_REJECTION = 0.01
 BETTER_POSITION = ("position and σ", "position")
-# Aiding sources whose √S is larger than needed with PX4's default noises, which is not a fault
+# Aiding sources whose √S is usually too large with PX4's default noises, which is no fault
 USUALLY_UNDERCONFIDENT = frozenset({"baro_hgt", "mag", "gravity"})
 DRIFT_HIDES_ERROR = (
     "σ too large against the source is not a fault here: the source may drift, and innovations do "
     "not show drift. Do not lower the noises for it."
 )
-# Bytes of a refused file that its card shows, and the first bytes of each ULog
+# Number of first bytes that the card of an unreadable log shows, and those of each ULog
 SHOWN_BYTES, ULOG_HEAD = 4, "55 4C 6F 67"
 HEADING_HIDES_ERROR = (
     "Both filters rotate the measured acceleration by the wrong heading and return to the position "
@@ -73,7 +73,7 @@ HEADING_HIDES_ERROR = (
 )
 UNEXPLAINED = "The two verdicts differ, and no tested change explains it."
 NO_FAULT = "No fault found: KF and EKF2 are consistent"
-# Findings of a source whose errors the innovations cannot show
+# Findings of errors that both filters follow, so that innovations do not show them
 SHIFTED_SOURCE = frozenset(
     {"source_time_offset", "source_scale_error", "source_frame_misaligned", "source_position_jump"}
 )
@@ -85,17 +85,17 @@ def build_card(
     request: ComparisonRequest,
     student: tuple[str, str] = ("", ""),
 ) -> Card:
-    """Return the diagnosis card of a comparison.
+    """Build the diagnosis card of a comparison.
 
     Parameters
     ----------
     analysis : Analysis
     findings : sequence of Finding
-        Most severe first, consequences behind their cause.
+        Most severe first; a finding that is a consequence follows its cause.
     request : ComparisonRequest
-        Makes the commands; without paths, they are for the folder of the log.
+        Options of the user, which the commands on the card repeat without paths.
     student : (str, str)
-        Name and id.
+        Name and id of the student.
     """
     result, source, segment = analysis.main, analysis.source, analysis.segment
     roots = [group[0] for group in group_by_root(findings)]
@@ -148,7 +148,7 @@ def build_aids_card(
     request: ComparisonRequest,
     student: tuple[str, str] = ("", ""),
 ) -> Card:
-    """Return the card of a flight without positions: EKF2's aiding sources only."""
+    """Build the card of a flight without a position source, from EKF2's aiding sources."""
     roots = [group[0] for group in group_by_root(findings)]
     faults = [one for one in roots if one.severity != "note"]
     causes = tuple(make_plain_cause(one) for one in faults[:MAX_CAUSES])
@@ -177,9 +177,9 @@ def build_aids_card(
 
 
 def build_refusal_card(error: LogError | MissingDataError, path: Path) -> Card:
-    """Return the card of a log that cannot be analysed: fault, bytes of the file, and action."""
+    """Build the card of a log that cannot be analysed: fault, first bytes of the file, and fix."""
     facts = {}
-    with suppress(LogError):  # the file cannot be opened, which the error says
+    with suppress(LogError):  # without access to the file, the error states the reason
         head = read_head(path, SHOWN_BYTES, LogError).hex(" ").upper()
         size = file_size(path, LogError)
         facts["read"] = f"{size:,} bytes, beginning with {head} (ULog: {ULOG_HEAD})"
@@ -199,7 +199,6 @@ def _severity_without_cause(verdicts: Sequence[Verdict]) -> CardSeverity:
 
 
 def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
-    """Return fault and size of the first cause; a second error follows if there is room."""
     if causes:
         first, *others = causes
         for other in others:
@@ -251,7 +250,7 @@ def horizontal_resets(analysis: Analysis) -> Array:
 
 
 def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
-    """Format the axis with its reference: "along the main axis, 30° from north"."""
+    """Describe the direction of an axis: "along the main axis, 30° from north"."""
     direction, heading = f"along {result.axis.label}", result.heading_deg
     if result.axis.name != AISLE or heading is None:
         return direction
@@ -275,7 +274,6 @@ def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
 
 
 def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]) -> str:
-    """Make the sentences about errors, their ratios to σ, rejections and resets."""
     sentences = []
     if analysis.flight.airborne == ():
         return "The vehicle stayed on the ground, so the errors of the filters are not evaluated."
@@ -319,7 +317,7 @@ def _in_brackets(label: str, lengths_m: Mapping[FilterName, float]) -> str:
 
 
 def _do_this(causes: Sequence[Cause]) -> tuple[str, ...]:
-    """Return the first actions of the causes, at most three."""
+    """Return at most three actions of the causes; first the alternative that is listed first."""
     texts: list[str] = []
     for cause in causes:
         for alternative in cause.alternatives[:1]:
@@ -334,7 +332,7 @@ def _is_change(action: Action) -> bool:
 
 def _sentence(action: Action) -> str:
     if action.where == "console":
-        one_change = action.sentence.partition(" ")[2]  # the command has the name of the parameter
+        one_change = action.sentence.partition(" ")[2]  # the command states the parameter
         change = one_change if len(action.commands) == 1 else action.sentence
         return f"EKF2: {', '.join(action.commands)} ({change})."
     if action.where == "shell":
@@ -347,7 +345,7 @@ def _sentence(action: Action) -> str:
 def _mark_explained(
     verdicts: Sequence[Verdict], causes: Sequence[Cause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
-    """Mark verdicts that are not consistent and need no change.
+    """Mark the inconsistent verdicts of filters that need no change.
 
     If the source may drift, a σ that is too large against the source is not a fault.
     """
@@ -377,7 +375,7 @@ def _mark_explained(
 
 
 def _horizon_ratio(analysis: Analysis) -> float | None:
-    """Return the ratio of EKF2's error to σ at the fusion horizon, if that is consistent.
+    """Return EKF2's error ÷ σ at the fusion horizon, or None unless it is consistent only there.
 
     The published position includes the lag of EKF2's output predictor, which σ does not describe.
     None if the published position is consistent, or if the horizon is not logged or not consistent.
@@ -406,7 +404,7 @@ def _horizon_sentence(ratio: float) -> str:
 def _reconcile(
     analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence[Cause], ids: Sequence[str]
 ) -> str:
-    """Explain two verdicts of one filter that differ, or ratios of which one is far larger."""
+    """Explain why verdicts against source and ground truth differ; "" if they agree."""
     corrected = {
         "ekf2" if rerun.is_prediction else "kf"
         for cause in causes[:1]
@@ -455,9 +453,9 @@ def _differ(source: Verdict, truth: Verdict, *, is_corrected: bool) -> bool:
 
 
 def _gate_sentence(analysis: Analysis) -> str:
-    """State that EKF2's gate rejected the outliers, with the ratio of the accepted positions."""
+    """State how many positions EKF2's gate rejected, and innovation ÷ √S of the accepted ones."""
     innovations = analysis.main.ekf2_innovations
-    assert not isinstance(innovations, Unavailable)  # EKF2's verdict needs them
+    assert not isinstance(innovations, Unavailable)  # else EKF2 has no verdict
     accepted = innovations[~(innovations["rejected"] > 0.0)]
     ratio = math.sqrt(
         float((accepted["innovation_m"] ** 2 / accepted["innovation_variance_m2"]).mean())
@@ -471,7 +469,6 @@ def _gate_sentence(analysis: Analysis) -> str:
 
 
 def _difference(effect: Effect, ranked: Sequence[RankedCause]) -> str:
-    """State the difference KF - EKF2 before and after the fix of the first cause."""
     if effect.difference_rms_m is None or not ranked:
         return ""
     text = f"KF − EKF2: {format_metres(effect.difference_rms_m)} m RMS"
@@ -517,7 +514,6 @@ def _identity(
 
 
 def _settings(analysis: Analysis, request: ComparisonRequest) -> str:
-    """Format the three settings of KF with their origin."""
     chosen = analysis.settings
     texts = []
     for name, label, unit in (
@@ -544,7 +540,6 @@ def _changed_settings(request: ComparisonRequest) -> tuple[str, ...]:
 
 
 def _changed_parameters(analysis: Analysis) -> tuple[str, ...]:
-    """Format noise, delay and gate of EKF2 for the source that differ from PX4's default."""
     if analysis.source.origin.aid is None:
         return ()
     aid, log = analysis.source.origin.aid, analysis.flight.log

@@ -38,7 +38,7 @@ SIGNS = {
     "clean": "✓ NO FAULT",
     "refused": "✕ REFUSED",
 }
-# SVG paths around the position of a ratio; triangles for ratios beyond the ends of the axis
+# SVG paths of the mark of a ratio; triangles mark ratios beyond the ends of the axis
 MARK_PATHS = {
     "source": "M-5.5 0a5.5 5.5 0 1 0 11 0a5.5 5.5 0 1 0-11 0",
     "truth": "M-6.5 0L0-6.5L6.5 0L0 6.5z",
@@ -46,7 +46,7 @@ MARK_PATHS = {
     "above": "M-5-7L7 0L-5 7z",
 }
 SPOKEN_QUANTITIES = {"source": "innovation over root S", "truth": "error over sigma"}
-HALF_HEIGHT = 5  # pixels; of the end ticks of an interval
+HALF_HEIGHT = 5  # half the height (pixels) of the end ticks of an interval
 
 
 def card_of(analysis: Analysis) -> Card:
@@ -132,7 +132,7 @@ def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str
 
 
 def axis_figures(analysis: Analysis) -> str:
-    """Return a figure of the verdicts for each analysed axis."""
+    """Return an HTML figure of the four verdicts for each analysed axis."""
     return "".join(
         axis_html(verdicts(result), describe_axis(analysis, result), name)
         for name, result in analysis.axes.items()
@@ -140,7 +140,7 @@ def axis_figures(analysis: Analysis) -> str:
 
 
 def band_limits() -> str:
-    """Format the limits of both bands.
+    """Format the limits of the consistent ratios against source and ground truth.
 
     >>> band_limits()
     '● 0.8 to 1.25, ◆ 0.67 to 1.5'
@@ -149,7 +149,7 @@ def band_limits() -> str:
 
 
 def card_style() -> str:
-    """Return the style of the card; its colours are in ``webpage/colours.css``."""
+    """Return the style sheet of the card; its colours are in ``webpage/colours.css``."""
     return read_asset("card.css", "px4fuse.report")
 
 
@@ -160,7 +160,7 @@ def notebook_html(card: Card) -> str:
 
 
 def alternative_text(verdicts: Sequence[Verdict]) -> str:
-    """Describe the axis for screen readers.
+    """Describe the verdicts on the axis for screen readers.
 
     >>> alternative_text([Verdict(filter="kf", against="truth", ratio=7.2, word="overconfident")])
     'KF, error over sigma: 7.2, overconfident.'
@@ -178,7 +178,6 @@ def _value(verdict: Verdict) -> str:
 
 
 def _is_prominent(row: tuple[str, Action]) -> bool:
-    """Return True for commands and alternatives; ``do_this`` contains the other actions."""
     return bool(row[0] or row[1].commands)
 
 
@@ -187,12 +186,11 @@ def _rerun_rows(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
 
 
 def _percent(ratio: float) -> str:
-    """Return the position of a ratio on the axis, limited to its ends."""
     return f"{100.0 * min(max(axis_fraction(ratio), 0.0), 1.0):.2f}"
 
 
 def _drawing(verdict: Verdict) -> dict[str, Any]:
-    """Return the SVG attributes of band, interval and mark."""
+    """Return the SVG attributes of the band, the 95 % interval and the mark of a ratio."""
     if verdict.ratio is None:
         return {}
     low, high = (axis_fraction(end) for end in BANDS[verdict.against])

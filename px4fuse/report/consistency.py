@@ -34,13 +34,13 @@ from px4fuse.text import format_number, format_p_value
 MAX_LAG = 20
 MAX_NORMALISED = 4.0
 BINS = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 33)
-# Upper limit of the density axis; the normal curve (maximum 0.4) stays visible
+# Maximum of the density axis, at which the normal curve (maximum 0.4) is visible
 MAX_DENSITY = 1.6
-# p value of the Ljung-Box test below which the caption calls the innovations not white
+# Maximum p value of the Ljung-Box test for innovations that the caption calls not white
 MAX_NON_WHITE_P = 0.01
-RUNNING_HEIGHT, LOWER_HEIGHT, LEGEND_HEIGHT = 140.0, 150.0, 14.0  # points; heights of the axes
+RUNNING_HEIGHT, LOWER_HEIGHT, LEGEND_HEIGHT = 140.0, 150.0, 14.0  # heights (points)
 BAND_GREY = "#dcdcdc"
-# Label of each statistic that a cause explains, and the power with which its value is printed
+# Label of each statistic that a re-run changes, and the power of the statistic that is printed
 CAUSE_STATISTICS: Mapping[Statistic, tuple[str, float]] = {
     "nis": ("mean NIS", 1.0),
     "nees": ("√NEES", 0.5),
@@ -52,7 +52,7 @@ Series = Mapping[str, "pd.Series[float]"]
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw one page: three panels of the main axis, and a table of all axes."""
+    """Draw the consistency tests of the main axis, and a table of all axes."""
     result = analysis.main
     axis_text = result.axis.label
     page = Page(
@@ -94,7 +94,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     else:
         kf_summary = result.filters["kf"]
         reason = kf_summary.reason if isinstance(kf_summary, Unavailable) else "too few innovations"
-        page.write(f"Along {axis_text}: {reason}.")
+        page.write(f"The consistency along {axis_text} is not tested: {reason}.")
     page.heading("All axes", above=12.0)
     head = [*VERDICT_HEAD, "n", "beyond\n2√S", "t of\nmean", "lag 1", "Ljung-\nBox"]
     page.table(head, verdict_rows(analysis.axes.values(), _statistic_cells), right=(2, 5, 6, 7, 8))
@@ -103,7 +103,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _write_causes(page: Page, analysis: Analysis) -> None:
-    """Write the table of re-runs along the main axis, each with one change."""
+    """Write the table of re-runs of KF and EKF2 with one change along the main axis."""
     axis = analysis.main.axis
     rows: list[list[Cell]] = []
     for cause in analysis.causes:
@@ -136,7 +136,6 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
 
 
 def _series(result: AxisComparison) -> Series:
-    """Return the normalised innovations ν/√S of each filter with a verdict."""
     verdicts = filters_by_name(result)
     return {
         name: values
@@ -227,7 +226,7 @@ def _whiteness_sentence(result: AxisComparison, series: Series) -> str:
     sentences = []
     for name, values in series.items():
         consistency = filters_by_name(result)[name]
-        assert isinstance(consistency, Consistency)  # else the filter has no series
+        assert isinstance(consistency, Consistency)  # else the filter has no innovations
         r, p = consistency.lag1_autocorrelation, consistency.ljung_box_p
         interpretation = "white" if p >= MAX_NON_WHITE_P else "not white"
         if p < MAX_NON_WHITE_P and abs(r) > _whiteness_bound(values):

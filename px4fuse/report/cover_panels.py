@@ -1,4 +1,7 @@
-"""Panels of the cover: map, errors of KF and EKF2, innovations; no value leaves one unmarked."""
+"""Panels of the cover: map, position errors of KF and EKF2, innovations.
+
+Values outside of a panel are marked by triangles at its edge.
+"""
 
 from __future__ import annotations
 
@@ -45,44 +48,50 @@ from px4fuse.report.panels import normalised_innovations
 from px4fuse.report.style import LINES, Artist, Axes, draw_curve
 
 MM = 72.0 / 25.4
-# Length / width of the track from which the panels stand one below the other
+# Minimum length / width of the track for panels that fill the page width
 MIN_LONG_RATIO = 2.2
-# pt; heights of panels with their titles and labels
+# Least and largest height (pt) of the map, with title and labels
 MAP_HEIGHTS = 40.0 * MM, 53.0 * MM
-# pt; least heights of all panels in two columns and in three
+# Least total heights (pt) of the panels in two columns and in three columns
 MIN_HALVES_HEIGHT, MIN_THIRDS_HEIGHT = 50.0 * MM, 38.0 * MM
 INNOVATION_HEIGHTS = 27.0 * MM, 38.0 * MM
 MIN_ERROR_HEIGHT = 17.0 * MM
-# pt; height of all panels if the card fills its page
+# Total height (pt) of the panels on the next page, if the card fills the first one
 NEXT_PAGE_HEIGHT = 160.0 * MM
-# pt; title with its gaps, each further line of it, gap above the legend, and what is left free
+# Heights (pt): title with gaps, each further line of it, gap above the legend, unused rest
 TITLE_HEIGHT, TITLE_LINE, LEGEND_GAP, SPARE = 16.5, 10.5, 11.0, 4.0
-MIN_TICKS_HEIGHT = 48.0  # pt; lower axes of the innovations have ticks at -4, 0 and 4 only
-MIN_WIDE = 200.0  # pt; narrower panels have fewer ticks
-LEFT = 38.0  # pt; tick and axis labels left of the axes
-# Share of the free height for the innovations and for the map
+# Minimum height (pt) of the innovations for ticks at ±2 besides -4, 0 and 4
+MIN_TICKS_HEIGHT = 48.0
+MIN_WIDE = 200.0  # minimum width (pt) of a panel for six ticks of the time axis
+LEFT = 38.0  # width (pt) for tick and axis labels left of the axes
+# Fraction of the height of all panels for the innovations, and for the map
 INNOVATION_SHARE, MAP_SHARE = 0.22, 0.25
-MAX_DRAWN = 400  # innovations per filter; more are decimated evenly, those beyond the scale never
+# Maximum number of drawn innovations per filter; those beyond the scale are always drawn
+MAX_DRAWN = 400
 MAX_NORMALISED = 4.0
-# pt; height below the axes, without and with labels of the x axis
+# Height (pt) below the axes, without and with labels of the time axis
 BELOW = UNLABELLED_HEIGHT, TICKS_HEIGHT + AXIS_LABEL_HEIGHT
 MAP_MARGIN, MAP_REACH, MIN_MAP_LENGTH_M = 1.08, 0.25, 0.5
-# Fraction of the map's length between two triangles of a track
+# Minimum distance between two triangles of a track, as a fraction of the map's length
 MIN_EXIT_DISTANCE = 0.02
-# A curve that fills less of its scale than this is called flat
+# Maximum part of the scale that a curve fills if the title calls it flat
 FLAT_SHARE = 0.1
 FLAT_INNOVATIONS = 1.0
-# σ is printed as one value if its largest is below this multiple of its smallest
+# Maximum ratio of the largest to the smallest σ for a title with one value of σ
 MAX_SIGMA_SPREAD = 1.5
-SETTLING_S = 2.0  # at the start, σ settles; its values do not count in the titles
-# Markers of the innovations, as in the title
+# Time (s) in which σ settles at the start; titles do not include its values
+SETTLING_S = 2.0
+# Markers of the innovations; the title of their panel shows the same symbols
 INNOVATION_DOTS: Mapping[str, dict[str, Any]] = {
     "KF": style.KF_DOTS,
     "EKF2": style.EKF2_DOTS | {"ms": 2.8, "mew": 0.6, "mfc": "none"},
 }
-# Fraction of the axes: of marks closer than this, one is drawn
+# Minimum distance of two marks as a fraction of the axes; of closer marks one is drawn
 MIN_MARK_DISTANCE = 1.0 / 150.0
-GAP_HATCH: dict[str, Any] = {**GAP_BAND, "facecolor": "none"}  # σ in the gap stays visible
+GAP_HATCH: dict[str, Any] = {
+    **GAP_BAND,
+    "facecolor": "none",
+}  # no fill, so that σ in the gap is visible
 RESET_LINE = style.line_style(style.EKF2_COLOUR, 1.0, (0, (1, 1)))
 REJECTED_MARK = style.dot_style("black", "|", 5.0, 0.7)
 Coordinates = tuple[Array, Array]
@@ -91,14 +100,14 @@ DrawStrip = Callable[[Axes], None]
 
 
 class Strip(NamedTuple):
-    """Panel over time: title, and the function that draws it."""
+    """Small plot over time: title, and the function that draws it."""
 
     title: str
     draw: DrawStrip
 
 
 class FlightMap(NamedTuple):
-    """Flight from above: tracks (m, right and up), and the labels of both axes.
+    """Flight from above: tracks in metres to the right and upwards, and the axis labels.
 
     Of ``right_labels`` the first that fits is used.
     """
@@ -110,13 +119,13 @@ class FlightMap(NamedTuple):
 
     @property
     def is_long(self) -> bool:
-        """True if the track is at least :data:`MIN_LONG_RATIO` times longer than wide."""
+        """True if the track is so long and narrow that the panels fill the page width."""
         length_m, width_m = (float(np.ptp(values)) for values in self.tracks["positions"])
         return length_m >= MIN_LONG_RATIO * max(width_m, 1e-6)
 
 
 def write_panels(block: Block, analysis: Analysis, card: Card, free: float) -> None:
-    """Draw legend, map and strips into the block of the cover.
+    """Draw legend, map and plots over time into the block of the cover.
 
     Parameters
     ----------
@@ -163,7 +172,7 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free: float) -> N
 def _draw_strips(
     page: Page, analysis: Analysis, strips: Sequence[Strip], heights: Sequence[float]
 ) -> None:
-    """Draw strips on one time axis; heights include titles and labels."""
+    """Draw plots on one time axis; their heights (pt) include titles and labels."""
     for strip, height in zip(strips, heights, strict=True):
         is_last = strip is strips[-1]
         axes_height = height - _head_height(page, strip.title) - BELOW[is_last]
@@ -177,7 +186,7 @@ def _draw_strips(
 def _equal_heights(
     page: Page, strips: Sequence[Strip], total: float, *, is_labelled: bool
 ) -> list[float]:
-    """Return heights of strips that add up to a total (pt), with axes of equal height.
+    """Return heights (pt) of plots with equal axes that add up to a total.
 
     If ``is_labelled``, the last strip has the labels of the time axis.
     """
@@ -193,15 +202,11 @@ def _tick_count(page: Page) -> int:
 
 
 def _head_height(page: Page, title: str) -> float:
-    """Return the height (pt) of a title with its gaps."""
     return TITLE_HEIGHT + TITLE_LINE * (line_count(title, page.width) - 1)
 
 
-# ------------------------------------------------------------------------------------------ errors
-
-
 def _error_strips(analysis: Analysis, card: Card) -> list[Strip]:
-    """Return a strip of the errors of each filter, or of KF - EKF2 without ground truth."""
+    """Return a plot of the position error of each filter, or of KF - EKF2 without ground truth."""
     result, effect = analysis.main, card.effect
     errors_by_filter = {
         owner: errors
@@ -252,7 +257,7 @@ def _strip(
     sigmas: Mapping[str, pd.Series[float]],
     half_height: float,
 ) -> Strip:
-    """Return the strip of an error or a difference (m) with ±2σ of the filters that it concerns."""
+    """Return the plot of a position error or of KF - EKF2 (m), with ±2σ of each filter."""
     texts = [f"{name} {text}" for name, sigma in sigmas.items() if (text := _format_sigma(sigma))]
     if len(sigmas) == 1:
         texts = [text.partition(" ")[2] for text in texts]
@@ -260,7 +265,7 @@ def _strip(
         sizes = [*sizes, f"σ {', '.join(texts)}"]
     largest = float(curve.abs().max())
     if largest < FLAT_SHARE * half_height:
-        sizes = [*sizes, f"flat on this scale, at most {format_metres(largest)}"]
+        sizes = [*sizes, f"at most {format_metres(largest)}, flat on this scale"]
     line = LINES[next(iter(sigmas))] if len(sigmas) == 1 else style.line_style("black", 1.0)
 
     def draw(axes: Axes) -> None:
@@ -281,7 +286,7 @@ def _strip(
 
 
 def _shown_height(errors: pd.DataFrame) -> float:
-    """Return the largest error (m), or 2.2 σ if that is not much larger."""
+    """Return the largest position error (m) of a filter, or 2.2 σ if that is not much larger."""
     largest, sigma = float(errors["error_m"].abs().max()), errors["sigma_m"].median()
     return max(largest, 1e-3, min(2.2 * sigma, 3.0 * largest) if np.isfinite(sigma) else 0.0)
 
@@ -298,7 +303,7 @@ def _format_sigma(sigma: pd.Series[float]) -> str:
 
 
 def _draw_sigma(axes: Axes, sigma: pd.Series[float], name: str) -> None:
-    """Draw ±2σ of a filter; where it leaves the scale, a triangle and the largest value."""
+    """Draw ±2σ of a filter; beyond the plot, draw triangles and write the largest value."""
     known = sigma.dropna()
     if known.empty:
         return
@@ -338,7 +343,6 @@ def _rejected(analysis: Analysis) -> Array:
 
 
 def _draw_at_edge(axes: Axes, times: Array, height: float, mark: Mapping[str, Any]) -> None:
-    """Draw marks at a height of the axes (0 to 1)."""
     if len(times):
         visible = _distant(axes, times)
         axes.plot(
@@ -351,11 +355,8 @@ def _distant(axes: Axes, times: Array) -> Array:
     return visible_times(times, MIN_MARK_DISTANCE * (high - low))
 
 
-# ------------------------------------------------------------------------------------- innovations
-
-
 def _innovation_strip(result: AxisComparison) -> Strip:
-    """Return the strip of the innovations over √S, with triangles beyond its scale."""
+    """Return the plot of innovation ÷ √S, with triangles for values beyond its scale."""
     series = normalised_innovations(result)
     signs = {"KF": "●", "EKF2": "□"}
     beyond = [
@@ -392,11 +393,8 @@ def _innovation_strip(result: AxisComparison) -> Strip:
     return Strip(title, draw)
 
 
-# ------------------------------------------------------------------------------------------ map
-
-
 def _tracks(analysis: Analysis) -> dict[str, Coordinates]:
-    """Return north and east (m) of each track within the segment."""
+    """Return north and east (m) of positions, KF, EKF2 and ground truth within the segment."""
     segment, flight = analysis.segment, analysis.flight
 
     def cut(frame: pd.DataFrame) -> Coordinates:
@@ -417,7 +415,7 @@ def _tracks(analysis: Analysis) -> dict[str, Coordinates]:
 
 
 def _flight_map(analysis: Analysis, card: Card) -> FlightMap:
-    """Return the map along the aisle, at a heading below 180°; else north up."""
+    """Return the map along the main axis, at a heading below 180°; without it, north is up."""
     aisle = next((line for line in analysis.lines if line.name == AISLE), None)
     heading, right_labels, up_label = np.pi / 2.0, ["east (m)"], "north (m)"
     if aisle is not None and aisle.heading_deg is not None:
@@ -437,12 +435,12 @@ def _flight_map(analysis: Analysis, card: Card) -> FlightMap:
 
 
 def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: float) -> None:
-    """Draw the tracks at equal scales; a triangle marks each place where one leaves the map."""
+    """Draw the tracks at equal scales, with triangles where a track leaves the map."""
     tracks, width = flight_map.tracks, page.width - LEFT - AXES_RIGHT
     title, axes_height = "Map", height - TITLE_HEIGHT - BELOW[True]
     limits = _map_limits(tracks, width / axes_height)
     if leaving := _leaving(tracks, limits):
-        title = f"Map; triangles: {leaving} outside"
+        title = f"Map; triangles: tracks leave it ({leaving})"
         axes_height = height - _head_height(page, title) - BELOW[True]
         limits = _map_limits(tracks, width / axes_height)
     axes = page.panel(title, "", axes_height, above=4.0, left=LEFT, is_compact=True)
@@ -473,7 +471,6 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
 
 
 def _leaving(tracks: Mapping[str, Coordinates], limits: MapLimits) -> str:
-    """Format the tracks that leave the map, each with its largest distance outside."""
     sizes = {name: _distance_outside(track, limits) for name, track in tracks.items()}
     return ", ".join(
         f"{name} {format_metres(size)} m" for name, size in sizes.items() if size > 0.0
@@ -514,7 +511,7 @@ def _ends(values: Array) -> Array:
 
 
 def _overshoot(values: Array, limits: tuple[float, float]) -> Array:
-    """Return the signed distance beyond limits; 0 inside."""
+    """Return the signed distance of values beyond two limits; 0 between them."""
     return np.asarray(values - np.clip(values, *limits))
 
 
@@ -533,7 +530,7 @@ def _exits(track: Coordinates, limits: MapLimits) -> Iterator[tuple[str, tuple[f
     spacing = MIN_EXIT_DISTANCE * (limits[0][1] - limits[0][0])
     last = np.full(2, np.inf)
     for change in changes:
-        # the outside sample next to the change
+        # use the sample outside of the map next to the crossing of its frame
         index = change if change < len(is_outside) and is_outside[change] else change - 1
         x, y = over[0][index], over[1][index]
         marker = ("^" if y > 0.0 else "v") if abs(y) >= abs(x) else (">" if x > 0.0 else "<")
@@ -543,11 +540,7 @@ def _exits(track: Coordinates, limits: MapLimits) -> Iterator[tuple[str, tuple[f
             last = place
 
 
-# -------------------------------------------------------------------------------------- legend
-
-
 def _legend_entries(analysis: Analysis) -> list[Artist]:
-    """Return entries for all lines and marks that occur."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 

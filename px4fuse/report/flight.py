@@ -21,11 +21,11 @@ from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, Artist, Axes
 
 ZOOM_UPDATES = 15
 MIN_ZOOM_S = 1.0
-ZOOM_HEIGHT = 125.0  # points; height of the axes
+ZOOM_HEIGHT = 125.0  # height (points) of the axes of the zoom
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the page on position and velocity along the main axis."""
+    """Draw position and velocity along the main axis over time."""
     result = analysis.main
     page = Page(f"Position and velocity along {result.axis.label}")
     _write_legend(page, analysis)
@@ -38,7 +38,6 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _write_legend(page: Page, analysis: Analysis) -> None:
-    """Write the legend of lines and marks, valid for all pages."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
@@ -55,7 +54,7 @@ def _write_legend(page: Page, analysis: Analysis) -> None:
 
 
 def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the page on innovations, σ_p and σ_v along the main axis, with a zoom."""
+    """Draw innovations, σ_p and σ_v along the main axis over time, with a zoom."""
     result = analysis.main
     page = Page(f"Innovations and variances along {result.axis.label}")
     for panel in (panels.INNOVATIONS, panels.SIGMA_P, panels.SIGMA_V):
@@ -70,7 +69,7 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _draw_zoom(page: Page, analysis: Analysis) -> None:
-    """Draw σ_p in each prediction and update of a short part of the flight."""
+    """Draw σ_p in each prediction and update during a short part of the flight."""
     result = analysis.main
     start_s, end_s = window = zoom_window(result, analysis.segment)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
@@ -88,15 +87,15 @@ def _draw_zoom(page: Page, analysis: Analysis) -> None:
     axes.set_xlabel(style.TIME_LABEL)
     symbols = []
     if isinstance(result.ekf2_innovations, pd.DataFrame):
-        symbols += ["triangle up before the update", "triangle down after"]
+        symbols += ["triangle up before an update", "triangle down after it"]
     if isinstance(result.ekf2_variance, pd.DataFrame):
-        symbols.append("square as logged")
-    ekf2_legend = f" EKF2: {', '.join(symbols)}." if symbols else ""
-    page.write_small(f"Line: KF. Grey ticks: measurements.{ekf2_legend}")
+        symbols.append("square for the logged σ")
+    ekf2_legend = f" Symbols of EKF2: {', '.join(symbols)}." if symbols else ""
+    page.write_small(f"The line is σ of KF; grey ticks mark measurements.{ekf2_legend}")
 
 
 def zoom_window(result: AxisComparison, segment: Segment) -> Span:
-    """Return start and end (s) of the zoom, with about ZOOM_UPDATES updates.
+    """Return start and end (s) of the zoom, which contains about ZOOM_UPDATES updates.
 
     The zoom is centred on the middle measurement (of EKF2, if logged), so it avoids gaps.
     """
@@ -114,10 +113,9 @@ def zoom_window(result: AxisComparison, segment: Segment) -> Span:
 
 
 def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
-    """Draw σ_p before and after each update."""
     updates, steps = result.replay.updates, result.replay.steps
     prior, posterior = updates["prior_position_variance_m2"], steps["position_variance_m2"]
-    # a stable sort keeps the prior before the posterior at equal times
+    # sort stably, so that the prior variance precedes the posterior at the time of an update
     variances = pd.concat([prior, posterior]).sort_index(kind="stable").loc[slice(*window)]
     axes.plot(
         variances.index, np.sqrt(variances), color=KF_COLOUR, lw=1.1, marker=".", ms=2.4, mew=0
@@ -140,7 +138,7 @@ def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
 
 
 def zoom_sentence(result: AxisComparison) -> str:
-    """Caption of the zoom: σ_p before and after an update, for KF and EKF2."""
+    """Return the caption of the zoom: σ_p before and after an update of KF and of EKF2."""
     texts = []
     for name, filter_summary in filters_by_name(result).items():
         prior_m, posterior_m = (
@@ -164,13 +162,13 @@ def zoom_sentence(result: AxisComparison) -> str:
 
 
 def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the other axes, one column each; no page if the comparison has one axis only."""
+    """Draw the axes except the main axis, one column each; no page without such axes."""
     others = analysis.others
     if not others:
         return
     page = Page(
         "Appendix: other axes",
-        "The same panels for the other axes, with the same lines, bands and marks.",
+        "Position, velocity, innovations and σ of the other axes, drawn as for the main axis.",
     )
     width = (PAGE_WIDTH - COLUMN_GAP * (len(others) - 1)) / max(len(others), 2)
     columns = [Page(width=width) for _ in others]
@@ -183,7 +181,9 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
             verdicts += f"; KF - EKF2 {result.difference.position_rms_m:.3f} m RMS"
         column.heading(result.axis.name)
         column.write(f"{verdicts}.")
-    first_row = Page()  # one column is not divided, so the headings stay with the first panels
+    first_row = (
+        Page()
+    )  # Typst does not divide one column, so headings and first panels share a page
     first_row.add_columns(*columns)
     for panel in (panels.POSITION, panels.VELOCITY, panels.INNOVATIONS, panels.SIGMA_P):
         columns = [Page(width=width) for _ in others]

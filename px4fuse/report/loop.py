@@ -26,11 +26,11 @@ from px4fuse.trajectory.scores import Interval, Statistics
 
 LEAD = (
     "The closure error is the distance between the end of the odometry and the true end. Each "
-    "correction distributes it along the path: by distance (positions only as in Example 2 of the "
-    "lesson, or headings too), or by pose graph optimisation. Each closure is tested first: a "
-    "false one would deform the whole path."
+    "correction distributes it along the path: by distance (positions only as in Example 2 of "
+    "lesson UAT 366, module 2, or headings too), or by pose graph optimisation. Each closure is "
+    "tested first, because a false closure would deform the whole path."
 )
-MAX_LISTED_CLOSURES = 10  # on the terminal
+MAX_LISTED_CLOSURES = 10  # maximum number of rejected closures that the terminal lists
 RED = style.SEVERITY_COLOURS["error"]
 PATH_STYLES = {
     corrections.UNCORRECTED: style.EKF2_LINE,
@@ -58,12 +58,12 @@ CLOSURE_HEAD = (
     "GNC\nweight",
 )
 TITLE = "Loop closure"
-MAX_MAP_POINTS = 2000  # drawn points per path
-MAP_HEIGHT = 290.0  # points; height of the axes
+MAX_MAP_POINTS = 2000  # maximum number of drawn points per path
+MAP_HEIGHT = 290.0  # height (points) of the axes of the map
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the appendix page if the flight contains a loop."""
+    """Draw the appendix on loop closure if the flight contains a loop."""
     if isinstance(analysis.loop, Loop):
         page = Page(appendix_title(TITLE), LEAD)
         _write_page(page, analysis.loop)
@@ -81,7 +81,6 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 
 
 def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
-    """Write the results, the map, the closures, and the RPE of each path."""
     write_loop(page, loop, findings)
     _draw_map(page, loop)
     page.heading("Closures and scores", 10.5, above=14.0)
@@ -97,7 +96,7 @@ def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> N
 
 
 def shown_paths(loop: Loop) -> list[CorrectedPath]:
-    """Return the corrected paths that the map shows, one per kind of correction."""
+    """Return the corrected paths for the map, one per kind of correction."""
     return [path for path in loop.reported_paths if path.name in PATH_STYLES]
 
 
@@ -108,7 +107,7 @@ def _draw_map(page: Page, loop: Loop) -> None:
 
 
 def draw_map(axes: Axes, loop: Loop) -> None:
-    """Draw each path from above, with the end of the odometry and the true end."""
+    """Draw each corrected path from above, with the end of the odometry and the true end."""
     path = loop.odometry.trajectory
     names = AXES_OF_FRAME[path.frame]
     _draw_reference(axes, loop)
@@ -153,11 +152,8 @@ def _draw_reference(axes: Axes, loop: Loop) -> None:
             )
 
 
-# ---------------------------------------------------------------------------------------- text
-
-
 def summary(loop: Loop, findings: tuple[Finding, ...]) -> Page:
-    """Make the terminal page of a loop: results, scores and findings."""
+    """Make the terminal page of a loop: closure error, corrected paths and findings."""
     page = Page()
     write_loop(page, loop)
     write_scores(page, loop)
@@ -213,7 +209,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
 
 
 def write_scores(page: Page, loop: Loop) -> None:
-    """Write the tables of closures (gate and weights) and RPE, and the method of the scores."""
+    """Write the tables of closures (gate, weights) and RPE, and the method of the evaluation."""
     rows: list[list[Cell]] = []
     for closure in loop.closures:
         cells = [
@@ -274,7 +270,7 @@ def _format_span(loop: Loop) -> str:
 
 
 def describe_closure_error(loop: Loop) -> str:
-    """Format the closure error in m, in percent of the path, per axis and in heading."""
+    """Format the loop closure error in m, in percent of the path, per axis and in heading."""
     error, misclosure = loop.closure_error_m, loop.closure_error_axes_m
     if error is None or misclosure is None:
         return f"path {loop.path_length_m:.1f} m; the loop is open (--open): no closure error"
@@ -289,7 +285,7 @@ def describe_closure_error(loop: Loop) -> str:
 
 
 def describe_gate(closure: Closure) -> str:
-    """Format the chi-square test of one closure."""
+    """Format the chi-square test of one loop closure."""
     verdict = "accepted (consistent with the stated drift)"
     if not closure.accepted:
         verdict = "REJECTED (not explained by the stated drift)"
@@ -300,7 +296,7 @@ def describe_gate(closure: Closure) -> str:
 
 
 def closure_name(closure: Closure, loop: Loop) -> str:
-    """Format the two times of a closure; UNIX timestamps are counted from the first pose."""
+    """Format the two times of a loop closure (s); UNIX timestamps count from the first pose."""
     if closure.source == LANDING:
         return "take-off and landing"
     origin_s = loop.start_s if loop.start_s > MIN_UNIX_TIME_S else 0.0
@@ -308,21 +304,21 @@ def closure_name(closure: Closure, loop: Loop) -> str:
 
 
 def by_distance_sentence(loop: Loop) -> str:
-    """Explain the corrections by distance; "" if the loop has none."""
+    """Explain the correction of the path by distance; "" if the loop has none."""
     if "by_distance_plain" not in loop.paths:
         return ""
     heading_deg = loop.heading_error_deg
-    headings = "Headings too: each step is also rotated by its share of the heading error."
+    headings = "With headings, each step is also rotated by its share of the heading error."
     if isinstance(heading_deg, Unavailable):
         headings = f"The correction of headings is missing: {heading_deg.reason}."
     return (
-        "By distance, positions only (Example 2 of the lesson): each position moves "
-        f"by its share of the closure error; headings are not corrected. {headings}"
+        "The correction by distance, positions only, moves each position by its share of the "
+        f"closure error (Example 2 of lesson UAT 366, module 2). {headings}"
     )
 
 
 def missing_corrections(loop: Loop) -> list[str]:
-    """Return the corrections that were not computed with the reasons, without repetitions."""
+    """Return why corrections of the path were not computed, each reason once."""
     unavailable = [
         correction
         for correction in loop.corrections.values()
@@ -339,7 +335,6 @@ def _format_ate(score: Evaluation | Unavailable) -> str:
 
 
 def _format_error(translation: Statistics | Unavailable, interval: Interval | Unavailable) -> str:
-    """Format an RMSE, with its 95 % interval in brackets if available."""
     interval_text = format_interval(interval)
     return _format_rmse(translation) + (f" ({interval_text})" if interval_text else "")
 
@@ -349,7 +344,7 @@ def _format_rmse(statistics: Statistics | Unavailable, digits: int = 3) -> str:
 
 
 def format_correction(correction: CorrectedPath) -> str:
-    """Format RMS and maximum (m) of a correction."""
+    """Format RMS and maximum (m) by which a correction moves the path."""
     if not correction.correction_max_m:
         return "–"
     return f"{correction.correction_rms_m:.2f} / {correction.correction_max_m:.2f}"

@@ -43,7 +43,7 @@ VELOCITIES = Quantity(
 
 
 class Panel(NamedTuple):
-    """Panel over time: title, height (points), drawing function, caption and numbers."""
+    """Plot over time along one axis: title, height (points), drawing, caption and numbers."""
 
     title: str
     height: float
@@ -61,7 +61,7 @@ class Panel(NamedTuple):
         with_mode_names: bool = False,
         is_narrow: bool = False,
     ) -> None:
-        """Draw the panel on a page.
+        """Draw the plot of one axis on a page.
 
         Parameters
         ----------
@@ -94,11 +94,8 @@ class Panel(NamedTuple):
         page.write_small(numbers)
 
 
-# ------------------------------------------------------------------------------ position, velocity
-
-
 def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
-    """Draw measurements, KF with its ±2σ band, EKF2 and ground truth."""
+    """Draw position or velocity: measurements, KF with ±2σ, EKF2 and ground truth."""
     if quantity is POSITIONS:
         measurements = pd.Series(result.axis.measurement_m, result.axis.measurement_time_s)
         draw_curve(axes, measurements, **style.MEASUREMENT_DOTS)
@@ -149,9 +146,6 @@ def _velocity_numbers(result: AxisComparison) -> str:
     if isinstance(result.difference, Difference):
         texts.append(f"KF - EKF2 RMS {result.difference.velocity_rms_m_s:.3f} m/s")
     return "; ".join(texts)
-
-
-# ---------------------------------------------------------------------------------- innovations, σ
 
 
 def _axis_half_height(result: AxisComparison) -> float:
@@ -218,7 +212,7 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
 
 
 def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
-    """Caption of the innovations: verdict, statistics and rejections."""
+    """Return the caption of the innovations: verdict, mean, standard deviation, rejections."""
     half_height, sentences = _axis_half_height(result), []
     innovation_tables = {"KF": result.replay.updates, "EKF2": result.ekf2_innovations}
     for name, consistency in filters_by_name(result).items():
@@ -260,7 +254,7 @@ def _draw_sigma(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
 
 
 def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
-    """Caption of σ: its growth in the longest gap of the source; "" without a gap."""
+    """Return the caption of σ: its growth in the longest gap of the source; "" without a gap."""
     if not analysis.events.gaps:
         return ""
     start, end = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])

@@ -31,10 +31,10 @@ from px4fuse.request import ComparisonRequest, Request, command_line
 
 # Encodings of terminals that can print all characters of a card
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
-# Lines of a card, by kind of block
+# Functions that yield the lines of a card, by kind of block
 CARD_LINES = {"card": card_lines, "closing": closing_lines, "headline": headline}
-INDENT = 9  # columns; width of the labels
-COLUMN_POINTS = 6.0  # points of an indent on paper per terminal column
+INDENT = 9  # number of columns of a label
+COLUMN_POINTS = 6.0  # indent on paper (points) that corresponds to one column of the terminal
 # Terminal styles of text colours; the other colours belong to plots
 STYLES = {
     MUTED_COLOUR: "dim",
@@ -43,12 +43,12 @@ STYLES = {
     SEVERITY_COLOURS["note"]: "cyan",
     GOOD_COLOUR: "green",
 }
-# A value does not end in a full stop: that ends the sentence
+# Commands in a text; a full stop after a value ends the sentence and is not part of the command
 _COMMAND = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(?:\.\d+)?)*)")
 
 
 def show(console: Console, blocks: Iterable[Block], request: Request | None = None) -> None:
-    """Print text and tables of a page.
+    """Print texts, tables and cards of a page on the terminal.
 
     Parameters
     ----------
@@ -86,7 +86,6 @@ def _show_card(
     card: Card,
     request: Request | None,
 ) -> None:
-    """Print lines of a card; commands contain the path as typed instead of the file name."""
     is_limited = console.encoding.lower() not in UNICODE_ENCODINGS
     typed = None if request is None else getattr(request, "log", None)
     for line in lines_of(with_typed_path(card, typed)):
@@ -142,7 +141,7 @@ def _styled_text(block: Block) -> Text:
 def print_paragraph(
     console: Console, text: str | Text, head: str | Text = "", indent: int = 0
 ) -> None:
-    """Print a paragraph.
+    """Print a paragraph that wraps with a hanging indent.
 
     Parameters
     ----------

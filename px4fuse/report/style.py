@@ -64,12 +64,12 @@ EKF2_DOTS = dot_style(EKF2_COLOUR, "s", 2.2)
 # Samples that EKF2 did not fuse are hollow in all panels
 EKF2_REJECTED = dot_style(EKF2_COLOUR, "s", 2.8, 0.6) | {"mfc": "white"}
 MEASUREMENT_DOTS = dot_style(MEASUREMENT_COLOUR, ".", 1.8)
-# Styles by display name
+# Styles of lines, dots and bands by the name of the track in legends
 LINES = {"KF": KF_LINE, "EKF2": EKF2_LINE, "ground truth": TRUTH_LINE}
 DOTS = {"KF": KF_DOTS, "EKF2": EKF2_DOTS}
 BANDS = {"KF": KF_BAND_COLOUR, "EKF2": EKF2_BAND_COLOUR}
 
-# Most drawn points of a series in wide and in narrow axes, and the smallest width of wide axes
+# Maximum number of drawn points in wide and in narrow axes; minimum width (inches) of wide axes
 MAX_POINTS, MAX_POINTS_NARROW, MIN_WIDE_INCHES = 1500, 500, 3.0
 
 

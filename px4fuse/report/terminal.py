@@ -21,8 +21,8 @@ from px4fuse.report.style import MUTED_COLOUR
 from px4fuse.text import capitalise_first
 
 ERROR_LEGEND = (
-    "KF-EKF2: RMS difference of position and velocity. RMSE: against ground truth. Consistent: "
-    "σ ratio 0.8 to 1.25, or its 95 % interval contains 1."
+    "KF-EKF2 is the RMS difference of position and velocity; RMSE is against ground truth. A "
+    "filter is consistent if its σ ratio is 0.8 to 1.25, or if the 95 % interval of the ratio contains 1."
 )
 
 
@@ -55,7 +55,6 @@ def summary(
 
 
 def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
-    """Write what the card leaves out."""
     page.add("blank")
     page.write_labelled_texts(facts(analysis))
     write_errors(page, analysis)
@@ -70,14 +69,14 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
 
 
 def card_page(part: str, card: Card) -> Page:
-    """Make a page of a part of a card: "card", "headline", or "closing" (where to read more)."""
+    """Make a page with a part of a card: "card", "headline", or "closing" (where to read more)."""
     page = Page()
     page.add(part, card=card)
     return page
 
 
 def facts(comparison: Comparison) -> dict[str, str]:
-    """Return filter settings, position source and segment as texts by label."""
+    """Return filter settings, position source, alignment and segment as texts by label."""
     source, segment = comparison.source, comparison.segment
     position = (
         f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, "
