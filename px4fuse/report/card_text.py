@@ -336,7 +336,7 @@ def _verdict_axis(card: Card) -> Iterator[Line]:
     yield Line(f"{'':{AXIS_INDENT}}{sides}")
     yield Line(f"{legend:{AXIS_INDENT}}{_ticks()}")
     if any(verdict.is_explained for verdict in card.verdicts):
-        yield Line("  A verdict in brackets is explained below and is no fault of the filter.")
+        yield Line("  A verdict in brackets is explained below and is not a fault of the filter.")
     for verdict in card.verdicts:
         yield _verdict_line(verdict)
 

@@ -358,19 +358,12 @@ def _distant(axes: Axes, times: Array) -> Array:
 def _innovation_strip(result: AxisComparison) -> Strip:
     """Return the plot of innovation ÷ √S, with triangles for values beyond its scale."""
     series = normalised_innovations(result)
-    signs = {"KF": "●", "EKF2": "□"}
-    beyond = [
-        f"{name} {format_ratio(size)}"
-        for name, values in series.items()
-        if len(values) and (size := float(values.abs().max())) > MAX_NORMALISED
-    ]
-    marks = ", ".join(f"{signs[name]} {name}" for name in series)
+    sizes = {name: float(values.abs().max()) for name, values in series.items() if len(values)}
+    marks = ", ".join(f"{sign} {name}" for name, sign in zip(series, "●□", strict=False))
     title = f"Innovations ÷ √S ({marks}): 95 % belong inside ±2"
-    largest = max(
-        (float(values.abs().max()) for values in series.values() if len(values)), default=0
-    )
-    if largest < FLAT_INNOVATIONS:
+    if (largest := max(sizes.values(), default=0.0)) < FLAT_INNOVATIONS:
         title += f"; all are inside ±{format_ratio(largest)}"
+    beyond = [f"{name} {format_ratio(n)}" for name, n in sizes.items() if n > MAX_NORMALISED]
     if beyond:
         title += f"; ▲▼ beyond ±{MAX_NORMALISED:g}, up to {', '.join(beyond)}"
 

@@ -10,13 +10,13 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import AxisComparison, Difference
+from px4fuse.comparison.model import AxisComparison
 from px4fuse.filter.signals import Segment
 from px4fuse.record import Span
 from px4fuse.report import event_marks, panels, style
 from px4fuse.report.difference_page import unexplained_note
 from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page
-from px4fuse.report.phrases import filters_by_name, format_verdict, verdict_notes
+from px4fuse.report.phrases import filters_by_name, verdict_notes
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, Artist, Axes
 
 ZOOM_UPDATES = 15
@@ -117,23 +117,17 @@ def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
     prior, posterior = updates["prior_position_variance_m2"], steps["position_variance_m2"]
     # sort stably, so that the prior variance precedes the posterior at the time of an update
     variances = pd.concat([prior, posterior]).sort_index(kind="stable").loc[slice(*window)]
-    axes.plot(
-        variances.index, np.sqrt(variances), color=KF_COLOUR, lw=1.1, marker=".", ms=2.4, mew=0
-    )
+    dots = style.dot_style(KF_COLOUR, ".", 2.4) | {"ls": "-", "lw": 1.1}
+    axes.plot(variances.index, np.sqrt(variances), **dots)
     if isinstance(result.ekf2_innovations, pd.DataFrame):
         ekf2 = result.ekf2_innovations.loc[slice(*window)].dropna(subset=["prior_variance_m2"])
-        prior_sigma, posterior_sigma = (
-            np.sqrt(ekf2["prior_variance_m2"]),
-            np.sqrt(ekf2["posterior_variance_m2"]),
-        )
-        axes.vlines(ekf2.index, posterior_sigma, prior_sigma, color=EKF2_COLOUR, lw=1.0)
-        axes.plot(
-            prior_sigma, ls="none", marker="^", ms=3.6, mew=0.7, mfc="none", color=EKF2_COLOUR
-        )
-        axes.plot(posterior_sigma, ls="none", marker="v", ms=3.6, mew=0, color=EKF2_COLOUR)
+        before, after = (np.sqrt(ekf2[f"{side}_variance_m2"]) for side in ("prior", "posterior"))
+        axes.vlines(ekf2.index, after, before, color=EKF2_COLOUR, lw=1.0)
+        axes.plot(before, **style.dot_style(EKF2_COLOUR, "^", 3.6, 0.7), mfc="none")
+        axes.plot(after, **style.dot_style(EKF2_COLOUR, "v", 3.6))
     if isinstance(result.ekf2_variance, pd.DataFrame):
         logged = np.sqrt(result.ekf2_variance["position_variance_m2"].loc[slice(*window)])
-        axes.plot(logged, ls="none", marker="s", ms=3.0, mew=0.7, mfc="white", color=EKF2_COLOUR)
+        axes.plot(logged, **style.dot_style(EKF2_COLOUR, "s", 3.0, 0.7), mfc="white")
     axes.set_xlim(*window)
 
 
@@ -171,27 +165,13 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
         "Position, velocity, innovations and σ of the other axes, drawn as for the main axis.",
     )
     width = (PAGE_WIDTH - COLUMN_GAP * (len(others) - 1)) / max(len(others), 2)
-    columns = [Page(width=width) for _ in others]
-    for column, result in zip(columns, others, strict=True):
-        verdicts = "; ".join(
-            f"{name} {format_verdict(consistency)}"
-            for name, consistency in filters_by_name(result).items()
-        )
-        if isinstance(result.difference, Difference):
-            verdicts += f"; KF - EKF2 {result.difference.position_rms_m:.3f} m RMS"
-        column.heading(result.axis.name)
-        column.write(f"{verdicts}.")
-    first_row = (
-        Page()
-    )  # Typst does not divide one column, so headings and first panels share a page
-    first_row.add_columns(*columns)
     for panel in (panels.POSITION, panels.VELOCITY, panels.INNOVATIONS, panels.SIGMA_P):
         columns = [Page(width=width) for _ in others]
         for column, result in zip(columns, others, strict=True):
+            if panel is panels.POSITION:
+                column.heading(result.axis.name)
             panel.draw_on_page(
                 column, analysis, result, with_time_label=panel is panels.SIGMA_P, is_narrow=True
             )
-        (first_row if panel is panels.POSITION else page).add_columns(*columns)
-        if panel is panels.POSITION:
-            page.add_columns(first_row)
+        page.add_columns(*columns)
     yield page

@@ -22,7 +22,7 @@ from px4fuse.text import capitalise_first
 
 ERROR_LEGEND = (
     "KF-EKF2 is the RMS difference of position and velocity; RMSE is against ground truth. A "
-    "filter is consistent if its σ ratio is 0.8 to 1.25, or if the 95 % interval of the ratio contains 1."
+    "filter is consistent if its σ ratio is 0.8 to 1.25, or if its 95 % interval contains 1."
 )
 
 
