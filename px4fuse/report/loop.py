@@ -17,7 +17,7 @@ from px4fuse.report.page import Cell, Page, appendix_title
 from px4fuse.report.phrases import student_line, write_finding
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, MUTED_COLOUR, Axes, set_map_axes
 from px4fuse.results.contract import LoopResults
-from px4fuse.text import capitalise_first, format_p_value
+from px4fuse.text import capitalise_first, format_p_value, join_first
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import MAX_ROBUST_CLOSURES, SOLUTIONS, SolvedGraph
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
@@ -367,16 +367,9 @@ def graph_summary(solved: SolvedGraph) -> Page:
         page.write_labelled("Gate", "no closures to test: every edge is odometry")
     else:
         rejected = [gate for gate in gates if not gate.accepted]
-        lines = [
-            f"{gate.first} – {gate.second}: d² {gate.d2:.1f}, p {gate.p:.2g}"
-            for gate in rejected[:MAX_LISTED_CLOSURES]
-        ]
-        lines += (
-            [f"and {len(rejected) - MAX_LISTED_CLOSURES} more"]
-            if len(rejected) > MAX_LISTED_CLOSURES
-            else []
-        )
-        page.write_labelled("Gate", f"{len(rejected)} of {len(gates)} closures rejected", *lines)
+        lines = [f"{g.first} – {g.second}: d² {g.d2:.1f}, p {g.p:.2g}" for g in rejected]
+        listed = join_first(lines, MAX_LISTED_CLOSURES, "\n").split("\n")
+        page.write_labelled("Gate", f"{len(rejected)} of {len(gates)} closures rejected", *listed)
     if len(solved.solutions) == 1 and (~solved.graph.is_successive).sum() > MAX_ROBUST_CLOSURES:
         page.write_labelled(
             "Robust", "not solved for this many closures; add --robust (takes some minutes)"

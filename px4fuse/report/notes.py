@@ -45,19 +45,12 @@ SYMBOLS = {
     "infty": "∞",
     "circ": "°",
     "sim": "~",
-    "hat": "",
-    "bar": "",
-    "mathrm": "",
-    "mathbf": "",
-    "text": "",
-    "left": "",
-    "right": "",
     "quad": " ",
     "ldots": "…",
     "degree": "°",
     ",": " ",
     ";": " ",
-    "!": "",
+    **dict.fromkeys(("hat", "bar", "mathrm", "mathbf", "text", "left", "right", "!"), ""),
 }
 
 
