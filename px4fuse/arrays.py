@@ -9,6 +9,11 @@ IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
 
+def median_interval(time_s: Array) -> float:
+    """Return the median interval (s) between successive times."""
+    return float(np.median(np.diff(time_s)))
+
+
 def cumulative_integral(values: Array, time_s: Array) -> Array:
     """Integrate values over time up to each sample (trapezoidal rule, first axis, from zero)."""
     integral = np.zeros_like(values)

@@ -79,10 +79,11 @@ class Flight:
         if isinstance(report, ResultsError):
             made = grade_unreadable(rubric, self.key, f"{report.reason}.", report.remedy)
             return GradedReport(
-                "a.pdf", "", "", verdict, made.items, pending_action=made.pending_action
+                "a.pdf", "", "", verdict, made.items, instructor_action=made.instructor_action
             )
         made = score_report(report, verdict, rubric, self.key)
-        return GradedReport("a.pdf", "", "", verdict, made.items, made.flags, made.pending_action)
+        action = made.instructor_action
+        return GradedReport("a.pdf", "", "", verdict, made.items, made.flags, action)
 
     def with_notes(self, text: str, rubric: Rubric) -> GradedReport:
         """Grade the report with other notes, as verified."""
@@ -135,9 +136,9 @@ def honest(flight: Flight, rubric: Rubric) -> GradedReport:
     return flight.graded(attached_results(flight.honest.pdf), verdict, rubric)
 
 
-def test_grade_honest_report_is_verified_with_points(honest: GradedReport) -> None:
+def test_grade_unchanged_report_is_verified_and_earns_points(honest: GradedReport) -> None:
     assert honest.status == "verified"
-    assert honest.pending_action == ""
+    assert honest.instructor_action == ""
     assert honest.flags == ()
     points = {item.title: item.points / item.max_points for item in honest.items}
     assert points["Mistakes of the flight"] > 0.4, honest.items
@@ -157,7 +158,7 @@ def test_grade_honest_report_is_verified_with_points(honest: GradedReport) -> No
         "a_" * 90_000,
     ],
 )
-def test_grade_notes_without_content_earn_no_points(
+def test_grade_gives_no_points_for_keywords_in_student_notes(
     flight: Flight, honest: GradedReport, rubric: Rubric, text: str
 ) -> None:
     graded = flight.with_notes(text, rubric)
@@ -271,7 +272,7 @@ FILES: dict[str, tuple[Change, str, str]] = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_grade_forged_results_are_not_verified(
+def test_grade_report_with_forged_results_is_not_verified(
     flight: Flight, honest: GradedReport, rubric: Rubric, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     change, status, pending = FILES[name]
@@ -292,12 +293,12 @@ def test_grade_forged_results_are_not_verified(
     assert not graded.counted_points
     assert graded.status == status, graded.verdict.reasons
     assert not any("Error" in reason for reason in graded.verdict.reasons), graded.verdict.reasons
-    assert pending in graded.pending_action
-    assert bool(graded.pending_action) == bool(pending)
+    assert pending in graded.instructor_action
+    assert bool(graded.instructor_action) == bool(pending)
     assert graded.points <= honest.points + 1e-9
 
 
-def test_grade_painted_page_is_scored_from_redrawn_report(
+def test_grade_overpainted_page_is_scored_from_redrawn_report(
     flight: Flight, honest: GradedReport, rubric: Rubric
 ) -> None:
     """The numbers are verified and the page is not; the redrawn report is scored."""
@@ -334,7 +335,7 @@ def grade_loop(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> Gra
     verdict = Verdict("verified", (), True, page_status="same")
     made = score_report(results, verdict, read_rubric(None), key)
     items = tuple(item for item in made.items if "Loop" in item.title)
-    return GradedReport("a.pdf", "", "", verdict, items, made.flags, made.pending_action)
+    return GradedReport("a.pdf", "", "", verdict, items, made.flags, made.instructor_action)
 
 
 LANDED = {"landed_at": {"forward_m": 6.0, "right_m": 0.0}}
@@ -356,7 +357,7 @@ LOOPS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], float, int]] = {
 
 
 @pytest.mark.parametrize("name", LOOPS)
-def test_grade_loop_gives_expected_points_and_flags(name: str) -> None:
+def test_grade_loop_flight_gives_expected_points_and_flags(name: str) -> None:
     truth, request, loop, points, flags = LOOPS[name]
     graded = grade_loop(truth, request, loop)
     assert graded.points == pytest.approx(points), graded.items

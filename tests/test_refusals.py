@@ -129,7 +129,7 @@ REFUSED = {
     "page of three": ("explore a.ulg a.ulg a.ulg", "unexpected extra argument"),
     "page of two and more": ("explore a.ulg a.ulg --mavlink a.tlog", "unexpected extra argument"),
     "too long a name": (f"info a.ulg --json {'x' * 300}.json", "File name too long"),
-    "no name": ("extract a.ulg -o ''", "the name is empty"),
+    "no name": ("extract a.ulg -o ''", "the file name is empty"),
     "no name of a log": ("batch '' -o out", "the name of a log is empty"),
     **{
         f"{name} by {command}": (f"{command} {name}.ulg", f"px4fuse: {name}.ulg")
@@ -177,7 +177,7 @@ REFUSED = {
     "nothing to grade": ("grade", "no submissions were given"),
     "grade to nowhere": ("grade in", "requires an output folder"),
     "grade into what is graded": ("grade in -o in/out", "is inside the input in"),
-    "grade into a report": ("grade in -o in/a.pdf", "is not a folder"),
+    "grade into a report": ("grade in -o in/a.pdf", "is inside the input"),
     "no rubric": ("grade in -o out --rubric missing.toml", "missing.toml"),
     "no key": ("grade in -o out --key missing.json", "missing.json"),
     "no logs": ("grade in -o out --logs missing", "missing: cannot be read"),
@@ -200,15 +200,15 @@ REFUSED = {
     "mistakes alone": ("simulate -o f.ulg --mistakes 1", "requires --assignment"),
     # trajectories and pose graphs
     "empty trajectory": ("loop empty.tum", "px4fuse: empty.tum is empty"),
-    "text junk": ("loop junk.txt", "junk.txt: not a trajectory file"),
-    "PDF": ("loop f.pdf", "f.pdf: a PDF, not a flight log"),
+    "text junk": ("loop junk.txt", "junk.txt is not a trajectory file"),
+    "PDF": ("loop f.pdf", "f.pdf: the file is a PDF, not a flight log"),
     "times that go back": ("loop nonmono.tum", "nonmono.tum, line 102"),
     "not a number": ("loop nan.tum -o f.pdf", "nan.tum, line 51"),
-    "no motion": ("loop still.tum", "still.tum: the path is only 0.00 m long"),
-    "closure outside": ("loop s.tum --closure 10,5000", "on the path"),
+    "no motion": ("loop still.tum", "still.tum: the path of 0.00 m"),
+    "closure outside": ("loop s.tum --closure 10,5000", "in ascending order, between"),
     "closure of one time": ("loop s.tum --closure 10", "'10' is not T1,T2"),
     "closure of four": ("loop s.tum --closure 1,2,3,4", "is not T1,T2"),
-    "closure backwards": ("loop s.tum --closure 50,10", "on the path"),
+    "closure backwards": ("loop s.tum --closure 50,10", "in ascending order, between"),
     "closure of no width": (
         "loop s.tum --closure 10,50,0",
         "SIGMA 0 is out of range (0.0001 to 100 m)",
@@ -232,8 +232,8 @@ REFUSED = {
     "graph with a bad edge": ("loop bad.g2o", "bad.g2o, line 2"),
     "part of a graph": ("loop g.g2o:vio", "a pose graph has no track 'vio'"),
     "report of a graph": ("loop g.g2o -o r.pdf", "not available for a pose graph"),
-    "evaluate junk": ("evaluate s.tum junk.bin", "junk.bin: neither a PX4 ULog"),
-    "evaluate apart": ("evaluate s.tum l.ulg --time-offset 0", "no poses match in time"),
+    "evaluate junk": ("evaluate s.tum junk.bin", "junk.bin: the file is neither a PX4 ULog"),
+    "evaluate apart": ("evaluate s.tum l.ulg --time-offset 0", "0 poses match in time"),
     "evaluate a line": ("evaluate line.tum line.tum", "--alignment yaw"),
     "offset of words": ("evaluate s.tum s.tum --time-offset abc", "Give for example 0.1, or auto."),
     "RPE over nothing": ("evaluate s.tum s.tum --rpe 0m", "'0m' is not a distance"),
@@ -270,9 +270,7 @@ SPARED = {
     [*REFUSED.values(), *((command, "not overwritten") for command in SPARED.values())],
     ids=[*REFUSED, *(f"over {name}" for name in SPARED)],
 )
-def test_commands_invalid_input_print_one_line_and_write_nothing(
-    desk, monkeypatch, capsys, command, said
-):
+def test_commands_on_invalid_input_print_one_error_line(desk, monkeypatch, capsys, command, said):
     monkeypatch.chdir(desk)
     before = contents(desk)
     typed = shlex.split(command.format(folder=Path(desk).name))
@@ -286,7 +284,7 @@ def test_commands_invalid_input_print_one_line_and_write_nothing(
     assert contents(desk) == before
 
 
-def test_estimates_without_result_exit_with_2(desk, monkeypatch, capsys):
+def test_tune_and_sync_without_result_exit_with_2(desk, monkeypatch, capsys):
     monkeypatch.chdir(desk)
     for command, said in (
         ("tune a.ulg --start 126", "SIGMA_A and SIGMA_Z cannot be estimated"),

@@ -157,7 +157,7 @@ def zoom_sentence(result: AxisComparison) -> str:
 
 def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the axes except the main axis, one column each; no page without such axes."""
-    others = analysis.others
+    others = analysis.secondary_axes
     if not others:
         return
     page = Page(
