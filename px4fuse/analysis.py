@@ -17,14 +17,14 @@ import numpy as np
 
 from px4fuse.comparison.causal_replays import (
     Intervention,
-    planned_variants,
+    planned_configurations,
     run_interventions,
 )
 from px4fuse.comparison.comparison import compare, compare_prepared
 from px4fuse.comparison.difference_steps import (
     corrected_settings,
     explain_ekf2_difference,
-    explanation_variants,
+    explanation_configurations,
 )
 from px4fuse.comparison.estimates import (
     Progress,
@@ -40,7 +40,7 @@ from px4fuse.comparison.preparation import explain_missing_source, prepare
 from px4fuse.comparison.remedy import ml_ekf2_parameters
 from px4fuse.comparison.trials import Trial
 from px4fuse.ekf2.aids import AidResult, evaluate_aids
-from px4fuse.ekf2.filter_recursion import Variant
+from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.replay import Ekf2Replay
@@ -556,11 +556,11 @@ def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Ana
     progress("replaying EKF2")
     corrected = corrected_settings(comparison, tuning)
 
-    def requested_variants(inputs: Inputs) -> list[Variant]:
-        cause_variants = planned_variants(comparison, tuning, clock, heading, inputs)
-        return [*explanation_variants(comparison, inputs, corrected), *cause_variants]
+    def requested_configurations(inputs: Inputs) -> list[FilterConfiguration]:
+        cause_configurations = planned_configurations(comparison, tuning, clock, heading, inputs)
+        return [*explanation_configurations(comparison, inputs, corrected), *cause_configurations]
 
-    model = open_model(comparison.flight, requested_variants)
+    model = open_model(comparison.flight, requested_configurations)
     difference_steps = explain_ekf2_difference(comparison, model, clock, corrected)
     progress("searching for a loop closure")
     from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync

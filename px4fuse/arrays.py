@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+ArrayPair = tuple[Array, Array]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 

@@ -112,8 +112,15 @@ class Parameter(NamedTuple):
 
 
 TABLES = table(__file__, "ekf2_parameters.toml", dict)
+# Keys of TABLES whose text contains several names, separated by blanks
+NAME_LISTS = ("axes", "fields", "old_fields", "lever_arm")
 AIDS, DISTURBANCES = (
-    msgspec.convert({name: {"name": name, **row} for name, row in rows.items()}, dict[str, Aid])
+    {
+        name: msgspec.convert(
+            {"name": name, **row} | {key: row[key].split() for key in NAME_LISTS if key in row}, Aid
+        )
+        for name, row in rows.items()
+    }
     for rows in (TABLES["aids"], TABLES["disturbances"])
 )
 EV_POS, GNSS_POS, GNSS_VEL, GNSS_HGT, BAROMETER, FLOW, MAG = map(
@@ -127,7 +134,7 @@ FIELD_NOISES = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
 # Defaults of PX4 up to v1.13 that differ from later ones (ekf2_params.c)
 OLD_DEFAULTS: Mapping[str, float] = {EV_POS.delay: 175.0}
 # Names of the logged parameters that the results contain
-REPORTED: tuple[str, ...] = tuple(TABLES["reported"])
+REPORTED: tuple[str, ...] = tuple(TABLES["reported"].split())
 
 
 def effective_settings(

@@ -145,7 +145,7 @@ def test_refusal_card_shows_fault_bytes_and_action(tmp_path) -> None:
     lines = [text for line in card_lines(build_refusal_card(caught.value, path)) for text in
              line.wrapped(100)]  # fmt: skip
     assert lines == [
-        "error[log_unreadable]: a.bin: an ArduPilot DataFlash log, not a PX4 ULog",
+        "error[log_unreadable]: a.bin: the file is an ArduPilot DataFlash log, not a PX4 ULog",
         "  read     1,200 bytes, beginning with A3 95 80 01 (ULog: 55 4C 6F 67)",
         "  fix      Give the .tlog that the ground station wrote.",
         "Nothing was written. Exit code 2.",

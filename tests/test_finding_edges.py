@@ -632,7 +632,7 @@ def at_multiples(multiples: list[int], base_s: float = 0.125, **parts: Any) -> A
 
 
 def low_pass(gain: float, lag_s: float, **parts: Any) -> Any:
-    usual = {"smoothing": SourceLowPass(0.5, lag_s, gain, 0.1), "clock": late(0.0)}
+    usual = {"source_low_pass": SourceLowPass(0.5, lag_s, gain, 0.1), "clock": late(0.0)}
     return analysis(**{**usual, **parts})
 
 
@@ -666,7 +666,7 @@ def stating(reported: float, noise: float, interval: Any = None, **parts: Any) -
     """Make a source that reports one standard deviation (m) and has another one."""
     low, high = interval or (0.99 * noise, 1.01 * noise)
     states = source(samples=positions(np.arange(0.0, 120.0), variance_m2=reported**2))
-    usual = {"smoothing": SourceLowPass(0.0, 0.0, 0.0, noise), "source": states,
+    usual = {"source_low_pass": SourceLowPass(0.0, 0.0, 0.0, noise), "source": states,
              "tuning": tuned(Noise(noise, low, high), count=100)}  # fmt: skip
     return analysis(**{**usual, **parts})
 
@@ -736,9 +736,11 @@ SOURCE_EDGES = [
         (6.0, 0.05, "warning"), (5.9, 0.05, None), (6.0, 0.049, None),
         (6.0, 0.0999, "warning"), (6.0, 0.1, "error"))),
     # correlated errors without a lag are not from a low pass
-    *((source_positions.detect_low_pass, low_pass(99.0, 1.0, coloured=slow(99.0, lag)), expected)
+    *((source_positions.detect_low_pass,
+       low_pass(99.0, 1.0, time_correlated_noise=slow(99.0, lag)), expected)
       for lag, expected in ((0.9, None), (1.0, "error"))),
-    *((source_noise.detect_time_correlated_noise, analysis(coloured=slow(gain, lag)), expected)
+    *((source_noise.detect_time_correlated_noise,
+       analysis(time_correlated_noise=slow(gain, lag)), expected)
       for gain, lag, expected in (
           (5.0, 0.9, "warning"), (4.9, 0.0, None), (99.0, 1.0, None))),
     *((source_noise.detect_repeated_positions, repeating(again, count), expected)
@@ -746,11 +748,11 @@ SOURCE_EDGES = [
         (10, 200, "warning"), (9, 100, None), (10, 201, None), (30, 100, "error"),
         (29, 100, "warning"))),
     (source_noise.detect_repeated_positions, repeating(50, 100, moved_m=0.5), None),
-    *((source_noise.detect, analysis(coloured=slow(99.0, 0.0), **parts), None)
+    *((source_noise.detect, analysis(time_correlated_noise=slow(99.0, 0.0), **parts), None)
       for parts in (ODOMETRY, REBUILT)),
-    (JUMPS, jumping(jump(0.0, 0.9), coloured=slow(0.0, 0.0, 0.2)), None),
-    (JUMPS, jumping(jump(0.0, 1.0), coloured=slow(0.0, 0.0, 0.2)), "error"),
-    (SCALE, scaled(0.5, coloured=slow(0.0, 0.0)), None),
+    (JUMPS, jumping(jump(0.0, 0.9), time_correlated_noise=slow(0.0, 0.0, 0.2)), None),
+    (JUMPS, jumping(jump(0.0, 1.0), time_correlated_noise=slow(0.0, 0.0, 0.2)), "error"),
+    (SCALE, scaled(0.5, time_correlated_noise=slow(0.0, 0.0)), None),
     (SCALE, scaled(0.5, ekf2=ages(20, 20)), None),
     (source_positions.detect, low_pass(99.0, 1.0, **ODOMETRY), None),
     (source_positions.detect, low_pass(99.0, 1.0, **REBUILT), None),
@@ -769,7 +771,7 @@ SOURCE_EDGES = [
       for which, of in ((SCALE, partial(scaled, 0.5)),
                         (source_positions.detect_low_pass, partial(low_pass, 99.0, 1.0)))
       for clock, expected in ((NONE, None), (late(0.0, is_determinable=False), "error"))),
-    (SCALE, scaled(0.5, smoothing=SourceLowPass(0.5, 1.0, 99.0, 0.1)), None),
+    (SCALE, scaled(0.5, source_low_pass=SourceLowPass(0.5, 1.0, 99.0, 0.1)), None),
     *((source_positions.detect, scaled(0.5, **parts), None) for parts in (ODOMETRY, REBUILT)),
     *((source_positions.detect_outliers,
        analysis(tuning=tuned(outlier_time_s=20.0 + np.arange(outliers), count=count)), expected)
@@ -784,7 +786,8 @@ SOURCE_EDGES = [
     *((STATED, stating(3.0, 1.0, interval), None) for interval in (
         (0.1, 9.0), (None, 9.0), (0.1, None))),
     (STATED, stating(3.0, 1.0, tuning=tuned(Noise(None, None, 9.0))), None),
-    (STATED, stating(3.0, 1.0, tuning={}), None), (STATED, stating(3.0, 1.0, smoothing=NONE), None),
+    (STATED, stating(3.0, 1.0, tuning={}), None),
+    (STATED, stating(3.0, 1.0, source_low_pass=NONE), None),
     (STATED, stating(np.nan, 1.0), None),
     (source_positions.detect, stating(3.0, 1.0, **ODOMETRY), None),
     *((CLOCK, analysis(clock=late(sign * offset_s, sigma_s)), expected)
@@ -794,7 +797,7 @@ SOURCE_EDGES = [
           (0.101, 0.001, "error"), (0.0625, 0.0208, "warning"), (0.0625, 0.0209, None))),
     *((CLOCK, analysis(**{"clock": late(0.2), **parts}), None) for parts in (
         {"clock": late(0.2, is_determinable=False)}, REBUILT, {"ekf2": ages(20, 20)},
-        {"smoothing": SourceLowPass(0.5, 0.2, 99.0, 0.1)})),
+        {"source_low_pass": SourceLowPass(0.5, 0.2, 99.0, 0.1)})),
     *((wrong_delay, delayed(delay_ms, late(0.0, sigma_s)), expected)
       for delay_ms, sigma_s, expected in (
           (30.0, 0.001, "warning"), (29.0, 0.001, None), (40.0, 0.01, "warning"),

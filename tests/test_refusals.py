@@ -155,9 +155,12 @@ REFUSED = {
             ("--sweep EKF2_EVP_NOISE=0.1", "Use NAME=LOW:HIGH"),
             (
                 "--sweep EKF2_EVP_NOISE=0.2:0.1",
-                "EKF2_EVP_NOISE=0.2:0.1: give the smaller value first",
+                "EKF2_EVP_NOISE=0.2:0.1: give the smaller parameter value first",
             ),
-            ("--sweep EKF2_EVP_NOISE=0.1:0.2:1", "1 values: give 2 to 200"),
+            (
+                "--sweep EKF2_EVP_NOISE=0.1:0.2:1",
+                "1 parameter values for a sweep: give a number from 2 to 200",
+            ),
             ("--set EKF2_EVP_NOISE=0.1 --sweep EKF2_EVP_NOISE=0.1:0.2", "set and swept"),
             ("--from 60", "--from requires --without AID"),
         )

@@ -436,7 +436,7 @@ def read_topics(name: str, content: bytes) -> Topics:
         ),
         parameter_defaults={
             name: value
-            for name, value in sorted(_system_defaults(ulog).items())
+            for name, value in sorted(ulog.get_default_parameters(0).items())
             if name in PARAMETERS
         },
         notes=(*notes, *parameter_faults),
@@ -451,10 +451,6 @@ def read_topics(name: str, content: bytes) -> Topics:
     return Topics(
         log, tables, zero_us, {}, MappingProxyType(parameters), is_cut, ulog.file_corruption
     )
-
-
-def _system_defaults(ulog: ULog) -> dict[str, float]:
-    return ulog.get_default_parameters(0) if ulog.has_default_parameters else {}
 
 
 def _read_tables(ulog: ULog) -> Tables:

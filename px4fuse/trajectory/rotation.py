@@ -59,6 +59,11 @@ def to_matrix(q: Array) -> Array:
     )
 
 
+def rotate(matrices: Array, vectors: Array) -> Array:
+    """Multiply each of n vectors with its matrix, shape (n, 3)."""
+    return np.asarray(np.einsum("nij,nj->ni", matrices, vectors))
+
+
 def skew(v: Array) -> Array:
     """Return the cross-product matrices [v]× with [v]× u = v × u, shape (..., 3, 3)."""
     x, y, z = np.moveaxis(v, -1, 0)
