@@ -392,7 +392,7 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
         logged, model = _matched_samples(replay, updates, rows, is_own_topic=is_own_topic)
         if len(logged) < MIN_SAMPLES:
             doubtful[name] = (
-                f"the log contains only {count_noun(len(logged), 'innovation')} in the replayed time"
+                f"the log has only {count_noun(len(logged), 'innovation')} in the replayed time"
             )
             continue
         if _has_constant_innovations(logged, model, axes_of(updates)):
