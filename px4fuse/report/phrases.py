@@ -139,7 +139,7 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     are consistent but not white.
     """
     consistencies = [
-        (result.axis.name, filter_name, consistency)
+        (result.axis.label, filter_name, consistency)
         for result in comparison.axes.values()
         for filter_name, consistency in filters_by_name(result).items()
         if isinstance(consistency, Consistency)
@@ -151,7 +151,7 @@ def verdict_notes(comparison: Comparison) -> list[str]:
             "not with the true position. Check the error with ground truth or a loop."
         )
     correlated = [
-        f"{filter_name} {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"
+        f"{filter_name} along {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"
         for axis, filter_name, consistency in consistencies
         if consistency.verdict == "consistent" and consistency.ljung_box_p < MIN_WHITE_P
     ]
