@@ -34,7 +34,7 @@ from findings_tools import (
     with_bias,
 )
 
-from px4fuse.comparison.trials import Outcome, Trial
+from px4fuse.comparison.trials import RunStatistics, Trial
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.frame_rotation import HeadingError, HeadingPart
 from px4fuse.filter.frame_rotation import combine_heading_parts as together
@@ -214,7 +214,11 @@ UNKNOWN = "The log does not contain the reason"
         (never_fusing(parameters={"EKF2_AID_MASK": 1.0}), "EKF2_AID_MASK is 1. Bit 3", "to 9."),
         (never_fusing(parameters={"EKF2_AID_MASK": 9.0}), UNKNOWN, "EKF2_EV_CTRL"),
         (never_fusing(2.0), UNKNOWN, "EKF2_EV_CTRL"),  # releases before v1.14 have no limit
-        (never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}), "they come at 2 Hz", "10 Hz"),
+        (
+            never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}),
+            "the positions come at 2 Hz",
+            "10 Hz",
+        ),
         (
             never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}, origin=LOGGED_BY_EKF2),
             UNKNOWN,
@@ -225,12 +229,12 @@ UNKNOWN = "The log does not contain the reason"
         (never_fusing(age_s=5.0, horizon_s=NONE), UNKNOWN, "Check"),
         (
             never_fusing(age_s=0.31),
-            "they are 0.31 s old at arrival. EKF2 buffers only 0.20 s",
+            "the positions are 0.31 s old at arrival. EKF2 buffers only 0.20 s",
             "EKF2_DELAY_MAX",
         ),
         (
             never_fusing(age_s=0.28, parameters={"EKF2_EV_DELAY": 50.0}),
-            "they are 0.33 s old",
+            "the positions are 0.33 s old",
             "EKF2_DELAY_MAX",
         ),
     ],
@@ -282,8 +286,8 @@ def test_recommended_action_must_halve_ekf2_rejections() -> None:
     ):  # fmt: skip
         trial = Trial(
             filter="ekf2", kinds=("noise",), change={"EKF2_EVP_NOISE": 0.1},
-            before=Outcome(nis_mean=9.0, rejected_fraction=0.2),
-            after=Outcome(nis_mean=1.0 if improves else 8.0, rejected_fraction=after),
+            before=RunStatistics(nis_mean=9.0, rejected_fraction=0.2),
+            after=RunStatistics(nis_mean=1.0 if improves else 8.0, rejected_fraction=after),
         )  # fmt: skip
         one = analysis(ekf2={"gate": 5.0}, axes=(axis("north", ekf2_innovations=frame),),
                        trials=(trial,))  # fmt: skip
@@ -352,7 +356,7 @@ def test_error_beyond_sigma_finding_states_aligned_rmse(
     if finding.id == "source_drift":
         assert finding.message.startswith(
             "VIO drifts: horizontal position RMSE 0.55 m after the best alignment. Before the "
-            "alignment: 1.00 m."
+            "alignment the RMSE is 1.00 m."
         )
     assert (finding.remedy == hidden_errors.FRAME_REMEDY) is frame
 
@@ -976,7 +980,7 @@ def test_time_offset_that_increases_true_error_has_no_finding(after_m, there) ->
 
 def rerun(owner: Any, kind: str, change: dict[str, float], after_m: float) -> Trial:
     """Make a re-run that changes the position RMSE from 1 m."""
-    before, after = Outcome(position_rmse_m=1.0), Outcome(position_rmse_m=after_m)
+    before, after = RunStatistics(position_rmse_m=1.0), RunStatistics(position_rmse_m=after_m)
     return Trial(filter=owner, kinds=(kind,), change=change, before=before, after=after)
 
 
