@@ -225,7 +225,7 @@ def error_above_reported_sigma(
     if isinstance(summary, Unavailable) or isinstance(truth, Unavailable):
         return None
     nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
-    if nees < MIN_NEES_FINDING or summary.nis_mean >= MAX_UNREMARKABLE_NIS:
+    if nees < MIN_NEES_FINDING or truth.is_lag_only or summary.nis_mean >= MAX_UNREMARKABLE_NIS:
         return None
     reported_sigma_m = summary.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
     return ErrorAboveSigma(nees, rmse_m, reported_sigma_m, summary.nis_mean)
@@ -729,9 +729,8 @@ class _Ekf2Rerun(_FilterRerun):
     def other_candidates(self, tuned: AxisTuning | None) -> list[Change]:
         """Return PX4's default of the gate and other parameters, and a noise for vibration."""
         aid, flown = self.inputs.aid, self.inputs.settings
-        default_values = {
-            name: PARAMETERS[name].default for name in (aid.gate, *PARAMETERS_OF_EKF2)
-        }
+        log = self.comparison.flight.log
+        default_values = {name: log.default_of(name) for name in (aid.gate, *PARAMETERS_OF_EKF2)}
         changes: list[Change] = [
             {name: value}
             for name, value in default_values.items()
