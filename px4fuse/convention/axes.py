@@ -265,8 +265,9 @@ def _evaluate(
     squares = squares**2
     gain, sigma_m = student_score(squares[0], 2, MIN_SIGMA_M)
     gain_down, sigma_down_m = student_score(squares[1], 1, MIN_SIGMA_DOWN_M)
-    gain += gain_down + 3.0 * np.log(unit)
-    gain -= sum(student_score(column**2, 1, 1e-6)[0] for column in sent.T)
+    is_known = sent.any(axis=0)  # False for a missing height
+    gain += gain_down * is_known[family.vertical] + np.log(unit) * np.count_nonzero(is_known)
+    gain -= sum(student_score(column**2, 1, 1e-6)[0] for column in sent.T[is_known])
     weight = 1.0 / (np.array([[sigma_m**2], [sigma_down_m**2]]) + squares / FREEDOM)
     weight *= row_s / WINDOW_S
     products = [weight[0] @ (x[:, :2] * measured[:, :2]) for x in (ned, measured)]

@@ -81,18 +81,17 @@ def check_convention(flight: Flight, track: PositionTrack) -> Convention | Unava
 
 
 def _read_positions(flight: Flight, track: PositionTrack) -> Positions:
-    """Return the positions without repeated ones; a missing height becomes the barometer's."""
+    """Return the positions without repeated ones; a missing height is 0."""
     samples, barometer = track.samples[Columns.POSITION], flight.barometer
-    heights = None
-    if barometer is not None:
-        heights = barometer.index.to_numpy(), -barometer["down_m"].to_numpy()
     if samples["down_m"].notna().mean() < MAX_REPEATED_SHARE:
-        down = 0.0 if heights is None else -np.interp(samples.index, *heights)
-        samples = samples.assign(down_m=down)
+        samples = samples.assign(down_m=0.0)
     samples = samples.dropna()
     is_repeated = (samples.diff() == 0.0).all(axis=1)
     if is_repeated.mean() < MAX_REPEATED_SHARE:
         samples = samples[~is_repeated]
+    heights = None
+    if barometer is not None:
+        heights = barometer.index.to_numpy(), -barometer["down_m"].to_numpy()
     return Positions(samples.index.to_numpy(), samples.to_numpy(), heights)
 
 
@@ -122,12 +121,13 @@ def _decide(found: list[Hypothesis], positions: Positions, drift: float) -> Conv
     """Compare the best hypothesis with the others and with the noise of the source."""
     best = found[0]
     rivals = [one for one in found if not one.has_meaning_of(best)]
+    if not positions.position_m[:, 2].any():  # without height, up and down are equivalent
+        rivals = [one for one in rivals if one.axes[:2] != best.axes[:2]]
     log_odds = best.score - rivals[0].score if rivals else None
-    close = [one for one in found if one.score > best.score - MIN_LOG_ODDS]
     rotations_deg = [
         -float(np.degrees(one.remainder_rad)) * one.has_rotation
-        for one in close
-        if one.has_meaning_of(best)
+        for one in found
+        if one.score > best.score - MIN_LOG_ODDS and one.has_meaning_of(best)
     ]
     noise_m = UNITS[best.unit] * white_noise(positions.position_m)
     explained_m = np.hypot(np.sqrt(SECOND_DIFFERENCE) * noise_m, IMU_ERROR_M)
@@ -157,7 +157,7 @@ def _decide(found: list[Hypothesis], positions: Positions, drift: float) -> Conv
         log_odds=log_odds,
         log_likelihood_gain=best.score,
         alternatives=tuple(
-            dict.fromkeys(_describe(one) for one in close if not one.has_meaning_of(best))
+            dict.fromkeys(_describe(one) for one in rivals if one.score > best.score - MIN_LOG_ODDS)
         ),
     )
 
@@ -189,7 +189,7 @@ def _clock_drift(positions: Positions, imu: ImuMotion, best: Hypothesis) -> floa
         candidates = find_candidates(positions.motion(imu), imu)
         best = replace(candidates[0], heading_from=best.heading_from) if candidates else best
     one = refine(replace(best, has_clock_drift=True), positions, positions.motion(imu), imu)
-    drift = start + float(one.parameters[3])
+    drift = (1.0 + start) / (1.0 - float(one.parameters[3])) - 1.0
     return drift if start or one.score > best.score + MIN_DRIFT_GAIN else 0.0
 
 

@@ -19,8 +19,6 @@ class OrientationConvention(Record, frozen=True, kw_only=True):
         convention makes the orientation follow the vehicle.
     order : {"w x y z", "x y z w"}
         Order of the components as sent.
-    inverted : bool
-        True if the inverse rotation is sent.
     frames : str
         Body frame and world frame of the orientation.
     heading_error_deg : float or None
@@ -33,7 +31,6 @@ class OrientationConvention(Record, frozen=True, kw_only=True):
 
     verdict: Literal["determined", "ambiguous", "copied", "unrelated"]
     order: Literal["w x y z", "x y z w"] = "w x y z"
-    inverted: bool = False
     frames: Frames = "FRD to NED"
     heading_error_deg: float | None = None
     tilt_difference_deg: NotNegative = 0.0

@@ -159,7 +159,7 @@ def _level(attitude: Array, force_m_s2: Array) -> Array:
     is_all = np.ones(len(mean), dtype=bool)
     for _ in range(2):
         mean = running_mean(mean, is_all, round(LEVELLING_S / STEP_S))
-    up = mean / np.linalg.norm(mean, axis=1, keepdims=True)
+    up = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1.0)
     correction = from_vector(np.cross(up, [0.0, 0.0, -1.0]))
     return multiply(np.concatenate([correction, correction[-1:]]), attitude)
 

@@ -12,7 +12,7 @@ import numpy as np
 from px4fuse.arrays import Array
 from px4fuse.convention.model import Frames, OrientationConvention
 from px4fuse.convention.motion import Inertial, heading
-from px4fuse.trajectory.rotation import conjugate, interpolate, multiply
+from px4fuse.trajectory.rotation import interpolate, multiply
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 FRD_FLU = np.array([0.0, 1.0, 0.0, 0.0])  # half a turn about x
@@ -39,7 +39,6 @@ class Candidate(NamedTuple):
 
     score: float
     order: str
-    inverted: bool
     frames: str
     body_quarters: int
     tilt_deg: float
@@ -47,9 +46,9 @@ class Candidate(NamedTuple):
     attitude: Array
 
     @property
-    def meaning(self) -> tuple[str, bool, str, int]:
+    def meaning(self) -> tuple[str, str, int]:
         """Convention without the heading: ENU and NWU differ only by a rotation."""
-        return self.order, self.inverted, self.frames.replace("ENU", "NWU"), self.body_quarters
+        return self.order, self.frames.replace("ENU", "NWU"), self.body_quarters
 
 
 def check_orientation(
@@ -91,10 +90,8 @@ def check_orientation(
     reference = interpolate(time, inertial.time_s, inertial.gyro)
     candidates = sorted(
         (
-            _make_candidate(time, sent, reference, order, inverted, frames, quarters)
-            for order, inverted, frames, quarters in product(
-                ("w x y z", "x y z w"), (False, True), FRAMES, range(4)
-            )
+            _make_candidate(time, sent, reference, order, frames, quarters)
+            for order, frames, quarters in product(("w x y z", "x y z w"), FRAMES, range(4))
         ),
         key=lambda candidate: -candidate.score,
     )
@@ -106,7 +103,6 @@ def check_orientation(
     convention = OrientationConvention(
         verdict=verdict,  # type: ignore[arg-type]
         order=best.order,  # type: ignore[arg-type]
-        inverted=best.inverted,
         frames=cast(Frames, best.frames),
         tilt_difference_deg=best.tilt_deg,
         heading_difference_deg=best.heading_deg,
@@ -119,14 +115,13 @@ def _make_candidate(
     sent: Array,
     reference: Array,
     order: str,
-    inverted: bool,
     frames: str,
     quarters: int,
 ) -> Candidate:
     """Convert an orientation by a hypothesis and compare it with the reference."""
     q = sent if order == "w x y z" else sent[:, [3, 0, 1, 2]]
     world, body = FRAMES[frames]
-    attitude = multiply(multiply(world, conjugate(q) if inverted else q), body)
+    attitude = multiply(multiply(world, q), body)
     half = quarters * np.pi / 4.0
     turned = multiply(attitude, np.array([np.cos(half), 0.0, 0.0, np.sin(half)]))
     difference = np.exp(1j * (heading(turned) - heading(reference)))
@@ -144,9 +139,9 @@ def _make_candidate(
             np.log(max(tilt_deg, MIN_DIFFERENCE_DEG)) + np.log(max(heading_deg, MIN_DIFFERENCE_DEG))
         )
     )
-    score -= 4.0 * (order != "w x y z") + 5.0 * inverted + 2.0 * (frames != "FRD to NED")
+    score -= 4.0 * (order != "w x y z") + 2.0 * (frames != "FRD to NED")
     score -= 2.0 * (quarters != 0) + 1.0 * (abs(offset_rad) > np.radians(8.0))
-    return Candidate(score, order, inverted, frames, quarters, tilt_deg, heading_deg, attitude)
+    return Candidate(score, order, frames, quarters, tilt_deg, heading_deg, attitude)
 
 
 def down_in_body(q: Array) -> Array:
