@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from unittest import mock
 
-import bad_jobs
+import failing_jobs
 
 from px4fuse.fleet import job
 
@@ -48,7 +48,7 @@ def analyse(work: job.Job) -> job.Outcome:
     """Analyse a log like the worker; a log named "hang" never ends, one named "crash" crashes."""
     name = Path(work.address).stem
     if name in ("hang", "crash"):
-        bad_jobs.act(("hang", 0) if name == "hang" else ("exit", 3))
+        failing_jobs.run_job(("hang", 0) if name == "hang" else ("exit", 3))
     return analyse_cached(work)
 
 

@@ -72,7 +72,7 @@ def evaluate(log: AidLog, name: str = "gnss_pos") -> AidResult:
     (0.5, "consistent"), (0.58, "consistent"), (0.68, "overconfident"),
     (0.43, "consistent"), (0.37, "underconfident"),
 ])  # fmt: skip
-def test_aid_verdict_sigma_ratio_has_tolerance(sigma, verdict) -> None:
+def test_aiding_source_verdict_allows_sigma_ratio_tolerance(sigma, verdict) -> None:
     aid = evaluate(aid_log(sigma=sigma))
     assert aid.verdict == verdict
     assert aid.nis_mean == pytest.approx((sigma / 0.5) ** 2, rel=0.06)
@@ -81,7 +81,7 @@ def test_aid_verdict_sigma_ratio_has_tolerance(sigma, verdict) -> None:
     assert aid.axes["north"].s_sqrt_median == pytest.approx(0.5)
 
 
-def test_aid_verdict_large_mean_innovation_is_biased() -> None:
+def test_aiding_source_with_large_mean_innovation_is_biased() -> None:
     assert evaluate(aid_log(mean=0.35)).verdict == "biased"
     assert evaluate(aid_log(mean=0.2)).verdict == "consistent"
     # small compared with √S: EKF2 hardly follows
@@ -89,7 +89,7 @@ def test_aid_verdict_large_mean_innovation_is_biased() -> None:
     assert evaluate(aid_log(sigma=0.05, mean=0.11)).verdict == "biased"
 
 
-def test_aid_gap_counts_only_if_it_begins_while_enabled() -> None:
+def test_aiding_source_gap_counts_only_if_begun_while_enabled() -> None:
     log = aid_log(enabled=steps((0.0, 1.0), (26.0, 0.0), (40.0, 1.0)))
     before_gap = log.samples.loc[:20.0]
     outage = evaluate(replace(log, samples=pd.concat([before_gap, log.samples.loc[40.0:]])))
@@ -107,7 +107,7 @@ def outage_free(log: AidLog, start_s: float, end_s: float) -> pd.DataFrame:
     return log.samples[(times <= start_s) | (times >= end_s)]
 
 
-def test_aid_verdict_states_disabled_not_fused_or_too_few() -> None:
+def test_unused_aiding_source_verdict_states_the_reason() -> None:
     log = aid_log()
     assert evaluate(replace(log, enabled=steps((0.0, 0.0)))).verdict == "disabled"
     few = evaluate(replace(log, samples=log.samples.iloc[::80], enabled=steps((0.0, 1.0))))
@@ -117,7 +117,7 @@ def test_aid_verdict_states_disabled_not_fused_or_too_few() -> None:
                   ).verdict == "too few samples"  # fmt: skip
 
 
-def test_aid_reset_rows_are_counted_and_excluded() -> None:
+def test_aiding_source_reset_samples_are_counted_and_excluded() -> None:
     log = aid_log()
     samples = log.samples.copy()
     reset = samples.index[[100, 300]]
@@ -128,7 +128,7 @@ def test_aid_reset_rows_are_counted_and_excluded() -> None:
     assert (aid.resets, aid.axes["north"].samples) == (2, evaluate(log).axes["north"].samples - 2)
 
 
-def test_aid_gate_is_from_test_ratios_or_parameter() -> None:
+def test_aiding_source_gate_is_read_from_test_ratio_or_param() -> None:
     assert evaluate(aid_log(gate=3.0)).gate == pytest.approx(3.0)
     assert evaluate(aid_log(own=False, EKF2_GPS_P_GATE=4.0)).gate == 4.0
     assert evaluate(aid_log(own=False, EKF2_GPS_P_GATE=0.0)).gate == 0.01
@@ -149,14 +149,16 @@ def test_aid_gate_is_from_test_ratios_or_parameter() -> None:
     ("mag", {"EKF2_MAG_NOISE": 0.05}, "EKF2_MAG_NOISE"),
     ("gnss_pos", {}, "the accuracy reported by the receiver"),
 ])  # fmt: skip
-def test_aid_noise_names_its_origin(name: str, parameters: dict[str, float], set_by: str) -> None:
+def test_aiding_source_noise_names_the_parameter_that_sets_it(
+    name: str, parameters: dict[str, float], set_by: str
+) -> None:
     aid = evaluate(aid_log(**parameters), name)
     assert aid.noise == pytest.approx(0.5 * 0.5**0.5)
     assert aid.noise_from == set_by
     assert evaluate(aid_log(own=False, **parameters), name).noise_from == ""
 
 
-def test_aid_verdict_slow_logging_is_consistent() -> None:
+def test_aiding_source_logged_at_low_rate_is_consistent() -> None:
     """Rows of zeros are samples that EKF2 logged between two measurements."""
     log = aid_log(own=False, enabled=steps((0.0, 1.0)))
     decimated = replace(log, samples=log.samples.iloc[::10])
@@ -165,7 +167,7 @@ def test_aid_verdict_slow_logging_is_consistent() -> None:
         assert evaluate(replace(decimated, samples=samples)).verdict == verdict
 
 
-def test_aid_findings_contain_aid_numbers_and_times() -> None:
+def test_aiding_source_findings_state_sensor_and_times() -> None:
     log = aid_log()
     with_gap = replace(log, samples=outage_free(log, 20.0, 41.0), enabled=steps((0.0, 1.0)))
     found = evaluate_aids(with_aids(
@@ -191,7 +193,7 @@ def test_aid_findings_contain_aid_numbers_and_times() -> None:
                    "EKF2 fused no sample of the barometer for 21 s: height error 0.80 m")),
     ],
 )  # fmt: skip
-def test_barometer_not_fused_is_fault_only_with_height_error(
+def test_unfused_barometer_is_a_fault_only_with_height_error(
     take_off_s: tuple[float, ...], height_error_m: float | None, expected: Any
 ) -> None:
     log = aid_log()
@@ -202,7 +204,7 @@ def test_barometer_not_fused_is_fault_only_with_height_error(
 
 
 @pytest.mark.parametrize(("error_m", "expected_m"), [(0.9, 0.9), (0.2, None)])
-def test_height_error_in_gap_counts_above_three_times_rmse(
+def test_height_error_in_barometer_gap_counts_above_three_rmse(
     error_m: float, expected_m: float | None
 ) -> None:
     time_s = np.arange(0.0, 60.0, 0.1)
@@ -218,7 +220,7 @@ def test_height_error_in_gap_counts_above_three_times_rmse(
     assert aids_detector._height_error_in(SimpleNamespace(axes={}), (0.0, 1.0)) is None  # type: ignore[arg-type]
 
 
-def test_aid_mean_change_is_reported_with_time() -> None:
+def test_aiding_source_change_of_mean_is_reported_with_time() -> None:
     log = aid_log()
     # windows of 10 s: from the window with the change, or the next one
     for from_s, expected_s in ((22.0, 20.0), (39.5, 40.0)):
@@ -251,7 +253,7 @@ def test_aid_mean_change_is_reported_with_time() -> None:
 
 
 @pytest.mark.parametrize("generation", ["v1.9", "v1.12", "v1.14", "v1.16"])
-def test_read_aids_each_release_has_one_sign_convention(generation, tmp_path):
+def test_innovation_sign_is_the_same_for_each_px4_release(generation, tmp_path):
     flight = read_log(gnss_log(generation).write(tmp_path / "a.ulg"))
     aids = flight.ekf2.aids  # type: ignore[union-attr]
     assert [name for name in aids if name in ("gnss_pos", "gnss_hgt", "baro_hgt")] == ["gnss_pos"]
@@ -270,7 +272,7 @@ def test_read_aids_each_release_has_one_sign_convention(generation, tmp_path):
 # ---------------------------------------------------------------------------- reporting
 
 
-def test_compare_checks_bad_ekf2_verdict_exits_with_1(tmp_path, monkeypatch, capsys) -> None:
+def test_compare_checks_option_exits_with_1_on_bad_verdict(tmp_path, monkeypatch, capsys) -> None:
     log, report = gnss_log("v1.16").write(tmp_path / "a.ulg"), tmp_path / "a.pdf"
     code, _, err = run_main(monkeypatch, capsys, "compare", log, "--checks", "-o", report)
     bad = [each.label for each in evaluate_aids(read_log(log)).values() if each.is_faulty]
@@ -279,14 +281,14 @@ def test_compare_checks_bad_ekf2_verdict_exits_with_1(tmp_path, monkeypatch, cap
 
 
 @pytest.mark.parametrize(("sigma", "bad"), [(0.5, False), (0.25, False), (1.5, True)])
-def test_failed_checks_list_overconfident_aids_only(sigma: float, bad: bool) -> None:
+def test_compare_checks_fail_only_for_overconfident_sources(sigma: float, bad: bool) -> None:
     """Overconfident aids fail, underconfident ones do not."""
     made = with_aids(gnss_pos=aid_log(sigma=sigma))
     alone = AidsOnlyAnalysis(made, evaluate_aids(made), Unavailable("it", "not there", "Log it."))
     assert failed_checks(alone) == ({"GNSS position": "overconfident"} if bad else {})
 
 
-def test_compare_without_position_evaluates_aids(tmp_path: Path) -> None:
+def test_compare_without_position_evaluates_aiding_sources(tmp_path: Path) -> None:
     log, report = gnss_log("v1.16").write(tmp_path / "a.ulg"), tmp_path / "a.pdf"
     done = run("compare", log, "-o", report)
     assert "no external position" in done.output
@@ -296,7 +298,7 @@ def test_compare_without_position_evaluates_aids(tmp_path: Path) -> None:
     assert "contains only EKF2 aids, no KF results" in str(refused)
 
 
-def test_compare_without_flight_raises_missing_data(tmp_path: Path) -> None:
+def test_compare_of_log_without_take_off_raises_missing_data(tmp_path: Path) -> None:
     made = gnss_log("v1.16")
     made["vehicle_land_detected"]["landed"][:] = 1
     done = run("compare", made.write(tmp_path / "a.ulg"), "-o", tmp_path / "a.pdf")

@@ -150,7 +150,7 @@ def true_offset_s(sample_flight: Flight, external: PositionRecording) -> float:
 # -- the sample flight -----------------------------------------------------------------------------
 
 
-def test_align_sample_file_without_options_recovers_placement(
+def test_align_sample_position_file_needs_no_options(
     sample_flight, external, true_offset_s
 ) -> None:
     alignment, track = align(sample_flight, external)
@@ -181,7 +181,7 @@ def test_align_sample_file_without_options_recovers_placement(
     yaw_deg=st.floats(-179.0, 179.0),
     origin_m=st.tuples(*[st.floats(-8.0, 8.0)] * 3),
 )
-def test_align_any_clock_frame_yaw_and_origin_is_recovered(
+def test_align_position_file_recovers_clock_frame_and_yaw(
     seed, frame, frame_given, offset_s, yaw_deg, origin_m
 ):
     flight = flight_along(seed=seed)
@@ -197,7 +197,7 @@ def test_align_any_clock_frame_yaw_and_origin_is_recovered(
     assert alignment.misplaced == alignment.warnings == ()
 
 
-def test_align_clock_and_yaw_sigma_match_scatter_of_flights() -> None:
+def test_align_position_file_sigma_equals_observed_scatter() -> None:
     clock, yaw = [], []
     for seed in range(24):
         flight = flight_along(seed=seed, duration_s=60.0)
@@ -210,7 +210,7 @@ def test_align_clock_and_yaw_sigma_match_scatter_of_flights() -> None:
 
 
 @pytest.mark.parametrize("frame", sorted(FROM_NED))
-def test_align_frame_is_from_columns_or_best_fit(flight: Flight, frame: str) -> None:
+def test_align_position_file_takes_frame_from_column_names(flight: Flight, frame: str) -> None:
     file = uwb_file(flight, frame=frame)
     alignment, track = align(flight, file)
     assert alignment.frame == frame
@@ -221,7 +221,7 @@ def test_align_frame_is_from_columns_or_best_fit(flight: Flight, frame: str) -> 
     assert alignment.frame_reason == "from the column names of the file"
 
 
-def test_align_aisle_at_45_degrees_without_height_needs_frame() -> None:
+def test_align_position_file_on_45_degree_path_needs_frame() -> None:
     flight = flight_along(partial(passes, across_m=0.0), heading_deg=45.0)
     file = uwb_file(flight, frame="enu")
     file.samples["z_m"] = np.nan
@@ -233,7 +233,7 @@ def test_align_aisle_at_45_degrees_without_height_needs_frame() -> None:
     assert track.samples["north_m"].notna().all()
 
 
-def test_align_rotates_variances_with_track(flight: Flight) -> None:
+def test_align_position_file_rotates_its_variances(flight: Flight) -> None:
     file = uwb_file(flight, frame="enu", yaw_deg=90.0, sigma_m=[0.1, 0.2, 0.3])
     options: dict[str, Any] = {"frame": "enu", "clock_offset_s": OFFSET_S}
     variances = [
@@ -249,7 +249,7 @@ def test_align_rotates_variances_with_track(flight: Flight) -> None:
     assert_same_track(track, flight.positions[0], 1e-9)
 
 
-def test_align_result_contains_track_file_and_reader_notes(flight: Flight) -> None:
+def test_align_position_file_keeps_notes_of_its_reader(flight: Flight) -> None:
     result = align_position_file(flight, uwb_file(flight))
     track, *others = result.positions
     assert track.name == track.log == "uwb.csv"
@@ -267,7 +267,7 @@ def test_align_result_contains_track_file_and_reader_notes(flight: Flight) -> No
     (90.0, (0.0, 0.0, 0.0)), (-12.0, (1.0, 2.0, 0.0)), (180.0, (5.0, 0.0, 0.0)),
     (0.0, (2.0, 0.0, 0.0)),
 ])  # fmt: skip
-def test_align_misaligned_frame_warns_and_recovers_clock(flight, yaw_deg, origin_m):
+def test_align_position_file_of_misaligned_frame_warns(flight, yaw_deg, origin_m):
     file = uwb_file(flight, yaw_deg=yaw_deg, origin_m=origin_m)
     alignment, _ = align(flight, file, frame="enu")
     assert alignment.yaw_deg == 0.0
@@ -283,7 +283,7 @@ def test_align_misaligned_frame_warns_and_recovers_clock(flight, yaw_deg, origin
     assert alignment.misplaced == alignment.warnings == ()
 
 
-def test_align_given_clock_offset_is_used_and_checked(flight: Flight) -> None:
+def test_align_position_file_uses_given_clock_offset(flight: Flight) -> None:
     wrong, _ = align(flight, uwb_file(flight), frame="enu", clock_offset_s=OFFSET_S + 11.0)
     (warning,) = wrong.warnings
     assert warning.startswith("The position file does not match the EKF2 position (correlation ")
@@ -295,7 +295,7 @@ def test_align_given_clock_offset_is_used_and_checked(flight: Flight) -> None:
     assert_same_track(track, flight.positions[0], 0.1)
 
 
-def test_align_inverted_height_or_other_start_time_warns(flight: Flight) -> None:
+def test_align_position_file_warns_on_inverted_height(flight: Flight) -> None:
     file = uwb_file(flight)
     file.samples["z_m"] *= -1.0
     other = replace(flight, log=replace(flight.log, start_unix_s=BOOT_S - OFFSET_S - 100.0))
@@ -308,7 +308,7 @@ def test_align_inverted_height_or_other_start_time_warns(flight: Flight) -> None
 # -- outliers, gaps and resets ---------------------------------------------------------------------
 
 
-def test_align_outliers_and_gap_keep_clock_and_yaw() -> None:
+def test_align_position_file_is_robust_to_outliers_and_gap() -> None:
     flight = flight_along(uwb=Uwb(outlier_share=0.08, gap_s=(30.0, 48.0)))
     alignment, _ = align(flight, uwb_file(flight), frame="enu", yaw_deg="auto")
     assert clock_error_s(alignment) < 0.03
@@ -317,7 +317,7 @@ def test_align_outliers_and_gap_keep_clock_and_yaw() -> None:
 
 
 @pytest.mark.parametrize("delta", [(3.0, -2.0, 0.5), (100.0, 40.0, 0.0)])
-def test_align_ekf2_position_reset_keeps_placement(delta: tuple[float, float, float]) -> None:
+def test_align_position_file_ignores_ekf2_position_reset(delta: tuple[float, float, float]) -> None:
     flight = flight_along(ekf2=Estimator(resets=(Reset(70.0, "position", delta),)))
     for yaw in (None, "auto"):
         alignment, track = align(flight, uwb_file(flight), frame="enu", yaw_deg=yaw)
@@ -333,7 +333,7 @@ QUIET = Imu(sigma_a_m_s2=0.1)
 
 
 @pytest.mark.parametrize("noise", [0.1, 0.5])
-def test_align_without_ekf2_uses_imu_for_clock_and_yaw(noise: float) -> None:
+def test_align_position_file_without_ekf2_uses_imu(noise: float) -> None:
     flight = flight_along(imu=Imu(sigma_a_m_s2=noise), ekf2=None)
     file = uwb_file(flight, yaw_deg=25.0, origin_m=(4.0, 5.0, 0.0))
     alignment, _ = align(flight, file, frame="enu", yaw_deg="auto")
@@ -346,7 +346,7 @@ def test_align_without_ekf2_uses_imu_for_clock_and_yaw(noise: float) -> None:
     assert any("set to 0" in warning for warning in alignment.warnings)
 
 
-def test_align_without_ekf2_imu_finds_frame_and_misalignment() -> None:
+def test_align_position_file_without_ekf2_finds_frame_and_yaw() -> None:
     flight = flight_along(imu=QUIET)
     blind = replace(flight, ekf2=unavailable("EKF2"))
     assert align(blind, uwb_file(flight, frame="nwu"))[0].frame == "nwu"
@@ -366,7 +366,7 @@ def test_align_without_ekf2_imu_finds_frame_and_misalignment() -> None:
 BOTH_SPANS = r"the log covers 2416\.25 s to 2536\.25 s of the boot clock, the file 1795253666\.45 s"
 
 
-def test_align_vehicle_at_rest_needs_clock_offset() -> None:
+def test_align_position_file_at_rest_requires_clock_offset() -> None:
     flight = flight_along(partial(passes, across_m=0.0), length_m=0.0)
     for parts in ({}, {"ekf2": unavailable("EKF2")}):
         said = rf"^uwb\.csv: .*hardly change; {BOTH_SPANS}.*Give `clock_offset_s`\.$"
@@ -379,7 +379,7 @@ def test_align_vehicle_at_rest_needs_clock_offset() -> None:
     assert_same_track(track, flight.positions[0], 1e-9)
 
 
-def test_align_without_ekf2_and_imu_needs_offset_and_frame() -> None:
+def test_align_position_file_without_imu_needs_offset_and_frame() -> None:
     flight = flight_along(imu=None, ekf2=None)
     file = uwb_file(flight)
     said = f"no EKF2 position; the log has no acceleration.*{BOTH_SPANS}.*"
@@ -393,7 +393,7 @@ def test_align_without_ekf2_and_imu_needs_offset_and_frame() -> None:
     assert_same_track(track, flight.positions[0], 1e-9)
 
 
-def test_align_no_overlap_long_or_short_file_is_refused(flight: Flight) -> None:
+def test_align_position_file_without_overlap_is_rejected(flight: Flight) -> None:
     """No overlap with the log, more than one day, or fewer than 10 positions."""
     file = uwb_file(flight)
     for offset in (0.0, OFFSET_S + 121.0, OFFSET_S - 121.0):
@@ -409,7 +409,7 @@ def test_align_no_overlap_long_or_short_file_is_refused(flight: Flight) -> None:
         align_position_file(flight, replace(file, samples=file.samples.iloc[:9]))
 
 
-def test_align_file_of_other_flight_is_refused(flight: Flight) -> None:
+def test_align_position_file_of_other_flight_is_rejected(flight: Flight) -> None:
     def other(time_s: Array, heading_deg: float, length_m: float) -> Array:
         angle = 2.0 * np.pi * time_s / 55.0
         radius = 3.0 + np.sin(7.0 * angle)
@@ -420,7 +420,7 @@ def test_align_file_of_other_flight_is_refused(flight: Flight) -> None:
 
 
 @pytest.mark.parametrize("yaw", [None, "auto"])
-def test_align_periodic_path_needs_clock_offset(yaw: Any) -> None:
+def test_align_position_file_of_periodic_path_needs_offset(yaw: Any) -> None:
     flight = replace(aisle_flight(), log=replace(aisle_flight().log, boot_time_s=BOOT_S))
     file = uwb_file(flight)
     said = r"from this path; offsets that differ by [1-6]0\.\d s fit.*"
@@ -430,7 +430,7 @@ def test_align_periodic_path_needs_clock_offset(yaw: Any) -> None:
     assert alignment.residual_rms_m == pytest.approx(0.11, abs=0.02)
 
 
-def test_align_almost_periodic_path_warns() -> None:
+def test_align_position_file_warns_of_second_possible_offset() -> None:
     def accelerating_passes(time_s: Array, heading_deg: float, length_m: float) -> Array:
         along = 5.0 * (1.0 - np.cos(2.0 * np.pi * (time_s / 20.0 + time_s**2 / 2e5)))
         return np.stack([along, 0.0 * along, 0.0 * along], axis=1)
@@ -448,7 +448,7 @@ def test_align_almost_periodic_path_warns() -> None:
     ({"yaw_deg": "north"}, "`yaw_deg` north is not valid: give degrees or auto."),
     ({"clock_offset_s": float("inf")}, "`clock_offset_s` inf is not a finite number."),
 ])  # fmt: skip
-def test_align_invalid_options_raise_settings_error(
+def test_align_position_file_with_invalid_option_raises_error(
     flight: Flight, options: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(SettingsError) as caught:
@@ -461,7 +461,7 @@ def test_align_invalid_options_raise_settings_error(
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", ["v1.14.4_aisle_nominal", "v1.16.1_aisle_nlos"])
-def test_align_simulated_logs_recovers_clock_and_frame(shared_logs: Path, name: str) -> None:
+def test_align_position_file_of_sitl_log_recovers_known_clock(shared_logs: Path, name: str) -> None:
     log = shared_logs / "simulated" / f"{name}.ulg"
     record = json.loads(log.with_suffix(".json").read_text())
     stamps = np.array([sample["t_unix"] for sample in record["uwb"]])

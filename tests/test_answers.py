@@ -31,7 +31,7 @@ def read(tmp_path: Path, text: str):
     return read_answers(path)
 
 
-def test_empty_form_has_no_answers_and_lists_every_mistake(tmp_path: Path) -> None:
+def test_empty_answer_form_lists_every_possible_mistake(tmp_path: Path) -> None:
     found = read(tmp_path, EMPTY)
     assert found.log_sha256 == SHA256
     assert (found.mistakes, found.quantities) == ((), (None, None, None))
@@ -40,7 +40,7 @@ def test_empty_form_has_no_answers_and_lists_every_mistake(tmp_path: Path) -> No
         assert f"#     {name} " in EMPTY
 
 
-def test_read_answers_returns_filled_in_values(tmp_path: Path) -> None:
+def test_read_answer_form_returns_filled_in_values(tmp_path: Path) -> None:
     text = EMPTY.replace('kind = ""', 'kind = "yaw"').replace('size = ""', "size = -0.367")
     text = text.replace('unit = ""', 'unit = "rad"', 1).replace('q2 = ""', "q2 = [3, 7]")
     former = 'verdict_ours = "overstated"'  # former name
@@ -75,7 +75,7 @@ def test_read_answers_returns_filled_in_values(tmp_path: Path) -> None:
         (EMPTY.replace("ekf2_did = []", 'ekf2_did = ["slept"]'), "'slept' is not one of"),
     ],
 )  # fmt: skip
-def test_read_answers_invalid_form_names_place_in_one_line(
+def test_read_invalid_answer_form_names_line_in_one_line_error(
     tmp_path: Path, text: str, said: str
 ) -> None:
     with pytest.raises(SettingsError) as error:
@@ -84,7 +84,7 @@ def test_read_answers_invalid_form_names_place_in_one_line(
     assert "\n" not in str(error.value).replace("\\n", "")
 
 
-def test_form_questions_depend_on_log_and_match_replay() -> None:
+def test_answer_form_questions_depend_on_log_hash() -> None:
     drawn = {draw_questions(f"{n:064x}") for n in range(200)}
     assert len(drawn) == 200
     kinds = {quantity.kind for each in drawn for quantity in each}
@@ -102,7 +102,7 @@ def test_form_questions_depend_on_log_and_match_replay() -> None:
         assert found == pytest.approx(by_hand.get(quantity.kind, found), rel=1e-9)
 
 
-def test_quantity_truth_source_gap_matches_closed_form() -> None:
+def test_correct_answer_for_sigma_after_gap_equals_closed_form() -> None:
     """Closed form: P grows by F P Fᵀ + Q in each step of DT."""
     main = compare(aisle_flight(duration_s=60.0)).main
     quantity = next(
@@ -123,7 +123,7 @@ def test_quantity_truth_source_gap_matches_closed_form() -> None:
 
 
 @pytest.mark.usefixtures("cached_analyses", "cached_pages")
-def test_compare_answers_option_adds_form_to_page_and_results(
+def test_compare_answers_option_adds_answer_form_to_report(
     tmp_path: Path, sample_log: Path
 ) -> None:
     """``answers`` writes the form, ``compare`` reads it."""

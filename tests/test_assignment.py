@@ -78,13 +78,13 @@ def files(folder):
 
 
 class TestDraw:
-    def test_same_secret_and_id_give_same_bytes(self):
+    def test_assigned_flight_of_same_secret_and_id_is_reproduced(self):
         given = SECRET, CLASS[0], "aisle", 2, True
         assert simulate_assigned(*given) == assignment.simulate_assigned(*given)
         # the id as another platform may spell it
         assert draw(SECRET, "S1 ", "aisle") == draw(SECRET, "s1", "aisle")
 
-    def test_draw_fixed_secret_is_unchanged(self):
+    def test_assigned_flight_of_fixed_secret_never_changes(self):
         drawn = draw(SECRET, "s1", "aisle", 2)
         scenario = drawn.scenario
         # a loop contains no ground truth, which would show the landing
@@ -97,14 +97,14 @@ class TestDraw:
         assert loops == [1, 5, 9, 11]
 
     @pytest.mark.parametrize("kind", ["aisle", "loop", "mixed"])
-    def test_other_students_or_secrets_give_other_flights(self, kind):
+    def test_assigned_flights_of_other_students_or_secrets_differ(self, kind):
         drawn = [draw(SECRET, f"s{n}", kind).scenario for n in range(200)]
         drawn += [draw(b"another secret", f"s{n}", kind).scenario for n in range(200)]
         assert len({one.seed for one in drawn}) == 400
         assert len({(one.sigma_a_m_s2, one.heading_deg, one.speed_m_s) for one in drawn}) > 390
 
     @pytest.mark.parametrize("kind", ["aisle", "loop"])
-    def test_mistake_counts_have_configured_shares(self, kind):
+    def test_assigned_mistake_counts_have_configured_fractions(self, kind):
         flights = [draw(SECRET, f"s{n}", kind) for n in range(1000)]
         for count, share in enumerate(COUNT_FRACTIONS[kind]):
             found = sum(len(one.mistake_options) == count for one in flights) / 1000
@@ -112,13 +112,13 @@ class TestDraw:
         names = {choice.mistake for one in flights for choice in choices_of(one)}
         assert names == {choice.mistake for choice in ASSIGNABLE_MISTAKES[kind]}
 
-    def test_mixed_kind_equals_separate_draws_of_each_kind(self):
+    def test_mixed_assignment_draws_aisle_and_loop_flights(self):
         mixed = [draw(SECRET, f"s{n}", "mixed") for n in range(1000)]
         kinds = Counter(one.scenario.kind for one in mixed)
         assert kinds["loop"] / 1000 == pytest.approx(LOOP_FRACTION, abs=0.05)
         assert all(one == draw(SECRET, f"s{n}", one.scenario.kind) for n, one in enumerate(mixed))
 
-    def test_two_mistakes_are_compatible_and_within_size_limits(self):
+    def test_two_assigned_mistakes_are_compatible_and_in_range(self):
         signs = Counter()
         for n in range(300):
             drawn = draw(SECRET, f"s{n}", "aisle", 2)
@@ -143,7 +143,7 @@ class TestDraw:
         both = {choice.mistake for choice in ASSIGNABLE_MISTAKES["aisle"] if choice.has_either_sign}
         assert {name for name, positive in signs if not positive} == both
 
-    def test_size_limits_are_smallest_detected_sizes(self):
+    def test_mistake_size_limits_equal_smallest_detected_sizes(self):
         """From the limit on, 95 % of the flights of tests/studies/rates.csv have the finding."""
         table = rates()
         table = table[~table.condition.str.contains("outdoor")]
@@ -162,7 +162,7 @@ class TestDraw:
             larger = [s for s in sizes if (s < choice.detectable_size) == choice.is_smaller_easier]
             assert set(larger) <= {choice.detectable_size, *found}
 
-    def test_difficulties_are_spread_over_their_range(self):
+    def test_assigned_flights_are_spread_over_difficulty_range(self):
         each = [draw(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]
         counts, _ = np.histogram(each, bins=4, range=(EASIEST_DIFFICULTY, HARDEST_DIFFICULTY))
         assert counts.min() > 90
@@ -171,7 +171,7 @@ class TestDraw:
 @pytest.mark.parametrize(
     ("kind", "number", "count"), [("aisle", 0, 2), ("aisle", 1, 2), ("aisle", 2, 1), ("loop", 0, 1)]
 )
-def test_simulate_assigned_log_shows_each_mistake_of_key(tmp_path, kind, number, count):
+def test_assigned_log_has_a_finding_for_each_mistake_of_key(tmp_path, kind, number, count):
     log, answer = assignment.simulate_assigned(SECRET, CLASS[number], kind, count, True)
     path = tmp_path / answer.file
     path.write_bytes(log)
@@ -198,7 +198,7 @@ class TestAssign:
         made_up = iter([SECRET.decode()])
         monkeypatch.setattr(secrets, "token_urlsafe", lambda _: next(made_up))
 
-    def test_assign_writes_logs_forms_and_key(self, tmp_path):
+    def test_assign_flights_writes_logs_answer_forms_and_key(self, tmp_path):
         folder, key_file = tmp_path / "a" / "flights", tmp_path / "key.json"
         made, written = assign(CLASS, folder, key_file, SECRET, "aisle", 2)
         key = read_key(key_file)
@@ -218,7 +218,7 @@ class TestAssign:
         if os.name == "posix":
             assert stat.S_IMODE(key_file.stat().st_mode) == 0o600
 
-    def test_assign_again_keeps_files_and_adds_students(self, tmp_path):
+    def test_assign_flights_again_keeps_files_and_adds_students(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         assert assign(CLASS[:2], folder, key_file, None, "aisle", 2)[0].secret
         before = files(folder) | {"key": key_file.read_bytes()}
@@ -231,7 +231,7 @@ class TestAssign:
         assign(CLASS, folder, key_file, key.secret.encode(), "aisle", 2)
         assert read_key(key_file).secret == key.secret
 
-    def test_assign_other_flights_or_key_are_not_overwritten(self, tmp_path):
+    def test_assign_flights_does_not_overwrite_other_files(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         assign(CLASS[:2], folder, key_file, SECRET, "aisle", 2)
         before = files(folder) | {"key": key_file.read_bytes()}
@@ -246,7 +246,7 @@ class TestAssign:
             assign(CLASS[:2], folder, key_file, SECRET, "aisle", 2)
         assert files(folder) == {k: v for k, v in before.items() if k != "key"}
 
-    def test_assign_interrupted_run_is_continued(self, tmp_path, monkeypatch):
+    def test_assign_flights_interrupted_run_is_continued(self, tmp_path, monkeypatch):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         flown = assignment.simulate_assigned
 
@@ -262,7 +262,7 @@ class TestAssign:
         assert len(read_key(key_file).answers) == 2
         assert assign(CLASS, folder, key_file, None, "aisle", 2) == (read_key(key_file), 1)
 
-    def test_assign_after_write_error_continues_elsewhere(self, tmp_path):
+    def test_assign_flights_continues_after_unwritable_key_path(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         key_file.mkdir()
         with pytest.raises(SettingsError):
@@ -280,7 +280,7 @@ class TestAssign:
         assert stat.S_IMODE(kept.stat().st_mode) == 0o600 or os.name == "nt"
         assert assign(CLASS[:1], folder, kept, None, "aisle", 2) == (read_key(kept), 1)
 
-    def test_key_path_is_outside_the_students_folder(self, tmp_path, monkeypatch):
+    def test_answer_key_path_inside_students_folder_is_rejected(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         flights = tmp_path / "flights"
         assert key_path(flights, None) == tmp_path / "flights_answers.json"
@@ -301,13 +301,13 @@ class TestKey:
         )
         return AnswerKey("aisle", tuple(answers), "s")
 
-    def test_key_text_is_read_back_equal(self, tmp_path):
+    def test_answer_key_written_and_read_again_is_equal(self, tmp_path):
         path = tmp_path / "key.json"
         path.write_text(key_text(self.key()), encoding="utf-8")
         assert read_key(path) == self.key()
         assert "Do not hand it out" in path.read_text(encoding="utf-8")
 
-    def test_read_key_invalid_content_raises_one_line(self, tmp_path):
+    def test_read_invalid_answer_key_raises_one_line_error(self, tmp_path):
         good = json.loads(key_text(self.key()))
 
         def with_values(**values):
@@ -347,7 +347,7 @@ class TestCommand:
         (tmp_path / "secret.txt").write_text("\ufeffour secret 2026\r\n", encoding="utf-8")
         return tmp_path
 
-    def test_simulate_preview_prints_flights_and_writes_nothing(self, at):
+    def test_simulate_preview_prints_flights_without_writing_files(self, at):
         given = ("--assignment", "roster.csv", "-o", "f", "--kind", "mixed", "--mistakes", "1",
                  "--secret-file", "secret.txt")  # fmt: skip
         before = files(at)

@@ -135,7 +135,7 @@ def honest(flight: Flight, rubric: Rubric) -> GradedReport:
     return flight.graded(attached_results(flight.honest.pdf), verdict, rubric)
 
 
-def test_grade_honest_report_is_verified_with_points(honest: GradedReport) -> None:
+def test_grade_unchanged_report_is_verified_and_earns_points(honest: GradedReport) -> None:
     assert honest.status == "verified"
     assert honest.pending_action == ""
     assert honest.flags == ()
@@ -157,7 +157,7 @@ def test_grade_honest_report_is_verified_with_points(honest: GradedReport) -> No
         "a_" * 90_000,
     ],
 )
-def test_grade_notes_without_content_earn_no_points(
+def test_grade_gives_no_points_for_keywords_in_student_notes(
     flight: Flight, honest: GradedReport, rubric: Rubric, text: str
 ) -> None:
     graded = flight.with_notes(text, rubric)
@@ -271,7 +271,7 @@ FILES: dict[str, tuple[Change, str, str]] = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_grade_forged_results_are_not_verified(
+def test_grade_report_with_forged_results_is_not_verified(
     flight: Flight, honest: GradedReport, rubric: Rubric, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     change, status, pending = FILES[name]
@@ -297,7 +297,7 @@ def test_grade_forged_results_are_not_verified(
     assert graded.points <= honest.points + 1e-9
 
 
-def test_grade_painted_page_is_scored_from_redrawn_report(
+def test_grade_overpainted_page_is_scored_from_redrawn_report(
     flight: Flight, honest: GradedReport, rubric: Rubric
 ) -> None:
     """The numbers are verified and the page is not; the redrawn report is scored."""
@@ -356,7 +356,7 @@ LOOPS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], float, int]] = {
 
 
 @pytest.mark.parametrize("name", LOOPS)
-def test_grade_loop_gives_expected_points_and_flags(name: str) -> None:
+def test_grade_loop_flight_gives_expected_points_and_flags(name: str) -> None:
     truth, request, loop, points, flags = LOOPS[name]
     graded = grade_loop(truth, request, loop)
     assert graded.points == pytest.approx(points), graded.items

@@ -91,7 +91,7 @@ def read_and_make_axes(path: Path) -> Flight | None:
         ),
     ],
 )  # fmt: skip
-def test_read_log_other_content_is_rejected(tmp_path, content, words):
+def test_read_log_of_other_file_format_is_rejected(tmp_path, content, words):
     path = tmp_path / "other.ulg"
     path.write_bytes(content)
     assert words in read_error(path)
@@ -105,19 +105,19 @@ def test_read_log_other_content_is_rejected(tmp_path, content, words):
         ("log.pdf", b"%PDF-1.7 and so on", "a PDF", "verify log.pdf LOG"),
     ],
 )
-def test_read_log_other_file_type_suggests_command(tmp_path, name, content, what, command):
+def test_read_log_of_other_file_type_suggests_right_command(tmp_path, name, content, what, command):
     (tmp_path / name).write_bytes(content)
     message = read_error(tmp_path / name)
     assert message.startswith(f"{name}: {what}")
     assert message.endswith(f"px4fuse {command}.")
 
 
-def test_read_log_mistyped_name_suggests_file(tmp_path):
+def test_read_log_with_mistyped_name_suggests_existing_file(tmp_path):
     make_log().write(tmp_path / "aisle_uwb.ulg")
     assert read_error(tmp_path / "aisle_uvb.ulg").endswith("Did you mean aisle_uwb.ulg?")
 
 
-def test_read_log_without_known_topics_has_no_data(tmp_path):
+def test_read_log_without_known_topics_reports_no_data(tmp_path):
     at = stamps(2.0, 10.0)
     log = Log([topic("battery_status", at, {"voltage_v": np.full(len(at), 16.0)})])
     flight = read_or_error(log.write(tmp_path / "battery.ulg"))
@@ -135,7 +135,7 @@ def test_read_log_without_known_topics_has_no_data(tmp_path):
         choose_source(flight)
 
 
-def test_read_log_format_containing_itself_ends(tmp_path):
+def test_read_log_with_recursive_ulog_format_does_not_hang(tmp_path):
     """A format that contains itself must not cause infinite recursion."""
     path = tmp_path / "nested.ulg"
     content = make_log("v1.16", 1.0).encode()
@@ -150,7 +150,7 @@ def test_read_log_format_containing_itself_ends(tmp_path):
 
 @pytest.mark.parametrize("key", ["char[4] ver_sw_release", "uint32_t[1] ver_sw_release",
                                  "float ver_sw_release"])  # fmt: skip
-def test_read_log_firmware_version_of_wrong_type_is_ignored(tmp_path, key):
+def test_read_log_ignores_firmware_version_of_wrong_type(tmp_path, key):
     """A damaged type name makes the release number another type."""
     content = make_log("v1.16", 1.0).encode()
     old = b"uint32_t ver_sw_release"
@@ -182,7 +182,7 @@ def write_and_read(log: Log, tmp_path: Path) -> Flight:
         ("vehicle_land_detected", "airborne"),
     ],
 )
-def test_read_log_missing_topic_makes_its_data_unavailable(tmp_path, topic, part):
+def test_read_log_without_topic_disables_only_its_data(tmp_path, topic, part):
     """Only the part of the missing topic is unavailable."""
     flight = write_and_read(make_log("v1.16", 2.0).drop(topic), tmp_path)
     for name in ("imu", "attitude", "ekf2", "airborne"):
@@ -218,7 +218,7 @@ def rich_log() -> Log:
 
 
 @pytest.mark.parametrize("name", sorted(rich_log().names()))
-def test_read_log_missing_field_is_read(tmp_path, name):
+def test_read_log_succeeds_if_any_one_field_is_missing(tmp_path, name):
     """Fields may be missing in other PX4 releases or in a damaged format."""
     for field in rich_log()[name].keys() - {"timestamp"}:
         log = rich_log()
@@ -229,7 +229,7 @@ def test_read_log_missing_field_is_read(tmp_path, name):
 # ---- impossible values ------------------------------------------------------------------------
 
 
-def test_read_log_all_timestamps_zero_is_rejected(tmp_path):
+def test_read_log_rejects_log_whose_timestamps_are_all_zero(tmp_path):
     log = make_log("v1.16", 2.0)
     for made in log.topics:
         made.fields["timestamp"][:] = 0
@@ -237,7 +237,7 @@ def test_read_log_all_timestamps_zero_is_rejected(tmp_path):
     assert "all timestamps are zero" in read_error(log.write(tmp_path / "zero.ulg"))
 
 
-def test_read_log_topic_with_zero_timestamps_is_noted(tmp_path):
+def test_read_log_notes_a_topic_with_zero_timestamps(tmp_path):
     """ekf2_innovations of a real log of 2016 had this fault."""
     log = make_log("v1.9", 2.0)
     log["ekf2_innovations"]["timestamp"][:] = 0
@@ -250,7 +250,7 @@ def test_read_log_topic_with_zero_timestamps_is_noted(tmp_path):
     "name", ["sensor_combined", "vehicle_attitude", "vehicle_visual_odometry",
              "vehicle_local_position", "estimator_aid_src_ev_pos"],
 )  # fmt: skip
-def test_read_log_swapped_timestamps_are_dropped_with_note(tmp_path, name):
+def test_read_log_drops_swapped_timestamps_with_a_note(tmp_path, name):
     """Samples out of order are dropped and counted; the others keep their times."""
     log = make_log("v1.16", 4.0)
     index = next(i for i, made in enumerate(log.topics) if made.name == name)
@@ -267,7 +267,7 @@ def test_read_log_swapped_timestamps_are_dropped_with_note(tmp_path, name):
     np.testing.assert_allclose(state["north_m"], position(state.index)[:, 0], rtol=1e-6)
 
 
-def test_read_log_clock_restart_keeps_longer_part(tmp_path):
+def test_read_log_with_reboot_keeps_the_longer_part(tmp_path):
     """After a reboot during the log, the longer part is kept."""
     log = make_log("v1.16", 4.0)
     for made in log.topics:
@@ -293,7 +293,7 @@ MISSING_PARTS = {
 
 @pytest.mark.parametrize("value", [np.nan, -np.inf])
 @pytest.mark.parametrize(("name", "field"), MISSING_PARTS)
-def test_read_log_field_never_finite_is_unavailable(tmp_path, name, field, value):
+def test_log_field_without_finite_values_is_unavailable(tmp_path, name, field, value):
     """A part without finite values is unavailable, not zero; other parts stay."""
     log = make_log("v1.16", 2.0)
     log[name][field][:] = value
@@ -306,7 +306,7 @@ def test_read_log_field_never_finite_is_unavailable(tmp_path, name, field, value
 
 
 @pytest.mark.parametrize("value", [7.4e8, -1.1e4])
-def test_read_log_impossible_force_is_dropped(tmp_path, value):
+def test_read_log_drops_impossible_acceleration_sample(tmp_path, value):
     """One such sample made the information matrix of the noises indefinite (found by fuzzing)."""
     log = make_log("v1.16", 10.0)
     log["sensor_combined"]["accelerometer_m_s2"][500, 2] = value
@@ -315,7 +315,7 @@ def test_read_log_impossible_force_is_dropped(tmp_path, value):
     assert flight.imu["down_m_s2"].abs().max() < 10.0
 
 
-def test_read_log_single_nan_samples_are_dropped(tmp_path):
+def test_read_log_drops_single_nan_samples(tmp_path):
     log = make_log("v1.16", 2.0)
     log["sensor_combined"]["accelerometer_m_s2"][[10, 20], 1] = np.nan
     log["vehicle_attitude"]["q"][7, 3] = np.nan
@@ -327,7 +327,7 @@ def test_read_log_single_nan_samples_are_dropped(tmp_path):
 
 @pytest.mark.parametrize("parameter", ["EKF2_EV_DELAY", "EKF2_EVP_GATE"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_read_log_parameter_not_finite_keeps_finite_times(tmp_path, parameter, value):
+def test_read_log_with_non_finite_parameter_keeps_times_finite(tmp_path, parameter, value):
     log = make_log("v1.16", 2.0)
     log.parameters[parameter] = value
     flight = read_and_make_axes(log.write(tmp_path / "made.ulg"))
@@ -349,7 +349,7 @@ def test_read_log_parameter_not_finite_keeps_finite_times(tmp_path, parameter, v
         ("SDLOG_PROFILE", np.inf, "is not a finite number and is not used."),
     ],
 )  # fmt: skip
-def test_parameter_out_of_range_becomes_default_with_note(tmp_path, parameter, value, note):
+def test_px4_parameter_out_of_range_is_replaced_by_default(tmp_path, parameter, value, note):
     log = rich_log()
     log.parameters[parameter] = value
     flight = write_and_read(log, tmp_path)
@@ -361,7 +361,7 @@ def test_parameter_out_of_range_becomes_default_with_note(tmp_path, parameter, v
     assert all(aid.parameters.get(parameter) != value for aid in flight.ekf2.aids.values())
 
 
-def test_parameter_at_float32_end_of_range_is_kept(tmp_path):
+def test_px4_parameter_at_float32_end_of_range_is_kept(tmp_path):
     log = make_log("v1.16", 2.0)
     lowest = float(np.float32(0.01))  # 0.0099999998
     log.parameters |= {"EKF2_EVP_NOISE": lowest, "EKF2_GYR_NOISE": float(np.float32(0.1))}
@@ -371,7 +371,7 @@ def test_parameter_at_float32_end_of_range_is_kept(tmp_path):
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_read_log_up_to_two_samples_per_topic_is_handled(tmp_path, count):
+def test_read_log_with_0_to_2_samples_per_topic_succeeds(tmp_path, count):
     log = make_log("v1.16", 2.0)
     log.topics = [take(made, range(count)) for made in log.topics]
     result = read_or_error(log.write(tmp_path / "made.ulg"))
@@ -411,7 +411,7 @@ def truth_impossible(log: Log) -> None:
     "damage", [flags_at_largest_time, flags_late, one_state, source_frozen, truth_impossible],
     ids=lambda one: one.__name__,
 )  # fmt: skip
-def test_compare_damaged_data_gives_finite_results(tmp_path, damage):
+def test_compare_of_log_with_damaged_values_gives_finite_results(tmp_path, damage):
     """Warnings are errors in these tests."""
     log = make_log("v1.16", 20.0)
     damage(log)
@@ -423,7 +423,7 @@ def test_compare_damaged_data_gives_finite_results(tmp_path, damage):
         assert any(reason in missing.reason for missing in results.missing)
 
 
-def test_ekf2_record_drops_negative_variance(tmp_path):
+def test_read_ekf2_covariance_drops_negative_variance(tmp_path):
     """The square root of a negative variance would be NaN, with a warning."""
     log = make_log("v1.16", 2.0)
     states = log["estimator_states"]
@@ -432,7 +432,7 @@ def test_ekf2_record_drops_negative_variance(tmp_path):
     assert len(write_and_read(log, tmp_path).ekf2.record.delayed) == len(states["timestamp"]) - 1
 
 
-def test_info_aid_with_one_sample_has_no_rate(tmp_path):
+def test_info_command_shows_no_rate_for_a_single_sample(tmp_path):
     log = make_log("v1.16", 20.0)
     name = "estimator_aid_src_ev_hgt"
     log.topics = [take(one, [50]) if one.name == name else one for one in log.topics]
@@ -448,7 +448,7 @@ def test_info_aid_with_one_sample_has_no_rate(tmp_path):
     ("name", "column"),
     [("vehicle_visual_odometry", "position"), ("sensor_combined", "accelerometer_m_s2")],
 )
-def test_commands_impossible_values_print_no_nan(
+def test_commands_on_impossible_log_values_print_no_nan(
     tmp_path, monkeypatch, capsys, name, column, whole, value, command
 ):
     """Warnings of overflow are errors in these tests."""

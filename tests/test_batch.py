@@ -16,17 +16,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import bad_jobs
 import batch_tools
+import failing_jobs
 import jsonschema
 import pandas as pd
 import psutil
 import pytest
+from artificial_batch import DAMAGED, artificial_logs
 from batch_tools import environment, start_dask, tiny_log, tiny_logs
 from class_tools import run_in_turn
 from cli_tools import error_line, run_checked
 from cli_tools import run as run_cli
-from made_up_fleet import DAMAGED, made_up
 from msgspec import structs
 from ulog_tools import gnss_log
 
@@ -115,7 +115,7 @@ def command(*arguments: str | Path) -> Any:
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_batch_table_has_numbers_or_reason_of_each_log(tmp_path):
+def test_batch_table_has_numbers_or_failure_reason_per_log(tmp_path):
     logs = tiny_logs(tmp_path / "logs", 1)
     (logs / "inner").mkdir()
     shutil.copy(logs / "f1.ulg", logs / "inner" / "twin.ulg")
@@ -176,8 +176,8 @@ def test_batch_table_has_numbers_or_reason_of_each_log(tmp_path):
     pd.testing.assert_frame_equal(written, table, rtol=1e-9)
 
 
-def test_batch_terminal_counts_logs_by_failure_reason(capsys):
-    table = made_up(60).fillna({"axis": "", "change": ""})
+def test_batch_summary_counts_logs_by_failure_reason(capsys):
+    table = artificial_logs(60).fillna({"axis": "", "change": ""})
     show(terminal(), format_summary(BatchResult(table, 3, frozenset(), ())).blocks)
     said = " ".join(capsys.readouterr().out.split())
     failed = table[table["status"] == "failed"]
@@ -185,7 +185,7 @@ def test_batch_terminal_counts_logs_by_failure_reason(capsys):
     assert f"60 logs: {(table.drop_duplicates('log')['status'] == 'done').sum()} done" in said
 
 
-def test_batch_csv_missing_numbers_empty_no_formulas(tmp_path):
+def test_batch_csv_leaves_missing_numbers_empty(tmp_path):
     table = make_table([{"name": "=1+1.ulg", "updates": 3, "kf_nis_mean": None}, {"reason": None}])
     assert table["kf_nis_mean"].isna().all()
     assert table["updates"].isna().tolist() == [False, True]
@@ -201,7 +201,7 @@ def test_batch_csv_missing_numbers_empty_no_formulas(tmp_path):
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_batch_log_without_position_is_not_compared(tmp_path):
+def test_batch_log_without_position_has_status_not_compared(tmp_path):
     log = gnss_log("v1.16").write(tmp_path / "a.ulg")
     row = px4fuse.batch(log, tmp_path / "out").loc[0]
     assert (row["status"], row["axis"]) == ("not compared", "")
@@ -214,7 +214,7 @@ def test_batch_log_without_position_is_not_compared(tmp_path):
 
 @pytest.mark.reallogs
 @pytest.mark.usefixtures("in_this_process")
-def test_batch_gnss_flight_has_rows(shared_logs):
+def test_batch_gnss_flight_has_one_table_row_per_axis(shared_logs):
     (log,) = shared_logs.glob("simulated/*no_uwb.ulg")
     table = px4fuse.batch(log)
     assert table["axis"].tolist() == ["aisle", "north", "east"]
@@ -225,7 +225,7 @@ def test_batch_gnss_flight_has_rows(shared_logs):
 
 
 @pytest.mark.usefixtures("remembered", "in_this_process")
-def test_batch_second_run_processes_new_logs_only(flights, tmp_path, monkeypatch):
+def test_batch_second_run_processes_only_new_logs(flights, tmp_path, monkeypatch):
     logs, output = tmp_path / "logs", tmp_path / "out"
     shutil.copytree(flights, logs)
     (logs / "f3.ulg").rename(tmp_path / "f3.ulg")
@@ -257,7 +257,7 @@ def test_batch_second_run_processes_new_logs_only(flights, tmp_path, monkeypatch
 
 
 @pytest.mark.usefixtures("in_this_process")  # the second time
-def test_batch_ctrl_c_keeps_results_and_prints_one_line(flights, undisturbed, tmp_path):
+def test_batch_stopped_by_ctrl_c_keeps_finished_results(flights, undisturbed, tmp_path):
     with running(flights, tmp_path, "--workers", "1", start_new_session=True) as process:
         wait_for_first_result(process, tmp_path)
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does: the workers too
@@ -275,7 +275,7 @@ def test_batch_ctrl_c_keeps_results_and_prints_one_line(flights, undisturbed, tm
 
 
 @pytest.mark.usefixtures("remembered")
-def test_batch_hanging_or_crashing_log_fails_alone(tmp_path, monkeypatch):
+def test_batch_hanging_log_does_not_affect_other_logs(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "analyse", batch_tools.analyse)
     logs = tmp_path / "logs"
     logs.mkdir()
@@ -302,7 +302,7 @@ def analysed(log: Path | str, max_bytes: int = 10**9) -> job.Outcome:
     return contextvars.copy_context().run(job.analyse, work)
 
 
-def test_batch_log_changed_while_read_fails(flights, tmp_path, monkeypatch):
+def test_batch_log_changed_during_reading_is_reported_failed(flights, tmp_path, monkeypatch):
     log = tmp_path / "f.ulg"
     shutil.copy(flights / "f1.ulg", log)
     compared = job._compare_log
@@ -323,7 +323,9 @@ def test_batch_log_changed_while_read_fails(flights, tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("remembered", "in_this_process")
 @pytest.mark.parametrize("ends", [KeyboardInterrupt, OutputError])
-def test_batch_interrupted_run_keeps_results(flights, undisturbed, tmp_path, monkeypatch, ends):
+def test_batch_interrupted_run_reuses_finished_results(
+    flights, undisturbed, tmp_path, monkeypatch, ends
+):
     write_all, written = run.write_all, []
 
     def full(contents: dict[Path, bytes]) -> None:
@@ -347,7 +349,7 @@ def test_batch_interrupted_run_keeps_results(flights, undisturbed, tmp_path, mon
 
 
 @pytest.mark.usefixtures("in_this_process")  # one of them
-def test_batch_two_runs_in_one_folder_keep_tables_valid(tmp_path):
+def test_batch_two_runs_in_one_output_folder_both_succeed(tmp_path):
     """Both runs succeed, and the table is complete."""
     logs, out = tiny_logs(tmp_path / "logs", 3, truth=False), tmp_path / "out"
     with running(logs, out, "--workers", "1") as other:
@@ -363,7 +365,7 @@ def test_batch_two_runs_in_one_folder_keep_tables_valid(tmp_path):
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_batch_invalid_logs_have_one_row_each(tmp_path):
+def test_batch_table_has_one_row_per_invalid_log(tmp_path):
     folder = tmp_path / "logs"
     folder.mkdir()
     for number in range(160):
@@ -376,7 +378,7 @@ def test_batch_invalid_logs_have_one_row_each(tmp_path):
     assert table["reason"].str.len().between(10, 300).all()
 
 
-def test_batch_settings_of_one_flight_are_refused(flights):
+def test_batch_rejects_settings_that_fit_only_one_flight(flights):
     for settings in ({"mavlink": "a.tlog"}, {"sigma": 1.0}, {"sigma_z_m": 0.0}):
         with pytest.raises(SettingsError):
             px4fuse.batch(flights, **settings)
@@ -387,7 +389,7 @@ def test_batch_settings_of_one_flight_are_refused(flights):
 # ------------------------------------------------------------------ search for logs
 
 
-def test_find_logs_in_folders_globs_and_urls(tmp_path, monkeypatch):
+def test_find_logs_accepts_folders_globs_and_urls(tmp_path, monkeypatch):
     import fsspec
 
     monkeypatch.chdir(tmp_path)
@@ -413,7 +415,7 @@ def test_find_logs_in_folders_globs_and_urls(tmp_path, monkeypatch):
 
 
 @pytest.mark.reallogs
-def test_batch_shared_logs_run_completely(shared_logs, tmp_path):
+def test_batch_processes_all_shared_logs_without_exception(shared_logs, tmp_path):
     """All shared logs except those of other tests, two long ones, and second recordings.
 
     test_gnss.py has the GNSS flights; test_flown.py and test_whatif_cli.py have other releases.
@@ -445,7 +447,7 @@ def test_batch_shared_logs_run_completely(shared_logs, tmp_path):
 # ------------------------------------------------------------------ Dask cluster
 
 
-def test_batch_unusable_cluster_prints_one_line(monkeypatch, flights):
+def test_batch_unreachable_cluster_raises_one_line_error(monkeypatch, flights):
     monkeypatch.setattr(engine, "CONNECT_TIMEOUT_S", 0.5)
     for address in ("tcp://127.0.0.1:1", "nonsense://x", ""):
         with (
@@ -467,7 +469,7 @@ def started_worker(address: str, log: Path, path: str) -> Any:
     return start_dask("worker", address, *local, says=says, log=log, PYTHONPATH=path)
 
 
-def test_batch_running_cluster_gives_the_same_table(flights, undisturbed, tmp_path):
+def test_batch_on_dask_cluster_gives_the_same_table(flights, undisturbed, tmp_path):
     """A scheduler and two workers; the scheduler is killed at the end."""
     path = os.pathsep.join((str(batch_tools.REPOSITORY / "tests"), str(batch_tools.REPOSITORY)))
     ports = ("--port", "0", "--dashboard-address", ":0", "--host", "127.0.0.1")
@@ -502,7 +504,7 @@ def assert_failed_job_does_not_affect_others(address):
 
     # jobs that end at once or never: reporting an exception takes seconds of imports
     jobs = [("square", 3), ("unreadable", 0), ("exit", 3), ("hang", 0), ("square", 4)]
-    work = partial(run_bounded, bad_jobs.act, timeout_s=5.0, memory_bytes=2 * 10**9)
+    work = partial(run_bounded, failing_jobs.run_job, timeout_s=5.0, memory_bytes=2 * 10**9)
     expected = [9, "could not be unpickled (ValueError)", "exit code 3", "limit of 5 s", 16]
     with Client(address) as client, connect_cluster() as same:
         assert same is client

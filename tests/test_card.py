@@ -47,7 +47,7 @@ OFFSET = Finding("source_time_offset", "error", "Timestamps are late.", "Subtrac
 NOISE = Finding("sigma_z_too_small", "error", "SIGMA_Z is too small.", "", {})
 
 
-def test_source_fault_is_ranked_before_setting() -> None:
+def test_rank_causes_puts_source_fault_before_wrong_setting() -> None:
     flight = analysis(trial("noises", outcome(1.0, 1.0, 0.1)), trial("time offset", CORRECTED))
     ranked = rank_causes(flight, [NOISE, OFFSET])
     assert [(each.finding.id, each.tier) for each in ranked] == [
@@ -67,11 +67,11 @@ def test_source_fault_is_ranked_before_setting() -> None:
         (outcome(0.3, 1.0, 0.29), "nothing"),  # the ratio against the source gets worse
     ],
 )
-def test_improvement_names_improved_numbers(after, improves) -> None:
+def test_filter_rerun_improvement_names_position_or_sigma(after, improves) -> None:
     assert improvement(trial("noises", after)) == improves
 
 
-def test_fix_that_does_not_help_is_no_action() -> None:
+def test_correction_without_improvement_is_not_recommended() -> None:
     helps, fails = trial("time offset", CORRECTED), trial("delay", FLOWN, owner="ekf2")
     (ranked,) = rank_causes(analysis(helps, fails), [OFFSET])
     cause = make_cause(analysis(helps, fails), ranked, (), REQUEST)
@@ -81,7 +81,7 @@ def test_fix_that_does_not_help_is_no_action() -> None:
     assert rank_causes(analysis(trial("time offset", FLOWN), fails), [OFFSET]) == []
 
 
-def test_time_offset_without_truth_remains_a_cause() -> None:
+def test_diagnosis_keeps_time_offset_cause_without_ground_truth() -> None:
     """Innovations hardly show a time offset, so the re-run cannot refute it."""
     flight = analysis(trial("time offset", outcome(0.98), outcome(1.0)))
     (ranked,) = rank_causes(flight, [OFFSET])
@@ -91,7 +91,7 @@ def test_time_offset_without_truth_remains_a_cause() -> None:
     assert rank_causes(analysis(trial("noises", outcome(0.98), outcome(1.0))), [NOISE]) == []
 
 
-def test_card_of_clean_flight_changes_nothing(sample: Analysis) -> None:
+def test_diagnosis_card_of_clean_flight_advises_no_change(sample: Analysis) -> None:
     card = build_card(sample, (), REQUEST)
     assert (card.severity, card.id, card.causes) == ("clean", "", ())
     assert card.headline == "No fault found: KF and EKF2 are consistent"

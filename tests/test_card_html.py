@@ -30,7 +30,7 @@ def text_of(html: str) -> str:
     return " ".join(unescape(re.sub(r"<[^>]+>", " ", html)).split())
 
 
-def test_card_html_contains_all_fields_of_card() -> None:
+def test_diagnosis_card_html_contains_all_fields() -> None:
     text = text_of(card_html(SMALL_SIGMA_A))
     cause = SMALL_SIGMA_A.causes[0]
     for part in (
@@ -45,7 +45,7 @@ def test_card_html_contains_all_fields_of_card() -> None:
     assert card_html(SMALL_SIGMA_A, has_apply=True).count("data-apply") == 1
 
 
-def test_axis_html_draws_ratios_interval_and_missing_verdict() -> None:
+def test_sigma_ratio_html_plot_shows_ratio_and_interval() -> None:
     four = list(verdicts((21.0, "overconfident"), (0.9, "consistent"), (0.05, "underconfident"),
                          (None, "not evaluated")))  # fmt: skip
     four[1] = structs.replace(four[1], interval=(0.8, 1.2))
@@ -69,14 +69,14 @@ def test_axis_html_draws_ratios_interval_and_missing_verdict() -> None:
     ]
 
 
-def test_explained_verdict_is_not_bold() -> None:
+def test_diagnosis_card_html_explained_verdict_is_not_bold() -> None:
     one = structs.replace(verdicts(*[(2.2, "overconfident")] * 4)[2], is_explained=True)
     html = axis_html([one], "along the aisle")
     assert "loud" not in html
     assert "2.2, overconfident, explained" in html
 
 
-def test_card_html_text_of_logs_is_escaped() -> None:
+def test_diagnosis_card_html_escapes_text_from_logs() -> None:
     cause = structs.replace(
         SMALL_SIGMA_A.causes[0],
         title=HOSTILE,
@@ -100,7 +100,7 @@ def test_card_html_text_of_logs_is_escaped() -> None:
     assert {tag for tag, _ in Elements(html).found} <= allowed
 
 
-def test_refused_card_has_facts_and_no_axis() -> None:
+def test_diagnosis_card_of_rejected_log_has_no_sigma_ratio_plot() -> None:
     card = Card(
         severity="refused",
         id="not_px4",
@@ -115,7 +115,7 @@ def test_refused_card_has_facts_and_no_axis() -> None:
 
 
 @pytest.mark.usefixtures("cached_analyses")
-def test_notebook_displays_card_with_style(sample_log: Path) -> None:
+def test_comparison_in_notebook_displays_diagnosis_card(sample_log: Path) -> None:
     analysis = px4fuse.compare(sample_log)
     html = analysis._repr_html_()
     assert html.startswith("<style>")
@@ -132,7 +132,7 @@ def structs_without_request(analysis: px4fuse.Analysis) -> px4fuse.Analysis:
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1000, "light"), (390, "dark")])
-def test_card_fits_width_and_has_no_axe_violations(
+def test_diagnosis_card_html_fits_phone_and_is_accessible(
     browser: Browser, tmp_path: Path, width: int, scheme: str
 ) -> None:
     file = tmp_path / "card.html"

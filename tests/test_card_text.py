@@ -24,17 +24,17 @@ def text_of(card: Card) -> list[str]:
     ("ratio", "column", "mark"),
     [(1.0, 18, "●"), (0.1, 0, "●"), (10.0, 36, "●"), (0.01, 0, "◀"), (128.0, 36, "▶")],
 )
-def test_axis_text_marks_ratio_at_its_column(ratio, column, mark) -> None:
+def test_sigma_ratio_text_plot_marks_ratio_at_its_column(ratio, column, mark) -> None:
     drawn = axis_text(ratio, "source")
     assert (len(drawn), drawn.index(mark)) == (37, column)
 
 
-def test_axis_text_without_ratio_draws_band_only() -> None:
+def test_sigma_ratio_text_plot_without_ratio_shows_only_band() -> None:
     assert re.fullmatch("─{16}░{5}─{16}", axis_text(None, "source"))
     assert re.fullmatch("─{15}░{7}─{15}", axis_text(None, "truth"))
 
 
-def test_card_text_is_short_and_ends_in_columns() -> None:
+def test_diagnosis_card_text_has_at_most_40_lines() -> None:
     lines = text_of(SMALL_SIGMA_A)
     assert len(lines) <= 40
     assert max(map(len, lines)) <= 100
@@ -44,7 +44,7 @@ def test_card_text_is_short_and_ends_in_columns() -> None:
         assert part in whole
 
 
-def test_alternative_actions_are_either_and_or() -> None:
+def test_diagnosis_card_text_marks_alternatives_either_or() -> None:
     cause = replace(SMALL_SIGMA_A.causes[0], alternatives=((SENDER,), (DELAY,)))
     card = replace(SMALL_SIGMA_A, causes=(cause,))
     lines = text_of(card)
@@ -58,7 +58,7 @@ def test_alternative_actions_are_either_and_or() -> None:
     assert closing.endswith(f"px4fuse explain {card.id}")
 
 
-def test_card_text_on_limited_terminal_is_ascii() -> None:
+def test_diagnosis_card_text_on_ascii_terminal_is_ascii() -> None:
     four = verdicts((0.01, "underconfident"), (128.0, "overconfident"), *[(1.0, "consistent")] * 2)
     text = "\n".join(map(to_ascii, text_of(replace(SMALL_SIGMA_A, verdicts=four))))
     assert text.isascii()
@@ -67,7 +67,7 @@ def test_card_text_on_limited_terminal_is_ascii() -> None:
     assert "<---" in text
 
 
-def test_typed_path_replaces_file_name_in_commands() -> None:
+def test_diagnosis_card_commands_contain_the_typed_path() -> None:
     note = Note("x", "Text of aisle_uwb.ulg.", "Check it (px4fuse sync aisle_uwb.ulg).")
     card = replace(SMALL_SIGMA_A, notes=(note,), do_this=("Run px4fuse tune aisle_uwb.ulg.",))
     typed = with_typed_path(card, "my logs/aisle_uwb.ulg")

@@ -23,12 +23,12 @@ def one(name: str, severity: str = "warning", **evidence: str) -> Finding:
     return Finding(name, severity, f"{name}.", "Do.", evidence)  # type: ignore[arg-type]
 
 
-def test_consequences_name_existing_findings_only() -> None:
+def test_consequences_of_causes_name_only_existing_findings() -> None:
     listed = {name for cause in CONSEQUENCES for name in effect_ids(cause)}
     assert listed | set(CONSEQUENCES) | NOISES | RECORDING <= set(TITLES)
 
 
-def test_consequences_list_inner_causes_first() -> None:
+def test_nested_causes_of_findings_are_listed_inner_first() -> None:
     outer = list(CONSEQUENCES)
     for at, cause in enumerate(outer):
         assert set(effect_ids(cause)) & set(outer) <= set(outer[:at]), cause
@@ -81,24 +81,24 @@ UNDERSTATED, REJECTING = "ekf2_overconfident", "ekf2_rejects_positions"
           ("aid_innovation_bias", "note", None)]),
     ],
 )  # fmt: skip
-def test_group_by_cause_lists_consequences_after_cause(given: Any, told: Any) -> None:
+def test_group_findings_lists_consequences_after_their_cause(given: Any, told: Any) -> None:
     assert [(each.id, each.severity, each.caused_by) for each in group_by_cause(given)] == told
 
 
-def test_verdict_notes_not_white_is_listed(sample: Analysis) -> None:
+def test_consistency_notes_list_innovations_that_are_not_white(sample: Analysis) -> None:
     (white,) = verdict_notes(sample)
     assert format_verdict(sample.axes["aisle"].filters["kf"]) == "consistent"
     assert "Ljung-Box test, p < 0.001" in white
     assert "KF down, lag-1 autocorrelation" in white
 
 
-def test_verdict_notes_consistent_white_axis_is_empty(sample: Analysis) -> None:
+def test_consistency_notes_of_white_innovations_are_empty(sample: Analysis) -> None:
     east = sample.axes["east"]
     fine = replace(east.filters["kf"], ljung_box_p=0.5)
     white = replace(east, filters={**east.filters, "kf": fine})
     assert verdict_notes(replace(sample, axes={"east": white})) == []
 
 
-def test_verdict_notes_drifting_source_is_named(sample: Analysis) -> None:
+def test_consistency_notes_name_a_source_that_may_drift(sample: Analysis) -> None:
     turning = replace(sample.source, origin=replace(sample.source.origin, kind="vio"))
     assert "source may drift" in verdict_notes(replace(sample, source=turning))[0]

@@ -117,7 +117,7 @@ def shape(text: str) -> list[tuple[str, list[str]]]:
     return [(tag, sorted(attributes)) for tag, attributes in Elements(text).found]
 
 
-def test_class_page_matches_golden_file() -> None:
+def test_class_page_matches_reference_file() -> None:
     text = html_text(CLASS, "Class", "px4fuse 1")
     above = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL).splitlines()
     lines = [line for line in above if line.strip() and "sha256" not in line]
@@ -126,7 +126,7 @@ def test_class_page_matches_golden_file() -> None:
 
 
 @given(text=st.text(max_size=60) | st.sampled_from([MARKUP, BREAKOUT, "\0\x1b\ud800", "$title"]))
-def test_class_page_any_text_adds_no_html_elements(text: str) -> None:
+def test_class_page_student_text_adds_no_html_elements(text: str) -> None:
     def page(word: str) -> str:
         one = row(
             word, 5.0, id=word, file=f"{word}.pdf", flags=(word,), reasons=(word,),
@@ -142,7 +142,7 @@ def test_class_page_any_text_adds_no_html_elements(text: str) -> None:
     assert shape(made) == shape(page("x" if text else ""))
 
 
-def test_class_page_pending_points_are_not_averaged() -> None:
+def test_class_page_average_excludes_pending_points() -> None:
     said = {"Notes": Override(9.0, "Good.")}
     entries = [row("Ada", 10.0, late_s=61), row("Bo", 20.0),
                row("Cy", 12.0, pending_action="Run 0.1.1."),
@@ -158,7 +158,7 @@ def test_class_page_pending_points_are_not_averaged() -> None:
                          ["13 / 20", 13.0, "set by instructor", "", 0.65]]  # fmt: skip
 
 
-def test_class_page_limits_long_text_and_omits_nan() -> None:
+def test_class_page_shortens_long_text_and_omits_nan() -> None:
     odd = row("x" * 10**6, 3.0, notes="y" * 10**6, numbers={"NIS": float("nan")})
     text = html_text([odd], "Class", "px4fuse 1")
     assert "nan" not in text.lower().split("<script>")[0]
@@ -199,7 +199,7 @@ def anonymous_class() -> list[Entry]:
     return entries
 
 
-def test_class_page_anonymous_contains_no_names() -> None:
+def test_class_page_in_anonymous_mode_contains_no_names() -> None:
     text = html_text(anonymous_class(), "Class", "px4fuse 1")
     written = unicodedata.normalize("NFC", text + json.dumps(content(text), ensure_ascii=False))
     for name, student_id, file in PEOPLE:
@@ -232,7 +232,7 @@ HEADS = ("Student", "Id", "Status", "Points", "Handed in", "Flags", "Pages", "No
          "mean NIS", MARKUP)  # fmt: skip
 
 
-def test_class_page_filters_by_text_and_status(page: Browser) -> None:
+def test_class_page_filters_reports_by_text_and_status(page: Browser) -> None:
     count = "document.querySelector('.count').textContent"
     assert page.ask(count) == f"Showing {len(CLASS)} of {len(CLASS)}"
     page.click("#text")
@@ -254,7 +254,7 @@ def test_class_page_filters_by_text_and_status(page: Browser) -> None:
     assert page.complaints() == []
 
 
-def test_class_page_row_opens_report_details(page: Browser) -> None:
+def test_class_page_click_on_row_opens_report_details(page: Browser) -> None:
     assert page.ask("[...document.querySelectorAll('.bar')].every((one) => one.ariaHidden)")
     assert page.ask("document.querySelector('tr:first-child .bar').closest('td').innerText") == (
         "18.5 / 20"
@@ -274,7 +274,7 @@ def test_class_page_row_opens_report_details(page: Browser) -> None:
     assert page.requests() <= {"file", "data"}
 
 
-def test_class_page_keys_step_through_reports(page: Browser) -> None:
+def test_class_page_keyboard_steps_through_reports(page: Browser) -> None:
     opened = "[...document.querySelectorAll('tr.open .name')].map((name) => name.textContent)"
     for key, name in (("j", "Zoë"), ("n", "ada"), ("j", "Émile"), ("k", "ada"), ("p", "Zoë")):
         page.press(key, key)
@@ -288,7 +288,7 @@ def test_class_page_keys_step_through_reports(page: Browser) -> None:
     assert page.ask(opened) == []
 
 
-def test_class_page_redrawn_report_is_linked() -> None:
+def test_class_page_links_the_redrawn_report() -> None:
     one = row("Zoë", 18.5, redrawn_path="reports/1.pdf", pages=(PageDifference(1, "a word"),))
     made = content(html_text([one, row("Bo", 1.0)], "Class", "px4fuse 1"))
     (leads,) = (part for part in made["rows"][0][3] if part[0] == "links")
@@ -296,7 +296,7 @@ def test_class_page_redrawn_report_is_linked() -> None:
     assert made["rows"][1][3] == []
 
 
-def test_count_tenths_returns_counts_and_lower_edges() -> None:
+def test_points_histogram_returns_counts_and_lower_edges() -> None:
     assert count_tenths([0, 5, 5.5, 9, 99], 10) == [
         (count, f"{edge}") for edge, count in enumerate((1, 0, 0, 0, 0, 2, 0, 0, 0, 2))
     ]
@@ -325,7 +325,7 @@ def test_class_page_student_markup_is_shown_as_text(page: Browser) -> None:
     assert page.requests() <= {"file", "data"}
 
 
-def test_class_page_policy_blocks_images_and_requests(page: Browser) -> None:
+def test_class_page_content_policy_blocks_images_and_requests(page: Browser) -> None:
     page.ask(
         "document.body.insertAdjacentHTML('beforeend',"
         ' \'<img src="http://127.0.0.1:9/x.png" onerror="window.alive=3">\')'
@@ -352,7 +352,7 @@ def test_class_page_print_repeats_table_header(browser: Browser, tmp_path: Path)
     assert "Student 129" in "".join(pages)
 
 
-def test_class_page_points_and_comments_download_as_csv(page: Browser) -> None:
+def test_class_page_downloads_points_and_comments_as_csv(page: Browser) -> None:
     page.ask("URL.createObjectURL = (one) => { window.table = one.text(); return '#'; }; 0")
     assert not page.ask("document.querySelector('#save').checkVisibility()")
     page.ask("document.querySelector('.list > tbody > tr .unfold').click()")

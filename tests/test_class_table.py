@@ -63,7 +63,7 @@ def may_be_formula(cell: str) -> bool:
 
 
 @given(texts)
-def test_csv_text_any_delimiter_has_no_formula_cell(text: str) -> None:
+def test_class_table_csv_has_no_formula_cell_for_any_delimiter(text: str) -> None:
     made = csv_text([graded(text, {text: -3.25})])
     made.encode()
     for delimiter in (",", ";", "\t"):
@@ -74,7 +74,7 @@ def test_csv_text_any_delimiter_has_no_formula_cell(text: str) -> None:
 
 
 @given(st.lists(st.tuples(texts, st.dictionaries(texts, finite, max_size=3)), max_size=4))
-def test_csv_text_is_read_back_as_neutralised_values(
+def test_class_table_csv_read_again_gives_formula_safe_values(
     rows: list[tuple[str, dict[str, float]]],
 ) -> None:
     head, *rest = cells(csv_text([graded(text, numbers) for text, numbers in rows]))
@@ -110,13 +110,13 @@ def test_csv_text_is_read_back_as_neutralised_values(
 
 
 @given(texts)
-def test_neutralise_formulas_twice_equals_once(text: str) -> None:
+def test_neutralise_csv_formulas_twice_equals_once(text: str) -> None:
     once = neutralise_formulas(text)
     assert neutralise_formulas(once).replace("'", "") == once.replace("'", "")
     assert not may_be_formula(once)
 
 
-def test_neutralise_formulas_changes_formulas_only() -> None:
+def test_neutralise_csv_formulas_changes_only_formulas() -> None:
     for text in DANGEROUS:
         assert neutralise_formulas(text) != text
         assert not may_be_formula(neutralise_formulas(text)), text
@@ -126,7 +126,7 @@ def test_neutralise_formulas_changes_formulas_only() -> None:
         assert neutralise_id(text) == text
 
 
-def test_csv_text_has_bom_and_crlf() -> None:
+def test_class_table_csv_begins_with_bom_and_has_crlf_line_ends() -> None:
     made = csv_text([graded("Zoë 李雷", {"NIS": float("nan")}, points=0.1 + 0.2)])
     assert made.encode().startswith(b"\xef\xbb\xbffile,student,")
     assert made.count("\r\n") == made.count("\n") == 2
@@ -134,7 +134,7 @@ def test_csv_text_has_bom_and_crlf() -> None:
     assert row[len(FIRST_COLUMNS) : -len(LAST_COLUMNS)] == ["0.3", ""]
 
 
-def test_csv_text_lists_late_pending_and_missing() -> None:
+def test_class_table_csv_lists_late_and_missing_students() -> None:
     one = GradedReport("a.pdf", "A", "1", VERIFIED, (Item("notes", 1.5, 2.0, ""),))
     late = entry(one, late_s=5400.0, deduction=0.4, total=1.1, comment="see me")
     pending = entry(replace(one, pending_action="Run 0.1.1."), total=None)

@@ -19,7 +19,7 @@ from px4fuse.results.contract import schema
 pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 
-def test_libraries_use_one_thread_unless_set_by_user(monkeypatch, capsys):
+def test_numeric_libraries_use_one_thread_unless_user_sets_it(monkeypatch, capsys):
     """With more threads, tune takes twice the CPU time and the same wall time."""
     environment = {"OPENBLAS_NUM_THREADS": "3"}
     monkeypatch.setattr(os, "environ", environment)
@@ -48,7 +48,7 @@ def report(tmp_path_factory, sample_log) -> tuple[Path, str]:
     return folder, result.output
 
 
-def test_compare_report_attaches_results_without_paths(report):
+def test_compare_report_attaches_results_json_without_paths(report):
     folder, said = report
     assert sorted(p.name for p in folder.iterdir()) == ["notes.md", "report.json", "report.pdf"]
     assert "warning[kf_underconfident]: KF is underconfident along the aisle" in said
@@ -62,7 +62,7 @@ def test_compare_report_attaches_results_without_paths(report):
     assert results["settings"]["sigma_z_m"] == 0.12
 
 
-def test_compare_report_prints_special_characters(report):
+def test_compare_report_prints_special_characters_of_student(report):
     pages = [page.extract_text() for page in pypdf.PdfReader(report[0] / "report.pdf").pages]
     assert "Ana $x$ Müller" in pages[0]
     assert "Costs $5 and x^2 or \\frac{1}{2}; bold, under, tag." in "\n".join(pages)
@@ -71,13 +71,13 @@ def test_compare_report_prints_special_characters(report):
 
 @pytest.mark.usefixtures("no_drawing")
 @pytest.mark.parametrize(("severity", "code"), [("note", 1), ("warning", 1), ("error", 0)])
-def test_compare_fail_on_sets_exit_code(tmp_path, sample_log, severity, code):
+def test_compare_fail_on_severity_sets_exit_code(tmp_path, sample_log, severity, code):
     command = "compare", sample_log, "-o", tmp_path / "a.pdf", "--fail-on", severity
     run_checked(*command, "--sigma-z", "0.12", code=code)  # the finding is a warning
     run_checked(*command, code=0)  # the flight has no finding
 
 
-def test_help_imports_no_slow_library():
+def test_help_command_does_not_import_slow_libraries():
     """--help is fast only without the imports of pandas, matplotlib and scipy."""
     code = (
         "import sys\n"
@@ -93,7 +93,7 @@ def test_help_imports_no_slow_library():
     assert "compare" in finished.stdout
 
 
-def test_compare_accepts_invalid_bytes_and_long_student_id(tmp_path, sample_log):
+def test_compare_accepts_invalid_bytes_in_student_name(tmp_path, sample_log):
     part = "--axis", "north", "--start", "20", "--end", "40"
     own = "--student", "bad\udcff", "--id", "9" * 10_000
     run_checked("compare", sample_log, *part, "-o", tmp_path / "r.pdf", *own)
@@ -114,7 +114,7 @@ def samples_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("samples_installed")
-def test_sample_writes_logs_and_prints_next_command() -> None:
+def test_sample_command_writes_logs_and_prints_next_command() -> None:
     assert run_checked("sample").output.splitlines()[0].split(maxsplit=1) == [
         "Run", f"px4fuse compare {Path('sample_logs') / 'aisle_uwb.ulg'}"
     ]  # fmt: skip
@@ -125,7 +125,7 @@ def test_sample_writes_logs_and_prints_next_command() -> None:
 
 
 @pytest.mark.usefixtures("samples_installed")
-def test_sample_existing_other_file_is_refused() -> None:
+def test_sample_command_does_not_overwrite_other_file() -> None:
     Path("flights").mkdir()
     Path("flights/loop_slam.tum").write_text("mine")
     said = error_line("sample", "-o", "flights")
@@ -133,13 +133,13 @@ def test_sample_existing_other_file_is_refused() -> None:
     assert contents(Path("flights")) == {"loop_slam.tum": b"mine"}
 
 
-def test_sample_without_package_prints_install_command(monkeypatch) -> None:
+def test_sample_command_without_package_advises_pip_install(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "px4fuse_samples", None)
     assert 'not installed. Run pip install "px4fuse[samples]".' in error_line("sample")
 
 
 @pytest.mark.parametrize(("words", "loaded"), [("info", False), ("extract -o out", True)])
-def test_commands_without_tables_do_not_import_pyarrow(words, loaded, sample_log, tmp_path):
+def test_commands_that_write_no_table_do_not_import_pyarrow(words, loaded, sample_log, tmp_path):
     """Run in a new process, as the modules are loaded in this one."""
     typed = [*words.split(), str(sample_log)]
     script = (
@@ -152,7 +152,7 @@ def test_commands_without_tables_do_not_import_pyarrow(words, loaded, sample_log
     assert finished.stdout.splitlines()[-1] == f"pyarrow {loaded} False"
 
 
-def test_commands_legacy_code_page_open_files_as_utf8(tmp_path: Path) -> None:
+def test_commands_on_windows_code_page_open_files_as_utf8(tmp_path: Path) -> None:
     """Use the Western code page of a Windows console and a locale with a decimal comma."""
     (tmp_path / "l.ulg").write_bytes(tiny_log(1))
     typed = [

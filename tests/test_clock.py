@@ -88,7 +88,7 @@ def level_signals(
     return make_signals(imu, attitude_table(time, spoiled), (0.5, 19.0))
 
 
-def test_sensitivities_level_vehicle_at_rest_match_theory() -> None:
+def test_imu_error_sensitivities_at_rest_equal_closed_form() -> None:
     signals = level_signals()
     t, g = signals.time_s - signals.time_s[0], GRAVITY[2]
     _, speed, value = np.moveaxis(signals.table, 1, 0)
@@ -105,7 +105,7 @@ def test_sensitivities_level_vehicle_at_rest_match_theory() -> None:
     np.testing.assert_allclose(value[:, :, 7:10], np.tile(-np.eye(3), (len(t), 1, 1)), atol=1e-12)
 
 
-def test_integrated_imu_constant_yaw_rate_gives_a_circle() -> None:
+def test_imu_integration_at_constant_yaw_rate_gives_a_circle() -> None:
     """Yaw rate ω with a body acceleration s to the right: a = s (-sin ωt, cos ωt)."""
     omega, sideways = 0.5, 2.0
     signals = level_signals((0.0, sideways, 0.0), turn=omega, interval=0.004)
@@ -117,7 +117,7 @@ def test_integrated_imu_constant_yaw_rate_gives_a_circle() -> None:
     np.testing.assert_allclose(signals.table[:, 1, :2, 0], speed, atol=1e-4)
 
 
-def test_motion_increments_equal_constant_acceleration() -> None:
+def test_motion_increments_equal_those_of_constant_acceleration() -> None:
     """Sideways acceleration s over dt gives s dt²/2 and s dt at every offset in each stretch."""
     time, stamps = np.arange(0.0, 80.0, 0.01), np.arange(0.0, 80.0, 0.25)
     still = np.zeros((len(time), 3))
@@ -270,7 +270,7 @@ def test_time_offset_likelihood_equals_joint_normal_density(exact_imu) -> None:
 # --- profiles and parts ---
 
 
-def test_clock_parabola_gives_vertex_sigma_interval() -> None:
+def test_time_offset_parabola_gives_vertex_sigma_and_interval() -> None:
     grid = np.linspace(-0.1, 0.3, 41)
     drop = (grid - 0.123) ** 2 / (2.0 * 0.03**2)
     assert time_offset._minimum_and_sigma(grid, drop) == pytest.approx((0.123, 0.03))
@@ -289,7 +289,9 @@ def test_clock_parabola_gives_vertex_sigma_interval() -> None:
 
 @pytest.mark.parametrize("offset_s", [0.0, -0.2, -0.21, 0.333])
 @pytest.mark.parametrize("factor", [1.0, 2.5])
-def test_time_offset_of_parts_follows_their_likelihood(monkeypatch, offset_s, factor) -> None:
+def test_time_offset_of_flight_parts_follows_their_likelihood(
+    monkeypatch, offset_s, factor
+) -> None:
     """Use parabolas as profiles of the parts."""
     shift, sigma = np.array([-0.05, 0.025, 0.0, 0.0]), np.array([0.03, 0.02, 0.03, 0.5])
 
@@ -315,7 +317,7 @@ def test_time_offset_of_parts_follows_their_likelihood(monkeypatch, offset_s, fa
     assert p == pytest.approx(chi2.sf(ratio, 2), abs=0.03)
 
 
-def test_variance_inflation_simulates_imu_and_source_noise(monkeypatch) -> None:
+def test_simulated_imu_and_source_noise_has_given_variance(monkeypatch) -> None:
     """Increments and measurements have the variance of the noises; velocities match."""
     given: list[Array] = []
 
@@ -353,7 +355,7 @@ def test_variance_inflation_simulates_imu_and_source_noise(monkeypatch) -> None:
 SEEDS = 12
 
 
-def test_clock_interval_contains_true_offset_95_percent() -> None:
+def test_time_offset_95_percent_interval_covers_the_truth() -> None:
     """12 seeds with random offsets; the estimates are also unbiased."""
     inside, normalised = [], []
     for seed in range(SEEDS):
@@ -371,7 +373,7 @@ def test_clock_interval_contains_true_offset_95_percent() -> None:
     assert 0.6 < np.std(normalised) < 1.4
 
 
-def test_clock_insufficient_data_gives_reason() -> None:
+def test_time_offset_from_insufficient_data_states_reason() -> None:
     hovering = estimate(made_flight(3, moving=0.0)[0])
     assert not hovering.is_determinable
     assert "too little acceleration" in hovering.reason
@@ -387,7 +389,7 @@ def test_clock_insufficient_data_gives_reason() -> None:
     assert "at least 30" in short.reason
 
 
-def test_clock_jump_and_drift_are_found_in_parts() -> None:
+def test_clock_jump_and_drift_are_found_from_flight_parts() -> None:
     found = estimate(made_flight(4, duration_s=120.0, jump_s=-0.25)[0])
     assert found.change_p_value < MAX_CHANGE_P
     for part in found.parts:
@@ -402,7 +404,7 @@ def test_clock_jump_and_drift_are_found_in_parts() -> None:
 
 
 @pytest.mark.parametrize("hole_s", [0.0, 1.0])
-def test_clock_constant_offset_shows_no_change(hole_s: float) -> None:
+def test_constant_time_offset_shows_no_significant_change(hole_s: float) -> None:
     found = estimate(made_flight(5, duration_s=100.0, offset_s=-0.2, hole_s=hole_s)[0])
     assert len(found.parts) == 4
     assert found.change_p_value > 0.01
@@ -411,7 +413,7 @@ def test_clock_constant_offset_shows_no_change(hole_s: float) -> None:
     assert not hole_s or not any(part.start_s < 50.5 < part.end_s for part in found.parts)
 
 
-def test_clock_excludes_outliers_and_keeps_applied_offset() -> None:
+def test_time_offset_estimate_excludes_position_outliers() -> None:
     flight, outlier = made_flight(8, offset_s=-0.2, outliers=12)
     inside = flight.positions[0].samples.index.to_numpy()[outlier]
     tuning, found = estimate_noises_and_clock(compare(flight, SETTINGS))
@@ -426,7 +428,7 @@ def test_clock_excludes_outliers_and_keeps_applied_offset() -> None:
     assert clock_advice(compared, found)["Offset"].startswith("-0.")
 
 
-def test_largest_step_p_value_equals_bonferroni_t_test() -> None:
+def test_time_offset_step_p_value_equals_bonferroni_t_test() -> None:
     """Compare with scipy's two-sample t for equal weights and a scatter above the stated σ."""
     offset = np.array([0.0, 0.03, -0.02, 0.01, 0.2, 0.24, 0.19, 0.22, 0.2])
     weight = np.full(len(offset), 1e6)
@@ -476,12 +478,12 @@ def stated(
         (LOGGED_BY_EKF2, True),
     ],
 )
-def test_origin_vision_with_orientation_may_drift(origin, drifts) -> None:
+def test_vision_source_with_orientation_is_marked_as_drifting(origin, drifts) -> None:
     assert with_orientation(origin, turns=True).may_drift is drifts
     assert not with_orientation(origin, turns=False).may_drift
 
 
-def test_widen_for_drift_scatter_widens_interval() -> None:
+def test_time_offset_interval_is_widened_by_scatter_of_parts() -> None:
     """Offsets of parts as measured on a VIO with correct timestamps."""
     scattered = stated(-0.013, 0.019, 0.076, 0.031, 0.082, 0.107, -0.077, 0.012, -0.007, -0.024)
     found = widen_for_drift(scattered)
@@ -493,12 +495,12 @@ def test_widen_for_drift_scatter_widens_interval() -> None:
     assert found.is_determinable
 
 
-def test_widen_for_drift_small_scatter_keeps_interval() -> None:
+def test_time_offset_interval_is_kept_at_small_scatter_of_parts() -> None:
     found = widen_for_drift(stated(0.01, -0.01, 0.015, -0.02, 0.0))
     assert (found.interval_s, found.sigma_s) == (pytest.approx((-0.021, 0.019)), 0.01)
 
 
-def test_widen_for_drift_keeps_jump_and_rejects_wide_interval() -> None:
+def test_time_offset_with_too_wide_interval_is_undetermined() -> None:
     step = widen_for_drift(stated(-0.41, -0.36, 0.03, -0.04, 0.02, 0.05, -0.03, 0.0))
     assert step.change_p_value < 1e-3
     wide = widen_for_drift(replace(stated(-0.4, 0.4, -0.3, 0.3), interval_s=(-0.05, 0.05)))

@@ -17,7 +17,9 @@ COORDINATE = st.floats(-50.0, 50.0)
 
 
 @given(st.lists(st.tuples(COORDINATE, COORDINATE), min_size=3, max_size=30, unique=True))
-def test_distribute_by_distance_equals_lesson_code(odom: list[tuple[float, float]]) -> None:
+def test_loop_error_distributed_by_distance_equals_lesson_code(
+    odom: list[tuple[float, float]],
+) -> None:
     err = (odom[-1][0] - odom[0][0], odom[-1][1] - odom[0][1])
     seg = [math.dist(a, b) for a, b in itertools.pairwise(odom)]
     cum = [0.0]
@@ -36,7 +38,7 @@ def trajectory(position: np.ndarray, rotation: Rotation | None) -> Trajectory:
     return Trajectory("flight", "vio", time, position, rotation, "FRD")
 
 
-def test_correct_by_distance_removes_linear_heading_drift() -> None:
+def test_loop_correction_removes_linear_heading_drift() -> None:
     position, rotation = square(100, 20.0)
     distance = cumulative_distance(position)
     share = distance / distance[-1]
@@ -56,7 +58,7 @@ def test_correct_by_distance_removes_linear_heading_drift() -> None:
     assert np.max(np.linalg.norm(sheared - position, axis=1)) > 0.3
 
 
-def test_key_frames_path_length_excludes_noise() -> None:
+def test_key_frame_path_length_excludes_position_noise() -> None:
     position, _ = square(600, 20.0)  # 80 m, 3.3 cm a step
     noisy = position + np.random.default_rng(1).normal(0.0, 0.02, position.shape)
     frames = closure.choose_key_frames(noisy, closure.default_key_frame_spacing_m(noisy))
@@ -67,13 +69,13 @@ def test_key_frames_path_length_excludes_noise() -> None:
 
 
 @given(st.floats(-3.1, 3.1), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
-def test_heading_change_is_rotation_about_vertical(yaw: float, x: float, y: float) -> None:
+def test_heading_change_equals_rotation_about_vertical(yaw: float, x: float, y: float) -> None:
     tilt = Rotation.from_rotvec([x, y, 0.0])
     turn = Rotation.from_rotvec([0.0, 0.0, yaw])
     assert abs(closure.heading_change_rad(turn * tilt) - yaw) < 1e-9
 
 
-def test_to_z_down_camera_frame_becomes_frd() -> None:
+def test_convert_camera_frame_to_z_down_gives_frd() -> None:
     # one metre ahead, two to the right, three up of the first camera, looking right
     position = np.array([[0.0, 0.0, 0.0], [2.0, -3.0, 1.0], [2.0, -3.0, 1.5]])
     looking_right = Rotation.from_rotvec([0.0, np.pi / 2, 0.0])  # about the camera's y, down
@@ -86,7 +88,7 @@ def test_to_z_down_camera_frame_becomes_frd() -> None:
     np.testing.assert_allclose(nose, [0.0, 1.0, 0.0], atol=1e-12)
 
 
-def test_to_z_down_enu_becomes_ned() -> None:
+def test_convert_enu_to_z_down_gives_ned() -> None:
     position = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0], [1.0, 2.0, 4.0]])
     given = Trajectory("m", "truth", np.arange(3.0), position, None, "ENU")
     found = closure.to_z_down(replace(given, position_variance_m2=position**2))

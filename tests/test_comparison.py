@@ -58,7 +58,7 @@ def true_errors(flight: Flight, frame: pd.DataFrame, column: str) -> Array:
 
 
 class TestSample:
-    def test_nis_mean_equals_logged_test_ratio(self, sample, sample_flight) -> None:
+    def test_ekf2_mean_nis_equals_logged_test_ratios(self, sample, sample_flight) -> None:
         """PX4 logs the test ratio ν² / (gate² S) with the opposite sign of ν."""
         segment = sample.segment
         for name in ("north", "east"):
@@ -71,7 +71,9 @@ class TestSample:
             nis = ours["innovation_m"] ** 2 / ours["innovation_variance_m2"]
             assert kf.nis_mean == pytest.approx(nis.mean(), rel=1e-12)
 
-    def test_ekf2_errors_equal_those_of_its_topics(self, sample, sample_flight) -> None:
+    def test_ekf2_errors_equal_those_computed_from_logged_topics(
+        self, sample, sample_flight
+    ) -> None:
         start, end = sample.segment.start_s, sample.segment.end_s
         state = sample_flight.ekf2.state.loc[start:end]
         for name in ("north", "east"):
@@ -91,7 +93,9 @@ class TestSample:
                 reported = np.interp(error.index, column.index, column, np.nan, np.nan)
                 assert nees == pytest.approx(np.nanmean(error**2 / reported))
 
-    def test_horizon_contains_position_before_update(self, sample, sample_flight, sample_log):
+    def test_ekf2_delayed_state_equals_position_before_update(
+        self, sample, sample_flight, sample_log
+    ):
         """Published positions include the output predictor's lag, which no variance contains."""
         (met,) = ULog(str(sample_log), ["estimator_aid_src_ev_pos"]).data_list
         at = met.data["timestamp_sample"] * 1e-6 - sample_flight.log.boot_time_s
@@ -107,7 +111,7 @@ class TestSample:
             np.testing.assert_allclose(horizon["position_m"], observed + state_minus, atol=1e-9)
             np.testing.assert_allclose(horizon["position_variance_m2"], s - r, rtol=1e-9)
 
-    def test_kf_errors_use_predictions_at_ekf2_times(self, sample, sample_flight):
+    def test_kf_errors_are_computed_at_ekf2_timestamps(self, sample, sample_flight):
         for name in ("north", "east"):
             result = sample[name]
             times = ekf2_times_within(result)
@@ -122,7 +126,7 @@ class TestSample:
             assert found.nees_velocity_mean == pytest.approx(np.mean(ev**2 / vv), rel=1e-9)
 
 
-def test_compare_source_kind_sets_drift_and_gnss_flags(sample_flight: Flight) -> None:
+def test_position_source_kind_sets_drift_and_gnss_flags(sample_flight: Flight) -> None:
     plain = compare(sample_flight)
     for kind, drifts, slow in (
         ("uwb", False, False), ("vio", True, False), ("mocap", False, False), ("gnss", False, True),
@@ -138,11 +142,11 @@ def test_compare_source_kind_sets_drift_and_gnss_flags(sample_flight: Flight) ->
 
 class TestMadeFlight:
     @pytest.mark.parametrize("nis", [0.01, 1.0, 20.0])
-    def test_ekf2_sigma_ratio_equals_simulated_one(self, nis: float) -> None:
+    def test_ekf2_sigma_ratio_equals_simulated_ratio(self, nis: float) -> None:
         comparison = compare(aisle_flight(ekf2=Estimator(nis=nis)))
         assert comparison.horizontal.get("ekf2").sigma_ratio == pytest.approx(nis**0.5, rel=0.05)
 
-    def test_ekf2_errors_and_sigmas_equal_simulated_ones(self, made: Comparison) -> None:
+    def test_ekf2_errors_and_sigmas_equal_simulated_values(self, made: Comparison) -> None:
         """P⁻ = S - R and P⁺ = P⁻R/S, with P⁻ = (0.06 m)² and R = (0.10 m)²."""
         for result in made.axes.values():
             ekf2 = result.filters["ekf2"]
@@ -155,7 +159,7 @@ class TestMadeFlight:
             around = ekf2.sigma_p_before_update_m, ekf2.sigma_p_after_update_m
             assert around == pytest.approx((0.06, 0.06 * 0.10 / np.hypot(0.06, 0.10)))
 
-    def test_difference_is_kf_minus_ekf2_at_ekf2_times(self, made: Comparison) -> None:
+    def test_position_difference_is_kf_minus_ekf2_at_ekf2_times(self, made: Comparison) -> None:
         for result in made.axes.values():
             times = ekf2_times_within(result)
             p, v, *_ = predicted(result, times)
@@ -166,7 +170,7 @@ class TestMadeFlight:
             expected = [each(values) for values in (dp, dv) for each in statistics]
             assert list(asdict(result.difference).values())[1:] == pytest.approx(expected)
 
-    def test_nees_is_independent_of_dt(self) -> None:
+    def test_kf_nees_does_not_depend_on_dt(self) -> None:
         """Variance and error have the same time, also between two steps."""
         flight = aisle_flight(uwb=Uwb(rate_hz=1.0))
         fine, coarse = (
@@ -177,7 +181,9 @@ class TestMadeFlight:
         assert other == pytest.approx(one, rel=0.1)
 
     @pytest.mark.parametrize(("heading", "name"), [(0.0, "north"), (90.0, "east")])
-    def test_aisle_with_cardinal_heading_equals_that_axis(self, made, heading, name) -> None:
+    def test_aisle_axis_with_north_or_east_heading_equals_that_axis(
+        self, made, heading, name
+    ) -> None:
         aisle = compare(made.flight, axes=("aisle",), heading_deg=heading).main
         same = made[name]
         assert asdict(aisle.difference) == pytest.approx(asdict(same.difference))
@@ -187,7 +193,7 @@ class TestMadeFlight:
             assert one.nis_mean == pytest.approx(other.nis_mean)
             assert one.sigma_p_after_update_m == pytest.approx(other.sigma_p_after_update_m)
 
-    def test_compare_uses_settings_and_segment(self, made: Comparison) -> None:
+    def test_compare_uses_given_settings_start_and_end(self, made: Comparison) -> None:
         chosen = Settings(sigma_z_m=0.3, clock_offset_s=0.05)
         run = compare(made.flight, chosen, start_s=20.0, end_s=50.0).main.replay
         assert run.settings == chosen
@@ -198,7 +204,7 @@ class TestMadeFlight:
 
 
 class TestMissingParts:
-    def test_compare_without_ekf2_has_kf_and_reasons(self) -> None:
+    def test_compare_without_ekf2_evaluates_kf_and_states_reason(self) -> None:
         comparison = compare(aisle_flight(ekf2=None))
         assert comparison.horizontal.get("kf").verdict == "consistent"
         assert comparison.horizontal.get("ekf2") is None
@@ -226,14 +232,14 @@ class TestMissingParts:
         with pytest.raises(SettingsError, match="`input` imu"):
             prepare(flight, input_required=True)
 
-    def test_compare_without_variances_has_rmse_but_no_nees(self) -> None:
+    def test_compare_without_ekf2_variances_has_rmse_but_no_nees(self) -> None:
         for result in compare(aisle_flight(ekf2=Estimator(variance_logged=False))).axes.values():
             assert isinstance(result.ekf2_variance, Unavailable)
             assert result.filters["ekf2"].sigma_p_median_m is None
             assert result.filters["ekf2"].truth.nees_position_mean is None
             assert result.filters["ekf2"].truth.position_rmse_m == pytest.approx(0.05, rel=0.06)
 
-    def test_compare_without_innovations_has_no_ekf2_verdict(self) -> None:
+    def test_compare_without_ekf2_innovations_has_no_ekf2_verdict(self) -> None:
         comparison = compare(aisle_flight(ekf2=Estimator(innovations_logged=False)))
         assert comparison.horizontal.get("ekf2") is None
         for result in comparison.axes.values():
@@ -241,7 +247,7 @@ class TestMissingParts:
             assert result.filters["ekf2"].sigma_p_before_update_m is None
             assert isinstance(result.difference, Difference)
 
-    def test_compare_short_truth_uses_interpolated_variance(self, made: Comparison) -> None:
+    def test_compare_with_short_ground_truth_interpolates_variance(self, made: Comparison) -> None:
         """EKF2's variances are logged at 1 Hz: none is within these 0.8 s of ground truth."""
         samples = made.flight.truth.samples.loc[40.1:40.9]
         flight = replace(made.flight, truth=Truth("0.8 s", samples))
@@ -253,7 +259,7 @@ class TestMissingParts:
             truth.position_rmse_m**2 / np.interp(40.5, variance.index, variance), rel=0.1
         )
 
-    def test_horizontal_nis_uses_common_updates_only(self) -> None:
+    def test_horizontal_nis_uses_only_updates_common_to_both_axes(self) -> None:
         flight = aisle_flight(ekf2=Estimator(nis=0.5))
         innovations = flight.ekf2.innovations
         north, east = innovations["north"], innovations["east"].iloc[100:]
@@ -266,14 +272,14 @@ class TestMissingParts:
 
 
 class TestRobustness:
-    def test_compare_frame_reset_is_removed_and_noted(self, made: Comparison) -> None:
+    def test_compare_removes_and_notes_ekf2_frame_reset(self, made: Comparison) -> None:
         reset = Reset(60.0, "position", (5.0, -3.0, 0.0))
         comparison = compare(aisle_flight(ekf2=Estimator(resets=(reset,))))
         assert any("resets removed: 1 of horizontal position" in note for note in comparison.notes)
         for result, same in zip(comparison.axes.values(), made.axes.values(), strict=True):
             assert asdict(result.difference) == pytest.approx(asdict(same.difference))
 
-    def test_compare_leaves_flight_unchanged(self) -> None:
+    def test_compare_does_not_modify_the_flight_data(self) -> None:
         flight = aisle_flight(ekf2=Estimator(resets=(Reset(60.0, "position", (5.0, 0.0, 0.0)),)))
 
         def frames() -> list[pd.DataFrame]:
@@ -289,6 +295,6 @@ class TestRobustness:
             pd.testing.assert_frame_equal(frame, copy)
 
 
-def test_compare_imu_gap_is_counted_in_seconds() -> None:
+def test_compare_reports_duration_of_imu_gap() -> None:
     result = compare(aisle_flight(imu=Imu(gap_s=(40.0, 42.0))), axes=("north",)).main
     assert result.updates.input_gap_s == pytest.approx(2.0, abs=1e-6)

@@ -55,7 +55,7 @@ def eventful() -> Analysis:
     return with_noises(comparison)
 
 
-def test_draw_marks_draws_each_kind_with_its_label(eventful: Analysis) -> None:
+def test_event_marks_in_plots_have_a_label_for_each_event_type(eventful: Analysis) -> None:
     labels = [artist.get_label() for artist in event_marks.legend_entries(eventful)]
     assert labels == [
         "flight modes (alternating)", "on the ground", "gap in position source", "log dropout",
@@ -79,14 +79,14 @@ def test_draw_marks_draws_each_kind_with_its_label(eventful: Analysis) -> None:
     assert set(axes.lines[1].get_xdata()) <= set(event_marks.outlier_times(eventful))
 
 
-def test_marks_of_long_flight_do_not_overlap() -> None:
+def test_event_marks_of_long_flight_do_not_overlap() -> None:
     time_s = np.linspace(0.0, 3600.0, 20_000)
     visible = event_marks._visible_times(time_s, 3600.0 * event_marks.MIN_MARK_DISTANCE)
     assert len(visible) <= 1.0 / event_marks.MIN_MARK_DISTANCE + 1.0
     assert set(visible) <= set(time_s)
 
 
-def test_zoom_window_avoids_source_gap() -> None:
+def test_zoomed_plot_window_avoids_position_gap() -> None:
     made = aisle_flight(duration_s=120.0, uwb=Uwb(gap_s=(50.0, 70.0)))
     comparison = compare(made)
     start, end = flight.zoom_window(comparison.main, comparison.segment)
@@ -109,7 +109,7 @@ def test_zoom_window_avoids_source_gap() -> None:
     ],
     ids=["no EKF2", "no truth", "no innovations", "no reference"],
 )
-def test_pages_missing_data_have_note_and_no_empty_panel(changes, expected: str) -> None:
+def test_report_pages_without_data_have_note_and_no_empty_plot(changes, expected: str) -> None:
     of = document(compare(aisle_flight(**changes)))
     draws = cover.draw, flight.draw, flight.draw_innovations, flight.draw_other_axes
     pages = [page for draw in draws for page in drawn(draw, of)]

@@ -9,7 +9,7 @@ from px4fuse.trajectory.time_offset import MIN_SECOND_PEAK_RATIO
 
 
 @pytest.mark.parametrize("is_complex", [False, True])
-def test_moments_equal_sums_at_each_lag(is_complex: bool) -> None:
+def test_cross_correlation_moments_equal_sums_at_each_lag(is_complex: bool) -> None:
     rng = np.random.default_rng(3)
     a, b = rng.normal(5.0, 1.0, 7), rng.normal(-3.0, 2.0, 11)
     if is_complex:
@@ -35,5 +35,5 @@ def test_autocovariance_equals_sum_of_products() -> None:
     np.testing.assert_allclose(autocovariance(v), expected, atol=1e-12)
 
 
-def test_min_second_peak_ratio_is_5_percent_f_quantile() -> None:
+def test_second_correlation_peak_limit_is_5_percent_f_quantile() -> None:
     assert pytest.approx(0.05, abs=0.005) == f.sf(MIN_SECOND_PEAK_RATIO**2, 80, 80)

@@ -59,7 +59,7 @@ def eventful() -> Analysis:
     return with_noises(compare(flight))
 
 
-def test_cover_of_card_prints_its_texts_and_numbers() -> None:
+def test_report_cover_prints_texts_of_the_diagnosis_card() -> None:
     text = text_of(SMALL_SIGMA_A)
     cause = SMALL_SIGMA_A.causes[0]
     expected = [
@@ -72,7 +72,7 @@ def test_cover_of_card_prints_its_texts_and_numbers() -> None:
     assert [each for each in expected if each not in text] == []
 
 
-def test_alternatives_are_marked_either_and_or() -> None:
+def test_report_cover_marks_alternative_actions_either_or() -> None:
     sender = Action("sender", "subtract 0.264 s")
     console = Action("EKF2", commands=("param set EKF2_EV_DELAY 264", "reboot"), where="console")
     cause = Cause(
@@ -86,7 +86,7 @@ def test_alternatives_are_marked_either_and_or() -> None:
     assert "console: MAVLink Console of QGroundControl" in text
 
 
-def test_more_than_three_notes_are_counted() -> None:
+def test_report_cover_counts_notes_beyond_three() -> None:
     notes = tuple(Note(f"note_{number}", f"Text {number}.") for number in range(5))
     text = text_of(replace(SMALL_SIGMA_A, notes=notes, more_causes=4))
     assert "note[note_2]: Text 2." in text
@@ -100,13 +100,13 @@ def test_more_than_three_notes_are_counted() -> None:
     [("reconcile", ""), ("difference", ""), ("causes", ()), ("notes", ()), ("do_this", ()),
      ("effect_text", ""), ("verdicts", ())],
 )  # fmt: skip
-def test_empty_row_takes_no_space(field: str, empty: Any) -> None:
+def test_report_cover_row_without_text_takes_no_space(field: str, empty: Any) -> None:
     card = replace(SMALL_SIGMA_A, reconcile="The two verdicts differ.")
     heights = [cover.free_height(page_of(each)) for each in (card, replace(card, **{field: empty}))]
     assert heights[1] > heights[0] + 8.0
 
 
-def test_explained_verdict_is_quiet() -> None:
+def test_report_cover_explained_verdict_is_not_emphasised() -> None:
     card = replace(
         SMALL_SIGMA_A,
         verdicts=tuple(replace(each, is_explained=True) for each in SMALL_SIGMA_A.verdicts[:2]),
@@ -116,7 +116,7 @@ def test_explained_verdict_is_quiet() -> None:
     assert all(row["quiet"] and not row["loud"] for row in block["rows"])
 
 
-def test_ratio_beyond_axis_is_a_triangle_without_interval() -> None:
+def test_report_cover_ratio_beyond_scale_is_drawn_as_triangle() -> None:
     ratios = verdicts(
         (0.05, "underconfident"), (0.1, "underconfident"), (10.0, "overconfident"),
         (35.0, "overconfident"),
@@ -128,7 +128,7 @@ def test_ratio_beyond_axis_is_a_triangle_without_interval() -> None:
     assert block["rows"][2]["interval"] == [1.0, 1.0]
 
 
-def test_verdict_not_evaluated_prints_its_reason() -> None:
+def test_report_cover_states_reason_of_missing_verdict() -> None:
     missing = replace(
         SMALL_SIGMA_A.verdicts[3], ratio=None, word="not evaluated", reason="no ground truth"
     )
@@ -136,7 +136,7 @@ def test_verdict_not_evaluated_prints_its_reason() -> None:
     assert "ground truth: error ÷ σ not evaluated: no ground truth" in text_of(card)
 
 
-def test_aiding_sources_have_rows_without_words() -> None:
+def test_report_cover_lists_sigma_ratios_of_aiding_sources() -> None:
     aids = (
         AidRow(label="barometer", component="height", ratio=0.57, is_usual=True),
         AidRow(label="magnetometer", component="x", ratio=None),
@@ -148,14 +148,14 @@ def test_aiding_sources_have_rows_without_words() -> None:
     assert "that is usual and not a fault" in text
 
 
-def test_right_to_left_name_keeps_the_id_behind_it() -> None:
+def test_report_cover_right_to_left_name_precedes_the_id() -> None:
     name = "محمد"
     identity = replace(SMALL_SIGMA_A.identity, student=name, student_id="s123")
     text = text_of(replace(SMALL_SIGMA_A, identity=identity))
     assert re.search(f"{name} ?, ?s123", text)
 
 
-def test_cover_has_four_panels_on_one_page_and_no_small_type(eventful: Analysis) -> None:
+def test_report_cover_has_four_plots_on_one_page(eventful: Analysis) -> None:
     page = drawn(eventful)
     pdf = pdf_of(page)
     panels = axes_of(page)
@@ -172,7 +172,7 @@ def test_cover_has_four_panels_on_one_page_and_no_small_type(eventful: Analysis)
         assert not axes.get_xlabel() or axes.xaxis.label.get_window_extent().y0 >= 0.0
 
 
-def test_error_strips_share_one_scale(eventful: Analysis) -> None:
+def test_report_cover_error_plots_share_one_scale(eventful: Analysis) -> None:
     panels = panels_by_title(drawn(eventful))
     limits = {axes.get_ylim() for title, axes in panels.items() if " error (m)" in title}
     assert len(limits) == 1
@@ -187,7 +187,7 @@ def test_error_strips_share_one_scale(eventful: Analysis) -> None:
     ],
     ids=["no EKF2", "no truth", "neither"],
 )
-def test_cover_with_missing_data_has_strips_of_the_rest(changes, titles) -> None:
+def test_report_cover_omits_plots_of_missing_data(changes, titles) -> None:
     page = drawn(unexplained(compare(aisle_flight(**changes))))
     found = [*panels_by_title(page)]
     assert found[0].startswith("Map")
@@ -196,7 +196,7 @@ def test_cover_with_missing_data_has_strips_of_the_rest(changes, titles) -> None
     assert len(set_by_typst(page)) == 1
 
 
-def test_track_outside_the_map_has_triangles_and_distance() -> None:
+def test_track_outside_map_is_marked_with_exit_distance() -> None:
     x = np.array([1.0, 5.0, 12.0, 13.0, 5.0, 5.0, 5.0])
     y = np.array([1.0, 1.0, 1.0, 1.0, 1.0, -3.0, 1.0])
     found = list(cover_panels._exits((x, y), LIMITS))
@@ -207,7 +207,7 @@ def test_track_outside_the_map_has_triangles_and_distance() -> None:
     assert text == "KF 3.00 m"
 
 
-def test_innovations_beyond_scale_are_triangles_in_title(eventful: Analysis) -> None:
+def test_innovations_beyond_plot_scale_are_drawn_as_triangles(eventful: Analysis) -> None:
     strip = cover_panels._innovation_strip(eventful.main)
     updates = eventful.main.replay.updates
     normalised = updates["innovation_m"] / np.sqrt(updates["innovation_variance_m2"])
@@ -220,14 +220,14 @@ def test_innovations_beyond_scale_are_triangles_in_title(eventful: Analysis) -> 
     assert {abs(value) for line in edges for value in line.get_ydata()} == {4.0}
 
 
-def test_flat_strip_says_so_in_its_title() -> None:
+def test_error_plot_title_says_if_curve_is_flat_on_its_scale() -> None:
     errors = pd.DataFrame({"error_m": [0.02, -0.05], "sigma_m": [0.05, 0.06]}, index=[0.0, 9.0])
     titles = [cover_panels._error_title("ekf2", errors, 0.04, scale) for scale in (0.1, 5.0)]
     assert titles[0] == "EKF2 error (m): RMSE 0.040, σ 0.060"
     assert titles[1] == f"{titles[0]}, flat on this scale, at most 0.050"
 
 
-def test_sigma_beyond_scale_has_triangles_and_its_value() -> None:
+def test_sigma_beyond_plot_scale_is_marked_with_its_value() -> None:
     axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
     axes.set(xlim=(0.0, 9.0), ylim=(-1.0, 1.0))
     cover_panels._draw_sigma(axes, pd.Series([0.1, 2.0, 0.1], [0.0, 4.0, 9.0]), "KF")
@@ -236,12 +236,12 @@ def test_sigma_beyond_scale_has_triangles_and_its_value() -> None:
     assert [text.get_text() for text in axes.texts] == ["±2σ of KF up to ±4.00 m"]
 
 
-def test_same_input_gives_the_same_cover(eventful: Analysis) -> None:
+def test_report_cover_from_same_input_is_byte_identical(eventful: Analysis) -> None:
     assert pdf_of(drawn(eventful)) == pdf_of(drawn(eventful))
 
 
 @pytest.mark.parametrize("count", [3, 6])
-def test_long_causes_move_panels_to_a_second_page(eventful: Analysis, count: int) -> None:
+def test_report_cover_long_text_moves_plots_to_second_page(eventful: Analysis, count: int) -> None:
     page = page_of(replace(SMALL_SIGMA_A, causes=SMALL_SIGMA_A.causes * count))
     with report_style():
         cover_panels.write_panels(page.blocks[0], eventful, SMALL_SIGMA_A, cover.free_height(page))
@@ -250,7 +250,7 @@ def test_long_causes_move_panels_to_a_second_page(eventful: Analysis, count: int
     assert "Innovations ÷ √S" in second
 
 
-def test_sections_continue_on_a_page_and_keep_their_first_panel() -> None:
+def test_report_sections_stay_with_their_first_plot() -> None:
     sections = [Page(f"Section {number}") for number in range(4)]
     for section in sections:
         section.panel("Panel", "", 210.0)

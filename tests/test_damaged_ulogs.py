@@ -79,7 +79,9 @@ def damage(content: bytes, kind: str, place: int) -> tuple[bytes, int, int]:
 
 @pytest.mark.parametrize("place", range(PLACES))
 @pytest.mark.parametrize("kind", KINDS)
-def test_read_ulog_damaged_states_the_loss(content, whole, capsys, kind: str, place: int) -> None:
+def test_read_damaged_ulog_states_the_missing_data(
+    content, whole, capsys, kind: str, place: int
+) -> None:
     data, at, size = damage(content, kind, place)
     flight, refusal = None, ""
     with time_limit():
@@ -107,7 +109,7 @@ def test_read_ulog_damaged_states_the_loss(content, whole, capsys, kind: str, pl
 
 
 @pytest.mark.parametrize("rubbish", [bytes(200_000), b"\xff" * 200_000], ids=["zeros", "ones"])
-def test_read_ulog_invalid_bytes_inside_keep_the_flight(content, whole, rubbish: bytes) -> None:
+def test_read_ulog_with_invalid_bytes_keeps_valid_messages(content, whole, rubbish: bytes) -> None:
     at = content.index(b"D\0\0", len(content) // 2) - 2  # a message of the first topic
     flight = read_ulog("long.ulg", content[:at] + rubbish + content[at:])
     assert count_samples(flight) > 0.999 * whole
@@ -115,7 +117,7 @@ def test_read_ulog_invalid_bytes_inside_keep_the_flight(content, whole, rubbish:
     assert re.search(r"\b0\.0 s of [\d.]+ s of IMU data are missing", flight.log.damage[0])
 
 
-def test_read_ulog_damaged_definition_ends(content) -> None:
+def test_read_ulog_with_damaged_format_does_not_hang(content) -> None:
     """Without the fix, pyulog loops at a definition longer than the rest of the file."""
     cut = content[: content.index(b"vehicle_attitude:")]
     with time_limit(), pytest.raises(LogError, match="contains no data"):
@@ -135,7 +137,7 @@ def message(kind: str, content: bytes) -> bytes:
     ],
     ids=["nested", "long", "many"],
 )
-def test_read_ulog_huge_formats_are_rejected(definitions: list[bytes]) -> None:
+def test_read_ulog_with_huge_format_definition_is_rejected(definitions: list[bytes]) -> None:
     """Without a limit these formats need up to 1,000 GB of memory."""
     subscriptions = [
         message("A", struct.pack("<BH", 0, number) + b"a") for number in range(len(definitions))
@@ -145,7 +147,9 @@ def test_read_ulog_huge_formats_are_rejected(definitions: list[bytes]) -> None:
 
 
 @pytest.mark.parametrize("share", [0.1, 0.25, 0.5, 0.9])
-def test_read_log_cut_off_states_the_end(tmp_path, sample_log, share: float) -> None:
+def test_read_truncated_log_states_that_it_ends_in_flight(
+    tmp_path, sample_log, share: float
+) -> None:
     path = tmp_path / "cut.ulg"
     content = sample_log.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
@@ -161,7 +165,9 @@ def test_read_log_cut_off_states_the_end(tmp_path, sample_log, share: float) -> 
     assert "the file ends within a message" in named.message.lower()
 
 
-def test_cli_damaged_log_prints_the_loss(tmp_path, sample_log, monkeypatch, capsys) -> None:
+def test_commands_on_damaged_log_print_the_missing_data(
+    tmp_path, sample_log, monkeypatch, capsys
+) -> None:
     """A fifth of the sample flight with a hole of 20 kB."""
     content = bytearray(sample_log.read_bytes()[:700_000])
     content[400_000:420_000] = bytes(20_000)
@@ -175,7 +181,7 @@ def test_cli_damaged_log_prints_the_loss(tmp_path, sample_log, monkeypatch, caps
         assert "0.8 s of 24.0 s of IMU data are missing" in text
 
 
-def test_info_unreadable_log_exits_with_one_line(tmp_path, monkeypatch, capsys) -> None:
+def test_commands_on_unreadable_log_print_one_error_line(tmp_path, monkeypatch, capsys) -> None:
     path = tmp_path / "head.ulg"
     path.write_bytes(HEAD + b"\xff" * 5000)
     for command in ("info", "compare"):
@@ -193,7 +199,7 @@ DAMAGED = {
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", DAMAGED)
-def test_read_log_real_damage_loses_little(shared_logs, name: str) -> None:
+def test_read_log_of_damaged_real_flight_keeps_most_samples(shared_logs, name: str) -> None:
     count, lost = DAMAGED[name]
     flight = read_log(shared_logs / "real" / f"{name}.ulg")
     assert count * (1.0 - lost) < len(flight.imu) < count

@@ -28,7 +28,7 @@ NOT_DETECTABLE = {
 }
 
 
-def test_rates_clean_flights_have_at_most_2_percent_alarms() -> None:
+def test_false_alarm_rate_on_clean_flights_is_at_most_2_percent() -> None:
     clean = TABLE[TABLE["condition"] == CLEAN]
     assert set(clean["scenario"]) == set(SCENARIOS)
     assert clean["flights"].min() >= 50
@@ -36,12 +36,12 @@ def test_rates_clean_flights_have_at_most_2_percent_alarms() -> None:
 
 
 @pytest.mark.parametrize("finding", sorted({condition.finding for condition in CONDITIONS}))
-def test_rates_each_mistake_is_listed_first_on_95_percent(finding) -> None:
+def test_each_mistake_is_first_finding_on_95_percent_of_logs(finding) -> None:
     rows = TABLE[(TABLE["finding"] == finding) & (TABLE["condition"] != CLEAN)]
     assert rows["rate" if finding in CONSEQUENCES else "first"].max() >= 0.95
 
 
-def test_rates_undetectable_mistakes_are_rarely_found() -> None:
+def test_undetectable_mistakes_are_found_in_at_most_10_percent() -> None:
     for finding, condition in NOT_DETECTABLE:
         (row,) = TABLE[
             (TABLE["finding"] == finding) & (TABLE["condition"] == condition)
@@ -49,13 +49,13 @@ def test_rates_undetectable_mistakes_are_rarely_found() -> None:
         assert row.rate <= 0.1
 
 
-def test_find_likelihood_lost_in_rounding_is_skipped() -> None:
+def test_clock_jump_is_found_despite_rounded_likelihood() -> None:
     """Time-correlated error of 10 m, SIGMA_Z 1 mm, an interval of 0.5 ms between two positions."""
     jump = Condition("source_time_offset_changes", "--mistake clock-jump=400ms")
     assert found(FAULTY_SEED + 2, jump)[0] == "source_time_offset_changes"
 
 
-def test_find_mistakes_detected_always_are_still_found() -> None:
+def test_mistakes_with_detection_rate_1_are_found_again() -> None:
     certain = {(row.finding, row.condition) for row in TABLE.itertuples() if row.rate == 1.0}
     assert found(5) == ()
     for condition in (
@@ -68,7 +68,7 @@ def test_find_mistakes_detected_always_are_still_found() -> None:
         assert condition.finding in found(20_000, condition)
 
 
-def test_rows_count_found_and_listed_first() -> None:
+def test_detection_rate_table_counts_found_and_first_findings() -> None:
     usual, yaw = clean(DEFAULT), Condition("source_frame_misaligned", "--mistake yaw=30")
     flown = [Job(0, (usual,)), Job(1, (usual,)), Job(FAULTY_SEED, (yaw,))]
     made = pd.DataFrame(

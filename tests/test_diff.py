@@ -36,12 +36,12 @@ def number(value: float, interval=None) -> ComparedNumber:
         (-0.05, 0.05, True),
     ],
 )  # fmt: skip
-def test_number_changes_beyond_tolerance_are_listed(a, b, differs):
+def test_diff_lists_number_changes_beyond_tolerance(a, b, differs):
     found = list(number_changes({"it": number(a)}, {"it": number(b)}))
     assert [(one.a, one.b) for one in found] == [(a, b)] * differs
 
 
-def test_number_changes_of_one_side_are_listed():
+def test_diff_lists_numbers_present_in_only_one_input():
     first, second = {"a": number(1.0, (0.5, None))}, {"b": number(2.0)}
     only_a, only_b = number_changes(first, second)
     assert (only_a.path, only_a.a, only_a.b, only_a.a_interval) == ("a", 1.0, None, (0.5, None))
@@ -74,14 +74,14 @@ def by_path(found: ChangeResults) -> dict[str, tuple[float | None, float | None]
     return {one.path: (one.a, one.b) for one in found.numbers}
 
 
-def test_changes_of_equal_flights_are_not_worse(clean):
+def test_diff_of_two_clean_flights_reports_nothing_worse(clean):
     found = list_changes(clean, flown(503))
     assert found.worse == ()
     assert {one.name for one in found.settings} <= {"start (s)", "end (s)"}
     assert list_changes(clean, clean).numbers == ()
 
 
-def test_changes_of_noisy_source_have_recorded_interval(clean):
+def test_diff_of_sigma_z_states_95_percent_intervals(clean):
     found = list_changes(clean, flown(502, sigma_uwb_m=0.2))
     (sigma_z,) = [one for one in found.numbers if one.path == "tuning.horizontal.sigma_z_m"]
     assert sigma_z.label == "SIGMA_Z estimate, horizontal"
@@ -90,7 +90,7 @@ def test_changes_of_noisy_source_have_recorded_interval(clean):
     assert any(text.startswith("Mean NIS of KF, aisle: ") for text in found.worse)
 
 
-def test_changes_of_ekf2_noise_are_worse_in_nis_of_ekf2(clean):
+def test_diff_with_larger_ekf2_noise_reports_worse_ekf2_nis(clean):
     found = list_changes(clean, flown(506, "ekf2-noise=0.3"))
     (noise,) = [one for one in found.settings if one.name == "EKF2_EVP_NOISE"]
     assert (noise.a, noise.b) == (0.1, 0.3)
@@ -124,14 +124,14 @@ def nees(side: DiffInput, value: float) -> DiffInput:
         (0.04, "0.04 (underconfident, σ 5 times too large)."),
     ],
 )  # fmt: skip
-def test_changes_of_nees_beyond_limit_are_worse(clean, value, said):
+def test_diff_with_nees_beyond_limit_is_reported_as_worse(clean, value, said):
     before, after = nees(clean, 1.0), nees(clean, value)
     worse = [f"Mean NEES of KF, north: 1 (consistent) → {said}"] if said else []
     assert list(list_changes(before, after).worse) == worse
     assert list_changes(after, before).worse == ()
 
 
-def test_changes_of_nis_need_another_verdict_to_be_worse(clean):
+def test_diff_with_larger_nis_but_same_verdict_is_not_worse(clean):
     before = with_kf(clean, nis_mean=1.0, verdict="consistent")
     for nis_mean, verdict, count in (
         (1.7, "overconfident", 1), (1.7, "consistent", 0), (0.5, "underconfident", 1),
@@ -141,7 +141,7 @@ def test_changes_of_nis_need_another_verdict_to_be_worse(clean):
         assert list_changes(after, after).worse == ()
 
 
-def test_changes_with_new_error_are_worse(clean):
+def test_diff_with_new_error_finding_is_reported_as_worse(clean):
     late = flown(505, "clock-offset=0.25")
     errors = {one.id for one in late.results.findings if one.severity == "error"}
     assert errors
@@ -158,7 +158,7 @@ def test_changes_with_new_error_are_worse(clean):
 # -- the list of measures --------------------------------------------------------------------------
 
 
-def test_measures_have_unique_paths_and_valid_intervals(clean):
+def test_diff_numbers_have_unique_paths_and_intervals(clean):
     paths = [one["path"] for one in MEASURES]
     assert len(set(paths)) == len(paths)
     found = collect_numbers(clean.results)
@@ -184,7 +184,7 @@ def aid_axis(nis_mean: float) -> AidAxis:
     )  # fmt: skip
 
 
-def test_measures_of_aids_leave_out_position_source(clean):
+def test_diff_of_aiding_sources_excludes_the_position_source(clean):
     axes = aid_axis(1.2), aid_axis(0.9)
     judged = {"gnss_vel": aid(*axes, rejected_fraction=0.1), "ev_pos": aid(*axes)}
     found = collect_numbers(structs.replace(clean.results, aids=judged))
@@ -200,7 +200,7 @@ def test_measures_of_aids_leave_out_position_source(clean):
     assert "ev_pos" in {path.split(".")[1] for path in found}
 
 
-def test_changes_axis_in_one_input_lists_its_numbers(clean):
+def test_diff_of_axis_in_only_one_input_lists_its_numbers(clean):
     part = as_input(replace(clean.results, axes={"north": clean.results.axes["north"]}))
     found = by_path(list_changes(clean, part))
     assert found["axes.down.filters.kf.nis_mean"][1] is None

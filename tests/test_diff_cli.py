@@ -37,7 +37,7 @@ def changed(settings) -> dict[str, object]:
     return json.loads(run_checked("diff", *settings, "--json", "-", code=1).stdout)
 
 
-def test_diff_of_two_settings_lists_setting_and_numbers(settings, changed):
+def test_diff_of_two_reports_lists_changed_settings_and_numbers(settings, changed):
     jsonschema.validate(changed, schema())
     assert changed["schema"]["name"] == "px4fuse-changes"
     assert [changed[side]["kind"] for side in "ab"] == ["report", "report"]
@@ -64,7 +64,7 @@ def test_diff_exit_code_is_1_if_verdict_is_worse(settings, changed):
     assert "No verdict is worse in B." in run_checked("diff", *settings[::-1]).stdout
 
 
-def test_diff_of_log_and_report_uses_settings_of_report(settings, tmp_path, monkeypatch):
+def test_diff_of_report_and_log_uses_settings_of_the_report(settings, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     found = json.loads(run_checked("diff", settings[1], LOG, "--json", "-").stdout)
     assert found["b"]["kind"] == "log"
@@ -72,7 +72,7 @@ def test_diff_of_log_and_report_uses_settings_of_report(settings, tmp_path, monk
     assert contents(tmp_path) == {}
 
 
-def test_diff_takes_report_of_aids_alone(tmp_path):
+def test_diff_accepts_report_with_aiding_sources_only(tmp_path):
     log = gnss_log("v1.16").write(tmp_path / "a.ulg")
     run_checked("compare", log, "-o", tmp_path / "a.pdf")
     found = json.loads(
@@ -85,7 +85,7 @@ def test_diff_takes_report_of_aids_alone(tmp_path):
 # -- bad input -------------------------------------------------------------------------------------
 
 
-def test_diff_unsuitable_inputs_are_refused(settings, tmp_path):
+def test_diff_of_unsuitable_files_is_rejected(settings, tmp_path):
     usual = settings[0]
     link, printed, text = tmp_path / "link.pdf", tmp_path / "printed.pdf", tmp_path / "notes.txt"
     link.symlink_to(usual)

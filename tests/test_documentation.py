@@ -54,10 +54,10 @@ def run_command(line: str) -> str:
 
 @pytest.mark.usefixtures("no_drawing", "at_root")  # other tests draw each kind of report
 @pytest.mark.parametrize("page", [page for page in PAGES if commands(page)])
-def test_page_commands_run_in_order(page: str, monkeypatch, tmp_path: Path) -> None:
+def test_documented_commands_run_in_given_order(page: str, monkeypatch, tmp_path: Path) -> None:
     """Commands that README contains too run only for README."""
     if page == "docs/instructors.md":
-        pytest.skip("test_instructors_commands_run_in_order makes the inputs")
+        pytest.skip("test_instructor_guide_commands_run_in_given_order makes the inputs")
     monkeypatch.setattr(run, "run_bounded", run_in_turn)
     readme_commands = commands("README.md") if page != "README.md" else []
     for number, line in enumerate(line for line in commands(page) if line not in readme_commands):
@@ -75,7 +75,7 @@ def test_page_commands_run_in_order(page: str, monkeypatch, tmp_path: Path) -> N
 
 
 @pytest.mark.usefixtures("cached_pages", "at_root")
-def test_instructors_commands_run_in_order(monkeypatch) -> None:
+def test_instructor_guide_commands_run_in_given_order(monkeypatch) -> None:
     in_this_process(monkeypatch)
     Path("roster.csv").write_text("id,name\n1001,Ada Lovelace\n1002,Grace Hopper\n")
     Path("notes.md").write_text("# What I found\n\nThe timestamps are late.\n")
@@ -90,7 +90,7 @@ def test_instructors_commands_run_in_order(monkeypatch) -> None:
 
 @pytest.mark.usefixtures("at_root")
 @pytest.mark.parametrize("page", ["README.md", "docs/python.md"])
-def test_python_examples_run(page: str, capsys) -> None:
+def test_documented_python_examples_run_without_error(page: str, capsys) -> None:
     """The tables of `px4fuse extract` are written first; the code blocks run in order."""
     mpl.use("Agg")
     for line in commands(page):
@@ -110,7 +110,7 @@ def test_python_examples_run(page: str, capsys) -> None:
 @pytest.mark.parametrize(
     ("page", "max_commands"), [("README.md", 3), ("docs/lab.md", 2)], ids=["readme", "lab"]
 )
-def test_lab_each_step_has_commands(page: str, max_commands: int) -> None:
+def test_each_step_of_lab_guide_contains_commands(page: str, max_commands: int) -> None:
     steps = re.split(r"\n\*\*\d\. ", PAGES[page].split("The lab in five steps\n")[-1])[1:]
     assert len(steps) == 5
     for number, step in enumerate(steps, 1):
@@ -119,7 +119,7 @@ def test_lab_each_step_has_commands(page: str, max_commands: int) -> None:
         assert page == "README.md" or f"reports/example/lab_{number}.png)" in step
 
 
-def test_pictures_are_small_and_made_by_script() -> None:
+def test_readme_pictures_are_small_and_created_by_script() -> None:
     script = (ROOT / "tests" / "benchmarks" / "readme_pictures.py").read_text(encoding="utf-8")
     pictures = re.findall(r"!\[[^]]+\]\((\S+\.png)\)", README + PAGES["docs/lab.md"])
     assert len({Path(picture).name for picture in pictures}) == 7
@@ -130,7 +130,7 @@ def test_pictures_are_small_and_made_by_script() -> None:
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_commands_page_completion_lines_work(shell, monkeypatch, capsys) -> None:
+def test_documented_shell_completion_lines_work(shell, monkeypatch, capsys) -> None:
     page = PAGES["docs/commands.md"]
     assert all(f"`px4fuse {command}" in page for command in COMMANDS)
     assert f"_PX4FUSE_COMPLETE={shell}_source px4fuse" in page
@@ -148,7 +148,7 @@ def test_commands_page_completion_lines_work(shell, monkeypatch, capsys) -> None
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_linked_files_and_headings_exist(page: str) -> None:
+def test_documentation_links_lead_to_existing_headings(page: str) -> None:
     folder = (ROOT / page).parent
     targets = re.findall(r"\]\(([^)]+)\)", PAGES[page])
     targets += re.findall(r"(?<=\{image\} )\S+|(?<=\}`)[^`]+", PAGES[page])
@@ -166,7 +166,7 @@ def test_linked_files_and_headings_exist(page: str) -> None:
         assert not heading or heading in anchors, target
 
 
-def test_readme_on_pypi_has_absolute_links() -> None:
+def test_readme_on_pypi_contains_only_absolute_links() -> None:
     """The substitutions are those that pyproject.toml gives the build plugin."""
     import tomllib
 
@@ -180,7 +180,7 @@ def test_readme_on_pypi_has_absolute_links() -> None:
     assert all(link.startswith("https://") for link in links)
 
 
-def test_sdist_includes_each_top_level_document() -> None:
+def test_source_distribution_includes_each_top_level_document() -> None:
     import tomllib
 
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))

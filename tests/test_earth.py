@@ -26,7 +26,7 @@ def record(latitude_deg: float, altitude_m: float = 0.0, north_m: float = np.nan
 
 
 @pytest.mark.parametrize("latitude_deg", DEGREE_M)
-def test_metres_of_latitude_uses_ekf2_curvature_radii(latitude_deg: float) -> None:
+def test_metres_per_degree_use_curvature_radii_of_ekf2(latitude_deg: float) -> None:
     """PX4's power of 2.5 makes the meridian radius too long by a known factor."""
     north_m, east_m = DEGREE_M[latitude_deg]
     latitude = np.radians(latitude_deg)
@@ -40,12 +40,12 @@ def test_metres_of_latitude_uses_ekf2_curvature_radii(latitude_deg: float) -> No
     assert np.subtract(higher, (north, east, down)) == pytest.approx([1e-4, 1e-4, 0.0], abs=1e-12)
 
 
-def test_ekf2_metres_per_metre_is_one_for_logs_in_metres() -> None:
+def test_ekf2_position_scale_is_1_if_state_is_logged_in_metres() -> None:
     assert ekf2_metres_per_metre(record(45.0, north_m=3.0)) == (1.0, 1.0, 1.0)
     assert ekf2_metres_per_metre(record(np.nan)) == (1.0, 1.0, 1.0)
 
 
-def test_earth_rate_matches_sidereal_day() -> None:
+def test_earth_rotation_rate_matches_sidereal_day() -> None:
     rate = 2.0 * np.pi / 86_164.1
     for latitude_deg, expected in ((0.0, (rate, 0.0, 0.0)), (90.0, (0.0, 0.0, -rate)),
                                    (-30.0, (rate * 0.75**0.5, 0.0, 0.5 * rate))):  # fmt: skip
@@ -54,7 +54,7 @@ def test_earth_rate_matches_sidereal_day() -> None:
     np.testing.assert_array_equal(earth_rate_rad_s(record(np.nan)), np.zeros(3))
 
 
-def test_model_gnss_flight_includes_earth_rotation() -> None:
+def test_ekf2_model_of_gnss_flight_includes_earth_rotation() -> None:
     """The model uses EKF2's metres, the output those of the track; simulations are flat."""
     flight = simulate_flight(make_scenario("outdoor", seed=3), parse(()))
     assert MODEL_NOTE in flight.log.notes

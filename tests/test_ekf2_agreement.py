@@ -37,7 +37,7 @@ def replayed(fused_at: list[float], taken: list[float] | None = None) -> pd.Data
     return pd.DataFrame({"fused_at_s": fused_at}, index=index)
 
 
-def test_match_updates_uses_measurement_or_fusion_time():
+def test_ekf2_replay_updates_are_matched_by_measurement_time():
     """An older topic has no measurement time, and repeats the last fusion for 0.5 s."""
     times = np.array([0.9, 0.9941, 1.0, 1.1059, 1.1061, 1.2, 1.3])
     found = match_updates(replayed([9.0, 9.0, 9.0], [1.0, 1.1, 1.2]), times, is_own_topic=True)
@@ -47,7 +47,7 @@ def test_match_updates_uses_measurement_or_fusion_time():
     assert found.tolist() == [-1, 0, 0, 0, -1, 1, 1]
 
 
-def test_evaluated_spans_exclude_first_5_s():
+def test_ekf2_replay_evaluation_excludes_first_5_s_of_segments():
     replay = made(Ekf2Replay, stretches_s=((10.0, 30.0), (40.0, 60.0)), flow_only_spans_s=())
     evaluated_spans = replay.evaluated_s
     assert evaluated_spans == ((15.0, 30.0), (45.0, 60.0))
@@ -97,7 +97,9 @@ def agreeing(
     (agreeing(0.5, nis=1.26), 0.1, 0.1, False, "mean NIS differs by 26%"),
     (agreeing(0.5, nis=0.74), 0.1, 0.1, False, "mean NIS differs by 26%"),
 ])  # fmt: skip
-def test_agreement_verdict_applies_limits(axis, logged, replayed_share, good, expected):
+def test_ekf2_replay_agreement_verdict_changes_at_its_limits(
+    axis, logged, replayed_share, good, expected
+):
     for axes in ({"north": axis, "east": agreeing()}, {"north": agreeing(), "east": axis}):
         found, reason = _agreement_verdict(axes, logged, replayed_share)
         assert found is good
@@ -108,7 +110,7 @@ def test_agreement_verdict_applies_limits(axis, logged, replayed_share, good, ex
     (agreeing(0.949), False), (agreeing(s=1.051), False), (agreeing(published_m=0.29), True),
     (agreeing(published_m=0.31), False),
 ])  # fmt: skip
-def test_logged_rejections_decide_verdict(axis, good):
+def test_ekf2_replay_agreement_is_decided_with_logged_rejections(axis, good):
     """The replay with logged rejections overrides the other verdict, good or bad."""
     own_gate = Agreement(
         north=agreeing(0.5), east=agreeing(0.5), ev_pos={}, samples=50,
@@ -125,7 +127,7 @@ def test_logged_rejections_decide_verdict(axis, good):
         assert found.axes == (logged_gate if all_known else own_gate).axes
 
 
-def test_axis_agreement_computes_statistics():
+def test_ekf2_replay_agreement_statistics_equal_their_formulas():
     s_log = np.full(101, 4.0)
     s = np.linspace(4.0, 8.0, 101)
     nu_log = np.tile([2.0, -2.0], 51)[:101]
@@ -146,7 +148,7 @@ def test_axis_agreement_computes_statistics():
     assert found.velocity_rms_difference_m_s == pytest.approx(0.25)
 
 
-def test_velocity_agreement_constant_is_empty():
+def test_velocity_agreement_of_constant_innovations_is_empty():
     """np.corrcoef of a constant is NaN, with a warning."""
     index = pd.Index(10.0 + np.arange(30.0))
     updates = pd.DataFrame(0.1, index=index, columns=VELOCITY_UPDATE_COLUMNS)
@@ -157,7 +159,7 @@ def test_velocity_agreement_constant_is_empty():
     assert _velocity_agreement(ekf2, replay, is_own_topic=True) == ({}, True)
 
 
-def test_heading_error_without_evaluated_state_is_none():
+def test_heading_error_without_logged_state_is_none():
     delayed = pd.DataFrame(index=pd.Index([1.0]))
     ekf2 = made(Ekf2, record=made(FusionRecord, delayed=delayed))
     replay = SimpleNamespace(settings={"EKF2_MAG_NOISE": 0.05}, evaluated_s=((5.0, 9.0),))
@@ -197,7 +199,7 @@ def compared(
     return agreement_with_log(SimpleNamespace(ekf2=ekf2), replay)  # type: ignore[arg-type]
 
 
-def test_agreement_needs_20_varying_innovations():
+def test_ekf2_replay_agreement_requires_20_varying_innovations():
     found = compared(20)
     assert found.samples == 20
     assert found.good
@@ -209,12 +211,12 @@ def test_agreement_needs_20_varying_innovations():
     assert "are constant" in same.reason
 
 
-def test_agreement_without_evaluated_state_is_unavailable():
+def test_ekf2_replay_agreement_without_state_is_unavailable():
     assert isinstance(unknown := compared(20, states=1), Unavailable)
     assert unknown.reason == "EKF2's position is not logged in the replayed time"
 
 
-def test_logged_innovations_missing_axis_is_empty():
+def test_logged_innovations_with_missing_axis_are_empty():
     frame = pd.DataFrame({"innovation_m": [0.1], "innovation_variance_m2": 0.1, "rejected": 0.0})
     for other in (NONE, frame.assign(rejected=np.nan)):
         ekf2 = made(Ekf2, innovations={"north": frame, "east": other}, innovation_topics=AID)

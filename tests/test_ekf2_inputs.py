@@ -62,7 +62,7 @@ AID = ("estimator_aid_src_ev_pos",)
 # ---------------------------------------------------------------- parameters
 
 
-def test_effective_settings_default_to_px4_values():
+def test_ekf2_parameters_missing_in_log_have_px4_defaults():
     """Defaults of PX4's module.yaml and params_*.yaml, by fused aid."""
     vision, gnss = effective_settings({}), effective_settings({}, GNSS_POS)
     for names, other_names, begin in ((vision, gnss, "EKF2_EV"), (gnss, vision, "EKF2_GPS")):
@@ -80,7 +80,7 @@ def test_effective_settings_default_to_px4_values():
     ("EKF2_EVP_GATE", (1.0, 1e3), (0.99, 1001.0)), ("EKF2_EV_NOISE_MD", (0.0, 1.0), (0.5, 2.0)),
     ("EKF2_EV_POS_X", (-5.0, 5.0), (math.inf, math.nan)),
 ])  # fmt: skip
-def test_check_parameters_range_includes_limits(name, fits, not_fits):
+def test_ekf2_parameter_check_accepts_limits_of_range(name, fits, not_fits):
     for value in fits:
         assert check_parameters({name: value}) == {name: value}
     for value in not_fits:
@@ -89,7 +89,7 @@ def test_check_parameters_range_includes_limits(name, fits, not_fits):
             check_parameters({name: value})
 
 
-def test_sweep_values_accept_2_to_200():
+def test_parameter_sweep_accepts_2_to_200_values():
     assert sweep_values("EKF2_EV_DELAY", 0.0, 100.0, 2) == [0.0, 100.0]
     assert len(sweep_values("EKF2_EV_DELAY", 0.0, 100.0, 200)) == 200
     assert len(sweep_values("EKF2_EV_DELAY", 0.0, 100.0)) == 9
@@ -131,7 +131,7 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     return prepared
 
 
-def test_fusion_rules_depend_on_release(flown):
+def test_ekf2_fusion_rules_depend_on_px4_release(flown):
     """EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h."""
     new = flown(EKF2_DELAY_MAX=200.0, EKF2_IMU_POS_Y=0.25)
     assert new.rules == FusionRules(0.2, 0.4, 1.0, 5, None, False)
@@ -143,7 +143,7 @@ def test_fusion_rules_depend_on_release(flown):
     assert flown(EKF2_PREDICT_US=8000.0).predict_s == pytest.approx(0.008)
 
 
-def test_prepare_inputs_checks_imu_and_horizon(flown):
+def test_ekf2_replay_without_complete_imu_data_is_unavailable(flown):
     assert isinstance(flown(0.0119), Inputs)
     assert "logged at 80 Hz" in flown(0.0125).reason
     assert isinstance(flown(horizon_s=NONE), Unavailable)
@@ -176,12 +176,12 @@ def track(name: str, origin: Origin, interval_s: float = 0.1, **parts: Any) -> P
     ([track("estimator_aid_src_ev_pos", LOGGED_BY_EKF2, 0.25)], "estimator_aid_src_ev_pos"),
     ([track("estimator_aid_src_ev_pos", LOGGED_BY_EKF2, 0.26)], None),
 ])  # fmt: skip
-def test_vision_track_selects_complete_track(tracks, expected):
+def test_ekf2_replay_selects_the_complete_vision_track(tracks, expected):
     found = _vision_track(made(Flight, positions=tuple(tracks)))
     assert getattr(found, "name", None) == expected
 
 
-def test_read_vision_frd_is_rotated_with_variance():
+def test_vision_positions_in_frd_are_rotated_with_variance():
     """Published heading 90°, sent 0°: sent north is east."""
     time = 10.0 + 0.1 * np.arange(30)
 
@@ -213,7 +213,7 @@ def test_read_vision_frd_is_rotated_with_variance():
     assert np.all(found.arrival_s == -np.inf)
 
 
-def test_logged_decisions_match_measurement_time():
+def test_logged_rejections_are_matched_by_measurement_time():
     """Measured half a step and the delay before the timestamp; resets show within 0.2 s."""
     stamp = 10.0 + 0.5 * np.arange(6)
     taken = stamp - 0.05 - 0.005
@@ -245,7 +245,7 @@ def test_logged_decisions_match_measurement_time():
 # ---------------------------------------------------------------- segments
 
 
-def test_position_corrections_exclude_resets():
+def test_published_position_corrections_exclude_resets():
     """EKF2 flies north at 2 m/s and is reset 3 m east at 5 s; one of three decisions is logged."""
     times = np.arange(0.0, 10.0, 0.1)
     state = pd.DataFrame(0.0, pd.Index(times, name="time_s"), Columns.STATE)
@@ -277,12 +277,12 @@ def test_position_corrections_exclude_resets():
     ([2.75] * 7, [0, 6], [3, 6]),
     ([3.2] * 9, [0, 2, 6], [2, 4, 6, 8]),  # 2.5 samples, rounded as the log shows
 ])  # fmt: skip
-def test_step_ends_by_count_duration_or_log(interval_ms, known, ends):
+def test_ekf2_prediction_step_ends_by_count_or_duration(interval_ms, known, ends):
     found = step_ends(np.array(interval_ms) * 1e-3, np.array(known, int), 0.008)
     assert found.tolist() == ends
 
 
-def test_downsample_imu_rotates_velocity_to_final_frame():
+def test_downsampled_imu_velocity_is_rotated_to_final_frame():
     """With 1 mrad per sample, earlier velocity changes are rotated by the later rotation."""
     turn = np.tile([0.0, 0.0, 0.001], (3, 1))
     gain = np.tile([1.0, 0.0, 0.0], (3, 1))
@@ -317,7 +317,7 @@ def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, Fusio
     return imu, attitude, made(Ekf2, state=state), record
 
 
-def test_make_segment_rotating_vehicle_has_expected_fields():
+def test_ekf2_replay_segment_of_turning_vehicle_has_known_values():
     flown = turning(10.0 + 0.1 * np.arange(21))
     found = _make_segment(*flown, 5, 11.5)
     steps = 10.5 + 0.01 * np.arange(101)
@@ -371,7 +371,7 @@ def without(times: np.ndarray, low: float, high: float) -> np.ndarray:
     return times[(times < low + 1e-6) | (times > high - 1e-6)]
 
 
-def test_find_replay_segments_applies_limits(monkeypatch):
+def test_ekf2_replay_segments_end_at_vision_and_imu_gaps(monkeypatch):
     imu, vision = np.arange(0.0, 60.0, 0.01), np.arange(0.0, 60.0, 0.1)
     assert segments(monkeypatch) == [(1.0, 59.99)]
     # 1 s of fusion, 4 s in the air

@@ -23,7 +23,7 @@ NOT_CARRIED = {
 GNSS_NOT_CARRIED = ("v1.13.3_gps_profile1", "v1.14.4_gps_magdist")
 
 
-def test_benchmark_numbers_match_documentation(shared_logs, model_of, monkeypatch):
+def test_ekf2_replay_benchmark_matches_documented_numbers(shared_logs, model_of, monkeypatch):
     monkeypatch.setattr(bench_ekf2, "opened", model_of)
     paths = bench_ekf2.flights([shared_logs / "simulated", shared_logs / "gps"])
     models = bench_ekf2.agreement_table(paths)
@@ -34,13 +34,13 @@ def test_benchmark_numbers_match_documentation(shared_logs, model_of, monkeypatc
 
 
 @pytest.mark.parametrize("name", NOT_CARRIED)
-def test_model_insufficient_log_states_reason(shared_logs, name):
+def test_ekf2_model_of_insufficient_log_states_reason(shared_logs, name):
     found = open_model(read_log(shared_logs / "simulated" / f"{name}.ulg"))
     assert isinstance(found, Unavailable)
     assert NOT_CARRIED[name] in found.reason
 
 
-def test_model_missing_imu_samples_states_fraction(shared_logs):
+def test_ekf2_model_states_fraction_of_missing_imu_samples(shared_logs):
     name = "mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3.ulg"
     found = open_model(read_log(shared_logs / "real" / name))
     assert isinstance(found, Unavailable)

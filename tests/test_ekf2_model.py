@@ -33,7 +33,7 @@ def vision_of(flight: Flight) -> pd.DataFrame:
     return next(t for t in flight.positions if t.name == "vehicle_visual_odometry").samples
 
 
-def test_interval_transition_equals_product_of_steps(model: Model) -> None:
+def test_ekf2_model_interval_transition_equals_product_of_steps(model: Model) -> None:
     segment, made = model.inputs.segments[0], next(iter(model.intervals.values()))[0]
     end = made.events.end_step
     starts = np.concatenate([[0], end[:-1]])
@@ -58,7 +58,7 @@ def test_interval_transition_equals_product_of_steps(model: Model) -> None:
 
 
 @pytest.mark.parametrize("attitude", [True, False])
-def test_delayed_states_follow_from_interval_start(model: Model, attitude: bool) -> None:
+def test_ekf2_model_states_follow_from_start_of_interval(model: Model, attitude: bool) -> None:
     """Without attitude as a state, the nominal attitude is not corrected."""
     variant = Variant(model.inputs.settings, attitude=attitude)
     (part,) = run_variants(model.inputs, [variant], model.intervals)
@@ -76,7 +76,7 @@ def test_delayed_states_follow_from_interval_start(model: Model, attitude: bool)
             np.testing.assert_allclose(state[k + 1], x, rtol=0.0, atol=1e-10)
 
 
-def test_recursion_matches_plain_replay(model: Model) -> None:
+def test_ekf2_model_innovations_match_plain_replay(model: Model) -> None:
     events = next(iter(model.intervals.values()))[0].events
     nu, S = plain_replay(model.inputs, model.inputs.segments[0], events[events.end_step < 3000])
     updates = model.flown.updates.iloc[: len(nu)]
@@ -86,7 +86,7 @@ def test_recursion_matches_plain_replay(model: Model) -> None:
         np.testing.assert_allclose(updates[f"innovation_variance_{axis}_m2"], S[:, at], rtol=3e-3)
 
 
-def test_model_sample_flight_agrees_with_log(model: Model) -> None:
+def test_ekf2_model_of_sample_flight_agrees_with_log(model: Model) -> None:
     agreement = model.agreement
     assert agreement.good
     assert agreement.samples > 200
@@ -102,7 +102,7 @@ def test_model_sample_flight_agrees_with_log(model: Model) -> None:
         assert axis.nis_mean_replayed == pytest.approx(axis.nis_mean_logged, rel=0.02)
 
 
-def test_replay_settings_together_equal_separate_runs(model: Model) -> None:
+def test_ekf2_replay_of_several_settings_equals_separate_runs(model: Model) -> None:
     settings = [
         {"EKF2_EVP_NOISE": 0.02}, {"EKF2_EV_DELAY": 80.0},
         {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_DELAY": 40.0, "EKF2_EVP_GATE": 2.0}, {},
@@ -117,7 +117,7 @@ def test_replay_settings_together_equal_separate_runs(model: Model) -> None:
     pd.testing.assert_frame_equal(together[3].published, model.flown.published, rtol=0.0, atol=1e-9)
 
 
-def test_replay_counts_late_and_lost_samples(model: Model) -> None:
+def test_ekf2_replay_counts_late_and_lost_vision_samples(model: Model) -> None:
     vision = model.inputs.received
     assert (model.flown.late, model.flown.lost) == (0, 0)
     # the horizon is 214 ms, and samples may be 100 ms later
@@ -153,7 +153,7 @@ def unavailable(flight: Flight) -> str:
     return found.reason
 
 
-def test_open_model_insufficient_log_states_reason(sample_flight: Flight) -> None:
+def test_ekf2_model_without_required_topic_states_reason(sample_flight: Flight) -> None:
     ekf2 = sample_flight.ekf2
     missing = Unavailable("IMU", "no topic sensor_combined", "Record it.")
     assert "sensor_combined" in unavailable(replace(sample_flight, imu=missing))
@@ -172,7 +172,7 @@ def test_open_model_insufficient_log_states_reason(sample_flight: Flight) -> Non
     assert "not logged" in unavailable(replace(sample_flight, ekf2=no_horizon))
 
 
-def test_open_model_joined_mavlink_supplies_vision(sample_flight: Flight) -> None:
+def test_ekf2_model_uses_vision_from_joined_mavlink_recording(sample_flight: Flight) -> None:
     recording = read_log(LOG.with_suffix(".tlog"))
     assert "estimator_states" in unavailable(recording)
     made = opened(join(with_copies(sample_flight), recording))
@@ -181,7 +181,7 @@ def test_open_model_joined_mavlink_supplies_vision(sample_flight: Flight) -> Non
     assert made.agreement.ev_pos["north"].innovation_correlation > 0.999
 
 
-def test_model_fused_vision_height_is_used(model: Model, sample_flight: Flight) -> None:
+def test_ekf2_model_fuses_vision_height_if_enabled(model: Model, sample_flight: Flight) -> None:
     ekf2 = sample_flight.ekf2
     samples = vision_of(sample_flight).copy()
     samples["down_m"] += 0.7
@@ -193,7 +193,7 @@ def test_model_fused_vision_height_is_used(model: Model, sample_flight: Flight) 
     assert abs(own.mean() - vision.mean()) > 0.4
 
 
-def test_model_fixed_accelerometer_bias_is_finite(sample_flight: Flight) -> None:
+def test_ekf2_model_with_fixed_accelerometer_bias_is_finite(sample_flight: Flight) -> None:
     record = sample_flight.ekf2.record
     fixed = record.delayed.copy()
     fixed.loc[:, [name for name in fixed if str(name).endswith("m2_s4")]] = 0.0

@@ -26,7 +26,7 @@ def made_log(generation, position=True):
 
 
 @pytest.mark.parametrize("generation", ["v1.12", "v1.14", "v1.15", "v1.16"])
-def test_read_record_each_release_has_same_layout(read, generation):
+def test_read_ekf2_states_layout_is_equal_for_each_px4_release(read, generation):
     ekf2 = read(made_log(generation, position=generation != "v1.16")).ekf2
     record = ekf2.record
     assert list(record.delayed) == Columns.DELAYED_STATE + Columns.DELAYED_VARIANCE
@@ -52,7 +52,7 @@ def test_read_record_each_release_has_same_layout(read, generation):
     assert row[Columns.DELAYED_VARIANCE[15:]].to_numpy() == pytest.approx(of_fields)
 
 
-def test_read_record_quaternion_variance_matches_samples(read):
+def test_quaternion_variance_converts_to_sampled_angle_variance(read):
     log = made_log("v1.14")
     variance = np.array([1e-5, 4e-5, 2e-5, 3e-5])
     log["estimator_states"]["covariances"][:, :4] = variance
@@ -64,7 +64,7 @@ def test_read_record_quaternion_variance_matches_samples(read):
     assert found == pytest.approx(errors.var(axis=0), rel=0.02)
 
 
-def test_read_record_keeps_all_ekf2_parameters(read, tmp_path):
+def test_read_ekf2_record_keeps_all_ekf2_parameters(read, tmp_path):
     log = made_log("v1.16")
     kept = {name: value for name, value in log.parameters.items() if name.startswith("EKF2_")}
     assert read(log).ekf2.record.parameters == pytest.approx(kept)
@@ -76,7 +76,7 @@ def test_read_record_keeps_all_ekf2_parameters(read, tmp_path):
     ("cs_opt_flow", ("optical flow",)),
     ("cs_ev_vel", ("vision velocity",)),
 ])  # fmt: skip
-def test_read_record_other_aiding_is_listed(read, flag, names):
+def test_read_ekf2_record_lists_other_aiding_sources(read, flag, names):
     log = made_log("v1.16")
     flags = log["estimator_status_flags"]
     used = np.zeros(len(flags["timestamp"]), np.bool_)
@@ -87,7 +87,7 @@ def test_read_record_other_aiding_is_listed(read, flag, names):
     assert read(log).ekf2.record.other_aiding == names
 
 
-def test_read_record_vision_age_is_publication_delay(read):
+def test_vision_age_equals_delay_until_publication(read):
     log = made_log("v1.16")
     fields = log["vehicle_visual_odometry"]
     age = read(log).ekf2.record.vision_age_s
@@ -99,7 +99,7 @@ def test_read_record_vision_age_is_publication_delay(read):
     assert moved.vision_age_s.to_numpy() == pytest.approx(age.to_numpy())
 
 
-def test_read_record_missing_states_is_unavailable(read):
+def test_read_ekf2_states_without_topic_is_unavailable(read):
     assert isinstance(read(make_log("v1.16")).ekf2.record, Unavailable)  # quaternions of zero
     assert isinstance(read(made_log("v1.16").drop("estimator_states")).ekf2.record, Unavailable)
     assert isinstance(read(make_log("v1.11")).ekf2.record, Unavailable)
@@ -109,7 +109,7 @@ STEP_S = 0.010  # s, EKF2's step at an IMU rate of 100 Hz
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)
-def test_read_record_bias_is_in_m_s2(read, generation):
+def test_read_accelerometer_bias_is_in_m_s2_for_each_release(read, generation):
     log = make_log(generation)
     number = int(generation.removeprefix("v1."))
     holder = log["estimator_states" if number >= 12 else "estimator_status"]
@@ -120,7 +120,7 @@ def test_read_record_bias_is_in_m_s2(read, generation):
     np.testing.assert_allclose(found, np.tile(BIAS, (len(found), 1)), rtol=1e-5)
 
 
-def test_read_bias_prefers_sensor_bias_topic(read):
+def test_read_accelerometer_bias_prefers_sensor_bias_topic(read):
     log = make_log("v1.14")
     own = {"accel_bias": np.tile(BIAS, (10, 1))}
     log.add(topic("estimator_sensor_bias", stamps(10.0, 1.0), own, sampled=True))
@@ -129,7 +129,7 @@ def test_read_bias_prefers_sensor_bias_topic(read):
     assert bias.index[1] == pytest.approx(1.0)
 
 
-def test_read_step_is_multiple_of_imu_interval(read):
+def test_ekf2_prediction_step_is_multiple_of_imu_interval(read):
     log = make_log("v1.14", imu_hz=1.0 / 0.004)
     log.parameters["EKF2_PREDICT_US"] = 10_000
     log["estimator_states"]["states"][:, 13:16] = BIAS * 0.012
@@ -142,7 +142,7 @@ def test_read_step_is_multiple_of_imu_interval(read):
     assert read(log).ekf2.step_s == STEP_S
 
 
-def test_read_horizon_is_age_at_publication(read):
+def test_ekf2_fusion_horizon_is_state_age_at_publication(read):
     log = make_log("v1.16")
     assert read(log).ekf2.horizon_s == pytest.approx(0.060)
     states = log["estimator_states"]

@@ -42,7 +42,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.trajectory.rotation import skew
 
 
-def test_limit_bias_applies_px4_limits():
+def test_accelerometer_bias_variance_obeys_px4_limits():
     P = np.zeros((2, 15, 15))
     for each in P:
         np.fill_diagonal(each[12:, 12:], [4.0, 1e-3, 0.1])
@@ -55,7 +55,7 @@ def test_limit_bias_applies_px4_limits():
     np.testing.assert_allclose(np.diag(P[0])[12:], [1e-3, 5e-4, 1e-3])
 
 
-def test_measurements_apply_lever_arm_and_noise():
+def test_vision_measurements_apply_lever_arm_and_noise_minimum():
     vision = made(ReceivedPositions, position_m=np.array([[1.0, 2.0, 3.0]]),
                   variance_m2=np.array([[0.04, 0.0001, 0.0]]))  # fmt: skip
     turned = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
@@ -128,7 +128,7 @@ def deciding(
     ({"follows_log": True}, (True, False, False, 9.5, False, 5)),
     ({"logged": 0.0}, (True, False, False, 9.5, False, 5)),
 ])  # fmt: skip
-def test_fusion_decision_matches_ekf2_rules(case, expected):
+def test_replayed_fusion_decision_follows_ekf2_rules(case, expected):
     assert deciding(**case) == expected
 
 
@@ -140,7 +140,7 @@ def test_fusion_decision_matches_ekf2_rules(case, expected):
     ({"EKF2_EV_DELAY": 50.0}, True, Timing(0.05, 0.12)),
     ({"EKF2_EV_DELAY": 200.0}, True, Timing(0.2, 0.19)),
 ])  # fmt: skip
-def test_timing_horizon_is_length_of_ekf2_buffer(settings, by_delay, timing):
+def test_fusion_horizon_equals_length_of_ekf2_buffer(settings, by_delay, timing):
     usual = {"EKF2_EV_DELAY": 0.0, "EKF2_DELAY_MAX": 200.0}
     rules = replace(RULES, horizon_by_delay=by_delay)
     inputs = made(Inputs, rules=rules, settings=usual, horizon_s=0.12, step_s=0.01, predict_s=0.01)
@@ -150,7 +150,7 @@ def test_timing_horizon_is_length_of_ekf2_buffer(settings, by_delay, timing):
     assert (shifted.delay_s, shifted.horizon_s) == pytest.approx((-0.035, math.inf))
 
 
-def test_replay_delay_max_unknown_raises_error():
+def test_ekf2_replay_of_delay_max_for_px4_v1_14_raises_error():
     rules = replace(RULES, horizon_by_delay=True)
     received = made(ReceivedPositions, uses_sender_times=False)
     inputs = made(Inputs, rules=rules, settings={}, aid=EV_POS, received=received)
@@ -170,14 +170,14 @@ GNSS_RULES = replace(RULES, stop_s=math.inf, reset_s=7.0, resets=1_000_000, with
     (7.1, 7.1, True, True), (6.9, 7.1, True, False), (7.1, 6.9, True, False),
     (13.9, 0.0, True, False), (14.1, 0.0, True, True), (7.1, 0.0, False, True),
 ])  # fmt: skip
-def test_fusion_gnss_reset_after_7_or_14_s(gap_s, velocity_gap_s, with_velocity, resets):
+def test_gnss_position_is_reset_after_7_or_14_s(gap_s, velocity_gap_s, with_velocity, resets):
     """shouldResetGpsFusion of gps_control.cpp; from main of 2026 on aids are independent."""
     rules = replace(GNSS_RULES, with_velocity=with_velocity)
     _, taken, reset, *_ = deciding(gap_s=gap_s, velocity_gap_s=velocity_gap_s, rules=rules, left=9)
     assert (taken, reset) == (False, resets)
 
 
-def test_sequential_update_uses_initial_innovations():
+def test_ekf2_sequential_update_uses_initial_innovations():
     """The second gain uses the new covariance and the old S, as in EKF2; it is not optimal."""
     rng = np.random.default_rng(6)
     root = rng.normal(size=(2, 15, 15))
@@ -205,7 +205,7 @@ def on_gnss(north_m: list[float], north_m_s: list[float], **more: Any) -> Segmen
     return at_rest(north_m, aid=GNSS_POS, rules=GNSS_RULES, speed_m_s=speed, **more)
 
 
-def test_recursion_gnss_tilt_variance_is_as_logged():
+def test_ekf2_replay_with_gnss_limits_tilt_variance_to_log():
     """Tilt is corrected as by a measurement to the logged variance, and only with GNSS."""
     fixes = [0.0] * 20
     free, limited = (on_gnss(fixes, fixes, tilt_rad2=tilt) for tilt in (np.inf, 2.5e-5))
@@ -218,7 +218,7 @@ def test_recursion_gnss_tilt_variance_is_as_logged():
 
 
 @pytest.mark.parametrize(("speed_m_s", "moves"), [(1.0, True), (3.0, False)])
-def test_recursion_velocity_outside_gate_is_rejected(speed_m_s, moves):
+def test_ekf2_replay_rejects_gnss_velocity_outside_gate(speed_m_s, moves):
     """Five times √(P + 0.09) is 1.5 m/s; the position of the fix is fused nevertheless."""
     done = on_gnss([0.0] * 20, [0.0] * 10 + [speed_m_s] + [0.0] * 9)
     assert done.fused.all()
@@ -232,7 +232,7 @@ def test_recursion_velocity_outside_gate_is_rejected(speed_m_s, moves):
     (2.0, 0.6, True), (2.0, 0.4, False), (3.3, 0.6, True), (3.3, 0.4, False),
     (1.5, 0.4, True), (4.0, 0.6, False),
 ])  # fmt: skip
-def test_recursion_gate_limit_uses_published_motion(north_m, share, fused):
+def test_ekf2_replay_at_gate_limit_follows_published_motion(north_m, share, fused):
     """The gate is at 2.515 m; ``share`` is the published motion over the full correction."""
     fixes = [0.0] * 10 + [north_m] + [0.0] * 9
     done = on_gnss(fixes, [0.0] * 20)
@@ -244,7 +244,7 @@ def test_recursion_gate_limit_uses_published_motion(north_m, share, fused):
     assert bool(done.fused[10, 0]) is (north_m < 2.515)
 
 
-def test_correlation_at_rest_matches_kalman_filter():
+def test_ekf2_replay_start_correlation_equals_kalman_filter():
     """Reference: a plain Kalman filter of a vehicle at rest for one minute, facing east."""
     turn = Rotation.from_euler("z", 110.0, degrees=True).as_matrix()
     count = 6000
@@ -269,7 +269,7 @@ def test_correlation_at_rest_matches_kalman_filter():
     assert np.linalg.eigvalsh(found).min() > -1e-9
 
 
-def test_recursion_gnss_reset_sets_velocity():
+def test_ekf2_replay_gnss_reset_sets_position_and_velocity():
     """After 7 s without both: position and velocity are those of the fix, with their variances."""
     done = on_gnss([0.0] * 5 + [300.0] * 80, [0.0] * 5 + [40.0] * 80)
     at = int(np.flatnonzero(done.reset[:, 0])[0])
@@ -279,7 +279,7 @@ def test_recursion_gnss_reset_sets_velocity():
     np.testing.assert_allclose(done.variance[at + 1, 0, 3:5], 0.09)
 
 
-def test_recursion_lost_aid_is_not_fused():
+def test_ekf2_replay_does_not_fuse_a_lost_aiding_source():
     """Ten fixes at the origin, then ten 1 m north with 0.5 m/s; the aid is lost at 11.05 s."""
     fixes, speeds = [0.0] * 10 + [1.0] * 10, [0.0] * 10 + [0.5] * 10
     done = {name: on_gnss(fixes, speeds, without=dict.fromkeys(name.split(), 11.05))
@@ -300,7 +300,7 @@ def test_recursion_lost_aid_is_not_fused():
 
 
 @pytest.mark.parametrize("speed_m_s", [None, np.zeros((20, 3))])
-def test_recursion_magnetometer_estimates_heading(speed_m_s):
+def test_ekf2_replay_with_magnetometer_estimates_heading(speed_m_s):
     """The initial heading error is 0.05 rad; the logged heading is not used."""
     done = at_rest([0.0] * 5 + [1.0] * 15, aid=GNSS_POS, rules=GNSS_RULES, speed_m_s=speed_m_s,
                    heading_rad=0.05, down_m=-3.0, field_gauss=(0.21, 0.0, 0.43))  # fmt: skip
@@ -361,7 +361,7 @@ def at_rest(
     return run_segment(inputs, segment, [variant], [intervals])
 
 
-def test_recursion_at_rest_matches_kalman_filter():
+def test_ekf2_replay_of_vehicle_at_rest_matches_kalman_filter():
     done = at_rest([0.0] * 20)
     np.testing.assert_allclose(done.state, 0.0, atol=1e-9)
     assert done.fused.all()
@@ -376,7 +376,7 @@ def test_recursion_at_rest_matches_kalman_filter():
     assert done.variance[-1, 0, 8] == pytest.approx(4e-4, rel=0.01)
 
 
-def test_recursion_source_jump_resets_after_1_s():
+def test_ekf2_replay_of_position_jump_resets_after_1_s():
     done = at_rest([0.0] * 5 + [3.0] * 15)
     rejected, reset, fused = done.rejected[:, 0], done.reset[:, 0], done.fused[:, 0]
     assert np.flatnonzero(rejected).tolist() == list(range(5, 16))
@@ -399,7 +399,7 @@ def test_recursion_source_jump_resets_after_1_s():
 
 
 @pytest.mark.parametrize("n", [4, 200])
-def test_interval_unit_noise_equals_sum_over_steps(n):
+def test_closed_form_process_noise_equals_sum_over_steps(n):
     """Step by step: θ gains unit noise · dt, v depends on θ, p on v."""
     dt = 0.008
     tilt = -skew(np.array([[0.3, -0.2, -9.8]]))[0] * dt
@@ -438,7 +438,7 @@ def acting(stamps: list[float], *, fusing: bool = True, rules: FusionRules = RUL
     return action.tolist()
 
 
-def test_fusion_starts_and_stops_by_sample_interval():
+def test_vision_fusion_starts_and_stops_by_sample_interval():
     assert acting([10.1, 10.3, 10.45], fusing=False) == [IDLE, IDLE, START]
     assert acting([10.1, 10.29, 10.45], fusing=False) == [IDLE, START, FUSE]
     assert acting([10.1, 10.29, 10.45]) == [FUSE, FUSE, FUSE]
@@ -458,7 +458,7 @@ def events(
     return _events(inputs, stretch_of(100), Timing(delay_s, horizon_s))
 
 
-def test_intervals_end_at_the_step_that_fuses_a_sample():
+def test_ekf2_replay_interval_ends_at_step_that_fuses_a_sample():
     """Half a step and the delay before its timestamp; additional events in gaps of vision."""
     found = events([10.2, 10.305, 10.9])
     has_sample = found.sample >= 0
@@ -482,7 +482,7 @@ def test_intervals_end_at_the_step_that_fuses_a_sample():
 @pytest.mark.parametrize(("age_s", "late", "lost"), [
     (0.22, False, False), (0.24, True, False), (0.28, True, False), (0.31, False, True),
 ])  # fmt: skip
-def test_intervals_arrival_age_decides_late_or_lost(age_s, late, lost):
+def test_vision_sample_is_late_or_lost_by_age_at_arrival(age_s, late, lost):
     """Due 0.2 s after its timestamp: late by more than 0.03 s, lost from 0.1 s on."""
     found = events([10.2, 10.4], age_s=age_s, horizon_s=0.2)
     assert (bool(found.late[0]), bool(found.lost[0])) == (late, lost)

@@ -44,7 +44,7 @@ from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
 
-def test_what_if_has_logged_and_replayed_columns(model):
+def test_what_if_result_contains_logged_and_replayed_values(model):
     made = what_if(model, [{"EKF2_EVP_NOISE": 0.5}, {"EKF2_EVP_NOISE": 0.02}])
     wide, narrow = made.whatif
     for axis in ("north", "east"):
@@ -68,14 +68,14 @@ def test_what_if_has_logged_and_replayed_columns(model):
     assert not made.notes
 
 
-def test_what_if_without_agreement_is_unavailable(model):
+def test_what_if_without_replay_agreement_is_unavailable(model):
     doubtful = replace(model, agreement=replace(model.agreement, good=False, reason="no reason"))
     for result in (what_if(doubtful, [{"EKF2_EVP_NOISE": 0.5}]), explain_by_steps(doubtful)):
         assert isinstance(result, Unavailable)
         assert "no reason" in result.reason
 
 
-def test_difference_steps_add_up_to_total_difference(model):
+def test_kf_ekf2_difference_steps_add_up_to_total_difference(model):
     for axis in explain_by_steps(model).values():
         assert axis.longest_rejection is None
         assert tuple(step.name for step in axis.steps) == STEPS
@@ -94,7 +94,7 @@ def test_difference_steps_add_up_to_total_difference(model):
         assert last == pytest.approx(axis.position_rmse_to_truth_m["ekf2"], abs=0.003)
 
 
-def test_difference_steps_without_common_time_are_unavailable(model):
+def test_kf_ekf2_difference_without_common_time_is_unavailable(model):
     axis, steps = made(Axis, direction=np.eye(3)[0]), pd.DataFrame(index=[1e4, 1e4 + 1.0])
     result = explain_by_steps(model, Settings(), {"north": made(Replay, axis=axis, steps=steps)})
     assert isinstance(result, Unavailable)
@@ -104,7 +104,7 @@ def test_difference_steps_without_common_time_are_unavailable(model):
 # ----------------------------------------------------------- cases with a known answer
 
 
-def test_step_variants_change_one_property_each():
+def test_kf_ekf2_difference_steps_change_one_property_each():
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(ReceivedPositions)
     plain = (made(ReplaySegment, flow=None, heights=None),)
@@ -146,7 +146,7 @@ def test_step_variants_change_one_property_each():
     assert [each.velocity for each in variants.values()] == [False] * 7 + [True] * 3
 
 
-def test_difference_steps_report_longest_rejection_run():
+def test_longest_run_of_ekf2_rejections_has_start_and_duration():
     taken = 20.0 + np.arange(10.0)
     updates = pd.DataFrame(
         {"rejected": [0, 1, 0, 0, 1, 1, 1, 0, 1, 1], "fused_at_s": taken + 0.5}, index=taken
@@ -166,7 +166,7 @@ def test_difference_steps_report_longest_rejection_run():
     assert _longest_rejection(one, still, (22.4, 24.4), ((0.0, 99.0),)) is None
 
 
-def test_rms_to_truth_uses_common_span():
+def test_rmse_to_ground_truth_uses_only_common_times():
     times, direction = np.array([9.0, 10.0, 15.0, 20.0, 21.0]), np.array([0.6, 0.8, 0.0])
     frame = pd.DataFrame(0.0, index=[10.0, 20.0], columns=Columns.STATE)
     truth = made(Truth, samples=frame.assign(north_m=[0.0, 2.0], east_m=2.0))
@@ -179,14 +179,14 @@ def test_rms_to_truth_uses_common_span():
     assert rms_to_truth(made(Flight, truth=NONE), there, direction, times) is None
 
 
-def test_longest_between_fusions_includes_both_ends():
+def test_longest_time_without_fusion_includes_start_and_end():
     evaluated_spans = ((15.0, 30.0), (40.0, 60.0))
     assert _longest_between_fusions(np.array([16.0, 29.0, 41.0, 59.0]), evaluated_spans) == 18.0
     assert _longest_between_fusions(np.array([40.0]), evaluated_spans) == 25.0
     assert _longest_between_fusions(np.array([16.0]), evaluated_spans) == 44.0
 
 
-def test_summary_combines_north_and_east() -> None:
+def test_what_if_summary_combines_north_and_east() -> None:
     north, east = (AxisSummary(nis, (0.9, 1.1), 0.1, 0.1, m) for nis, m in ((1.0, 0.3), (3.0, 0.4)))
     one = Summary(changed={}, north=north, east=east, samples=9, rejected_fraction=0.0,
                   longest_without_fusion_s=0.1, resets=0)  # fmt: skip
@@ -197,7 +197,7 @@ def test_summary_combines_north_and_east() -> None:
     assert why.unexplained_fraction == 0.25
 
 
-def test_what_if_late_samples_add_note():
+def test_what_if_with_late_samples_adds_a_note():
     for by_delay, remedy in ((False, ": raise EKF2_DELAY_MAX"), (True, "")):
         rules = replace(RULES, horizon_by_delay=by_delay)
         model: Any = SimpleNamespace(inputs=SimpleNamespace(rules=rules))
@@ -227,7 +227,7 @@ def flown(tmp_path: Path, mistake: str, seed: int) -> Model:
     ("ekf2-noise=0.02", 1, {"EKF2_EVP_NOISE": 0.1}),
     ("ekf2-noise=0.02", 2, {"EKF2_EVP_NOISE": 0.1}), ("ekf2-gate=1", 1, {"EKF2_EVP_GATE": 5.0}),
 ])  # fmt: skip
-def test_what_if_rejecting_flight_predicts_remedy(tmp_path, mistake, seed, changes):
+def test_what_if_on_flight_with_rejections_predicts_correction(tmp_path, mistake, seed, changes):
     """Only with the logged rejections does the replay agree with these logs."""
     faulty, correct = flown(tmp_path, mistake, seed), flown(tmp_path, "", seed)
     assert faulty.agreement.rejected_fraction_logged > 0.35
@@ -242,7 +242,7 @@ def test_what_if_rejecting_flight_predicts_remedy(tmp_path, mistake, seed, chang
     )
 
 
-def test_what_if_delay_without_fusion_is_rejected(model, monkeypatch):
+def test_what_if_delay_that_prevents_fusion_raises_error(model, monkeypatch):
     changed = {"EKF2_EV_DELAY": 300.0}
     never = replace(model.flown, updates=model.flown.updates[:0], lost=9, changed=changed)
     monkeypatch.setattr(whatif, "replay_settings", lambda *_, **_more: [never])
@@ -250,7 +250,7 @@ def test_what_if_delay_without_fusion_is_rejected(model, monkeypatch):
         what_if(model, [changed])
 
 
-def test_what_if_many_rejections_are_unpredictable(model):
+def test_what_if_with_many_rejections_is_marked_unpredictable(model):
     unpredictable, some, none = what_if(
         model, [{"EKF2_EVP_NOISE": 0.02}, {"EKF2_EVP_NOISE": 0.05}, {"EKF2_EVP_NOISE": 0.2}]
     ).whatif
@@ -261,7 +261,7 @@ def test_what_if_many_rejections_are_unpredictable(model):
     assert none.is_predictable
 
 
-def test_what_if_noise_sensitive_result_is_unpredictable(model, monkeypatch):
+def test_what_if_result_sensitive_to_noise_is_unpredictable(model, monkeypatch):
     """Each of the three numbers just inside and just outside its limit."""
     north = AxisSummary(1.0, (0.9, 1.1), 0.1, 0.1, 0.1)
     base = Summary(

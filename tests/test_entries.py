@@ -55,7 +55,7 @@ THREE = {
 
 
 @pytest.mark.parametrize(("attempt", "points"), [("latest", 7.0), ("first", 4.0), ("best", 9.0)])
-def test_class_entries_attempt_rule_selects_counting_report(attempt, points) -> None:
+def test_class_entry_attempt_rule_selects_the_graded_report(attempt, points) -> None:
     (ada, grace), _ = make_entries(THREE, Course(RUBRIC, attempt=attempt))
     assert ada.counted_report.points == ada.total == points
     assert len(ada.other_reports) == 2
@@ -63,7 +63,7 @@ def test_class_entries_attempt_rule_selects_counting_report(attempt, points) -> 
     assert (grace.counted_report, grace.total, grace.max_points) == (None, None, 10.0)
 
 
-def test_class_entries_late_report_has_deduction() -> None:
+def test_class_entry_of_late_report_has_points_deducted() -> None:
     term = Course(RUBRIC, due=DUE, late_rule=parse_late_rule("10%/day"))
     (ada, _), _ = make_entries(THREE, term)
     assert (ada.late_s, ada.deduction, ada.total) == (46 * 3600.0, 2.0, 5.0)
@@ -88,13 +88,13 @@ def test_class_entries_late_report_has_deduction() -> None:
         ),
     ],
 )
-def test_class_entries_deduction_ends_at_zero_points(due, rule, late_s, off) -> None:
+def test_class_entry_late_deduction_stops_at_zero_points(due, rule, late_s, off) -> None:
     (ada, _), _ = make_entries(THREE, Course(RUBRIC, due=due, late_rule=parse_late_rule(rule)))
     assert (ada.late_s, ada.deduction) == (late_s, off)
     assert ada.total == 0.0
 
 
-def test_class_entries_zip_time_sorts_but_deducts_nothing() -> None:
+def test_zip_entry_time_orders_reports_but_deducts_no_points() -> None:
     first, second = "hoppergrace_7_8_b.pdf", "hoppergrace_7_9_a.pdf"
     packed = {first: datetime(2026, 11, 24), second: datetime(2026, 11, 25)}
     files = {second: graded_report("", 7.0), first: graded_report("", 9.0)}
@@ -108,7 +108,7 @@ def test_class_entries_zip_time_sorts_but_deducts_nothing() -> None:
     assert "Canvas marks the file as late" in grace.flags[0]
 
 
-def test_class_entries_non_report_counts_only_if_alone() -> None:
+def test_submitted_file_that_is_no_report_counts_only_if_alone() -> None:
     essay = replace(
         graded_report("", 0.0), version="", verdict=Verdict("cannot verify", ("x",), False)
     )
@@ -126,7 +126,7 @@ def of_form(points: float, kind: str, **more):
     return replace(graded_report("", points, student_id="1"), form=form, **more)
 
 
-def test_class_entries_differing_forms_are_pending() -> None:
+def test_class_entry_with_differing_answer_forms_is_pending() -> None:
     """None of the files submitted together counts until the instructor selects one."""
     files = {"a.pdf": of_form(4.0, "yaw"), "b.pdf": of_form(9.0, "nlos")}
     (ada, _), _ = make_entries(files)
@@ -139,7 +139,7 @@ def test_class_entries_differing_forms_are_pending() -> None:
     assert ada.total == 4.0
 
 
-def test_class_entries_pending_report_keeps_counting_report() -> None:
+def test_pending_report_does_not_replace_the_graded_report() -> None:
     """For example a later report of another student with this student's id."""
     files = {
         "a.pdf": of_form(9.0, "yaw"),
@@ -159,7 +159,7 @@ def test_class_entries_pending_report_keeps_counting_report() -> None:
     assert ada.counted_report.submission == "a.pdf"
 
 
-def test_class_entries_imitated_platform_name_is_flagged() -> None:
+def test_file_name_that_imitates_platform_names_is_flagged() -> None:
     name = blackboard("ada", "20-10-00-00", "ada_attempt_2026-11-18-10-00-00_r.pdf")
     (ada, _), _ = make_entries({name: graded_report("", 4.0)})
     assert ada.submission_time == "2026-11-20 10:00"
@@ -169,7 +169,7 @@ def test_class_entries_imitated_platform_name_is_flagged() -> None:
     )
 
 
-def test_class_entries_best_file_of_one_submission_counts() -> None:
+def test_graded_report_is_the_best_of_one_submission() -> None:
     files = {blackboard("ada", "19-10-00-00", "a.pdf"): graded_report("", 8.0),
              blackboard("ada", "19-10-00-00", "b.pdf"): graded_report("", 2.0)}  # fmt: skip
     for attempt in ("first", "latest", "best"):
@@ -177,7 +177,7 @@ def test_class_entries_best_file_of_one_submission_counts() -> None:
         assert ada.total == 8.0, attempt
 
 
-def test_class_entries_platform_id_overrides_report_id() -> None:
+def test_learning_platform_id_overrides_id_in_report() -> None:
     files = {
         blackboard("grace", "19-10-00-00"): graded_report("", 8.0, student="Ada", student_id="1")
     }
@@ -187,7 +187,7 @@ def test_class_entries_platform_id_overrides_report_id() -> None:
     assert "is that of 1 (Ada Lovelace)" in grace.flags[0]
 
 
-def test_class_entries_unlisted_student_has_flagged_row() -> None:
+def test_student_outside_class_list_has_flagged_entry() -> None:
     files = {
         "report.pdf": graded_report("", 8.0, student="Mallory", student_id="9"),
         "other.pdf": graded_report("", 3.0, student="lovelace ADA"),
@@ -198,7 +198,7 @@ def test_class_entries_unlisted_student_has_flagged_row() -> None:
     assert stranger.flags[0] == "Not in the class list."
 
 
-def test_class_entries_without_roster_one_row_per_student() -> None:
+def test_class_entries_without_roster_list_each_student_once() -> None:
     files = {
         "Doe Jane_5_assignsubmission_file_/a.pdf": graded_report(
             "", 1.0, student="Jane", student_id="42"
@@ -232,7 +232,7 @@ TWO = {
 }
 
 
-def test_overrides_replace_points_and_add_comments(tmp_path) -> None:
+def test_instructor_overrides_replace_points_and_add_comments(tmp_path) -> None:
     rows = write_overrides(
         tmp_path, "1,a,9.5,A good idea.", '01,,,"Come and', 'see me."', "1,total,8,Agreed.",
         "2,total,3,", "3,total,1,", "1,C,1,", '2,B,2,"x"',
@@ -263,13 +263,13 @@ def test_overrides_replace_points_and_add_comments(tmp_path) -> None:
         )),
     ], ids=["points above the maximum", "duplicate row"],
 )  # fmt: skip
-def test_overrides_excess_or_duplicate_row_is_noted(rows, points, told, tmp_path) -> None:
+def test_instructor_override_with_excess_points_is_noted(rows, points, told, tmp_path) -> None:
     (ada, _), notes = make_entries(TWO, overrides=write_overrides(tmp_path, *rows))
     assert (ada.counted_report.points, ada.total) == points
     assert notes == tuple(f"overrides.csv: {one}." for one in told)
 
 
-def test_overrides_from_class_page_include_all_students(tmp_path) -> None:
+def test_instructor_overrides_from_page_include_all_students(tmp_path) -> None:
     """Includes students without a submission, because the download replaces the file."""
     rows = write_overrides(
         tmp_path, "1,A,9.5,Good.", "1,,,Come.", "1,total,8,Agreed.", "2,total,5,Shown."
@@ -283,7 +283,7 @@ def test_overrides_from_class_page_include_all_students(tmp_path) -> None:
     assert (again, notes) == (rows, ())
 
 
-def test_overrides_total_makes_pending_points_count(tmp_path) -> None:
+def test_total_points_from_instructor_end_pending_status(tmp_path) -> None:
     files = {"1.pdf": graded_report("", 4.0, student_id="1", pending_action="Run 0.1.1.")}
     (ada, _), _ = make_entries(files, overrides=write_overrides(tmp_path, "1,A,9,"))
     assert ada.total is None
@@ -291,7 +291,7 @@ def test_overrides_total_makes_pending_points_count(tmp_path) -> None:
     assert ada.total == 9.0
 
 
-def test_overrides_without_submission_give_points(tmp_path) -> None:
+def test_instructor_override_without_submission_gives_points(tmp_path) -> None:
     (_, grace), notes = make_entries(
         {}, overrides=write_overrides(tmp_path, "2,Total,5,Shown in class.")
     )
@@ -301,7 +301,7 @@ def test_overrides_without_submission_give_points(tmp_path) -> None:
     assert (grace.total, len(notes)) == (None, 1)
 
 
-def test_read_overrides_semicolons_and_decimal_commas_are_read(tmp_path) -> None:
+def test_read_overrides_accepts_semicolons_and_decimal_commas(tmp_path) -> None:
     rows = write_overrides(tmp_path, "1;A;7,5;", head="\ufeffid;item;points;comment")
     assert rows == {"1": {"A": Override(7.5)}}
 
@@ -317,7 +317,7 @@ def test_read_overrides_semicolons_and_decimal_commas_are_read(tmp_path) -> None
         ("1,A,5,\n1,A,6,", "a second row for student 1, item A"),
     ],
 )
-def test_read_overrides_invalid_row_raises_error(tmp_path, row, says) -> None:
+def test_read_overrides_with_invalid_row_raises_error(tmp_path, row, says) -> None:
     with pytest.raises(SettingsError, match=says):
         write_overrides(tmp_path, row)
     with pytest.raises(SettingsError, match="no column comment"):
@@ -341,11 +341,11 @@ BERLIN = "2026-11-20T23:59:59+01:00"
         ("2026-11-20 Europe/Berlin", BERLIN),
     ],
 )
-def test_due_time_with_zone_is_parsed(text, is_) -> None:
+def test_due_time_with_time_zone_is_parsed(text, is_) -> None:
     assert parse_due_time(text) == datetime.fromisoformat(is_)
 
 
-def test_due_time_without_zone_uses_local_zone(monkeypatch) -> None:
+def test_due_time_without_time_zone_uses_local_time_zone(monkeypatch) -> None:
     monkeypatch.setenv("TZ", "America/New_York")
     time.tzset()
     try:
@@ -360,14 +360,14 @@ def test_due_time_without_zone_uses_local_zone(monkeypatch) -> None:
     [(parse_due_time, "--due", ("", "tomorrow", "20.11.2026", "2026-11-20 23:59 Mars/Base", "Z")),
      (parse_late_rule, "--late", ("", "10", "10%", "-1%/day", "110%/day", "10%/week", "x%/day"))],
 )  # fmt: skip
-def test_due_time_and_late_rule_invalid_text_is_one_line(read, said, texts) -> None:
+def test_invalid_due_time_or_late_rule_raises_one_line_error(read, said, texts) -> None:
     for text in texts:
         with pytest.raises(SettingsError, match=said) as caught:
             read(text)
         assert "\n" not in str(caught.value)
 
 
-def test_late_rule_counts_started_days_up_to_limit() -> None:
+def test_late_rule_deducts_points_per_started_day_up_to_limit() -> None:
     for late_s, off in ((0.0, 0), (1.0, 12), (86_400.0, 12), (86_400.5, 24), (1e9, 120)):
         assert parse_late_rule("10%/day").deduction(late_s, 120.0) == off
     # a rule may state a limit, and hours
@@ -375,7 +375,7 @@ def test_late_rule_counts_started_days_up_to_limit() -> None:
     assert parse_late_rule("1%/hour up to 5%").deduction(1e6, 100.0) == 5.0
 
 
-def test_add_time_zone_naive_time_uses_zone_of_due_time() -> None:
+def test_submission_time_without_zone_uses_zone_of_due_time() -> None:
     due = parse_due_time("2026-11-20 23:59:00 +05:30")
     bare = datetime(2026, 11, 21, 0, 59)
     assert (add_time_zone(bare, due) - due).total_seconds() == 3600.0
@@ -383,7 +383,7 @@ def test_add_time_zone_naive_time_uses_zone_of_due_time() -> None:
     assert add_time_zone(told, due) == due
 
 
-def test_moodle_time_parses_english_dates_only() -> None:
+def test_parse_moodle_time_accepts_only_english_dates() -> None:
     assert parse_moodle_time("Friday, 20 November 2026, 23:58") == datetime(2026, 11, 20, 23, 58)
     assert parse_moodle_time("Friday, 20 November 2026, 11:58 PM") == datetime(2026, 11, 20, 23, 58)
     assert parse_moodle_time("Freitag, 20. November 2026, 23:58") is None

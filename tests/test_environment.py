@@ -27,7 +27,7 @@ def started(
 
 
 @posix
-def test_report_ignores_backend_of_notebooks(tmp_path) -> None:
+def test_report_ignores_notebook_backend_of_matplotlib(tmp_path) -> None:
     backend = "module://matplotlib_inline.backend_inline"
     code, _, err = started(
         f"loop {LOG.with_name('loop_slam.tum')} -o r.pdf", folder=tmp_path, MPLBACKEND=backend
@@ -37,14 +37,14 @@ def test_report_ignores_backend_of_notebooks(tmp_path) -> None:
 
 
 @posix
-def test_info_ignores_invalid_source_date_epoch(tmp_path) -> None:
+def test_info_command_ignores_invalid_source_date_epoch(tmp_path) -> None:
     code, out, err = started(f"info {LOG}", folder=tmp_path, SOURCE_DATE_EPOCH="abc")
     assert (code, err) == (0, "")
     assert out.startswith(LOG.name)
 
 
 @pytest.mark.parametrize("columns", ["0", "00", "abc", ""])
-def test_output_ignores_invalid_columns_variable(monkeypatch, capsys, columns) -> None:
+def test_output_ignores_invalid_columns_environment_variable(monkeypatch, capsys, columns) -> None:
     monkeypatch.delenv("COLUMNS", raising=False)
     usual = run_main(monkeypatch, capsys, "info", LOG)
     monkeypatch.setenv("COLUMNS", columns)
@@ -52,7 +52,7 @@ def test_output_ignores_invalid_columns_variable(monkeypatch, capsys, columns) -
     assert usual[1].startswith(LOG.name)
 
 
-def test_terminal_ignores_width_of_zero(monkeypatch, capsys) -> None:
+def test_terminal_output_ignores_columns_variable_of_zero(monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "0")
     monkeypatch.setenv("TTY_COMPATIBLE", "1")
     code, out, _ = run_main(monkeypatch, capsys, "info", LOG)
@@ -62,7 +62,7 @@ def test_terminal_ignores_width_of_zero(monkeypatch, capsys) -> None:
 
 @posix
 @pytest.mark.parametrize("command", ["compare {log} -o r.pdf", "info {log} --json i.json"])
-def test_deleted_current_folder_is_reported(tmp_path, command) -> None:
+def test_command_in_deleted_folder_reports_missing_folder(tmp_path, command) -> None:
     gone = tmp_path / "gone"
     gone.mkdir()
     code, out, err = started(command.format(log=LOG), before='rmdir "$PWD";', folder=gone)
@@ -71,7 +71,7 @@ def test_deleted_current_folder_is_reported(tmp_path, command) -> None:
 
 
 @linux
-def test_small_memory_limit_is_reported(tmp_path) -> None:
+def test_command_under_small_memory_limit_reports_the_limit(tmp_path) -> None:
     for command in (f"compare {LOG} -o r.pdf", f"explore {LOG} -o r.html", f"info {LOG}"):
         code, out, err = started(command, before="ulimit -v 400000;", folder=tmp_path)
         assert (code, out) == (2, "")
@@ -81,7 +81,7 @@ def test_small_memory_limit_is_reported(tmp_path) -> None:
     assert contents(tmp_path) == {}
 
 
-def test_exhausted_memory_prints_one_line(monkeypatch, capsys, tmp_path) -> None:
+def test_exhausted_memory_prints_one_error_line(monkeypatch, capsys, tmp_path) -> None:
     from px4fuse import analysis
 
     def exhausted(*_: object) -> None:
@@ -96,7 +96,9 @@ def test_exhausted_memory_prints_one_line(monkeypatch, capsys, tmp_path) -> None
 
 
 @pytest.mark.parametrize("command", ["tune {log} --start 126", "sync {log} --end 3"])
-def test_failed_estimate_writes_no_file(monkeypatch, capsys, tmp_path, command) -> None:
+def test_failed_noise_or_offset_estimate_writes_no_file(
+    monkeypatch, capsys, tmp_path, command
+) -> None:
     monkeypatch.chdir(tmp_path)
     words = command.format(log=LOG).split()
     code, out, err = run_main(monkeypatch, capsys, *words, "--json", "j.json")

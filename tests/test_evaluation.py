@@ -58,7 +58,9 @@ def evo_aligned(estimate: str, reference: str, kind: AlignmentKind) -> tuple[Any
 @pytest.mark.reallogs
 @pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
 @pytest.mark.parametrize("kind", ["none", "se3", "sim3"])
-def test_ate_equals_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
+def test_trajectory_ate_equals_that_of_the_evo_package(
+    pair: tuple[str, str], kind: AlignmentKind
+) -> None:
     pytest.importorskip("evo")
     from evo.core.metrics import APE, PoseRelation
 
@@ -84,7 +86,9 @@ DELTAS = (Delta(1, "frames"), Delta(10, "frames"), Delta(0.5, "m"), Delta(5.0, "
 @pytest.mark.reallogs
 @pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
 @pytest.mark.parametrize("kind", ["none", "se3", "sim3"])
-def test_rpe_equals_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
+def test_trajectory_rpe_equals_that_of_the_evo_package(
+    pair: tuple[str, str], kind: AlignmentKind
+) -> None:
     pytest.importorskip("evo")
     from evo.core.filters import FilterException
     from evo.core.metrics import RPE, PoseRelation
@@ -117,7 +121,9 @@ def test_rpe_equals_evo(pair: tuple[str, str], kind: AlignmentKind) -> None:
 
 
 @pytest.mark.parametrize(("kind", "unknowns"), [("yaw", 4), ("se3", 6), ("sim3", 7)])
-def test_fit_alignment_minimises_squared_distances(kind: AlignmentKind, unknowns: int) -> None:
+def test_trajectory_alignment_minimises_squared_distances(
+    kind: AlignmentKind, unknowns: int
+) -> None:
     random = np.random.default_rng(5)
     x = random.normal(0.0, 2.0, (40, 3))
     y = 1.2 * TURN.apply(x) + SHIFT + random.normal(0.0, 0.5, (40, 3))
@@ -143,7 +149,7 @@ def line(noise_m: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 1e-9, 1e-3, 0.1])
-def test_fit_alignment_straight_line_allows_yaw_only(noise_m: float) -> None:
+def test_alignment_of_straight_line_allows_only_yaw(noise_m: float) -> None:
     x, y = line(noise_m)
     for kind in ("se3", "sim3"):
         with pytest.raises(TrajectoryError, match=r"along a line.*`alignment` yaw"):
@@ -151,7 +157,7 @@ def test_fit_alignment_straight_line_allows_yaw_only(noise_m: float) -> None:
     assert fit_alignment(x, y, "yaw").rotation.magnitude() < 0.02
 
 
-def test_fit_alignment_without_motion_is_refused() -> None:
+def test_trajectory_alignment_without_motion_is_rejected() -> None:
     random = np.random.default_rng(3)
     still = random.normal(0.0, 0.01, (200, 3))
     up = np.linspace(0.0, 3.0, 200)[:, None] * [0.0, 0.0, 1.0]
@@ -170,7 +176,7 @@ def test_fit_alignment_without_motion_is_refused() -> None:
 # -- association -----------------------------------------------------------------------------------
 
 
-def test_associate_interpolates_uniform_motion_not_gaps() -> None:
+def test_pose_association_interpolates_motion_but_not_gaps() -> None:
     time = np.arange(0.0, 10.0, 0.1)
     turns = Rotation.from_rotvec(time[:, None] * [0.1, 0.5, 0.2])
     reference = Trajectory("r", "truth", time, time[:, None] * [1.0, 2.0, 3.0], turns)
@@ -196,7 +202,7 @@ def test_associate_interpolates_uniform_motion_not_gaps() -> None:
 
 
 @pytest.mark.parametrize("denser", [False, True], ids=["estimate sparser", "estimate denser"])
-def test_associate_nearest_equals_exhaustive_search(denser: bool) -> None:
+def test_nearest_pose_association_equals_exhaustive_search(denser: bool) -> None:
     """Poses before, after and in a gap of the reference."""
     reference = flight(20.0, 10.0)
     reference = reference[(reference.time_s < 8.0) | (reference.time_s > 12.0)]
@@ -227,7 +233,7 @@ def test_associate_nearest_equals_exhaustive_search(denser: bool) -> None:
 
 
 @pytest.mark.parametrize("method", ["interpolate", "nearest"])
-def test_evaluate_no_overlap_names_spans_and_remedy(method: Method) -> None:
+def test_evaluate_without_overlap_states_both_time_spans(method: Method) -> None:
     reference = flight()
     estimate = replace(reference, name="boot.tum", time_s=reference.time_s + 500.0)
     said = r"no poses match.*500.000 to 559.950 s.*0.000 to 59.950 s.*`time_offset_s` auto"
@@ -240,7 +246,7 @@ def test_evaluate_no_overlap_names_spans_and_remedy(method: Method) -> None:
 
 
 @pytest.mark.parametrize("kind", ["yaw", "se3", "sim3"])
-def test_evaluate_transformed_copy_has_zero_error(kind: AlignmentKind) -> None:
+def test_evaluate_transformed_copy_gives_zero_ate_and_rpe(kind: AlignmentKind) -> None:
     reference = flight()
     turn = Rotation.from_euler("z", 2.0) if kind == "yaw" else TURN
     copied = transformed(reference, turn, SHIFT, 0.3 if kind == "sim3" else 1.0, kind="vio")
@@ -254,7 +260,7 @@ def test_evaluate_transformed_copy_has_zero_error(kind: AlignmentKind) -> None:
     assert not got.warnings
 
 
-def test_ate_tilt_remains_after_yaw_alignment_only() -> None:
+def test_ate_of_tilted_track_remains_after_yaw_alignment() -> None:
     reference = flight()
     tilted = transformed(reference, Rotation.from_euler("x", 5.0, degrees=True), SHIFT, kind="vio")
     got = evaluate(tilted, reference)
@@ -264,7 +270,7 @@ def test_ate_tilt_remains_after_yaw_alignment_only() -> None:
     assert evaluate(tilted, reference, alignment="se3").ate.translation_m.rmse < 1e-9
 
 
-def test_rpe_scale_error_is_proportional_to_distance() -> None:
+def test_rpe_of_scaled_track_is_proportional_to_distance() -> None:
     reference = flight(200.0, 50.0)
     got = evaluate(
         transformed(reference, TURN, SHIFT, 1.02, kind="vio"), reference, alignment="se3"
@@ -295,7 +301,7 @@ def test_rpe_pairs_equal_their_definition(steps: list[float], value: float) -> N
     np.testing.assert_array_equal(end, start + 2)
 
 
-def test_relative_error_pairs_follow_reference_distance() -> None:
+def test_rpe_pairs_are_chosen_by_reference_distance() -> None:
     """Also if the path of the estimate is twice as long."""
     reference = flight(30.0)
     double = transformed(reference, TURN, SHIFT, 2.0, kind="vio")
@@ -304,7 +310,7 @@ def test_relative_error_pairs_follow_reference_distance() -> None:
     np.testing.assert_array_equal((other.start, other.end), (same.start, same.end))
 
 
-def test_evaluate_missing_orientation_or_pairs_give_reason() -> None:
+def test_evaluate_without_orientation_or_pairs_states_reason() -> None:
     reference = flight()
     got = evaluate(replace(reference, rotation=None, kind="vio"), reference)
     assert isinstance(got.ate.rotation_deg, Unavailable)
@@ -335,7 +341,7 @@ def test_evaluate_missing_orientation_or_pairs_give_reason() -> None:
     (("unknown", "unknown"), ("truth", "unknown"), "a", 1.0, "se3", "unknown system"),
     (("truth", "NED"), ("truth", "NED"), "a", 1.0, "none", "ground truth"),
 ])  # fmt: skip
-def test_choose_alignment_depends_on_kinds_and_frames(
+def test_default_alignment_depends_on_source_kind_and_frame(
     estimate, reference, name, scale, expected, why
 ):
     y = replace(flight(), kind=reference[0], frame=reference[1])
@@ -345,7 +351,7 @@ def test_choose_alignment_depends_on_kinds_and_frames(
     assert why in reason
 
 
-def test_evaluate_aisle_with_vertical_z_is_aligned_by_yaw() -> None:
+def test_evaluate_straight_track_with_vertical_z_aligns_by_yaw() -> None:
     x, y = line(0.02)
     aisle = Trajectory("aisle", "truth", np.arange(len(x)) * 0.1, y, None, "NED")
     got = evaluate(replace(aisle, kind="unknown", position_m=x), aisle)
@@ -355,7 +361,7 @@ def test_evaluate_aisle_with_vertical_z_is_aligned_by_yaw() -> None:
         evaluate(replace(aisle, kind="slam", frame="camera", position_m=x), aisle)
 
 
-def test_evaluate_camera_removes_mounting_rotation() -> None:
+def test_evaluate_camera_track_removes_mounting_rotation() -> None:
     reference = flight()
     mounted = Rotation.from_euler("ZYX", [90.0, 0.0, 90.0], degrees=True)
     camera = transformed(reference, TURN, SHIFT, kind="slam", frame="camera")
@@ -373,7 +379,7 @@ def test_evaluate_camera_removes_mounting_rotation() -> None:
         assert evaluate(same, reference, alignment="se3").body_rotation is None
 
 
-def test_evaluate_doubtful_arguments_give_warnings() -> None:
+def test_evaluate_with_doubtful_arguments_gives_warnings() -> None:
     truth = flight()
     vio = transformed(truth, Rotation.from_euler("z", 1.0), SHIFT, kind="vio", name="log:vio")
     slam = replace(vio, kind="slam", name="slam")
@@ -399,7 +405,9 @@ def test_evaluate_doubtful_arguments_give_warnings() -> None:
 
 @pytest.mark.parametrize("offset_s", [0.0, 0.0371, -2.5, 17.0, 1_795_253_724.3])
 @pytest.mark.parametrize("rate_hz", [7.0, 50.0])
-def test_time_offset_is_recovered_at_each_rate(offset_s: float, rate_hz: float) -> None:
+def test_trajectory_time_offset_is_recovered_at_each_sample_rate(
+    offset_s: float, rate_hz: float
+) -> None:
     reference = flight()
     random = np.random.default_rng(4)
     estimate = transformed(flight(40.0, rate_hz), TURN, SHIFT, 1.7, kind="slam", frame="camera")
@@ -414,7 +422,7 @@ def test_time_offset_is_recovered_at_each_rate(offset_s: float, rate_hz: float) 
     assert back.offset_s == pytest.approx(-offset_s, abs=2e-3)
 
 
-def test_time_offset_interval_contains_true_offset() -> None:
+def test_trajectory_time_offset_interval_contains_true_offset() -> None:
     reference, held = flight(40.0, 100.0), 0
     random = np.random.default_rng(8)
     for _ in range(25):
@@ -426,7 +434,7 @@ def test_time_offset_interval_contains_true_offset() -> None:
     assert held >= 22
 
 
-def test_time_offset_unix_clocks_start_at_their_difference() -> None:
+def test_trajectory_time_offset_starts_at_unix_clock_difference() -> None:
     reference = replace(flight(), unix_offset_s=1.5e9)
     estimate = replace(flight(), unix_offset_s=0.0, time_s=flight().time_s + 1.5e9 - 0.2)
     assert clock_difference(estimate, reference) == -1.5e9
@@ -443,7 +451,7 @@ def test_time_offset_unix_clocks_start_at_their_difference() -> None:
 
 @pytest.mark.parametrize("kind", ["still", "line", "circle"])
 @pytest.mark.parametrize("noise_m", [0.0, 0.01, 0.05])
-def test_time_offset_without_excitation_is_undetermined(kind: str, noise_m: float) -> None:
+def test_trajectory_time_offset_needs_varying_motion(kind: str, noise_m: float) -> None:
     time = np.arange(0.0, 60.0, 0.05)
     position = {
         "still": np.zeros((len(time), 3)),
@@ -460,7 +468,7 @@ def test_time_offset_without_excitation_is_undetermined(kind: str, noise_m: floa
     assert "Unchanged timestamps used instead." in used.warnings[0]
 
 
-def test_time_offset_periodic_motion_is_undetermined() -> None:
+def test_time_offset_of_periodic_motion_is_undetermined() -> None:
     one = flight(20.0)
     lap = np.tile(np.arange(len(one)), 4)
     time = np.arange(len(lap)) * 0.05
@@ -474,7 +482,7 @@ def test_time_offset_periodic_motion_is_undetermined() -> None:
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
-def test_time_offset_shifted_public_data_is_recovered(pair: tuple[str, str]) -> None:
+def test_time_offset_of_shifted_public_data_is_recovered(pair: tuple[str, str]) -> None:
     estimate, reference = map(read_public, pair)
     base = estimate_time_offset(estimate, reference).offset_s
     assert abs(base) < 0.06  # the published clocks have small offsets
@@ -488,7 +496,7 @@ def test_time_offset_shifted_public_data_is_recovered(pair: tuple[str, str]) -> 
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.9, 0.97])
-def test_rmse_interval_contains_true_rmse(phi: float) -> None:
+def test_rmse_confidence_interval_contains_true_rmse(phi: float) -> None:
     random = np.random.default_rng(9)
     flights, n = 200, 2000
     white = random.normal(size=(n + 500, flights, 3)) * np.sqrt(1.0 - phi**2)
@@ -501,7 +509,7 @@ def test_rmse_interval_contains_true_rmse(phi: float) -> None:
     assert 0.85 < held <= 1.0
 
 
-def test_autocorrelation_time_equals_ar1_value() -> None:
+def test_autocorrelation_time_of_ar1_series_equals_closed_form() -> None:
     white = np.random.default_rng(10).normal(size=200_000)
     for phi in (0.0, 0.5, 0.9):
         values = lfilter([1.0], [1.0, -phi], white)
@@ -509,7 +517,7 @@ def test_autocorrelation_time_equals_ar1_value() -> None:
     assert autocorrelation_time(np.ones(50)) == 1.0
 
 
-def test_rmse_interval_too_few_blocks_is_unavailable() -> None:
+def test_rmse_interval_from_too_few_blocks_is_unavailable() -> None:
     drift = np.linspace(0.0, 1.0, 500)
     got = rmse_interval(drift, "ATE")
     assert isinstance(got, Unavailable)

@@ -77,7 +77,7 @@ def panel(score: Evaluation, title: str) -> Axes:
 # -- captions --------------------------------------------------------------------------------------
 
 
-def test_unaligned_sentence_has_rmse_of_evo_and_transform() -> None:
+def test_unaligned_rmse_in_evaluation_report_equals_evo() -> None:
     pytest.importorskip("evo")
     from evo.core import metrics, sync
     from evo.core.trajectory import PoseTrajectory3D
@@ -103,7 +103,7 @@ def test_unaligned_sentence_has_rmse_of_evo_and_transform() -> None:
     assert ", scale 2 (" in unaligned_sentence(evaluate(half, true, alignment="sim3"))
 
 
-def test_quarters_of_linearly_growing_error_match_integral() -> None:
+def test_rmse_per_quarter_of_growing_error_equals_integral() -> None:
     score = evaluate_with_error(across(np.linspace(0.0, 4.0, 2001)))
     ends = np.arange(5.0)  # ∫ x² dx over a quarter
     expected = np.sqrt((ends[1:] ** 3 - ends[:-1] ** 3) / 3.0)
@@ -114,13 +114,13 @@ def test_quarters_of_linearly_growing_error_match_integral() -> None:
 @pytest.mark.parametrize(("error", "share"), [
     (np.full(2000, 0.3), "10%"), (np.arange(2000) // 100 == 7, "100%"), (np.zeros(2000), "0%"),
 ], ids=["even", "a peak", "none"])  # fmt: skip
-def test_worst_moments_sentence_states_share_of_worst_tenth(error, share) -> None:
+def test_evaluation_report_states_error_of_worst_tenth_of_poses(error, share) -> None:
     sentence = worst_poses_sentence(evaluate_with_error(across(error.astype(np.float64))))
     assert f"contribute {share} of the squared error" in sentence
 
 
 @pytest.mark.parametrize(("kind", "times"), [("noise", 1.0), ("walk", 10**0.5), ("scale", 10.0)])
-def test_rpe_growth_separates_noise_from_drift(kind: str, times: float) -> None:
+def test_rpe_growth_distinguishes_noise_from_drift(kind: str, times: float) -> None:
     rng = np.random.default_rng(3)
     n = 20_001
     error = {
@@ -141,7 +141,7 @@ def test_rpe_growth_separates_noise_from_drift(kind: str, times: float) -> None:
 @pytest.mark.parametrize(("frame", "axes"), [
     ("NED", (1, 0)), ("FRD", (1, 0)), ("ENU", (0, 1)), ("camera", (0, 2)), ("unknown", (0, 1)),
 ])  # fmt: skip
-def test_path_views_flat_path_has_no_side_view(frame, axes) -> None:
+def test_flat_trajectory_is_drawn_without_side_view(frame, axes) -> None:
     spatial = replace(flight(), frame=frame)
     vertical = 3 - sum(axes)
     level = spatial.position_m.copy()
@@ -156,7 +156,7 @@ def test_path_views_flat_path_has_no_side_view(frame, axes) -> None:
     assert side.is_down == (frame in ("NED", "FRD", "camera"))
 
 
-def test_page_without_alignment_or_rpe_has_no_panel() -> None:
+def test_evaluation_report_without_alignment_omits_its_plot() -> None:
     assert not any(
         "alignment" in title for title in panels(evaluate_with_error(across(np.full(2001, 0.3))))
     )

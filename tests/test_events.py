@@ -21,7 +21,7 @@ from px4fuse.readers.common import mode_spans
 MODES = (FlightMode(0.0, 40.0, "Offboard"), FlightMode(40.0, 90.0, "Land"))
 
 
-def test_modes_sample_log_has_expected_spans(sample_flight: Flight) -> None:
+def test_flight_modes_of_sample_log_have_expected_times(sample_flight: Flight) -> None:
     assert [mode.name for mode in sample_flight.modes] == ["Offboard", "Land", "Offboard"]
     _, land, last = sample_flight.modes
     assert (land.start_s, land.end_s) == pytest.approx((120.48, 128.74), abs=0.01)
@@ -30,7 +30,9 @@ def test_modes_sample_log_has_expected_spans(sample_flight: Flight) -> None:
     assert land.start_s < sample_flight.airborne[-1][1] < land.end_s
 
 
-def test_modes_mavlink_recording_equals_ulog(sample_flight: Flight, sample_log: Path) -> None:
+def test_flight_modes_of_mavlink_recording_equal_those_of_ulog(
+    sample_flight: Flight, sample_log: Path
+) -> None:
     recording = read_log(sample_log.with_suffix(".tlog"))
     assert [mode.name for mode in recording.modes] == ["Hold", "Offboard", "Land", "Offboard"]
     shift = recording.log.boot_time_s - sample_flight.log.boot_time_s
@@ -42,21 +44,21 @@ def test_modes_mavlink_recording_equals_ulog(sample_flight: Flight, sample_log: 
     assert join(sample_flight, recording).modes == sample_flight.modes
 
 
-def test_mode_spans_equal_modes_are_joined() -> None:
+def test_consecutive_equal_flight_modes_are_merged() -> None:
     names = pd.Series(["a", "a", "b", "c", "a"], index=[-3.0, 1.0, 2.0, 1.5, 6.0])
     assert mode_spans(names, 8.0) == (
         FlightMode(0.0, 2.0, "a"), FlightMode(2.0, 6.0, "c"), FlightMode(6.0, 8.0, "a"),
     )  # fmt: skip
 
 
-def test_source_gaps_exceed_1_s_and_five_intervals() -> None:
+def test_detected_position_gaps_exceed_1_s_and_five_intervals() -> None:
     time_s = np.array([0.0, 0.2, 0.4, 1.4, 1.6, 3.0, 3.2])
     assert source_gaps(time_s, 5.0) == ((1.6, 3.0),)
     assert source_gaps(time_s, 1.0) == ()
     assert source_gaps(time_s[:1], 5.0) == ()
 
 
-def test_collect_events_lists_all_within_the_segment() -> None:
+def test_flight_events_outside_evaluated_segment_are_excluded() -> None:
     resets = tuple(Reset(time, "position", (1.0, 0.0, 0.0)) for time in (5.0, 30.0, 30.0, 95.0))
     flight = aisle_flight(
         duration_s=100.0, uwb=Uwb(gap_s=(60.0, 65.0)), ekf2=Estimator(resets=resets),
@@ -74,7 +76,7 @@ def test_collect_events_lists_all_within_the_segment() -> None:
     assert found.resets_s == (30.0,)
 
 
-def test_collect_events_rejections_are_per_axis() -> None:
+def test_flight_events_list_rejections_per_axis() -> None:
     comparison = compare(aisle_flight(ekf2=Estimator(rejected_fraction=0.2)))
     found = collect_events(comparison)
     for result in comparison.axes.values():
@@ -83,7 +85,7 @@ def test_collect_events_rejections_are_per_axis() -> None:
     assert len(found.rejected_s["aisle"]) > 50
 
 
-def test_collect_events_missing_data_gives_no_events() -> None:
+def test_flight_events_without_data_are_empty() -> None:
     flight = aisle_flight(ekf2=None)
     absent = Unavailable("land detector", "no topic", "Record it.")
     found = collect_events(compare(replace(flight, airborne=absent)))

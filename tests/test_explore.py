@@ -54,7 +54,7 @@ def page_of(analysis: Analysis, file: Path) -> Path:
 # ------------------------------------------------------------------ without a browser
 
 
-def test_policy_allows_only_included_scripts(
+def test_explore_page_content_policy_allows_only_own_scripts(
     explored: tuple[Path, Analysis],
 ) -> None:
     text = explored[0].read_text(encoding="utf-8")
@@ -74,7 +74,7 @@ def test_policy_allows_only_included_scripts(
         assert attributes.get("href") in (None, "data:,")
 
 
-def test_page_is_small_and_contains_no_paths(
+def test_explore_page_is_small_and_contains_no_file_paths(
     explored: tuple[Path, Analysis], tmp_path: Path
 ) -> None:
     text = explored[0].read_text(encoding="utf-8")
@@ -137,7 +137,7 @@ def cells(result: AxisComparison) -> dict[str, list[str]]:
     return expected
 
 
-def test_dragged_sliders_match_command_on_page(
+def test_explore_page_slider_values_match_the_shown_command(
     page: Browser, explored: tuple[Path, Analysis], sample_log: Path
 ) -> None:
     before = page.ask(TABLE)
@@ -172,7 +172,7 @@ def test_dragged_sliders_match_command_on_page(
     assert {name: shown[name] for name in expected} == expected
 
 
-def test_buttons_set_estimated_ekf2_and_lesson_values(
+def test_explore_page_buttons_set_estimated_or_ekf2_noises(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     tuned = explored[1].tuning["horizontal"]
@@ -192,7 +192,7 @@ def test_buttons_set_estimated_ekf2_and_lesson_values(
     assert page.ask("document.querySelector('#command').textContent").endswith("aisle_uwb.ulg")
 
 
-def test_invalid_address_or_number_prints_message(page: Browser) -> None:
+def test_explore_page_invalid_input_shows_a_message(page: Browser) -> None:
     page.ask("location.hash = '#sigma-a=-1&sigma-z=0.2&dt=abc&axis=<b>&input=gps&view=nowhere'")
     settle(page)
     message = "document.getElementById('message').textContent"
@@ -208,7 +208,7 @@ def test_invalid_address_or_number_prints_message(page: Browser) -> None:
     assert page.ask(VALUES) == ["0.5", "0.2", "0", "0.1"]
 
 
-def test_step_view_shows_numbers_of_each_measurement(
+def test_explore_page_steps_show_numbers_of_each_measurement(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     result = explored[1].main
@@ -240,7 +240,7 @@ def test_step_view_shows_numbers_of_each_measurement(
     assert page.ask("document.getElementById('now').textContent").startswith("Measurement 3 ")
 
 
-def test_buttons_set_time_of_all_plots(page: Browser) -> None:
+def test_explore_page_zoom_buttons_set_time_axis_of_all_plots(page: Browser) -> None:
     span = "document.getElementById('span').textContent"
     whole = page.ask(span)
     open_view(page, "sigma")
@@ -261,7 +261,7 @@ def test_buttons_set_time_of_all_plots(page: Browser) -> None:
     assert page.ask(span) != whole
 
 
-def test_tooltips_show_values_and_dark_mode_has_colours(page: Browser) -> None:
+def test_explore_page_tooltips_show_values(page: Browser) -> None:
     open_view(page, "track")
     x, y, width, height = box(page, "position")
     for step in range(3):
@@ -287,7 +287,7 @@ def test_tooltips_show_values_and_dark_mode_has_colours(page: Browser) -> None:
     assert ask(page, back) == light
 
 
-def test_box_on_map_selects_time(page: Browser) -> None:
+def test_explore_page_box_on_map_selects_time_span(page: Browser) -> None:
     span = "document.getElementById('span').textContent"
     whole = page.ask(span)
     open_view(page, "step")
@@ -302,7 +302,7 @@ def test_box_on_map_selects_time(page: Browser) -> None:
     assert 95.0 < high < 112.0
 
 
-def test_markup_in_log_name_is_shown_as_text(browser: Browser, tmp_path: Path) -> None:
+def test_explore_page_shows_markup_in_log_name_as_text(browser: Browser, tmp_path: Path) -> None:
     flight = aisle_flight(duration_s=20.0)
     flight = replace(flight, log=replace(flight.log, name=f"{MARKUP}.ulg"))
     show(browser, page_of(bare(flight), tmp_path / "hostile.html"))
@@ -313,7 +313,9 @@ def test_markup_in_log_name_is_shown_as_text(browser: Browser, tmp_path: Path) -
     assert browser.complaints() == []
 
 
-def test_page_without_ekf2_truth_imu_shows_kf_only(browser: Browser, tmp_path: Path) -> None:
+def test_explore_page_without_ekf2_and_truth_shows_only_kf(
+    browser: Browser, tmp_path: Path
+) -> None:
     flight = aisle_flight(duration_s=20.0, ekf2=None, truth=False, imu=None)
     show(browser, page_of(bare(flight), tmp_path / "bare.html"))
     table = browser.ask(TABLE)
@@ -334,7 +336,7 @@ def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("no_page")
-def test_explore_without_log_uses_sample_flight(
+def test_explore_command_without_log_uses_sample_flight(
     sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -350,7 +352,7 @@ def test_explore_without_log_uses_sample_flight(
 
 
 @pytest.mark.usefixtures("no_drawing", "no_page")
-def test_open_option_opens_written_file(
+def test_open_option_opens_the_written_file(
     sample_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened: list[str] = []

@@ -121,7 +121,7 @@ def flights(name: str, sample_log: Path) -> Comparison:
 
 
 @pytest.mark.parametrize("name", ["sample", "odometry", "IMU with a gap", "no IMU, gap in source"])
-def test_engine_matches_python_replay(engine: Browser, sample_log: Path, name: str) -> None:
+def test_javascript_kf_matches_python_replay(engine: Browser, sample_log: Path, name: str) -> None:
     comparison = flights(name, sample_log)
     rng = np.random.default_rng(len(name))
     imu = comparison.settings.input == "imu"
@@ -152,7 +152,7 @@ def close(page: list[float], expected: Any, column: str, settings: Settings) -> 
     )
 
 
-def test_unpack_returns_packed_arrays(engine: Browser) -> None:
+def test_javascript_unpack_restores_packed_arrays(engine: Browser) -> None:
     rng = np.random.default_rng(2)
     packer = Packer()
     arrays = [
@@ -174,7 +174,7 @@ def test_unpack_returns_packed_arrays(engine: Browser) -> None:
     assert unpacked[-1] == [0.1, 0.2, 123.456789]
 
 
-def test_engine_too_few_measurements_returns_null(engine: Browser) -> None:
+def test_javascript_kf_with_too_few_measurements_returns_null(engine: Browser) -> None:
     comparison = compare(aisle_flight(duration_s=30.0))
     packer = Packer()
     flight = replay_signals(comparison, packer)

@@ -60,7 +60,7 @@ def key(page: Browser, name: str) -> None:
 # ------------------------------------------------------------------ one screen
 
 
-def test_desktop_settings_card_and_plot_are_visible(page: Browser) -> None:
+def test_explore_page_on_desktop_shows_settings_card_and_plot(page: Browser) -> None:
     wanted = [*SLIDERS, "#innovation", "#card h2", "#card figure", "#tabs", ".legend", "#flown"]
     assert page.ask(f"({IN_VIEW})(...{json.dumps(wanted)})") == wanted
 
@@ -78,7 +78,7 @@ OVERLAPPING = """(() => {
 
 
 @pytest.mark.parametrize("width", [390, 1000, 1100, 1280, 1366, 1920])
-def test_axis_labels_do_not_overlap(
+def test_explore_page_plot_labels_do_not_overlap(
     browser: Browser, explored: tuple[Path, Analysis], width: int
 ) -> None:
     show(browser, explored[0], width=width)
@@ -89,7 +89,7 @@ def test_axis_labels_do_not_overlap(
     assert overlapping == []
 
 
-def test_phone_card_plot_and_sheet_are_on_one_screen(
+def test_explore_page_on_phone_fits_card_and_plot_on_one_screen(
     browser: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     show(browser, explored[0], width=390)
@@ -115,7 +115,7 @@ def test_phone_card_plot_and_sheet_are_on_one_screen(
     assert browser.complaints() == []
 
 
-def test_phone_swipe_opens_and_closes_sheet(
+def test_explore_page_swipe_on_phone_opens_settings_sheet(
     browser: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     show(browser, explored[0], width=390)
@@ -129,7 +129,7 @@ def test_phone_swipe_opens_and_closes_sheet(
         assert browser.ask("document.querySelector('aside').matches('.open')") == is_open
 
 
-def test_innovations_outside_plot_are_marked_at_edge(page: Browser) -> None:
+def test_explore_page_marks_innovations_outside_plot_at_edge(page: Browser) -> None:
     put(page, sigmaA=0.002)
 
     def drawn(name: str, *columns: str) -> list[Any]:
@@ -158,7 +158,7 @@ ROWS = """Object.fromEntries([...document.querySelectorAll('#card [data-filter]'
 }))"""
 
 
-def test_card_is_that_of_analysis_until_settings_change(
+def test_explore_page_shows_analysed_card_until_settings_change(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     card = card_of(explored[1])
@@ -177,7 +177,7 @@ def test_card_is_that_of_analysis_until_settings_change(
     assert card.headline in page.ask("document.querySelector('#card h2').textContent")
 
 
-def test_card_follows_settings_with_ratios_of_python(
+def test_explore_page_card_after_change_equals_python_ratios(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     analysis = explored[1]
@@ -204,7 +204,7 @@ def test_card_follows_settings_with_ratios_of_python(
     assert f"{format_ratio(truth.ratio)} overconfident" in label
 
 
-def test_apply_button_sets_values_of_command(
+def test_explore_page_apply_button_sets_values_of_command(
     browser: Browser, sample_log: Path, tmp_path: Path
 ) -> None:
     analysis = run(ComparisonRequest(log=str(sample_log), sigma_a_m_s2=0.001))
@@ -222,7 +222,9 @@ def test_apply_button_sets_values_of_command(
     assert browser.complaints() == []
 
 
-def test_ekf2_curves_equal_the_log(page: Browser, explored: tuple[Path, Analysis]) -> None:
+def test_explore_page_ekf2_curves_equal_logged_values(
+    page: Browser, explored: tuple[Path, Analysis]
+) -> None:
     result = explored[1].main
     state, variance = result.ekf2_state.dropna(), result.ekf2_variance.dropna()
     for view, name, column, logged in (
@@ -243,7 +245,9 @@ def test_ekf2_curves_equal_the_log(page: Browser, explored: tuple[Path, Analysis
     assert count == (result.ekf2_innovations["rejected"] > 0).sum()
 
 
-def test_address_restores_all_settings(page: Browser, explored: tuple[Path, Analysis]) -> None:
+def test_explore_page_address_restores_all_settings(
+    page: Browser, explored: tuple[Path, Analysis]
+) -> None:
     wanted = (
         "#axis=east&input=zero&sigma-a=0.7&sigma-z=0.07&dt=0.05&clock-offset=-0.1"
         "&view=step&measurement=17"
@@ -264,7 +268,7 @@ def test_address_restores_all_settings(page: Browser, explored: tuple[Path, Anal
 # ------------------------------------------------------------------ the step
 
 
-def test_ellipse_equals_covariance_in_each_step(
+def test_explore_page_ellipse_equals_covariance_in_each_step(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     open_view(page, "step")
@@ -294,7 +298,7 @@ def test_ellipse_equals_covariance_in_each_step(
             assert mean[0] == pytest.approx(steps["position_m"].iloc[i], abs=1e-9)
 
 
-def test_space_key_starts_and_pauses_steps(page: Browser) -> None:
+def test_explore_page_space_key_starts_and_pauses_animation(page: Browser) -> None:
     page.ask("document.activeElement.blur()")
     steps = "Explore.then((e) => e.stepper.at())"
     page.call("Input.dispatchKeyEvent", type="keyDown", key=" ", text=" ")
@@ -313,7 +317,7 @@ def test_space_key_starts_and_pauses_steps(page: Browser) -> None:
 # ------------------------------------------------------------------ the tour
 
 
-def test_tour_shows_numbers_of_flight_in_each_station(
+def test_explore_page_tour_shows_numbers_of_the_flight(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     analysis = explored[1]
@@ -360,7 +364,7 @@ def _shifted(analysis: Analysis, offset_s: float) -> Any:
 # ------------------------------------------------------------------ accessibility
 
 
-def test_tabs_and_sliders_work_with_keyboard(page: Browser) -> None:
+def test_explore_page_tabs_and_sliders_work_with_keyboard(page: Browser) -> None:
     page.ask("document.getElementById('tab-errors').focus()")
     key(page, "ArrowRight")
     settle(page)
@@ -384,7 +388,7 @@ def test_tabs_and_sliders_work_with_keyboard(page: Browser) -> None:
 
 
 @pytest.mark.parametrize(("width", "height", "scheme"), [(1400, 900, "dark"), (390, 844, "light")])
-def test_explore_page_has_no_serious_axe_violations(
+def test_explore_page_has_no_serious_accessibility_violation(
     browser: Browser, explored: tuple[Path, Analysis], width: int, height: int, scheme: str
 ) -> None:
     show(browser, explored[0], width=width)

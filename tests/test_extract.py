@@ -63,7 +63,7 @@ def rich_flight() -> Flight:
 # ---- tables -----------------------------------------------------------------------------------
 
 
-def test_extract_csv_reads_back_identical_floats(written, sample_flight):
+def test_extracted_csv_read_again_gives_identical_floats(written, sample_flight):
     ekf2 = sample_flight.ekf2
     expected = {
         "imu": sample_flight.imu, "attitude": sample_flight.attitude,
@@ -80,7 +80,7 @@ def test_extract_csv_reads_back_identical_floats(written, sample_flight):
         np.testing.assert_array_equal(table.iloc[:, 1:], frame, err_msg=name)
 
 
-def test_extract_innovations_are_one_table_with_axis_column(written, sample_flight):
+def test_extract_writes_innovations_of_all_axes_in_one_table(written, sample_flight):
     table = read(written / "ekf2_innovations.csv")
     assert table["time_s"].is_monotonic_increasing
     assert set(table["axis"]) == {"north", "east"}
@@ -90,7 +90,7 @@ def test_extract_innovations_are_one_table_with_axis_column(written, sample_flig
         np.testing.assert_array_equal(rows[frame.columns], frame)
 
 
-def test_extract_gnss_flight_has_gnss_innovations(tmp_path):
+def test_extract_from_gnss_flight_writes_gnss_innovations(tmp_path):
     log = tmp_path / "o.ulg"
     log.write_bytes(to_ulog(simulate(make_scenario("outdoor", passes=1, length_m=10.0))))
     assert "external vision" not in extract(log, "-o", tmp_path / "o")
@@ -99,7 +99,7 @@ def test_extract_gnss_flight_has_gnss_innovations(tmp_path):
     assert {*read(tmp_path / "o" / "ekf2_innovations.csv")["axis"]} == {"north", "east"}
 
 
-def test_tables_contain_resets_instances_clocks_and_spans():
+def test_extracted_tables_contain_resets_clocks_and_parameters():
     flight = rich_flight()
     tables = extraction.tables(flight)
     resets = tables["resets"]
@@ -118,7 +118,7 @@ def test_tables_contain_resets_instances_clocks_and_spans():
     assert clock == {name: value for name, value in expected.items() if value is not None}
 
 
-def test_tables_contain_ekf2_parameters_and_orientation(sample_flight):
+def test_extracted_tables_contain_orientation_from_odometry(sample_flight):
     """Parameters of EKF2, and the orientation from odometry."""
     flight = read_log(REPOSITORY / "sample_logs" / "loop_vio.ulg")
     tables = extraction.tables(flight)
@@ -135,7 +135,7 @@ def test_tables_contain_ekf2_parameters_and_orientation(sample_flight):
 # ---- the dictionary ---------------------------------------------------------------------------
 
 
-def test_dictionary_lists_exactly_the_written_columns(written, sample_flight):
+def test_data_dictionary_lists_exactly_the_written_columns(written, sample_flight):
     dictionary = pd.read_csv(written / "data_dictionary.csv", keep_default_na=False)
     described = list(zip(dictionary["table"], dictionary["column"], strict=True))
     assert len(set(described)) == len(described)
@@ -155,7 +155,7 @@ def test_dictionary_lists_exactly_the_written_columns(written, sample_flight):
 
 
 @pytest.mark.parametrize("flight", [rich_flight(), aisle_flight(duration_s=5.0, imu=None)])
-def test_dictionary_units_match_column_names(flight):
+def test_data_dictionary_units_match_column_names(flight):
     dictionary = extraction.data_dictionary(flight)
     tables = extraction.tables(flight)
     assert list(dict.fromkeys(dictionary["table"])) == list(tables)
@@ -167,7 +167,7 @@ def test_dictionary_units_match_column_names(flight):
         assert not suffix or row.unit == UNITS[suffix], row
 
 
-def test_flight_json_lists_log_streams_and_missing_data(written, sample_flight):
+def test_extracted_flight_json_lists_streams_and_missing_data(written, sample_flight):
     text = (written / "flight.json").read_text(encoding="utf-8")
     about = json.loads(text, parse_constant=pytest.fail)
     assert about["schema"] == {"name": "px4fuse-flight", "version": "1.0"}
@@ -187,7 +187,7 @@ def test_flight_json_lists_log_streams_and_missing_data(written, sample_flight):
     ("estimator_states", {"ekf2_variance"}),
     ("vehicle_visual_odometry", {"position_vehicle_visual_odometry"}),
 ])  # fmt: skip
-def test_extract_unavailable_part_has_no_table_and_is_listed(tmp_path, dropped, lost):
+def test_extract_without_topic_writes_no_table_and_states_it(tmp_path, dropped, lost):
     whole = set(extraction.tables(read_log(make_log().write(tmp_path / "whole.ulg"))))
     path = make_log().drop(dropped).write(tmp_path / "less.ulg")
     said = extract(path, "-o", tmp_path / "out")
@@ -200,7 +200,7 @@ def test_extract_unavailable_part_has_no_table_and_is_listed(tmp_path, dropped, 
 # ---- names and folders ------------------------------------------------------------------------
 
 
-def test_tables_names_are_valid_file_names(sample_flight):
+def test_extracted_table_names_are_valid_file_names(sample_flight):
     track = sample_flight.positions[0]
     names = ["uwb log.csv", "UWB_LOG.csv", 'a/b\\c:d*?"<>|', "CON", "ünï", "x" * 300, "end. "]
     flight = replace(sample_flight, positions=tuple(replace(track, name=name) for name in names))
@@ -213,7 +213,7 @@ def test_tables_names_are_valid_file_names(sample_flight):
 @pytest.mark.parametrize(("options", "said"), [
     ([], "is a file"), (["--format", "parquet"], 'pip install "px4fuse[parquet]"'),
 ])  # fmt: skip
-def test_extract_impossible_output_prints_one_line(
+def test_extract_to_unwritable_folder_prints_one_error_line(
     tmp_path, monkeypatch, capsys, sample_log, options, said
 ):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
@@ -229,7 +229,7 @@ def test_extract_impossible_output_prints_one_line(
 # ---- Parquet ----------------------------------------------------------------------------------
 
 
-def test_extract_parquet_contains_the_same_tables(tmp_path, sample_log, sample_flight):
+def test_extract_to_parquet_writes_the_same_tables(tmp_path, sample_log, sample_flight):
     pytest.importorskip("pyarrow", reason="Parquet needs the extra px4fuse[parquet]")
     extract(sample_log, "-o", tmp_path, "--format", "parquet")
     for name, table in extraction.tables(sample_flight).items():
@@ -241,7 +241,7 @@ def test_extract_parquet_contains_the_same_tables(tmp_path, sample_log, sample_f
 # ---- the lesson by hand -----------------------------------------------------------------------
 
 
-def test_lesson_example_on_tables_matches_compare(
+def test_lesson_example_on_extracted_tables_matches_compare(
     tmp_path, monkeypatch, capsys, sample_log, sample_flight
 ):
     """The example is KF, except that it rounds the time of each measurement to the DT grid."""

@@ -94,11 +94,11 @@ def make_finding(name: str, level: Any = "error", caused_by: str | None = None) 
         (((0.0, 0.05),), "0.0 s"), (((0.0, 0.06),), "0.0 s to 0.1 s"),
     ],
 )  # fmt: skip
-def test_finding_when_formats_spans(spans: Any, expected: str) -> None:
+def test_finding_text_lists_times_of_its_occurrence(spans: Any, expected: str) -> None:
     assert replace(make_finding("x"), spans_s=spans).when == expected
 
 
-def test_fraction_on_first_value_extends_backwards() -> None:
+def test_status_flag_before_first_sample_has_first_value() -> None:
     flag, whole = pd.Series([1.0, 0.0, 1.0], index=[20.0, 30.0, 80.0]), Segment(10.0, 110.0, "")
     assert fraction_on(flag, whole) == 0.5
     assert fraction_on(flag, Segment(25.0, 35.0, "")) == 0.5
@@ -107,7 +107,7 @@ def test_fraction_on_first_value_extends_backwards() -> None:
     assert spans_with_value(0.0, flag, Segment(40.0, 50.0, "")) == ((40.0, 50.0),)
 
 
-def test_by_root_groups_consequences_behind_cause() -> None:
+def test_group_findings_lists_consequences_behind_root_cause() -> None:
     first, other = make_finding("kf_underconfident"), make_finding("no_motion", "note")
     follows = make_finding("kf_underconfident", caused_by="kf_underconfident")
     assert group_by_root([first, follows, other]) == [[first, follows], [other]]
@@ -119,7 +119,7 @@ def test_by_root_groups_consequences_behind_cause() -> None:
 NO_GAP = SimpleNamespace(gaps=())
 
 
-def test_ekf2_resets_outside_segment_are_ignored(
+def test_ekf2_resets_outside_evaluated_segment_are_ignored(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(ekf2_resets, "continuous_state", lambda *_: (None, "resets undone"))
@@ -149,7 +149,7 @@ def test_ekf2_resets_outside_segment_are_ignored(
         (Reset(65.1, "position", (1.0, 0.0, 0.0)), ((50.0, 60.0),), ("warning", ELSEWHERE)),
     ],
 )
-def test_ekf2_resets_at_take_off_are_usual_and_gap_is_cause(
+def test_ekf2_height_reset_at_take_off_is_not_reported(
     reset: Reset, gaps: Any, expected: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ekf2_resets, "continuous_state", lambda *_: (None, "resets kept"))
@@ -159,7 +159,7 @@ def test_ekf2_resets_at_take_off_are_usual_and_gap_is_cause(
     assert found == ([] if expected is None else [expected])
 
 
-def test_dropouts_outside_segment_are_ignored() -> None:
+def test_log_dropouts_outside_evaluated_segment_are_ignored() -> None:
     lost = tuple(Dropout(at, 1.0) for at in (8.9, 9.0, 50.0, 110.0, 110.1))
     finding = only(
         recording.detect_dropouts, analysis(log=log(dropouts=(*lost, Dropout(60.0, 0.5))))
@@ -174,7 +174,9 @@ def test_dropouts_outside_segment_are_ignored() -> None:
         (60.0, {"ekf2_fusion_interrupted": "warning"}), (59.9, {"ekf2_not_fusing": "error"}),
     ],
 )  # fmt: skip
-def test_ekf2_not_fusing_severity_follows_share(until_s: float, expected: dict[str, str]) -> None:
+def test_ekf2_not_fusing_severity_follows_fraction_of_time(
+    until_s: float, expected: dict[str, str]
+) -> None:
     one = analysis(ekf2=with_fusion((0.0, 1.0), (until_s, 0.0)))
     assert named(ekf2_not_fusing.detect, one) == expected
     for finding in ekf2_not_fusing.detect(one):
@@ -233,7 +235,9 @@ UNKNOWN = "The log does not contain the reason"
         ),
     ],
 )
-def test_ekf2_not_fusing_states_reason_and_action(flight: Any, reason: str, remedy: str) -> None:
+def test_ekf2_not_fusing_finding_states_reason_and_action(
+    flight: Any, reason: str, remedy: str
+) -> None:
     finding = only(ekf2_not_fusing.detect, flight)
     assert finding.severity == "error"
     assert finding.title.startswith("EKF2 never fused the UWB positions")
@@ -251,7 +255,9 @@ def rejected(count: int, of: int) -> pd.DataFrame:
     ("count", "of", "expected"),
     [(1, 100, "warning"), (1, 101, None), (20, 100, "error"), (19, 100, "warning")],
 )
-def test_ekf2_rejecting_severity_follows_share(count: int, of: int, expected: str | None) -> None:
+def test_ekf2_rejection_severity_follows_rejected_fraction(
+    count: int, of: int, expected: str | None
+) -> None:
     """EKF2 rejects the horizontal vector, so the main axis is used."""
     axes = axis("north", ekf2_innovations=rejected(count, of)), axis("east")
     axes[1].ekf2_innovations = rejected(9, 9)
@@ -268,7 +274,7 @@ def test_ekf2_rejecting_severity_follows_share(count: int, of: int, expected: st
             assert finding.remedy.endswith(remedy)
 
 
-def test_ekf2_rejecting_action_is_rerun_with_half_the_rejections() -> None:
+def test_recommended_action_must_halve_ekf2_rejections() -> None:
     frame = rejected(20, 100)
     for after, improves, action in (
         (0.09, True, "Set EKF2_EVP_NOISE to 0.1 m."), (0.1, True, CHECK_FIRST),
@@ -292,7 +298,7 @@ CHECK_FIRST = (
 # ---------------------------------------------------------------- errors and truth
 
 
-def test_error_beyond_sigma_reports_worst_axis_and_action() -> None:
+def test_error_beyond_sigma_finding_names_axis_and_action() -> None:
     ekf2 = axis("east", ekf2=statement(0.49), ekf2_truth=against_truth(25.0, 1.0))
     finding = only(hidden_errors.detect, analysis(axes=(axis(), hiding(name="down"), ekf2)))
     assert finding.title == (
@@ -320,7 +326,7 @@ def test_error_beyond_sigma_reports_worst_axis_and_action() -> None:
 
 @pytest.mark.parametrize(("left", "frame"), [(0.45, True), (0.55, False)])
 @pytest.mark.parametrize("drifts", [False, True])
-def test_error_beyond_sigma_reports_rmse_after_alignment(
+def test_error_beyond_sigma_finding_states_aligned_rmse(
     left: float, frame: bool, drifts: bool
 ) -> None:
     """Circle of 5 m with a shift and an error that changes its sign with each sample."""
@@ -362,7 +368,9 @@ def test_error_beyond_sigma_reports_rmse_after_alignment(
         ((10.0, 109.9), (10.0, 110.0), [(39.99, 42.0), (109.9, 110.0)]),
     ],
 )  # fmt: skip
-def test_imu_gap_spans_are_found_inside_the_segment(ends: Any, segment: Any, spans: Any) -> None:
+def test_imu_gaps_are_found_only_inside_evaluated_segment(
+    ends: Any, segment: Any, spans: Any
+) -> None:
     """Gaps at an end count if longer than 0.05 s; gaps outside the segment do not."""
     time = np.concatenate([np.arange(ends[0], 40.0, 0.01), np.arange(42.0, ends[1], 0.01)])
     found = imu._gap_spans(pd.DataFrame(index=time), Segment(*segment, ""))
@@ -374,7 +382,7 @@ def test_imu_gap_spans_are_found_inside_the_segment(ends: Any, segment: Any, spa
     ("imu_hz", "attitude_hz", "expected"),
     [(49.1, 9.9, []), (48.9, 9.9, [100.0]), (49.1, 9.7, [20.0])],
 )
-def test_imu_rates_below_98_percent_are_reported(imu_hz, attitude_hz, expected) -> None:
+def test_imu_rate_below_98_percent_of_required_is_reported(imu_hz, attitude_hz, expected) -> None:
     flight = {"imu": at_rate(imu_hz), "attitude": at_rate(attitude_hz)}
     for info, action in (
         (log(), "Set SDLOG_PROFILE to 17 "),
@@ -396,7 +404,7 @@ def test_imu_rates_below_98_percent_are_reported(imu_hz, attitude_hz, expected) 
         (2.0, "estimator_aid_src_ev_pos", True), (5.0, "ekf2_state_plus_innovation", True),
     ],
 )  # fmt: skip
-def test_source_as_sent_logger_limit_is_reported(
+def test_position_source_not_logged_as_received_is_reported(
     rate_hz: float, name: str, decimated: bool
 ) -> None:
     lacks = (
@@ -425,7 +433,7 @@ def test_source_as_sent_logger_limit_is_reported(
 
 
 @pytest.mark.parametrize(("rate_hz", "least_s"), [(2.0, 2.5), (10.0, 1.0)])
-def test_gaps_above_five_intervals_and_1_s_are_reported(
+def test_position_gap_above_1_s_and_five_intervals_is_reported(
     rate_hz: float, least_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The limit is five intervals, but at least 1 s."""
@@ -440,7 +448,7 @@ def test_gaps_above_five_intervals_and_1_s_are_reported(
         ] * there
 
 
-def test_motion_range_ignores_5_percent_at_each_end() -> None:
+def test_motion_range_ignores_5_percent_of_positions_at_each_end() -> None:
     moving = positions(10.0 + np.arange(100))
     moving["east_m"] = np.repeat([-9.0, -1.0, -0.5, 0.0, 0.5, 1.0, 9.0], [3, 4, 3, 80, 3, 4, 3])
     outside = positions([5.0, 111.0], 99.0)
@@ -451,7 +459,7 @@ def test_motion_range_ignores_5_percent_at_each_end() -> None:
 # ---------------------------------------------------------------- frames
 
 
-def test_placement_conflict_is_error_and_doubt_is_warning() -> None:
+def test_wrong_frame_of_position_file_is_reported_as_error() -> None:
     placed = SimpleNamespace(
         misplaced=("as good as ned: give --position-frame ned.",), warnings=("it is weak.",)
     )
@@ -461,7 +469,9 @@ def test_placement_conflict_is_error_and_doubt_is_warning() -> None:
 
 
 @pytest.mark.parametrize(("until_s", "expected"), [(60.0, "warning"), (60.1, "note")])
-def test_frame_not_north_severity_depends_on_fused_yaw(until_s: float, expected: str) -> None:
+def test_severity_of_frame_without_north_depends_on_fused_yaw(
+    until_s: float, expected: str
+) -> None:
     frd = source(frame="FRD")
     one = analysis(source=frd, ekf2=with_fusion((0.0, 1.0), (until_s, 0.0), column="yaw"))
     finding = only(source_frame.detect, one)
@@ -482,7 +492,7 @@ def heading_error(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> He
     return together(tuple(parts), p, "positions")
 
 
-def test_misalignment_reports_interval_and_opposite_rotation() -> None:
+def test_misaligned_frame_finding_gives_rotation_to_apply() -> None:
     finding = only(source_frame.detect, analysis(heading=heading_error(20.0, sigma_deg=2.0)))
     assert finding.id == "source_frame_misaligned"
     assert finding.title == "UWB positions are rotated by +20° relative to the IMU"
@@ -493,7 +503,7 @@ def test_misalignment_reports_interval_and_opposite_rotation() -> None:
     assert only(source_frame.detect, one).id == "ekf2_heading_error"
 
 
-def test_misalignment_heading_drift_reports_both_ends() -> None:
+def test_heading_drift_finding_states_heading_at_both_ends() -> None:
     drifting = heading_error(2.0, 30.0, p=0.0)
     for has_ulog in (True, False):
         one = analysis(heading=drifting, log=log(has_ulog=has_ulog))
@@ -787,7 +797,7 @@ SOURCE_EDGES = [
 ]  # fmt: skip
 
 
-def test_bias_reports_interval_tilt_and_ekf2_estimate() -> None:
+def test_accelerometer_bias_finding_states_95_percent_interval() -> None:
     one = analysis(
         bias_scale_jump_fit=with_bias(0.3, 0.05, -0.4), ekf2=bias_of_ekf2(0.1, -0.2, 0.0)
     )
@@ -806,11 +816,11 @@ def test_bias_reports_interval_tilt_and_ekf2_estimate() -> None:
       ["source_timestamps_constant", "source_timestamp_jitter"]),
      (clock_map(jitter_s=0.5), []), (clock_map("arrival time"), ["companion_not_synchronised"])],
 )  # fmt: skip
-def test_source_stamps_recording_reports_clock_faults(clock: Any, expected: list[str]) -> None:
+def test_faulty_timestamps_of_recording_are_reported(clock: Any, expected: list[str]) -> None:
     assert list(named(source_stamps.detect, analysis(source=source(clock_map=clock)))) == expected
 
 
-def test_arrivals_end_at_first_measurement_time() -> None:
+def test_arrival_times_used_until_clock_sync_are_reported() -> None:
     one = analysis(ekf2=ages(12, 20, 0.05))
     finding = only(source_stamps.detect_arrival_times, one)
     assert finding.evidence == {"until_s": 32.0, "latency_s": 0.05}
@@ -819,7 +829,7 @@ def test_arrivals_end_at_first_measurement_time() -> None:
     assert source_stamps.find_synchronisation(analysis(ekf2=ages(30, 0))) is None
 
 
-def test_base_interval_is_found_within_jitter() -> None:
+def test_sample_interval_is_found_despite_jitter() -> None:
     def base(intervals: Any) -> float | None:
         found = source_intervals._base_interval(np.array(intervals))
         return None if found is None else found[0]
@@ -834,20 +844,20 @@ def test_base_interval_is_found_within_jitter() -> None:
         assert (found == pytest.approx(1.0)) if there else found is None
 
 
-def test_losses_do_not_count_gaps() -> None:
+def test_lost_samples_in_a_position_gap_are_not_counted() -> None:
     for longest, lost in ((5.0, [4]), (5.1, [])):  # intervals of 0.25 s
         one = at_multiples([1.0] * 20 + [longest], 0.25, clock_map=clock_map())  # type: ignore[list-item]
         assert [each.evidence["lost"] for each in source_intervals.detect_lost_samples(one)] == lost
 
 
-def test_jumps_report_count_and_largest() -> None:
+def test_position_jump_finding_states_count_and_largest_jump() -> None:
     sizes = (jump(0.3, 0.0, at_s=30.0), jump(0.6, 0.8, at_s=60.0), jump(0.1, 0.0, at_s=90.0))
     finding = only(source_positions.detect_jumps, jumping(*sizes))
     assert finding.evidence == {"count": 2, "size_m": 1.0, "at_s": 60.0, "sigma_m": 0.02}
     assert finding.spans_s == ((30.0, 30.0), (60.0, 60.0))
 
 
-def test_scale_and_reported_variance_state_direction() -> None:
+def test_scale_error_finding_states_too_long_or_too_short() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
         finding = only(source_positions.detect_scale_error, scaled(signed))
         assert finding.title == f"UWB distances are 20 % too {word}"
@@ -859,7 +869,7 @@ def test_scale_and_reported_variance_state_direction() -> None:
 
 
 @pytest.mark.parametrize(("error_m", "expected"), [(1.41, "error"), (1.42, None)])
-def test_stated_variance_covering_true_errors_is_accepted(error_m, expected):
+def test_reported_variance_that_covers_true_error_is_accepted(error_m, expected):
     time = np.arange(0.0, 120.0)
     still = pd.DataFrame({"position_m": 0.0 * time}, index=time)
     axes = tuple(axis(name, truth=still) for name in ("north", "east"))
@@ -879,14 +889,14 @@ def test_stated_variance_covering_true_errors_is_accepted(error_m, expected):
         ((jump(1.0, 0.0, at_s=20.0),), (18.9, 26.0, 27.0)),
     ],
 )
-def test_outliers_next_to_a_jump_are_ignored(jumps, times_s):
+def test_position_outliers_next_to_a_jump_are_ignored(jumps, times_s):
     outliers = tuned(outlier_time_s=np.array([18.9, 19.0, 25.9, 26.0, 27.0]), count=100)
     finding = only(source_positions.detect_outliers, jumping(*jumps, tuning=outliers))
     assert finding.evidence["count"] == len(times_s)
     assert finding.spans_s == tuple((time_s, time_s) for time_s in times_s)
 
 
-def test_outlier_sizes_are_distances_to_truth_or_neighbours() -> None:
+def test_position_outlier_size_is_distance_to_ground_truth() -> None:
     time = np.arange(0.0, 120.0)
     truth = pd.DataFrame({"position_m": 0.0 * time}, index=time)
     for known, north_m, reference in (
@@ -904,7 +914,7 @@ def test_outlier_sizes_are_distances_to_truth_or_neighbours() -> None:
         assert f"distance of {north_m:.2f} m to {reference}" in finding.message
 
 
-def test_outliers_state_number_that_ekf2_rejected() -> None:
+def test_position_outlier_finding_states_number_ekf2_rejected() -> None:
     innovations = pd.DataFrame({"rejected": np.zeros(120)}, index=np.arange(0.05, 120.0))
     innovations.iloc[[20, 40, 50], 0] = 1.0
     outliers = tuned(outlier_time_s=np.array([20.0, 30.0, 40.0]), count=120)
@@ -920,7 +930,7 @@ def test_outliers_state_number_that_ekf2_rejected() -> None:
 APPLIED = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0, clock_offset_s=-0.05)
 
 
-def test_clock_offset_action_includes_offset_in_use() -> None:
+def test_time_offset_action_includes_the_offset_already_applied() -> None:
     one = analysis(clock=late(-0.1, applied_s=-0.05), settings=APPLIED)
     finding = only(source_clock.detect, one)
     assert finding.title == "Position timestamps are 0.10 s late"
@@ -939,7 +949,7 @@ def test_clock_offset_action_includes_offset_in_use() -> None:
 
 
 @pytest.mark.parametrize(("p", "there"), [(0.005, False), (0.0049, True), (None, False)])
-def test_clock_offset_change_below_p_limit_is_reported(p: float | None, there: bool) -> None:
+def test_change_of_time_offset_with_small_p_value_is_reported(p: float | None, there: bool) -> None:
     found = only(source_clock.detect, analysis(clock=late(0.1, change_p_value=p)))
     assert found.id == ("source_time_offset_changes" if there else "source_time_offset")
     if there:
@@ -948,7 +958,7 @@ def test_clock_offset_change_below_p_limit_is_reported(p: float | None, there: b
 
 
 @pytest.mark.parametrize(("after_m", "there"), [(1.005, True), (1.0051, False), (0.5, True)])
-def test_clock_offset_contradicted_by_truth_has_no_finding(after_m, there) -> None:
+def test_time_offset_that_increases_true_error_has_no_finding(after_m, there) -> None:
     shifted = rerun("kf", "time offset", {"clock_offset_s": 0.123}, after_m)
     one = analysis(clock=late(0.12345), trials=(shifted,))
     assert severity(source_clock.detect, one) == ("error" if there else None)
@@ -1003,7 +1013,7 @@ def rerun(owner: Any, kind: str, change: dict[str, float], after_m: float) -> Tr
         (late(-0.3, interval_s=(-0.4, -0.2)), 0.0, "300 ms late", "Check EKF2_EV_DELAY."),
     ],
 )
-def test_delay_remedy_stays_in_px4_range(
+def test_recommended_ekf2_delay_stays_in_px4_range(
     clock: Any, delay_ms: float, text: str, remedy: str
 ) -> None:
     finding = only(wrong_delay, delayed(delay_ms, clock))
@@ -1016,13 +1026,13 @@ def test_delay_remedy_stays_in_px4_range(
     ("after_m", "remedy"),
     [(0.5, "Set EKF2_EV_DELAY to 120 ms."), (1.0, "Correct the timestamps at the sender.")],
 )
-def test_delay_is_named_only_if_its_rerun_improves(after_m: float, remedy: str) -> None:
+def test_ekf2_delay_is_recommended_only_if_its_rerun_improves(after_m: float, remedy: str) -> None:
     trials = (rerun("ekf2", "delay", {"EKF2_EV_DELAY": 120.0}, after_m),)
     finding = only(wrong_delay, delayed(0.0, late(-0.12), trials=trials))
     assert finding.remedy == remedy
 
 
-def test_time_offset_names_the_delay_of_a_gnss_receiver() -> None:
+def test_time_offset_of_gnss_names_the_receiver_delay_parameter() -> None:
     parameters = {"EKF2_GPS_DELAY": 110.0}
     one = analysis(clock=late(-0.05), source=source(origin=GNSS), log=log(parameters=parameters))
     finding = only(source_clock.detect, one)
@@ -1031,7 +1041,7 @@ def test_time_offset_names_the_delay_of_a_gnss_receiver() -> None:
 
 
 @pytest.mark.parametrize(("detect", "one", "expected"), EDGES + SOURCE_EDGES)
-def test_detectors_at_limits_have_expected_severity(
+def test_finding_severity_changes_at_limits_of_each_detector(
     detect: Any, one: Any, expected: str | None
 ) -> None:
     assert severity(detect, one) == expected

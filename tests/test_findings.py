@@ -291,12 +291,12 @@ def ids(findings: tuple[Finding, ...]) -> set[str]:
 
 
 @pytest.mark.parametrize("seed", range(2, 8))
-def test_find_clean_flight_returns_nothing(seed: int) -> None:
+def test_clean_flight_has_no_findings(seed: int) -> None:
     assert found(compare(aisle_flight(seed=seed))) == ()
 
 
 @pytest.mark.reallogs
-def test_find_crash_lists_tumbling_first(shared_logs: Path) -> None:
+def test_crash_flight_lists_tumbling_as_first_finding(shared_logs: Path) -> None:
     """Flight Review log "ekf_failure": accelerometer clipping, then roll and pitch at 68 s."""
     flight = read_log(shared_logs / "real" / "PX4_flight-review-rs_ekf_failure.ulg")
     first, second = found(compare(flight))[:2]
@@ -307,7 +307,7 @@ def test_find_crash_lists_tumbling_first(shared_logs: Path) -> None:
     assert second.spans_s[0][0] == pytest.approx(24.9, abs=0.1)
 
 
-def test_faults_cover_all_findings() -> None:
+def test_each_finding_has_a_test_with_a_simulated_fault() -> None:
     assert set(TITLES) == {fault.id for fault in FAULTS} | TESTED_ELSEWHERE
 
 
@@ -316,7 +316,7 @@ def test_faults_cover_all_findings() -> None:
     list(enumerate(FAULTS)),
     ids=[f"{fault.id}-{fault.severity}" for fault in FAULTS],
 )
-def test_find_fault_reports_evidence_and_no_other_error(at: int, fault: Fault) -> None:
+def test_each_simulated_fault_gives_only_its_finding_as_error(at: int, fault: Fault) -> None:
     """Messages and actions are compared with tests/golden/findings.txt (see test_golden)."""
     is_tuned = "sigma_z_asked_m" in fault.evidence or fault.id == "process_noise_near_zero"
     findings = found(compare(fault.fly(), Settings(**fault.settings)), tuned=is_tuned)
@@ -333,7 +333,7 @@ def test_find_fault_reports_evidence_and_no_other_error(at: int, fault: Fault) -
 @pytest.mark.parametrize(
     ("gate", "expected"), [(1.0, 0.5340), (1.5, 0.2494), (2.0, 0.0889), (2.8, 0.0102), (3.0, None)]
 )
-def test_find_narrow_gate_lists_gate_before_rejections(gate, expected) -> None:
+def test_narrow_gate_finding_precedes_its_rejection_findings(gate, expected) -> None:
     """Expected shares: tables of the normal distribution, two axes."""
     flown = with_ekf2(gate=gate)(aisle_flight(**ekf2(rejected_fraction=0.3)))
     first, *others = found(compare(flown))
@@ -352,7 +352,9 @@ def test_find_narrow_gate_lists_gate_before_rejections(gate, expected) -> None:
 @pytest.mark.parametrize(
     ("absent", "flight", "present"), MISSING_FIELD, ids=lambda value: str(value)[:40]
 )
-def test_find_missing_field_is_not_guessed(absent: str, flight: Any, present: str | None) -> None:
+def test_log_without_required_field_gives_no_finding_about_it(
+    absent: str, flight: Any, present: str | None
+) -> None:
     found_ids = ids(found(compare(aisle_flight(duration_s=60.0, **flight))))
     assert absent not in found_ids
     assert present is None or present in found_ids
@@ -360,7 +362,7 @@ def test_find_missing_field_is_not_guessed(absent: str, flight: Any, present: st
 
 @pytest.mark.parametrize("duration_s", [0.4, 2.0])
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: f"{fault.id}-{fault.severity}")
-def test_find_very_short_flight_does_not_raise(fault: Fault, duration_s: float) -> None:
+def test_findings_of_very_short_flight_raise_no_exception(fault: Fault, duration_s: float) -> None:
     # one in ten of these is lost
     rate_hz = 10.0 if fault.id == "source_samples_lost" else 5.0
     uwb = replace(fault.flight.get("uwb", Uwb()), rate_hz=rate_hz, gap_s=None)
@@ -372,14 +374,14 @@ def test_find_very_short_flight_does_not_raise(fault: Fault, duration_s: float) 
     assert ("too_few_innovations" in ids(found(comparison))) == few
 
 
-def test_catalogue_entries_have_known_group_and_full_sentences() -> None:
+def test_finding_catalogue_entry_has_known_group() -> None:
     for entry in CATALOGUE.values():
         assert entry.group in GROUPS
         assert not entry.title.endswith(".")
         assert entry.meaning.endswith(".")
 
 
-def test_examples_contain_rates_of_the_study() -> None:
+def test_explain_command_examples_state_measured_rates() -> None:
     examples = load_examples()
     assert list(examples) == list(CATALOGUE)
     rows = pd.read_csv(Path(__file__).parent / "studies" / "rates.csv")
@@ -395,7 +397,7 @@ def test_examples_contain_rates_of_the_study() -> None:
     "typed",
     ["source_scale_error", "Source-Scale-Error", "source_scale_wrong"],  # former name
 )
-def test_explain_finding_prints_its_page(typed, monkeypatch, capsys) -> None:
+def test_explain_command_prints_meaning_and_example_of_finding(typed, monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "2000")  # no line breaks
     code, out, err = run_main(monkeypatch, capsys, "explain", typed)
     assert (code, err) == (0, "")
@@ -413,12 +415,12 @@ def test_explain_finding_prints_its_page(typed, monkeypatch, capsys) -> None:
         assert text in out
 
 
-def test_explain_unmeasured_finding_states_it(monkeypatch, capsys) -> None:
+def test_explain_unmeasured_finding_prints_not_measured(monkeypatch, capsys) -> None:
     _, out, _ = run_main(monkeypatch, capsys, "explain", "not_px4")
     assert "Not measured" in out
 
 
-def test_explain_without_argument_lists_all_by_group(monkeypatch, capsys) -> None:
+def test_explain_command_without_argument_lists_all_findings(monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "2000")  # no line breaks
     code, out, _ = run_main(monkeypatch, capsys, "explain")
     assert code == 0
@@ -432,7 +434,9 @@ def test_explain_without_argument_lists_all_by_group(monkeypatch, capsys) -> Non
 @pytest.mark.parametrize(
     ("typed", "suggestion"), [("source_gapp", "Did you mean source_gap? "), ("xyz", "")]
 )
-def test_explain_unknown_finding_exits_with_2(typed, suggestion, monkeypatch, capsys) -> None:
+def test_explain_command_with_unknown_finding_exits_with_2(
+    typed, suggestion, monkeypatch, capsys
+) -> None:
     code, out, err = run_main(monkeypatch, capsys, "explain", typed)
     assert (code, out) == (2, "")
     assert err == (

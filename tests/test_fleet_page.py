@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from artificial_batch import DAMAGED, NOT_LOGGED, STORY, VEHICLES, artificial_logs
 from browser import Browser, Elements, content
 from explore_tools import axe, serious
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_up_fleet import DAMAGED, NOT_LOGGED, STORY, VEHICLES, made_up
 
 from px4fuse.fleet.page import html_text, logs_of, sort_logs
 from px4fuse.report.card_html import MARK_PATHS
@@ -37,8 +37,8 @@ def parts(row: list[Any]) -> dict[str, Any]:
 # ------------------------------------------------------------------ without a browser
 
 
-def test_page_compared_log_lists_its_missing_results() -> None:
-    table = made_up(30)
+def test_batch_page_lists_missing_results_of_each_log() -> None:
+    table = artificial_logs(30)
     table.loc[table["axis"] == "down", ["reason", "remedy"]] = ("EKF2, down: no heights", "Set it.")
     text = html_text(table, "Bench", "px4fuse 1")
     inside = parts(content(text)["rows"][0])
@@ -48,8 +48,8 @@ def test_page_compared_log_lists_its_missing_results() -> None:
     assert f'<option value="remedy:Set it.">Set it. ({count})' in text
 
 
-def test_logs_are_sorted_by_severity_ratio_and_rmse() -> None:
-    table = made_up(8).drop_duplicates("log").reset_index(drop=True)
+def test_batch_page_sorts_logs_by_severity_and_rmse() -> None:
+    table = artificial_logs(8).drop_duplicates("log").reset_index(drop=True)
     failed = table["status"] != "done"
     table = (
         table[~failed]
@@ -66,8 +66,8 @@ def test_logs_are_sorted_by_severity_ratio_and_rmse() -> None:
     assert [log["name"] for log in sort_logs(logs_of(table))] == ["c", "d", "b", "a"]
 
 
-def test_page_row_has_sign_diagnosis_action_and_ratios() -> None:
-    table = made_up(30)
+def test_batch_page_row_has_diagnosis_action_and_ratios() -> None:
+    table = artificial_logs(30)
     rows = [row[0] for row in content(html_text(table, "Bench", "px4fuse 1"))["rows"]]
     first = rows[0]
     assert first[0][0] == "■ ERROR"
@@ -79,8 +79,8 @@ def test_page_row_has_sign_diagnosis_action_and_ratios() -> None:
     assert rows[-1][2][0] in (f"refused: {DAMAGED[0]}", f"not compared: {NOT_LOGGED[0]}")
 
 
-def test_logs_of_column_without_numbers_is_absent() -> None:
-    table = made_up(4)
+def test_batch_page_omits_column_without_numbers() -> None:
+    table = artificial_logs(4)
     for name in ("clock_offset_s", "sigma_z_m", "kf_truth_ratio", "difference_rms_m"):
         table[name] = np.nan
     table["updates"] = table["updates"].astype("Int64")
@@ -92,9 +92,9 @@ def test_logs_of_column_without_numbers_is_absent() -> None:
     assert "nan" not in text.split("<script")[0].split("</style>")[1]
 
 
-def test_page_without_compared_logs_is_complete() -> None:
-    assert "0 logs" in html_text(made_up(0), "Bench", "px4fuse 1")
-    table = made_up(30)
+def test_batch_page_without_compared_logs_lists_failed_logs() -> None:
+    assert "0 logs" in html_text(artificial_logs(0), "Bench", "px4fuse 1")
+    table = artificial_logs(30)
     failed = table[table["status"] == "failed"].reset_index(drop=True)
     text = html_text(failed, "B", "px4fuse 1")
     assert text == html_text(failed, "B", "px4fuse 1")  # the same table gives the same page
@@ -102,14 +102,14 @@ def test_page_without_compared_logs_is_complete() -> None:
 
 
 def hostile_table(word: str, count: int = 2) -> pd.DataFrame:
-    table = made_up(12).iloc[: 3 * count].copy()
+    table = artificial_logs(12).iloc[: 3 * count].copy()
     logs = [f"{place // 3}{word}" for place in range(3 * count)]
     return table.assign(**dict.fromkeys(TEXTS, word), findings=f"{word};x", log=logs)
 
 
 @settings(max_examples=40)
 @given(text=st.text(max_size=40) | st.sampled_from(HOSTILE))
-def test_page_text_of_logs_is_escaped(text: str) -> None:
+def test_batch_page_escapes_text_from_logs(text: str) -> None:
     def shape(word: str) -> list[tuple[str, list[str]]]:
         made = html_text(hostile_table(f"a{word}z"), word, word)
         made.encode()
@@ -120,9 +120,9 @@ def test_page_text_of_logs_is_escaped(text: str) -> None:
     assert shape(text.replace(";", ",").replace("/", "|")) == shape("x")
 
 
-def test_page_links_stay_beside_the_page() -> None:
+def test_batch_page_links_lead_only_to_relative_paths() -> None:
     bad = ("//example.org/a", "/etc/passwd", "javascript:alert(1)", "https://example.org/")
-    table = made_up(4).assign(report=np.repeat(bad, 3), results="")
+    table = artificial_logs(4).assign(report=np.repeat(bad, 3), results="")
     rows = content(html_text(table, "a", "b"))["rows"]
     assert len(rows) == 4
     for row in rows:
@@ -141,7 +141,7 @@ def shown(browser: Browser, folder: Path, table: pd.DataFrame, *titles: str, **h
 
 @pytest.fixture
 def page(browser: Browser, tmp_path: Path) -> Browser:
-    shown(browser, tmp_path, made_up(240))
+    shown(browser, tmp_path, artificial_logs(240))
     return browser
 
 
@@ -153,12 +153,12 @@ def head(title: str) -> str:
 COUNT = "document.querySelector('.count').textContent"
 
 
-def test_page_sorts_filters_and_opens_rows(page: Browser) -> None:
+def test_batch_page_sorts_filters_and_opens_rows(page: Browser) -> None:
     page.click(head("KF"))
     page.click("tbody tr:first-child .name")
     ratios = {
         log["name"]: log["kf_source_ratio"]
-        for log in sort_logs(logs_of(made_up(240)))
+        for log in sort_logs(logs_of(artificial_logs(240)))
         if "kf_source_ratio" in log
     }
     assert page.names()[:3] == sorted(ratios, key=lambda name: ratios[name])[:3]
@@ -176,8 +176,8 @@ def test_page_sorts_filters_and_opens_rows(page: Browser) -> None:
     assert page.requests() <= {"file", "data"}
 
 
-def test_filters_of_fleet_page_combine(page: Browser) -> None:
-    table = made_up(240).drop_duplicates("log")
+def test_batch_page_applies_two_filters_together(page: Browser) -> None:
+    table = artificial_logs(240).drop_duplicates("log")
     page.choose("#filter-4", "finding:ekf2_rejects_positions")
     rejecting = table["findings"].fillna("").str.contains("ekf2_rejects_positions")
     assert page.ask(COUNT) == f"Showing {rejecting.sum()} of 240"
@@ -190,8 +190,8 @@ def test_filters_of_fleet_page_combine(page: Browser) -> None:
     assert page.complaints() == []
 
 
-def test_page_5000_logs_shows_100_rows(browser: Browser, tmp_path: Path) -> None:
-    shown(browser, tmp_path, made_up(5000))
+def test_batch_page_of_5000_logs_shows_100_rows(browser: Browser, tmp_path: Path) -> None:
+    shown(browser, tmp_path, artificial_logs(5000))
     rows = "document.querySelectorAll('.list > tbody > tr').length"
     everything = "document.querySelectorAll('*').length"
     assert browser.ask(rows) == MAX_PAGE_ROWS
@@ -214,19 +214,21 @@ def test_page_5000_logs_shows_100_rows(browser: Browser, tmp_path: Path) -> None
     assert browser.requests() <= {"file", "data"}
 
 
-def test_page_without_scripts_is_a_table(browser: Browser, tmp_path: Path) -> None:
-    shown(browser, tmp_path, made_up(400), scripts=False)
+def test_batch_page_without_javascript_shows_a_table(browser: Browser, tmp_path: Path) -> None:
+    shown(browser, tmp_path, artificial_logs(400), scripts=False)
     browser.call("Emulation.setScriptExecutionDisabled", value=False)
     text = browser.ask("document.body.innerText")
     assert "The first 300 of 400 logs." in text
     assert "All rows are in fleet.csv." in text
-    names = [log["name"] for log in sort_logs(logs_of(made_up(400)))]
+    names = [log["name"] for log in sort_logs(logs_of(artificial_logs(400)))]
     table = text.split("Sorting, searching")[1]
     assert [name in table for name in names] == [True] * 300 + [False] * 100
 
 
 @pytest.mark.parametrize(("scheme", "width"), [("light", 360), ("dark", 1400)])
-def test_page_is_accessible(page: Browser, scheme: str, width: int) -> None:
+def test_batch_page_has_no_serious_accessibility_violation(
+    page: Browser, scheme: str, width: int
+) -> None:
     page.resize(width, 800)
     page.scheme(scheme)
     page.click("tbody tr:nth-child(3) .name")

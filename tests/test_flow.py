@@ -67,7 +67,7 @@ def flying(noise_m_s: float = 0.3) -> Model:
     return replace(model(), inputs=replace(inputs, segments=segments))
 
 
-def test_read_flow_recovers_mean_between_rows(tmp_path):
+def test_optical_flow_mean_between_logged_rows_is_recovered(tmp_path):
     log = gnss_log("v1.16")
     log["estimator_states"]["states"][:, :4] = [1.0, 0.0, 0.0, 0.0]
     at = stamps(20.0, 50.0)
@@ -106,7 +106,7 @@ def test_read_flow_recovers_mean_between_rows(tmp_path):
 
 
 @pytest.mark.parametrize("every", [1, 10])
-def test_flow_samples_give_velocity_at_next_event(every):
+def test_optical_flow_samples_give_velocity_at_next_update(every):
     """The motion since a sample is known from the IMU, so corners cause no innovations."""
     (segment,) = model().inputs.segments
     with_flow = add_flow_samples(segment, flow_of(every=every), 3.0)
@@ -121,7 +121,7 @@ def test_flow_samples_give_velocity_at_next_event(every):
     assert np.ptp(expected, axis=0).min() > 0.7
 
 
-def test_fuse_flow_mean_is_weighted_by_sample_count():
+def test_fused_optical_flow_mean_is_weighted_by_sample_count():
     turn = np.eye(3)[None, :2]
     x, P = np.zeros((1, 15)), np.diag(np.full(15, 1e-9))[None].copy()
     P[0, 3:5, 3:5] = 0.25 * np.eye(2)
@@ -139,7 +139,7 @@ def test_fuse_flow_mean_is_weighted_by_sample_count():
     np.testing.assert_array_equal(fuse_flow(x, P, none, 3.0)[0], x)
 
 
-def test_replay_without_gnss_flow_limits_drift():
+def test_ekf2_replay_without_gnss_drifts_less_with_optical_flow():
     """Over one minute the drift is about 1 m with flow, above 10 m with the IMU only."""
     lost = dict.fromkeys(("gnss_pos", "gnss_vel"), 40.0)
     off = []
@@ -161,7 +161,7 @@ def stretches_s(flight: Flight) -> list[tuple[float, float]]:
     return [(float(one.time_s[0]), float(one.time_s[-1])) for one in segments]
 
 
-def test_segments_split_at_height_resets_and_clipping():
+def test_ekf2_replay_is_split_at_height_resets_and_clipping():
     flight = model().flight
     ((start, end),) = stretches_s(flight)
     for delta, parted in (((0.0, 0.0, 1.0), True), ((1.0, 0.0, 0.0), False)):
@@ -184,7 +184,7 @@ def test_segments_split_at_height_resets_and_clipping():
             assert found[1][0] > 60.5
 
 
-def test_read_gnss_while_disabled_omits_fixes():
+def test_read_gnss_omits_fixes_while_fusion_is_disabled():
     flight = model().flight
     ekf2 = flight.ekf2
     enabled = pd.Series([1.0, 0.0, 1.0], index=[0.0, 50.0, 60.0])
@@ -199,7 +199,7 @@ def test_read_gnss_while_disabled_omits_fixes():
     np.testing.assert_array_equal(found.stamp_s, every.stamp_s[remaining])  # type: ignore[union-attr]
 
 
-def test_segment_start_correlation_is_from_earlier_flight():
+def test_ekf2_replay_start_correlation_uses_earlier_flight():
     """Six seconds at rest and the climb correlate tilt and accelerometer bias."""
     (segment,) = model().inputs.segments
     assert segment.history is not None
@@ -215,7 +215,7 @@ def test_segment_start_correlation_is_from_earlier_flight():
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", ["v1.16.1_gps_stock_flow", "main202603_gps_outage_flow"])
-def test_model_real_flow_flights_agree_with_log(name, shared_logs, model_of):
+def test_ekf2_model_of_optical_flow_flights_agrees_with_log(name, shared_logs, model_of):
     found = model_of(shared_logs / "gps" / f"{name}.ulg")
     agreement = found.agreement
     assert agreement.good
@@ -240,7 +240,7 @@ def test_model_real_flow_flights_agree_with_log(name, shared_logs, model_of):
 
 
 @pytest.mark.reallogs
-def test_model_flow_beyond_limit_splits_segment(shared_logs, monkeypatch):
+def test_ekf2_replay_is_split_if_flow_drift_exceeds_limit(shared_logs, monkeypatch):
     monkeypatch.setattr("px4fuse.ekf2.replay.MAX_FLOW_ONLY_DIFFERENCE_M", 0.3)
     found = opened(read_log(shared_logs / "gps" / "main202603_gps_outage_flow.ulg"))
     assert set(found.agreement.doubtful) == {"optical_flow"}
@@ -251,7 +251,7 @@ def test_model_flow_beyond_limit_splits_segment(shared_logs, monkeypatch):
 
 
 @pytest.mark.reallogs
-def test_model_crash_flight_is_replayed_until_tumble(shared_logs):
+def test_ekf2_model_of_crash_flight_agrees_until_tumbling(shared_logs):
     """Vertical velocity was reset at 47 s; the IMU clipped strongly at 26 and 46 s."""
     found = opened(read_log(shared_logs / "real" / "PX4_flight-review-rs_ekf_failure.ulg"))
     ends = [(one.time_s[0], one.time_s[-1]) for one in found.inputs.segments]

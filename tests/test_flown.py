@@ -95,7 +95,7 @@ FLIGHTS = {
 
 
 @pytest.mark.parametrize("name", FLIGHTS)
-def test_findings_known_fault_has_id_numbers_and_remedy(shared_logs, name):
+def test_flight_with_known_fault_has_expected_finding(shared_logs, name):
     log = shared_logs / "simulated" / f"{name}.ulg"
     analysis, flown = explain(compare(read_log(log))), FLIGHTS[name]
     found = find(analysis)
@@ -154,7 +154,7 @@ def test_findings_known_fault_has_id_numbers_and_remedy(shared_logs, name):
 
 
 @pytest.mark.parametrize("name", [name for name, flown in FLIGHTS.items() if flown.reruns])
-def test_card_known_fault_has_reruns_and_console_lines(shared_logs, name):
+def test_diagnosis_card_of_known_fault_shows_filter_reruns(shared_logs, name):
     log = shared_logs / "simulated" / f"{name}.ulg"
     analysis, flown = explain(compare(read_log(log))), FLIGHTS[name]
     cause = build_card(analysis, find(analysis), ComparisonRequest(log=log.name)).causes[0]
@@ -177,7 +177,7 @@ OVERSTATED = {
 
 
 @pytest.mark.parametrize(("name", "factor"), OVERSTATED.items())
-def test_findings_motion_capture_flights_are_underconfident(shared_logs, name, factor):
+def test_motion_capture_flights_are_found_underconfident(shared_logs, name, factor):
     """Sent with an orientation, as odometry is; all noises are defaults."""
     flight = read_log(shared_logs / "real" / f"{name}.ulg")
     whole = compare(flight, start_s=0.0, end_s=flight.log.duration_s)

@@ -84,7 +84,7 @@ def parts(answers: Answers, truth: FormTruth = TRUTH) -> list[float]:
     return [round(found[name], 2) for name in PART_NAMES]
 
 
-def test_each_simulated_mistake_has_kind_panel_and_correction() -> None:
+def test_answer_form_offers_correct_answers_for_each_mistake() -> None:
     assert set(SIMULATED) == set(MISTAKES) - {"none", "vio-drift"}
     assert set(TABLE["shows"]) | {"cover"} == set(PANELS)
     for name in SIMULATED:
@@ -94,7 +94,7 @@ def test_each_simulated_mistake_has_kind_panel_and_correction() -> None:
         assert set(panels(name)) > {"cover"}
 
 
-def test_form_points_correct_is_full_and_empty_is_zero() -> None:
+def test_correct_answer_form_has_full_and_empty_form_no_points() -> None:
     assert form_points(RIGHT, TRUTH).points_by_part == FULL
     assert parts(Answers(log_sha256=SHA256)) == [0.0] * 6
     assert form_points(RIGHT, TRUTH).is_named_by_mistake == {"clock-offset": True, "dropout": True}
@@ -129,13 +129,13 @@ HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
 
 
 @pytest.mark.parametrize(("answers", "less"), HALF_RIGHT)
-def test_form_points_partly_correct_has_partial_points(
+def test_partly_correct_answer_form_has_partial_points(
     answers: Answers, less: dict[str, float]
 ) -> None:
     assert form_points(answers, TRUTH).points_by_part == pytest.approx({**FULL, **less}, abs=0.01)
 
 
-def test_form_points_flight_without_mistake_expects_none() -> None:
+def test_answer_form_for_clean_flight_must_name_no_mistake() -> None:
     none = Answers(log_sha256=SHA256, mistakes=(StudentMistake("none"),))
     assert parts(none, CLEAN) == [40.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     assert form_points(none, CLEAN).share == 0.4
@@ -147,7 +147,7 @@ def test_form_points_flight_without_mistake_expects_none() -> None:
     assert parts(RIGHT, CLEAN)[:4] == [0.0] * 4
 
 
-def test_form_points_open_end_needs_size_for_all_points() -> None:
+def test_loop_open_end_answer_needs_its_size_for_all_points() -> None:
     landed = TrueMistake("open-end", 5.0, 4.25, 5.75, 60.0, None)
     truth = replace(CLEAN, mistakes=(landed,), quantities=())
     claim = StudentMistake("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")
@@ -157,7 +157,7 @@ def test_form_points_open_end_needs_size_for_all_points() -> None:
     assert parts(measured, truth)[:4] == [30.0, 15.0, 10.0, 15.0]
 
 
-def test_form_points_constant_form_on_loops_is_low() -> None:
+def test_same_answer_form_for_all_loops_earns_few_points() -> None:
     """300 drawn loops with their closure errors and verdicts.
 
     Most have no update outside the gate, so an empty list is not counted as an answer.
@@ -177,7 +177,7 @@ def test_form_points_constant_form_on_loops_is_low() -> None:
             assert np.mean([form_points(form, one).share for one in truths]) <= 0.35
 
 
-def test_form_truth_open_end_size_includes_odometry_drift() -> None:
+def test_correct_loop_open_end_size_includes_odometry_drift() -> None:
     """A student cannot separate the drift from the measured closure error."""
     scenario = Scenario(kind="loop", passes=1, vio_drift=0.02, seed=4, truth=False)
     (wrong,) = form_truth(flights.simulate(scenario, parse(("open-end=5m",))), SHA256).mistakes
@@ -248,7 +248,7 @@ def verdicts_by_hand(flight: dict[str, Any]) -> tuple[VerdictTruth, VerdictTruth
 
 
 @pytest.mark.reallogs
-def test_form_points_agree_with_points_given_by_hand(shared_logs: Path) -> None:
+def test_answer_form_points_agree_with_manual_grading(shared_logs: Path) -> None:
     bank = json.loads((shared_logs.parent / "grading" / "bank.json").read_text(encoding="utf-8"))
     truths = {
         flight["flight"]: form_truth(simulation_of(flight["simulate"]), SHA256)
@@ -276,7 +276,7 @@ def test_form_points_agree_with_points_given_by_hand(shared_logs: Path) -> None:
             assert made.verdict == known, flight["flight"]
 
 
-def test_form_points_random_forms_are_at_most_20_percent() -> None:
+def test_random_answer_forms_earn_at_most_20_percent() -> None:
     """500 random forms on flights with two mistakes, one and none."""
     rng = np.random.default_rng(5)
     truths = (TRUTH, replace(TRUTH, mistakes=(LATE,)), CLEAN)

@@ -12,7 +12,7 @@ from fuzz import COMMANDS, TARGETS, Target, run_target
 
 
 @pytest.mark.parametrize("target", TARGETS, ids=lambda one: one.name)
-def test_readers_damaged_input_gives_result_or_one_line(target: Target, tmp_path: Path) -> None:
+def test_file_readers_on_fuzzed_input_give_result_or_error(target: Target, tmp_path: Path) -> None:
     outcome = run_target(target, target.in_suite, seed=1, folder=tmp_path)
     assert outcome.faults == []
     # Some inputs must be read and some rejected, otherwise the damage is too strong or too weak
@@ -25,5 +25,5 @@ def test_readers_damaged_input_gives_result_or_one_line(target: Target, tmp_path
 @pytest.mark.parametrize(
     "target", [one for one in COMMANDS if one.in_suite], ids=lambda one: one.name
 )
-def test_commands_damaged_input_end_without_exception(target: Target, tmp_path: Path) -> None:
+def test_commands_on_fuzzed_input_end_without_exception(target: Target, tmp_path: Path) -> None:
     assert run_target(target, target.in_suite, seed=1, folder=tmp_path).faults == []

@@ -31,7 +31,7 @@ def assert_equal_graphs(a: PoseGraph, b: PoseGraph) -> None:
 
 
 @pytest.mark.parametrize(("whole", "unit"), [(PLANE, UNIT_2), (SPACE, UNIT_3)])
-def test_parse_g2o_information_is_upper_triangle_by_rows(whole: str, unit: str) -> None:
+def test_parse_g2o_reads_information_as_upper_triangle_by_rows(whole: str, unit: str) -> None:
     size = 3 if whole == PLANE else 6
     upper = np.triu_indices(size)
     expected = np.zeros((size, size))
@@ -42,7 +42,7 @@ def test_parse_g2o_information_is_upper_triangle_by_rows(whole: str, unit: str) 
     np.testing.assert_array_equal(graph.information[0], graph.information[0].T)
 
 
-def test_read_g2o_comments_and_order_do_not_change_graph(tmp_path: Path) -> None:
+def test_read_g2o_ignores_comments_and_line_order(tmp_path: Path) -> None:
     file = tmp_path / "a.g2o"
     messy = (
         "\ufeff# made by hand\r\n\r\n" + PLANE.replace("\n", " # remark \r\n").replace(" ", "   ")
@@ -53,12 +53,12 @@ def test_read_g2o_comments_and_order_do_not_change_graph(tmp_path: Path) -> None
         assert_equal_graphs(read_g2o(file), parse_g2o(PLANE, "a.g2o"))
 
 
-def test_parse_g2o_quaternions_are_normalised() -> None:
+def test_parse_g2o_normalises_quaternions() -> None:
     graph = parse_g2o(SPACE.replace("0 0 0 1\nE", "0 0 0 -2\nE"), "a.g2o")
     assert graph.poses[1].tolist() == [1, 0, 0, 0, 0, 0, -1]
 
 
-def test_parse_g2o_without_vertices_initialises_poses() -> None:
+def test_parse_g2o_without_vertices_initialises_poses_from_edges() -> None:
     graph = parse_g2o(f"EDGE_SE2 7 9 1 0 0 {UNIT_2}\nEDGE_SE2 9 12 1 0 1 {UNIT_2}", "a.g2o")
     assert graph.ids.tolist() == [7, 9, 12]
     np.testing.assert_allclose(graph.poses, [[0, 0, 0], [1, 0, 0], [2, 0, 1]], atol=1e-12)
@@ -111,7 +111,7 @@ INVALID_TEXTS = {
 
 
 @pytest.mark.parametrize("case", INVALID_TEXTS)
-def test_parse_g2o_invalid_text_names_line(case: str) -> None:
+def test_parse_g2o_with_invalid_text_names_the_line(case: str) -> None:
     text, expected = INVALID_TEXTS[case]
     with pytest.raises(TrajectoryError) as refused:
         parse_g2o(text, "made.g2o")
@@ -122,7 +122,7 @@ def test_parse_g2o_invalid_text_names_line(case: str) -> None:
     assert message.endswith(".")
 
 
-def test_read_g2o_binary_or_missing_file_is_rejected(tmp_path: Path) -> None:
+def test_read_g2o_from_binary_or_missing_file_is_rejected(tmp_path: Path) -> None:
     binary = tmp_path / "log.g2o"
     binary.write_bytes(b"ULog\x01\x12\x35\xff\xfe\x00")
     with pytest.raises(TrajectoryError, match=r"^log\.g2o: not a text file"):
@@ -131,14 +131,14 @@ def test_read_g2o_binary_or_missing_file_is_rejected(tmp_path: Path) -> None:
         read_g2o(tmp_path / "none.g2o")
 
 
-def test_parse_g2o_rank_deficient_information_is_read() -> None:
+def test_parse_g2o_accepts_rank_deficient_information() -> None:
     rank_3 = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 0 0 0 0 0 0"
     graph = parse_g2o(SPACE.replace(UNIT_3, rank_3), "a.g2o")
     assert np.linalg.matrix_rank(graph.information[0]) == 3
 
 
 @given(st.text(alphabet="VERTEXSDG_23:QUAFI 0159.-einf#\n\r", max_size=200))
-def test_parse_g2o_any_text_is_read_or_rejected(text: str) -> None:
+def test_parse_g2o_of_any_text_raises_only_trajectory_errors(text: str) -> None:
     for whole in (text, PLANE + text, SPACE + text):
         with contextlib.suppress(TrajectoryError):
             parse_g2o(whole, "a.g2o")
@@ -157,7 +157,7 @@ def random_graph(dimension: int, count: int, seed: int = 0) -> PoseGraph:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("seed", range(5))
-def test_g2o_text_is_read_back_exactly(dimension: int, seed: int) -> None:
+def test_graph_written_as_g2o_is_read_back_exactly(dimension: int, seed: int) -> None:
     once = parse_g2o(g2o_text(random_graph(dimension, 200, seed)), "a.g2o")
     text = g2o_text(once)
     again = parse_g2o(text, "a.g2o")
@@ -166,7 +166,7 @@ def test_g2o_text_is_read_back_exactly(dimension: int, seed: int) -> None:
 
 
 @pytest.mark.reallogs
-def test_g2o_text_public_graphs_are_read_back_exactly() -> None:
+def test_public_graph_written_as_g2o_is_read_back_exactly() -> None:
     for file in sorted(shared("pose_graphs").glob("*.g2o")):
         once = read_g2o(file)
         assert_equal_graphs(once, parse_g2o(g2o_text(once), file.name))
@@ -179,7 +179,9 @@ SQUARE = "".join(f"EDGE_SE2 {i} {i + 1} 1 0 1.57 {{}}\n" for i in range(4))
 
 @pytest.mark.parametrize("edge", [1, 4])
 @pytest.mark.parametrize("entry", ["1e-50", "1e-12", "1e12", "1e50", "0"])
-def test_loop_extreme_information_gives_finite_results(tmp_path, monkeypatch, capsys, entry, edge):
+def test_loop_on_g2o_with_extreme_information_stays_finite(
+    tmp_path, monkeypatch, capsys, entry, edge
+):
     """A square path with two loop closures; no warnings, and no NaN in the JSON."""
     numbers = UNIT_2.split()
     numbers[0 if edge == 1 else 5] = entry  # information of a position or a heading
@@ -191,7 +193,7 @@ def test_loop_extreme_information_gives_finite_results(tmp_path, monkeypatch, ca
     assert json.loads(out, parse_constant=pytest.fail)["graph"]["solutions"]
 
 
-def test_loop_not_converged_graph_is_stated(tmp_path, monkeypatch, capsys):
+def test_loop_on_g2o_states_that_solution_did_not_converge(tmp_path, monkeypatch, capsys):
     path = tmp_path / "g.g2o"
     far = "".join(f"VERTEX_SE2 {number} {number} 3 0\n" for number in range(5))
     path.write_text(far + SQUARE.format(*[UNIT_2] * 4) + f"EDGE_SE2 0 4 0.1 0.1 6.2 {UNIT_2}\n")

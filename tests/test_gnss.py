@@ -96,7 +96,7 @@ def track_of(flight: Flight) -> PositionTrack:
 
 
 @pytest.mark.parametrize("generation", ["v1.9", "v1.12", "v1.14", "v1.16"])
-def test_read_gnss_fixes_have_ekf2_position_and_time(generation, tmp_path):
+def test_read_gnss_fixes_have_position_and_time_as_in_ekf2(generation, tmp_path):
     """Relative to EKF2's origin, and EKF2_GPS_DELAY before their timestamps."""
     track = track_of(flight_of(outdoors(generation), tmp_path))
     times = track.samples.index.to_numpy()
@@ -116,13 +116,15 @@ def test_read_gnss_fixes_have_ekf2_position_and_time(generation, tmp_path):
     ({"EKF2_GPS_MODE": 0}, 0.03, 0.11 - 0.03),  # main of 2026: measurement time of the driver
     ({"EKF2_GPS_MODE": 0}, 0.0, 0.0),  # without one: the delay
 ])  # fmt: skip
-def test_read_gnss_time_follows_delay_or_driver(parameters, own_s, expected_s, tmp_path):
+def test_gnss_measurement_time_uses_delay_parameter_or_driver(
+    parameters, own_s, expected_s, tmp_path
+):
     track = track_of(flight_of(outdoors(own_s=own_s, **parameters), tmp_path))
     first = seconds_of(stamps(SECONDS, 5.0, 0.2))[0]
     assert track.samples.index[0] - first == pytest.approx(expected_s, abs=1e-6)
 
 
-def test_read_gnss_new_topic_gives_same_track(tmp_path):
+def test_read_gnss_from_vehicle_gnss_topic_gives_same_track(tmp_path):
     """vehicle_gnss contains the receiver's message; its timestamp_sample includes the delay."""
     log = with_velocity(outdoors(own_s=0.03, EKF2_GPS_MODE=0))
     before = track_of(flight_of(log, tmp_path))
@@ -149,7 +151,7 @@ def test_read_gnss_new_topic_gives_same_track(tmp_path):
     assert track.lever_arm_m == pytest.approx((0.1, 0.0, -0.2))
 
 
-def test_compare_gnss_subtracts_antenna_lever_arm(tmp_path):
+def test_compare_subtracts_gnss_antenna_lever_arm(tmp_path):
     moved = flight_of(outdoors(EKF2_GPS_POS_X=0.3, EKF2_GPS_POS_Z=-0.2), tmp_path)
     antenna, vehicle = track_of(moved), compare(moved).source
     assert antenna.lever_arm_m == pytest.approx((0.3, 0.0, -0.2))
@@ -164,7 +166,7 @@ def test_compare_gnss_subtracts_antenna_lever_arm(tmp_path):
     assert compare(flight_of(outdoors(), tmp_path)).source.notes == ()
 
 
-def test_choose_source_only_fused_gnss_is_selected(tmp_path):
+def test_default_source_is_gnss_only_if_ekf2_fused_it(tmp_path):
     flight = flight_of(outdoors(), tmp_path)
     track, reason = choose_source(flight)
     assert track.name == "vehicle_gps_position"
@@ -183,7 +185,7 @@ def test_choose_source_only_fused_gnss_is_selected(tmp_path):
     (0.4, 0.2, ("down",), 0.7),  # epv
     (0.4, 0.5, ("down",), 0.75),  # 1.5 times EKF2_GPS_P_NOISE
 ])  # fmt: skip
-def test_prepare_gnss_sigma_z_equals_ekf2_noise(eph_m, least_m, axes, expected_m, tmp_path):
+def test_default_sigma_z_of_gnss_equals_ekf2_noise(eph_m, least_m, axes, expected_m, tmp_path):
     flight = flight_of(outdoors(eph_m=eph_m, EKF2_GPS_P_NOISE=least_m), tmp_path)
     request = ComparisonRequest(log="a.ulg", axes=axes)
     prepared = prepare_comparison(request, flight=flight)
@@ -192,7 +194,7 @@ def test_prepare_gnss_sigma_z_equals_ekf2_noise(eph_m, least_m, axes, expected_m
     assert prepare_comparison(requested, flight=flight).settings.sigma_z_m == 0.3
 
 
-def test_prepare_gnss_flight_uses_gnss_innovations(tmp_path):
+def test_compare_of_gnss_flight_uses_gnss_innovations(tmp_path):
     flight = flight_of(outdoors(), tmp_path)
     ekf2 = prepare(flight).flight.ekf2
     north, down = ekf2.innovations["north"], ekf2.innovations["down"]
@@ -228,7 +230,7 @@ def with_barometer(log: Log, *, fused: bool = True) -> Log:
     return log
 
 
-def test_prepare_axis_down_uses_fused_barometer(tmp_path):
+def test_down_axis_of_gnss_flight_uses_fused_barometer(tmp_path):
     flight = flight_of(with_barometer(outdoors()), tmp_path)
     request = ComparisonRequest(log="a.ulg", axes=("down", "north"))
     prepared = prepare_comparison(request, flight=flight)
@@ -246,7 +248,7 @@ def test_prepare_axis_down_uses_fused_barometer(tmp_path):
     assert isinstance(fused_as_gnss.flight.ekf2.innovations["down"], Unavailable)  # type: ignore[union-attr]
 
 
-def test_prepare_axis_down_unfused_barometer_needs_option(tmp_path):
+def test_down_axis_uses_unfused_barometer_only_on_request(tmp_path):
     flight = flight_of(with_barometer(outdoors(), fused=False), tmp_path)
     assert prepare(flight, axes=("down",)).source.barometer is None
     requested = prepare(flight, axes=("down",), height="barometer")
@@ -260,7 +262,7 @@ def test_prepare_axis_down_unfused_barometer_needs_option(tmp_path):
 
 
 @pytest.mark.reallogs
-def test_compare_down_v1_13_uses_barometer(shared_logs):
+def test_down_axis_of_px4_v1_13_log_uses_barometer(shared_logs):
     """EKF2 of v1.13 uses the barometer height by default."""
     log = shared_logs / "gps" / "v1.13.3_gps_profile1.ulg"
     analysis = px4fuse.compare(log, axes="down")
@@ -274,7 +276,7 @@ def test_compare_down_v1_13_uses_barometer(shared_logs):
 
 
 @pytest.mark.parametrize("fused", [True, False])
-def test_read_truth_gnss_is_relative_to_ekf2_origin(fused, tmp_path):
+def test_ground_truth_of_gnss_flight_is_relative_to_ekf2_origin(fused, tmp_path):
     log = outdoors(fused=fused)
     home = (ORIGIN[0] + 1e-5, ORIGIN[1] - 2e-5, ORIGIN[2] + 0.5)
     times = stamps(SECONDS, 20.0)
@@ -295,7 +297,7 @@ def test_read_truth_gnss_is_relative_to_ekf2_origin(fused, tmp_path):
 @pytest.mark.parametrize(("least_m", "eph_m", "expected"), [
     (2.0, 0.3, True), (0.5, 0.45, False), (0.5, 0.9, False), (None, 0.3, False),
 ])  # fmt: skip
-def test_noise_remedy_needs_parameter_above_accuracy(
+def test_gnss_noise_is_reduced_only_if_above_receiver_accuracy(
     least_m, eph_m, expected, tmp_path, monkeypatch
 ):
     log = outdoors(eph_m=eph_m)
@@ -342,7 +344,7 @@ OF_OTHERS = ("EKF2_EV", "vision", "anchor", "UWB", "line of sight", " tag ")
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", FLIGHTS)
-def test_compare_real_gnss_flights_match_known_numbers(name, shared_logs):
+def test_compare_of_real_gnss_flights_gives_known_numbers(name, shared_logs):
     folder = shared_logs / "gps"
     analysis = px4fuse.compare(folder / f"{name}.ulg")
     injected = json.loads((folder / f"{name}.json").read_text())
@@ -411,7 +413,7 @@ def models(shared_logs: Path, model_of: Any) -> dict[str, Model]:
 
 
 @pytest.mark.reallogs
-def test_model_real_gnss_flights_agree_with_log(models):
+def test_ekf2_model_of_real_gnss_flights_agrees_with_log(models):
     """Flights without rejections, and one that rejects almost half."""
     for name in ("delay0", "fullrate", "nominal"):
         agreement = models[name].agreement
@@ -459,7 +461,7 @@ def test_what_if_gnss_settings_match_independent_replay(models):
 
 
 @pytest.mark.reallogs
-def test_what_if_gnss_delay_changes_heading(models):
+def test_what_if_with_other_gnss_delay_changes_heading(models):
     """An independent replay with a magnetometer gives 4.7° before and 1.5° after."""
 
     def heading_deg(name: str, **settings: float) -> tuple[float, float]:
@@ -485,7 +487,7 @@ def test_what_if_gnss_delay_changes_heading(models):
 
 
 @pytest.mark.reallogs
-def test_what_if_without_aid_predicts_error(models):
+def test_what_if_without_aiding_source_predicts_position_error(models):
     """93 s without an aid: the error agrees with the noise of the remaining aids."""
 
     def without(*names: str) -> tuple[Summary, float]:
@@ -509,7 +511,7 @@ def test_what_if_without_aid_predicts_error(models):
 
 
 @pytest.mark.reallogs
-def test_what_if_unused_parameter_raises_settings_error(models):
+def test_what_if_with_unused_parameter_raises_settings_error(models):
     with pytest.raises(SettingsError, match="EKF2 fused GNSS position in this log"):
         what_if(models["nominal"], [{"EKF2_EVP_NOISE": 0.2}])
     own = replace(models["nominal"].inputs.received, uses_sender_times=True)
@@ -518,7 +520,7 @@ def test_what_if_unused_parameter_raises_settings_error(models):
         what_if(model, [{"EKF2_GPS_DELAY": 50.0}])
 
 
-def test_read_gnss_missing_fixes_are_from_aid_source(tmp_path):
+def test_read_gnss_recovers_unlogged_fixes_from_innovations(tmp_path):
     log = outdoors(rate_hz=10.0)
     every = log["vehicle_gps_position"]
     count, fused_at = len(every["timestamp"]), every["timestamp"] - np.uint64(115_000)
@@ -577,7 +579,7 @@ def with_velocity(log: Log) -> Log:
     ({}, True), ({"EKF2_GPS_CTRL": 7.0}, True), ({"EKF2_GPS_CTRL": 3.0}, False),
     ({"EKF2_AID_MASK": 1.0}, True),
 ])  # fmt: skip
-def test_read_gnss_noise_is_limited_as_in_ekf2(parameters, fused, tmp_path):
+def test_gnss_noise_is_limited_by_the_same_bounds_as_in_ekf2(parameters, fused, tmp_path):
     """Timestamps and accuracies as in EKF2; the noise is limited by EKF2_NOAID_NOISE."""
     flight = flight_of(with_velocity(outdoors(eph_m=12.0)), tmp_path)
     record = made(FusionRecord, parameters=parameters)
@@ -593,7 +595,7 @@ def test_read_gnss_noise_is_limited_as_in_ekf2(parameters, fused, tmp_path):
         np.testing.assert_allclose(found.velocity_variance_m2_s2, 0.04, rtol=1e-6)
 
 
-def test_model_without_fixes_while_enabled_is_unavailable(tmp_path):
+def test_ekf2_model_without_fixes_during_fusion_is_unavailable(tmp_path):
     log = with_velocity(outdoors())
     log["estimator_states"]["states"][:, 0] = 1.0
     log["estimator_status_flags"]["cs_gnss_pos"][1:] = False  # disabled from 1 s on
@@ -606,7 +608,7 @@ def test_model_without_fixes_while_enabled_is_unavailable(tmp_path):
     assert "no sample of GNSS position at a time at which EKF2 reports its fusion" in found.reason
 
 
-def test_read_gnss_driver_time_replaces_delay(tmp_path):
+def test_gnss_driver_timestamp_replaces_delay_parameter(tmp_path):
     record = made(FusionRecord, parameters={"EKF2_GPS_DELAY": 110.0, "EKF2_GPS_MODE": 0.0})
     flight = flight_of(outdoors(own_s=0.09, EKF2_GPS_MODE=0.0), tmp_path)
     found = read_gnss(flight, flight.ekf2, record)
@@ -619,7 +621,7 @@ def test_read_gnss_driver_time_replaces_delay(tmp_path):
 @pytest.mark.parametrize(("north_m", "parameters", "scale", "with_velocity"), [
     (0.0, {}, 1.0, True), (np.nan, {}, 2.0, True), (np.nan, {"EKF2_GPS_MODE": 0.0}, 2.0, False),
 ])  # fmt: skip
-def test_rules_gnss_reset_depends_on_release(north_m, parameters, scale, with_velocity):
+def test_gnss_reset_rule_depends_on_px4_release(north_m, parameters, scale, with_velocity):
     delayed = pd.DataFrame({"north_m": [north_m]})
     record = made(FusionRecord, parameters=parameters, per_step_biases=False, delayed=delayed)
     rules = _rules(record, 0.01, is_gnss=True)
@@ -633,7 +635,7 @@ def test_rules_gnss_reset_depends_on_release(north_m, parameters, scale, with_ve
     (200.0, 0.2, 0.15, ("EKF2_GPS_DELAY", "50 ms", "30 to 60")),
     (110.0, 0.0, -0.15, None),  # EKF2 uses the driver's times
 ])  # fmt: skip
-def test_clock_advice_gnss_names_delay_parameter(delay_ms, age_s, remaining_s, expected):
+def test_gnss_time_offset_advice_names_delay_parameter(delay_ms, age_s, remaining_s, expected):
     source = SimpleNamespace(origin=GNSS, age_s=age_s, alignment=None, aid=lambda _: GNSS.aid)
     log = SimpleNamespace(name="x.ulg", parameters={"EKF2_GPS_DELAY": delay_ms})
     comparison = SimpleNamespace(source=source, flight=SimpleNamespace(log=log))
@@ -643,7 +645,7 @@ def test_clock_advice_gnss_names_delay_parameter(delay_ms, age_s, remaining_s, e
     assert (advice is None) is (expected is None)
 
 
-def test_read_gnss_damaged_fix_is_dropped_with_velocity(tmp_path):
+def test_read_gnss_drops_damaged_fix_and_its_velocity(tmp_path):
     """The velocity is dropped too if another fix has the same publication time."""
     log = with_velocity(outdoors(own_s=0.0))
     fixes = log["vehicle_gps_position"]
@@ -656,7 +658,7 @@ def test_read_gnss_damaged_fix_is_dropped_with_velocity(tmp_path):
 @pytest.mark.parametrize(
     "recorded", [False, pytest.param(True, marks=pytest.mark.reallogs)], ids=["model", "real EKF2"]
 )
-def test_reconstruct_fixes_recovers_missing_fixes(recorded, request):
+def test_gnss_fix_reconstruction_recovers_missing_fixes(recorded, request):
     """Keep every fourth to sixth fix of a complete flight, and two innovations per second."""
     if recorded:
         folder = request.getfixturevalue("shared_logs")
@@ -699,7 +701,7 @@ def test_reconstruct_fixes_recovers_missing_fixes(recorded, request):
     assert reconstruct_fixes(remaining, replace(ekf2, horizon_s=0.05), 0.11)[1] != (note,)
 
 
-def test_receiver_interval_is_found_from_logged_fixes():
+def test_gnss_receiver_interval_is_found_from_logged_fixes():
     rng = np.random.default_rng(3)
     for interval_s in (0.1, 0.096, 0.2, 0.125):
         remaining = np.cumsum(rng.choice([4, 5, 6], 100)) * interval_s

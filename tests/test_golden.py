@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from artificial_batch import artificial_logs
 from browser import content
 from class_tools import in_this_process
 from cli_tools import run
 from conftest import REPOSITORY, blank_page
 from golden_tools import assert_matches_golden, numbers, of_blocks, of_values, rounded, written
-from made_up_fleet import made_up
 from scipy.spatial.transform import Rotation
 from ulog_tools import gnss_log
 
@@ -140,7 +140,7 @@ def kept_pages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.usefixtures("cached_analyses")
 @pytest.mark.parametrize("name", COMMANDS)
-def test_command_output_matches_golden_file(
+def test_command_output_matches_reference_file(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept_pages: list[Any]
 ) -> None:
     shutil.copytree(REPOSITORY / "sample_logs", tmp_path / "sample_logs")
@@ -178,7 +178,7 @@ def spread(kind: str, *mistakes: str) -> list[str]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_simulated_flight_matches_golden_file(kind: str) -> None:
+def test_simulated_flight_values_match_reference_file(kind: str) -> None:
     """Flight without mistakes, then the lines that differ with each mistake."""
     clean = spread(kind)
     lines = [*clean]
@@ -190,7 +190,7 @@ def test_simulated_flight_matches_golden_file(kind: str) -> None:
     assert_matches_golden(f"simulated_{kind}", lines)
 
 
-def test_help_matches_golden_file() -> None:
+def test_help_texts_match_reference_file() -> None:
     lines = []
     for command in ("", *CLI_COMMANDS, "lesson kalman"):
         lines += [
@@ -200,7 +200,9 @@ def test_help_matches_golden_file() -> None:
     assert_matches_golden("help", lines)
 
 
-def test_gnss_flight_report_contains_aids(tmp_path: Path, kept_pages: list[Any]) -> None:
+def test_report_on_aiding_sources_matches_reference_file(
+    tmp_path: Path, kept_pages: list[Any]
+) -> None:
     log = gnss_log("v1.16").write(tmp_path / "a.ulg")
     result = run("compare", log, "-o", tmp_path / "a.pdf")
     assert result.exit_code == 0, result.output
@@ -210,15 +212,15 @@ def test_gnss_flight_report_contains_aids(tmp_path: Path, kept_pages: list[Any])
     )
 
 
-def test_batch_page_matches_golden_file() -> None:
-    text = html_text(made_up(12), "Bench", "px4fuse 1")
+def test_batch_page_matches_reference_file() -> None:
+    text = html_text(artificial_logs(12), "Bench", "px4fuse 1")
     above = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL)
     drawn = [rounded(line) for line in above.splitlines() if line.strip()]
     assert_matches_golden("fleet_page", [*drawn, *of_values(content(text))])
 
 
 @pytest.mark.usefixtures("cached_analyses")
-def test_explore_plots_match_golden_file(sample_log: Path) -> None:
+def test_explore_page_plots_match_reference_file(sample_log: Path) -> None:
     analysis = px4fuse.compare(str(sample_log))
     data = flight_data(analysis, Packer())
     document, _ = document_json(data, analysis.tuning)

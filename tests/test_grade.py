@@ -84,7 +84,7 @@ def test_grade_table_lists_every_submitted_file(submitted, tmp_path) -> None:
 
 
 @pytest.mark.usefixtures("jobs_in_process", "cached_pages")
-def test_grade_pages_beyond_limits_cannot_be_verified(tmp_path, monkeypatch) -> None:
+def test_grade_report_beyond_time_limit_cannot_be_verified(tmp_path, monkeypatch) -> None:
     """The comparison of pages exceeds its time limit."""
     folder = tmp_path / "in"
     folder.mkdir()
@@ -103,7 +103,7 @@ def test_grade_pages_beyond_limits_cannot_be_verified(tmp_path, monkeypatch) -> 
 
 
 @pytest.mark.usefixtures("jobs_in_process", "cached_pages")
-def test_grade_with_log_verifies_unchanged_report_only(tmp_path) -> None:
+def test_grade_with_log_verifies_only_the_unchanged_report(tmp_path) -> None:
     folder = tmp_path / "in"
     folder.mkdir()
     shutil.copy(REPORT, folder / "a.pdf")
@@ -141,7 +141,7 @@ def test_grade_with_log_verifies_unchanged_report_only(tmp_path) -> None:
 
 
 @pytest.mark.usefixtures("jobs_in_process")
-def test_grade_again_processes_changed_files_only(submitted, tmp_path) -> None:
+def test_grade_second_run_processes_only_changed_files(submitted, tmp_path) -> None:
     output = tmp_path / "class"
 
     def reused(title: str = "") -> int:
@@ -169,7 +169,7 @@ def test_grade_again_processes_changed_files_only(submitted, tmp_path) -> None:
 
 
 @pytest.mark.usefixtures("jobs_in_process", "cached_pages")
-def test_grade_with_other_logs_verifies_again(tmp_path) -> None:
+def test_grade_with_other_logs_verifies_reports_again(tmp_path) -> None:
     (tmp_path / "in").mkdir()
     shutil.copy(REPORT, tmp_path / "in" / "a.pdf")
     said = []
@@ -186,7 +186,7 @@ def test_grade_with_other_logs_verifies_again(tmp_path) -> None:
 
 
 @pytest.mark.usefixtures("jobs_in_process")
-def test_grade_missing_log_makes_points_pending(tmp_path) -> None:
+def test_grade_report_without_its_log_makes_points_pending(tmp_path) -> None:
     (tmp_path / "in").mkdir()
     shutil.copy(REPORT, tmp_path / "in")
     (tmp_path / "logs").mkdir()
@@ -204,7 +204,7 @@ def test_grade_missing_log_makes_points_pending(tmp_path) -> None:
 
 
 @pytest.mark.usefixtures("jobs_in_process")
-def test_grade_command_shortens_names_and_can_be_continued(tmp_path, monkeypatch) -> None:
+def test_interrupted_grade_command_tells_how_to_continue(tmp_path, monkeypatch) -> None:
     """Each name is one line; an interrupted run prints how to continue."""
     import px4fuse.grading.grade as module
 
@@ -224,13 +224,13 @@ def test_grade_command_shortens_names_and_can_be_continued(tmp_path, monkeypatch
     assert "Run the same command to continue." in str(result.exception)
 
 
-def test_file_names_are_safe_and_unique() -> None:
+def test_grade_output_file_names_are_safe_and_unique() -> None:
     assert file_names(["12345", "12345", "../../etc/passwd", "CON", "", "日本"]) == [
         "12345", "12345-2", "_.._etc_passwd", "_CON", "report", "日本"
     ]  # fmt: skip
 
 
-def test_grade_command_passes_course_options(tmp_path, monkeypatch) -> None:
+def test_grade_command_passes_all_course_options(tmp_path, monkeypatch) -> None:
     import px4fuse.grading.grade as module
 
     noted = Mock(return_value=GradeOutcome((), (), 0, ()))
@@ -252,7 +252,7 @@ def test_grade_command_passes_course_options(tmp_path, monkeypatch) -> None:
     assert (course.late_rule.text, course.include_pending) == ("5%/hour", False)
 
 
-def test_grade_write_rubric_writes_default_once(tmp_path, monkeypatch) -> None:
+def test_grade_write_rubric_does_not_overwrite_existing_file(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     run_checked("grade", "--write-rubric", "lab.toml")
     assert read_rubric(Path("lab.toml")) == read_rubric(None)

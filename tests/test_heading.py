@@ -57,7 +57,7 @@ def with_heading_drift(flight: Flight) -> tuple[Flight, np.ndarray]:
 
 
 @pytest.mark.parametrize("misalignment_deg", [0.0, 20.0, -40.0])
-def test_heading_constant_misalignment_is_recovered(misalignment_deg):
+def test_constant_heading_misalignment_is_recovered(misalignment_deg):
     found = estimate(simulated(*([f"yaw={misalignment_deg:g}"] if misalignment_deg else [])))
     assert not found.drifts
     assert found.misalignment_deg == pytest.approx(misalignment_deg, abs=3.0 * found.sigma_deg)
@@ -65,7 +65,7 @@ def test_heading_constant_misalignment_is_recovered(misalignment_deg):
 
 
 @pytest.mark.parametrize("by", ["positions", "orientation"])
-def test_heading_drifting_misalignment_is_followed(by):
+def test_drifting_heading_misalignment_is_followed(by):
     """A source with an orientation gives the misalignment more accurately than positions."""
     plain = simulated(passes=6 if by == "positions" else 4)
     flight, turn = with_heading_drift(plain)
@@ -87,7 +87,7 @@ def test_heading_drifting_misalignment_is_followed(by):
     assert first.heading_error_deg > last.heading_error_deg
 
 
-def test_heading_insufficient_data_gives_reason():
+def test_heading_misalignment_without_data_states_reason():
     flight = simulated()
     few = tuple(replace(t, samples=t.samples.iloc[:40]) for t in flight.positions)
     for changed, reason in (
@@ -111,7 +111,7 @@ def test_heading_insufficient_data_gives_reason():
         ("mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3", False, -5.0, 5.0),
     ],
 )
-def test_heading_motion_capture_logs_match_known_range(shared_logs, log, drifts, low, high):
+def test_heading_misalignment_of_real_logs_is_in_known_range(shared_logs, log, drifts, low, high):
     """Their orientation gives the misalignment of EKF2's magnetometer heading; so do positions."""
     flight = read_log(shared_logs / "real" / f"{log}.ulg")
     found = estimate(flight, 0.001)
@@ -130,7 +130,7 @@ def test_heading_motion_capture_logs_match_known_range(shared_logs, log, drifts,
 # ---- parts and drift ----------------------------------------------------------------------------
 
 
-def test_heading_long_downsampled_flight_has_parts() -> None:
+def test_heading_of_long_flight_is_estimated_in_over_100_parts() -> None:
     """1,000 measurements in 25 minutes: fewer than three per part of ``PART_LENGTH_S``."""
     time = np.linspace(0.0, 1500.0, 1000)
     parts = frame_rotation._mean_per_part(
@@ -142,7 +142,7 @@ def test_heading_long_downsampled_flight_has_parts() -> None:
     assert all(part.heading_error_deg == pytest.approx(4.0) for part in parts)
 
 
-def test_heading_drifts_needs_range_and_significance() -> None:
+def test_heading_drift_requires_range_and_significance() -> None:
     for spread, drift_p, drifts in ((1.0, 0.0, True), (0.999, 0.0, False), (9.0, 1.0, False)):
         turns = (0.0, spread * frame_rotation.MIN_DRIFT_DEG)
         parts = tuple(HeadingPart(float(n), n + 1.0, turn, 0.1) for n, turn in enumerate(turns))

@@ -85,7 +85,7 @@ def standing(of: HeightSamples, count: int = 400, **how: Any) -> tuple[HeightFil
     return heights, heights.updates("baro_hgt", 0, end * STEP_S)
 
 
-def test_height_bias_matches_scalar_kalman_filter() -> None:
+def test_barometer_bias_matches_scalar_kalman_filter() -> None:
     """The barometer reads 1.7 m too high (down 1.7 m less); the height is known exactly.
 
     Steady state: p = (q + √(q² + 4 q R)) / 2 before a sample, with q = 0.13² T
@@ -109,7 +109,7 @@ def test_height_bias_matches_scalar_kalman_filter() -> None:
     np.testing.assert_allclose(found["innovation_down_m"], innovations, atol=1e-9)
 
 
-def test_height_bias_without_reference_is_constant() -> None:
+def test_barometer_bias_without_height_reference_is_constant() -> None:
     steps = list(range(10, 400, 10))
     _, found = standing(sampled(steps, [-1.0] * len(steps)), reference_until=1.005)
     after = found["innovation_down_m"].loc[1.15:]
@@ -118,14 +118,14 @@ def test_height_bias_without_reference_is_constant() -> None:
 
 
 @pytest.mark.parametrize(("down_m", "learned"), [(-2.0, True), (-2.3, False)])
-def test_height_bias_outside_gate_is_not_updated(down_m, learned) -> None:
+def test_barometer_bias_outside_gate_is_not_updated(down_m, learned) -> None:
     """The gate is 3 √(0.25 + 0.25) m."""
     heights, _ = standing(sampled([10], [down_m]))
     assert (heights.bias.value_m[0] > 0.0) == learned
 
 
 @pytest.mark.parametrize("reference", BOTH)
-def test_height_bias_of_reference_is_zero(reference: str) -> None:
+def test_height_bias_of_the_reference_sensor_stays_zero(reference: str) -> None:
     steps = list(range(10, 400, 10))
     heights, _ = standing(sampled(steps, [-1.0] * len(steps), reference=reference))
     assert (heights.bias.value_m[0] == 0.0) == (reference == "baro_hgt")
@@ -166,14 +166,14 @@ def test_height_sample_weight_equals_repeated_samples() -> None:
 @pytest.mark.parametrize(
     ("innovation", "expected"), [(-0.5, -0.5), (0.5, 0.0), (3.9, 0.0), (4.5, 0.5)]
 )
-def test_heights_ground_effect_ignores_low_barometer(innovation, expected) -> None:
+def test_ground_effect_dead_zone_ignores_low_barometer_height(innovation, expected) -> None:
     """Dead zone EKF2_GND_EFF_DZ of baro_height_control.cpp."""
     _, found = standing(of_baro([10], [innovation], dead_zone_m=4.0))
     assert found["innovation_down_m"].item() == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(("has_gate", "fused"), [(True, 0.0), (False, 1.0)])
-def test_height_outside_gate_is_rejected(has_gate: bool, fused: float) -> None:
+def test_height_sample_outside_gate_is_rejected(has_gate: bool, fused: float) -> None:
     _, found = standing(of_baro([10], [2.6]), has_gate=has_gate)
     assert (found["fused"].item(), found["rejected"].item()) == (fused, 1.0 - fused)
 
@@ -196,7 +196,7 @@ def opened_once() -> Model:
     return opened(outdoors())
 
 
-def test_what_if_barometer_noise_matches_real_run() -> None:
+def test_what_if_barometer_noise_matches_flight_with_that_noise() -> None:
     model = opened_once()
     assert model.agreement.baro_hgt["down"].innovation_correlation > 0.999
     assert model.agreement.baro_hgt["down"].position_rms_difference_m < 0.02
@@ -225,7 +225,7 @@ def test_what_if_without_height_sensor_reports_drift() -> None:
     assert "; the height by at most " in found.notes[-1]
 
 
-def test_what_if_long_height_rejection_is_unpredictable() -> None:
+def test_what_if_with_long_height_rejection_is_unpredictable() -> None:
     """EKF2 resets the height after 5 s, which the model does not contain."""
     flight = outdoors()
     jump = flight.barometer.copy()
@@ -239,7 +239,7 @@ def test_what_if_long_height_rejection_is_unpredictable() -> None:
     assert found.whatif[0].heights["baro_hgt"].longest_without_fusion_s > 5.0
 
 
-def test_model_disagreeing_height_is_excluded() -> None:
+def test_what_if_excludes_height_sensor_that_disagrees_with_log() -> None:
     flight = outdoors()
     noise = np.random.default_rng(1).normal(0.0, 1.0, (len(flight.barometer), 1))
     model = opened(replace(flight, barometer=flight.barometer + noise))
@@ -260,7 +260,7 @@ def test_model_disagreeing_height_is_excluded() -> None:
         what_if(model, [{}], {"baro_hgt": 40.0})
 
 
-def test_add_heights_insufficient_log_returns_reason() -> None:
+def test_ekf2_replay_of_heights_without_data_states_reason() -> None:
     flight = outdoors()
     model = opened_once()
     ekf2, segments = model.flight.ekf2, model.inputs.segments
@@ -290,7 +290,7 @@ def test_add_heights_insufficient_log_returns_reason() -> None:
     assert "before PX4 v1.14" in add_heights(flight, ekf2, log, segments)
 
 
-def test_recursion_bad_acceleration_noise_is_4_9_m_s2() -> None:
+def test_clipped_acceleration_has_noise_of_4_9_m_s2() -> None:
     """The noise is BADACC_BIAS_PNOISE of covariance.cpp."""
     inputs = opened_once().inputs
     (segment,) = inputs.segments
@@ -308,7 +308,7 @@ def test_recursion_bad_acceleration_noise_is_4_9_m_s2() -> None:
     np.testing.assert_allclose(ran(clipped).variance, expected, rtol=1e-9)
 
 
-def test_segment_clipped_axes_increase_noise_share() -> None:
+def test_clipped_imu_axes_increase_fraction_of_bad_acceleration() -> None:
     flight = outdoors()
     (plain,) = opened_once().inputs.segments
     clipped = pd.Series(0, flight.imu.index)
@@ -335,7 +335,9 @@ def models(shared_logs: Path, model_of: Any) -> dict[str, Model]:
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", FLOWN)
-def test_model_real_heights_agree_with_log(models: dict[str, Model], name: str) -> None:
+def test_ekf2_model_heights_of_real_flights_agree_with_log(
+    models: dict[str, Model], name: str
+) -> None:
     """Half of the barometer samples are not logged, except in the last flight."""
     gnss, barometer, published_m = FLOWN[name]
     agreement = models[name].agreement
@@ -354,7 +356,7 @@ def test_model_real_heights_agree_with_log(models: dict[str, Model], name: str) 
 
 
 @pytest.mark.reallogs
-def test_what_if_height_settings_change_statistics(models: dict[str, Model]) -> None:
+def test_what_if_with_smaller_barometer_gate_rejects_more(models: dict[str, Model]) -> None:
     """EKF2_BARO_NOISE scales NIS; the gate rejects innovations outside it."""
 
     def heights(without: dict[str, float] | None = None, **settings: float) -> Any:
@@ -384,7 +386,7 @@ def test_what_if_height_settings_change_statistics(models: dict[str, Model]) -> 
 
 
 @pytest.mark.reallogs
-def test_what_if_range_finder_height_raises_error(shared_logs: Path) -> None:
+def test_what_if_on_flight_with_range_finder_raises_error(shared_logs: Path) -> None:
     model = opened(read_log(shared_logs / "simulated" / "v1.16.1_no_uwb.ulg"))
     assert model.agreement.good
     with pytest.raises(SettingsError, match="EKF2 also fused range to the ground"):

@@ -66,7 +66,7 @@ def found(analysis: Analysis, detectors: tuple[Any, ...] = DETECTORS) -> dict[st
 # ------------------------------------------------------------------ the regression
 
 
-def test_design_columns_equal_filter_responses() -> None:
+def test_bias_regression_columns_equal_kf_step_responses() -> None:
     """Compare innovations with and without a step with filterpy replays."""
     north = compare(aisle_flight(duration_s=30.0), RIGHT, axes=("north",))["north"].axis
     step = np.where(north.measurement_time_s >= 12.0, 0.7, 0.0)
@@ -93,7 +93,7 @@ def test_design_columns_equal_filter_responses() -> None:
     np.testing.assert_allclose([nu[:, 0], s], expected, atol=1e-9)
 
 
-def test_design_matrix_imu_gap_separates_axis_groups() -> None:
+def test_bias_regression_with_imu_gap_equals_kf_innovations() -> None:
     analysis = flown()
     axes = tuple(analysis.axes[name].axis for name in ("north", "east"))
     model = make_design_matrix(analysis.flight, axes, RIGHT, 0.10, 0.0)
@@ -117,7 +117,7 @@ def test_design_matrix_imu_gap_separates_axis_groups() -> None:
             np.testing.assert_allclose(fits.residual[fits.axis == at], residual, atol=1e-9)
 
 
-def test_design_fit_equals_least_squares_with_prior() -> None:
+def test_bias_regression_equals_least_squares_with_prior() -> None:
     rng = np.random.default_rng(1)
     columns, data = rng.normal(size=(2, 25, 2)), rng.normal(size=(2, 25))
     skip = np.arange(25) % 5 == 0
@@ -142,7 +142,7 @@ def test_design_fit_equals_least_squares_with_prior() -> None:
 # ------------------------------------------------------------------ the causes
 
 
-def test_fit_clean_flight_has_no_bias_scale_or_jump() -> None:
+def test_clean_flight_has_no_bias_scale_error_or_jump() -> None:
     causes, low_pass = flown().bias_scale_jump_fit, flown().smoothing
     assert causes.jumps == ()
     assert low_pass.correlation == 0.0
@@ -173,7 +173,9 @@ def test_fit_clean_flight_has_no_bias_scale_or_jump() -> None:
         ("r-scale=4", "source_reported_variance_wrong", "error", {"variance_factor": (4.0, 0.8)}),
     ],
 )
-def test_find_simulated_mistake_is_first_with_size(mistake, name, severity, evidence) -> None:
+def test_simulated_mistake_is_first_finding_with_its_size(
+    mistake, name, severity, evidence
+) -> None:
     named = found(flown(mistake))
     assert next(iter(named)) == name
     assert ("source_low_pass_filtered" in named) == (name == "source_low_pass_filtered")
@@ -193,7 +195,9 @@ def test_find_simulated_mistake_is_first_with_size(mistake, name, severity, evid
         ("sigma_a_too_large", "", {"sigma_a_m_s2": 2.0}, "error", "--sigma-a 0.2|--sigma-a 0.3"),
     ],
 )
-def test_find_simulated_mistake_has_command(name, mistake, settings, severity, remedy) -> None:
+def test_finding_of_simulated_mistake_gives_a_command(
+    name, mistake, settings, severity, remedy
+) -> None:
     named = found(analysed(flight(), replace(RIGHT, **settings)) if settings else flown(mistake))
     assert named[name].severity == severity
     # either noise makes S too large; the likelihood separates them
@@ -202,7 +206,7 @@ def test_find_simulated_mistake_has_command(name, mistake, settings, severity, r
     assert any(part in named[name].remedy for part in remedy.split("|"))
 
 
-def test_scale_estimate_is_not_biased_by_imu_noise() -> None:
+def test_scale_factor_estimate_is_not_biased_by_imu_noise() -> None:
     """Plain regression on a noisy acceleration would be 8 % too small."""
     scales = []
     for seed in range(5):
@@ -216,7 +220,7 @@ def test_scale_estimate_is_not_biased_by_imu_noise() -> None:
     assert np.mean(scales) == pytest.approx(0.0, abs=0.04)
 
 
-def test_jump_is_located_and_outlier_burst_is_not_one() -> None:
+def test_outlier_burst_is_not_reported_as_position_jump() -> None:
     assert set(found(flown("nlos=5%"))) == {"source_outliers"}
     assert "source_outliers" not in found(flown("jump=1,40s"))
     causes = flown("jump=1,40s").bias_scale_jump_fit
@@ -241,7 +245,7 @@ def with_ekf2(*mistakes: str) -> Analysis:
 
 
 @pytest.mark.parametrize(("jump", "severity"), [("50ms", "warning"), ("300ms", "error")])
-def test_clock_change_from_publication_age_has_severity(jump, severity):
+def test_clock_jump_severity_follows_its_size(jump, severity):
     (finding,) = stamps.detect_arrival_times(with_ekf2(f"clock-jump={jump}"))
     assert finding.severity == severity
     assert finding.evidence["until_s"] == pytest.approx(50.0, abs=0.5)
@@ -268,12 +272,12 @@ def without_variances(flight: Flight) -> Flight:
         ("r-scale=0.25", without_variances),
     ],
 )
-def test_find_missing_data_gives_no_finding(mistake, change) -> None:
+def test_flight_without_required_data_gives_no_bias_finding(mistake, change) -> None:
     named = set(found(analysed(change(flight(mistake))), OF_CAUSES))
     assert named <= {"source_outliers"}
 
 
-def test_fit_without_tuning_is_unavailable_with_remedy() -> None:
+def test_bias_fit_without_tuned_noises_is_unavailable() -> None:
     untuned = replace(flown("jump=1,40s"), tuning={})
     assert isinstance(untuned.bias_scale_jump_fit, Unavailable)
     assert isinstance(untuned.smoothing, Unavailable)
@@ -281,7 +285,7 @@ def test_fit_without_tuning_is_unavailable_with_remedy() -> None:
 
 
 @pytest.mark.parametrize("mistake", ["accel-bias=0.4", "jump=1,21s", "decimate=2Hz"])
-def test_find_very_short_flight_gives_no_finding(mistake) -> None:
+def test_very_short_flight_gives_no_bias_or_jump_finding(mistake) -> None:
     short = analysed(flight(mistake), start_s=20.0, end_s=25.0)
     assert found(short) == {}
     assert isinstance(short.bias_scale_jump_fit, Unavailable)

@@ -64,7 +64,7 @@ def remedies(inventory: Inventory) -> list[str]:
 # ---- the sample log ---------------------------------------------------------------------------
 
 
-def test_inventory_rows_match_flight_contents(sample_flight):
+def test_info_rows_match_contents_of_flight(sample_flight):
     inventory, ekf2 = take_inventory(sample_flight), sample_flight.ekf2
     frames = {
         "IMU": sample_flight.imu, "attitude": sample_flight.attitude, "EKF2 state": ekf2.state,
@@ -85,7 +85,7 @@ def test_inventory_rows_match_flight_contents(sample_flight):
     assert source(inventory, "land detector").start_s == sample_flight.airborne[0][0]
 
 
-def test_inventory_counts_match_compare(sample_flight):
+def test_info_sample_counts_match_those_of_compare(sample_flight):
     """The counts are those of the samples that compare uses."""
     inventory = take_inventory(sample_flight)
     comparison = compare(sample_flight)
@@ -133,7 +133,7 @@ def test_info_json_is_written_to_stdout_or_file(
     ("vehicle_local_position", "EKF2 state",
      {"EKF2 states", "EKF2 variances", "EKF2 consistency", "aids", "what-if"}),
 ])  # fmt: skip
-def test_inventory_missing_topic_disables_analyses(tmp_path, topic_, part, lost):
+def test_info_lists_analyses_disabled_by_missing_topic(tmp_path, topic_, part, lost):
     inventory = inventory_of(make_log().drop(topic_), tmp_path)
     assert topic_ in source(inventory, part).unavailable
     assert {can.name for can in inventory.abilities if not can.possible} - {"error"} == lost
@@ -142,7 +142,7 @@ def test_inventory_missing_topic_disables_analyses(tmp_path, topic_, part, lost)
 
 
 @pytest.mark.parametrize(("profile", "wanted"), [(1, 129), (3, 131)])
-def test_inventory_unlogged_source_advises_sdlog_profile(tmp_path, profile, wanted):
+def test_info_on_unlogged_source_advises_sdlog_profile(tmp_path, profile, wanted):
     log = make_log().drop("vehicle_visual_odometry")
     log.parameters["SDLOG_PROFILE"] = profile
     inventory = inventory_of(log, tmp_path)
@@ -153,7 +153,7 @@ def test_inventory_unlogged_source_advises_sdlog_profile(tmp_path, profile, want
 @pytest.mark.parametrize(
     ("imu_hz", "said"), [(4.0, "IMU was logged at 4.0 Hz"), (49.5, None), (100.0, None)]
 )
-def test_inventory_slow_imu_or_attitude_has_no_acceleration(tmp_path, imu_hz, said):
+def test_info_on_slow_imu_reports_no_acceleration_analysis(tmp_path, imu_hz, said):
     inventory = inventory_of(make_log(imu_hz=imu_hz), tmp_path)
     found = ability(inventory, "acceleration")
     slow = [remedy for remedy in remedies(inventory) if "sensor_combined at full rate" in remedy]
@@ -168,7 +168,7 @@ def test_inventory_slow_imu_or_attitude_has_no_acceleration(tmp_path, imu_hz, sa
     assert "attitude was logged at 5.0 Hz, but 10 Hz are needed" in slow.reason
 
 
-def test_inventory_damage_is_first_advice_by_recording_type(tmp_path, sample_log):
+def test_info_on_damaged_log_states_the_damage_first(tmp_path, sample_log):
     path = tmp_path / "damaged.tlog"
     content = Aisle(seconds=10.0).record().tlog()
     path.write_bytes(content[: len(content) // 2] + bytes(5000) + content[len(content) // 2 :])
@@ -183,7 +183,7 @@ def test_inventory_damage_is_first_advice_by_recording_type(tmp_path, sample_log
     assert "Copy the log" in remedies(take_inventory(read_log(path.with_suffix(".ulg"))))[0]
 
 
-def test_info_log_without_take_off_is_described(tmp_path):
+def test_info_on_log_without_take_off_states_never_airborne(tmp_path):
     log = make_log()
     for name in ("x", "y", "z"):
         log["vehicle_local_position"][name][:] = 0
@@ -195,7 +195,7 @@ def test_info_log_without_take_off_is_described(tmp_path):
     assert "never (land detector)" in info(tmp_path / "made.ulg")
 
 
-def test_inventory_mocap_as_source_is_no_ground_truth(tmp_path):
+def test_info_does_not_use_position_source_as_ground_truth(tmp_path):
     log = make_log().add(odometry("vehicle_mocap_odometry", 10.0, 16))
     assert ability(inventory_of(log, tmp_path), "error").possible
     flight = read_log(log.drop("vehicle_visual_odometry").write(tmp_path / "made.ulg"))
@@ -207,7 +207,7 @@ def test_inventory_mocap_as_source_is_no_ground_truth(tmp_path):
 # ---- gaps -------------------------------------------------------------------------------------
 
 
-def test_inventory_gaps_have_count_and_durations(tmp_path):
+def test_info_states_count_and_duration_of_gaps(tmp_path):
     log = make_log(seconds=40.0)
     for name, rate_hz, first_s in (("sensor_combined", 100, 0.0),
                                    ("vehicle_visual_odometry", 5, 0.1)):  # fmt: skip
@@ -241,7 +241,7 @@ def test_inventory_gaps_have_count_and_durations(tmp_path):
     aisle_flight(duration_s=20.0, uwb=Uwb(name="vehicle_gps_position", origin=GNSS)),
     replace(aisle_flight(duration_s=20.0), positions=()),
 ])  # fmt: skip
-def test_inventory_analyses_agree_with_compare(flight: Flight):
+def test_info_lists_exactly_the_analyses_that_compare_performs(flight: Flight):
     """The flights have no streams; an analysis is possible exactly if compare performs it."""
     inventory = take_inventory(flight)
     strict(json.dumps(to_plain(inventory)))
@@ -262,7 +262,7 @@ def test_inventory_analyses_agree_with_compare(flight: Flight):
         assert ability(inventory, name).possible != isinstance(part, Unavailable), name
 
 
-def test_info_prints_dropouts_and_senders_without_sequence(monkeypatch, tmp_path, sample_flight):
+def test_info_prints_log_dropouts_and_advice(monkeypatch, tmp_path, sample_flight):
     """The golden files test other logs; the UNIX time of this one is out of range."""
     senders = (Sender(1, 197, "visual odometry", 99, None, False),)
     dropouts = (Dropout(3.0, 0.25), Dropout(7.0, 0.5))
@@ -281,7 +281,7 @@ def test_info_prints_dropouts_and_senders_without_sequence(monkeypatch, tmp_path
 
 
 @pytest.mark.reallogs
-def test_info_shared_logs_are_described_or_refused(shared_logs, monkeypatch, capsys):
+def test_info_describes_or_rejects_each_shared_log(shared_logs, monkeypatch, capsys):
     kinds = ("real/*.ulg", "simulated/*.ulg", "mavlink/*")
     paths = sorted(path for kind in kinds for path in shared_logs.glob(kind))
     assert len(paths) > 30
@@ -316,7 +316,7 @@ def test_info_shared_logs_are_described_or_refused(shared_logs, monkeypatch, cap
             assert any(remedy in a.remedy for a in inventory.advice), path.name
 
 
-def test_inventory_without_any_topic_is_made(sample_log, tmp_path):
+def test_info_succeeds_on_log_that_lacks_any_one_topic(sample_log, tmp_path):
     whole = load(sample_log)
     short = Log([take(t, range(0, len(t.fields["timestamp"]), 40)) for t in whole.topics])
     for name in sorted(short.names()):

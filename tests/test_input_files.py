@@ -7,10 +7,17 @@ import shutil
 from pathlib import Path
 
 import pytest
-from aimed import RUNS, Aim, aims, file_hashes, make_desk, make_empty_folder
 from class_tools import in_this_process, make_report
 from cli_tools import error_line, run, run_checked
 from conftest import REPORT, SAMPLES
+from overwrite_cases import (
+    RUNS,
+    OverwriteCase,
+    all_cases,
+    file_hashes,
+    make_desk,
+    make_empty_folder,
+)
 
 from px4fuse.errors import OutputError
 
@@ -25,22 +32,24 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_desk(tmp_path_factory.mktemp("desk") / "desk")
 
 
-def group(aim: Aim) -> tuple[str, str, str | None]:
-    return aim.command, aim.option, aim.name
+def group(case: OverwriteCase) -> tuple[str, str, str | None]:
+    return case.command, case.option, case.name
 
 
 @pytest.mark.parametrize("command", [command for command, *_ in RUNS])
-def test_output_at_input_is_refused_by_every_path(desk, tmp_path, monkeypatch, command) -> None:
+def test_every_command_refuses_to_write_over_its_input(
+    desk, tmp_path, monkeypatch, command
+) -> None:
     monkeypatch.chdir(desk)
     before, tried = file_hashes(desk), 0
-    for aim in (aim for aim in aims() if aim.command == command):
-        arguments = aim.arguments(desk, make_empty_folder(tmp_path / "place"))
+    for case in (case for case in all_cases() if case.command == command):
+        arguments = case.arguments(desk, make_empty_folder(tmp_path / "place"))
         if arguments is None:
             continue
         result = run(*arguments)
-        assert isinstance(result.exception, OutputError), (aim, result.output)
+        assert isinstance(result.exception, OutputError), (case, result.output)
         assert result.stdout == ""
-        assert file_hashes(desk) == before, aim
+        assert file_hashes(desk) == before, case
         tried += 1
     assert tried >= 4
 
@@ -68,13 +77,13 @@ def class_desk(tmp_path, monkeypatch) -> Path:
     ["grade h/reports -o h", "grade h/reports --roster gg/class.csv -o gg",
      "grade h/reports --worksheet g3/grades/ws.csv -o g3"],
 )  # fmt: skip
-def test_grade_into_folder_of_inputs_is_refused(class_desk, command) -> None:
+def test_grade_refuses_output_folder_that_contains_inputs(class_desk, command) -> None:
     before = file_hashes(class_desk)
     assert "contains an input of this command" in error_line(*command.split())
     assert file_hashes(class_desk) == before
 
 
-def test_grade_keeps_pdf_behind_linked_reports_folder(class_desk) -> None:
+def test_grade_refuses_output_folder_linked_to_its_inputs(class_desk) -> None:
     (class_desk / "out").mkdir()
     (class_desk / "out" / "reports").symlink_to(class_desk / "h" / "reports")
     before = file_hashes(class_desk)
@@ -82,7 +91,7 @@ def test_grade_keeps_pdf_behind_linked_reports_folder(class_desk) -> None:
     assert file_hashes(class_desk) == before
 
 
-def test_grade_twice_into_one_folder_keeps_names(class_desk) -> None:
+def test_grade_second_run_keeps_anonymous_names_file(class_desk) -> None:
     command = ["grade", "h/reports", "--roster", "gg/class.csv", "--anonymous", "-o", "out"]
     run_checked(*command)
     (class_desk / "out" / "overrides.csv").write_text("id,item,points,comment\n1001,,,Good\n")
@@ -91,7 +100,7 @@ def test_grade_twice_into_one_folder_keeps_names(class_desk) -> None:
     assert (class_desk / "out" / "names.csv").read_bytes() == before
 
 
-def test_compare_keeps_its_answer_form(tmp_path, monkeypatch) -> None:
+def test_compare_refuses_to_write_over_its_answer_form(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     shutil.copy(SAMPLES / "aisle_uwb.ulg", "l.ulg")
     run_checked("answers", "l.ulg", "-o", "form.toml")
@@ -101,7 +110,7 @@ def test_compare_keeps_its_answer_form(tmp_path, monkeypatch) -> None:
     assert file_hashes(tmp_path) == before
 
 
-def test_verify_keeps_a_log_of_a_folder(tmp_path, monkeypatch) -> None:
+def test_verify_refuses_to_write_over_a_log_of_its_folder(tmp_path, monkeypatch) -> None:
     in_this_process(monkeypatch)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "d").mkdir()
@@ -113,7 +122,7 @@ def test_verify_keeps_a_log_of_a_folder(tmp_path, monkeypatch) -> None:
     assert file_hashes(tmp_path) == before
 
 
-def test_batch_into_folder_of_logs_is_refused(tmp_path, monkeypatch) -> None:
+def test_batch_refuses_output_folder_that_contains_logs(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "d" / "in").mkdir(parents=True)
     shutil.copy(SAMPLES / "aisle_uwb.ulg", "d/in/fleet.ulg")
@@ -124,7 +133,7 @@ def test_batch_into_folder_of_logs_is_refused(tmp_path, monkeypatch) -> None:
 # --- the register ---
 
 
-def test_write_to_registered_file_is_refused(tmp_path) -> None:
+def test_write_to_protected_input_file_is_refused(tmp_path) -> None:
     from px4fuse.input_files import inputs_protected
     from px4fuse.reading import read_text
     from px4fuse.writing import write_all
@@ -140,7 +149,7 @@ def test_write_to_registered_file_is_refused(tmp_path) -> None:
     assert path.read_bytes() == b"x"
 
 
-def test_file_system_without_inodes_compares_paths(tmp_path, monkeypatch) -> None:
+def test_protected_inputs_without_inodes_are_compared_by_path(tmp_path, monkeypatch) -> None:
     """Simulate a file system that ignores case and gives every file the inode 0."""
     from px4fuse.input_files import add_input, check_output_folder, check_outputs, inputs_protected
 

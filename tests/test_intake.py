@@ -91,7 +91,7 @@ def dictionary(**entries: object) -> DictionaryObject:
 # ------------------------------------------------------------------ reports
 
 
-def test_read_report_example_returns_its_results():
+def test_read_report_pdf_returns_its_attached_results():
     report = read_report(REAL, "aisle_uwb.pdf")
     assert to_json(report).encode() == JSON
 
@@ -101,12 +101,12 @@ def test_read_report_example_returns_its_results():
      json.loads(JSON)),
     (lambda: small_report(json.dumps(LOOP).encode()), LOOP),
 ])  # fmt: skip
-def test_read_report_compressed_or_loop_returns_results(pdf, results):
+def test_read_report_pdf_with_compressed_results_succeeds(pdf, results):
     report = read_report(pdf(), "a\nb\u202e\x1b" * 10_000)
     assert report == decode_results(results)
 
 
-def test_read_report_resaved_returns_same_results():
+def test_read_resaved_report_pdf_returns_same_results():
     writer = PdfWriter(clone_from=io.BytesIO(REAL))
     again = read_report(pdf_bytes(writer), "r.pdf")
     assert to_json(again).encode() == JSON
@@ -134,11 +134,11 @@ def test_read_report_resaved_returns_same_results():
     (small_report(edit=lambda w: w.add_attachment("results.json", b"{}")), "several attachments"),
     (raw_pdf(CATALOG, b"<< /Type /Pages /Kids [] /Count 0 >>"), "the PDF has no pages"),
 ], ids=range(12))  # fmt: skip
-def test_read_report_unsuitable_file_states_reason(pdf, said):
+def test_read_report_from_unsuitable_pdf_states_reason(pdf, said):
     assert said in reason(pdf)
 
 
-def test_read_report_ambiguous_attachment_is_rejected():
+def test_read_report_pdf_with_two_attachments_is_rejected():
     embedded = stream(JSON, b"/Type /EmbeddedFile")
     two = with_attachment(embedded, b"/F (results.json) /EF << /F 5 0 R /UF 4 0 R >>")
     assert "several attachments" in reason(two)
@@ -147,7 +147,7 @@ def test_read_report_ambiguous_attachment_is_rejected():
 
 
 @pytest.mark.parametrize("algorithm", ["RC4-128", "RC4-40"])
-def test_read_report_encrypted_is_rejected(algorithm):
+def test_read_report_from_encrypted_pdf_is_rejected(algorithm):
     for password in ("", "secret"):
         encrypted = small_report(
             edit=lambda writer, p=password: writer.encrypt(p, algorithm=algorithm)
@@ -160,7 +160,7 @@ def test_read_report_encrypted_is_rejected(algorithm):
 
 
 @pytest.mark.parametrize("count", [101, 3000])
-def test_read_report_too_many_pages_are_rejected(count):
+def test_read_report_pdf_with_too_many_pages_is_rejected(count):
     kids = b"<< /Type /Pages /Kids [%b] /Count 1 >>" % (b"3 0 R " * 30 * count)
     assert reason(raw_pdf(CATALOG, kids, PAGE))
 
@@ -224,7 +224,7 @@ ACTS = {
 
 
 @pytest.mark.parametrize(("said", "edit"), ACTS.items(), ids=ACTS)
-def test_read_report_with_action_is_rejected(edit, said):
+def test_read_report_pdf_with_action_is_rejected(edit, said):
     assert said in reason(small_report(edit=edit))
     assert "the PDF contains" in reason(small_report(edit=edit))
 
@@ -236,7 +236,7 @@ def test_read_report_with_action_is_rejected(edit, said):
     annotation(Subtype=NameObject("/Link"), A=action("URI", URI=TEXT)),
     annotation(Subtype=NameObject("/FreeText")),
 ], ids=range(5))  # fmt: skip
-def test_read_report_harmless_additions_are_ignored(edit):
+def test_read_report_pdf_with_harmless_additions_is_accepted(edit):
     """Other programs add these entries when they save a report."""
     report = read_report(small_report(edit=edit), "r.pdf")
     assert to_json(report).encode() == JSON
@@ -277,7 +277,7 @@ def stream_bomb(kind: bytes) -> bytes:
     (stream_bomb(b"XRef"), "expands to more"),
     (stream_bomb(b"ObjStm"), "expands to more"),
 ], ids=range(8))  # fmt: skip
-def test_read_report_compression_bomb_takes_little_memory(pdf, said):
+def test_read_report_pdf_compression_bomb_takes_little_memory(pdf, said):
     tracemalloc.start()
     found, peak = reason(pdf), tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -289,14 +289,14 @@ def test_read_report_compression_bomb_takes_little_memory(pdf, said):
     b"/Filter [" + b"/FlateDecode " * 20 + b"]", b"/Filter [/FlateDecode /FlateDecode]",
     b"/Filter /LZWDecode", b"/Filter /Invented", b"/Filter [/DCTDecode /DCTDecode]", b"/Filter 7",
 ])  # fmt: skip
-def test_read_report_other_compression_is_rejected(filters):
+def test_read_report_pdf_with_other_compression_is_rejected(filters):
     attached = with_attachment(stream(zlib.compress(JSON), b"/Type /EmbeddedFile " + filters))
     assert "a stream with other compression" in reason(attached)
     content = raw_pdf(CATALOG, PAGES, PAGE, stream(b"x", filters))
     assert "a stream with other compression" in reason(content)
 
 
-def test_read_report_many_stream_keywords_are_rejected():
+def test_read_report_pdf_with_many_streams_is_rejected():
     # each keyword starts a decompression; all share one limit
     stored = b"".join(b"stream\x78\x01\x00" + b"\x00\x00\xff\xff\x00" * 3 for _ in range(200_000))
     assert reason(b"%PDF-1.4\n" + stored + b"%%EOF")
@@ -318,11 +318,11 @@ def test_read_report_many_stream_keywords_are_rejected():
     b"%PDF-1.4\nxref\n0 99999999\ntrailer\n<< >>\nstartxref\n9\n%%EOF",
     b"%PDF-1.4\n" + b"startxref\n9\n%%EOF\n" * 20_000,
 ], ids=range(11))  # fmt: skip
-def test_read_report_broken_structure_is_rejected(pdf):
+def test_read_report_pdf_with_broken_structure_is_rejected(pdf):
     assert reason(pdf)
 
 
-def test_read_report_invalid_object_stream_is_rejected():
+def test_read_report_pdf_with_invalid_object_stream_is_rejected():
     """Object streams that contain themselves or have wrong offsets."""
     for offsets in (b"1 0 2 9 ", b"5 0 5 3 ", b"1 99 ", b"x y "):
         packed = stream(offsets + CATALOG + PAGES, b"/Type /ObjStm /N 2 /First 8")
@@ -333,13 +333,13 @@ def test_read_report_invalid_object_stream_is_rejected():
         assert reason(pdf)
 
 
-def test_read_report_many_undefined_references_are_rejected():
+def test_read_report_pdf_with_undefined_objects_is_rejected():
     refer = b"".join(b"%d 0 R " % number for number in range(100, 20_000))
     pdf = raw_pdf(b"<< /Type /Catalog /Pages 2 0 R /X [%b] >>" % refer, PAGES, PAGE, stream(b""))
     assert "more memory or time" in reason(pdf)
 
 
-def test_read_report_too_many_objects_are_rejected():
+def test_read_report_pdf_with_too_many_objects_is_rejected():
     catalog = b"<< /Type /Catalog /Pages 2 0 R /X 5 0 R >>"
     listed = b"[%b]" % b"".join(b"%d 0 R " % number for number in range(6, 25_000))
     many = raw_pdf(catalog, PAGES, PAGE, stream(b""), listed, *[b"null"] * 24_995)
@@ -353,7 +353,7 @@ def changed(**entries: object) -> bytes:
     return json.dumps(json.loads(JSON) | entries).encode()
 
 
-def test_read_report_removes_control_characters():
+def test_read_report_removes_control_characters_from_texts():
     student = {"name": "Zoë \u202eevil\u2066 李\x1b[31m", "id": "=1+1", "notes": "a\n\tb\x07"}
     report = read_report(small_report(changed(student=student)), "r.pdf")
     assert report.student == Student("Zoë evil 李[31m", "=1+1", "a\n\tb")
@@ -362,7 +362,7 @@ def test_read_report_removes_control_characters():
 # ------------------------------------------------------------------ other types
 
 
-def test_read_report_unexpected_types_are_read_or_rejected():
+def test_read_report_pdf_with_wrong_types_raises_no_exception():
     """Values of unexpected types at each key that read_report uses."""
     odd = [NumberObject(7), TEXT, ArrayObject(), dictionary(), DecodedStreamObject()]
     for key in ("/Names", "/Pages", "/Outlines", "/Metadata", "/S", "/Filter", "/EF", "/Annots"):

@@ -31,7 +31,7 @@ def analysis(sample_log) -> px4fuse.Analysis:
 # -- names -----------------------------------------------------------------------------------------
 
 
-def test_dir_lists_public_names_only() -> None:
+def test_dir_of_package_lists_only_public_names() -> None:
     assert dir(px4fuse) == sorted(px4fuse.__all__)
     assert {"compare", "find", "read_log", "Settings"} <= set(dir(px4fuse))
     for name in dir(px4fuse):
@@ -52,7 +52,7 @@ def test_type_checking_imports_equal_lazy_imports() -> None:
     assert read == px4fuse._MODULES
 
 
-def test_import_loads_no_library() -> None:
+def test_import_px4fuse_loads_no_numeric_library() -> None:
     code = "import px4fuse, sys; print({'numpy', 'pandas', 'msgspec'} & sys.modules.keys())"
     assert subprocess.check_output([sys.executable, "-c", code], text=True) == "set()\n"
 
@@ -61,7 +61,7 @@ def test_import_loads_no_library() -> None:
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_find_equals_findings_of_command_line(sample_log, analysis, tmp_path):
+def test_python_find_equals_findings_of_command_line(sample_log, analysis, tmp_path):
     command = "compare", sample_log, "--sigma-z", "0.2", "--json", "-", "-o", tmp_path / "r.pdf"
     told = json.loads(run_checked(*command).stdout)["findings"]
     typed = [(f["id"], f["message"], f["remedy"]) for f in told]
@@ -71,13 +71,13 @@ def test_find_equals_findings_of_command_line(sample_log, analysis, tmp_path):
     assert px4fuse.find(analysis) == found
 
 
-def test_compare_flight_equals_compare_path(sample_log, analysis):
+def test_compare_of_flight_equals_compare_of_its_log_path(sample_log, analysis):
     again = px4fuse.compare(px4fuse.read_log(str(sample_log)), sigma_z_m=0.2)
     pd.testing.assert_frame_equal(px4fuse.table(again), px4fuse.table(analysis))
     assert px4fuse.find(again) == px4fuse.find(analysis)
 
 
-def test_compare_arguments_act_like_options(sample_log, analysis):
+def test_python_compare_arguments_act_like_command_options(sample_log, analysis):
     chosen = {"sigma_a_m_s2": 0.3, "sigma_z_m": 0.3, "dt_s": 0.05, "clock_offset_s": 1}
     found = px4fuse.compare(
         analysis.flight, axes="aisle", heading_deg=30, end_s=60, input="zero", **chosen
@@ -101,7 +101,7 @@ def test_compare_arguments_act_like_options(sample_log, analysis):
         ({"position_source": "gps"}, "position source gps: no such source."),
     ],
 )
-def test_compare_invalid_arguments_are_rejected(analysis, arguments, said):
+def test_python_compare_with_invalid_arguments_is_rejected(analysis, arguments, said):
     with pytest.raises(px4fuse.Px4FuseError) as raised:
         px4fuse.compare(analysis.flight, **arguments)
     assert said in str(raised.value)
@@ -112,7 +112,7 @@ def test_compare_invalid_arguments_are_rejected(analysis, arguments, said):
 # -- errors ----------------------------------------------------------------------------------------
 
 
-def test_errors_name_arguments_or_options(sample_log):
+def test_settings_errors_name_python_argument_or_command_option(sample_log):
     with pytest.raises(px4fuse.Px4FuseError, match=r"^`clock_offset_s` 99 is out of range"):
         px4fuse.Settings(clock_offset_s=99.0)
     said = error_line("tune", sample_log, "--clock-offset", 99.0)
@@ -122,7 +122,7 @@ def test_errors_name_arguments_or_options(sample_log):
 # -- table and text --------------------------------------------------------------------------------
 
 
-def test_table_has_the_numbers_of_the_results(analysis) -> None:
+def test_python_table_contains_the_numbers_of_the_results(analysis) -> None:
     table = px4fuse.table(analysis)
     assert list(table.columns) == list(COLUMNS)
     assert list(table.index) == [(axis, name) for axis in analysis.axes for name in ("kf", "ekf2")]
@@ -134,14 +134,14 @@ def test_table_has_the_numbers_of_the_results(analysis) -> None:
             assert row[column] == getattr(summary.truth if truth else summary, column)
 
 
-def test_table_filter_without_innovations_is_nan(analysis) -> None:
+def test_python_table_has_nan_for_filter_without_innovations(analysis) -> None:
     row = px4fuse.table(analysis).loc[("down", "ekf2")]
     assert row[["count", "nis_mean", "nis_low", "nis_high", "sigma_ratio"]].isna().all()
     assert row["verdict"] == ""
     assert row["position_rmse_m"] == analysis["down"].filters["ekf2"].truth.position_rmse_m
 
 
-def test_repr_shows_arrays_by_their_shape(sample_log, analysis):
+def test_repr_of_results_shows_arrays_by_their_shape(sample_log, analysis):
     """Also of all records that are fields of a result."""
     vio, slam = sample_log.with_name("loop_vio.ulg"), sample_log.with_name("loop_slam.tum")
     results = {
@@ -175,7 +175,7 @@ def test_repr_shows_arrays_by_their_shape(sample_log, analysis):
     assert len(seen) > 50
 
 
-def test_what_if_noise_changes_the_mean_nis(analysis) -> None:
+def test_python_what_if_with_larger_noise_reduces_mean_nis(analysis) -> None:
     found = px4fuse.what_if(analysis.flight, {"EKF2_EVP_NOISE": 0.3})
     assert found.whatif[0].north.nis_mean < 0.3 * found.logged.north.nis_mean
 
@@ -184,7 +184,7 @@ def test_what_if_noise_changes_the_mean_nis(analysis) -> None:
 
 
 @pytest.mark.usefixtures("cached_pages")
-def test_report_and_page_are_written_as_by_the_commands(
+def test_python_write_report_equals_report_of_the_command(
     analysis: px4fuse.Analysis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     in_this_process(monkeypatch)
@@ -200,7 +200,7 @@ def test_report_and_page_are_written_as_by_the_commands(
     run_checked("verify", report, LOG)
 
 
-def test_write_wrong_suffix_or_no_request_is_rejected(
+def test_python_write_report_to_wrong_suffix_is_rejected(
     analysis: px4fuse.Analysis, tmp_path: Path
 ) -> None:
     for function, name in ((px4fuse.write_report, "x.html"), (px4fuse.write_page, "x.pdf")):

@@ -46,7 +46,7 @@ def cause(analysis: Analysis, owner: Any, of: Any = "nis") -> Intervention:
     return find_cause(analysis.causes, owner, "aisle", of)
 
 
-def test_interventions_without_discrepancy_are_empty() -> None:
+def test_consistent_flight_has_no_causes_of_inconsistency() -> None:
     assert flown().causes == ()
 
 
@@ -73,7 +73,9 @@ def test_interventions_without_discrepancy_are_empty() -> None:
         ("ekf2-delay=0.175", {}, "ekf2", "nees", {"EKF2_EV_DELAY": (0, 0)}),
     ],
 )  # fmt: skip
-def test_cause_of_simulated_mistake_is_that_mistake(mistake, settings, owner, of, change) -> None:
+def test_cause_found_for_simulated_mistake_is_that_mistake(
+    mistake, settings, owner, of, change
+) -> None:
     analysis = flown(*filter(None, (mistake,)), **settings)
     found = cause(analysis, owner, of)
     assert found.change.keys() == change.keys()
@@ -82,7 +84,7 @@ def test_cause_of_simulated_mistake_is_that_mistake(mistake, settings, owner, of
     assert found.is_complete_cause
 
 
-def test_kf_changes_remove_bias_from_acceleration() -> None:
+def test_kf_rerun_without_bias_equals_corrected_acceleration() -> None:
     analysis = flown("accel-bias=0.5")
     found, imu = cause(analysis, "kf"), analysis.flight.imu
     without = imu[Columns.SPECIFIC_FORCE] - [
@@ -95,7 +97,7 @@ def test_kf_changes_remove_bias_from_acceleration() -> None:
     assert found.after == pytest.approx(again.nis_mean, rel=1e-6)
 
 
-def test_ekf2_changes_vibration_raises_noise_to_px4_limit() -> None:
+def test_filter_rerun_for_vibration_raises_ekf2_acc_noise() -> None:
     analysis = flown("vibration=1.5")
     found = cause(analysis, "ekf2", "nis")
     assert found.change == {"EKF2_ACC_NOISE": 1.0}  # PX4's maximum
@@ -103,7 +105,7 @@ def test_ekf2_changes_vibration_raises_noise_to_px4_limit() -> None:
     assert not any("EKF2_ACC_NOISE" in row.change for row in flown("nlos=7%").causes)
 
 
-def test_offset_applied_to_kf_is_candidate_for_ekf2() -> None:
+def test_time_offset_applied_to_kf_is_tried_for_ekf2() -> None:
     bare = flown("clock-offset=-0.19")
     offset_s = cause(bare, "kf", "nees").change[CLOCK_OFFSET]
     analysis = explain(compare(bare.flight, replace(RIGHT, clock_offset_s=offset_s)))
@@ -116,7 +118,7 @@ def test_offset_applied_to_kf_is_candidate_for_ekf2() -> None:
 @pytest.mark.parametrize(
     ("analysis", "of"), [(lambda: flown(sigma_z=0.03), "nis"), (lambda: flown(LATE), "nees")]
 )
-def test_kf_rerun_equals_comparison_with_the_change(analysis, of) -> None:
+def test_kf_rerun_equals_compare_with_the_changed_setting(analysis, of) -> None:
     analysis = analysis()
     found = find_cause(analysis.causes, "kf", "north", of)
     again = compare(analysis.flight, replace(analysis.settings, **found.change))
@@ -133,7 +135,7 @@ def test_kf_rerun_equals_comparison_with_the_change(analysis, of) -> None:
     )
 
 
-def test_ekf2_rerun_equals_what_if() -> None:
+def test_ekf2_rerun_equals_what_if_with_the_same_change() -> None:
     analysis = flown("ekf2-noise=0.03")
     found = [find_cause(analysis.causes, "ekf2", axis) for axis in ("north", "east")]
     model, change = analysis.ekf2_model, found[0].change  # type: ignore[union-attr]
@@ -153,7 +155,7 @@ def test_ekf2_rerun_equals_what_if() -> None:
 rms_difference = attrgetter("main.difference.position_rms_m")
 
 
-def test_cause_has_difference_before_and_after() -> None:
+def test_cause_states_position_difference_before_and_after() -> None:
     kf_case = flown(sigma_a=0.02)
     right = compare(kf_case.flight, replace(kf_case.settings, **cause(kf_case, "kf").change))
     (row,) = [one for one in kf_case.causes if (one.statistic, one.axis) == ("difference", "aisle")]
@@ -174,7 +176,7 @@ def test_cause_has_difference_before_and_after() -> None:
     )
 
 
-def test_outliers_are_excluded_at_shifted_timestamps() -> None:
+def test_filter_rerun_excludes_outliers_at_shifted_timestamps() -> None:
     analysis = flown("clock-offset=-0.19", "nlos=7%")
     count = cause(analysis, "ekf2").change[OUTLIERS]
     rows = [one for one in analysis.causes if one.filter == "ekf2" and one.axis == "aisle"]
@@ -193,7 +195,7 @@ def test_outliers_are_excluded_at_shifted_timestamps() -> None:
         assert nis.mean() < 1.3
 
 
-def test_ekf2_changes_include_non_default_parameter() -> None:
+def test_ekf2_rerun_candidates_include_non_default_parameters() -> None:
     analysis = flown("ekf2-noise=0.03")
     settings = {**analysis.ekf2_model.inputs.settings, "EKF2_ACC_NOISE": 0.5, "EKF2_GYR_NOISE": 0.1}
     inputs = replace(analysis.ekf2_model.inputs, settings=settings)
@@ -204,7 +206,7 @@ def test_ekf2_changes_include_non_default_parameter() -> None:
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
 
-def test_is_cause_requires_half_to_one_and_a_half() -> None:
+def test_cause_must_explain_50_to_150_percent_of_inconsistency() -> None:
     def one(change: Any, explains: float, *, into: bool = False) -> Intervention:
         return Intervention(
             statistic="nis", filter="kf", axis="aisle", change=change, before=9.0,
@@ -232,7 +234,7 @@ def test_is_cause_requires_half_to_one_and_a_half() -> None:
     assert find_cause([whole], "ekf2", "aisle") is find_cause([whole], "kf", "north") is None
 
 
-def test_candidate_without_required_data_is_skipped() -> None:
+def test_filter_rerun_without_required_data_is_skipped() -> None:
     analysis = flown("nlos=7%", sigma_z=0.05)
     missing = Unavailable("it", "not known", "None.")
 

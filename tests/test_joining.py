@@ -45,7 +45,7 @@ def record(tmp_path):
 # ---- the sample -------------------------------------------------------------------------------
 
 
-def test_join_ulog_without_positions_gets_tlog_positions(stripped, tlog_flight, sample_flight):
+def test_joined_ulog_without_positions_gets_those_of_the_tlog(stripped, tlog_flight, sample_flight):
     assert "vehicle_visual_odometry" not in [t.name for t in stripped.positions]
     joined = join(stripped, tlog_flight)
     assert joined.positions[0].name == "VISION_POSITION_ESTIMATE"
@@ -73,7 +73,7 @@ def test_join_ulog_without_positions_gets_tlog_positions(stripped, tlog_flight, 
     assert given.sha256 == tlog_flight.log.sha256
 
 
-def test_join_in_either_order_gives_equal_boot_times(sample_flight, tlog_flight):
+def test_joined_recordings_have_equal_times_in_either_order(sample_flight, tlog_flight):
     one, other = join(sample_flight, tlog_flight), join(tlog_flight, sample_flight)
     note = one.log.notes[-1]
     for said in ("joined with aisle_uwb.tlog", "129.7 s in common", "differ by 0.001 m (median)"):
@@ -91,7 +91,7 @@ def test_join_in_either_order_gives_equal_boot_times(sample_flight, tlog_flight)
 # ---- made recordings ----------------------------------------------------------------------------
 
 
-def test_join_missing_parts_are_copied_with_time_shift(record):
+def test_joined_recording_copies_missing_data_with_shifted_time(record):
     """The second recording starts 5 s later."""
     left_out = "HIGHRES_IMU", "ATTITUDE_QUATERNION", "EXTENDED_SYS_STATE", "ODOMETRY"
     bare = record(Aisle(uwb=None), "bare.tlog", *left_out)
@@ -111,7 +111,7 @@ def test_join_missing_parts_are_copied_with_time_shift(record):
     assert "not verified that both are of the same flight" in joined.log.notes[-1]
 
 
-def test_shift_times_moves_times_inside_records(sample_flight):
+def test_shift_times_also_shifts_times_inside_records(sample_flight):
     ekf2 = replace(sample_flight.ekf2, instances=((0.0, 0), (9.0, 1)), gate=5.0)
     ekf2 = replace(ekf2, resets=(Reset(3.0, "position", (1.0, 0.0, 0.0)),))
     moved = shift_times(ekf2, 2.5)
@@ -121,7 +121,7 @@ def test_shift_times_moves_times_inside_records(sample_flight):
     assert shift_times((FlightMode(1.0, 2.0, "Land"),), 2.5) == (FlightMode(3.5, 4.5, "Land"),)
 
 
-def test_join_missing_lists_remaining_parts_only(record):
+def test_joined_recording_lists_only_data_missing_in_both(record):
     """Parts that the copied EKF2 lacks are listed."""
     bare = record(Aisle(uwb=None), "bare.tlog", "ODOMETRY", "HIGHRES_IMU")
     full = record(Aisle(), "full.tlog")
@@ -137,7 +137,7 @@ def test_join_missing_lists_remaining_parts_only(record):
 
 
 @pytest.mark.parametrize("earlier_s", [0.0, 10.0])
-def test_join_copies_senders_and_shifts_unix_time(record, earlier_s):
+def test_joined_recording_has_senders_and_shifted_unix_time(record, earlier_s):
     ulog = aisle_flight(duration_s=60.0, ekf2=None, attitude_hz=None)
     ulog = replace(ulog, log=replace(ulog.log, boot_time_s=BOOT_S - earlier_s))
     flight = record(Aisle(system_time=True))
@@ -150,7 +150,7 @@ def test_join_copies_senders_and_shifts_unix_time(record, earlier_s):
 # ---- refusals -----------------------------------------------------------------------------------
 
 
-def test_join_without_overlap_names_both_spans(record):
+def test_join_of_recordings_without_overlap_states_both_spans(record):
     first = record(Aisle(seconds=20.0), "first.tlog")
     second = record(Aisle(seconds=20.0, start_s=BOOT_S + 30.0), "second.tlog")
     said = r"first.tlog and second.tlog do not overlap.*50.0 s to 70.0 s.*80.0 s to 100.0 s"
@@ -158,7 +158,7 @@ def test_join_without_overlap_names_both_spans(record):
         join(first, second)
 
 
-def test_join_other_flight_is_refused_by_positions(sample_flight, tlog_flight):
+def test_join_of_flights_with_other_positions_is_rejected(sample_flight, tlog_flight):
     moved = replace(tlog_flight.ekf2, state=tlog_flight.ekf2.state + 3.0)
     with pytest.raises(
         MissingDataError, match="are different flights: their EKF2 positions differ"
@@ -167,7 +167,7 @@ def test_join_other_flight_is_refused_by_positions(sample_flight, tlog_flight):
 
 
 @pytest.mark.reallogs
-def test_join_other_flight_with_same_boot_time_is_refused(shared_logs, sample_flight):
+def test_join_of_other_flight_with_same_boot_time_is_rejected(shared_logs, sample_flight):
     other = read_log(shared_logs / "mavlink" / "v1.16.1_aisle_clock_nosync.tlog")
     other = replace(other, log=replace(other.log, boot_time_s=sample_flight.log.boot_time_s))
     with pytest.raises(MissingDataError, match="different flights"):

@@ -95,7 +95,7 @@ def axis() -> Axis:
 
 @settings(max_examples=60)
 @given(axis=any_axis(), chosen=any_settings)
-def test_replay_any_axis_equals_plain_recursion(axis: Axis, chosen: Settings) -> None:
+def test_kf_replay_of_any_axis_equals_plain_recursion(axis: Axis, chosen: Settings) -> None:
     run = replay(axis, chosen)
     states, updates = plain_replay(axis, chosen)
     np.testing.assert_allclose(run.steps[STATE], states, rtol=1e-9, atol=1e-9)
@@ -103,18 +103,18 @@ def test_replay_any_axis_equals_plain_recursion(axis: Axis, chosen: Settings) ->
 
 
 @pytest.mark.parametrize("name", ["sigma_a_m_s2", "sigma_z_m", "dt_s", "clock_offset_s"])
-def test_settings_out_of_range_are_rejected(name: str) -> None:
+def test_kf_settings_out_of_range_are_rejected(name: str) -> None:
     for value in (-11.0, 1e300, math.nan, math.inf, *([] if name[0] == "c" else [0.0, 1e-300])):
         with pytest.raises(SettingsError, match=rf"^`{name}` \S+ is out of range: give .+\.$"):
             Settings(**{name: value})
 
 
-def test_replay_imu_input_without_imu_is_rejected() -> None:
+def test_kf_replay_with_imu_input_but_no_imu_is_rejected() -> None:
     with pytest.raises(SettingsError, match="`input` imu needs an acceleration"):
         replay(line([0.0, 0.2, 0.4], [0.0, 0.0, 0.0]), Settings(input="imu"))
 
 
-def test_replay_starts_at_first_measurement_or_state(axis: Axis) -> None:
+def test_kf_replay_starts_at_first_measurement(axis: Axis) -> None:
     run = replay(axis, Settings())
     assert run.steps.index[0] == axis.measurement_time_s[0]
     assert run.steps[STATE].iloc[0].tolist() == [axis.measurement_m[0], 0.0, 0.25, 0.0, 1.0]
@@ -125,7 +125,7 @@ def test_replay_starts_at_first_measurement_or_state(axis: Axis) -> None:
     assert run.updates.index.tolist() == axis.measurement_time_s.tolist()
 
 
-def test_state_at_predicts_from_previous_step(axis: Axis) -> None:
+def test_kf_state_between_steps_is_predicted_from_previous_step(axis: Axis) -> None:
     """At a step the state is that of the step, between two predicted, outside NaN."""
     run = replay(axis, Settings())
     edges = run.steps.index.to_numpy()
@@ -142,7 +142,7 @@ def test_state_at_predicts_from_previous_step(axis: Axis) -> None:
 
 @pytest.mark.parametrize("dt", [0.02, 0.1, 0.4])
 @pytest.mark.parametrize("gap", [False, True])
-def test_variance_at_predicts_from_previous_step(dt: float, gap: bool) -> None:
+def test_kf_variance_between_steps_is_predicted_from_previous(dt: float, gap: bool) -> None:
     """P = FPFᵀ + Q in matrix form, at several points of every step, with and without a gap."""
     time = 0.37 * np.arange(12)
     imu = np.arange(0.0, 5.0, 0.02)
@@ -167,7 +167,7 @@ def test_variance_at_predicts_from_previous_step(dt: float, gap: bool) -> None:
 
 @settings(max_examples=30)
 @given(axis=any_axis(), chosen=any_settings, data=st.data())
-def test_state_at_ignores_later_measurements(axis, chosen, data) -> None:
+def test_kf_state_does_not_depend_on_later_measurements(axis, chosen, data) -> None:
     changed = data.draw(st.integers(1, len(axis.measurement_m) - 1))
     arrival = axis.measurement_time_s[changed]
     measured = axis.measurement_m.copy()
@@ -181,7 +181,7 @@ def test_state_at_ignores_later_measurements(axis, chosen, data) -> None:
     assert abs(after[0, -1] - before[0, -1]) > 0.0
 
 
-def test_replay_imu_gap_adds_input_mean_square_to_q() -> None:
+def test_kf_replay_adds_process_noise_during_imu_gap() -> None:
     time = 0.5 * np.arange(21)
     imu = np.arange(0.0, 10.001, 0.02)
     value = 2.0 * np.sin(imu)
@@ -208,7 +208,7 @@ P = (0.5, -0.2, 0.7)
 
 
 @pytest.mark.parametrize("dt", [0.01, 0.1, 0.7])
-def test_model_elements_equal_matrices(dt: float) -> None:
+def test_kf_prediction_formulas_equal_matrix_products(dt: float) -> None:
     f, b = np.array([[1.0, dt], [0.0, 1.0]]), np.array([[dt**2 / 2.0], [dt]])
     propagate_covariance = f @ model.symmetric_matrix(P) @ f.T
     np.testing.assert_allclose(
@@ -223,7 +223,7 @@ def test_model_elements_equal_matrices(dt: float) -> None:
     )
 
 
-def test_continuous_noise_is_limit_of_short_steps() -> None:
+def test_kf_continuous_process_noise_is_limit_of_short_steps() -> None:
     count, total = 10_000, 0.7
     dt = total / count
     covariance = (0.0, 0.0, 0.0)

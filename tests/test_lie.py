@@ -40,16 +40,16 @@ def homogeneous(pose: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("angle", ANGLES)
 @pytest.mark.parametrize("dimension", [2, 3])
 class TestTangents:
-    def test_exp_equals_matrix_exponential(self, dimension: int, angle: float) -> None:
+    def test_lie_group_exp_equals_matrix_exponential(self, dimension: int, angle: float) -> None:
         for xi in tangents(dimension, angle, 5):
             found = homogeneous(lie.exp(xi))
             np.testing.assert_allclose(found, expm(generator(xi)), atol=1e-13, rtol=0)
 
-    def test_log_inverts_exp(self, dimension: int, angle: float) -> None:
+    def test_lie_group_log_inverts_exp(self, dimension: int, angle: float) -> None:
         xi = tangents(dimension, angle)
         np.testing.assert_allclose(lie.log(lie.exp(xi)), xi, atol=3e-11, rtol=0)
 
-    def test_right_jacobian_inverse_equals_finite_difference(self, dimension, angle) -> None:
+    def test_inverse_right_jacobian_equals_finite_difference(self, dimension, angle) -> None:
         xi, step = tangents(dimension, min(angle, 3.0)), 1e-5  # log is discontinuous at π
         jacobian, pose = lie.right_jacobian_inverse(xi), lie.exp(xi)
         for k, axis in enumerate(np.eye(SIZES[dimension][0])):
@@ -57,14 +57,16 @@ class TestTangents:
             quotient = (up - down) / (2.0 * step)
             np.testing.assert_allclose(jacobian[:, :, k], quotient, atol=1e-7, rtol=0)
 
-    def test_adjoint_moves_tangent_to_other_side(self, dimension: int, angle: float) -> None:
+    def test_lie_group_adjoint_moves_tangent_vector_to_other_side(
+        self, dimension: int, angle: float
+    ) -> None:
         x, xi = lie.exp(tangents(dimension, angle)), tangents(dimension, 0.7)
         moved = (lie.adjoint(x) @ xi[..., None])[..., 0]
         left, right = lie.compose(x, lie.exp(xi)), lie.compose(lie.exp(moved), x)
         np.testing.assert_allclose(lie.log(lie.between(left, right)), 0.0, atol=1e-12)
 
 
-def test_log_half_turn_has_angle_pi() -> None:
+def test_lie_group_log_of_half_turn_has_angle_pi() -> None:
     for axis in np.eye(3):
         half = np.concatenate([np.zeros(3), axis, [0.0]])
         assert np.linalg.norm(lie.log(half)[3:]) == pytest.approx(np.pi, abs=1e-15)
@@ -74,7 +76,7 @@ def test_log_half_turn_has_angle_pi() -> None:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 64, 65])
-def test_chain_equals_running_product(dimension: int, count: int) -> None:
+def test_chained_poses_equal_running_matrix_product(dimension: int, count: int) -> None:
     steps = lie.exp(tangents(dimension, 0.4, count))
     made = lie.chain(steps)
     expected = np.eye(dimension + 1)
@@ -89,7 +91,9 @@ numbers = st.floats(-50.0, 50.0)
 
 
 @given(st.lists(numbers, min_size=18, max_size=18), st.sampled_from([2, 3]))
-def test_compose_inverse_and_between_form_a_group(values: list[float], dimension: int) -> None:
+def test_pose_composition_and_inverse_satisfy_group_axioms(
+    values: list[float], dimension: int
+) -> None:
     size = SIZES[dimension][0]
     xi = np.array(values[: 3 * size]).reshape(3, size)
     xi[:, dimension:] /= 50.0

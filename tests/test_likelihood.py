@@ -40,7 +40,7 @@ def walk(seed: int = 3, *, sigma_z: float = 0.1, count: int = 4000) -> Axis:
     return random_walk(rng, count=count, interval_s=0.2, sigma_a=0.5, sigma_z=sigma_z)
 
 
-def test_innovations_sample_grid_equals_replay(sample_flight: Flight) -> None:
+def test_fast_kf_on_noise_grid_equals_kf_replay(sample_flight: Flight) -> None:
     for axis in sample_axes(sample_flight):
         nu, s = innovations(
             preintegrate(axis, Settings()), np.array(SIGMA_A)[:, None], np.array(SIGMA_Z)
@@ -54,7 +54,7 @@ def test_innovations_sample_grid_equals_replay(sample_flight: Flight) -> None:
 
 @settings(max_examples=60)
 @given(axis=any_axis(), chosen=any_settings)
-def test_innovations_any_axis_equal_replay(axis: Axis, chosen: Settings) -> None:
+def test_fast_kf_innovations_of_any_axis_equal_kf_replay(axis: Axis, chosen: Settings) -> None:
     found = innovations(preintegrate(axis, chosen), chosen.sigma_a_m_s2, chosen.sigma_z_m)
     np.testing.assert_allclose(found, replayed(axis, chosen), rtol=1e-9, atol=1e-9)
     quick, exact = quick_replay(axis, chosen), replay(axis, chosen)
@@ -63,7 +63,7 @@ def test_innovations_any_axis_equal_replay(axis: Axis, chosen: Settings) -> None
         pd.testing.assert_frame_equal(*frames, rtol=1e-9, atol=1e-9)
 
 
-def test_innovations_with_imu_gap_equal_replay() -> None:
+def test_fast_kf_innovations_with_imu_gap_equal_kf_replay() -> None:
     imu = np.arange(0.0, 12.0, 0.02)
     imu = imu[(imu < 4.0) | (imu > 5.3)]
     time = 0.37 * np.arange(30)
@@ -75,7 +75,7 @@ def test_innovations_with_imu_gap_equal_replay() -> None:
 
 @settings(max_examples=30)
 @given(axis=any_axis(), chosen=any_settings)
-def test_filter_states_equal_replay_at_measurements(axis: Axis, chosen: Settings) -> None:
+def test_fast_kf_states_equal_kf_replay(axis: Axis, chosen: Settings) -> None:
     grid = filter_states(
         preintegrate(axis, chosen), chosen.sigma_a_m_s2 * np.array([[2.0], [1.0]]), chosen.sigma_z_m
     )
@@ -92,7 +92,7 @@ def test_filter_states_equal_replay_at_measurements(axis: Axis, chosen: Settings
         np.testing.assert_allclose(values[:, 1, 0], expected, rtol=1e-9, atol=1e-9)
 
 
-def test_innovations_skipped_measurement_is_not_fused() -> None:
+def test_fast_kf_does_not_fuse_skipped_measurement() -> None:
     """Later innovations are as without the skipped measurement."""
     axis = walk(count=60)
     skip = np.zeros(59, dtype=bool)
@@ -106,7 +106,7 @@ def test_innovations_skipped_measurement_is_not_fused() -> None:
     assert np.all(nu[skip] != 0.0)
 
 
-def test_run_filter_weight_divides_variance() -> None:
+def test_fast_kf_weight_divides_measurement_variance() -> None:
     """A weight of 1/w² multiplies SIGMA_Z by w; a weight near zero excludes the measurement."""
     legs = preintegrate(walk(count=40), ZERO)
     rows = list(run_filter(legs, 0.5, 0.2, None, np.full(39, 4.0)))
@@ -119,7 +119,7 @@ def test_run_filter_weight_divides_variance() -> None:
     np.testing.assert_allclose(np.array([row[1] for row in left_out])[~skip], s[~skip], rtol=1e-6)
 
 
-def test_score_grid_equals_normal_density() -> None:
+def test_likelihood_grid_of_noises_equals_normal_density() -> None:
     """Compare both axes with scipy's density of the replay's innovations."""
     axes = walk(4, count=60), walk(5, count=60)
     a, z = np.array([0.2, 0.5, 2.0]), np.array([0.05, 0.1])

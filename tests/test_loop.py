@@ -91,7 +91,7 @@ def true_closure_error_m() -> float:
     return float(np.linalg.norm(moved[0] - moved[1]))
 
 
-def test_loop_sample_closure_error_equals_ground_truth(sample_loop: Loop) -> None:
+def test_loop_closure_error_of_sample_flight_equals_ground_truth(sample_loop: Loop) -> None:
     assert sample_loop.closure_error_m == pytest.approx(true_closure_error_m(), abs=0.02)
     assert sample_loop.closure_error_m == pytest.approx(1.42, abs=0.05)  # sample_logs/README.md
     assert sample_loop.path_length_m == pytest.approx(87.7, abs=1.5)
@@ -100,7 +100,7 @@ def test_loop_sample_closure_error_equals_ground_truth(sample_loop: Loop) -> Non
     assert sample_loop.part_reason == "from take-off to landing, by the land detector"
 
 
-def test_loop_sample_corrections_reduce_ate_and_end_error(sample_loop):
+def test_loop_corrections_of_sample_flight_reduce_ate(sample_loop):
     for reference in (0, 1):  # ground truth and SLAM
         before = rmse(sample_loop, "uncorrected", reference)
         for way in ("by_distance", "gated"):
@@ -115,7 +115,7 @@ def test_loop_sample_corrections_reduce_ate_and_end_error(sample_loop):
         assert robust.reason == SINGLE_LOOP_REASON
 
 
-def test_loop_lesson_example_2_equals_lesson_output() -> None:
+def test_loop_on_lesson_example_2_equals_lesson_output() -> None:
     corners = np.column_stack([np.array(ODOMETRY_M), np.zeros(len(ODOMETRY_M))])
     found = close_loop(Trajectory("corners", "vio", np.arange(5.0), corners, None, "FRD"))
     error, total = closure_error_vector_m(found), found.path_length_m
@@ -130,7 +130,7 @@ def test_loop_lesson_example_2_equals_lesson_output() -> None:
     ]
 
 
-def test_by_distance_plain_shifts_positions_linearly(sample_loop) -> None:
+def test_loop_correction_by_distance_shifts_positions_linearly(sample_loop) -> None:
     plain, odometry = path(sample_loop, "by_distance_plain"), sample_loop.odometry.trajectory
     share = sample_loop.distance_m / sample_loop.distance_m[-1]
     moved = odometry.position_m - plain.trajectory.position_m
@@ -140,7 +140,7 @@ def test_by_distance_plain_shifts_positions_linearly(sample_loop) -> None:
     assert plain.trajectory.rotation is odometry.rotation
 
 
-def test_by_distance_with_heading_keeps_rpe_over_10_m(sample_loop: Loop) -> None:
+def test_loop_correction_with_heading_keeps_rpe_over_10_m(sample_loop: Loop) -> None:
     """The sample's heading drifts, so a correction of positions only increases the RPE."""
     over = [
         next(e.translation_m for e in score(sample_loop, way).rpe if e.delta_text == "10 m")
@@ -151,7 +151,7 @@ def test_by_distance_with_heading_keeps_rpe_over_10_m(sample_loop: Loop) -> None
     assert plain > 1.1 * before
 
 
-def test_by_distance_without_heading_has_one_path(sample, sample_loop) -> None:
+def test_loop_correction_without_heading_has_only_one_path(sample, sample_loop) -> None:
     assert [part.name for part in sample_loop.reported_paths[1:3]] == [POSITIONS_ONLY, BY_DISTANCE]
     found = analyse_loop(sample, landed_at=Landing(0.0, 0.0))
     assert isinstance(found.heading_error_deg, Unavailable)
@@ -162,7 +162,9 @@ def test_by_distance_without_heading_has_one_path(sample, sample_loop) -> None:
     np.testing.assert_allclose(plain.position_m, turned.position_m, atol=1e-9)
 
 
-def test_loop_landed_at_option_equals_ground_truth(sample: LoopSource, sample_loop: Loop) -> None:
+def test_loop_with_given_landing_point_equals_ground_truth(
+    sample: LoopSource, sample_loop: Loop
+) -> None:
     forward, right, _ = sample_loop.true_end.displacement  # the vehicle heads along x
     heading = sample_loop.true_end.heading_change_deg
     taped = analyse_loop(sample, landed_at=Landing(forward, right, heading))
@@ -172,12 +174,12 @@ def test_loop_landed_at_option_equals_ground_truth(sample: LoopSource, sample_lo
 
 
 @pytest.mark.reallogs
-def test_loop_tlog_has_same_closure_error(shared_logs: Path) -> None:
+def test_loop_from_tlog_has_closure_error_of_ground_truth(shared_logs: Path) -> None:
     found = analyse(read_source(str(shared_logs / "mavlink" / "v1.16.1_loop_vio.tlog")))
     assert found.closure_error_m == pytest.approx(true_closure_error_m(), abs=0.05)
 
 
-def test_loop_absolute_track_has_finding() -> None:
+def test_loop_on_absolute_positions_is_reported() -> None:
     source = read_source(str(REPOSITORY / "sample_logs" / "aisle_uwb.ulg"))
     assert source.trajectory.kind == "ekf2"
     found = analyse(source)
@@ -217,7 +219,7 @@ TRUE = tuple(
 FALSE = GivenClosure(12.0, 2 * LAP_S + 35.0, 0.05)
 
 
-def test_loop_false_closure_is_rejected_among_true_ones() -> None:
+def test_false_loop_closure_is_rejected_among_true_ones() -> None:
     truth, odometry = laps(3, 0, OdometryNoise())
     clean = close_loop(odometry, closures=TRUE, reference=truth)
     fooled = close_loop(odometry, closures=(*TRUE, FALSE), reference=truth)
@@ -240,7 +242,7 @@ def test_loop_false_closure_is_rejected_among_true_ones() -> None:
     assert "loop_closure_inconsistent" not in named
 
 
-def test_gate_p_value_of_true_landings_is_uniform() -> None:
+def test_loop_closure_gate_p_value_at_true_landing_is_uniform() -> None:
     """The gate assumes the noise with which the laps are simulated."""
     p = []
     for seed in range(60):
@@ -251,7 +253,7 @@ def test_gate_p_value_of_true_landings_is_uniform() -> None:
         assert np.mean(np.array(p) < share) == pytest.approx(share, abs=0.2)
 
 
-def test_loop_open_end_is_rejected_and_not_corrected() -> None:
+def test_loop_with_open_end_is_rejected_and_not_corrected() -> None:
     _, odometry = laps(1, 3, OdometryNoise())
     half = odometry[: len(odometry) // 2]
     found = close_loop(half)
@@ -272,7 +274,7 @@ def test_loop_open_end_is_rejected_and_not_corrected() -> None:
     assert find_loop(opened) == ()
 
 
-def test_loop_heading_is_closed_only_if_similar() -> None:
+def test_loop_closes_heading_only_if_start_and_end_are_similar() -> None:
     _, odometry = laps(1, 4, OdometryNoise())
     turned = close_loop(odometry)  # the vehicle lands with another heading
     assert isinstance(turned.heading_error_deg, Unavailable)
@@ -285,7 +287,7 @@ def test_loop_heading_is_closed_only_if_similar() -> None:
     assert found.closures[0].degrees_of_freedom == 4
 
 
-def test_find_loop_contradicting_closure_is_doubtful() -> None:
+def test_contradicting_loop_closure_is_reported_as_inconsistent() -> None:
     """The error is within the drift, but contradicts the other closures."""
     _, odometry = laps(3, 5, OdometryNoise())
     wrong = GivenClosure(20.0, 21.5 + LAP_S, 0.05)  # 1.5 m further along the side
@@ -296,7 +298,7 @@ def test_find_loop_contradicting_closure_is_doubtful() -> None:
     assert doubtful[0].evidence["time_1_s"] == 20.0
 
 
-def test_find_loop_too_small_stated_drift_is_reported() -> None:
+def test_loop_drift_setting_that_is_too_small_is_reported() -> None:
     """The odometry has a heading error in every step; the stated drift is small."""
     _, odometry = laps(3, 7, OdometryNoise())
     turn = Rotation.from_rotvec(np.outer(np.linspace(0.0, 0.7, len(odometry)), [0, 0, 1]))
@@ -307,7 +309,7 @@ def test_find_loop_too_small_stated_drift_is_reported() -> None:
     assert "loop_drift_too_small" in {finding.id for finding in find_loop(found)}
 
 
-def test_find_loop_assumed_landing_is_reported(sample: LoopSource, sample_loop: Loop) -> None:
+def test_loop_with_assumed_landing_point_is_reported(sample: LoopSource, sample_loop: Loop) -> None:
     assert find_loop(sample_loop) == ()  # the log contains ground truth
     blind = Unavailable("ground truth", "left out", "")
     found = analyse(LoopSource(sample.trajectory, replace(sample.flight, truth=blind)))
@@ -317,7 +319,7 @@ def test_find_loop_assumed_landing_is_reported(sample: LoopSource, sample_loop: 
     assert find_loop(analyse_loop(sample, landed_at=Landing(0.0, 0.0))) == ()
 
 
-def test_odometry_variances_use_growing_reported_variances() -> None:
+def test_odometry_variance_uses_growth_of_reported_variance() -> None:
     _, odometry = laps(1, 6, OdometryNoise())
     nodes = np.arange(0, len(odometry), 10)
     constant = replace(odometry, position_variance_m2=np.full((len(odometry), 3), 0.0025))
@@ -332,7 +334,7 @@ def test_odometry_variances_use_growing_reported_variances() -> None:
     assert "growth of the logged position variances" in words
 
 
-def test_pose_graph_interpolates_between_key_frames(sample_loop: Loop) -> None:
+def test_pose_graph_correction_interpolates_between_key_frames(sample_loop: Loop) -> None:
     solved, before = path(sample_loop, "gated"), sample_loop.odometry.trajectory
     after, nodes = solved.trajectory, sample_loop.nodes
     poses = solved.solution.poses
@@ -349,7 +351,7 @@ def test_pose_graph_interpolates_between_key_frames(sample_loop: Loop) -> None:
 # ------------------------------------------------------------------ options and files
 
 
-def test_closure_times_are_unix_or_from_first_pose() -> None:
+def test_loop_closure_times_may_be_unix_or_from_first_pose() -> None:
     source = read_source(str(SLAM))
     relative = analyse_loop(source, closures=(GivenClosure(3.0, 80.0, 0.3),))
     start = float(source.trajectory.time_s[0])
@@ -357,7 +359,7 @@ def test_closure_times_are_unix_or_from_first_pose() -> None:
     assert relative.closures[1] == stamped.closures[1]
 
 
-def test_loop_slam_file_is_levelled_with_small_closure_error() -> None:
+def test_loop_on_slam_file_levels_the_camera_frame() -> None:
     source = read_source(str(SLAM))
     found = analyse_loop(source, landed_at=Landing(0.0, 0.0))
     assert found.odometry.trajectory.frame == "FRD"
@@ -374,12 +376,12 @@ def test_loop_slam_file_is_levelled_with_small_closure_error() -> None:
     ({"start_s": 96.0, "end_s": 98.0}, "too short for a loop"),
     ({"key_frames_m": 101.0}, "`key_frames_m` 101 is out of range"),
 ])  # fmt: skip
-def test_loop_invalid_segment_or_closure_is_refused(sample, how, says) -> None:
+def test_loop_with_invalid_segment_or_closure_is_rejected(sample, how, says) -> None:
     with pytest.raises((TrajectoryError, SettingsError), match=says):
         analyse_loop(sample, **how)
 
 
-def test_split_part_separates_log_and_source_at_colon(tmp_path: Path) -> None:
+def test_trajectory_argument_is_split_into_log_and_source(tmp_path: Path) -> None:
     assert split_part(f"{SAMPLE}:ekf2") == (SAMPLE, "ekf2")
     assert split_part(str(SAMPLE)) == (SAMPLE, None)
     odd = tmp_path / "a:vio"

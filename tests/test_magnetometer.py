@@ -33,7 +33,7 @@ def known_field_state(size: int = 1) -> tuple[np.ndarray, np.ndarray]:
     return x, np.tile(np.diag(deviation**2), (size, 1, 1))
 
 
-def test_fuse_field_corrects_heading_error() -> None:
+def test_magnetometer_fusion_corrects_heading_error() -> None:
     """The true heading is 0.05 rad larger than the filter's."""
     body = np.zeros(3)
     nominal = Rotation.from_euler("ZYX", [0.7, 0.1, -0.05])
@@ -53,7 +53,7 @@ def test_fuse_field_corrects_heading_error() -> None:
     assert np.linalg.eigvalsh(P[0]).min() > -1e-15
 
 
-def test_fuse_field_turning_vehicle_determines_body_field() -> None:
+def test_magnetometer_bias_is_estimated_on_turning_vehicle() -> None:
     body = np.array([0.05, -0.03, 0.02])
     x, P = known_field_state()
     deviation = np.full(21, 1e-6)
@@ -69,7 +69,7 @@ def test_fuse_field_turning_vehicle_determines_body_field() -> None:
     np.testing.assert_allclose(x[0, 15:18], EARTH, atol=1e-3)
 
 
-def test_fuse_field_weighted_sample_equals_repeats() -> None:
+def test_weighted_magnetometer_sample_equals_repeated_samples() -> None:
     seen = field_samples(Rotation.from_euler("z", 0.4), np.zeros(3))
     noise, gate = np.array([0.05]), np.array([3.0])
     x, P = known_field_state()
@@ -80,7 +80,7 @@ def test_fuse_field_weighted_sample_equals_repeats() -> None:
     np.testing.assert_allclose(once[1], P, atol=1e-9)
 
 
-def test_fuse_field_parameter_sets_use_own_noise_and_gate() -> None:
+def test_magnetometer_fusion_uses_noise_and_gate_of_each_run() -> None:
     x, P = known_field_state(4)
     seen = field_samples(Rotation.identity(), np.array([0.3, 0.0, 0.0]), size=4)
     seen = seen._replace(sample_count=np.array([1.0, 1.0, 0.0, 1.0]))
@@ -99,7 +99,7 @@ def test_fuse_field_parameter_sets_use_own_noise_and_gate() -> None:
     np.testing.assert_allclose(after[3], least[0])
 
 
-def test_mean_by_event_assigns_samples_to_next_event() -> None:
+def test_magnetometer_samples_are_averaged_until_next_update() -> None:
     rotation = Rotation.from_rotvec(0.1 * np.eye(3)[2] * np.arange(10)[:, None]).as_matrix()
     gauss = np.arange(12.0).reshape(4, 3)
     step = np.array([2, 3, 6, 9])
@@ -136,13 +136,13 @@ def field_of(log: Log, folder: Path) -> pd.DataFrame:
 
 
 @pytest.mark.parametrize("generation", ["v1.14", "v1.16"])
-def test_read_field_contains_3d_fusion_flag(generation: str, tmp_path: Path) -> None:
+def test_read_magnetometer_contains_3d_fusion_flag(generation: str, tmp_path: Path) -> None:
     field = field_of(magnetic(generation), tmp_path)
     np.testing.assert_allclose(field.iloc[:, :3], np.tile(EARTH, (len(field), 1)), rtol=1e-6)
     assert field["fused_3d"].tolist() == [0.0] * 40 + [1.0] * (len(field) - 40)
 
 
-def test_read_field_prefers_topic_with_more_samples(tmp_path: Path) -> None:
+def test_read_magnetometer_prefers_topic_with_more_samples(tmp_path: Path) -> None:
     """The measurement time is that of the sensor, minus EKF2's delay and half a step."""
     log = magnetic(kept_hz=20.0)
     field = field_of(log, tmp_path)
@@ -151,7 +151,7 @@ def test_read_field_prefers_topic_with_more_samples(tmp_path: Path) -> None:
     assert field.index[0] - stamped_s == pytest.approx(0.02 + 0.5 * 0.01, abs=1e-6)
 
 
-def test_read_field_reads_logged_filtered_innovations(tmp_path: Path) -> None:
+def test_read_magnetometer_uses_ekf2_samples_at_low_rate(tmp_path: Path) -> None:
     """EKF2's copy at a low rate is used, except if the sensor topic contains all samples."""
     log = magnetic()
     remaining = log["estimator_aid_src_mag"]
@@ -172,7 +172,7 @@ def test_read_field_reads_logged_filtered_innovations(tmp_path: Path) -> None:
     assert list(field) == ["forward_gauss", "right_gauss", "down_gauss", "fused_3d"]
 
 
-def test_mean_field_recovers_mean_measurement() -> None:
+def test_mean_of_filtered_magnetometer_samples_is_recovered() -> None:
     """The vehicle rotates, EKF2's attitude differs from the published one, the sensor is noisy."""
     count, every, rows = 12, 7, 30
     interval_s, dt = 0.5 / every, 0.008
@@ -226,7 +226,7 @@ def settled(frame_hz: float, on: slice, count: int = 60) -> tuple[float, float] 
     return _field_span(made(FusionRecord, field_gauss=frame))
 
 
-def test_field_span_needs_continuous_3d_fusion() -> None:
+def test_magnetometer_replay_requires_continuous_3d_fusion() -> None:
     assert settled(2.0, slice(20, 50)) == (11.0, 24.5)
     assert settled(1.4, slice(20, 50)) is None
     assert settled(2.0, slice(0, 0)) is None

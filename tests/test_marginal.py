@@ -60,7 +60,7 @@ def matrices(elements: Array) -> Array:
 
 @settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_banded_system_equals_dense_normal_equations(seed: int) -> None:
+def test_banded_solver_equals_dense_normal_equations(seed: int) -> None:
     """Two stretches and one unmeasured state, compared with lstsq, slogdet and inv."""
     rng = np.random.default_rng(seed)
     count = int(rng.integers(6, 14))
@@ -105,7 +105,7 @@ def test_banded_system_equals_dense_normal_equations(seed: int) -> None:
     np.testing.assert_allclose(system.position_variance(), variance, rtol=1e-6)
 
 
-def test_factorise_singular_q_of_one_step_stays_accurate() -> None:
+def test_banded_factorisation_with_singular_q_stays_accurate() -> None:
     """Q of a single step has rank one, so the term that makes it invertible is below rounding."""
     step, joined = np.full(19, 0.09755900000000004), np.ones(19, dtype=bool)
     unit = 0.1 * step * np.stack([step**2 / 4.0, step / 2.0, np.ones(19)])
@@ -210,7 +210,7 @@ def joint_normal(
     return signals[:, 0], covariance + block_diag(*(each[2] for each in made)), made
 
 
-def test_fit_positions_unknown_constants_add_covariance() -> None:
+def test_unknown_imu_constants_add_covariance_to_likelihood() -> None:
     """Equal at all offsets and noises, except for a constant."""
     part = with_constants()
 
@@ -238,7 +238,7 @@ def test_fit_positions_unknown_constants_add_covariance() -> None:
 
 
 @pytest.mark.parametrize("start_known", [True, False])
-def test_fit_positions_single_measurement_has_no_effect(start_known: bool) -> None:
+def test_single_position_in_a_segment_adds_no_likelihood(start_known: bool) -> None:
     """A single position in a stretch has the same likelihood as none."""
     part = with_constants()
     if not start_known:
@@ -252,7 +252,7 @@ def test_fit_positions_single_measurement_has_no_effect(start_known: bool) -> No
         np.testing.assert_allclose(one.constants(), none.constants(), rtol=1e-9, atol=1e-12)
 
 
-def test_fitted_constants_and_squares_equal_dense_solution() -> None:
+def test_fitted_imu_constants_equal_dense_solution() -> None:
     part = with_constants(offsets=1)
     # without the third axis, which has too few measurements
     part = replace(part, measurement_m=part.measurement_m * [1.0, 1.0, np.nan])
@@ -279,7 +279,7 @@ def test_fitted_constants_and_squares_equal_dense_solution() -> None:
         np.testing.assert_array_equal(count, np.isfinite(part.measurement_m).sum(axis=1))
 
 
-def test_products_by_segment_equal_dense_covariance() -> None:
+def test_banded_products_by_segment_equal_dense_covariance() -> None:
     part, noises = with_constants(offsets=1), Noises(0.5, 0.1)
     signal = np.random.default_rng(8).normal(0.0, 1.0, (COUNT, 3, 2))
     still = np.zeros((3, 2, COUNT - 1))
@@ -301,7 +301,7 @@ def test_products_by_segment_equal_dense_covariance() -> None:
         np.testing.assert_allclose(found_values[stretch], expected[1], rtol=1e-4, atol=1e-4)
 
 
-def test_centre_on_path_keeps_likelihood() -> None:
+def test_centring_positions_on_imu_path_keeps_likelihood() -> None:
     part = with_constants()
     given = [arguments(each, SOME_NOISES[0], WEIGHT) for each in (part, centre_on_path(part))]
     plain, found_values = (fit_positions(*each).scores()[0] for each in given)
@@ -319,7 +319,7 @@ def test_centre_on_path_keeps_likelihood() -> None:
 
 
 @pytest.mark.parametrize("which", ["filter", "constants"])
-def test_likelihood_interpolation_equals_direct_value(which: str) -> None:
+def test_interpolated_noise_likelihood_equals_direct_value(which: str) -> None:
     """Equal over four decades of the ratio and of SIGMA_Z, except for a constant."""
     parts = [filter_positions(preintegrate(modelled(seed, COUNT), TRUE)) for seed in (1, 2)]
     if which == "constants":
@@ -349,7 +349,7 @@ def with_gap() -> Axis:
 
 
 @pytest.mark.parametrize("interval", [0.1, 0.2, 0.5, None])
-def test_filter_positions_likelihood_equals_innovations(interval: float | None) -> None:
+def test_banded_likelihood_equals_that_of_kf_innovations(interval: float | None) -> None:
     """Intervals of one step (singular Q), of several steps, and with an IMU gap."""
     axis, chosen = with_gap(), Settings()
     if interval is not None:
@@ -381,7 +381,7 @@ def test_filter_positions_likelihood_equals_innovations(interval: float | None) 
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.1, 0.8, -3.0])
-def test_profile_ends_of_parabola_are_1_96_sigma(slope: float) -> None:
+def test_profile_likelihood_interval_of_parabola_is_1_96_sigma(slope: float) -> None:
     """With the other parameter maximised out, σ is the marginal one."""
     sigma, other_sigma = 0.2, 0.05
 
@@ -437,7 +437,7 @@ def clean() -> list[NoiseFit]:
     ("share", "size_m", "length", "least_found"),
     [(0.05, 2.0, 4, 0.99), (0.12, 2.0, 4, 0.99), (0.06, 0.5, 2, 0.9)],
 )
-def test_maximise_likelihood_finds_outliers(clean, share, size_m, length, least_found):
+def test_maximum_likelihood_fit_finds_simulated_outliers(clean, share, size_m, length, least_found):
     hits = wrong = missed = 0
     ratio = []
     for seed in SEEDS:
@@ -462,7 +462,7 @@ def test_maximise_likelihood_finds_outliers(clean, share, size_m, length, least_
 
 
 @pytest.mark.parametrize(("axes", "share", "width"), [(1, 0.15, 4.0), (2, 0.1, 5.0), (2, 0.3, 3.0)])
-def test_outlier_variance_factor_equals_mixture_curvature(axes, share, width):
+def test_sigma_widening_for_outliers_equals_likelihood_curvature(axes, share, width):
     """Without motion the likelihood has a closed form."""
     rng = np.random.default_rng(axes)
     wrong = rng.random(4000) < share
@@ -493,7 +493,7 @@ def test_outlier_variance_factor_equals_mixture_curvature(axes, share, width):
     assert widening == pytest.approx(curved * 2.0 * axes * 4000, rel=0.01)
 
 
-def test_maximise_likelihood_without_outliers_keeps_weights() -> None:
+def test_maximum_likelihood_without_outliers_keeps_weights() -> None:
     weight = np.random.default_rng(1).uniform(0.2, 1.0, MANY)
     parts = [filter_positions(preintegrate(pair(1)[0], TRUE))]
     found = maximise_likelihood(parts, Noises(0.5, 0.1), weight, outliers=False)
@@ -505,7 +505,7 @@ def test_maximise_likelihood_without_outliers_keeps_weights() -> None:
         assert negative_log_likelihood(parts, other, weight) > best
 
 
-def test_outlier_probability_rises_from_prior_to_one() -> None:
+def test_outlier_probability_follows_bayes_rule() -> None:
     """Bayes: ε N(e; 0, w²σ²) against (1 - ε) N(e; 0, σ²), over all axes."""
     error = np.linspace(0.0, 6.0, 25)
     for axes in (1, 2):

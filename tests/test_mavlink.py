@@ -3,7 +3,7 @@
 The number of fuzz cases is the environment variable PX4FUSE_FUZZ_CASES (default 60); the cases are
 the same in every run::
 
-    PX4FUSE_FUZZ_CASES=20000 python -m pytest tests/test_mavlink.py -k fuzz
+    PX4FUSE_FUZZ_CASES=20000 python -m pytest tests/test_mavlink.py -k malicious
 """
 
 import itertools
@@ -82,7 +82,7 @@ def reason(flight: Flight, what: str) -> str:
 # ---- whole simulated flight ---------------------------------------------------------------------
 
 
-def test_read_mavlink_simulated_flight_equals_closed_form(read):
+def test_read_mavlink_of_simulated_flight_equals_closed_form(read):
     """All parts equal their closed form; HIGHRES_IMU is preferred to a denser SCALED_IMU."""
     aisle = Aisle(asks=True)
     made = aisle.record()
@@ -111,7 +111,7 @@ def test_read_mavlink_simulated_flight_equals_closed_form(read):
     assert_allclose(variance, np.tile(POSE_VARIANCE, (200, 1)), rtol=1e-6)
 
 
-def test_read_mavlink_version_1_and_raw_stream_are_equal(read):
+def test_read_mavlink_version_1_equals_version_2(read):
     """MAVLink 1 has no ids above 255, so the state message is LOCAL_POSITION_NED."""
     aisle = Aisle(state="LOCAL_POSITION_NED")
     recorder = record_without(aisle, "ODOMETRY")
@@ -126,7 +126,7 @@ def test_read_mavlink_version_1_and_raw_stream_are_equal(read):
     assert_frame_equal(as_2.positions[0].samples, as_1.positions[0].samples)
 
 
-def test_read_mavlink_duplicates_over_two_links_are_removed(read):
+def test_read_mavlink_removes_duplicates_of_two_links(read):
     """MAVProxy with two radios records every message twice, with a delay."""
     aisle = Aisle(asks=True)
     once = aisle.record()
@@ -146,7 +146,7 @@ def test_read_mavlink_duplicates_over_two_links_are_removed(read):
 
 
 @pytest.mark.parametrize("name", ["SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3"])
-def test_imu_scaled_imu_is_converted_to_si_units(read, name):
+def test_mavlink_scaled_imu_is_converted_to_si_units(read, name):
     recorder = add(record_without(Aisle(), "HIGHRES_IMU"), 50.0, lambda t: message(
         name, time_boot_ms=ms(t), xacc=1000, yacc=-500, zacc=-1000, xgyro=1000, ygyro=-20, zgyro=3,
     ))  # fmt: skip
@@ -156,7 +156,7 @@ def test_imu_scaled_imu_is_converted_to_si_units(read, name):
     assert_allclose(imu[Columns.ANGULAR_RATE].iloc[0], [1.0, -0.02, 0.003], rtol=1e-12)
 
 
-def test_imu_raw_imu_is_unavailable_with_reason(read):
+def test_mavlink_raw_imu_is_unavailable_with_reason(read):
     recorder = add(record_without(Aisle(), "HIGHRES_IMU"), 50.0, lambda t: message(
         "RAW_IMU", time_usec=us(t), xacc=17, zacc=-998,
     ))  # fmt: skip
@@ -166,7 +166,7 @@ def test_imu_raw_imu_is_unavailable_with_reason(read):
     assert [(u.name, u.count) for u in flight.unused] == [("RAW_IMU", 2000)]
 
 
-def test_imu_several_ids_uses_most_frequent(read):
+def test_mavlink_imu_with_several_ids_uses_most_frequent_id(read):
     recorder = record_without(Aisle(), "HIGHRES_IMU")
     add(recorder, 50.0, lambda t: message("HIGHRES_IMU", time_usec=us(t), xacc=2.0, id=1))
     add(recorder, 10.0, lambda t: message("HIGHRES_IMU", time_usec=us(t) + 7, xacc=9.0, id=0))
@@ -178,7 +178,7 @@ def test_imu_several_ids_uses_most_frequent(read):
 # ---- attitude -----------------------------------------------------------------------------------
 
 
-def test_attitude_euler_angles_become_quaternion(read):
+def test_mavlink_euler_angles_are_converted_to_quaternion(read):
     roll, pitch, yaw = 0.1, -0.3, 2.0
     recorder = add(record_without(Aisle(), "ATTITUDE_QUATERNION"), 30.0, lambda t: message(
         "ATTITUDE", time_boot_ms=ms(t), roll=roll, pitch=pitch, yaw=yaw,
@@ -206,7 +206,7 @@ def test_attitude_euler_angles_become_quaternion(read):
     (12, "", [], []),
     (255, "", [], []),
 ])  # fmt: skip
-def test_positions_odometry_frame_is_converted_to_ned(read, frame_id, name, position, variance):
+def test_mavlink_odometry_position_is_converted_to_ned(read, frame_id, name, position, variance):
     flight = read(add(Aisle(uwb=None, asks=True).record(), 30.0, lambda t: odometry(
         us(unix(t)), [1.0, 2.0, 3.0], [0, 0, 0], estimator=3, frame_id=frame_id,
         attitude=Rotation.from_euler("z", 0.1 * t),
@@ -232,7 +232,7 @@ TO_NED = {
 
 
 @pytest.mark.parametrize("child", TO_NED)
-def test_ekf2_velocity_and_variance_are_rotated_to_ned(read, child):
+def test_mavlink_odometry_velocity_is_rotated_to_ned(read, child):
     """PX4 v1.13: v_NED = R v and var_i = Σ_j R_ij² var_j."""
     velocity, matrix = np.array([1.0, -0.5, 0.25]), TO_NED[child]
     recorder = add(record_without(Aisle(), "ODOMETRY"), 30.0, lambda t: odometry(
@@ -251,7 +251,7 @@ def test_ekf2_velocity_and_variance_are_rotated_to_ned(read, child):
     (2, "ODOMETRY_VISION", RECEIVED), (3, "ODOMETRY_VIO", RECEIVED),
     (6, "ODOMETRY_MOCAP", MOTION_CAPTURE), (4, "", None), (8, "", None),
 ])  # fmt: skip
-def test_positions_odometry_estimator_type_gives_track(read, estimator, name, origin):
+def test_mavlink_odometry_estimator_type_selects_source_name(read, estimator, name, origin):
     """ODOMETRY from the autopilot remains EKF2's state; types GPS and AUTOPILOT are no input."""
     flight = read(Aisle(uwb="ODOMETRY", estimator=estimator, asks=True))
     if not name:
@@ -269,7 +269,7 @@ def test_positions_odometry_estimator_type_gives_track(read, estimator, name, or
         assert_allclose(given.iloc[0], POSE_VARIANCE, rtol=1e-6)
 
 
-def test_truth_motion_capture_besides_other_source(read):
+def test_mavlink_mocap_besides_other_source_is_ground_truth(read):
     aisle = Aisle(asks=True)
     recorder = aisle.record()
     add(recorder, 50.0, lambda t: message(
@@ -283,7 +283,7 @@ def test_truth_motion_capture_besides_other_source(read):
     assert [t.name for t in flight.positions] == ["VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP"]
 
 
-def test_positions_nan_dropped_and_variance_zero_is_nan(read):
+def test_read_mavlink_drops_nan_positions(read):
     """NaN positions are dropped; a variance of 0 or NaN is not given."""
     recorder = Aisle(uwb=None, asks=True).record()
     kinds = itertools.cycle(range(4))
@@ -304,7 +304,7 @@ def test_positions_nan_dropped_and_variance_zero_is_nan(read):
 
 
 @pytest.mark.parametrize("state", ["LOCAL_POSITION_NED", "ODOMETRY"])
-def test_ekf2_variance_from_estimator_status(read, state):
+def test_mavlink_ekf2_variance_is_read_from_estimator_status(read, state):
     """The horizontal accuracy is the root of the sum of both variances."""
     recorder = Aisle(state="LOCAL_POSITION_NED" if state != "ODOMETRY" else None).record()
     if state == "ODOMETRY":
@@ -350,7 +350,7 @@ def simulated(name: str, aisle: Aisle, boot_s: float):
 
 
 @pytest.mark.parametrize("name", ["HIL_STATE_QUATERNION", "SIMSTATE"])
-def test_truth_simulation_is_projected_about_first_sample(read, name):
+def test_mavlink_simulated_truth_is_projected_to_local_metres(read, name):
     """The time is the receive time, because the timestamp is 0 in PX4."""
     aisle = Aisle(asks=True)
     flight = read(add(aisle.record(), 25.0, lambda t: simulated(name, aisle, t)))
@@ -380,7 +380,7 @@ def parameter(name: bytes, value: int | float, *, by_bytes: bool):
 
 
 @pytest.mark.parametrize(("autopilot", "by_bytes"), [(12, True), (3, False)])
-def test_parameters_integer_encoding_depends_on_autopilot(read, autopilot, by_bytes):
+def test_mavlink_integer_parameter_encoding_depends_on_autopilot(read, autopilot, by_bytes):
     recorder = record_without(Aisle(), "HEARTBEAT")
     add(recorder, 1.0, lambda t: heartbeat(2, autopilot))
     for i, (name, value) in enumerate(
@@ -397,7 +397,7 @@ def test_parameters_integer_encoding_depends_on_autopilot(read, autopilot, by_by
     assert flight.ekf2.gate == 3.5
 
 
-def test_parameter_out_of_range_becomes_default_with_note(read):
+def test_mavlink_parameter_out_of_range_is_replaced_by_default(read):
     recorder = Aisle().record()
     for name, value in (
         (b"EKF2_EVP_GATE", 0.0),
@@ -441,7 +441,7 @@ def test_ardupilot_messages_contain_no_px4_advice(read, missing_messages):
     assert len(texts) > 3
 
 
-def test_log_info_reads_autopilot_version(read):
+def test_read_mavlink_reads_firmware_from_autopilot_version(read):
     recorder = Aisle().record()
     recorder.hear(unix(60.0), AUTOPILOT, message(
         "AUTOPILOT_VERSION", flight_sw_version=0x011001FF,
@@ -496,7 +496,7 @@ def outdoors(
 
 
 @pytest.mark.parametrize(("origin", "clock"), [(True, same), (False, same), (False, unix)])
-def test_positions_gnss_is_relative_to_autopilot_origin(read, origin, clock):
+def test_mavlink_gnss_position_is_relative_to_autopilot_origin(read, origin, clock):
     """The receiver's timestamps may be boot time or UNIX time."""
     flight = read(outdoors(origin=origin, clock=clock))
     (track,) = flight.positions
@@ -516,7 +516,7 @@ def test_positions_gnss_is_relative_to_autopilot_origin(read, origin, clock):
     assert result.settings.sigma_z_m == 0.5  # EKF2_GPS_P_NOISE is the lower limit
 
 
-def test_compare_height_barometer_uses_pressure(read):
+def test_mavlink_barometer_height_is_computed_from_pressure(read):
     """Pressures are from the table of the standard atmosphere (ISO 2533), at 400 m and 1 km."""
     altitude_m = pressure_altitude(np.array([1013.25, 966.114, 898.746]))
     assert altitude_m == pytest.approx([0.0, 400.0, 1000.0], abs=0.1)
@@ -531,20 +531,20 @@ def test_compare_height_barometer_uses_pressure(read):
     assert [note for note in flight.log.notes if "SCALED_PRESSURE" in note]
 
 
-def test_compare_gnss_without_global_position_is_not_chosen(read):
+def test_mavlink_gnss_not_used_by_ekf2_is_not_default_source(read):
     flight = read(outdoors(has_global_position=False))
     assert not flight.positions[0].origin.is_automatic
     with pytest.raises(MissingDataError, match=r"position.source`? GPS_RAW_INT"):
         compare(flight)
 
 
-def test_positions_repeated_and_2d_fixes_are_dropped(read):
+def test_read_mavlink_drops_repeated_and_2d_gnss_fixes(read):
     again = read(add(outdoors(), 5.0, fix, seconds=39.9))
     assert again.positions[0].rate_hz == pytest.approx(5.0, rel=0.02)
     assert read(outdoors(fix_type=2)).positions == ()
 
 
-def test_read_mavlink_heartbeats_only_lists_missing_parts(read):
+def test_read_mavlink_with_only_heartbeats_lists_missing_data(read):
     flight = read(add(Recorder(), 1.0, lambda t: heartbeat()))
     for part in ("imu", "attitude", "ekf2", "truth", "airborne"):
         assert isinstance(getattr(flight, part), Unavailable)
@@ -616,7 +616,7 @@ def assert_same_flight(tlog: Flight, ulog: Flight) -> None:
     assert truth.std(axis=0).max() < 0.01
 
 
-def test_read_log_sample_tlog_and_ulog_are_equal(sample_log, sample_flight):
+def test_read_log_of_sample_tlog_equals_its_ulog(sample_log, sample_flight):
     tlog = read_log(sample_log.with_suffix(".tlog"))
     late, rows = stamp_differences(tlog, sample_flight)
     assert len(rows) == len(track_of(sample_flight, "vehicle_visual_odometry").samples)
@@ -627,7 +627,7 @@ def test_read_log_sample_tlog_and_ulog_are_equal(sample_log, sample_flight):
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", PAIRS)
-def test_read_log_real_pairs_have_equal_times(shared_logs, name):
+def test_read_log_of_real_tlog_and_ulog_gives_equal_times(shared_logs, name):
     """The tlog times are the companion's timestamps converted to boot time.
 
     Without TIMESYNC the ULog has arrival times, 250 ms after the measurement.
@@ -654,7 +654,7 @@ def test_read_log_real_pairs_have_equal_times(shared_logs, name):
 
 
 @pytest.mark.reallogs
-def test_read_log_real_recordings_of_other_systems(shared_logs):
+def test_read_log_of_other_mavlink_systems_succeeds(shared_logs):
     folder = shared_logs / "mavlink"
     flight = read_log(folder / "Ian-McConachie-CU_drone_position_hold_hist_40e21c1c_mav.tlog")
     [track] = flight.positions
@@ -785,7 +785,7 @@ def malicious_recording(
     return b"".join(parts if stamped else [part[8:] for part in parts])
 
 
-def test_fuzz_malicious_values_in_valid_frames(fuzz_cases):
+def test_read_mavlink_with_malicious_values_raises_no_exception(fuzz_cases):
     rng = np.random.default_rng(1)
     read = 0
     for case in range(FUZZ_CASES):

@@ -52,9 +52,7 @@ def clock_error(flight: Flight, aisle: Aisle, track: int = 0) -> np.ndarray:
     scale=st.floats(0.0, 0.3), seed=st.integers(0, 2**32 - 1),
 )  # fmt: skip
 @settings(max_examples=60)
-def test_fit_least_delay_random_delay_recovers_offset_and_drift(
-    offset, drift_ppm, least, scale, seed
-):
+def test_mavlink_clock_fit_with_random_delay_recovers_offset(offset, drift_ppm, least, scale, seed):
     """1200 messages in 120 s: the smallest delay in each 2 s is scale/20 on average."""
     rng = np.random.default_rng(seed)
     x = np.arange(1200) * 0.1
@@ -68,7 +66,7 @@ def test_fit_least_delay_random_delay_recovers_offset_and_drift(
 
 
 @pytest.mark.parametrize(("span", "slope"), [(100.0, 1.00005), (20.0, 1.0)])
-def test_fit_least_delay_without_delay_is_exact(span, slope):
+def test_mavlink_clock_fit_of_messages_without_delay_is_exact(span, slope):
     x = np.linspace(0.0, span, 500)
     line = fit_least_delay(x, 7.0 + 1.00005 * x)
     assert (line.pairs, line.slope) == (500, pytest.approx(slope, abs=1e-12))
@@ -79,7 +77,7 @@ def test_fit_least_delay_without_delay_is_exact(span, slope):
 
 @pytest.mark.parametrize("speed", [0.04, 0.5, 10.0])
 @pytest.mark.parametrize("span", [10.0, 100.0])
-def test_fit_least_delay_replay_speed_is_recovered(speed, span):
+def test_mavlink_clock_fit_of_replayed_file_recovers_its_speed(speed, span):
     x = np.linspace(0.0, span, 600)
     delay = np.random.default_rng(1).exponential(0.01, len(x))
     line = fit_least_delay(x, 5.0 + speed * x + delay)
@@ -93,7 +91,7 @@ def test_fit_least_delay_replay_speed_is_recovered(speed, span):
 # a slope of 1e321, which is infinite
 @example([(-2.0, 0.0), (-1e-308, 0.0), (1e-308, 1e13), (2e-308, 1e13), (2.0, 1e13)])
 @settings(max_examples=100)
-def test_fit_least_delay_any_pairs_give_invertible_line(pairs):
+def test_mavlink_clock_fit_of_any_time_pairs_is_invertible(pairs):
     x, y = np.array(pairs).T
     line = fit_least_delay(x, y)
     turned = line.inverse()
@@ -141,7 +139,7 @@ NOTES = {"SYSTEM_TIME": "same UNIX time", "receive time": "minimum link delay"}
 
 
 @pytest.mark.parametrize("case", METHODS)
-def test_clock_map_uses_best_available_method(read, case):
+def test_mavlink_clock_mapping_uses_best_available_method(read, case):
     aisle, method, clock, (low, high) = METHODS[case]
     flight = read(aisle)
     found = flight.positions[0].clock_map
@@ -161,7 +159,7 @@ def test_clock_map_uses_best_available_method(read, case):
 
 
 @pytest.mark.parametrize("asks", [False, True])
-def test_clock_map_two_distinct_timestamps_uses_receive_time(read, asks):
+def test_constant_mavlink_timestamp_is_replaced_by_receive_time(read, asks):
     """TIMESYNC is not used for timestamps that are not a clock."""
     aisle = Aisle()
     recorder = replace(aisle, uwb=None, asks=asks).record()
@@ -182,7 +180,7 @@ def test_clock_map_two_distinct_timestamps_uses_receive_time(read, asks):
     assert 0.5e-3 < track.clock_map.jitter_s < 4e-3
 
 
-def test_clock_map_two_companions_are_separated(read):
+def test_mavlink_clocks_of_two_companions_are_separated(read):
     """Both send TIMESYNC requests; ``ts1`` assigns the autopilot's replies."""
     first = Aisle(asks=True, replies=False)
     second = replace(first, clock=lambda boot: unix(boot) + 2.0, seed=2, state=None)
@@ -202,7 +200,7 @@ def test_clock_map_two_companions_are_separated(read):
         assert np.abs(clock_error(flight, aisle, number)).max() < 1.5 * LEAST_DELAY_S
 
 
-def test_clock_map_ignores_ground_station_timesync(read):
+def test_mavlink_clock_mapping_ignores_ground_station_timesync(read):
     """QGroundControl sends requests with its clock and replies to the autopilot."""
     aisle = Aisle(asks=True)
     recorder = aisle.record()
@@ -216,7 +214,7 @@ def test_clock_map_ignores_ground_station_timesync(read):
     assert np.abs(clock_error(flight, aisle)).max() < LEAST_DELAY_S
 
 
-def test_clock_map_raw_stream_uses_timesync_or_order(read):
+def test_mavlink_stream_without_receive_time_uses_timesync(read):
     for replies, method, allowed in (
         (True, "TIMESYNC", 1.5 * LEAST_DELAY_S),
         (False, "position in the stream", 0.1),
@@ -229,7 +227,7 @@ def test_clock_map_raw_stream_uses_timesync_or_order(read):
         assert [c.clock for c in flight.clocks] == ["UNIX time of system 1, component 197"]
 
 
-def test_recording_without_boot_clock_starts_at_first_receipt(read):
+def test_mavlink_without_boot_clock_starts_at_first_message(read):
     """Only messages from the companion were recorded."""
     aisle = Aisle(replies=False)
     recorder = aisle.record()
@@ -289,7 +287,7 @@ CONSTANT_CLOCK = change_timestamps(lambda _: 1000, lambda _: 1_000_000)
     (with_autopilot_heartbeat, True), (without_heartbeat, True), (as_component_4, True),
     (as_component_4, False), (UNIX_CLOCK, True), (UNIX_CLOCK, False), (CONSTANT_CLOCK, True),
 ])  # fmt: skip
-def test_recording_unusual_autopilot_is_found_with_times(read, change, stamped):
+def test_mavlink_autopilot_without_heartbeat_is_found(read, change, stamped):
     """The companion also sends setpoints with a constant boot time."""
     aisle = Aisle(replies=False, state=None if change is CONSTANT_CLOCK else "ODOMETRY")
     recorder = change_messages(aisle.record(), change)
@@ -305,7 +303,7 @@ def test_recording_unusual_autopilot_is_found_with_times(read, change, stamped):
         np.testing.assert_allclose(np.diff(flight.imu.index), 1.0 / aisle.imu_hz, atol=1e-5)
 
 
-def test_recording_stream_without_clock_has_note(read):
+def test_mavlink_stream_without_any_time_has_a_note(read):
     flight = read(Recorder().hear(0.0, AUTOPILOT, heartbeat()), stamped=False)
     assert flight.log.duration_s == 0.0
     assert any("no message in the stream contains a time" in note for note in flight.log.notes)
@@ -314,7 +312,7 @@ def test_recording_stream_without_clock_has_note(read):
 # ---- restarts, late packets, several vehicles ---------------------------------------------------
 
 
-def test_recording_after_restart_longer_part_is_read(read):
+def test_mavlink_recording_with_reboot_keeps_longer_part(read):
     first = Aisle(seconds=20.0, start_s=500.0)
     second = Aisle(seconds=60.0, start_s=3.0, receiver=lambda boot: UNIX_S + 520.0 + boot,
                    clock=lambda boot: UNIX_S + 520.0 + boot, seed=2)  # fmt: skip
@@ -332,7 +330,7 @@ def test_recording_after_restart_longer_part_is_read(read):
     assert flight.airborne[0] == pytest.approx((15.0, 45.0), abs=0.1)
 
 
-def test_recording_late_or_early_packet_is_no_restart(read):
+def test_late_mavlink_packet_is_not_taken_for_a_reboot(read):
     """Packets may be ten seconds late, for example from a router's queue."""
     aisle = Aisle(seconds=40.0)
     recorder = aisle.record()
@@ -347,7 +345,7 @@ def test_recording_late_or_early_packet_is_no_restart(read):
     assert len(flight.attitude) == 800
 
 
-def test_recording_timestamp_years_ahead_is_dropped(read):
+def test_mavlink_timestamp_years_ahead_is_dropped(read):
     aisle = Aisle()
     recorder = aisle.record()
     end = BOOT_S + aisle.seconds
@@ -361,7 +359,7 @@ def test_recording_timestamp_years_ahead_is_dropped(read):
     assert note.startswith("3 samples")
 
 
-def test_recording_several_vehicles_system_selects_one(read):
+def test_mavlink_system_option_selects_one_of_several_vehicles(read):
     busy = Aisle(seconds=30.0, system=3)
     other = Aisle(seconds=20.0, system=7, start_s=900.0, clock=lambda boot: unix(boot) - 850.0,
                   receiver=lambda boot: unix(boot) - 850.0, seed=2)  # fmt: skip
@@ -380,7 +378,7 @@ def test_recording_several_vehicles_system_selects_one(read):
             read(recorder, system=system)
 
 
-def test_describe_senders_reports_lost_fraction(tmp_path):
+def test_mavlink_sender_description_states_lost_fraction(tmp_path):
     """Every tenth message of the companion is missing, every twentieth is repeated."""
     aisle = Aisle(seconds=60.0)
     recorder = aisle.record()
@@ -417,7 +415,7 @@ def map_unix_timestamps(received, *exchanges):
     return stamps, map_clock("x", stamps, received, line, *exchanges, None, has_receipt=True)
 
 
-def test_map_clock_timesync_of_other_clock_is_ignored():
+def test_timesync_that_contradicts_receive_time_is_ignored():
     """This TIMESYNC would place messages one hour before their receipt."""
     received = np.arange(0.0, 60.0, 0.1) + 0.01
     wrong = (received, UNIX_S + 3600.0 + received), NO_EXCHANGES[1]
@@ -426,7 +424,7 @@ def test_map_clock_timesync_of_other_clock_is_ignored():
     np.testing.assert_allclose(found.to_boot.at(stamps), received, atol=1e-6)
 
 
-def test_clock_map_record_gives_the_same_times():
+def test_mavlink_clock_mapping_by_reported_offset_is_equal():
     """boot = timestamp + offset + drift · (timestamp - middle of the timestamps)."""
     received = 20.0 + 1.0001 * np.arange(0.0, 100.0, 0.1)
     stamps, found = map_unix_timestamps(received, *NO_EXCHANGES)

@@ -146,13 +146,13 @@ def assert_equals_pymavlink(path: Path) -> None:
         assert frames.unknown_frame_count == unknown
 
 
-def test_read_frames_sample_equals_pymavlink(sample_log):
+def test_mavlink_frames_of_sample_tlog_equal_pymavlink(sample_log):
     assert_equals_pymavlink(sample_log.with_suffix(".tlog"))
 
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("path", REAL_RECORDINGS, ids=lambda path: path.name)
-def test_read_frames_real_recordings_equal_pymavlink(path, tmp_path):
+def test_mavlink_frames_of_real_recordings_equal_pymavlink(path, tmp_path):
     """Only beginning and end of long files, because pymavlink needs half a minute for each."""
     if path.stat().st_size > LONG_BYTES and path.name not in BEYOND_PYMAVLINK:
         frames, content = read_frames(path.name, path.read_bytes()), path.read_bytes()
@@ -180,7 +180,7 @@ def example(kind) -> object:
     return message(kind.msgname, **fields)
 
 
-def test_table_every_message_is_decoded_as_packed(read):
+def test_each_mavlink_message_type_is_decoded_to_packed_values(read):
     """The layouts are from pymavlink's tables, the bytes from its packers."""
     kinds = [kind for _, kind in sorted(MESSAGES.items())]
     made = [example(kind) for kind in kinds]
@@ -198,7 +198,7 @@ def test_table_every_message_is_decoded_as_packed(read):
 # ---- the wire format --------------------------------------------------------------------------
 
 
-def test_table_omitted_trailing_zeros_are_restored(read):
+def test_mavlink_2_trailing_zeros_of_payload_are_restored(read):
     whole = message("PARAM_VALUE", param_id=b"EKF2_EV_DELAY", param_value=3.5, param_type=9)
     short = message("ATTITUDE", time_boot_ms=7)
     frames = read(stamped(frame(short), frame(whole, sequence=1), frame(ATTITUDE, sequence=2)))
@@ -209,7 +209,7 @@ def test_table_omitted_trailing_zeros_are_restored(read):
     assert decoded(frames, "PARAM_VALUE")["param_id"].tolist() == [b"EKF2_EV_DELAY"]
 
 
-def test_table_longer_payload_is_truncated(read):
+def test_mavlink_payload_with_unknown_extension_is_truncated(read):
     """A later dialect may add extension fields at the end."""
     payload = bytes(ATTITUDE.unpacker.pack(1000, 0.1, -0.2, 1.5, 0.0, 0.0, 0.0)) + b"\x07" * 20
     longer = raw_frame(30, payload, seed=ATTITUDE.crc_extra)
@@ -236,7 +236,7 @@ JUNK = {"zeros": b"\x00" * 50, "starts": b"\xfd" * 50, "old starts": b"\xfe" * 3
     pytest.param([*BEATS[:4], with_wrong_checksum(BEATS[4]), *BEATS[5:]],
                  (0, 1, 2, 3, 5, 6, 7, 8, 9), 0, 1, id="damaged"),
 ])  # fmt: skip
-def test_read_frames_counts_unknown_frames_and_bad_bytes(
+def test_read_mavlink_counts_unknown_frames_and_bad_bytes(
     read, parts, good, unknown_frame_count, bad, with_stamps
 ):
     """Signatures are not bad bytes, and unknown frames do not affect other frames."""
@@ -247,7 +247,9 @@ def test_read_frames_counts_unknown_frames_and_bad_bytes(
 
 
 @pytest.mark.parametrize(("share", "is_stated"), [(0.002, False), (0.005, True)])
-def test_damage_above_limit_of_bad_bytes_is_stated(tmp_path, share: float, is_stated: bool):
+def test_mavlink_bad_bytes_above_limit_are_reported_as_damage(
+    tmp_path, share: float, is_stated: bool
+):
     content = Aisle(seconds=40.0).record().raw()
     junk = b"\x00" * round(share * len(content) + 2 * is_stated * mavlink_frames.MAX_FRAME_BYTES)
     at = len(content) // 2
@@ -260,7 +262,7 @@ def test_damage_above_limit_of_bad_bytes_is_stated(tmp_path, share: float, is_st
 
 @pytest.mark.parametrize("stamped", [True, False])
 @pytest.mark.parametrize("missing", [0, 1, 11, 25, 30])
-def test_damage_truncated_recording_is_stated(tmp_path, stamped: bool, missing: int):
+def test_truncated_mavlink_recording_is_reported_as_damage(tmp_path, stamped: bool, missing: int):
     made = Aisle(seconds=20.0).record()
     content = made.tlog() if stamped else made.raw()
     (tmp_path / "made.tlog").write_bytes(content[: len(content) - missing])
@@ -270,20 +272,20 @@ def test_damage_truncated_recording_is_stated(tmp_path, stamped: bool, missing: 
 
 
 @pytest.mark.parametrize("rest", [b"\x00" * 50, raw_frame(40_000, b"abcdefg", seed=7)])
-def test_in_frame_other_bytes_at_end_is_false(read, rest: bytes):
+def test_complete_mavlink_recording_is_not_reported_truncated(read, rest: bytes):
     """Invalid bytes and a complete frame of an unknown dialect are not a truncated frame."""
     assert not read(b"".join(beats(6)) + rest).ends_in_frame
 
 
 @pytest.mark.parametrize("junk", JUNK.values(), ids=JUNK)
-def test_read_frames_invalid_bytes_between_frames_are_skipped(read, junk):
+def test_invalid_bytes_between_mavlink_frames_are_skipped(read, junk):
     parts = beats(6)
     frames = read(b"".join(parts[:3]) + junk + b"".join(parts[3:]))
     assert frames.sequence.tolist() == list(range(6))
     assert frames.bad_bytes == len(junk)
 
 
-def test_read_frames_receive_time_like_frame_start_is_skipped(read):
+def test_tlog_receive_time_is_not_read_as_start_of_a_frame(read):
     """Its last bytes and the next frame together form a valid MAVLink 1 STATUSTEXT."""
     head = raw_frame(30, b"\x01\x02\x03", seed=0, sequence=3)[:-2]
     body = bytes([12, 1, 1, 1]) + bytes([0xFD, 28]) + head[2:]
@@ -298,7 +300,7 @@ def test_read_frames_receive_time_like_frame_start_is_skipped(read):
 
 
 @pytest.mark.parametrize("with_stamps", [True, False])
-def test_read_frames_frame_inside_payload_is_ignored(read, with_stamps):
+def test_mavlink_frame_inside_payload_is_ignored(read, with_stamps):
     """TUNNEL contains complete frames, even some that end at the outer frame's checksum."""
     inner = frame(message("VISION_POSITION_ESTIMATE", usec=1, x=1.0), COMPANION)
     payload = list(inner.ljust(128, b"\x01"))
@@ -312,7 +314,7 @@ def test_read_frames_frame_inside_payload_is_ignored(read, with_stamps):
     assert bytes(carried[: len(inner)]) == inner
 
 
-def test_read_frames_incomplete_first_and_last_are_dropped(read):
+def test_incomplete_first_and_last_mavlink_frame_are_dropped(read):
     parts = beats(5)
     whole = b"".join(parts)
     for cut in (1, 5, len(parts[0]) - 1):
@@ -327,7 +329,7 @@ def test_read_frames_incomplete_first_and_last_are_dropped(read):
         assert (np.diff(frames.received_us[1:]) == 1000).all()
 
 
-def test_read_frames_damaged_receive_times_are_interpolated(read):
+def test_damaged_tlog_receive_times_are_interpolated(read):
     parts = beats(9)
     times = [START_US + 1000 * i for i in range(9)]
     for at, wrong in ((2, 0), (3, 2**64 - 1), (6, START_US + 10**12)):
@@ -339,7 +341,7 @@ def test_read_frames_damaged_receive_times_are_interpolated(read):
 
 
 @pytest.mark.parametrize("with_stamps", [True, False])
-def test_read_frames_single_message_is_read(read, with_stamps):
+def test_mavlink_file_of_a_single_message_is_read(read, with_stamps):
     content = frame(odometry(5_000_000, [1, 2, 3], [0, 0, 0], estimator=8))
     frames = read(stamped(content) if with_stamps else content)
     assert len(frames) == 1
@@ -349,7 +351,7 @@ def test_read_frames_single_message_is_read(read, with_stamps):
 
 @given(st.lists(st.sampled_from(["v1", "v2", "signed", "unknown", "bad", "junk"]), min_size=1))
 @settings(max_examples=60)
-def test_read_frames_any_mixture_finds_valid_frames(tmp_path_factory, kinds):
+def test_valid_mavlink_frames_are_found_among_damaged_ones(tmp_path_factory, kinds):
     """The number of valid frames is known; junk contains no byte that could begin a frame."""
     good = 3
     parts = [*beats(3)]
@@ -382,7 +384,7 @@ def test_read_frames_any_mixture_finds_valid_frames(tmp_path_factory, kinds):
     ("headers of long frames", (b"\xfd\xff\x00" + b"\xfd" * 7) * (MANY_BYTES // 10)),
     ("chance", np.random.default_rng(1).bytes(MANY_BYTES)),
 ], ids=lambda value: value if isinstance(value, str) else "")  # fmt: skip
-def test_read_log_not_mavlink_is_rejected_in_bounded_memory(tmp_path, name, content):
+def test_file_without_mavlink_is_rejected_in_bounded_memory(tmp_path, name, content):
     path = tmp_path / "hostile.tlog"
     path.write_bytes(content)
     flight, peak = flight_and_peak(path)
@@ -390,7 +392,7 @@ def test_read_log_not_mavlink_is_rejected_in_bounded_memory(tmp_path, name, cont
     assert peak < 4 * len(content) + BLOCK_BYTES, name
 
 
-def test_read_frames_checksum_work_is_bounded(tmp_path, monkeypatch):
+def test_mavlink_checksum_work_on_malicious_file_is_bounded(tmp_path, monkeypatch):
     """The checksum input is at most 267 bytes per byte of the file; independent of run time."""
     summed = 0
 
@@ -439,7 +441,7 @@ ALL_IDS = sorted(kind.id for kind in MESSAGES.values() if kind.id < 60_000)
     (lambda: cut_frames("VISION_POSITION_ESTIMATE", COMPANION), DECODED_BYTES, TINY_BYTES),
     (lambda: cut_frames("PARAM_VALUE", AUTOPILOT), DECODED_BYTES, TINY_BYTES),
 ], ids=["shortest", "all", "own state", "odometry", "vision", "parameters"])  # fmt: skip
-def test_read_log_memory_per_frame_is_bounded(tmp_path, make, each_bytes, more_bytes):
+def test_read_mavlink_memory_per_frame_is_bounded(tmp_path, make, each_bytes, more_bytes):
     parts, path = make(), tmp_path / "hostile.raw"
     path.write_bytes(b"".join(parts[:800]))
     read_log(path)  # fills the caches before the measurement
@@ -450,7 +452,7 @@ def test_read_log_memory_per_frame_is_bounded(tmp_path, make, each_bytes, more_b
     assert peak < path.stat().st_size + each_bytes * len(parts) + more_bytes
 
 
-def test_read_log_truncated_tlog_ends_in_flight(tmp_path, sample_log):
+def test_truncated_tlog_is_marked_as_ending_in_flight(tmp_path, sample_log):
     content = sample_log.with_suffix(".tlog").read_bytes()
     path = tmp_path / "half.tlog"
     path.write_bytes(content[: len(content) // 2])

@@ -75,7 +75,7 @@ def trial(
         (0.101, Noise(0.033, 0.032, 0.034), ("warning", 3.06)),
     ],
 )  # fmt: skip
-def test_setting_deviation_severity_at_limits(
+def test_noise_setting_severity_changes_at_limit_ratios(
     chosen: float, estimate: Noise, expected: Any
 ) -> None:
     off = noises.setting_deviation("sigma_z_m", chosen, estimate)
@@ -104,7 +104,7 @@ SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m":
           ("sigma_a_too_large", "note", noises.NO_IMPROVEMENT)]),
     ],
 )  # fmt: skip
-def test_deviating_settings_action_is_improving_rerun(trials: Any, expected: Any) -> None:
+def test_wrong_noise_finding_recommends_the_improving_rerun(trials: Any, expected: Any) -> None:
     fitted = tuned(Noise(0.5, 0.45, 0.55), Noise(0.1, 0.09, 0.11))
     cause, other = noises.detect_wrong_settings(
         analysis(source=MOVING, tuning=fitted, trials=trials)
@@ -121,7 +121,7 @@ def test_deviating_settings_action_is_improving_rerun(trials: Any, expected: Any
         (0.5, None, ("note", noises.NO_IMPROVEMENT)),
     ],
 )
-def test_consistent_kf_without_truth_does_not_refute_estimate(
+def test_rerun_of_consistent_kf_does_not_refute_noise_estimate(
     nis_mean: float, rmse_m: float | None, expected: tuple[str, str]
 ) -> None:
     """A re-run shows no improvement if σ is consistent before and the position error unknown."""
@@ -134,7 +134,7 @@ def test_consistent_kf_without_truth_does_not_refute_estimate(
     assert (finding.severity, finding.remedy) == expected
 
 
-def test_deviating_settings_state_size_and_estimate() -> None:
+def test_wrong_noise_finding_states_factor_and_estimate() -> None:
     fitted = tuned(Noise(0.5, 0.45, 0.55), Noise(0.1, 0.09, 0.11))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=fitted))
     assert worse.evidence["factor"] == pytest.approx(10.0)
@@ -151,7 +151,7 @@ def test_deviating_settings_state_size_and_estimate() -> None:
     assert named(noises.detect_wrong_settings, analysis(source=MOVING)) == {}
 
 
-def test_deviating_settings_bound_is_typed_as_at_least_5_mm() -> None:
+def test_recommended_sigma_z_is_at_least_5_mm() -> None:
     bounded = tuned(Noise(None, None, 0.0021))
     finding = only(noises.detect_wrong_settings, analysis(source=MOVING, tuning=bounded))
     assert finding.remedy == "Compare with a run with --sigma-z 0.005."
@@ -173,7 +173,7 @@ def test_deviating_settings_bound_is_typed_as_at_least_5_mm() -> None:
          ["sigma_a_too_large", "sigma_z_too_small"]),
     ],
 )  # fmt: skip
-def test_deviating_settings_drift_or_hidden_error_keep_noise(
+def test_wrong_noise_of_drifting_source_has_no_finding(
     parts: dict[str, Any], expected: list[str]
 ) -> None:
     estimate = 3.0 * (parts.get("settings") or CHOSEN).sigma_z_m
@@ -205,13 +205,13 @@ def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
         (axis(kf=NONE, replay=SimpleNamespace(updates=None)), None),
     ],
 )  # fmt: skip
-def test_near_zero_process_noise_needs_slow_correlated_filter(
+def test_near_zero_process_noise_finding_requires_correlation(
     one: Any, expected: str | None
 ) -> None:
     assert severity(noises.detect_process_noise_near_zero, analysis(axes=(one,))) == expected
 
 
-def test_near_zero_process_noise_reports_response_time() -> None:
+def test_near_zero_process_noise_finding_states_response_time() -> None:
     slower = following(0.01)
     slower.axis.name = "east"
     finding = only(noises.detect_process_noise_near_zero, analysis(axes=(following(0.05), slower)))
@@ -234,7 +234,7 @@ def kf(nis: float, name: str = "north", **parts: Any) -> Any:
     return axis(name, kf=statement(nis, **{"verdict": verdict, **parts}))
 
 
-def test_variances_severity_at_limits() -> None:
+def test_inconsistent_filter_severity_changes_at_nis_of_4() -> None:
     for nis, expected in (
         (3.99, "warning"), (4.0, "error"), (0.25, "error"), (0.251, "warning"),
     ):  # fmt: skip
@@ -249,7 +249,7 @@ def test_variances_severity_at_limits() -> None:
     )
 
 
-def test_variances_group_axes_with_vertical_as_consequence() -> None:
+def test_inconsistent_filter_finding_groups_horizontal_axes() -> None:
     axes = (kf(0.1, "aisle"), kf(2.0), kf(3.0, "east"), kf(9.0, "down"))
     found = tuple(noises.detect_inconsistent_variances(analysis(axes=axes)))
     assert [(one.id, one.caused_by, one.evidence["axis"]) for one in found] == [
@@ -263,7 +263,7 @@ def test_variances_group_axes_with_vertical_as_consequence() -> None:
     assert group_by_cause(found) == found
 
 
-def test_variances_underconfident_drift_or_error_keep_noise() -> None:
+def test_underconfident_filter_on_drifting_source_keeps_noise() -> None:
     for nis, is_kept, level in ((0.2, True, "note"), (5.0, False, "error")):
         finding = only(
             noises.detect_inconsistent_variances, analysis(axes=(kf(nis),), source=ODOMETRY)
@@ -279,7 +279,7 @@ def test_variances_underconfident_drift_or_error_keep_noise() -> None:
         assert finding.evidence["cause"] == "elsewhere"
 
 
-def test_variances_default_settings_lower_severity() -> None:
+def test_inconsistent_filter_with_default_noise_is_only_warning() -> None:
     for chosen, level in (
         ({}, "warning"), ({"sigma_z_m": 0.11}, "error"), ({"sigma_a_m_s2": 0.51}, "error"),
     ):  # fmt: skip
@@ -300,7 +300,7 @@ def fused(noise_m: float, nis: float = 5.0, name: str = "north", **parts: Any) -
     [({}, 0.1, True), ({"EKF2_EVP_NOISE": 0.1}, 0.1, True), ({"EKF2_EVP_NOISE": 0.11}, 0.1, False),
      ({}, 0.124, True), ({}, 0.126, False), ({}, 0.081, True), ({}, 0.079, False)],
 )  # fmt: skip
-def test_is_default_ekf2_noise_unless_sender_reports_another(flown, used_m, default):
+def test_ekf2_noise_is_default_unless_sender_reports_another(flown, used_m, default):
     assert (
         _has_default_noises(analysis(log=log(parameters=flown)), "ekf2", fused(used_m)) is default
     )
@@ -329,7 +329,7 @@ def test_is_default_ekf2_noise_unless_sender_reports_another(flown, used_m, defa
         ("ekf2", {"EKF2_ACC_NOISE": 0.35}, "process noise", "Set EKF2_ACC_NOISE to 0.35 m/s^2."),
     ],
 )  # fmt: skip
-def test_variances_cause_determines_action(owner, change, kind, action) -> None:
+def test_inconsistent_filter_action_follows_from_its_cause(owner, change, kind, action) -> None:
     # changes that explain less than 0.5 or more than 1.5 are not causes
     causes = (tried(owner, {"sigma_z_m": 7.0}, explained_fraction=0.4), tried(owner, change),
               tried(owner, {"sigma_z_m": 7.0}, explained_fraction=1.6))  # fmt: skip
@@ -339,7 +339,7 @@ def test_variances_cause_determines_action(owner, change, kind, action) -> None:
     assert finding.evidence["cause"] == kind
 
 
-def test_variances_cause_whose_rerun_improves_nothing_is_no_action() -> None:
+def test_filter_rerun_that_improves_nothing_is_not_advised() -> None:
     change = {"sigma_z_m": 2.0}
     for after, action in ((1.0, "Set SIGMA_Z to 2 m (--sigma-z 2)."), (9.0, noises.NOT_EXPLAINED)):
         one = analysis(axes=(kf(9.0),), causes=(tried("kf", change),), tuning=tuned(),
@@ -347,7 +347,7 @@ def test_variances_cause_whose_rerun_improves_nothing_is_no_action() -> None:
         assert only(noises.detect_inconsistent_variances, one).remedy == action
 
 
-def test_variances_without_cause_name_a_check() -> None:
+def test_inconsistent_filter_without_cause_recommends_a_check() -> None:
     causes = (tried("kf", {"sigma_z_m": 7.0}, explained_fraction=0.4),
               tried("kf", {"sigma_z_m": 2.0}, "east"))  # fmt: skip
     one = analysis(axes=(kf(9.0),), causes=causes, tuning=tuned())
@@ -357,7 +357,7 @@ def test_variances_without_cause_name_a_check() -> None:
     assert unknown.remedy == noises.UNKNOWN_NOISE
 
 
-def test_variances_smaller_noise_contradicted_by_truth_is_no_action() -> None:
+def test_smaller_noise_that_contradicts_truth_is_not_advised() -> None:
     contradicted = replace(tried("kf", {"sigma_z_m": 0.5}, before=0.2), contradicts_truth=True)
     one = analysis(axes=(kf(0.2),), causes=(contradicted,))
     finding = only(noises.detect_inconsistent_variances, one)
@@ -381,7 +381,9 @@ def test_variances_smaller_noise_contradicted_by_truth_is_no_action() -> None:
         (fused(0.1), Noise(None, None, 0.2), {}, "Set EKF2_EVP_NOISE to 0.2 m (EKF2 uses 0.1 m)."),
     ],
 )  # fmt: skip
-def test_variances_ekf2_without_replay_compare_noises(one, estimate, parameters, text) -> None:
+def test_overconfident_ekf2_without_replay_gets_noise_advice(
+    one, estimate, parameters, text
+) -> None:
     flown = analysis(axes=(one,), log=log(parameters=parameters), tuning=tuned(estimate))
     assert only(noises.detect_inconsistent_variances, flown).remedy.startswith(text)
 
@@ -408,7 +410,7 @@ def test_variances_ekf2_without_replay_compare_noises(one, estimate, parameters,
           "rejects 44 %")),
     ],
 )  # fmt: skip
-def test_ekf2_noise_title_names_parameter_or_sensor(
+def test_wrong_ekf2_noise_finding_names_parameter_or_sensor(
     flown_m: float, kind: str, rejected: float, expected: tuple[str, str, str]
 ) -> None:
     aid = GNSS_POS if kind == "gnss" else EV_POS
@@ -463,7 +465,7 @@ def loop(*closures: Closure, **parts: Any) -> Loop:
         ((closure(0.0, accepted=False),), ["loop_drift_too_small", "false_loop_closure"]),
     ],
 )  # fmt: skip
-def test_loop_closures_gnc_weight_determines_findings(
+def test_loop_closure_with_small_gnc_weight_is_reported(
     closures: tuple[Closure, ...], expected: list[str]
 ) -> None:
     found = list(loops.detect_inconsistent_closures(loop(*closures, is_end_assumed=False)))
@@ -478,7 +480,7 @@ def closing(gap_m: float | None, length_m: float = 50.0, end: Any = NONE, **part
     return loop(closure_error_m=gap_m, path_length_m=length_m, true_end=end, **usual | parts)
 
 
-def test_possible_drift_reports_noise_and_closure_error() -> None:
+def test_possible_source_drift_finding_states_closure_error() -> None:
     finding = only(hidden_errors.detect, analysis(source=ODOMETRY))
     assert finding.evidence == {"source": "uwb"}
     assert finding.message.endswith("not the position error.")
@@ -510,7 +512,7 @@ END = TrueEnd(displacement_m={"forward": 0.0, "right": 0.0, "down": 0.0}, sigma_
         (NONE, None),
     ],
 )  # fmt: skip
-def test_drift_states_closure_error_only_of_known_landing(loop: Any, size: str | None) -> None:
+def test_drift_finding_states_closure_error_of_known_landing(loop: Any, size: str | None) -> None:
     one = analysis(axes=(hiding(nees=25.0),), source=ODOMETRY, loop=loop)
     finding = only(hidden_errors.detect, one)
     assert (finding.id, finding.severity) == ("source_drift", "error")
@@ -535,7 +537,7 @@ def test_drift_states_closure_error_only_of_known_landing(loop: Any, size: str |
          "EKF2_EV_DELAY 90 ms instead of 7 ms"),
     ],
 )  # fmt: skip
-def test_format_change_names_old_and_new_value(
+def test_changed_setting_text_states_old_and_new_value(
     owner: Any, change: dict[str, float], expected: str
 ) -> None:
     model = SimpleNamespace(inputs=SimpleNamespace(settings=dict.fromkeys(PARAMETERS, 7.0)))

@@ -57,7 +57,7 @@ def roots(analysis: Analysis) -> list[str]:
 
 
 @given(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.floats(-75.0, 75.0), st.floats(-180.0, 180.0))
-def test_project_inverts_unproject(
+def test_latitude_longitude_to_metres_and_back_is_exact(
     north_m: float, east_m: float, latitude_deg: float, longitude_deg: float
 ) -> None:
     origin = latitude_deg, longitude_deg
@@ -68,7 +68,7 @@ def test_project_inverts_unproject(
     assert north[0] == pytest.approx(111_194.93, abs=0.01)
 
 
-def test_simulated_fixes_have_stated_noise_and_age(
+def test_simulated_gnss_fixes_have_stated_noise_and_age(
     tmp_path: Path,
 ) -> None:
     simulation = simulate(make_scenario("outdoor", seed=2, passes=6))
@@ -92,7 +92,7 @@ def test_simulated_fixes_have_stated_noise_and_age(
     assert stated.to_numpy() == pytest.approx([0.16, 0.16, 0.36], rel=1e-5)
 
 
-def test_simulated_field_and_height_have_stated_noise(tmp_path: Path) -> None:
+def test_simulated_magnetometer_and_height_have_stated_noise(tmp_path: Path) -> None:
     """Includes EKF2's height, and its attitude published as vehicle_attitude."""
     log = tmp_path / "outdoor.ulg"
     log.write_bytes(to_ulog(simulate(OUTDOOR, parse(["mag=0.3,60"]))))
@@ -119,7 +119,7 @@ def test_simulated_field_and_height_have_stated_noise(tmp_path: Path) -> None:
     assert error[20:].std() == pytest.approx(reported, rel=0.3)
 
 
-def test_outdoor_clean_flight_is_consistent() -> None:
+def test_outdoor_flight_without_mistake_is_consistent() -> None:
     analysis = flown()
     assert roots(analysis) == []
     for name, axes in {"gnss_pos": 2, "gnss_vel": 3}.items():
@@ -158,7 +158,7 @@ def test_outdoor_clean_flight_is_consistent() -> None:
         ("slow-error=0.5,30", "source_noise_time_correlated"),
     ],
 )
-def test_outdoor_mistake_is_first_finding(mistake: str, root: str) -> None:
+def test_simulated_outdoor_mistake_is_first_finding(mistake: str, root: str) -> None:
     """Mistakes for which GNSS takes other branches in the findings than indoor positions."""
     assert roots(flown(mistake))[0] == root
 
@@ -171,7 +171,7 @@ def test_outdoor_mistake_is_first_finding(mistake: str, root: str) -> None:
         ("r-scale=0.1", "nis", "EKF2_GPS_P_NOISE", 0.4, 0.02),
     ],
 )
-def test_outdoor_mistake_is_cause_of_ekf2_error(
+def test_simulated_outdoor_mistake_is_cause_of_ekf2_error(
     mistake: str, of: Any, name: str, value: float, within: float
 ) -> None:
     analysis = flown(mistake)
@@ -180,7 +180,7 @@ def test_outdoor_mistake_is_cause_of_ekf2_error(
     assert found.is_sufficient
 
 
-def test_outdoor_vibration_is_explained_in_part_by_noise() -> None:
+def test_outdoor_vibration_is_partly_explained_by_noise() -> None:
     """EKF2_ACC_NOISE corrects the filter, but the output predictor still integrates vibration."""
     analysis = flown("vibration=1")
     (tried,) = interventions_for(analysis.causes, "ekf2", "aisle", "nees")
@@ -201,7 +201,7 @@ def test_outdoor_vibration_is_explained_in_part_by_noise() -> None:
     assert np.nanmean(error_m**2) / variances < 1.5**2 < process_noise.after.nees_mean
 
 
-def test_what_if_gnss_delay_equals_flight_without_mistake() -> None:
+def test_what_if_with_correct_gnss_delay_equals_correct_flight() -> None:
     wrong, right = (flown(*texts).ekf2_model for texts in (("ekf2-delay=0",), ()))
     result, other = what_if(wrong, [{"EKF2_GPS_DELAY": 110.0}]), what_if(right, [])
     (predicted,), true = result.whatif, other.logged
@@ -225,7 +225,7 @@ def test_what_if_without_magnetometer_keeps_heading(tmp_path: Path) -> None:
         what_if(model, [{"EKF2_MAG_NOISE": 0.1}])
 
 
-def test_clock_message_receiver_delay_is_named() -> None:
+def test_time_offset_message_names_gnss_receiver_delay() -> None:
     analysis = flown("clock-offset=0.25")
     log = analysis.flight.log
     assert "SENS_GPS0_DELAY" not in next(source_clock.detect(analysis)).message
@@ -239,7 +239,7 @@ def test_clock_message_receiver_delay_is_named() -> None:
     assert int(estimate_ms) == pytest.approx(110 + 250, abs=60)
 
 
-def test_findings_mag_change_causes_rejection_finding() -> None:
+def test_magnetometer_change_is_the_cause_of_its_rejections() -> None:
     changed, starved = [item for item in find(flown("mag=0.2")) if item.id.startswith("aid_")]
     assert (changed.id, starved.id) == ("aid_innovation_shift", "aid_not_fused")
     assert starved.caused_by == "aid_innovation_shift"
@@ -248,14 +248,14 @@ def test_findings_mag_change_causes_rejection_finding() -> None:
     assert changed.evidence["time_s"] == pytest.approx(67.0, abs=10.0)
 
 
-def test_simulate_ineffective_ekf2_noise_raises_error() -> None:
+def test_simulate_with_ineffective_ekf2_noise_raises_error() -> None:
     with pytest.raises(SettingsError, match=r"the larger of EKF2_GPS_P_NOISE .*0\.4 m"):
         simulate(OUTDOOR, parse(["ekf2-noise=0.05"]))
     parameters = simulate(OUTDOOR, parse(["ekf2-noise=0.8"])).parameters
     assert parameters["EKF2_GPS_P_NOISE"] == 0.8
 
 
-def test_slow_error_has_given_sigma_and_time() -> None:
+def test_simulated_correlated_error_has_given_sigma_and_time() -> None:
     mistakes = Mistakes(slow_error_m=0.5, slow_error_s=4.0)
     drawn = sensors.slow_error(OUTDOOR, mistakes, 100_000, 0.2)
     assert drawn.std(axis=0) == pytest.approx(0.5, rel=0.05)
@@ -267,7 +267,7 @@ def test_slow_error_has_given_sigma_and_time() -> None:
     assert np.std(first) == pytest.approx(0.5, rel=0.1)
 
 
-def test_attitude_error_heading_mistake_follows_with_lag() -> None:
+def test_simulated_heading_error_builds_up_with_a_lag() -> None:
     time_s = np.array([0.0, 39.9, 43.0, 100.0])
     clean = sensors.attitude_error(OUTDOOR, Mistakes(), time_s).as_rotvec()
     wrong = sensors.attitude_error(OUTDOOR, parse(["heading=25,40"]), time_s).as_rotvec()
@@ -275,7 +275,7 @@ def test_attitude_error_heading_mistake_follows_with_lag() -> None:
     assert turned == pytest.approx([0.0, 0.0, 25.0 * (1.0 - np.exp(-1.0)), 25.0], abs=0.01)
 
 
-def test_simulate_outdoor_command_uses_kind_defaults(tmp_path: Path) -> None:
+def test_simulate_outdoor_command_uses_outdoor_defaults(tmp_path: Path) -> None:
     arguments = "simulate", "--kind", "outdoor", "-o", tmp_path / "o.ulg"
     output = run_checked(*arguments, "--speed", "3").output
     assert "outdoor, 3 laps of a square of 30 m at 3 m/s" in output

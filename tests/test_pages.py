@@ -66,7 +66,7 @@ def pdf(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 @pytest.fixture(autouse=True)
 def _in_this_process(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    if "limits" not in request.node.name:
+    if "time_limit" not in request.node.name:
         monkeypatch.setattr(pages, "run_one_bounded", lambda function, job, *_: function(job))
 
 
@@ -529,7 +529,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
 
 
 @pytest.mark.parametrize("kind", FORGERIES)
-def test_compare_pages_forged_report_is_found(pdf: bytes, kind: str) -> None:
+def test_pdf_comparison_finds_forged_report_page(pdf: bytes, kind: str) -> None:
     forge, said, structural = FORGERIES[kind]
     found = compare(forged(pdf, forge), pdf)
     assert any(one.what.startswith(said) for one in found), found
@@ -601,7 +601,7 @@ FILES: dict[str, tuple[Callable[[bytes], bytes], str]] = {
 
 
 @pytest.mark.parametrize("kind", FILES)
-def test_compare_pages_forged_file_is_found(pdf: bytes, kind: str) -> None:
+def test_pdf_comparison_finds_forged_file_structure(pdf: bytes, kind: str) -> None:
     forge, said = FILES[kind]
     made = forge(pdf)
     assert made != pdf
@@ -609,7 +609,7 @@ def test_compare_pages_forged_file_is_found(pdf: bytes, kind: str) -> None:
     assert any(one.what.startswith(said) for one in found), found
 
 
-def test_compare_pages_pattern_is_compared() -> None:
+def test_pdf_comparison_finds_changed_fill_pattern() -> None:
     pdf = REPORT.read_bytes()
     (at,) = (at for at, sheet in enumerate(PdfReader(REPORT).pages, 1)
              if "/Pattern" in sheet["/Resources"])  # type: ignore[operator] # fmt: skip
@@ -682,14 +682,14 @@ HONEST: dict[str, Callable[[bytes], bytes]] = {
 
 
 @pytest.mark.parametrize("kind", HONEST)
-def test_compare_pages_resaved_report_is_equal(pdf: bytes, kind: str) -> None:
+def test_pdf_comparison_of_resaved_report_finds_no_difference(pdf: bytes, kind: str) -> None:
     made = HONEST[kind](pdf)
     read_report(made, "r.pdf")
     assert compare(made, pdf) == ()
 
 
 @pytest.mark.parametrize("how", ["plain", "objects", "linearize", "qdf", "normalize"])
-def test_compare_pages_qpdf_resaved_is_equal(pdf: bytes, how: str) -> None:
+def test_pdf_comparison_after_qpdf_finds_no_difference(pdf: bytes, how: str) -> None:
     options: dict[str, dict[str, Any]] = {
         "plain": {}, "linearize": {"linearize": True}, "qdf": {"qdf": True},
         "objects": {"object_stream_mode": pikepdf.ObjectStreamMode.generate},
@@ -710,12 +710,14 @@ def shift_operands(by: float, operator: bytes = b"l") -> Edit:
 
 
 @pytest.mark.parametrize(("factor", "equal"), [(0.3, True), (0.99, True), (1.01, False)])
-def test_compare_pages_coordinates_within_tolerance(pdf: bytes, factor: float, equal: bool) -> None:
+def test_pdf_comparison_ignores_shift_within_tolerance(
+    pdf: bytes, factor: float, equal: bool
+) -> None:
     made = forged(pdf, on_page(1, shift_operands(factor * COORDINATE_TOLERANCE_PT)))
     assert (compare(made, pdf) == ()) == equal
 
 
-def test_compare_pages_rounded_number_is_equal(pdf: bytes) -> None:
+def test_pdf_comparison_ignores_rounded_last_digit(pdf: bytes) -> None:
     """One number is rounded differently, as on another processor."""
     made = forged(pdf, other_digit)
     asked: list[tuple[str, str]] = []
@@ -738,7 +740,7 @@ def test_compare_pages_rounded_number_is_equal(pdf: bytes) -> None:
 # -- limits --------------------------------------------------------------------------------------
 
 
-def test_compare_pages_beyond_limits_is_a_difference(
+def test_pdf_comparison_beyond_time_limit_reports_difference(
     pdf: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pages are compared in a separate process."""
@@ -750,7 +752,7 @@ def test_compare_pages_beyond_limits_is_a_difference(
     assert compare(pdf, pdf) == ()
 
 
-def test_compare_pages_damaged_file_never_raises(pdf: bytes) -> None:
+def test_pdf_comparison_of_damaged_file_raises_no_exception(pdf: bytes) -> None:
     dice = random.Random(1)
     for _ in range(60):
         content = bytearray(pdf)
@@ -759,7 +761,7 @@ def test_compare_pages_damaged_file_never_raises(pdf: bytes) -> None:
         assert isinstance(compare(bytes(content), pdf), tuple)
 
 
-def test_read_report_aes_encrypted_is_called_encrypted() -> None:
+def test_read_report_pdf_encrypted_with_aes_states_encryption() -> None:
     """pypdf decrypts AES with a library that px4fuse does not need."""
     writer = PdfWriter(clone_from=REPORT)
     writer.encrypt("", algorithm="RC4-128")

@@ -116,7 +116,7 @@ def test_chordal_initialisation_equals_dense_least_squares(dimension: int, seed:
 
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_cost_equals_gtsam(dimension: int, seed: int) -> None:
+def test_pose_graph_cost_equals_gtsam(dimension: int, seed: int) -> None:
     gtsam = pytest.importorskip("gtsam")
     graph = random_graph(dimension, seed)
     factors, values = gtsam_problem(gtsam, graph)
@@ -125,7 +125,7 @@ def test_cost_equals_gtsam(dimension: int, seed: int) -> None:
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", FILES)
-def test_solve_minimum_equals_gtsam(name: str) -> None:
+def test_pose_graph_minimum_cost_equals_gtsam(name: str) -> None:
     gtsam = pytest.importorskip("gtsam")
     graph = read_g2o(shared("pose_graphs") / f"{name}.g2o")
     solution = solve(graph)
@@ -140,7 +140,7 @@ def test_solve_minimum_equals_gtsam(name: str) -> None:
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", ["SE-Sync_manhattan", "SE-Sync_CSAIL", "SE-Sync_kitti_00"])
-def test_read_g2o_without_vertices_starts_chordal(name: str) -> None:
+def test_g2o_without_vertices_starts_from_chordal_solution(name: str) -> None:
     graph = read_g2o(shared("pose_graphs") / f"{name}.g2o")
     assert graph.initialised == FROM_CHORDAL
     assert cost(graph) < 1e-3 * cost(compose_odometry(graph))
@@ -151,7 +151,7 @@ def test_read_g2o_without_vertices_starts_chordal(name: str) -> None:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_solve_square_loop_equals_compass_rule(dimension: int) -> None:
+def test_pose_graph_of_square_loop_equals_compass_rule(dimension: int) -> None:
     """With equal variance per metre and exact rotations the correction grows with distance."""
     free, side = TANGENT[dimension], 10
     step = np.zeros((4 * side, free))
@@ -186,7 +186,7 @@ def test_solve_square_loop_equals_compass_rule(dimension: int) -> None:
 
 @settings(max_examples=30)
 @given(st.lists(st.floats(-100.0, 100.0), min_size=6, max_size=6), st.sampled_from([2, 3]))
-def test_cost_is_independent_of_frame(values: list[float], dimension: int) -> None:
+def test_pose_graph_cost_does_not_depend_on_frame(values: list[float], dimension: int) -> None:
     tangent = np.array(values[: TANGENT[dimension]])
     tangent[dimension:] /= 40.0
     graph = noisy_graph(dimension, 2)
@@ -195,7 +195,7 @@ def test_cost_is_independent_of_frame(values: list[float], dimension: int) -> No
     assert solve(moved).cost == pytest.approx(solve(graph).cost, rel=1e-8)
 
 
-def test_solve_is_independent_of_edge_order_and_direction() -> None:
+def test_pose_graph_cost_does_not_depend_on_edge_order() -> None:
     graph = noisy_graph(3, 4)
     shuffled = graph.select_edges(np.random.default_rng(0).permutation(len(graph.first)))
     # inverted edge with the same information: Z^-1 exp(-Ad(Z) r)
@@ -212,7 +212,7 @@ def test_solve_is_independent_of_edge_order_and_direction() -> None:
 # --- refusals ------------------------------------------------------------------------------------
 
 
-def test_solve_invalid_graph_states_reason() -> None:
+def test_solve_invalid_pose_graph_states_reason() -> None:
     graph = noisy_graph(2, 0)
     poses = graph.poses.copy()
     poses[4, 1] = np.nan
@@ -230,7 +230,7 @@ def test_solve_invalid_graph_states_reason() -> None:
 # --- starts --------------------------------------------------------------------------------------
 
 
-def test_initialise_star_of_edges_composes_poses() -> None:
+def test_pose_graph_of_star_edges_is_initialised_exactly() -> None:
     # star of vertices with edges in both directions
     unit = "1 0 0 1 0 1"
     text = "".join(f"EDGE_SE2 {9 if k % 2 else k} {k if k % 2 else 9} 1 0 1 {unit}\n" for k in (
@@ -289,7 +289,7 @@ def ate(poses: np.ndarray, truth: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.sum((poses[:, :3] - truth[:, :3]) ** 2, axis=1))))
 
 
-def test_solve_robust_removes_false_closure() -> None:
+def test_robust_pose_graph_removes_false_loop_closure() -> None:
     """ATE of DCS and GNC is within 5 % of the solution without the false closure."""
     off: dict[str, list[float]] = {"none": [], "dcs": [], "gnc": []}
     for seed in range(SEEDS):
@@ -311,7 +311,7 @@ def test_solve_robust_removes_false_closure() -> None:
     assert within["none"] < 0.2
 
 
-def test_solve_gnc_true_closures_keep_weight_1() -> None:
+def test_gnc_pose_graph_keeps_weight_1_of_true_loop_closures() -> None:
     for seed in range(2):
         graph, _, _ = laps(seed, false=0)
         robust = solve(graph, robust="gnc")
@@ -319,7 +319,7 @@ def test_solve_gnc_true_closures_keep_weight_1() -> None:
         assert robust.cost == pytest.approx(solve(graph).cost, rel=1e-8)
 
 
-def test_solve_robust_reweights_given_loops_only() -> None:
+def test_robust_pose_graph_reweights_only_given_loop_closures() -> None:
     graph, _, true = laps(0)
     plain = solve(graph).cost
     for method in ("dcs", "gnc"):
@@ -368,7 +368,7 @@ POSITION_AND_YAW = np.diag([1e4, 1e4, 1e4, 0.0, 0.0, 4e4])
 @pytest.mark.parametrize(("dimension", "information", "freedom"), [
     (2, None, 3), (3, None, 6), (3, POSITION_ONLY, 3), (3, POSITION_AND_YAW, 4),
 ])  # fmt: skip
-def test_gate_p_value_of_true_closures_is_uniform(dimension, information, freedom) -> None:
+def test_p_value_of_true_loop_closures_is_uniform(dimension, information, freedom) -> None:
     graph = odometry_graph(dimension, 3e-3)
     edge = len(graph.first) - 1
     if information is not None:
@@ -381,7 +381,7 @@ def test_gate_p_value_of_true_closures_is_uniform(dimension, information, freedo
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("is_back", [False, True])
-def test_gate_distance_uses_covariance_of_gtsam(dimension: int, is_back: bool) -> None:
+def test_loop_closure_gate_distance_equals_gtsam(dimension: int, is_back: bool) -> None:
     """For an exact closure the distance depends on the odometry covariance only."""
     gtsam = pytest.importorskip("gtsam")
     graph = odometry_graph(dimension, 1e-3)
@@ -410,7 +410,7 @@ def test_gate_distance_uses_covariance_of_gtsam(dimension: int, is_back: bool) -
         assert found.d2 == pytest.approx(off @ np.linalg.solve(covariance, off), rel=1e-4)
 
 
-def test_gate_without_odometry_edge_raises_error() -> None:
+def test_loop_closure_gate_without_odometry_edge_raises_error() -> None:
     graph = odometry_graph(2, 1e-3)
     edge = len(graph.first) - 1
     gap = graph.select_edges(np.arange(len(graph.first)) != 10)
@@ -427,7 +427,7 @@ def test_gate_without_odometry_edge_raises_error() -> None:
     assert gate_edges(graph, []) == []
 
 
-def test_information_eigenvectors_restore_information() -> None:
+def test_information_eigenvectors_restore_information_matrix() -> None:
     """Correlated metres and radians of different size, two directions without information."""
     rng = np.random.default_rng(4)
     root = rng.normal(size=(6, 4)) * np.array([3.0, 2.0, 5.0, 40.0, 70.0, 20.0])[:, None]

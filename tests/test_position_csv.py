@@ -140,7 +140,7 @@ DIALECTS: dict[str, str | bytes] = {
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
-def test_read_position_csv_every_dialect_gives_equal_samples(read, dialect):
+def test_read_position_csv_of_every_dialect_gives_equal_samples(read, dialect):
     content = DIALECTS[dialect]
     content = content if isinstance(content, bytes) else content.encode()
     file = read(content)
@@ -183,14 +183,14 @@ TIMES: dict[str, tuple[str, list[str], int, str]] = {
 
 
 @pytest.mark.parametrize("case", TIMES)
-def test_read_position_csv_time_unit_and_clock_are_detected(read, case):
+def test_read_position_csv_detects_time_unit_and_clock(read, case):
     name, texts, start_us, clock = TIMES[case]
     file = read(table({name: texts, "x": X, "y": Y, "z": Z}))
     assert_track(file, start_us=start_us)
     assert file.clock == clock
 
 
-def test_read_position_csv_ns_timestamps_keep_microseconds(read):
+def test_read_position_csv_keeps_microseconds_of_ns_timestamps(read):
     stamps = [1_795_253_650_123_456_789 + 1000 * i for i in range(5)]
     rows = "".join(f"{stamp},{i},0.5,1.5\n" for i, stamp in enumerate(stamps))
     file = read("t_ns,x,y,z\n" + rows)
@@ -199,7 +199,7 @@ def test_read_position_csv_ns_timestamps_keep_microseconds(read):
 
 
 @pytest.mark.parametrize("rate", [0.2, 200])
-def test_read_position_csv_rate_at_limit_has_no_note(read, rate):
+def test_read_position_csv_with_rate_at_limit_adds_no_note(read, rate):
     stamps = [str(round(1e9 * (0.98 * i / rate + 1795253650))) for i in range(ROWS)]
     file = read(table({"t": stamps, "x": X, "y": Y, "z": Z}))
     assert np.diff(file.samples.index) == pytest.approx(0.98 / rate, abs=1e-6)
@@ -207,7 +207,7 @@ def test_read_position_csv_rate_at_limit_has_no_note(read, rate):
 
 
 @pytest.mark.parametrize("step", ["0.0001", "1e7"])
-def test_read_position_csv_implausible_rate_has_note(read, step):
+def test_read_position_csv_with_implausible_rate_adds_note(read, step):
     texts = [f"{float(step) * i:.6f}" for i in range(ROWS)]
     file = read(table({"time_s": texts, "x": X, "y": Y, "z": Z}))
     assert_stated(file, "is not a plausible UWB rate", "--position-time-unit")
@@ -215,7 +215,7 @@ def test_read_position_csv_implausible_rate_has_note(read, step):
 
 
 @pytest.mark.parametrize("unit", TIME_UNITS)
-def test_read_position_csv_time_unit_option_overrides_name(read, unit):
+def test_read_position_csv_time_unit_overrides_column_name(read, unit):
     texts = [str(10 * i) for i in range(ROWS)]
     file = read(table({"time_us": texts, "x": X, "y": Y, "z": Z}), time_unit=unit)
     assert file.samples.index[1] == pytest.approx(10 * TIME_UNITS[unit])
@@ -266,7 +266,7 @@ POSITIONS: dict[str, tuple[dict[str, list[str]], str | None]] = {
 
 @pytest.mark.parametrize("separator", [",", " "])
 @pytest.mark.parametrize("case", POSITIONS)
-def test_read_position_csv_position_names_units_and_frames(read, case, separator):
+def test_read_position_csv_detects_frame_from_column_names(read, case, separator):
     columns, frame = POSITIONS[case]
     file = read(table({"time": UNIX_S, **columns}, separator=separator))
     assert_track(file)
@@ -277,12 +277,12 @@ def test_read_position_csv_position_names_units_and_frames(read, case, separator
     ("mm unsaid", ("mm", "m is too large for an indoor flight", "--position-unit")),
     ("two tracks", ("'raw_x', 'raw_y', 'raw_z' as x, y, z",)),
 ])  # fmt: skip
-def test_read_position_csv_states_position_columns(read, case, words):
+def test_read_position_csv_notes_used_position_columns(read, case, words):
     assert_stated(read(table({"time": UNIX_S, **POSITIONS[case][0]})), "position: ", *words)
 
 
 @pytest.mark.parametrize("unit", LENGTH_UNITS)
-def test_read_position_csv_length_unit_option_overrides_name(read, unit):
+def test_read_position_csv_unit_option_overrides_column_name(read, unit):
     columns = {"time": UNIX_S, "x_cm": X, "y_cm": Y, "z": Z, "sigma_cm": fixed(SIGMA_M, 3)}
     samples = read(table(columns), length_unit=unit).samples
     assert samples["x_m"].to_numpy() == pytest.approx(TRACK_M[:, 0] * LENGTH_UNITS[unit])
@@ -294,7 +294,7 @@ def test_read_position_csv_length_unit_option_overrides_name(read, unit):
     ([*X[:7], "4000.0", *X[8:]], "in m (no unit in the column names)"),
     (fixed(np.linspace(0.0, 5e6, ROWS), 1), "no unit gives the size of an indoor flight"),
 ])  # fmt: skip
-def test_read_position_csv_outlier_does_not_change_unit(read, x, words):
+def test_read_position_csv_unit_is_not_changed_by_outlier(read, x, words):
     file = read(table({**PLAIN, "x": x}))
     assert file.samples["x_m"].tolist() == list(map(float, x))
     assert file.samples["y_m"].to_numpy() == pytest.approx(TRACK_M[:, 1])
@@ -302,7 +302,7 @@ def test_read_position_csv_outlier_does_not_change_unit(read, x, words):
 
 
 @pytest.mark.parametrize("extra", [{}, {"z": [""] * ROWS}, {"z": ["nan"] * ROWS}])
-def test_read_position_csv_without_height_z_is_nan(read, extra):
+def test_read_position_csv_without_height_sets_z_to_nan(read, extra):
     file = read(table({"time": UNIX_S, "x": X, "y": Y, **extra}))
     assert file.samples["z_m"].isna().all()
     assert file.samples["y_m"].to_numpy() == pytest.approx(TRACK_M[:, 1])
@@ -322,7 +322,7 @@ SIGMA = fixed(SIGMA_M, 3)
     ({"stdev": SIGMA}, (1, 1, 1)),
     ({"raw_sigma": SIGMA, "filtered_sigma": fixed(9 * SIGMA_M, 3)}, (1, 1, 1)),
 ])  # fmt: skip
-def test_read_position_csv_sigma_columns_are_read(read, columns, factors):
+def test_read_position_csv_reads_sigma_columns(read, columns, factors):
     file = read(table({**PLAIN, **columns}))
     assert_track(file)
     sigmas = file.samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()
@@ -330,7 +330,7 @@ def test_read_position_csv_sigma_columns_are_read(read, columns, factors):
     assert_stated(file, "sigma: ", repr(next(iter(columns))))
 
 
-def test_read_position_csv_sigma_not_positive_is_nan(read):
+def test_read_position_csv_sets_non_positive_sigma_to_nan(read):
     sigma = [*SIGMA]
     sigma[3], sigma[4] = "0", "-1"
     file = read(table({**PLAIN, "sigma": sigma}))
@@ -347,7 +347,7 @@ def test_read_position_csv_sigma_not_positive_is_nan(read):
     ["nan", "", "null", "-", "-inf", "1e999", "12.3m", "1.2.3", "1_000", "1,5", "soon", ".", "0x1f",
      "١", "infinite"],
 )  # fmt: skip
-def test_read_position_csv_rows_without_position_are_dropped(read, missing):
+def test_read_position_csv_drops_rows_without_position(read, missing):
     x, z = [*X], [*Z]
     x[0] = x[20] = z[21] = missing
     file = read(table({**PLAIN, "x": x, "z": z}, separator=";"))
@@ -355,7 +355,7 @@ def test_read_position_csv_rows_without_position_are_dropped(read, missing):
     assert_stated(file, "3 rows were dropped", "no valid time or position")
 
 
-def test_read_position_csv_short_row_is_dropped(read):
+def test_read_position_csv_drops_row_with_too_few_columns(read):
     lines = table(PLAIN).splitlines(keepends=True)
     lines[30] = UNIX_S[29] + ",1.0\n"
     file = read("".join(lines))
@@ -363,7 +363,7 @@ def test_read_position_csv_short_row_is_dropped(read):
     assert_stated(file, "1 row was dropped")
 
 
-def test_read_position_csv_last_line_without_end_is_dropped(read):
+def test_read_position_csv_drops_last_line_without_line_feed(read):
     """The last line may be incomplete, also in its last digits."""
     file = read(table(PLAIN)[:-2])
     assert_track(file, rows=slice(-1))
@@ -377,7 +377,7 @@ def test_read_position_csv_last_line_without_end_is_dropped(read):
     ({10: 3_600_000_000, 40: -60_000_000}, [10, 40]),
     ({0: 10**15}, [0]),
 ])  # fmt: skip
-def test_read_position_csv_backward_timestamps_are_dropped(read, shifts_us, dropped):
+def test_read_position_csv_drops_backward_timestamps(read, shifts_us, dropped):
     stamps = UNIX_US + TIME_US
     for at, shift in shifts_us.items():
         stamps[at] += shift
@@ -387,7 +387,7 @@ def test_read_position_csv_backward_timestamps_are_dropped(read, shifts_us, drop
 
 
 @pytest.mark.parametrize("name", ["tag_id", "tagid", "node"])
-def test_read_position_csv_several_tags_have_note(read, name):
+def test_read_position_csv_with_several_tags_adds_note(read, name):
     file = read(table({name: ["A1", "B2"] * (ROWS // 2), **PLAIN}))
     assert_stated(file, "positions of 2 tags (such as 'A1', 'B2')")
 
@@ -428,14 +428,14 @@ def test_read_position_csv_columns_option_selects_columns(read, given, columns, 
     ({"columns": ("1", "2", "3", "9" * 5000)}, "no column '9999"),
     ({"columns": ("time", "2", "x", "y")}, "names one column twice"),
 ])  # fmt: skip
-def test_read_position_csv_invalid_options_raise_settings_error(read, options, words):
+def test_read_position_csv_with_invalid_option_raises_error(read, options, words):
     with pytest.raises(SettingsError) as caught:
         read(table(PLAIN), **options)
     assert words in str(caught.value)
     assert_one_line(caught.value)
 
 
-def test_read_position_csv_missing_column_is_named(read):
+def test_read_position_csv_names_missing_column_in_error(read):
     line = error_message(read, table(PLAIN), columns=("time", "x", "y", "w"))
     assert "no header with the columns 'time', 'w', 'x', 'y'" in line
 
@@ -462,13 +462,13 @@ def test_read_position_csv_missing_column_is_named(read):
     ("time,x,y,z\n" + table({"n": JUNK, **PLAIN}, header=False), "4 columns, but the rows have 5"),
     (table({**PLAIN, "time": ["12.5"] * ROWS}), "1 usable rows"),
 ])  # fmt: skip
-def test_read_position_csv_unreadable_file_raises_log_error(read, content, words):
+def test_read_position_csv_of_unreadable_file_raises_log_error(read, content, words):
     line = error_message(read, content)
     assert words in line
     assert line.startswith("uwb.csv")
 
 
-def test_read_position_csv_too_large_file_is_rejected(read, monkeypatch):
+def test_read_position_csv_rejects_too_large_file(read, monkeypatch):
     monkeypatch.setattr(position_csv, "MAX_FILE_BYTES", 1000)
     assert "MB; the limit is" in error_message(read, table(PLAIN))
 
@@ -496,7 +496,7 @@ def check_any(read, content: bytes) -> None:
     "line",
     [line * 9_000 for line in (b'"', b" ", b"1 ", b"1,", b"(", b"x,", b"a1B", b"_", b"1", b"[ ")],
 )
-def test_read_position_csv_repeated_characters_end_in_time(read, line):
+def test_read_position_csv_of_repeated_characters_ends_fast(read, line):
     text = table(PLAIN).encode()
     line += b"1\n"
     for content in (line + text, text + line, line * 30 + text, line * 300):
@@ -511,7 +511,7 @@ def test_read_position_csv_repeated_characters_end_in_time(read, line):
 @pytest.mark.parametrize(("pattern", "time", "count"), [
     ("dwm1001__tag__*position.csv", "bag_time", 3), ("vrpn*.csv", "header_stamp", 2),
 ])  # fmt: skip
-def test_read_position_csv_real_uwb_equals_file(pattern, time, count):
+def test_read_position_csv_of_real_uwb_file_keeps_its_values(pattern, time, count):
     paths = sorted(shared("uwb").glob(f"*/{pattern}"))
     assert len(paths) == count
     for path in paths:

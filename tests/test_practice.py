@@ -41,7 +41,9 @@ SEED, COUNT = 5, 3
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3), st.integers(1, 20))
-def test_draw_uses_all_choices_equally_often(seed: int, level: int, count: int) -> None:
+def test_practice_flights_contain_each_mistake_equally_often(
+    seed: int, level: int, count: int
+) -> None:
     rounds = draw(seed, level, count)
     assert draw(seed, level, count) == rounds
     assert len(rounds) == count
@@ -56,7 +58,7 @@ def test_draw_uses_all_choices_equally_often(seed: int, level: int, count: int) 
             assert mistake.either_sign or not size.startswith("-")
 
 
-def test_draw_level_3_has_two_mistakes_in_some_flights() -> None:
+def test_practice_level_3_has_some_flights_with_two_mistakes() -> None:
     rounds = [one for seed in range(5) for one in draw(seed, 3, 12)]
     two = sum(len(one.mistakes) == 2 for one in rounds)
     assert 0.15 * len(rounds) < two < 0.5 * len(rounds)
@@ -98,7 +100,7 @@ def hidden(name: str) -> HiddenMistake:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_flight_without_mistake_is_consistent(seed: int) -> None:
+def test_practice_flight_without_mistake_is_consistent(seed: int) -> None:
     found = compared(flown(None, 1, seed))
     assert {one.verdict for one in found.main.filters.values()} == {"consistent"}
     assert 0.01 < np.mean(_sigmas(found.main) > 2.0) < 0.09
@@ -111,7 +113,7 @@ def _sigmas(result: AxisComparison) -> Any:
 
 
 @pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
-def test_source_mistakes_have_their_symptoms(level: int, seed: int) -> None:
+def test_practice_flight_shows_symptoms_of_its_source_mistake(level: int, seed: int) -> None:
     found = compared(flown(hidden("nlos"), level, seed))
     far = [np.mean(_sigmas(found.axes[name]) > 4.0) for name in ("north", "east")]
     assert 0.01 < max(far) < 0.2
@@ -131,7 +133,7 @@ def test_source_mistakes_have_their_symptoms(level: int, seed: int) -> None:
 
 
 @pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
-def test_clock_offset_corrects_late_timestamps(level: int, seed: int) -> None:
+def test_clock_offset_setting_corrects_late_timestamps(level: int, seed: int) -> None:
     one = hidden("clock-offset")
     flight = flown(one, level, seed)
     late_s = float(one.sizes[level - 1].removesuffix("ms")) / 1e3
@@ -141,7 +143,7 @@ def test_clock_offset_corrects_late_timestamps(level: int, seed: int) -> None:
 
 
 @pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
-def test_clock_offset_does_not_correct_misaligned_frame(level: int, seed: int) -> None:
+def test_clock_offset_setting_does_not_correct_misaligned_frame(level: int, seed: int) -> None:
     flight = flown(hidden("yaw"), level, seed)
     for offset_s in (-0.4, -0.2, 0.0, 0.2, 0.4):
         found = compared(flight, clock_offset_s=offset_s)
@@ -149,7 +151,7 @@ def test_clock_offset_does_not_correct_misaligned_frame(level: int, seed: int) -
 
 
 @pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
-def test_each_noise_mistake_is_corrected_by_its_setting(level: int, seed: int) -> None:
+def test_practice_noise_mistake_is_corrected_by_its_setting(level: int, seed: int) -> None:
     noisy = flown(hidden(NOISY_UWB), level, seed)
     assert kf_statistics(noisy).nis_mean > 2.0
     size = float(hidden(NOISY_UWB).sizes[level - 1])
@@ -168,7 +170,7 @@ def test_each_noise_mistake_is_corrected_by_its_setting(level: int, seed: int) -
 
 
 @pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
-def test_small_gate_rejects_innovations_that_fit_kf(level: int, seed: int) -> None:
+def test_too_small_ekf2_gate_rejects_consistent_innovations(level: int, seed: int) -> None:
     found = compared(flown(hidden("ekf2-gate"), level, seed)).main
     rows = found.ekf2_innovations
     assert (rows["rejected"] > 0).mean() > 0.15
@@ -191,7 +193,7 @@ def keys(file: Path) -> list[dict[str, Any]]:
     return [json.loads(zlib.decompress(base64.b64decode(text))) for text in packed]
 
 
-def test_page_source_does_not_show_answers(quiz: Path) -> None:
+def test_practice_page_source_does_not_reveal_answers(quiz: Path) -> None:
     source = quiz.read_text(encoding="utf-8")
     answers = keys(quiz)
     assert [one["right"] for one in answers] == [
@@ -239,7 +241,7 @@ def element_text(page: Browser, name: str) -> str:
     return str(page.ask(f"document.getElementById({json.dumps(name)}).textContent"))
 
 
-def test_quiz_scores_right_and_wrong_answers(browser: Browser, quiz: Path) -> None:
+def test_practice_page_scores_right_and_wrong_answers(browser: Browser, quiz: Path) -> None:
     page, answers = show(browser, quiz), keys(quiz)
     points = 0
     for number, key in enumerate(answers):
@@ -296,9 +298,7 @@ def test_quiz_scores_right_and_wrong_answers(browser: Browser, quiz: Path) -> No
     assert element_text(page, "quiz-score") == ""
 
 
-def test_quiz_half_answer_scores_half_and_nothing_is_exclusive(
-    browser: Browser, quiz: Path
-) -> None:
+def test_practice_page_gives_half_a_point_for_half_an_answer(browser: Browser, quiz: Path) -> None:
     page = show(browser, quiz)
     for name in ("gate", "clock", "nothing"):
         page.click(f"[name=choice][value={name}]")
@@ -313,7 +313,7 @@ def test_quiz_half_answer_scores_half_and_nothing_is_exclusive(
     assert points == [0.5, 1, 0, 0.5]
 
 
-def test_card_of_undetected_mistake_names_the_mistake() -> None:
+def test_practice_page_card_names_an_undetected_mistake() -> None:
     clean = structs.replace(SMALL_SIGMA_A, severity="clean", causes=(), headline="No fault found")
     described = [{"fault": "gate of EKF2 too small", "size": "EKF2_EVP_GATE 1.4"}]
     named = practice._name_mistakes(clean, described)
@@ -323,7 +323,7 @@ def test_card_of_undetected_mistake_names_the_mistake() -> None:
     assert practice._name_mistakes(SMALL_SIGMA_A, described) is SMALL_SIGMA_A
 
 
-def test_quiz_has_no_serious_axe_violations(browser: Browser, quiz: Path) -> None:
+def test_practice_page_has_no_serious_accessibility_violation(browser: Browser, quiz: Path) -> None:
     page = show(browser, quiz, width=390)
     assert page.ask("document.documentElement.scrollWidth") <= 390
     page.ask(axe())
@@ -336,7 +336,9 @@ def test_quiz_has_no_serious_axe_violations(browser: Browser, quiz: Path) -> Non
 # ------------------------------------------------------------------ command
 
 
-def test_practice_command_writes_one_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_practice_command_writes_one_html_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     opened: list[str] = []
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(click, "launch", opened.append)

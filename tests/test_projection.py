@@ -60,7 +60,7 @@ def innovations(made: Flight, axis: str, segment: Segment = WHOLE) -> pd.DataFra
     return project_innovations(made, made.ekf2, made.positions[0], axes_of(made)[axis], segment)
 
 
-def test_project_innovations_aisle_combines_north_and_east() -> None:
+def test_aisle_innovations_combine_north_and_east() -> None:
     got = innovations(with_innovations(flight(), north=NORTH, east=EAST), "aisle")
     assert got.index.tolist() == pytest.approx([1.2, 1.4, 1.6])
     for k, time in enumerate(got.index):
@@ -75,7 +75,7 @@ def test_project_innovations_aisle_combines_north_and_east() -> None:
 
 
 @pytest.mark.parametrize("axis", ["north", "east", "aisle"])
-def test_project_innovations_variances_follow_scalar_update(axis: str) -> None:
+def test_projected_variances_follow_scalar_kalman_update(axis: str) -> None:
     """P⁻ = S - R and 1/P⁺ = 1/P⁻ + 1/R; a rejected sample leaves P⁻ unchanged."""
     got = innovations(with_innovations(flight(), north=NORTH, east=EAST), axis)
     s, r = got["innovation_variance_m2"], got["observation_variance_m2"]
@@ -87,7 +87,7 @@ def test_project_innovations_variances_follow_scalar_update(axis: str) -> None:
     np.testing.assert_allclose(got["posterior_variance_m2"], expected)
 
 
-def test_project_innovations_s_below_r_has_no_prior() -> None:
+def test_innovation_variance_below_r_gives_nan_prior_variance() -> None:
     """S equal to R or smaller gives NaN instead of P⁻ ≤ 0."""
     north = NORTH.assign(innovation_variance_m2=[0.05, 0.02, 0.005, 0.08])
     got = innovations(with_innovations(flight(), north=north), "north")
@@ -108,14 +108,14 @@ GONE = Unavailable("innovations", "none logged", "Log them.")
     (flight(uwb=Uwb(name="vehicle_mocap_odometry", origin=MOTION_CAPTURE)), "north", WHOLE,
      "never fuses vehicle_mocap_odometry"),
 ], ids=["segment", "north", "east", "mocap"])  # fmt: skip
-def test_project_innovations_missing_gives_reason(made, axis, segment, says) -> None:
+def test_missing_ekf2_innovations_of_axis_state_reason(made, axis, segment, says) -> None:
     (track,) = made.positions
     got = project_innovations(made, made.ekf2, track, axes_of(made)[axis], segment)
     assert isinstance(got, Unavailable)
     assert says in str(got)
 
 
-def test_project_innovations_without_r_uses_parameters() -> None:
+def test_unlogged_measurement_noise_is_read_from_parameters() -> None:
     made = flight(ekf2=Estimator(noise_logged=False), parameters={"EKF2_EVP_NOISE": 0.05})
     got = innovations(made, "north")
     np.testing.assert_allclose(got["observation_variance_m2"], 0.05**2)
@@ -133,7 +133,7 @@ def test_project_innovations_without_r_uses_parameters() -> None:
     ({"EKF2_EVP_NOISE": 0.2, "EKF2_EV_NOISE_MD": 0.0}, (0.3, 0.3, 1.0), 0.3**2),
     ({"EKF2_EVP_NOISE": 0.2, "EKF2_EV_NOISE_MD": 1.0}, (0.3, 0.3, 1.0), 0.2**2),
 ])  # fmt: skip
-def test_observation_variance_follows_ekf2_rule(parameters, reported_m, expected_m2) -> None:
+def test_measurement_variance_follows_ekf2_noise_rule(parameters, reported_m, expected_m2) -> None:
     made = flight(parameters=parameters)
     (track,) = made.positions
     if reported_m is not None:

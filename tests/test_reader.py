@@ -77,7 +77,7 @@ def delay_boot(log, by_us):
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)
-def test_read_ulog_every_release_reads_external_vision(read, generation):
+def test_read_ulog_of_each_px4_release_reads_external_vision(read, generation):
     (track, *_) = read(make_log(generation)).positions
     assert (track.name, track.origin) == ("vehicle_visual_odometry", RECEIVED)
     assert_equals_external_vision(track)
@@ -87,7 +87,7 @@ def test_read_ulog_every_release_reads_external_vision(read, generation):
 
 @pytest.mark.parametrize("generation", GENERATIONS)
 @pytest.mark.parametrize("axis", range(3))
-def test_innovations_are_measurement_minus_state(read, generation, axis):
+def test_ekf2_innovation_sign_becomes_measurement_minus_state(read, generation, axis):
     """PX4 logs state minus measurement; the flight has the opposite sign."""
     log = make_log(generation)
     logged = {
@@ -106,7 +106,7 @@ def test_innovations_are_measurement_minus_state(read, generation, axis):
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)
-def test_innovations_flags_and_noise_exist_since_v1_14(read, generation):
+def test_ekf2_innovation_flags_are_read_since_px4_v1_14(read, generation):
     ekf2 = read(make_log(generation)).ekf2
     if int(generation.removeprefix("v1.")) < 14:
         older = ekf2.innovations["north"]
@@ -123,7 +123,7 @@ def test_innovations_flags_and_noise_exist_since_v1_14(read, generation):
 
 
 @pytest.mark.parametrize("generation", ["v1.9", "v1.11", "v1.12"])
-def test_innovations_unlogged_rejection_follows_from_gate(read, generation):
+def test_unlogged_ekf2_rejection_is_derived_from_gate(read, generation):
     """An innovation above 5 √S along east rejects both horizontal axes."""
     log = make_log(generation)
     topic = "ekf2_innovations" if generation == "v1.9" else "estimator_innovations"
@@ -139,7 +139,7 @@ def test_innovations_unlogged_rejection_follows_from_gate(read, generation):
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)
-def test_read_ulog_every_release_reads_state_and_imu(read, generation):
+def test_read_ulog_of_each_px4_release_reads_state_and_imu(read, generation):
     flight = read(make_log(generation))
     state = flight.ekf2.state
     np.testing.assert_allclose(times(state), seconds_of(stamps(10.0, 10.0)), atol=1e-9)
@@ -154,7 +154,7 @@ def test_read_ulog_every_release_reads_state_and_imu(read, generation):
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)
-def test_variance_array_lengths_select_layout(read, generation):
+def test_ekf2_covariance_layout_follows_from_array_length(read, generation):
     """Element i of the arrays is (i + 1) / 100, so a wrong offset is detected."""
     variance = read(make_log(generation)).ekf2.variance
     found = variance[Columns.VELOCITY_VARIANCE + Columns.POSITION_VARIANCE]
@@ -163,7 +163,7 @@ def test_variance_array_lengths_select_layout(read, generation):
     np.testing.assert_allclose(found, np.tile(expected, (len(variance), 1)), rtol=1e-6)
 
 
-def test_variance_unknown_array_length_is_unavailable(read):
+def test_ekf2_covariance_of_unknown_length_is_unavailable(read):
     """The firmware version is ignored; a development version may have either layout."""
     log = make_log("v1.15")
     log.info["ver_sw_release"] = 1 << 24 | 14 << 16
@@ -180,7 +180,7 @@ def test_variance_unknown_array_length_is_unavailable(read):
     ("v1.11", 0, "NED"), ("v1.11", 1, "FRD"), ("v1.11", 2, "unknown"), ("v1.11", 3, "FRD"),
     ("v1.16", 0, "unknown"), ("v1.16", 1, "NED"), ("v1.16", 2, "FRD"), ("v1.16", 9, "unknown"),
 ])  # fmt: skip
-def test_external_vision_frame_code_gives_frame(read, generation, code, frame):
+def test_external_vision_frame_code_is_converted_to_frame_name(read, generation, code, frame):
     log = make_log(generation)
     fields = log["vehicle_visual_odometry"]
     name = "pose_frame" if "pose_frame" in fields else "local_frame"
@@ -198,7 +198,7 @@ def test_external_vision_variance_zero_or_nan_is_nan(read, value):
 # ---- time -----------------------------------------------------------------------------------
 
 
-def test_imu_times_include_accelerometer_offset(read):
+def test_imu_times_include_accelerometer_timestamp_offset(read):
     log = make_log("v1.16")
     offset = log["sensor_combined"]["accelerometer_timestamp_relative"]
     offset[:] = -2_000
@@ -208,7 +208,7 @@ def test_imu_times_include_accelerometer_offset(read):
     np.testing.assert_allclose(times(imu), expected, atol=1e-9)
 
 
-def test_read_ulog_reads_clipping_and_failure_detector(read):
+def test_read_ulog_reads_imu_clipping_and_failure_detector(read):
     log = make_log("v1.16")
     assert (plain := read(log)).tumble_spans == ()
     assert "clipped" not in plain.imu
@@ -230,7 +230,7 @@ def test_read_ulog_reads_clipping_and_failure_detector(read):
     *(("sensor_combined", at, hours * HOUR_US)
       for at in (0, 1, 500, -2, -1) for hours in (3, -3)),
 ])  # fmt: skip
-def test_duration_ignores_stray_timestamp(read, name, at, jump_us):
+def test_log_duration_ignores_a_stray_timestamp(read, name, at, jump_us):
     log = delay_boot(make_log("v1.16"), 4 * HOUR_US)
     shift(log[name]["timestamp"], at, jump_us)
     info = read(log).log
@@ -239,7 +239,7 @@ def test_duration_ignores_stray_timestamp(read, name, at, jump_us):
     assert info.boot_time_s == pytest.approx(4 * 3600 + 5.0, abs=allowed)
 
 
-def test_duration_without_imu_uses_densest_topic(read):
+def test_log_duration_without_imu_uses_densest_topic(read):
     log = make_log("v1.16").drop("sensor_combined")
     shift(log["vehicle_land_detected"]["timestamp"], -1, 3 * HOUR_US)
     flight = read(log)
@@ -265,7 +265,7 @@ def with_two_instances(generation, switches):
     [(0.0, 1), (4.95, 0)],
     [(0.0, 0), (2.05, 1), (3.05, 1), (6.95, 0)],
 ])  # fmt: skip
-def test_ekf2_samples_are_from_primary_instance(read, generation, switches):
+def test_ekf2_samples_are_taken_from_primary_instance(read, generation, switches):
     ekf2 = read(with_two_instances(generation, switches)).ekf2
     starts = np.array([start for start, _ in switches])
     numbers = np.array([number for _, number in switches])
@@ -287,7 +287,7 @@ def test_ekf2_samples_are_from_primary_instance(read, generation, switches):
     ]
 
 
-def test_primary_instance_ignores_unset_selector(read):
+def test_ekf2_primary_instance_ignores_unset_selector(read):
     ekf2 = read(with_two_instances("v1.16", [(0.0, 255), (3.05, 1)])).ekf2
     assert ekf2.instances == ((-np.inf, 1),)
     assert ekf2.variance["north_m2"].iloc[-1] == pytest.approx(3.0 * 0.07, rel=1e-6)
@@ -297,7 +297,7 @@ def test_primary_instance_ignores_unset_selector(read):
 
 
 @pytest.mark.parametrize("before", [0, 254, 255])
-def test_resets_counter_wrap_is_one_reset(read, before):
+def test_ekf2_reset_counter_overflow_counts_as_one_reset(read, before):
     """The counters are uint8: the reset after number 255 is number 0."""
     log = make_log("v1.16")
     fields = log["vehicle_local_position"]
@@ -320,7 +320,7 @@ def test_resets_counter_wrap_is_one_reset(read, before):
 # ---- innovations ------------------------------------------------------------------------------
 
 
-def test_innovations_without_near_variance_are_dropped(read):
+def test_ekf2_innovations_without_variance_in_time_are_dropped(read):
     log = make_log("v1.12")
     late = log["estimator_innovation_variances"]
     kept = seconds_of(late["timestamp_sample"]) < 5.0
@@ -334,7 +334,7 @@ def test_innovations_without_near_variance_are_dropped(read):
     assert any(note.startswith(said) for note in ekf2.notes), ekf2.notes
 
 
-def test_innovations_while_vision_not_fused_are_dropped(read):
+def test_ekf2_innovations_while_vision_is_not_fused_are_dropped(read):
     log = make_log("v1.12")
     flags = log["estimator_status_flags"]
     at = seconds_of(flags["timestamp_sample"])
@@ -345,7 +345,7 @@ def test_innovations_while_vision_not_fused_are_dropped(read):
     np.testing.assert_allclose(times(frame), expected, atol=1e-9)
 
 
-def test_innovations_not_fused_nor_rejected_are_dropped(read):
+def test_innovations_neither_fused_nor_rejected_are_dropped(read):
     log = make_log("v1.16")
     fields = log["estimator_aid_src_ev_pos"]
     fields["fused"][:10] = False
@@ -356,7 +356,7 @@ def test_innovations_not_fused_nor_rejected_are_dropped(read):
     assert frame["fused"].sum() == len(frame) - 3
 
 
-def test_innovations_never_fused_axis_is_unavailable(read):
+def test_ekf2_innovations_of_never_fused_axis_are_unavailable(read):
     log = make_log("v1.16")
     log["estimator_status_flags"]["cs_ev_hgt"][:] = False
     flight = read(log)
@@ -372,7 +372,7 @@ def test_innovations_never_fused_axis_is_unavailable(read):
 @pytest.mark.parametrize(("parameters", "reason"), [
     ({"EKF2_EN": 0}, "EKF2_EN is 0"), ({"SYS_MC_EST_GROUP": 1}, "SYS_MC_EST_GROUP is 1"),
 ])  # fmt: skip
-def test_read_ekf2_other_estimator_is_unavailable(read, parameters, reason):
+def test_ekf2_is_unavailable_if_other_estimator_was_active(read, parameters, reason):
     """The position topics are in the log, published by the other estimator."""
     log = make_log("v1.11")
     log.parameters |= parameters
@@ -383,7 +383,7 @@ def test_read_ekf2_other_estimator_is_unavailable(read, parameters, reason):
     assert flight.positions[0].name == "vehicle_visual_odometry"
 
 
-def test_read_ekf2_group_2_reads_gate_parameter(read):
+def test_ekf2_gate_is_read_if_estimator_group_selects_ekf2(read):
     log = make_log("v1.11")
     log.parameters |= {"SYS_MC_EST_GROUP": 2, "EKF2_EVP_GATE": 3.0}
     ekf2 = read(log).ekf2
@@ -415,7 +415,7 @@ PREFERRED = [
 ]
 
 
-def test_positions_are_in_order_of_preference(read):
+def test_position_sources_are_listed_in_order_of_preference(read):
     log = make_log("v1.16")
     log.add(odometry("vehicle_mocap_odometry", 10.0, 16), gps_topic())
     log.add(odometry("estimator_visual_odometry_aligned", 10.0, 12))
@@ -430,7 +430,7 @@ def test_positions_are_in_order_of_preference(read):
         assert "--position-source" in reason
 
 
-def test_choose_source_missing_source_lists_available(read):
+def test_choosing_missing_position_source_lists_available_ones(read):
     flight = read(make_log("v1.16"))
     with pytest.raises(MissingDataError, match="vehicle_mocap_odometry") as error:
         choose_source(flight, "vehicle_mocap_odometry")
@@ -439,7 +439,7 @@ def test_choose_source_missing_source_lists_available(read):
         choose_source(flight, "sonar")
 
 
-def test_choose_source_unfused_gps_must_be_requested(read):
+def test_unfused_gnss_is_used_as_source_only_on_request(read):
     log = make_log("v1.16")
     log.drop(*(n for n in log.names() if "_ev_" in n or n == "vehicle_visual_odometry"))
     with pytest.raises(MissingDataError, match="SDLOG_PROFILE to 129"):
@@ -451,7 +451,7 @@ def test_choose_source_unfused_gps_must_be_requested(read):
 
 
 @pytest.mark.parametrize("delay_ms", [0.0, 175.0])
-def test_ev_pos_aid_times_exclude_ekf2_delay(read, delay_ms):
+def test_estimator_aid_src_ev_pos_times_exclude_ekf2_delay(read, delay_ms):
     """EKF2 subtracts EKF2_EV_DELAY and half its prediction interval from the timestamp."""
     log = make_log("v1.16").drop("vehicle_visual_odometry")
     log.parameters["EKF2_EV_DELAY"] = delay_ms
@@ -462,7 +462,7 @@ def test_ev_pos_aid_times_exclude_ekf2_delay(read, delay_ms):
     assert_equals_external_vision(track)
 
 
-def test_ev_pos_aid_height_too_far_in_time_is_nan_with_note(read):
+def test_estimator_aid_src_height_logged_at_other_time_is_nan(read):
     """The logger decimates heights separately, so their times may differ from the positions."""
     log = make_log("v1.16").drop("vehicle_visual_odometry")
     stamped = log["estimator_aid_src_ev_hgt"]["timestamp_sample"]
@@ -483,7 +483,7 @@ def test_ev_pos_aid_height_too_far_in_time_is_nan_with_note(read):
 
 
 @pytest.mark.parametrize("generation", ["v1.9", "v1.11", "v1.12"])
-def test_reconstruction_equals_measurement(read, generation):
+def test_position_reconstructed_from_innovation_equals_measured(read, generation):
     log = make_log(generation).drop("vehicle_visual_odometry")
     if generation == "v1.12":
         log.drop("estimator_visual_odometry_aligned")
@@ -497,7 +497,7 @@ def test_reconstruction_equals_measurement(read, generation):
 # ---- truth ------------------------------------------------------------------------------------
 
 
-def test_read_truth_reads_simulation_ground_truth(read):
+def test_read_ulog_reads_ground_truth_of_simulation(read):
     at = stamps(10.0, 20.0)
     here = position(seconds_of(at)) + 0.5
     fields = dict(zip("xyz", here.T, strict=True))
@@ -508,7 +508,7 @@ def test_read_truth_reads_simulation_ground_truth(read):
     assert (flight.truth.samples[Columns.VELOCITY] == 0.25).all(axis=None)
 
 
-def test_read_truth_motion_capture_needs_other_source(read):
+def test_motion_capture_is_ground_truth_only_beside_other_source(read):
     log = make_log("v1.16").add(odometry("vehicle_mocap_odometry", 10.0, 16))
     assert read(log).truth.name == "vehicle_mocap_odometry"
     log.drop(*(n for n in log.names() if "_ev_" in n or n == "vehicle_visual_odometry"))
@@ -527,7 +527,7 @@ STREAMS = {
 
 
 @pytest.mark.parametrize("generation", STREAMS)
-def test_streams_name_topics_clock_and_file(read, generation):
+def test_data_streams_name_their_topics_clock_and_file(read, generation):
     streams = read(make_log(generation)).streams
     of_ekf2 = ("ekf2_innovations", "ekf2_fusing", "ekf2_variance")
     assert [streams[part].topics[0] for part in of_ekf2] == STREAMS[generation]
@@ -541,7 +541,7 @@ def test_streams_name_topics_clock_and_file(read, generation):
     assert measured == {"imu"} | (set() if generation == "v1.9" else {"ekf2_state", *of_ekf2})
 
 
-def test_unused_lists_uwb_ranges(read):
+def test_uwb_ranges_are_listed_as_unused_data(read):
     at = stamps(10.0, 4.0)
     ranges = topic("sensor_uwb", at, {"distance": np.ones(len(at))})
     grid = topic("uwb_grid", at[:3], {"num_anchors": np.ones(3, np.uint8)})
@@ -553,7 +553,7 @@ def test_unused_lists_uwb_ranges(read):
 
 
 @pytest.mark.parametrize("unknown_us", [0, 5_000_000, 2**64 - 1])
-def test_start_unix_is_from_gps_fixes(read, unknown_us):
+def test_unix_start_time_of_log_is_read_from_gnss_fixes(read, unknown_us):
     made = gps_topic()
     utc_us = 1_700_000_000_000_000 + np.round(seconds_of(made.fields["timestamp"]) * 1e6)
     made.fields["time_utc_usec"] = utc_us.astype(np.uint64)
@@ -577,7 +577,7 @@ SIMULATED = [
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", SIMULATED)
-def test_read_log_simulated_uwb_equals_sent_samples(shared_logs, name):
+def test_read_log_of_simulation_returns_the_sent_uwb_samples(shared_logs, name):
     """Each sample of the chosen source equals a sent sample, at its measurement time."""
     flight = read_log(shared_logs / "simulated" / f"{name}.ulg")
     sent = json.loads((shared_logs / "simulated" / f"{name}.json").read_text())
@@ -615,7 +615,7 @@ def test_read_log_simulated_uwb_equals_sent_samples(shared_logs, name):
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", [name for name in SIMULATED if "1.13" in name])
-def test_read_truth_global_only_is_projected(shared_logs, name):
+def test_global_ground_truth_is_projected_to_local_metres(shared_logs, name):
     """The UWB error against the projected ground truth has the simulated noise (0.10 m)."""
     flight = read_log(shared_logs / "simulated" / f"{name}.ulg")
     assert flight.truth.name == "vehicle_global_position_groundtruth"
@@ -645,7 +645,7 @@ REAL = {
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", REAL)
-def test_read_log_real_logs_give_duration_and_source(shared_logs, name):
+def test_read_log_of_real_logs_gives_known_duration_and_source(shared_logs, name):
     duration_s, source = REAL[name]
     flight = read_log(shared_logs / "real" / f"{name}.ulg")
     assert flight.log.duration_s == pytest.approx(duration_s, abs=0.06)

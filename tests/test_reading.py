@@ -75,19 +75,21 @@ def refusal(monkeypatch, capsys, desk: Path, command: str) -> str:
 @posix
 @pytest.mark.parametrize("what", ["zero", "pipe", "socket"])
 @pytest.mark.parametrize("command", READERS)
-def test_read_special_file_is_refused(desk, monkeypatch, capsys, command, what) -> None:
+def test_reading_a_device_pipe_or_socket_is_refused(
+    desk, monkeypatch, capsys, command, what
+) -> None:
     err = refusal(monkeypatch, capsys, desk, command.format(what))
     assert f"{what} is not a regular file" in err
 
 
 @pytest.mark.parametrize("command", READERS)
-def test_read_10_gb_file_is_refused_without_reading(desk, monkeypatch, capsys, command) -> None:
+def test_file_of_10_gb_is_rejected_without_reading_it(desk, monkeypatch, capsys, command) -> None:
     err = refusal(monkeypatch, capsys, desk, command.format("sparse"))
     assert "sparse: the file has 10,000 MB; the limit is " in err
 
 
 @posix
-def test_files_by_sha256_ignores_special_and_huge_files(desk, monkeypatch, capsys):
+def test_file_search_by_sha256_ignores_special_and_huge_files(desk, monkeypatch, capsys):
     found = []
 
     def verify_nothing(work, reports, **_):
@@ -107,7 +109,7 @@ def test_files_by_sha256_ignores_special_and_huge_files(desk, monkeypatch, capsy
 # --- the limit, and its option ---
 
 
-def test_max_size_applies_to_one_command(desk, monkeypatch, capsys) -> None:
+def test_max_size_option_applies_to_only_one_command(desk, monkeypatch, capsys) -> None:
     monkeypatch.chdir(desk)
     assert 1_000_000 < (desk / "l.ulg").stat().st_size < 10_000_000
     before = max_log_bytes.get()
@@ -118,7 +120,7 @@ def test_max_size_applies_to_one_command(desk, monkeypatch, capsys) -> None:
     assert run_main(monkeypatch, capsys, "info", "l.ulg", "--max-size", "10")[0] == 0
 
 
-def test_read_file_at_limit_is_read_completely(tmp_path) -> None:
+def test_file_of_exactly_the_size_limit_is_read_completely(tmp_path) -> None:
     path = tmp_path / "x"
     path.write_bytes(b"x" * 100)
     assert len(read_bytes_limited(path, LogError, 100)) == 100
@@ -127,7 +129,7 @@ def test_read_file_at_limit_is_read_completely(tmp_path) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/kallsyms").exists(), reason="the file is Linux's")
-def test_read_file_of_size_0_stops_at_limit() -> None:
+def test_file_that_states_size_0_is_read_only_up_to_limit() -> None:
     path = Path("/proc/kallsyms")
     assert path.stat().st_size == 0
     with pytest.raises(LogError, match="the limit is"):
@@ -135,7 +137,7 @@ def test_read_file_of_size_0_stops_at_limit() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
-def test_read_text_accepts_utf8_and_utf16(tmp_path, encoding) -> None:
+def test_text_file_in_utf8_or_utf16_is_read(tmp_path, encoding) -> None:
     path = tmp_path / "t"
     path.write_bytes("σ = 1\n".encode(encoding))
     assert read_text(path, LogError, 100) == "σ = 1\n"
@@ -149,7 +151,9 @@ def test_read_text_accepts_utf8_and_utf16(tmp_path, encoding) -> None:
 
 @posix
 @pytest.mark.parametrize("command", READERS)
-def test_read_error_name_with_line_feed_is_one_line(tmp_path, desk, monkeypatch, capsys, command):
+def test_error_about_file_name_with_line_feed_is_one_line(
+    tmp_path, desk, monkeypatch, capsys, command
+):
     name = "a\nb\x1b[2J"
     (tmp_path / name).write_bytes(b"\xff\0 junk")
     for other in ("l.ulg", "s.tum", "r.pdf", "roster.csv"):
@@ -163,11 +167,13 @@ def test_read_error_name_with_line_feed_is_one_line(tmp_path, desk, monkeypatch,
 
 @pytest.mark.parametrize("command", OF_FILES)
 @pytest.mark.parametrize("path", ["folder", ".", "..", "/"])
-def test_read_folder_is_refused_with_its_name(desk, monkeypatch, capsys, command, path) -> None:
+def test_command_with_folder_as_input_file_names_the_folder(
+    desk, monkeypatch, capsys, command, path
+) -> None:
     err = refusal(monkeypatch, capsys, desk, command.format(path))
     assert f"{path} is a folder. Give a file." in err
 
 
-def test_errors_are_printed_on_one_line() -> None:
+def test_error_message_with_line_feeds_becomes_one_line() -> None:
     assert str(Px4FuseError("a\r\nb c\td\x00\ud800")) == "a  b c d??"
     assert display_name(Path("logs") / "σ.ulg") == "σ.ulg"

@@ -18,7 +18,7 @@ from px4fuse.log import Stream
     ("sensor_combined", 100.0, None),
     ("sensor_combined", 20.0, "40 Hz"),
 ])  # fmt: skip
-def test_clock_offset_low_imu_rate_is_unavailable(topic, imu_hz, needed) -> None:
+def test_time_offset_with_low_imu_rate_is_unavailable(topic, imu_hz, needed) -> None:
     """Telemetry samples of a faster IMU are single values, not means over the interval."""
     flight = aisle_flight(duration_s=40.0, imu=Imu(rate_hz=imu_hz))
     flight = replace(flight, streams={"imu": Stream((topic,), "boot clock", flight.log.name)})

@@ -30,7 +30,7 @@ RECORDS = [kind for kind in classes() if dataclasses.is_dataclass(kind)]
 STRUCTS = [kind for kind in classes() if issubclass(kind, msgspec.Struct)]
 
 
-def test_records_of_package_are_frozen() -> None:
+def test_all_record_types_of_package_are_immutable() -> None:
     assert len(RECORDS) > 50
     assert len(STRUCTS) > 50
     mutable = {kind.__name__ for kind in RECORDS if not kind.__dataclass_params__.frozen}  # type: ignore[attr-defined]
@@ -38,7 +38,7 @@ def test_records_of_package_are_frozen() -> None:
     assert mutable == BUFFERS
 
 
-def test_settings_assignment_raises() -> None:
+def test_assignment_to_a_settings_field_raises_error() -> None:
     flight = px4fuse.Settings()
     with pytest.raises(dataclasses.FrozenInstanceError):
         flight.sigma_a_m_s2 = 1.0  # type: ignore[misc]

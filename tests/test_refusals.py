@@ -270,9 +270,7 @@ SPARED = {
     [*REFUSED.values(), *((command, "not overwritten") for command in SPARED.values())],
     ids=[*REFUSED, *(f"over {name}" for name in SPARED)],
 )
-def test_commands_invalid_input_print_one_line_and_write_nothing(
-    desk, monkeypatch, capsys, command, said
-):
+def test_commands_on_invalid_input_print_one_error_line(desk, monkeypatch, capsys, command, said):
     monkeypatch.chdir(desk)
     before = contents(desk)
     typed = shlex.split(command.format(folder=Path(desk).name))
@@ -286,7 +284,7 @@ def test_commands_invalid_input_print_one_line_and_write_nothing(
     assert contents(desk) == before
 
 
-def test_estimates_without_result_exit_with_2(desk, monkeypatch, capsys):
+def test_tune_and_sync_without_result_exit_with_2(desk, monkeypatch, capsys):
     monkeypatch.chdir(desk)
     for command, said in (
         ("tune a.ulg --start 126", "SIGMA_A and SIGMA_Z cannot be estimated"),

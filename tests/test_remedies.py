@@ -57,7 +57,7 @@ def parameters(remedy: str) -> dict[str, float]:
      ({}, ("clock-offset=250ms",)), ({}, ("nlos=5%",))],
     ids=str,
 )  # fmt: skip
-def test_remedies_followed_do_not_increase_rmse(settings, mistakes) -> None:
+def test_recommended_actions_do_not_increase_rmse_when_applied(settings, mistakes) -> None:
     analysis = flown(AISLE, Settings(**settings), *mistakes)
     comparison, model = analysis, analysis.ekf2_model
     followed = 0
@@ -79,7 +79,7 @@ def test_remedies_followed_do_not_increase_rmse(settings, mistakes) -> None:
 
 
 @pytest.mark.parametrize(("seed", "mistakes"), [(1, ()), (2, ("ekf2-noise=50cm",))])
-def test_find_drifting_vio_lists_error_first_and_keeps_noises(seed, mistakes) -> None:
+def test_drifting_vio_is_the_first_finding(seed, mistakes) -> None:
     """With PX4's default noise, and with an EKF2 noise of 50 times the short-term noise."""
     analysis = flown(replace(LOOP, seed=seed), Settings(), *mistakes)
     findings = find(analysis)
@@ -112,13 +112,13 @@ def trial(after: Outcome, change: str = "sigma_z_m", kind: str = "noises") -> Tr
         (13.3, 9.0, 0.5, "nothing", False),
     ],
 )
-def test_improvement_names_what_a_rerun_improves(nis, nees, rmse_m, expected, has) -> None:
+def test_filter_rerun_improvement_names_improved_quantity(nis, nees, rmse_m, expected, has) -> None:
     one = trial(Outcome(nis_mean=nis, nees_mean=nees, position_rmse_m=rmse_m))
     assert improvement(one) == expected
     assert has_effect(one) is has
 
 
-def test_find_trial_prefers_smallest_change_that_suffices() -> None:
+def test_recommended_rerun_is_smallest_sufficient_change() -> None:
     right, near = Outcome(nis_mean=1.0, nees_mean=1.0), Outcome(nis_mean=1.2, nees_mean=1.2)
     pair = replace(trial(right), change={"sigma_z_m": 1.0, "sigma_a_m_s2": 1.0})
     alone, bias = trial(near), trial(right, "bias_forward_m_s2", "bias")
@@ -142,7 +142,7 @@ def offset(analysis: Analysis, offset_s: float) -> Analysis:
     return replace(analysis, clock=clock)
 
 
-def test_ml_ekf2_parameters_follow_noise_and_time_offset(sample: Analysis) -> None:
+def test_estimated_ekf2_parameters_follow_noise_and_time_offset(sample: Analysis) -> None:
     model, comparison = sample.ekf2_model, sample
 
     def estimated(analysis: Analysis) -> dict[str, float]:
@@ -167,7 +167,7 @@ def test_ml_ekf2_parameters_follow_noise_and_time_offset(sample: Analysis) -> No
     assert ml_ekf2_parameters(other, model, sample.tuning, sample.clock) == {}
 
 
-def test_noise_change_reported_variance_sets_noise_mode(sample: Analysis) -> None:
+def test_ekf2_noise_action_for_reported_variance_sets_noise_mode(sample: Analysis) -> None:
     model = sample.ekf2_model
     assert noise_used_m(model) == pytest.approx(0.1)
     flown = model.inputs.aid, model.inputs.settings, noise_used_m(model)
@@ -187,7 +187,7 @@ def only(name: str, analysis: Analysis) -> Finding:
     return finding
 
 
-def test_delay_remedy_worse_replay_is_not_proposed(sample: Analysis) -> None:
+def test_ekf2_delay_with_worse_replay_is_not_recommended(sample: Analysis) -> None:
     """The timestamps of the sample are correct; a replay with 150 ms is worse."""
     finding = only("ekf2_ev_delay_wrong", offset(sample, -0.15))
     assert finding.remedy == "Correct the timestamps at the sender."

@@ -62,7 +62,7 @@ def with_font(monkeypatch: pytest.MonkeyPatch, name: str, characters: str) -> No
 
 
 @pytest.mark.usefixtures("_fresh")
-def test_fonts_missing_in_dejavu_uses_installed_font(monkeypatch) -> None:
+def test_characters_missing_in_dejavu_use_an_installed_font(monkeypatch) -> None:
     with_font(monkeypatch, "Some Thai", THAI)
     assert fonts.missing_characters(f"Ångström σ Жанна {ARABIC} 5 ≤ 6") == ""
     assert fonts.font_names(f"Ångström {ARABIC}") == [fonts.FONT]
@@ -71,7 +71,7 @@ def test_fonts_missing_in_dejavu_uses_installed_font(monkeypatch) -> None:
 
 
 @pytest.mark.usefixtures("_fresh")
-def test_characters_without_font_become_squares_with_advice(
+def test_characters_without_any_font_are_printed_as_squares(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(fonts, "_other_fonts", lambda: ())
@@ -83,7 +83,7 @@ def test_characters_without_font_become_squares_with_advice(
 
 
 @pytest.mark.usefixtures("_fresh")
-def test_fonts_with_box_glyphs_are_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fonts_that_draw_only_boxes_are_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     own = font_manager.findfont(fonts.FONT)
     entries = [
         SimpleNamespace(name=name, style="normal", weight=400, fname=str(own), index=0)
@@ -99,7 +99,7 @@ def test_fonts_with_box_glyphs_are_ignored(monkeypatch: pytest.MonkeyPatch) -> N
     ]
 
 
-def test_notes_lists_keep_marks_and_indent() -> None:
+def test_markdown_lists_in_notes_keep_bullets_and_indent() -> None:
     blocks = written("- a\n  - b\n\n    c\n- d\n\n7. e\n8. f\n\n- - g\n")
     assert [(b["mark"], b["text"], b["indent"] / notes.INDENT) for b in blocks] == [
         ("•", "a", 1), ("•", "b", 2), ("", "c", 2), ("•", "d", 1),
@@ -107,7 +107,7 @@ def test_notes_lists_keep_marks_and_indent() -> None:
     ]  # fmt: skip
 
 
-def test_notes_code_keeps_spaces_and_dollar_signs() -> None:
+def test_markdown_code_in_notes_keeps_spaces_and_dollar_signs() -> None:
     assert replace_unprintable("\N{NO-BREAK SPACE}x\n") == "\N{NO-BREAK SPACE}x\n"
     (code,) = written("```\nif x:\n    $y$ <b>\n```")
     assert code["text"].replace("\N{NO-BREAK SPACE}", " ") == "if x:\n    $y$ <b>"
@@ -132,12 +132,12 @@ def test_notes_code_keeps_spaces_and_dollar_signs() -> None:
         ("<div><p>a</p></div>\n\n<!-- no -->\n\nyes", ["a", "yes"]),
     ],
 )
-def test_notes_markdown_becomes_plain_text(markdown: str, read_as: list[str]) -> None:
+def test_markdown_in_notes_becomes_plain_text(markdown: str, read_as: list[str]) -> None:
     assert [block["text"] for block in written(markdown) if block["text"]] == read_as
 
 
 @given(st.text(st.sampled_from("#*-_`$|<>[]()!\\ \n1.ab{}^&;~="), max_size=80))
-def test_notes_any_markdown_is_accepted(text: str) -> None:
+def test_any_markdown_in_notes_is_accepted(text: str) -> None:
     assert all(block["kind"] in ("text", "table") for block in written(text))
 
 
@@ -146,7 +146,7 @@ def pages_of(student: Student) -> Iterator[Page]:
     return notes.draw(empty, SimpleNamespace(student=student))  # type: ignore[arg-type]
 
 
-def test_notes_long_text_continues_on_next_pages() -> None:
+def test_long_notes_continue_on_next_report_pages() -> None:
     words = [f"word{number}" for number in range(1500)]
     table = "| a | b |\n|---|---|\n" + "".join(f"| r{i} | {'cell ' * 30} |\n" for i in range(40))
     student = Student("", "", " ".join(words) + "\n\n" + table)
@@ -159,7 +159,7 @@ def test_notes_long_text_continues_on_next_pages() -> None:
     assert not list(pages_of(Student("", "", " \n <!-- nothing --> \n")))
 
 
-def test_notes_words_without_spaces_are_split() -> None:
+def test_very_long_words_in_notes_are_split() -> None:
     """PDF/A limits strings to 32,767 characters."""
     endless = "a" * 33_000
     code = '{"x": 1, ' * 4_000
@@ -169,7 +169,7 @@ def test_notes_words_without_spaces_are_split() -> None:
     assert text.count("{") == 4_000
 
 
-def test_typst_code_in_notes_is_printed_as_text() -> None:
+def test_typst_code_in_student_notes_is_printed_as_text() -> None:
     hostile = '#read("/etc/passwd") #sys.inputs $x$ = y *b* @ref <label> // c'
     page = Page("Notes")
     page.write(hostile)
@@ -185,7 +185,7 @@ def test_typst_code_in_notes_is_printed_as_text() -> None:
      'image(bytes("<svg xmlns=\'http://www.w3.org/2000/svg\'><image href=\'/etc/hostname\' '
      'width=\'1\' height=\'1\'/></svg>"), format: "svg")'],
 )  # fmt: skip
-def test_template_cannot_read_files(code: str) -> None:
+def test_typst_template_cannot_read_files(code: str) -> None:
     with pytest.raises(typst.TypstError):
         compile_pdf({"fonts": [fonts.FONT]}, f"#{code}")
 
@@ -212,7 +212,7 @@ def with_clock(found: ClockOffset | Unavailable, delay_ms: float = 0.0) -> Any:
     return SimpleNamespace(clock=found, settings=settings, flight=flight, source=source())
 
 
-def test_clock_page_exists_only_with_result_to_report() -> None:
+def test_report_page_on_time_offset_is_printed_only_with_result() -> None:
     whole = offset(parts=())
     fine, unknown = with_clock(whole), replace(whole, is_determinable=False, reason="no motion")
     with_finding = [
@@ -248,7 +248,7 @@ def test_clock_page_exists_only_with_result_to_report() -> None:
     ],
     ids=["fits", "other delay", "late", "early", "negligible", "changes", "drift", "no drift"],
 )  # fmt: skip
-def test_clock_advice_states_result_and_action(
+def test_time_offset_advice_states_result_and_action(
     changes: dict[str, Any], delay_ms: float, expected: dict[str, str]
 ) -> None:
     analysis = with_clock(offset(**changes), delay_ms)
@@ -256,7 +256,7 @@ def test_clock_advice_states_result_and_action(
     assert all(text in advice[label] for label, text in expected.items()), advice
 
 
-def test_settings_with_same_ratio_have_same_gain_and_track() -> None:
+def test_kf_noises_of_equal_ratio_give_equal_gain_and_track() -> None:
     """Statement of the sensitivity page: the tracks coincide, σ and NIS scale."""
     rng = np.random.default_rng(3)
     axis = random_walk(rng, count=600, interval_s=0.2, sigma_a=0.5, sigma_z=0.1)

@@ -80,16 +80,16 @@ def parsed(command: str) -> Request:
 
 @settings(deadline=None)
 @given(COMPARISONS | LOOPS)
-def test_command_line_parsed_gives_the_request(request: Request) -> None:
+def test_analysis_request_as_command_line_is_parsed_back_equal(request: Request) -> None:
     assert parsed(command_line(request)) == request
 
 
 @given(COMPARISONS | LOOPS)
-def test_request_json_round_trip_is_equal(request: Request) -> None:
+def test_analysis_request_written_as_json_is_read_back_equal(request: Request) -> None:
     assert msgspec.json.decode(msgspec.json.encode(request), type=Request) == request
 
 
-def test_request_without_paths_contains_file_names_only() -> None:
+def test_analysis_request_without_paths_has_only_file_names() -> None:
     request = ComparisonRequest(
         log="/home/eve/a.ulg", mavlink="b/c.tlog", position=PositionFile(path="../d.csv")
     )
@@ -109,7 +109,7 @@ def test_request_without_paths_contains_file_names_only() -> None:
         ({"command": "compare", "log": "a", "system": 256}, "<= 255"),
     ],
 )
-def test_request_invalid_json_is_refused(recorded: object, says: str) -> None:
+def test_analysis_request_from_invalid_json_is_rejected(recorded: object, says: str) -> None:
     with pytest.raises(msgspec.ValidationError, match=says):
         msgspec.convert(recorded, Request)
 
@@ -121,7 +121,7 @@ def test_request_invalid_json_is_refused(recorded: object, says: str) -> None:
         (loop, requests.OPTION_NAMES[LoopRequest], (LoopRequest,)),
     ],
 )
-def test_request_has_a_field_for_every_option(command, declared, kinds) -> None:
+def test_analysis_request_has_a_field_for_each_option(command, declared, kinds) -> None:
     """An option that is not in the request would be missing in the results."""
     about_outputs = {
         "-o", "--json", "--student", "--id", "--notes", "--answers", "--fail-on", "--checks",

@@ -38,14 +38,14 @@ def assert_valid(text: str) -> None:
     assert to_json(read_results(text.encode())) == text
 
 
-def test_schema_is_valid_and_has_all_types():
+def test_results_schema_is_valid_and_contains_each_result_type():
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
     kinds = [f"#/$defs/{kind.__name__}" for kind in KINDS.values()]
     assert [one["$ref"] for one in SCHEMA["oneOf"]] == kinds
 
 
 @pytest.mark.parametrize("one", [EXAMPLE, LOOP], ids=["compare", "loop"])
-def test_schema_accepts_results_only(one):
+def test_results_schema_rejects_invalid_results(one):
     validator = jsonschema.Draft202012Validator(SCHEMA)
     assert validator.is_valid(json.loads(json.dumps(one)))
     for wrong in (
@@ -64,14 +64,14 @@ def test_schema_accepts_results_only(one):
     ],
     ids=lambda options: next(iter(options)),
 )
-def test_results_of_other_settings_validate_and_render(sample_flight, options):
+def test_results_of_any_settings_follow_the_schema(sample_flight, options):
     made = document(sample_flight, **({"start_s": 40.0, "end_s": 70.0} | options))
     text = to_json(made[1])
     assert_valid(text)
     assert render(*made, text).startswith(b"%PDF-")
 
 
-def test_results_too_few_updates_have_reason_not_zero(sample_flight):
+def test_results_of_too_few_updates_state_reason_instead_of_zero(sample_flight):
     """One second of flight is too short for a test of consistency."""
     _, made = document(sample_flight, start_s=40.0, end_s=41.0)
     north = made.axes["north"]
@@ -81,7 +81,7 @@ def test_results_too_few_updates_have_reason_not_zero(sample_flight):
     assert_valid(to_json(made))
 
 
-def test_to_json_rejects_nan_and_infinity():
+def test_results_json_rejects_nan_and_infinity():
     made = decode_results(EXAMPLE)
     for number in (math.nan, math.inf):
         broken = replace(made, settings=replace(made.settings, dt_s=number))
@@ -119,7 +119,7 @@ def test_to_json_rejects_nan_and_infinity():
     ],
     ids=range(21),
 )
-def test_read_results_invalid_file_is_refused(given, said):
+def test_read_results_from_invalid_json_file_is_rejected(given, said):
     with pytest.raises(ResultsError, match=said) as raised:
         read_results(given, "r.json")
     assert str(raised.value).startswith("r.json ")
@@ -145,12 +145,12 @@ def test_read_results_invalid_file_is_refused(given, said):
     ],
     ids=str,
 )
-def test_read_results_schema_violation_is_refused(values, said):
+def test_results_that_violate_the_schema_are_rejected(values, said):
     with pytest.raises(ResultsError, match=f"does not follow the schema.*{said}|{said}"):
         decode_results(changed_results(**values))
 
 
-def test_read_results_fields_of_a_newer_minor_version_are_ignored():
+def test_read_results_ignores_fields_of_newer_minor_version():
     known = decode_results(changed_results(schema__version="4.9999"))
     more = changed_results(
         schema__version="4.9999", new=1, log__new={}, axes__aisle__filters__kf__new=[0.0],
@@ -167,18 +167,18 @@ def test_read_results_fields_of_a_newer_minor_version_are_ignored():
     ("provenance", "said"),
     [({"px4fuse": "0.2.0\n"}, "px4fuse 0.2.0."), (7, "the px4fuse that wrote it.")],
 )
-def test_read_results_of_schema_3_names_the_version_to_use(provenance, said):
+def test_read_results_of_schema_3_names_px4fuse_version_to_use(provenance, said):
     with pytest.raises(ResultsError, match=r"schema version 3\.0; .* reads version 4\.") as raised:
         decode_results(changed_results(schema__version="3.0", provenance=provenance))
     assert str(raised.value).endswith(f"Create the report again, or read it with {said}")
 
 
-def test_read_results_cleans_keys_like_texts():
+def test_read_results_removes_control_characters_from_keys():
     nothing = {"what": "noises", "reason": "too short", "remedy": ""}
     assert list(decode_results(changed_results(tuning={"a\u202eb": nothing})).tuning) == ["ab"]
 
 
-def test_to_json_numbers_have_ten_significant_digits():
+def test_results_json_numbers_have_ten_significant_digits():
     """Further digits depend on the processor; UNIX times keep microseconds."""
     written = json.loads(to_json({"a": [1 / 3, 2e-7 / 3], "unix_s": 1795251250.2020127, "n": 3}))
     assert written == {"a": [0.3333333333, 6.666666667e-8], "unix_s": 1795251250.202013, "n": 3}
@@ -187,7 +187,7 @@ def test_to_json_numbers_have_ten_significant_digits():
         assert to_json(json.loads(once)) == once
 
 
-def test_results_number_outside_bounds_is_absent_with_reason():
+def test_results_omit_number_outside_bounds_and_state_reason():
     """An optional number is left out alone, a required one with its record."""
     results = read_results(json.dumps(EXAMPLE).encode())
     assert within_bounds(results) is results
@@ -207,7 +207,7 @@ def test_results_number_outside_bounds_is_absent_with_reason():
     assert_valid(to_json(found))
 
 
-def test_results_without_valid_axis_are_refused():
+def test_results_without_any_valid_axis_raise_error():
     results = read_results(json.dumps(EXAMPLE).encode())
     wrong = replace(
         results.axes["aisle"], updates=replace(results.axes["aisle"].updates, input_gap_s=math.nan)

@@ -80,7 +80,7 @@ def table(tmp_path: Path, text: str, encoding: str = "utf-8-sig") -> Sheet:
         ("Email\njane@x.edu\n", Person("jane@x.edu", "", "jane@x.edu")),
     ],
 )  # fmt: skip
-def test_read_people_finds_columns_of_each_platform(tmp_path, text, is_) -> None:
+def test_read_class_list_finds_columns_of_each_learning_platform(tmp_path, text, is_) -> None:
     for encoding in ("utf-8", "utf-8-sig", "utf-16"):
         assert read_people(table(tmp_path, text, encoding))[0] == is_
 
@@ -98,7 +98,7 @@ ROSTERS = {
 
 
 @pytest.mark.parametrize("content", ROSTERS.values(), ids=ROSTERS.keys())
-def test_read_roster_any_table_format_gives_students(tmp_path, content) -> None:
+def test_read_roster_accepts_any_table_format(tmp_path, content) -> None:
     students = read_roster(written(tmp_path, content))
     assert [one.student_id for one in students] == ["1001", "1002"]
     assert [one.file for one in students] == ["1001.ulg", "1002.ulg"]
@@ -124,7 +124,7 @@ BAD_ROSTERS = {
 
 
 @pytest.mark.parametrize(("content", "said"), BAD_ROSTERS.values(), ids=BAD_ROSTERS.keys())
-def test_read_roster_invalid_list_raises_one_line(tmp_path, content, said) -> None:
+def test_read_invalid_roster_raises_one_line_error(tmp_path, content, said) -> None:
     with pytest.raises(SettingsError) as error:
         read_roster(written(tmp_path, content, "utf-8"))
     assert said in str(error.value)
@@ -167,11 +167,11 @@ def at(platform: str, number: str = "", name: str = "", **more: str) -> ExportOr
         (at("moodle", "99", "Jane"), None),
     ],
 )
-def test_student_index_uses_platform_number_then_name(origin, place) -> None:
+def test_student_is_matched_by_platform_number_before_name(origin, place) -> None:
     assert CLASS.student_index(origin.person) == place
 
 
-def test_student_index_uses_id_before_name() -> None:
+def test_student_is_matched_by_id_before_name() -> None:
     said = (("42", "Max Roe"), ("", "Roe, Max"), ("99", "Jane Doe"), ("", ""))
     assert [CLASS.student_index(Person(*each)) for each in said] == [0, 1, 0, None]
     # an exact id has priority over one with leading zeros
@@ -179,7 +179,7 @@ def test_student_index_uses_id_before_name() -> None:
     assert [register.student_index(Person(each)) for each in ("42", "0042")] == [1, None]
 
 
-def test_register_worksheet_fills_missing_fields() -> None:
+def test_grading_worksheet_completes_fields_of_class_list() -> None:
     register = Register(
         [Person("0042", "Jane Doe"), Person("43", "Max Roe")],
         [Person("42", "Doe J", "j@x.edu", "jdoe", {"moodle": "7"}), Person("9", "No One")],
@@ -209,7 +209,7 @@ def register(sheet) -> Register:
         (BLACKBOARD, TITLE, TITLE, "Feedback to Learner"),
     ],
 )
-def test_fill_grades_changes_grade_and_feedback_only(
+def test_fill_grades_changes_only_grade_and_feedback(
     tmp_path, text, column, title, feedback, encoding
 ) -> None:
     sheet = table(tmp_path, text, encoding)
@@ -233,14 +233,14 @@ def test_fill_grades_changes_grade_and_feedback_only(
         assert any("above the maximum of 100 on the platform" in note for note in notes)
 
 
-def test_fill_grades_anonymous_row_matches_participant(tmp_path) -> None:
+def test_fill_grades_matches_anonymous_row_by_participant_number(tmp_path) -> None:
     hidden = MOODLE.replace("Doe Jane", "").replace("0042,jane@x.edu", ",")
     sheet = table(tmp_path, hidden)
     people = Register([Person("0042", numbers={"moodle": "4711"}), *PEOPLE[1:]])
     assert fill_grades(sheet, ENTRIES, people, "", TEXTS)[0].rows[0][5] == "87.5"
 
 
-def test_fill_grades_missing_student_is_noted(tmp_path) -> None:
+def test_fill_grades_reports_a_student_missing_in_the_table(tmp_path) -> None:
     sheet = table(tmp_path, "\r\n".join(MOODLE.split("\r\n")[:2]) + "\r\n")
     _, notes = fill_grades(sheet, ENTRIES, register(sheet), "", TEXTS)
     assert notes == ("table.csv has no row for Max Roe. These grades were not entered.",)
@@ -267,7 +267,7 @@ def test_fill_grades_keeps_semicolon_and_decimal_comma(tmp_path) -> None:
         ("id,name\n1,A\n", "", "no grade column"),
     ],
 )
-def test_grade_column_ambiguous_or_missing_raises_error(tmp_path, text, column, says) -> None:
+def test_ambiguous_or_missing_grade_column_raises_error(tmp_path, text, column, says) -> None:
     with pytest.raises(SettingsError, match=says) as caught:
         find_grade_column(table(tmp_path, text), column)
     assert "\n" not in str(caught.value)

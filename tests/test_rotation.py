@@ -17,14 +17,14 @@ from px4fuse.trajectory.rotation import (
 )
 
 
-def test_to_vector_tiny_rotation_keeps_angle() -> None:
+def test_tiny_quaternion_to_rotation_vector_keeps_angle() -> None:
     tiny = np.array([1.0, 2e-14, -4e-14, 6e-14])
     for sign in (1.0, -1.0):
         np.testing.assert_allclose(to_vector(sign * tiny), [4e-14, -8e-14, 12e-14])
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 9, 10, 50])
-def test_running_product_equals_repeated_multiplication(count: int) -> None:
+def test_quaternion_running_product_equals_single_products(count: int) -> None:
     turns = from_vector(np.random.default_rng(count).normal(0.0, 1.0, (count, 3)))
     product, one = cumulative_product(turns), np.array([1.0, 0.0, 0.0, 0.0])
     for row, turn in zip(product, turns, strict=True):
@@ -32,7 +32,7 @@ def test_running_product_equals_repeated_multiplication(count: int) -> None:
         np.testing.assert_allclose(row, one, atol=1e-12)
 
 
-def test_interpolate_quaternions_gives_midpoint() -> None:
+def test_interpolated_quaternion_at_midpoint_has_half_the_angle() -> None:
     known = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, -1.0], [-1.0, 0.0, 0.0, 0.0]])
     middle = interpolate(np.array([0.5, 1.5]), np.arange(3.0), known)
     half = math.sqrt(0.5)
@@ -40,7 +40,7 @@ def test_interpolate_quaternions_gives_midpoint() -> None:
     assert np.linalg.norm(middle, axis=1) == pytest.approx(1.0)
 
 
-def test_rotation_functions_equal_scipy() -> None:
+def test_quaternion_functions_equal_scipy() -> None:
     rng = np.random.default_rng(1)
     turns = rng.normal(0.0, 0.7, (50, 3))
     q = from_vector(turns)

@@ -12,7 +12,7 @@ NOTES = ITEM + 'check = "verified"\n'
 NUMBER = ITEM + 'check = "number"\npath = "a.b"\n'
 
 
-def test_default_rubric_contains_each_check_and_parameter():
+def test_default_rubric_contains_each_check_and_its_parameters():
     text = rubric_text()
     used = {item["check"] for item in tomllib.loads(text)["item"]}
     checks = AnyItem.__args__
@@ -23,20 +23,20 @@ def test_default_rubric_contains_each_check_and_parameter():
 
 
 @pytest.mark.parametrize("kind", ["compare", "loop"])
-def test_default_rubric_points_add_up_to_60_and_120_with_key(kind):
+def test_default_rubric_points_add_up_to_60_and_120(kind):
     items = [one for one in read_rubric(None).items if one.report in ("any", kind)]
     assert {one.points for one in items if one.needs_key} == {100.0, 20.0}
     assert [one.by_hand for one in items if one.needs_key] == [False, True]
     assert sum(one.points for one in items) == 60 + 120
 
 
-def test_read_rubric_copy_of_default_is_equal(tmp_path):
+def test_read_copy_of_default_rubric_gives_equal_rubric(tmp_path):
     path = tmp_path / "rubric.toml"
     path.write_bytes(b"\xef\xbb\xbf" + rubric_text().replace("\n", "\r\n").encode())
     assert read_rubric(path) == read_rubric(None)
 
 
-def test_parse_rubric_missing_parameters_have_defaults():
+def test_rubric_without_parameters_has_default_values():
     (item,) = parse_rubric(ITEM + 'check = "clock"\n', "x").items
     assert (item.margin_s, item.report) == (0.03, "any")
     (item,) = parse_rubric(NUMBER + "at_most = 1\n", "x").items
@@ -81,7 +81,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(("text", "said"), BAD.values(), ids=BAD.keys())
-def test_read_rubric_invalid_text_names_place_in_one_line(tmp_path, text, said):
+def test_read_invalid_rubric_names_line_in_one_line_error(tmp_path, text, said):
     path = tmp_path / "mine.toml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(SettingsError) as error:
@@ -93,7 +93,7 @@ def test_read_rubric_invalid_text_names_place_in_one_line(tmp_path, text, said):
     assert len(message) < 500
 
 
-def test_read_rubric_folder_or_missing_file_is_refused(tmp_path):
+def test_read_rubric_from_folder_or_missing_file_is_rejected(tmp_path):
     for path, said in ((tmp_path, "is a folder"), (tmp_path / "none.toml", "cannot be read")):
         with pytest.raises(SettingsError, match=said):
             read_rubric(path)

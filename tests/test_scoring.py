@@ -69,7 +69,7 @@ def with_form(kinds, results=EXAMPLE, **values):
 # ------------------------------------------------------------------ checks
 
 
-def test_check_verified_without_log_has_zero_points():
+def test_rubric_check_verified_without_log_gives_zero_points():
     pdf = (ROOT / "reports" / "example" / "aisle_uwb.pdf").read_bytes()
     verdict = verify(read_report(pdf, "a.pdf"), pdf, {})
     assert check_points("verified", verdict=verdict)[0] == 0.0
@@ -150,13 +150,13 @@ CHECKED = [
 
 
 @pytest.mark.parametrize(("check", "results", "given", "points", "said"), CHECKED)
-def test_check_gives_points_and_comment(check, results, given, points, said):
+def test_rubric_check_gives_points_and_comment(check, results, given, points, said):
     found, comment = check_points(check, results, **given)
     assert found == pytest.approx(points, abs=0.01), comment
     assert said in comment
 
 
-def test_check_clock_of_assigned_flight_has_full_points():
+def test_rubric_check_clock_of_assigned_flight_gives_full_points():
     assert check_points("clock", UNCLEAR, key=key())[0] == 1.0
 
 
@@ -176,7 +176,7 @@ def key(*mistakes, sha256=SHA, **values):
 
 
 class TestForm:
-    def test_form_is_scored_by_answer_key(self):
+    def test_answer_form_is_scored_by_answer_key(self):
         found = with_form(["dropout"], student__id="S01 ")
         points, comment = check_points("answers", found, key=key())
         assert points == 0.3
@@ -199,26 +199,26 @@ class TestForm:
             ({"log_sha256": SHA, "mistakes": [{"kind": "yaw", "size": 900.0}]}, "cannot be read"),
         ],
     )
-    def test_missing_or_invalid_form_has_zero_points(self, form, said):
+    def test_missing_or_invalid_answer_form_earns_zero_points(self, form, said):
         more = {"student__answers": form} if form else {}
         points, comment = check_points(
             "answers", changed_results(student__id="s01", **more), key=key()
         )
         assert (points, said in comment) == (0.0, True)
 
-    def test_form_on_other_log_has_zero_points(self):
+    def test_answer_form_about_other_log_earns_zero_points(self):
         for student_id in ("s01", "zz"):
             results = with_form(["dropout"], student__id=student_id)
             points, comment = check_points("answers", results, key=key(sha256="c" * 64))
             assert (points, "not about the log that you were given" in comment) == (0.0, True)
 
     @pytest.mark.parametrize(("owner_id", "points"), [("", 0.0), ("s01", 30.0), ("zz", 0.0)])
-    def test_platform_id_overrides_mistyped_report_id(self, owner_id, points):
+    def test_scoring_uses_platform_id_instead_of_mistyped_report_id(self, owner_id, points):
         mistyped = with_form(["dropout"], student__id="s02")
         items = assess_results(mistyped, key=key(), owner_id=owner_id).items
         assert [item.points for item in items if "Mistakes" in item.title] == [points]
 
-    def test_notes_await_points_of_instructor(self):
+    def test_student_notes_await_points_of_instructor(self):
         for notes, awaits_points in (("", False), ("I saw a gap.", True)):
             made = assess_results(with_notes(notes, student__id="s01"), key=key())
             assert (made.awaits_points, made.counted_points is None, made.items[-1].points) == (
@@ -232,14 +232,14 @@ class TestForm:
 
 
 class TestScore:
-    def test_report_with_differing_numbers_has_zero_points(self):
+    def test_report_with_differing_numbers_earns_zero_points(self):
         verdict = Verdict("numbers differ", ("SIGMA_A is 0.5",), with_log=True)
         made = assess_results(verdict=verdict)
         assert {item.points for item in made.items} == {0.0}
         assert all("SIGMA_A is 0.5" in item.comment for item in made.items)
         assert made.pending_action == ""
 
-    def test_unverified_report_is_pending_or_zero_by_rubric(self):
+    def test_unverified_report_earns_pending_or_no_points(self):
         verdict = Verdict("other log", ("no log",), False, remedy="Look.")
         made = assess_results(verdict=verdict)
         assert made.items[0].points == 0.0
@@ -250,7 +250,7 @@ class TestScore:
         assert zero.pending_action == ""
 
     @pytest.mark.parametrize("student_id", ["s02", "S02", "ѕ02", "s77", "", " "])
-    def test_log_of_other_student_follows_rubric_rule(self, student_id):
+    def test_report_on_log_of_other_student_follows_rubric_rule(self, student_id):
         given = changed_results(student__id=student_id)
         said = f"id in the report is {student_id}" if student_id.strip() else "report has no id"
         assert (
@@ -264,12 +264,12 @@ class TestScore:
         # with the owner from the platform
         assert assess_results(given, key=key(), owner_id="s01").pending_action == ""
 
-    def test_log_outside_answer_key_is_pending(self):
+    def test_report_on_log_outside_answer_key_is_pending(self):
         made = assess_results(with_notes("", student__id="s01"), key=key(sha256="c" * 64))
         assert "not about a log of the answer key" in made.pending_action
 
     @pytest.mark.parametrize("results", [EXAMPLE, LOOP], ids=["compare", "loop"])
-    def test_any_valid_results_can_be_scored(self, results):
+    def test_any_results_that_follow_the_schema_can_be_scored(self, results):
         """Extreme values and missing parts, as far as the schema allows."""
         rng = random.Random(0)
         numbers, others = [1e308, -1e308, 5e-324, 0.0, -1, 10**19], [NONE, ..., "x" * 2000, "\0"]
@@ -327,12 +327,12 @@ class TestFeedback:
              ("pending, not counted yet",), "--logs"),
         ],
     )  # fmt: skip
-    def test_feedback_text_has_status_and_hides_flags(self, values, there, absent):
+    def test_student_feedback_contains_status_but_no_flags(self, values, there, absent):
         text = feedback_words(graded(**values), "Lab 2")
         assert all(said in text for said in there), text
         assert absent not in text
 
-    def test_comments_contain_no_ids_or_paths(self):
+    def test_grading_comments_contain_no_internal_names(self):
         """Ids of findings and paths in results are internal names."""
         wrong = [finding(name, "error") for name in TITLES]
         spoilt = [
@@ -367,7 +367,7 @@ class TestFeedback:
         ({"source__path": "kept by EKF2"}, ("kept by EKF2",)),
     ],
 )
-def test_flag_settings_suspicious_report_has_each_flag(values, said):
+def test_report_with_suspicious_settings_is_flagged(values, said):
     found = list(flag_settings(decode_results(changed_results(**values))))
     assert len(found) == len(said)
     assert all(word in flag for word, flag in zip(said, found, strict=True))
@@ -383,7 +383,7 @@ def test_flag_settings_suspicious_report_has_each_flag(values, said):
         ("heading_drift_deg", 90.0, "--heading-drift is 90 ° per 100 m (default 3 °)."),
     ],
 )
-def test_flag_settings_unusual_drift_is_flagged(option, stated, said):
+def test_report_with_unusual_drift_setting_is_flagged(option, stated, said):
     found = list(
         flag_settings(decode_results(changed_results(LOOP, **{f"request__{option}": stated})))
     )
@@ -401,10 +401,10 @@ def report(number, **values):
 
 
 class TestClassFlags:
-    def test_flag_equal_contents_different_reports_have_none(self):
+    def test_different_reports_are_not_flagged_as_copies(self):
         assert flag_equal_contents([report(n) for n in range(12)]) == {}
 
-    def test_flag_equal_contents_shared_log_id_or_file_is_listed(self):
+    def test_reports_with_same_log_id_or_file_are_flagged_as_copies(self):
         made = flag_equal_contents(
             [report(1, student="a\n<b>", log_sha256="x"), report(2, log_sha256="x"), report(4),
              report(5),
@@ -419,7 +419,7 @@ class TestClassFlags:
         assert "The id in this report is also in that of" in made["5.pdf"][0]
         assert "identical to that of" in made["8.pdf"][0]
 
-    def test_flag_equal_contents_same_student_flags_id_only(self):
+    def test_two_reports_of_one_student_are_flagged_only_for_the_id(self):
         two = [
             report(1, log_sha256="x"),
             report(1, log_sha256="x", sha256="z", submission="b.pdf"),
@@ -429,7 +429,7 @@ class TestClassFlags:
             "b.pdf": ["The id in this report is also in that of Student1 Name1, 1001 (1.pdf)."],
         }
 
-    def test_flag_equal_contents_similar_forms_are_flagged(self):
+    def test_reports_with_similar_answer_forms_are_flagged(self):
         claims = StudentMistake("yaw", -20.5), StudentMistake("nlos", 1.23)
         mine = Answers(log_sha256=SHA, mistakes=claims, quantities=(0.123, None, 0.45))
         other = (StudentMistake("nlos", 1.24), StudentMistake("yaw", -20.3))

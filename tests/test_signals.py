@@ -73,7 +73,7 @@ def test_ned_acceleration_at_rest_is_zero_at_any_attitude(angles_deg):
 
 @pytest.mark.parametrize("axis", [(0, 0, 1), (0, 1, 0), (0.6, 0.0, 0.8)])
 @pytest.mark.parametrize("rate_rad_s", [0.5, -3.0])
-def test_ned_acceleration_rotating_body_is_constant(axis, rate_rad_s):
+def test_ned_acceleration_of_rotating_body_stays_constant(axis, rate_rad_s):
     """Turning at a constant rate, the specific force is R(t)ᵀ(a − g); a must come back.
 
     The attitude is logged ten times slower than the IMU; interpolation on the sphere is exact for
@@ -94,7 +94,7 @@ def test_ned_acceleration_rotating_body_is_constant(axis, rate_rad_s):
     np.testing.assert_allclose(acceleration, np.tile(truth, (len(acceleration), 1)), atol=1e-9)
 
 
-def test_ned_acceleration_without_overlap_is_unavailable():
+def test_ned_acceleration_without_attitude_is_unavailable():
     time = np.arange(0.0, 1.0, 0.01)
     level = attitude_table(time, Rotation.identity(len(time)))
     assert ned_acceleration(flight_of(attitude=level)) is ABSENT
@@ -115,7 +115,7 @@ intervals = st.lists(st.integers(1, 50), min_size=3, max_size=40)
 
 
 @given(intervals, st.data())
-def test_step_means_piecewise_linear_are_exact(gaps_ms, data):
+def test_acceleration_mean_per_step_of_linear_signal_is_exact(gaps_ms, data):
     """Between samples the signal is a straight line; steps that end on samples average exactly."""
     time = np.concatenate([[0.0], np.cumsum(gaps_ms) * 1e-3])
     count = len(time)
@@ -139,7 +139,7 @@ def test_step_means_piecewise_linear_are_exact(gaps_ms, data):
         (np.r_[0.0 : 20.0 : 1 / 8.6], np.arange(0.0, 19.0, 0.1), np.zeros(189)),
     ],
 )  # fmt: skip
-def test_step_means_gap_is_share_without_imu(time, edges, gaps):
+def test_imu_gap_per_step_is_fraction_without_imu(time, edges, gaps):
     """In a gap between equal values the mean is that value; outside the data it is zero."""
     mean, gap = step_means(acceleration_of(time, np.ones(len(time))), edges)
     np.testing.assert_allclose(gap, gaps, atol=1e-9)
@@ -147,7 +147,7 @@ def test_step_means_gap_is_share_without_imu(time, edges, gaps):
     np.testing.assert_allclose(mean, inside, atol=1e-9)
 
 
-def test_acceleration_rms_uses_segment_only():
+def test_acceleration_rms_uses_only_the_evaluated_segment():
     time = np.arange(0.0, 10.0, 0.01)
     pushed = table(time, np.outer(np.where(time < 5.0, 100.0, 2.0), NORTH), AXIS_NAMES)
     inside = project_acceleration(pushed, NORTH, Segment(5.0, 9.0, ""))
@@ -170,14 +170,14 @@ def line_track(heading_deg, count=200, noise=0.0):
 
 
 @pytest.mark.parametrize("heading_deg", [0.0, 30.0, 90.0, 135.0, 179.0, 210.0])
-def test_aisle_heading_of_straight_line_is_its_heading(heading_deg):
+def test_aisle_heading_of_straight_track_equals_its_heading(heading_deg):
     heading, elongation = aisle_heading(line_track(heading_deg)[0], ALL)
     assert (heading - heading_deg + 90.0) % 180.0 - 90.0 == pytest.approx(0.0, abs=1e-6)
     assert 0.0 <= heading < 180.0
     assert elongation > 1e6
 
 
-def test_make_axes_projects_positions():
+def test_positions_are_projected_on_each_axis():
     track, along = line_track(30.0)
     axes = {axis.name: axis for axis in make_axes(flight_of(track=track), track, ALL)}
     assert list(axes) == ["north", "east", "down", "aisle"]
@@ -189,7 +189,7 @@ def test_make_axes_projects_positions():
     np.testing.assert_allclose(axes["aisle"].measurement_m, along + offset, atol=1e-9)
 
 
-def test_make_axes_given_heading_projects_both():
+def test_positions_and_imu_are_projected_on_given_heading():
     time = np.arange(0.0, 10.0, 0.01)
     track, _ = line_track(30.0, count=50)
     flight = flight_of(
@@ -205,7 +205,7 @@ def test_make_axes_given_heading_projects_both():
     assert "--heading" in axis.note
 
 
-def test_shift_clock_changes_times_only():
+def test_clock_shift_changes_only_timestamps():
     track, _ = line_track(30.0)
     moved = shift_clock(track, -0.1)
     np.testing.assert_allclose(moved.samples.index, track.samples.index - 0.1, atol=1e-12)
@@ -213,7 +213,7 @@ def test_shift_clock_changes_times_only():
     assert replace(moved, samples=track.samples) == track
 
 
-def test_make_axes_contain_measurements_of_segment():
+def test_axis_contains_only_measurements_of_evaluated_segment():
     track, _ = line_track(30.0)
     track.samples["down_m"] = np.nan
     axes = make_axes(flight_of(track=track), track, ALL)
@@ -243,7 +243,7 @@ def straight(first_s, last_s):
     (((19.0, 20.0),), (2.0, 18.0)),  # no positions in flight
     (ABSENT, (2.0, 18.0)),  # no land detector
 ])  # fmt: skip
-def test_choose_segment_is_airborne_part_of_source(airborne, expected):
+def test_default_evaluated_segment_is_airborne_part_of_source(airborne, expected):
     track = straight(2.0, 18.0)
     flight = flight_of(track=track, duration_s=20.0, airborne=airborne)
     segment = choose_segment(flight, track)
@@ -251,7 +251,7 @@ def test_choose_segment_is_airborne_part_of_source(airborne, expected):
     assert segment.reason
 
 
-def test_choose_segment_uses_given_ends():
+def test_evaluated_segment_uses_given_start_and_end():
     track = straight(2.0, 18.0)
     flight = flight_of(track=track, duration_s=20.0, airborne=((4.0, 12.0),))
     for start_s, end_s in ((5.0, None), (None, 9.0), (3.0, 15.0)):
@@ -298,7 +298,7 @@ WHOLE = Segment(0.0, 19.9, "")
     ("at", "good"),
     [([2.0], 0), ([6.0], 0), ([17.0], 0), *(([5.0, 15.0], good) for good in range(3))],
 )
-def test_continuous_state_removes_frame_resets(at, good):
+def test_ekf2_reset_that_moves_the_frame_is_removed(at, good):
     """The source is in the frame of the first, middle or last stretch between resets."""
     deltas = np.array([[1.0, 0.5, 0.0], [-3.0, 2.0, 0.0]])[: len(at)]
     later = STATE_TIME[:, None] >= np.array(at)
@@ -312,7 +312,7 @@ def test_continuous_state_removes_frame_resets(at, good):
 
 
 @pytest.mark.parametrize("reset_s", [4.0, 10.0, 15.0])
-def test_continuous_state_keeps_correcting_resets(reset_s):
+def test_ekf2_reset_that_corrects_an_error_is_kept(reset_s):
     """EKF2 drifts by 2 m and a reset moves it back to the source."""
     drift = np.where(reset_s > STATE_TIME, 2.0 * STATE_TIME / reset_s, 0.0)
     resets = [Reset(reset_s, kind, (-2.0, 0.0, 0.0)) for kind in ("position", "velocity")]
@@ -324,7 +324,7 @@ def test_continuous_state_keeps_correcting_resets(reset_s):
     assert "undone" not in statement
 
 
-def test_continuous_state_treats_height_separately():
+def test_ekf2_height_resets_are_treated_separately():
     frame_change = np.where(STATE_TIME >= 8.0, 3.0, 0.0)
     drift = np.where(STATE_TIME < 12.0, 0.1 * STATE_TIME, 0.0)
     offset = np.stack([frame_change, 0.0 * drift, drift], axis=1)
@@ -337,7 +337,7 @@ def test_continuous_state_treats_height_separately():
     assert "height" in statement.split("kept")[1]
 
 
-def test_continuous_state_keeps_unmeasured_resets():
+def test_ekf2_reset_on_axis_without_measurements_is_kept():
     """A source without height contains no information on a change of the frame."""
     track = noisy_track()
     blind = replace(track, samples=track.samples.assign(down_m=np.nan))
@@ -352,7 +352,7 @@ def test_continuous_state_keeps_unmeasured_resets():
 @pytest.mark.parametrize(("reset_s", "said"), [
     (0.5, ""), (1.0, ""), (1.1, "kept"), (17.9, "kept"), (18.0, "kept"), (18.5, ""),
 ])  # fmt: skip
-def test_continuous_state_ignores_resets_outside_segment(reset_s, said):
+def test_ekf2_resets_outside_the_segment_change_no_state(reset_s, said):
     """A reset at the start defines the frame; one at the end affects the last sample only."""
     ekf2 = ekf2_of(np.zeros(3), [Reset(reset_s, "position", (5.0, 5.0, 0.0))])
     state, statement = continuous_state(ekf2, noisy_track(), Segment(1.0, 18.0, ""))
@@ -365,7 +365,7 @@ def test_continuous_state_ignores_resets_outside_segment(reset_s, said):
     ("across_m", "heading_deg", "called"),
     [(1.0, None, "the aisle"), (4.0, None, "the main direction"), (4.0, 30.0, "the aisle")],
 )
-def test_axis_label_depends_on_elongation_and_heading(across_m, heading_deg, called) -> None:
+def test_axis_label_says_aisle_only_for_elongated_track(across_m, heading_deg, called) -> None:
     """The track is an ellipse 10 m long; an aisle needs at least three times the width."""
     flight = aisle_flight(uwb=Uwb(sigma_m=0.01))
     (track,) = flight.positions

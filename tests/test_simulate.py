@@ -40,7 +40,7 @@ IDEAL = {
 
 
 @pytest.mark.parametrize("record", [Scenario, Mistakes])
-def test_scenario_and_mistakes_numbers_have_bounds(record) -> None:
+def test_simulation_parameters_all_have_limits(record) -> None:
     numbers = {item.name for item in fields(record) if {"int", "float"} & {*str(item.type).split()}}
     numbers |= {item.name for item in fields(record) if item.type in (int, float)}
     assert set(quantities(record)) == numbers
@@ -60,7 +60,7 @@ def stamps_s(simulation):
 
 @pytest.mark.parametrize("scenario", [AISLE, LOOP, FOLLOWING], ids=["aisle", "loop", "follow"])
 class TestMotion:
-    def test_derivatives_integrate_to_values(self, scenario):
+    def test_simulated_velocity_integrates_to_position(self, scenario):
         motion = motion_of(scenario)
         time = np.linspace(0.0, motion.duration_s, 40_001)
         state = motion.at(time)
@@ -75,7 +75,7 @@ class TestMotion:
         turned = cumulative_simpson(state.yaw_rate_rad_s, x=time, initial=0)
         assert np.allclose(state.yaw_rad, state.yaw_rad[0] + turned, atol=1e-6)
 
-    def test_start_and_end_are_at_rest_on_ground(self, scenario):
+    def test_simulated_flight_starts_and_ends_at_rest_on_ground(self, scenario):
         motion = motion_of(scenario)
         time = np.array([0.0, motion.take_off_s, motion.touch_down_s + 1e-6, motion.duration_s])
         state = motion.at(time)
@@ -83,7 +83,7 @@ class TestMotion:
         assert np.allclose(state.acceleration_m_s2, 0.0, atol=1e-9)
         assert np.allclose(state.position_m[:, 2], 0.0, atol=1e-9)
 
-    def test_attitude_matches_acceleration_and_rates(self, scenario):
+    def test_simulated_attitude_matches_acceleration_and_rates(self, scenario):
         motion = motion_of(scenario)
         # the jerk has small steps at the ends of the fade
         time = np.linspace(0.0, motion.duration_s, 20_001)
@@ -100,7 +100,7 @@ class TestMotion:
 
 
 @pytest.mark.parametrize(("left_out", "texts"), [(0.0, []), (2.5, ["open-end=2.5m"])])
-def test_loop_open_end_equals_closure_error(left_out, texts):
+def test_simulated_open_end_equals_loop_closure_error(left_out, texts):
     scenario = replace(LOOP, passes=2)
     flown = simulate(scenario, parse(texts))
     first, last = flown.motion.at(np.array([0.0, flown.motion.duration_s])).position_m
@@ -111,7 +111,7 @@ def test_loop_open_end_equals_closure_error(left_out, texts):
 
 
 @pytest.mark.parametrize("yaw", ["fixed", "follow"])
-def test_aisle_path_has_length_and_yaw_mode(yaw):
+def test_simulated_aisle_path_has_given_length_and_yaw_mode(yaw):
     motion = motion_of(replace(AISLE, wander_m=0.0, yaw=yaw))
     state = motion.at(np.linspace(0.0, motion.duration_s, 5001))
     assert (state.position_m @ direction(30.0)).max() == pytest.approx(12.0, abs=1e-9)
@@ -129,7 +129,7 @@ def test_aisle_path_has_length_and_yaw_mode(yaw):
 
 
 @pytest.mark.parametrize("texts", [[], ["vibration=0.5"]])
-def test_imu_noise_averaged_over_dt_is_sigma_a(texts):
+def test_simulated_imu_noise_averaged_over_dt_equals_sigma_a(texts):
     scenario = Scenario(seed=3, passes=4, wander_m=0.0, **IDEAL)
     simulation = simulate(scenario, parse(texts))
     imu = to_flight(simulation).imu
@@ -146,7 +146,7 @@ def test_imu_noise_averaged_over_dt_is_sigma_a(texts):
         assert np.std(mean) == pytest.approx(expected, rel=0.07)
 
 
-def test_biases_are_constant_with_given_sigma():
+def test_simulated_imu_biases_are_constant_with_given_sigma():
     simulation = simulate(Scenario(seed=9))
     imu = to_flight(simulation).imu
     truth = attitude(simulation.motion.at(imu.index.to_numpy()))
@@ -160,7 +160,7 @@ def test_biases_are_constant_with_given_sigma():
     assert np.std([b[1] for b in drawn]) == pytest.approx(0.002, rel=0.1)
 
 
-def test_vio_drift_has_given_rate_and_random_walk():
+def test_simulated_vio_drift_has_given_rate():
     ends = []
     for seed in range(40):
         scenario = Scenario(kind="loop", passes=1, length_m=8.0, seed=seed, sigma_vio_m=0.0)
@@ -184,7 +184,7 @@ class TestMistakes:
     @pytest.mark.parametrize(("text", "offset_s", "share"), [
         ("clock-offset=80ms", 0.08, 0), ("clock-drift=500ppm", 0, 5e-4),
     ])  # fmt: skip
-    def test_clock_error_shifts_only_timestamps(self, text, offset_s, share):
+    def test_simulated_clock_error_shifts_only_timestamps(self, text, offset_s, share):
         late = simulate(UNFILTERED, parse([text]))
         time = late.positions.measured_s
         assert np.allclose(stamps_s(late) - time, offset_s + share * time, atol=1e-6)
@@ -192,7 +192,7 @@ class TestMistakes:
         assert np.array_equal(*arrivals)
         assert answer(late)["truth"]["clock_offset_to_add_s"] == -offset_s
 
-    def test_clock_jump_ends_at_timesync_convergence(self):
+    def test_simulated_clock_jump_ends_at_timesync_convergence(self):
         jumping = simulate(Scenario(seed=4), parse(["clock-jump=0.25"]))
         fields, time = jumping.positions.topic.fields, jumping.positions.measured_s
         before = time < 50.0
@@ -202,7 +202,7 @@ class TestMistakes:
         assert np.mean(late[before]) == pytest.approx(0.25, abs=1e-3)
         assert np.allclose(late[~before], 0.0, atol=1e-6)
 
-    def test_nlos_has_exact_fraction_in_bursts(self):
+    def test_simulated_nlos_outliers_have_exact_fraction(self):
         simulation = simulate(Scenario(seed=6, sigma_uwb_m=0.0), parse(["nlos=5%,3m"]))
         outlier, motion = simulation.positions.is_outlier, simulation.motion
         time = simulation.positions.measured_s
@@ -222,7 +222,7 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("text", "start", "end"), [("dropout=6s,12s", 12.0, 18.0), ("dropout=6", None, None)]
     )
-    def test_dropout_removes_source_samples(self, text, start, end):
+    def test_simulated_dropout_removes_position_samples(self, text, start, end):
         with_gap = simulate(UNFILTERED, parse([text]))
         middle = with_gap.motion.duration_s / 2.0
         start, end = start or middle - 3.0, end or middle + 3.0
@@ -231,7 +231,7 @@ class TestMistakes:
         assert np.array_equal(with_gap.positions.measured_s, remaining)
 
     @pytest.mark.parametrize("rate", [2.0, 4.0])
-    def test_decimation_keeps_remaining_samples(self, rate):
+    def test_simulated_decimation_reduces_position_and_imu_rate(self, rate):
         mistakes = parse([f"decimate={rate}Hz", f"imu-rate={10 * rate}", "imu-dropout=2s,10s"])
         decimated, clean = (to_flight(s) for s in (simulate(AISLE, mistakes), self.CLEAN))
         samples = decimated.positions[0].samples
@@ -243,7 +243,7 @@ class TestMistakes:
         assert intervals.max() == pytest.approx(2.0, abs=0.1 / rate)
         assert len(decimated.attitude) == len(clean.attitude)
 
-    def test_smoothed_positions_lag_by_time_constant(self):
+    def test_simulated_low_pass_positions_lag_by_time_constant(self):
         scenario = Scenario(seed=4, sigma_uwb_m=0.0, uwb_rate_hz=50.0, wander_m=0.0)
         simulation = simulate(scenario, parse(["smoothed=0.5s"]))
         truth = simulation.motion.at(simulation.positions.measured_s)
@@ -256,7 +256,7 @@ class TestMistakes:
         noisy = simulate(replace(AISLE, ekf2=False), parse(["smoothed=1s"])).positions.error_m
         assert np.std(noisy[:25]) < 0.07  # on the ground; 0.10 m without the filter
 
-    def test_mistake_no_vvo_removes_position_source(self):
+    def test_no_vvo_mistake_removes_vehicle_visual_odometry(self):
         remaining = to_flight(simulate(AISLE, parse(["no-vvo"]))).positions
         assert [round(track.rate_hz) for track in remaining] == [2, 2]
         flight = to_flight(simulate(replace(AISLE, ekf2=False), parse(["no-vvo"])))
@@ -273,12 +273,12 @@ class TestMistakes:
     ("accel-bias=.5m/s²", "accel_bias_m_s2", 0.5),
     ("no-motion", "no_motion", True),
 ])  # fmt: skip
-def test_parse_mistake_converts_units(text, field, value):
+def test_parse_mistake_option_converts_units(text, field, value):
     assert getattr(parse([text]), field) == pytest.approx(value)
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_format_mistake_default_is_parsed_again(name):
+def test_formatted_mistake_option_is_parsed_to_same_mistake(name):
     parsed = parse([name])
     assert active_mistakes(parsed) == (name,)
     assert parse([format_mistake(name, parsed)]) == parsed
@@ -296,7 +296,7 @@ def test_format_mistake_default_is_parsed_again(name):
     ("clock-offset=", "give seconds"),
     ("no-motion=1", "give no-motion"),
 ])  # fmt: skip
-def test_parse_mistake_invalid_text_raises_one_line(text, expected):
+def test_parse_invalid_mistake_option_raises_one_line_error(text, expected):
     with pytest.raises(SettingsError, match=expected) as error:
         parse([text])
     assert "\n" not in str(error.value)
@@ -306,7 +306,7 @@ def test_parse_mistake_invalid_text_raises_one_line(text, expected):
     {"kind": "spiral"}, {"yaw": "spin"}, {"passes": 0}, {"speed_m_s": float("nan")},
     {"length_m": 2.0, "speed_m_s": 4.0}, {"seed": -1},
 ])  # fmt: skip
-def test_scenario_invalid_values_raise_error(changes):
+def test_simulation_scenario_with_invalid_value_raises_error(changes):
     with pytest.raises(SettingsError):
         Scenario(**changes)
 
@@ -317,7 +317,7 @@ def test_scenario_invalid_values_raise_error(changes):
     (Scenario(passes=100, length_m=100.0), [], "limited to 3600 s"),
     (AISLE, ["dropout=600s,0s"], "vehicle_visual_odometry contains no data"),
 ])  # fmt: skip
-def test_simulate_unsuitable_mistake_raises_error(scenario, texts, expected):
+def test_simulate_with_unsuitable_mistake_raises_error(scenario, texts, expected):
     with pytest.raises(SettingsError, match=expected):
         simulate(scenario, parse(texts))
 
@@ -325,7 +325,7 @@ def test_simulate_unsuitable_mistake_raises_error(scenario, texts, expected):
 # --- ULog and memory
 
 
-def test_to_ulog_contains_no_mistake_names():
+def test_simulated_ulog_contains_no_names_of_mistakes():
     texts = [name for name, one in MISTAKES.items() if "aisle" in one.kinds and name != "no-vvo"]
     content = to_ulog(simulate(AISLE, parse(texts)))
     for name in (*MISTAKES, *(field for mistake in MISTAKES.values() for field in mistake.fields)):
@@ -353,7 +353,7 @@ def nis(scenario, names=("north", "east", "down")):
 @pytest.mark.parametrize(("errors", "off", "share"), [
     ({}, np.inf, 0.75), (IDEAL, 0.03, 0.88),
 ], ids=["usual", "ideal"])  # fmt: skip
-def test_kf_true_noises_is_consistent(errors, off, share):
+def test_kf_with_true_noises_is_consistent(errors, off, share):
     values, inside = [], []
     for seed in range(14):
         found, (low, high) = nis(Scenario(seed=seed, passes=4, **errors))
@@ -364,7 +364,7 @@ def test_kf_true_noises_is_consistent(errors, off, share):
 
 
 @pytest.mark.parametrize("scenario", [Scenario(seed=7, passes=4), LOOP], ids=["aisle", "loop"])
-def test_findings_clean_flight_are_notes_only(scenario):
+def test_simulated_clean_flight_has_only_notes_as_findings(scenario):
     """The VIO of a loop drifts, which is not a mistake; its effect on the filters is reported."""
     settings = Settings(sigma_a_m_s2=0.2, sigma_z_m=scenario.source_sigma_m)
     compared = compare(simulate_flight(scenario), settings)
@@ -379,7 +379,7 @@ def test_findings_clean_flight_are_notes_only(scenario):
 # --- the command
 
 
-def test_simulate_command_is_reproducible_with_answer(tmp_path):
+def test_simulate_command_with_same_seed_is_reproducible(tmp_path):
     log, answer_path, again = (tmp_path / name for name in ("s07.ulg", "s07.json", "again.ulg"))
     options = ("--seed", 7, "--passes", 1, "--mistake", "nlos=5%", "--mistake", "clock-offset=80ms")
     assert (

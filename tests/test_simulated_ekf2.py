@@ -61,7 +61,7 @@ def clean() -> Flight:
 # --- the model from take-off on
 
 
-def test_simulated_ekf2_clean_flight_agrees_with_replay(clean):
+def test_simulated_ekf2_of_clean_flight_agrees_with_replay(clean):
     found = agreement(clean)
     assert found.good
     assert found.decisions_same == 1.0
@@ -78,7 +78,7 @@ def test_simulated_ekf2_clean_flight_agrees_with_replay(clean):
     (("ekf2-delay=175ms",), AISLE),
     ((), Scenario(kind="loop", passes=1, seed=5)),
 ], ids=["outliers", "delay", "loop"])  # fmt: skip
-def test_simulated_ekf2_mistakes_agree_with_replay(texts, scenario):
+def test_simulated_ekf2_with_mistakes_agrees_with_replay(texts, scenario):
     found = agreement(flown(*texts, scenario=scenario))
     assert found.good
     assert found.decisions_same > 0.99
@@ -87,7 +87,7 @@ def test_simulated_ekf2_mistakes_agree_with_replay(texts, scenario):
         assert axis.s_ratio_median == pytest.approx(1.0, abs=0.01)
 
 
-def test_simulated_ekf2_clean_flights_are_consistent():
+def test_simulated_ekf2_of_clean_flights_is_consistent():
     values, inside, errors, stated = [], [], [], []
     for seed in range(8):
         flight = flown(scenario=Scenario(passes=2, seed=seed))
@@ -120,7 +120,7 @@ def test_simulated_ekf2_delayed_state_is_consistent(clean):
     assert last["accelerometer_bias_down_m_s2"] == pytest.approx(bias[2], abs=0.05)
 
 
-def test_initial_state_at_rest_levels_attitude():
+def test_simulated_ekf2_start_at_rest_levels_attitude():
     tilt = Rotation.from_euler("x", 0.1).as_matrix()
     gravity = np.array([0.0, 0.0, 9.80665])
     bias, rate = np.array([0.03, -0.02, 0.05]), np.array([0.002, -0.001, 0.003])
@@ -135,7 +135,7 @@ def test_initial_state_at_rest_levels_attitude():
     assert abs(P[0, 13]) / deviation[0] / deviation[13] > 0.95
 
 
-def test_simulated_ekf2_slow_source_stops_and_resets():
+def test_simulated_ekf2_stops_fusing_a_slow_source():
     slow = flown("decimate=2Hz")
     fusing = slow.ekf2.fusing
     assert not fusing["horizontal"].any()
@@ -156,7 +156,7 @@ def test_simulated_ekf2_slow_source_stops_and_resets():
     assert moved == pytest.approx(resets[0].delta[0], abs=0.3)
 
 
-def test_simulated_ekf2_late_samples_are_not_fused():
+def test_simulated_ekf2_does_not_fuse_late_samples():
     early = flown("clock-offset=-350ms")
     compared = compare(early, RIGHT, axes=("north",))
     (finding,) = (f for f in find(unexplained(compared)) if f.id == "ekf2_not_fusing")
@@ -165,14 +165,14 @@ def test_simulated_ekf2_late_samples_are_not_fused():
     assert "EKF2_DELAY_MAX" in finding.remedy
 
 
-def test_samples_per_step_rounds_to_nearest():
+def test_imu_samples_per_ekf2_step_are_rounded_to_nearest():
     found = [samples_per_step(0.01, t) for t in (0.00375, 0.004, 0.005, 0.0021, 0.05)]
     assert found == [3, 3, 2, 5, 1]
     # a median of timestamps is never exactly 4 ms
     assert samples_per_step(0.01, 0.004 + 1e-12) == samples_per_step(0.01, 0.004 - 1e-12) == 3
 
 
-def test_samples_per_step_at_half_is_taken_from_log():
+def test_imu_samples_per_ekf2_step_at_half_follow_the_log():
     """EKF2 rounds a measured mean: 2.5 samples become two or three."""
     by_two, by_three = 2 * np.arange(0, 60, 7), 3 * np.arange(0, 60, 7)
     ends = by_two, by_three, [5], [0, 25, 50]
@@ -183,7 +183,7 @@ def test_samples_per_step_at_half_is_taken_from_log():
     assert samples_per_step(0.01, 0.00375, by_two) == 3
 
 
-def test_simulated_ekf2_ignores_older_timestamps():
+def test_simulated_ekf2_ignores_samples_with_older_timestamps():
     simulation = simulate(Scenario(passes=4, seed=5), parse(["clock-jump=400ms"]))
     topics = {topic.name: topic.fields for topic in simulation.topics}
     sent = topics["vehicle_visual_odometry"]["timestamp_sample"].astype(np.int64)
@@ -198,7 +198,7 @@ def test_simulated_ekf2_ignores_older_timestamps():
 # --- mistakes in EKF2 parameters
 
 
-def test_simulated_ekf2_disabled_fusion_holds_position(clean):
+def test_simulated_ekf2_holds_position_if_fusion_is_disabled(clean):
     flight = flown("ekf2-off")
     assert flight.log.parameters["EKF2_EV_CTRL"] == 0.0
     assert flight.ekf2.fusing["horizontal"].max() == 0.0
@@ -215,7 +215,7 @@ def test_simulated_ekf2_disabled_fusion_holds_position(clean):
 # --- the log
 
 
-def test_simulated_log_notes_ekf2_model(clean, tmp_path):
+def test_simulated_log_notes_that_ekf2_is_simulated(clean, tmp_path):
     path = tmp_path / "flight.ulg"
     path.write_bytes(to_ulog(simulate(AISLE)))
     assert read_log(path).log.notes == clean.log.notes == (MODEL_NOTE,)

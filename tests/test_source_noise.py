@@ -79,7 +79,7 @@ LOUDER, SCALED = partial(errors.two_levels, factor=6.0), partial(errors.scaled, 
 PASSES = {UNEQUAL: 5, LOUDER: 5, SCALED: 5}
 
 
-def test_find_white_noise_returns_nothing() -> None:
+def test_white_position_noise_has_no_finding() -> None:
     analysis = analysed(errors.white)
     assert root_findings(analysis) == {}
     assert list(detect(analysis)) == []
@@ -101,7 +101,9 @@ def test_find_white_noise_returns_nothing() -> None:
         (LOUDER, "source_noise_varies", "error", {"ratio": (6.0, 1.3)}),
     ],
 )  # fmt: skip
-def test_find_noise_model_reports_kind_and_size(model, name, severity, evidence) -> None:
+def test_simulated_position_noise_is_found_with_type_and_size(
+    model, name, severity, evidence
+) -> None:
     found = root_findings(analysed(model))
     assert set(found) == {name}
     assert found[name].severity == severity
@@ -109,7 +111,7 @@ def test_find_noise_model_reports_kind_and_size(model, name, severity, evidence)
         assert found[name].evidence[key] == pytest.approx(value, abs=within)
 
 
-def test_noise_variation_reports_the_noisy_third() -> None:
+def test_noise_variation_finding_names_noisy_third_of_flight() -> None:
     analysis = analysed(LOUD)
     ((start, end),) = root_findings(analysis)["source_noise_varies"].spans_s
     time = analysis.axes["north"].axis.measurement_time_s
@@ -118,7 +120,7 @@ def test_noise_variation_reports_the_noisy_third() -> None:
     assert end == pytest.approx(time[0] + 2.0 * third, abs=third / 3.0)
 
 
-def test_find_separates_correlated_noise_from_low_pass() -> None:
+def test_correlated_noise_is_distinguished_from_low_pass() -> None:
     slow, smooth = analysed(SLOW), analysed(SMOOTH)
     assert "source_low_pass_filtered" not in {one.id for one in find(slow)}
     assert "source_noise_time_correlated" not in {one.id for one in find(smooth)}
@@ -130,7 +132,7 @@ def test_find_separates_correlated_noise_from_low_pass() -> None:
         assert 0.5 < found.share <= 1.0
 
 
-def test_find_other_mistakes_report_no_noise_kind() -> None:
+def test_outliers_and_jumps_are_not_reported_as_correlated_noise() -> None:
     for model, name in (
         (partial(errors.with_outliers, share=0.05), "source_outliers"),
         (partial(errors.jumped, size=1.0), "source_position_jump"),
@@ -145,7 +147,9 @@ def test_find_other_mistakes_report_no_noise_kind() -> None:
     ("model", "sigma_z_m", "contradicts"),
     [(partial(errors.coloured, tau_s=20.0), 0.10, True), (errors.white, 0.14, False)],
 )
-def test_rerun_smaller_noise_is_checked_against_truth(model, sigma_z_m, contradicts) -> None:
+def test_filter_rerun_with_smaller_noise_is_checked_with_truth(
+    model, sigma_z_m, contradicts
+) -> None:
     """The estimate is 0.7 SIGMA_Z in both cases; the first one has time-correlated errors too."""
     analysis = analysed(model, truth_for=sigma_z_m)
     tried = [
@@ -160,7 +164,7 @@ def test_rerun_smaller_noise_is_checked_against_truth(model, sigma_z_m, contradi
 
 
 @pytest.mark.parametrize(("tau_s", "seed"), [(5.0, 1), (20.0, 2)])
-def test_find_slow_errors_with_truth_reports_correlation(tau_s: float, seed: int) -> None:
+def test_slow_position_errors_are_found_with_ground_truth(tau_s: float, seed: int) -> None:
     """Correlation times of IMU errors, so the innovations do not show them."""
     analysis = analysed(partial(errors.coloured, tau_s=tau_s), 5.0, seed, truth_for=0.10)
     found = root_findings(analysis)
@@ -189,14 +193,12 @@ def test_find_slow_errors_with_truth_reports_correlation(tau_s: float, seed: int
         (partial(errors.low_pass, tau_s=0.3), "source_low_pass_filtered"),
     ],
 )
-def test_find_other_mistakes_with_truth_report_no_correlation(
-    model: errors.Model, name: str
-) -> None:
+def test_scale_error_is_not_reported_as_correlated_noise(model: errors.Model, name: str) -> None:
     analysis = analysed(model, truth_for=0.10)
     assert set(root_findings(analysis)) == {name}
 
 
-def test_find_small_clock_jump_reports_no_correlation() -> None:
+def test_small_clock_jump_is_not_reported_as_correlated_noise() -> None:
     """Errors along the motion after the jump are correlated in time against ground truth."""
     changes = partial(errors.clock_jump, late=0.15)
     assert "source_noise_time_correlated" not in root_findings(
@@ -204,7 +206,7 @@ def test_find_small_clock_jump_reports_no_correlation() -> None:
     )
 
 
-def test_find_low_pass_reports_lag_below_time_constant() -> None:
+def test_low_pass_finding_states_lag_below_time_constant() -> None:
     """Expected lag for steady motion: Δt ρ / (1 - ρ)."""
     found = root_findings(analysed(SMOOTH, 5.0))["source_low_pass_filtered"]
     assert found.evidence["lag_s"] == pytest.approx(0.2 / (np.exp(0.2 / 0.5) - 1.0), abs=0.06)
@@ -220,7 +222,7 @@ def test_find_low_pass_reports_lag_below_time_constant() -> None:
         ("10hz", UNEQUAL, 1107, "source_noise_unequal_axes"),
     ],
 )
-def test_find_px4_flight_reports_only_the_added_mistake(
+def test_sitl_flight_with_added_error_has_only_its_finding(
     shared_logs, name, model, seed, finding
 ) -> None:
     log = shared_logs / "simulated" / f"v1.16.1_aisle_{name}.ulg"
@@ -229,14 +231,14 @@ def test_find_px4_flight_reports_only_the_added_mistake(
     assert set(root_findings(explain(compare(flight, RIGHT, axes=("north", "east"))))) == {finding}
 
 
-def test_noise_variation_fused_outliers_are_not_reported() -> None:
+def test_fused_outliers_are_not_reported_as_noise_variation() -> None:
     """At 2 Hz outliers pull KF away, so most innovations within 13 s are large."""
     analysis = analysed(partial(errors.with_outliers, share=0.05), 2.0, seed=13)
     assert {"source_outliers"} == set(root_findings(analysis))
     assert list(detect_noise_variation(analysis)) == []
 
 
-def test_time_correlation_few_samples_or_no_imu_is_unavailable() -> None:
+def test_time_correlation_fit_without_imu_is_unavailable() -> None:
     analysis = analysed(MIXED)
     axis, given = analysis.axes["north"].axis, {"outlier_time_s": NONE, "clock_offset_s": 0.0}
     few = replace(axis, measurement_time_s=axis.measurement_time_s[:99],
@@ -266,7 +268,7 @@ def test_time_correlation_fit_tries_zero_and_estimated_offset(
     assert tried[::2] == tried[1::2] == [[0.0], [0.0, 0.3], [-0.2, 0.0]]
 
 
-def test_find_correlated_noise_with_outliers_reports_both() -> None:
+def test_correlated_noise_and_outliers_are_both_reported() -> None:
     """Jumps and outliers are removed before the correlation is estimated."""
     assert {"source_position_jump", "source_noise_time_correlated"} <= set(
         root_findings(analysed(partial(both, jump_m=2.0)))
@@ -283,7 +285,7 @@ def both(rng: Any, time: Any, true: Any, jump_m: float = 0.0, outliers: float = 
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_find_jump_among_outliers_reports_one_jump(seed: int) -> None:
+def test_position_jump_among_outliers_is_reported_once(seed: int) -> None:
     """Outliers in the seconds after the jump must not hide it."""
     kept: dict[str, float] = {}
 

@@ -149,5 +149,5 @@ def test_docstrings_begin_with_an_imperative_or_noun() -> None:
         ("errors against ground truth", False),
     ],
 )
-def test_rejected_phrases_match_examples(text: str, is_rejected: bool) -> None:
+def test_rejected_phrase_patterns_match_their_examples(text: str, is_rejected: bool) -> None:
     assert any(phrase.pattern.search(text) for phrase in PHRASES) == is_rejected

@@ -60,7 +60,7 @@ def single_submission(path: Path) -> Submission:
 # ------------------------------------------------------------------ search
 
 
-def test_find_submissions_searches_folders_and_sorts(tmp_path):
+def test_find_submissions_searches_folders_recursively(tmp_path):
     for name in ("b/report.pdf", "A/Report.PDF", "c.pdf", "notes.docx", "b/log.ulg", "x.docx"):
         write(tmp_path / name, PDF)
     for name in (".hidden.pdf", "__MACOSX/x.pdf", ".git/x.pdf"):
@@ -89,11 +89,11 @@ def test_find_submissions_searches_folders_and_sorts(tmp_path):
         ("flight_lab_reports_2026/r.pdf", ("", "")),
     ],
 )  # fmt: skip
-def test_parse_origin_uses_platform_part_of_name(name, is_):
+def test_student_name_is_read_from_platform_part_of_file_name(name, is_):
     assert name_and_number(name) == is_
 
 
-def test_parse_origin_reads_login_time_and_late_mark():
+def test_submission_file_name_gives_login_time_and_late_mark():
     blackboard = parse_origin("Lab 3_roe1_attempt_2026-11-20-12-34-56_Lab_doe1_attempt_x.pdf")
     assert (blackboard.person.login, blackboard.platform) == ("roe1", "blackboard")
     assert parse_origin("Lab_roe1_attempt_2026-99-20-12-34-56_r.pdf").time is None
@@ -120,7 +120,7 @@ submission_31:
 """
 
 
-def test_add_origins_forged_name_keeps_platform_and_time():
+def test_forged_submission_name_does_not_change_platform():
     """The student's part of the name contains a second time, or a name as from Moodle."""
     usual = [f"Lab_user{n}_attempt_2026-11-20-11-00-0{n}_r.pdf" for n in range(3)]
     forged = [
@@ -157,7 +157,7 @@ def test_find_submissions_reads_gradescope_metadata(tmp_path):
         assert found.origin.time.isoformat() == "2026-11-20T22:59:01.123456+00:00"
 
 
-def test_find_submissions_unreadable_metadata_is_noted(tmp_path):
+def test_find_submissions_notes_unreadable_gradescope_metadata(tmp_path):
     bomb = zipped({"submission_metadata.yml": b" " * 5_000_000, "submission_3.pdf": PDF})
     (found,), (note,) = find_submissions([write(tmp_path / "export.zip", bomb)])
     assert found.origin.person == Person("", numbers={"gradescope": "3"})
@@ -166,7 +166,7 @@ def test_find_submissions_unreadable_metadata_is_noted(tmp_path):
     )
 
 
-def test_find_submissions_keeps_zip_entry_times(tmp_path):
+def test_find_submissions_keeps_times_of_zip_entries(tmp_path):
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         archive.writestr(zipfile.ZipInfo("a.pdf", (2026, 11, 20, 12, 34, 56)), PDF)
@@ -176,7 +176,7 @@ def test_find_submissions_keeps_zip_entry_times(tmp_path):
     assert times == {"a.pdf": "2026-11-20T12:34:56", "b.pdf": None}
 
 
-def test_find_submissions_zip_inside_export_is_not_opened(tmp_path):
+def test_find_submissions_does_not_open_zip_inside_export(tmp_path):
     name = "Roe_1_assignsubmission_file_/work.zip"
     handed_in = zipped({"report.pdf": PDF, "more.zip": zipped({"deep.pdf": PDF})})
     export = write(tmp_path / "all.zip", zipped({name: handed_in, "log.ulg": b""}))
@@ -196,7 +196,7 @@ def test_find_submissions_zip_inside_export_is_not_opened(tmp_path):
     assert (again.name, again.zip_entry) == (name, "")
 
 
-def test_find_submissions_80_files_are_found(tmp_path):
+def test_find_submissions_finds_80_files_in_one_zip(tmp_path):
     class_ = {f"N_{n}_assignsubmission_file_/r.pdf": PDF for n in range(80)}
     assert len(find_submissions([write(tmp_path / "class.zip", zipped(class_))])[0]) == 80
 
@@ -210,7 +210,7 @@ def test_find_submissions_without_pdf_raises_error(tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_find_submissions_damaged_zip_is_skipped_with_note(tmp_path):
+def test_find_submissions_skips_damaged_zip_with_note(tmp_path):
     bad = write(tmp_path / "bad.zip", b"PK" + bytes(100))
     good = write(tmp_path / "good.zip", zipped({"a.pdf": PDF}))
     found, notes = find_submissions([bad, good])
@@ -237,7 +237,7 @@ def test_find_submissions_ignores_links_and_special_files(tmp_path):
     )
 
 
-def test_find_submissions_1500_nested_folders_are_searched(tmp_path):
+def test_find_submissions_searches_1500_nested_folders(tmp_path):
     """Deeper than Python's recursion limit."""
     folders = [tmp_path / "in" / ("d/" * depth) for depth in range(1_500)]
     for folder in folders:
@@ -259,7 +259,7 @@ def test_find_submissions_1500_nested_folders_are_searched(tmp_path):
 # ------------------------------------------------------------------ names
 
 
-def test_find_submissions_cleans_names_and_writes_nothing(tmp_path):
+def test_find_submissions_cleans_file_names(tmp_path):
     shown_as = {
         "../../../etc/x.pdf": "etc/x.pdf",
         "C:\\Windows\\system32\\y.pdf": "Windows/system32/y.pdf",
@@ -279,7 +279,7 @@ def test_find_submissions_cleans_names_and_writes_nothing(tmp_path):
 # ------------------------------------------------------------------ bounds
 
 
-def test_read_too_large_file_is_rejected_in_bounded_memory(tmp_path):
+def test_submission_above_size_limit_is_rejected_without_reading(tmp_path):
     path = tmp_path / "large.pdf"
     with path.open("wb") as file:
         file.truncate(500_000_000)  # sparse file
@@ -291,7 +291,7 @@ def test_read_too_large_file_is_rejected_in_bounded_memory(tmp_path):
     assert peak < 3 * MAX_BYTES
 
 
-def test_read_zip_bomb_or_wrong_size_is_rejected(tmp_path, monkeypatch):
+def test_submission_with_zip_bomb_is_rejected(tmp_path, monkeypatch):
     packed = zipped({"bomb.pdf": bytes(20_000_000)})
     path = write(tmp_path / "x.zip", packed)
     assert "compressed more than 100 times" in reason(single_submission(path))
@@ -313,7 +313,7 @@ def test_read_zip_bomb_or_wrong_size_is_rejected(tmp_path, monkeypatch):
         ("MAX_DIRECTORY_BYTES", 100, "damaged"),
     ],
 )
-def test_find_submissions_zip_beyond_limits_is_skipped(tmp_path, monkeypatch, limit, value, said):
+def test_find_submissions_skips_zip_beyond_size_limits(tmp_path, monkeypatch, limit, value, said):
     path = write(tmp_path / "x.zip", zipped({f"{n}.pdf": bytes(100) for n in range(4)}))
     other = write(tmp_path / "y.pdf", PDF)
     monkeypatch.setattr(submissions, limit, value)
@@ -322,7 +322,7 @@ def test_find_submissions_zip_beyond_limits_is_skipped(tmp_path, monkeypatch, li
     assert any(note.startswith("x.zip: ignored: ") and said in note for note in notes)
 
 
-def test_read_unsupported_zip_entry_states_reason(tmp_path):
+def test_read_submission_from_unsupported_zip_states_reason(tmp_path):
     link = zipfile.ZipInfo("link.pdf")
     link.external_attr = 0o120777 << 16
     out = io.BytesIO()
@@ -348,7 +348,7 @@ def test_read_unsupported_zip_entry_states_reason(tmp_path):
     assert reason(by_name["same.pdf"]).endswith("(No such file or directory).")
 
 
-def test_find_submissions_equal_names_are_numbered(tmp_path):
+def test_find_submissions_makes_equal_file_names_unique(tmp_path):
     for folder in "abc":
         write(tmp_path / folder / "Report.pdf", folder.encode())
     folders = [tmp_path / folder for folder in "abc"]
@@ -362,7 +362,7 @@ def test_find_submissions_equal_names_are_numbered(tmp_path):
     assert [each.name for each in found] == ["Müller.pdf", "Zoë.pdf"]
 
 
-def test_find_submissions_mutated_zip_is_read_or_rejected(tmp_path):
+def test_find_submissions_on_fuzzed_zip_raises_no_exception(tmp_path):
     rng = random.Random(6)
     whole = zipped({"a/report.pdf": PDF * 20, "b.zip": zipped({"c.pdf": PDF}), "d.txt": b""})
     path = tmp_path / "x.zip"

@@ -71,7 +71,7 @@ def document(sample_log: Path) -> tuple[Analysis, ComparisonResults]:
     return analysis, results(request, analysis)
 
 
-def test_summary_wraps_without_cutting_text(document, monkeypatch) -> None:
+def test_terminal_summary_wraps_without_cutting_text(document, monkeypatch) -> None:
     summaries: dict[int | None, str] = {}  # by terminal width; None is a pipe
     for width in (WIDTH, 60, None):
         monkeypatch.delenv("COLUMNS", raising=False)
@@ -100,14 +100,14 @@ def test_summary_wraps_without_cutting_text(document, monkeypatch) -> None:
     assert max(map(len, whole.splitlines()[len(first) :])) > card_text.WIDTH
 
 
-def test_paragraph_has_hanging_indent(capsys) -> None:
+def test_terminal_paragraph_has_hanging_indent(capsys) -> None:
     console = Console(width=30, highlight=False)
     print_paragraph(console, "one two three four five six seven", "Label", 9)
     lines = ["Label    one two three four", "         five six seven"]
     assert capsys.readouterr().out.splitlines() == lines
 
 
-def test_text_modules_do_not_import_matplotlib() -> None:
+def test_text_output_modules_do_not_import_matplotlib() -> None:
     """Importing matplotlib takes 0.3 s, which text-only commands such as `sync` save."""
     modules = ", ".join(f"px4fuse.report.{n}" for n in ("terminal", "loop", "whatif", "evaluation"))
     code = f"import sys, {modules}; sys.exit('matplotlib' in sys.modules)"
@@ -117,7 +117,7 @@ def test_text_modules_do_not_import_matplotlib() -> None:
 # --- commands ready to paste ---
 
 
-def test_expand_commands_adds_typed_files_and_options() -> None:
+def test_printed_commands_contain_typed_files_and_options() -> None:
     request = ComparisonRequest(
         log="my flights/a'b.ulg", mavlink="-t.tlog", position=PositionFile(path="u w/b.csv"),
         start_s=12.5, sigma_z_m=0.3,
@@ -147,7 +147,7 @@ def test_expand_commands_adds_typed_files_and_options() -> None:
     ["compare {log} --sigma-z 0.5", "tune {log} --axis north --start 8", "sync {log} --dt 0.05",
      "info {log}"],
 )  # fmt: skip
-def test_printed_commands_run_when_pasted(desk, monkeypatch, typed) -> None:
+def test_printed_command_lines_run_when_pasted_in_a_shell(desk, monkeypatch, typed) -> None:
     monkeypatch.chdir(desk.parent)  # the typed path then contains blanks and a quote
     words = shlex.split(typed.format(log=shlex.quote(f"{desk.name}/l.ulg")))
     printed = commands(run_checked(*words).stdout)
@@ -160,7 +160,7 @@ def test_printed_commands_run_when_pasted(desk, monkeypatch, typed) -> None:
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_command_of_finding_removes_finding(desk) -> None:
+def test_command_printed_by_a_finding_removes_that_finding(desk) -> None:
     first = run_checked("compare", "l.ulg", "--sigma-z", "0.12")
     assert "reports/l_sigma-z-0.12.pdf" in first.stdout.replace(os.sep, "/")
     command = next(command for command in commands(first.stdout) if "--clock-offset" in command)
@@ -180,12 +180,12 @@ def files(folder: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("command", ["compare", "tune", "sync", "whatif", "loop", "info"])
-def test_json_to_standard_output_writes_no_file(command, desk) -> None:
+def test_json_option_to_standard_output_writes_no_file(command, desk) -> None:
     assert json.loads(run_checked(command, "l.ulg", "--json", "-").stdout)
     assert files(desk) == {"l.ulg"}
 
 
-def test_json_to_file_writes_no_report(desk) -> None:
+def test_json_option_to_file_writes_no_report(desk) -> None:
     run_checked("compare", "l.ulg", "--json", "a.json")
     assert files(desk) == {"a.json", "l.ulg"}
 
@@ -210,21 +210,21 @@ def reported(made: ComparisonResults, **changes: object) -> str:
     return path.name
 
 
-def test_default_report_of_same_run_is_replaced(made) -> None:
+def test_default_report_file_of_same_run_is_replaced(made) -> None:
     assert reported(made) == reported(made) == "aisle_uwb.pdf"
     assert reported(made, sigma_z_m=0.05) == "aisle_uwb_sigma-z-0.05.pdf"
     # a report without a student may be replaced by one with a student
     assert reported(made, student="Ana") == reported(made, student="Ana") == "aisle_uwb.pdf"
 
 
-def test_default_report_with_long_name_is_shortened(made) -> None:
+def test_default_report_file_name_is_shortened_if_too_long(made) -> None:
     log = f"{'ü' * 110}.ulg"
     names = {reported(made, log=log), reported(made, log=log, sigma_z_m=0.05)}
     assert len(names) == 2
     assert all(len(os.fsencode(name)) < 200 and name.startswith("ü" * 80) for name in names)
 
 
-def test_default_report_of_other_log_or_student_is_kept(made) -> None:
+def test_default_report_file_of_other_student_is_not_replaced(made) -> None:
     reported(made, student="Ana")
     before = Path("reports/aisle_uwb.pdf").read_bytes()
     other = replace(made, log=replace(made.log, sha256="0" * 64))
@@ -237,7 +237,7 @@ def test_default_report_of_other_log_or_student_is_kept(made) -> None:
 
 
 @pytest.mark.parametrize("name", ["aisle_uwb.pdf", "aisle_uwb.json"])
-def test_default_name_of_another_file_is_refused(made, name) -> None:
+def test_default_report_does_not_replace_another_file(made, name) -> None:
     mine = Path("reports") / name
     mine.parent.mkdir()
     mine.write_text("mine")
@@ -247,7 +247,7 @@ def test_default_name_of_another_file_is_refused(made, name) -> None:
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_same_name_in_two_folders_keeps_first_report(desk, sample_log) -> None:
+def test_report_of_log_with_same_name_keeps_the_first_report(desk, sample_log) -> None:
     (desk / "b").mkdir()
     shutil.copy(sample_log, desk / "b" / "l.ulg")
     run_checked("compare", "l.ulg")
@@ -257,7 +257,7 @@ def test_same_name_in_two_folders_keeps_first_report(desk, sample_log) -> None:
     run_checked("compare", "l.ulg")
 
 
-def test_default_page_of_another_log_is_kept(desk, sample_log) -> None:
+def test_explore_page_of_another_log_is_not_overwritten(desk, sample_log) -> None:
     (desk / "b").mkdir()
     shutil.copy(sample_log, desk / "b" / "l.ulg")
     page = Path("reports/l.html")
@@ -276,7 +276,7 @@ def test_default_page_of_another_log_is_kept(desk, sample_log) -> None:
 @pytest.mark.parametrize(
     "mine", [b"mine", b"\xff", b"<html><title>l.ulg - px4fuse explore</title>"]
 )
-def test_default_page_of_user_is_kept(desk, command, mine) -> None:
+def test_html_file_of_user_is_not_overwritten_by_default(desk, command, mine) -> None:
     page = Path("reports", "practice_3.html" if "practice" in command else "l.html")
     page.parent.mkdir()
     page.write_bytes(mine)
@@ -287,7 +287,7 @@ def test_default_page_of_user_is_kept(desk, command, mine) -> None:
     run_checked(*command.split())  # an own page is replaced
 
 
-def test_settings_name_is_valid_in_file_names() -> None:
+def test_default_file_name_of_settings_has_valid_characters() -> None:
     request = ComparisonRequest(
         log="a.ulg", axes=("north", "east"), clock_offset_s=-0.12, heading_deg=30.0,
         position=PositionFile(path="/home/x/u wb.csv", columns=("t", "x/y", "*")),
@@ -301,7 +301,7 @@ def test_settings_name_is_valid_in_file_names() -> None:
 # --- progress bar ---
 
 
-def test_progress_bar_appears_on_terminal_only(monkeypatch, capsys) -> None:
+def test_progress_bar_appears_only_on_a_terminal(monkeypatch, capsys) -> None:
     with progress() as step:
         step("reading x")
     assert capsys.readouterr().err == ""
@@ -321,7 +321,7 @@ def test_progress_bar_appears_on_terminal_only(monkeypatch, capsys) -> None:
 # --- styles ---
 
 
-def test_bold_text_of_page_is_bold_on_terminal() -> None:
+def test_bold_text_of_report_is_bold_on_terminal() -> None:
     for weight, bold in (("bold", True), ("regular", False)):
         block = {"text": "so", "colour": "black", "weight": weight}
         assert ("bold" in str(screen._styled_text(block).style)) is bold  # type: ignore[arg-type]

@@ -76,7 +76,7 @@ def found(made: tuple[Path, Result]) -> dict[str, Any]:
     return read
 
 
-def test_loop_writes_report_results_path_and_graph(made, found) -> None:
+def test_loop_command_writes_report_results_tum_and_g2o(made, found) -> None:
     folder, result = made
     assert result.exit_code == 0, result.output
     names = ["r.g2o", "r.json", "r.pdf", "r.tum"]
@@ -90,7 +90,7 @@ def test_loop_writes_report_results_path_and_graph(made, found) -> None:
     assert [each["accepted"] for each in found["loop"]["closures"]] == [True, False]
 
 
-def test_loop_report_is_reproducible_without_paths(made, tmp_path):
+def test_loop_report_is_reproducible_and_contains_no_paths(made, tmp_path):
     folder, _ = made
     pages = "".join(page.extract_text() for page in pypdf.PdfReader(folder / "r.pdf").pages)
     assert "Ana $x$ Müller" in pages
@@ -102,7 +102,7 @@ def test_loop_report_is_reproducible_without_paths(made, tmp_path):
 
 
 @pytest.mark.parametrize("reference", [f"{LOG}:truth", str(LOG)])
-def test_loop_tum_file_has_the_reported_ate(made, found, reference) -> None:
+def test_loop_tum_file_has_the_ate_stated_in_the_report(made, found, reference) -> None:
     gated = found["loop"]["corrections"]["pose_graph_gated"]["scores"][TRUTH]
     again = results("evaluate", made[0] / "r.tum", reference, "--alignment", gated["alignment"])
     in_loop, in_evaluate = (score["ate"]["translation_m"]["rmse"] for score in (gated, again))
@@ -110,7 +110,7 @@ def test_loop_tum_file_has_the_reported_ate(made, found, reference) -> None:
     assert again["association"]["poses"] == gated["association"]["poses"]
 
 
-def test_loop_g2o_file_is_at_the_optimum(made, found, tmp_path) -> None:
+def test_loop_g2o_file_contains_the_optimised_pose_graph(made, found, tmp_path) -> None:
     """All closures of this graph are accepted; a rejected one would change the optimum."""
     graph = tmp_path / "g.g2o"
     written = results("loop", LOG, "--g2o", graph)["loop"]["corrections"]["pose_graph_gated"]
@@ -141,7 +141,7 @@ def test_loop_results_contain_repeatable_command(desk, tmp_path) -> None:
     assert set(contents(tmp_path)) == {"o.tum"}
 
 
-def test_evaluate_writes_page_and_results(desk, tmp_path, monkeypatch) -> None:
+def test_evaluate_command_writes_report_and_results(desk, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     command = ["evaluate", desk / "s.tum", desk / "l.ulg:truth"]
     result = run(*command)
@@ -166,7 +166,7 @@ def test_evaluate_writes_page_and_results(desk, tmp_path, monkeypatch) -> None:
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_evaluate_other_settings_or_files_keep_old_report(desk, tmp_path, monkeypatch):
+def test_evaluate_with_other_settings_keeps_the_old_report(desk, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "other").mkdir()
     write(tmp_path / "other" / "s.tum", ROWS[:-50])
@@ -190,7 +190,7 @@ def test_evaluate_other_settings_or_files_keep_old_report(desk, tmp_path, monkey
     ("--json r.json", {"r.json"}),
     ("--json -", set()),
 ])  # fmt: skip
-def test_evaluate_writes_only_the_named_files(
+def test_evaluate_command_writes_only_the_named_files(
     desk, tmp_path, monkeypatch, options, written
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -202,7 +202,7 @@ def test_evaluate_writes_only_the_named_files(
     assert alone == ("ATE (m)" not in result.output)
 
 
-def test_loop_reference_gives_ate_of_each_path(desk) -> None:
+def test_loop_with_reference_states_ate_of_each_correction(desk) -> None:
     """References: the source itself, a flight with other timestamps, and one without overlap."""
 
     def scores(reference: str, way: str = "uncorrected") -> dict[str, Any]:
@@ -230,7 +230,7 @@ def to_z_up(rows: list[str]) -> list[str]:
     return converted
 
 
-def test_loop_z_up_track_has_same_ate_as_evaluate(tmp_path) -> None:
+def test_loop_on_z_up_track_has_zero_error_to_its_reference(tmp_path) -> None:
     for name in ("a.tum", "truth.tum"):
         write(tmp_path / name, to_z_up(ROWS))
     found = results("loop", tmp_path / "a.tum", "--reference", tmp_path / "truth.tum")["loop"]

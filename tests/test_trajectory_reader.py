@@ -87,7 +87,7 @@ def write(folder: Path, content: str | bytes, name: str = "track.txt") -> Path:
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
-def test_read_trajectory_every_dialect_gives_equal_poses(dialect: str, tmp_path: Path) -> None:
+def test_read_trajectory_of_every_dialect_gives_equal_poses(dialect: str, tmp_path: Path) -> None:
     path = write(tmp_path, DIALECTS[dialect])
     got = read_trajectory(path)
     expected = np.array([float(Decimal(t) / 10**9) for t in NANOSECONDS.tolist()])
@@ -104,7 +104,7 @@ def test_read_trajectory_every_dialect_gives_equal_poses(dialect: str, tmp_path:
     assert is_ns == any("nanoseconds and were divided" in note for note in got.notes)
 
 
-def test_read_trajectory_other_clock_has_no_unix_offset(tmp_path: Path) -> None:
+def test_read_trajectory_with_other_clock_has_no_unix_offset(tmp_path: Path) -> None:
     values = text(rows()[:4]).replace("14036365", "")
     assert read_trajectory(write(tmp_path, values)).unix_offset_s is None
     lines = [f"{12_000_000_000 + 33_000_000 * i}.000000 {i} 0 0 0 0 0 1" for i in range(9)]
@@ -114,7 +114,7 @@ def test_read_trajectory_other_clock_has_no_unix_offset(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["MH_04_groundtruth.txt", "truth/data.csv", "room_gt.txt", ""])
-def test_read_trajectory_ground_truth_name_gives_kind(name: str, tmp_path: Path) -> None:
+def test_read_trajectory_detects_ground_truth_by_file_name(name: str, tmp_path: Path) -> None:
     path = tmp_path / (name or "track.txt")
     path.parent.mkdir(exist_ok=True)
     path.write_text(("" if name else "# Ground truth trajectory\n") + text(rows()))
@@ -124,7 +124,9 @@ def test_read_trajectory_ground_truth_name_gives_kind(name: str, tmp_path: Path)
 @pytest.mark.parametrize(("axes", "tilt_deg", "frame"), [
     ("xzy", 15.0, "camera"), ("xzy", 30.0, "unknown"), ("xyz", 0.0, "unknown"),
 ])  # fmt: skip
-def test_read_trajectory_level_motion_gives_camera_frame(axes, tilt_deg, frame, tmp_path) -> None:
+def test_read_trajectory_detects_camera_frame_by_level_motion(
+    axes, tilt_deg, frame, tmp_path
+) -> None:
     angle = np.linspace(0.0, 6.0, 200)
     level = np.column_stack((9 * np.sin(angle), 6 - 6 * np.cos(angle), 0.1 * np.sin(7 * angle)))
     position = level[:, ["xyz".index(axis) for axis in axes]]
@@ -134,7 +136,7 @@ def test_read_trajectory_level_motion_gives_camera_frame(axes, tilt_deg, frame, 
     assert (got.kind, got.frame) == ("slam", frame)
 
 
-def test_read_trajectory_gaps_and_repeats_have_notes(tmp_path: Path) -> None:
+def test_read_trajectory_notes_gaps_and_repeated_timestamps(tmp_path: Path) -> None:
     time = np.arange(1000) * 0.05
     keep = ((time < 10) | (time > 14)) & ((time < 30) | (time > 31))
     made = Trajectory("t", "unknown", time, np.tile(POSITION_M, (20, 1)), Rotation.identity(1000))
@@ -150,7 +152,7 @@ def test_read_trajectory_gaps_and_repeats_have_notes(tmp_path: Path) -> None:
     assert "Dropped poses with a repeated timestamp: 1." in again.notes
 
 
-def test_read_trajectory_incomplete_last_line_is_dropped(tmp_path: Path) -> None:
+def test_read_trajectory_drops_incomplete_last_line(tmp_path: Path) -> None:
     got = read_trajectory(write(tmp_path, text(rows())[:-50]))
     assert len(got) == POSES - 1
     assert got.notes[-1] == f"The last line ({POSES}) was dropped: it is incomplete."
@@ -207,7 +209,7 @@ INVALID_FILES: dict[str, tuple[str | bytes, str]] = {
 
 
 @pytest.mark.parametrize("case", INVALID_FILES)
-def test_read_trajectory_invalid_file_is_rejected(case: str, tmp_path: Path) -> None:
+def test_read_trajectory_from_invalid_file_is_rejected(case: str, tmp_path: Path) -> None:
     content, words = INVALID_FILES[case]
     with pytest.raises(TrajectoryError) as caught:
         read_trajectory(write(tmp_path, content))
@@ -218,7 +220,7 @@ def test_read_trajectory_invalid_file_is_rejected(case: str, tmp_path: Path) -> 
     assert message.endswith(".")
 
 
-def test_read_trajectory_too_large_file_is_rejected(tmp_path, monkeypatch) -> None:
+def test_read_trajectory_from_too_large_file_is_rejected(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(reader, "MAX_FILE_BYTES", 10)
     with pytest.raises(TrajectoryError, match="the limit is"):
         read_trajectory(write(tmp_path, text(rows())))
@@ -234,7 +236,9 @@ NUMBER = st.floats(-1e6, 1e6)
     position=hnp.arrays(float, (8, 3), elements=NUMBER),
     quaternion=hnp.arrays(float, (8, 4), elements=st.floats(0.1, 1.0)),
 )
-def test_tum_text_is_read_back_exactly(steps, start, position, quaternion, tmp_path) -> None:
+def test_trajectory_written_as_tum_is_read_back_exactly(
+    steps, start, position, quaternion, tmp_path
+) -> None:
     time_s, rotation = start + np.cumsum(steps), Rotation.from_quat(quaternion)
     made = Trajectory("t", "unknown", time_s, position, rotation)
     once = read_trajectory(write(tmp_path, tum_text(made)))
@@ -244,7 +248,7 @@ def test_tum_text_is_read_back_exactly(steps, start, position, quaternion, tmp_p
     assert tum_text(once) == tum_text(made)
 
 
-def test_tum_text_writes_unix_time_and_needs_orientation(tmp_path: Path) -> None:
+def test_tum_file_has_unix_time_and_requires_orientation(tmp_path: Path) -> None:
     made = Trajectory("t", "vio", np.arange(5.0), POSITION_M[:5], ROTATION[:5], unix_offset_s=1.5e9)
     assert read_trajectory(write(tmp_path, tum_text(made))).time_s[0] == 1.5e9
     with pytest.raises(TrajectoryError, match="needs orientations"):

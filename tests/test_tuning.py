@@ -44,7 +44,7 @@ def many() -> tuple[AxisTuning, ...]:
 
 
 @pytest.mark.parametrize(("name", "true"), [("sigma_z", SIGMA_Z), ("sigma_a", SIGMA_A)])
-def test_tune_intervals_contain_true_value_95_percent(name: str, true: float) -> None:
+def test_tuned_noise_95_percent_interval_covers_true_value(name: str, true: float) -> None:
     """With 1000 seeds of 400 measurements the coverage was 95.2 % (SIGMA_Z), 95.5 % (SIGMA_A)."""
     noises = [getattr(found, name) for found in many()]
     inside = sum(noise.low <= true <= noise.high for noise in noises)
@@ -58,11 +58,11 @@ def test_tune_intervals_contain_true_value_95_percent(name: str, true: float) ->
     assert error < 0.03 * true
 
 
-def test_tune_clean_data_have_no_outliers() -> None:
+def test_tune_finds_no_outliers_in_clean_data() -> None:
     assert sum(len(found.outlier_time_s) for found in many()) <= 0.001 * SEEDS * COUNT
 
 
-def test_held_out_true_settings_have_no_likelihood_gain() -> None:
+def test_held_out_data_with_true_noises_show_no_likelihood_gain() -> None:
     gains = np.array([found.held_out.log_likelihood_gain_per_measurement for found in many()])
     assert np.mean(gains) < 0.0
     assert np.median(gains) <= 0.0
@@ -73,7 +73,7 @@ def test_held_out_true_settings_have_no_likelihood_gain() -> None:
     assert np.mean(seen) == pytest.approx(1.0, abs=2.6 / np.sqrt(SEEDS))
 
 
-def test_held_out_wrong_settings_have_a_likelihood_gain() -> None:
+def test_held_out_data_with_wrong_noises_show_likelihood_gain() -> None:
     bad = Settings(sigma_a_m_s2=5.0, sigma_z_m=0.02, input="zero")
     found = tuned(modelled(1), chosen=bad)
     assert found.held_out.log_likelihood_gain_per_measurement > 0.1
@@ -90,7 +90,7 @@ def test_held_out_wrong_settings_have_a_likelihood_gain() -> None:
         assert one == pytest.approx(two, rel=1e-4)
 
 
-def test_tune_two_axes_narrow_the_interval() -> None:
+def test_tune_with_two_axes_narrows_the_noise_interval() -> None:
     for seed in range(2):
         north, east = modelled(seed), modelled(seed + 100)
         both = tuned(north, east)
@@ -106,7 +106,7 @@ def test_tune_two_axes_narrow_the_interval() -> None:
 # --- the map ---
 
 
-def test_tune_map_and_intervals_equal_likelihood_profile() -> None:
+def test_tuned_noise_intervals_equal_likelihood_profile() -> None:
     axis = modelled(5)
     found = tuned(axis)
     assert len(found.outlier_time_s) == 0
@@ -137,14 +137,14 @@ def test_tune_map_and_intervals_equal_likelihood_profile() -> None:
 
 
 @pytest.mark.parametrize("sigma_a", [0.05, 0.5])
-def test_tune_noise_free_positions_give_upper_bound(sigma_a: float) -> None:
+def test_tune_on_noise_free_positions_bounds_sigma_z_from_above(sigma_a: float) -> None:
     found = tuned(modelled(3, 500, sigma_a=sigma_a, sigma_z=0.0))
     assert found.sigma_z.value is found.sigma_z.low is None
     assert SIGMA_Z_SEARCH_M[0] <= found.sigma_z.high < 0.003
     assert found.sigma_a.low <= sigma_a <= found.sigma_a.high or sigma_a < 0.1
 
 
-def test_tune_noise_at_search_end_has_one_bound() -> None:
+def test_tuned_noise_at_end_of_search_range_has_one_bound() -> None:
     noise = np.random.default_rng(0).normal(0.0, 1.0, 300)
     still, wild = (tuned(line(0.2 * np.arange(300), sigma * noise)) for sigma in (0.1, 30.0))
     assert still.sigma_a.value is still.sigma_a.low is None
@@ -154,7 +154,7 @@ def test_tune_noise_at_search_end_has_one_bound() -> None:
     assert wild.sigma_z.low > 9.0
 
 
-def test_tune_too_few_measurements_are_unavailable() -> None:
+def test_tune_with_too_few_measurements_is_unavailable() -> None:
     short = tune_axes("down", (modelled(1, MIN_MEASUREMENTS - 1),), TRUE)
     assert isinstance(short, Unavailable)
     assert short.what == "tuning, down"
@@ -165,7 +165,7 @@ def test_tune_too_few_measurements_are_unavailable() -> None:
     assert enough.sigma_z.low < SIGMA_Z < enough.sigma_z.high
 
 
-def test_tune_pools_axes_with_equal_timestamps() -> None:
+def test_tune_combines_axes_with_equal_timestamps() -> None:
     north, east = modelled(1, 60), replace(modelled(2, 60), name="east")
     steps: list[str] = []
     found = tune((north, east), TRUE, progress=steps.append)
@@ -185,7 +185,7 @@ def horizontal(flight: Flight, *, imu: bool = True, drifts: bool = False) -> Axi
     return found
 
 
-def test_tune_separates_biases_and_tilt_from_noise() -> None:
+def test_tune_separates_imu_bias_and_tilt_from_noise() -> None:
     """KF has no states for biases and tilt, so its SIGMA_A is larger than the noise."""
     flight, _ = made_flight(3, offset_s=0.1)
     found, without = horizontal(flight), horizontal(flight, imu=False)
@@ -199,7 +199,7 @@ def test_tune_separates_biases_and_tilt_from_noise() -> None:
     assert found.noises.random_walk_m == 0.0
 
 
-def test_tune_weak_motion_scale_does_not_bias_sigma_a() -> None:
+def test_tuned_sigma_a_at_weak_motion_is_unbiased() -> None:
     """A scale signal that contains the noise would explain part of it (errors in variables)."""
     ratios = [
         horizontal(made_flight(seed, moving=0.1, sigma_a=0.5)[0]).noises.sigma_a_m_s2 / 0.5
@@ -208,7 +208,7 @@ def test_tune_weak_motion_scale_does_not_bias_sigma_a() -> None:
     assert np.mean(ratios) == pytest.approx(1.0, abs=2.6 * np.std(ratios) / np.sqrt(len(ratios)))
 
 
-def test_tune_drifting_source_gets_random_walk() -> None:
+def test_tune_estimates_random_walk_of_drifting_source() -> None:
     """Add 0.1 m/√s, which would otherwise be estimated as acceleration noise."""
     flight, _ = made_flight(4, duration_s=90.0)
     track = flight.positions[0]
@@ -235,7 +235,7 @@ def test_tune_drifting_source_gets_random_walk() -> None:
         (Noise(None, None, None), "unknown"),
     ],
 )
-def test_format_noise_at_search_end_is_a_bound(noise: Noise, said: str) -> None:
+def test_noise_text_at_end_of_search_range_is_a_bound(noise: Noise, said: str) -> None:
     assert format_noise(noise, "m") == said
 
 
@@ -249,5 +249,5 @@ def test_format_noise_at_search_end_is_a_bound(noise: Noise, said: str) -> None:
         (Noise(0.1, 0.05, None), "0.1 (0.05-?)"),
     ],
 )
-def test_tune_noise_text_has_interval_or_bound(noise: Noise, expected: str) -> None:
+def test_tuned_noise_text_has_interval_or_bound(noise: Noise, expected: str) -> None:
     assert format_noise_estimate(noise) == expected

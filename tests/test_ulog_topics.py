@@ -30,7 +30,7 @@ def longest_run_length(stamps: list[int]) -> int:
 
 
 @given(any_timestamps)
-def test_longest_increasing_run_is_positive_and_increasing(stamps):
+def test_kept_ulog_timestamps_are_positive_and_increasing(stamps):
     indices = kept_indices(stamps)
     chosen = [stamps[at] for at in indices]
     assert indices == sorted(set(indices))
@@ -39,7 +39,7 @@ def test_longest_increasing_run_is_positive_and_increasing(stamps):
 
 
 @given(few_timestamps)
-def test_longest_increasing_run_has_maximum_length(stamps):
+def test_kept_ulog_timestamps_are_the_longest_increasing_run(stamps):
     assert len(kept_indices(stamps)) == longest_run_length(stamps)
 
 
@@ -67,12 +67,12 @@ PUBLISHED = [10_000_000, 11_000_000, 12_000_000, 13_000_000]
         id="one unusable falls back alone",
     ),
 ])  # fmt: skip
-def test_measurement_time_us_selects_sample_or_publication(sampled, expected):
+def test_measurement_time_is_sample_or_publication_timestamp(sampled, expected):
     assert measurement_time_us(table(PUBLISHED, sampled)).tolist() == (expected or sampled)
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)
-def test_make_log_is_read_back_by_pyulog(tmp_path, generation):
+def test_generated_ulog_is_read_back_by_pyulog(tmp_path, generation):
     """pyulog, which is independent of the writer, reads every value that was written."""
     log = make_log(generation, 2.0)
     ulog = ULog(str(log.write(tmp_path / "made.ulg")))
@@ -89,7 +89,7 @@ def test_make_log_is_read_back_by_pyulog(tmp_path, generation):
                 np.testing.assert_array_equal(read[key], column, err_msg=f"{topic.name}.{key}")
 
 
-def test_read_topics_time_zero_is_first_imu_sample(tmp_path):
+def test_read_ulog_sets_time_zero_to_first_imu_sample(tmp_path):
     path = make_log("v1.16", 10.0).write(tmp_path / "made.ulg")
     topics = read_topics(path.name, path.read_bytes())
     assert topics.log.boot_time_s == pytest.approx(5.0)
@@ -106,13 +106,13 @@ def test_read_topics_time_zero_is_first_imu_sample(tmp_path):
     (255, "PX4 v1.16.2"), (192, "PX4 v1.16.2-rc"), (128, "PX4 v1.16.2-beta"),
     (64, "PX4 v1.16.2-alpha"), (0, "PX4 v1.16.2-dev"),
 ])  # fmt: skip
-def test_read_topics_formats_firmware_version(kind, text):
+def test_read_ulog_formats_firmware_version(kind, text):
     log = make_log("v1.16", 2.0)
     log.info["ver_sw_release"] = 1 << 24 | 16 << 16 | 2 << 8 | kind
     assert read_topics("made.ulg", log.encode()).log.firmware == text
 
 
-def test_read_topics_dropout_has_start_and_duration():
+def test_read_ulog_gives_start_and_duration_of_dropout():
     log = make_log("v1.16", 2.0)
     log.dropouts_ms = (250,)
     last = max(int(topic.fields["timestamp"].max()) for topic in log.topics)
@@ -122,7 +122,7 @@ def test_read_topics_dropout_has_start_and_duration():
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_read_topics_two_subscriptions_are_joined(order):
+def test_read_ulog_joins_two_subscriptions_of_one_topic(order):
     """A logger that restarts subscribes again; both parts belong to the same topic."""
     log = make_log("v1.9", 4.0)
     whole = next(t for t in log.topics if t.name == "vehicle_local_position")

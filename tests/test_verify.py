@@ -92,7 +92,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> VerifiedReport:
 # -- unchanged reports -----------------------------------------------------------------------------
 
 
-def test_verify_example_report_is_verified(aisle: VerifiedReport) -> None:
+def test_verify_unchanged_example_report_returns_verified(aisle: VerifiedReport) -> None:
     shipped = REPORT.read_bytes()
     verdict = verify(attached_results(shipped), shipped, aisle.files, recompute=aisle.recompute)
     assert verdict.status == "verified", verdict
@@ -101,7 +101,7 @@ def test_verify_example_report_is_verified(aisle: VerifiedReport) -> None:
     assert LIMIT_NOTE in verdict.reasons
 
 
-def test_verify_loop_report_is_verified(loop: VerifiedReport) -> None:
+def test_verify_unchanged_loop_report_returns_verified(loop: VerifiedReport) -> None:
     verdict = loop.verified(loop.pdf)
     assert verdict.status == "verified", verdict
     text = "".join(page.extract_text() for page in PdfReader(io.BytesIO(loop.pdf)).pages)
@@ -109,7 +109,9 @@ def test_verify_loop_report_is_verified(loop: VerifiedReport) -> None:
     assert "heading drifts most" in text.replace("*", "")
 
 
-def test_verify_without_log_cannot_verify(aisle: VerifiedReport, loop: VerifiedReport) -> None:
+def test_verify_report_without_log_returns_cannot_verify(
+    aisle: VerifiedReport, loop: VerifiedReport
+) -> None:
     for one in (aisle, loop):
         verdict = verify(attached_results(one.pdf), one.pdf, {})
         assert verdict.status == "cannot verify"
@@ -142,7 +144,7 @@ def move_lines(pdf: bytes, by: float) -> bytes:
 
 
 @pytest.mark.parametrize("which", ["aisle", "loop"])
-def test_verify_numbers_of_other_platform_are_verified(
+def test_verify_report_from_other_platform_is_verified(
     which: str, request: pytest.FixtureRequest
 ) -> None:
     one: VerifiedReport = request.getfixturevalue(which)
@@ -159,7 +161,7 @@ def test_verify_numbers_of_other_platform_are_verified(
     assert verdict.redrawn == aside
 
 
-def test_verify_numbers_1e_12_apart_are_verified(aisle: VerifiedReport) -> None:
+def test_verify_accepts_numbers_that_differ_by_1e_12(aisle: VerifiedReport) -> None:
     """Other kernels of OpenBLAS change results of the sample flights by 3e-8 at most."""
     scaled_results = read_again(scaled(json.loads(to_json(aisle.again[0])), -1e-12))
     elsewhere = (scaled_results, lambda: forged(aisle.pdf))
@@ -169,7 +171,7 @@ def test_verify_numbers_1e_12_apart_are_verified(aisle: VerifiedReport) -> None:
     assert verdict.outcome == "verified", verdict
 
 
-def test_compare_results_numbers_1e_4_apart_differ(aisle: VerifiedReport) -> None:
+def test_verify_reports_numbers_that_differ_by_1e_4(aisle: VerifiedReport) -> None:
     """All numbers, except estimates, which have another tolerance, and those near zero."""
     ours = json.loads(to_json(aisle.again[0]))
     for share, least in ((1e-4, RELATIVE_TOLERANCE), (1e-2, ESTIMATE_RELATIVE_TOLERANCE)):
@@ -187,7 +189,7 @@ def test_compare_results_numbers_1e_4_apart_differ(aisle: VerifiedReport) -> Non
 KF = ("axes", "north", "filters", "kf")
 
 
-def test_compare_results_applies_each_tolerance(aisle: VerifiedReport) -> None:
+def test_verify_applies_the_tolerance_of_each_number(aisle: VerifiedReport) -> None:
     ours = json.loads(to_json(aisle.again[0]))
     for share, path, alike in (
         (0.5 * RELATIVE_TOLERANCE, (*KF, "nis_mean"), True),
@@ -253,7 +255,7 @@ def change_value(results: dict[str, Any], path: tuple[Any, ...]) -> dict[str, An
 
 
 @pytest.mark.parametrize("path", KINDS, ids=lambda path: ".".join(map(str, path)))
-def test_compare_results_finds_each_changed_value(
+def test_verify_finds_each_kind_of_changed_value(
     aisle: VerifiedReport, path: tuple[Any, ...]
 ) -> None:
     found, *_ = compare_results(change_value(aisle.results, path), to_plain(aisle.again[0]))
@@ -301,7 +303,7 @@ STRUCTURE: dict[str, tuple[Change, str]] = {
 
 @pytest.mark.usefixtures("no_drawing")
 @pytest.mark.parametrize("name", STRUCTURE)
-def test_verify_forged_results_are_not_verified(
+def test_verify_report_with_forged_results_is_not_verified(
     aisle: VerifiedReport, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     change, expected = STRUCTURE[name]
@@ -319,7 +321,7 @@ def test_verify_forged_results_are_not_verified(
 @pytest.mark.parametrize(
     "path", [("student", "name"), ("student", "notes"), ("provenance", "libraries", "matplotlib")]
 )
-def test_verify_changed_printed_record_is_not_verified(
+def test_verify_report_with_changed_student_name_is_not_verified(
     loop: VerifiedReport, path: tuple[str, ...]
 ) -> None:
     results = copy.deepcopy(loop.results)
@@ -344,7 +346,7 @@ def foreign(loop: VerifiedReport) -> VerifiedReport:
     return VerifiedReport(forged(drawn, with_results(to_json(results))), results, again, loop.files)
 
 
-def test_verify_other_libraries_same_drawing_is_verified(foreign: VerifiedReport) -> None:
+def test_verify_report_made_with_other_libraries_is_verified(foreign: VerifiedReport) -> None:
     verdict = foreign.verified(foreign.pdf)
     assert verdict.outcome == "verified", verdict
     assert foreign.verified(forged(foreign.pdf, shifted_page)).outcome == "verified"
@@ -376,7 +378,9 @@ PLOTS: dict[str, Edit] = {
 
 
 @pytest.mark.parametrize("name", PLOTS)
-def test_verify_other_libraries_changed_plot_is_found(foreign: VerifiedReport, name: str) -> None:
+def test_verify_finds_changed_plot_despite_other_libraries(
+    foreign: VerifiedReport, name: str
+) -> None:
     verdict = foreign.verified(forged(foreign.pdf, on_page(1, PLOTS[name])))
     assert verdict.outcome == "cannot verify", verdict
     assert "page 1: drawing operation" in verdict.reasons[0]
@@ -447,7 +451,9 @@ PAGE_CASES = [
 
 
 @pytest.mark.parametrize(("page", "name"), PAGE_CASES)
-def test_verify_changed_page_differs(aisle: VerifiedReport, page: int, name: str) -> None:
+def test_verify_report_with_changed_page_returns_page_differs(
+    aisle: VerifiedReport, page: int, name: str
+) -> None:
     verdict = aisle.verified(forged(aisle.pdf, on_page(page, DRAWING[name])))
     assert verdict.redrawn == aisle.pdf  # the redrawn report does not contain the forgery
     assert verdict.status == "verified"
@@ -472,7 +478,9 @@ DOCUMENT: dict[str, tuple[Forge, str, str]] = {
 
 
 @pytest.mark.parametrize("name", DOCUMENT)
-def test_verify_changed_document_states_reason(aisle: VerifiedReport, name: str) -> None:
+def test_verify_report_with_changed_pdf_document_states_reason(
+    aisle: VerifiedReport, name: str
+) -> None:
     forge, expected, said = DOCUMENT[name]
     verdict = aisle.verified(forged(aisle.pdf, forge))
     assert verdict.redrawn == aisle.pdf
@@ -487,7 +495,7 @@ def test_verify_changed_document_states_reason(aisle: VerifiedReport, name: str)
 
 
 @pytest.mark.parametrize("key", ["/OpenAction", "/AA"])
-def test_read_report_with_script_is_refused(aisle: VerifiedReport, key: str) -> None:
+def test_read_report_pdf_with_script_is_rejected(aisle: VerifiedReport, key: str) -> None:
     script = dictionary(S=NameObject("/JavaScript"), JS=TextStringObject("app.alert(1)"))
     with pytest.raises(ResultsError):
         read_report(forged(aisle.pdf, catalogue(key, script)), "r.pdf")
@@ -545,7 +553,7 @@ FILES: dict[str, tuple[Callable[[VerifiedReport, VerifiedReport], bytes], set[st
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_verify_changed_file_has_expected_outcome(
+def test_verify_gives_expected_outcome_for_each_pdf_change(
     aisle: VerifiedReport, loop: VerifiedReport, name: str
 ) -> None:
     forge, expected = FILES[name]
@@ -557,7 +565,7 @@ def test_verify_changed_file_has_expected_outcome(
     assert verdict.redrawn == (b"" if verdict.status == "other log" else aisle.pdf)
 
 
-def test_verify_other_log_is_reported(aisle: VerifiedReport) -> None:
+def test_verify_with_log_of_other_flight_returns_other_log(aisle: VerifiedReport) -> None:
     for files in ([LOOP_LOG], [LOOP_LOG, Path(__file__)]):
         verdict = verify(attached_results(aisle.pdf), aisle.pdf, files)
         assert verdict.status == "other log"
@@ -565,7 +573,7 @@ def test_verify_other_log_is_reported(aisle: VerifiedReport) -> None:
 
 
 @pytest.mark.usefixtures("cached_pages")
-def test_verify_finds_joined_recording_by_hash(tmp_path: Path) -> None:
+def test_verify_finds_all_input_files_by_sha256(tmp_path: Path) -> None:
     """The file names differ from those of the report."""
     positions, target = SAMPLES / "aisle_uwb_external.csv", tmp_path / "joined.pdf"
     run_checked("compare", LOG, "--position", positions, "--axis", "down", "-o", target)
@@ -583,7 +591,7 @@ def test_verify_finds_joined_recording_by_hash(tmp_path: Path) -> None:
 # -- the command -----------------------------------------------------------------------------------
 
 
-def test_verify_command_prints_and_writes_verdict(
+def test_verify_command_prints_and_writes_the_verdict(
     tmp_path: Path, aisle: VerifiedReport, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     in_this_process(monkeypatch)  # the next test uses a worker process
@@ -599,7 +607,7 @@ def test_verify_command_prints_and_writes_verdict(
     assert json.loads(output)["status"] == "cannot verify"
 
 
-def test_verify_command_finds_renamed_log(tmp_path: Path) -> None:
+def test_verify_command_finds_a_renamed_log(tmp_path: Path) -> None:
     target = tmp_path / "loop.pdf"
     run_checked("loop", f"{LOOP_LOG}:ekf2", "-o", target)
     folder = tmp_path / "logs"

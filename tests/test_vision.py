@@ -209,7 +209,7 @@ def update_log(done: SegmentRun, at: int = 0) -> pd.DataFrame:
 @pytest.mark.parametrize(("rate_hz", "late_s", "settings"), [
     (30.0, 0.0, {}), (12.0, 0.1, {"EKF2_EV_DELAY": 100.0}), (30.0, 0.0, {"EKF2_EVP_NOISE": 0.8}),
 ])  # fmt: skip
-def test_recursion_matches_plain_filter(
+def test_ekf2_replay_of_vision_and_gnss_matches_plain_filter(
     rate_hz: float, late_s: float, settings: dict[str, float]
 ) -> None:
     inputs = flying(sent(rate_hz, late_s=late_s), **settings)
@@ -235,7 +235,7 @@ def test_recursion_matches_plain_filter(
     assert found["fused"].all()
 
 
-def test_vision_noise_with_gnss_is_at_least_gnss_noise() -> None:
+def test_vision_noise_besides_gnss_is_at_least_gnss_noise() -> None:
     """R is the largest of EKF2_EVP_NOISE, EKF2_GPS_P_NOISE and the reported variance."""
     inputs = flying(sent(), EKF2_GPS_P_NOISE=0.5)
     noises = ({**inputs.settings, "EKF2_EVP_NOISE": noise_m} for noise_m in (0.01, 0.5, 0.7))
@@ -248,7 +248,7 @@ def test_vision_noise_with_gnss_is_at_least_gnss_noise() -> None:
     assert np.abs(update_log(done, 2) - update_log(done, 1)).max(axis=None) > 0.01
 
 
-def test_vision_lever_arm_is_subtracted() -> None:
+def test_vision_lever_arm_is_subtracted_in_replay() -> None:
     """EKF2_EV_POS is in the body frame, rotated by the attitude at each sample."""
     inputs, vision, lever_arm_m = flying(sent()), sent(), np.array([1.5, -0.5, 0.8])
     (segment,) = inputs.segments
@@ -263,7 +263,7 @@ def test_vision_lever_arm_is_subtracted() -> None:
     )
 
 
-def test_vision_bias_estimates_frame_offset() -> None:
+def test_vision_position_bias_estimates_frame_offset() -> None:
     done = ran(flying(sent(sigma_m=0.05)))
     assert done.vision is not None
     np.testing.assert_allclose(-done.vision.bias.value_m[0], FRAME_M[:2], atol=0.5)
@@ -275,7 +275,7 @@ def test_vision_bias_estimates_frame_offset() -> None:
         assert done.state[-1, 0, 6 + axis] == pytest.approx(true, abs=0.5)
 
 
-def test_vision_jump_is_rejected_until_bias_reset() -> None:
+def test_vision_jump_is_rejected_until_its_bias_is_reset() -> None:
     """A jump of vision by 20 m does not move EKF2."""
     vision = sent(sigma_m=0.05)
     at_s = float(on_gnss().inputs.segments[0].time_s[0]) + 20.0
@@ -294,7 +294,7 @@ def test_vision_jump_is_rejected_until_bias_reset() -> None:
     assert not update_log(without_gate)["rejected"].any()
 
 
-def test_vision_gap_restarts_bias() -> None:
+def test_vision_position_bias_restarts_after_a_gap() -> None:
     vision = sent(sigma_m=0.05)
     at_s = float(on_gnss().inputs.segments[0].time_s[0]) + 20.0
     for gap_s, anew in ((0.9 * MAX_SAMPLE_GAP_S, False), (1.5 * MAX_SAMPLE_GAP_S, True)):
@@ -307,7 +307,7 @@ def test_vision_gap_restarts_bias() -> None:
         assert bool(after["rejected"].any()) is not anew
 
 
-def test_vision_without_gnss_resets_position() -> None:
+def test_loss_of_gnss_resets_position_to_vision() -> None:
     """Reset without bias, with the noise of vision (ev_pos_control.cpp)."""
     inputs = flying(sent(sigma_m=0.05))
     lost_s = float(inputs.segments[0].time_s[0]) + 20.0
@@ -329,7 +329,7 @@ def test_vision_without_gnss_resets_position() -> None:
     assert after["fused"].all()
 
 
-def test_vision_bias_follows_gnss_reset() -> None:
+def test_vision_position_bias_follows_gnss_reset() -> None:
     """Position and bias move together (resetHorizontalPositionTo): vision is fused as before."""
     inputs = flying(sent(sigma_m=0.05))
     for with_velocity in (False, True):
@@ -348,7 +348,7 @@ def off_by(received: ReceivedPositions, north_m: float) -> ReceivedPositions:
     return replace(received, position_m=received.position_m + far)
 
 
-def test_vision_both_rejected_resets_to_vision() -> None:
+def test_rejection_of_gnss_and_vision_resets_position_to_vision() -> None:
     inputs = flying(off_by(sent(sigma_m=0.05), 20.0), seconds=20.0)
     done = ran(replace(inputs, received=off_by(inputs.received, 40.0)))
     found = update_log(done)
@@ -360,7 +360,7 @@ def test_vision_both_rejected_resets_to_vision() -> None:
     np.testing.assert_allclose(-done.vision.bias.value_m[0], FRAME_M[:2], atol=0.7)
 
 
-def test_timing_vision_delay_sets_fusion_horizon() -> None:
+def test_larger_vision_delay_extends_the_fusion_horizon() -> None:
     inputs = flying(sent())
     settings = inputs.settings
     flown = Variant(settings).timing(inputs)
@@ -370,7 +370,7 @@ def test_timing_vision_delay_sets_fusion_horizon() -> None:
     assert flown.horizon_s == inputs.horizon_s < later.horizon_s
 
 
-def test_vision_samples_same_step_or_late_are_dropped() -> None:
+def test_second_vision_sample_in_one_step_is_dropped() -> None:
     vision = sent(rate_hz=25.0)
     doubled = {
         name: np.repeat(getattr(vision, name), 2, axis=0)
@@ -442,7 +442,7 @@ def model() -> Model:
     return opened(flown())
 
 
-def test_model_gnss_and_vision_agree_with_log() -> None:
+def test_ekf2_model_of_gnss_and_vision_agrees_with_log() -> None:
     agreement = model().agreement
     assert agreement.good
     assert agreement.doubtful == {}
@@ -455,7 +455,7 @@ def test_model_gnss_and_vision_agree_with_log() -> None:
     assert model().inputs.settings["EKF2_EVP_NOISE"] == pytest.approx(0.1)
 
 
-def test_what_if_other_vision_noise_matches_real_flight() -> None:
+def test_what_if_vision_noise_equals_flight_with_that_noise() -> None:
     other = opened(flown(EKF2_EVP_NOISE=1.0))
     for one, value, then in ((model(), 1.0, other), (other, 0.1, model())):
         found, true = what_if(one, [{"EKF2_EVP_NOISE": value}]), what_if(then, [])
@@ -470,7 +470,7 @@ def test_what_if_other_vision_noise_matches_real_flight() -> None:
     assert update_log.whatif[0].others == update_log.replayed.others
 
 
-def test_what_if_smaller_vision_gate_rejects_more() -> None:
+def test_what_if_with_smaller_vision_gate_rejects_more() -> None:
     request = WhatIfRequest(log="flight.ulg", changes={"EKF2_EVP_GATE": 1.0})
     made_of = run_what_if(request, flight=flown())
     found, update_log = made_of.whatif, {label: cells for label, *cells in rows(made_of)}
@@ -482,7 +482,7 @@ def test_what_if_smaller_vision_gate_rejects_more() -> None:
     assert found.whatif[0].others["ev_pos"].rejected_fraction > 0.2
 
 
-def test_what_if_without_vision_or_gnss_uses_other() -> None:
+def test_what_if_without_gnss_uses_vision() -> None:
     without_vision = what_if(model(), [{}], {"ev_pos": 40.0})
     assert without_vision.whatif[0].others == {}
     lost = what_if(model(), [{}], dict.fromkeys(("gnss_pos", "gnss_vel"), 40.0))
@@ -500,7 +500,7 @@ def test_what_if_without_vision_or_gnss_uses_other() -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"wrong_m": 1.0}, {"flipped": True}])
-def test_model_disagreeing_vision_is_excluded(wrong: dict[str, Any]) -> None:
+def test_ekf2_model_excludes_vision_that_disagrees_with_log(wrong: dict[str, Any]) -> None:
     found = opened(flown(**wrong))
     assert "external vision" in format_agreement(found.agreement)
     assert "ev_pos" in found.agreement.doubtful
@@ -513,7 +513,7 @@ def test_model_disagreeing_vision_is_excluded(wrong: dict[str, Any]) -> None:
         replay_settings(found, [{"EKF2_EVP_NOISE": 0.3}])
 
 
-def test_model_vision_while_disabled_is_not_fused() -> None:
+def test_ekf2_model_does_not_fuse_vision_while_disabled() -> None:
     found = opened(flown(off_from_s=60.0))
     assert found.inputs.vision is not None
     update_log = np.isfinite(found.inputs.vision.position_m[:, 0])
@@ -522,7 +522,7 @@ def test_model_vision_while_disabled_is_not_fused() -> None:
     assert found.agreement.doubtful == {}
 
 
-def test_model_incomplete_vision_is_unavailable() -> None:
+def test_ekf2_model_with_incomplete_vision_is_unavailable() -> None:
     flight = flown()
     gnss_alone = replace(flight, positions=flight.positions[1:])
     lacking = open_model(gnss_alone)
@@ -536,7 +536,7 @@ def test_model_incomplete_vision_is_unavailable() -> None:
     assert "relative vision positions" in refused.reason
 
 
-def test_difference_steps_contain_vision_causes_only_kf() -> None:
+def test_kf_ekf2_difference_steps_include_vision_besides_gnss() -> None:
     found = steps.explain_by_steps(model())
     for why in found.values():
         names = [step.name for step in why.steps]

@@ -38,7 +38,7 @@ def swept(sample_log: Path) -> WhatIfAnalysis:
     return run_what_if(request)
 
 
-def test_whatif_results_have_logged_replayed_and_changed(sample_log: Path) -> None:
+def test_whatif_command_writes_logged_replayed_and_changed(sample_log: Path) -> None:
     options = "--set", "EKF2_EVP_NOISE=0.3", "--json", "-"
     text = run_checked("whatif", sample_log, *options).stdout
     said = json.loads(text)
@@ -50,7 +50,7 @@ def test_whatif_results_have_logged_replayed_and_changed(sample_log: Path) -> No
     assert said["whatif"]["north"]["nis_mean"] < 0.3 * said["replayed"]["north"]["nis_mean"]
 
 
-def test_whatif_without_gnss_from_time_drifts_afterwards(sample_log: Path) -> None:
+def test_whatif_command_without_vision_drifts_afterwards(sample_log: Path) -> None:
     options = "--without", "ev_pos", "--from", "100", "--json", "-"
     said = json.loads(run_checked("whatif", sample_log, *options).stdout)
     jsonschema.validate(said, schema())
@@ -68,7 +68,7 @@ def test_whatif_without_gnss_from_time_drifts_afterwards(sample_log: Path) -> No
     assert "EKF2 stops providing a position after EKF2_NOAID_TOUT (5 s)" in note
 
 
-def test_whatif_unknown_aid_or_time_is_refused(estimated: WhatIfAnalysis) -> None:
+def test_what_if_with_unknown_aiding_source_raises_error(estimated: WhatIfAnalysis) -> None:
     model = open_model(estimated.flight)
     for without, said in (
         ({"baro_hgt": 60.0}, "baro_hgt: in this log the replay fuses only ev_pos."),
@@ -78,7 +78,7 @@ def test_whatif_unknown_aid_or_time_is_refused(estimated: WhatIfAnalysis) -> Non
             what_if(model, [], without)
 
 
-def test_whatif_without_set_uses_ml_estimates(estimated: WhatIfAnalysis) -> None:
+def test_whatif_command_without_set_uses_estimated_parameters(estimated: WhatIfAnalysis) -> None:
     """The UWB noise is 0.10 m, and its timestamps are right."""
     assert estimated.asked
     assert set(estimated.changes) == {"EKF2_EVP_NOISE"}
@@ -91,7 +91,7 @@ def test_whatif_without_set_uses_ml_estimates(estimated: WhatIfAnalysis) -> None
     assert all(len(cells) == len(column_heads(estimated)) == 3 for cells in table.values())
 
 
-def test_whatif_sweep_keeps_set_parameters(swept: WhatIfAnalysis) -> None:
+def test_whatif_sweep_keeps_parameters_given_with_set(swept: WhatIfAnalysis) -> None:
     first, *values = swept.whatif.whatif
     assert dict(first.changed) == {"EKF2_EVP_GATE": 3.0}
     assert [v.changed["EKF2_EVP_NOISE"] for v in values] == pytest.approx([0.05, 0.1, 0.2])
@@ -106,7 +106,7 @@ def test_whatif_sweep_keeps_set_parameters(swept: WhatIfAnalysis) -> None:
     assert f"smallest at EKF2_EVP_NOISE {least.changed['EKF2_EVP_NOISE']:.3g}" in error
 
 
-def test_whatif_log_without_replay_data_gives_reason(sample_log: Path) -> None:
+def test_whatif_on_log_without_ekf2_states_raises_missing_data(sample_log: Path) -> None:
     with pytest.raises(MissingDataError, match="EKF2 replay: estimator_states is not logged"):
         run_what_if(WhatIfRequest(log=str(sample_log.with_suffix(".tlog"))))
 
@@ -119,7 +119,7 @@ class TestFlownFlights:
         log = shared_logs / "simulated" / f"{name}.ulg"
         return run_what_if(WhatIfRequest(log=str(log)))
 
-    def test_ml_noise_ends_rejections(self, shared_logs: Path) -> None:
+    def test_what_if_with_estimated_noise_has_no_rejections(self, shared_logs: Path) -> None:
         found = self.of(shared_logs, "v1.16.1_aisle_overconfident")
         assert set(found.changes) == {"EKF2_EVP_NOISE"}
         (cured,) = found.whatif.whatif
@@ -129,7 +129,9 @@ class TestFlownFlights:
         assert cured.position_rmse_to_truth_m < 0.4 * error(found.whatif.logged)
 
     @pytest.mark.parametrize("name", ["v1.16.1_aisle_clock_late", "v1.16.1_aisle_clock_nosync"])
-    def test_estimated_delay_restores_position_rmse(self, shared_logs: Path, name: str) -> None:
+    def test_what_if_with_estimated_delay_restores_position_rmse(
+        self, shared_logs: Path, name: str
+    ) -> None:
         found = self.of(shared_logs, name)
         assert found.changes["EKF2_EV_DELAY"] == pytest.approx(250.0, abs=25.0)
         clean = self.of(shared_logs, "v1.16.1_aisle_nominal").whatif.logged
@@ -137,7 +139,7 @@ class TestFlownFlights:
         assert error(cured) < 1.2 * error(clean) < 0.5 * error(found.whatif.logged)
         assert not any("would reach EKF2 after" in note for note in found.whatif.notes)
 
-    def test_previous_delay_is_reverted(self, shared_logs: Path) -> None:
+    def test_what_if_estimate_reverts_a_wrong_ekf2_delay(self, shared_logs: Path) -> None:
         found = self.of(shared_logs, "v1.13.3_aisle_evdelay175")
         assert found.changes["EKF2_EV_DELAY"] == 0.0
         (cured,) = found.whatif.whatif
@@ -158,7 +160,7 @@ class TestFlownFlights:
             ("real/vladimireganov_ROS_PX4_MOCAP_square2", "EKF2 may have fused more samples"),
         ],
     )  # fmt: skip
-    def test_replay_without_agreement_is_refused(
+    def test_what_if_on_log_without_agreement_raises_missing_data(
         self, shared_logs: Path, log: str, said: str
     ) -> None:
         with pytest.raises(MissingDataError, match=said):
@@ -173,7 +175,7 @@ def error(summary: Summary) -> float:
     return float(np.hypot(*parts))
 
 
-def test_unpredictable_change_has_no_numbers(sample_flight: Flight) -> None:
+def test_what_if_table_shows_no_numbers_if_unpredictable(sample_flight: Flight) -> None:
     name, sweep = sample_flight.log.name, Sweep("EKF2_EVP_GATE", 1.0, 5.0, 2)
     request = WhatIfRequest(log=name, changes={"EKF2_EVP_NOISE": 0.02}, sweep=sweep)
     assert command_line(request).endswith("--set EKF2_EVP_NOISE=0.02 --sweep EKF2_EVP_GATE=1:5:2")

@@ -32,7 +32,7 @@ def explain_again(analysis: Analysis, settings: Settings, **choices: Any) -> Dif
     return explain_ekf2_difference(comparison, analysis.ekf2_model, analysis.clock, {})["aisle"]
 
 
-def test_explain_ekf2_difference_total_is_kf_minus_published(sample: Analysis) -> None:
+def test_explained_kf_ekf2_difference_equals_kf_minus_ekf2(sample: Analysis) -> None:
     explanation = of(sample)
     result = next(r for r in sample.axes.values() if r.axis.name == "aisle")
     position, speed = state_at(result.replay, explanation.times_s)
@@ -47,7 +47,7 @@ def test_explain_ekf2_difference_total_is_kf_minus_published(sample: Analysis) -
     )
 
 
-def test_explain_ekf2_difference_kf_settings_change_their_step(sample: Analysis) -> None:
+def test_kf_setting_changes_only_its_step_of_kf_ekf2_difference(sample: Analysis) -> None:
     plain = of(sample)
     zero = explain_again(sample, Settings(input="zero"))
     assert zero.steps[0].name == SAMPLES
@@ -63,14 +63,14 @@ def test_explain_ekf2_difference_kf_settings_change_their_step(sample: Analysis)
     assert [o.unexplained_mean_square_m2 for o in (zero, small, late)] == [left] * 3
 
 
-def test_explain_ekf2_difference_covers_the_segment_only(sample: Analysis) -> None:
+def test_explained_kf_ekf2_difference_covers_only_the_segment(sample: Analysis) -> None:
     explanation = explain_again(sample, Settings(), start_s=30.0, end_s=60.0)
     assert explanation.spans_s[0][0] == pytest.approx(30.0, abs=0.2)
     assert explanation.spans_s[0][1] == pytest.approx(60.0, abs=0.3)
     assert of(sample).outside.at_s < of(sample).spans_s[0][0]
 
 
-def test_explain_ekf2_difference_without_model_gives_reason(sample: Analysis) -> None:
+def test_kf_ekf2_difference_without_replay_states_reason(sample: Analysis) -> None:
     down = compare(sample.flight, axes=("down",))
     found = explain_ekf2_difference(down, sample.ekf2_model, sample.clock, {})["down"]
     assert "horizontal" in found.reason
@@ -85,7 +85,7 @@ def drawn(analysis: Analysis) -> list:
         return list(draw(analysis, None))
 
 
-def test_report_without_agreeing_replay_has_no_why_page(sample: Analysis) -> None:
+def test_report_without_agreeing_replay_has_no_difference_page(sample: Analysis) -> None:
     model = sample.ekf2_model
     agreement = replace(model.agreement, good=False, reason="they part")
     doubtful = replace(model, agreement=agreement, flown=replace(model.flown, agreement=agreement))
@@ -107,7 +107,7 @@ def test_report_without_agreeing_replay_has_no_why_page(sample: Analysis) -> Non
     ("share", "text"),
     [(0.47, "47 % of the mean square"), (1.4, "more than the whole mean square")],
 )
-def test_add_sentences_states_step_share_and_largest_effect(sample, share, text) -> None:
+def test_kf_ekf2_difference_sentence_states_largest_step(sample, share, text) -> None:
     explanation = of(sample)
     first, whole = explanation.steps[0], explanation.position_mean_square_m2
     shares = [share, *[1e-3] * (len(explanation.steps) - 1)]
@@ -122,7 +122,7 @@ def test_add_sentences_states_step_share_and_largest_effect(sample, share, text)
     assert f"Largest effect at {first.moved_at_s:.1f} s" in explained.sentences[0]
 
 
-def test_corrected_settings_replace_a_wrong_setting_first(sample: Analysis) -> None:
+def test_kf_ekf2_difference_names_a_wrong_kf_setting_first(sample: Analysis) -> None:
     comparison = compare(sample.flight, Settings(sigma_a_m_s2=0.001), axes=("aisle",))
     corrected = corrected_settings(comparison, sample.tuning)
     assert corrected == {"sigma_a_m_s2": pytest.approx(0.363, abs=0.01)}

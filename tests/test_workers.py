@@ -10,7 +10,7 @@ import sys
 from contextlib import closing
 
 import pytest
-from bad_jobs import act
+from failing_jobs import run_job
 
 from px4fuse import workers
 from px4fuse.workers import JobFailure, run_bounded
@@ -20,7 +20,9 @@ MEMORY = 1_500_000_000
 
 def run(jobs, processes=2, timeout_s=60.0, memory_bytes=None):
     outcomes = list(
-        run_bounded(act, jobs, processes=processes, timeout_s=timeout_s, memory_bytes=memory_bytes)
+        run_bounded(
+            run_job, jobs, processes=processes, timeout_s=timeout_s, memory_bytes=memory_bytes
+        )
     )
     assert not multiprocessing.active_children()
     assert [index for index, _ in sorted(outcomes, key=lambda outcome: outcome[0])] == [
@@ -29,7 +31,7 @@ def run(jobs, processes=2, timeout_s=60.0, memory_bytes=None):
     return [result for _, result in sorted(outcomes, key=lambda outcome: outcome[0])], outcomes
 
 
-def test_run_bounded_failed_job_does_not_affect_others():
+def test_worker_job_that_fails_does_not_affect_other_jobs():
     before = os.environ.get("OMP_NUM_THREADS")
     jobs = [
         ("square", 1),
@@ -57,7 +59,7 @@ def test_run_bounded_failed_job_does_not_affect_others():
     assert os.environ.get("OMP_NUM_THREADS") == before
 
 
-def test_run_bounded_hanging_job_ends_at_time_limit():
+def test_worker_job_that_hangs_ends_at_time_limit():
     results, _ = run([("hang", 0), ("square", 2), ("hang", 0), ("square", 3)], timeout_s=3.0)
     assert results[1::2] == [4, 9]
     late = JobFailure("the time limit of 3 s was exceeded.")
@@ -65,7 +67,7 @@ def test_run_bounded_hanging_job_ends_at_time_limit():
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not enforce the limit")
-def test_run_bounded_large_job_ends_at_memory_limit():
+def test_worker_job_above_memory_limit_is_ended():
     jobs = [("square", 2), ("hog", 10 * MEMORY), ("square", 3)]
     results, _ = run(jobs, processes=1, memory_bytes=MEMORY)
     assert results == [4, JobFailure("the memory limit for one file was exceeded."), 9]
@@ -75,15 +77,15 @@ def test_run_bounded_large_job_ends_at_memory_limit():
     assert before != after
 
 
-def test_run_bounded_replaces_process_after_job_count(monkeypatch):
+def test_worker_process_is_replaced_after_given_number_of_jobs(monkeypatch):
     monkeypatch.setattr(workers, "JOBS_PER_WORKER", 2)
     results, _ = run([("process", 0)] * 5, processes=1)
     assert len(set(results)) == 3
     assert results[0] == results[1] != results[2]
 
 
-def test_run_bounded_unknown_function_fails_each_job(monkeypatch):
-    monkeypatch.setattr(act, "__module__", "test_workers_is_not_here")
+def test_worker_that_cannot_import_the_function_fails_each_job(monkeypatch):
+    monkeypatch.setattr(run_job, "__module__", "test_workers_is_not_here")
     monkeypatch.setitem(sys.modules, "test_workers_is_not_here", sys.modules[__name__])
     results, _ = run([("square", 1), ("square", 2)])
     assert all(
@@ -91,9 +93,9 @@ def test_run_bounded_unknown_function_fails_each_job(monkeypatch):
     )
 
 
-def test_run_bounded_close_ends_all_processes():
+def test_closing_the_worker_pool_ends_all_processes():
     jobs = [("square", 1), ("hang", 0)]
-    with closing(run_bounded(act, jobs, processes=2, timeout_s=60, memory_bytes=None)) as work:
+    with closing(run_bounded(run_job, jobs, processes=2, timeout_s=60, memory_bytes=None)) as work:
         assert next(work) == (0, 1)
     assert not multiprocessing.active_children()
 
@@ -102,10 +104,10 @@ INTERRUPTED = """
 import os, sys, time
 sys.path.insert(0, {tests!r})
 from px4fuse.workers import run_bounded
-from bad_jobs import act
+from failing_jobs import run_job
 
 if __name__ == "__main__":
-    for _, result in run_bounded(act, [("process", 0), ("hang", 0)], processes=1, timeout_s=500,
+    for _, result in run_bounded(run_job, [("process", 0), ("hang", 0)], processes=1, timeout_s=500,
                                  memory_bytes=None):
         print(result, flush=True)
 """
@@ -119,7 +121,7 @@ def hanging(folder):
     return subprocess.Popen([sys.executable, script], stdout=pipe, stderr=pipe, text=True)
 
 
-def test_worker_does_not_import_from_current_folder(tmp_path):
+def test_worker_process_does_not_import_from_current_folder(tmp_path):
     """A submitted types.py must not be executed if grade runs in its folder."""
     script = tmp_path / "program" / "script.py"
     script.parent.mkdir()
@@ -135,7 +137,7 @@ def test_worker_does_not_import_from_current_folder(tmp_path):
     assert not (work / "executed").exists()
 
 
-def test_worker_closed_pipe_ends_without_traceback():
+def test_worker_with_closed_pipe_ends_without_traceback():
     script = """if True:
         from multiprocessing import Pipe
         from px4fuse.workers import _serve
@@ -150,7 +152,7 @@ def test_worker_closed_pipe_ends_without_traceback():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
-def test_worker_parent_killed_ends_hanging_job(tmp_path):
+def test_killing_the_parent_process_ends_a_hanging_worker(tmp_path):
     with hanging(tmp_path) as parent:
         parent.stdout.readline()
         parent.kill()
@@ -159,7 +161,7 @@ def test_worker_parent_killed_ends_hanging_job(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for one process")
-def test_worker_ctrl_c_ends_hanging_job(tmp_path):
+def test_ctrl_c_ends_a_hanging_worker_job(tmp_path):
     with hanging(tmp_path) as parent:
         worker = int(parent.stdout.readline())
         parent.send_signal(signal.SIGINT)

@@ -59,7 +59,7 @@ LOOP = ("loop", "s.tum", "--tum", "c.tum")
 
 
 @posix
-def test_write_named_pipe_is_written_and_kept(desk) -> None:
+def test_output_to_named_pipe_keeps_the_pipe(desk) -> None:
     pipe = desk / "pipe"
     os.mkfifo(pipe)
     heard = []
@@ -73,7 +73,7 @@ def test_write_named_pipe_is_written_and_kept(desk) -> None:
 
 
 @posix
-def test_write_device_is_written_and_kept(desk) -> None:
+def test_output_to_device_keeps_the_device(desk) -> None:
     """Use a link, so that a failure replaces the link and not the device."""
     link = desk / "null"
     link.symlink_to(os.devnull)
@@ -83,7 +83,7 @@ def test_write_device_is_written_and_kept(desk) -> None:
 
 
 @posix
-def test_write_socket_is_refused_and_kept(desk) -> None:
+def test_output_to_socket_is_refused_and_keeps_the_socket(desk) -> None:
     import socket
 
     with socket.socket(socket.AF_UNIX) as listening:
@@ -94,7 +94,7 @@ def test_write_socket_is_refused_and_kept(desk) -> None:
 
 
 @posix
-def test_write_symbolic_link_replaces_its_target(tmp_path) -> None:
+def test_output_to_symbolic_link_replaces_its_target(tmp_path) -> None:
     (tmp_path / "old").write_bytes(b"old")
     for link, target in (("a", "old"), ("b", "new"), ("c", "a")):
         (tmp_path / link).symlink_to(target)
@@ -108,7 +108,7 @@ def test_write_symbolic_link_replaces_its_target(tmp_path) -> None:
 
 
 @posix
-def test_write_dev_stdout_appends_to_redirected_file(desk) -> None:
+def test_output_to_dev_stdout_appends_to_redirected_file(desk) -> None:
     """Use a link, so that a failure replaces the link and not /dev/stdout."""
     out = desk / "out.txt"
     out.write_bytes(b"before\n")
@@ -124,7 +124,7 @@ def test_write_dev_stdout_appends_to_redirected_file(desk) -> None:
 # --- each file complete or not at all ---
 
 
-def test_write_longest_file_name_is_written(tmp_path) -> None:
+def test_output_with_longest_file_name_is_written(tmp_path) -> None:
     path = tmp_path / ("n" * 250 + ".json")
     write_all({path: b"x"})
     assert path.read_bytes() == b"x"
@@ -147,7 +147,7 @@ def deny() -> None:
     raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
-def test_error_stops_writing_and_lists_written_files(tmp_path, monkeypatch) -> None:
+def test_write_error_lists_the_files_already_written(tmp_path, monkeypatch) -> None:
     a, b, c = (tmp_path / name for name in "abc")
     for path in (a, b, c):
         path.write_bytes(b"old")
@@ -163,7 +163,7 @@ def test_error_stops_writing_and_lists_written_files(tmp_path, monkeypatch) -> N
         write_all({b: b"new"})
 
 
-def test_write_locked_file_advises_to_close_the_program(tmp_path, monkeypatch) -> None:
+def test_output_to_locked_file_advises_to_close_the_program(tmp_path, monkeypatch) -> None:
     path = tmp_path / "r.pdf"
     path.write_bytes(b"old")
     at_rename_to(path, monkeypatch, deny)
@@ -176,7 +176,7 @@ def test_write_locked_file_advises_to_close_the_program(tmp_path, monkeypatch) -
 
 @posix
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_signal_at_rename_leaves_complete_files_only(tmp_path, monkeypatch, name) -> None:
+def test_stop_signal_while_writing_leaves_only_complete_files(tmp_path, monkeypatch, name) -> None:
     number = getattr(signal, name)
 
     def stop(number: int, _: object) -> None:
@@ -200,7 +200,7 @@ def test_signal_at_rename_leaves_complete_files_only(tmp_path, monkeypatch, name
 
 @posix
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
-def test_signal_while_writing_names_the_written_files(desk, name, code) -> None:
+def test_stop_signal_while_writing_lists_the_written_files(desk, name, code) -> None:
     os.mkfifo(desk / "pipe")  # without a reader the run waits after writing its other file
     number = getattr(signal, name)
     handler = signal.signal(number, signal.SIG_DFL)  # the new process inherits ignored signals
@@ -235,7 +235,7 @@ main()
 
 
 @posix
-def test_signal_in_finaliser_ends_run(tmp_path) -> None:
+def test_stop_signal_in_python_finaliser_ends_the_command(tmp_path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", SIGNAL_IN_FINALISER], capture_output=True, timeout=50, check=False
     )
@@ -243,7 +243,7 @@ def test_signal_in_finaliser_ends_run(tmp_path) -> None:
     assert done.stderr == b"px4fuse: interrupted; nothing was written.\n"
 
 
-def test_signal_after_writing_names_the_written_files(desk, monkeypatch, capsys) -> None:
+def test_stop_signal_after_writing_lists_the_written_files(desk, monkeypatch, capsys) -> None:
     from px4fuse.report import screen
 
     def stopped(*_: object) -> None:
@@ -266,7 +266,7 @@ def test_signal_after_writing_names_the_written_files(desk, monkeypatch, capsys)
         ("c.json", "; already written: c.tum, c.json.", ["c.json", "c.tum"]),
     ],
 )
-def test_full_standard_output_names_the_written_files(desk, json_path, left, there) -> None:
+def test_full_disk_at_standard_output_lists_the_written_files(desk, json_path, left, there) -> None:
     with Path("/dev/full").open("wb") as device:
         process = start(desk, *LOOP, "--json", json_path, stdout=device)
         err = process.communicate()[1].decode()
@@ -277,7 +277,7 @@ def test_full_standard_output_names_the_written_files(desk, json_path, left, the
     assert names(desk) == [*there, "l.ulg", "s.tum"]
 
 
-def test_json_to_closed_pipe_writes_other_files(desk) -> None:
+def test_json_to_closed_pipe_still_writes_the_other_files(desk) -> None:
     process = start(desk, *LOOP, "--json", "-", stdout=subprocess.PIPE)
     process.stdout.close()
     assert process.stderr.read() == b""
@@ -286,7 +286,7 @@ def test_json_to_closed_pipe_writes_other_files(desk) -> None:
     assert names(desk) == ["c.tum", "l.ulg", "s.tum"]
 
 
-def test_folder_as_target_is_refused(tmp_path, capsysbinary) -> None:
+def test_output_to_existing_folder_name_is_refused(tmp_path, capsysbinary) -> None:
     (tmp_path / "folder").mkdir()
     with pytest.raises(OutputError, match=r"folder: cannot be written \(Is a directory\)"):
         write_all({tmp_path / "folder": b"", STANDARD_OUTPUT: b"{}"})
@@ -299,7 +299,7 @@ def test_folder_as_target_is_refused(tmp_path, capsysbinary) -> None:
 
 
 @pytest.mark.parametrize(("name", "said"), [("王小明", True), ("Ångström", False)])
-def test_compare_warns_early_if_name_has_no_font(
+def test_compare_warns_before_drawing_if_name_has_no_font(
     desk, monkeypatch, capsys, name: str, said: bool
 ) -> None:
     warnings = []
@@ -324,14 +324,14 @@ def test_compare_warns_early_if_name_has_no_font(
     ["compare l.ulg -o \x1b[31m.pdf", "extract l.ulg -o \x1b[31m", "simulate -o \x1b[31m.ulg",
      "answers l.ulg -o \u202e.toml"],
 )  # fmt: skip
-def test_written_names_have_no_escape_sequences(desk, command: str) -> None:
+def test_printed_file_names_contain_no_escape_sequences(desk, command: str) -> None:
     warnings = run(*command.split(" "))
     assert warnings.exit_code == 0
     assert not {"\x1b", "\u202e"} & set(warnings.output)
     assert any({"\x1b", "\u202e"} & set(path.name) for path in desk.iterdir())
 
 
-def test_extract_into_folder_of_other_log_is_refused(desk) -> None:
+def test_extract_into_folder_with_other_log_is_refused(desk) -> None:
     make_log("v1.14", SECONDS).write(desk / "other.ulg")
     for _ in range(2):  # the same log again
         run_checked("extract", "l.ulg", "-o", "tables")
@@ -344,7 +344,7 @@ def test_extract_into_folder_of_other_log_is_refused(desk) -> None:
 
 
 @pytest.mark.parametrize("command", ["info", "extract"])
-def test_output_to_closed_pipe_exits_with_0(desk, command) -> None:
+def test_terminal_output_to_closed_pipe_exits_with_0(desk, command) -> None:
     """The reader ends before the first line, as with px4fuse info LOG | head -1."""
     options = ["-o", "tables"] if command == "extract" else []
     process = start(desk, command, "l.ulg", *options, stdout=subprocess.PIPE)
@@ -357,7 +357,7 @@ def test_output_to_closed_pipe_exits_with_0(desk, command) -> None:
 # --- --clock-offset auto ---
 
 
-def test_clock_offset_auto_insignificant_estimate_adds_zero(sample_log) -> None:
+def test_clock_offset_auto_is_zero_if_not_significant(sample_log) -> None:
     request = ComparisonRequest(log=str(sample_log), clock_offset_s="auto", axes=("north", "east"))
     found = run_comparison(request)
     assert found.settings.clock_offset_s == 0.0
@@ -384,14 +384,14 @@ def test_clock_offset_auto_corrects_late_timestamps(shared_logs) -> None:
 
 @posix
 @pytest.mark.parametrize("words", ["--help", "lesson kalman"])
-def test_output_closed_stdout_exits_with_0(words: str) -> None:
+def test_command_with_closed_standard_output_exits_with_0(words: str) -> None:
     command = ["sh", "-c", f"{sys.executable} -m px4fuse {words} >&-"]
     ended = subprocess.run(command, stderr=subprocess.PIPE, check=False)
     assert (ended.returncode, ended.stderr) == (0, b"")
 
 
 @posix
-def test_write_pipe_without_reader_ends_after_timeout(
+def test_output_to_pipe_without_reader_ends_after_timeout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample_log: Path
 ) -> None:
     monkeypatch.setattr("px4fuse.writing.READER_TIMEOUT_S", 0.1)

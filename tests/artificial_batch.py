@@ -12,7 +12,7 @@ NOT_LOGGED = ("position: the log has no vehicle_visual_odometry", "Set SDLOG_PRO
 DAMAGED = ("not a ULog file", "Give the log as the flight controller wrote it.")
 
 
-def made_up(count: int, seed: int = 1) -> pd.DataFrame:
+def artificial_logs(count: int, seed: int = 1) -> pd.DataFrame:
     """Make logs of three vehicles over a year: every tenth failed, every twelfth is not compared.
 
     SIGMA_Z of the first vehicle triples in the middle of the year; the clock of the second jumps.

@@ -1,9 +1,9 @@
 """Random commands whose output path is one of their inputs; no run may change an input.
 
-``python tests/studies/aimed_outputs.py --count 2000 --seed 1`` draws a command, one of its inputs,
-one of its outputs and a way to it (``tests/aimed.py``), and adds detours (``./``, ``x/../``) and
-further links. It prints per command the runs, how many were refused as an input and otherwise, and
-the runs that changed an input; these end with exit code 1.
+``python tests/studies/overwrite_attempts.py --count 2000 --seed 1`` draws a command, one of its
+inputs, one of its outputs and a way to it (``tests/overwrite_cases.py``), and adds detours (``./``,
+``x/../``) and further links. It prints per command the runs, how many were refused as an input and
+otherwise, and the runs that changed an input; these end with exit code 1.
 
 Each case once, without detours, is in the suite: ``tests/test_input_files.py``.
 """
@@ -26,8 +26,8 @@ TESTS = Path(__file__).resolve().parents[1]
 if str(TESTS) not in sys.path:
     sys.path.insert(0, str(TESTS))
 
-from aimed import Aim, aims, file_hashes, make_desk, make_empty_folder  # noqa: E402
 from conftest import blank_page  # noqa: E402
+from overwrite_cases import OverwriteCase, all_cases, file_hashes, make_desk, make_empty_folder  # noqa: E402
 
 from px4fuse.cli import cli  # noqa: E402
 from px4fuse.errors import OutputError  # noqa: E402
@@ -53,13 +53,15 @@ def detoured(typed: str, place: Path, rng: random.Random) -> str:
     return typed
 
 
-def outcome(aim: Aim, desk: Path, place: Path, rng: random.Random, before: object) -> str:
-    """Run one aim and return its outcome; "" if the way is not possible."""
-    arguments = aim.arguments(desk, make_empty_folder(place))
+def outcome(
+    case: OverwriteCase, desk: Path, place: Path, rng: random.Random, before: object
+) -> str:
+    """Run one case and return its outcome; "" if the way is not possible."""
+    arguments = case.arguments(desk, make_empty_folder(place))
     if arguments is None:
         return ""
     *rest, target = arguments
-    if not target.endswith(".pdf") or aim.way != "beside":
+    if not target.endswith(".pdf") or case.way != "beside":
         target = detoured(target, place, rng)
     result = CliRunner().invoke(cli, [*rest, target])
     if file_hashes(desk) != before:
@@ -70,13 +72,13 @@ def outcome(aim: Aim, desk: Path, place: Path, rng: random.Random, before: objec
 
 
 def main() -> None:
-    """Draw and run aims, and print the table."""
+    """Draw and run cases, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
-    rng, every, begin = random.Random(given.seed), aims(), time.monotonic()
-    counts: dict[str, Counter[str]] = {aim.command: Counter() for aim in every}
+    rng, every, begin = random.Random(given.seed), all_cases(), time.monotonic()
+    counts: dict[str, Counter[str]] = {case.command: Counter() for case in every}
     with (
         tempfile.TemporaryDirectory() as folder,
         mock.patch("px4fuse.report.pdf.render", blank_page),
@@ -86,12 +88,12 @@ def main() -> None:
         os.chdir(desk)
         done = 0
         while done < given.count:
-            aim = rng.choice(every)
-            found = outcome(aim, desk, Path(folder, "place"), rng, before)
+            case = rng.choice(every)
+            found = outcome(case, desk, Path(folder, "place"), rng, before)
             done += bool(found)
-            counts[aim.command][found] += 1
+            counts[case.command][found] += 1
             if found not in ("", "refused"):
-                print(f"{found}: {aim}", flush=True)
+                print(f"{found}: {case}", flush=True)
             if found == "changed":
                 sys.exit(1)
         os.chdir(TESTS)

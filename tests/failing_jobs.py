@@ -16,7 +16,7 @@ class Unreadable:
         return int, ("no number",)
 
 
-def act(job: tuple[str, Any]) -> Any:
+def run_job(job: tuple[str, Any]) -> Any:
     """Perform the action that a job names."""
     what, value = job
     match what:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import itertools
 import os
-import random
 import shutil
 import zipfile
 from dataclasses import dataclass
@@ -90,7 +89,7 @@ def file_hashes(folder: Path) -> dict[str, str]:
 
 
 @dataclass(frozen=True)
-class Aim:
+class OverwriteCase:
     """A command with one of its outputs at one of its inputs.
 
     Attributes
@@ -166,7 +165,7 @@ def _linked_into(target: Path, way: str, place: Path, name: str) -> str | None:
     return str(out)
 
 
-def aims() -> list[Aim]:
+def all_cases() -> list[OverwriteCase]:
     """Return all combinations of command, input, output and way."""
     found = []
     for command, reads, options, names in RUNS:
@@ -175,13 +174,8 @@ def aims() -> list[Aim]:
         for read, (option, name), way in itertools.product(
             reads.split(), outputs, (*PATHS, "beside")
         ):
-            found.append(Aim(command, read, option, name, way))
+            found.append(OverwriteCase(command, read, option, name, way))
     return found
-
-
-def draw_aims(count: int, seed: int) -> list[Aim]:
-    """Draw aims with replacement."""
-    return random.Random(seed).choices(aims(), k=count)
 
 
 def make_empty_folder(place: Path) -> Path:
