@@ -1,7 +1,7 @@
 """Maximum-likelihood search of the map from the positions of a source to north, east and down.
 
 A hypothesis consists of axes (48 signed permutations, mirrored ones included), a rotation about the
-vertical, a unit and a time offset up to ``MAX_OFFSET_S``. For one time offset, all hypotheses
+vertical, a unit and a time offset, usually up to 10 s. For one time offset, all hypotheses
 follow from one 3×3 matrix of moments: with w = D_a ± i D_b of the source and n = A_north + i A_east
 of the IMU, the best rotation is the angle of Σ conj(w) n. The best hypotheses are refined together
 with an accelerometer bias (body) and, with the heading of the gyro, its linear drift.
@@ -91,6 +91,7 @@ class Positions:
 
     time_s: Array
     position_m: Array
+    max_offset_s: float
     barometer: tuple[Array, Array] | None = None
 
     def with_clock_drift(self, drift: float) -> "Positions":
@@ -99,8 +100,8 @@ class Positions:
         return replace(self, time_s=middle + (self.time_s - middle) / (1.0 + drift))
 
     def motion(self, imu: ImuMotion) -> SourceMotion:
-        """Return the motion on the grid of the IMU, extended by ``MAX_OFFSET_S``."""
-        edge = round(MAX_OFFSET_S / GRID_S)
+        """Return the motion on the grid of the IMU, extended by the largest time offset."""
+        edge = round(self.max_offset_s / GRID_S)
         grid = imu.time_s[0] + GRID_S * np.arange(-edge, len(imu.time_s) + edge)
         return SourceMotion.of(self.time_s, self.position_m, grid)
 

@@ -8,6 +8,7 @@ from msgspec import structs
 
 from px4fuse.arrays import Array
 from px4fuse.convention.axes import (
+    MAX_OFFSET_S,
     SMALL_ROTATION,
     UNITS,
     Hypothesis,
@@ -42,7 +43,9 @@ MAX_REPEATED_SHARE = 0.5
 THIRD_DIFFERENCE, SECOND_DIFFERENCE = 20.0, 6.0
 
 
-def check_convention(flight: Flight, track: PositionTrack) -> Convention | Unavailable:
+def check_convention(
+    flight: Flight, track: PositionTrack, max_offset_s: float = MAX_OFFSET_S
+) -> Convention | None:
     """Determine axes, unit, clock and orientation of a position source.
 
     Parameters
@@ -50,15 +53,17 @@ def check_convention(flight: Flight, track: PositionTrack) -> Convention | Unava
     flight : Flight
     track : PositionTrack
         Positions as read: north, east, down by their definition.
+    max_offset_s : float
+        Largest time offset that is tried.
 
     Returns
     -------
-    Convention, or Unavailable without IMU or attitude.
+    Convention, or None without IMU or attitude.
     """
     inertial = read_inertial(flight)
     if isinstance(inertial, Unavailable):
-        return inertial
-    positions = _read_positions(flight, track)
+        return None
+    positions = _read_positions(flight, track, max_offset_s)
     motions = {
         "EKF2": motion_from_imu(inertial, inertial.with_logged_heading),
         "gyroscopes": motion_from_imu(inertial, inertial.gyro),
@@ -80,7 +85,7 @@ def check_convention(flight: Flight, track: PositionTrack) -> Convention | Unava
     return structs.replace(convention, orientation=orientation)
 
 
-def _read_positions(flight: Flight, track: PositionTrack) -> Positions:
+def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -> Positions:
     """Return the positions without repeated ones; a missing height is 0."""
     samples, barometer = track.samples[Columns.POSITION], flight.barometer
     if samples["down_m"].notna().mean() < MAX_REPEATED_SHARE:
@@ -92,7 +97,7 @@ def _read_positions(flight: Flight, track: PositionTrack) -> Positions:
     heights = None
     if barometer is not None:
         heights = barometer.index.to_numpy(), -barometer["down_m"].to_numpy()
-    return Positions(samples.index.to_numpy(), samples.to_numpy(), heights)
+    return Positions(samples.index.to_numpy(), samples.to_numpy(), max_offset_s, heights)
 
 
 def _search(positions: Positions, motions: dict[str, ImuMotion]) -> list[Hypothesis]:

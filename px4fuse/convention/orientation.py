@@ -110,6 +110,16 @@ def check_orientation(
     return convention, time, best.attitude
 
 
+def to_attitude(quaternion: Array, convention: OrientationConvention) -> Array:
+    """Convert an orientation as sent to the attitude (w, x, y, z; FRD to NED)."""
+    return _convert(quaternion, convention.order, convention.frames)
+
+
+def _convert(sent: Array, order: str, frames: str) -> Array:
+    world, body = FRAMES[frames]
+    return multiply(multiply(world, sent if order == "w x y z" else np.roll(sent, 1, 1)), body)
+
+
 def _make_candidate(
     time: Array,
     sent: Array,
@@ -119,9 +129,7 @@ def _make_candidate(
     quarters: int,
 ) -> Candidate:
     """Convert an orientation by a hypothesis and compare it with the reference."""
-    q = sent if order == "w x y z" else sent[:, [3, 0, 1, 2]]
-    world, body = FRAMES[frames]
-    attitude = multiply(multiply(world, q), body)
+    attitude = _convert(sent, order, frames)
     half = quarters * np.pi / 4.0
     turned = multiply(attitude, np.array([np.cos(half), 0.0, 0.0, np.sin(half)]))
     difference = np.exp(1j * (heading(turned) - heading(reference)))
