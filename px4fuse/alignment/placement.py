@@ -100,7 +100,7 @@ def align_position_file(
     try:
         match = matching.find_match(flight, problem)
     except NoMatchError as error:
-        if fault := explain_mismatch(flight, problem):
+        if fault := explain_mismatch(flight, problem, recording.metres_per_unit):
             raise MissingDataError(f"{recording.name}: {fault[0]}.", fault[1]) from None
         raise MissingDataError(
             f"{recording.name}: {error}; {spans_text}", f"{error.remedy}."

@@ -42,9 +42,8 @@ class Faults:
         0 if not significant.
     orientation : str
         Fault of the orientation; "" if there is none.
-    turned_ekf2 : bool
-        True if EKF2 fused a faulty source and its heading followed, so that the heading of the
-        gyroscopes is used.
+    affects_ekf2 : bool
+        True if EKF2 fused a faulty source, so that its attitude is wrong, too.
     is_ambiguous : bool
         True if other conventions than NED in metres fit equally well, but NED does not.
     """
@@ -55,7 +54,7 @@ class Faults:
     late_s: float = 0.0
     clock_drift: float = 0.0
     orientation: OrientationFault = ""
-    turned_ekf2: bool = False
+    affects_ekf2: bool = False
     is_ambiguous: bool = False
 
     @property
@@ -68,8 +67,8 @@ class Faults:
         return self != Faults()
 
 
-def find_faults(convention: Convention | None, flight: Flight) -> Faults:
-    """Return the faults of a convention that EKF2 or KF would not correct."""
+def find_faults(convention: Convention | None, flight: Flight, frame: str) -> Faults:
+    """Return the faults of a convention; ``frame`` is the stated frame of the source."""
     if convention is None:
         return Faults()
     orientation, fault = convention.orientation, _orientation_fault(convention)
@@ -88,10 +87,10 @@ def find_faults(convention: Convention | None, flight: Flight) -> Faults:
     axes, rotation_deg = _axes_and_rotation(convention)
     has_wrong_heading = fault in ("order", "heading")
     is_drifting = convention.heading_from == "gyroscopes"
-    turned_ekf2 = is_fused and (is_drifting or (has_wrong_heading and rotation_deg != 0.0))
     # if EKF2's heading came from the orientation, the positions have no reference to north
     has_own_heading = is_fused and is_drifting and orientation is not None and fault != "copied"
-    if has_wrong_heading or has_own_heading or (is_drifting and not is_fused and not axes):
+    is_other_drift = is_drifting and not is_fused and not axes
+    if has_wrong_heading or has_own_heading or is_other_drift or frame == "FRD":
         rotation_deg = 0.0
     late_s = convention.late_s if abs(convention.late_s) >= MIN_LATE_S else 0.0
     faults = Faults(
@@ -102,7 +101,8 @@ def find_faults(convention: Convention | None, flight: Flight) -> Faults:
         clock_drift=convention.clock_drift,
         orientation=fault,
     )
-    return replace(faults, turned_ekf2=turned_ekf2 and bool(faults) and fault != "copied")
+    is_wrong = faults.of_positions or has_wrong_heading
+    return replace(faults, affects_ekf2=is_fused and is_wrong)
 
 
 def _axes_and_rotation(convention: Convention) -> tuple[bool, float]:
@@ -144,10 +144,10 @@ def correct(
     """Return the flight and the source without the faults of the convention.
 
     The positions become NED in metres, on the clock of the autopilot. A faulty orientation is
-    converted or left out. If EKF2's heading followed a faulty source, the heading of the gyroscopes
-    replaces it, so that positions and attitude agree.
+    converted or left out. If EKF2 fused a faulty source, the attitude of the gyroscopes replaces
+    EKF2's, so that positions and attitude agree.
     """
-    faults = find_faults(convention, flight)
+    faults = find_faults(convention, flight, track.frame)
     if convention is None or not faults:
         return flight, track
     samples, orientation = track.samples, track.orientation
@@ -172,7 +172,7 @@ def correct(
         orientation = orientation.assign(**dict(zip(Columns.QUATERNION, attitude.T, strict=True)))
         orientation = orientation.set_axis(_corrected_times(orientation.index, faults))
     track = replace(track, samples=samples, orientation=orientation, origin=origin)
-    inertial = read_inertial(flight) if faults.turned_ekf2 else None
+    inertial = read_inertial(flight) if faults.affects_ekf2 else None
     if inertial is None or isinstance(inertial, Unavailable):
         return flight, track
     attitude = inertial.gyro

@@ -8,7 +8,7 @@ FRAME_AXES: dict[str, Axes] = {
     "ENU": ("east", "north", "up"),
     "NWU": ("north", "west", "up"),
 }
-UNIT_NAMES = {"cm": "centimetres", "mm": "millimetres", "feet": "feet"}
+UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "feet": "feet"}
 
 
 def opposite(direction: str) -> str:
@@ -73,13 +73,15 @@ def describe_axes(axes: Axes, stated: str, *, is_mirrored: bool, is_file: bool) 
     return fault, action
 
 
-def describe_unit(unit: str, positions: str, *, is_file: bool) -> tuple[str, str]:
-    """Return the fault of a unit other than metres, and the action.
+def describe_unit(
+    unit: str, positions: str, stated: str = "metres", *, is_file: bool
+) -> tuple[str, str]:
+    """Return the fault of a unit other than the stated one, and the action.
 
     >>> describe_unit("cm", "positions", is_file=True)
     ('positions are in centimetres, not in metres', 'Run again with --position-unit cm.')
     """
-    fault = f"{positions} are in {UNIT_NAMES[unit]}, not in metres"
+    fault = f"{positions} are in {UNIT_NAMES[unit]}, not in {stated}"
     if is_file and unit != "feet":
         return fault, f"Run again with --position-unit {unit}."
     where = "in the file" if is_file else "before they are sent"

@@ -27,6 +27,8 @@ FALSE_AFTER = (
     "ekf2_heading_error",
     "ekf2_underconfident",
     "position_file_alignment",
+    "source_drift",
+    "error_exceeds_reported_sigma",
 )
 # Findings that remain true, with another action
 EFFECTS = (
@@ -37,7 +39,6 @@ EFFECTS = (
     "ekf2_not_fusing",
     "aid_not_fused",
     "aid_overconfident",
-    "error_exceeds_reported_sigma",
 )
 # Groups of findings that an ambiguous convention leaves
 UNAFFECTED_GROUPS = ("logging", "IMU")
@@ -45,7 +46,10 @@ UNAFFECTED_GROUPS = ("logging", "IMU")
 
 def detect(analysis: Comparison) -> Findings:
     """Detect faults of the convention, the cause of others first."""
-    convention, faults = analysis.convention, find_faults(analysis.convention, analysis.flight)
+    convention, faults = (
+        analysis.convention,
+        find_faults(analysis.convention, analysis.flight, analysis.source.frame),
+    )
     if convention is None or not faults:
         return
     if faults.orientation:
@@ -69,7 +73,7 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
 
     Findings about EKF2, which fused what was sent, follow the fault as its effects.
     """
-    faults = find_faults(analysis.convention, analysis.flight)
+    faults = _faults(analysis)
     roots = [one for one in findings if CONVENTION in one.evidence]
     if not roots or (faults.orientation == "copied" and not faults.of_positions):
         return [*findings]
@@ -77,11 +81,15 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
     if faults.is_ambiguous:
         return [*roots, *(one for one in others if one.id in EFFECTS or one.severity == "note")]
     effects = [
-        replace(one, remedy=CORRECT_FIRST, caused_by=roots[0].id)
+        replace(one, message=f"{one.title}.", remedy=CORRECT_FIRST, caused_by=roots[0].id)
         for one in others
         if one.id in EFFECTS and one.caused_by is None
     ]
     return [roots[0], *effects, *roots[1:], *(one for one in others if one.id not in EFFECTS)]
+
+
+def _faults(analysis: Comparison) -> Faults:
+    return find_faults(analysis.convention, analysis.flight, analysis.source.frame)
 
 
 def _fault(
@@ -92,13 +100,12 @@ def _fault(
 
 
 def _basis(convention: Convention) -> str:
-    """State the evidence for the axes, unit or clock."""
-    others = ""
-    if convention.log_odds is not None:
-        others = f", {convention.log_odds:.0f} above any other convention"
+    """State the evidence for axes, unit or clock."""
+    odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
+    more = "above " if odds == 99.0 else ""
     return (
-        "IMU and attitude measure this motion: the log likelihood is "
-        f"{convention.log_likelihood_gain:.0f} above positions without relation to it{others}."
+        "The motion measured by the IMU fits this better than any other convention (log likelihood "
+        f"ratio {more}{odds:.0f})."
     )
 
 
