@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cache
 
 import numpy as np
@@ -9,10 +10,16 @@ import pandas as pd
 import pytest
 from conftest import shared
 from exchange import replace
+from flights import given_placement
 
+from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.preparation import prepare
 from px4fuse.convention.axes import CLOCKWISE, FAMILIES, UNITS, Axes
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.model import Convention, OrientationConvention
+from px4fuse.findings import source_convention
+from px4fuse.findings.cause_grouping import CONVENTION
+from px4fuse.findings.model import Finding, finding
 from px4fuse.flight import Columns, Flight, PositionTrack
 from px4fuse.position_source import RECEIVED
 from px4fuse.readers import read_log
@@ -186,20 +193,116 @@ def test_check_heading_error_of_the_orientation_is_found(error_deg):
 
 
 def test_check_orientation_with_w_last_has_its_order():
-    time, attitude = oriented(flown())
-    track = with_orientation(sent(flown()), np.roll(attitude, -1, axis=1), time)
-    found = check_convention(flown(), track).orientation
+    found = check_convention(flown(), w_last(flown())).orientation
     assert (found.verdict, found.order) == ("determined", "x y z w")
 
 
 def test_check_attitude_sent_back_is_copied():
-    attitude = flown().attitude
+    assert check_convention(flown(), copied(flown())).orientation.verdict == "copied"
+
+
+def copied(flight: Flight) -> PositionTrack:
+    """Return positions with the attitude of the autopilot, 0.03 s later."""
+    attitude = flight.attitude
     time = np.arange(attitude.index[0] + 1.0, attitude.index[-1], 0.1)
-    copied = interpolate(
-        time - 0.03, attitude.index.to_numpy(), attitude[Columns.QUATERNION].to_numpy()
-    )
-    found = check_convention(flown(), with_orientation(sent(flown()), copied, time))
-    assert found.orientation.verdict == "copied"
+    quaternions = attitude[Columns.QUATERNION].to_numpy()
+    sent_back = interpolate(time - 0.03, attitude.index.to_numpy(), quaternions)
+    return with_orientation(sent(flight), sent_back, time)
+
+
+def w_last(flight: Flight) -> PositionTrack:
+    time, attitude = oriented(flight)
+    return with_orientation(sent(flight), np.roll(attitude, -1, axis=1), time)
+
+
+def turned(flight: Flight) -> PositionTrack:
+    time, attitude = oriented(flight)
+    return with_orientation(sent(flight), multiply(yaw(90.0), attitude), time)
+
+
+# By id of the finding, and kind of the fault
+FAULTS = {
+    ("source_axes_wrong", "axes"): lambda flight: sent(flight, ENU),
+    ("source_unit_wrong", "unit"): lambda flight: sent(flight, unit="cm"),
+    ("source_frame_misaligned", "rotation"): lambda flight: sent(flight, rotation_deg=60.0),
+    ("source_time_offset", "time offset"): lambda flight: sent(flight, late_s=1.5),
+    ("source_time_offset_changes", "clock drift"): lambda flight: sent(flight, clock_drift=0.02),
+    ("source_orientation_wrong", "order"): w_last,
+    ("source_orientation_wrong", "heading"): turned,
+    ("source_orientation_copied", "copied"): copied,
+}
+
+
+def compared(track: PositionTrack) -> Comparison:
+    """Return the prepared comparison of a flight that EKF2 flew with other positions."""
+    usual = [one for one in flown().positions if not one.origin.is_automatic]
+    return prepare(replace(flown(), positions=(track, *usual)))
+
+
+def examples() -> Iterator[Finding]:
+    """Return examples of the findings about the convention, for their pages."""
+    for change in FAULTS.values():
+        yield from source_convention.detect(compared(change(flown())))
+    unclear = replace(compared(sent(flown())), convention=AMBIGUOUS)
+    yield from source_convention.detect(unclear)
+
+
+AMBIGUOUS = Convention(
+    verdict="ambiguous", x="east", y="north", z="up", log_odds=1.2, log_likelihood_gain=30.0,
+    alternatives=("x south, y west, z up, m, rotated by +12°, timestamps +0.0 s late",),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "kind"), FAULTS)
+def test_detect_faulty_convention_is_the_only_finding(name, kind):
+    found = list(source_convention.detect(compared(FAULTS[name, kind](flown()))))
+    assert [(one.id, one.evidence[CONVENTION]) for one in found] == [(name, kind)]
+
+
+@pytest.mark.parametrize("name", [name for name, _ in FAULTS if "orientation" not in name])
+def test_prepare_faulty_positions_are_corrected(name):
+    track = next(FAULTS[one](flown()) for one in FAULTS if one[0] == name)
+    samples, truth = compared(track).source.samples, flown().truth.samples
+    error = [
+        samples[column] - np.interp(samples.index, truth.index, truth[column])
+        for column in Columns.POSITION
+    ]
+    assert np.std(error, axis=1).max() < 0.25
+
+
+def test_prepare_copied_orientation_is_left_out():
+    source = compared(copied(flown())).source
+    assert source.orientation is None
+    assert source.origin.kind == "uwb"
+
+
+def test_detect_clean_source_has_no_finding():
+    assert not list(source_convention.detect(prepare(flown())))
+    assert not list(source_convention.detect(compared(sent(flown()))))
+
+
+def test_detect_ambiguous_axes_are_listed():
+    (found,) = source_convention.detect(replace(compared(sent(flown())), convention=AMBIGUOUS))
+    assert found.id == "source_convention_ambiguous"
+    assert "rotated by +12°" in found.message
+
+
+def test_detect_file_read_in_another_frame_names_the_option():
+    converted = sent(flown(), ("north", "east", "up"))
+    alignment = replace(given_placement(), frame="enu")
+    (found,) = source_convention.detect(compared(replace(converted, alignment=alignment)))
+    assert found.message.startswith("x and y are exchanged: x is east, y north, z down")
+
+
+def test_apply_convention_effects_follow_with_another_action():
+    comparison = compared(sent(flown(), ENU))
+    roots = list(source_convention.detect(comparison))
+    other = finding("error", "ekf2_rejects_positions", "EKF2 rejects 9 %. Why.", "Set a gate.")
+    false = finding("error", "ekf2_noise_too_small", "Too small.", "Set EKF2_EVP_NOISE to 1.")
+    root, effect = source_convention.apply_convention(comparison, [false, other, *roots])
+    assert root.id == "source_axes_wrong"
+    assert (effect.caused_by, effect.message) == ("source_axes_wrong", "EKF2 rejects 9 %.")
+    assert effect.remedy == source_convention.CORRECT_FIRST
 
 
 @pytest.mark.reallogs

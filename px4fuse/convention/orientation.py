@@ -46,9 +46,9 @@ class Candidate(NamedTuple):
     attitude: Array
 
     @property
-    def meaning(self) -> tuple[str, str, int]:
-        """Convention without the heading: ENU and NWU differ only by a rotation."""
-        return self.order, self.frames.replace("ENU", "NWU"), self.body_quarters
+    def meaning(self) -> tuple[str, str]:
+        """Convention without headings: ENU and NWU differ by a rotation about the vertical."""
+        return self.order, self.frames.replace("ENU", "NWU")
 
 
 def check_orientation(
