@@ -19,6 +19,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.alignment import matching, tracks
+from px4fuse.alignment.file_convention import explain_mismatch
 from px4fuse.alignment.matching import AlignmentProblem, Match
 from px4fuse.alignment.time_and_pose_fit import MIN_CONCORDANCE, truncated_rms
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
@@ -95,10 +96,12 @@ def align_position_file(
             "Correct --clock-offset, or omit it: px4fuse then estimates the time offset.",
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
+    problem = AlignmentProblem(samples, frame or recording.frame, yaw_rad, lag_s)
     try:
-        problem = AlignmentProblem(samples, frame or recording.frame, yaw_rad, lag_s)
         match = matching.find_match(flight, problem)
     except NoMatchError as error:
+        if fault := explain_mismatch(flight, problem, recording.metres_per_unit):
+            raise MissingDataError(f"{recording.name}: {fault[0]}.", fault[1]) from None
         raise MissingDataError(
             f"{recording.name}: {error}; {spans_text}", f"{error.remedy}."
         ) from None

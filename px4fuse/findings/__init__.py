@@ -26,6 +26,7 @@ from px4fuse.findings import (
     noises,
     recording,
     source_clock,
+    source_convention,
     source_frame,
     source_intervals,
     source_noise,
@@ -61,6 +62,7 @@ DETECTORS: tuple[Callable[[Analysis], Findings], ...] = (
     noises.detect,
     recording.detect,
     source_clock.detect,
+    source_convention.detect,
     source_frame.detect,
     source_intervals.detect,
     source_noise.detect,
@@ -78,7 +80,8 @@ def find(subject: Analysis | Comparison) -> tuple[Finding, ...]:
         A comparison is first explained (re-runs with changes), which takes some seconds.
     """
     analysis = subject if isinstance(subject, Analysis) else explain(subject)
-    return group_by_cause(found for detect in DETECTORS for found in detect(analysis))
+    findings = [found for detect in DETECTORS for found in detect(analysis)]
+    return group_by_cause(source_convention.apply_convention(analysis, findings))
 
 
 def find_loop(loop: Loop) -> tuple[Finding, ...]:

@@ -28,6 +28,8 @@ WHITE_RATIO = "white_over_assumed"
 SENSOR, CHANGE = "the source's sensor", "change"
 # Kind of cause of resets: all of them follow a gap in the source
 GAP = "gap"
+# Evidence key of faults of the source's convention, which precede all others
+CONVENTION = "convention"
 # Kind of cause of little motion
 GROUND = "never took off"
 
@@ -258,6 +260,8 @@ def _is_effect(finding: Finding, effects: tuple[str | tuple[str, str], ...]) -> 
 
 def _report_rank(group: list[Finding]) -> int:
     """Return the sort key of a group: severity, with the recording before noises."""
+    if CONVENTION in group[0].evidence:
+        return -1
     error_rank, warning_rank = (
         2 if group[0].id in NOISES else 0,
         1 if group[0].id in RECORDING else 3,

@@ -71,6 +71,8 @@ class PositionRecording:
         Number of dropped rows with the reason, and warnings.
     dropped : int
         Number of rows with an invalid timestamp.
+    metres_per_unit : float
+        Factor that was applied to the first position column.
     """
 
     name: str
@@ -82,6 +84,7 @@ class PositionRecording:
     detected: tuple[str, ...]
     notes: tuple[str, ...]
     dropped: int = 0
+    metres_per_unit: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -239,6 +242,7 @@ def read_position_csv(
             f"sigma: {table.label(*sigma) or 'none'}",
         ),
         notes=tuple(notes),
+        metres_per_unit=scales[axes[0]],
     )
 
 
