@@ -26,7 +26,7 @@ from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
 from px4fuse.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Alignment, Flight, PositionTrack, Unavailable
-from px4fuse.log import InputFile
+from px4fuse.log import SHARED_STAMPS, ClockMap, InputFile
 from px4fuse.position_source import POSITION_FILE
 from px4fuse.readers.common import finite_rows
 from px4fuse.readers.position_csv import PositionRecording
@@ -122,6 +122,11 @@ def align_position_file(
         topics=(recording.name,),
         log=recording.name,
         alignment=alignment,
+        clock_map=_shared_timestamps(recording),
+        invalid=recording.invalid.set_axis(
+            recording.invalid.index + (aligned_samples.index[0] - start_s)
+        ),
+        step_m=recording.step_m,
     )
     reader_notes = tuple(
         f"{recording.name}: {text}" for text in (*recording.detected, *recording.notes)
@@ -134,6 +139,14 @@ def align_position_file(
         InputFile(recording.name, recording.sha256, recording.size_bytes, "position"),
     )
     return replace(flight, log=log, positions=(track, *flight.positions), inputs=inputs)
+
+
+def _shared_timestamps(recording: PositionRecording) -> ClockMap | None:
+    """Describe a clock whose timestamps are shared by most rows; None for another clock."""
+    if not recording.stamp_count:
+        return None
+    count, distinct = recording.stamp_count, len(recording.samples)
+    return ClockMap(recording.clock, "as sent", count, 0.0, 0.0, 0.0, SHARED_STAMPS, distinct)
 
 
 def _check_options(

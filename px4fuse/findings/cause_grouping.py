@@ -30,6 +30,15 @@ SENSOR, CHANGE = "the source's sensor", "change"
 GAP = "gap"
 # Evidence key of faults of the source's convention, which precede all others
 CONVENTION = "convention"
+# Faults of the source that leave no usable position, and others that make findings about EKF2's
+# parameters false; they precede all others
+UNUSABLE = (
+    "source_is_ekf2_estimate",
+    "source_two_senders",
+    "source_positions_rounded",
+    "source_timestamps_shared",
+)
+MISLEADING = ("source_timestamp_unit", "source_position_held", "source_zero_positions")
 # Kind of cause of little motion
 GROUND = "never took off"
 
@@ -260,7 +269,7 @@ def _is_effect(finding: Finding, effects: tuple[str | tuple[str, str], ...]) -> 
 
 def _report_rank(group: list[Finding]) -> int:
     """Return the sort key of a group: severity, with the recording before noises."""
-    if CONVENTION in group[0].evidence:
+    if CONVENTION in group[0].evidence or group[0].id in UNUSABLE + MISLEADING:
         return -1
     error_rank, warning_rank = (
         2 if group[0].id in NOISES else 0,

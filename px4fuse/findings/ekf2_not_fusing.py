@@ -13,6 +13,7 @@ from px4fuse.findings.model import (
     spans_with_value,
     warning,
 )
+from px4fuse.findings.source_stamps import SET_TIMESTAMP, STAMP_FAULTS
 from px4fuse.flight import Ekf2, FusionRecord, Unavailable, positions_of
 from px4fuse.text import capitalise_first
 
@@ -35,6 +36,8 @@ def detect(analysis: Comparison) -> Findings:
     if share >= MIN_FUSING_SHARE_ERROR:
         yield from _detect_slow_restart(analysis, ekf2, fusing)
     evidence = {"fused_fraction": share, "source_interval_s": 1.0 / source.rate_hz}
+    if source.alignment is not None:
+        return  # EKF2 did not receive the position file
     if not source.origin.is_vision:
         if source.name == "vehicle_mocap_odometry" and share == 0.0:
             yield warning(
@@ -111,6 +114,13 @@ def _reason_and_action(analysis: Comparison, ekf2: Ekf2) -> tuple[str, str, str]
             f"Bit {bit} ({quantity}) is not set.",
             f"Set {switch} to {int(value) | 1 << bit}.",
         )
+    clock, minimum = analysis.source.clock_map, parameters.get("EKF2_EV_QMIN", 0)
+    if clock is not None and clock.clock in STAMP_FAULTS:
+        return f"their timestamps are {STAMP_FAULTS[clock.clock]}", "", SET_TIMESTAMP
+    quality = analysis.source.status.get("quality", pd.Series(dtype=float))
+    quality = quality[analysis.segment.start_s : analysis.segment.end_s]
+    if minimum > 0 and len(quality) and np.mean(quality < minimum) > MIN_FUSING_SHARE_ERROR:
+        return _low_quality(float(quality.median()), int(minimum))
     horizon_s, age_s = ekf2.horizon_s, _age_s(analysis, ekf2)
     if isinstance(horizon_s, float) and age_s > horizon_s + MAX_LATENESS_S:
         return (
@@ -130,6 +140,20 @@ def _reason_and_action(analysis: Comparison, ekf2: Ekf2) -> tuple[str, str, str]
             "Send the position at 10 Hz.",
         )
     return "", "The log does not contain the reason.", CHECK_SWITCH
+
+
+def _low_quality(quality: float, minimum: int) -> tuple[str, str, str]:
+    """Return the reason and the action for a quality below EKF2_EV_QMIN."""
+    action = "Check light, texture and speed in view of the camera"
+    if quality == 0.0:
+        action = (
+            "Send ODOMETRY with a quality: VISION_POSITION_ESTIMATE has none, which EKF2 reads as 0"
+        )
+    return (
+        f"their quality is {quality:.0f}, EKF2_EV_QMIN is {minimum}",
+        "EKF2 (v1.14 and later) fuses external vision only with this quality or a better one.",
+        f"{action}. Lower EKF2_EV_QMIN only if the positions are correct.",
+    )
 
 
 def _age_s(analysis: Comparison, ekf2: Ekf2) -> float:

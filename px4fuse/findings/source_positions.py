@@ -45,6 +45,7 @@ MIN_LAG_S = 0.05  # s; at 1 m/s half of the noise of good UWB (0.1 m)
 MIN_LAG_ERROR_S = 0.10  # s; at 1 m/s the noise of good UWB (0.1 m)
 MIN_JUMP_M = 0.2  # m; twice the noise of good UWB (0.1 m)
 MIN_JUMP_SIGMAS = 5.0  # σ of the time-correlated noise; differences of this noise have up to √2 σ
+MAX_RESET_DISTANCE_S = 1.0  # s; two intervals of a source of 2 Hz
 MIN_JUMP_ERROR_M = 0.5  # m; five times the noise of good UWB
 MIN_SCALE = 0.12  # relative; PX4's simulated flights without a mistake reach 0.11
 MIN_SCALE_ERROR = 0.15  # relative; 1 m in 7 m
@@ -161,11 +162,15 @@ def detect_jumps(analysis: Analysis) -> Findings:
     if not isinstance(correlated_noise, Unavailable):
         min_jump_m = max(min_jump_m, MIN_JUMP_SIGMAS * correlated_noise.slow_m)
     large = [jump for jump in fit.jumps if jump.size_m >= min_jump_m]
+    reset_s = _reset_times(analysis)
     if large:
         largest = max(large, key=lambda jump: jump.size_m)
         size_m, at_s, sigma = largest.size_m, largest.time_s, max(s.sigma for s in largest.step_m)
         positions = capitalise_first(positions_of(analysis.source))
         causes, action = JUMP_CAUSES[analysis.source.origin.kind]
+        cause = f"Possible causes: {causes}."
+        if np.any(np.abs(reset_s - at_s) < MAX_RESET_DISTANCE_S):
+            cause = "The source announced it (reset_counter): it relocalised or set a new origin."
         extent = f"by {size_m:.2f} m"
         if len(large) > 1:
             extent = f"{format_count(len(large))}, by up to {size_m:.2f} m"
@@ -173,12 +178,18 @@ def detect_jumps(analysis: Analysis) -> Findings:
             "error" if size_m >= MIN_JUMP_ERROR_M else "warning",
             "source_position_jump",
             f"{positions} jump {extent} at {at_s:.1f} s and stay there. The IMU measures no such "
-            f"motion (± {1.96 * sigma:.2f} m, 95 %). Possible causes: {causes}. After the jump KF "
-            "and EKF2 are wrong by its size, with consistent innovations.",
+            f"motion (± {1.96 * sigma:.2f} m, 95 %). {cause} The frames before and after it differ "
+            "by its size: after the jump KF and EKF2 are wrong by it, with consistent innovations.",
             f"{action} Analyse one side of the jump (--start, --end).",
             {"count": len(large), "size_m": size_m, "at_s": at_s, "sigma_m": sigma},
             zero_length_spans(jump.time_s for jump in large),
         )
+
+
+def _reset_times(analysis: Analysis) -> Array:
+    """Return the times (s) at which ``reset_counter`` changes."""
+    counter = analysis.source.status.get("reset_counter", pd.Series(dtype=float))
+    return counter.index.to_numpy()[1:][np.diff(counter.to_numpy()) != 0.0]
 
 
 def detect_scale_error(analysis: Analysis) -> Findings:

@@ -10,7 +10,7 @@ import hashlib
 import io
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -20,6 +20,7 @@ import pandas as pd
 from px4fuse.arrays import Array
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.readers import position_names
+from px4fuse.readers.common import find_invalid, rounding_step
 from px4fuse.readers.position_names import LENGTH_UNITS, TIME_UNITS, ColumnMeaning, read_column_name
 from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, decode_text, quote
 from px4fuse.readers.ulog_topics import longest_increasing_run
@@ -73,6 +74,13 @@ class PositionRecording:
         Number of rows with an invalid timestamp.
     metres_per_unit : float
         Factor that was applied to the first position column.
+    invalid : Series
+        Rows that are no measurement, as in :class:`~px4fuse.flight.PositionTrack`.
+    step_m : float
+        Rounding step of the coarsest horizontal coordinate; 0 if there is none.
+    stamp_count : int
+        Number of rows that share the timestamps of ``samples``, if most rows repeat a timestamp;
+        else 0.
     """
 
     name: str
@@ -85,6 +93,9 @@ class PositionRecording:
     notes: tuple[str, ...]
     dropped: int = 0
     metres_per_unit: float = 1.0
+    invalid: "pd.Series[str]" = field(default_factory=lambda: pd.Series(dtype=str))
+    step_m: float = 0.0
+    stamp_count: int = 0
 
 
 @dataclass(frozen=True)
@@ -175,10 +186,11 @@ def read_position_csv(
     )
     axes = [at for at in position if at is not None]
     # Numbers such as 1e999 are read as infinite
-    is_usable = np.isfinite(numbers[time])
-    is_usable &= (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
+    has_time = np.isfinite(numbers[time])
+    is_usable = has_time & (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
     if unusable_count := int(np.count_nonzero(~is_usable)):
         notes.insert(0, f"{_format_row_count(unusable_count)} dropped: no valid time or position")
+    without_position = numbers[time][has_time & ~is_usable].to_numpy()
     for tag in (at for at, m in enumerate(meanings) if m.kind == "tag"):
         tags = sorted({*texts[tag].dropna()})
         if tags[1:]:
@@ -196,7 +208,10 @@ def read_position_csv(
     # Ranks instead of times, because the function requires positive values
     ranks = np.unique(seconds[usable_rows], return_inverse=True)[1].astype(np.int64)
     kept_rows = usable_rows[longest_increasing_run(ranks + 1)]
-    if dropped := len(seconds) - len(kept_rows):
+    dropped = len(seconds) - len(kept_rows)
+    if stamp_count := len(seconds) * (dropped > 0.5 * len(seconds)):
+        dropped = 0
+    if dropped:
         notes.append(
             f"{_format_row_count(dropped)} dropped: timestamps repeat, go back or are out of range"
         )
@@ -218,6 +233,13 @@ def read_position_csv(
     }
     samples = pd.DataFrame(columns_m, index=numbers.index)
     samples = samples.where(np.isfinite(samples))
+    step_m = max(rounding_step(samples[name].to_numpy()) for name in ("x_m", "y_m"))
+    reason = find_invalid(samples, SAMPLE_COLUMNS[: len(axes)])
+    samples = samples[reason == ""]
+    rows_by_reason = [
+        pd.Series("NaN", without_position / round(1.0 / TIME_UNITS[unit])),
+        reason[reason != ""],
+    ]
     is_not_positive = samples[SIGMA_COLUMNS] <= 0.0
     if bad_row_count := int(is_not_positive.any(axis=1).sum()):
         notes.append(f"sigma is zero or negative in {bad_row_count} rows and was ignored there")
@@ -243,6 +265,9 @@ def read_position_csv(
         ),
         notes=tuple(notes),
         metres_per_unit=scales[axes[0]],
+        invalid=pd.concat(rows_by_reason).sort_index(),
+        step_m=step_m,
+        stamp_count=stamp_count,
     )
 
 
