@@ -1,7 +1,6 @@
-"""Answer form of a flight, ``answers.toml``: its questions, and reading a completed form.
+"""Answer form in which a student names the mistakes of a flight: questions, and reading.
 
-``form.toml`` lists the choices: mistakes with the units of their sizes, behaviour of EKF2, panels
-of the report, corrections. Reading checks the grammar of a form, not whether answers are right.
+``form.toml`` lists the allowed answers. Reading checks the syntax, not whether answers are right.
 """
 
 import hashlib
@@ -19,8 +18,8 @@ from px4fuse.errors import SettingsError
 from px4fuse.reading import read_text
 from px4fuse.record import Record, Sha256, table
 
-# maximum bytes of a form and characters of a line: tomllib takes seconds and gigabytes for one
-# dotted key of 64 kB
+# Maximum size (bytes) of an answer form and maximum length (characters) of its lines: tomllib needs
+# seconds and gigabytes for a dotted key of 64 kB
 MAX_BYTES, MAX_LINE_LENGTH = 20_000, 500
 MAX_MISTAKES = 20
 NONE = "none"
@@ -28,7 +27,10 @@ EMPTY_CELL = "\u2013"
 
 
 class MistakeKind(Record, frozen=True, rename={"size_quantity": "in"}):
-    """Kind of mistake: description, quantity of the size, and range of the size (first unit)."""
+    """Mistake that a flight can have: description, quantity of its size, and allowed sizes.
+
+    ``range``: smallest and largest size, in the first unit of the quantity.
+    """
 
     description: str
     size_quantity: str = ""
@@ -36,12 +38,12 @@ class MistakeKind(Record, frozen=True, rename={"size_quantity": "in"}):
 
     @property
     def units(self) -> Mapping[str, float]:
-        """Conversion factors of the units to the first unit; empty if the mistake has no size."""
+        """Factors that convert each unit of the size to the first unit; empty without a size."""
         return _UNITS[self.size_quantity]
 
 
-class Form(Record, frozen=True):
-    """Tables of ``form.toml``."""
+class FormChoices(Record, frozen=True):
+    """Allowed answers of the answer form (``form.toml``); ``renamed``: new names of old answers."""
 
     behaviours: tuple[str, ...]
     panels: tuple[str, ...]
@@ -51,35 +53,35 @@ class Form(Record, frozen=True):
     renamed: dict[str, str]
 
 
-_FORM = table(__file__, "form.toml", Form)
-_UNITS: Mapping[str, Mapping[str, float]] = {"": {}, **_FORM.units}
-MISTAKES, EKF2_BEHAVIOURS, PANELS = _FORM.mistakes, _FORM.behaviours, _FORM.panels
-# corrections of mistakes, with the units of their value (empty: no value)
-CORRECTIONS = {name: _UNITS[units] for name, units in _FORM.corrections.items()}
+_CHOICES = table(__file__, "form.toml", FormChoices)
+_UNITS: Mapping[str, Mapping[str, float]] = {"": {}, **_CHOICES.units}
+MISTAKES, EKF2_BEHAVIOURS, PANELS = _CHOICES.mistakes, _CHOICES.behaviours, _CHOICES.panels
+# Corrections of mistakes that a form can name, with the units of their values (empty: no value)
+CORRECTIONS = {name: _UNITS[units] for name, units in _CHOICES.corrections.items()}
 VERDICTS = ("consistent", "overconfident", "underconfident")
 
 Number = Annotated[float, Meta(gt=-1e9, lt=1e9)]
 Unit = Annotated[str, Meta(max_length=10)]
 VerdictWord = Literal["", "consistent", "overconfident", "underconfident"]
-# a number, or a list of update numbers; None: not answered
+# Answer to a question about a number: the number, a list of update numbers, or None (left blank)
 QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
 
 
 class StudentMistake(Record, frozen=True):
-    """Mistake that a student names in the form.
+    """Mistake of a flight that a student names in the answer form.
 
     Attributes
     ----------
     kind : str
         One of :data:`MISTAKES`.
     size : float or None
-        Size with sign, in ``unit``, which is a unit of the kind.
+        Size of the mistake with sign, in ``unit``.
     when : str
         "whole flight", or empty if ``from_s`` and ``until_s`` (s since the first data) are given.
     parameter : str
-        Correction, one of :data:`CORRECTIONS`, with its ``value`` in ``value_unit``.
+        Correction of the mistake, one of :data:`CORRECTIONS`, with its ``value`` in ``value_unit``.
     panel : str
-        Part of the report that shows the mistake, one of :data:`PANELS`.
+        Panel of the report that shows the mistake, one of :data:`PANELS`.
     """
 
     kind: str
@@ -94,7 +96,7 @@ class StudentMistake(Record, frozen=True):
     panel: str = ""
 
     def size_in_first_unit(self) -> float | None:
-        """Return the size in the first unit of the kind; a scale factor of 1.05 becomes 5 %."""
+        """Convert the size to the first unit of the mistake, such as a factor of 1.05 to 5 %."""
         units = MISTAKES[self.kind].units
         if self.size is None or not units:
             return None
@@ -103,7 +105,7 @@ class StudentMistake(Record, frozen=True):
         return self.size * (units[self.unit] if self.unit else next(iter(units.values())))
 
     def value_in_first_unit(self) -> float | None:
-        """Return the value of the correction in the first unit of its parameter."""
+        """Convert the value of the correction to the first unit of its parameter, cm to m."""
         units = CORRECTIONS.get(self.parameter, {})
         if self.value is None or not units:
             return self.value
@@ -111,16 +113,18 @@ class StudentMistake(Record, frozen=True):
 
 
 class Answers(Record, frozen=True, kw_only=True):
-    """Completed answer form; blank answers are absent.
+    """Student's answers about one flight; answers left blank are absent.
 
     Attributes
     ----------
     log_sha256 : str
-        SHA-256 of the log that the form is about.
+        SHA-256 of the flight log.
     verdict_kf, verdict_ekf2 : str
         Verdict on the reported σ of KF and EKF2, one of :data:`VERDICTS`.
+    ekf2_did : tuple of str
+        Behaviour of EKF2, from :data:`EKF2_BEHAVIOURS`.
     quantities : tuple of (float, tuple of float, or None)
-        In the order of :func:`draw_questions`; a tuple answers a question about several updates.
+        Answers to :func:`draw_questions`; a tuple lists update numbers.
     """
 
     log_sha256: Sha256
@@ -132,62 +136,62 @@ class Answers(Record, frozen=True, kw_only=True):
 
     @property
     def names_no_mistake(self) -> bool:
-        """Return True if the form states that the flight has no mistake."""
-        return [claim.kind for claim in self.mistakes] == [NONE]
+        """True if the form states that the flight has no mistake."""
+        return [mistake.kind for mistake in self.mistakes] == [NONE]
 
 
-QuestionKind = Literal["gain", "variance", "innovation", "nis", "silence", "gate"]
-# Kinds of questions; one kind of each pair is drawn
+QuestionKind = Literal["gain", "variance", "innovation", "nis", "prediction", "gate"]
+# Quantities that the questions of a form can request: one of each pair is drawn at random
 _QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
     ("gain", "variance"),
     ("innovation", "nis"),
-    ("silence", "gate"),
+    ("prediction", "gate"),
 )
 
 
 class FormQuestion(Record, frozen=True):
-    """Question about a number that no report prints, with filter settings drawn for the log.
+    """Question to the student about a number of KF that no report prints.
 
     Attributes
     ----------
     kind : str
         Requested quantity along the main horizontal axis of the flight ("aisle").
     update : int
-        Number of the update, from 1; the first measurement sets the state and is not counted.
+        Number of the KF update, from 1; the first measurement sets the state and is not counted.
     sigma_a_m_s2, sigma_z_m : float
-        Settings of KF.
-    extra : float
-        Prediction time without measurement (s), or the gate (in √S).
+        Settings of KF for this question.
+    duration_or_gate : float
+        For "prediction": time without measurement (s). For "gate": gate (in √S).
     """
 
     kind: QuestionKind
     update: int
     sigma_a_m_s2: float
     sigma_z_m: float
-    extra: float = 0.0
+    duration_or_gate: float = 0.0
 
     @property
     def text(self) -> str:
-        """Question as printed in the form."""
-        update, extra = self.update, f"{self.extra:g}"
+        """Question as the answer form prints it."""
+        update, number = self.update, f"{self.duration_or_gate:g}"
         quantity = {
             "gain": f"position gain of update {update}",
             "variance": f"position variance after update {update} (m²)",
             "innovation": f"innovation of update {update} (m)",
             "nis": f"NIS of update {update}",
-            "silence": f"position sigma {extra} s after update {update}, without measurement (m)",
+            "prediction": f"position sigma (m) {number} s after update {update}, no measurement",
             "gate": f"list of the updates {update} to {update + GATE_UPDATES} with an innovation "
-            f"outside {extra} sqrt(S); KF uses these updates, too",
+            f"outside {number} sqrt(S); KF uses these updates, too",
         }[self.kind]
         return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 
 
-# number of updates in a question about the gate
+# Number of KF updates that a question about the innovation gate covers
 GATE_UPDATES = 20
 
 
 def draw_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
-    """Draw three questions from the SHA-256 of the log, so that they differ between logs."""
+    """Draw three questions at random, with the SHA-256 of the log as seed: each log has others."""
     random_bytes = iter(hashlib.sha256(f"px4fuse answers {log_sha256}".encode()).digest())
 
     def draw_between(low: float, high: float, decimals: int) -> float:
@@ -195,41 +199,41 @@ def draw_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
 
     settings = (draw_between(0.2, 0.45, 2), draw_between(0.06, 0.14, 3))
     first_kind, second_kind, third_kind = (pair[next(random_bytes) % 2] for pair in _QUESTION_PAIRS)
-    extra = draw_between(1.0, 4.0, 1) if third_kind == "silence" else draw_between(1.3, 2.0, 1)
+    limits = (1.0, 4.0) if third_kind == "prediction" else (1.3, 2.0)
+    duration_or_gate = draw_between(*limits, 1)
     return (
         FormQuestion(first_kind, 2 + next(random_bytes) % 7, *settings),
         FormQuestion(second_kind, 20 + next(random_bytes) % 130, *settings),
-        FormQuestion(third_kind, 20 + next(random_bytes) % 100, *settings, extra),
+        FormQuestion(third_kind, 20 + next(random_bytes) % 100, *settings, duration_or_gate),
     )
 
 
 def read_answers(path: Path) -> Answers:
-    """Read an answer form and check its grammar.
+    """Read the answer form of a student and check its syntax.
 
     Raises
     ------
     SettingsError
-        The file is not an answer form, or a field has a value that is not allowed.
+        The file is not an answer form, or an answer is not allowed.
     """
     text = read_text(path, SettingsError, MAX_BYTES, name=str(path))
     if any(len(line) > MAX_LINE_LENGTH for line in text.splitlines()):
         raise SettingsError(f"{path}: a line has more than {MAX_LINE_LENGTH} characters.")
     try:
         answers = msgspec.convert(_as_record(tomllib.loads(text)), Answers)
-        check(answers)
+        check_answers(answers)
     except (tomllib.TOMLDecodeError, RecursionError, msgspec.ValidationError, ValueError) as error:
-        raise SettingsError(f"{path}: {error}", "Correct the form.") from error
+        raise SettingsError(f"{path}: {error}", "Correct the form with the answers.") from error
     return answers
 
 
 def _as_record(form: dict[str, Any]) -> dict[str, Any]:
-    """Rearrange the TOML file as :class:`Answers`, without blank answers."""
     filled_form = _without_blanks(update_renamed_values(form))
     mistakes = filled_form.pop("mistake", ())
     quantities = msgspec.convert(filled_form.pop("quantities", {}), dict[str, Any])
     names = [f"q{number}" for number in range(1, len(draw_questions("")) + 1)]
     if unknown := sorted({*quantities, *({"mistakes"} & filled_form.keys())} - set(names)):
-        raise ValueError(f"{unknown[0]} is not one of mistake, {', '.join(names)}")
+        raise ValueError(f"the field {unknown[0]} is not one of mistake, {', '.join(names)}")
     return {
         **filled_form,
         "mistakes": mistakes,
@@ -238,14 +242,14 @@ def _as_record(form: dict[str, Any]) -> dict[str, Any]:
 
 
 def update_renamed_values(value: Any) -> Any:
-    """Replace old names and values in forms and answer keys from before schema version 4."""
+    """Replace names and values of answer forms and answer keys written before schema version 4."""
     if isinstance(value, dict):
         return {
-            _FORM.renamed.get(key, key): update_renamed_values(part) for key, part in value.items()
+            update_renamed_values(key): update_renamed_values(part) for key, part in value.items()
         }
     if isinstance(value, list):
         return [update_renamed_values(part) for part in value]
-    return _FORM.renamed.get(value, value) if isinstance(value, str) else value
+    return _CHOICES.renamed.get(value, value) if isinstance(value, str) else value
 
 
 def _without_blanks(value: Any) -> Any:
@@ -256,20 +260,14 @@ def _without_blanks(value: Any) -> Any:
     return value
 
 
-def check(answers: Answers) -> None:
-    """Check choices, ranges and duplicates of a form.
-
-    Raises
-    ------
-    ValueError
-        A value that is not a choice, a number out of range, or a mistake named twice.
-    """
-    named_kinds = [named.kind for named in answers.mistakes]
-    for name in named_kinds:
-        _require_choice("kind", name, MISTAKES)
-        if named_kinds.count(name) > 1:
-            raise ValueError(f"kind {name!r} is given twice; give each mistake once")
-    if NONE in named_kinds and len(named_kinds) > 1:
+def check_answers(answers: Answers) -> None:
+    """Raise ValueError if an answer is not allowed, out of range, or names a mistake twice."""
+    kinds = [named.kind for named in answers.mistakes]
+    for kind in kinds:
+        _require_choice("kind", kind, MISTAKES)
+        if kinds.count(kind) > 1:
+            raise ValueError(f"kind {kind!r} is given twice; give each kind of mistake once")
+    if NONE in kinds and len(kinds) > 1:
         raise ValueError('kind "none" is given together with a mistake; give only one of them')
     for behaviour in answers.ekf2_did:
         _require_choice("ekf2_did", behaviour, EKF2_BEHAVIOURS)
@@ -287,17 +285,14 @@ def check(answers: Answers) -> None:
         low, high = mistake.range
         size = named.size_in_first_unit()
         if size is not None and not low <= size <= high:
-            unit = next(iter(mistake.units))
-            raise ValueError(
-                f"{named.kind}: size {size:g} {unit} is out of range ({low:g} to {high:g} {unit})"
-            )
+            unit, limits = next(iter(mistake.units)), f"{low:g} to {high:g}"
+            raise ValueError(f"{named.kind}: size {size:g} is out of range ({limits} {unit})")
 
 
 def _require_choice(field: str, value: str, choices: Any) -> None:
-    if not choices:
-        raise ValueError(f"{field} {value!r} has no choices; leave it empty")
     if value not in choices:
-        raise ValueError(f"{field} {value!r} is not one of {_join_quoted(choices)}")
+        allowed = _join_quoted(choices) or "the allowed values (none: leave it empty)"
+        raise ValueError(f"{field} {value!r} is not one of {allowed}")
 
 
 def form_name(log_name: str) -> str:
@@ -310,7 +305,7 @@ def form_name(log_name: str) -> str:
 
 
 def form_text(log_name: str, log_sha256: str) -> str:
-    """Return an empty answer form for a log, with comments that list all choices."""
+    """Return an empty answer form (TOML) for a log; its comments list all allowed answers."""
     template = Template(files("px4fuse").joinpath("answer_form.toml").read_text(encoding="utf-8"))
     questions = [
         f'# {question.text}\nq{number} = ""{"    # such as [61, 64]" * (question.kind == "gate")}'
@@ -327,47 +322,36 @@ def form_text(log_name: str, log_sha256: str) -> str:
         verdicts=_join_quoted(VERDICTS),
         behaviours=_format_block(_format_in_threes(EKF2_BEHAVIOURS)),
         kinds=_format_block(kinds),
-        corrections=_format_block(
-            f"{name}{_format_units(units)}" for name, units in CORRECTIONS.items()
-        ),
+        corrections=_format_block(name + _format_units(CORRECTIONS[name]) for name in CORRECTIONS),
         panels=_format_block(_format_in_threes(PANELS)),
         questions="\n".join(questions),
     )
 
 
 def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
-    """Yield names and values of a completed form, for the report and the class page."""
+    """Yield question and answer of each row of a completed form, for the PDF and the class page."""
     yield "Verdict on KF", answers.verdict_kf or EMPTY_CELL
     yield "Verdict on EKF2", answers.verdict_ekf2 or EMPTY_CELL
     yield "Behaviour of EKF2", ", ".join(answers.ekf2_did) or EMPTY_CELL
     for mistake in answers.mistakes:
-        time_limits = (("from", mistake.from_s), ("until", mistake.until_s))
-        value = _format_number_with_unit(
-            mistake.value, mistake.value_unit, CORRECTIONS.get(mistake.parameter, {})
-        )
+        size_units = MISTAKES.get(mistake.kind, MistakeKind("")).units
+        value_units = CORRECTIONS.get(mistake.parameter, {})
+        value = _format_number_with_unit(mistake.value, mistake.value_unit, value_units)
+        from_text = "" if mistake.from_s is None else f"from {mistake.from_s:g} s"
+        until_text = "" if mistake.until_s is None else f"until {mistake.until_s:g} s"
         details = (
-            _format_number_with_unit(
-                mistake.size, mistake.unit, MISTAKES.get(mistake.kind, MistakeKind("")).units
-            ),
-            mistake.when
-            or " ".join(
-                f"{name} {time_s:g} s" for name, time_s in time_limits if time_s is not None
-            ),
+            _format_number_with_unit(mistake.size, mistake.unit, size_units),
+            mistake.when or f"{from_text} {until_text}".strip(),
             f"shown in {mistake.panel}" if mistake.panel else "",
             f"{mistake.parameter} {value}".strip(),
         )
         yield mistake.kind, "; ".join(filter(None, details)) or EMPTY_CELL
-    for quantity, quantity_answer in zip(
+    for question, answer in zip(
         draw_questions(answers.log_sha256), answers.quantities, strict=False
     ):
-        numbers = (
-            quantity_answer
-            if isinstance(quantity_answer, tuple)
-            else []
-            if quantity_answer is None
-            else [quantity_answer]
-        )
-        yield quantity.text, ", ".join(f"{number:g}" for number in numbers) or EMPTY_CELL
+        numbers = answer if isinstance(answer, tuple) else (answer,)
+        numbers_text = ", ".join(f"{number:g}" for number in numbers if number is not None)
+        yield question.text, numbers_text or EMPTY_CELL
 
 
 def _format_number_with_unit(number: float | None, unit: str, units: Mapping[str, float]) -> str:

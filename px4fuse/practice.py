@@ -1,6 +1,6 @@
-"""Practice page: simulated flights with hidden mistakes that the student identifies.
+"""Practice page: simulated flights with mistakes that the student has to identify.
 
-It is not an exam: the page contains the answers, compressed so they are not read by accident.
+The page contains the right answers, compressed so that students do not read them by accident.
 """
 
 import base64
@@ -29,14 +29,14 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-# Groups of mistakes that one flight can combine: one affects the whole motion, the other single
-# samples. A wrong noise would hide another mistake, so it is not combined
+# Pairs of right answers that one flight can combine: the first mistake affects the whole flight,
+# the second single samples. A wrong noise would hide another mistake, so it is not combined
 COMBINABLE_GROUPS = ({"clock", "source"}, {"clock", "gate"}, {"frame", "source"}, {"frame", "gate"})
 MAX_LEVEL = 3
 MAX_SEED = 2**32 - 1
 SIGMA_A_M_S2, SIGMA_Z_M = 0.10, 0.10
-# A flight of less than a minute with two turns. The IMU errors are small, because large errors
-# would resemble a time offset or a misaligned frame
+# Scenario of the simulated flights: less than a minute, with two turns. The IMU errors are small,
+# because large errors would resemble a time offset or a misaligned position frame
 SCENARIO_VALUES: dict[str, Any] = {
     "passes": 3,
     "speed_m_s": 1.5,
@@ -46,38 +46,40 @@ SCENARIO_VALUES: dict[str, Any] = {
     "tilt_error_deg": 0.02,
     "yaw_error_deg": 0.2,
 }
-LENGTH_M = (8.0, 12.0)  # m; range of the length of a pass
-# Finding that contains the time span of a mistake
+# Smallest and largest length (m) of a pass along the aisle, which is drawn for each flight
+LENGTH_M = (8.0, 12.0)
+# Finding of the analysis that contains the time span of each mistake
 FINDING_WITH_TIME = {
     "nlos": "source_outliers",
     "jump": "source_position_jump",
     "dropout": "source_gap",
 }
 NO_MISTAKE = "No mistake: about 5 % of the innovations are outside ±2√S, and they are white."
-NOISY_UWB = "noisy-uwb"  # the log is correct, but SIGMA_Z of KF is too small
+# Name of the mistake "SIGMA_Z of KF is too small", which is not in the log
+NOISY_UWB = "noisy-uwb"
 
 
 class HiddenMistake(Record, frozen=True):
-    """Mistake of a practice flight.
+    """Mistake in a practice flight that the student has to identify.
 
     Attributes
     ----------
     choice : str
-        Correct answer, a key of :data:`CHOICES`.
+        Right answer, a key of :data:`CHOICES`.
     mistake : str
         Name in :data:`px4fuse.simulation.mistakes.MISTAKES`, or :data:`NOISY_UWB`.
     sizes : tuple of str
-        Size for each level, as on the command line.
+        Size for each level of difficulty, as after ``px4fuse simulate --mistake NAME=``.
     view : str
         View of the page that shows the mistake.
     fault : str
-        Name of the mistake.
+        Description of the mistake for the student.
     size_text : str
-        Text of its size; {0} and {1} are the parts of the size.
+        Text of the size; {0} and {1} are replaced by the numbers in ``sizes``.
     symptom : str
         Effect on the plots, and the setting that confirms the mistake.
-    either_sign : bool
-        The size may also be negative.
+    has_either_sign : bool
+        True if the sign of the size is drawn at random.
     """
 
     choice: str
@@ -87,11 +89,11 @@ class HiddenMistake(Record, frozen=True):
     fault: str
     size_text: str
     symptom: str
-    either_sign: bool = False
+    has_either_sign: bool = False
 
 
 class MistakeTable(Record, frozen=True):
-    """Tables of ``practice.toml``: answers with their texts, and mistakes."""
+    """Possible answers with their texts, and mistakes of practice flights (``practice.toml``)."""
 
     choices: dict[str, str]
     mistakes: tuple[HiddenMistake, ...]
@@ -103,15 +105,16 @@ CHOICES, HIDDEN_MISTAKES = _TABLES.choices, _TABLES.mistakes
 
 @dataclass(frozen=True)
 class PracticeFlight:
-    """Flight of a practice set.
+    """Simulated flight of the practice page.
 
     Attributes
     ----------
     scenario : Scenario
+        Settings of the simulation.
     mistakes : tuple of HiddenMistake
-        Zero to two, with different choices.
+        None, one or two mistakes with different right answers.
     sizes : tuple of str
-        Sizes of the mistakes, as on the command line.
+        Sizes of the mistakes, as after ``px4fuse simulate --mistake NAME=``.
     """
 
     scenario: Scenario
@@ -120,20 +123,21 @@ class PracticeFlight:
 
     @property
     def correct_answers(self) -> list[str]:
-        """Correct answers, sorted."""
+        """Right answers about the mistakes of the flight, sorted."""
         return sorted({mistake.choice for mistake in self.mistakes}) or ["nothing"]
 
 
 def draw(seed: int, level: int = 1, count: int = 10) -> tuple[PracticeFlight, ...]:
-    """Draw a random set of flights in which all choices occur equally often.
+    """Draw random flights in which all right answers occur equally often.
 
     Parameters
     ----------
     seed : int
-        Seed, level and count determine the set.
+        Random seed; the same seed, level and count give the same flights.
     level : {1, 2, 3}
-        1: one large mistake; 2: smaller; 3: small, two mistakes in some of the flights.
+        Level of difficulty: a large mistake (1), a smaller one (2), or up to two small ones (3).
     count : int
+        Number of flights.
     """
     rng = np.random.default_rng([seed, level, count])
     names: list[str] = []
@@ -143,25 +147,19 @@ def draw(seed: int, level: int = 1, count: int = 10) -> tuple[PracticeFlight, ..
 
 
 def _draw_flight(rng: np.random.Generator, choice: str, level: int) -> PracticeFlight:
-    mistakes = [mistake for mistake in HIDDEN_MISTAKES if mistake.choice == choice]
-    mistakes = [mistakes[rng.integers(len(mistakes))]] if mistakes else []
+    def draw_one(choices: list[HiddenMistake]) -> list[HiddenMistake]:
+        return [choices[rng.integers(len(choices))]] if choices else []
+
+    mistakes = draw_one([mistake for mistake in HIDDEN_MISTAKES if mistake.choice == choice])
     if level == MAX_LEVEL and mistakes and rng.random() < 0.5:
-        second_mistakes = [
-            mistake for mistake in HIDDEN_MISTAKES if {mistake.choice, choice} in COMBINABLE_GROUPS
-        ]
-        mistakes += [second_mistakes[rng.integers(len(second_mistakes))]] if second_mistakes else []
-    sizes = []
+        pairs = ((mistake, {mistake.choice, choice}) for mistake in HIDDEN_MISTAKES)
+        mistakes += draw_one([mistake for mistake, pair in pairs if pair in COMBINABLE_GROUPS])
+    sizes, noise_m = [], SIGMA_Z_M
     for mistake in mistakes:
-        sign = "-" if mistake.either_sign and rng.random() < 0.5 else ""
+        sign = "-" if mistake.has_either_sign and rng.random() < 0.5 else ""
         sizes.append(f"{sign}{mistake.sizes[level - 1]}")
-    noise_m = next(
-        (
-            float(s)
-            for mistake, s in zip(mistakes, sizes, strict=True)
-            if mistake.mistake == NOISY_UWB
-        ),
-        SIGMA_Z_M,
-    )
+        if mistake.mistake == NOISY_UWB:
+            noise_m = float(sizes[-1])
     scenario = Scenario(
         **SCENARIO_VALUES,
         length_m=round(float(rng.uniform(*LENGTH_M)), 1),
@@ -178,23 +176,13 @@ def practice_text(
     count: int = 10,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> str:
-    """Simulate a set of flights and make the practice page.
+    """Simulate the flights of :func:`draw`, and return the practice page (HTML) about them.
 
-    Parameters
-    ----------
-    seed, level, count : int
-        See :func:`draw`.
-    progress : callable
-        Called with a text, the number of finished flights and their total.
-
-    Returns
-    -------
-    str
-        HTML page that loads nothing from a network; write it as UTF-8.
+    ``progress`` is called with a text, the number of finished flights, and the number of flights.
     """
-    practice_flights, scripts = draw(seed, level, count), []
+    scripts = []
     data: dict[str, Any] = {}
-    for number, practice_flight in enumerate(practice_flights):
+    for number, practice_flight in enumerate(draw(seed, level, count)):
         progress(f"flight {number + 1}", number, count)
         data, script = _flight_data(practice_flight, number)
         scripts.append(script)
@@ -210,22 +198,20 @@ def practice_text(
 
 
 def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str, Any], str]:
-    """Return the data of a flight, and its elements with the compressed answer."""
-    mistakes = [
+    """Return the plot data of a flight, and HTML elements with the data and the right answer."""
+    mistakes_and_sizes = [*zip(practice_flight.mistakes, practice_flight.sizes, strict=True)]
+    options = [
         f"{mistake.mistake}={size}"
-        for mistake, size in zip(practice_flight.mistakes, practice_flight.sizes, strict=True)
+        for mistake, size in mistakes_and_sizes
         if mistake.mistake != NOISY_UWB
     ]
-    simulation = flights.simulate(practice_flight.scenario, parse(mistakes))
+    simulation = flights.simulate(practice_flight.scenario, parse(options))
     flight = flights.to_flight(simulation, f"flight {number + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
     analysis = run(request, flight=flight)
     findings, packer = find(analysis), Packer()
     data, card = flight_data(analysis, packer), build_card(analysis, findings, request)
-    described = [
-        _describe_mistake(mistake, size, findings)
-        for mistake, size in zip(practice_flight.mistakes, practice_flight.sizes, strict=True)
-    ]
+    described = [_describe_mistake(*pair, findings) for pair in mistakes_and_sizes]
     key = {
         "right": practice_flight.correct_answers,
         "mistakes": described,
@@ -240,9 +226,9 @@ def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str
 def _describe_mistake(
     mistake: HiddenMistake, size: str, findings: tuple[Finding, ...]
 ) -> dict[str, Any]:
-    """Return fault, size, time, symptom and view of a mistake for the page, in words."""
+    """Describe a mistake for the page: fault, size, time, symptom, and the view that shows it."""
     finding_id = FINDING_WITH_TIME.get(mistake.mistake)
-    spans = [span for one in findings if one.id == finding_id for span in one.spans_s]
+    spans = [span for finding in findings if finding.id == finding_id for span in finding.spans_s]
     time = f"{spans[0][0]:.1f} to {spans[-1][1]:.1f} s" if spans else "whole flight"
     return {
         "fault": mistake.fault,
@@ -255,7 +241,7 @@ def _describe_mistake(
 
 
 def size_in_words(size: str) -> list[str]:
-    """Split a size of the command line into its parts, with a blank before each unit.
+    """Split the size of a mistake at commas, and add a blank before each unit.
 
     >>> size_in_words("5%,2m"), size_in_words("-400ms"), size_in_words("0.3")
     (['5 %', '2 m'], ['-400 ms'], ['0.3'])
@@ -264,13 +250,11 @@ def size_in_words(size: str) -> list[str]:
 
 
 def _rerun_sentence(card: Card) -> str:
-    """Return the re-run that improves most, in one sentence."""
-    reruns = [
-        rerun for cause in card.causes for rerun in cause.reruns if rerun.improves != "nothing"
-    ]
-    if not reruns:
+    """Describe the most effective re-run with one change: RMSE and innovation before and after."""
+    reruns = (rerun for cause in card.causes for rerun in cause.reruns)
+    best = next((rerun for rerun in reruns if rerun.improves != "nothing"), None)
+    if best is None:
         return "No re-run with one change corrects this flight."
-    best = reruns[0]
     changes = [
         f"{name} {format_value(pair[0])} → {format_value(pair[1])}{unit}"
         for name, pair, format_value, unit in (
@@ -279,14 +263,14 @@ def _rerun_sentence(card: Card) -> str:
         )
         if pair is not None
     ]
-    return f"Re-run, {best.label}: {', '.join(changes)}."
+    return f"Re-run of {best.label}: {', '.join(changes)}."
 
 
 def _name_mistakes(card: Card, described: Sequence[Mapping[str, Any]]) -> Card:
-    """Replace the headline of a card that found no cause on a flight with a mistake."""
+    """Replace the headline of the report card if the analysis did not detect the mistake."""
     if card.causes or not described:
         return card
-    fault = "; ".join(f"{one['fault']}: {one['size']}" for one in described)
+    fault = "; ".join(f"{mistake['fault']}: {mistake['size']}" for mistake in described)
     return structs.replace(
         card,
         severity="warning",

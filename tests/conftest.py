@@ -70,12 +70,40 @@ settings.load_profile("steady")
 MANY_OBJECTS = 500_000
 
 
+# Files whose tests the command of the README leaves out, by marker (pyproject.toml explains each).
+# ``.ci/run`` runs them afterwards; ``python -m pytest FILE`` runs all tests of a file.
+MARKED_FILES = {
+    "process": "attacks bad_logs batch cli environment terminal workers writing",
+    "browser": "class_page explore explore_engine explore_screen fleet_page practice",
+    "oracle": "mavlink mavlink_frames pose_graph",
+    "docs": "documentation",
+    "slow": (
+        "answers assignment detector_rates flown form_points fuzz gnss grade hypotheses outdoor "
+        "remedies source_noise vision"
+    ),
+}
+LEFT_OUT = f"not ({' or '.join((*MARKED_FILES, 'reallogs'))})"
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of each file in ``MARKED_FILES``."""
+    markers = {
+        f"test_{name}.py": mark for mark, names in MARKED_FILES.items() for name in names.split()
+    }
+    for item in items:
+        if marker := markers.get(item.path.name):
+            item.add_marker(marker)
+
+
 def pytest_configure(config: pytest.Config) -> None:
-    """Collect garbage between tests only.
+    """Leave out marked tests in a run without arguments; collect garbage between tests only.
 
     Test processes may write bytecode, which saves the compilation in each; processes of a study
     may not, because the study changes the code.
     """
+    if config.args_source is config.ArgsSource.TESTPATHS and not config.option.markexpr:
+        config.option.markexpr = LEFT_OUT
     gc.disable()
     if config.getoption("numprocesses", None):
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

@@ -58,8 +58,8 @@ def test_read_answer_form_returns_filled_in_values(tmp_path: Path) -> None:
     [
         ("a" * 30_000, "the file has 0.03 MB; the limit is 0.02 MB"),
         ("a." * 400 + "b = 1", "a line has more than 500"),
-        ("x = " + "[" * 450, "Correct the form"),
-        ("log_sha256 = 'x'", "Correct the form"),
+        ("x = " + "[" * 450, "Correct the form with the answers"),
+        ("log_sha256 = 'x'", "Correct the form with the answers"),
         (EMPTY.replace('kind = ""', 'kind = "gremlins"'), "'gremlins' is not one of"),
         (EMPTY + CLAIM.format("yaw", "size = 900"), "is out of range"),
         (EMPTY.replace('kind = ""', 'kind = "yaw"').replace('size = ""', "size = nan"), "size"),
@@ -88,7 +88,7 @@ def test_answer_form_questions_depend_on_log_hash() -> None:
     drawn = {draw_questions(f"{n:064x}") for n in range(200)}
     assert len(drawn) == 200
     kinds = {quantity.kind for each in drawn for quantity in each}
-    assert kinds == {"gain", "variance", "innovation", "nis", "silence", "gate"}
+    assert kinds == {"gain", "variance", "innovation", "nis", "prediction", "gate"}
     main = compare(aisle_flight(duration_s=60.0)).main
     for quantity in next(iter(drawn)):
         run = replay(main.axis, Settings(quantity.sigma_a_m_s2, quantity.sigma_z_m))
@@ -106,14 +106,14 @@ def test_correct_answer_for_sigma_after_gap_equals_closed_form() -> None:
     """Closed form: P grows by F P Fᵀ + Q in each step of DT."""
     main = compare(aisle_flight(duration_s=60.0)).main
     quantity = next(
-        q for n in range(99) for q in draw_questions(f"{n:064x}") if q.kind == "silence"
+        q for n in range(99) for q in draw_questions(f"{n:064x}") if q.kind == "prediction"
     )
     settings = Settings(quantity.sigma_a_m_s2, quantity.sigma_z_m)
     run = replay(main.axis, settings)
     at = run.updates.index[quantity.update - 1]
     p0, p1, p2 = run.steps.loc[at, ["position_variance_m2", "covariance_m2_s",
                                     "velocity_variance_m2_s2"]]  # fmt: skip
-    dt, n = settings.dt_s, round(quantity.extra / settings.dt_s)
+    dt, n = settings.dt_s, round(quantity.duration_or_gate / settings.dt_s)
     t = n * dt
     # the acceleration of a step moves the position by dt²/2, and by dt² in each later step
     lags = dt * (np.arange(n) + 0.5)

@@ -79,10 +79,11 @@ class Flight:
         if isinstance(report, ResultsError):
             made = grade_unreadable(rubric, self.key, f"{report.reason}.", report.remedy)
             return GradedReport(
-                "a.pdf", "", "", verdict, made.items, pending_action=made.pending_action
+                "a.pdf", "", "", verdict, made.items, instructor_action=made.instructor_action
             )
         made = score_report(report, verdict, rubric, self.key)
-        return GradedReport("a.pdf", "", "", verdict, made.items, made.flags, made.pending_action)
+        action = made.instructor_action
+        return GradedReport("a.pdf", "", "", verdict, made.items, made.flags, action)
 
     def with_notes(self, text: str, rubric: Rubric) -> GradedReport:
         """Grade the report with other notes, as verified."""
@@ -137,7 +138,7 @@ def honest(flight: Flight, rubric: Rubric) -> GradedReport:
 
 def test_grade_unchanged_report_is_verified_and_earns_points(honest: GradedReport) -> None:
     assert honest.status == "verified"
-    assert honest.pending_action == ""
+    assert honest.instructor_action == ""
     assert honest.flags == ()
     points = {item.title: item.points / item.max_points for item in honest.items}
     assert points["Mistakes of the flight"] > 0.4, honest.items
@@ -292,8 +293,8 @@ def test_grade_report_with_forged_results_is_not_verified(
     assert not graded.counted_points
     assert graded.status == status, graded.verdict.reasons
     assert not any("Error" in reason for reason in graded.verdict.reasons), graded.verdict.reasons
-    assert pending in graded.pending_action
-    assert bool(graded.pending_action) == bool(pending)
+    assert pending in graded.instructor_action
+    assert bool(graded.instructor_action) == bool(pending)
     assert graded.points <= honest.points + 1e-9
 
 
@@ -334,7 +335,7 @@ def grade_loop(truth: Any, request: dict[str, Any], loop: dict[str, Any]) -> Gra
     verdict = Verdict("verified", (), True, page_status="same")
     made = score_report(results, verdict, read_rubric(None), key)
     items = tuple(item for item in made.items if "Loop" in item.title)
-    return GradedReport("a.pdf", "", "", verdict, items, made.flags, made.pending_action)
+    return GradedReport("a.pdf", "", "", verdict, items, made.flags, made.instructor_action)
 
 
 LANDED = {"landed_at": {"forward_m": 6.0, "right_m": 0.0}}

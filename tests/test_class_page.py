@@ -93,7 +93,7 @@ CLASS = (
         notes=BREAKOUT,
         reasons=(BREAKOUT,),
         numbers={MARKUP: 1.0},
-        pending_action=MARKUP,
+        instructor_action=MARKUP,
         form=FORM,
         mistakes={MARKUP: False},
         redrawn_path="javascript:alert(1)",
@@ -132,7 +132,7 @@ def test_class_page_student_text_adds_no_html_elements(text: str) -> None:
             word, 5.0, id=word, file=f"{word}.pdf", flags=(word,), reasons=(word,),
             notes=f"So: {word}",
             numbers={word: 1.0}, items=(Item(word, 5.0, 20.0, word),), mistakes={word: False},
-            pending_action=word, form=FORM, comment=word,
+            instructor_action=word, form=FORM, comment=word,
         )  # fmt: skip
         return html_text([one], word, word)
 
@@ -145,7 +145,7 @@ def test_class_page_student_text_adds_no_html_elements(text: str) -> None:
 def test_class_page_average_excludes_pending_points() -> None:
     said = {"Notes": Override(9.0, "Good.")}
     entries = [row("Ada", 10.0, late_s=61), row("Bo", 20.0),
-               row("Cy", 12.0, pending_action="Run 0.1.1."),
+               row("Cy", 12.0, instructor_action="Run 0.1.1."),
                row("Di", 13.0, overrides=said, total=13.0)]  # fmt: skip
     text = html_text(entries, "Class", "px4fuse 1")
     assert "2 min late" in text  # 61 s are rounded up
@@ -186,7 +186,7 @@ def anonymous_class() -> list[Entry]:
         said = f"Your report names {name}, {student_id}. {SAYS}"
         entry = row(
             name, 9.0, id=student_id, file=file, flags=(flag,), reasons=(said,),
-            pending_action=said,
+            instructor_action=said,
             notes=f"{name} ({student_id}): {SAYS} 王小明", form=FORM,
             numbers={"mean NIS": 1.0}, items=(Item("Settings", 9.0, 20.0, said),),
             mistakes={"positions that jump": False}, comment=said,
@@ -210,7 +210,12 @@ def test_class_page_in_anonymous_mode_contains_no_names() -> None:
     parts = [part for one in content(text)["rows"] for part in one[2]]
     points = [part[3] for part in parts if part[1] == "Points (proposed)"]
     assert {tuple(row) for rows in points for row in rows} == {("Settings", "9", "20", "")}
-    assert ["list", "Mistakes of this flight", ["positions that jump: not named"], False] in parts
+    assert [
+        "list",
+        "Mistakes of this flight",
+        ["positions that jump: not named in the answer form"],
+        False,
+    ] in parts
     # no text of students, no link to a PDF, no input boxes without an owner
     assert not {"boxes", "prose", "links"} & {part[0] for part in parts}
     for there in ("Lovelace", ".pdf", "data:image/png"):

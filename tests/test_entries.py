@@ -131,7 +131,9 @@ def test_class_entry_with_differing_answer_forms_is_pending() -> None:
     files = {"a.pdf": of_form(4.0, "yaw"), "b.pdf": of_form(9.0, "nlos")}
     (ada, _), _ = make_entries(files)
     assert ada.total is None
-    assert ada.counted_report.pending_action == "Ask which of 2 reports counts: their forms differ."
+    assert (
+        ada.counted_report.instructor_action == "Ask which of 2 reports counts: their forms differ."
+    )
     assert len(ada.other_reports) == 1
     assert make_entries(files, Course(RUBRIC, attempt="best"))[0][0].total == 9.0
     # equal forms are not pending
@@ -143,7 +145,7 @@ def test_pending_report_does_not_replace_the_graded_report() -> None:
     """For example a later report of another student with this student's id."""
     files = {
         "a.pdf": of_form(9.0, "yaw"),
-        "z.pdf": of_form(2.0, "nlos", pending_action="Ask whose."),
+        "z.pdf": of_form(2.0, "nlos", instructor_action="Ask whose."),
     }
     packed = {"a.pdf": datetime(2026, 11, 18), "z.pdf": datetime(2026, 11, 19)}
     for times in (None, packed):
@@ -195,7 +197,7 @@ def test_student_outside_class_list_has_flagged_entry() -> None:
     (ada, grace, stranger), _ = make_entries(files)
     assert (ada.total, grace.total) == (3.0, None)
     assert (stranger.student, stranger.student_id, stranger.total) == ("Mallory", "9", 8.0)
-    assert stranger.flags[0] == "Not in the class list."
+    assert stranger.flags[0] == "The student is not in the class list."
 
 
 def test_class_entries_without_roster_list_each_student_once() -> None:
@@ -243,7 +245,7 @@ def test_instructor_overrides_replace_points_and_add_comments(tmp_path) -> None:
         "": Override(None, "Come and\nsee me."),
     }  # fmt: skip
     assert (ada.counted_report.points, ada.total, grace.total) == (15.5, 8.0, 3.0)
-    told = ("1 has no item 'C'", "2 has no item 'B'", "no student has the id 3")
+    told = ("student 1 has no item 'C'", "student 2 has no item 'B'", "no student has the id 3")
     assert notes == tuple(f"overrides.csv: {one}." for one in told)
     text, reason = feedback_text(ada, "Lab"), "Because. Your instructor: A good idea."
     assert f"9.5 of 10  A\n    {reason} (Your instructor gave 9.5" in text
@@ -255,11 +257,11 @@ def test_instructor_overrides_replace_points_and_add_comments(tmp_path) -> None:
     ("rows", "points", "told"),
     [
         (("1,A,95,A slip.", "1,total,200,"), (10.0, 10.0), (
-            "1 cannot have more than 10 points of 'A'",
-            "1 cannot have more than 20 points of 'total'",
+            "student 1 cannot have more than 10 points of 'A'",
+            "student 1 cannot have more than 20 points of 'total'",
         )),
         (("1,A,9,", "1,a,2,", "01,total,12,", "1,Total,3,"), (15.0, 3.0), (
-            "1 has two rows for 'A'", "01 has two rows for 'total'",
+            "student 1 has two rows for 'A'", "student 01 has two rows for 'total'",
         )),
     ], ids=["points above the maximum", "duplicate row"],
 )  # fmt: skip
@@ -284,7 +286,7 @@ def test_instructor_overrides_from_page_include_all_students(tmp_path) -> None:
 
 
 def test_total_points_from_instructor_end_pending_status(tmp_path) -> None:
-    files = {"1.pdf": graded_report("", 4.0, student_id="1", pending_action="Run 0.1.1.")}
+    files = {"1.pdf": graded_report("", 4.0, student_id="1", instructor_action="Run 0.1.1.")}
     (ada, _), _ = make_entries(files, overrides=write_overrides(tmp_path, "1,A,9,"))
     assert ada.total is None
     (ada, _), _ = make_entries(files, overrides=write_overrides(tmp_path, "1,total,9,"))

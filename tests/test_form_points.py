@@ -25,7 +25,7 @@ from px4fuse.answer_form import (
 from px4fuse.assignment.random_assignment import draw
 from px4fuse.assignment.truth import FormTruth, TrueMistake, VerdictTruth, form_truth
 from px4fuse.cli.simulate import simulate
-from px4fuse.grading.form_points import PART_NAMES, TABLE, cures, form_points, panels
+from px4fuse.grading.form_points import PART_NAMES, TABLE, form_points, panels, right_corrections
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
 from px4fuse.simulation.mistakes import parse
@@ -88,7 +88,7 @@ def test_answer_form_offers_correct_answers_for_each_mistake() -> None:
     assert set(SIMULATED) == set(MISTAKES) - {"none", "vio-drift"}
     assert set(TABLE["shows"]) | {"cover"} == set(PANELS)
     for name in SIMULATED:
-        offered = cures(TrueMistake(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
+        offered = right_corrections(TrueMistake(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
         assert {cure for cure, _, _ in offered} <= set(CORRECTIONS)
         assert max(share for _, _, share in offered) == 1.0
         assert set(panels(name)) > {"cover"}
@@ -138,12 +138,12 @@ def test_partly_correct_answer_form_has_partial_points(
 def test_answer_form_for_clean_flight_must_name_no_mistake() -> None:
     none = Answers(log_sha256=SHA256, mistakes=(StudentMistake("none"),))
     assert parts(none, CLEAN) == [40.0, 0.0, 0.0, 0.0, 0.0, 0.0]
-    assert form_points(none, CLEAN).share == 0.4
+    assert form_points(none, CLEAN).fraction == 0.4
     whole = replace(
         none, verdict_kf="consistent", verdict_ekf2="consistent", quantities=(0.5, 0.1, 0.2),
         ekf2_did=("followed the positions",),
     )  # fmt: skip
-    assert form_points(whole, CLEAN).share == 1.0
+    assert form_points(whole, CLEAN).fraction == 1.0
     assert parts(RIGHT, CLEAN)[:4] == [0.0] * 4
 
 
@@ -174,7 +174,7 @@ def test_same_answer_form_for_all_loops_earns_few_points() -> None:
     for kind in ("open-end", "none"):
         for each in constants(truths, kind):
             form = replace(each, quantities=(None, None, ()))
-            assert np.mean([form_points(form, one).share for one in truths]) <= 0.35
+            assert np.mean([form_points(form, one).fraction for one in truths]) <= 0.35
 
 
 def test_correct_loop_open_end_size_includes_odometry_drift() -> None:
@@ -280,5 +280,5 @@ def test_random_answer_forms_earn_at_most_20_percent() -> None:
     """500 random forms on flights with two mistakes, one and none."""
     rng = np.random.default_rng(5)
     truths = (TRUTH, replace(TRUTH, mistakes=(LATE,)), CLEAN)
-    earned = [form_points(at_random(rng), truths[n % 3]).share for n in range(500)]
+    earned = [form_points(at_random(rng), truths[n % 3]).fraction for n in range(500)]
     assert np.mean(earned) <= 0.2

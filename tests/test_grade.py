@@ -98,7 +98,7 @@ def test_grade_report_beyond_time_limit_cannot_be_verified(tmp_path, monkeypatch
         [folder], Course(read_rubric(None), logs=[LOG.parent]), tmp_path / "class"
     ).reports
     assert only.status == "cannot verify"
-    assert only.pending_action.startswith("Ask for the PDF that px4fuse wrote")
+    assert only.instructor_action.startswith("Ask for the PDF that px4fuse wrote")
     assert any("not compared within the limits" in flag for flag in only.flags)
 
 
@@ -132,7 +132,7 @@ def test_grade_with_log_verifies_only_the_unchanged_report(tmp_path) -> None:
     assert (third.verdict.status, third.verdict.outcome) == ("verified", "page differs")
     assert third.status == "page differs"
     assert third.points == first.points
-    assert any(f"Page {REPORT_PAGES}: missing." in flag for flag in third.flags)
+    assert any(f"Page {REPORT_PAGES}: the page is missing." in flag for flag in third.flags)
     assert first.flags == ()
     # a second run reuses all results
     again = grade([folder], Course(read_rubric(None), logs=[LOG.parent]), output, processes=2)
@@ -200,7 +200,7 @@ def test_grade_report_without_its_log_makes_points_pending(tmp_path) -> None:
         assert one.verdict.status == status
         assert one.points > 0
         assert one.counted_points is None
-        assert "aisle_uwb.ulg" in one.pending_action
+        assert "aisle_uwb.ulg" in one.instructor_action
 
 
 @pytest.mark.usefixtures("jobs_in_process")

@@ -55,7 +55,7 @@ def test_practice_flights_contain_each_mistake_equally_often(
         assert len(one.mistakes) <= (2 if level == 3 else 1)
         for mistake, size in zip(one.mistakes, one.sizes, strict=True):
             assert size.removeprefix("-") == mistake.sizes[level - 1]
-            assert mistake.either_sign or not size.startswith("-")
+            assert mistake.has_either_sign or not size.startswith("-")
 
 
 def test_practice_level_3_has_some_flights_with_two_mistakes() -> None:

@@ -13,7 +13,7 @@ import pytest
 import px4fuse
 
 # Mutable buffers, which are filled while reading, writing or replaying
-BUFFERS = {"Packer", "_Fusion", "_Walk"}
+BUFFERS = {"Packer", "_Fusion", "_PdfComparison"}
 
 
 def classes() -> Iterator[type]:

@@ -39,9 +39,9 @@ SHA = SHA256
 NONE = {"what": "it", "reason": "too few of them", "remedy": ""}
 
 
-def assess_results(results=EXAMPLE, verdict=VERIFIED, key=None, rubric=None, owner_id=""):
+def assess_results(results=EXAMPLE, verdict=VERIFIED, key=None, rubric=None, submitter_id=""):
     return score_report(
-        decode_results(results), verdict, rubric or read_rubric(None), key, owner_id
+        decode_results(results), verdict, rubric or read_rubric(None), key, submitter_id
     )
 
 
@@ -212,10 +212,10 @@ class TestForm:
             points, comment = check_points("answers", results, key=key(sha256="c" * 64))
             assert (points, "not about the log that you were given" in comment) == (0.0, True)
 
-    @pytest.mark.parametrize(("owner_id", "points"), [("", 0.0), ("s01", 30.0), ("zz", 0.0)])
-    def test_scoring_uses_platform_id_instead_of_mistyped_report_id(self, owner_id, points):
+    @pytest.mark.parametrize(("submitter_id", "points"), [("", 0.0), ("s01", 30.0), ("zz", 0.0)])
+    def test_scoring_uses_platform_id_instead_of_mistyped_report_id(self, submitter_id, points):
         mistyped = with_form(["dropout"], student__id="s02")
-        items = assess_results(mistyped, key=key(), owner_id=owner_id).items
+        items = assess_results(mistyped, key=key(), submitter_id=submitter_id).items
         assert [item.points for item in items if "Mistakes" in item.title] == [points]
 
     def test_student_notes_await_points_of_instructor(self):
@@ -237,17 +237,17 @@ class TestScore:
         made = assess_results(verdict=verdict)
         assert {item.points for item in made.items} == {0.0}
         assert all("SIGMA_A is 0.5" in item.comment for item in made.items)
-        assert made.pending_action == ""
+        assert made.instructor_action == ""
 
     def test_unverified_report_earns_pending_or_no_points(self):
         verdict = Verdict("other log", ("no log",), False, remedy="Look.")
         made = assess_results(verdict=verdict)
         assert made.items[0].points == 0.0
         assert sum(item.points for item in made.items) > 30
-        assert made.pending_action == "Look."
+        assert made.instructor_action == "Look."
         zero = assess_results(verdict=verdict, rubric=replace(read_rubric(None), unverified="zero"))
         assert {item.points for item in zero.items} == {0.0}
-        assert zero.pending_action == ""
+        assert zero.instructor_action == ""
 
     @pytest.mark.parametrize("student_id", ["s02", "S02", "ѕ02", "s77", "", " "])
     def test_report_on_log_of_other_student_follows_rubric_rule(self, student_id):
@@ -255,18 +255,18 @@ class TestScore:
         said = f"id in the report is {student_id}" if student_id.strip() else "report has no id"
         assert (
             f"given to student s01, but the {said}"
-            in assess_results(given, key=key()).pending_action
+            in assess_results(given, key=key()).instructor_action
         )
         for rule, earns in (("zero", False), ("count", True)):
             rubric = replace(read_rubric(None), others_log=rule)
             made = assess_results(given, key=key(), rubric=rubric)
-            assert (made.pending_action, any(item.points for item in made.items)) == ("", earns)
+            assert (made.instructor_action, any(item.points for item in made.items)) == ("", earns)
         # with the owner from the platform
-        assert assess_results(given, key=key(), owner_id="s01").pending_action == ""
+        assert assess_results(given, key=key(), submitter_id="s01").instructor_action == ""
 
     def test_report_on_log_outside_answer_key_is_pending(self):
         made = assess_results(with_notes("", student__id="s01"), key=key(sha256="c" * 64))
-        assert "not about a log of the answer key" in made.pending_action
+        assert "not about a log of the answer key" in made.instructor_action
 
     @pytest.mark.parametrize("results", [EXAMPLE, LOOP], ids=["compare", "loop"])
     def test_any_results_that_follow_the_schema_can_be_scored(self, results):
@@ -323,7 +323,7 @@ class TestFeedback:
              ("could not be verified: one; page 3: two. Make a new report",), "Points"),
             ({"student": "=cmd|' /C calc'!A0\n<script>", "student_id": "\x1b[31m"},
              ("=cmd|' /C calc'!A0 <script>",), "\x1b"),
-            ({"items": assess_results().items, "pending_action": "Add uwb.csv to --logs."},
+            ({"items": assess_results().items, "instructor_action": "Add uwb.csv to --logs."},
              ("pending, not counted yet",), "--logs"),
         ],
     )  # fmt: skip

@@ -185,7 +185,9 @@ def test_find_submissions_does_not_open_zip_inside_export(tmp_path):
     assert name_and_number(found[0].name) == ("Roe", "1")
     with pytest.raises(ResultsError) as refused:
         read_report(read(found[0]), found[0].name)
-    assert str(refused.value) == f"{name}: not a PDF. Hand in the file that px4fuse wrote."
+    assert (
+        str(refused.value) == f"{name}: the file is not a PDF. Hand in the file that px4fuse wrote."
+    )
     assert notes == (
         "Ignored files (not PDF): 1.",
         "Zip files not opened: 1. Name the export of a platform on the command line.",
@@ -216,7 +218,7 @@ def test_find_submissions_skips_damaged_zip_with_note(tmp_path):
     found, notes = find_submissions([bad, good])
     assert [each.name for each in found] == ["a.pdf"]
     assert len(notes) == 1
-    assert "bad.zip: ignored: it cannot be read (damaged)." in notes
+    assert "bad.zip was ignored: the file cannot be read (damaged)." in notes
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links need rights that tests do not have")
@@ -287,7 +289,7 @@ def test_submission_above_size_limit_is_rejected_without_reading(tmp_path):
     said = reason(single_submission(path))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert said == "large.pdf: larger than 25 MB; reports are below 2 MB."
+    assert said == "large.pdf: the file is larger than 25 MB; reports are below 2 MB."
     assert peak < 3 * MAX_BYTES
 
 
@@ -308,7 +310,7 @@ def test_submission_with_zip_bomb_is_rejected(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("limit", "value", "said"),
     [
-        ("MAX_TOTAL_BYTES", 200, "it unpacks to more than"),
+        ("MAX_TOTAL_BYTES", 200, "the zip file unpacks to more than"),
         ("MAX_ENTRIES", 3, "more than 3 entries"),
         ("MAX_DIRECTORY_BYTES", 100, "damaged"),
     ],
@@ -319,7 +321,7 @@ def test_find_submissions_skips_zip_beyond_size_limits(tmp_path, monkeypatch, li
     monkeypatch.setattr(submissions, limit, value)
     found, notes = find_submissions([path, other])
     assert [each.file for each in found] == [other]
-    assert any(note.startswith("x.zip: ignored: ") and said in note for note in notes)
+    assert any(note.startswith("x.zip was ignored: ") and said in note for note in notes)
 
 
 def test_read_submission_from_unsupported_zip_states_reason(tmp_path):

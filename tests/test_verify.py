@@ -332,7 +332,7 @@ def test_verify_report_with_changed_student_name_is_not_verified(
     assert verdict.outcome != "verified", verdict
     assert verdict.differences == ()
     assert verdict.redrawn != loop.pdf
-    named = any("matplotlib 9.9.9; here" in reason for reason in verdict.reasons)
+    named = any("matplotlib 9.9.9; this" in reason for reason in verdict.reasons)
     assert named == (path[-1] == "matplotlib")
 
 
@@ -384,7 +384,7 @@ def test_verify_finds_changed_plot_despite_other_libraries(
     verdict = foreign.verified(forged(foreign.pdf, on_page(1, PLOTS[name])))
     assert verdict.outcome == "cannot verify", verdict
     assert "page 1: drawing operation" in verdict.reasons[0]
-    assert any("made with matplotlib 3.99.0; here" in reason for reason in verdict.reasons)
+    assert any("made with matplotlib 3.99.0; this" in reason for reason in verdict.reasons)
     assert verdict.remedy.startswith("Verify it with matplotlib 3.99.0.")
     assert verdict.redrawn == foreign.again[1]()
 
@@ -463,9 +463,10 @@ def test_verify_report_with_changed_page_returns_page_differs(
 
 DOCUMENT: dict[str, tuple[Forge, str, str]] = {
     "a page away": (
-        lambda w: w.remove_page(REPORT_PAGES - 1), "page differs", f"page {REPORT_PAGES}: missing",
+        lambda w: w.remove_page(REPORT_PAGES - 1), "page differs",
+        f"page {REPORT_PAGES}: the page is missing",
     ),
-    "another title": (document_info(Title="my report"), "page differs", "document: /Title is"),
+    "another title": (document_info(Title="my report"), "page differs", "document: the PDF entry"),
     "a form": (
         catalogue("/AcroForm", dictionary(Fields=array())), "cannot verify", "form fields that",
     ),

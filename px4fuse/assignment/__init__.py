@@ -1,1 +1,1 @@
-"""Assignments: individual simulated flights for a class, and the answer key."""
+"""Assignments: a simulated flight with mistakes for each student, and the answer key."""

@@ -1,4 +1,4 @@
-"""Individual simulated flights for a class, with an answer key for the instructor."""
+"""Writing of an assignment: log and answer form for each student, and the answer key."""
 
 import hashlib
 import secrets
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from px4fuse.answer_form import form_name, form_text
 from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key
-from px4fuse.assignment.random_assignment import AssignedFlight, Kinds, draw
+from px4fuse.assignment.random_assignment import AssignedFlight, FlightKind, draw
 from px4fuse.assignment.roster import Person, normalise_text
 from px4fuse.assignment.truth import form_truth
 from px4fuse.errors import OutputError, SettingsError
@@ -18,7 +18,7 @@ from px4fuse.simulation.mistakes import parse
 from px4fuse.text import to_json_types
 from px4fuse.writing import write_all
 
-# true values of the simulation that the answer key contains
+# True values of the simulation that the answer key lists
 TRUTH_NAMES = (
     "duration_s",
     "sigma_z_m",
@@ -31,9 +31,9 @@ TRUTH_NAMES = (
 
 
 def simulate_assigned(
-    secret: bytes, student: Person, kind: Kinds, count: int | None = None, truth: bool = True
+    secret: bytes, student: Person, kind: FlightKind, count: int | None = None, truth: bool = True
 ) -> tuple[bytes, Answer]:
-    """Simulate the flight of one student; return the log (ULog) and the entry of the answer key."""
+    """Simulate the flight of one student; return the log (ULog) and the right answers."""
     assigned_flight = draw(secret, student.student_id, kind, count, truth)
     simulation = flights.simulate(assigned_flight.scenario, parse(assigned_flight.mistake_options))
     log = flights.to_ulog(simulation)
@@ -53,12 +53,12 @@ def simulate_assigned(
 
 
 def key_path(folder: Path, key_option: Path | None) -> Path:
-    """Return the path of the answer key, by default beside the students' folder.
+    """Return the path of the answer key, by default beside the folder for the students.
 
     Raises
     ------
     OutputError
-        The path is inside the students' folder.
+        The path is inside the folder for the students.
     """
     resolved_folder = folder.resolve()
     path = key_option or resolved_folder.parent / f"{resolved_folder.name}_answers.json"
@@ -75,14 +75,13 @@ def assign(
     folder: Path,
     key_file: Path,
     secret: bytes | None,
-    kind: Kinds,
+    kind: FlightKind,
     count: int | None = None,
     truth: bool = True,
-    progress: Callable[[int, int], None] = lambda finished_count, of: None,
+    progress: Callable[[int, int], None] = lambda *_: None,
 ) -> tuple[AnswerKey, int]:
     """Write the log and the answer form of each student to a folder, and the answer key.
 
-    The key is written before log and form of a student, so that an interrupted run can continue.
     An existing log or form is never replaced: it must be identical. Students can be added to an
     existing key; the entries of the other students must be unchanged.
 
@@ -91,16 +90,17 @@ def assign(
     secret : bytes or None
         None for the secret in the existing key, or for a new random secret.
     count : int, optional
-        Number of mistakes per flight; drawn by default.
+        Number of mistakes per flight; drawn at random by default.
     truth : bool
-        Logs of aisle flights contain the ground truth.
+        True if the logs of aisle flights contain the ground truth.
     progress : callable
-        Called after each flight with the number of finished flights, and the number of all.
+        Called after each flight with the number of finished flights and the number of students.
 
     Returns
     -------
-    AnswerKey
-    int
+    key : AnswerKey
+        Right answers for all students.
+    written_count : int
         Number of written logs; the other logs existed already.
 
     Raises
@@ -134,9 +134,9 @@ def assign(
             path: content for path, content in contents.items() if not _is_written(path, content)
         }
         key = AnswerKey(kind, tuple(answers.values()), new_secret)
-        # the key is written first, because an interrupted run needs its secret to continue
+        # the answer key is written before the log, because an interrupted run needs its secret
         write_all({key_file: key_text(key).encode()})
-        key_file.chmod(0o600)  # readable only for the instructor
+        key_file.chmod(0o600)  # only the instructor can read the answer key
         write_all(missing_contents)
         written_count += folder / student.file in missing_contents
         progress(finished_count, len(students))
@@ -147,17 +147,15 @@ def preview(
     students: Sequence[Person],
     key_file: Path,
     secret: bytes | None,
-    kind: Kinds,
+    kind: FlightKind,
     count: int | None = None,
 ) -> list[AssignedFlight]:
-    """Draw the flights of :func:`assign` without simulating them or writing files.
+    """Draw the flights that :func:`assign` would simulate, without writing files.
 
     Raises
     ------
     SettingsError
-        One flight cannot have this many mistakes, or there is no secret.
-    OutputError
-        The existing key was written by another version of px4fuse.
+        One flight cannot have this many mistakes, or no secret was given or stored.
     """
     if secret is None:
         stored_key = read_key(key_file) if key_file.exists() else None
@@ -171,7 +169,7 @@ def preview(
 
 
 def _is_written(path: Path, content: bytes) -> bool:
-    """Return True if the file exists with this content; raise OutputError for other content."""
+    """Return True if the file exists with this content; raise OutputError if it has another."""
     if not path.exists() and not path.is_symlink():
         return False
     if path.is_file() and path.stat().st_size == len(content) and path.read_bytes() == content:
@@ -183,7 +181,6 @@ def _is_written(path: Path, content: bytes) -> bool:
 
 
 def _check_extends(key_file: Path, is_extension: bool) -> None:
-    """Raise OutputError unless the new answer key is an extension of the existing one."""
     if not is_extension:
         raise OutputError(
             f"{key_file} is the answer key of other flights and was not overwritten. Use the "

@@ -1,4 +1,4 @@
-"""Answer key of an assignment: flight, mistakes and right answers of each student."""
+"""Answer key of an assignment: flight, mistakes and right answers for each student."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,7 +12,7 @@ from px4fuse.assignment.truth import FormTruth
 from px4fuse.errors import SettingsError
 from px4fuse.reading import read_text
 
-# bytes; the key of 1000 students has two million bytes
+# Maximum size (bytes) of an answer key: the key of 1000 students has two million bytes
 MAX_KEY_BYTES = 20_000_000
 NOTE = (
     "For the instructor only: this file lists the mistakes of every student's flight. Do not hand "
@@ -26,7 +26,7 @@ _Texts = Annotated[
 
 
 class Answer(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
-    """Flight of one student, with the right answers.
+    """Assigned flight of one student, with its mistakes and the right answers.
 
     Attributes
     ----------
@@ -39,12 +39,11 @@ class Answer(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
     mistakes : tuple of str
         Values of ``px4fuse simulate --mistake``; empty for a flight without a mistake.
     truth : dict
-        True values of the simulation, which the log does not contain: ``sigma_z_m``,
-        ``sigma_a_m_s2``, ``clock_offset_to_add_s`` and others.
+        True values of the simulation that the log does not contain, for example ``sigma_z_m``.
     difficulty : float or None
         See :class:`px4fuse.assignment.random_assignment.AssignedFlight`.
     form : FormTruth or None
-        Right answers of the answer form.
+        Right answers to the student's answer form.
     """
 
     student_id: Annotated[str, Meta(max_length=1000, pattern=r"\S")]
@@ -64,14 +63,16 @@ class _Schema(msgspec.Struct, frozen=True):
 
 
 class AnswerKey(msgspec.Struct, frozen=True):
-    """Answers for all students of a class, and the secret; written as JSON.
+    """Right answers for all students of a class, and the secret; written as JSON.
 
     Attributes
     ----------
     kind : str
-        Kind of the flights.
+        Kind of all flights: "aisle", "loop" or "mixed".
+    answers : tuple of Answer
+        Assigned flight and right answers of each student.
     secret : str
-        Secret from which px4fuse drew the flights; "" if the instructor gave it.
+        Random secret that determined the flights; "" if the instructor has the secret.
     """
 
     kind: _Text
@@ -82,28 +83,27 @@ class AnswerKey(msgspec.Struct, frozen=True):
     schema: _Schema = _Schema()
     note: str = NOTE
 
-    def __repr__(self) -> str:  # hides the secret
+    def __repr__(self) -> str:  # without the secret, which an error message must not show
         return f"AnswerKey({self.kind!r}, {len(self.answers)} students)"
 
     def of_student(self, student_id: str) -> Answer | None:
-        """Return the entry of a student id; :class:`Register` compares the ids."""
-        student_index = Register(Person(a.student_id) for a in self.answers).student_index(
-            Person(student_id)
-        )
+        """Return flight and right answers of a student; leading zeros of the id may be missing."""
+        register = Register(Person(answer.student_id) for answer in self.answers)
+        student_index = register.student_index(Person(student_id))
         return None if student_index is None else self.answers[student_index]
 
     def of_log(self, sha256: str) -> Answer | None:
-        """Return the entry of the log with this SHA-256."""
-        return next((a for a in self.answers if sha256 and a.sha256 == sha256), None)
+        """Return flight and right answers for the log with this SHA-256; None if not assigned."""
+        return next((answer for answer in self.answers if answer.sha256 == sha256), None)
 
 
 def key_text(key: AnswerKey) -> str:
-    """Format the answer key as JSON, for :func:`read_key`."""
+    """Format the answer key as JSON with line breaks."""
     return msgspec.json.format(msgspec.json.encode(key), indent=1).decode() + "\n"
 
 
 def read_key(path: Path) -> AnswerKey:
-    """Read and check an answer key.
+    """Read the answer key of an assignment.
 
     Raises
     ------

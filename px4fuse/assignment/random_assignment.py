@@ -1,4 +1,4 @@
-"""Random assignment: draws flight, mistakes and their sizes for each student.
+"""Random assignment of a flight with mistakes to each student.
 
 Random numbers are the HMAC (RFC 2104) of the student id with the instructor's secret as key. They
 cannot be predicted without the secret, and a second run gives the same flights.
@@ -20,24 +20,26 @@ from px4fuse.errors import SettingsError
 from px4fuse.record import Record, table
 from px4fuse.simulation.scenario import Kind, Scenario, make_scenario
 
-# kind of flight of a class; for "mixed", the kind is drawn for each student
-Kinds = Literal["aisle", "loop", "mixed"]
+# Kind of the flights of a class; for "mixed", aisle or loop is drawn for each student
+FlightKind = Literal["aisle", "loop", "mixed"]
 
-MIN_SECRET_LENGTH = 8  # characters
-# part of each HMAC message. With another label all flights change, and existing answer keys cannot
-# be extended
+# Minimum length (characters) of the instructor's secret: a shorter one can be guessed
+MIN_SECRET_LENGTH = 8
+# First part of each HMAC message. Another label would change all flights, so that students could
+# not be added to existing answer keys
 DRAW_LABEL = "px4fuse assignment 2"
-# fractions of flights with 0, 1 and 2 mistakes, without --mistakes. Loops have one possible
-# mistake, "open-end". Many loops have none, so that students cannot guess it
+# Fractions of flights with 0, 1 and 2 mistakes, unless --mistakes sets the number. The only
+# possible mistake of a loop is "open-end". Many loops have none, so that students cannot guess it
 COUNT_FRACTIONS: dict[Kind, tuple[float, ...]] = {"aisle": (0.1, 0.5, 0.4), "loop": (0.4, 0.6)}
-# fraction of loops in a mixed class
+# Fraction of the students of a "mixed" class who get a loop; the others get an aisle flight
 LOOP_FRACTION = 1 / 3
-# range of the drawn difficulty: smallest detectable size of a mistake over the size in the flight
+# Limits of the difficulty of a mistake: its smallest detectable size divided by its size in the
+# flight
 EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
 
 
 class AssignableMistake(Record, frozen=True):
-    """Mistake that can be assigned, with its smallest detectable size.
+    """Mistake of a simulated flight that can be assigned to a student.
 
     Attributes
     ----------
@@ -49,15 +51,15 @@ class AssignableMistake(Record, frozen=True):
         Smallest size, in ``unit``, that px4fuse detects in 19 of 20 flights
         (tests/studies/rates.csv); None for a mistake without a size.
     unit : str
-        Unit of ``detectable_size``, as in ``--mistake``.
+        Unit of ``detectable_size``, as in ``px4fuse simulate --mistake``.
     is_smaller_easier : bool
         True if a smaller number is easier to detect.
     has_either_sign : bool
-        True if the sign of the size is drawn.
+        True if the sign of the size is drawn at random.
     start_range_s : (float, float) or None
-        Range of the start time (s), for a mistake that has one.
+        Earliest and latest start (s) of a mistake that does not last the whole flight.
     hidden_groups : tuple of str
-        Groups of mistakes that cannot be detected beside this mistake.
+        Groups of mistakes that cannot be detected in a flight with this mistake.
     """
 
     mistake: str
@@ -71,26 +73,21 @@ class AssignableMistake(Record, frozen=True):
 
     def is_detectable_with(self, other: AssignableMistake) -> bool:
         """Return True if both mistakes can be detected in the same flight."""
-        return not (
-            self.group == other.group
-            or self.group in other.hidden_groups
-            or other.group in self.hidden_groups
-        )
+        is_hidden = other.group in (self.group, *self.hidden_groups)
+        return not is_hidden and self.group not in other.hidden_groups
 
     def format_option(
         self, difficulty: float, sign: float = 1.0, start_fraction: float = 0.5
     ) -> str:
-        """Format the value of ``--mistake`` that gives this difficulty.
+        """Format the value of ``px4fuse simulate --mistake`` that gives this difficulty.
 
-        ``start_fraction``: start time, as a fraction of ``start_range_s`` (0 to 1).
+        ``start_fraction``: position of the start time in ``start_range_s`` (0 to 1).
         """
         if self.detectable_size is None:
             return self.mistake
-        size = (
-            self.detectable_size * difficulty
-            if self.is_smaller_easier
-            else self.detectable_size / difficulty
-        )
+        size = self.detectable_size / difficulty
+        if self.is_smaller_easier:
+            size = self.detectable_size * difficulty
         text = f"{self.mistake}={math.copysign(float(f'{size:.3g}'), sign):g}{self.unit}"
         if self.start_range_s is None:
             return text
@@ -99,9 +96,14 @@ class AssignableMistake(Record, frozen=True):
 
 
 class DrawingRules(Record, frozen=True):
-    """Rules for one kind of flight: possible mistakes, and ranges of the scenario's numbers.
+    """Rules for drawing aisle flights or loops at random (``drawn.toml``).
 
-    A range is (low, high, decimals), by field of the scenario.
+    Attributes
+    ----------
+    mistakes : tuple of AssignableMistake
+        Possible mistakes.
+    numbers : dict
+        Minimum, maximum and decimals of random numbers, by field of the scenario.
     """
 
     mistakes: tuple[AssignableMistake, ...]
@@ -118,12 +120,13 @@ class AssignedFlight:
 
     Attributes
     ----------
+    scenario : Scenario
+        Settings of the simulation.
     mistake_options : tuple of str
-        Values of ``--mistake``.
+        Values of ``px4fuse simulate --mistake``.
     difficulty : float
-        Largest difficulty of the mistakes with a size: smallest detectable size over size. A flight
-        without a mistake has the largest difficulty, because excluding all mistakes is the most
-        work.
+        Largest difficulty of the mistakes: smallest detectable size divided by the size. A flight
+        without a mistake is the most difficult, because all mistakes have to be excluded.
     """
 
     scenario: Scenario
@@ -131,15 +134,15 @@ class AssignedFlight:
     difficulty: float
 
 
-def draw_uniform(secret: bytes, student_id: str, kind: Kinds, label: str) -> float:
-    """Return a reproducible random number in [0, 1) for a student and a label."""
+def draw_uniform(secret: bytes, student_id: str, kind: FlightKind, label: str) -> float:
+    """Return a random number in [0, 1) that secret, student, kind and label determine."""
     message = "\0".join((DRAW_LABEL, kind, normalise_text(student_id), label))
     digest = hmac.new(secret, message.encode(errors="replace"), hashlib.sha256).digest()
     return int.from_bytes(digest[:7], "big") / 2**56
 
 
 def draw(
-    secret: bytes, student_id: str, kind: Kinds, count: int | None = None, truth: bool = True
+    secret: bytes, student_id: str, kind: FlightKind, count: int | None = None, truth: bool = True
 ) -> AssignedFlight:
     """Draw the flight of one student.
 
@@ -148,7 +151,7 @@ def draw(
     kind : {"aisle", "loop", "mixed"}
         "mixed" draws aisle or loop.
     count : int, optional
-        Number of mistakes; drawn by default.
+        Number of mistakes; drawn at random by default.
     truth : bool
         True to log the ground truth of aisle flights. The log of a loop never contains it, because
         the ground truth shows the landing place.
@@ -158,9 +161,8 @@ def draw(
     SettingsError
         One flight cannot have this many mistakes.
     """
-    max_count = (
-        min(len(COUNT_FRACTIONS[k]) for k in (COUNT_FRACTIONS if kind == "mixed" else (kind,))) - 1
-    )
+    possible_kinds = COUNT_FRACTIONS if kind == "mixed" else (kind,)
+    max_count = min(len(COUNT_FRACTIONS[each]) for each in possible_kinds) - 1
     if count is not None and not 0 <= count <= max_count:
         raise SettingsError(
             f"--mistakes {count} is out of range: a flight of kind {kind} has 0 to "
@@ -171,42 +173,32 @@ def draw(
     draw_number = partial(draw_uniform, secret, student_id, kind)
     if count is None:
         count = bisect(list(accumulate(COUNT_FRACTIONS[kind][:-1])), draw_number("count"))
-    chosen_mistakes: list[tuple[AssignableMistake, float, str]] = []
-    for choice in sorted(
-        ASSIGNABLE_MISTAKES[kind], key=lambda c: draw_number(f"order {c.mistake}")
+    mistakes: list[AssignableMistake] = []
+    for mistake in sorted(
+        ASSIGNABLE_MISTAKES[kind], key=lambda each: draw_number(f"order {each.mistake}")
     ):
-        if len(chosen_mistakes) < count and all(
-            choice.is_detectable_with(other) for other, *_ in chosen_mistakes
-        ):
-            name = choice.mistake
-            difficulty_fraction = (
-                0.0 if choice.detectable_size is None else draw_number(f"size {name}")
-            )
-            sign = -1.0 if choice.has_either_sign and draw_number(f"sign {name}") < 0.5 else 1.0
-            difficulty = (
-                EASIEST_DIFFICULTY + (HARDEST_DIFFICULTY - EASIEST_DIFFICULTY) * difficulty_fraction
-            )
-            chosen_mistakes.append(
-                (
-                    choice,
-                    difficulty,
-                    choice.format_option(difficulty, sign, draw_number(f"at {name}")),
-                )
-            )
+        if len(mistakes) < count and all(map(mistake.is_detectable_with, mistakes)):
+            mistakes.append(mistake)
+    difficulties, options = [], []
+    for mistake in mistakes:
+        name, difficulty = mistake.mistake, EASIEST_DIFFICULTY
+        if mistake.detectable_size is not None:
+            difficulty += (HARDEST_DIFFICULTY - difficulty) * draw_number(f"size {name}")
+        sign = -1.0 if mistake.has_either_sign and draw_number(f"sign {name}") < 0.5 else 1.0
+        difficulties.append(difficulty)
+        options.append(mistake.format_option(difficulty, sign, draw_number(f"at {name}")))
     numbers: dict[str, Any] = {
         name: round(low + (high - low) * draw_number(name), decimals)
         for name, (low, high, decimals) in _RULES_BY_KIND[kind].numbers.items()
     }
     has_truth, seed = truth and kind == "aisle", int(draw_number("seed") * 2**32)
     scenario = make_scenario(kind, truth=has_truth, seed=seed, **numbers)
-    hardest = max((difficulty for _, difficulty, _ in chosen_mistakes), default=HARDEST_DIFFICULTY)
-    return AssignedFlight(
-        scenario, tuple(option for *_, option in chosen_mistakes), round(hardest, 2)
-    )
+    hardest = max(difficulties, default=HARDEST_DIFFICULTY)
+    return AssignedFlight(scenario, tuple(options), round(hardest, 2))
 
 
 def encode_secret(text: str, where: str) -> bytes:
-    """Encode a secret as bytes; ``where`` names its option or file in errors.
+    """Encode the instructor's secret as bytes; ``where`` names its option or file in errors.
 
     Raises
     ------

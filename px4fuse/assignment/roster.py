@@ -1,4 +1,4 @@
-"""Class list: reading of the table of a learning platform, and identification of students."""
+"""Class list: reading of tables of learning platforms, and identification of students."""
 
 import re
 import unicodedata
@@ -16,16 +16,17 @@ from px4fuse.results.reading import one_line
 
 MAX_NAME_LENGTH = 200
 MAX_STUDENTS = 1000
-# maximum characters of a file name: systems allow 255 bytes, and a character has up to 4 bytes
+# Maximum length (characters) of a file name without suffix: systems allow 255 bytes, and a
+# character has up to 4 bytes
 MAX_STEM_LENGTH = 48
-# names that Windows reserves
+# File names that Windows reserves
 RESERVED_NAMES = {"con", "prn", "aux", "nul"} | {
     f"{n}{i}" for n in ("com", "lpt") for i in range(10)
 }
 COLUMNS = table(__file__, "columns.toml", dict[str, tuple[str, ...]])
-# fields that a second list adds to a student if the class list does not contain them
+# Fields of a student that another list adds if the class list does not contain them
 ADDED_FIELDS = ("name", "email", "login", "submitted")
-# names in rows of Canvas that are not students, as letters
+# Names of rows in Canvas gradebooks that are not students, without blanks and punctuation
 NOT_STUDENT_NAMES = ("pointspossible", "studenttest")
 
 
@@ -39,10 +40,10 @@ class Person:
         As in the class list.
     login : str
         Login on Blackboard or ILIAS.
-    numbers : mapping
-        Number of the student on each platform, by platform.
+    numbers : dict
+        Number of the student on each learning platform, by name of the platform.
     submitted : str
-        Submission time in Moodle's worksheet, as text.
+        Submission time as in Moodle's worksheet.
     """
 
     student_id: str
@@ -59,11 +60,10 @@ class Person:
 
 
 def read_people(sheet: Sheet) -> tuple[Person, ...]:
-    """Read the students from a class list, worksheet or gradebook.
+    """Read the students from a class list, Moodle worksheet or Canvas gradebook.
 
     Titles of the columns: id (Student ID, ID number, Matrikelnummer, SIS User ID), login (Username,
-    SIS Login ID), email, name (or first and last name). Worksheets of Moodle and gradebooks of
-    Canvas have these columns.
+    SIS Login ID), email, name (or first and last name).
 
     Raises
     ------
@@ -72,7 +72,8 @@ def read_people(sheet: Sheet) -> tuple[Person, ...]:
     """
     if all(sheet.column(titles) is None for titles in COLUMNS.values()):
         raise SettingsError(
-            f"{sheet.path}: no column identifies the student.", "Name one column id, email or name."
+            f"{sheet.path}: no column identifies the student.",
+            "Give one column the title id, email or name.",
         )
     row_by_id: dict[str, int] = {}
     people = []
@@ -97,13 +98,14 @@ def read_roster(path: Path) -> tuple[Person, ...]:
     Raises
     ------
     SettingsError
-        As :func:`~px4fuse.assignment.sheet.read_sheet` and :func:`read_people`, or an id cannot be
-        used as a file name, or the list has no students or more than MAX_STUDENTS.
+        The file is not a table of students, an id cannot be used as a file name, or the number of
+        students is zero or above MAX_STUDENTS.
     """
     people = read_people(read_sheet(path))
     if not people or len(people) > MAX_STUDENTS:
         raise SettingsError(
-            f"{path} contains {len(people)} students.", f"Give a list of 1 to {MAX_STUDENTS}."
+            f"{path} contains {len(people)} students.",
+            f"Give a class list with 1 to {MAX_STUDENTS}.",
         )
     stems: dict[str, Person] = {}
     for person in people:
@@ -118,7 +120,7 @@ def read_roster(path: Path) -> tuple[Person, ...]:
 
 
 def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
-    """Return the student in a row of a table; None if the row contains no student."""
+    """Return the student in a row of a class list; None if the row contains no student."""
     cells = {
         field_name: one_line(sheet.cell(row, titles), MAX_NAME_LENGTH)
         for field_name, titles in COLUMNS.items()
@@ -139,22 +141,19 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
 
 
 class Register:
-    """Students of the class; other lists add missing fields to students of the class."""
+    """Students of the class; other lists add missing data, but no further students."""
 
     def __init__(self, people: Iterable[Person] = (), *other_lists: Iterable[Person]) -> None:
         self.people = list(people)
-        # the other lists may contain people who are not in the class; they are ignored
         for other in chain.from_iterable(other_lists):
-            if (student_index := self.student_index(other)) is not None:
-                known_person = self.people[student_index]
-                combined_fields = {
-                    name: getattr(known_person, name) or getattr(other, name)
-                    for name in ADDED_FIELDS
+            index = self.student_index(other)
+            if index is not None:
+                student = self.people[index]
+                fields = {
+                    name: getattr(student, name) or getattr(other, name) for name in ADDED_FIELDS
                 }
-                numbers = {**other.numbers, **known_person.numbers}
-                self.people[student_index] = replace(
-                    known_person, numbers=numbers, **combined_fields
-                )
+                numbers = other.numbers | student.numbers
+                self.people[index] = replace(student, numbers=numbers, **fields)
 
     def student_index(self, other: Person) -> int | None:
         """Return the index of a person in the class; None if the person is not identified.
@@ -162,32 +161,29 @@ class Register:
         The first of these fields that matches exactly one student decides: platform number, id,
         email, login, name. Leading zeros of ids may be missing, because spreadsheets remove them.
         """
-        numbers = other.numbers.items()
         criteria: tuple[tuple[Callable[[str, str], bool], Callable[[Person], str], str], ...] = (
             *(
                 (_is_same_text, lambda person, at=platform: person.numbers.get(at, ""), value)
-                for platform, value in numbers
+                for platform, value in other.numbers.items()
             ),
             (_is_same_text, attrgetter("student_id"), other.student_id),
             (is_same_id, attrgetter("student_id"), other.student_id),
             (_is_same_text, attrgetter("email"), other.email),
-            # if the class list contains no login, the id may be the login
+            # in a class list without logins, the ids may be the logins
             (_is_same_text, lambda person: person.login or person.student_id, other.login),
             (is_same_name, attrgetter("name"), other.name),
         )
         for is_same, field_of, value in criteria:
-            matching_indices = [
-                index
-                for index, person in enumerate(self.people)
-                if is_same(field_of(person), value)
+            matches = [
+                i for i, person in enumerate(self.people) if is_same(field_of(person), value)
             ]
-            if len(matching_indices) == 1:
-                return matching_indices[0]
+            if len(matches) == 1:
+                return matches[0]
         return None
 
 
 def normalise_text(text: str) -> str:
-    """Normalise an id or name for comparison: Unicode NFKC, no case, no outer blanks."""
+    """Normalise an id or name for comparison: Unicode NFKC, lower case, no outer blanks."""
     return unicodedata.normalize("NFKC", text).strip().casefold()
 
 
@@ -220,7 +216,7 @@ def is_same_name(name: str, other: str) -> bool:
 
 
 def file_stem(student_id: str) -> str | None:
-    """Convert an id to a file name for all systems; None if the id has no letter or digit.
+    """Convert a student id to a file name that all systems allow; None without letter or digit.
 
     >>> file_stem("s01/2026"), file_stem("../../x"), file_stem("nul"), file_stem("=;")
     ('s01_2026', '_.._x', '_nul', None)
@@ -236,7 +232,7 @@ def file_stem(student_id: str) -> str | None:
 
 
 def make_unique(names: Iterable[str], pattern: str = "{} ({})") -> list[str]:
-    """Append a number to repeated names, so that all names differ in more than case.
+    """Append numbers to repeated names, so that all names differ in more than case.
 
     >>> make_unique(["notes", "cover", "Notes"])
     ['notes', 'cover', 'Notes (2)']
@@ -253,5 +249,5 @@ def make_unique(names: Iterable[str], pattern: str = "{} ({})") -> list[str]:
 
 
 def file_names(stems: Iterable[str]) -> list[str]:
-    """Make file names for all systems that differ in more than case."""
+    """Make file names that all systems allow and that differ in more than case."""
     return make_unique((file_stem(stem) or "report" for stem in stems), "{}-{}")

@@ -1,4 +1,4 @@
-"""Tables (CSV) of learning platforms and users: reading, and writing of a changed copy.
+"""CSV tables of learning platforms and instructors: reading, and writing of a changed copy.
 
 The reader detects encoding (UTF-8 with and without byte order mark, UTF-16, Windows-1252) and
 separator. A copy has the encoding and the separator of the original.
@@ -22,14 +22,14 @@ SEPARATORS = ",;\t|"
 
 @dataclass(frozen=True)
 class Sheet:
-    """Table with a header.
+    """CSV table with a header.
 
     Attributes
     ----------
     head : tuple of str
         Titles of the columns.
     rows : tuple of tuple of str
-        Cells of each row; at least one per title.
+        Cells of each row, at least as many as titles.
     """
 
     path: Path
@@ -39,18 +39,18 @@ class Sheet:
     separator: str = ","
 
     def column(self, titles: Sequence[str]) -> int | None:
-        """Return the column index of the first of ``titles`` in the table; None without any."""
+        """Return the index of the column with the first title that exists; None if none exists."""
         plain_titles = [normalise_title(title) for title in self.head]
         return next((plain_titles.index(title) for title in titles if title in plain_titles), None)
 
     def cell(self, row: Sequence[str], titles: Sequence[str]) -> str:
-        """Return the cell of a row in the column that :meth:`column` finds; "" if there is none."""
+        """Return the cell of a row in the column with the first title that exists, or ""."""
         column_index = self.column(titles)
         return "" if column_index is None else row[column_index].strip()
 
     @property
     def text(self) -> str:
-        """Table as CSV (RFC 4180), with its original separator."""
+        """Table as CSV (RFC 4180), with the original separator."""
         out = io.StringIO()
         csv.writer(out, delimiter=self.separator).writerows((self.head, *self.rows))
         return out.getvalue()
@@ -59,9 +59,7 @@ class Sheet:
         """Encode the table in its original encoding."""
         try:
             return self.text.encode(self.encoding)
-        except (
-            UnicodeEncodeError
-        ):  # feedback may contain characters that Windows-1252 does not have
+        except UnicodeEncodeError:  # Windows-1252 does not have all characters of a feedback text
             return self.text.encode("utf-8-sig")
 
 
@@ -75,7 +73,7 @@ def normalise_title(title: str) -> str:
 
 
 def read_sheet(path: Path) -> Sheet:
-    """Read a table with a header.
+    """Read a CSV table with a header.
 
     Raises
     ------
@@ -83,7 +81,7 @@ def read_sheet(path: Path) -> Sheet:
         The file cannot be read, is not text, or has no header.
     """
     content = read_bytes_limited(
-        path, SettingsError, MAX_BYTES, name=str(path), size_remedy="Give a CSV file of one class"
+        path, SettingsError, MAX_BYTES, name=str(path), size_remedy="Give a CSV table of one class"
     )
     if content.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
         raise SettingsError(f"{path} is a spreadsheet, not a CSV file.", "Save it as CSV.")

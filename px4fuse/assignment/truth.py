@@ -1,4 +1,4 @@
-"""Right answers of the answer form for a simulated flight."""
+"""Right answers to the answer form about a simulated flight."""
 
 import math
 from collections.abc import Mapping
@@ -19,31 +19,32 @@ from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.record import Record, table
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
+from px4fuse.simulation.mistakes import MISTAKES as SIMULATED_MISTAKES
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
 
-# relative tolerance of the size of a mistake
+# Relative tolerance of the size of a mistake in a right answer
 SIZE_TOLERANCE = 0.15
-# m; tolerance of a loop closure error
+# Tolerance (m) of the loop closure error in a right answer
 CLOSURE_TOLERANCE_M = 0.3
-# minimum fraction of rejected samples that a right form must name
-MIN_REJECTED_SHARE = 0.005
-# minimum size (m) of a reset that a right form must name. Resets in the first seconds (s) of the
-# segment are ignored, because EKF2 resets to its first position
+# Minimum fraction of samples rejected by EKF2 for which a complete answer must name rejections
+MIN_REJECTED_FRACTION = 0.005
+# Minimum position reset of EKF2 (m) that a complete answer must name, and time (s) after the start
+# in which resets are ignored, because EKF2 resets to its first position
 MIN_RESET_M, EKF2_START_S = 0.2, 5.0
 EKF2_BEHAVIOUR = table(__file__, "did.toml", dict[str, dict[str, set[str]]])
 
 
 class TrueMistake(Record, frozen=True):
-    """Mistake of a simulated flight, with the range of right answers.
+    """Mistake of a simulated flight, with the limits of right answers.
 
     Attributes
     ----------
     size : float or None
-        Size in the first unit of :data:`px4fuse.answer_form.MISTAKES`. Answers from ``low`` to
-        ``high`` are right.
+        Size in the first unit of the mistake in ``form.toml``.
+    low, high : float or None
+        Smallest and largest size that is a right answer.
     from_s, until_s : float or None
-        Time (s) since the first data; both None: the whole flight.
+        Start and end of the mistake (s since the first data); both None for the whole flight.
     """
 
     kind: str
@@ -55,21 +56,25 @@ class TrueMistake(Record, frozen=True):
 
 
 class VerdictTruth(Record, frozen=True):
-    """Verdict on the reported σ of a filter ("": none), and the factor by which σ is wrong."""
+    """Right verdict on the reported σ of a filter, or "", and the factor by which σ is wrong."""
 
     verdict: str
     factor: float | None = None
 
 
 class FormTruth(Record, frozen=True):
-    """Right answers of the answer form for one flight.
+    """Right answers to the answer form about one flight.
 
     Attributes
     ----------
+    mistakes : tuple of TrueMistake
+        Mistakes of the flight.
     sigma_z_m : float
-        True position noise of the source (1 σ).
+        True noise of the position source (m, 1 σ).
+    kf, ekf2 : VerdictTruth
+        Verdicts on KF and EKF2.
     ekf2_did, ekf2_did_also : tuple of str
-        Behaviour of EKF2 that the form must name, and further behaviour that it may name.
+        Behaviour of EKF2 that a complete answer names, and further behaviour that is not wrong.
     quantities : tuple
         Answers to :func:`px4fuse.answer_form.draw_questions`; None if the flight is too short.
     """
@@ -84,7 +89,7 @@ class FormTruth(Record, frozen=True):
 
 
 def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
-    """Compute the right answers from the simulation and a comparison with default settings."""
+    """Compute the right answers from a simulation and its analysis with default settings."""
     answer = flights.answer(simulation)
     comparison = compare(flights.to_flight(simulation), Settings())
     mistakes = tuple(
@@ -105,11 +110,12 @@ def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
 def _true_mistake(
     name: str, values: Mapping[str, Any], truth: Mapping[str, Any], comparison: Comparison
 ) -> TrueMistake:
-    sizes = SIMULATED[name].sizes
+    sizes = SIMULATED_MISTAKES[name].sizes
     if not sizes:
         return TrueMistake(name)
-    size, tolerance = values[sizes[0]], SIZE_TOLERANCE * abs(values[sizes[0]])
-    if name == "open-end":  # a student measures the closure error, which includes odometry drift
+    size = values[sizes[0]]
+    tolerance = SIZE_TOLERANCE * abs(size)
+    if name == "open-end":  # the student measures the closure error, which includes odometry drift
         odometry = trajectory_of(comparison.flight, "vio")
         measured_m = analyse(LoopSource(odometry, comparison.flight)).closure_error_m
         size, tolerance = measured_m if isinstance(measured_m, float) else size, CLOSURE_TOLERANCE_M
@@ -144,7 +150,7 @@ def _verdict(comparison: Comparison, filter_name: FilterName) -> VerdictTruth:
 def _ekf2_behaviour(
     comparison: Comparison, mistakes: tuple[TrueMistake, ...], sigma_z_m: float
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the behaviour of EKF2 that the form must name, and that it may name in addition."""
+    """Return behaviour of EKF2 that a complete answer names, and further behaviour not wrong."""
     size_of = {mistake.kind: mistake.size or 0.0 for mistake in mistakes}
     required, allowed = (
         [behaviour for behaviour, kinds in EKF2_BEHAVIOUR[rule].items() if kinds & size_of.keys()]
@@ -155,7 +161,7 @@ def _ekf2_behaviour(
     innovations = comparison.main.ekf2_innovations
     if not isinstance(innovations, Unavailable):
         has_bad_samples = "nlos" in size_of or "jump" in size_of
-        if (innovations["rejected"] > 0).mean() > MIN_REJECTED_SHARE:
+        if (innovations["rejected"] > 0).mean() > MIN_REJECTED_FRACTION:
             required.append("rejected outliers" if has_bad_samples else "rejected good samples")
     ekf2 = comparison.flight.ekf2
     since_s = comparison.segment.start_s + EKF2_START_S
@@ -165,49 +171,39 @@ def _ekf2_behaviour(
             required.append("dead-reckoned, then reset")
     if not required:
         required, allowed = ["normal"], ["followed the positions", *allowed]
-    return tuple(dict.fromkeys(required)), tuple(
-        behaviour for behaviour in dict.fromkeys(allowed) if behaviour not in required
-    )
+    required = [*dict.fromkeys(required)]
+    return tuple(required), tuple(each for each in dict.fromkeys(allowed) if each not in required)
 
 
 def quantity_truth(
     result: AxisComparison, question: FormQuestion
 ) -> float | tuple[float, ...] | None:
-    """Answer a question by a replay of KF with the settings of the question.
+    """Compute the right answer by a run of KF with the settings of the question.
 
-    None if the flight has too few measurements. The answer about a gap is the position σ after
-    predictions with F and Q (steps of DT), without an update.
+    Returns None if the flight has too few measurements. For "prediction", the answer is the
+    position σ (m) after predictions with F and Q in steps of DT, without an update.
     """
     settings = Settings(question.sigma_a_m_s2, question.sigma_z_m)
     kf_replay = replay(result.axis, settings)
-    updates = kf_replay.updates
-    update_index = question.update - 1
-    if update_index >= len(updates):
+    updates = kf_replay.updates.iloc[question.update - 1 :]
+    if updates.empty:
         return None
-    row, covariance = (
-        updates.iloc[update_index],
-        kf_replay.steps.loc[updates.index[update_index], COVARIANCES],
-    )
+    row, covariance = updates.iloc[0], kf_replay.steps.loc[updates.index[0], COVARIANCES]
+    nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
     match question.kind:
         case "gate":
-            following_updates = updates.iloc[update_index : update_index + GATE_UPDATES + 1]
-            nis = (
-                following_updates["innovation_m"] ** 2 / following_updates["innovation_variance_m2"]
-            )
-            outside_numbers = np.flatnonzero(nis > question.extra**2) + question.update
+            is_outside = nis.iloc[: GATE_UPDATES + 1] > question.duration_or_gate**2
+            outside_numbers = np.flatnonzero(is_outside) + question.update
             return tuple(outside_numbers.astype(float).tolist())
-        case "silence":
+        case "prediction":
             p, f = symmetric_matrix(tuple(covariance)), transition(settings.dt_s)
-            q = (
-                settings.sigma_a_m_s2**2
-                * settings.dt_s
-                * symmetric_matrix(process_noise_unit(settings.dt_s))
-            )
-            for _ in range(round(question.extra / settings.dt_s)):
+            q = symmetric_matrix(process_noise_unit(settings.dt_s))
+            q *= settings.sigma_a_m_s2**2 * settings.dt_s
+            for _ in range(round(question.duration_or_gate / settings.dt_s)):
                 p = f @ p @ f.T + q
             return math.sqrt(p[0, 0])
         case "nis":
-            return float(row["innovation_m"] ** 2 / row["innovation_variance_m2"])
+            return float(nis.iloc[0])
         case "variance":
             return float(covariance.iloc[0])
     return float(row["gain_position" if question.kind == "gain" else "innovation_m"])

@@ -35,7 +35,7 @@ from px4fuse.comparison.model import (
 from px4fuse.comparison.projection import project, project_truth
 from px4fuse.comparison.remedy import is_fused_source, ml_delay_change, noise_change
 from px4fuse.comparison.trials import Change, Outcome, Statistic, Trial, distance_from_one
-from px4fuse.ekf2.filter_recursion import Variant
+from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings, with_misaligned_positions
 from px4fuse.ekf2.replay import HORIZONTAL as HORIZONTAL_AXES
@@ -272,14 +272,14 @@ def run_interventions(
     return tuple(rows), tuple(trial for changed in filters for trial in _try_on_main_axis(changed))
 
 
-def planned_variants(
+def planned_configurations(
     comparison: Comparison,
     tuning: Tuning,
     clock: ClockOffset | Unavailable,
     heading: HeadingError | Unavailable,
     inputs: Inputs,
-) -> list[Variant]:
-    """Return EKF2 variants that :func:`run_interventions` needs; others are replayed on demand."""
+) -> list[FilterConfiguration]:
+    """Return the EKF2 filter configurations that :func:`run_interventions` replays in any case."""
     if not is_fused_source(comparison, inputs):
         return []
     ekf2_changes, flown = _Ekf2Rerun(comparison, tuning, clock, heading, inputs), inputs.settings
@@ -290,7 +290,11 @@ def planned_variants(
     ]
     if isinstance(comparison.main.filters["ekf2"], FilterSummary):
         changes += ekf2_changes.main_axis_candidates(comparison.main)
-    return [Variant({**flown, **change}) for change in changes if change.keys() <= flown.keys()]
+    return [
+        FilterConfiguration({**flown, **change})
+        for change in changes
+        if change.keys() <= flown.keys()
+    ]
 
 
 def _difference_reduction(

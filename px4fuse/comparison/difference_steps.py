@@ -17,11 +17,11 @@ from px4fuse.comparison.estimates import Tuning, first_axis_tuning
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.remedy import noise_used_m
 from px4fuse.ekf2 import steps
-from px4fuse.ekf2.filter_recursion import Variant
+from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.replay import Spans, inside_spans
-from px4fuse.ekf2.steps import DifferenceExplanation, Step, UnreplayedPart
+from px4fuse.ekf2.steps import DifferenceExplanation, Step, UnreplayedDifference
 from px4fuse.filter.fast_replay import quick_replay
 from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
@@ -125,11 +125,13 @@ def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, floa
     return corrected
 
 
-def explanation_variants(
+def explanation_configurations(
     comparison: Comparison, inputs: Inputs, corrected: Mapping[str, float]
-) -> list[Variant]:
-    """Return the EKF2 variants that :func:`explain_ekf2_difference` needs."""
-    return list(steps.step_variants(inputs, _settings(comparison, inputs, corrected)).values())
+) -> list[FilterConfiguration]:
+    """Return the EKF2 configurations that :func:`explain_ekf2_difference` needs."""
+    return list(
+        steps.step_configurations(inputs, _settings(comparison, inputs, corrected)).values()
+    )
 
 
 def _settings(comparison: Comparison, inputs: Inputs, corrected: Mapping[str, float]) -> Settings:
@@ -144,7 +146,9 @@ def _with_changes(settings: Settings, changes: Mapping[str, float]) -> Settings:
     return replace(settings, **values)
 
 
-def _unreplayed_part(result: AxisComparison, kf_run: Replay, spans: Spans) -> UnreplayedPart | None:
+def _unreplayed_part(
+    result: AxisComparison, kf_run: Replay, spans: Spans
+) -> UnreplayedDifference | None:
     if not isinstance(result.ekf2_state, pd.DataFrame):
         return None
     state = result.ekf2_state[~inside_spans(result.ekf2_state.index, spans)]
@@ -153,7 +157,7 @@ def _unreplayed_part(result: AxisComparison, kf_run: Replay, spans: Spans) -> Un
     if not np.isfinite(distance_m).any():
         return None
     largest = int(np.nanargmax(distance_m))
-    return UnreplayedPart(float(distance_m[largest]), float(times[largest]))
+    return UnreplayedDifference(float(distance_m[largest]), float(times[largest]))
 
 
 def add_sentences(

@@ -49,7 +49,7 @@ def detect(analysis: Analysis) -> Findings:
 
 def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     """Detect position errors that are correlated in time, without a lag of the positions."""
-    noise = analysis.coloured
+    noise = analysis.time_correlated_noise
     if not isinstance(noise, TimeCorrelatedNoise) or noise.gain_nats < MIN_CORRELATION_GAIN_NATS:
         return
     if noise.lag_nats >= MIN_LAG_NATS:

@@ -107,7 +107,7 @@ def detect(analysis: Analysis) -> Findings:
 
 def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     """Return the low-pass filter of the source; None if there is none or it is not identifiable."""
-    source, low_pass = analysis.source, analysis.smoothing
+    source, low_pass = analysis.source, analysis.source_low_pass
     # drift of odometry also correlates successive errors, and positions rebuilt from EKF2 output
     # contain the filter of EKF2
     if source.orientation is not None or source.origin.reconstructed:
@@ -120,7 +120,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
         or low_pass.lag_s < MIN_LAG_S
     ):
         return None
-    correlation = analysis.coloured
+    correlation = analysis.time_correlated_noise
     # errors that are correlated without a lag are not from a low pass
     if isinstance(correlation, TimeCorrelatedNoise) and correlation.lag_nats < MIN_LAG_NATS:
         return None
@@ -155,7 +155,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
     # a step of the time offset also shifts the positions of a moving vehicle
     if not isinstance(fit, BiasScaleJumpFit) or any(detect_arrival_times(analysis)):
         return
-    correlated_noise = analysis.coloured
+    correlated_noise = analysis.time_correlated_noise
     # time-correlated noise changes by about its σ within seconds
     min_jump_m = MIN_JUMP_M
     if not isinstance(correlated_noise, Unavailable):
@@ -192,7 +192,7 @@ def detect_scale_error(analysis: Analysis) -> Findings:
     # a low-pass filter reduces the motion, and time-correlated noise may resemble a scale error
     if not isinstance(fit, BiasScaleJumpFit) or find_low_pass(analysis) is not None:
         return
-    if not isinstance(analysis.coloured, Unavailable) or not _is_clock_known(analysis):
+    if not isinstance(analysis.time_correlated_noise, Unavailable) or not _is_clock_known(analysis):
         return
     excess, sigma = fit.scale.value, fit.scale.sigma
     if abs(excess) >= max(MIN_SCALE, MIN_SCALE_SIGMAS * sigma):
@@ -281,7 +281,7 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     source, axis_tuning = analysis.source, analysis.tuning.get(HORIZONTAL)
     # for a low-pass filtered source the noise between samples is only part of the error
     may_be_low_passed = (
-        isinstance(analysis.smoothing, Unavailable) or find_low_pass(analysis) is not None
+        isinstance(analysis.source_low_pass, Unavailable) or find_low_pass(analysis) is not None
     )
     if may_be_low_passed or not isinstance(axis_tuning, AxisTuning) or not source.origin.is_vision:
         return

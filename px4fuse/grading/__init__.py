@@ -1,5 +1,5 @@
-"""Grading of a class: verification and points of the reports that students hand in.
+"""Grading of a class: verification and points of the reports that students submit.
 
-Handed-in files are not trusted: reading is bounded in time and memory, nothing in them is executed,
-and their paths, formulas and markup have no effect on the file system, tables or pages.
+Submitted files may be malicious: reading is bounded in time and memory, no content is executed, and
+paths, formulas and markup in them have no effect on the file system, tables or pages.
 """

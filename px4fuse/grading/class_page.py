@@ -22,7 +22,7 @@ from px4fuse.webpage.safe import load_template, local_link
 
 BIN_COUNT = 10
 MISSING = "no submission"
-# CSS style and symbol of each verification status, in the order in which the table sorts them
+# CSS style and symbol of each verification status, in the order in which the class table sorts them
 STATUS_STYLES: dict[str, tuple[str, str]] = {
     "verified": ("good", "✓"),
     "numbers differ": ("bad", "≠"),
@@ -36,19 +36,16 @@ FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "set by instr
 
 
 def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
-    """Format a class as one HTML file.
+    """Format the class page as HTML; the same input gives the same text, without a date.
 
     Parameters
     ----------
     entries : sequence of Entry
-        One per student.
+        Rows of the class table.
+    title : str
+        Title of the page.
     made_with : str
         Name and version of the program.
-
-    Returns
-    -------
-    str
-        HTML to write as UTF-8; equal for equal input, because it does not contain the date.
     """
     items, numbers = list_titles(entries)
     counts = Counter(tag for entry in entries for tag in _tags(entry))
@@ -73,13 +70,13 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
         rows=[_row(entry, items, numbers) for entry in entries],
         filters=[("Status", [("", f"Everyone ({len(entries)})"), *options])],
         groups=(("items", "Points of each item"), ("numbers", "Numbers")),
-        placeholder="name, id, file, flag",
+        placeholder="search for name, id, file or flag",
         full_table_note="All rows are in class.csv.",
     )
 
 
 def _above_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
-    """Format the part above the table: counts by status, and distributions of points."""
+    """Format the HTML above the class table: reports by status, and distributions of points."""
     totals = [entry.total for entry in entries if entry.total is not None]
     max_points = max((entry.max_points for entry in entries if entry.max_points > 0.0), default=1.0)
     reports = [report for entry in entries if (report := entry.counted_report)]
@@ -90,40 +87,29 @@ def _above_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
         totals=count_tenths(totals, max_points) if totals else (),
         max_points_text=format_cell_number(max_points),
         max_points_edge=format_number(max_points),
-        pending_points=[report.points for report in reports if report.pending_action],
+        pending_points=[report.points for report in reports if report.instructor_action],
         number=format_cell_number,
         items=list(_item_statistics(reports)),
     )
 
 
 def _item_statistics(reports: Sequence[GradedReport]) -> Iterator[tuple[Any, ...]]:
-    """Yield title, distribution, mean and maximum of the points of each item."""
+    """Yield title, distribution, mean and maximum of the points for each rubric item."""
     items_by_title: dict[str, list[Item]] = defaultdict(list)
     for report in reports:
-        for item in () if report.pending_action else report.items:
+        for item in () if report.instructor_action else report.items:
             items_by_title[item.title].append(item)
     for title, items in items_by_title.items():
-        shares = [item.points / item.max_points if item.max_points else 0.0 for item in items]
-        mean, max_points = (
-            statistics.fmean(i.points for i in items),
-            max(i.max_points for i in items),
-        )
-        zero_count, full_count = (
-            sum(share <= 0.0 for share in shares),
-            sum(share >= 1.0 for share in shares),
-        )
-        yield (
-            title,
-            count_tenths(shares, 1.0),
-            mean,
-            format_cell_number(max_points),
-            zero_count,
-            full_count,
-        )
+        fractions = [item.points / item.max_points if item.max_points else 0.0 for item in items]
+        mean = statistics.fmean(item.points for item in items)
+        max_text = format_cell_number(max(item.max_points for item in items))
+        zero_count = sum(fraction <= 0.0 for fraction in fractions)
+        full_count = sum(fraction >= 1.0 for fraction in fractions)
+        yield title, count_tenths(fractions, 1.0), mean, max_text, zero_count, full_count
 
 
 def count_tenths(values: Sequence[float], maximum: float) -> list[tuple[int, str]]:
-    """Count the values in each tenth from 0 to ``maximum``; return counts and lower edges.
+    """Count the values in each tenth of 0 to ``maximum``; return (count, lower edge) of each.
 
     >>> count_tenths([0.0, 5.0, 5.5, 9.0], 10.0)[5]
     (2, '5')
@@ -138,7 +124,7 @@ def _tags(entry: Entry) -> list[str]:
     tags = [report.status if report else MISSING]
     tags += ["flagged"] * bool(entry.flags) + ["late"] * bool(entry.late_s)
     if report:
-        tags += ["pending"] * bool(report.pending_action) + ["to read"] * report.awaits_points
+        tags += ["pending"] * bool(report.instructor_action) + ["to read"] * report.awaits_points
         tags += [
             f"missed: {mistake}" for mistake, is_named in report.mistakes.items() if not is_named
         ]
@@ -168,27 +154,22 @@ def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
         *(frame.number_cell(number_values.get(name)) for name in numbers),
     )
     # overrides.csv identifies students by id or file; a row with pseudonym has neither
-    box_parts = (_point_boxes(entry),) if entry.student_id or file else ()
+    boxes = (_point_boxes(entry),) if entry.student_id or file else ()
     # a row with pseudonym has no link, because the file name may contain the student's name
-    redrawn_links = (
-        [("Redrawn from the log (PDF)", local_link(report.redrawn_path))] if report else []
-    )
-    report_parts = (frame.links_section("Report", redrawn_links),)
-    return Row(cells, tuple(_tags(entry)), (*_details(entry), *box_parts), report_parts)
+    links = [("Redrawn from the log (PDF)", local_link(report.redrawn_path))] if report else []
+    link_sections = (frame.links_section("Report", links),)
+    return Row(cells, tuple(_tags(entry)), (*_details(entry), *boxes), link_sections)
 
 
 def _details(entry: Entry) -> Iterator[Section]:
-    """Yield the details that the page shows if a row is opened."""
+    """Yield the sections that the class page shows if a row is opened."""
     report, comment = entry.counted_report, frame.prose_section("Your comment", entry.comment)
     if report is None:
         yield frame.list_section("Missing", ["No submission."])
         yield comment
         return
     verdict = report.verdict
-    differences = [
-        (difference.path, difference.recorded, difference.recomputed)
-        for difference in verdict.differences
-    ]
+    differences = [(each.path, each.recorded, each.recomputed) for each in verdict.differences]
     items = [
         (
             item.title,
@@ -199,22 +180,19 @@ def _details(entry: Entry) -> Iterator[Section]:
         for item in report.items
     ]
     named_texts = [
-        f"{name}: {'' if is_named else 'not '}named" for name, is_named in report.mistakes.items()
+        f"{name}: {'named' if is_named else 'not named'} in the answer form"
+        for name, is_named in report.mistakes.items()
     ]
     attempts = [f"{other.submission}: {other.status}" for other in entry.other_reports]
     yield frame.list_section("Flags", entry.flags, is_warning=True)
-    yield frame.list_section(
-        "Pending: action required",
-        [report.pending_action] if report.pending_action else [],
-        is_warning=True,
-    )
+    actions = list(filter(None, [report.instructor_action]))
+    yield frame.list_section("Pending: action required", actions, is_warning=True)
     yield frame.list_section("Verification", verdict.reasons)
     titles = ("Value", "Report", "New run") if differences else ()
     yield frame.table_section("Numbers that differ", titles, differences)
-    title = "Points (proposed)" if report.pending_action else "Points"
-    yield frame.table_section(
-        title, ("Item", "Points", "Of", "Comment") if items else (), items, (1, 2)
-    )
+    title = "Points (proposed)" if report.instructor_action else "Points"
+    item_titles = ("Item", "Points", "Of", "Comment") if items else ()
+    yield frame.table_section(title, item_titles, items, (1, 2))
     yield comment
     yield frame.list_section("Mistakes of this flight", named_texts)
     yield frame.pairs_section("Answer form", [*form_rows(report.form)] if report.form else [])
@@ -231,17 +209,19 @@ def _points_cell(entry: Entry) -> Cell:
             else ""
         )
         return Cell("pending" if proposed_text else "–", None, proposed_text)
-    share = min(max(entry.total / entry.max_points, 0.0), 1.0) if entry.max_points > 0.0 else None
+    fraction = (
+        min(max(entry.total / entry.max_points, 0.0), 1.0) if entry.max_points > 0.0 else None
+    )
     notes = [f"{format_cell_number(entry.deduction)} deducted (late)"] * bool(entry.deduction)
     notes += ["set by instructor"] * any(
         override.points is not None for override in entry.overrides.values()
     )
     text = f"{format_cell_number(entry.total)} / {format_cell_number(entry.max_points)}"
-    return Cell(text, entry.total, ", ".join(notes), "", share)
+    return Cell(text, entry.total, ", ".join(notes), "", fraction)
 
 
 def _point_boxes(entry: Entry) -> Section:
-    """Make input boxes for the items that the instructor scores, and for the total.
+    """Make input boxes for the rubric items that the instructor scores, and for the total.
 
     Other rows of overrides.csv are included, because the downloaded file replaces overrides.csv.
     """

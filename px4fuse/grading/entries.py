@@ -1,6 +1,6 @@
-"""Rows of the class table: the report that counts, late deduction, and the instructor's overrides.
+"""Rows of the class table: the report that counts, late deduction, and the instructor's points.
 
-Points that the instructor writes into ``overrides.csv`` replace all computed points. A late
+Points that the instructor writes into ``overrides.csv`` replace the computed points. A late
 deduction is a percentage of the maximum points for each started day (or hour) after the due time,
 at most the maximum that the rule states. The total is never negative.
 """
@@ -27,47 +27,47 @@ from px4fuse.grading.rubric import Rubric
 from px4fuse.results.reading import clean_text, one_line
 
 TIME_FORMAT = "%Y-%m-%d %H:%M"
-# table of the instructor's points and comments, which px4fuse never overwrites
+# Table of the instructor's points and comments, which px4fuse never overwrites
 OVERRIDES_NAME = "overrides.csv"
 OVERRIDE_TITLES = ("id", "item", "points", "comment")
 OVERRIDES_TEMPLATE = "\ufeff" + ",".join(OVERRIDE_TITLES) + "\r\n"
 MAX_OVERRIDE_POINTS = 1e6
 MAX_COMMENT_LENGTH = 10_000
 
-# override by student id and item title, as the instructor typed them ("": the whole report)
+# Points or comment of the instructor, by student id and item title as typed ("": the whole report)
 Overrides = Mapping[str, Mapping[str, Override]]
-# syntax of --late
+# Syntax of the option --late, for example "10 % / day up to 50 %"
 _LATE_RULE = re.compile(
     r"(?P<rate>\d+(?:\.\d+)?)\s*%\s*/\s*(?P<unit>day|hour)"
     r"(?:\s+up to\s+(?P<most>\d+(?:\.\d+)?)\s*%)?"
 )
-# Moodle's format strftimedaydatetime in English, with a 12-hour and a 24-hour clock
+# Formats of submission times in Moodle's worksheets (English), with a 12-hour and a 24-hour clock
 _MOODLE_FORMATS = ("%A, %d %B %Y, %I:%M %p", "%A, %d %B %Y, %H:%M")
 
 
 @dataclass(frozen=True)
 class LateRule:
-    """Deduction for late submissions.
+    """Rule of the instructor for the deduction of points for late submissions.
 
     Attributes
     ----------
-    share_per_unit : float
-        Fraction of the maximum points that is deducted per started unit.
+    fraction_per_unit : float
+        Fraction of the maximum points that is deducted for each started unit of time.
     unit_s : float
-        A day or an hour (s).
-    max_share : float
+        Unit of time: a day or an hour (s).
+    max_fraction : float
         Largest fraction of the maximum points that is deducted.
     text : str
         Rule as the instructor typed it.
     """
 
-    share_per_unit: float
+    fraction_per_unit: float
     unit_s: float
-    max_share: float
+    max_fraction: float
     text: str
 
     def deduction(self, late_s: float, max_points: float) -> float:
-        """Compute the deducted points, for a submission that is late by ``late_s`` seconds.
+        """Compute the points to deduct from a submission that is late by ``late_s`` seconds.
 
         >>> parse_late_rule("10%/day").deduction(86_401.0, 50.0)
         10.0
@@ -75,18 +75,19 @@ class LateRule:
         15.0
         """
         units = math.ceil(max(late_s, 0.0) / self.unit_s)
-        return round(max_points * min(units * self.share_per_unit, self.max_share), 2)
+        return round(max_points * min(units * self.fraction_per_unit, self.max_fraction), 2)
 
 
 @dataclass(frozen=True)
 class Course:
-    """Class list, answer key, logs and rules, without the submissions.
+    """Class list, answer key, logs and rules for grading, without the submissions.
 
     Attributes
     ----------
     rubric : Rubric
+        Items that give points.
     key : AnswerKey or None
-        Mistakes of each student's flight.
+        Right answers about each student's flight.
     logs : sequence of Path
         Flight logs, and folders of logs. The SHA-256 identifies the log of a report.
     title : str
@@ -94,16 +95,17 @@ class Course:
     roster : tuple of Person or None
         Class list; by default the students of the answer key, else of the worksheets.
     worksheets : tuple of Sheet
-        Tables of learning platforms that receive the grades.
+        Tables of learning platforms, into which the grades are entered.
     column : str
-        Title of the grade column in the worksheets; "" if there is only one.
+        Title of the grade column in the worksheets; "" if they have only one.
     attempt : {"latest", "best", "first"}
-        Attempt of a student that counts.
+        Report of a student that counts.
     due : datetime or None
         Due time, with time zone.
     include_pending : bool
-        True to count the proposed points of pending reports, on which the instructor has to decide.
+        True to count the points of reports on which the instructor still has to decide.
     late_rule : LateRule or None
+        Deduction for late submissions.
     anonymous : bool
         True to show pseudonyms instead of names on the class page.
     """
@@ -127,13 +129,12 @@ class Course:
         people_by_sheet = [read_people(sheet) for sheet in self.worksheets]
         answers = self.key.answers if self.key else ()
         assigned_people = tuple(Person(answer.student_id, answer.name) for answer in answers)
-        return Register(
-            self.roster or assigned_people or next(iter(people_by_sheet), ()), *people_by_sheet
-        )
+        people = self.roster or assigned_people or next(iter(people_by_sheet), ())
+        return Register(people, *people_by_sheet)
 
 
-# one submitted report: sort key (submission time, time of the zip entry), graded report, and the
-# row of the class table if the student had submitted this report only
+# Submitted report of a student: sort key (submission time, time of the zip entry), graded report,
+# and row of the class table as if the student had submitted only this report
 Attempt = tuple[tuple[float, float], GradedReport, Entry]
 
 
@@ -152,17 +153,17 @@ def build_entries(
     Parameters
     ----------
     reports, submissions : sequences
-        All files, in the same order.
+        Graded reports and their files, in the same order.
 
     Returns
     -------
     entries : tuple of Entry
+        Rows of the class table.
     notes : tuple of str
-        Overrides that match no student or item.
+        Sentences about overrides that match no student or item.
     """
-    register = (
-        course.register if course.register.people else _collect_students(reports, submissions)
-    )
+    has_list = bool(course.register.people)
+    register = course.register if has_list else _collect_students(reports, submissions)
     attempts: dict[int | None, list[Attempt]] = defaultdict(list)
     for report, submission in zip(reports, submissions, strict=True):
         student_index = register.student_index(submission.origin.person)
@@ -172,49 +173,43 @@ def build_entries(
             _make_attempt(report, submission, course, student_index, register)
         )
     max_points = max((report.max_points for report in reports), default=0.0)
-    class_rows = [
+    rows = [
         _choose_attempt(attempts[student_index], course)
         if attempts[student_index]
         else Entry(person.name, person.student_id, None, max_points=max_points)
         for student_index, person in enumerate(register.people)
     ]
-    no_name = "Neither the report nor the platform names a student."
-    unknown_note = "Not in the class list." if course.register.people else no_name
-    class_rows += [
-        replace(entry, flags=(unknown_note, *entry.flags)) for *_, entry in attempts[None]
-    ]
-    overrides_by_entry, notes = match_overrides(overrides, class_rows)
-    flags_by_submission = flag_equal_contents(
-        [entry.counted_report for entry in class_rows if entry.counted_report]
+    flag = "Neither the report nor the platform names a student."
+    if has_list:
+        flag = "The student is not in the class list."
+    rows += [replace(row, flags=(flag, *row.flags)) for *_, row in attempts[None]]
+    overrides_by_row, notes = match_overrides(overrides, rows)
+    flags = flag_equal_contents([row.counted_report for row in rows if row.counted_report])
+    final_rows = (
+        _apply_overrides(*row_and_overrides, flags, course)
+        for row_and_overrides in zip(rows, overrides_by_row, strict=True)
     )
-    final_entries = (
-        _apply_overrides(*entry_and_overrides, flags_by_submission, course)
-        for entry_and_overrides in zip(class_rows, overrides_by_entry, strict=True)
-    )
-    return tuple(final_entries), notes
+    return tuple(final_rows), notes
 
 
 def _collect_students(
     reports: Sequence[GradedReport], submissions: Sequence[Submission]
 ) -> Register:
-    """Collect the students that platforms and reports name, each once."""
+    """Collect the students that learning platforms and reports name, if there is no class list."""
     register = Register()
     for report, submission in zip(reports, submissions, strict=True):
         person = submission.origin.person
-        index_of_stated_id = (
-            register.student_index(Person(report.student_id)) if report.student_id else None
-        )
+        stated_index = register.student_index(Person(report.student_id))
         if person.numbers or person.login:
             if register.student_index(person) is not None:
                 continue
             # if another student has this id already, only the platform identifies this student
-            student_id = person.student_id or (
-                "" if index_of_stated_id is not None else report.student_id
-            )
+            free_id = report.student_id if stated_index is None else ""
+            student_id = person.student_id or free_id
             name = one_line(report.student if student_id else person.name, 200) or person.name
             student_id = next(filter(None, (student_id, person.login, *person.numbers.values())))
             register.people.append(replace(person, student_id=student_id, name=name))
-        elif report.student_id and index_of_stated_id is None:
+        elif report.student_id and stated_index is None:
             register.people.append(Person(report.student_id, one_line(report.student, 200)))
     return register
 
@@ -226,16 +221,15 @@ def _make_attempt(
     student_index: int | None,
     register: Register,
 ) -> Attempt:
-    """Make the row of a student as if this were the only report, with the sort key."""
+    """Make the row of the class table for a student with this report only, and its sort key."""
     origin, due = submission.origin, course.due
     platform = origin.platform.capitalize()
     person = Person(report.student_id) if student_index is None else register.people[student_index]
     stated_time = origin.time or parse_moodle_time(person.submitted)
     time, zip_time = (time and add_time_zone(time, due) for time in (stated_time, submission.time))
-    late_s = None
-    flags = []
+    late_s, flags = None, []
     if due is not None and time is not None:
-        # differences of UNIX times: datetime differences in one time zone ignore daylight saving
+        # UNIX times are subtracted, because datetime ignores daylight saving in one time zone
         late_s = max(time.timestamp() - due.timestamp(), 0.0)
     elif origin.is_late:
         flags.append(
@@ -251,29 +245,21 @@ def _make_attempt(
             "The file name looks like a file name of a platform, but a student wrote it "
             f"(platform of the export: {platform or 'none'})."
         )
-    index_of_stated_id = (
-        register.student_index(Person(report.student_id)) if origin.platform else None
-    )
-    if (
-        index_of_stated_id is not None
-        and student_index is not None
-        and index_of_stated_id != student_index
-    ):
-        other = register.people[index_of_stated_id]
+    stated_index = register.student_index(Person(report.student_id)) if platform else None
+    if stated_index is not None and student_index not in (None, stated_index):
+        other = register.people[stated_index]
         flags.append(
             f"The id in the report is that of {other.student_id} ({other.name or 'no name'}), but "
             f"{platform} names another student."
         )
+    rule = course.late_rule
     entry = Entry(
         person.name or one_line(report.student or origin.person.name, 200),
         person.student_id,
         report,
-        (),
-        "" if time is None else time.strftime(TIME_FORMAT),
-        late_s,
-        course.late_rule.deduction(late_s, report.max_points)
-        if course.late_rule and late_s
-        else 0.0,
+        submission_time="" if time is None else time.strftime(TIME_FORMAT),
+        late_s=late_s,
+        deduction=rule.deduction(late_s, report.max_points) if rule and late_s else 0.0,
         max_points=report.max_points,
         flags=tuple(flags),
     )
@@ -282,58 +268,39 @@ def _make_attempt(
 
 
 def _points_after_deduction(attempt: Attempt) -> float:
-    """Return the points, proposed or final, minus the late deduction."""
     _, report, entry = attempt
     return max(report.points - entry.deduction, 0.0)
 
 
 def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
-    """Choose the attempt that counts, and add flags if the choice is ambiguous."""
+    """Choose the report of a student that counts, and add flags if the choice is ambiguous."""
     # several reports of one submission have the same time; points are the second sort key
-    ordered_attempts = sorted(
-        attempts,
-        key=lambda attempt: (attempt[0], _points_after_deduction(attempt), attempt[1].submission),
-    )
-    # reports that need no decision of the instructor come first, then pending reports, then other
+    ordered = sorted(attempts, key=lambda a: (a[0], _points_after_deduction(a), a[1].submission))
+    # reports without open action of the instructor are preferred, then other reports, then other
     # files
-    report_attempts = [attempt for attempt in ordered_attempts if attempt[1].version]
-    eligible_attempts = (
-        [attempt for attempt in report_attempts if not attempt[1].pending_action]
-        or report_attempts
-        or ordered_attempts
-    )
-    chosen_attempt = {
-        "latest": eligible_attempts[-1],
-        # of several reports in the first submission, the one with the most points
-        "first": [
-            attempt for attempt in eligible_attempts if attempt[0] == eligible_attempts[0][0]
-        ][-1],
-        "best": max(reversed(eligible_attempts), key=_points_after_deduction),
+    with_report = [attempt for attempt in ordered if attempt[1].version]
+    without_action = [attempt for attempt in with_report if not attempt[1].instructor_action]
+    eligible = without_action or with_report or ordered
+    chosen_key, chosen_report, entry = {
+        "latest": eligible[-1],
+        # of several reports in the first submission, the report with the most points
+        "first": [attempt for attempt in eligible if attempt[0] == eligible[0][0]][-1],
+        "best": max(reversed(eligible), key=_points_after_deduction),
     }[course.attempt]
-    chosen_key, chosen_report, entry = chosen_attempt
     flags = list(entry.flags)
-    other_reports = tuple(
-        report for _, report, _ in ordered_attempts if report is not chosen_report
-    )
-    simultaneous_reports = [
-        report for sort_key, report, _ in eligible_attempts if sort_key == chosen_key
-    ]
-    if (
-        course.attempt != "best" and len({report.form for report in simultaneous_reports}) > 1
-    ):  # otherwise students could hand in several guesses, and the best one would count
-        pending_action = (
-            f"Ask which of {len(simultaneous_reports)} reports counts: their forms differ."
-        )
-        chosen_report = replace(chosen_report, pending_action=pending_action)
-    elif len(simultaneous_reports) > 1 and any(chosen_key):
-        flags.append(
-            f"{len(simultaneous_reports)} reports have the same time; the best one counts."
-        )
-    for sort_key, report, _ in ordered_attempts:
+    other_reports = tuple(report for _, report, _ in ordered if report is not chosen_report)
+    forms = [report.form for sort_key, report, _ in eligible if sort_key == chosen_key]
+    # students must not hand in several forms with different guesses, of which the best would count
+    if course.attempt != "best" and len(set(forms)) > 1:
+        action = f"Ask which of {len(forms)} reports counts: their forms differ."
+        chosen_report = replace(chosen_report, instructor_action=action)
+    elif len(forms) > 1 and any(chosen_key):
+        flags.append(f"{len(forms)} reports have the same time; the best one counts.")
+    for sort_key, report, _ in ordered:
         if (
             report in other_reports
             and sort_key >= chosen_key
-            and (report.pending_action or not report.version)
+            and (report.instructor_action or not report.version)
         ):
             reason = "is pending" if report.version else "is not a report"
             flags.append(f"{one_line(report.submission, 80)} {reason}, so another file counts.")
@@ -348,7 +315,7 @@ def _apply_overrides(
     flags_by_submission: Mapping[str, Sequence[str]],
     course: Course,
 ) -> Entry:
-    """Apply the instructor's overrides, compute the total, and add the flags of the report."""
+    """Apply the instructor's points and comments, compute the total, and add flags."""
     report, total, flags = entry.counted_report, None, entry.flags
     if report is not None:
         items = (_override_item(item, own_overrides.get(item.title)) for item in report.items)
@@ -356,26 +323,24 @@ def _apply_overrides(
         flags = (*flags, *report.flags, *flags_by_submission.get(report.submission, ()))
         if report.counted_points is not None or course.include_pending:
             total = round(max(report.points - entry.deduction, 0.0), 2)
-    total_override = own_overrides.get(TOTAL_TITLE, Override())
+    on_report, on_total = (own_overrides.get(title, Override()) for title in ("", TOTAL_TITLE))
     return replace(
         entry,
         counted_report=report,
         overrides=own_overrides,
-        comment="\n".join(
-            filter(None, (own_overrides.get("", Override()).comment, total_override.comment))
-        ),
-        total=total if total_override.points is None else total_override.points,
+        comment="\n".join(filter(None, (on_report.comment, on_total.comment))),
+        total=total if on_total.points is None else on_total.points,
         flags=flags,
     )
 
 
 def _override_item(item: Item, override: Override | None) -> Item:
-    """Replace the points of an item by the instructor's points, and append the comment."""
+    """Replace the points of a rubric item by the instructor's points, and append the comment."""
     if override is None:
         return item
-    comment = (
-        f"{item.comment} Your instructor: {override.comment}" if override.comment else item.comment
-    )
+    comment = item.comment
+    if override.comment:
+        comment += f" Your instructor: {override.comment}"
     if override.points is None:
         return replace(item, comment=comment)
     if override.points != item.points:
@@ -387,7 +352,7 @@ def _override_item(item: Item, override: Override | None) -> Item:
 
 
 def read_overrides(path: Path) -> Overrides:
-    """Read ``overrides.csv``; empty if the file does not exist.
+    """Read the instructor's points and comments from ``overrides.csv``, if the file exists.
 
     Columns: id (as in class.csv, or the file name of the report), item (a title of the rubric,
     "total", or empty for a comment on the whole report), points, comment.
@@ -402,10 +367,8 @@ def read_overrides(path: Path) -> Overrides:
     sheet = read_sheet(path)
     missing = [title for title in OVERRIDE_TITLES if sheet.column((title,)) is None]
     if missing:
-        raise SettingsError(
-            f"{path}: no column {', '.join(missing)}.",
-            f"Required columns: {', '.join(OVERRIDE_TITLES)}.",
-        )
+        remedy = f"Required columns: {', '.join(OVERRIDE_TITLES)}."
+        raise SettingsError(f"{path}: no column {', '.join(missing)}.", remedy)
     overrides: dict[str, dict[str, Override]] = defaultdict(dict)
     for row_number, row in enumerate(sheet.rows, start=2):
         student, item, points, comment = (
@@ -428,54 +391,48 @@ def read_overrides(path: Path) -> Overrides:
 def match_overrides(
     overrides: Overrides, entries: Sequence[Entry]
 ) -> tuple[list[dict[str, Override]], tuple[str, ...]]:
-    """Match overrides with entries; return a note for each override that matches no entry or item.
+    """Match the instructor's points and comments with the rows of the class table.
 
     Returns
     -------
     matched_overrides : list of dict
-        Overrides of each entry, by the title of an item, "total", or "" (the whole report).
+        Points and comments for each row, by title of an item, "total", or "" (the whole report).
     notes : tuple of str
+        Sentences about points and comments that match no row or item.
     """
     matched_overrides: list[dict[str, Override]] = [{} for _ in entries]
-    max_total = max(
-        (report.max_points for entry in entries for report in entry.reports),
-        default=MAX_OVERRIDE_POINTS,
-    )
-    file_names = (
-        entry.counted_report.submission if entry.counted_report else "" for entry in entries
-    )
+    all_points = (report.max_points for entry in entries for report in entry.reports)
+    max_total = max(all_points, default=MAX_OVERRIDE_POINTS)
     people = Register(
-        Person(entry.student_id, login=file)
-        for entry, file in zip(entries, file_names, strict=True)
+        Person(entry.student_id, login=report.submission if report else "")
+        for entry in entries
+        for report in [entry.counted_report]
     )
     notes = []
     for student, override_by_item in overrides.items():
         # the instructor may type an id, with or without leading zeros, or a file name
         student_index = people.student_index(Person(student, login=student))
+        who = one_line(student, 40) or "(empty)"
         if student_index is None:
-            notes.append(
-                f"{OVERRIDES_NAME}: no student has the id {one_line(student, 40) or '(empty)'}."
-            )
+            notes.append(f"{OVERRIDES_NAME}: no student has the id {who}.")
             continue
-        report = entries[student_index].counted_report
-        max_by_title = {item.title: item.max_points for item in report.items} if report else {}
-        max_by_title |= {
-            TOTAL_TITLE: report.max_points if report else max_total,
-            "": MAX_OVERRIDE_POINTS,
-        }
+        max_by_title = {TOTAL_TITLE: max_total, "": MAX_OVERRIDE_POINTS}
+        if report := entries[student_index].counted_report:
+            max_by_title |= {item.title: item.max_points for item in report.items}
+            max_by_title[TOTAL_TITLE] = report.max_points
         titles = {normalise_text(title): title for title in max_by_title}
         for item, override in override_by_item.items():
             title, problem = titles.get(normalise_text(item)), ""
             if title is None:
-                problem = f"has no item {one_line(item, 60)!r}"
+                problem = f"student {who} has no item {one_line(item, 60)!r}"
             elif title in matched_overrides[student_index]:
-                problem = f"has two rows for {title or 'a comment on the whole report'!r}"
+                problem = f"student {who} has two rows for {title or 'the whole report'!r}"
             elif (override.points or 0.0) > max_by_title[title]:
                 limit = f"{max_by_title[title]:g} points of {one_line(title, 60)!r}"
-                problem = f"cannot have more than {limit}"
+                problem = f"student {who} cannot have more than {limit}"
             else:
                 matched_overrides[student_index][title] = override
-            notes += [f"{OVERRIDES_NAME}: {one_line(student, 40)} {problem}."] if problem else []
+            notes += [f"{OVERRIDES_NAME}: {problem}."] if problem else []
     return matched_overrides, tuple(notes)
 
 
@@ -494,8 +451,8 @@ def parse_late_rule(text: str) -> LateRule:
     if match is None or not 0.0 <= float(match["rate"]) <= 100.0:
         raise SettingsError(f"--late {text!r} is not a rule. Use 10%/day or 10%/day up to 50%.")
     unit_s = {"day": 86_400.0, "hour": 3_600.0}[match["unit"]]
-    max_share = min(float(match["most"] or 100.0) / 100.0, 1.0)
-    return LateRule(float(match["rate"]) / 100.0, unit_s, max_share, text.strip())
+    max_fraction = min(float(match["most"] or 100.0) / 100.0, 1.0)
+    return LateRule(float(match["rate"]) / 100.0, unit_s, max_fraction, text.strip())
 
 
 def parse_due_time(text: str) -> datetime:
@@ -527,14 +484,14 @@ def parse_due_time(text: str) -> datetime:
 
 
 def add_time_zone(time: datetime, due: datetime | None) -> datetime:
-    """Add the time zone of the due time to a time without time zone."""
+    """Add the time zone of the due time, or of this computer, to a time without time zone."""
     if time.tzinfo is not None:
         return time
     return time.replace(tzinfo=due.tzinfo) if due is not None else time.astimezone()
 
 
 def parse_moodle_time(text: str) -> datetime | None:
-    """Parse the submission time in Moodle's worksheet; None if the format is not known.
+    """Parse the submission time in Moodle's worksheet; None for an unsupported format.
 
     >>> parse_moodle_time("Friday, 20 November 2026, 11:58 PM").isoformat()
     '2026-11-20T23:58:00'

@@ -1,4 +1,4 @@
-"""Flags: sentences for the instructor about suspicious reports. They do not change points.
+"""Flags: sentences for the instructor about suspicious reports, without effect on points.
 
 A flag does not prove a copy: two students may fly together, and students who follow the advice of
 px4fuse get the same settings.
@@ -21,23 +21,23 @@ from px4fuse.simulation import flights
 from px4fuse.text import capitalise_first, join_first
 from px4fuse.verification.model import Verdict
 
-# minimum number of equal numbers in two answer forms that are flagged, and relative tolerance of
-# equal numbers, which detects a copy with small changes
+# Minimum number of equal numbers in two answer forms that are flagged as copies, and relative
+# tolerance of equal numbers, which detects a copy with small changes
 MIN_SAME_NUMBERS, SAME_NUMBER_TOLERANCE = 3, 0.02
-# minimum fraction of the log in the segment of --start and --end; a shorter segment is flagged
+# Minimum fraction of the log between --start and --end: a report on a shorter segment is flagged
 MIN_SEGMENT_FRACTION = 0.5
-# maximum factor between SIGMA_A or SIGMA_Z and its maximum-likelihood estimate, in both directions
+# Maximum factor between SIGMA_A or SIGMA_Z and its maximum-likelihood estimate, above or below
 MAX_SETTING_FACTOR = 30.0
-# maximum factor between --drift or --heading-drift and its default, in both directions
+# Maximum factor between --drift or --heading-drift and its default value, above or below
 MAX_DRIFT_FACTOR = 4.0
-# maximum number of reports that a flag lists
+# Maximum number of reports with equal contents that a flag lists
 MAX_LISTED_REPORTS = 4
-# pairs of reports with the same contents
+# Pairs of reports with equal contents
 Pairs = Iterator[tuple[GradedReport, GradedReport]]
 
 
 def flag_pages(verdict: Verdict) -> Iterator[str]:
-    """Flag a PDF that differs from the redrawn report, with the first difference."""
+    """Yield a flag with the first difference if a PDF differs from the redrawn report."""
     if verdict.pages:
         first, *others = verdict.pages
         more_text = f" The PDF has {len(others)} more differences." if others else ""
@@ -48,7 +48,7 @@ def flag_pages(verdict: Verdict) -> Iterator[str]:
 
 
 def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[str]:
-    """Flag unusual settings of one report.
+    """Yield flags about unusual settings of one report.
 
     ``has_key``: True if there is an answer key; a simulated log is then expected.
     """
@@ -56,13 +56,12 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
         yield from _flag_drift(results.request)
         return
     settings, whole_s = results.settings, results.log.duration_s
-    segment_fraction = (settings.end_s - settings.start_s) / whole_s if whole_s else 1.0
+    fraction = (settings.end_s - settings.start_s) / whole_s if whole_s else 1.0
     has_segment = (results.request.start_s, results.request.end_s) != (None, None)
-    if has_segment and segment_fraction < MIN_SEGMENT_FRACTION:
+    if has_segment and fraction < MIN_SEGMENT_FRACTION:
         yield (
-            f"The student analysed only {segment_fraction:.0%} of the log "
-            f"({settings.start_s:.1f} to {settings.end_s:.1f} s of {whole_s:.1f} s). Ask for the "
-            "reason."
+            f"The student analysed only {fraction:.0%} of the log ({settings.start_s:.1f} to "
+            f"{settings.end_s:.1f} s of {whole_s:.1f} s). Ask for the reason."
         )
     if not {"north", "east", "aisle"} & set(results.axes):
         yield "Only the vertical axis was analysed (--axis)."
@@ -76,14 +75,12 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
             f"The position source is {source.name} ({source.path}), not "
             f"{tracks_as_received[0]}, the positions as received by PX4."
         )
+    estimates = [each for each in results.tuning.values() if isinstance(each, NoiseEstimate)]
     for name, label in (("sigma_z_m", "SIGMA_Z"), ("sigma_a_m_s2", "SIGMA_A")):
         value = getattr(settings, name)
-        tuned = (
-            estimate for estimate in results.tuning.values() if isinstance(estimate, NoiseEstimate)
-        )
-        ml_values = [ml_value for estimate in tuned if (ml_value := getattr(estimate, name))]
-        if ml_values and not min(ml_values) / MAX_SETTING_FACTOR < value < MAX_SETTING_FACTOR * max(
-            ml_values
+        ml_values = [ml_value for each in estimates if (ml_value := getattr(each, name))]
+        if ml_values and not (
+            min(ml_values) / MAX_SETTING_FACTOR < value < MAX_SETTING_FACTOR * max(ml_values)
         ):
             yield (
                 f"{label} {value:g} differs by more than a factor of {MAX_SETTING_FACTOR:g} from "
@@ -94,9 +91,9 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
 
 
 def _flag_drift(request: LoopRequest) -> Iterator[str]:
-    """Flag a drift of the odometry, stated by an option, that is far from the default.
+    """Yield flags about an odometry drift in the options that is far from the default.
 
-    The chi-square test of a loop closure uses this drift; the limit is MAX_DRIFT_FACTOR.
+    The chi-square test of a loop closure uses this drift.
     """
     defaults = LoopRequest(source="")
     for option, unit, drift, default in (
@@ -111,22 +108,20 @@ def _flag_drift(request: LoopRequest) -> Iterator[str]:
 
 
 def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
-    """Return the numbers of an answer form, by (mistake, "size" or "value") or ("", question)."""
+    """Return the numbers in an answer form, by (mistake, "size" or "value") or ("", question)."""
     if report.form is None:
         return {}
-    values_by_place: dict[tuple[str, str], object] = {
+    answers: dict[tuple[str, str], object] = {
         (mistake.kind, name): getattr(mistake, name)
         for mistake in report.form.mistakes
         for name in ("size", "value")
     }
-    values_by_place |= {
-        ("", f"q{index}"): number for index, number in enumerate(report.form.quantities)
-    }
-    return {key: float(n) for key, n in values_by_place.items() if isinstance(n, float | int)}
+    answers |= {("", f"q{index}"): number for index, number in enumerate(report.form.quantities)}
+    return {key: float(n) for key, n in answers.items() if isinstance(n, float | int)}
 
 
 def _count_same_numbers(numbers: Mapping[Any, float], other_numbers: Mapping[Any, float]) -> int:
-    """Count the equal numbers of two forms that have more than one digit.
+    """Count the equal numbers of two answer forms that have more than one digit.
 
     Sizes and answers are equal within SAME_NUMBER_TOLERANCE, values of corrections exactly.
     """
@@ -143,9 +138,9 @@ def _student_key(report: GradedReport) -> str:
     return normalise_text(report.student_id) or normalise_text(report.student) or report.submission
 
 
-# checks for equal contents: sentence of the flag, function for the content (empty contents are not
-# compared), and function for the owner. Only reports of different owners are flagged: for example,
-# two reports of one student may be about the same log
+# Checks for equal contents of two reports: text of the flag, function that returns the compared
+# content, and function that returns an owner. Reports with the same owner are not flagged: two
+# reports of one student may be about the same log
 COMMON_CHECKS: tuple[
     tuple[str, Callable[[GradedReport], object], Callable[[GradedReport], str]], ...
 ] = (
@@ -157,8 +152,7 @@ COMMON_CHECKS: tuple[
     ),
     ("This report is about the same log as that of {}.", attrgetter("log_sha256"), _student_key),
     (
-        "The numbers are those of {}, but the SHA-256 of the log differs: a changed copy of the "
-        "log.",
+        "The numbers are those of {}, but the log has another SHA-256: it is a changed copy.",
         lambda report: (
             report.verdict.status == "verified"
             and len(report.numbers) >= MIN_SAME_NUMBERS
@@ -170,7 +164,7 @@ COMMON_CHECKS: tuple[
 
 
 def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequence[str]]:
-    """Return the flags of :data:`COMMON_CHECKS` and of copied forms, by name of the submission."""
+    """Return the flags about equal contents of two reports, by name of the submission."""
     flags_by_submission: dict[str, list[str]] = defaultdict(list)
     for sentence, pairs in (
         *(
@@ -209,18 +203,15 @@ def _copied_forms(reports: Sequence[GradedReport]) -> Pairs:
     """Yield pairs of reports of different students whose answer forms have the same numbers."""
     numbers_by_report = [(report, _form_numbers(report)) for report in reports]
     for (report, numbers), (other, other_numbers) in combinations(numbers_by_report, 2):
-        if _count_same_numbers(numbers, other_numbers) >= MIN_SAME_NUMBERS and _student_key(
-            report
-        ) != _student_key(other):
+        is_copied = _count_same_numbers(numbers, other_numbers) >= MIN_SAME_NUMBERS
+        if is_copied and _student_key(report) != _student_key(other):
             yield report, other
 
 
 def _student_text(report: GradedReport) -> str:
-    """Format name and id of the student; without both, the name of the submission."""
     names = filter(None, (report.student.strip(), report.student_id.strip()))
     return one_line(", ".join(names) or report.submission, 80)
 
 
 def _count_digits(number: float) -> int:
-    """Count the significant digits of a number."""
     return len(Decimal(repr(abs(number))).normalize().as_tuple().digits) if number else 0

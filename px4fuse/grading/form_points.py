@@ -2,8 +2,7 @@
 
 The constants reproduce points that an instructor gave by hand. Guessing is not rewarded: each false
 mistake (named in the form, but not in the flight) costs points, and a mistake that can be guessed
-without a measurement has points only with the correct size. ``form_points.toml`` contains the
-tables.
+without a measurement has points only with the correct size.
 """
 
 import math
@@ -12,57 +11,57 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from px4fuse.answer_form import MISTAKES, Answers, QuantityAnswer, StudentMistake
+from px4fuse.answer_form import MISTAKES, NONE, Answers, QuantityAnswer, StudentMistake
 from px4fuse.assignment.truth import FormTruth, TrueMistake
 from px4fuse.record import table
 
-# deduction (points) for each false mistake, and number of false mistakes from which the right ones
-# have no points either
-FALSE_CLAIM_POINTS, MAX_FALSE_CLAIMS = 10.0, 3
-# fractions of the points if the form names another mistake instead: a related one, one with the
-# same effect on EKF2's noise, and a consequence
-NEIGHBOUR_SHARE, SAME_NUMBER_SHARE, EFFECT_SHARE = 0.4, 2.0 / 3.0, 0.15
-# mistakes that can be guessed without a measurement: only the correct size has points. A close size
+# Deduction (points) for each false mistake, which the flight does not have, and number of false
+# mistakes from which the right ones have no points either
+FALSE_MISTAKE_POINTS, MAX_FALSE_MISTAKES = 10.0, 3
+# Fractions of the points if the answer form names another mistake instead: a related mistake, a
+# wrong EKF2 noise instead of a wrong reported variance, and a consequence of the mistake
+NEIGHBOUR_FRACTION, SAME_NUMBER_FRACTION, EFFECT_FRACTION = 0.4, 2.0 / 3.0, 0.15
+# Mistakes that can be guessed without a measurement: only the correct size has points. A close size
 # has none, because the assigned sizes are close to each other
 GUESSABLE_KINDS = frozenset(("open-end",))
 ANY_BOUNDS = (-math.inf, math.inf)
-# tolerances of a time, the larger one applies: seconds, and fraction of the time
-TIME_TOLERANCE_S, TIME_TOLERANCE_SHARE = 2.0, 0.05
-# relative tolerances of a computed number for all points and for half of the points
+# Tolerance of start and end of a mistake: the larger of a duration (s) and a fraction of the time
+TIME_TOLERANCE_S, TIME_TOLERANCE_FRACTION = 2.0, 0.05
+# Relative tolerances of a computed number for full points and for half of the points
 FULL_TOLERANCE, HALF_TOLERANCE = 0.02, 0.10
-# relative tolerance of the size of a mistake for half of the points
+# Relative tolerance of the size of a mistake for half of the points
 HALF_SIZE_TOLERANCE = 0.4
 
 
 @dataclass(frozen=True)
-class _Cure:
-    """Correction that the form may name: parameter and right values, from ``form_points.toml``.
+class _CorrectionRule:
+    """Parameter that corrects mistakes, and its right values, from ``form_points.toml``.
 
     Attributes
     ----------
-    of : mapping
+    fraction_by_mistake : mapping
         Fraction of the points for this correction, by mistake.
-    to : (float, float) or str
-        Bounds of the right values, or the name of a rule in :func:`cures`.
-    late : bool
+    right_values : (float, float) or str
+        Smallest and largest right value, or the name of a rule in :func:`right_corrections`.
+    only_if_late : bool
         True if the correction is right for late timestamps only.
     """
 
     parameter: str
-    of: Mapping[str, float]
-    to: tuple[float, float] | str = ANY_BOUNDS
-    late: bool = False
+    fraction_by_mistake: Mapping[str, float]
+    right_values: tuple[float, float] | str = ANY_BOUNDS
+    only_if_late: bool = False
 
 
 TABLE = table(__file__, "form_points.toml", dict)
-CORRECTIONS = msgspec.convert(TABLE["cures"], tuple[_Cure, ...])
+CORRECTIONS = msgspec.convert(TABLE["corrections"], tuple[_CorrectionRule, ...])
 NEIGHBOURS = msgspec.convert([*TABLE["neighbours"].values()], tuple[frozenset[str], ...])
 PART_NAMES = tuple(TABLE["weights"])
 
 
 @dataclass(frozen=True)
 class FormPoints:
-    """Points of an answer form.
+    """Points of a student's answer form.
 
     Attributes
     ----------
@@ -71,7 +70,7 @@ class FormPoints:
     max_points_by_part : mapping
         Maximum points of each part of the form.
     feedback : tuple of str
-        Phrases about right, missed and false mistakes, for the student.
+        Clauses for the student about right, missed and false mistakes.
     is_named_by_mistake : mapping
         True for each mistake of the flight that the form names.
     """
@@ -82,187 +81,179 @@ class FormPoints:
     is_named_by_mistake: Mapping[str, bool] = field(default_factory=dict)
 
     @property
-    def share(self) -> float:
-        """Points divided by the maximum points."""
+    def fraction(self) -> float:
+        """Sum of the points divided by the maximum, 0 to 1."""
         return sum(self.points_by_part.values()) / sum(self.max_points_by_part.values())
 
 
 def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
-    """Compute the points of a form by comparison with the right answers."""
+    """Compute the points of an answer form by comparison with the right answers."""
     is_clean_named = not truth.mistakes and answers.names_no_mistake
     weights = TABLE["weights_clean" if is_clean_named else "weights"]
-    shares = dict.fromkeys(PART_NAMES, 0.0)
-    matches, false_claims = _match_claims(answers, truth)
-    if truth.mistakes and len(false_claims) < MAX_FALSE_CLAIMS:
-        shares |= _mistake_shares(matches, truth)
-    shares["numbers"] = quantities_share = _quantities_share(answers, truth)
+    fractions = dict.fromkeys(PART_NAMES, 0.0)
+    matches, false_mistakes = _match_mistakes(answers, truth)
+    if truth.mistakes and len(false_mistakes) < MAX_FALSE_MISTAKES:
+        fractions |= _mistake_fractions(matches, truth)
+    fractions["numbers"] = quantities_fraction = _quantities_fraction(answers, truth)
     # half of the points if no computed number is right, because most verdicts can be guessed
-    shares["verdicts"] = _verdicts_share(answers, truth) * (1.0 if quantities_share else 0.5)
-    points_by_part = {name: weights[name] * share for name, share in shares.items()}
+    fractions["verdicts"] = _verdicts_fraction(answers, truth) * (
+        1.0 if quantities_fraction else 0.5
+    )
+    points_by_part = {name: weights[name] * fraction for name, fraction in fractions.items()}
     if is_clean_named:
         points_by_part["mistakes"] = weights["mistakes"]
     elif truth.mistakes and all(mistake.size is None for mistake in truth.mistakes):
-        # no mistake of this flight has a size, so "mistakes" gets the points of "sizes" in addition
-        points_by_part["mistakes"] += weights["sizes"] * shares["mistakes"]
-    points_by_part["mistakes"] = max(
-        points_by_part["mistakes"] - FALSE_CLAIM_POINTS * len(false_claims), 0.0
-    )
-    claimed_kinds = [claim.kind for claim in answers.mistakes]
-    is_named_by_mistake = {
-        mistake.kind: mistake.kind in claimed_kinds for mistake in truth.mistakes
-    }
-    return FormPoints(
-        points_by_part,
-        weights,
-        tuple(_mistake_feedback(matches, false_claims, is_clean_named)),
-        is_named_by_mistake,
-    )
+        # no mistake of this flight has a size, so the part "mistakes" gets the points of "sizes"
+        # too
+        points_by_part["mistakes"] += weights["sizes"] * fractions["mistakes"]
+    points_by_part["mistakes"] -= FALSE_MISTAKE_POINTS * len(false_mistakes)
+    points_by_part["mistakes"] = max(points_by_part["mistakes"], 0.0)
+    named_kinds = [named.kind for named in answers.mistakes]
+    is_named_by_mistake = {mistake.kind: mistake.kind in named_kinds for mistake in truth.mistakes}
+    feedback = tuple(_mistake_feedback(matches, false_mistakes, is_clean_named))
+    return FormPoints(points_by_part, weights, feedback, is_named_by_mistake)
 
 
-# mistake of the flight, best matching mistake in the form, and fraction of the points
+# Mistake of the flight, best matching mistake in the answer form, and fraction of the points
 Match = tuple[TrueMistake, StudentMistake | None, float]
 
 
 def _mistake_feedback(
-    matches: list[Match], false_claims: list[StudentMistake], is_clean_named: bool
+    matches: list[Match], false_mistakes: list[StudentMistake], is_clean_named: bool
 ) -> Iterator[str]:
-    """Yield a phrase for each right or missed mistake, and one for all false mistakes."""
+    """Yield a clause for each right or missed mistake, and one for all false mistakes."""
     if not matches:
         yield f"your flight has no mistake{', as your form states' * is_clean_named}"
-    for mistake, claim, _ in matches:
+    for mistake, named, _ in matches:
         mistake_text = f"{mistake.kind} ({MISTAKES[mistake.kind].description})"
-        if claim is None:
+        if named is None:
             yield f"you did not name {mistake_text}"
-        elif claim.kind != mistake.kind:
-            yield f"you named {claim.kind} instead of {mistake_text}"
+        elif named.kind != mistake.kind:
+            yield f"you named {named.kind} instead of {mistake_text}"
         else:
             yield f"you named {mistake.kind}, which is right"
-    if false_claims:
-        yield f"your flight does not have {', '.join(claim.kind for claim in false_claims)}"
+    if false_mistakes:
+        kinds = ", ".join(named.kind for named in false_mistakes)
+        yield f"your flight does not have {kinds}"
 
 
-def _match_claims(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[StudentMistake]]:
-    """Match each mistake of the flight with one of the form; also return the false mistakes.
+def _match_mistakes(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[StudentMistake]]:
+    """Match each mistake of the flight with one in the answer form; also return the others.
 
     Equal mistakes are matched first, then related mistakes, then consequences.
     """
-    unmatched = [claim for claim in answers.mistakes if claim.kind != "none"]
-    claim_by_kind: dict[str, tuple[StudentMistake, float]] = {}
-    candidates = [
-        (kind_share(mistake.kind, claim.kind), mistake.kind, claim)
+    unmatched = [named for named in answers.mistakes if named.kind != NONE]
+    match_by_kind: dict[str, tuple[StudentMistake, float]] = {}
+    pairs = [
+        (kind_fraction(mistake.kind, named.kind), mistake.kind, named)
         for mistake in truth.mistakes
-        for claim in unmatched
+        for named in unmatched
     ]
-    for share, kind, claim in sorted(candidates, key=lambda candidate: -candidate[0]):
-        if share and kind not in claim_by_kind and claim in unmatched:
-            claim_by_kind[kind] = claim, share
-            unmatched.remove(claim)
-    return [
-        (mistake, *claim_by_kind.get(mistake.kind, (None, 0.0))) for mistake in truth.mistakes
-    ], unmatched
+    for fraction, kind, named in sorted(pairs, key=lambda pair: -pair[0]):
+        if fraction and kind not in match_by_kind and named in unmatched:
+            match_by_kind[kind] = named, fraction
+            unmatched.remove(named)
+    no_match = (None, 0.0)
+    matches = [(each, *match_by_kind.get(each.kind, no_match)) for each in truth.mistakes]
+    return matches, unmatched
 
 
-def kind_share(kind: str, claimed_kind: str) -> float:
-    """Return the fraction of the points if the form names ``claimed_kind`` instead of ``kind``."""
-    if kind == claimed_kind:
+def kind_fraction(kind: str, named_kind: str) -> float:
+    """Return the fraction of the points if a form names ``named_kind``, the flight has ``kind``."""
+    if kind == named_kind:
         return 1.0
-    if (kind, claimed_kind) == ("r-scale", "ekf2-noise"):
-        return SAME_NUMBER_SHARE
-    if any({kind, claimed_kind} <= group for group in NEIGHBOURS):
-        return NEIGHBOUR_SHARE
-    return EFFECT_SHARE if claimed_kind in TABLE["effects"].get(kind, ()) else 0.0
+    if (kind, named_kind) == ("r-scale", "ekf2-noise"):
+        return SAME_NUMBER_FRACTION
+    if any({kind, named_kind} <= group for group in NEIGHBOURS):
+        return NEIGHBOUR_FRACTION
+    return EFFECT_FRACTION if named_kind in TABLE["effects"].get(kind, ()) else 0.0
 
 
-def _mistake_shares(matches: list[Match], truth: FormTruth) -> dict[str, float]:
-    """Return the fraction of the points of the parts about mistakes: the mean over the mistakes."""
+def _mistake_fractions(matches: list[Match], truth: FormTruth) -> dict[str, float]:
+    """Return the fraction of the points for four parts of the form, as mean over all mistakes."""
     sized_count = sum(mistake.size is not None for mistake, _, _ in matches)
-    shares = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
-    for mistake, claim, share in matches:
-        if claim is None:
+    fractions = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
+    for mistake, named, fraction in matches:
+        if named is None:
             continue
-        size_points = size_share(mistake, claim)
-        when_points = when_share(mistake, claim) * (1.0 if claim.kind == mistake.kind else 0.5)
-        cure_points = cure_share(mistake, claim, truth)
-        weight = size_points if mistake.kind in GUESSABLE_KINDS else 1.0
-        shares["mistakes"] += share / len(matches)
-        shares["time and panel"] += when_points * weight / len(matches)
-        shares["correction"] += cure_points * weight / len(matches)
-        shares["sizes"] += size_points / max(sized_count, 1)
-    return shares
+        size_points = size_fraction(mistake, named)
+        weight = (size_points if mistake.kind in GUESSABLE_KINDS else 1.0) / len(matches)
+        time_weight = weight if named.kind == mistake.kind else 0.5 * weight
+        fractions["mistakes"] += fraction / len(matches)
+        fractions["time and panel"] += time_and_panel_fraction(mistake, named) * time_weight
+        fractions["correction"] += correction_fraction(mistake, named, truth) * weight
+        fractions["sizes"] += size_points / max(sized_count, 1)
+    return fractions
 
 
-def size_share(mistake: TrueMistake, claim: StudentMistake) -> float:
-    """Return the fraction of the points for a size: 1 (right), 1/2 (close), 1/3, or 0.
+def size_fraction(mistake: TrueMistake, named: StudentMistake) -> float:
+    """Return the fraction of the points for the size of a mistake: 1, 1/2 (close), 1/3, or 0.
 
-    1/3 is for the wrong sign, and for the correct size of a related mistake.
+    1/3 is for the wrong sign, and for the size of a related mistake.
     """
-    size = claim.size_in_first_unit()
+    size = named.size_in_first_unit()
     if mistake.size is None or mistake.low is None or mistake.high is None or size is None:
         return 0.0
-    if claim.kind != mistake.kind:
-        has_same_unit = [*MISTAKES[claim.kind].units][:1] == [*MISTAKES[mistake.kind].units][:1]
-        return 1.0 / 3.0 if mistake.low <= size <= mistake.high and has_same_unit else 0.0
-    is_close = mistake.kind not in GUESSABLE_KINDS and abs(
-        size - mistake.size
-    ) <= HALF_SIZE_TOLERANCE * abs(mistake.size)
-    return _value_share(size, mistake.low, mistake.high, 0.5 if is_close else 0.0)
+    if named.kind != mistake.kind:
+        first_units = [[*MISTAKES[kind].units][:1] for kind in (named.kind, mistake.kind)]
+        is_right = mistake.low <= size <= mistake.high and first_units[0] == first_units[1]
+        return is_right / 3.0
+    is_close = abs(size - mistake.size) <= HALF_SIZE_TOLERANCE * abs(mistake.size)
+    close_fraction = 0.5 * (is_close and mistake.kind not in GUESSABLE_KINDS)
+    return _value_fraction(size, mistake.low, mistake.high, close_fraction)
 
 
-def when_share(mistake: TrueMistake, claim: StudentMistake) -> float:
-    """Return the fraction of the points for the time and the report panel: half for each."""
+def time_and_panel_fraction(mistake: TrueMistake, named: StudentMistake) -> float:
+    """Return the fraction of the points for time and report panel of a mistake: half for each."""
     if mistake.from_s is None and mistake.until_s is None:
-        is_time_right = claim.when == "whole flight"
+        is_time_right = named.when == "whole flight"
     else:
-        times = (mistake.from_s, claim.from_s), (mistake.until_s, claim.until_s)
-        is_time_right = not claim.when and all(
-            true_s is None
-            or (
-                claimed_s is not None
-                and abs(claimed_s - true_s) <= max(TIME_TOLERANCE_S, TIME_TOLERANCE_SHARE * true_s)
-            )
-            for true_s, claimed_s in times
+        times = (mistake.from_s, named.from_s), (mistake.until_s, named.until_s)
+        is_time_right = not named.when and all(
+            named_s is not None
+            and abs(named_s - true_s) <= max(TIME_TOLERANCE_S, TIME_TOLERANCE_FRACTION * true_s)
+            for true_s, named_s in times
+            if true_s is not None
         )
-    return 0.5 * is_time_right + 0.5 * (claim.panel in panels(mistake.kind))
+    return 0.5 * is_time_right + 0.5 * (named.panel in panels(mistake.kind))
 
 
 def panels(kind: str) -> list[str]:
-    """Return the panels of the report that can show a kind of mistake."""
+    """Return the panels of the report that show a kind of mistake."""
     return [*(panel for panel, kinds in TABLE["shows"].items() if kind in kinds), "cover"]
 
 
-def cure_share(mistake: TrueMistake, claim: StudentMistake, truth: FormTruth) -> float:
-    """Return the fraction of the points for a correction and its value."""
-    value = claim.value_in_first_unit()
-    shares = [
-        share
+def correction_fraction(mistake: TrueMistake, named: StudentMistake, truth: FormTruth) -> float:
+    """Return the fraction of the points for the correction of a mistake and its value."""
+    value = named.value_in_first_unit()
+    fractions = [
+        fraction
         if (low, high) == ANY_BOUNDS
-        else share * (0.5 if value is None else _value_share(value, low, high, 0.5))
-        for parameter, (low, high), share in cures(mistake, truth)
-        if parameter == claim.parameter
+        else fraction * (0.5 if value is None else _value_fraction(value, low, high, 0.5))
+        for parameter, (low, high), fraction in right_corrections(mistake, truth)
+        if parameter == named.parameter
     ]
-    return max(shares, default=0.0)
+    return max(fractions, default=0.0)
 
 
-def _value_share(value: float, low: float, high: float, fallback: float) -> float:
-    """Return 1 for a value within bounds, 1/3 for its negative within bounds, else ``fallback``."""
+def _value_fraction(value: float, low: float, high: float, fallback: float) -> float:
+    """Return 1 for a value within bounds, 1/3 with the wrong sign, else ``fallback``."""
     if low <= value <= high:
         return 1.0
     return 1.0 / 3.0 if low <= -value <= high else fallback
 
 
-# parameter, bounds of the right values, and fraction of the points
-Cure = tuple[str, tuple[float, float], float]
+# Parameter that corrects a mistake, bounds of its right values, and fraction of the points
+RightCorrection = tuple[str, tuple[float, float], float]
 
 
-def cures(mistake: TrueMistake, truth: FormTruth) -> tuple[Cure, ...]:
-    """Return the right corrections of a mistake, with bounds of their right values."""
-    size, low, high = (
-        0.0 if value is None else value for value in (mistake.size, mistake.low, mistake.high)
-    )
-    from_s = 0.0 if mistake.from_s is None else mistake.from_s
+def right_corrections(mistake: TrueMistake, truth: FormTruth) -> tuple[RightCorrection, ...]:
+    """Return the parameters that correct a mistake, with bounds of their right values."""
+    size, low, high = (value or 0.0 for value in (mistake.size, mistake.low, mistake.high))
+    from_s = mistake.from_s or 0.0
     until_s = from_s if mistake.until_s is None else mistake.until_s
     bounds = {
-        "back": (-high, -low),
+        "negated": (-high, -low),
         "size": (low, high),
         "milliseconds": (1e3 * low, 1e3 * high),
         "twice": (2.0 * size, 1e4),
@@ -273,57 +264,51 @@ def cures(mistake: TrueMistake, truth: FormTruth) -> tuple[Cure, ...]:
     }
     return tuple(
         (
-            row.parameter,
-            bounds[row.to] if isinstance(row.to, str) else row.to,
-            0.0 if row.late and size <= 0.0 else row.of[mistake.kind],
+            rule.parameter,
+            bounds[values] if isinstance(values := rule.right_values, str) else values,
+            0.0 if rule.only_if_late and size <= 0.0 else rule.fraction_by_mistake[mistake.kind],
         )
-        for row in CORRECTIONS
-        if mistake.kind in row.of
+        for rule in CORRECTIONS
+        if mistake.kind in rule.fraction_by_mistake
     )
 
 
-def _verdicts_share(answers: Answers, truth: FormTruth) -> float:
-    """Return the fraction of the points for both verdicts (KF, EKF2) and the behaviour of EKF2."""
-    shares = [_ekf2_behaviour_share(answers, truth)]
-    for answer, known in ((answers.verdict_kf, truth.kf), (answers.verdict_ekf2, truth.ekf2)):
-        shares.append(1.0 if answer and answer == known.verdict else 0.0)
-    return sum(shares) / len(shares)
+def _verdicts_fraction(answers: Answers, truth: FormTruth) -> float:
+    """Return the fraction of the points for the verdicts on KF and EKF2, and EKF2's behaviour."""
+    pairs = (answers.verdict_kf, truth.kf.verdict), (answers.verdict_ekf2, truth.ekf2.verdict)
+    right_count = sum(bool(answer) and answer == right for answer, right in pairs)
+    return (right_count + _ekf2_behaviour_fraction(answers, truth)) / 3.0
 
 
-def _ekf2_behaviour_share(answers: Answers, truth: FormTruth) -> float:
-    """Return the fraction of the points for EKF2's behaviour: 1 if complete, 1/2 with one error.
+def _ekf2_behaviour_fraction(answers: Answers, truth: FormTruth) -> float:
+    """Return 1 if the form names EKF2's behaviour completely, 1/2 with one error, else 0.
 
     An error is a missing or a false statement.
     """
     named, required = set(answers.ekf2_did), set(truth.ekf2_did)
-    allowed = required | set(truth.ekf2_did_also)
-    false_count, right_count = len(named - allowed), len(named & allowed)
-    if not right_count or false_count > 1:
+    also_allowed = set(truth.ekf2_did_also)
+    false_count = len(named - required - also_allowed)
+    if len(named) == false_count or false_count > 1:
         return 0.0
-    is_complete = required <= named or (
-        len(required) == 1 and bool(named & set(truth.ekf2_did_also))
-    )
+    is_complete = required <= named or (len(required) == 1 and named & also_allowed)
     return 1.0 if is_complete and not false_count else 0.5
 
 
-def _quantities_share(answers: Answers, truth: FormTruth) -> float:
-    """Return the fraction of the points for the numbers that can be computed from the flight."""
-    # an empty list is the right answer on most flights, so it has no points
+def _quantities_fraction(answers: Answers, truth: FormTruth) -> float:
+    """Return the fraction of the points for the computed numbers of KF."""
+    # an empty list of updates is the right answer on most flights, so it has no points
     known_count = sum(value not in (None, ()) for value in truth.quantities)
     pairs = zip(answers.quantities, truth.quantities, strict=False)
-    return sum(_quantity_share(*pair) for pair in pairs) / max(known_count, 1)
+    return sum(_quantity_fraction(*pair) for pair in pairs) / max(known_count, 1)
 
 
-def _quantity_share(answer: QuantityAnswer, true_value: QuantityAnswer) -> float:
+def _quantity_fraction(answer: QuantityAnswer, true_value: QuantityAnswer) -> float:
     if isinstance(answer, tuple) and isinstance(true_value, tuple):
         difference_count = len(set(answer) ^ set(true_value))
-        return (
-            (1.0, 0.5)[difference_count]
-            if difference_count < 2 and set(answer) & set(true_value)
-            else 0.0
-        )
+        has_right_number = not set(answer).isdisjoint(true_value)
+        return max(1.0 - 0.5 * difference_count, 0.0) * has_right_number
     if isinstance(answer, float | int) and isinstance(true_value, float | int):
-        for tolerance, share in ((FULL_TOLERANCE, 1.0), (HALF_TOLERANCE, 0.5)):
+        for tolerance, fraction in ((FULL_TOLERANCE, 1.0), (HALF_TOLERANCE, 0.5)):
             if abs(answer - true_value) <= tolerance * abs(true_value):
-                return share
+                return fraction
     return 0.0

@@ -1,4 +1,4 @@
-"""Grading of a class: submissions are verified in parallel, with limits of time and memory."""
+"""Grading of a class: verification of all submissions in parallel, and output files."""
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
@@ -29,9 +29,9 @@ class GradeOutcome:
     Attributes
     ----------
     entries : tuple of Entry
-        Rows of the class list, then rows of unknown students; without the redrawn PDFs.
+        Rows of the class table: students of the class list, then unknown students.
     notes : tuple of str
-        Sentences about ignored files, overrides and grades.
+        Sentences about ignored files and overrides, and grades that could not be entered.
     reused_count : int
         Number of reports whose stored verification was loaded.
     written_paths : tuple of Path
@@ -45,7 +45,7 @@ class GradeOutcome:
 
     @property
     def reports(self) -> tuple[GradedReport, ...]:
-        """All reports, grouped by student; the first one of each student counts."""
+        """All reports by student; the first report of each student counts."""
         return tuple(report for entry in self.entries for report in entry.reports)
 
 
@@ -55,14 +55,16 @@ def grade(
     output: Path,
     *,
     processes: int | None = None,
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    progress: Callable[[int, int], None] = lambda *_: None,
 ) -> GradeOutcome:
     """Grade all submissions of a class.
 
     Parameters
     ----------
     paths : sequence of Path
-        PDFs, folders and zip files.
+        Submitted PDFs, and folders and zip files with PDFs.
+    course : Course
+        Class list, rubric, answer key and logs.
     output : Path
         Folder for the class table (``class.csv``, ``class.html``), redrawn ``reports/``,
         ``feedback/``, ``grades/`` for learning platforms, and ``records/``: stored verifications,
@@ -70,7 +72,7 @@ def grade(
     processes : int, optional
         Number of processes; by default one per core.
     progress : callable
-        Called with the number of finished submissions, and the number of all.
+        Called with the number of finished submissions and the number of all submissions.
 
     Raises
     ------
@@ -82,49 +84,43 @@ def grade(
     overrides = read_overrides(output / OVERRIDES_NAME)
     for worksheet in course.worksheets:
         find_grade_column(worksheet, course.column)
-    unread_names = sorted(
-        file.name for file in output.glob("overrides*") if file.name != OVERRIDES_NAME
-    )
     unread_notes = [
-        f"{one_line(name, 80)} was not read; only {OVERRIDES_NAME} is read."
-        for name in unread_names
+        f"{one_line(file.name, 80)} was not read; only {OVERRIDES_NAME} is read."
+        for file in sorted(output.glob("overrides*"))
+        if file.name != OVERRIDES_NAME
     ]
     found_submissions, notes = submissions.find_submissions(paths)
     jobs = []
     for submission in found_submissions:
         student_index = course.register.student_index(submission.origin.person)
-        owner_id = "" if student_index is None else course.register.people[student_index].student_id
-        jobs.append((submission, owner_id))
+        submitter_id = (
+            "" if student_index is None else course.register.people[student_index].student_id
+        )
+        jobs.append((submission, submitter_id))
     rules, logs = (course.rubric, course.key), files_by_sha256(course.logs)
-    grade_job = partial(
-        grade_submission, *rules, logs, output / RECORDS_FOLDER, max_log_bytes.get()
-    )
+    records = output / RECORDS_FOLDER
+    grade_job = partial(grade_submission, *rules, logs, records, max_log_bytes.get())
     graded_by_index: dict[int, GradedReport] = {}
     reused_count = 0
     progress(0, len(found_submissions))
     with closing(run_bounded(grade_job, jobs, processes=processes)) as results:
         for index, result in results:
             if isinstance(result, JobFailure):
-                graded_report = grade_unreadable(
-                    *rules, f"grading failed: {result.reason}", FAILED_REMEDY
-                )
-                is_loaded = False
+                reason = f"the grading of this file failed: {result.reason}"
+                report, is_loaded = grade_unreadable(*rules, reason, FAILED_REMEDY), False
             else:
-                graded_report, is_loaded = result
-            submission = found_submissions[index]
-            has_identity = graded_report.student or graded_report.student_id
-            student = graded_report.student if has_identity else submission.origin.person.name
-            graded_by_index[index] = replace(
-                graded_report, submission=submission.name, student=student
-            )
+                report, is_loaded = result
+            submission, student = found_submissions[index], report.student
+            if not student and not report.student_id:
+                student = submission.origin.person.name
+            graded_by_index[index] = replace(report, submission=submission.name, student=student)
             reused_count += is_loaded
             progress(len(graded_by_index), len(found_submissions))
     graded = [graded_by_index[index] for index in range(len(found_submissions))]
     entries, override_notes = build_entries(graded, found_submissions, course, overrides)
     written_paths, class_notes = write_class(entries, course, output)
-    return GradeOutcome(
-        entries, (*notes, *unread_notes, *override_notes, *class_notes), reused_count, written_paths
-    )
+    all_notes = *notes, *unread_notes, *override_notes, *class_notes
+    return GradeOutcome(entries, all_notes, reused_count, written_paths)
 
 
 def grade_submission(
@@ -135,16 +131,13 @@ def grade_submission(
     max_bytes: int,
     job: tuple[Submission, str],
 ) -> tuple[GradedReport, bool]:
-    """Read, verify and score one file, in a separate process.
+    """Read, verify and score one submission, in a separate process.
 
-    Returns
-    -------
-    GradedReport
-    bool
-        True if a stored verification was loaded.
+    ``job`` is the submission and the student id according to the learning platform. Returns the
+    graded report, and True if a stored verification was loaded.
     """
     max_log_bytes.set(max_bytes)
-    submission, owner_id = job
+    submission, submitter_id = job
     assigned_hashes = frozenset(answer.sha256 for answer in key.answers) if key else frozenset()
     sha256, is_loaded = "", False
     try:
@@ -154,5 +147,5 @@ def grade_submission(
     except ResultsError as error:
         graded_report = grade_unreadable(rubric, key, f"{error.reason}.", error.remedy)
     else:
-        graded_report = score_report(results, verdict, rubric, key, owner_id)
+        graded_report = score_report(results, verdict, rubric, key, submitter_id)
     return replace(graded_report, sha256=sha256), is_loaded

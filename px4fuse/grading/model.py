@@ -1,4 +1,4 @@
-"""Data of grading: submissions, graded reports, and rows of the class."""
+"""Records of grading: submitted files, graded reports, and rows of the class table."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from px4fuse.answer_form import Answers
 from px4fuse.assignment.roster import Person
 from px4fuse.verification.model import Verdict
 
-# title of the sum over all items, in overrides.csv and messages
+# Title of the sum over all rubric items, in overrides.csv and messages
 TOTAL_TITLE = "total"
 
 
@@ -18,12 +18,12 @@ UNKNOWN_PERSON = Person("")
 
 @dataclass(frozen=True)
 class ExportOrigin:
-    """Student and submission time of a file, according to a learning platform.
+    """Student and submission time of a file, as a learning platform encodes them in its name.
 
     Attributes
     ----------
     platform : str
-        One of :data:`px4fuse.grading.submissions.PLATFORMS`; "" if no platform wrote the file name.
+        Learning platform (``platforms.toml``); "" if no platform wrote the file name.
     person : Person
         Student. ``numbers`` contains the number of the participant (Moodle), the user (Canvas,
         ILIAS) or the submission (Gradescope).
@@ -32,7 +32,7 @@ class ExportOrigin:
     is_late : bool
         True if the platform marks the file as late.
     is_imitated : bool
-        True if the part of the file name that the student chose imitates a platform's file names.
+        True if the student chose a name that looks like a file name of a platform.
     """
 
     platform: str = ""
@@ -56,12 +56,11 @@ class Submission:
     zip_entry : str
         Name of the entry in the zip file; "" for a file.
     name : str
-        Name in messages: one line of at most 200 characters, without folders of this computer. A
-        number at the end makes it unique in a run.
+        Unique name for messages: one line of at most 200 characters.
     time : datetime or None
         Time of the zip entry, in an unknown time zone: time of the submission or of the download.
     origin : ExportOrigin
-        Student and time according to a platform.
+        Student and submission time according to a learning platform.
     """
 
     file: Path
@@ -73,9 +72,9 @@ class Submission:
 
 @dataclass(frozen=True)
 class Item:
-    """Points of a report for one item of the rubric, with a comment.
+    """Points of a report for one item of the rubric, with a comment for the student.
 
-    ``awaits_points``: the instructor has to score this item, and has not done it yet.
+    ``awaits_points``: True if the instructor has to score this item and has not done it yet.
     """
 
     title: str
@@ -88,32 +87,32 @@ class Item:
 
 @dataclass(frozen=True)
 class GradedReport:
-    """Submitted report with verdict and points; missing texts are empty.
+    """Submitted report with the result of its verification and its points.
 
     Attributes
     ----------
     submission : str
-        :attr:`Submission.name`.
+        Name of the submission in messages.
     student, student_id : str
-        As in the report.
+        Name and id of the student in the report; "" if missing.
     verdict : Verdict
-        Result of verification; "cannot verify" for a file that is not a report.
+        Result of the verification; "cannot verify" for a file that is not a report.
     items : tuple of Item
-        In the order of the rubric.
+        Points for each item of the rubric.
     flags : tuple of str
         Sentences about suspicious contents, for the instructor.
-    pending_action : str
+    instructor_action : str
         Action of the instructor before the points count; "" if they count.
     form : Answers or None
-        Completed answer form.
+        Completed answer form of the student.
     numbers : mapping
         Numbers of the report for the class table, by column title.
     sha256, log_sha256, version : str
-        SHA-256 of the PDF and of its log, and px4fuse version of the report.
+        SHA-256 of the PDF and of its log, and px4fuse version that made the report.
     notes : str
         Text of the student.
     mistakes : mapping
-        Mistakes of the student's flight (answer key); True if the form names them.
+        True for each mistake of the assigned flight that the answer form names.
     redrawn_path : str
         Path of the PDF that px4fuse drew again from the log, relative to the class page.
     """
@@ -124,7 +123,7 @@ class GradedReport:
     verdict: Verdict
     items: tuple[Item, ...] = ()
     flags: tuple[str, ...] = ()
-    pending_action: str = ""
+    instructor_action: str = ""
     form: Answers | None = None
     numbers: Mapping[str, float] = field(default_factory=dict)
     sha256: str = ""
@@ -136,18 +135,18 @@ class GradedReport:
 
     @property
     def status(self) -> str:
-        """Status of the verification, or "page differs"."""
+        """Status of the verification, or "page differs" if only pages differ."""
         return self.verdict.outcome
 
     @property
     def points(self) -> float:
-        """Sum over the items; a proposal while there is a :attr:`pending_action`."""
+        """Sum of the points of all items, whether they count already or not."""
         return sum(item.points for item in self.items)
 
     @property
     def counted_points(self) -> float | None:
-        """Points that count; None while the instructor has to act or to score an item."""
-        return None if self.pending_action or self.awaits_points else self.points
+        """Sum of the points; None while the instructor has to act or to score an item."""
+        return None if self.instructor_action or self.awaits_points else self.points
 
     @property
     def awaits_points(self) -> bool:
@@ -156,13 +155,13 @@ class GradedReport:
 
     @property
     def max_points(self) -> float:
-        """Maximum points."""
+        """Sum of the maximum points of all items."""
         return sum(item.max_points for item in self.items)
 
 
 @dataclass(frozen=True)
 class Override:
-    """Points, comment, or both, from the instructor; they replace those of px4fuse."""
+    """Points or comment of the instructor, which replace those of px4fuse."""
 
     points: float | None = None
     comment: str = ""
@@ -175,25 +174,25 @@ class Entry:
     Attributes
     ----------
     student, student_id : str
-        From the class list; without a class list from the report or the platform.
+        Name and id from the class list; without a class list from the report or the platform.
     counted_report : GradedReport or None
-        Report that counts, with overrides applied; None without a submission.
+        Report that counts, with the instructor's points; None without a submission.
     other_reports : tuple of GradedReport
         Reports of the same student that do not count, earliest first.
     submission_time : str
         Submission time of the report that counts; "" if unknown.
     late_s : float or None
-        Time after the due time (s), 0 if in time; None if unknown.
+        Submission time minus due time (s), 0 if in time; None if unknown.
     deduction : float
         Points deducted for late submission.
     overrides : mapping
-        Overrides by the title of an item, "total", or "" (the whole report).
+        Points and comments of the instructor by rubric item, "total", or "" (the whole report).
     comment : str
         Comment of the instructor on the whole report.
     total : float or None
         Grade in points; None without a submission, and while the instructor has to act.
     max_points : float
-        Maximum points.
+        Maximum points of the rubric.
     flags : tuple of str
         Sentences for the instructor about suspicious submissions and reports.
     """
@@ -213,19 +212,18 @@ class Entry:
 
     @property
     def reports(self) -> tuple[GradedReport, ...]:
-        """All reports of the student; the first one counts."""
+        """Reports of the student; the first one counts."""
         return (*([self.counted_report] if self.counted_report else []), *self.other_reports)
 
     @property
     def display_name(self) -> str:
-        """Name of the student on the class page."""
+        """Name of the student, else id."""
         return self.student or self.student_id or "no name"
 
 
 def list_titles(entries: Sequence[Entry]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the titles of all items and of all numbers in the class table, each once."""
+    """Return the titles of the columns with points of items and with numbers of reports."""
     reports = [report for entry in entries if (report := entry.counted_report)]
     items = dict.fromkeys(item.title for report in reports for item in report.items)
-    return tuple(items), tuple(
-        dict.fromkeys(title for report in reports for title in report.numbers)
-    )
+    numbers = dict.fromkeys(title for report in reports for title in report.numbers)
+    return tuple(items), tuple(numbers)

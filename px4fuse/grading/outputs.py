@@ -1,9 +1,9 @@
 """Output files of grading: class table and page, redrawn reports, feedback, platform tables.
 
-px4fuse enters grades into copies of the tables that platforms export, and feedback if a table has a
-column for it. All other cells stay unchanged. The row of a student without a grade (no submission,
-or points not decided yet) is not changed: platforms delete a grade if the cell is empty, and read 0
-as a grade.
+px4fuse enters grades into copies of the tables that learning platforms export, and feedback if a
+table has a column for it. All other cells stay unchanged. The row of a student without a grade (no
+submission, or points not decided yet) is not changed: platforms delete a grade if the cell is
+empty, and read 0 as a grade.
 
 - Moodle: "Using Assignment", Offline grading worksheet, docs.moodle.org.
   ``mod/assign/feedback/offline/importgradeslib.php`` finds "Identifier" ("Participant 12"), "Grade"
@@ -24,6 +24,7 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import metadata
+from operator import itemgetter
 from pathlib import Path
 
 from px4fuse.assignment.roster import (
@@ -47,13 +48,13 @@ from px4fuse.text import join_first
 from px4fuse.webpage.safe import load_template
 from px4fuse.writing import write_all
 
-# folder of the reports that px4fuse drew from the logs; read them instead of the submitted PDFs
+# Folder of the reports that px4fuse draws again from the logs, to be read instead of submitted PDFs
 REPORTS_FOLDER = "reports"
 FEEDBACK_FOLDER = "feedback"
 GRADES_FOLDER = "grades"
 NAMES_FILE = "names.csv"
 NAMES_TITLES = ("pseudonym", "id", "name")
-# columns of the class table, before and after the columns of rubric items and report numbers
+# Columns of the class table, before and after the columns of rubric items and report numbers
 FIRST_COLUMNS = (
     "file",
     "student",
@@ -76,35 +77,35 @@ LAST_COLUMNS = (
     "log SHA-256",
 )
 LIST_SEPARATOR = " | "
-# maximum number of verification reasons in the feedback
+# Maximum number of reasons of the verdict in the feedback for a student
 MAX_REASONS = 4
-# titles of grade columns in platform tables, as letters and digits
+# Titles of grade columns in tables of learning platforms, as lower-case letters and digits
 GRADE_TITLES = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
 MAX_GRADE_TITLES = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
-# titles of feedback columns: the platform reads the cells as HTML, or as text
+# Titles of feedback columns, which the learning platform reads as HTML, or as HTML or text
 HTML_COMMENT_TITLES = ("feedbackcomments", "feedbackalskommentar")
 COMMENT_TITLES = (*HTML_COMMENT_TITLES, "feedbacktolearner", "feedback", "comment")
 _ASSIGNMENT_NUMBER = re.compile(r" \(\d+\)$")
-# mark of columns that Canvas computes; px4fuse does not change them
+# Text in columns that Canvas computes and px4fuse therefore does not change
 READ_ONLY_MARK = "(read only)"
 
 
 def write_class(
     entries: Sequence[Entry], course: Course, output: Path
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
-    """Write all output files; return their paths, and notes about grades that were not entered.
-
-    ``overrides.csv`` is created if it does not exist, and never overwritten.
+    """Write all output files of grading. An existing ``overrides.csv`` is not overwritten.
 
     Parameters
     ----------
     entries : sequence of Entry
-        Entries of the students in the course's register first, in its order.
+        Rows of the class table: the students in ``course.register`` first, in the same order.
 
     Returns
     -------
     written : tuple of Path
+        Files and folders.
     notes : tuple of str
+        Sentences about grades that could not be entered.
 
     Raises
     ------
@@ -139,23 +140,19 @@ def write_class(
         contents[f"{GRADES_FOLDER}/{name}"] = filled_sheet.content()
         notes += sheet_notes
     write_all({output / name: content for name, content in contents.items()})
-    folders = (
-        [REPORTS_FOLDER] * has_redrawn
-        + [FEEDBACK_FOLDER]
-        + [GRADES_FOLDER] * bool(course.worksheets)
-    )
-    written = tuple(output / name for name in ("class.csv", "class.html", *folders, OVERRIDES_NAME))
-    return written, tuple(notes)
+    outputs = ["class.csv", "class.html", *[REPORTS_FOLDER] * has_redrawn, FEEDBACK_FOLDER]
+    outputs += [GRADES_FOLDER] * bool(course.worksheets) + [OVERRIDES_NAME]
+    return tuple(output / name for name in outputs), tuple(notes)
 
 
 def _identity(entry: Entry, stem: bool = False) -> str:
-    """Return id, else name, else file name of a row, which identify it in each run."""
+    """Return id, else name, else file name: the identity of a row in all runs of grading."""
     file = entry.counted_report.submission if entry.counted_report else ""
     return entry.student_id or (Path(file).stem if stem else entry.student or file)
 
 
 def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
-    """Copy the redrawn report of a row to the folder ``reports``, and add the path to the row."""
+    """Copy a redrawn report to the folder ``reports``, and add its path to the row."""
     report = entry.counted_report
     if report is None or not report.sha256:
         return entry
@@ -168,9 +165,9 @@ def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
 
 
 def _anonymise(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
-    """Replace names by pseudonyms and sort by pseudonym; also return the list of names as CSV.
+    """Replace names by pseudonyms and sort by pseudonym; also return the table of names as CSV.
 
-    Pseudonyms are assigned in random order. A later run reads them from the list at ``path``.
+    Pseudonyms are assigned in random order. A later run reads them from the table at ``path``.
     """
     names_by_identity: dict[str, tuple[str, str]] = {}
     if path.exists():
@@ -184,19 +181,14 @@ def _anonymise(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
     used_names = {name for name, _ in names_by_identity.values()}
     numbered_names = (f"Student {number:03}" for number in itertools.count(1))
     free_names = (name for name in numbered_names if name not in used_names)
-    student_by_new_identity = {
-        identity: entry.student
-        for entry in entries
-        if (identity := _identity(entry)) not in names_by_identity
-    }
-    for identity in random.SystemRandom().sample(
-        list(student_by_new_identity), len(student_by_new_identity)
-    ):
-        names_by_identity[identity] = next(free_names), student_by_new_identity[identity]
-    ordered_names = sorted(names_by_identity.items(), key=lambda pair: pair[1])
+    students = {_identity(entry): entry.student for entry in entries}
+    new_identities = [identity for identity in students if identity not in names_by_identity]
+    random.SystemRandom().shuffle(new_identities)
+    for identity in new_identities:
+        names_by_identity[identity] = next(free_names), students[identity]
     rows = (
         (name, neutralise_id(identity), neutralise_formulas(student))
-        for identity, (name, student) in ordered_names
+        for identity, (name, student) in sorted(names_by_identity.items(), key=itemgetter(1))
     )
     anonymous_entries = [
         anonymise_entry(entry, names_by_identity[_identity(entry)][0]) for entry in entries
@@ -206,7 +198,7 @@ def _anonymise(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
 
 
 def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
-    """Return a row with pseudonym, status, points and form, but without texts of the student."""
+    """Return a row with pseudonym, status, points and answer form, without the student's texts."""
     report = entry.counted_report
     if report is not None:
         report = GradedReport(
@@ -215,7 +207,8 @@ def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
             "",
             replace(report.verdict, reasons=(), differences=()),
             tuple(replace(item, comment="") for item in report.items),
-            pending_action=report.pending_action and "Points are pending.",
+            instructor_action=report.instructor_action
+            and "The instructor has to decide on the points.",
             form=report.form,
             numbers=report.numbers,
             mistakes=report.mistakes,
@@ -224,13 +217,12 @@ def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
         pseudonym,
         "",
         report,
-        (),
-        entry.submission_time,
-        entry.late_s,
-        entry.deduction,
+        submission_time=entry.submission_time,
+        late_s=entry.late_s,
+        deduction=entry.deduction,
         total=entry.total,
         max_points=entry.max_points,
-        flags=("Flagged.",) * bool(entry.flags),
+        flags=("This report is flagged.",) * bool(entry.flags),
     )
 
 
@@ -238,13 +230,9 @@ def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
 
 
 def csv_text(entries: Sequence[Entry]) -> str:
-    """Format the class table as CSV, for Excel and LibreOffice; points include overrides.
+    """Format the class table as CSV for spreadsheet programs; points include the instructor's.
 
-    Returns
-    -------
-    str
-        Starts with the byte order mark, by which Excel detects UTF-8. Lines end with CRLF, so write
-        the text without conversion of line ends.
+    The text begins with the byte order mark, by which Excel detects UTF-8, and lines end with CRLF.
     """
     items, numbers = list_titles(entries)
     titles = tuple(map(neutralise_formulas, (*FIRST_COLUMNS, *items, *numbers, *LAST_COLUMNS)))
@@ -266,7 +254,7 @@ def csv_text(entries: Sequence[Entry]) -> str:
             *(report.numbers.get(title) if report else None for title in numbers),
             entry.submission_time,
             None if entry.late_s is None else entry.late_s / 3600.0,
-            report.pending_action if report else "",
+            report.instructor_action if report else "",
             entry.comment,
             LIST_SEPARATOR.join(entry.flags),
             LIST_SEPARATOR.join(other.submission for other in entry.other_reports),
@@ -286,18 +274,14 @@ def csv_text(entries: Sequence[Entry]) -> str:
 
 
 def feedback_text(entry: Entry, class_name: str = "") -> str:
-    """Format the feedback for one student, without flags, which are for the instructor."""
+    """Format the feedback for one student, without the flags for the instructor."""
     graded = entry.counted_report
-    reasons = (
-        (shorten_text(reason).rstrip(".") for reason in graded.verdict.reasons[:MAX_REASONS])
-        if graded
-        else ()
-    )
+    reasons = graded.verdict.reasons[:MAX_REASONS] if graded else ()
     text = load_template("grading/feedback.j2").render(
         entry=entry,
         graded=graded,
         class_name=class_name,
-        reasons="; ".join(filter(None, reasons)),
+        reasons="; ".join(filter(None, (shorten_text(each).rstrip(".") for each in reasons))),
         is_total_set=TOTAL_TITLE in entry.overrides,
         line=shorten_text,
         number=format_cell_number,
@@ -321,7 +305,7 @@ def _wrap_text(text: str, indent: str = "") -> str:
 
 
 def find_grade_column(sheet: Sheet, column_title: str) -> int:
-    """Find the grade column of a platform table.
+    """Return the index of the grade column in a table of a learning platform.
 
     Parameters
     ----------
@@ -340,48 +324,50 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
         if not any(READ_ONLY_MARK in row[index] for row in sheet.rows[:3])
     }
     grade_index = sheet.column(GRADE_TITLES)
-    assignment_indices = [
-        index for index in title_by_index if _ASSIGNMENT_NUMBER.search(title_by_index[index])
+    plain_titles = {at: _ASSIGNMENT_NUMBER.sub("", title) for at, title in title_by_index.items()}
+    assignments = [at for at, title in title_by_index.items() if plain_titles[at] != title]
+    matches = [
+        at
+        for at, title in title_by_index.items()
+        if normalise_text(column_title) in map(normalise_text, (title, plain_titles[at]))
     ]
-    matching_indices = [
-        index
-        for index, title in title_by_index.items()
-        if normalise_text(column_title)
-        in (normalise_text(title), normalise_text(_ASSIGNMENT_NUMBER.sub("", title)))
-    ]
-    candidates = assignment_indices if grade_index is None else [grade_index]
-    # Moodle's worksheets have only one grade column: a title that differs is for another table
-    if column_title and (matching_indices or sheet.column(("identifier",)) is None):
-        candidates = matching_indices
-    if len(candidates) == 1:
-        return candidates[0]
-    problem = "several grade columns" if candidates else "no grade column"
-    candidate_titles = (
-        _ASSIGNMENT_NUMBER.sub("", title_by_index[index])
-        for index in assignment_indices or title_by_index
-    )
-    titles_text = one_line(", ".join(one_line(title, 40) for title in candidate_titles), 300)
-    raise SettingsError(f"{sheet.path}: {problem}.", f"Name one with --column: {titles_text}.")
+    columns = assignments if grade_index is None else [grade_index]
+    # Moodle's worksheets have only one grade column: another title is for another table
+    if column_title and (matches or sheet.column(("identifier",)) is None):
+        columns = matches
+    if len(columns) == 1:
+        return columns[0]
+    problem = "the table has several grade columns" if columns else "no grade column matches"
+    titles = ", ".join(one_line(plain_titles[at], 40) for at in assignments or title_by_index)
+    remedy = f"Name one of them with --column: {one_line(titles, 300)}."
+    raise SettingsError(f"{sheet.path}: {problem}.", remedy)
 
 
 def fill_grades(
     sheet: Sheet, entries: Sequence[Entry], register: Register, column: str, feedback: Sequence[str]
 ) -> tuple[Sheet, tuple[str, ...]]:
-    """Enter grades and feedback into a platform table; also return notes about missing grades.
+    """Enter grades and feedback into a table of a learning platform.
 
     Parameters
     ----------
     entries : sequence of Entry
-        Entries of the students in ``register`` first, in its order.
+        Rows of the class table: the students in ``register`` first, in the same order.
     column : str
-        See :func:`find_grade_column`.
+        Title of the grade column; "" if the table has only one.
     feedback : sequence of str
-        Feedback of each entry.
+        Feedback for the student of each row.
+
+    Returns
+    -------
+    filled_sheet : Sheet
+        Copy of the table with grades and feedback.
+    notes : tuple of str
+        Sentences about grades that were not entered, or are above the maximum.
 
     Raises
     ------
     SettingsError
-        From :func:`find_grade_column`.
+        The table does not have exactly one such column.
     """
     grade_index, feedback_index = find_grade_column(sheet, column), sheet.column(COMMENT_TITLES)
     format_feedback = (
@@ -410,9 +396,9 @@ def fill_grades(
         if feedback_index is not None and feedback_index != grade_index:
             row[feedback_index] = format_feedback(feedback[student_index])
     missing_names = [
-        names[student_index]
-        for student_index in range(len(register.people))
-        if student_index not in found_people and entries[student_index].total is not None
+        names[index]
+        for index in range(len(register.people))
+        if index not in found_people and entries[index].total is not None
     ]
     if missing_names:
         notes.append(
@@ -423,7 +409,7 @@ def fill_grades(
 
 
 def _max_points(sheet: Sheet, row: Sequence[str], grade_index: int) -> float | None:
-    """Return the maximum points of the platform, if the table contains them."""
+    """Return the maximum points on the learning platform, if its table contains them."""
     maximum_texts = (
         cells[grade_index] for cells in sheet.rows[:3] if "points possible" in cells[0].casefold()
     )
@@ -431,7 +417,7 @@ def _max_points(sheet: Sheet, row: Sequence[str], grade_index: int) -> float | N
 
 
 def escape_html(text: str) -> str:
-    r"""Escape plain text for a field that the platform displays as HTML; keep the line breaks.
+    r"""Escape a text that the learning platform displays as HTML; keep the line breaks.
 
     >>> escape_html("a <b>\n 1")
     'a &lt;b&gt;<br>&nbsp;1'

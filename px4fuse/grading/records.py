@@ -1,8 +1,8 @@
-"""Stored verifications: a report is verified again only if the report, a log or a version changed.
+"""Stored verifications: a report is verified again only if it, a log or a version has changed.
 
-The SHA-256 of the PDF identifies its record. A record is valid while library versions and available
-input files are unchanged. It contains no points, so a change of the rubric or of overrides needs no
-new verification.
+The SHA-256 of the PDF identifies the record of its verification, which is valid while library
+versions and available input files are unchanged. It contains no points, so that a new rubric needs
+no new verification.
 """
 
 import hashlib
@@ -22,23 +22,24 @@ from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import log_sha256, verify
 from px4fuse.writing import write_all
 
-# subfolder of the output folder, for the records
+# Subfolder of the output folder for stored verifications
 RECORDS_FOLDER = "records"
-# suffix of a redrawn report; record and redrawn report have the SHA-256 of the submitted PDF as
-# name
+# Suffix of a redrawn report, whose name is the SHA-256 of the submitted PDF
 REDRAWN_SUFFIX = ".pdf"
 
 
 @dataclass(frozen=True)
 class VerificationRecord:
-    """Verification of one report.
+    """Stored verification of one report.
 
     Attributes
     ----------
     dependencies : dict
-        Versions and files for which the record is valid: see :func:`_dependencies`.
+        Library versions, and availability of input files, for which the record is valid.
     results : str
         Results attached to the PDF, as JSON.
+    verdict : Verdict
+        Result of the verification, without the redrawn PDF.
     """
 
     dependencies: dict[str, str]
@@ -54,20 +55,23 @@ def load_or_verify(
     Parameters
     ----------
     records : Path
-        Folder of the records.
+        Folder of the stored verifications.
     pdf : bytes
         Content of the submitted file.
     logs : mapping
-        Files by SHA-256.
+        Logs and other input files by SHA-256.
     assigned_hashes : frozenset of str
         SHA-256 of the logs in the answer key. A report on one of these logs gets the verdict
         "cannot verify", not "other log", if the log is not in ``logs``.
 
     Returns
     -------
-    results, verdict
+    results : ComparisonResults or LoopResults
+        Results attached to the PDF.
+    verdict : Verdict
+        Result of the verification.
     is_loaded : bool
-        True if the stored verification was loaded.
+        True if a stored verification was loaded.
 
     Raises
     ------
@@ -84,16 +88,15 @@ def load_or_verify(
     verdict = verify(results, pdf, {} if is_log_missing else logs)
     files = {REDRAWN_SUFFIX: verdict.redrawn} if verdict.redrawn else {}
     stored_verdict = replace(verdict, redrawn=b"")
-    _write_record(
-        records, sha256, VerificationRecord(dependencies, attached, stored_verdict), files
-    )
+    record = VerificationRecord(dependencies, attached, stored_verdict)
+    _write_record(records, sha256, record, files)
     return results, stored_verdict, False
 
 
 def _dependencies(
     results: str, logs: Mapping[str, Path], assigned_hashes: frozenset[str]
 ) -> dict[str, str]:
-    """Return the library versions, and the availability of each input file by SHA-256.
+    """Return library versions, and the availability of each input file of a report by SHA-256.
 
     Availability: "available", "assigned" (in the answer key, but not available), or "missing".
     """
@@ -113,7 +116,7 @@ def _write_record(
     records: Path, sha256: str, record: VerificationRecord, files: Mapping[str, bytes]
 ) -> None:
     for old_file in records.glob(f"{sha256}.*"):
-        # the record is replaced, not deleted: another process may read it for an identical PDF
+        # the JSON record is not deleted: another process may read it for an identical PDF
         if old_file.suffix != ".json":
             old_file.unlink(missing_ok=True)
     contents = {**files, ".json": msgspec.json.encode(record)}
@@ -123,14 +126,14 @@ def _write_record(
 def _load_record(
     records: Path, sha256: str, logs: Mapping[str, Path], assigned_hashes: frozenset[str]
 ) -> tuple[ReportedResults, Verdict] | None:
-    """Load the record of a PDF; None if there is none, or its dependencies have changed."""
+    """Load a stored verification; None if there is none, or its dependencies have changed."""
     try:
         content = (records / f"{sha256}.json").read_bytes()
         record = msgspec.json.decode(content, type=VerificationRecord)
         if record.dependencies != _dependencies(record.results, logs, assigned_hashes):
             return None
         results = read_results(record.results.encode())
-    # without a readable record, the report is verified again
+    # if the stored verification cannot be read, the report is verified again
     except (OSError, msgspec.MsgspecError, ResultsError):
         return None
     return (results, record.verdict) if isinstance(results, ReportedResults) else None

@@ -1,7 +1,7 @@
-"""Rubric: reading of the instructor's TOML file, and scoring of a report.
+"""Rubric, the instructor's table of items that give points: reading, and scoring of a report.
 
-An item of the rubric has a title, points, a check of :mod:`px4fuse.grading.checks` and parameters
-of the check. A number that a report does not contain gives no points and a comment.
+An item has a title, points, a check of :mod:`px4fuse.grading.checks` and parameters of the check. A
+number that a report does not contain gives no points and a comment.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from px4fuse.answer_form import Answers
 from px4fuse.assignment.key import AnswerKey
 from px4fuse.assignment.roster import make_unique
 from px4fuse.errors import SettingsError
-from px4fuse.grading.checks import Evidence, RubricItem, Text, format_reason, shorten_text
+from px4fuse.grading.checks import CheckInput, RubricItem, Text, format_reason, shorten_text
 from px4fuse.grading.flags import flag_pages, flag_settings
 from px4fuse.grading.model import TOTAL_TITLE, GradedReport, Item
 from px4fuse.reading import read_text
@@ -32,7 +32,7 @@ DEFAULT_NAME = "rubric.toml"
 MAX_RUBRIC_BYTES = 1_000_000
 RUBRIC_HELP = "Write a commented example with px4fuse grade --write-rubric FILE.toml."
 
-# numbers of a report in the class table: column title, and path in the results
+# Numbers of a report in the class table: column title, and path in the results
 TABLE_NUMBERS = (
     ("SIGMA_A (m/s²)", "settings.sigma_a_m_s2"),
     ("SIGMA_Z (m)", "settings.sigma_z_m"),
@@ -48,23 +48,28 @@ TABLE_NUMBERS = (
 if TYPE_CHECKING:
     AnyItem = RubricItem
 else:
-    # items of all checks; the field "check" of the TOML file selects the class
+    # union of the item classes of all checks; the field "check" of the TOML file selects one
     AnyItem = Union[tuple(RubricItem.__subclasses__())]  # noqa: UP007
-# rule for the points of a report: the instructor decides, zero points, or the points count
+# Rule for the points of a report: the instructor decides (pending), zero points, or the points
+# count
 PointsRule = Literal["pending", "zero", "count"]
 
 
 class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Items, and rules for reports that are not fully verified.
+    """Items that give points to a report, and rules for reports that are not fully verified.
 
     Attributes
     ----------
+    title : str
+        Title of the class page.
     unverified : {"pending", "zero"}
         Rule for a report that could not be verified.
     others_log : {"pending", "zero", "count"}
         Rule for a report on a log that was not given to the student.
     pages : {"count", "pending", "zero"}
-        Rule for a verified report with pages that differ from the redrawn ones.
+        Rule for a verified report with pages that differ from the redrawn report.
+    items : tuple of RubricItem
+        Items with points and check.
     """
 
     title: Text = ""
@@ -84,17 +89,12 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 def rubric_text() -> str:
-    """Return the default rubric with its comments, as an example to edit."""
+    """Return the default rubric (TOML) with its comments, as an example to edit."""
     return files("px4fuse.grading").joinpath(DEFAULT_NAME).read_text(encoding="utf-8")
 
 
 def read_rubric(path: Path | None) -> Rubric:
-    """Read and check a rubric.
-
-    Parameters
-    ----------
-    path : Path or None
-        None for the default rubric.
+    """Read and check a rubric; None for the default rubric.
 
     Raises
     ------
@@ -107,17 +107,17 @@ def read_rubric(path: Path | None) -> Rubric:
 
 
 def parse_rubric(text: str, source_name: str) -> Rubric:
-    """Parse and check the text of a rubric; ``source_name`` names it in errors."""
+    """Parse and check the text of a rubric; ``source_name`` is its name in errors."""
     try:
         return msgspec.convert(tomllib.loads(text.replace("\r\n", "\n")), Rubric)
-    # ValueError: not TOML, or an integer with more digits than Python parses
+    # tomllib raises ValueError for a syntax error, and for an integer with very many digits
     except (msgspec.ValidationError, ValueError, RecursionError) as error:
         message = re.sub(r"`\$\.item\[(\d+)\]\.?([^`]*)`", _describe_place, str(error))
         raise SettingsError(f"{source_name}: {one_line(message, 300)}", RUBRIC_HELP) from error
 
 
 def _describe_place(path: re.Match[str]) -> str:
-    """Replace msgspec's path of an error by the item number (from 1) and the field."""
+    """Replace the path in an error of msgspec by the item number (from 1) and the field."""
     return f"item {int(path[1]) + 1}{f', {path[2]}' * bool(path[2])}"
 
 
@@ -129,30 +129,30 @@ def score_report(
     verdict: Verdict,
     rubric: Rubric,
     key: AnswerKey | None,
-    owner_id: str = "",
+    submitter_id: str = "",
 ) -> GradedReport:
     """Score a report, and add flags and the action that the instructor has to take.
 
-    Items for reports of another command are omitted. Without an answer key, items that need one are
-    omitted too. The caller adds the file name of the report. ``owner_id`` is the student id
-    according to the learning platform; it takes precedence over the id in the report.
+    Items for reports of another command are omitted, and without an answer key also items that need
+    a key. The caller adds the file name of the report. ``submitter_id`` is the student id according
+    to the learning platform; it takes precedence over the id in the report.
     """
-    evidence = Evidence(results, verdict, key, owner_id)
-    points_rule, rule_text = _points_rule(evidence, rubric)
-    student, command = results.student, "compare" if evidence.comparison else "loop"
+    check_input = CheckInput(results, verdict, key, submitter_id)
+    points_rule, rule_text = _points_rule(check_input, rubric)
+    student, command = results.student, "compare" if check_input.comparison else "loop"
     graded_items = []
     for item in rubric.items:
         if not item.applies(command, key):
             continue
-        share, comment = 0.0, f"No points: {rule_text}."
+        fraction, comment = 0.0, f"No points: {rule_text}."
         if points_rule != "zero":
-            share, comment = item.score(evidence)
+            fraction, comment = item.score(check_input)
         awaits_points = item.by_hand and bool(student.notes.strip()) and points_rule != "zero"
-        points = round(item.points * min(max(share, 0.0), 1.0), 2)
+        points = round(item.points * min(max(fraction, 0.0), 1.0), 2)
         graded_items.append(
             Item(item.title, points, item.points, comment, item.by_hand, awaits_points)
         )
-    form_result, values = evidence.form_points, evidence.values
+    form_result, values = check_input.form_points, check_input.values
     return GradedReport(
         "",
         student.name,
@@ -162,13 +162,13 @@ def score_report(
         flags=(
             *flag_pages(verdict),
             *flag_settings(results, key is not None),
-            *([] if evidence.is_own_log else [_foreign_log_advice(evidence)]),
+            *([] if check_input.is_own_log else [_foreign_log_advice(check_input)]),
         ),
-        pending_action=rule_text if points_rule == "pending" else "",
+        instructor_action=rule_text if points_rule == "pending" else "",
         mistakes={}
-        if isinstance(form_result, str) or not evidence.is_own_log
+        if isinstance(form_result, str) or not check_input.is_own_log
         else form_result.is_named_by_mistake,
-        form=evidence.form if isinstance(evidence.form, Answers) else None,
+        form=check_input.form if isinstance(check_input.form, Answers) else None,
         numbers={title: float(values[path]) for title, path in TABLE_NUMBERS if path in values},
         log_sha256=log_sha256(results),
         version=results.provenance.px4fuse,
@@ -176,45 +176,45 @@ def score_report(
     )
 
 
-def _points_rule(evidence: Evidence, rubric: Rubric) -> tuple[PointsRule, str]:
-    """Return the rule for the points, and the reason; for "pending" the required action."""
-    verdict = evidence.verdict
+def _points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[PointsRule, str]:
+    """Return the rule for the points, and the reason; for "pending" the instructor's action."""
+    verdict = check_input.verdict
     reason = format_reason("".join(verdict.reasons[:1]))
     if verdict.status == "numbers differ":
         return "zero", f"the numbers of your report differ from those of its log{reason}"
-    # reasons for doubt: rule of the rubric, sentence for the student, action for the instructor
-    doubts: list[tuple[PointsRule, str, str]] = []
+    # problems of the report: rule of the rubric, text for the student, action of the instructor
+    problems: list[tuple[PointsRule, str, str]] = []
     if verdict.status != "verified":
         action = verdict.remedy or f"Check the report by hand: it was not verified{reason}."
-        doubts.append((rubric.unverified, f"your report could not be verified{reason}", action))
+        problems.append((rubric.unverified, f"your report could not be verified{reason}", action))
     elif verdict.page_status == "differ":
         reason_text = "pages of your PDF differ from those that px4fuse draws from the log"
-        doubts.append((rubric.pages, reason_text, "Compare the pages with the redrawn report."))
-    if not evidence.is_own_log:
+        problems.append((rubric.pages, reason_text, "Compare the pages with the redrawn report."))
+    if not check_input.is_own_log:
         reason_text = "your report is not about the log that you were given"
-        doubts.append((rubric.others_log, reason_text, _foreign_log_advice(evidence)))
-    if evidence.key is not None and getattr(evidence.results.request, "position", None):
+        problems.append((rubric.others_log, reason_text, _foreign_log_advice(check_input)))
+    if check_input.key is not None and getattr(check_input.results.request, "position", None):
         action = (
             "Ask for the origin of the position file (--position): the assignment contains no "
             "position files."
         )
-        doubts.append(("pending", "", action))
-    for rule, reason_text, _ in doubts:
+        problems.append(("pending", "", action))
+    for rule, reason_text, _ in problems:
         if rule == "zero":
             return "zero", reason_text
-    action = " ".join(action for rule, _, action in doubts if rule == "pending")
+    action = " ".join(action for rule, _, action in problems if rule == "pending")
     return ("pending", action) if action else ("count", "")
 
 
-def _foreign_log_advice(evidence: Evidence) -> str:
-    """Format the instructor's action for a report on a log of another student."""
-    student_id = shorten_text(evidence.results.student.id)
+def _foreign_log_advice(check_input: CheckInput) -> str:
+    """Describe the instructor's action for a report on a log of another student."""
+    student_id = shorten_text(check_input.results.student.id)
     id_text = f"the id in the report is {student_id}" if student_id else "the report has no id"
-    if evidence.owner_id:
-        id_text += f", and {shorten_text(evidence.owner_id)} handed it in"
-    if evidence.answer is None:
+    if check_input.submitter_id:
+        id_text += f", and {shorten_text(check_input.submitter_id)} handed it in"
+    if check_input.answer is None:
         return "The report is not about a log of the answer key. Ask for a report on that log."
-    given_to = shorten_text(evidence.answer.student_id)
+    given_to = shorten_text(check_input.answer.student_id)
     return f"Find out who wrote the report: its log was given to student {given_to}, but {id_text}."
 
 
@@ -223,11 +223,10 @@ def grade_unreadable(
 ) -> GradedReport:
     """Return a graded report with zero points, for a file that is not a report."""
     comment = f"No points: the file is not a px4fuse report ({shorten_text(reason).rstrip('.')})."
-    items = (
+    verdict, items = cannot_verify(reason, remedy), rubric.items
+    graded_items = tuple(
         Item(item.title, 0.0, item.points, comment)
-        for item in rubric.items
+        for item in items
         if item.applies("compare", key)
     )
-    return GradedReport(
-        "", "", "", cannot_verify(reason, remedy), tuple(items), pending_action=remedy
-    )
+    return GradedReport("", "", "", verdict, graded_items, instructor_action=remedy)

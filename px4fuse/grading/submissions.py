@@ -1,8 +1,8 @@
-"""Submissions: PDFs in folders and in zip files of learning platforms, with student and time.
+"""Search for submitted PDFs in folders and in zip files of learning platforms, with their students.
 
 Zip files are not unpacked to disk, and the names in them are never used as paths. The platform
 writes the beginning of a path, and students choose the rest. Therefore the first part of a path
-that matches a pattern identifies the student.
+that matches a pattern of ``platforms.toml`` identifies the student.
 
 Sources of the patterns:
 
@@ -26,7 +26,7 @@ import zipfile
 import zlib
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -42,32 +42,32 @@ from px4fuse.results.reading import clean_text, one_line
 from px4fuse.verification.model import BAD_VALUES
 from px4fuse.verification.pdf_input import MAX_BYTES
 
-# maximum number of entries of a zip file
+# Maximum number of entries of a submitted zip file
 MAX_ENTRIES = 10_000
-# maximum bytes of a zip file's table of contents, which zipfile reads before entries are counted
+# Maximum size (bytes) of the table of contents of a zip file, which zipfile reads completely
 MAX_DIRECTORY_BYTES = 4_000_000
-# bytes; maximum sum of the unpacked sizes of the entries, which may refer to the same data
+# Maximum sum (bytes) of the unpacked sizes of the entries of a zip file: they may share their data
 MAX_TOTAL_BYTES = 4_000_000_000
-# maximum ratio of unpacked to packed size of an entry: a PDF is compressed already, so its ratio is
-# near 1
+# Maximum ratio of unpacked to packed size of a zip entry: a PDF is compressed already, so that its
+# ratio is near 1
 MAX_COMPRESSION_RATIO = 100
-# maximum characters of a file name in messages
+# Maximum length (characters) of a file name in messages
 MAX_NAME_LENGTH = 200
-# year that zip programs write if they do not know the time of an entry
+# Year that zip programs write if an entry has no time
 ZIP_EPOCH_YEAR = 1980
 
-_TOO_LARGE_REASON = f"larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."
-# general purpose bit flags of a zip entry (APPNOTE.TXT of PKWARE, 4.4.4)
+_TOO_LARGE_REASON = f"the file is larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."
+# General purpose bit flags of a zip entry (APPNOTE.TXT of PKWARE, 4.4.4)
 _ENCRYPTED_FLAG = 1
 _UTF8_FLAG = 0x800
 GRADESCOPE_METADATA = "submission_metadata.yml"
-# pattern of the paths in an export, by platform
+# Pattern of the file paths in an export, by learning platform
 PLATFORMS = {
     name: re.compile(pattern)
     for name, pattern in table(__file__, "platforms.toml", dict[str, str]).items()
 }
-# parts of a path that a platform writes once; a second one was written by the student
-_PLATFORM_MARKS = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
+# Texts that a platform writes once into a path: the student wrote any further occurrence
+_PLATFORM_NAMES = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
 BLACKBOARD_TIME_FORMAT = "%Y-%m-%d-%H-%M-%S"
 _SUBMISSION_BLOCK = re.compile(
     r"^(?:submission_)?(\d+)(?:\.pdf)?:\s*\n((?:[ -].*\n?)*)", re.MULTILINE
@@ -76,20 +76,20 @@ _SUBMITTERS_BLOCK = re.compile(r"^  :submitters:\s*\n((?:  - .*\n?|    .*\n?)*)"
 
 
 class _EntryError(Exception):
-    """Reason why an entry of a zip file is not read."""
+    """Zip entry or file that is not read; the argument is the reason."""
 
 
 _BROKEN_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryError)
-# RuntimeError in BAD_VALUES includes the NotImplementedError that zipfile raises
+# BAD_VALUES contains RuntimeError, and so the NotImplementedError that zipfile raises
 _UNREADABLE_ERRORS = (_EntryError, *_BROKEN_ZIP_ERRORS, *BAD_VALUES)
 
 
 def _unread_reason(error: Exception) -> str:
-    """Format the reason why a file was not read, for a message after the file name and a colon."""
+    """Return the reason why a file was not read, for a message that begins with its name."""
     if isinstance(error, _EntryError):
         return str(error)
     reason = error.strerror if isinstance(error, OSError) and error.strerror else "damaged"
-    return f"it cannot be read ({reason})."
+    return f"the file cannot be read ({reason})."
 
 
 def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
@@ -105,7 +105,7 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
     Returns
     -------
     submissions : tuple of Submission
-        Sorted by name. Unreadable PDFs are included: :func:`read` raises an error with the reason.
+        Submitted PDFs sorted by name, with unreadable ones.
     notes : tuple of str
         Sentences about ignored files.
 
@@ -144,46 +144,35 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
         raise SettingsError(one_line(" ".join(["No PDF found.", *notes]), 500))
     ordered = sorted(
         submission_by_path.values(),
-        key=lambda submission: (
-            submission.name.casefold(),
-            submission.name,
-            submission.file,
-            submission.zip_entry,
-        ),
+        key=lambda each: (each.name.casefold(), each.name, each.file, each.zip_entry),
     )
     names = make_unique(_short_name(submission.name) for submission in ordered)
-    named_submissions = [
-        replace(submission, name=name) for submission, name in zip(ordered, names, strict=True)
-    ]
-    return tuple(add_origins(named_submissions, origin_by_number)), tuple(notes)
+    renamed = [replace(each, name=name) for each, name in zip(ordered, names, strict=True)]
+    return tuple(add_origins(renamed, origin_by_number)), tuple(notes)
 
 
 def add_origins(
     submissions: Sequence[Submission], origin_by_number: Mapping[str, ExportOrigin]
 ) -> Iterator[Submission]:
-    """Add student and platform to submissions.
+    """Add student and learning platform to submissions.
 
     All files of an export (zip file or top-level folder) are from the platform whose pattern
-    matches most of them. So a student cannot change the platform by imitating its file names.
+    matches most of them, so that a student cannot imitate the file names of another platform.
 
     Parameters
     ----------
     origin_by_number : mapping
         Students and times of Gradescope, by submission number.
     """
-    exports = [
-        submission.file if submission.zip_entry else submission.name.partition("/")[0]
-        for submission in submissions
-    ]
+    exports = [each.file if each.zip_entry else each.name.partition("/")[0] for each in submissions]
     platform_counts: dict[object, Counter[str]] = defaultdict(Counter)
     for export, submission in zip(exports, submissions, strict=True):
         platform_counts[export].update(filter(None, [parse_origin(submission.name).platform]))
     for export, submission in zip(exports, submissions, strict=True):
-        origin = parse_origin(
-            submission.name, [platform for platform, _ in platform_counts[export].most_common(1)]
-        )
+        platforms = [platform for platform, _ in platform_counts[export].most_common(1)]
+        origin = parse_origin(submission.name, platforms)
         if origin.platform in ("gradescope", ""):
-            # PDF assignments are exported as 123456.pdf
+            # Gradescope exports PDF assignments as 123456.pdf
             stem = submission.name.rpartition("/")[2].casefold().removesuffix(".pdf")
             origin = origin_by_number.get(origin.person.numbers.get("gradescope", stem), origin)
         yield replace(submission, origin=origin)
@@ -207,21 +196,19 @@ def read(submission: Submission) -> bytes:
         if len(content) > MAX_BYTES:
             raise _EntryError(_TOO_LARGE_REASON)
     except _UNREADABLE_ERRORS as error:
-        raise ResultsError(
-            f"{one_line(submission.name, MAX_NAME_LENGTH)}: {_unread_reason(error)}"
-        ) from error
+        name = one_line(submission.name, MAX_NAME_LENGTH)
+        raise ResultsError(f"{name}: {_unread_reason(error)}") from error
     return content
 
 
 def _is_metadata(name: str) -> bool:
-    *folders, last = name.split("/")
-    return last == GRADESCOPE_METADATA and not any(
-        folder.startswith("submission_") for folder in folders
-    )
+    *folders, file = name.split("/")
+    is_submitted = any(folder.startswith("submission_") for folder in folders)
+    return file == GRADESCOPE_METADATA and not is_submitted
 
 
 class _LimitedFile:
-    """File whose ``read`` returns at most MAX_DIRECTORY_BYTES."""
+    """Zip file whose ``read`` returns at most MAX_DIRECTORY_BYTES."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -230,7 +217,7 @@ class _LimitedFile:
 
     def read(self, size: int = -1) -> bytes:
         if size > MAX_DIRECTORY_BYTES:
-            raise zipfile.BadZipFile("table of contents too large")
+            raise zipfile.BadZipFile("the table of contents of the zip file is too large")
         # zipfile calls read() without a size only to find the end of the archive
         return self._file.read(size if size >= 0 else MAX_DIRECTORY_BYTES)
 
@@ -239,7 +226,7 @@ class _LimitedFile:
 def _open_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
     with zipfile.ZipFile(_LimitedFile(file)) as archive:
         if len(archive.infolist()) > MAX_ENTRIES:
-            raise _EntryError(f"it has more than {MAX_ENTRIES} entries.")
+            raise _EntryError(f"the zip file has more than {MAX_ENTRIES} entries.")
         yield archive
 
 
@@ -248,15 +235,14 @@ def _zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
     try:
         with path.open("rb") as file, _open_zip(file) as archive:
             entries = [entry for entry in archive.infolist() if not entry.is_dir()]
-        # the declared sizes are reliable limits: zipfile never returns more than the declared size
+        # zipfile never returns more than the declared size of an entry
         if sum(entry.file_size for entry in entries) > MAX_TOTAL_BYTES:
-            raise _EntryError(f"it unpacks to more than {MAX_TOTAL_BYTES // 10**9} GB.")
+            raise _EntryError(f"the zip file unpacks to more than {MAX_TOTAL_BYTES // 10**9} GB.")
     except _UNREADABLE_ERRORS as error:
-        notes.append(f"{_short_name(path.name)}: ignored: {_unread_reason(error)}")
+        notes.append(f"{_short_name(path.name)} was ignored: {_unread_reason(error)}")
         return []
     last_by_name = {entry.filename: entry for entry in entries}
-    if len(last_by_name) < len(entries):
-        duplicate_count = len(entries) - len(last_by_name)
+    if duplicate_count := len(entries) - len(last_by_name):
         notes.append(
             f"{_short_name(path.name)}: {duplicate_count} entries have duplicate names; "
             "only the last entry of each name was read."
@@ -265,15 +251,11 @@ def _zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
         Submission(path.resolve(), name, _entry_label(entry), _entry_time(entry))
         for name, entry in last_by_name.items()
     )
-    return [
-        submission
-        for submission in submissions
-        if not any(map(_is_hidden, submission.name.split("/")))
-    ]
+    return [each for each in submissions if not any(map(_is_hidden, each.name.split("/")))]
 
 
 def _folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
-    """Yield the regular files of a folder, except hidden ones."""
+    """Yield the regular files of a folder and its subfolders, except hidden files."""
     if path.is_file():
         yield Submission(path.resolve(), "", path.name)
         return
@@ -287,9 +269,9 @@ def _folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
             continue
         try:
             resolved = file.resolve(strict=True)
-            # reading a named pipe would wait forever
+            # only regular files: reading a named pipe would wait forever
             is_inside = resolved.is_relative_to(root) and resolved.is_file()
-        except (OSError, RuntimeError):  # link without target, or circular
+        except (OSError, RuntimeError):  # symbolic link without target, or circular
             is_inside = False
         if is_inside:
             yield Submission(resolved, "", name.as_posix())
@@ -315,52 +297,43 @@ def _entry_time(entry: zipfile.ZipInfo) -> datetime | None:
 
 
 def _entry_label(entry: zipfile.ZipInfo) -> str:
-    """Return the path of a zip entry for messages, without '.', '..' and drive letters."""
+    """Return the path of a zip entry for messages, without ``.``, ``..`` and drive letters."""
     name = entry.filename
     if not entry.flag_bits & _UTF8_FLAG:
-        # zipfile decodes names without UTF-8 flag as code page 437; most programs write UTF-8
-        try:
+        # zipfile decodes names without UTF-8 flag as code page 437, but most programs write UTF-8
+        with suppress(UnicodeError):
             name = name.encode("cp437").decode("utf-8")
-        except UnicodeError:
-            name = entry.filename
-    path_parts = re.split(r"[/\\]", name)
-    return "/".join(
-        path_part
-        for path_part in path_parts
-        if path_part not in ("", ".", "..") and path_part[1:] != ":"
-    )
+    folders = (each for each in re.split(r"[/\\]", name) if each not in ("", ".", ".."))
+    return "/".join(folder for folder in folders if folder[1:] != ":")
 
 
 def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
-    """Read an entry of a zip file; refuse kinds of entries that learning platforms do not write."""
+    """Read an entry of a zip file; reject types of entries that learning platforms do not write."""
     entry = archive.getinfo(name)
-    is_small = entry.file_size <= max(1_000_000, MAX_COMPRESSION_RATIO * entry.compress_size)
-    is_known_method = entry.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-    for has_problem, reason in (
-        (entry.flag_bits & _ENCRYPTED_FLAG, "the zip entry is encrypted."),
-        (
-            stat.S_ISLNK(entry.external_attr >> 16),
-            "the zip entry is a symbolic link.",
-        ),
-        (not is_known_method, "the compression method of the zip entry is not supported."),
-        (entry.file_size > MAX_BYTES, _TOO_LARGE_REASON),
-        (
-            not is_small,
-            f"the zip entry is compressed more than {MAX_COMPRESSION_RATIO} times, unlike reports.",
-        ),
-    ):
-        if has_problem:
-            raise _EntryError(reason)
+    max_bytes = max(1_000_000, MAX_COMPRESSION_RATIO * entry.compress_size)
+    reason = ""
+    if entry.flag_bits & _ENCRYPTED_FLAG:
+        reason = "the zip entry is encrypted."
+    elif stat.S_ISLNK(entry.external_attr >> 16):
+        reason = "the zip entry is a symbolic link."
+    elif entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        reason = "the compression method of the zip entry is not supported."
+    elif entry.file_size > MAX_BYTES:
+        reason = _TOO_LARGE_REASON
+    elif entry.file_size > max_bytes:
+        reason = f"the zip entry is compressed more than {MAX_COMPRESSION_RATIO} times."
+    if reason:
+        raise _EntryError(reason)
     # zipfile returns at most the declared size
     return archive.read(entry)
 
 
 def _short_name(name: str) -> str:
-    """Format a name on one line; shorten a long name in the middle."""
+    """Format a file name on one line; shorten a long name in the middle."""
     line = " ".join(clean_text(name[-10 * MAX_NAME_LENGTH :]).split())
     if len(line) > MAX_NAME_LENGTH:
-        head_length = MAX_NAME_LENGTH // 2
-        line = f"{line[:head_length]}…{line[head_length + 1 - MAX_NAME_LENGTH :]}"
+        half = MAX_NAME_LENGTH // 2
+        line = f"{line[:half]}…{line[1 - half :]}"
     return line or "no name"
 
 
@@ -368,7 +341,7 @@ def _short_name(name: str) -> str:
 
 
 def parse_origin(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportOrigin:
-    """Return student and time of a file, from its path in the export.
+    """Return student and submission time of a file, from its path in an export.
 
     >>> parse_origin("Doe Jane_4711_assignsubmission_file_/report.pdf").person.name
     'Doe Jane'
@@ -379,9 +352,8 @@ def parse_origin(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> Expo
     >>> parse_origin("report.pdf") == ExportOrigin()
     True
     """
-    path_parts = name.split("/")
-    for index in range(len(path_parts)):
-        tail = "/".join(path_parts[index:])
+    tail = name
+    while tail:
         for platform in platforms:
             match = PLATFORMS[platform].match(tail)
             if match is None:
@@ -392,22 +364,21 @@ def parse_origin(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> Expo
                 time = datetime.strptime(time_text, BLACKBOARD_TIME_FORMAT) if time_text else None
             except ValueError:  # a platform writes valid times, so a student wrote this name
                 continue
-            full_name = (
-                fields.get("name") or f"{fields.get('first', '')} {fields.get('last', '')}".strip()
-            )
+            names = (fields.get(key) for key in ("name", "first", "last"))
             numbers = {platform: fields["number"]} if "number" in fields else {}
-            person = Person("", full_name, "", fields.get("login", ""), numbers)
-            is_imitated = len(_PLATFORM_MARKS.findall(name)) > (
-                platform in ("moodle", "blackboard")
-            )
+            full_name, login = " ".join(filter(None, names)), fields.get("login", "")
+            person = Person("", full_name, "", login, numbers)
+            expected_count = platform in ("moodle", "blackboard")
+            is_imitated = len(_PLATFORM_NAMES.findall(name)) > expected_count
             return ExportOrigin(platform, person, time, bool(fields.get("late")), is_imitated)
+        tail = tail.partition("/")[2]
     return UNKNOWN_SUBMITTER
 
 
 def read_gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
     r"""Read students and times from Gradescope's ``submission_metadata.yml``, by submission number.
 
-    Only keys at the indentation of Gradescope's own keys are read; texts of students are indented
+    Only keys at the indentation that Gradescope writes are read; texts of students are indented
     further. A group submission belongs to its first member.
 
     >>> text = "submission_7:\n  :submitters:\n  - :name: Ada\n    :sid: '12'\n"
@@ -422,20 +393,19 @@ def read_gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
             for key in ("name", "sid", "email")
         )
         person = Person(student_id, name, email, "", {"gradescope": number})
-        origins[number] = ExportOrigin(
-            "gradescope", person, _parse_time(_yaml_value(block, "  :created_at"))
-        )
+        time = _parse_time(_yaml_value(block, "  :created_at"))
+        origins[number] = ExportOrigin("gradescope", person, time)
     return origins
 
 
 def _yaml_value(block: str, key: str) -> str:
-    """Return the value at the first occurrence of a key, without quotes."""
+    """Return the value of the first line with a YAML key, without quotes."""
     match = re.search(rf"^{key}: *(['\"]?)(.*)\1 *$", block, re.MULTILINE)
     return match[2] if match else ""
 
 
 def _parse_time(value: str) -> datetime | None:
-    """Parse a time in Gradescope's YAML; UTC if it has no time zone. None if it is not valid.
+    """Parse a time in Gradescope's YAML file; UTC without time zone, None if not valid.
 
     >>> _parse_time("2026-11-20 12:34:56.123456000 Z").isoformat()
     '2026-11-20T12:34:56.123456+00:00'

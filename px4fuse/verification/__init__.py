@@ -1,1 +1,1 @@
-"""Verification of reports: comparison with a new run of the analysis on the log."""
+"""Verification of students' reports: comparison with a new run of the analysis on the log."""

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-# Python errors caused by values of a damaged file: wrong type, out of range, missing
+# Python errors that missing or invalid values in a damaged file can raise
 BAD_VALUES = (
     ArithmeticError,
     AssertionError,
@@ -13,21 +13,21 @@ BAD_VALUES = (
     TypeError,
     ValueError,
 )
-# results of the comparison of numbers (Status) and of the comparison of pages (PageStatus)
+# Result of comparing the numbers (Status) and the pages (PageStatus) of a report with a new run
 Status = Literal["verified", "numbers differ", "other log", "cannot verify"]
 PageStatus = Literal["same", "differ", "not compared"]
 
 
 @dataclass(frozen=True)
 class Mismatch:
-    """Value in a report that differs from the value of a new run of the analysis.
+    """Value of a report that a new run of the analysis does not reproduce.
 
     Attributes
     ----------
     path : str
         Path in the results, for example ``axes.north.filters.kf.nis_mean``.
     recorded, recomputed : str
-        Values; "absent" if missing.
+        Value in the report and value of the new run; "absent" if missing.
     """
 
     path: str
@@ -37,16 +37,17 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class PageDifference:
-    """Difference between the handed-in PDF and the report that px4fuse draws.
+    """Difference between a submitted PDF and the report that px4fuse draws again.
 
     Attributes
     ----------
     page : int
-        Page number from 1; 0 for the document.
+        Page number from 1; 0 for the whole document.
     what : str
-        Difference, as the end of a sentence that begins with the page.
+        Difference in words, without the page.
     is_structural : bool
-        True if parts of the PDF are added or missing, because another program wrote the file.
+        True if PDF objects are added or missing, which indicates that another program wrote the
+        file.
     """
 
     page: int
@@ -55,35 +56,36 @@ class PageDifference:
 
     @property
     def sentence(self) -> str:
-        """Sentence with page and difference."""
+        """Description of the difference, with the page number in front."""
         return f"{f'page {self.page}' if self.page else 'document'}: {self.what}"
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Result of a verification.
+    """Result of verifying a report against its log.
 
     Attributes
     ----------
     status : Status
-        Result of the comparison of numbers. If the numbers agree, it is still "cannot verify" in
-        two cases: the structure of the PDF differs from that of the redrawn report, or pages differ
-        and the report was made with other library versions.
+        Result of comparing the numbers. If they agree, it is still "cannot verify" in two cases:
+        another program wrote the PDF, or pages differ and the library versions too.
     reasons : tuple of str
-        Sentences: the differences, the reason for "cannot verify", or the checks of a verified
-        report.
+        Sentences with the differences, the reason for "cannot verify", or the successful checks.
     with_log : bool
         True if the analysis was repeated on the log.
-    page_status : {"same", "differ", "not compared"}
-        Result of the comparison of pages.
+    differences : tuple of Mismatch
+        Values that differ.
+    page_status : PageStatus
+        Result of comparing the pages.
     pages : tuple of PageDifference
+        Differences of the pages.
     redrawn : bytes
-        Report that px4fuse drew from the repeated analysis (PDF), to be read instead of the
-        handed-in one; empty if the analysis was not repeated.
+        PDF that px4fuse drew from the repeated analysis, to be read instead of the submitted one;
+        empty if the analysis was not repeated.
     remedy : str
-        Action if the report was not verified: one sentence.
+        Action of the user if the report was not verified, one sentence.
     missing : str
-        Name of the log or other input file that is missing; else empty.
+        Name of a missing log or other input file; else empty.
     """
 
     status: Status
@@ -98,6 +100,6 @@ class Verdict:
 
     @property
     def outcome(self) -> str:
-        """Status, or "page differs" if the numbers are verified and the pages are not."""
+        """Status of the numbers, or "page differs" if only pages of the report differ."""
         differ = self.status == "verified" and self.page_status == "differ"
         return "page differs" if differ else self.status

@@ -1,4 +1,4 @@
-"""Comparison of a handed-in PDF with the report that px4fuse draws again from the log.
+"""Comparison of a submitted PDF with the report that px4fuse draws again from the log.
 
 Starting from each page, the document information and the catalogue, all objects of both files are
 compared pairwise. They have to be equal in keys, names, numbers, texts and decoded streams:
@@ -42,22 +42,27 @@ from px4fuse.verification.pdf_input import (
     MAX_VALUES,
     PYPDF_LIMITS,
     open_strictly,
+    resolve_reference,
 )
 from px4fuse.workers import JobFailure, run_one_bounded
 
-# maximum difference of coordinates (pt): different OpenBLAS kernels move points by at most 0.07 pt,
-# and 0.25 pt is not visible
+# Maximum difference (pt) of equal coordinates: different OpenBLAS kernels move points by at most
+# 0.07 pt, and 0.25 pt is not visible
 COORDINATE_TOLERANCE_PT = 0.25
-# relative and absolute tolerance of other numbers, because other programs save 32-bit floats
+# Relative and absolute tolerance of PDF numbers that are not coordinates: other programs save them
+# as 32-bit floats
 NUMBER_TOLERANCE = 1e-5
-# maximum letter distance (1/1000 em) of a text in which a number may differ by rounding
+# Maximum kerning (1/1000 em) of a text in which a number may differ by rounding: wider kerning
+# could rearrange digits
 MAX_KERNING = 200.0
-# maximum length of submitted over redrawn content: a byte of a string may be written as four bytes
+# Maximum ratio of submitted to redrawn page content (bytes): PDF may write a character as four
+# bytes
 MAX_LENGTH_RATIO = 4
-# limits of one comparison, which needs 3 s and 0.3 GB for the largest report
+# Maximum time (s) and memory (bytes) for comparing two PDFs: the largest report needs 3 s and 0.3
+# GB
 TIMEOUT_S, MEMORY_BYTES = 12.0, 1_000_000_000
 MAX_LISTED_DIFFERENCES = 20
-# keys that are not compared: compression of streams, and fields that other programs write
+# PDF dictionary keys that are not compared, because programs that save a PDF again change them
 _COMPRESSION_KEYS = frozenset(("/Length", "/Filter"))
 _WRITER_KEYS = frozenset(("/Producer", "/CreationDate", "/ModDate"))
 _XMP_WRITER_FIELDS = re.compile(
@@ -65,10 +70,10 @@ _XMP_WRITER_FIELDS = re.compile(
     r"|stEvt:(?:when|instanceID))( [^>]*)?>[^<]*</\1>"
 )
 MAX_XMP_BYTES = 100_000
-# the Typst version is not compared: 0.15.0 and 0.15.2 produce the same pages
+# Typst version in the PDF, which is not compared: 0.15.0 and 0.15.2 produce the same pages
 _TYPST_VERSION = re.compile(r"Typst \d+(\.\d+)*")
 _END_OF_FILE = re.compile(rb"startxref\s+(\d{1,10})\s+%%EOF\s*\Z")
-_PART_NAMES = {
+_FEATURE_NAMES = {
     "/AA": "an action",
     "/AcroForm": "form fields",
     "/Annots": "an annotation",
@@ -80,7 +85,7 @@ _PART_NAMES = {
     "/UserUnit": "another unit of length",
     "/XObject": "a picture or form",
 }
-# ISO 32000-1, 7.2 and 7.3: strings, delimiters of dictionaries, names, numbers and operators
+# Tokens of PDF page content (ISO 32000-1, 7.2 and 7.3): strings, hexadecimal strings, and others
 _TOKEN = re.compile(
     r"\(((?:[^\\()]|\\.|\((?:[^\\()]|\\.)*+\))*+)\)|<([0-9A-Fa-f]*)>"
     r"|(<<|>>|/?[^\0\t\n\f\r ()<>\[\]{}/%]+|[^\0\t\n\f\r ])",
@@ -98,14 +103,14 @@ _ESCAPED_CHARACTERS = {
     "\r": "",
     "\r\n": "",
 }
-# operators with coordinates, and index of their first coordinate
+# PDF drawing operators with coordinates, and index of the first coordinate among their operands
 _FIRST_COORDINATE = {"m": 0, "l": 0, "c": 0, "v": 0, "y": 0, "re": 0, "cm": 4, "Tm": 4}
 _TEXT_OPERATORS = frozenset(("Tj", "TJ"))
-# entry of a ToUnicode map: glyph and letters
+# Entry of a font's ToUnicode map: glyph number and its characters (UTF-16), in hexadecimal digits
 _TO_UNICODE_ENTRY = re.compile(r"<([0-9A-Fa-f]{4})> <((?:[0-9A-Fa-f]{4})+)>\n")
 
 TextComparison = Callable[[str, str], bool]
-# operand of an operation: number, string, or name, bracket and other tokens
+# Operand of a PDF drawing operation: number, string, or another token (name or bracket)
 Operand = float | bytes | str
 Operation = tuple[str, tuple[Operand, ...]]
 
@@ -113,12 +118,12 @@ Operation = tuple[str, tuple[Operand, ...]]
 def compare_pages(
     submitted: bytes, redrawn: bytes, is_same_text: TextComparison
 ) -> tuple[PageDifference, ...]:
-    """Compare a handed-in PDF with the redrawn report, in a process with limits.
+    """Compare a submitted PDF with the redrawn report, in a process with limits.
 
     Parameters
     ----------
     submitted : bytes
-        A file that :func:`px4fuse.verification.pdf_input.read_report` accepted.
+        PDF that :func:`px4fuse.verification.pdf_input.read_report` accepted.
     is_same_text : callable
         Returns True if two texts are equal up to the rounding of a number.
 
@@ -128,12 +133,12 @@ def compare_pages(
         At most MAX_LISTED_DIFFERENCES, in page order; empty if the PDF is as px4fuse writes it. If
         the comparison exceeds its limits, this is the only difference.
     """
-    job = (submitted, redrawn, is_same_text)
+    job = submitted, redrawn, is_same_text
     differences = run_one_bounded(_compare_pdfs, job, TIMEOUT_S, MEMORY_BYTES)
-    if isinstance(differences, JobFailure):
-        what = f"not compared within the limits ({differences.reason.rstrip('.')})"
-        return (PageDifference(0, what, True),)
-    return differences
+    if not isinstance(differences, JobFailure):
+        return differences
+    reason = differences.reason.rstrip(".")
+    return (PageDifference(0, f"the pages were not compared within the limits ({reason})", True),)
 
 
 def _compare_pdfs(job: tuple[bytes, bytes, TextComparison]) -> tuple[PageDifference, ...]:
@@ -141,99 +146,103 @@ def _compare_pdfs(job: tuple[bytes, bytes, TextComparison]) -> tuple[PageDiffere
     try:
         with pypdf.apply_configuration(**PYPDF_LIMITS):
             submitted_pdf, redrawn_pdf = map(open_strictly, (submitted, redrawn))
-            walk = _Walk(is_same_text)
-            differences = [PageDifference(0, what, True) for what in _ambiguities(submitted)]
-            differences += islice(
-                walk.differences(submitted_pdf, redrawn_pdf), MAX_LISTED_DIFFERENCES
-            )
+            found = _PdfComparison(is_same_text).differences(submitted_pdf, redrawn_pdf)
+            differences = [
+                *(PageDifference(0, ambiguity, True) for ambiguity in _ambiguities(submitted)),
+                *islice(found, MAX_LISTED_DIFFERENCES),
+            ]
             producer = (submitted_pdf.metadata or DictionaryObject()).get("/Producer")
             if producer is not None and any(difference.is_structural for difference in differences):
-                what = f"another program wrote this file ({one_line(str(producer), 60)})"
-                differences.insert(0, PageDifference(0, what, True))
+                program = one_line(str(producer), 60)
+                description = f"another program wrote this file ({program})"
+                differences.insert(0, PageDifference(0, description, True))
             return tuple(differences)
     except (LimitReachedError, RecursionError, SyntaxError, *BROKEN_PDF_ERRORS) as error:
-        what = f"cannot be read ({type(error).__name__})"
-        return (PageDifference(0, what, True),)
+        reason = f"the PDF cannot be read ({type(error).__name__})"
+        return (PageDifference(0, reason, True),)
 
 
 @dataclass
-class _Walk:
+class _PdfComparison:
     """Pairwise comparison of all objects of two PDFs.
 
     Attributes
     ----------
     compared : set of tuple
-        Compared pairs: object number and generation in the submitted file, number in the redrawn.
+        Compared pairs: object number and generation in the submitted PDF, and object number in the
+        redrawn one.
     parents : list of tuple
-        Parents of pages, which are compared after the catalogue.
+        Parents of pages, which are compared after the document catalogue.
     fonts : mapping
-        Fonts of the current page, by their names in the content of the page.
+        Fonts of the current page, by their names in the page content.
+    value_count : int
+        Number of compared values; limited, because a malicious PDF may contain very many.
     """
 
     is_same_text: TextComparison
     compared: set[tuple[int, int, int]] = field(default_factory=set)
     parents: list[tuple[Any, Any, str]] = field(default_factory=list)
     fonts: Mapping[str, Any] = field(default_factory=dict)
-    steps: int = 0
+    value_count: int = 0
 
     def differences(
         self, submitted: pypdf.PdfReader, redrawn: pypdf.PdfReader
     ) -> Iterator[PageDifference]:
         """Yield the differences of pages, document information and catalogue."""
         pages = [_page_references(reader) for reader in (submitted, redrawn)]
-        for number, (one, other) in enumerate(zip_longest(*pages), start=1):
-            if one is None or other is None:
-                what = "missing" if one is None else f"px4fuse draws only {len(pages[1])} pages"
-                yield PageDifference(number, what)
+        for number, (page, expected) in enumerate(zip_longest(*pages), start=1):
+            if page is None or expected is None:
+                excess = f"px4fuse draws only {len(pages[1])} pages"
+                yield PageDifference(number, "the page is missing" if page is None else excess)
                 return
-            self.fonts = _resolved(other.get_object()["/Resources"].get("/Font", {}))
-            yield from self._compare(one, other, "/Page", number)
+            self.fonts = resolve_reference(expected.get_object()["/Resources"].get("/Font", {}))
+            yield from self._compare(page, expected, "/Page", number)
         for key in ("/Info", "/Root"):
-            one, other = (dict.get(reader.trailer, key) for reader in (submitted, redrawn))
-            yield from self._compare(one, other, key, 0)
-        for one, other, key in self.parents:
-            yield from self._compare(one, other, key, 0)
-        if "/XRefStm" in submitted.trailer:  # programs differ in the table that they use
-            yield PageDifference(0, "a second table of objects", True)
+            value, expected = (dict.get(reader.trailer, key) for reader in (submitted, redrawn))
+            yield from self._compare(value, expected, key, 0)
+        for parents in self.parents:
+            yield from self._compare(*parents, 0)
+        # programs that support PDF 1.4 and PDF 1.5 read different cross-reference tables
+        if "/XRefStm" in submitted.trailer:
+            yield PageDifference(0, "the file has a second table of objects", True)
 
     def _compare(
         self, submitted: Any, redrawn: Any, key: str, page: int
     ) -> Iterator[PageDifference]:
-        """Yield the differences of two values and of all that they contain."""
+        """Yield the differences of two PDF values and of all values that they contain."""
         remaining = [(submitted, redrawn, key)]
         while remaining:
             submitted, redrawn, key = remaining.pop()
-            self.steps += 1
-            if self.steps > MAX_VALUES:
-                raise LimitReachedError("too many values")
-            if (
-                isinstance(submitted, IndirectObject) and submitted.generation
-            ):  # some programs ignore the generation
-                yield PageDifference(page, f"{key}: an object of a later generation", True)
-            if isinstance(submitted, IndirectObject) and isinstance(redrawn, IndirectObject):
-                pair = submitted.idnum, submitted.generation, redrawn.idnum
-                if pair in self.compared:
-                    continue
-                self.compared.add(pair)
-            submitted, redrawn = _resolved(submitted), _resolved(redrawn)
+            self.value_count += 1
+            if self.value_count > MAX_VALUES:
+                raise LimitReachedError("the PDF has too many values")
+            if isinstance(submitted, IndirectObject):
+                if submitted.generation:  # some programs ignore the generation
+                    yield PageDifference(
+                        page, f"the PDF entry {key} is an object of a later generation", True
+                    )
+                if isinstance(redrawn, IndirectObject):
+                    pair = submitted.idnum, submitted.generation, redrawn.idnum
+                    if pair in self.compared:
+                        continue
+                    self.compared.add(pair)
+            submitted, redrawn = map(resolve_reference, (submitted, redrawn))
             if _kind(submitted) is not _kind(redrawn):
-                yield PageDifference(page, f"{key} is of another type", True)
+                yield PageDifference(page, f"the PDF entry {key} is of another type", True)
             elif isinstance(redrawn, DictionaryObject):
                 yield from self._dictionaries(submitted, redrawn, key, page, remaining)
             elif isinstance(redrawn, ArrayObject):
                 if len(submitted) != len(redrawn):
-                    what = f"{key} has {len(submitted)} parts; px4fuse writes {len(redrawn)}"
-                    yield PageDifference(page, what, True)
+                    expected = f"px4fuse writes {len(redrawn)}"
+                    description = f"the array {key} has {len(submitted)} elements; {expected}"
+                    yield PageDifference(page, description, True)
                     continue
-                pairs = zip(list.__iter__(submitted), list.__iter__(redrawn), strict=True)
-                remaining += [(one, other, key) for one, other in pairs][::-1]
+                pairs = zip(*map(list.__iter__, (submitted, redrawn)), strict=True)
+                remaining += [(*pair, key) for pair in pairs][::-1]
             elif not self._is_same_value(submitted, redrawn):
-                submitted_text, redrawn_text = (
-                    one_line(str(each), 60) for each in (submitted, redrawn)
-                )
-                yield PageDifference(
-                    page, f"{key} is {submitted_text!r}; px4fuse writes {redrawn_text!r}"
-                )
+                texts = [one_line(str(value), 60) for value in (submitted, redrawn)]
+                description = f"the PDF entry {key} is {texts[0]!r}; px4fuse writes {texts[1]!r}"
+                yield PageDifference(page, description)
 
     def _dictionaries(
         self,
@@ -243,12 +252,14 @@ class _Walk:
         page: int,
         remaining: list[tuple[Any, Any, str]],
     ) -> Iterator[PageDifference]:
-        """Yield the differences of keys and streams; add the values to ``remaining``."""
-        submitted_keys, redrawn_keys = (_keys(each, key) for each in (submitted, redrawn))
+        """Yield different keys and streams of PDF dictionaries; ``remaining`` gets the values."""
+        submitted_keys, redrawn_keys = _keys(submitted, key), _keys(redrawn, key)
         for name in sorted(submitted_keys ^ redrawn_keys):
-            part_name = _PART_NAMES.get(name, f"an entry {one_line(name, 40)}")
-            what = "that px4fuse does not write" if name in submitted_keys else "is missing"
-            yield PageDifference(page, f"{part_name} {what}", True)
+            feature = _FEATURE_NAMES.get(name, f"an entry {one_line(name, 40)}")
+            description = f"{feature} is missing"
+            if name in submitted_keys:
+                description = f"{feature} that px4fuse does not write"
+            yield PageDifference(page, description, True)
         for name in sorted(submitted_keys & redrawn_keys, reverse=True):
             pair = submitted.raw_get(name), redrawn.raw_get(name), name
             (self.parents if page and name == "/Parent" else remaining).append(pair)
@@ -260,128 +271,114 @@ class _Walk:
             return math.isclose(
                 submitted, redrawn, rel_tol=NUMBER_TOLERANCE, abs_tol=NUMBER_TOLERANCE
             )
-        if (
-            _kind(redrawn) is str
-            and _TYPST_VERSION.fullmatch(str(submitted))
-            and _TYPST_VERSION.fullmatch(str(redrawn))
-        ):
+        if _kind(redrawn) is not str:
+            return bool(submitted == redrawn)
+        texts = [
+            str(value) if isinstance(value, str) else value.decode("latin-1")
+            for value in (submitted, redrawn)
+        ]
+        if texts[0] == texts[1] or all(map(_TYPST_VERSION.fullmatch, texts)):
             return True
-        if _kind(redrawn) is str:
-            one, other = (
-                str(each) if isinstance(each, str) else each.decode("latin-1")
-                for each in (submitted, redrawn)
-            )
-            return one == other or self.is_same_text(one, other)
-        return bool(submitted == redrawn)
+        return self.is_same_text(*texts)
 
     def _streams(
         self, submitted: StreamObject, redrawn: StreamObject, key: str, page: int
     ) -> Iterator[PageDifference]:
         kind = redrawn.get("/Type")
-        if kind == "/EmbeddedFile":  # results.json, which intake has read
+        if kind == "/EmbeddedFile":  # the attached results, which are compared as numbers
             return
-        filters = _resolved(submitted.get("/Filter"))
+        filters = resolve_reference(submitted.get("/Filter"))
         if filters not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf does not decode JPEG
-            yield PageDifference(page, f"{key} has another compression", True)
+            yield PageDifference(page, f"the PDF entry {key} has another compression", True)
             return
-        one, other = submitted.get_data(), redrawn.get_data()
-        if one == other or (kind == "/Metadata" and _xmp(one) == _xmp(other)):
+        data, redrawn_data = submitted.get_data(), redrawn.get_data()
+        if data == redrawn_data or (kind == "/Metadata" and _xmp(data) == _xmp(redrawn_data)):
             return
-        if (key != "/Contents" and kind != "/Pattern") or len(one) > MAX_LENGTH_RATIO * len(other):
-            yield PageDifference(page, f"{key}: the content differs from px4fuse's")
-        elif what := self._describe_operation_difference(one, other):
-            yield PageDifference(page, what)
+        is_drawing = key == "/Contents" or kind == "/Pattern"
+        if not is_drawing or len(data) > MAX_LENGTH_RATIO * len(redrawn_data):
+            yield PageDifference(page, f"the content of {key} differs from the redrawn report")
+        elif description := self._describe_operation_difference(data, redrawn_data):
+            yield PageDifference(page, description)
 
     def _describe_operation_difference(self, submitted: bytes, redrawn: bytes) -> str:
-        """Describe the first drawing operation that differs; "" if there is none."""
-        operation_lists = [_operations(each) for each in (submitted, redrawn)]
+        """Describe the first drawing operation of a page that differs; "" if there is none."""
+        operation_lists = map(_operations, (submitted, redrawn))
         font = ""
         for number, pair in enumerate(zip_longest(*operation_lists, fillvalue=("", ())), start=1):
-            (submitted_operator, submitted_operands), (redrawn_operator, redrawn_operands) = pair
-            if redrawn_operator == "Tf":
+            (submitted_operator, submitted_operands), (operator, redrawn_operands) = pair
+            if operator == "Tf":
                 font = str(redrawn_operands[0])
             if pair[0] == pair[1] or (
-                submitted_operator == redrawn_operator
-                and _has_near_operands(submitted_operator, submitted_operands, redrawn_operands)
+                submitted_operator == operator
+                and _has_near_operands(operator, submitted_operands, redrawn_operands)
             ):
                 continue
-            if {submitted_operator, redrawn_operator} <= _TEXT_OPERATORS:
-                texts = [
-                    self._text(operands, font)
-                    for operands in (submitted_operands, redrawn_operands)
-                ]
-                max_kerning = max(
-                    (abs(each) for each in submitted_operands if isinstance(each, float)),
-                    default=0.0,
-                )
-                if texts[0] != texts[1] and max_kerning < MAX_KERNING and self.is_same_text(*texts):
+            if {submitted_operator, operator} <= _TEXT_OPERATORS:
+                texts = [self._text(operands, font) for _, operands in pair]
+                kerning = [abs(value) for value in submitted_operands if isinstance(value, float)]
+                is_narrow = max(kerning, default=0.0) < MAX_KERNING
+                if texts[0] != texts[1] and is_narrow and self.is_same_text(*texts):
                     continue
-                shortened_texts = [one_line(text, 60) for text in texts]
-                return f"text {shortened_texts[0]!r}; px4fuse prints {shortened_texts[1]!r}"
-            expected = one_line(redrawn_operator, 9)
-            return f"drawing operation {number} differs from px4fuse's ({expected})"
+                submitted_text, redrawn_text = (one_line(text, 60) for text in texts)
+                return f"the text is {submitted_text!r}; px4fuse prints {redrawn_text!r}"
+            expected = one_line(operator, 9)
+            return f"drawing operation {number} differs from px4fuse's operation {expected}"
         return ""
 
     def _text(self, operands: tuple[Operand, ...], font: str) -> str:
-        """Decode the text of Tj or TJ with the font's ToUnicode map; ? for unknown glyphs."""
+        """Decode the text of a Tj or TJ operation with the font's ToUnicode map; ? if unknown."""
         cmap = self.fonts[font].get_object()["/ToUnicode"].get_data().decode("latin-1")
         letters = {
             int(glyph, 16): bytes.fromhex(text) for glyph, text in _TO_UNICODE_ENTRY.findall(cmap)
         }
-        glyphs = b"".join(each for each in operands if isinstance(each, bytes))
+        glyphs = b"".join(operand for operand in operands if isinstance(operand, bytes))
         numbers = struct.unpack(f">{len(glyphs) // 2}H", glyphs[: len(glyphs) // 2 * 2])
-        return b"".join(letters.get(each, b"\0?") for each in numbers).decode(
-            "utf-16-be", "replace"
-        )
+        text = b"".join(letters.get(number, b"\0?") for number in numbers)
+        return text.decode("utf-16-be", "replace")
 
 
 def _ambiguities(pdf: bytes) -> Iterator[str]:
-    """Yield structures of the PDF in which different programs may read different objects."""
+    """Describe structures of a PDF that make different programs read different objects."""
     end = _END_OF_FILE.search(pdf[-1024:])
     if end is None:
-        yield "bytes after its end"
+        yield "the file has bytes after its end"
     elif b"/Linearized" in pdf[:1024]:
         # the end of the file must refer to the first cross-reference table
         begin = pdf.find(b"endobj") + len(b"endobj")
         if pdf[begin : int(end[1])].strip():
-            yield "a second table of objects"
+            yield "the file has a second table of objects"
 
 
 def _page_references(reader: pypdf.PdfReader) -> list[Any]:
     """Return references to the pages of a page tree with one level, as px4fuse writes it."""
     tree: Any = reader.root_object["/Pages"]
-    return list(list.__iter__(tree["/Kids"]))
-
-
-def _resolved(value: Any) -> Any:
-    return value.get_object() if isinstance(value, IndirectObject) else value
+    return [*list.__iter__(tree["/Kids"])]
 
 
 def _kind(value: Any) -> type:
-    """Return the type of a PDF value; a name is not a string, a stream not a dictionary."""
-    kinds = StreamObject, DictionaryObject, ArrayObject, NameObject
+    """Return the type of a PDF value: a name is not a string, a stream is not a dictionary."""
     if isinstance(value, TextStringObject | ByteStringObject):
         return str
     if isinstance(value, int | float):
         return float
-    return next((kind for kind in kinds if isinstance(value, kind)), type(value))
+    types = StreamObject, DictionaryObject, ArrayObject, NameObject
+    return next((each for each in types if isinstance(value, each)), type(value))
 
 
 def _keys(value: DictionaryObject, key: str) -> set[str]:
-    """Return the keys of a dictionary that are compared; a null counts as absent."""
-    ignored_keys = set(_COMPRESSION_KEYS) if isinstance(value, StreamObject) else set()
-    ignored_keys |= _WRITER_KEYS if key == "/Info" else set()
-    ignored_keys |= {"/Params"} if value.get("/Type") == "/EmbeddedFile" else set()
-    return {
-        each for each in value if not isinstance(value.raw_get(each), NullObject)
-    } - ignored_keys
+    """Return the keys of a PDF dictionary that are compared; a null value is ignored."""
+    keys = {name for name in value if not isinstance(value.raw_get(name), NullObject)}
+    if isinstance(value, StreamObject):
+        keys -= _COMPRESSION_KEYS
+    if key == "/Info":
+        keys -= _WRITER_KEYS
+    return keys - {"/Params"} if value.get("/Type") == "/EmbeddedFile" else keys
 
 
 def _xmp(data: bytes) -> str:
     """Return XMP metadata in canonical form, without fields that other programs change."""
-    if (
-        len(data) > MAX_XMP_BYTES or b"<!" in data
-    ):  # document types may contain entities that expand
+    # an XML document type ("<!") may contain entities that expand to huge texts
+    if len(data) > MAX_XMP_BYTES or b"<!" in data:
         return data.decode("latin-1")
     packet = re.sub(r"<\?.*?\?>", "", data.decode("utf-8", "replace"))
     canonical_text = ElementTree.canonicalize(packet.strip(), strip_text=True)
@@ -389,7 +386,7 @@ def _xmp(data: bytes) -> str:
 
 
 def _operations(content: bytes) -> Iterator[Operation]:
-    """Parse page content: yield each operator with its operands."""
+    """Parse the content of a PDF page; yield each drawing operator with its operands."""
     operands: list[Operand] = []
     for match in _TOKEN.finditer(content.decode("latin-1")):
         literal, digits, token = match.groups("")
@@ -422,18 +419,15 @@ def _has_near_operands(
     operator: str, submitted: Sequence[Operand], redrawn: Sequence[Operand]
 ) -> bool:
     """Return True if operands are equal, coordinates within COORDINATE_TOLERANCE_PT."""
+    if len(submitted) != len(redrawn):
+        return False
     first = _FIRST_COORDINATE.get(operator, len(redrawn))
-    return len(submitted) == len(redrawn) and all(
-        one == other
-        or (
-            isinstance(one, float)
-            and isinstance(other, float)
-            and math.isclose(
-                one,
-                other,
-                rel_tol=NUMBER_TOLERANCE,
-                abs_tol=COORDINATE_TOLERANCE_PT if at >= first else NUMBER_TOLERANCE,
-            )
-        )
-        for at, (one, other) in enumerate(zip(submitted, redrawn, strict=True))
-    )
+    for index, (operand, expected) in enumerate(zip(submitted, redrawn, strict=True)):
+        tolerance = COORDINATE_TOLERANCE_PT if index >= first else NUMBER_TOLERANCE
+        if operand != expected and not (
+            isinstance(operand, float)
+            and isinstance(expected, float)
+            and math.isclose(operand, expected, rel_tol=NUMBER_TOLERANCE, abs_tol=tolerance)
+        ):
+            return False
+    return True

@@ -1,12 +1,12 @@
 """Reading of the results from submitted PDFs, which may be malicious.
 
-Nothing in the file is executed, no link is followed, and nothing is written to disk. This module
-checks sizes before pypdf reads the file, and sets the limits of pypdf. :mod:`px4fuse.workers`
+Nothing in the PDF is executed, no link is followed, and nothing is written to disk. This module
+checks sizes before pypdf reads the PDF, and sets the limits of pypdf. :mod:`px4fuse.workers`
 limits time and memory.
 
 Only the attached results are read. The pages are counted but not read, because px4fuse draws the
-report again. A file that another program saved again is therefore accepted if the results are still
-attached.
+report again. A PDF that another program saved again is therefore accepted if it still contains the
+attached results.
 """
 
 import io
@@ -29,32 +29,32 @@ from px4fuse.verification.model import BAD_VALUES
 
 MAX_BYTES = 25_000_000
 MAX_PAGES = 100
-# maximum bytes of one inflated stream, and of all inflated streams
+# Maximum size (bytes) of one inflated PDF stream, and of all inflated streams together
 MAX_CONTENT_BYTES = 20_000_000
 MAX_DOCUMENT_BYTES = 100_000_000
 MAX_OBJECTS = 20_000
 MAX_VALUES = 1_000_000
-# maximum number of references to missing objects; pypdf would search the whole file for each
+# Maximum number of references to missing PDF objects: pypdf searches the whole file for each
 MAX_MISSING_OBJECTS = 100
 
 _DAMAGED_REASON = "the PDF is damaged. Hand in the file that px4fuse wrote."
 _ENCRYPTED_REASON = "the PDF is encrypted. Hand in the file that px4fuse wrote."
 _COSTLY_REASON = "reading the PDF needs more memory or time than reading a report."
 
-# errors of pypdf for damaged files; AttributeError occurred in a test of 900 files with changed
-# bytes. Other errors are errors of px4fuse and are not caught
+# Exceptions that pypdf raises for damaged PDFs; AttributeError occurred in a test of 900 PDFs with
+# changed bytes. Other exceptions are errors of px4fuse and are not caught
 BROKEN_PDF_ERRORS = (*BAD_VALUES, PyPdfError, AttributeError, zlib.error)
 
-# keys of dictionaries with active content. Links, comments, forms without scripts and the initial
-# view are allowed, because programs add them when they save a report
+# Keys of PDF dictionaries with active content. Links, comments, forms without scripts and the
+# initial view are allowed, because programs add them when they save a PDF
 _ACTIVE_KEYS = re.compile("/(JS|JavaScript|XFA|RichMediaContent|RichMediaSettings|Collection|RF)")
-# types of actions with active content
+# Types of PDF actions that run programs or open other files and addresses
 _ACTIVE_ACTIONS = re.compile(
     "/(JavaScript|Launch|SubmitForm|ImportData|GoToR|GoToE|Rendition|RichMediaExecute|Movie|Sound)"
 )
 
-# limits of pypdf, stricter than its defaults: px4fuse's reports need no recovery of broken streams,
-# no filters except Flate, no chains of filters and no external JBIG2 decoder
+# Limits of pypdf, stricter than its defaults: reports of px4fuse need no recovery of broken
+# streams, no filters except Flate, no chains of filters and no external JBIG2 decoder
 PYPDF_LIMITS: dict[str, Any] = {
     "maximum_declared_stream_length": MAX_BYTES,
     "array_based_stream_maximum_output_length": MAX_CONTENT_BYTES,
@@ -71,46 +71,40 @@ PYPDF_LIMITS: dict[str, Any] = {
     "page_tree_maximum_page_entries": 100 * MAX_PAGES,
 }
 
-# filters of streams that _check_file can test for decompression bombs
+# PDF stream filters that _check_file can test for decompression bombs
 _ALLOWED_FILTERS = frozenset(("/FlateDecode", "/DCTDecode"))
 
 _STREAM = re.compile(rb"(?<!end)stream *\r?\n?")
 
 
-# pypdf must not print warnings about damaged files on the terminal
+# pypdf must not print warnings about damaged PDFs on the terminal
 logging.getLogger("pypdf").setLevel(logging.CRITICAL + 1)
 
 
 def read_report(pdf: bytes, name: str) -> ReportedResults:
-    """Read the results of a report that was handed in; ``name`` names the file in errors.
-
-    Returns
-    -------
-    ComparisonResults or LoopResults
+    """Read the compare or loop results of a submitted report; errors contain the file ``name``.
 
     Raises
     ------
     ResultsError
-        As :func:`attached_results`, or the results contain only EKF2 aids.
+        The PDF is not a report, or the results contain only the EKF2 aiding sources.
     """
     results = attached_results(pdf, name)
-    if not isinstance(results, ReportedResults):
-        content = "no results of compare or loop"
-        if isinstance(results, AidsResults):
-            content = "only EKF2 aids, no KF results"
-        raise ResultsError(
-            f"{one_line(name, 200)}: the attached {RESULTS_NAME} contains {content}."
-        )
-    return results
+    if isinstance(results, ReportedResults):
+        return results
+    reason = f"the attached {RESULTS_NAME} contains no results of compare or loop"
+    if isinstance(results, AidsResults):
+        reason = f"the attached {RESULTS_NAME} contains only EKF2 aids, no KF results"
+    raise ResultsError(f"{one_line(name, 200)}: {reason}.")
 
 
 def attached_results(pdf: bytes, name: str) -> Results:
-    """Read the results attached to a PDF; control characters are removed from strings.
+    """Read the results attached to a report PDF; control characters are removed from texts.
 
     Raises
     ------
     ResultsError
-        The PDF is not a report of px4fuse, or is damaged or too large.
+        The PDF is not a report of px4fuse, is damaged or too large.
     """
     remedy = ""
     try:
@@ -134,27 +128,30 @@ def attached_results(pdf: bytes, name: str) -> Results:
 
 
 def open_strictly(pdf: bytes) -> pypdf.PdfReader:
-    """Open a PDF without repair of damaged parts, because programs repair them differently."""
-    return pypdf.PdfReader(
-        io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=10 * MAX_OBJECTS
-    )
+    """Open a PDF without repair of damage, which programs repair differently."""
+    max_entries = 10 * MAX_OBJECTS
+    return pypdf.PdfReader(io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=max_entries)
 
 
 def _check_file(pdf: bytes) -> None:
     for has_problem, reason in (
         (
             len(pdf) > MAX_BYTES,
-            f"larger than {MAX_BYTES // 1_000_000} MB; reports are smaller than 2 MB.",
+            f"the file is larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB.",
         ),
-        (not pdf.startswith(b"%PDF-"), "not a PDF. Hand in the file that px4fuse wrote."),
+        (
+            not pdf.startswith(b"%PDF-"),
+            "the file is not a PDF. Hand in the file that px4fuse wrote.",
+        ),
         (b"%%EOF" not in pdf[-2048:], "the end of the PDF is missing. Hand it in again."),
     ):
         if has_problem:
             raise ResultsError(reason)
-    # inflate every stream and discard the data, so that no decompression bomb reaches pypdf
+    # every stream is inflated and discarded here, so that no decompression bomb reaches pypdf
     remaining_bytes = MAX_DOCUMENT_BYTES
     for match in _STREAM.finditer(pdf):
-        # the keyword may occur inside a stream, so each occurrence counts towards the limit
+        # data of a stream may contain the word "stream", so each occurrence counts towards the
+        # limit
         inflated_bytes = _inflated_bytes(pdf, match.end(), min(remaining_bytes, MAX_CONTENT_BYTES))
         remaining_bytes -= inflated_bytes
         if inflated_bytes > MAX_CONTENT_BYTES or remaining_bytes < 0:
@@ -165,9 +162,9 @@ def _check_file(pdf: bytes) -> None:
 
 
 def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
-    """Return the bytes of the zlib data at ``start``, compressed or inflated, whichever is more.
+    """Return the larger size (bytes) of the zlib data at ``start``: compressed or inflated.
 
-    The result is at least 1000 and at most ``limit`` + 1; it is 0 for data that are not zlib data.
+    The result is 0 without zlib data, otherwise at least 1000 and at most ``limit`` + 1.
     """
     header = pdf[start : start + 2]
     if len(header) < 2 or header[0] & 15 != zlib.DEFLATED or int.from_bytes(header) % 31:
@@ -185,12 +182,12 @@ def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
         except zlib.error:  # pypdf rejects this stream, because repair is disabled
             break
     input_bytes -= len(inflate.unused_data)
-    # the minimum is the cost of starting to inflate
+    # starting to inflate costs as much as 1000 bytes
     return min(max(input_bytes, output_bytes, 1000), limit + 1)
 
 
 def _dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, bool]]:
-    """Yield all dictionaries that a viewer can reach, each once, without decoding streams.
+    """Yield all PDF dictionaries that a viewer can reach, each once, without decoding streams.
 
     The flag is True if a viewer reaches the dictionary only by a click on a link or bookmark.
     """
@@ -204,7 +201,7 @@ def _dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, b
             if (value, needs_click) in visited:
                 continue
             visited.add((value, needs_click))
-            # pypdf reads objects in the cross-reference table without searching the file
+            # pypdf searches the whole file for objects that the cross-reference table does not list
             number, generation = value.idnum, value.generation
             is_packed = generation == 0 and number in reader.xref_objStm
             is_listed = is_packed or number in reader.xref.get(generation, {})
@@ -223,7 +220,7 @@ def _dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, b
 
 
 def _foreign_features(value: DictionaryObject, needs_click: bool) -> Iterator[str]:
-    """Yield the features of a dictionary that reports do not have."""
+    """Yield the features of a PDF dictionary that reports of px4fuse do not have."""
     yield from (key[1:] for key in value if _ACTIVE_KEYS.fullmatch(key))
     action, kind = _name(value.get("/S")) or "", _name(value.get("/Type"))
     if _ACTIVE_ACTIONS.fullmatch(action):
@@ -234,39 +231,38 @@ def _foreign_features(value: DictionaryObject, needs_click: bool) -> Iterator[st
     if ("/EF" not in value and kind in {"/Filespec", "/F"}) or (is_stream and "/F" in value):
         yield "a reference to another file"
     if is_stream:
-        filters = _resolve(value.get("/Filter"))
-        names = list(filters) if isinstance(filters, ArrayObject) else [filters]
-        used_names = [_name(each) for each in names if each is not None]
-        if not _ALLOWED_FILTERS.issuperset(used_names) or len(set(used_names)) != len(used_names):
-            filter_names = " ".join(each or "?" for each in used_names[:3])
+        filters = resolve_reference(value.get("/Filter"))
+        filters = filters if isinstance(filters, ArrayObject) else [filters]
+        names = [_name(each) for each in filters if each is not None]
+        if not _ALLOWED_FILTERS.issuperset(names) or len(set(names)) != len(names):
+            filter_names = " ".join(name or "?" for name in names[:3])
             yield f"a stream with other compression ({one_line(filter_names, 60)})"
 
 
-def _resolve(value: object) -> object:
+def resolve_reference(value: Any) -> Any:
+    """Return the object to which a PDF reference points; other values are returned unchanged."""
     return value.get_object() if isinstance(value, IndirectObject) else value
 
 
 def _name(value: object) -> str | None:
-    value = _resolve(value)
+    value = resolve_reference(value)
     return str(value) if isinstance(value, str) else None
 
 
 def _attachment(reader: pypdf.PdfReader) -> bytes:
-    """Return the content of the attached file; a report has one, with the name RESULTS_NAME."""
+    """Return the content of the file attached to a report: one file with the name RESULTS_NAME."""
     files: list[DictionaryObject] = []
     streams: dict[int, StreamObject] = {}
     features: set[str] = set()
     for value, needs_click in _dictionaries(reader):
         features.update(_foreign_features(value, needs_click))
-        candidates: list[object] = [value] if _name(value.get("/Type")) == "/EmbeddedFile" else []
+        contents: list[object] = [value] if _name(value.get("/Type")) == "/EmbeddedFile" else []
         if "/EF" in value:
             files.append(value)
-            versions = _resolve(value.get("/EF"))
-            candidates += versions.values() if isinstance(versions, DictionaryObject) else ()
-        objects = map(_resolve, candidates)
-        streams |= {
-            id(candidate): candidate for candidate in objects if isinstance(candidate, StreamObject)
-        }
+            versions = resolve_reference(value.get("/EF"))
+            contents += versions.values() if isinstance(versions, DictionaryObject) else ()
+        objects = map(resolve_reference, contents)
+        streams |= {id(each): each for each in objects if isinstance(each, StreamObject)}
     if features:
         raise ResultsError(f"the PDF contains {', '.join(sorted(features))}, unlike a report.")
     if not files and not streams:
@@ -279,16 +275,13 @@ def _attachment(reader: pypdf.PdfReader) -> bytes:
             "The PDF has several attachments, or an unreadable one. Hand in one report per PDF."
         )
     (file,), (stream,) = files, streams.values()
-    names = {
-        str(_resolve(file.get(key)))
-        for key in ("/UF", "/F", "/DOS", "/Mac", "/Unix")
-        if key in file
-    }
+    keys = {"/UF", "/F", "/DOS", "/Mac", "/Unix"} & file.keys()
+    names = {str(resolve_reference(file.get(key))) for key in keys}
     if names != {RESULTS_NAME}:
         name_text = one_line(" / ".join(sorted(names)), 80)
         raise ResultsError(f"the name of the attached file is {name_text!r}, not {RESULTS_NAME!r}.")
     data = bytes(stream.get_data())
     if len(data) > MAX_ATTACHMENT_BYTES:
-        limit = MAX_ATTACHMENT_BYTES // 1_000_000
-        raise ResultsError(f"the attached {RESULTS_NAME} is larger than {limit} MB.")
+        limit_mb = MAX_ATTACHMENT_BYTES // 1_000_000
+        raise ResultsError(f"the attached {RESULTS_NAME} is larger than {limit_mb} MB.")
     return data

@@ -1,21 +1,20 @@
 """Verification: repeat the analysis of a report on its log, and compare numbers and pages.
 
 The recorded command is run again on the log, which is found by its SHA-256, and the results are
-compared with the attached ones. This confirms that the numbers follow from the log. It does not
-confirm the author: each person with the log can make the same report under another name.
+compared with those attached to the PDF. This confirms that the numbers follow from the log. It does
+not confirm the author: each person with the log can make the same report under another name.
 
-The report is drawn again from the new results, and the handed-in PDF is compared with it
-(:mod:`px4fuse.verification.pages`). No number is read from the handed-in pages.
+The report is drawn again from the new results, and the submitted PDF is compared with it
+(:mod:`px4fuse.verification.pages`). No number is read from the submitted pages.
 
-The recorded request is not trusted: it is decoded strictly, all values are checked for their
-ranges, files are found by SHA-256 and never by name, and it cannot name an output file.
+The recorded request may be forged: it is decoded strictly, all values are checked for their ranges,
+files are found by SHA-256 and never by name, and it cannot name an output file.
 """
 
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -36,22 +35,23 @@ from px4fuse.results.reading import clean_text, one_line
 from px4fuse.verification.model import Mismatch, PageStatus, Status, Verdict
 from px4fuse.verification.pages import TextComparison, compare_pages
 
-ADD_LOGS_ADVICE = "Add {} to --logs."
 ASK_ADVICE = "Ask how the report was made, and for its log and all other input files."
 FOREIGN_REQUEST_REASON = "the recorded command was not written by px4fuse"
-# minimum DT (s) of a report: ten minutes of flight then have 60,000 steps, which take half a minute
+# Minimum KF prediction step DT (s) of a report: for ten minutes of flight, 60,000 steps take half a
+# minute
 MIN_DT_S = 0.01
 ORIGINAL_PDF_ADVICE = "Ask for the PDF that px4fuse wrote."
 LIMIT_NOTE = (
     "Verification confirms that the numbers follow from the log. It does not confirm the author."
 )
 NO_LOG_REASON = "no log was given, so the analysis could not be repeated"
-# Tolerance for another processor. Sums over a flight differ in the last few of 16 digits, and
-# differences of sums in the last 8. Four OpenBLAS kernels differ by at most 3e-8 (six flights)
+# Relative and absolute tolerance of equal numbers. On another processor, sums over a flight differ
+# in the last few of 16 digits, and differences of sums in the last 8. Four OpenBLAS kernels differ
+# by at most 3e-8 (six flights)
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-6, 1e-9
-# Tolerance of estimates at a minimum of a likelihood or cost. Minima are flat: if a likelihood or
-# cost differs in its 12th digit, its minimum differs in the 6th, and the ends of its interval in
-# the 4th digit. Pages print up to three digits
+# Relative and absolute tolerance of estimates, which minimise a likelihood or cost. Minima are
+# flat: if the cost differs in its 12th digit, the estimate differs in the 6th digit, and the ends
+# of its 95 % interval in the 4th. Pages print up to three digits
 ESTIMATE_RELATIVE_TOLERANCE, ESTIMATE_ABSOLUTE_TOLERANCE = 1e-3, 1e-5
 ESTIMATE_PATHS = (
     "tuning",
@@ -66,54 +66,45 @@ ESTIMATE_PATHS = (
     "source.alignment",
     "settings.clock_offset_s",
 )
-# field with the number of solver iterations, and accepted difference
+# Results field with the number of solver iterations, and maximum difference of equal numbers
 ITERATIONS_FIELD, MAX_MORE_ITERATIONS = "iterations", 2
-# fields that are not compared, because they describe the computer of the report
+# Results fields that are not compared, because they describe the computer that made the report
 MACHINE_PATHS = ("provenance.python", "provenance.libraries")
 MAX_DIFFERENCES = 20
 MAX_LISTED_PAGES = 5
 MAX_TEXT_LENGTH = 120
-# factors between a result and the printed number: 1, per cent, thousandths
+# Factors between a result and its printed number: 1, per cent, thousandths (mm, ms)
 PRINTED_SCALES = (1.0, 100.0, 1000.0)
-# maximum lines of a student's notes in a report that is drawn again; a page has about 60 lines
+# Maximum number of lines of a student's notes in a report that px4fuse draws again: a page has 60
 MAX_NOTES_LINES = 5_000
 _NUMBER = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
-# new results, and a function that draws the report with the recorded student and versions
+# Results of the new run, and a function that draws their report with the recorded student
 Recomputed = tuple[ReportedResults, Callable[[], bytes]]
 _LinkFile = Callable[[str, str | None, str], str]
 
 
 class NotRepeatableError(Exception):
-    """Reason why an analysis cannot be repeated: arguments of :func:`cannot_verify`."""
+    """Analysis of a report that cannot be repeated; arguments: reason, remedy, missing file."""
 
 
 def log_sha256(results: ReportedResults) -> str:
-    """Return the SHA-256 of the log of a report."""
+    """Return the SHA-256 of the log that a report analyses."""
     return results.track.sha256 if isinstance(results, LoopResults) else results.log.sha256
 
 
 def log_name(results: ReportedResults) -> str:
-    """Return the name of the log of a report, as recorded."""
-    loop = isinstance(results, LoopResults)
-    return split_track(results.track.name)[0] if loop else results.log.name  # type: ignore[union-attr]
+    """Return the file name of the log that a report analyses."""
+    if isinstance(results, LoopResults):
+        return split_track(results.track.name)[0]
+    return results.log.name
 
 
 def recompute(results: ReportedResults, logs: Mapping[str, Path]) -> Recomputed | Verdict:
-    """Repeat the recorded analysis of a report.
+    """Repeat the analysis that a report records, on the files in ``logs`` (by SHA-256).
 
-    Parameters
-    ----------
-    results : ComparisonResults or LoopResults
-        Attached results.
-    logs : mapping of str to Path
-        Files by SHA-256.
-
-    Returns
-    -------
-    Recomputed or Verdict
-        "cannot verify" if px4fuse cannot have written the command, a file is missing, or the
-        analysis fails.
+    Returns the verdict "cannot verify" if px4fuse cannot have written the recorded command, a file
+    is missing, or the analysis fails.
     """
     try:
         if tuple(results.provenance.libraries) != LIBRARIES:
@@ -121,20 +112,19 @@ def recompute(results: ReportedResults, logs: Mapping[str, Path]) -> Recomputed 
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as folder:
             link_file = partial(_link_file, logs, Path(folder))
             if isinstance(results, LoopResults):
-                analysis_result, new_results = _repeat_loop(results, link_file)
+                analysis, new_results = _repeat_loop(results, link_file)
             else:
-                analysis_result, new_results = _repeat_comparison(results, link_file)
-        return new_results, partial(_draw_report, analysis_result, new_results, results.provenance)
-    except SettingsError as error:  # px4fuse rejects these settings, so it did not make the report
+                analysis, new_results = _repeat_comparison(results, link_file)
+        return new_results, partial(_draw_report, analysis, new_results, results.provenance)
+    except SettingsError as error:  # px4fuse would have rejected these settings too
         return cannot_verify(f"{FOREIGN_REQUEST_REASON}: {error}", ASK_ADVICE)
     except NotRepeatableError as error:
         return cannot_verify(*error.args)
     except Px4FuseError as error:
         return cannot_verify(str(error), ASK_ADVICE)
     except Exception as error:  # noqa: BLE001 - forged settings may fail anywhere
-        return cannot_verify(
-            f"the analysis cannot be repeated ({type(error).__name__})", ASK_ADVICE
-        )
+        reason = f"the analysis cannot be repeated ({type(error).__name__})"
+        return cannot_verify(reason, ASK_ADVICE)
 
 
 def _link_file(
@@ -142,18 +132,17 @@ def _link_file(
 ) -> str:
     """Link the file with this SHA-256 into a temporary folder, and return the path of the link.
 
-    The link has the recorded name, because the report prints it. Names with folders are rejected.
+    The link has the recorded name, because the report prints it. ``role`` names the file in errors.
     """
     path = None if sha256 is None else logs.get(sha256)
     if path is None:
         missing_name = one_line(name, 80) or "the file"
         reason = f"none of the given files has the SHA-256 of {role}"
-        raise NotRepeatableError(reason, ADD_LOGS_ADVICE.format(missing_name), missing_name)
+        raise NotRepeatableError(reason, f"Add {missing_name} to --logs.", missing_name)
     if name != Path(name).name or name == ".." or "\\" in name or not name.isprintable():
-        raise NotRepeatableError(
-            f"{FOREIGN_REQUEST_REASON}: it contains a path instead of a file name", ASK_ADVICE
-        )
-    # in separate folders, because two files may have the same name
+        reason = f"{FOREIGN_REQUEST_REASON}: it contains a path instead of a file name"
+        raise NotRepeatableError(reason, ASK_ADVICE)
+    # each link has a separate folder, because two files may have the same name
     target = Path(tempfile.mkdtemp(dir=folder), name)
     try:
         target.symlink_to(path.resolve())
@@ -163,7 +152,7 @@ def _link_file(
 
 
 def split_track(source: str) -> tuple[str, str]:
-    """Split ``LOG:vio`` into file and track, without checking if the file exists."""
+    """Split ``LOG:vio`` into the file ``LOG`` and the track ``:vio``, which may be missing."""
     from px4fuse.loop.tracks import TRACK_NAMES  # noqa: PLC0415
 
     name, colon, tail = source.rpartition(":")
@@ -171,52 +160,49 @@ def split_track(source: str) -> tuple[str, str]:
 
 
 def _repeat_comparison(
-    handed_in: ComparisonResults, link_file: _LinkFile
+    submitted: ComparisonResults, link_file: _LinkFile
 ) -> tuple[object, ReportedResults]:
     from px4fuse.analysis import run  # noqa: PLC0415
     from px4fuse.results.build import results  # noqa: PLC0415
 
-    recorded = handed_in.request
+    recorded = submitted.request
     if recorded.dt_s < MIN_DT_S:
-        raise NotRepeatableError(
-            f"DT is below {MIN_DT_S:g} s, so the analysis would take too long", ASK_ADVICE
-        )
-    hash_by_role = {file.role: file.sha256 for file in handed_in.log.joined}
-    request = replace(recorded, log=link_file(recorded.log, handed_in.log.sha256, "the log"))
-    if (mavlink := recorded.mavlink) is not None:
-        request = replace(
-            request, mavlink=link_file(mavlink, hash_by_role.get("mavlink"), "--mavlink")
-        )
+        reason = f"DT is below {MIN_DT_S:g} s, so the analysis would take too long"
+        raise NotRepeatableError(reason, ASK_ADVICE)
+    hash_by_role = {file.role: file.sha256 for file in submitted.log.joined}
+    request = replace(recorded, log=link_file(recorded.log, submitted.log.sha256, "the log"))
+    if recorded.mavlink is not None:
+        link = link_file(recorded.mavlink, hash_by_role.get("mavlink"), "--mavlink")
+        request = replace(request, mavlink=link)
     if (position := recorded.position) is not None:
-        linked_path = link_file(position.path, hash_by_role.get("position"), "--position")
-        request = replace(request, position=replace(position, path=linked_path))
-    analysis_result = run(request)
-    return analysis_result, results(recorded, analysis_result, handed_in.student)
+        link = link_file(position.path, hash_by_role.get("position"), "--position")
+        request = replace(request, position=replace(position, path=link))
+    analysis = run(request)
+    return analysis, results(recorded, analysis, submitted.student)
 
 
-def _repeat_loop(handed_in: LoopResults, link_file: _LinkFile) -> tuple[object, ReportedResults]:
+def _repeat_loop(submitted: LoopResults, link_file: _LinkFile) -> tuple[object, ReportedResults]:
     from px4fuse.analysis import run_loop  # noqa: PLC0415
     from px4fuse.results.build import loop_results  # noqa: PLC0415
 
-    recorded = handed_in.request
-    path, track_part = split_track(recorded.source)
-    request = replace(
-        recorded, source=link_file(path, handed_in.track.sha256, "the log") + track_part
-    )
+    recorded = submitted.request
+    path, track = split_track(recorded.source)
+    link = link_file(path, submitted.track.sha256, "the log")
+    request = replace(recorded, source=link + track)
     if recorded.reference is not None:
-        path, track_part = split_track(recorded.reference)
-        sha256 = handed_in.references[-1].sha256 if handed_in.references else None
-        request = replace(request, reference=link_file(path, sha256, "--reference") + track_part)
-    loop_result = run_loop(request)
-    return loop_result, loop_results(recorded, loop_result, handed_in.student)
+        path, track = split_track(recorded.reference)
+        sha256 = submitted.references[-1].sha256 if submitted.references else None
+        request = replace(request, reference=link_file(path, sha256, "--reference") + track)
+    analysis = run_loop(request)
+    return analysis, loop_results(recorded, analysis, submitted.student)
 
 
-def _draw_report(subject: object, results: ReportedResults, versions: Provenance) -> bytes:
-    """Draw the report with the versions that the submitted report states."""
+def _draw_report(analysis: object, results: ReportedResults, versions: Provenance) -> bytes:
+    """Draw the report with the library versions that the submitted report states."""
     from px4fuse.report.pdf import render  # noqa: PLC0415
 
     new_provenance = replace(versions, command=results.provenance.command)
-    return render(subject, replace(results, provenance=new_provenance), to_json(results))
+    return render(analysis, replace(results, provenance=new_provenance), to_json(results))
 
 
 # ------------------------------------------------------------------ the verdict
@@ -229,48 +215,49 @@ def verify(
     *,
     recompute: Callable[[ReportedResults, Mapping[str, Path]], Recomputed | Verdict] = recompute,
 ) -> Verdict:
-    """Verify a report: repeat its analysis, compare numbers and pages, and draw it again.
+    """Verify a report: repeat its analysis, draw it again, and compare numbers and pages.
 
     Parameters
     ----------
+    results : ComparisonResults or LoopResults
+        Results attached to the report.
+    pdf : bytes
+        Content of the report file.
     logs : mapping of str to Path
         Logs and other recordings by SHA-256.
     recompute : callable
-        Repeats the analysis.
+        Function that repeats the analysis.
 
     Returns
     -------
     Verdict
-        "verified" only if the analysis was repeated on the log and all numbers agree. ``redrawn``
-        is the report drawn again, ``pages`` lists pages that differ from it.
+        "verified" only if the analysis was repeated on the log and all numbers agree.
     """
-    report_version, own_version = results.provenance.px4fuse, metadata.version("px4fuse")
-    if report_version != own_version:
-        shown_version = one_line(report_version, 40)
-        reason = f"made with px4fuse {shown_version}; this is px4fuse {own_version}"
-        return cannot_verify(reason, f"Verify it with px4fuse {shown_version}.")
+    version, own_version = results.provenance.px4fuse, metadata.version("px4fuse")
+    if version != own_version:
+        version = one_line(version, 40)
+        reason = f"the report was made with px4fuse {version}; this is px4fuse {own_version}"
+        return cannot_verify(reason, f"Verify it with px4fuse {version}.")
     name = one_line(log_name(results), 80) or "the log"
     if not logs:
-        return cannot_verify(NO_LOG_REASON, ADD_LOGS_ADVICE.format(name), name)
+        return cannot_verify(NO_LOG_REASON, f"Add {name} to --logs.", name)
     sha256 = log_sha256(results)
     if sha256 not in logs:
         expected_hash = one_line(sha256, 64) or "none"
         reason = f"none of the {len(logs)} given files is the log (SHA-256 {expected_hash})"
-        remedy = f"If the log is yours, a{ADD_LOGS_ADVICE.format(name)[1:]}"
+        remedy = f"If the log is yours, add {name} to --logs."
         return Verdict("other log", (reason,), False, remedy=remedy, missing=name)
     if results.student.notes.count("\n") > MAX_NOTES_LINES:
-        reason = f"the notes have more than {MAX_NOTES_LINES} lines"
+        reason = f"the student's notes have more than {MAX_NOTES_LINES} lines"
         return cannot_verify(reason, ASK_ADVICE)
     recomputed = recompute(results, logs)
-    return (
-        recomputed
-        if isinstance(recomputed, Verdict)
-        else _verify_with_log(results, pdf, *recomputed)
-    )
+    if isinstance(recomputed, Verdict):
+        return recomputed
+    return _verify_with_log(results, pdf, *recomputed)
 
 
 def cannot_verify(reason: str, remedy: str = "", missing: str = "") -> Verdict:
-    """Return the verdict "cannot verify" with reason, remedy and name of a missing file."""
+    """Return the verdict "cannot verify", with the reason and the name of a missing input file."""
     reasons = (one_line(reason, 400),)
     return Verdict("cannot verify", reasons, False, remedy=remedy, missing=missing)
 
@@ -280,93 +267,80 @@ def _verify_with_log(
 ) -> Verdict:
     redrawn = draw()
     if redrawn == pdf:
-        reason = "the new run on the log gives an identical file"
+        reason = "the new run on the log gives an identical PDF"
         return Verdict("verified", (reason, LIMIT_NOTE), True, page_status="same", redrawn=redrawn)
     mismatches, is_same_number, value_count = compare_results(
         to_plain(submitted), to_plain(recomputed)
     )
-    first_paths = ", ".join(m.path for m in mismatches[:3]) + ", …" * (len(mismatches) > 3)
     reasons = [
-        f"{len(mismatches)} of {value_count} values differ from a new run on the log: {first_paths}"
-        if mismatches
-        else f"all {value_count} values agree with a new run on the log (within "
+        f"all {value_count} values agree with a new run on the log (within "
         f"{RELATIVE_TOLERANCE:g}, estimates within {ESTIMATE_RELATIVE_TOLERANCE:g})"
     ]
+    if mismatches:
+        paths = ", ".join(mismatch.path for mismatch in mismatches[:3])
+        paths += ", …" * (len(mismatches) > 3)
+        reasons = [
+            f"{len(mismatches)} of {value_count} values differ from a new run on the log: {paths}"
+        ]
     is_same_text = partial(is_same_text_rounded, is_same_number=is_same_number)
     pages = compare_pages(pdf, redrawn, is_same_text)
     is_foreign = any(difference.is_structural for difference in pages)
-    here = recomputed.provenance.libraries.items()
-    others = sorted({*submitted.provenance.libraries.items()} - {*here}) if pages else []
-    not_comparable = is_foreign or bool(others)
+    own_libraries = recomputed.provenance.libraries.items()
+    other_libraries = {*submitted.provenance.libraries.items()} - {*own_libraries} if pages else ()
+    is_comparable = not (is_foreign or other_libraries)
     page_status: PageStatus = "same"
     if pages:
-        page_status = "not compared" if not_comparable else "differ"
-    status: Status = "verified"
-    if mismatches or not_comparable:
-        status = "numbers differ" if mismatches else "cannot verify"
+        page_status = "differ" if is_comparable else "not compared"
+    status: Status = "verified" if is_comparable else "cannot verify"
+    if mismatches:
+        status = "numbers differ"
     page_sentences = [difference.sentence for difference in pages[:MAX_LISTED_PAGES]]
-    page_sentences += [f"further differences: {len(pages) - MAX_LISTED_PAGES}"] * (
-        len(pages) > MAX_LISTED_PAGES
-    )
-    # the class table shows the first reason
-    reasons = (
-        [*page_sentences, *reasons] if status == "cannot verify" else [*reasons, *page_sentences]
-    )
+    if len(pages) > MAX_LISTED_PAGES:
+        page_sentences.append(f"the PDF has {len(pages) - MAX_LISTED_PAGES} more differences")
+    # the class table shows only the first reason, so the decisive reasons are first
+    if status == "cannot verify":
+        reasons = page_sentences + reasons
+    else:
+        reasons += page_sentences
     remedy = ORIGINAL_PDF_ADVICE if is_foreign else ""
-    if others:  # other libraries may draw differently
-        versions = one_line(", ".join(map(" ".join, others)), 300)
-        reasons.append(f"made with {versions}; here are other versions")
+    if other_libraries:  # other library versions may draw other pages
+        versions = one_line(", ".join(map(" ".join, sorted(other_libraries))), 300)
+        reasons.append(f"the report was made with {versions}; this computer has other versions")
         remedy = remedy or f"Verify it with {versions}."
     reasons += [LIMIT_NOTE] * (status == "verified")
-    return Verdict(
-        status,
-        tuple(reasons),
-        True,
-        mismatches[:MAX_DIFFERENCES],
-        page_status,
-        pages,
-        redrawn,
-        remedy,
-    )
+    listed = mismatches[:MAX_DIFFERENCES]
+    return Verdict(status, tuple(reasons), True, listed, page_status, pages, redrawn, remedy)
 
 
-@dataclass(frozen=True)
-class Rounding:
-    """Comparison of numbers in texts: equal if both are roundings of the same result.
+def is_same_number_rounded(pairs: Iterable[tuple[float, float]], number: str, redrawn: str) -> bool:
+    """Return True if two printed numbers are roundings of the two results of one of the pairs.
 
-    Attributes
-    ----------
-    pairs : tuple of tuple of float
-        Recorded and recomputed results that are equal within the tolerances.
+    A pair contains a recorded and a recomputed result that are equal within the tolerances.
     """
-
-    pairs: tuple[tuple[float, float], ...]
-
-    def __call__(self, one: str, other: str) -> bool:
-        """Return True if the two results of a pair round to these two numbers."""
-        decimals, printed = _decimals(one), (float(one), float(other))
-        return decimals == _decimals(other) and any(
-            printed == (round(abs(a) * scale, decimals), round(abs(b) * scale, decimals))
-            for scale in PRINTED_SCALES
-            for a, b in self.pairs
-        )
+    decimals, printed = _decimals(number), (float(number), float(redrawn))
+    return decimals == _decimals(redrawn) and any(
+        printed == (round(abs(a) * scale, decimals), round(abs(b) * scale, decimals))
+        for scale in PRINTED_SCALES
+        for a, b in pairs
+    )
 
 
 def compare_results(
     recorded: Mapping[str, Any], recomputed: Mapping[str, Any]
-) -> tuple[tuple[Mismatch, ...], Rounding, int]:
-    """Compare all values of recorded and recomputed results.
+) -> tuple[tuple[Mismatch, ...], TextComparison, int]:
+    """Compare all values of the recorded results with those of a new run.
 
     Returns
     -------
-    differences : tuple of Mismatch
+    mismatches : tuple of Mismatch
         Values that differ by more than the tolerances.
-    is_same_number : Rounding
-    compared : int
+    is_same_number : callable
+        Returns True if two printed numbers are roundings of the same result.
+    value_count : int
         Number of compared values.
     """
     command = str(recomputed["provenance"]["command"])
-    # with these options all numbers depend on an estimated time offset or alignment
+    # with these options, all numbers depend on an estimated time offset or frame alignment
     is_estimate_everywhere = not {"auto", "--position"}.isdisjoint(command.split())
     recorded_values, new_values = dict(flatten(recorded)), dict(flatten(recomputed))
     pairs = {
@@ -380,7 +354,8 @@ def compare_results(
         if all(map(is_number, pair))
     }
     near_pairs = (pairs[path] for path, is_near in is_near_by_path.items() if is_near)
-    is_same_number = Rounding(tuple((float(a), float(b)) for a, b in near_pairs if a != b))
+    unequal_pairs = tuple((float(a), float(b)) for a, b in near_pairs if a != b)
+    is_same_number = partial(is_same_number_rounded, unequal_pairs)
     wrong_paths = [path for path, is_near in is_near_by_path.items() if not is_near]
     wrong_paths += [
         path
@@ -394,12 +369,12 @@ def compare_results(
     return tuple(mismatches), is_same_number, len(pairs)
 
 
-# marker of a missing value
+# Placeholder of a value that only one of two results contains
 _ABSENT = object()
 
 
 def flatten(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield paths (keys joined by dots) and values of nested mappings and lists.
+    """Yield path and value of each element of nested mappings and lists; dots join the keys.
 
     >>> [*flatten({"a": {"b.c": [1, 2]}})]
     [('a.b.c.0', 1), ('a.b.c.1', 2)]
@@ -420,21 +395,18 @@ def is_number(value: object) -> bool:
 
 def _is_near(path: str, submitted: float, recomputed: float, is_estimate: bool) -> bool:
     if isinstance(recomputed, int):
-        return abs(submitted - recomputed) <= (
-            MAX_MORE_ITERATIONS if path.endswith(ITERATIONS_FIELD) else 0
-        )
-    relative, absolute = (
-        (ESTIMATE_RELATIVE_TOLERANCE, ESTIMATE_ABSOLUTE_TOLERANCE)
-        if is_estimate
-        else (RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE)
-    )
-    return abs(submitted - recomputed) <= relative * abs(recomputed) + absolute
+        tolerance: float = MAX_MORE_ITERATIONS * path.endswith(ITERATIONS_FIELD)
+    elif is_estimate:
+        tolerance = ESTIMATE_RELATIVE_TOLERANCE * abs(recomputed) + ESTIMATE_ABSOLUTE_TOLERANCE
+    else:
+        tolerance = RELATIVE_TOLERANCE * abs(recomputed) + ABSOLUTE_TOLERANCE
+    return abs(submitted - recomputed) <= tolerance
 
 
-def _is_same(submitted: Any, recomputed: Any, rounded: TextComparison) -> bool:
+def _is_same(submitted: Any, recomputed: Any, is_same_number: TextComparison) -> bool:
     """Return True if two values are equal, texts up to the rounding of their numbers."""
     if isinstance(submitted, str) and isinstance(recomputed, str):
-        return is_same_text_rounded(submitted, clean_text(recomputed), rounded)
+        return is_same_text_rounded(submitted, clean_text(recomputed), is_same_number)
     return type(submitted) is type(recomputed) and bool(submitted == recomputed)
 
 
@@ -448,7 +420,7 @@ def is_same_text_rounded(one: str, other: str, is_same_number: TextComparison) -
     """
     if one == other:
         return True
-    # the pieces are alternately text and number
+    # texts and numbers alternate in the lists
     pieces, other_pieces = _NUMBER.split(one), _NUMBER.split(other)
     numbers = zip(pieces[1::2], other_pieces[1::2], strict=False)
     return pieces[::2] == other_pieces[::2] and all(
@@ -457,7 +429,7 @@ def is_same_text_rounded(one: str, other: str, is_same_number: TextComparison) -
 
 
 def _decimals(number: str) -> int:
-    """Count the decimals of a printed number.
+    """Count the decimal places of a printed number.
 
     >>> _decimals("0.15"), _decimals("3"), _decimals("1.2e-3")
     (2, 0, 4)

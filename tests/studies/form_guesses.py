@@ -29,7 +29,7 @@ from px4fuse.answer_form import (
 from px4fuse.assignment.assignment import simulate_assigned
 from px4fuse.assignment.roster import Person
 from px4fuse.assignment.truth import FormTruth, TrueMistake
-from px4fuse.grading.form_points import cures, form_points, panels
+from px4fuse.grading.form_points import form_points, panels, right_corrections
 
 SECRET = b"form guesses"
 SHA256 = "0" * 64
@@ -86,7 +86,7 @@ def constants(truths: Sequence[FormTruth], kind: str) -> Iterator[Answers]:
     sizes = [wrong.size for wrong in of_kind if wrong.size is not None] or [0.0]
     begins = [wrong.from_s for wrong in of_kind if wrong.from_s is not None] or [0.0]
     for size in np.quantile(sizes, np.arange(0.05, 1.0, 0.1)):
-        cure = cures(TrueMistake(kind, size, size, size), truths[0])[0][0]
+        cure = right_corrections(TrueMistake(kind, size, size, size), truths[0])[0][0]
         for from_s in (None, float(np.median(begins))):
             claim = StudentMistake(
                 kind, float(size), when="whole flight" if from_s is None else "", from_s=from_s,
@@ -99,7 +99,7 @@ def right(one: FormTruth) -> Answers:
     """Return the correct form."""
     claims = []
     for wrong in one.mistakes:
-        parameter, (low, high), _ = cures(wrong, one)[0]
+        parameter, (low, high), _ = right_corrections(wrong, one)[0]
         value = 1.1 * low if np.isinf(high) else 0.5 * (low + high)
         value = None if np.isinf(low) else value
         whole = wrong.from_s is None and wrong.until_s is None
@@ -133,7 +133,7 @@ def main() -> None:
     print(f"{len(aisles)} aisles, {len(loops)} loops")
     for name, group in (("all", truths), ("aisles", aisles), ("loops", loops)):
         kinds = {wrong.kind for one in group for wrong in one.mistakes} | {"none"}
-        best = {kind: max(fmean(form_points(form, one).share for one in group)
+        best = {kind: max(fmean(form_points(form, one).fraction for one in group)
                           for form in constants(group, kind))
                 for kind in kinds}  # fmt: skip
         kind = max(best, key=lambda each: best[each])
@@ -141,7 +141,7 @@ def main() -> None:
             ("right", right, 1), ("random", lambda _: at_random(rng), GUESSES),
             ("none", lambda _: none, 1),
         ):  # fmt: skip
-            shares = [form_points(form(one), one).share for one in group for _ in range(times)]
+            shares = [form_points(form(one), one).fraction for one in group for _ in range(times)]
             print(f"{name:7} {what:7} {fmean(shares):.3f}")
         print(f"{name:7} best constant {best[kind]:.3f} ({kind})")
 
