@@ -35,7 +35,6 @@ from px4fuse.readers.position_csv import PositionRecording
 # warning that the offset is ambiguous, by reference: IMU noise gives ratios of 1.4 to 1.7
 MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}
 # Minimum negative correlation between the heights of file and EKF2 for opposite z axes
-MIN_MIRRORED_CORRELATION = 0.8
 # Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
 # indicates another flight
 MAX_UNIX_DIFFERENCE_S = 60.0
@@ -217,8 +216,6 @@ def _describe_alignment(
         correlation=unexplained_correlation,
         clock_offset_s=clock_offset_s,
     )
-    if not (match and match.better_frame):
-        frame_conflicts += _find_height_conflicts(flight, aligned_samples)
     alignment = Alignment(
         frame=frame,
         frame_reason=frame_reason,
@@ -272,25 +269,6 @@ def _compare_with_ekf2(
     ) / power if has_motion and power > 0.0 else None
 
 
-def _find_height_conflicts(flight: Flight, aligned_samples: pd.DataFrame) -> Iterator[str]:
-    if isinstance(flight.ekf2, Unavailable):
-        return
-    down = flight.ekf2.state["down_m"]
-    file_down_m = aligned_samples["down_m"].loc[down.index[0] : down.index[-1]].dropna()
-    if len(file_down_m) < tracks.MIN_SAMPLES:
-        return
-    ekf2_down_m = np.interp(file_down_m.index, down.index, down)
-    range_m = min(np.ptp(np.percentile(file_down_m, [2, 98])), np.ptp(ekf2_down_m))
-    if (
-        range_m >= tracks.MIN_MOTION_M
-        and np.corrcoef(file_down_m, ekf2_down_m)[0, 1] <= -MIN_MIRRORED_CORRELATION
-    ):
-        yield (
-            "The z axis of the position file is inverted: the heights of file and EKF2 change in "
-            "opposite directions. Give another --position-frame."
-        )
-
-
 def _find_frame_conflicts(
     match: Match | None, comparison: tuple[Array, float | None] | None, yaw_rad: float
 ) -> Iterator[str]:
@@ -303,12 +281,7 @@ def _find_frame_conflicts(
         is_rotated = matching.is_good_fit(match.free_yaw_fit, name) and matching.needs_rotation(
             rms_m, match.free_yaw_fit, name
         )
-    if is_rotated and match.better_frame:
-        yield (
-            f"The positions of the file fit the {name} in the frame {match.better_frame}, but not "
-            f"in {match.frame}. Give --position-frame {match.better_frame}."
-        )
-    elif is_rotated:
+    if is_rotated:
         yaw_deg = np.degrees(np.angle(np.exp(1j * (match.free_yaw_fit.yaw_rad - yaw_rad))))
         shift_m = np.hypot(*match.free_yaw_fit.origin_m[:2])
         shift_text = f" and shifted by {shift_m:.1f} m" if comparison else ""
