@@ -1,4 +1,4 @@
-"""px4fuse: replay a PX4 flight through a two-state Kalman filter and compare it with EKF2.
+"""px4fuse: run a two-state Kalman filter on a PX4 flight and compare it with EKF2.
 
 >>> import px4fuse
 >>> analysis = px4fuse.compare("sample_logs/aisle_uwb.ulg", sigma_z_m=0.1)
@@ -9,7 +9,7 @@
 import importlib as _importlib
 import typing as _typing
 
-# Module of each public name; imported at first use, so that ``px4fuse --help`` is fast
+# Module of each public name; a module is imported at first use, so that ``px4fuse --help`` is fast
 _MODULES = {
     "Analysis": "px4fuse.analysis",
     "Px4FuseError": "px4fuse.errors",
@@ -52,7 +52,6 @@ if _typing.TYPE_CHECKING:
 else:
 
     def __dir__():
-        """List the public names."""
         return sorted(__all__)
 
     def __getattr__(name):

@@ -1,4 +1,4 @@
-"""``python -m px4fuse``."""
+"""Run the command line (``python -m px4fuse``)."""
 
 from px4fuse.cli import main
 

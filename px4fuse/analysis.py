@@ -1,7 +1,7 @@
-"""Run a comparison, a loop analysis or a what-if from its request.
+"""Run a comparison, a loop analysis or a what-if analysis from its request.
 
-A comparison reads and aligns the recordings, runs KF, compares it with EKF2, and explains the
-difference.
+A comparison reads and aligns the recordings of a flight, runs KF, compares KF with EKF2, and
+explains the differences.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import numpy as np
 
 from px4fuse.comparison.causal_replays import (
     Intervention,
-    planned_variants,
+    planned_configurations,
     run_interventions,
 )
 from px4fuse.comparison.comparison import compare, compare_prepared
 from px4fuse.comparison.difference_steps import (
     corrected_settings,
     explain_ekf2_difference,
-    explanation_variants,
+    explanation_configurations,
 )
 from px4fuse.comparison.estimates import (
     Progress,
@@ -40,7 +40,7 @@ from px4fuse.comparison.preparation import explain_missing_source, prepare
 from px4fuse.comparison.remedy import ml_ekf2_parameters
 from px4fuse.comparison.trials import Trial
 from px4fuse.ekf2.aids import AidResult, evaluate_aids
-from px4fuse.ekf2.filter_recursion import Variant
+from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.replay import Ekf2Replay
@@ -69,13 +69,13 @@ from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
 if TYPE_CHECKING:
     from px4fuse.loop.model import Loop
 
-# The report contains one noise estimate for both horizontal axes; `px4fuse tune` prints all axes
+# Axes of the noise estimates in a report; north and east have one estimate
 REPORTED_AXES = (HORIZONTAL, "down")
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Analysis(Comparison):
-    """Comparison of KF and EKF2 with the estimates and re-runs that explain it.
+    """Comparison of KF and EKF2, with estimates and re-runs that explain the differences.
 
     Attributes
     ----------
@@ -84,14 +84,15 @@ class Analysis(Comparison):
     tuning : mapping from axis name, or "horizontal", to AxisTuning or Unavailable
         Maximum-likelihood estimates of the noises.
     clock : ClockOffset or Unavailable
+        Time offset between position source and IMU.
     ekf2_model : Model or Unavailable
-        EKF2 prepared for replays; ``agreement`` states how well a replay matches the log.
+        Model of EKF2 for replays; ``agreement`` compares a replay with the log.
     difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
-        Steps that explain the difference KF - EKF2.
+        Differences KF - EKF2 after each replacement of one EKF2 property by that of KF.
     loop : Loop or Unavailable
-        Loop closure of the flight's odometry.
+        Loop closure error of the flight's odometry, and corrected paths.
     heading : HeadingError or Unavailable
-        Misalignment of the source's frame in yaw.
+        Yaw misalignment of the position frame.
     request : ComparisonRequest or None
         None if :func:`explain` was called without :func:`run`.
     """
@@ -105,33 +106,32 @@ class Analysis(Comparison):
     request: ComparisonRequest | None = None
 
     def _repr_html_(self) -> str | None:
-        """Return the diagnosis card for notebooks."""
         return display_html(self)
 
     @property
     def ekf2_replay(self) -> Ekf2Replay | Unavailable:
-        """EKF2 replay with the flown parameters, and its agreement with the log."""
+        """Replay of EKF2 with the parameters as flown, and its agreement with the log."""
         model = self.ekf2_model
         return model if isinstance(model, Unavailable) else model.flown
 
     @cached_property
     def events(self) -> Events:
-        """Events for the time axes: gaps, rejections, resets, flight modes."""
+        """Events that time plots show: gaps, rejections, resets, flight modes."""
         return collect_events(self)
 
     @property
-    def others(self) -> list[AxisComparison]:
-        """All axes except the main one."""
+    def secondary_axes(self) -> list[AxisComparison]:
+        """Comparisons along all axes except the main axis."""
         return [axis for axis in self.axes.values() if axis is not self.main]
 
     @property
     def causes(self) -> tuple[Intervention, ...]:
-        """Re-runs with one change each, and the share of a discrepancy that each explains."""
+        """Re-runs with one change each, and the fraction of an inconsistency that it explains."""
         return self._reruns[0]
 
     @property
     def trials(self) -> tuple[Trial, ...]:
-        """Re-runs along the main axis, with all statistics before and after."""
+        """Re-runs along the main axis, with all statistics before and after the change."""
         return self._reruns[1]
 
     @cached_property
@@ -140,14 +140,14 @@ class Analysis(Comparison):
         reruns = run_interventions(
             self, self.tuning, self.clock, self.heading, self.bias_scale_jump_fit, model
         )
-        if isinstance(model, Model):  # frees most of the memory; later replays are computed again
+        if isinstance(model, Model):  # frees most of the memory; a later replay is computed again
             model.runs.clear()
             model.intervals.clear()
         return reruns
 
     @cached_property
     def bias_scale_jump_fit(self) -> BiasScaleJumpFit | Unavailable:
-        """Accelerometer biases, scale factor error and jumps, fitted to the innovations."""
+        """Accelerometer biases, scale factor error and position jumps, fitted to innovations."""
         horizontal = self._horizontal_estimate()
         if isinstance(horizontal, Unavailable):
             return horizontal
@@ -166,7 +166,7 @@ class Analysis(Comparison):
     def time_correlation_fit(
         self,
     ) -> tuple[SourceLowPass | Unavailable, TimeCorrelatedNoise | Unavailable]:
-        """Low-pass filter and time-correlated noise of the source, with jumps removed."""
+        """Low-pass filter and time-correlated noise of the position source, without jumps."""
         horizontal = self._horizontal_estimate()
         if isinstance(horizontal, Unavailable):
             return horizontal, horizontal
@@ -176,7 +176,7 @@ class Analysis(Comparison):
             if isinstance(self.bias_scale_jump_fit, BiasScaleJumpFit)
             else ()
         )
-        # measurements just after a jump are excluded, because the exact time of the jump is unknown
+        # the exact time of a jump is unknown, so measurements just after the jump are excluded
         time_s, excluded_s = axes[0].measurement_time_s, axis_tuning.outlier_time_s
         for jump in jumps:
             is_after_jump = (time_s >= jump.time_s) & (time_s < jump.time_s + OUTLIERS_AFTER_STEP_S)
@@ -202,22 +202,20 @@ class Analysis(Comparison):
         return low_pass, correlated_noise
 
     @property
-    def smoothing(self) -> SourceLowPass | Unavailable:
-        """Low-pass filter of the position source, or Unavailable."""
+    def source_low_pass(self) -> SourceLowPass | Unavailable:
         return self.time_correlation_fit[0]
 
     @property
-    def coloured(self) -> TimeCorrelatedNoise | Unavailable:
-        """Time-correlated noise of the position source, or Unavailable."""
+    def time_correlated_noise(self) -> TimeCorrelatedNoise | Unavailable:
         return self.time_correlation_fit[1]
 
     @cached_property
     def aids(self) -> Mapping[str, AidResult] | Unavailable:
-        """Innovation check of every aid that EKF2 can fuse, by PX4's name."""
+        """Innovation statistics of each aiding source of EKF2, by PX4's name."""
         return evaluate_aids(self.flight)
 
     def _horizontal_estimate(self) -> tuple[tuple[Axis, ...], AxisTuning, float] | Unavailable:
-        """Return the horizontal axes, their tuning and the significant time offset (s)."""
+        """Return horizontal axes, their noise estimates, and the time offset (s) if significant."""
         clock, offset_s = self.clock, 0.0
         if isinstance(clock, ClockOffset) and clock.is_determinable:
             offset_s = clock.remaining_s if abs(clock.remaining_s) > clock.three_sigma_s else 0.0
@@ -231,21 +229,21 @@ class Analysis(Comparison):
                 )
         return Unavailable(
             "causes other than noise",
-            "the noises of the horizontal axes could not be estimated",
-            "Analyse north and east, or the aisle (--axis).",
+            "the noises along the horizontal axes could not be estimated",
+            "Analyse the axes north and east, or the axis aisle (--axis).",
         )
 
 
 @dataclass(frozen=True)
 class AidsOnlyAnalysis:
-    """Evaluation of EKF2's aids in a flight without positions for KF.
+    """Evaluation of EKF2's aiding sources in a flight without positions for KF.
 
     Attributes
     ----------
     flight : Flight
     aids : mapping from PX4's name to AidResult
     missing_data : Unavailable
-        Reason for the missing comparison, and its remedy.
+        Reason why KF cannot be run, and the action.
     """
 
     flight: Flight
@@ -256,10 +254,10 @@ class AidsOnlyAnalysis:
 
 
 def failed_checks(analysis: Analysis | AidsOnlyAnalysis) -> dict[str, str]:
-    """Return the failed EKF2 checks for ``--checks``: axis or aid, and its verdict.
+    """Return the failed EKF2 checks of ``--checks``: axis or aiding source, and its verdict.
 
-    A check fails for overconfident axes and aids, biased aids, and aids that were not fused for too
-    long; not for KF, underconfident aids, and aids with too few samples.
+    A check fails if EKF2 is overconfident along an axis, or if an aiding source is overconfident,
+    biased or not fused for too long.
     """
     failed = {}
     if isinstance(analysis, Analysis):
@@ -274,12 +272,12 @@ def failed_checks(analysis: Analysis | AidsOnlyAnalysis) -> dict[str, str]:
 def run_or_evaluate_aids(
     request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
 ) -> Analysis | AidsOnlyAnalysis:
-    """Run a comparison as :func:`run`; without positions, check EKF2's aids only.
+    """Run a comparison as :func:`run`; without positions, evaluate only EKF2's aiding sources.
 
     Raises
     ------
     LogError, MissingDataError, SettingsError
-        See :func:`run`; also if the flight has neither positions nor aids that can be checked.
+        See :func:`run`; also if the flight has no positions and no innovations of EKF2.
     """
     flight = flight or read_flight(request, progress)
     has_named_source = request.position_source is not None
@@ -289,26 +287,29 @@ def run_or_evaluate_aids(
     if isinstance(aids, Unavailable):
         if flight.airborne == ():
             raise MissingDataError(
-                f"{flight.log.name}: the vehicle did not fly, so nothing can be analysed "
-                f"({aids.reason}). px4fuse info {flight.log.name} lists what is logged."
+                f"{flight.log.name}: the vehicle did not fly, so no analysis is possible "
+                f"({aids.reason}). px4fuse info {flight.log.name} lists the logged data."
             )
-        reason = f"{no_position.reason}, and EKF2's aids cannot be checked: {aids.reason}"
-        raise MissingDataError(f"{flight.log.name}: {reason}", no_position.remedy)
+        raise MissingDataError(
+            f"{flight.log.name}: {no_position.reason}, and EKF2's aiding sources cannot be "
+            f"checked: {aids.reason}",
+            no_position.remedy,
+        )
     return AidsOnlyAnalysis(flight, aids, no_position)
 
 
 def run(
     request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
 ) -> Analysis:
-    """Read a flight, compare KF with EKF2 and explain the difference.
+    """Read a flight, compare KF with EKF2 and explain the differences.
 
     Parameters
     ----------
     request : ComparisonRequest
     progress : callable
-        Called with the name of each step.
+        Function that receives the name of each step of the computation.
     flight : Flight, optional
-        Flight that was already read from the request's recordings.
+        Flight from the recordings of the request; without it, the recordings are read.
 
     Raises
     ------
@@ -329,7 +330,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
     log = Path(request.log)
     progress(f"reading {display_name(log)}")
     flight = read_log(log, system=request.system if request.mavlink is None else None)
-    # imported here, because scipy.signal and scipy.ndimage take 0.2 s and only alignment needs them
+    # imported on demand, as alignment imports scipy.signal and scipy.ndimage, which takes 0.2 s
     if request.mavlink is not None:
         from px4fuse.alignment.merge_recordings import join  # noqa: PLC0415
 
@@ -362,18 +363,18 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
 def run_comparison(
     request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
 ) -> Comparison:
-    """Read a flight and compare KF with EKF2, without the explanations.
+    """Read a flight and compare KF with EKF2, without explaining the differences.
 
     Arguments and errors are those of :func:`run`.
     """
     prepared = prepare_comparison(request, progress, flight)
-    return compare_prepared(prepared, lambda name: progress(f"filtering {name}"))
+    return compare_prepared(prepared, lambda name: progress(f"running KF along {name}"))
 
 
 def prepare_comparison(
     request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
 ) -> Comparison:
-    """Read a flight and choose source, segment and axes, which is enough for tuning and sync.
+    """Read a flight and select position source, time span and axes, without running KF.
 
     Arguments and errors are those of :func:`run`.
     """
@@ -385,7 +386,7 @@ def prepare_comparison(
         sigma_z_m=Settings().sigma_z_m if request.sigma_z_m is None else request.sigma_z_m,
         dt_s=request.dt_s,
         input=request.input or "imu",
-        # the alignment of a position file applies its own offset
+        # for a position file, align_position_file has already applied the time offset
         clock_offset_s=clock_offset
         if isinstance(clock_offset, float) and request.position is None
         else 0.0,
@@ -405,13 +406,13 @@ def prepare_comparison(
         raise MissingDataError(
             f"{flight.log.name}: the time offset cannot be estimated from this flight "
             f"({clock.reason}).",
-            "Give --clock-offset SECONDS, or omit it.",
+            "Give --clock-offset SECONDS, or omit --clock-offset.",
         )
     low, high = clock.interval_s
     if low <= 0.0 <= high:
         note = (
-            f"--clock-offset auto: {clock.offset_s:+.3f} s (95 % {low:+.3f} to {high:+.3f} s) "
-            "is not significant; no offset was applied"
+            f"--clock-offset auto: the time offset {clock.offset_s:+.3f} s (95 % {low:+.3f} to "
+            f"{high:+.3f} s) is not significant and was not applied"
         )
         return replace(prepared, notes=(*prepared.notes, note))
     settings = replace(settings, clock_offset_s=clock.offset_s)
@@ -432,7 +433,7 @@ def run_loop(request: LoopRequest, progress: Progress = ignore_progress) -> Loop
     TrajectoryError, LogError, MissingDataError, SettingsError
         A file cannot be read or lacks required data, or a setting is out of range.
     """
-    from px4fuse.loop.analysis import analyse  # noqa: PLC0415 (tune and sync have none)
+    from px4fuse.loop.analysis import analyse  # noqa: PLC0415 - not for tune and sync
     from px4fuse.loop.tracks import read_source  # noqa: PLC0415
 
     _check_finite(start_s=request.start_s, end_s=request.end_s)
@@ -446,42 +447,43 @@ def run_loop(request: LoopRequest, progress: Progress = ignore_progress) -> Loop
 
 @dataclass(frozen=True)
 class WhatIfAnalysis:
-    """EKF2 replayed with other parameters.
+    """Replays of EKF2 with changed parameters or without aiding sources.
 
     Attributes
     ----------
     flight : Flight
     whatif : WhatIf
-        Results; its ``whatif`` contains the changes (if any), then the values of the sweep.
+        Results of the replays. Its field ``whatif`` has the replay with ``changes`` and ``without``
+        (if any), and then one replay for each value of the sweep.
     changes : mapping from PX4 name to value
-        Empty if only a sweep is requested.
-    asked : bool
+        Changed parameters; empty if only a sweep is requested.
+    uses_estimates : bool
         True if the changes are the maximum-likelihood estimates.
-    without : mapping from PX4's name of an aid to float
-        Time (s) from which EKF2 does not fuse the aid.
+    without : mapping from PX4's name of an aiding source to float
+        Time (s) from which EKF2 does not fuse the aiding source.
     difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
-        Difference between KF with default settings and EKF2 as flown; empty if not comparable.
+        Differences between KF with default settings and EKF2 as flown; empty if not comparable.
     """
 
     flight: Flight
     whatif: WhatIf
     changes: Mapping[str, float]
-    asked: bool
+    uses_estimates: bool
     difference_steps: Mapping[str, DifferenceExplanation | Unavailable]
     without: Mapping[str, float] = field(default_factory=dict)
 
     __repr__ = one_line_repr
 
     @property
-    def first(self) -> int:
-        """Index of the sweep's first value in the list of replays."""
+    def sweep_start(self) -> int:
+        """Index of the first replay of the sweep in ``whatif.whatif``."""
         return int(bool(self.changes or self.without))
 
 
 def run_what_if(
     request: WhatIfRequest, progress: Progress = ignore_progress, flight: Flight | None = None
 ) -> WhatIfAnalysis:
-    """Read a flight and replay its EKF2 with other parameters; arguments as in :func:`run`.
+    """Read a flight and replay EKF2 with other parameters; arguments as in :func:`run`.
 
     Raises
     ------
@@ -494,7 +496,9 @@ def run_what_if(
     if sweep is not None:
         values = sweep_values(sweep.parameter, sweep.low, sweep.high, sweep.count)
         if sweep.parameter in changes:
-            raise SettingsError(f"{sweep.parameter} is both set and swept.", "Set it or sweep it.")
+            raise SettingsError(
+                f"{sweep.parameter} is both set and swept.", f"Set or sweep {sweep.parameter}."
+            )
     recordings = ComparisonRequest(log=request.log, mavlink=request.mavlink, system=request.system)
     flight = flight or read_flight(recordings, progress)
     progress("replaying EKF2")
@@ -507,7 +511,7 @@ def run_what_if(
     try:
         if model.agreement.good:
             comparison = compare(flight, axes=("north", "east", AISLE), sigma_z_given=False)
-    except MissingDataError:  # EKF2 can be replayed without a comparison
+    except MissingDataError:  # a replay of EKF2 is possible without a comparison with KF
         if is_default_change:
             raise
     if comparison is not None:
@@ -520,7 +524,7 @@ def run_what_if(
                 raise MissingDataError(_explain_missing_change(comparison, model))
     settings = [changes] if changes or request.without else []
     settings += [{**changes, sweep.parameter: value} for value in values] if sweep else []
-    progress("replaying with other parameters")
+    progress("replaying EKF2 with other parameters")
     replays = what_if(model, settings, request.without)
     if isinstance(replays, Unavailable):
         raise MissingDataError(
@@ -532,41 +536,34 @@ def run_what_if(
 
 
 def _explain_missing_change(comparison: Comparison, model: Model) -> str:
-    """Format the error for a log that gives no maximum-likelihood change of EKF2's parameters."""
+    """Format the error that a log does not determine maximum-likelihood parameters of EKF2."""
     source = comparison.source
     reason = f"noise and delay of {source.name} cannot be estimated from this log"
     if source.origin.is_gnss or source.origin.may_drift:
         reason = (
-            f"innovations do not show the slow errors of {source.name}, and its delay is correct "
-            "or cannot be estimated"
+            f"innovations do not show the slow errors of {source.name}, and the delay of "
+            f"{source.name} is correct or cannot be estimated"
         )
     name, noise = comparison.flight.log.name, model.inputs.aid.noise
-    return f"{name}: {reason}. Give a change, for example `changes` {noise}=0.1."
+    return f"{name}: {reason}. Give a changed parameter, for example `changes` {noise}=0.1."
 
 
 def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
-    """Add tuning, time offset, explanations and loop closure to a comparison.
-
-    Parameters
-    ----------
-    comparison : Comparison
-    progress : callable
-        Called with the name of each step.
-    """
+    """Add noise estimates, time offset, explanations and loop closure error to a comparison."""
     names = REPORTED_AXES if {"north", "east"} <= {line.name for line in comparison.lines} else None
     tuning, clock = estimate_noises_and_clock(comparison, progress, names)
     heading = estimate_frame_rotation(comparison, tuning, clock, progress)
     progress("replaying EKF2")
     corrected = corrected_settings(comparison, tuning)
 
-    def requested_variants(inputs: Inputs) -> list[Variant]:
-        cause_variants = planned_variants(comparison, tuning, clock, heading, inputs)
-        return [*explanation_variants(comparison, inputs, corrected), *cause_variants]
+    def requested_configurations(inputs: Inputs) -> list[FilterConfiguration]:
+        cause_configurations = planned_configurations(comparison, tuning, clock, heading, inputs)
+        return [*explanation_configurations(comparison, inputs, corrected), *cause_configurations]
 
-    model = open_model(comparison.flight, requested_variants)
+    model = open_model(comparison.flight, requested_configurations)
     difference_steps = explain_ekf2_difference(comparison, model, clock, corrected)
     progress("searching for a loop closure")
-    from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 (tune and sync have none)
+    from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync
 
     loop = analyse_flight_loop(comparison.flight, progress)
     return Analysis(

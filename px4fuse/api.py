@@ -27,8 +27,8 @@ from px4fuse.writing import write_all
 
 Pathlike = str | Path
 Progress = Callable[[str], None]
-# Columns of table() and their types: fields of FilterSummary (nis_band is split) and of
-# ErrorsAgainstTruth
+# Columns of table() with their data types: fields of FilterSummary and ErrorsAgainstTruth, with
+# nis_low and nis_high for nis_band
 COLUMNS = {
     "count": "Int64",
     "nis_mean": "float64",
@@ -51,7 +51,7 @@ def compare(
     sigma_a_m_s2: float = request.SIGMA_A_M_S2,
     sigma_z_m: float | None = None,
     dt_s: float = request.DT_S,
-    input: request.InputName | None = None,  # noqa: A002 - the name of the setting
+    input: request.InputName | None = None,  # noqa: A002 - name of the setting
     clock_offset_s: float | Literal["auto"] | None = None,
     axes: request.AxisName | Sequence[request.AxisName] = (),
     heading_deg: float | None = None,
@@ -72,35 +72,35 @@ def compare(
     log : str, Path or Flight
         ULog or MAVLink recording, or a flight from :func:`px4fuse.read_log`.
     sigma_a_m_s2, sigma_z_m, dt_s, input
-        See :class:`px4fuse.Settings`. Default of SIGMA_Z: 0.1 m; with GNSS the measurement noise
-        of EKF2.
+        See :class:`px4fuse.Settings`. Default of SIGMA_Z: 0.1 m; for GNSS the measurement noise of
+        EKF2.
     clock_offset_s : float or "auto", optional
         Time offset to add to the timestamps of the position source; "auto" estimates it.
     axes : str or sequence of str
-        "north", "east", "down" or "aisle"; default: all axes of the source.
+        "north", "east", "down" or "aisle"; default: all axes of the position source.
     heading_deg : float, optional
-        Heading of the main horizontal axis ("aisle"), clockwise from north.
+        Heading of the axis "aisle", clockwise from north; default: main direction of the track.
     start_s, end_s : float, optional
-        Segment to analyse, seconds from the first data.
+        Analysed time span, in seconds after the first data; default: take-off and landing.
     position_source : str, optional
-        Name of a position track of the flight.
+        Name of the position track for KF.
     source_kind : {"uwb", "vio", "mocap", "gnss"}, optional
-        Kind of the position source if its messages do not state it.
+        Kind of the position source; default: from its messages.
     height : {"gnss", "barometer"}, optional
-        Height source of the axis "down" with GNSS; default: the one that EKF2 fused.
+        Height source of the axis "down" with GNSS; default: the height source that EKF2 fused.
     position : str, Path or px4fuse.request.PositionFile, optional
-        Recording of the positioning system.
+        Recording of the positioning system (CSV).
     mavlink : str or Path, optional
         MAVLink recording of the same flight.
     system : int, optional
-        MAVLink system id of the vehicle.
+        MAVLink system id of the vehicle; default: the id with the most messages.
     progress : callable
-        Called with the name of each step.
+        Function that receives the name of each step of the computation.
 
     Returns
     -------
     Analysis
-        Input of :func:`px4fuse.table`, :func:`px4fuse.find`, :func:`px4fuse.write_report` and
+        Argument of :func:`px4fuse.table`, :func:`px4fuse.find`, :func:`px4fuse.write_report` and
         :func:`px4fuse.write_page`.
 
     Raises
@@ -108,19 +108,21 @@ def compare(
     LogError, MissingDataError, SettingsError
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
-    arguments = locals()  # named like the fields of the request
+    arguments = locals()  # names of the arguments are fields of the request
     known = get_args(request.AxisName)
     axis_names = (axes,) if isinstance(axes, str) else tuple(axes)
     if unknown := set(axis_names).difference(known):
-        raise SettingsError(f"`axes` {unknown.pop()!r}: choose from {', '.join(known)}.")
+        raise SettingsError(f"`axes` {unknown.pop()!r} is unknown. Choose from {', '.join(known)}.")
     if isinstance(log, Flight) and (position, mavlink, system) != (None, None, None):
         raise SettingsError(
-            "position, mavlink and system are only used when a log is read, and this flight is "
-            "already read.",
-            "Give the path of its log instead.",
+            "the arguments position, mavlink and system are not possible with a Flight, because "
+            "they determine how a log is read.",
+            "Give the path of the log instead of the Flight.",
         )
     if isinstance(clock_offset_s, str) and clock_offset_s != request.AUTO:
-        raise SettingsError(f"`clock_offset_s` {clock_offset_s!r}: give seconds, or 'auto'.")
+        raise SettingsError(
+            f"`clock_offset_s` {clock_offset_s!r} is not a number of seconds or 'auto'."
+        )
     fields = {name: arguments[name] for name in request.ComparisonRequest.__struct_fields__}
     fields |= {"log": log.log.name if isinstance(log, Flight) else str(log), "axes": axis_names}
     if mavlink is not None:
@@ -134,14 +136,14 @@ def compare(
 
 
 def table(analysis: Analysis) -> pd.DataFrame:
-    """Tabulate the main numbers of an analysis.
+    """Return a table of the main numbers of an analysis.
 
     Returns
     -------
     DataFrame
-        One row per axis and filter ("kf", "ekf2"), which are the index. The columns have the names
-        of the JSON results; ``nis_low`` and ``nis_high`` are the 95 % band of the mean NIS. RMSE
-        and NEES are against ground truth. A number that is not available is NaN.
+        One row per axis and filter ("kf", "ekf2"), which are the index. Columns have the names of
+        the JSON results; ``nis_low`` and ``nis_high`` are the 95 % band of the mean NIS. RMSE and
+        NEES are against ground truth. A number that is not available is NaN.
     """
     rows = {
         (axis_name, filter_name): _summary_row(summary)
@@ -167,7 +169,7 @@ def evaluate(
     Parameters
     ----------
     estimate, reference : str, Path or Trajectory
-        Trajectory file, or part of a flight log: "LOG:vio", "LOG:ekf2", "LOG:kf" or "LOG:truth".
+        Trajectory file, or track of a flight log: "LOG:vio", "LOG:ekf2", "LOG:kf" or "LOG:truth".
     **options
         Arguments of :func:`px4fuse.trajectory.evaluation.evaluate`: ``alignment``,
         ``association``, ``max_gap_s``, ``time_offset_s``, ``rpe_deltas``, ``all_pairs``.
@@ -176,7 +178,7 @@ def evaluate(
     ------
     TrajectoryError, LogError, MissingDataError, SettingsError
         A file cannot be read, the times do not overlap, the motion is too small for the alignment,
-        or a delta is not above zero.
+        or an RPE delta is not above zero.
     """
     if not isinstance(estimate, Trajectory):
         estimate = read_source(str(estimate)).trajectory
@@ -211,24 +213,24 @@ def close_loop(
     source : str, Path or Trajectory
         Trajectory file or flight log, as in :func:`px4fuse.evaluate`.
     start_s, end_s : float, optional
-        Times of take-off and landing; default: detected.
+        Times of the start and the end of the loop; default: take-off and landing.
     landed_at : tuple of float, optional
-        Place of landing in metres forward and right of the take-off, and degrees of clockwise
-        rotation there.
+        Measured landing place: distances (m) forward and right of the take-off place, and the
+        clockwise rotation (°) if known.
     closed_loop : bool
-        False if the landing closes no loop.
+        False if the vehicle did not return to the take-off place.
     closures : sequence of px4fuse.request.GivenClosure
-        Further pairs of times at the same place.
+        Other loop closures: pairs of times at which the vehicle was at the same place.
     reference : str, Path or Trajectory, optional
-        Reference of the scores in addition to the ground truth of the log.
+        Reference for the ATE and RPE of each path, in addition to the ground truth of the log.
     position_drift_m, heading_drift_deg : float
-        Drift of the odometry per 100 m (1 σ).
+        Drift of the odometry after 100 m (1 σ).
     key_frames_m : float, optional
-        Distance between key frames.
+        Distance between the key frames of the pose graph.
     frame : str, optional
-        Frame of a trajectory file: "NED", "FRD", "ENU" or "camera".
+        Frame of a trajectory file: "NED", "FRD", "ENU" or "camera"; default: detected.
     progress : callable
-        Called with the name of each step.
+        Function that receives the name of each step of the computation.
 
     Raises
     ------
@@ -247,24 +249,19 @@ def close_loop(
 
 
 def write_report(analysis: Analysis, path: Pathlike) -> Path:
-    """Write the PDF report of ``px4fuse compare``, and the JSON results beside it.
+    """Write the PDF report of an analysis, and its JSON results in the same folder.
 
     Parameters
     ----------
     analysis : Analysis
-        From :func:`px4fuse.compare`.
+        Analysis from :func:`px4fuse.compare`.
     path : str or Path
-        Path that ends in .pdf.
-
-    Returns
-    -------
-    Path
-        Path of the PDF.
+        Path of the report, which ends in .pdf.
 
     Raises
     ------
     OutputError, SettingsError
-        A file cannot be written, or the analysis has no request.
+        A file cannot be written, or the analysis is not from :func:`px4fuse.compare`.
     """
     from px4fuse.report.pdf import render  # noqa: PLC0415 - slow import
     from px4fuse.results.build import results  # noqa: PLC0415
@@ -278,24 +275,19 @@ def write_report(analysis: Analysis, path: Pathlike) -> Path:
 
 
 def write_page(analysis: Analysis, path: Pathlike) -> Path:
-    """Write the web page of ``px4fuse explore``.
+    """Write the interactive web page of an analysis, as ``px4fuse explore`` does.
 
     Parameters
     ----------
     analysis : Analysis
-        From :func:`px4fuse.compare`.
+        Analysis from :func:`px4fuse.compare`.
     path : str or Path
-        Path that ends in .html.
-
-    Returns
-    -------
-    Path
-        Path of the page.
+        Path of the page, which ends in .html.
 
     Raises
     ------
     OutputError, SettingsError
-        The page cannot be written, or the analysis has no request.
+        The page cannot be written, or the analysis is not from :func:`px4fuse.compare`.
     """
     from px4fuse.explore.page import html_text  # noqa: PLC0415 - slow import
 
@@ -307,7 +299,6 @@ def write_page(analysis: Analysis, path: Pathlike) -> Path:
 
 @display_html.register
 def _display_card(analysis: Analysis) -> str | None:
-    """Return the diagnosis card of an analysis as HTML; None without a request."""
     from px4fuse.report.card_html import card_of, notebook_html  # noqa: PLC0415 - slow import
 
     return None if analysis.request is None else notebook_html(card_of(analysis))
@@ -316,7 +307,9 @@ def _display_card(analysis: Analysis) -> str | None:
 def _require_suffix(path: Pathlike, suffix: str) -> Path:
     target = Path(path)
     if target.suffix.lower() != suffix:
-        raise OutputError(f"{target}: give a name that ends in {suffix}.")
+        raise OutputError(
+            f"{target}: the name does not end in {suffix}. Give a name ending in {suffix}."
+        )
     return target
 
 
@@ -324,7 +317,7 @@ def _require_request(analysis: Analysis) -> request.ComparisonRequest:
     if analysis.request is None:
         raise SettingsError(
             "This analysis contains no request, so its command is unknown.",
-            "Create it with px4fuse.compare.",
+            "Make the analysis with px4fuse.compare.",
         )
     return analysis.request
 
@@ -342,15 +335,15 @@ def what_if(
         ULog or MAVLink recording, or a flight from :func:`px4fuse.read_log`.
     changes : mapping or sequence of mappings, optional
         Parameter values by PX4 name, in PX4's units; one replay per mapping. Default: the
-        maximum-likelihood estimates of noise and delay.
-    without : mapping from PX4's name of an aid to float, optional
-        Time (s) from which EKF2 does not fuse the aid, as ``{"gnss_pos": 60.0}``.
+        maximum-likelihood estimates of noise and delay of the position source.
+    without : mapping from PX4's name of an aiding source to float, optional
+        Time (s) from which EKF2 does not fuse the aiding source, as ``{"gnss_pos": 60.0}``.
 
     Raises
     ------
     LogError, MissingDataError, SettingsError
         The log cannot be read, the replay is not possible or does not agree with the log, or a
-        parameter, value or aid is not valid.
+        parameter, a value or an aiding source is not valid.
     """
     flight = log if isinstance(log, Flight) else read_log(log)
     if changes is None and not without:

@@ -5,8 +5,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+ArrayPair = tuple[Array, Array]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
+
+
+def median_interval(time_s: Array) -> float:
+    """Return the median interval (s) between successive times."""
+    return float(np.median(np.diff(time_s)))
 
 
 def cumulative_integral(values: Array, time_s: Array) -> Array:

@@ -1,12 +1,13 @@
-"""EKF2 aids and parameters: PX4 names by role, defaults, units and ranges.
+"""Aiding sources and parameters of EKF2: PX4 names by role, defaults, units and ranges.
 
-``ekf2_parameters.toml`` has one row per aid and per parameter. Other modules get the names of
-parameters of external vision and GNSS from the aid (``EV_POS.noise``).
+``ekf2_parameters.toml`` has one entry per aiding source and per parameter. Other modules get the
+names of the parameters of external vision and GNSS from the aiding source (``EV_POS.noise``).
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import msgspec
 
@@ -16,37 +17,37 @@ from px4fuse.record import table
 
 @dataclass(frozen=True)
 class Aid:
-    """Kind of measurement that EKF2 can fuse, and the names of its parameters.
+    """Aiding source of EKF2: a kind of measurement that EKF2 can fuse, with its parameters.
 
     Attributes
     ----------
     name : str
         PX4's name, as in ``estimator_aid_src_<name>``.
     switch : str
-        Parameter that enables fusion of the aid, from v1.14 on; before, EKF2_AID_MASK does.
+        Name of the parameter that enables fusion, from PX4 v1.14 on; before, EKF2_AID_MASK does.
     noise, gate, delay : str
-        Parameters of standard deviation, gate (√S) and age (ms).
+        Names of the parameters for measurement noise (σ), gate (√S) and age (ms).
     noise_mode : str
-        Parameter that ignores reported variances if 1; empty without such a parameter.
+        Name of the parameter that, if 1, makes EKF2 ignore reported variances; else empty.
     lever_arm : tuple of str
-        Parameters of the lever arm of the sensor (m, FRD).
+        Names of the parameters for the position of the sensor (m, FRD).
     label, unit : str
         Name for users, and unit of the innovations.
     noise_origin : str
-        Origin of the variance if it is not ``noise`` alone; else empty.
+        Origin of the measurement variance if it is not ``noise`` alone; else empty.
     default_gate : float
-        Gate if the log does not contain the parameter ``gate``.
+        Gate (√S) if the log does not contain the parameter ``gate``.
     axes : tuple of str
         Axes of the innovations, in PX4's order.
     fields : tuple of str
-        Fields of ``estimator_innovations`` and ``_variances``, by axis; empty without such fields.
+        Fields of ``estimator_innovations`` and ``_variances``, by axis; empty without these fields.
     old_fields : tuple of str
         Fields of ``ekf2_innovations`` (v1.8 to v1.10); ``_var`` is appended for the variance.
     flags : tuple of tuple of str
-        Fields of ``estimator_status_flags``. The aid is enabled if any flag of the first logged
-        group is set.
+        Groups of fields of ``estimator_status_flags``. EKF2 is configured to fuse the aiding source
+        if a flag is set in the first group that the log contains.
     status_bit : int or None
-        Bit in ``estimator_status.control_mode_flags`` that is set if the aid is enabled.
+        Bit of ``estimator_status.control_mode_flags`` with the same meaning as ``flags``.
     """
 
     name: str
@@ -68,36 +69,27 @@ class Aid:
 
     @property
     def own_parameters(self) -> frozenset[str]:
-        """Parameters that affect only the measurements of this aid."""
+        """Names of the parameters that affect only the measurements of this aiding source."""
         return frozenset((self.noise, self.gate, self.delay, self.noise_mode))
 
     def logged_parameters(self, logged: Mapping[str, float]) -> dict[str, float]:
-        """Return the logged parameters of this aid and the parameter that enables it."""
+        """Return the logged parameters of this aiding source, with the one that enables fusion."""
         names = (self.noise, self.delay, self.gate, self.noise_mode, self.switch, AID_MASK)
         return {name: float(logged[name]) for name in names if name in logged}
 
 
 AID_MASK = "EKF2_AID_MASK"
-# only in logs of PX4 main since 2026, where EKF2 uses the measurement time of a fix from the driver
+# Parameter of PX4 main since 2026: EKF2 gets the measurement time of a GNSS fix from the driver
 GNSS_MODE = "EKF2_GPS_MODE"
-# relative tolerance of the limits of a range, because logged values are float32 (rounding 6e-8)
+# Relative tolerance of PX4's parameter ranges, because logged values are float32 (rounding 6e-8)
 FLOAT32_TOLERANCE = 1e-6
-# age of a fix of the first receiver from v1.17 on: EKF2 subtracts it from the timestamp
+# Parameters from PX4 v1.17 on for the age (ms) of a fix of the first GNSS receiver, which EKF2
+# subtracts from its timestamp
 RECEIVER_DELAYS = ("SENS_GNSS0_DELAY", "SENS_GPS0_DELAY")
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """One parameter of EKF2.
-
-    Attributes
-    ----------
-    unit : str
-    default : float
-        PX4's default, from v1.14 on.
-    minimum, maximum : float
-        PX4's range, both ends included.
-    """
+class Parameter(NamedTuple):
+    """Unit of an EKF2 parameter, PX4's default from v1.14 on, and PX4's range (ends included)."""
 
     unit: str
     default: float
@@ -105,10 +97,7 @@ class Parameter:
     maximum: float
 
     def describe_range_error(self, value: float) -> str:
-        """Return a text if a finite value is outside the range, else "".
-
-        Logged values are float32, in which the limit 0.01 is 0.0099999998.
-        """
+        """Return " 9 m is outside PX4's range 0.01 to 5" for a value outside the range, else ""."""
         low = self.minimum - FLOAT32_TOLERANCE * abs(self.minimum)
         high = self.maximum + FLOAT32_TOLERANCE * abs(self.maximum)
         if low <= value <= high:
@@ -118,8 +107,15 @@ class Parameter:
 
 
 TABLES = table(__file__, "ekf2_parameters.toml", dict)
+# Keys of TABLES whose text contains several names, separated by blanks
+NAME_LISTS = ("axes", "fields", "old_fields", "lever_arm")
 AIDS, DISTURBANCES = (
-    msgspec.convert({name: {"name": name, **row} for name, row in rows.items()}, dict[str, Aid])
+    {
+        name: msgspec.convert(
+            {"name": name, **row} | {key: row[key].split() for key in NAME_LISTS if key in row}, Aid
+        )
+        for name, row in rows.items()
+    }
     for rows in (TABLES["aids"], TABLES["disturbances"])
 )
 EV_POS, GNSS_POS, GNSS_VEL, GNSS_HGT, BAROMETER, FLOW, MAG = map(
@@ -127,28 +123,28 @@ EV_POS, GNSS_POS, GNSS_VEL, GNSS_HGT, BAROMETER, FLOW, MAG = map(
     ("ev_pos", "gnss_pos", "gnss_vel", "gnss_hgt", "baro_hgt", "optical_flow", "mag"),
 )
 PARAMETERS = msgspec.convert(TABLES["parameters"], dict[str, Parameter])
-# parameters of the model, and other logged parameters with which px4fuse computes
+# Parameters of the EKF2 model, and other logged parameters with which px4fuse computes
 RANGES = PARAMETERS | msgspec.convert(TABLES["logged"], dict[str, Parameter])
 FIELD_NOISES = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
-# defaults up to v1.13 (ekf2_params.c)
+# Defaults of PX4 up to v1.13 that differ from later ones (ekf2_params.c)
 OLD_DEFAULTS: Mapping[str, float] = {EV_POS.delay: 175.0}
-# parameters that are written to the results
-REPORTED: tuple[str, ...] = tuple(TABLES["reported"])
+# Names of the logged parameters that the results contain
+REPORTED: tuple[str, ...] = tuple(TABLES["reported"].split())
 
 
 def effective_settings(
-    logged: Mapping[str, float], aid: Aid = EV_POS, *others: Aid
+    logged: Mapping[str, float], aid: Aid = EV_POS, *other_aids: Aid
 ) -> dict[str, float]:
-    """Return the values of the model's parameters: logged ones, else PX4's defaults.
+    """Return the parameter values of the EKF2 model: the logged value, else PX4's default.
 
     Parameters
     ----------
     logged : mapping
-        Parameters of the log, by PX4 name.
-    aid, *others : Aid
-        Fused aids; parameters of other aids are omitted.
+        Parameter values in the log, by PX4 name.
+    aid, *other_aids : Aid
+        Aiding sources that EKF2 fuses; parameters of other aiding sources are omitted.
     """
-    used_switches = {fused_aid.switch for fused_aid in (aid, *others)}
+    used_switches = {fused_aid.switch for fused_aid in (aid, *other_aids)}
     excluded_names = {
         name
         for other in (EV_POS, GNSS_POS, GNSS_VEL, MAG, BAROMETER)
@@ -170,7 +166,7 @@ def effective_settings(
 
 
 def fuses_by_mask(logged: Mapping[str, float]) -> bool:
-    """Return True for a release that enables aids by EKF2_AID_MASK (up to v1.13)."""
+    """Return True if EKF2_AID_MASK selects the aiding sources in this log (PX4 up to v1.13)."""
     return AID_MASK in logged and EV_POS.switch not in logged
 
 
@@ -182,9 +178,9 @@ def replace_invalid_parameters(
     Returns
     -------
     valid : dict
-        All parameters, except non-finite ones without a known default.
+        All parameters, except non-finite ones whose default is not in ``RANGES``.
     notes : tuple of str
-        One per parameter that was replaced or omitted.
+        One sentence per parameter that was replaced or omitted.
 
     Examples
     --------
@@ -197,26 +193,26 @@ def replace_invalid_parameters(
         defaults |= OLD_DEFAULTS
     for name, value in logged.items():
         parameter = RANGES.get(name)
-        finite = math.isfinite(value)
         fault = "" if parameter is None else parameter.describe_range_error(value)
-        if finite and not fault:
+        if not math.isfinite(value):
+            fault = " is not a finite number"
+        if not fault:
             valid[name] = value
         elif parameter is None:
-            notes.append(f"{name} is not a finite number and is not used.")
+            notes.append(f"{name}{fault} and is not used.")
         else:
             valid[name] = defaults[name]
-            problem = fault if finite else " is not a finite number"
-            notes.append(f"{name}{problem}; the default {valid[name]:g} is used.")
+            notes.append(f"{name}{fault}; the default {valid[name]:g} is used.")
     return valid, tuple(notes)
 
 
 def check_parameters(changes: Mapping[str, float]) -> dict[str, float]:
-    """Return the parameters, if all are in the model and within PX4's range.
+    """Return changes of EKF2 parameters if the EKF2 model contains all of them.
 
     Raises
     ------
     SettingsError
-        A name that the model does not contain, or a value outside PX4's range.
+        The EKF2 model does not contain a parameter, or a value is outside PX4's range.
 
     Examples
     --------
@@ -230,12 +226,8 @@ def check_parameters(changes: Mapping[str, float]) -> dict[str, float]:
                 f"{name} is not a parameter of the EKF2 replay",
                 f"{suggest_name(name, PARAMETERS)}Choose from {', '.join(PARAMETERS)}.",
             )
-        if not parameter.minimum <= value <= parameter.maximum or not math.isfinite(value):
-            unit = f" {parameter.unit}" if parameter.unit else ""
-            raise SettingsError(
-                f"{name}={value:g} is outside PX4's range of {parameter.minimum:g} to "
-                f"{parameter.maximum:g}{unit} (default {parameter.default:g})."
-            )
+        if fault := parameter.describe_range_error(value):
+            raise SettingsError(f"{name}{fault} (default {parameter.default:g}).")
         if name == EV_POS.noise_mode and value not in (0.0, 1.0):
-            raise SettingsError(f"{name}={value:g}: give 0 or 1.")
+            raise SettingsError(f"{name}={value:g} is not possible. Give 0 or 1.")
     return {name: float(value) for name, value in changes.items()}

@@ -18,15 +18,15 @@ The text is one line: the fault, its place, and an action. Arguments are in back
 from collections.abc import Iterable
 
 
-def suggest_name(name: str, known: Iterable[str]) -> str:
-    """Return a question with the known name that is most similar; empty if none is similar.
+def suggest_name(name: str, known_names: Iterable[str]) -> str:
+    """Return "Did you mean X? " with the most similar known name X; "" without a similar name.
 
     >>> suggest_name("EKF2_EVP_NOIS", ["EKF2_EVP_GATE", "EKF2_EVP_NOISE"]), suggest_name("x", ["y"])
     ('Did you mean EKF2_EVP_NOISE? ', '')
     """
     import difflib  # noqa: PLC0415 - needed for errors only
 
-    similar = difflib.get_close_matches(name, list(known), n=1)
+    similar = difflib.get_close_matches(name, list(known_names), n=1)
     return f"Did you mean {similar[0]}? " if similar else ""
 
 

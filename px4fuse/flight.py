@@ -13,24 +13,32 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.ekf2_parameters import BAROMETER, Aid
 from px4fuse.log import ClockMap, InputFile, LogInfo, Stream, UnusedData
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.position_source import Origin, PositionKind
-from px4fuse.record import NotNegative, Record, Vector
+from px4fuse.record import NotNegative, Record, Span, Vector
 from px4fuse.record import Unavailable as Unavailable  # noqa: PLC0414 - public re-export
 
 AxisName = Literal["north", "east", "down"]
-# Minimum fraction of sample intervals up to 3 medians; below it, the samples arrive in bursts
-MIN_REGULAR_SHARE = 0.8
+TableOrUnavailable = pd.DataFrame | Unavailable
+# Step functions of flight time by name: values are valid until the next index
+StepFunctions: TypeAlias = "Mapping[str, pd.Series[float]]"
+# Intervals (start, end) in s of flight time
+Spans = tuple[Span, ...]
+# Minimum fraction of sample intervals of up to three times the median for a regular rate; with a
+# smaller fraction, the samples arrive in bursts
+MIN_REGULAR_FRACTION = 0.8
 # Values of ClockMap.method for which the timestamps are not times of measurement
 ARRIVAL_METHODS = ("arrival time", "receive time", "position in the stream")
+BODY_AXES = ("forward", "right", "down")
 AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
 SOURCE_NAMES: Mapping[PositionKind, str] = {
     "uwb": "UWB",
@@ -54,13 +62,11 @@ class Columns:
     QUATERNION: Final = ["w", "x", "y", "z"]
     ROTATION_VARIANCE: Final = ["forward_rad2", "right_rad2", "down_rad2"]
     # State and variances of EKF2 at the fusion horizon, common to all PX4 releases
-    GYRO_BIAS: Final = [f"gyro_bias_{axis}_rad_s" for axis in ("forward", "right", "down")]
-    ACCELEROMETER_BIAS: Final = [
-        f"accelerometer_bias_{axis}_m_s2" for axis in ("forward", "right", "down")
-    ]
+    GYRO_BIAS: Final = [f"gyro_bias_{axis}_rad_s" for axis in BODY_AXES]
+    ACCELEROMETER_BIAS: Final = [f"accelerometer_bias_{axis}_m_s2" for axis in BODY_AXES]
     EARTH_FIELD: Final = [f"earth_field_{axis}_gauss" for axis in AXIS_NAMES]
-    BODY_FIELD: Final = [f"body_field_{axis}_gauss" for axis in ("forward", "right", "down")]
-    FIELD_INNOVATION: Final = [f"innovation_{axis}_gauss" for axis in ("forward", "right", "down")]
+    BODY_FIELD: Final = [f"body_field_{axis}_gauss" for axis in BODY_AXES]
+    FIELD_INNOVATION: Final = [f"innovation_{axis}_gauss" for axis in BODY_AXES]
     DELAYED_STATE: Final = [
         *QUATERNION,
         *VELOCITY,
@@ -140,7 +146,7 @@ class Alignment(Record, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class PositionTrack:
-    """External position track.
+    """Positions of one external source over time.
 
     Attributes
     ----------
@@ -213,11 +219,11 @@ class PositionTrack:
     __repr__ = one_line_repr
 
     def aid(self, axis: str) -> Aid | None:
-        """Return the EKF2 aid of this source along an axis; None if EKF2 never fuses it."""
+        """Return the aiding source of EKF2 that fuses this track along an axis, if any."""
         return self.origin.aid if axis != "down" or self.barometer is None else BAROMETER
 
     def description_fields(self) -> dict[str, Any]:
-        """Return the descriptive fields of the results (JSON) by name."""
+        """Return the fields that describe the track in results.json, by name."""
         names = (
             "name",
             "kind",
@@ -230,10 +236,10 @@ class PositionTrack:
             "log",
             "alignment",
         )
-        owner_by_name = {
-            name: self.origin if hasattr(self.origin, name) else self for name in names
+        return {
+            name: getattr(self.origin if hasattr(self.origin, name) else self, name)
+            for name in names
         }
-        return {name: getattr(owner_by_name[name], name) for name in names}
 
     @property
     def rate_hz(self) -> float:
@@ -242,7 +248,7 @@ class PositionTrack:
 
 
 def source_name(source: PositionTrack) -> str:
-    """Return the name of a position source as its users call it, not its topic."""
+    """Return the usual name of a position source, such as "UWB", instead of its topic."""
     return SOURCE_NAMES[source.origin.kind]
 
 
@@ -288,12 +294,12 @@ HORIZON_NOT_LOGGED = Unavailable(
 RECORD_NOT_LOGGED = Unavailable(
     "EKF2 state at the fusion horizon",
     "estimator_states is not logged",
-    "Record a ULog with PX4 v1.12 or newer and SDLOG_PROFILE bit 0 (default), and add it.",
+    "Add a ULog of PX4 v1.12 or newer, recorded with SDLOG_PROFILE bit 0 (default).",
 )
 
 
 GROUND_EFFECT, BAD_ACCELERATION = "gnd_effect", "bad_acc_vertical"
-# Weight of a new sample in EKF2's low-pass filter of optical flow (_flow_vel_body_lpf, ekf.h)
+# Weight of a new sample in EKF2's low-pass filter of optical flow (_flow_vel_body_lpf in ekf.h)
 FLOW_FILTER_WEIGHT = 0.1
 
 
@@ -348,7 +354,7 @@ class FusionRecord:
     latitude_deg: float = np.nan
     altitude_m: float = 0.0
     height_bias: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    states: Mapping[str, pd.Series[float]] = field(default_factory=dict)
+    states: StepFunctions = field(default_factory=dict)
 
     __repr__ = one_line_repr
 
@@ -358,7 +364,7 @@ class FusionRecord:
         return not np.isfinite(self.delayed["north_m"]).any()
 
     def was_in_state(self, state: str, times_s: Array) -> BoolArray:
-        """Return a mask of the times in one of :attr:`states`; all False if not logged."""
+        """Return a mask of the times in the state, a key of ``states``; all False if not logged."""
         steps = self.states.get(state)
         return (
             np.zeros(len(times_s), bool) if steps is None else step_values_at(steps, times_s) > 0.0
@@ -367,7 +373,7 @@ class FusionRecord:
 
 @dataclass(frozen=True)
 class AidLog:
-    """Logged data of one EKF2 aid.
+    """Logged innovations, variances and fusion results of one aiding source of EKF2.
 
     Attributes
     ----------
@@ -398,7 +404,7 @@ class AidLog:
 
 
 def step_values_at(steps: pd.Series[float], times: pd.Index[float] | Array) -> Array:
-    """Return the values of a step function; before its first time, the first value."""
+    """Return the values of a step function at times; before its first time, its first value."""
     rows = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
     return np.asarray(steps, dtype=np.float64)[rows]
 
@@ -442,15 +448,15 @@ class Ekf2:
     """
 
     state: pd.DataFrame
-    variance: pd.DataFrame | Unavailable
-    innovations: Mapping[AxisName, pd.DataFrame | Unavailable]
+    variance: TableOrUnavailable
+    innovations: Mapping[AxisName, TableOrUnavailable]
     innovation_topics: tuple[str, ...]
-    fusing: pd.DataFrame | Unavailable
+    fusing: TableOrUnavailable
     resets: tuple[Reset, ...]
     instances: tuple[tuple[float, int], ...]
     gate: float
     notes: tuple[str, ...] = ()
-    accelerometer_bias: pd.DataFrame | Unavailable = BIAS_NOT_LOGGED
+    accelerometer_bias: TableOrUnavailable = BIAS_NOT_LOGGED
     step_s: float = EKF2_STEP_S
     horizon_s: float | Unavailable = HORIZON_NOT_LOGGED
     record: FusionRecord | Unavailable = RECORD_NOT_LOGGED
@@ -526,22 +532,28 @@ class Flight:
     """
 
     log: LogInfo
-    imu: pd.DataFrame | Unavailable
-    attitude: pd.DataFrame | Unavailable
+    imu: TableOrUnavailable
+    attitude: TableOrUnavailable
     positions: tuple[PositionTrack, ...]
     ekf2: Ekf2 | Unavailable
     truth: Truth | Unavailable
-    airborne: tuple[tuple[float, float], ...] | Unavailable
+    airborne: Spans | Unavailable
     missing: tuple[Unavailable, ...] = ()
     streams: Mapping[str, Stream] = field(default_factory=dict)
     clocks: tuple[ClockMap, ...] = ()
     unused: tuple[UnusedData, ...] = ()
     inputs: tuple[InputFile, ...] = ()
     modes: tuple[FlightMode, ...] | Unavailable = MODES_NOT_LOGGED
-    tumble_spans: tuple[tuple[float, float], ...] = ()
+    tumble_spans: Spans = ()
     barometer: pd.DataFrame | None = None
 
     __repr__ = one_line_repr
+
+
+def time_index(time_s: NDArray[Any]) -> pd.Index[float]:
+    """Return the index ``time_s`` (s) of a table of a flight."""
+    index: pd.Index[float] = pd.Index(time_s, name="time_s")
+    return index
 
 
 def sort_by_preference(tracks: Iterable[PositionTrack]) -> tuple[PositionTrack, ...]:
@@ -560,6 +572,6 @@ def sample_rate(samples: pd.DataFrame) -> float:
         return float("nan")
     intervals = samples.index.to_series().diff().dropna()
     regular_intervals = intervals[intervals <= 3.0 * intervals.median()]
-    if len(regular_intervals) < MIN_REGULAR_SHARE * len(intervals):
+    if len(regular_intervals) < MIN_REGULAR_FRACTION * len(intervals):
         regular_intervals = intervals
     return float(1.0 / regular_intervals.mean())

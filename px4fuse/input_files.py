@@ -1,9 +1,9 @@
-"""Register of the input files of a command; px4fuse never writes to any of them.
+"""Register of the input files of a command, to which px4fuse never writes.
 
-Files are identified by device and inode, so a link, another path, or another spelling on a file
-system that ignores case is the same file. Readers add each file that they open.
-:func:`px4fuse.writing.write_all` raises an error for a registered file. Only the process of the
-command has a register: it adds the files of its workers before they start.
+Files are identified by device and inode, so that a file is recognised by a link, another path, or a
+name in another case. Readers add each file that they open, and
+:func:`px4fuse.writing.write_all` raises an error for a registered file. Only the main process of a
+command has a register, and adds the files of its worker processes before they start.
 """
 
 import os
@@ -15,19 +15,17 @@ from pathlib import Path
 
 from px4fuse.errors import OutputError
 
-# Device and inode; the path on a file system without inodes
+# Device and inode of a file or folder; its path on a file system without inodes
 _Identity = tuple[int, int] | str
 
 
 @dataclass(frozen=True)
 class _Register:
-    """Input files, and the folders that contain them."""
+    """Input files, folders that contain them, and folders whose parents are registered."""
 
     inputs: set[_Identity] = field(default_factory=set)
     input_by_folder: dict[_Identity, Path] = field(default_factory=dict)
-    registered_folders: set[Path] = field(
-        default_factory=set
-    )  # folders whose parents are in `containing`
+    registered_folders: set[Path] = field(default_factory=set)
 
 
 _register: ContextVar[_Register | None] = ContextVar("register", default=None)
@@ -45,7 +43,7 @@ def inputs_protected() -> Iterator[None]:
 
 @contextmanager
 def inputs_not_registered() -> Iterator[None]:
-    """Do not register files that are read inside the context, because they will be updated."""
+    """Do not register files that are read inside the context, because the command replaces them."""
     token = _register.set(None)
     try:
         yield
@@ -67,13 +65,7 @@ def add_input(path: Path) -> None:
 
 
 def check_outputs(targets: Iterable[Path]) -> None:
-    """Raise an error if an output is a registered input.
-
-    Raises
-    ------
-    OutputError
-        An output is an input.
-    """
+    """Raise an OutputError if an output is a registered input file or folder."""
     register = _register.get() or _Register()
     for target in targets:
         if _identity(target) in register.inputs:
@@ -84,22 +76,15 @@ def check_outputs(targets: Iterable[Path]) -> None:
 
 
 def check_output_folder(folder: Path) -> None:
-    """Raise an error if the output folder contains an input, also through a link.
+    """Raise an OutputError if the output folder is a file or contains an input, also by a link.
 
-    Outputs are written to the folder and its subfolders, so the entries of both are compared.
-
-    Raises
-    ------
-    OutputError
-        The folder contains an input.
+    Files in the folder and in its subfolders are checked, because outputs are written to both.
     """
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"-o {folder} is not a folder. Choose another name.")
     register = _register.get() or _Register()
     entries = _entries(folder)
-    for path in (
-        folder,
-        *entries,
-        *(subentry for entry in entries for subentry in _entries(entry)),
-    ):
+    for path in (folder, *entries, *(child for entry in entries for child in _entries(entry))):
         if (identity := _identity(path)) is None:
             continue
         input_path = path if identity in register.inputs else register.input_by_folder.get(identity)

@@ -1,6 +1,6 @@
-"""Worked examples of the lesson, computed with px4fuse's KF.
+"""Worked Examples 1 and 2 of the lesson UAT 366, module 2 ("SLAM and sensor fusion").
 
-Source: UAT 366, module 2, "SLAM and sensor fusion", Examples 1 and 2.
+Example 1 is computed with KF, Example 2 with the compass rule of ``px4fuse loop``.
 """
 
 from collections.abc import Iterator
@@ -15,27 +15,30 @@ from px4fuse.loop.closure import distribute_by_distance
 from px4fuse.trajectory.model import cumulative_distance
 
 TRUE_VELOCITY_M_S = 1.0
-STEPS = 30
-STEPS_PER_UPDATE = 5
-# m; the lesson's fixed values instead of random noise
+PREDICTIONS = 30
+PREDICTIONS_PER_UPDATE = 5
+# Errors (m) of the six UWB positions in Example 1: fixed numbers instead of random noise
 UWB_NOISE_M = (0.08, -0.12, 0.05, 0.10, -0.06, -0.09)
-# m; corners of Example 2's odometry; the true path returns to its start
+# Corners (m) of the odometry path in Example 2; the true path returns to its start
 ODOMETRY_M = ((0.0, 0.0), (20.3, 0.2), (20.6, 20.4), (0.8, 20.9), (1.2, 0.8))
 
 
 def example_1() -> Replay:
     """Run Example 1: UWB every 0.5 s along an aisle at 1 m/s, initial velocity unknown."""
     settings = Settings(sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input="zero")
-    step = np.arange(STEPS_PER_UPDATE, STEPS + 1, STEPS_PER_UPDATE, dtype=np.float64)
-    time = settings.dt_s * step
+    time = settings.dt_s * np.arange(
+        PREDICTIONS_PER_UPDATE, PREDICTIONS + 1, PREDICTIONS_PER_UPDATE, dtype=np.float64
+    )
     axis = Axis(
         name="aisle",
         direction=np.array([1.0, 0.0, 0.0]),
         heading_deg=0.0,
-        note="the lesson's aisle",
+        note="aisle of UAT 366, Example 1",
         measurement_time_s=time,
         measurement_m=TRUE_VELOCITY_M_S * time + np.array(UWB_NOISE_M),
-        acceleration=Unavailable("acceleration", "the lesson's IMU measures zero", "none needed"),
+        acceleration=Unavailable(
+            "acceleration", "Example 1 has no acceleration", "No action needed."
+        ),
     )
     return replay(axis, settings, InitialState(time_s=0.0, position_m=0.0))
 
@@ -46,8 +49,8 @@ def kalman_lines() -> Iterator[str]:
     for time, row in kf_run.steps.loc[kf_run.updates.index].iterrows():
         seconds = float(str(time))
         yield (
-            f"t {seconds:.1f} s: p {row['position_m']:.2f} (true "
-            f"{TRUE_VELOCITY_M_S * seconds:.2f}), v {row['velocity_m_s']:.2f}, "
+            f"time {seconds:.1f} s: position {row['position_m']:.2f} m (true "
+            f"{TRUE_VELOCITY_M_S * seconds:.2f} m), velocity {row['velocity_m_s']:.2f} m/s, "
             f"sigma_p {np.sqrt(row['position_variance_m2']):.3f} m, "
             f"sigma_v {np.sqrt(row['velocity_variance_m2_s2']):.3f} m/s"
         )

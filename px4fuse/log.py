@@ -1,4 +1,4 @@
-"""Description of a recording: log file, senders, clocks, and topics of each kind of data."""
+"""Description of a flight log: file, senders, clocks, and topics of each kind of data."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,35 +7,34 @@ from typing import Literal
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record, Sha256, Share
 
-
 SHARED_STAMPS = "most samples share a timestamp"
 # Clock of timestamps that PX4 converted or replaced
 SENDER_CLOCK = "sender timestamps"
 
 
 class Dropout(Record, frozen=True):
-    """Interval that the logger lost: start and duration in s."""
+    """Time span (s) in which the logger of the autopilot lost data."""
 
     start_s: float
     duration_s: NotNegative
 
 
 class Sender(Record, frozen=True):
-    """MAVLink sender in a recording.
+    """Sender of messages in a MAVLink recording.
 
     Attributes
     ----------
     system, component : int
         MAVLink ids.
     description : str
-        Type from its heartbeat ("PX4 quadrotor", "companion computer").
+        Type from the heartbeat of the sender ("PX4 quadrotor", "companion computer").
     messages : int
-        Messages with a valid checksum.
+        Number of messages with a valid checksum.
     lost_fraction : float or None
-        Fraction of its messages missing in the recording, by the sequence numbers; None if the
-        sender does not count its messages.
+        Fraction of the sender's messages that the recording does not contain, from the sequence
+        numbers; None if the sender does not count its messages.
     chosen : bool
-        True for the autopilot of the flight.
+        True for the autopilot of the analysed flight.
     """
 
     system: int
@@ -47,7 +46,7 @@ class Sender(Record, frozen=True):
 
 
 class ClockMap(Record, frozen=True):
-    """Map from one clock to the autopilot's boot clock.
+    """Conversion of the timestamps of a clock to the autopilot's boot clock.
 
     boot = timestamp + offset + drift · (timestamp - middle of the timestamps)
 
@@ -56,20 +55,21 @@ class ClockMap(Record, frozen=True):
     clock : str
         Name of the clock ("UNIX time of system 1, component 197").
     method : str
-        "boot clock", "TIMESYNC", "SYSTEM_TIME", "receive time", "arrival time" or "position in the
-        stream".
+        Data from which the conversion is estimated: "boot clock", "TIMESYNC", "SYSTEM_TIME",
+        "receive time", "arrival time" or "position in the stream".
     pairs : int
-        Number of pairs of clock readings.
+        Number of simultaneous readings of both clocks.
     offset_s : float
-        Boot clock minus this clock, at the middle of the pairs.
+        Boot clock minus this clock, at the middle of the readings.
     drift_ppm : float
         Rate of the boot clock minus rate of this clock (parts per million).
     jitter_s : float
-        Standard deviation of the pairs about the fitted line (1.4826 · median absolute deviation).
+        Standard deviation of the readings from the fitted line (1.4826 · median absolute
+        deviation).
     note : str
-        Limitation of the map; may be empty.
+        Limitation of the conversion; may be empty.
     distinct_stamps : int or None
-        Number of distinct timestamps if the timestamps are not usable as a clock.
+        Number of different timestamps, if the timestamps are not usable as a clock.
     """
 
     clock: str
@@ -84,17 +84,7 @@ class ClockMap(Record, frozen=True):
 
 @dataclass(frozen=True)
 class Stream:
-    """Topics, clock and file of one kind of data (IMU, attitude, ...).
-
-    Attributes
-    ----------
-    topics : tuple of str
-        PX4 topics or MAVLink messages.
-    clock : str
-        Clock of the timestamps.
-    log : str
-        File name.
-    """
+    """PX4 topics or MAVLink messages of one kind of data, clock of the timestamps, and log name."""
 
     topics: tuple[str, ...]
     clock: str
@@ -103,7 +93,7 @@ class Stream:
 
 @dataclass(frozen=True)
 class UnusedData:
-    """Position-related topic or message that px4fuse does not use, with the reason."""
+    """Topic or message about position that px4fuse does not use; ``count``: its messages."""
 
     name: str
     count: int
@@ -111,7 +101,7 @@ class UnusedData:
 
 
 class InputFile(Record, frozen=True):
-    """File read in addition to the log: name without folder, hash, size and role."""
+    """Input file in addition to the log: name without folder, SHA-256, size (bytes) and role."""
 
     name: str
     sha256: Sha256
@@ -127,43 +117,43 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
     name : str
         File name without folder.
     sha256 : str
-        Hash of the file content.
+        SHA-256 of the file content.
     bytes : int
-        File size.
+        Size of the file.
     format : str
         "ULog", "MAVLink tlog" (with receive times) or "MAVLink stream" (without).
     firmware : str
-        For example "PX4 v1.16.1"; "unknown" if not in the log.
+        Version, for example "PX4 v1.16.1"; "unknown" if not in the log.
     firmware_hash : str
-        Git hash, or "unknown".
+        Git hash of the firmware; "unknown" if not in the log.
     hardware : str
     boot_time_s : float
-        Boot clock (s) of time zero, the first sample of data.
+        Boot clock (s) at time zero of the flight, which is the first sample.
     duration_s : float
-        Duration of the data: in a ULog of the IMU (or else of the topic with most samples), in
-        MAVLink of the messages with boot time. Single messages hours away are ignored.
+        Duration of the data. ULog: duration of the IMU samples, else of the topic with the most
+        samples. MAVLink: duration of the messages with boot time. Outliers of time are ignored.
     dropouts : tuple of Dropout
         Dropouts that the logger reported.
     parameters : mapping
-        Parameters of fusion and logging at the start of the log, by PX4 name.
+        PX4 parameters for fusion and logging at the start of the log, by name.
     notes : tuple of str
-        Sentences on dropped samples and mapped clocks.
+        Sentences about dropped samples and clocks.
     damage : tuple of str
-        Sentences on unreadable parts of the file.
+        Sentences about damaged bytes of the file.
     bytes_read : int
         Number of bytes that were read as complete messages.
     ends_in_flight : bool
         True if the land detector reports flight at the end of the data.
     restarts : int or None
-        Number of restarts of the boot clock; only one part of the recording is used then.
+        Number of restarts of the boot clock; if any, only the data between two restarts are used.
     receive_time_reversals : int or None
-        Number of backward steps of the recording computer's clock.
+        Number of backward jumps of the recording computer's clock.
     dropped : mapping
         Number of samples with invalid timestamps, by topic, message or file.
     autopilot : str
         "PX4", "ArduPilot", or the name in the log.
     start_unix_s : float or None
-        UNIX time of time zero; None if not in the log.
+        UNIX time at time zero of the flight; None if not in the log.
     senders : tuple of Sender
         Senders of a MAVLink recording, most messages first.
     vehicle : str

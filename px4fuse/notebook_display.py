@@ -1,23 +1,25 @@
-"""Display of results in notebooks: short text of records with tables or arrays, and HTML."""
+"""Display of results in notebooks: HTML, and records with tables or arrays as short texts."""
 
 from collections.abc import Mapping
 from functools import singledispatch
 from typing import Any
 
-MAX_TEXT = 60  # characters; a longer text is cut
+# Maximum length (characters) of a text field in the representation of a record
+MAX_TEXT = 60
 
 
 @singledispatch
 def display_html(result: object) -> str | None:
-    """Return a result as HTML for notebooks, or None to display its text.
+    """Return a result as HTML for notebooks; None if notebooks show its text representation.
 
-    Modules above that of a type register its function, because they format the results.
+    The function of a type is registered by the module that formats it, because the module of the
+    type must not import that module.
     """
     return None
 
 
 def one_line_repr(result: Any) -> str:
-    """Format a record on one line, with tables and arrays by their shapes.
+    """Format a record on one line; a table or array is shown by its shape.
 
     >>> import pandas as pd
     >>> from px4fuse.flight import Truth

@@ -1,4 +1,4 @@
-"""Origin of a position track: kind of source, path to the log, and their properties."""
+"""Origin of a position track: kind of position source, and data path from sender to log."""
 
 from typing import Literal
 
@@ -14,18 +14,18 @@ DataPath = Literal[
 
 
 class Origin(Record, frozen=True):
-    """Kind of a position source and its path to the log.
+    """Kind of a position source, and the data path of its positions from the sender to the log.
 
     Attributes
     ----------
     kind : str
         "uwb" is any positioning system without orientation, "vio" is any odometry.
     path : str
-        Path from the sender to the log.
+        Data path from the sender to the log.
     aid : Aid or None
-        EKF2 aid of this source, with its EKF2 parameters; None if EKF2 never fuses it.
+        Aiding source as which EKF2 fuses the positions; None if EKF2 never fuses them.
     is_automatic : bool
-        True if the source may be selected by default; for GNSS only if EKF2 fused it.
+        True if px4fuse may select the source by default; for GNSS, True only if EKF2 fused it.
     """
 
     kind: PositionKind
@@ -35,10 +35,10 @@ class Origin(Record, frozen=True):
 
     @property
     def may_drift(self) -> bool:
-        """True if the error may grow with the distance travelled, as for odometry.
+        """True if the position error may grow with the distance travelled, as for odometry.
 
-        A log does not distinguish odometry from motion capture sent in the same messages. UWB,
-        motion capture in its own messages, GNSS and position files do not drift.
+        A log does not distinguish odometry from motion capture sent in the same messages, so both
+        may drift.
         """
         return self.kind == "vio"
 
@@ -49,32 +49,29 @@ class Origin(Record, frozen=True):
 
     @property
     def has_all_samples(self) -> bool:
-        """True if the track contains all samples of the sender."""
+        """True if the position track contains all samples of the sender."""
         return self.path in ("given file", "as received")
 
     @property
     def is_vision(self) -> bool:
-        """True if EKF2 fuses the source as external vision."""
         return self.aid == EV_POS
 
     @property
     def fused_as_gnss(self) -> bool:
-        """True if EKF2 fuses the source as GNSS."""
         return self.aid == GNSS_POS
 
     @property
     def is_gnss(self) -> bool:
-        """True for satellite navigation, whose errors are mostly time-correlated.
+        """True for GNSS, whose multipath and atmospheric errors are correlated over minutes.
 
-        Multipath and atmospheric errors change over seconds to minutes, so R must be larger than
-        the differences of consecutive positions suggest.
+        R must be larger than the variance estimated from differences of consecutive positions.
         """
         return self.kind == "gnss"
 
     @property
     def preference(self) -> int:
-        """Index in :data:`ORIGINS`; the source with the smallest index is preferred."""
-        origins = [(known.aid, known.path) for known in ORIGINS]
+        """Index in :data:`ORIGINS`; the position source with the smallest index is preferred."""
+        origins = [(origin.aid, origin.path) for origin in ORIGINS]
         return origins.index((self.aid, self.path))
 
 
@@ -85,19 +82,15 @@ ALIGNED = Origin("uwb", "aligned by EKF2", EV_POS)
 LOGGED_BY_EKF2 = Origin("uwb", "kept by EKF2", EV_POS)
 FROM_INNOVATIONS = Origin("uwb", "rebuilt from innovations", EV_POS)
 GNSS = Origin("gnss", "as received", GNSS_POS, is_automatic=False)
-# In order of preference. A position file is assumed to be from the system that EKF2 fused
+# All origins in order of preference. px4fuse assumes that EKF2 fused the source of a position file
 ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS, GNSS)
 
 
 def find_origin(kind: str, path: str) -> Origin:
-    """Return the known origin of this kind and path to the log."""
-    return next(
-        known_origin
-        for known_origin in ORIGINS
-        if (known_origin.kind, known_origin.path) == (kind, path)
-    )
+    """Return the origin in :data:`ORIGINS` with this kind of source and data path."""
+    return next(origin for origin in ORIGINS if (origin.kind, origin.path) == (kind, path))
 
 
 def with_orientation(origin: Origin, *, turns: bool) -> Origin:
-    """Change the kind "uwb" to "vio" if the track has a changing orientation (``turns``)."""
+    """Change the kind "uwb" to "vio" if the source reports a changing orientation (``turns``)."""
     return replace(origin, kind="vio") if origin.kind == "uwb" and turns else origin

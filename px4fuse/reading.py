@@ -1,8 +1,8 @@
 """Reading of input files: regular files only, up to a size limit.
 
-Each file is registered as an input, so that no output replaces it. A device, named pipe or socket
-may block or never end, and a sparse file may be larger than the memory. Therefore type and size are
-checked before a file is opened, and at most the limit is read.
+Each file is registered as an input, so that no output replaces it. Type and size are checked before
+a file is opened, because reading a device, named pipe or socket may never end, and a sparse file
+may be larger than the memory.
 """
 
 import hashlib
@@ -16,14 +16,14 @@ from pathlib import Path
 from px4fuse.errors import LogError, Px4FuseError, suggest_name, to_one_line
 from px4fuse.input_files import add_input
 
-#: bytes; maximum size of a flight log, which ``--max-size`` sets for one command
+#: Maximum size (bytes) of a flight log, which ``--max-size`` sets for one command
 max_log_bytes: ContextVar[int] = ContextVar("max_log_bytes", default=2_000_000_000)
 _SIZE_REMEDY = "Cut the log to the flight, or increase the limit with --max-size MB"
 _BYTES_PER_MB = 1_000_000
 
 
 def display_name(path: Path) -> str:
-    r"""Return the file name of a path for messages: never empty, and on one line.
+    r"""Return the file name in a path for messages, as one line that is not empty.
 
     >>> display_name(Path("logs/a.ulg")), display_name(Path(".")), display_name(Path("a\nb"))
     ('a.ulg', '.', 'a b')
@@ -32,21 +32,21 @@ def display_name(path: Path) -> str:
 
 
 def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int:
-    """Return the size of a regular file in bytes, and register the file as an input.
+    """Return the size (bytes) of a regular file, and register the file as an input.
 
     Parameters
     ----------
     path : Path
-        Symbolic links are followed.
+        File whose symbolic links are followed.
     error_type : type
-        Error to raise.
+        Type of the error to raise.
     name : str, optional
-        For messages; by default as :func:`display_name` shows it.
+        Name of the file in messages; by default :func:`display_name`.
 
     Raises
     ------
     Px4FuseError
-        Of type ``error_type``: the file is missing, not accessible, or not a regular file.
+        The file is missing, not accessible, or not a regular file; of type ``error_type``.
     """
     name = name or display_name(path)
     try:
@@ -61,20 +61,14 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
         raise error_type(f"{name} is a folder", "Give a file.")
     if not stat.S_ISREG(status.st_mode):
         raise error_type(
-            f"{name} is not a regular file (device, pipe or socket).", "Save it to a file first."
+            f"{name} is not a regular file (device, pipe or socket).", "Save its data to a file."
         )
     add_input(path)
     return status.st_size
 
 
 def read_head(path: Path, count: int, error_type: type[Px4FuseError]) -> bytes:
-    """Read the first bytes of a regular file, at most ``count``.
-
-    Raises
-    ------
-    Px4FuseError
-        Of type ``error_type``.
-    """
+    """Read the first bytes of a regular file, at most ``count``; errors are of ``error_type``."""
     file_size(path, error_type)
     return _read(path, count, error_type, display_name(path))
 
@@ -93,26 +87,26 @@ def read_bytes_limited(
     Parameters
     ----------
     error_type : type
-        Error to raise.
+        Type of the error to raise.
     name : str, optional
-        For messages; by default as :func:`display_name` shows it.
+        Name of the file in messages; by default :func:`display_name`.
     size_remedy : str
-        Action in the error if the file is too large.
+        Action in the error for a file that is too large.
     empty_remedy : str, optional
-        Action in the error if the file is empty; without it an empty file is accepted.
+        Action in the error for an empty file; without this argument, empty files are accepted.
 
     Raises
     ------
     Px4FuseError
-        Of type ``error_type``.
+        The file cannot be read, is too large or empty; of type ``error_type``.
     """
     name = name or display_name(path)
     size = file_size(path, error_type, name)
     content = b"" if size > limit_bytes else _read(path, size + 1, error_type, name)
-    if len(content) > size:  # the file grows, or is in /proc, where sizes are 0
+    if len(content) > size:  # the file grows, or is in /proc, in which all sizes are 0
         content = _read(path, limit_bytes + 1, error_type, name)
-    if (size_found := max(size, len(content))) > limit_bytes:
-        raise error_type(_too_large(name, size_found, limit_bytes), f"{size_remedy}.")
+    if (actual_size := max(size, len(content))) > limit_bytes:
+        raise error_type(_too_large(name, actual_size, limit_bytes), f"{size_remedy}.")
     if empty_remedy is not None and not content:
         raise error_type(f"{name}: the file is empty", f"{empty_remedy}.")
     return content
@@ -140,17 +134,9 @@ def read_text(
     name: str = "",
     size_remedy: str = "Shorten the file",
 ) -> str:
-    """Read a text file in UTF-8, or in UTF-16 as written by a Windows shell.
+    """Read a text file in UTF-8, or in UTF-16 as written by Windows shells.
 
-    Parameters
-    ----------
-    path, error_type, limit_bytes, name, size_remedy
-        See :func:`read_bytes_limited`.
-
-    Raises
-    ------
-    Px4FuseError
-        Of type ``error_type``.
+    Arguments and errors are those of :func:`read_bytes_limited`.
     """
     name = name or display_name(path)
     content = read_bytes_limited(path, error_type, limit_bytes, name=name, size_remedy=size_remedy)
@@ -159,20 +145,20 @@ def read_text(
         return content.decode("utf-16" if is_utf16 else "utf-8-sig")
     except UnicodeDecodeError as error:
         raise error_type(
-            f"{name} is not a UTF-8 text file (byte {error.start}).", "Save it as UTF-8."
+            f"{name} is not a UTF-8 text file (byte {error.start}).", "Save the file as UTF-8."
         ) from error
 
 
 def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
-    """Map the SHA-256 of files to their paths; of a folder, all regular files are included.
+    """Return the paths of files by their SHA-256, with all regular files in folders.
 
-    In a folder, files larger than :data:`max_log_bytes` are ignored. Of files with the same content
-    the first is used.
+    Files in folders are ignored if they are larger than :data:`max_log_bytes`. Of files with the
+    same content, the first is returned.
 
     Raises
     ------
     LogError
-        A path is not a regular file or a folder, is too large, or cannot be read.
+        A path is not a regular file or a folder, or the file is too large or cannot be read.
     """
     file_by_hash: dict[str, Path] = {}
     limit = max_log_bytes.get()
@@ -196,9 +182,9 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
 
 
 def files_below(folder: Path) -> list[Path]:
-    """Return all files in a folder and its subfolders, sorted; links are not followed.
+    """Return all files in a folder and its subfolders, sorted; links to folders are not followed.
 
-    A folder that cannot be listed is included, so that reading it raises the error.
+    A folder that cannot be listed is returned as a file, so that its reading raises the error.
     """
     files: list[Path] = []
     open_folders = [folder]

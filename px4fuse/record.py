@@ -1,7 +1,7 @@
 """Base class of the records in results: immutable, strictly typed, and written without change.
 
-Field names contain the unit. A number that could not be computed is absent, or its record is
-replaced by an :class:`Unavailable`; it is never replaced by zero.
+Field names contain the unit. If a number cannot be computed, the number is absent, or an
+:class:`Unavailable` replaces its record.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ Vector = tuple[float, float, float]
 
 
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Immutable record; fields that are None are not written.
+    """Immutable record; fields that are None are not written to the results.
 
     Attributes
     ----------
     schema_type : type or None
-        For a record that also contains arrays or tables: its base class with the written fields.
+        Base class with the fields in the results, if the record also contains arrays or tables.
     """
 
     schema_type: ClassVar[type[Record] | None] = None
 
 
 class Unavailable(Record, frozen=True):
-    """Missing data, with reason and action, in place of a record.
+    """Missing data with reason and action, used in place of a record.
 
     Attributes
     ----------
     what : str
         Missing data as a noun phrase ("EKF2 innovations").
     reason : str
-        Reason in terms of the log ("no topic vehicle_attitude").
+        Property of the log that is the reason ("no topic vehicle_attitude").
     remedy : str
-        Action: how to log the data, or an alternative.
+        Action, for example a setting to log the data.
     source : str
-        Name of the position source, if a position source is missing; else empty.
+        Name of the missing position source; empty if other data are missing.
     """
 
     what: str
@@ -70,8 +70,8 @@ else:
     class RecordOrUnavailable:
         """``RecordOrUnavailable[T, A]``: a record T, or a subclass A of :class:`Unavailable`.
 
-        msgspec needs tags to decode a union of two structs, and the records have none. So each
-        union is a separate type, which :func:`decode_record_or_unavailable` decodes.
+        Each union is a separate type, which :func:`decode_record_or_unavailable` decodes, because
+        msgspec decodes unions of structs only if they have tags, and records have no tags.
         """
 
         def __class_getitem__(cls, kinds: tuple[type, type]) -> type:
@@ -90,7 +90,7 @@ else:
 
 
 def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
-    """Decode a :class:`RecordOrUnavailable`; a ``dec_hook`` of msgspec.
+    """Decode a :class:`RecordOrUnavailable`, as ``dec_hook`` of msgspec.
 
     Raises
     ------
@@ -106,31 +106,29 @@ def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
     try:
         return msgspec.convert(value, kind, dec_hook=decode_record_or_unavailable)
     except msgspec.ValidationError as error:
-        raise ValueError(str(error)) from error  # msgspec adds the path to a ValueError
+        raise ValueError(str(error)) from error  # msgspec adds the path of the value
 
 
 def to_serializable(value: Any) -> Any:
-    """Return the written fields of a record and of records in it, without arrays and tables."""
+    """Convert a record and the records in it to their schema types, without arrays and tables."""
     if isinstance(value, Record):
         kind = value.schema_type or type(value)
         return kind(
             **{name: to_serializable(getattr(value, name)) for name in kind.__struct_fields__}
         )
     if isinstance(value, Mapping):
-        return {key: to_serializable(part) for key, part in value.items()}
+        return {key: to_serializable(child) for key, child in value.items()}
     return tuple(map(to_serializable, value)) if isinstance(value, tuple) else value
 
 
-def table(beside: str, name: str, kind: type[T]) -> T:
-    """Read a TOML file of the package as a type.
+def table(module_file: str, name: str, kind: type[T]) -> T:
+    """Read a TOML file of px4fuse as the type ``kind``.
 
     Parameters
     ----------
-    beside : str
-        ``__file__`` of a module in the folder of the file.
+    module_file : str
+        ``__file__`` of a module in the same folder.
     name : str
         Name of the TOML file.
-    kind : type
-        Type of the content.
     """
-    return msgspec.toml.decode(Path(beside).with_name(name).read_bytes(), type=kind)
+    return msgspec.toml.decode(Path(module_file).with_name(name).read_bytes(), type=kind)

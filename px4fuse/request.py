@@ -1,7 +1,6 @@
-"""Requests: the files and settings of one analysis, parsed from a command line.
+"""Requests: files and settings of one analysis, for example parsed from a command line.
 
-The results contain the request, so that :func:`px4fuse.analysis.run` can repeat an analysis without
-its command line.
+The results contain the request, so that :func:`px4fuse.analysis.run` can repeat the analysis.
 """
 
 import os
@@ -15,33 +14,35 @@ from typing import Annotated, Any, Literal, Self
 import msgspec
 
 AUTO: Literal["auto"] = "auto"
-# Default settings of KF
+# Default settings of KF: process noise, measurement noise and prediction interval
 SIGMA_A_M_S2, SIGMA_Z_M, DT_S = 0.5, 0.10, 0.1
 AxisName = Literal["north", "east", "down", "aisle"]
 InputName = Literal["imu", "zero"]
-# Kind of a position source; the messages in a log may not determine it
+# Kind of a position source that the user may state, as the messages in a log can be ambiguous
 SourceKind = Literal["uwb", "vio", "mocap", "gnss"]
-# Height source of a GNSS flight
+# Height source for the axis "down" of a flight with GNSS
 HeightName = Literal["gnss", "barometer"]
-# Frame of a trajectory file
+# Coordinate frame of a trajectory file
 FrameName = Literal["NED", "FRD", "ENU", "camera"]
 System = Annotated[int, msgspec.Meta(ge=0, le=255)]
 
 
 class PositionFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Position file of the positioning system (CSV), and how to read it.
+    """Recording of the positioning system (CSV), with its frame, columns and units.
 
     Attributes
     ----------
     path : str
     frame : {"ned", "enu", "nwu"} or None
-        None: from the column names, else the frame that fits EKF2 best.
+        Coordinate frame; None: from the column names, else the frame with the best fit to EKF2.
     yaw_deg : float, "auto" or None
-        Clockwise rotation of the file, seen from above; "auto" estimates yaw and origin.
+        Clockwise rotation of the positions, seen from above; "auto" estimates yaw and origin.
     columns : tuple of str or None
-        Names or numbers of its columns: time, x, y, z and sigma.
+        Names or numbers of the columns: time, x, y, z and sigma; None: detected.
     time_unit : {"s", "ms", "us", "ns"} or None
+        Unit of the times; None: detected.
     length_unit : {"m", "cm", "mm"} or None
+        Unit of x, y and z; None: detected.
     """
 
     path: str
@@ -52,7 +53,7 @@ class PositionFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     length_unit: Literal["m", "cm", "mm"] | None = None
 
 
-# Fields of a request that are paths
+# Fields of requests that contain a path
 _PATHS = ("log", "mavlink", "source", "estimate", "reference")
 
 
@@ -60,7 +61,7 @@ class _RequestBase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base class of all requests."""
 
     def without_paths(self) -> Self:
-        """Return the request with file names instead of paths, as the results record it."""
+        """Return the request with file names instead of paths, as the results contain it."""
         paths = {name: getattr(self, name, None) for name in _PATHS}
         changes: dict[str, Any] = {
             n: _file_name(path) for n, path in paths.items() if path is not None
@@ -74,37 +75,38 @@ class _RequestBase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class ComparisonRequest(
     _RequestBase, frozen=True, kw_only=True, tag_field="command", tag="compare"
 ):
-    """Flight to compare with EKF2, for ``compare``, ``tune`` and ``sync``.
+    """Request to compare KF with EKF2: ``px4fuse compare``, ``tune`` or ``sync``.
 
     Attributes
     ----------
     log : str
-        Path of the ULog or MAVLink recording; in results its name.
+        Path of the ULog or MAVLink recording; in results its file name.
     mavlink : str or None
         Path of the MAVLink recording of the same flight.
     system : int or None
-        MAVLink system id of the vehicle; None for the one with the most data.
+        MAVLink system id of the vehicle; None: the id with the most messages.
     position : PositionFile or None
+        Recording of the positioning system.
     position_source : str or None
-        Name of a position track of the flight; None for the most direct one.
+        Name of the position track for KF; None: the track with the fewest processing steps.
     source_kind : {"uwb", "vio", "mocap", "gnss"} or None
         Kind of the position source; None: from its messages.
     height : {"gnss", "barometer"} or None
-        Height source on a GNSS flight; None for the one that EKF2 fused, GNSS first.
+        Height source on a flight with GNSS; None: the source that EKF2 fused, GNSS first.
     sigma_a_m_s2, dt_s : float
         See :class:`px4fuse.filter.settings.Settings`.
     sigma_z_m : float or None
-        None: 0.1 m, and for GNSS the measurement noise that EKF2 uses.
+        KF measurement noise; None: 0.1 m, or for GNSS the measurement noise of EKF2.
     input : {"imu", "zero"} or None
-        None: the IMU if it is logged.
+        Acceleration for KF; None: from the IMU if it is logged.
     axes : tuple of str
-        Empty for all axes with a position.
+        Axes to analyse; empty: all axes with a position.
     heading_deg : float or None
-        Heading of the axis "aisle", clockwise from north; None for the main direction of the track.
+        Heading of the axis "aisle", clockwise from north; None: main direction of the track.
     start_s, end_s : float or None
-        Segment in seconds after the first data; None for take-off and landing.
+        Analysed time span, in seconds after the first data; None: take-off and landing.
     clock_offset_s : float, "auto" or None
-        Seconds to add to the timestamps of the source; None is 0, or "auto" with ``position``.
+        Time to add to the timestamps of the position source; None: 0, or "auto" with ``position``.
     """
 
     log: str
@@ -126,14 +128,14 @@ class ComparisonRequest(
 
 
 class Landing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Landing place and rotation relative to the take-off place.
+    """Landing place and heading relative to take-off.
 
     Attributes
     ----------
     forward_m, right_m : float
-        Along the nose of the vehicle at take-off, and to its right (m).
+        Distances from the take-off place along the vehicle's nose at take-off, and to its right.
     turned_deg : float or None
-        Rotation between take-off and landing, clockwise; None if unknown.
+        Clockwise rotation of the vehicle between take-off and landing; None if unknown.
     """
 
     forward_m: float
@@ -142,7 +144,7 @@ class Landing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class GivenClosure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Two times (s) at which the vehicle was at the same place, within ``sigma_m`` (m, 1 σ)."""
+    """Loop closure from the user: two times at the same place within ``sigma_m`` (1 σ)."""
 
     time_1_s: float
     time_2_s: float
@@ -150,28 +152,29 @@ class GivenClosure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LoopRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", tag="loop"):
-    """Loop to measure and correct, for ``loop``.
+    """Request to measure and correct a loop closure error: ``px4fuse loop``.
 
     Attributes
     ----------
     source : str
-        Path of a trajectory or a flight log (``FILE`` or ``LOG:TRACK``); in results its name.
+        Path of a trajectory or a flight log (``FILE`` or ``LOG:TRACK``); in results its file name.
     frame : str or None
-        Frame of a trajectory file; None: as detected.
+        Coordinate frame of a trajectory file; None: detected.
     system : int or None
-        MAVLink system id of the vehicle.
+        MAVLink system id of the vehicle; None: the id with the most messages.
     reference : str or None
-        Path of a reference trajectory for ATE and RPE, besides the log's ground truth.
+        Path of a reference trajectory for ATE and RPE, in addition to the log's ground truth.
     start_s, end_s : float or None
-        Start and end of the loop; None for take-off and landing.
+        Start and end of the loop; None: take-off and landing.
     landed_at : Landing or None
+        Measured landing place; None: the ground truth of the log, else the take-off place.
     closed_loop : bool
         False if the vehicle did not return to the take-off place.
     closures : tuple of GivenClosure
     position_drift_m, heading_drift_deg : float
         Drift of the odometry after 100 m (1 σ).
     key_frames_m : float or None
-        Distance between key frames; None: 2 % of the extent of the path.
+        Distance between the key frames of the pose graph; None: 2 % of the extent of the path.
     """
 
     source: str
@@ -189,7 +192,7 @@ class LoopRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", 
 
 
 class Sweep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Range of one parameter, ends included; equal ratios of values above 0, else equal steps."""
+    """Values of an EKF2 parameter for replays: equal ratios if ``low`` is above 0, else steps."""
 
     parameter: str
     low: float
@@ -198,22 +201,23 @@ class Sweep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class WhatIfRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", tag="whatif"):
-    """Flight whose EKF2 is replayed with changed parameters, for ``whatif``.
+    """Request to replay EKF2 with changed parameters: ``px4fuse whatif``.
 
     Attributes
     ----------
     log : str
-        Path of the ULog; in results its name.
+        Path of the ULog; in results its file name.
     mavlink : str or None
         Path of the MAVLink recording of the same flight.
     system : int or None
-        MAVLink system id of the vehicle; None for the one with the most data.
+        MAVLink system id of the vehicle; None: the id with the most messages.
     changes : mapping from PX4 name to value
-        In PX4's units. Empty without a sweep: the maximum-likelihood noise and delay.
+        Changed parameters in PX4's units; without any change, the maximum-likelihood estimates of
+        noise and delay are used.
     sweep : Sweep or None
-        One parameter with several values, in addition to ``changes``.
-    without : mapping from PX4's name of an aid to float
-        Time (s) from which EKF2 does not fuse the aid.
+        Values of one parameter, in addition to ``changes``.
+    without : mapping from PX4's name of an aiding source to float
+        Time (s) from which EKF2 does not fuse the aiding source.
     """
 
     log: str
@@ -225,19 +229,20 @@ class WhatIfRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command"
 
 
 class EvaluationRequest(_RequestBase, frozen=True, kw_only=True):
-    """Two trajectories to compare by ATE and RPE, for ``evaluate``.
+    """Request to compute ATE and RPE of a trajectory: ``px4fuse evaluate``.
 
     Attributes
     ----------
     estimate, reference : str
         Paths of trajectories or flight logs (``FILE`` or ``LOG:TRACK``).
     alignment, association, max_gap_s, time_offset_s
-        Arguments of :func:`px4fuse.evaluate`; None: chosen automatically.
+        Arguments of :func:`px4fuse.evaluate`; None: selected automatically.
     rpe : tuple of str
-        Deltas with their units; empty: several that fit the path length.
+        Deltas of the RPE with their units; empty: several distances that fit the path length.
     consecutive : bool
+        True to compute the RPE over consecutive, non-overlapping pairs of poses.
     system : int or None
-        MAVLink system id of the vehicle.
+        MAVLink system id of the vehicle; None: the id with the most messages.
     """
 
     estimate: str
@@ -262,61 +267,43 @@ _POSITION_OPTIONS = {
     "time_unit": "--position-time-unit",
     "length_unit": "--position-unit",
 }
-# Option for each field of a request that is not an argument of the command
+
+
+def _option_names(
+    kind: type[msgspec.Struct], excluded: Sequence[str] = (), **exceptions: str
+) -> dict[str, str]:
+    """Return the option of each optional field: its name with hyphens and without the unit."""
+    names = {
+        field.name: "--" + re.sub(r"(_m_s2|_m|_s|_deg)$", "", field.name).replace("_", "-")
+        for field in msgspec.structs.fields(kind)
+        if not field.required and field.name not in excluded
+    }
+    return names | exceptions
+
+
+# Command line option for each field of a request that is not an argument of the command
 OPTION_NAMES: Mapping[type[msgspec.Struct], Mapping[str, str]] = {
-    ComparisonRequest: {
-        "mavlink": "--mavlink",
-        "system": "--system",
-        "position_source": "--position-source",
-        "source_kind": "--source-kind",
-        "height": "--height",
-        "sigma_a_m_s2": "--sigma-a",
-        "sigma_z_m": "--sigma-z",
-        "dt_s": "--dt",
-        "input": "--input",
-        "axes": "--axis",
-        "heading_deg": "--heading",
-        "start_s": "--start",
-        "end_s": "--end",
-        "clock_offset_s": "--clock-offset",
-        **_POSITION_OPTIONS,
-    },
+    ComparisonRequest: _option_names(ComparisonRequest, ["position"], axes="--axis")
+    | _POSITION_OPTIONS,
     PositionFile: _POSITION_OPTIONS,
-    LoopRequest: {
-        "system": "--system",
-        "frame": "--frame",
-        "reference": "--reference",
-        "start_s": "--from",
-        "end_s": "--to",
-        "landed_at": "--landed-at",
-        "closed_loop": "--open",
-        "closures": "--closure",
-        "position_drift_m": "--drift",
-        "heading_drift_deg": "--heading-drift",
-        "key_frames_m": "--key-frames",
-    },
-    WhatIfRequest: {"mavlink": "--mavlink", "system": "--system"},
-    EvaluationRequest: {
-        "system": "--system",
-        "alignment": "--alignment",
-        "association": "--association",
-        "max_gap_s": "--max-gap",
-        "time_offset_s": "--time-offset",
-        "rpe": "--rpe",
-        "consecutive": "--consecutive",
-    },
+    LoopRequest: _option_names(
+        LoopRequest,
+        start_s="--from",
+        end_s="--to",
+        closed_loop="--open",
+        closures="--closure",
+        position_drift_m="--drift",
+    ),
+    WhatIfRequest: _option_names(WhatIfRequest, ["changes", "sweep", "without"]),
+    EvaluationRequest: _option_names(EvaluationRequest),
 }
 COMPARISON_OPTIONS = OPTION_NAMES[ComparisonRequest]
-# Options for arguments that are named in errors and are not fields of a request
-_ARGUMENTS = {
-    "position": "--position",
-    "changes": "--set",
-    "scheduler": "--scheduler",
-}
+# Options for names of Python arguments in errors that are not in OPTION_NAMES
+_ARGUMENTS = {"position": "--position", "changes": "--set", "scheduler": "--scheduler"}
 
 
 def with_options(text: str, option_names: Mapping[str, str] = COMPARISON_OPTIONS) -> str:
-    """Replace argument names in backticks by the options of the command line.
+    """Replace names of Python arguments in backticks by options of the command line.
 
     >>> with_options("`sigma_z_m` 0 is out of range: give 0.0001 to 100 m.")
     '--sigma-z 0 is out of range: give 0.0001 to 100 m.'
@@ -328,20 +315,19 @@ def with_options(text: str, option_names: Mapping[str, str] = COMPARISON_OPTIONS
 def command_line(
     request: Request | EvaluationRequest, command: str | None = None, *, for_shell: bool = False
 ) -> str:
-    """Format the command line that repeats an analysis, without defaults.
+    """Format the command line that repeats an analysis, without options at their defaults.
 
     Parameters
     ----------
     request : Request or EvaluationRequest
     command : str, optional
-        Name of the command; by default ``compare``, ``loop``, ``whatif`` or
-        ``evaluate``.
+        Name of the command; by default ``compare``, ``loop``, ``whatif`` or ``evaluate``.
     for_shell : bool
-        True: with paths, quoted for the shell of this system, so that it can be pasted. False: with
-        file names only, quoted for a POSIX shell.
+        True: with paths and quotes for the shell of this system. False: with file names and quotes
+        for a POSIX shell.
     """
     shown_request = request if for_shell else request.without_paths()
-    # required fields are files; all other fields are options
+    # required fields of a request are input files, and all other fields are options
     required_names = [
         field.name for field in msgspec.structs.fields(shown_request) if field.required
     ]
@@ -356,8 +342,8 @@ def command_line(
             arguments += ["--sweep", f"{sweep.parameter}={values}"]
         for name in shown_request.without:
             arguments += ["--without", name]
-        for since in {*shown_request.without.values()} - {0.0}:
-            arguments += ["--from", _option_text(since)]
+        for start_s in {*shown_request.without.values()} - {0.0}:
+            arguments += ["--from", _option_text(start_s)]
     words = ["px4fuse", *arguments]
     return quote_command(words) if for_shell else shlex.join(words)
 
@@ -368,7 +354,7 @@ def quote_command(words: Sequence[str]) -> str:
 
 
 def settings_name(request: ComparisonRequest | EvaluationRequest | LoopRequest) -> str:
-    """Format the settings that are not at their defaults, as part of a file name.
+    """Format the settings that differ from their defaults as a part of a file name.
 
     >>> settings_name(ComparisonRequest(log="a.ulg", sigma_z_m=0.05, mavlink="b/c.tlog"))
     '_mavlink-c_sigma-z-0.05'
@@ -382,12 +368,12 @@ def settings_name(request: ComparisonRequest | EvaluationRequest | LoopRequest) 
 
 
 def _path_argument(path: str) -> str:
-    """Prefix a path that begins with "-", so that it is not read as an option."""
+    # the prefix ./ prevents that a path that begins with "-" is read as an option
     return f"./{path}" if path.startswith("-") else path
 
 
 def _all_options(request: msgspec.Struct) -> Iterator[tuple[str, str | None]]:
-    """Yield options and values (None for a flag) of fields that are not at their defaults."""
+    """Yield options with values (None for a flag) of fields that differ from their defaults."""
     option_names = OPTION_NAMES[type(request)]
     for field in msgspec.structs.fields(request):
         value = getattr(request, field.name)
@@ -402,7 +388,6 @@ def _all_options(request: msgspec.Struct) -> Iterator[tuple[str, str | None]]:
 
 
 def _option_text(value: Any) -> str:
-    """Format a value for the command line."""
     if isinstance(value, msgspec.Struct):
         value = msgspec.structs.astuple(value)
     if isinstance(value, tuple):
@@ -411,5 +396,5 @@ def _option_text(value: Any) -> str:
 
 
 def _file_name(path: str) -> str:
-    """Return the file name of a path; bytes that are not valid text are replaced."""
+    """Return the file name in a path; bytes that are not UTF-8 are replaced by question marks."""
     return PurePath(path).name.encode(errors="replace").decode()

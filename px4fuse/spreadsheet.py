@@ -34,7 +34,7 @@ def _is_formula(text: str) -> bool:
     if text.startswith(("\t", "\r")):
         return True
     for character in text:
-        # Z: separators; C: control and format characters, surrogates
+        # Unicode categories Z (separators) and C (control characters) are not visible
         if character in "\"'" or unicodedata.category(character)[0] in "ZC":
             continue
         return unicodedata.normalize("NFKC", character)[0] in FORMULA_STARTS

@@ -1,4 +1,4 @@
-"""Conversion to JSON types, and formatting of numbers and short texts."""
+"""Formatting of numbers and short texts, and conversion of records to JSON types."""
 
 import math
 import re
@@ -13,9 +13,9 @@ import msgspec
 
 
 def to_json_types(value: object) -> Any:
-    """Convert records, mappings and tuples to dicts and lists.
+    """Convert records, mappings and tuples to dicts and lists for JSON.
 
-    None, NaN and infinity are left out of a dict.
+    None, NaN and infinity in a dict are omitted.
 
     >>> to_json_types({"rate_hz": float("nan"), "topics": ("a", "b")})
     {'topics': ['a', 'b']}
@@ -25,10 +25,10 @@ def to_json_types(value: object) -> Any:
     elif is_dataclass(value):
         value = {field.name: getattr(value, field.name) for field in fields(value)}
     if isinstance(value, Mapping):
-        fields_by_name = {str(name): to_json_types(part) for name, part in value.items()}
-        return {name: part for name, part in fields_by_name.items() if part is not None}
+        children = {str(name): to_json_types(child) for name, child in value.items()}
+        return {name: child for name, child in children.items() if child is not None}
     if isinstance(value, list | tuple):
-        return [to_json_types(part) for part in value]
+        return list(map(to_json_types, value))
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
@@ -67,12 +67,11 @@ def format_factor(factor: float) -> str:
 
 
 def capitalise_first(text: str) -> str:
-    """Return the text with its first letter in upper case."""
     return text[:1].upper() + text[1:]
 
 
 def join_first(names: Sequence[str], max_count: int, separator: str = ", ") -> str:
-    """Join the first ``max_count`` names, and append the number of the others.
+    """Join the first ``max_count`` names, and append the number of further names.
 
     >>> join_first("abcd", 2), join_first("ab", 2)
     ('a, b and 2 more', 'a, b')
@@ -82,7 +81,7 @@ def join_first(names: Sequence[str], max_count: int, separator: str = ", ") -> s
 
 
 def format_p_value(p: float) -> str:
-    """Format a p-value with 2 digits; below 0.001 only the bound is given.
+    """Format a p-value with 2 digits; below 0.001, the text is "p < 0.001".
 
     >>> [format_p_value(p) for p in (0.43, 0.0214, 0.00051, 3e-113, 0.0)]
     ['p 0.43', 'p 0.021', 'p < 0.001', 'p < 0.001', 'p < 0.001']
@@ -91,7 +90,7 @@ def format_p_value(p: float) -> str:
 
 
 def format_length(metres: float) -> str:
-    """Format a length (m) in mm, cm or m.
+    """Format a length (m) with its unit: mm, cm or m.
 
     >>> [format_length(m) for m in (0.0041, 0.0612, 0.336, 1.42, 23.4, 250.0)]
     ['4 mm', '6 cm', '34 cm', '1.4 m', '23 m', '250 m']
@@ -103,23 +102,22 @@ def format_length(metres: float) -> str:
 
 
 def format_ratio(ratio: float) -> str:
-    """Format a ratio of actual to reported uncertainty.
+    """Format a σ ratio (actual σ over reported σ).
 
     >>> [format_ratio(ratio) for ratio in (128.2, 21.04, 4.52, 1.214, 0.926, 0.0012)]
     ['128', '21', '4.5', '1.21', '0.93', '0.001']
     """
-    decimals = 0 if ratio >= 9.95 else 1 if ratio >= 1.995 else 2 if ratio >= 0.00995 else 3
+    decimals = sum(ratio < limit for limit in (9.95, 1.995, 0.00995))
     return f"{ratio:.{decimals}f}"
 
 
 def format_metres(length_m: float) -> str:
-    """Format a length in metres without the unit.
+    """Format a length (m) in metres, without the unit.
 
     >>> [format_metres(length) for length in (2981.4, 12.34, 2.114, 0.388, 0.0623, 0.0004)]
     ['2981', '12.3', '2.11', '0.39', '0.062', '0.000']
     """
-    size = abs(length_m)
-    decimals = 0 if size >= 99.95 else 1 if size >= 9.995 else 2 if size >= 0.0995 else 3
+    decimals = sum(abs(length_m) < limit for limit in (99.95, 9.995, 0.0995))
     return f"{length_m:.{decimals}f}"
 
 

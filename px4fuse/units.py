@@ -7,7 +7,7 @@ from typing import Any
 from px4fuse.record import table
 
 _UNITS = table(__file__, "units.toml", dict[str, dict[str, Any]])
-# Names of the units that px4fuse uses, and conversion factors of units that users may type
+# Full names of the units by symbol, and factors that convert typed units to the units of px4fuse
 NAMES: Mapping[str, str] = _UNITS["names"]
 _SCALES: Mapping[str, Mapping[str, float]] = _UNITS["typed"]
 _NUMBER_WITH_UNIT = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNORECASE)

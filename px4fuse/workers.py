@@ -1,10 +1,9 @@
 """Worker processes for untrusted files, with limits of time and memory for each job.
 
-A job may hang, crash or use all memory without effect on the others. The pools of the standard
-library cannot do this: in ``concurrent.futures`` a killed worker ends the whole pool
-(BrokenProcessPool), and ``multiprocessing.Pool`` waits forever for the result of a dead worker.
-Pebble's pool (5.2) ends if a worker dies before its job was registered. So each process here has a
-pipe and a deadline.
+Each process has a pipe and a deadline, so that a job may hang, crash or use all memory without
+effect on other jobs. Process pools are not sufficient: in ``concurrent.futures`` a killed process
+ends the pool (BrokenProcessPool), ``multiprocessing.Pool`` waits forever for the result of a killed
+process, and Pebble's pool (5.2) ends if a process dies before its job is registered.
 """
 
 import multiprocessing
@@ -25,38 +24,35 @@ from px4fuse.threads import ONE_THREAD
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-# A worker is replaced after this number of jobs, because caches of libraries grow. More frequent
-# replacement would cost time: the imports of a new process take 2 s
+# Maximum number of jobs of a worker process, because caches of libraries grow; a lower number would
+# cost time, because the imports of a new process take 2 s
 JOBS_PER_WORKER = 80
-# maximum time of a job (s); one report of a 10-minute flight takes about 60 s
-TIMEOUT_S = 120.0
-MEMORY_BYTES = 4_000_000_000
-# s for the imports of a new process on a slow and busy computer
+# Default maximum time (s) and memory (bytes) of a job; a report of a 10-minute flight takes 60 s
+TIMEOUT_S, MEMORY_BYTES = 120.0, 4_000_000_000
+# Maximum time (s) for the imports of a new process on a slow and busy computer
 START_TIMEOUT_S = 180.0
-# Read by a Python interpreter when it starts
-_ENVIRONMENT = {
-    # without it, an interpreter imports modules from the current folder first: a submitted
-    # functools.py would be executed
-    "PYTHONSAFEPATH": "1",
-    **ONE_THREAD,
-}
+# Environment variables of worker processes. PYTHONSAFEPATH prevents imports from the current
+# folder, by which a submitted functools.py would be executed
+_ENVIRONMENT = {"PYTHONSAFEPATH": "1", **ONE_THREAD}
 
 
 @dataclass(frozen=True)
 class JobFailure:
-    """Result of a job that failed, with the reason on one line."""
+    """Failure of a job in a worker process, used in place of its result; the reason is one line."""
 
     reason: str
 
 
 class _Worker:
-    """Worker process, the parent's end of its pipe, and its current job."""
+    """Worker process with its current job, and the pipe through which it is controlled."""
 
     def __init__(self, function: Callable[[Any], Any], memory_bytes: int | None, job: int) -> None:
         # spawn works on all systems and does not copy the memory of the parent
         context = multiprocessing.get_context("spawn")
         self.pipe, child_pipe = context.Pipe()
-        self.process = context.Process(target=_serve, args=(child_pipe, function, memory_bytes))
+        self.process = context.Process(
+            target=_run_worker, args=(child_pipe, function, memory_bytes)
+        )
         environment = dict(os.environ)
         os.environ.update(_ENVIRONMENT)
         try:
@@ -64,7 +60,7 @@ class _Worker:
         finally:
             os.environ.clear()
             os.environ.update(environment)
-        child_pipe.close()  # so the pipe is closed when the process ends
+        child_pipe.close()  # only the worker process may keep this end of the pipe open
         self.is_ready = False
         self.job = job
         self.jobs_done = 0
@@ -85,22 +81,22 @@ def run_bounded(
     timeout_s: float = TIMEOUT_S,
     memory_bytes: int | None = MEMORY_BYTES,
 ) -> Generator[tuple[int, Result | JobFailure]]:
-    """Call a function on every job in worker processes, each job within limits.
+    """Call a function on every job in worker processes, with limits of time and memory for a job.
 
-    If the process of a job hangs, dies or uses too much memory, it is ended and replaced; other
-    jobs continue. All processes end with this generator (error, Ctrl-C, ``close``).
+    A process that hangs, dies or uses too much memory is replaced, and the other jobs continue. All
+    processes end when this generator ends (error, Ctrl-C, ``close``).
 
     Parameters
     ----------
     function : callable
-        Defined at the top level of a module; function, jobs and results are pickled.
+        Function at the top level of a module, because function, jobs and results are pickled.
     processes : int, optional
         Number of parallel processes; by default the number of cores.
     timeout_s : float
-        Time limit for one job, once its process is ready.
+        Maximum time for one job, without the start of its process.
     memory_bytes : int or None
-        Address space of one process (RLIMIT_AS), of which libraries use about 0.6 GB; None for no
-        limit. Without effect on Windows and macOS.
+        Maximum address space of one process (RLIMIT_AS), of which libraries use about 0.6 GB; None
+        for no limit. The limit has no effect on Windows and macOS.
 
     Yields
     ------
@@ -112,10 +108,10 @@ def run_bounded(
     try:
         while waiting_jobs or workers:
             while waiting_jobs and len(workers) < (processes or os.cpu_count() or 1):
-                # the job is assigned now, so that a process that fails to start ends only one job
+                # the job is assigned before the process starts, so that a failed start ends one job
                 new_worker = _Worker(function, memory_bytes, waiting_jobs.pop())
                 workers[new_worker.pipe] = new_worker
-            # wait until the first deadline at most
+            # the wait ends at the first deadline or if a pipe has data
             first_deadline = min(worker.deadline for worker in workers.values())
             ready_pipes = wait(workers, max(0.0, first_deadline - time.monotonic()))
             for pipe, worker in list(workers.items()):
@@ -131,7 +127,7 @@ def run_bounded(
                             continue
                         worker.job = waiting_jobs.pop()
                     worker.deadline = time.monotonic() + timeout_s
-                    # a process that died meanwhile is detected at the next read of its pipe
+                    # the next read of the pipe detects that the worker process has died
                     with suppress(BrokenPipeError, ConnectionResetError):
                         pipe.send(jobs[worker.job])
                 elif time.monotonic() >= worker.deadline:
@@ -146,41 +142,41 @@ def run_bounded(
 def run_one_bounded(
     function: Callable[[Job], Result], job: Job, timeout_s: float, memory_bytes: int = MEMORY_BYTES
 ) -> Result | JobFailure:
-    """Call a function on one job in a worker process, within limits: see :func:`run_bounded`."""
+    """Call a function on one job in a worker process, with limits as in :func:`run_bounded`."""
     results = run_bounded(function, [job], timeout_s=timeout_s, memory_bytes=memory_bytes)
     with closing(results):
         return next(results)[1]
 
 
 def _receive_result(worker: _Worker) -> tuple[bool, Any]:
-    """Return True if the process is usable, and the result that it sent."""
+    """Return True if the worker process can take more jobs, and the result that it sent."""
     try:
         message: tuple[bool, Any] = worker.pipe.recv()
     except (EOFError, OSError):
         worker.process.join(5)
-        status = f"exit code {worker.process.exitcode}"
-        phase = "" if worker.is_ready else " during its start"
-        return False, JobFailure(f"the worker process ended{phase} ({status}).")
-    # unpickling runs code of the result's classes, which may raise any exception
+        phase = "a job" if worker.is_ready else "its start"
+        code = worker.process.exitcode
+        return False, JobFailure(f"the worker process ended during {phase} (exit code {code}).")
+    # unpickling runs code of the classes of the result, which may raise any exception
     except Exception as error:  # noqa: BLE001
         return False, JobFailure(f"the result could not be unpickled ({type(error).__name__}).")
     return message
 
 
-def _serve(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int | None) -> None:
-    """Run the loop of a worker process: job by job until the pipe is closed."""
-    # the parent handles Ctrl-C and ends its workers
+def _run_worker(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int | None) -> None:
+    """Run jobs in a worker process in sequence, until its pipe is closed."""
+    # the parent process handles Ctrl-C and ends its worker processes
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _limit_memory(memory_bytes)
-    with suppress(EOFError, OSError):  # the parent closed the pipe, or was killed
+    with suppress(EOFError, OSError):  # the parent process closed the pipe, or was killed
         pipe.send((True, None))
         while True:
             pipe.send_bytes(_result_of(function, pipe.recv()))
 
 
 def _result_of(function: Callable[[Any], Any], job: Any) -> bytes:
-    """Run a job; return the pickled message for :func:`_receive_result`."""
+    """Run a job in a worker process; return the pickled message for :func:`_receive_result`."""
     try:
         return pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)
     except MemoryError:
@@ -188,7 +184,7 @@ def _result_of(function: Callable[[Any], Any], job: Any) -> bytes:
         failure = JobFailure("the memory limit for one file was exceeded.")
         return pickle.dumps((False, failure))
     except Exception as error:  # noqa: BLE001 - the failure of a job is its result
-        # imported here: the import takes 2 s and is needed for errors only
+        # imported here, because the import takes 2 s and is necessary only after errors
         from px4fuse.results.reading import one_line  # noqa: PLC0415
 
         kind = "" if isinstance(error, Px4FuseError) else f"{type(error).__name__}: "
@@ -196,7 +192,7 @@ def _result_of(function: Callable[[Any], Any], job: Any) -> bytes:
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent ends, even if the parent was killed."""
+    """End this worker process when its parent process ends or is killed."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -208,8 +204,8 @@ def _limit_memory(memory_bytes: int | None) -> None:
         import resource  # noqa: PLC0415 - not on Windows
     except ImportError:
         return
-    # no core dump: it would contain the file of a student
+    # no core dump, because it would contain the file of a student
     for resource_kind, limit in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, memory_bytes)):
         if limit is not None:
-            with suppress(ValueError, OSError):  # macOS refuses some values
+            with suppress(ValueError, OSError):  # macOS rejects some limits
                 resource.setrlimit(resource_kind, (limit, limit))

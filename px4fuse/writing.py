@@ -1,4 +1,4 @@
-"""Writing of outputs: each file under a temporary name beside its target, then renamed."""
+"""Writing of output files: each file is written under a temporary name and then renamed."""
 
 import errno
 import os
@@ -14,21 +14,21 @@ from px4fuse.errors import OutputError
 from px4fuse.input_files import check_outputs
 
 STANDARD_OUTPUT = Path("-")
-# maximum time (s) to wait for a reader of a named pipe
+# Maximum time (s) to wait for a program that reads a named pipe
 READER_TIMEOUT_S = 5.0
-# True on Windows, which does not replace a file that another program has open
+# True on Windows, on which a file cannot be replaced while another program has it open
 LOCKS_OPEN_FILES = sys.platform == "win32"
-# Maximum number of paths in a message; more paths are counted
+# Maximum number of paths that a message lists; if there are more, it contains their number
 _MAX_LISTED = 4
 
 
 def write_all(
     contents: Mapping[Path, bytes], on_written: Callable[[Path], None] = lambda _: None
 ) -> None:
-    """Write outputs in the order given, and stop at the first that cannot be written.
+    """Write outputs in the order of ``contents``, and stop at the first that cannot be written.
 
-    A regular file is written under a temporary name beside its target and renamed: at any time the
-    target is the old file or the complete new one. A symbolic link stays, and the file that it
+    A regular file is written under a temporary name in the same folder and renamed, so that the
+    path always leads to the old or the complete new file. For a symbolic link, the file that it
     points to is replaced. Standard output, devices and named pipes are written directly.
 
     Parameters
@@ -36,13 +36,13 @@ def write_all(
     contents : mapping from Path to bytes
         Missing folders are created. :data:`STANDARD_OUTPUT` is standard output.
     on_written : callable
-        Called with each path after the output is written.
+        Function that is called with each path after its output is written.
 
     Raises
     ------
     OutputError
-        An output is an input of this command, and nothing is written; or an output cannot be
-        written, and the text lists the outputs that were written before it.
+        An output is an input of this command, so nothing is written; or an output cannot be
+        written, and the message lists the outputs written before.
     BrokenPipeError
         The reader of a pipe has ended. All other outputs are written.
     """
@@ -74,7 +74,6 @@ def written_before(paths: Sequence[Path]) -> str:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Write one output."""
     if path == STANDARD_OUTPUT or _is_standard_output(path):
         sys.stdout.flush()
         sys.stdout.buffer.write(content)
@@ -87,7 +86,7 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def _is_standard_output(path: Path) -> bool:
-    """Return True if standard output goes to this file, as /dev/stdout does under ``> file``."""
+    """Return True if standard output is redirected to this file."""
     try:
         return os.path.samestat(path.stat(), os.fstat(1))
     except OSError:  # the file does not exist, or standard output is closed
@@ -95,7 +94,7 @@ def _is_standard_output(path: Path) -> bool:
 
 
 def _mode(path: Path) -> int:
-    """Return the mode of a file; if it does not exist, the mode of a regular file."""
+    """Return type and permissions of a file; for a new file, the type of a regular file."""
     try:
         return path.stat().st_mode
     except FileNotFoundError:
@@ -103,9 +102,8 @@ def _mode(path: Path) -> int:
 
 
 def _replace(target: Path, content: bytes) -> None:
-    """Write a file completely or not at all."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    # a short name: the target's name may already have the maximum length
+    # the temporary name is short, because the target's name may have the maximum length
     temporary = target.with_name(f".px4fuse-{secrets.token_hex(8)}")
     try:
         with temporary.open("xb") as file:
@@ -116,7 +114,7 @@ def _replace(target: Path, content: bytes) -> None:
 
 
 def _open_pipe(path: Path) -> IO[bytes]:
-    """Open a named pipe; wait at most READER_TIMEOUT_S for a reader."""
+    """Open a named pipe; wait at most READER_TIMEOUT_S for a program that reads it."""
     deadline = time.monotonic() + READER_TIMEOUT_S
     while True:
         try:
@@ -133,9 +131,8 @@ def _open_pipe(path: Path) -> IO[bytes]:
 def _make_output_error(path: Path, error: OSError, written: Sequence[Path]) -> OutputError:
     name = "standard output" if path == STANDARD_OUTPUT else path
     reason = "the pipe has no reader" if error.errno == errno.ENXIO else error.strerror
-    is_locked = LOCKS_OPEN_FILES and isinstance(error, PermissionError)
     already_written = f"; {written_before(written)}" if written else ""
-    remedy = "Close the program that has it open, or choose" if is_locked else "Choose"
-    return OutputError(
-        f"{name}: cannot be written ({reason}){already_written}", f"{remedy} another name."
-    )
+    remedy = "Choose another name."
+    if LOCKS_OPEN_FILES and isinstance(error, PermissionError):
+        remedy = "Close the program that has the file open, or choose another name."
+    return OutputError(f"{name}: cannot be written ({reason}){already_written}", remedy)

@@ -353,9 +353,9 @@ class TestCommand:
         before = files(at)
         shown = run_checked("simulate", *given, "--preview").output
         assert files(at) == before
-        assert "nothing was written" in shown
+        assert "no file was written" in shown
         run_checked("simulate", *given)
-        assert "0 written, 2 existed already" in run_checked("simulate", *given).output
+        assert "0 logs written, 2 existed already" in run_checked("simulate", *given).output
         assert "our secret" not in (at / "f_answers.json").read_text(encoding="utf-8")
         key = read_key(at / "f_answers.json")
         lines = shown.splitlines()
@@ -367,7 +367,7 @@ class TestCommand:
         # without a given secret that of the key is used
         given = "--assignment", "roster.csv", "-o", "g", "--kind", "loop"
         kept = run_checked("simulate", *given).output
-        assert "stored in the answers" in kept
+        assert "stored in the answer key" in kept
         assert read_key(at / "g_answers.json").secret not in kept
         again = run_checked("simulate", *given, "--preview").output
         for answer in read_key(at / "g_answers.json").answers:

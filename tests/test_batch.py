@@ -238,7 +238,7 @@ def test_batch_second_run_processes_only_new_logs(flights, tmp_path, monkeypatch
     (logs / "late.ulg").write_bytes(tiny_log(9))
     said: list[tuple[str, int, int]] = []
     table = px4fuse.batch(logs, output, progress=lambda *step: said.append(step))
-    assert said[-1] == ("comparing, 0 failed", 4, 4)
+    assert said[-1] == ("comparing logs, 0 failed", 4, 4)
     after = {file: file.stat().st_mtime_ns for file in (output / "results").iterdir()}
     assert {file: after[file] for file in times} == times
     assert len(after) == 4
@@ -293,7 +293,7 @@ def test_batch_hanging_log_does_not_affect_other_logs(tmp_path, monkeypatch):
     assert (hang["status"], crash["status"]) == ("failed", "failed")
     assert hang["reason"] == "the time limit of 600 s was exceeded"
     assert "--timeout" in hang["remedy"]
-    assert crash["reason"] == "the worker process ended (exit code 3)"
+    assert crash["reason"] == "the worker process ended during a job (exit code 3)"
 
 
 def analysed(log: Path | str, max_bytes: int = 10**9) -> job.Outcome:

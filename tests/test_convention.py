@@ -287,11 +287,16 @@ def test_detect_ambiguous_axes_are_listed():
     assert "rotated by +12°" in found.message
 
 
-def test_detect_file_read_in_another_frame_names_the_option():
-    converted = sent(flown(), ("north", "east", "up"))
+@pytest.mark.parametrize(("axes", "message", "remedy"), [
+    (("north", "east", "up"), "x and y are exchanged: x is east, y north, z down", "(y, x, z)"),
+    (("west", "north", "down"), "NWU read as ENU: x is north, y west, z up", "frame nwu."),
+])  # fmt: skip
+def test_detect_file_read_in_another_frame_names_it(axes, message, remedy):
+    """The axes are those of positions that were converted from ENU."""
     alignment = replace(given_placement(), frame="enu")
-    (found,) = source_convention.detect(compared(replace(converted, alignment=alignment)))
-    assert found.message.startswith("x and y are exchanged: x is east, y north, z down")
+    (found,) = source_convention.detect(compared(replace(sent(flown(), axes), alignment=alignment)))
+    assert found.message.startswith(message)
+    assert remedy in found.remedy
 
 
 def test_apply_convention_effects_follow_with_another_action():

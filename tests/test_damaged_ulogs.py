@@ -120,7 +120,7 @@ def test_read_ulog_with_invalid_bytes_keeps_valid_messages(content, whole, rubbi
 def test_read_ulog_with_damaged_format_does_not_hang(content) -> None:
     """Without the fix, pyulog loops at a definition longer than the rest of the file."""
     cut = content[: content.index(b"vehicle_attitude:")]
-    with time_limit(), pytest.raises(LogError, match="contains no data"):
+    with time_limit(), pytest.raises(LogError, match="contains no samples"):
         read_ulog("cut.ulg", cut[:-3] + struct.pack("<HB", 60_000, 0) + bytes(100))
 
 
@@ -142,7 +142,7 @@ def test_read_ulog_with_huge_format_definition_is_rejected(definitions: list[byt
     subscriptions = [
         message("A", struct.pack("<BH", 0, number) + b"a") for number in range(len(definitions))
     ]
-    with time_limit(), pytest.raises(LogError, match=r"its topics have more than 200,000 fields"):
+    with time_limit(), pytest.raises(LogError, match=r"the topics have more than 200,000 fields"):
         read_ulog("huge.ulg", HEAD + b"".join(definitions + subscriptions))
 
 
@@ -187,7 +187,7 @@ def test_commands_on_unreadable_log_print_one_error_line(tmp_path, monkeypatch, 
     for command in ("info", "compare"):
         code, out, err = run_main(monkeypatch, capsys, command, path)
         assert (code, out, len(err.splitlines())) == (2, "", 1)
-        assert "contains no data" in err
+        assert "contains no samples" in err
 
 
 # (IMU samples found by a reader with better resynchronisation, fraction that pyulog may lose)

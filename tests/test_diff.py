@@ -10,7 +10,7 @@ from msgspec import structs
 from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
 from px4fuse.ekf2.aids import AidAxis, AidResult
-from px4fuse.fleet.changes import list_changes, number_changes
+from px4fuse.fleet.changes import compare_numbers, list_changes
 from px4fuse.fleet.inputs import DiffInput
 from px4fuse.fleet.measures import MEASURES, ComparedNumber, collect_numbers
 from px4fuse.request import ComparisonRequest
@@ -37,13 +37,13 @@ def number(value: float, interval=None) -> ComparedNumber:
     ],
 )  # fmt: skip
 def test_diff_lists_number_changes_beyond_tolerance(a, b, differs):
-    found = list(number_changes({"it": number(a)}, {"it": number(b)}))
+    found = list(compare_numbers({"it": number(a)}, {"it": number(b)}))
     assert [(one.a, one.b) for one in found] == [(a, b)] * differs
 
 
 def test_diff_lists_numbers_present_in_only_one_input():
     first, second = {"a": number(1.0, (0.5, None))}, {"b": number(2.0)}
-    only_a, only_b = number_changes(first, second)
+    only_a, only_b = compare_numbers(first, second)
     assert (only_a.path, only_a.a, only_a.b, only_a.a_interval) == ("a", 1.0, None, (0.5, None))
     assert (only_b.path, only_b.a, only_b.b, only_b.b_interval) == ("b", None, 2.0, None)
 
@@ -77,7 +77,10 @@ def by_path(found: ChangeResults) -> dict[str, tuple[float | None, float | None]
 def test_diff_of_two_clean_flights_reports_nothing_worse(clean):
     found = list_changes(clean, flown(503))
     assert found.worse == ()
-    assert {one.name for one in found.settings} <= {"start (s)", "end (s)"}
+    assert {one.name for one in found.settings} <= {
+        "start of the analysis (s)",
+        "end of the analysis (s)",
+    }
     assert list_changes(clean, clean).numbers == ()
 
 
@@ -192,9 +195,9 @@ def test_diff_of_aiding_sources_excludes_the_position_source(clean):
     # external vision is the source itself, and listed by axis
     assert {path.split(".")[1] for path in of_aids} == {"gnss_vel"}
     north = of_aids["aids.gnss_vel.axes.north.nis_mean"]
-    assert (north.label, north.value) == ("mean NIS, GNSS velocity, north", 1.2)
+    assert (north.label, north.value) == ("mean NIS of EKF2, GNSS velocity, north", 1.2)
     share = of_aids["aids.gnss_vel.rejected_fraction"]
-    assert (share.label, share.unit) == ("rejected by EKF2, GNSS velocity", "share")
+    assert (share.label, share.unit) == ("measurements rejected by EKF2, GNSS velocity", "share")
     source = structs.replace(clean.results.source, kind="gnss")
     found = collect_numbers(structs.replace(clean.results, source=source, aids=judged))
     assert "ev_pos" in {path.split(".")[1] for path in found}

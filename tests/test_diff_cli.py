@@ -61,7 +61,7 @@ def test_diff_exit_code_is_1_if_verdict_is_worse(settings, changed):
     assert "Worse    Mean NIS of KF, aisle: " in said
     nothing = json.loads(run_checked("diff", settings[0], first, "--json", "-").stdout)
     assert [nothing[part] for part in ("settings", "numbers", "findings", "worse")] == [[]] * 4
-    assert "No verdict is worse in B." in run_checked("diff", *settings[::-1]).stdout
+    assert "No verdict is worse in B than in A." in run_checked("diff", *settings[::-1]).stdout
 
 
 def test_diff_of_report_and_log_uses_settings_of_the_report(settings, tmp_path, monkeypatch):
@@ -103,8 +103,8 @@ def test_diff_of_unsuitable_files_is_rejected(settings, tmp_path):
     for a, b, said in (
         (usual, usual, "the same file"),
         (usual, link, "the same file"),
-        (usual, loop, "loop.json contains px4fuse-loop"),
-        (loop, usual, "loop.json contains px4fuse-loop"),
+        (usual, loop, "loop.json contains results with the schema px4fuse-loop"),
+        (loop, usual, "loop.json contains results with the schema px4fuse-loop"),
         (usual, old, "uses schema version 1.0"),
         (usual, other, "contains no results of px4fuse"),
         (usual, printed, "o results.json is attached"),

@@ -89,7 +89,7 @@ def agreeing(
     (agreeing(published_m=0.10004), 0.0, 0.0, False, "differs by 0.10004 m"),
     (agreeing(0.949), 0.0, 0.09, False, "innovations 0.9490 only"),
     # with many rejections, shares and NIS decide
-    (agreeing(0.5), 0.1, 0.06, True, "rejected 6.0% (log 10.0%)"),
+    (agreeing(0.5), 0.1, 0.06, True, "rejected 6.0% of the samples (log 10.0%)"),
     (agreeing(0.5), 0.06, 0.1, True, "single innovations differ"),
     (agreeing(0.5), 0.25, 0.19, False, "limits "),
     (agreeing(0.5), 0.125, 0.1875, False, "limits "),
@@ -206,7 +206,7 @@ def test_ekf2_replay_agreement_requires_20_varying_innovations():
     shares = found.rejected_fraction_logged, found.rejected_fraction_replayed, found.decisions_same
     assert shares == pytest.approx((0.1, 0.05, 0.95))
     assert isinstance(few := compared(19), Unavailable)
-    assert "only 19 logged innovations to compare with (at least 20" in few.reason
+    assert "only 19 innovations in the replayed time (at least 20" in few.reason
     assert isinstance(same := compared(20, varying=False), Unavailable)
     assert "are constant" in same.reason
 

@@ -10,8 +10,14 @@ from ekf2_tools import opened, plain_replay, step_matrix, step_noise, step_state
 from exchange import replace
 
 from px4fuse.alignment.merge_recordings import join
-from px4fuse.ekf2.filter_recursion import Variant
-from px4fuse.ekf2.model import Model, delayed_states, open_model, replay_settings, run_variants
+from px4fuse.ekf2.filter_recursion import FilterConfiguration
+from px4fuse.ekf2.model import (
+    Model,
+    delayed_states,
+    open_model,
+    replay_settings,
+    run_configurations,
+)
 from px4fuse.ekf2.replay import HORIZONTAL
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.position_source import RECEIVED
@@ -60,8 +66,8 @@ def test_ekf2_model_interval_transition_equals_product_of_steps(model: Model) ->
 @pytest.mark.parametrize("attitude", [True, False])
 def test_ekf2_model_states_follow_from_start_of_interval(model: Model, attitude: bool) -> None:
     """Without attitude as a state, the nominal attitude is not corrected."""
-    variant = Variant(model.inputs.settings, attitude=attitude)
-    (part,) = run_variants(model.inputs, [variant], model.intervals)
+    configuration = FilterConfiguration(model.inputs.settings, attitude=attitude)
+    (part,) = run_configurations(model.inputs, [configuration], model.intervals)
     kept = np.random.default_rng(4).normal(0.0, 0.05, part.state.shape)
     state, _ = delayed_states(replace(part, state=kept), 0)
     segment, ends = part.segment, part.events[0].end_step
@@ -167,7 +173,7 @@ def test_ekf2_model_without_required_topic_states_reason(sample_flight: Flight) 
     dropped = sample_flight.imu[(sample_flight.imu.index % 8.0) > 0.1]
     assert "without a gap" in unavailable(replace(sample_flight, imu=dropped))
     frame = with_vision(sample_flight, vision_of(sample_flight), frame="FRD")
-    assert "no orientation" in unavailable(frame)
+    assert "without an orientation" in unavailable(frame)
     no_horizon = replace(ekf2, horizon_s=Unavailable("horizon", "not logged", "Update PX4."))
     assert "not logged" in unavailable(replace(sample_flight, ekf2=no_horizon))
 

@@ -15,8 +15,8 @@ from findings_tools import log, made
 from scipy.spatial.transform import Rotation
 
 from px4fuse.ekf2.filter_recursion import (
+    FilterConfiguration,
     SegmentRun,
-    Variant,
     _Fusion,
     _limit_bias,
     _sequential_update,
@@ -144,9 +144,9 @@ def test_fusion_horizon_equals_length_of_ekf2_buffer(settings, by_delay, timing)
     usual = {"EKF2_EV_DELAY": 0.0, "EKF2_DELAY_MAX": 200.0}
     rules = replace(RULES, horizon_by_delay=by_delay)
     inputs = made(Inputs, rules=rules, settings=usual, horizon_s=0.12, step_s=0.01, predict_s=0.01)
-    found = Variant({**usual, **settings}).timing(inputs)
+    found = FilterConfiguration({**usual, **settings}).timing(inputs)
     assert (found.delay_s, found.horizon_s) == pytest.approx((timing.delay_s, timing.horizon_s))
-    shifted = Variant(usual, timestamp_offset_s=0.03).timing(inputs)
+    shifted = FilterConfiguration(usual, timestamp_offset_s=0.03).timing(inputs)
     assert (shifted.delay_s, shifted.horizon_s) == pytest.approx((-0.035, math.inf))
 
 
@@ -357,8 +357,10 @@ def at_rest(
         vision_height=False, imu_offset_m=np.zeros(3), aid=aid,
     )  # fmt: skip
     intervals = make_intervals(inputs, segment, Timing(0.0, 0.1))
-    variant = Variant(inputs.settings, uses_logged_decisions=True, without=without or {})
-    return run_segment(inputs, segment, [variant], [intervals])
+    configuration = FilterConfiguration(
+        inputs.settings, uses_logged_decisions=True, without=without or {}
+    )
+    return run_segment(inputs, segment, [configuration], [intervals])
 
 
 def test_ekf2_replay_of_vehicle_at_rest_matches_kalman_filter():

@@ -29,7 +29,7 @@ from px4fuse.ekf2.steps import (
     DifferenceExplanation,
     _longest_rejection,
     explain_by_steps,
-    step_variants,
+    step_configurations,
 )
 from px4fuse.ekf2.whatif import AxisSummary, Summary, _longest_between_fusions, _notes, what_if
 from px4fuse.ekf2_parameters import GNSS_POS
@@ -110,17 +110,17 @@ def test_kf_ekf2_difference_steps_change_one_property_each():
     plain = (made(ReplaySegment, flow=None, heights=None),)
     flight = made(Inputs, settings=flown, step_s=0.01, received=received, segments=plain)
     kf_settings = Settings(0.5, 0.2, 0.16, clock_offset_s=-0.05)
-    found = list(step_variants(flight, kf_settings).values())
-    settings = [variant.settings for variant in found]
+    found = list(step_configurations(flight, kf_settings).values())
+    settings = [configuration.settings for configuration in found]
     assert [s["EKF2_ACC_NOISE"] for s in settings] == pytest.approx([2.0] * 4 + [0.35] * 3)
     assert [s["EKF2_EVP_NOISE"] for s in settings] == [0.2] * 2 + [0.3] * 5
-    assert [variant.reported for variant in found] == [False] * 2 + [True] * 5
+    assert [configuration.reported for configuration in found] == [False] * 2 + [True] * 5
     assert settings[0]["EKF2_EV_POS_X"] == 0.0
-    assert [variant.biases for variant in found] == [False] * 3 + [True] * 4
-    assert [variant.attitude for variant in found] == [False] * 5 + [True] * 2
-    assert [variant.has_gate for variant in found] == [False] * 6 + [True]
-    assert [variant.uses_logged_decisions for variant in found] == [False] * 6 + [True]
-    assert [variant.timestamp_offset_s for variant in found] == [-0.05] + [None] * 6
+    assert [configuration.biases for configuration in found] == [False] * 3 + [True] * 4
+    assert [configuration.attitude for configuration in found] == [False] * 5 + [True] * 2
+    assert [configuration.has_gate for configuration in found] == [False] * 6 + [True]
+    assert [configuration.uses_logged_decisions for configuration in found] == [False] * 6 + [True]
+    assert [configuration.timestamp_offset_s for configuration in found] == [-0.05] + [None] * 6
     gnss = made(
         Inputs,
         aid=GNSS_POS,
@@ -129,21 +129,23 @@ def test_kf_ekf2_difference_steps_change_one_property_each():
         settings={"EKF2_ACC_NOISE": 0.35, "EKF2_GPS_P_NOISE": 0.5, "EKF2_GPS_DELAY": 110.0},
         segments=plain,
     )
-    found = list(step_variants(gnss, kf_settings).values())
-    assert [variant.velocity for variant in found] == [False] * 6 + [True] * 2
-    assert [variant.has_gate for variant in found] == [False] * 7 + [True]
+    found = list(step_configurations(gnss, kf_settings).values())
+    assert [configuration.velocity for configuration in found] == [False] * 6 + [True] * 2
+    assert [configuration.has_gate for configuration in found] == [False] * 7 + [True]
     # the GNSS positions of KF already include the delay
     assert found[0].timestamp_offset_s == pytest.approx(-0.16)
-    assert [variant.settings["EKF2_GPS_P_NOISE"] for variant in found] == [0.2] * 2 + [0.5] * 6
+    assert [configuration.settings["EKF2_GPS_P_NOISE"] for configuration in found] == [0.2] * 2 + [
+        0.5
+    ] * 6
     flow = (made(ReplaySegment, flow=made(SensorSamples), heights=None),)
     more = {"segments": flow, "settings": gnss.settings | {"EKF2_MAG_NOISE": 0.05}}
-    variants = step_variants(made(Inputs, **{**vars(gnss), **more}), kf_settings)
-    assert list(variants)[-5:] == [ATTITUDE, FIELD_STEP, VELOCITY_STEP, FLOW_STEP, GATE]
-    assert ["mag" in each.without for each in variants.values()] == [True] * 6 + [False] * 4
-    assert ["optical_flow" in each.without for each in variants.values()] == [True] * 8 + [
+    configurations = step_configurations(made(Inputs, **{**vars(gnss), **more}), kf_settings)
+    assert list(configurations)[-5:] == [ATTITUDE, FIELD_STEP, VELOCITY_STEP, FLOW_STEP, GATE]
+    assert ["mag" in each.without for each in configurations.values()] == [True] * 6 + [False] * 4
+    assert ["optical_flow" in each.without for each in configurations.values()] == [True] * 8 + [
         False
     ] * 2
-    assert [each.velocity for each in variants.values()] == [False] * 7 + [True] * 3
+    assert [each.velocity for each in configurations.values()] == [False] * 7 + [True] * 3
 
 
 def test_longest_run_of_ekf2_rejections_has_start_and_duration():

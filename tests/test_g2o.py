@@ -67,16 +67,19 @@ def test_parse_g2o_without_vertices_initialises_poses_from_edges() -> None:
 
 EDGE = f"EDGE_SE2 0 1 1 0 0 {UNIT_2}"
 NOT_READ, NO_TABLE, NO_VERTEX = (
-    "lines are not supported",
+    "are not supported",
     "columns of numbers",
-    "the vertex number is not an integer of at",
+    "a vertex id is not an integer of at",
 )
 INVALID_TEXTS = {
     "no edges": ("VERTEX_SE2 0 0 0 0\n", "no edges"),
     "empty": ("", "no edges"),
     "mixed": (PLANE + SPACE, "line 4: the file contains both SE2 and SE3 poses"),
-    "unknown edge": (PLANE + f"EDGE_SE2_XY 0 1 1 0 {UNIT_2}", f"line 4: 'EDGE_SE2_XY' {NOT_READ}"),
-    "TORO": (f"EDGE2 0 1 1 0 0 {UNIT_2}", f"line 1: 'EDGE2' {NOT_READ}"),
+    "unknown edge": (
+        PLANE + f"EDGE_SE2_XY 0 1 1 0 {UNIT_2}",
+        f"line 4: lines with the tag 'EDGE_SE2_XY' {NOT_READ}",
+    ),
+    "TORO": (f"EDGE2 0 1 1 0 0 {UNIT_2}", f"line 1: lines with the tag 'EDGE2' {NOT_READ}"),
     "cut off": (PLANE + "EDGE_SE2 0 1 1 0", f"line 4: 'EDGE_SE2 0 1 1 0' is not 12 {NO_TABLE}"),
     "nothing": (PLANE + "EDGE_SE2", "line 4: 'EDGE_SE2' is not 12"),
     "too long": (PLANE.replace("1 0 0\n", "1 0 0 0\n"), "line 2: 'VERTEX_SE2 1 1 0 0 0' is not 5"),
@@ -88,24 +91,30 @@ INVALID_TEXTS = {
     "huge": (PLANE.replace("SE2 0 1", "SE2 0 " + "9" * 30), f"line 3: {NO_VERTEX}"),
     "missing": (
         PLANE + EDGE.replace("0 1", "1 5", 1),
-        "line 4: an edge to a vertex that is not in",
+        "line 4: the edge connects a vertex that is not in",
     ),
     "twice": (PLANE + "\nVERTEX_SE2 1 0 0 0", "line 5: this vertex id is repeated"),
-    "self": (PLANE + EDGE.replace("0 1", "1 1", 1), "line 4: an edge from a vertex to itself"),
+    "self": (PLANE + EDGE.replace("0 1", "1 1", 1), "line 4: the edge connects a vertex to itself"),
     "negative": (PLANE.replace(UNIT_2, "1 0 0 1 0 -1"), "line 3: the information matrix has a neg"),
     "indefinite": (PLANE.replace(UNIT_2, "1 2 0 1 0 1"), "line 3: the information matrix has a n"),
     "no rotation": (SPACE.replace("0 0 0 1\nE", "0 0 0 0\nE"), "line 2: the quaternion does not"),
     "endless": (SPACE.replace("0 0 0 1\nE", "0 0 0 1.8e308\nE"), "line 2: a number is not finite"),
     "long": (SPACE.replace("0 0 0 1\nE", "0 0 0 1.7e308\nE"), "line 2: the quaternion does not"),
-    "two FIX": (PLANE + "FIX 0\nFIX 1", "line 5: FIX of a second vertex"),
+    "two FIX": (PLANE + "FIX 0\nFIX 1", "line 5: the line fixes a second vertex"),
     "parts": (
         f"{EDGE}\n{EDGE.replace('0 1', '5 6', 1)}",
         "2 disconnected parts: vertex 5 is not connected",
     ),
     "too small": (PLANE.replace(UNIT_2, "1e-51 0 0 1 0 1"), "line 3: the information matrix has"),
     "smallest": (PLANE.replace(UNIT_2, "1 0 0 5e-324 0 1"), "line 3: the information matrix has"),
-    "far vertex": (PLANE.replace("1 1 0 0\n", "1 1e30 0 0\n"), "line 2: a value is outside ±1e+09"),
-    "far edge": (SPACE.replace("QUAT 0 1 1", "QUAT 0 1 -1e9"), "line 3: a value is outside ±1e+09"),
+    "far vertex": (
+        PLANE.replace("1 1 0 0\n", "1 1e30 0 0\n"),
+        "line 2: a position or angle is outside",
+    ),
+    "far edge": (
+        SPACE.replace("QUAT 0 1 1", "QUAT 0 1 -1e9"),
+        "line 3: a position or angle is outside",
+    ),
     "too large": (PLANE.replace(UNIT_2, "1 0 0 1 0 1e51"), "line 3: the information matrix has an"),
 }
 
@@ -125,7 +134,7 @@ def test_parse_g2o_with_invalid_text_names_the_line(case: str) -> None:
 def test_read_g2o_from_binary_or_missing_file_is_rejected(tmp_path: Path) -> None:
     binary = tmp_path / "log.g2o"
     binary.write_bytes(b"ULog\x01\x12\x35\xff\xfe\x00")
-    with pytest.raises(TrajectoryError, match=r"^log\.g2o: not a text file"):
+    with pytest.raises(TrajectoryError, match=r"^log\.g2o: the file is not a text file"):
         read_g2o(binary)
     with pytest.raises(TrajectoryError, match=r"^none\.g2o: cannot be read \(No such file"):
         read_g2o(tmp_path / "none.g2o")

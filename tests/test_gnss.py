@@ -257,7 +257,7 @@ def test_down_axis_uses_unfused_barometer_only_on_request(tmp_path):
     with pytest.raises(MissingDataError, match="no barometer height in the log"):
         prepare(bare, height="barometer")
     vision = simulate_flight(make_scenario("aisle", seed=1))
-    with pytest.raises(SettingsError, match="`height` needs a GNSS position"):
+    with pytest.raises(SettingsError, match="`height` needs GNSS as position source"):
         prepare(vision, height="gnss")
 
 
@@ -605,7 +605,7 @@ def test_ekf2_model_without_fixes_during_fusion_is_unavailable(tmp_path):
     ]
     found = prepare_replay(flight_of(log, tmp_path))
     assert isinstance(found, Unavailable)
-    assert "no sample of GNSS position at a time at which EKF2 reports its fusion" in found.reason
+    assert "no sample of GNSS position while EKF2 reports its fusion" in found.reason
 
 
 def test_gnss_driver_timestamp_replaces_delay_parameter(tmp_path):

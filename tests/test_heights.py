@@ -14,9 +14,9 @@ from exchange import replace
 from findings_tools import made
 
 from px4fuse.analysis import WhatIfAnalysis
-from px4fuse.ekf2.filter_recursion import SegmentRun, Variant
+from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun
 from px4fuse.ekf2.heights import HeightFilter, add_heights, barometer_samples
-from px4fuse.ekf2.model import Model, run_variants
+from px4fuse.ekf2.model import Model, run_configurations
 from px4fuse.ekf2.replay_segments import HeightSamples, ReplaySegment
 from px4fuse.ekf2.whatif import HEIGHT_LOGGED_NOTE, HEIGHT_REPLAYED_NOTE, what_if
 from px4fuse.errors import SettingsError
@@ -298,7 +298,9 @@ def test_clipped_acceleration_has_noise_of_4_9_m_s2() -> None:
 
     def ran(one: ReplaySegment, **changed: float) -> SegmentRun:
         settings = inputs.settings | changed
-        return run_variants(replace(inputs, segments=(one,)), [Variant(settings)], {})[0]
+        return run_configurations(
+            replace(inputs, segments=(one,)), [FilterConfiguration(settings)], {}
+        )[0]
 
     np.testing.assert_array_equal(ran(spoilt).state, ran(segment, EKF2_ACC_NOISE=4.9).state)
     # one clipped axis of three equals a third of the steps
@@ -399,7 +401,7 @@ def test_what_if_results_contain_each_height_sensor(models: dict[str, Model]) ->
     request = WhatIfRequest(log=model.flight.log.name, changes=changes, without=without)
     asked = what_if(model, [changes], without)
     found = WhatIfAnalysis(
-        model.flight, asked, changes, asked=False, difference_steps={}, without=without
+        model.flight, asked, changes, uses_estimates=False, difference_steps={}, without=without
     )
     results = json.loads(to_json(whatif_results(request, found)))
     jsonschema.validate(results, schema())

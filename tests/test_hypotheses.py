@@ -143,7 +143,7 @@ def test_bias_regression_equals_least_squares_with_prior() -> None:
 
 
 def test_clean_flight_has_no_bias_scale_error_or_jump() -> None:
-    causes, low_pass = flown().bias_scale_jump_fit, flown().smoothing
+    causes, low_pass = flown().bias_scale_jump_fit, flown().source_low_pass
     assert causes.jumps == ()
     assert low_pass.correlation == 0.0
     assert causes.sigma_a_m_s2 == pytest.approx(0.2, rel=0.35)  # the white noise alone
@@ -232,8 +232,8 @@ def test_outlier_burst_is_not_reported_as_position_jump() -> None:
 
 def test_time_offset_is_not_reported_as_low_pass() -> None:
     late = flown("clock-offset=250ms", passes=6)
-    assert late.smoothing.gain_nats == 0.0
-    assert replace(late, clock=unavailable("clock offset")).smoothing.gain_nats > 3.0
+    assert late.source_low_pass.gain_nats == 0.0
+    assert replace(late, clock=unavailable("clock offset")).source_low_pass.gain_nats > 3.0
 
 
 # ------------------------------------------------------------------ arrival times
@@ -280,7 +280,7 @@ def test_flight_without_required_data_gives_no_bias_finding(mistake, change) -> 
 def test_bias_fit_without_tuned_noises_is_unavailable() -> None:
     untuned = replace(flown("jump=1,40s"), tuning={})
     assert isinstance(untuned.bias_scale_jump_fit, Unavailable)
-    assert isinstance(untuned.smoothing, Unavailable)
+    assert isinstance(untuned.source_low_pass, Unavailable)
     assert found(untuned) == {}
 
 
@@ -289,4 +289,4 @@ def test_very_short_flight_gives_no_bias_or_jump_finding(mistake) -> None:
     short = analysed(flight(mistake), start_s=20.0, end_s=25.0)
     assert found(short) == {}
     assert isinstance(short.bias_scale_jump_fit, Unavailable)
-    assert isinstance(short.smoothing, Unavailable)
+    assert isinstance(short.source_low_pass, Unavailable)

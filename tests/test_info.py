@@ -192,7 +192,7 @@ def test_info_on_log_without_take_off_states_never_airborne(tmp_path):
     inventory = inventory_of(log, tmp_path)
     assert inventory.flight.airborne == ()
     assert ability(inventory, "compare").possible
-    assert "never (land detector)" in info(tmp_path / "made.ulg")
+    assert "never, according to the land detector" in info(tmp_path / "made.ulg")
 
 
 def test_info_does_not_use_position_source_as_ground_truth(tmp_path):
@@ -273,7 +273,7 @@ def test_info_prints_log_dropouts_and_advice(monkeypatch, tmp_path, sample_fligh
     assert take_inventory(flight).start_utc is None
     text = info(tmp_path / "any.tlog")
     assert widest(text) <= WIDTH
-    for words in ("unknown", "2 of the logger", "faster SD card"):
+    for words in ("unknown", "2 logger dropouts", "faster SD card"):
         assert words in text
 
 

@@ -93,9 +93,12 @@ def test_python_compare_arguments_act_like_command_options(sample_log, analysis)
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ({"axes": "ailse"}, "`axes` 'ailse': choose from north, east, down, aisle."),
-        ({"clock_offset_s": "find"}, "`clock_offset_s` 'find': give seconds, or 'auto'."),
-        ({"mavlink": "a.tlog"}, "position, mavlink and system are only used when a log is read"),
+        ({"axes": "ailse"}, "`axes` 'ailse' is unknown. Choose from north, east, down, aisle."),
+        (
+            {"clock_offset_s": "find"},
+            "`clock_offset_s` 'find' is not a number of seconds or 'auto'",
+        ),
+        ({"mavlink": "a.tlog"}, "position, mavlink and system are not possible with a Flight"),
         ({"sigma_a_m_s2": -1}, "`sigma_a_m_s2` -1 is out of range"),
         ({"start_s": float("nan")}, "`start_s` nan is not a finite number."),
         ({"position_source": "gps"}, "position source gps: no such source."),
@@ -204,7 +207,7 @@ def test_python_write_report_to_wrong_suffix_is_rejected(
     analysis: px4fuse.Analysis, tmp_path: Path
 ) -> None:
     for function, name in ((px4fuse.write_report, "x.html"), (px4fuse.write_page, "x.pdf")):
-        with pytest.raises(px4fuse.Px4FuseError, match="give a name that ends in"):
+        with pytest.raises(px4fuse.Px4FuseError, match="Give a name ending in"):
             function(analysis, tmp_path / name)
     bare = dataclasses.replace(analysis, request=None)
     with pytest.raises(px4fuse.Px4FuseError, match="contains no request"):

@@ -17,12 +17,12 @@ from px4fuse.comparison.causal_replays import (
     ROTATION,
     Intervention,
     find_cause,
-    planned_variants,
+    planned_configurations,
     run_interventions,
 )
 from px4fuse.comparison.causal_replays import RIGHT_BIAS as TO_RIGHT
 from px4fuse.comparison.comparison import compare
-from px4fuse.ekf2.filter_recursion import Variant
+from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.model import replay_settings, with_misaligned_positions, with_position_noise
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.frame_rotation import HeadingError
@@ -143,9 +143,11 @@ def test_ekf2_rerun_equals_what_if_with_the_same_change() -> None:
     for one, axis in zip(found, ("north", "east"), strict=True):
         assert one.before == analysis.axes[axis].filters["ekf2"].nis_mean
         assert one.after == pytest.approx(replays.whatif[0].axes[axis].nis_mean, rel=1e-9)
-    # the variant was planned with EKF2 as flown; other positions give another replay
+    # the configuration was planned with EKF2 as flown; other positions give another replay
     known = analysis, analysis.tuning, analysis.clock, analysis.heading
-    assert Variant({**model.inputs.settings, **change}) in planned_variants(*known, model.inputs)
+    assert FilterConfiguration({**model.inputs.settings, **change}) in planned_configurations(
+        *known, model.inputs
+    )
     once, other = (
         replay_settings(of, [change])[0] for of in (model, with_position_noise(model, 0.01, 1))
     )

@@ -86,7 +86,7 @@ def test_magnetometer_fusion_uses_noise_and_gate_of_each_run() -> None:
     seen = seen._replace(sample_count=np.array([1.0, 1.0, 0.0, 1.0]))
     noise, gate = np.array([0.05, 0.2, 0.2, 0.0]), np.array([3.0, 3.0, 3.0, 100.0])
     after, left, innovation = fuse_field(x, P, seen, noise, gate)
-    # 0.3 gauss is 6 σ for the first variant; the third has no sample
+    # 0.3 gauss is 6 σ for the first configuration; the third has no sample
     moved = np.abs(after - x).max(axis=1) > 0.0
     assert moved.tolist() == [False, True, False, True]
     np.testing.assert_array_equal(left[0], P[0])

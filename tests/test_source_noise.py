@@ -83,7 +83,7 @@ def test_white_position_noise_has_no_finding() -> None:
     analysis = analysed(errors.white)
     assert root_findings(analysis) == {}
     assert list(detect(analysis)) == []
-    assert isinstance(analysis.coloured, Unavailable)
+    assert isinstance(analysis.time_correlated_noise, Unavailable)
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_correlated_noise_is_distinguished_from_low_pass() -> None:
     assert "source_noise_time_correlated" not in {one.id for one in find(smooth)}
     assert "source_low_pass_filtered" in root_findings(smooth)
     for analysis, lags in ((slow, False), (smooth, True)):
-        found = analysis.coloured
+        found = analysis.time_correlated_noise
         assert found.gain_nats > 30.0
         assert (found.lag_nats > 1.0) == lags
         assert 0.5 < found.share <= 1.0

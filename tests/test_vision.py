@@ -19,10 +19,10 @@ from exchange import replace
 from px4fuse.analysis import explain, run_what_if
 from px4fuse.comparison.comparison import compare
 from px4fuse.ekf2 import steps
-from px4fuse.ekf2.filter_recursion import SegmentRun, Variant, run_segment
+from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun, run_segment
 from px4fuse.ekf2.inputs import Inputs, ReceivedPositions
 from px4fuse.ekf2.intervals import Events, make_intervals
-from px4fuse.ekf2.model import Model, modelled_aids, open_model, replay_settings, run_variants
+from px4fuse.ekf2.model import Model, modelled_aids, open_model, replay_settings, run_configurations
 from px4fuse.ekf2.replay_segments import ReplaySegment
 from px4fuse.ekf2.vision import MAX_SAMPLE_GAP_S
 from px4fuse.ekf2.whatif import what_if
@@ -194,11 +194,11 @@ def flying(vision: ReceivedPositions | None, seconds: float = 40.0, **settings: 
     return replace(inputs, segments=(segment,), vision=vision, settings=known)
 
 
-def ran(inputs: Inputs, *variants: Variant) -> SegmentRun:
+def ran(inputs: Inputs, *configurations: FilterConfiguration) -> SegmentRun:
     (segment,) = inputs.segments
-    variants = variants or (Variant(inputs.settings),)
-    made = [make_intervals(inputs, segment, one.timing(inputs)) for one in variants]
-    return run_segment(inputs, segment, variants, made)
+    configurations = configurations or (FilterConfiguration(inputs.settings),)
+    made = [make_intervals(inputs, segment, one.timing(inputs)) for one in configurations]
+    return run_segment(inputs, segment, configurations, made)
 
 
 def update_log(done: SegmentRun, at: int = 0) -> pd.DataFrame:
@@ -239,8 +239,8 @@ def test_vision_noise_besides_gnss_is_at_least_gnss_noise() -> None:
     """R is the largest of EKF2_EVP_NOISE, EKF2_GPS_P_NOISE and the reported variance."""
     inputs = flying(sent(), EKF2_GPS_P_NOISE=0.5)
     noises = ({**inputs.settings, "EKF2_EVP_NOISE": noise_m} for noise_m in (0.01, 0.5, 0.7))
-    alone = Variant(inputs.settings, without={"gnss_pos": 0.0})
-    done = ran(inputs, *map(Variant, noises), alone)
+    alone = FilterConfiguration(inputs.settings, without={"gnss_pos": 0.0})
+    done = ran(inputs, *map(FilterConfiguration, noises), alone)
     assert done.vision is not None
     noise = np.sqrt(np.unique(done.vision.noise_m2[done.vision.has_sample[0]].round(9), axis=0))
     assert sorted({*noise[:, 0].round(6)}) == [0.1, 0.5, 0.7]
@@ -290,7 +290,7 @@ def test_vision_jump_is_rejected_until_its_bias_is_reset() -> None:
     assert not done.position_reset_m.any()
     difference = done.state[-1, 0, 6:8] - smooth.state[-1, 0, 6:8]
     assert np.abs(difference).max() < 0.05
-    without_gate = ran(flying(jumped), Variant(flying(jumped).settings, has_gate=False))
+    without_gate = ran(flying(jumped), FilterConfiguration(flying(jumped).settings, has_gate=False))
     assert not update_log(without_gate)["rejected"].any()
 
 
@@ -312,7 +312,11 @@ def test_loss_of_gnss_resets_position_to_vision() -> None:
     inputs = flying(sent(sigma_m=0.05))
     lost_s = float(inputs.segments[0].time_s[0]) + 20.0
     lost = dict.fromkeys(("gnss_pos", "gnss_vel"), lost_s)
-    done = ran(inputs, Variant(inputs.settings), Variant(inputs.settings, without=lost))
+    done = ran(
+        inputs,
+        FilterConfiguration(inputs.settings),
+        FilterConfiguration(inputs.settings, without=lost),
+    )
     found, flown = update_log(done, 1), update_log(done, 0)
     assert not flown["reset"].any()
     (reset_s,) = found.index[found["reset"] > 0.0]
@@ -363,8 +367,8 @@ def test_rejection_of_gnss_and_vision_resets_position_to_vision() -> None:
 def test_larger_vision_delay_extends_the_fusion_horizon() -> None:
     inputs = flying(sent())
     settings = inputs.settings
-    flown = Variant(settings).timing(inputs)
-    later = Variant({**settings, "EKF2_EV_DELAY": 290.0}).timing(inputs)
+    flown = FilterConfiguration(settings).timing(inputs)
+    later = FilterConfiguration({**settings, "EKF2_EV_DELAY": 290.0}).timing(inputs)
     assert later.delay_s == flown.delay_s == pytest.approx(1e-3 * settings["EKF2_GPS_DELAY"])
     assert later.horizon_s == pytest.approx(28 * inputs.step_s)
     assert flown.horizon_s == inputs.horizon_s < later.horizon_s
@@ -400,20 +404,24 @@ def flown(
     opposite sign in EKF2; ``off_from_s``: EKF2 does not fuse vision from then on.
     """
     vision, runs = sent(), []
-    usual, usual_run = simulated.parameters, run_variants
+    usual, usual_run = simulated.parameters, run_configurations
     noise = np.random.default_rng(9).normal(0.0, 1.0, vision.position_m.shape)
     heard = replace(vision, position_m=(-1.0 if flipped else 1.0) * vision.position_m
                     + wrong_m * noise)  # fmt: skip
 
-    def both(inputs: Inputs, variants: list[Variant], known: Any) -> list[SegmentRun]:
+    def both(
+        inputs: Inputs, configurations: list[FilterConfiguration], known: Any
+    ) -> list[SegmentRun]:
         settings = {**inputs.settings, **SETTINGS, **changed}
         given = replace(inputs, vision=heard, settings=settings)
-        runs.extend(usual_run(given, [Variant(settings, without={"ev_pos": off_from_s})], known))
+        runs.extend(
+            usual_run(given, [FilterConfiguration(settings, without={"ev_pos": off_from_s})], known)
+        )
         return runs
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulated, "parameters", lambda *of: usual(*of) | OF_VISION | changed)
-        patch.setattr(simulated, "run_variants", both)
+        patch.setattr(simulated, "run_configurations", both)
         flight = simulate_flight(OUTDOOR, parse(()))
     updates = update_log(runs[0])
     enabled = pd.Series([1.0, 0.0], index=[0.0, off_from_s])
@@ -466,7 +474,9 @@ def test_what_if_vision_noise_equals_flight_with_that_noise() -> None:
     assert found.logged.others["ev_pos"].nis_mean < 0.5 * predicted.others["ev_pos"].nis_mean
     # R is then the noise of GNSS
     update_log = what_if(model(), [{"EKF2_EVP_NOISE": 0.2}])
-    assert "at least EKF2_GPS_P_NOISE (0.4 m) as noise of vision" in update_log.notes[-1]
+    assert (
+        "the noise of vision positions is at least EKF2_GPS_P_NOISE (0.4 m)" in update_log.notes[-1]
+    )
     assert update_log.whatif[0].others == update_log.replayed.others
 
 
@@ -527,13 +537,13 @@ def test_ekf2_model_with_incomplete_vision_is_unavailable() -> None:
     gnss_alone = replace(flight, positions=flight.positions[1:])
     lacking = open_model(gnss_alone)
     assert isinstance(lacking, Unavailable)
-    assert "no vehicle_visual_odometry" in lacking.reason
+    assert "no topic vehicle_visual_odometry" in lacking.reason
     record = flight.ekf2.record
     remaining = {name: v for name, v in record.parameters.items() if name != "EKF2_EV_CTRL"}
     older = replace(record, parameters={**remaining, "EKF2_AID_MASK": 9.0})
     refused = open_model(replace(flight, ekf2=replace(flight.ekf2, record=older)))
     assert isinstance(refused, Unavailable)
-    assert "relative vision positions" in refused.reason
+    assert "changes of the vision position" in refused.reason
 
 
 def test_kf_ekf2_difference_steps_include_vision_besides_gnss() -> None:

@@ -80,7 +80,7 @@ def test_what_if_with_unknown_aiding_source_raises_error(estimated: WhatIfAnalys
 
 def test_whatif_command_without_set_uses_estimated_parameters(estimated: WhatIfAnalysis) -> None:
     """The UWB noise is 0.10 m, and its timestamps are right."""
-    assert estimated.asked
+    assert estimated.uses_estimates
     assert set(estimated.changes) == {"EKF2_EVP_NOISE"}
     assert estimated.changes["EKF2_EVP_NOISE"] == pytest.approx(0.1, abs=0.01)
     assert "maximum-likelihood estimate" in column_heads(estimated)[-1]

@@ -48,14 +48,14 @@ def test_worker_job_that_fails_does_not_affect_other_jobs():
     ]
     results, _ = run(jobs)
     assert [results[n] for n in (0, 3, 10)] == [1, 4, 9]
-    assert results[1] == JobFailure("the worker process ended (exit code 3).")
+    assert results[1] == JobFailure("the worker process ended during a job (exit code 3).")
     assert results[2] == JobFailure("ValueError: a b[2J")
     assert results[4] == JobFailure("x.ulg: empty.")
     assert isinstance(results[5], JobFailure)
     assert results[6] == JobFailure("the result could not be unpickled (ValueError).")
     assert results[7] == bytes(30_000_000)
     assert results[8] == "1"
-    assert results[9] == JobFailure("the worker process ended (exit code 0).")
+    assert results[9] == JobFailure("the worker process ended during a job (exit code 0).")
     assert os.environ.get("OMP_NUM_THREADS") == before
 
 
@@ -140,10 +140,10 @@ def test_worker_process_does_not_import_from_current_folder(tmp_path):
 def test_worker_with_closed_pipe_ends_without_traceback():
     script = """if True:
         from multiprocessing import Pipe
-        from px4fuse.workers import _serve
+        from px4fuse.workers import _run_worker
         parent, worker = Pipe()
         parent.close()
-        _serve(worker, len, None)
+        _run_worker(worker, len, None)
     """
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, timeout=60, check=False

@@ -167,7 +167,7 @@ def test_output_to_locked_file_advises_to_close_the_program(tmp_path, monkeypatc
     path = tmp_path / "r.pdf"
     path.write_bytes(b"old")
     at_rename_to(path, monkeypatch, deny)
-    for locks, said in ((True, "Close the program that has it open, or c"), (False, "C")):
+    for locks, said in ((True, "Close the program that has the file open, or c"), (False, "C")):
         monkeypatch.setattr(writing, "LOCKS_OPEN_FILES", locks)
         with pytest.raises(OutputError, match=rf"\. {said}hoose another"):
             write_all({path: b"new"})

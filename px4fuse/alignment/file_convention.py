@@ -47,9 +47,8 @@ def explain_mismatch(
         faults.append(describe_unit(convention.unit, "the positions", stated, is_file=True))
     stated = (problem.frame or "").upper()
     is_rotated = abs(convention.rotation_deg) > MIN_ROTATION_DEG
-    if axes != FRAME_AXES.get(stated) and not (stated and is_rotated):
-        text = stated or "stated"
-        faults.append(describe_axes(axes, text, is_mirrored=convention.is_mirrored, is_file=True))
+    if stated and axes != FRAME_AXES[stated] and not is_rotated:
+        faults.append(describe_axes(axes, stated, is_mirrored=convention.is_mirrored, is_file=True))
     if not faults:
         return None
     texts, actions = zip(*faults, strict=True)

@@ -19,20 +19,23 @@ from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_PEAK_RATIO
 
 # Frames to try if yaw is estimated; nwu is not tried, because it is enu rotated by 90°
 YAW_FREE_FRAMES = ("ned", "enu")
-MAX_SPAN_S = 86400.0  # maximum time span of a file: a day of positions takes five seconds
-# Minimum concordance correlation coefficient (Lin 1989) of a good match, by reference. A match that
-# is not good gets a warning and does not overrule options
+# Maximum time span (s) of a position file: matching a day of positions takes five seconds
+MAX_SPAN_S = 86400.0
+# Minimum value of Lin's concordance correlation coefficient (1989) for a good match, by reference:
+# a match below gets a warning and does not overrule options
 GOOD_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
-MAX_CLOCK_SIGMA_S = 0.5  # maximum standard deviation of an accepted time offset
-MIN_FRAME_RATIO = 1.3  # minimum ratio of the residuals in the second best frame and the best frame
-# Misaligned frame: minimum ratio of the residual with the given yaw to the residual with estimated
-# yaw and origin, and minimum residual (m) with the given yaw
+# Maximum standard deviation (s) of an accepted time offset
+MAX_CLOCK_SIGMA_S = 0.5
+# Minimum ratio of the residual in the second best frame to the residual in the best frame
+MIN_FRAME_RATIO = 1.3
+# Limits for a misaligned frame: minimum ratio of the residual with the given yaw to the residual
+# with estimated yaw and origin, and minimum residual (m) with the given yaw
 MIN_ROTATION_RATIO, MIN_ROTATION_RMS_M = 2.0, 0.3
 
 
 @dataclass(frozen=True)
 class AlignmentProblem:
-    """Position file with given alignment parameters. Parameters that are None are estimated.
+    """Position file, with the alignment parameters from options; None if a parameter is estimated.
 
     Attributes
     ----------
@@ -53,7 +56,7 @@ class AlignmentProblem:
 
 @dataclass(frozen=True)
 class Match:
-    """Result of matching the file with one reference.
+    """Match of the position file with one reference, EKF2 or the IMU.
 
     Attributes
     ----------
@@ -67,8 +70,6 @@ class Match:
         Fit with estimated yaw.
     is_rotated : bool
         True if the frame of the file is misaligned; the time offset is then from ``free_yaw_fit``.
-    better_frame : str
-        Other frame in which the file fits without rotation; "" if there is none.
     """
 
     reference: SampledTrack
@@ -77,11 +78,10 @@ class Match:
     fit: Fit
     free_yaw_fit: Fit
     is_rotated: bool
-    better_frame: str = ""
 
     @property
     def time_offset_fit(self) -> Fit:
-        """Fit that determines the time offset."""
+        """Fit from which the time offset is used."""
         return self.free_yaw_fit if self.is_rotated else self.fit
 
     @property
@@ -93,7 +93,7 @@ class Match:
 
 
 def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
-    """Match the file with the first suitable reference: EKF2, or else the IMU.
+    """Match the position file with the first suitable reference: EKF2, or else the IMU.
 
     Return None if no reference is suitable and no parameter has to be estimated.
 
@@ -109,8 +109,8 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     }
     missing_options = [f"`{name}`" for name, value in given_parameters.items() if value is None]
     reasons = []
-    # if all parameters are given, they are only checked against EKF2: the band-passed IMU motion is
-    # not sufficient for a check
+    # If options give all parameters, the parameters are only checked, and only against EKF2: the
+    # band-passed IMU motion is not accurate enough for a check
     reference_kinds = (tracks.make_ekf2_references, tracks.make_imu_references)
     for references in reference_kinds if missing_options else reference_kinds[:1]:
         try:
@@ -129,12 +129,15 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
 
 
 def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
-    """Match with the reference and the frame that give the smallest residual."""
-    samples, frame, yaw_rad = problem.samples, problem.frame, problem.yaw_rad
+    samples = problem.samples
+    frame = problem.frame
+    yaw_rad = problem.yaw_rad
     if samples.index[-1] - samples.index[0] > MAX_SPAN_S:
-        raise NoMatchError("the position file spans more than one day; cut it to the flight")
+        raise NoMatchError("the position file is longer than one day; cut the file to the flight")
     if tracks.horizontal_range_m(tracks.convert_to_ned(samples, "ned")) < tracks.MIN_MOTION_M:
-        raise NoMatchError("the positions in the file hardly change")
+        raise NoMatchError(
+            f"the positions in the file change by less than {tracks.MIN_MOTION_M:g} m"
+        )
     frames = (frame,) if frame else YAW_FREE_FRAMES if yaw_rad is None else tuple(tracks.FRAMES)
     matches = []
     for reference in references:
@@ -152,23 +155,7 @@ def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
             fit.concordance < MIN_CONCORDANCE[name]
             or needs_rotation(fit.horizontal_rms_m, free_yaw_fit, name)
         )
-        better_frame = ""
-        if is_rotated and frame and yaw_rad is not None:
-            other_fits = {
-                tried_frame: fit_frame(tried_frame, yaw_rad)
-                for tried_frame in tracks.FRAMES
-                if tried_frame != frame
-            }
-            other_frame, other_fit = min(other_fits.items(), key=lambda item: item[1].rms_m)
-            is_other_fit_good = other_fit.concordance >= GOOD_CONCORDANCE[name]
-            better_frame = (
-                other_frame
-                if is_other_fit_good and MIN_ROTATION_RATIO * other_fit.rms_m < fit.rms_m
-                else ""
-            )
-        matches.append(
-            Match(reference, best_frame, residuals_m, fit, free_yaw_fit, is_rotated, better_frame)
-        )
+        matches.append(Match(reference, best_frame, residuals_m, fit, free_yaw_fit, is_rotated))
     return min(matches, key=lambda match: match.time_offset_fit.rms_m)
 
 
@@ -188,47 +175,48 @@ def is_good_fit(fit: Fit, reference: str) -> bool:
 
 
 def _check_match(match: Match) -> None:
-    """Raise NoMatchError if the match is poor or ambiguous."""
-    name, fit = match.reference.name, match.time_offset_fit
+    name = match.reference.name
+    fit = match.time_offset_fit
     if fit.concordance < MIN_CONCORDANCE[name]:
         raise NoMatchError(
-            f"the position file does not match the {name} (concordance correlation "
-            f"{fit.concordance:.2f}; at least {MIN_CONCORDANCE[name]:g} needed)"
+            f"the position file does not match the {name}: the concordance correlation is "
+            f"{fit.concordance:.2f} (at least {MIN_CONCORDANCE[name]:g} is needed)"
         )
     ambiguity = ""
     if fit.second_peak_ratio < MIN_SECOND_PEAK_RATIO:
-        difference_s = abs(fit.second_peak_s)
-        ambiguity = f"; offsets that differ by {difference_s:.1f} s fit the {name} equally well"
+        ambiguity = f"two offsets that differ by {abs(fit.second_peak_s):.1f} s fit equally well"
     elif fit.lag_sigma_s is not None and fit.lag_sigma_s > MAX_CLOCK_SIGMA_S:
-        ambiguity = f" (its standard deviation exceeds {MAX_CLOCK_SIGMA_S:g} s)"
+        ambiguity = f"the standard deviation exceeds {MAX_CLOCK_SIGMA_S:g} s"
     if ambiguity:
         raise NoMatchError(
-            f"the time offset cannot be estimated from this path{ambiguity}",
+            f"the time offset against the {name} cannot be estimated: {ambiguity}",
             "Give `clock_offset_s`",
         )
     if len(match.residuals_m) > 1:
         best_m, second_m = (np.hypot(m, GRID_RESIDUAL_M) for m in [*match.residuals_m.values()][:2])
         if second_m < MIN_FRAME_RATIO * best_m:
             raise NoMatchError(
-                f"no frame fits the {name} significantly better than the others "
-                f"({match.residuals_text})",
+                f"the frame cannot be estimated, because the residuals against the {name} are "
+                f"similar ({match.residuals_text})",
                 f"Give `frame`{' or `yaw_deg` auto' if match.is_rotated else ''}",
             )
 
 
 def _refit_with_corrected_resets(flight: Flight, match: Match, problem: AlignmentProblem) -> Match:
     """Repeat the fit to EKF2 with EKF2's resets removed as in the comparison with the file."""
-    ekf2, clock = flight.ekf2, match.time_offset_fit
+    ekf2 = flight.ekf2
+    clock = match.time_offset_fit
     if match.reference.name == IMU or isinstance(ekf2, Unavailable) or not ekf2.resets:
         return match
-    samples, frame = problem.samples, match.frame
+    samples = problem.samples
+    frame = match.frame
     aligned = tracks.align_samples(samples, frame, clock.yaw_rad, clock.origin_m, clock.lag_s)
-    track, file_track = (
-        tracks.ekf2_track_without_resets(ekf2, aligned),
-        tracks.convert_to_ned(samples, frame),
-    )
+    track = tracks.ekf2_track_without_resets(ekf2, aligned)
     fit_again = partial(
-        time_and_pose_fit.fit_by_least_squares, file_track, track, is_lag_free=problem.lag_s is None
+        time_and_pose_fit.fit_by_least_squares,
+        tracks.convert_to_ned(samples, frame),
+        track,
+        is_lag_free=problem.lag_s is None,
     )
     free_yaw_fit = fit_again(match.free_yaw_fit, None)
     fit = free_yaw_fit if problem.yaw_rad is None else fit_again(match.fit, problem.yaw_rad)
@@ -239,14 +227,16 @@ def _best_fit(
     problem: AlignmentProblem, reference: SampledTrack, frame: str, yaw_rad: float | None
 ) -> Fit:
     """Find the lag by correlation, unless it is given; then fit by least squares."""
-    track, lag_s = tracks.convert_to_ned(problem.samples, frame), problem.lag_s
+    track = tracks.convert_to_ned(problem.samples, frame)
+    lag_s = problem.lag_s
     grid_track = tracks.resample_to_grid(tracks.remove_spikes(track))
     if reference.name == IMU:
         if len(grid_track.time_s) * GRID_STEP_S < tracks.MIN_OVERLAP_S:
-            raise NoMatchError("the file is too short for a match with the IMU")
-        band_passed_twice = tracks.band_pass(tracks.band_pass(grid_track.position_m))
+            raise NoMatchError("the position file is too short for a match with the IMU")
         track = grid_track = tracks.mark_transients(
-            replace(grid_track, position_m=band_passed_twice)
+            replace(
+                grid_track, position_m=tracks.band_pass(tracks.band_pass(grid_track.position_m))
+            )
         )
     peak = (
         time_and_pose_fit.find_correlation_peak(grid_track, reference, yaw_rad)

@@ -1,4 +1,4 @@
-"""Joining of two recordings of one flight: missing data are taken from the second recording."""
+"""Joining of two recordings of one flight: the second recording supplies missing data."""
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
@@ -9,17 +9,18 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.errors import MissingDataError
-from px4fuse.flight import Columns, Ekf2, Flight, Unavailable, sort_by_preference
+from px4fuse.flight import Columns, Ekf2, Flight, Unavailable, sort_by_preference, time_index
 from px4fuse.log import InputFile
 from px4fuse.readers.common import collect_unavailable
 
-# Names of record fields that contain times
+# Names of the record fields that contain times (s)
 TIME_FIELDS = ("time_s", "start_s", "end_s")
-# Minimum overlap (s) of the recordings
+# Minimum overlap in time (s) of the two recordings
 MIN_OVERLAP_S = 2.0
-# Maximum difference (m) of the EKF2 positions due to interpolation; a larger difference shows that
-# the recordings are of different flights
+# Maximum difference (m) between the EKF2 positions of two recordings, due to interpolation: a
+# larger difference shows that the recordings are of different flights
 MAX_POSITION_DIFFERENCE_M = 0.5
+# Minimum number of EKF2 positions in the common time to compare the recordings
 MIN_COMMON_SAMPLES = 5
 
 
@@ -44,10 +45,8 @@ def join(flight: Flight, other: Flight) -> Flight:
             "Give the other recording of the flight.",
         )
     shift_s = other.log.boot_time_s - flight.log.boot_time_s
-    common_start_s, common_end_s = (
-        max(0.0, shift_s),
-        min(flight.log.duration_s, shift_s + other.log.duration_s),
-    )
+    common_start_s = max(0.0, shift_s)
+    common_end_s = min(flight.log.duration_s, shift_s + other.log.duration_s)
     if common_end_s - common_start_s < MIN_OVERLAP_S:
         raise MissingDataError(
             f"{flight.log.name} and {other.log.name} do not overlap in time: "
@@ -56,16 +55,17 @@ def join(flight: Flight, other: Flight) -> Flight:
         )
     shifted = shift_times(other, shift_s)
     comparison_note = _compare_ekf2_positions(flight, shifted)
-    parts_taken: dict[str, Any] = {}
+    supplied_data: dict[str, Any] = {}
     streams = dict(flight.streams)
-    for part in ("imu", "attitude", "ekf2", "truth", "airborne", "modes"):
-        own_part, other_part = getattr(flight, part), getattr(shifted, part)
-        if isinstance(own_part, Unavailable) and not isinstance(other_part, Unavailable):
-            parts_taken[part] = other_part
-            streams |= {k: v for k, v in shifted.streams.items() if k.startswith(part)}
-    joined = replace(flight, **parts_taken)
-    missing_parts = collect_unavailable(joined.imu, joined.attitude, joined.ekf2, joined.truth)
-    log, other_log = flight.log, other.log
+    for name in ("imu", "attitude", "ekf2", "truth", "airborne", "modes"):
+        data = getattr(shifted, name)
+        if isinstance(getattr(flight, name), Unavailable) and not isinstance(data, Unavailable):
+            supplied_data[name] = data
+            streams |= {k: v for k, v in shifted.streams.items() if k.startswith(name)}
+    joined = replace(flight, **supplied_data)
+    missing_data = collect_unavailable(joined.imu, joined.attitude, joined.ekf2, joined.truth)
+    log = flight.log
+    other_log = other.log
     unix_s = log.start_unix_s
     if unix_s is None and other_log.start_unix_s is not None:
         unix_s = other_log.start_unix_s - shift_s
@@ -97,7 +97,7 @@ def join(flight: Flight, other: Flight) -> Flight:
             },
         ),
         positions=sort_by_preference((*flight.positions, *shifted.positions)),
-        missing=(*missing_parts, *(part for part in flight.missing if part.source)),
+        missing=(*missing_data, *(source for source in flight.missing if source.source)),
         streams=streams,
         clocks=(*flight.clocks, *other.clocks),
         unused=(*flight.unused, *other.unused),
@@ -113,32 +113,32 @@ def _format_span(flight: Flight) -> str:
     return f"{start:.1f} s to {start + flight.log.duration_s:.1f} s"
 
 
-def shift_times(part: Any, shift_s: float) -> Any:
-    """Shift all times of a flight or of any of its data: table indices, and times in records.
+def shift_times(data: Any, shift_s: float) -> Any:
+    """Shift all times of a flight or of flight data: table indices, and times in records.
 
     Parameters
     ----------
-    part : DataFrame, Series, record, or a tuple or mapping of records
+    data : DataFrame, Series, record, or a tuple or mapping of records
         Data of a flight. Values of other types are returned unchanged.
     """
-    if isinstance(part, pd.DataFrame | pd.Series):
-        return part.set_axis(pd.Index(part.index.to_numpy() + shift_s, name="time_s"))
-    if isinstance(part, tuple):
-        return tuple(shift_times(entry, shift_s) for entry in part)
-    if isinstance(part, Mapping):
-        return {key: shift_times(entry, shift_s) for key, entry in part.items()}
-    if not is_dataclass(part) or isinstance(part, type):
-        return part
+    if isinstance(data, pd.DataFrame | pd.Series):
+        return data.set_axis(time_index(data.index.to_numpy() + shift_s))
+    if isinstance(data, tuple):
+        return tuple(shift_times(entry, shift_s) for entry in data)
+    if isinstance(data, Mapping):
+        return {key: shift_times(entry, shift_s) for key, entry in data.items()}
+    if not is_dataclass(data) or isinstance(data, type):
+        return data
     shifted = {}
-    for name in (field.name for field in fields(part)):
-        value = getattr(part, name)
+    for name in (field.name for field in fields(data)):
+        value = getattr(data, name)
         shifted[name] = value + shift_s if name in TIME_FIELDS else shift_times(value, shift_s)
-    if isinstance(part, Ekf2):
-        shifted["instances"] = tuple((time + shift_s, number) for time, number in part.instances)
-    if isinstance(part, Flight) and not isinstance(part.airborne, Unavailable):
-        spans = part.airborne
+    if isinstance(data, Ekf2):
+        shifted["instances"] = tuple((time + shift_s, number) for time, number in data.instances)
+    if isinstance(data, Flight) and not isinstance(data.airborne, Unavailable):
+        spans = data.airborne
         shifted["airborne"] = tuple((start + shift_s, end + shift_s) for start, end in spans)
-    return replace(part, **shifted)
+    return replace(data, **shifted)
 
 
 def _compare_ekf2_positions(flight: Flight, other: Flight) -> str:
@@ -147,7 +147,8 @@ def _compare_ekf2_positions(flight: Flight, other: Flight) -> str:
     An overlap in time does not prove that the flight is the same, because times count from boot.
     """
     if isinstance(flight.ekf2, Ekf2) and isinstance(other.ekf2, Ekf2):
-        own_state, other_state = flight.ekf2.state, other.ekf2.state
+        own_state = flight.ekf2.state
+        other_state = other.ekf2.state
         common_s = other_state.index[
             (other_state.index >= own_state.index[0]) & (other_state.index <= own_state.index[-1])
         ]
@@ -165,5 +166,5 @@ def _compare_ekf2_positions(flight: Flight, other: Flight) -> str:
                     f"positions differ by {median_m:.2f} m (median).",
                     "Give recordings of the same flight.",
                 )
-            return f"EKF2 positions of both differ by {median_m:.3f} m (median)"
-    return "not verified that both are of the same flight: EKF2 data are not in both"
+            return f"the EKF2 positions of both differ by {median_m:.3f} m (median)"
+    return "without EKF2 data in both it is not verified that both are of the same flight"

@@ -31,10 +31,14 @@ from px4fuse.position_source import POSITION_FILE
 from px4fuse.readers.common import finite_rows
 from px4fuse.readers.position_csv import PositionRecording
 
-# Maximum ratio of another lag's residual to the best lag's residual for a warning, by reference
-MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}  # IMU noise gives ratios of 1.4 to 1.7
-MIN_MIRRORED_CORRELATION = 0.8  # z axes are opposite if the correlation of heights is below -0.8
-MAX_UNIX_DIFFERENCE_S = 60.0  # maximum difference between the clocks of computers in a lab
+# Maximum ratio of the residual at another time offset to the residual at the best time offset for a
+# warning that the offset is ambiguous, by reference: IMU noise gives ratios of 1.4 to 1.7
+MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}
+# Minimum negative correlation between the heights of file and EKF2 for opposite z axes
+# Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
+# indicates another flight
+MAX_DISTINCT_FRACTION = 0.5  # of the rows, if their timestamps are too coarse
+MAX_UNIX_DIFFERENCE_S = 60.0
 
 
 def align_position_file(
@@ -79,21 +83,22 @@ def align_position_file(
     if len(samples) < tracks.MIN_SAMPLES:
         raise MissingDataError(
             f"{recording.name} contains {len(samples)} positions; at least "
-            f"{tracks.MIN_SAMPLES} are needed. Check the file and the segment (--start, "
-            "--end)."
+            f"{tracks.MIN_SAMPLES} are needed",
+            "Check the position file.",
         )
-    start_s, end_s = float(samples.index[0]), float(samples.index[-1])
+    start_s = float(samples.index[0])
+    end_s = float(samples.index[-1])
     boot_s = flight.log.boot_time_s
     spans_text = (
-        f"the log covers {boot_s:.2f} s to {boot_s + flight.log.duration_s:.2f} s of the boot "
-        f"clock, the file {start_s:.2f} s to {end_s:.2f} s of its {recording.clock} clock"
+        f"log {boot_s:.2f} s to {boot_s + flight.log.duration_s:.2f} s on the boot clock, file "
+        f"{start_s:.2f} s to {end_s:.2f} s on a {recording.clock} clock"
     )
     lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_s
     if lag_s is not None and not start_s - end_s <= lag_s <= flight.log.duration_s:
         raise MissingDataError(
             f"{recording.name}: with --clock-offset {clock_offset_s:.3f} the file does not "
-            f"overlap the log ({spans_text}).",
-            "Correct --clock-offset, or omit it: px4fuse then estimates the time offset.",
+            f"overlap the log ({spans_text})",
+            "Correct or omit --clock-offset.",
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
     problem = AlignmentProblem(samples, frame or recording.frame, yaw_rad, lag_s)
@@ -110,6 +115,7 @@ def align_position_file(
     )
     clock_source = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
+    clock_map = _shared_timestamps(recording)
     track = PositionTrack(
         name=recording.name,
         origin=POSITION_FILE,
@@ -122,7 +128,7 @@ def align_position_file(
         topics=(recording.name,),
         log=recording.name,
         alignment=alignment,
-        clock_map=_shared_timestamps(recording),
+        clock_map=clock_map,
         invalid=recording.invalid.set_axis(
             recording.invalid.index + (aligned_samples.index[0] - start_s)
         ),
@@ -131,8 +137,9 @@ def align_position_file(
     reader_notes = tuple(
         f"{recording.name}: {text}" for text in (*recording.detected, *recording.notes)
     )
-    dropped = {recording.name: recording.dropped} if recording.dropped else {}
-    notes, dropped = (*flight.log.notes, *reader_notes), {**flight.log.dropped, **dropped}
+    dropped = {recording.name: recording.dropped} if recording.dropped and not clock_map else {}
+    notes = (*flight.log.notes, *reader_notes)
+    dropped = {**flight.log.dropped, **dropped}
     log = structs.replace(flight.log, notes=notes, dropped=dropped)
     inputs = (
         *flight.inputs,
@@ -143,9 +150,9 @@ def align_position_file(
 
 def _shared_timestamps(recording: PositionRecording) -> ClockMap | None:
     """Describe a clock whose timestamps are shared by most rows; None for another clock."""
-    if not recording.stamp_count:
+    distinct, count = len(recording.samples), len(recording.samples) + recording.dropped
+    if distinct > MAX_DISTINCT_FRACTION * count:
         return None
-    count, distinct = recording.stamp_count, len(recording.samples)
     return ClockMap(recording.clock, "as sent", count, 0.0, 0.0, 0.0, SHARED_STAMPS, distinct)
 
 
@@ -154,7 +161,7 @@ def _check_options(
 ) -> None:
     if frame is not None and frame not in tracks.FRAMES:
         raise SettingsError(
-            f"Frame {frame} is not known.", f"Use one of {', '.join(tracks.FRAMES)}."
+            f"`frame` {frame} is not valid.", f"Use one of {', '.join(tracks.FRAMES)}."
         )
     if isinstance(yaw_deg, str) and yaw_deg != "auto":
         raise SettingsError(f"`yaw_deg` {yaw_deg} is not valid: give degrees or auto.")
@@ -172,21 +179,26 @@ def _describe_alignment(
     yaw_deg: float | Literal["auto"] | None,
     clock_offset_s: float | None,
 ) -> tuple[Alignment, pd.DataFrame]:
-    """Return the alignment, with the reason for each parameter, and the aligned samples."""
-    samples, frame, is_yaw_free = problem.samples, problem.frame or "", problem.yaw_rad is None
-    yaw_rad, lag_s = problem.yaw_rad or 0.0, problem.lag_s or 0.0
+    samples = problem.samples
+    frame = problem.frame or ""
+    is_yaw_free = problem.yaw_rad is None
+    yaw_rad = problem.yaw_rad or 0.0
+    lag_s = problem.lag_s or 0.0
     yaw_sigma_deg = clock_sigma_s = correlation = None
-    origin_m, reference = np.zeros(3), ""
-    yaw_reason, clock_reason = "given with --position-yaw", "given with --clock-offset"
+    origin_m = np.zeros(3)
+    reference = ""
+    yaw_reason = "given with --position-yaw"
+    clock_reason = "given with --clock-offset"
     if yaw_deg is None:
-        yaw_reason = "assumed: frame of the file = frame of EKF2"
+        yaw_reason = "assumed: the file has the yaw of EKF2's frame"
     frame_reason = "from the column names of the file"
     if frame_option:
         frame_reason = "given with --position-frame"
     if match:
-        frame, reference = match.frame, match.reference.name
+        frame = match.frame
+        reference = match.reference.name
         if not (frame_option or recording.frame):
-            frame_reason = f"fits {reference} best; residuals: {match.residuals_text}"
+            frame_reason = f"smallest residual against {reference} ({match.residuals_text})"
             if is_yaw_free and frame == "enu":
                 frame_reason += "; nwu differs from enu only in yaw, which was estimated"
         if is_yaw_free:
@@ -195,14 +207,16 @@ def _describe_alignment(
             yaw_reason = f"estimated against {reference}"
             origin_m = match.fit.origin_m if reference == EKF2_POSITION else origin_m
         if clock_offset_s is None:
-            lag_s, clock_sigma_s = match.time_offset_fit.lag_s, match.time_offset_fit.lag_sigma_s
+            lag_s = match.time_offset_fit.lag_s
+            clock_sigma_s = match.time_offset_fit.lag_sigma_s
             clock_offset_s = lag_s + (flight.log.boot_time_s - float(samples.index[0]))
             clock_reason = f"estimated against {reference}; includes the delay of {reference}"
         correlation = float((np.exp(-1j * yaw_rad) * match.time_offset_fit.coherence).real)
     aligned_samples = tracks.align_samples(samples, frame, yaw_rad, origin_m, lag_s)
     ekf2_comparison = None if reference == IMU else _compare_with_ekf2(flight, aligned_samples)
     if ekf2_comparison:
-        reference, correlation = EKF2_POSITION, ekf2_comparison[1]
+        reference = EKF2_POSITION
+        correlation = ekf2_comparison[1]
     frame_conflicts = (
         [] if is_yaw_free else [*_find_frame_conflicts(match, ekf2_comparison, yaw_rad)]
     )
@@ -217,8 +231,6 @@ def _describe_alignment(
         correlation=unexplained_correlation,
         clock_offset_s=clock_offset_s,
     )
-    if not (match and match.better_frame):
-        frame_conflicts += _find_height_conflicts(flight, aligned_samples)
     alignment = Alignment(
         frame=frame,
         frame_reason=frame_reason,
@@ -263,10 +275,8 @@ def _compare_with_ekf2(
     )[is_known]
     ekf2_position = (ekf2[:, 0] + 1j * ekf2[:, 1])[is_known]
     distance_m = np.abs(file_position - ekf2_position)
-    file_position, ekf2_position = (
-        file_position - np.mean(file_position),
-        ekf2_position - np.mean(ekf2_position),
-    )
+    file_position = file_position - np.mean(file_position)
+    ekf2_position = ekf2_position - np.mean(ekf2_position)
     has_motion = max(np.ptp(ekf2_position.real), np.ptp(ekf2_position.imag)) >= tracks.MIN_MOTION_M
     power = float(np.linalg.norm(file_position) * np.linalg.norm(ekf2_position))
     return distance_m, float(
@@ -274,44 +284,19 @@ def _compare_with_ekf2(
     ) / power if has_motion and power > 0.0 else None
 
 
-def _find_height_conflicts(flight: Flight, aligned_samples: pd.DataFrame) -> Iterator[str]:
-    """Yield a message if the heights of file and EKF2 have opposite signs."""
-    if isinstance(flight.ekf2, Unavailable):
-        return
-    down = flight.ekf2.state["down_m"]
-    file_down_m = aligned_samples["down_m"].loc[down.index[0] : down.index[-1]].dropna()
-    if len(file_down_m) < tracks.MIN_SAMPLES:
-        return
-    ekf2_down_m = np.interp(file_down_m.index, down.index, down)
-    range_m = min(np.ptp(np.percentile(file_down_m, [2, 98])), np.ptp(ekf2_down_m))
-    if (
-        range_m >= tracks.MIN_MOTION_M
-        and np.corrcoef(file_down_m, ekf2_down_m)[0, 1] <= -MIN_MIRRORED_CORRELATION
-    ):
-        yield (
-            "The heights of file and EKF2 change in opposite directions. The z axis of the file is "
-            "inverted. Give another --position-frame."
-        )
-
-
 def _find_frame_conflicts(
     match: Match | None, comparison: tuple[Array, float | None] | None, yaw_rad: float
 ) -> Iterator[str]:
-    """Yield a message if the frame of the file is misaligned with EKF2's frame."""
     if match is None:
         return
-    name, is_rotated = match.reference.name, match.is_rotated
+    name = match.reference.name
+    is_rotated = match.is_rotated
     if comparison:
         rms_m = truncated_rms(comparison[0]) / np.sqrt(2.0)
         is_rotated = matching.is_good_fit(match.free_yaw_fit, name) and matching.needs_rotation(
             rms_m, match.free_yaw_fit, name
         )
-    if is_rotated and match.better_frame:
-        yield (
-            f"The file does not fit the {name} in frame {match.frame}, but in "
-            f"{match.better_frame}. Give --position-frame {match.better_frame}."
-        )
-    elif is_rotated:
+    if is_rotated:
         yaw_deg = np.degrees(np.angle(np.exp(1j * (match.free_yaw_fit.yaw_rad - yaw_rad))))
         shift_m = np.hypot(*match.free_yaw_fit.origin_m[:2])
         shift_text = f" and shifted by {shift_m:.1f} m" if comparison else ""
@@ -330,25 +315,24 @@ def _find_warnings(
     correlation: float | None,
     clock_offset_s: float | None,
 ) -> Iterator[str]:
-    """Yield warnings on a poor or ambiguous match, a match with the IMU, and different flights."""
     if match:
-        name, fit = match.reference.name, match.time_offset_fit
+        name = match.reference.name
+        fit = match.time_offset_fit
         if fit.concordance < matching.GOOD_CONCORDANCE[name]:
             yield (
-                f"The position file matches the {name} only roughly. The concordance "
+                f"The match of the position file with the {name} is poor: the concordance "
                 f"correlation is {fit.concordance:.2f}."
             )
         if fit.second_peak_ratio < MAX_SIMILAR_RESIDUAL_RATIO[name]:
             yield (
-                f"A time offset that differs by {fit.second_peak_s:+.1f} s fits nearly as well. "
-                f"Its residual is {fit.second_peak_ratio:.1f} times larger. If the estimated "
-                "offset is wrong, give --clock-offset SECONDS."
+                f"A time offset that differs by {fit.second_peak_s:+.1f} s fits nearly as well: "
+                f"the residual is {fit.second_peak_ratio:.1f} times larger. Check the offset, or "
+                "give --clock-offset."
             )
         if is_yaw_free and name == IMU:
             yield (
-                "With the IMU as reference the yaw is accurate to a few degrees. On simulated "
-                "flights the error is 1° to 6°. The origin of the file's frame is unknown and set "
-                "to 0."
+                "The yaw estimated against the IMU has an error of 1° to 6°. The origin of the "
+                "file's frame is unknown and set to 0."
             )
     if not is_yaw_free and correlation is not None and correlation < MIN_CONCORDANCE[EKF2_POSITION]:
         yield (
@@ -361,6 +345,6 @@ def _find_warnings(
         difference_s = abs(flight.log.boot_time_s - clock_offset_s - start_s)
         if difference_s >= MAX_UNIX_DIFFERENCE_S:
             yield (
-                f"The UNIX times of file and log differ by {difference_s:.0f} s. Check that both "
-                "are of the same flight: flights along one path match each other well."
+                f"The UNIX times of position file and log differ by {difference_s:.0f} s. Check "
+                "that both are of the same flight."
             )

@@ -11,14 +11,19 @@ from px4fuse.arrays import Array, Complex
 from px4fuse.trajectory.correlation import autocovariance, moments
 from px4fuse.trajectory.time_offset import GRID_STEP_S
 
-MAX_LAG_SHIFT_S = 1.0  # maximum distance of the fitted lag from the correlation peak
-# Minimum concordance correlation coefficient (Lin 1989) of an accepted match, by reference
+# Maximum distance (s) of the least-squares lag from the correlation peak
+MAX_LAG_SHIFT_S = 1.0
+# Minimum value of Lin's concordance correlation coefficient (1989) for an accepted match, by
+# reference
 MIN_CONCORDANCE = {EKF2_POSITION: 0.7, IMU: 0.5}
-# Lower limit of 1 - concordance: of several nearly perfect matches the longest is chosen
+# Lower limit of 1 - concordance in the likelihood: of nearly perfect matches the longest is chosen
 MIN_DISCORDANCE = 1e-4
-MIN_PEAK_DISTANCE_S = 3.0  # minimum distance of the lags of separate peaks
-GRID_RESIDUAL_M = 0.05  # residual of a perfect match, caused by the grid
-MAX_RESIDUAL_M = 1.0  # larger residuals are truncated to this value, because they may be outliers
+# Minimum distance (s) between the lags of two separate correlation peaks
+MIN_PEAK_DISTANCE_S = 3.0
+# Residual (m) of a perfect match, caused by the time grid
+GRID_RESIDUAL_M = 0.05
+# Maximum residual (m): larger residuals are truncated, because they may be outliers
+MAX_RESIDUAL_M = 1.0
 
 
 @dataclass(frozen=True)
@@ -91,21 +96,19 @@ def find_correlation_peak(
         No lag has sufficient overlap.
     """
     if not file_track.is_valid.any() or not reference.is_valid.any():
-        raise NoMatchError("too few samples between gaps to match the tracks")
+        raise NoMatchError("the tracks have too few samples between gaps for a match")
     track_moments = moments(
         file_track.horizontal_m, reference.horizontal_m, file_track.is_valid, reference.is_valid
     )
-    count, covariance, power = (
-        track_moments.count,
-        track_moments.covariance,
-        track_moments.power_a + track_moments.power_b,
-    )
+    count = track_moments.count
+    covariance = track_moments.covariance
+    power = track_moments.power_a + track_moments.power_b
     min_count = min(np.count_nonzero(file_track.is_valid), np.count_nonzero(reference.is_valid))
     has_overlap = count >= max(
         tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / GRID_STEP_S, min_count / 2.0)
     )
     if not has_overlap.any():
-        raise NoMatchError("too few samples between gaps to match the tracks")
+        raise NoMatchError("the tracks have too few samples between gaps for a match")
     has_overlap &= power > 1e-9 * np.max(power)  # exclude rounding errors
     real_covariance = (
         np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real
@@ -118,7 +121,8 @@ def find_correlation_peak(
     def lag_at(index: int) -> float:
         return float(reference.time_s[0]) + (index - len(file_track.is_valid) + 1) * GRID_STEP_S
 
-    # lags of the same peak: down to half of its concordance, at least MIN_PEAK_DISTANCE_S around it
+    # Lags around the best lag with more than half of its concordance, and lags nearer than
+    # MIN_PEAK_DISTANCE_S, are the same peak
     low_indices = np.flatnonzero(concordance < 0.5 * concordance[best_index])
     peak_start = np.max(low_indices[low_indices < best_index], initial=-1)
     peak_end = np.min(low_indices[low_indices > best_index], initial=len(count))
@@ -135,13 +139,14 @@ def find_correlation_peak(
     peak = CorrelationPeak(lag_at(best_index), float(concordance[best_index]))
     if not is_other_peak.any():
         return peak
-    # residual per axis; with GRID_RESIDUAL_M added, two perfect matches are equally good
+    # Residual (m) per axis; with GRID_RESIDUAL_M added, two perfect matches are equally good
     mean_square = np.maximum(power - 2.0 * real_covariance, 0.0) / (2.0 * np.maximum(count, 1.0))
     residual = np.sqrt(mean_square + GRID_RESIDUAL_M**2)
     second_peak = int(np.argmin(np.where(is_other_peak, residual, np.inf)))
-    ratio = float(residual[second_peak] / residual[best_index])
     return replace(
-        peak, second_peak_s=lag_at(second_peak) - lag_at(best_index), second_peak_ratio=ratio
+        peak,
+        second_peak_s=lag_at(second_peak) - lag_at(best_index),
+        second_peak_ratio=float(residual[second_peak] / residual[best_index]),
     )
 
 
@@ -172,12 +177,10 @@ def fit_by_least_squares(
             f"only {np.count_nonzero(is_used)} positions of the file overlap the reference in time"
         )
     time = file_track.time_s[is_used] + peak.lag_s
-    file_m, target_m = (
-        file_track.horizontal_m[is_used],
-        (reference_m[:, 0] + 1j * reference_m[:, 1])[is_used],
-    )
+    file_m = file_track.horizontal_m[is_used]
+    target_m = (reference_m[:, 0] + 1j * reference_m[:, 1])[is_used]
     centre_m = np.mean(file_m)
-    file_m = file_m - centre_m  # makes yaw and origin uncorrelated
+    file_m = file_m - centre_m  # so that yaw and origin are uncorrelated
     power = float(np.sqrt(np.var(file_m) * np.var(target_m)))
     coherence = complex(np.vdot(file_m, target_m) / len(file_m) / power) if power > 0 else 0j
     mean_square = float(np.var(file_m) + np.var(target_m)) / 2.0
@@ -202,19 +205,18 @@ def fit_by_least_squares(
         return np.concatenate([residuals.real, residuals.imag])
 
     start_origin = complex(np.mean(target_m))
-    # free parameters: origin, lag, yaw
+    # Free parameters: origin (north, east), lag, yaw
     is_free = [True, True, is_lag_free, yaw_rad is None]
     start_parameters = np.array(
         [start_origin.real, start_origin.imag, 0.0, float(np.angle(coherence))]
     )[is_free]
     bounds = np.array([np.inf, np.inf, MAX_LAG_SHIFT_S, np.inf])[is_free]
-    residual_scale = _robust_scale(residuals_at(start_parameters))
     solution = least_squares(
         residuals_at,
         start_parameters,
         bounds=(-bounds, bounds),
         loss="soft_l1",
-        f_scale=residual_scale,
+        f_scale=_robust_scale(residuals_at(start_parameters)),
     )
     (origin, lag_shift_s, yaw), residuals = unpack(solution.x), residuals_at(solution.x)
     complex_residuals = residuals[: len(file_m)] + 1j * residuals[len(file_m) :]
@@ -262,7 +264,7 @@ def _robust_scale(residual: Array) -> float:
 
 
 def _autocorrelation_factor(residual: Complex) -> float:
-    """Return 1 + 2Σρ: number of correlated residuals per independent residual."""
+    """Return 1 + 2Σρ: the number of correlated residuals that equal one independent residual."""
     limit = 3.0 * _robust_scale(np.abs(residual))
     clipped = residual * np.minimum(1.0, limit / np.maximum(np.abs(residual), 1e-12))
     rho = autocovariance(clipped)
@@ -274,5 +276,5 @@ def _autocorrelation_factor(residual: Complex) -> float:
 
 
 def truncated_rms(values_m: Array) -> float:
-    """Return the RMS of values after truncation to MAX_RESIDUAL_M."""
+    """Return the RMS (m) of residuals that are truncated to MAX_RESIDUAL_M."""
     return float(np.sqrt(np.mean(np.minimum(np.abs(values_m), MAX_RESIDUAL_M) ** 2)))

@@ -1,4 +1,4 @@
-"""Tracks of a position file and of its references, in north, east, down."""
+"""Tracks of a position file and of its references (EKF2 or IMU), in north, east, down."""
 
 from dataclasses import dataclass, replace
 
@@ -11,13 +11,13 @@ from scipy.signal import butter, sosfiltfilt
 from px4fuse.arrays import Array, BoolArray, Complex
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.filter.signals import Segment, ned_acceleration
-from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Unavailable
+from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Unavailable, time_index
 from px4fuse.position_source import POSITION_FILE
 from px4fuse.readers.common import finite_rows
 from px4fuse.trajectory.association import gap_limit, is_bracketed
 from px4fuse.trajectory.time_offset import GRID_STEP_S
 
-# By frame: indices of north, east, down in (x, y, z), and their signs
+# Indices of north, east, down in (x, y, z), and their signs, by frame
 FRAMES = {
     "ned": ([0, 1, 2], [1.0, 1.0, 1.0]),
     "enu": ([1, 0, 2], [1.0, 1.0, -1.0]),
@@ -25,20 +25,26 @@ FRAMES = {
 }
 EKF2_POSITION, IMU = "EKF2 position", "IMU"
 
-MIN_GAP_LIMIT_S = 0.5  # a gap is longer than this limit and than three median intervals
+# Minimum length (s) of a gap, which is also longer than three median intervals
+MIN_GAP_LIMIT_S = 0.5
+# Minimum horizontal motion (m), number of positions and overlap (s) for a match; of short tracks,
+# half of the shorter track must overlap
 MIN_MOTION_M = 0.5
 MIN_SAMPLES = 10
-MIN_OVERLAP_S = 10.0  # minimum overlap; for short tracks half of the shorter track
+MIN_OVERLAP_S = 10.0
 # σ (s) of the Gaussian filter without delay that smooths EKF2's steps at updates
 SMOOTHING_S = 0.2
-# Band in which acceleration integrated twice equals position; below the band the integral drifts
+# Frequency band in which acceleration integrated twice equals position; below, the integral drifts
 BAND_HZ = (0.1, 1.0)
-# Length (s) of the band-pass filter's transients, and of the padding at both ends
+# Length (s) of the transients of the band-pass filter, and of the padding at both ends of a track
 TRANSIENT_S, BAND_PADDING_S = 2.0, 10.0
 
 
 class NoMatchError(Exception):
-    """Reason why a reference does not match; with an action if no other reference can match."""
+    """The position file does not match a reference.
+
+    The error contains an action if no other reference can match either.
+    """
 
     def __init__(self, reason: str, remedy: str = "") -> None:
         super().__init__(reason)
@@ -79,11 +85,11 @@ class SampledTrack:
 
 
 def convert_to_ned(samples: pd.DataFrame, frame: str) -> SampledTrack:
-    """Convert the axes of the file to north, east, down; times count from the first sample."""
+    """Convert a position file to north, east, down; times count from the first sample."""
     order, sign = FRAMES[frame]
     time = samples.index.to_numpy()
     position = samples[["x_m", "y_m", "z_m"]].to_numpy()[:, order] * sign
-    return SampledTrack(time - time[0], position, np.ones(len(time), dtype=bool))
+    return SampledTrack(time - time[0], position, np.ones(len(time), bool))
 
 
 def resample_to_grid(track: SampledTrack) -> SampledTrack:
@@ -94,43 +100,49 @@ def resample_to_grid(track: SampledTrack) -> SampledTrack:
 
 
 def remove_spikes(track: SampledTrack, window_size: int = 3) -> SampledTrack:
-    """Remove single outliers by a median filter; a longer window removes longer outliers."""
+    """Remove outliers of up to half the window (in samples) by a median filter."""
     return replace(track, position_m=median_filter(track.position_m, size=(window_size, 1)))
 
 
 def band_pass(position_m: Array) -> Array:
-    """Band-pass filter positions without delay."""
+    """Band-pass filter positions on the time grid, without delay."""
     sos = butter(2, BAND_HZ, "bandpass", fs=1.0 / GRID_STEP_S, output="sos")
-    padding = min(round(BAND_PADDING_S / GRID_STEP_S), len(position_m) - 1)
-    return sosfiltfilt(sos, position_m, axis=0, padlen=padding)
+    return sosfiltfilt(
+        sos,
+        position_m,
+        axis=0,
+        padlen=min(round(BAND_PADDING_S / GRID_STEP_S), len(position_m) - 1),
+    )
 
 
 def mark_transients(track: SampledTrack) -> SampledTrack:
     """Mark the transients of the band-pass filter at ends and gaps as invalid."""
     edge = round(TRANSIENT_S / GRID_STEP_S)
-    return replace(
-        track, is_valid=binary_erosion(track.is_valid, np.ones(2 * edge + 1, dtype=bool))
-    )
+    return replace(track, is_valid=binary_erosion(track.is_valid, np.ones(2 * edge + 1, bool)))
 
 
 def horizontal_range_m(track: SampledTrack) -> float:
-    """Return the larger of the ranges (m) of north and east, without noise and outliers."""
+    """Return the larger of the ranges (m) of north and east, without outliers."""
     return float(np.max(np.ptp(remove_spikes(track, 5).position_m[:, :2], axis=0)))
 
 
 def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
-    """Return EKF2's smoothed position on the grid."""
     finite_state = finite_rows(state, Columns.POSITION[:2])
     if len(finite_state) < MIN_SAMPLES:
         raise NoMatchError("no horizontal EKF2 position in the log")
-    time, position = finite_state.index.to_numpy(), finite_state[Columns.POSITION].to_numpy()
-    grid = resample_to_grid(SampledTrack(time, position, np.ones(len(finite_state), dtype=bool)))
+    grid = resample_to_grid(
+        SampledTrack(
+            finite_state.index.to_numpy(),
+            finite_state[Columns.POSITION].to_numpy(),
+            np.ones(len(finite_state), bool),
+        )
+    )
     smooth = gaussian_filter1d(grid.position_m, SMOOTHING_S / GRID_STEP_S, axis=0, mode="nearest")
     return replace(grid, position_m=smooth, name=EKF2_POSITION)
 
 
 def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
-    """Return EKF2's published position and, with horizontal resets, also a version without them.
+    """Return EKF2's published position and, if it has horizontal resets, also without these resets.
 
     Height resets are not removed, because most of them correct an error from before take-off.
     """
@@ -147,7 +159,7 @@ def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
         states.append(state.assign(**(state[Columns.POSITION] - reset_sum_m)))
     references = [_smooth_ekf2_track(state) for state in states]
     if max(map(horizontal_range_m, references)) < MIN_MOTION_M:
-        raise NoMatchError("the EKF2 position hardly changes")
+        raise NoMatchError(f"the EKF2 position changes by less than {MIN_MOTION_M:g} m")
     return references
 
 
@@ -158,7 +170,7 @@ def make_imu_references(flight: Flight) -> list[SampledTrack]:
         raise NoMatchError("the log has no acceleration in NED")
     time = acceleration.index.to_numpy()
     velocity = cumulative_trapezoid(acceleration.to_numpy(), time, axis=0, initial=0)
-    grid = resample_to_grid(SampledTrack(time, velocity, np.ones(len(time), dtype=bool)))
+    grid = resample_to_grid(SampledTrack(time, velocity, np.ones(len(time), bool)))
     if len(grid.time_s) * GRID_STEP_S < MIN_OVERLAP_S:
         raise NoMatchError("the IMU data are too short")
     position = cumulative_trapezoid(band_pass(grid.position_m), dx=GRID_STEP_S, axis=0, initial=0)
@@ -177,19 +189,22 @@ def align_samples(
     position = track.position_m.copy()
     order, _ = FRAMES[frame]
     variance = samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()[:, order] ** 2
-    if yaw_rad:  # without rotation a missing sigma of one axis does not affect the other
-        c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    if yaw_rad:  # without rotation, a missing sigma of one axis does not make the other missing
+        c = np.cos(yaw_rad)
+        s = np.sin(yaw_rad)
         rotation = np.array([[c, -s], [s, c]])
         position[:, :2] = position[:, :2] @ rotation.T
         variance[:, :2] = variance[:, :2] @ (rotation**2).T
     columns = Columns.POSITION + Columns.POSITION_VARIANCE
     values = np.hstack([position + origin_m, variance])
-    times = pd.Index(track.time_s + lag_s, name="time_s")
-    return pd.DataFrame(dict(zip(columns, values.T, strict=True)), index=times)
+    return pd.DataFrame(
+        dict(zip(columns, values.T, strict=True)),
+        index=time_index(track.time_s + lag_s),
+    )
 
 
 def ekf2_track_without_resets(ekf2: Ekf2, aligned_samples: pd.DataFrame) -> SampledTrack:
-    """Return EKF2's track with resets removed as in the comparison with the aligned file."""
+    """Return EKF2's track without the resets that the comparison with the aligned file removes."""
     track = PositionTrack("", POSITION_FILE, "", aligned_samples, "NED", "", ())
     segment = Segment(float(aligned_samples.index[0]), float(aligned_samples.index[-1]), "")
     return _smooth_ekf2_track(continuous_state(ekf2, track, segment)[0])

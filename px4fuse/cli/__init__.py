@@ -1,4 +1,4 @@
-"""Command line: parses the arguments and prints; it computes nothing."""
+"""Command line of px4fuse: parses the arguments and prints results, without computations."""
 
 import atexit
 import errno
@@ -20,9 +20,9 @@ from px4fuse.threads import ONE_THREAD
 # Help text of each command; --help does not import the modules of the commands, which is slow
 COMMANDS = {
     "compare": "Check EKF2 against a two-state Kalman filter and report mistakes.",
-    "batch": "Run compare on many logs and collect one table.",
+    "batch": "Compare KF and EKF2 on many logs and write one table.",
     "diff": "List differences between two flights or reports.",
-    "answers": "Write the answer form for a flight.",
+    "answers": "Write the answer form of a student for a flight.",
     "explore": "Write an interactive page with sliders for the filter settings.",
     "practice": "Write a quiz page with simulated flights and hidden mistakes.",
     "info": "List the contents of a log and which analyses are possible.",
@@ -37,7 +37,7 @@ COMMANDS = {
     "verify": "Verify that the numbers of a report follow from its log.",
     "grade": "Verify and grade the reports of a class.",
     "sample": "Write the sample logs (aisle with UWB, loop with VIO).",
-    "lesson": "Print the worked examples of the lesson.",
+    "lesson": "Print the worked examples of the lesson UAT 366, module 2.",
 }
 
 
@@ -52,10 +52,10 @@ HELP_OPTIONS = ["-h", "--help"]
 # Environment variables that px4fuse removes: an invalid value stops the import of matplotlib or
 # pymavlink, and no output depends on them (figures are SVG without a date)
 IGNORED_VARIABLES = ("MPLBACKEND", "SOURCE_DATE_EPOCH")
-# The report of the sample log needs 0.7 GB with all libraries
+# Minimum address space (bytes) for a run: the report of the sample log needs 0.7 GB
 MIN_ADDRESS_SPACE_BYTES = 800_000_000
 
-# Only these commands need pyarrow (70 MB), which pandas imports if it is installed
+# Commands that need pyarrow; in all other runs pandas must not import it, which takes 70 MB
 PARQUET_COMMANDS = ("batch", "extract")
 
 
@@ -63,7 +63,6 @@ class LazyGroup(click.Group):
     """Group that imports a command only when it is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the names of all commands."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
@@ -93,7 +92,7 @@ class LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> object:
-        """Run a command; turn system errors and Ctrl-C into messages of px4fuse."""
+        """Run a command; convert system errors and Ctrl-C to errors with a message of px4fuse."""
         try:
             with inputs_protected():
                 return super().invoke(ctx)
@@ -101,9 +100,9 @@ class LazyGroup(click.Group):
             error.args = (_with_option_names(str(error), ctx.invoked_subcommand),)
             raise
         except BrokenPipeError as error:
-            # The new error has no errno, because click ends with exit code 1 for EPIPE
+            # the new error has no errno, because click ends the command with exit code 1 for EPIPE
             raise BrokenPipeError from error
-        except KeyboardInterrupt as interrupt:  # click itself would print an empty line
+        except KeyboardInterrupt as interrupt:  # otherwise click prints an empty line
             raise Interrupted(interrupt, written_so_far(ctx)) from None
         except MemoryError as error:
             raise _system_error(OSError(errno.ENOMEM, ""), written_so_far(ctx)) from error
@@ -111,7 +110,6 @@ class LazyGroup(click.Group):
             raise _system_error(error, written_so_far(ctx)) from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """List the commands from COMMANDS without importing them."""
         with formatter.section("Commands"):
             formatter.write_dl(list(COMMANDS.items()))
 
@@ -128,7 +126,6 @@ def cli() -> None:
 
 
 def _system_error(error: OSError, written: str) -> Px4FuseError:
-    """Turn an error of the operating system into an error of px4fuse that states the cause."""
     if error.errno == errno.ENOMEM:
         return Px4FuseError(
             f"not enough memory; {written}", "Close other programs, or raise the limit (ulimit -v)."
@@ -140,15 +137,14 @@ def _system_error(error: OSError, written: str) -> Px4FuseError:
             f"the current folder no longer exists; {written}", "Change to another folder."
         )
     if error.filename is not None:
-        return OutputError(f"{error.filename}: cannot be used ({error.strerror}); {written}")
+        return OutputError(
+            f"The file {error.filename} cannot be used ({error.strerror}); {written}"
+        )
     return OutputError(f"standard output: cannot be written ({error.strerror}); {written}")
 
 
 def _check_memory() -> None:
-    """Reject a memory limit (ulimit -v) below MIN_ADDRESS_SPACE_BYTES.
-
-    With less memory, libraries end the process without a message.
-    """
+    # with less memory, libraries end the process without a message
     try:
         import resource
     except ImportError:  # Windows has no memory limit for a process
@@ -158,13 +154,13 @@ def _check_memory() -> None:
         raise SettingsError(
             f"the memory limit is {limit / 1e6:.0f} MB; px4fuse needs at least "
             f"{MIN_ADDRESS_SPACE_BYTES / 1e6:.0f} MB of address space",
-            "Raise the limit, for example with ulimit -v unlimited.",
+            "Raise the memory limit, for example with ulimit -v unlimited.",
         )
 
 
 def main() -> None:
-    """Run the command line; an error is one line on standard error and exit code 2."""
-    # Garbage collection takes 10 % of the run time of a short command, and as much again at its end
+    """Run the command line; print an error as one line on standard error, with exit code 2."""
+    # garbage collection takes 10 % of the run time of a short command, and 10 % more at exit
     gc.disable()
     atexit.register(gc.freeze)
     _prepare_libraries()
@@ -173,9 +169,9 @@ def main() -> None:
         if hasattr(stream, "reconfigure"):  # legacy Windows code pages have no σ and ν
             stream.reconfigure(errors="replace")
     for signal_number in TERMINATION_SIGNALS:
-        if signal.getsignal(signal_number) is signal.SIG_DFL:  # nohup ignores SIGHUP
+        if signal.getsignal(signal_number) is signal.SIG_DFL:  # under nohup, SIGHUP is ignored
             signal.signal(signal_number, _interrupt)
-    if hasattr(signal, "pthread_kill"):  # not on Windows
+    if hasattr(signal, "pthread_kill"):  # Windows has no such function
         sys.unraisablehook = _interrupt_again
     try:
         if not {*HELP_OPTIONS, "--version"} & set(sys.argv):
@@ -194,32 +190,32 @@ def main() -> None:
     except Interrupted as interrupt:
         _print_error(str(interrupt))
         exit_code = interrupt.exit_code
-    except BrokenPipeError:  # the reader of the pipe has ended (| head); the files are written
+    except BrokenPipeError:  # the program that reads the pipe has ended
         _abandon_output()
         exit_code = 0
-    except OSError as error:  # from --help and --version, which click writes
+    except OSError as error:  # click printed --help or --version
         _print_error(f"standard output: cannot be written ({error.strerror}); nothing was written.")
         exit_code = 2
     sys.exit(_flush_output(exit_code if isinstance(exit_code, int) else 0))
 
 
 def _prepare_libraries() -> None:
-    """Set the environment variables that libraries read at their import."""
     for name, value in ONE_THREAD.items():
         os.environ.setdefault(name, value)
     for name in IGNORED_VARIABLES:
         os.environ.pop(name, None)
     if not set(PARQUET_COMMANDS) & set(sys.argv[1:2]):
-        sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]  # as if not installed
+        # pandas then assumes that pyarrow is not installed
+        sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]
 
 
 def _flush_output(exit_code: int) -> int:
-    """Flush standard output and return the exit code, 2 if that is impossible."""
+    """Flush standard output; return the exit code, or 2 if standard output cannot be written."""
     try:
         sys.stdout.flush()
     except OSError as error:
         _abandon_output()
-        if exit_code == 0:  # with another code, an error is printed already
+        if exit_code == 0:  # for another exit code, an error is already printed
             _print_error(f"standard output: cannot be written ({error.strerror}).")
             return 2
     return exit_code
@@ -233,11 +229,11 @@ def _redirect_closed_streams() -> None:
             if null_device != number:
                 os.dup2(null_device, number)
                 os.close(null_device)
-            setattr(sys, name, open(number, "w", encoding="utf-8"))  # noqa: SIM115, PTH123 - stays open
+            setattr(sys, name, open(number, "w", encoding="utf-8"))  # noqa: SIM115, PTH123 - must stay open
 
 
 def _with_option_names(text: str, command: str | None) -> str:
-    """Replace the argument names in an error by the options of the command."""
+    """Replace names of Python arguments in an error text by the options of the command."""
     from px4fuse.request import (
         COMPARISON_OPTIONS,
         OPTION_NAMES,
@@ -255,21 +251,21 @@ def _print_error(text: str) -> None:
 
 
 def _interrupt(signal_number: int, _: object) -> None:
-    """Handle a termination signal like Ctrl-C, so that temporary files are deleted."""
+    # a termination signal has the effect of Ctrl-C, so that temporary files are deleted
     raise KeyboardInterrupt(signal_number)
 
 
 def _interrupt_again(ignored: "sys.UnraisableHookArgs") -> None:
     """Repeat a signal that arrived in a finaliser or callback, whose exceptions Python ignores."""
-    stopped = ignored.exc_value
-    if isinstance(stopped, KeyboardInterrupt):
-        number = stopped.args[0] if stopped.args else signal.SIGINT
-        # 0.1 s later the callback has ended; a signal also ends a wait of the main thread
+    error = ignored.exc_value
+    if isinstance(error, KeyboardInterrupt):
+        number = error.args[0] if error.args else signal.SIGINT
+        # after 0.1 s the finaliser has ended; the signal also ends a wait of the main thread
         threading.Timer(0.1, signal.pthread_kill, [threading.main_thread().ident, number]).start()
     else:
         sys.__unraisablehook__(ignored)
 
 
 def _abandon_output() -> None:
-    """Discard buffered output, so that Python prints no error at exit."""
+    # discards the buffered output, so that Python prints no error at exit
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""``px4fuse answers``: writes the answer form for a flight."""
+"""Command ``px4fuse answers``: writes the answer form of a student for a flight."""
 
 import hashlib
 from pathlib import Path
@@ -11,12 +11,12 @@ from px4fuse.cli.outputs import write_new
 
 @click.command()
 @click.argument("log", type=InputPath())
-@output_option("FILE.toml", "Output file.  [default: LOG.answers.toml beside LOG]")
+@output_option("FILE.toml", "Answer form to write (TOML).  [default: LOG.answers.toml beside LOG]")
 def answers(log: Path, output: Path | None) -> None:
-    """Write the answer form for a flight.
+    """Write the answer form of a student for a flight.
 
-    The form has questions about the mistakes of the flight, the behaviour of EKF2, and three
-    numbers. Complete it and give it to px4fuse compare --answers.
+    The form contains questions on the mistakes of the flight, the behaviour of EKF2, and three
+    numbers. Complete the form and give it to px4fuse compare --answers.
     """
     from px4fuse.answer_form import form_name, form_text
     from px4fuse.reading import read_log_bytes

@@ -1,4 +1,4 @@
-"""``px4fuse batch``: compares many logs and writes one table."""
+"""Command ``px4fuse batch``: compares many logs and writes one table."""
 
 import gc
 import sys
@@ -12,11 +12,11 @@ import click
 
 from px4fuse.cli import options, outputs
 from px4fuse.cli.compare import SEVERITIES, Severity
-from px4fuse.errors import OutputError, SettingsError
+from px4fuse.errors import SettingsError
 from px4fuse.fleet import TIMEOUT_S
 
 FAILED = "failed"
-# --scheduler NAME prints NAME.txt of this folder: instructions to start such a cluster
+# Types of clusters for which --scheduler NAME prints instructions, from NAME.txt in this folder
 CLUSTERS = ("slurm", "kubernetes")
 
 
@@ -26,49 +26,47 @@ CLUSTERS = ("slurm", "kubernetes")
 @click.option("--reports", is_flag=True, help="Also write a PDF report for each log.")
 @click.option(
     "--timeout",
+    "timeout_s",
     type=click.FloatRange(1.0),
     metavar="SECONDS",
     default=TIMEOUT_S,
-    help="Time limit for each log.",
+    help="Maximum time for one log (s); a log that takes longer fails.",
 )
 @click.option(
     "--workers",
     type=click.IntRange(1, 1024),
     metavar="N",
-    help="Number of logs processed in parallel on this computer.  [default: number of cores]",
+    help="Number of logs that this computer processes in parallel.  [default: number of cores]",
 )
 @click.option(
     "--memory",
+    "memory_gb",
     type=click.FloatRange(1.0),
     metavar="GB",
     default=4.0,
-    help="Memory limit for each log, in GB (Linux only).",
+    help="Maximum memory for one log (GB, Linux only); a log that needs more fails.",
 )
 @click.option(
     "--scheduler",
     metavar="ADDRESS",
-    help="Address of a running Dask scheduler (tcp://host:8786). slurm or kubernetes prints how to "
-    "start one.",
+    help="Address of a running Dask scheduler (tcp://host:8786) whose cluster processes the logs. "
+    "slurm or kubernetes prints instructions to start a cluster.  [default: this computer]",
 )
 @options.settings_options
 @options.fail_option(
     (FAILED, *SEVERITIES),
-    "Exit with 1 if a log failed or has a finding of at least this severity.",
+    "Exit with code 1 if a log failed or has a finding of at least this severity.",
 )
 @options.open_option
 def batch(
     logs: tuple[str, ...],
     *,
     output: Path | None,
-    reports: bool,
-    timeout: float,
-    workers: int | None,
-    memory: float,
     scheduler: str | None,
     fail_on: Literal["failed", Severity] | None,
     **option_values: Any,
 ) -> None:
-    """Run compare on many logs and collect one table.
+    """Compare KF and EKF2 on many logs and write one table.
 
     LOGS are files, folders, globs and URLs (s3://, gs://, https://, sftp://). Writes
     fleet.html, fleet.csv, fleet.parquet and the results of each log to DIR. A second run processes
@@ -79,10 +77,8 @@ def batch(
         return
     if output is None:
         raise SettingsError("batch requires an output folder: -o DIR.")
-    if output.exists() and not output.is_dir():
-        raise OutputError(f"-o {output} is not a folder. Choose another name.")
-    if scheduler is not None and workers is not None:
-        raise SettingsError("--workers applies to this computer. Omit it with --scheduler.")
+    if scheduler is not None and option_values["workers"] is not None:
+        raise SettingsError("--workers applies to this computer. Omit --workers with --scheduler.")
     from px4fuse.fleet.run import run
     from px4fuse.fleet.terminal import format_summary
 
@@ -92,11 +88,7 @@ def batch(
             fleet = run(
                 logs,
                 output,
-                reports=reports,
-                timeout_s=timeout,
                 scheduler=scheduler,
-                workers=workers,
-                memory_gb=memory,
                 progress=partial(_show_rate, show_progress, time.monotonic()),
                 **option_values,
             )
@@ -117,7 +109,6 @@ def _show_rate(
     done_count: int,
     total_count: int,
 ) -> None:
-    """Show the progress with the logs per minute; ``start_s`` is the monotonic start time."""
     per_minute = 60.0 * done_count / (time.monotonic() - start_s)
-    text = f"{activity}, {per_minute:.3g} per minute" if done_count else activity
+    text = f"{activity}, {per_minute:.3g} logs per minute" if done_count else activity
     show_progress(text, done_count, total_count)

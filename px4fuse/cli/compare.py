@@ -1,4 +1,4 @@
-"""``px4fuse compare``: checks EKF2 against the two-state Kalman filter."""
+"""Command ``px4fuse compare``: checks EKF2 against the two-state Kalman filter."""
 
 import sys
 from pathlib import Path
@@ -17,17 +17,23 @@ SEVERITIES = get_args(Severity)
 @click.command()
 @click.argument("log", type=options.InputPath())
 @options.analysis_options
-@options.person_options
+@options.student_options
 @options.report_options(
-    "Output report.  [default: reports/LOG.pdf; changed settings are part of the name]"
+    "Report to write (PDF).  [default: reports/LOG.pdf; the name contains changed settings]"
 )
-@options.fail_option(SEVERITIES, "Exit with 1 on a finding of at least this severity.")
+@options.fail_option(SEVERITIES, "Exit with code 1 on a finding of at least this severity.")
 @click.option(
     "--checks",
     is_flag=True,
-    help="Exit with 1 if an EKF2 aid is overconfident, biased or not fused for a long time.",
+    help="Exit with code 1 if an EKF2 aiding source is overconfident, biased or not fused for a "
+    "long time.",
 )
-@click.option("-v", "--verbose", is_flag=True, help="Print all findings, axes and settings.")
+@click.option(
+    "-v",
+    "--verbose",
+    is_flag=True,
+    help="Print all findings, axes and KF settings on the terminal.",
+)
 @click.option("-q", "--quiet", is_flag=True, help="Print the diagnosis on one line only.")
 @options.open_option
 def compare(
@@ -42,9 +48,9 @@ def compare(
 ) -> None:
     """Check EKF2 against a two-state Kalman filter and report mistakes.
 
-    LOG is a PX4 ULog or a MAVLink recording (.tlog or raw stream). Replays IMU and position through
-    a two-state Kalman filter (KF) and compares innovations and variances with EKF2. Names mistakes
-    with their fix. Writes a PDF report and the results as JSON, for example
+    LOG is a PX4 ULog or a MAVLink recording (.tlog or raw stream). Runs a two-state Kalman filter
+    (KF) on the IMU and position data, and compares its innovations and variances with EKF2. Lists
+    mistakes and how to fix them. Writes a PDF report and the results as JSON, for example
     reports/LOG_sigma-z-0.05.pdf and .json.
     """
     from px4fuse.analysis import failed_checks, run_or_evaluate_aids
@@ -54,11 +60,13 @@ def compare(
 
     student = options.read_student(option_values)
     request = options.comparison_request(log, option_values)
-    outputs.report_paths(output, json_path)  # report an impossible output before the long analysis
+    outputs.report_paths(
+        output, json_path
+    )  # report an invalid output path before the long analysis
     with outputs.progress(json_path) as show_progress:
         outcome = run_or_evaluate_aids(request, show_progress)
         results = outcome_results(request, outcome, student)
-        release_free_memory()  # importing the report modules needs memory
+        release_free_memory()  # the report modules, imported next, need memory
         if output is None and json_path is None:
             output = outputs.default_report(log.stem, settings_name(request), results)
         contents = outputs.result_files(results, json_path, output, outcome, show_progress)

@@ -1,4 +1,4 @@
-"""``px4fuse diff``: lists settings, numbers and findings that differ."""
+"""Command ``px4fuse diff``: lists settings, numbers and findings that differ between two runs."""
 
 import sys
 from pathlib import Path
@@ -20,14 +20,14 @@ def diff(a: Path, b: Path, json_path: Path | None) -> None:
 
     The exit code is 1 if a verdict is worse in B: the mean NIS or mean NEES of KF or EKF2 along an
     axis is consistent in A and not in B, or B has a new finding of severity error. A mean NIS is
-    consistent inside its 95 % band, or if σ is less than 1.25 times too small or too large; a mean
-    NEES if σ is at most 1.5 times too small or too large. Otherwise the exit code is 0; 2 for bad
-    input.
+    consistent inside its 95 % band, or if σ is less than 1.25 times too small or too large. A mean
+    NEES is consistent if σ is at most 2 times too small or too large. The exit code is 2 for
+    invalid input, otherwise 0.
     """
     from px4fuse.fleet.changes import diff as compare_inputs
     from px4fuse.fleet.terminal import format_differences
 
-    outputs.check_targets([json_path])  # report an impossible output before the long analysis
+    outputs.check_targets([json_path])  # report an invalid output path before the long analysis
     with outputs.progress(json_path) as show_progress:
         results = compare_inputs(a, b, progress=show_progress)
     outputs.write_and_print(outputs.result_files(results, json_path), format_differences(results))

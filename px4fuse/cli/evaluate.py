@@ -1,4 +1,4 @@
-"""``px4fuse evaluate``: ATE and RPE of one trajectory against another."""
+"""Command ``px4fuse evaluate``: computes ATE and RPE of one trajectory against another."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from px4fuse.request import EvaluationRequest, settings_name
 if TYPE_CHECKING:
     from px4fuse.trajectory.scores import Delta
 
-MAX_DELTA = 1e6  # maximum RPE delta (m, s or frames)
-# Parameters that the function evaluate has under the same name
+# Maximum RPE delta (m, s or frames)
+MAX_DELTA = 1e6
+# Options that are arguments of px4fuse.trajectory.evaluation.evaluate with the same name
 SCORE_OPTIONS = ("alignment", "association", "max_gap_s", "time_offset_s")
 _DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
@@ -28,7 +29,7 @@ def parse_delta(text: str) -> Delta:
     match = _DELTA.fullmatch(text.strip())
     if match is None or not 0.0 < float(match[1]) <= MAX_DELTA:
         raise click.BadParameter(
-            f"{text!r} is not a distance (5m), a time (10s) or a number of frames (1f)."
+            f"The delta {text!r} is not a distance (5m), a time (10s) or a number of frames (1f)."
         )
     unit = {"m": "m", "s": "s"}.get(match[2], "frames")
     return Delta(float(match[1]), unit)  # type: ignore[arg-type]
@@ -42,43 +43,43 @@ def parse_delta(text: str) -> Delta:
     type=parse_delta,
     metavar="DELTA",
     multiple=True,
-    help="RPE over a distance (5m), a time (10s) or a number of frames (1f); repeatable.  "
-    "[default: several that fit the path length]",
+    help="Delta of the RPE: a distance (5m), a time (10s) or a number of frames (1f); repeatable.  "
+    "[default: several distances that fit the path length]",
 )
 @click.option(
     "--alignment",
     type=options.Choice(("none", "yaw", "se3", "sim3")),
-    help="Transform that is fitted before errors are computed.  [default: yaw for VIO, EKF2 and "
-    "KF; se3 for SLAM; sim3 for monocular SLAM]",
+    help="Transform of the estimate that is fitted to the reference before errors are computed.  "
+    "[default: yaw for VIO, EKF2 and KF; se3 for SLAM; sim3 for monocular SLAM]",
 )
 @click.option(
     "--association",
     type=options.Choice(("interpolate", "nearest")),
     default="interpolate",
-    help="Interpolate the reference, or use its nearest pose (as evo does).",
+    help="Reference pose for an estimated pose: interpolated, or nearest in time (as in evo).",
 )
 @click.option(
     "--max-gap",
     "max_gap_s",
     type=options.TypedQuantity("s"),
-    help="Longest gap in the reference to interpolate over; with --association nearest, "
-    "the largest time difference.  [default: from the rate of the reference; 0.01 for nearest]",
+    help="Maximum gap in the reference for interpolation (s); with --association nearest, the "
+    "maximum time difference.  [default: from the rate of the reference; 0.01 s for nearest]",
 )
 @click.option(
     "--time-offset",
     "time_offset_s",
     type=options.TypedQuantity("s", auto=True),
-    help="Seconds to add to the timestamps of the estimate; auto estimates them from the motion.  "
-    "[default: auto if the two trajectories do not overlap in time]",
+    help="Time (s) to add to the timestamps of the estimate; auto estimates it from the motion.  "
+    "[default: auto if the two trajectories do not overlap in time, else 0]",
 )
 @click.option(
     "--consecutive",
     is_flag=True,
-    help="RPE over consecutive, non-overlapping pairs instead of all pairs.",
+    help="Compute the RPE over consecutive, non-overlapping pairs of poses instead of all pairs.",
 )
 @options.system_option
 @options.max_size_option
-@options.report_options("Output report.  [default: reports/A_against_B.pdf]")
+@options.report_options("Report to write (PDF).  [default: reports/A_against_B.pdf]")
 @options.open_option
 def evaluate(
     estimate: Path,
@@ -89,9 +90,9 @@ def evaluate(
 ) -> None:
     """Compute ATE and RPE of a trajectory against a reference.
 
-    Both are trajectory files (TUM, EuRoC, ORB-SLAM3) or tracks of a flight log: LOG:vio,
-    LOG:ekf2, LOG:kf or LOG:truth. Prints errors with 95 % intervals. Writes a PDF report and the
-    results as JSON.
+    ESTIMATE and REFERENCE are trajectory files (TUM, EuRoC, ORB-SLAM3) or tracks of a flight log:
+    LOG:vio, LOG:ekf2, LOG:kf or LOG:truth. Prints errors with 95 % intervals. Writes a PDF report
+    and the results as JSON.
     """
     from px4fuse.loop.tracks import file_name, read_source
     from px4fuse.report.evaluation import write_evaluation
@@ -107,7 +108,7 @@ def evaluate(
         **option_values,
     )
     if request.max_gap_s is not None and request.max_gap_s <= 0.0:
-        raise SettingsError(f"--max-gap {request.max_gap_s:g}: the value must be above 0 s.")
+        raise SettingsError(f"--max-gap {request.max_gap_s:g} is too small. Give a time above 0 s.")
     outputs.report_paths(output, json_path)
     with outputs.progress(json_path) as show_progress:
         show_progress("reading")

@@ -1,4 +1,4 @@
-"""``px4fuse explain``: prints the meaning, an example and the error rates of a finding."""
+"""Command ``px4fuse explain``: prints the meaning, an example and the error rates of a finding."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("finding", required=False)
 def explain(finding: str | None) -> None:
-    """Explain a finding: meaning, example, action, false alarms. Without FINDING, list all.
+    """Explain a finding: meaning, example, action, false alarms.
 
-    FINDING is an id that px4fuse compare prints, such as source_outliers.
+    FINDING is an id that px4fuse compare prints, such as source_outliers. Without FINDING, the
+    ids of all findings are listed.
     """
     write_and_print({}, _list_page() if finding is None else _finding_page(finding))
 
@@ -46,7 +47,7 @@ def _finding_page(finding_id: str) -> Page:
     if name not in CATALOGUE:
         raise SettingsError(
             f"{finding_id!r} is not a finding",
-            f"{suggest_name(name, CATALOGUE)}For a list, run px4fuse explain.",
+            f"{suggest_name(name, CATALOGUE)}For a list of findings, run px4fuse explain.",
         )
     entry, example = CATALOGUE[name], load_examples()[name]
     causes = [cause for cause in CONSEQUENCES if name in effect_ids(cause)]
@@ -65,13 +66,12 @@ def _finding_page(finding_id: str) -> Page:
 
 
 def _rates(clean_flights: int, false_alarms: int, detection: Mapping[str, float]) -> list[str]:
-    """Format the false alarm rate and the detection rates on simulated flights."""
     if not clean_flights:
-        return ["Not measured: this finding states a fact of the log or of a setting."]
+        return ["Not measured, because this finding states a property of the log or a setting."]
     detected = "; ".join(
         f"{mistake}: {100.0 * fraction:.0f} %" for mistake, fraction in detection.items()
     )
     return [
         f"False alarms on {false_alarms} of {clean_flights} simulated flights without a mistake.",
-        f"Found on simulated flights with {detected}.",
+        f"Detected on simulated flights with {detected}.",
     ]

@@ -1,4 +1,4 @@
-"""``px4fuse explore``: writes a page with sliders that re-run KF in the browser."""
+"""Command ``px4fuse explore``: writes a page with sliders that re-run KF in the browser."""
 
 from pathlib import Path
 from typing import Any
@@ -13,15 +13,15 @@ from px4fuse.request import settings_name
 @click.command()
 @click.argument("log", required=False, type=options.InputPath())
 @options.analysis_options
-@options.output_option("FILE.html", "Output file.  [default: reports/LOG.html]")
+@options.output_option("FILE.html", "Web page to write.  [default: reports/LOG.html]")
 @options.open_option
 def explore(log: Path | None, output: Path | None, **option_values: Any) -> None:
     """Write an interactive page with sliders for the filter settings.
 
     LOG is a PX4 ULog or a MAVLink recording; without LOG, the sample flight is used. Sliders for
-    SIGMA_A, SIGMA_Z, DT and the clock offset re-run the filter in the browser. Plots show
-    innovations, σ and errors; a step view shows each predict and update; a tour explains the main
-    effects. The page is one file and needs no network.
+    SIGMA_A, SIGMA_Z, DT and the clock offset re-run KF in the browser. Plots show innovations, σ
+    and errors. A step view shows each prediction and update, and a tour explains the main effects.
+    The page is one file and needs no network.
     """
     from px4fuse.analysis import run
 
@@ -31,7 +31,7 @@ def explore(log: Path | None, output: Path | None, **option_values: Any) -> None
     with outputs.progress(target) as show_progress:
         analysis = run(request, show_progress)
         show_progress("writing the page")
-        # Bokeh is slow to import, so an error above is shown without waiting for the import
+        # imported after the analysis, so that its errors are shown without the slow import of Bokeh
         from px4fuse.explore.page import html_text
 
         page = html_text(analysis)

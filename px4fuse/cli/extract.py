@@ -1,4 +1,4 @@
-"""``px4fuse extract``: exports a log as tables."""
+"""Command ``px4fuse extract``: exports a log as tables."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from px4fuse.reading import read_text
 if TYPE_CHECKING:
     import pandas as pd
 
-# Limit for flight.json of an earlier run
+# Maximum size (bytes) of flight.json of an earlier run
 MAX_DESCRIPTION_BYTES = 50_000_000
 
 
@@ -36,13 +36,13 @@ MAX_DESCRIPTION_BYTES = 50_000_000
     "--format",
     type=Choice(("csv", "parquet")),
     default="csv",
-    help='Table format; parquet requires pip install "px4fuse[parquet]".',
+    help='File format of the tables; parquet requires pip install "px4fuse[parquet]".',
 )
 @flight_options
 def extract(
     log: Path,
     output: Path,
-    format: str,  # noqa: A002 - the name of the option
+    format: str,  # noqa: A002 - name of the option
     **option_values: Any,
 ) -> None:
     """Export a log as tables (CSV or Parquet).
@@ -51,8 +51,6 @@ def extract(
     each column) and flight.json (log information and missing data).
     """
     check_output_folder(output)
-    if output.exists() and not output.is_dir():
-        raise OutputError(f"{output} is a file. Give a folder with -o.")
     if format == "parquet" and importlib.util.find_spec("pyarrow") is None:
         raise OutputError(
             '--format parquet requires pyarrow. Run pip install "px4fuse[parquet]", or '
@@ -79,14 +77,13 @@ def extract(
 
 
 def _require_same_flight(folder: Path, sha256: str) -> None:
-    """Raise an OutputError if the folder contains the tables of another log."""
     try:
         with inputs_not_registered():
             text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
         earlier_log = json.loads(text)["log"]
         is_other_log = earlier_log["sha256"] != sha256
         name = str(earlier_log["name"])
-    except (OutputError, ValueError, KeyError, TypeError):  # flight.json is not from px4fuse
+    except (OutputError, ValueError, KeyError, TypeError):  # no flight.json of px4fuse
         return
     if is_other_log:
         raise OutputError(
@@ -95,7 +92,7 @@ def _require_same_flight(folder: Path, sha256: str) -> None:
 
 
 def _csv_bytes(table: pd.DataFrame) -> bytes:
-    # by default pandas writes the shortest text that is read back as the same float64
+    # pandas writes the shortest text of a number from which the same float64 is read
     return table.to_csv(index=False, lineterminator="\n").encode()
 
 

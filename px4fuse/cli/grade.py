@@ -1,4 +1,4 @@
-"""``px4fuse grade``: verifies and grades the reports of a class."""
+"""Command ``px4fuse grade``: verifies and grades the reports of a class."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from px4fuse.cli.options import (
     Choice,
     InputPath,
     NonEmptyPath,
+    input_option,
     max_size_option,
     open_option,
     output_option,
@@ -28,77 +29,74 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("submissions", nargs=-1, type=InputPath())
-@click.option(
+@input_option(
     "--logs",
-    type=InputPath(),
-    metavar="DIR",
+    "DIR",
+    "Folder with the flight logs, or one log; repeatable. A report without its log is not "
+    "verified.",
     multiple=True,
-    help="Folder with the flight logs (or one log); repeatable. A report cannot be verified "
-    "without its log.",
 )
-@click.option(
+@input_option(
     "--rubric",
-    type=InputPath(),
-    metavar="FILE.toml",
-    help="Rubric with the points of each item.  [default: the rubric of this lab]",
+    "FILE.toml",
+    "Grading rubric with the points of each item.  [default: the rubric of px4fuse]",
 )
 @max_size_option
-@click.option(
+@input_option(
     "--key",
-    type=InputPath(),
-    metavar="FILE.json",
-    help="Answer key written by px4fuse simulate --assignment.",
+    "FILE.json",
+    "Answer key of the class, written by px4fuse simulate --assignment.",
 )
 @output_option("DIR", "Output folder for the class table and the feedback.")
 @click.option("--title", help="Title of the class page.  [default: the rubric's title]")
-@click.option(
+@input_option(
     "--roster",
-    type=InputPath(),
-    metavar="FILE.csv",
-    help="Class list with all students.  [default: the students in --key]",
+    "FILE.csv",
+    "Class list with all students.  [default: the students in --key]",
 )
 @click.option(
     "--attempt",
     type=Choice(("latest", "best", "first")),
     default="latest",
-    help="Attempt of each student that counts.",
+    help="Attempt that is graded if a student submitted several reports.",
 )
 @click.option(
     "--due",
     metavar="TIME",
-    help="Due time: '2026-11-20 23:59' in this computer's time zone, or followed by '+01:00' or "
-    "'Europe/Berlin'. Submission times without a zone are in the same zone.",
+    help="Due time of the reports: '2026-11-20 23:59' in this computer's time zone, or followed by "
+    "'+01:00' or 'Europe/Berlin'. Submission times without a zone are in the same zone.",
 )
 @click.option(
     "--late",
     metavar="RULE",
-    help="Deduction for late submissions: '10%/day' or '10%/day up to 50%' of all points, for each "
-    "day or part of a day.",
+    help="Deduction for a late submission: '10%/day' or '10%/day up to 50%' of all points, for "
+    "each started day.  [default: no deduction]",
 )
 @click.option(
     "--include-pending",
     is_flag=True,
-    help="Also enter points that the instructor has not confirmed yet.",
+    help="Count points that the instructor has not confirmed yet.",
+)
+@input_option(
+    "--worksheet",
+    "FILE.csv",
+    "Moodle grading worksheet, Canvas gradebook, or another table with student ids or names, "
+    "of which a copy with the grades is written; repeatable.",
+    multiple=True,
 )
 @click.option(
-    "--worksheet",
-    type=InputPath(),
-    metavar="FILE.csv",
-    multiple=True,
-    help="Moodle grading worksheet, Canvas gradebook, or another table with ids or names; px4fuse "
-    "writes a copy with the grades. Repeatable.",
+    "--column", metavar="TITLE", help="Title of the column of --worksheet for the grades."
 )
-@click.option("--column", metavar="TITLE", help="Title of the grade column in the worksheets.")
 @click.option(
     "--anonymous",
     is_flag=True,
-    help="Show pseudonyms on the class page; names.csv maps them to students.",
+    help="Show pseudonyms on the class page; names.csv lists the student of each pseudonym.",
 )
 @click.option(
     "--jobs",
     type=click.IntRange(1, 256),
     metavar="N",
-    help="Number of reports processed in parallel.  [default: number of cores]",
+    help="Number of reports that are processed in parallel.  [default: number of cores]",
 )
 @click.option(
     "--write-rubric",
@@ -131,7 +129,7 @@ def grade(
     SUBMISSIONS are PDFs, folders, or zip files of learning platforms. Writes class.csv, class.html,
     one feedback text per student and grade files for the platforms to DIR. Entries in overrides.csv
     (id, item or total, points, comment) replace computed points. A second run verifies only changed
-    reports. Submitted files are never executed and are read with time and memory limits.
+    reports. Submitted files are never executed, and are read with limits of time and memory.
     """
     from px4fuse.assignment.key import read_key
     from px4fuse.assignment.roster import read_people
@@ -182,15 +180,13 @@ def grade(
 
 
 def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None:
-    if output.exists() and not output.is_dir():
-        raise OutputError(f"-o {output} is not a folder. Choose another name.")
     resolved = output.resolve()
     parents = [folder for folder in (resolved, *resolved.parents) if folder.is_dir()]
     for path in input_paths:
         if path.is_dir() and any(map(path.samefile, parents)):
             raise OutputError(
                 f"-o {output} is inside the input {path}, so the next run would read this output. "
-                "Choose another folder."
+                "Choose another output folder."
             )
         for file in files_below(path):
             add_input(file)
@@ -220,8 +216,8 @@ def _page(outcome: GradeOutcome) -> Page:
     missing = sum(entry.counted_report is None for entry in outcome.entries)
     page.write(
         f"{len(outcome.reports)} submissions: {status_counts or 'none'}; no submission from "
-        f"{missing} of {len(outcome.entries)} students; stored verifications of "
-        f"{outcome.reused_count} submissions were used"
+        f"{missing} of {len(outcome.entries)} students; {outcome.reused_count} submissions were "
+        "verified in an earlier run"
     )
     for note in outcome.notes:
         page.write(note, colour=MUTED_COLOUR)

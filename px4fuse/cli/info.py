@@ -1,4 +1,4 @@
-"""``px4fuse info``: lists the contents of a log and the possible analyses."""
+"""Command ``px4fuse info``: lists the contents of a log and the possible analyses."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def _print_versions(context: click.Context, _: click.Parameter, is_requested: bo
 def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
     """List the contents of a log and which analyses are possible.
 
-    Lists topics, rates and gaps, the possible analyses, the reasons why others are not possible,
-    and what to log on the next flight.
+    Lists topics, rates (Hz) and gaps, the possible analyses, the reasons why other analyses are
+    not possible, and settings to log the missing data on the next flight.
     """
     from px4fuse.analysis import read_flight
     from px4fuse.inspect.inventory import take_inventory, to_plain
@@ -73,7 +73,7 @@ def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
 
     page = Page()
     page.write(inventory.flight.log.name, bold=True)
-    for label, text in _log_facts(inventory):
+    for label, text in _describe_log(inventory):
         page.write_labelled(label, text)
     if inventory.flight.log.senders:
         page.table(("sender", "type", "messages", "lost"), _sender_rows(inventory), right=(2, 3))
@@ -104,13 +104,13 @@ def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
     return page
 
 
-def _log_facts(inventory: Inventory) -> list[tuple[str, str]]:
+def _describe_log(inventory: Inventory) -> list[tuple[str, str]]:
     log = inventory.flight.log
     size = f"{log.bytes / 1e6:.1f} MB" if log.bytes >= 1e5 else f"{log.bytes} bytes"
     version = log.firmware if log.firmware != "unknown" else f"{log.autopilot}, version unknown"
     git = "" if log.firmware_hash == "unknown" else f" (git {log.firmware_hash[:8]})"
     hardware = "hardware unknown" if log.hardware == "unknown" else log.hardware
-    facts = [
+    labelled_texts = [
         ("Log", f"{log.format}, {size}, SHA-256 {log.sha256[:12]}"),
         ("Vehicle", f"{version}{git}, {hardware}"),
         ("Data", f"{_duration_text(log.duration_s)}, {_start_text(inventory)}"),
@@ -120,31 +120,31 @@ def _log_facts(inventory: Inventory) -> list[tuple[str, str]]:
         lost_s = sum(dropout.duration_s for dropout in log.dropouts)
         longest_s = max(dropout.duration_s for dropout in log.dropouts)
         count = len(log.dropouts)
-        text = f"{count} of the logger, {lost_s:.2f} s in total, the longest {longest_s:.2f} s"
-        facts.append(("Dropouts", text))
-    facts += [
+        text = f"{count} logger dropouts, {lost_s:.2f} s in total, the longest {longest_s:.2f} s"
+        labelled_texts.append(("Dropouts", text))
+    labelled_texts += [
         (file.role.capitalize(), f"{file.name}, SHA-256 {file.sha256[:12]}")
         for file in inventory.flight.inputs
     ]
-    return facts
+    return labelled_texts
 
 
 def _duration_text(seconds: float) -> str:
-    return f"{seconds:.{1 if seconds >= 1 else 3}f} s" if seconds else "one point in time"
+    return f"{seconds:.{1 if seconds >= 1 else 3}f} s" if seconds else "data of one time only"
 
 
 def _start_text(inventory: Inventory) -> str:
     if inventory.start_utc is None:
-        return f"from {inventory.flight.log.boot_time_s:.1f} s after boot (no UTC in the log)"
-    return f"from {inventory.start_utc[:19].replace('T', ' ')} UTC"
+        return f"starting {inventory.flight.log.boot_time_s:.1f} s after boot (no UTC in the log)"
+    return f"starting at {inventory.start_utc[:19].replace('T', ' ')} UTC"
 
 
 def _airborne_text(inventory: Inventory) -> str:
     airborne = inventory.flight.airborne
     if isinstance(airborne, Unavailable):
-        return "unknown (no land detector in the log)"
+        return "unknown (the log contains no land detector)"
     if not airborne:
-        return "never (land detector)"
+        return "never, according to the land detector"
     spans = [f"{start:.1f} s to {end:.1f} s" for start, end in airborne]
     return join_first(spans, 3)
 
@@ -169,14 +169,8 @@ def _source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
         data_type = source.part if source.part != previous else ""
         previous = source.part
         if source.unavailable:
-            yield (
-                data_type,
-                ("none", MUTED_COLOUR),
-                "",
-                "",
-                "",
-                "",
-            )  # the table of analyses gives the reason
+            # the table of analyses contains the reason
+            yield (data_type, ("none", MUTED_COLOUR), *("" for _ in SOURCES_HEAD[2:]))
             continue
         yield (
             f"{data_type:8} (used)" if source.chosen else data_type,
@@ -197,7 +191,7 @@ def _gaps_text(source: Source) -> str:
 
 
 def _format_short(value: float) -> str:
-    """Format a number with at least two digits, for a narrow column."""
+    """Format a rate (Hz) or time (s) with two or more digits, for a narrow column."""
     return f"{value:.{2 if value < 1 else 1 if value < 10 else 0}f}"
 
 
@@ -205,7 +199,7 @@ def _span_text(source: Source) -> str:
     if source.start_s is None or source.end_s is None:
         return ""
     digits = 1 if source.end_s < 10 else 0
-    # Adding 0.0 turns -0.0 into 0.0
+    # adding 0.0 converts -0.0 to 0.0
     start, end = (round(time, digits) + 0.0 for time in (source.start_s, source.end_s))
     return f"{start:.{digits}f} to {end:.{digits}f}"
 

@@ -1,16 +1,16 @@
-"""``px4fuse lesson``: prints the worked examples of the lesson."""
+"""Command ``px4fuse lesson``: prints the worked examples of the lesson UAT 366, module 2."""
 
 import click
 
 
 @click.group()
 def lesson() -> None:
-    """Print the worked examples of the lesson, computed by px4fuse's own code."""
+    """Print the worked examples of the lesson UAT 366, module 2, computed by px4fuse."""
 
 
 @lesson.command()
 def kalman() -> None:
-    """Print Example 1: fusing IMU and UWB in an aisle at 1 m/s."""
+    """Print Example 1 of the lesson: fusion of IMU and UWB in an aisle at 1 m/s."""
     from px4fuse.lesson import kalman_lines
 
     for line in kalman_lines():
@@ -19,7 +19,7 @@ def kalman() -> None:
 
 @lesson.command()
 def loop() -> None:
-    """Print Example 2: loop closure error distributed by distance."""
+    """Print Example 2 of the lesson: loop closure error, distributed by distance."""
     from px4fuse.lesson import loop_lines
 
     for line in loop_lines():

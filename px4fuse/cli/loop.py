@@ -1,4 +1,4 @@
-"""``px4fuse loop``: measures and corrects the loop closure error."""
+"""Command ``px4fuse loop``: measures and corrects the loop closure error."""
 
 from __future__ import annotations
 
@@ -24,32 +24,31 @@ from px4fuse.writing import STANDARD_OUTPUT
 if TYPE_CHECKING:
     from px4fuse.loop.model import Loop
 
-# Limit for --landed-at, longer than any tape measure
+# Maximum distance (m) for --landed-at: longer than any tape measure
 MAX_LANDING_DISTANCE_M = 10_000.0
-# Parameters that are allowed with a pose graph
+# Parameters of the command that are allowed if SOURCE is a pose graph
 GRAPH_PARAMETERS = ("source", "json_path", "g2o", "robust")
 
 
 def _parse_numbers(text: str, expected: str, max_absolute: float) -> list[float]:
-    """Parse two or three comma-separated numbers with absolute values up to ``max_absolute``."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
         numbers = []
     if len(numbers) not in (2, 3) or not all(abs(number) <= max_absolute for number in numbers):
-        raise click.BadParameter(f"{text!r} is not {expected}.")
+        raise click.BadParameter(f"The value {text!r} is not {expected}.")
     return numbers
 
 
 def parse_landing(text: str) -> Landing:
-    """Parse ``FORWARD,RIGHT`` (m) or ``FORWARD,RIGHT,DEG``."""
+    """Parse a landing place: ``FORWARD,RIGHT`` (m) or ``FORWARD,RIGHT,DEG``."""
     return Landing(
         *_parse_numbers(text, "FORWARD,RIGHT in m, or FORWARD,RIGHT,DEG", MAX_LANDING_DISTANCE_M)
     )
 
 
 def parse_closure(text: str) -> GivenClosure:
-    """Parse ``T1,T2`` (s) or ``T1,T2,SIGMA`` (m)."""
+    """Parse a loop closure: ``T1,T2`` (s) or ``T1,T2,SIGMA`` (m)."""
     return GivenClosure(*_parse_numbers(text, "T1,T2 in s, or T1,T2,SIGMA", sys.float_info.max))
 
 
@@ -59,15 +58,16 @@ def parse_closure(text: str) -> GivenClosure:
     "--landed-at",
     type=parse_landing,
     metavar="FORWARD,RIGHT[,DEG]",
-    help="Measured landing place relative to the take-off place: m forward (along the nose at "
-    "take-off), m right, and optionally the clockwise rotation in degrees.  [default: the log's "
-    "ground truth, else 0,0]",
+    help="Measured landing place relative to the take-off place: distance forward (m, along the "
+    "nose at take-off) and to the right (m), and the clockwise rotation (°) if known.  [default: "
+    "the ground truth of the log, else 0,0]",
 )
 @click.option(
     "--open",
     "opened",
     is_flag=True,
-    help="The vehicle did not return to the take-off place: do not use the landing as a closure.",
+    help="Do not use the landing as a loop closure, because the vehicle did not return to the "
+    "take-off place.",
 )
 @click.option(
     "--closure",
@@ -75,64 +75,66 @@ def parse_closure(text: str) -> GivenClosure:
     type=parse_closure,
     metavar="T1,T2[,SIGMA]",
     multiple=True,
-    help="Loop closure: the vehicle was at the same place at times T1 and T2, within SIGMA m "
-    "(0.10); repeatable.",
+    help="Loop closure: the vehicle was at the same place at the times T1 and T2 (s), within SIGMA "
+    "(m, 1 σ); repeatable.  [default SIGMA: 0.1 m]",
 )
 @click.option(
     "--robust",
     is_flag=True,
-    help="Also run robust optimisation on a pose graph with more than 1000 closures (takes "
-    "minutes).",
+    help="Run the robust optimisation also for a pose graph with more than 1000 loop closures, "
+    "which takes minutes.",
 )
 @click.option(
     "--from",
     "start_s",
     type=options.TypedQuantity("s", 20.0),
-    help="Start of the loop, in seconds after the first data, or a timestamp of the trajectory.  "
+    help="Start of the loop: time after the first data (s), or a timestamp of the trajectory.  "
     "[default: take-off]",
 )
 @click.option(
     "--to",
     "end_s",
     type=options.TypedQuantity("s", 60.0),
-    help="End of the loop.  [default: landing]",
+    help="End of the loop: time after the first data (s), or a timestamp of the trajectory.  "
+    "[default: landing]",
 )
 @click.option(
     "--reference",
     type=options.InputPath(str),
     metavar="FILE|LOG:TRACK",
-    help="Reference trajectory (for example SLAM) for the ATE and RPE of each path, besides the "
-    "log's ground truth.",
+    help="Reference trajectory (for example from SLAM) for the ATE and RPE of each path, in "
+    "addition to the ground truth of the log.",
 )
 @click.option(
     "--drift",
     "position_drift_m",
     type=options.TypedQuantity("m", 1.0),
     default=1.0,
-    help="Position drift of the odometry after 100 m (1 σ).",
+    help="Position drift (m, 1 σ) of the odometry after 100 m, which weights it in the pose graph.",
 )
 @click.option(
     "--heading-drift",
     "heading_drift_deg",
     type=options.TypedQuantity("°", 3.0),
     default=3.0,
-    help="Heading drift of the odometry after 100 m (1 σ).",
+    help="Heading drift (°, 1 σ) of the odometry after 100 m, which weights it in the pose graph.",
 )
 @click.option(
     "--key-frames",
     "key_frames_m",
     type=options.TypedQuantity("m", 0.2),
-    help="Distance between key frames.  [default: 2 % of the path's extent, 0.02 to 0.5 m]",
+    help="Distance (m) between the key frames of the pose graph.  [default: 2 % of the extent of "
+    "the path, 0.02 to 0.5 m]",
 )
 @click.option(
     "--frame",
     type=options.Choice(get_args(FrameName)),
-    help="Frame of a trajectory file.  [default: detected]",
+    help="Coordinate frame of a trajectory file.  [default: detected]",
 )
 @options.system_option
 @options.max_size_option
-@options.person_options
-@options.report_options("Output report.  [default: reports/SOURCE_loop.pdf]")
+@options.student_options
+@options.report_options("Report to write (PDF).  [default: reports/SOURCE_loop.pdf]")
 @click.option(
     "--tum",
     type=options.NonEmptyPath(),
@@ -189,7 +191,7 @@ def loop(
 
 
 def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
-    """Make a request from the values of the options."""
+    """Make the request of a loop analysis from the values of the command's options."""
     del option_values["robust"]
     return LoopRequest(
         source=str(source), closed_loop=not option_values.pop("opened"), **option_values
@@ -197,7 +199,7 @@ def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
 
 
 def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]:
-    """Return the corrected path (TUM) and the optimised graph (g2o) as files."""
+    """Return the file contents of the corrected path (TUM) and the optimised pose graph (g2o)."""
     from px4fuse.errors import MissingDataError
     from px4fuse.loop.closure import from_z_down
     from px4fuse.readers.g2o import g2o_text
@@ -209,7 +211,7 @@ def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict
         if best is loop_result.odometry:
             raise MissingDataError(
                 f"--tum {display_name(tum)}: no corrected path exists, as no loop closure was "
-                "accepted. Give a closure (--closure) or the landing place (--landed-at)."
+                "accepted. Give a loop closure (--closure) or the landing place (--landed-at)."
             )
         contents[tum] = tum_text(from_z_down(best.trajectory, loop_result.original_frame)).encode()
     if g2o is not None:
@@ -220,7 +222,6 @@ def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict
 def _solve_graph(
     source: Path, json_path: Path | None, g2o: Path | None, robust: bool | None
 ) -> None:
-    """Optimise a pose graph file and write the results."""
     from px4fuse.loop.tracks import split_part
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop import graph_summary
@@ -235,10 +236,7 @@ def _solve_graph(
     for parameter in options.typed_parameters():
         if parameter.name not in GRAPH_PARAMETERS:
             raise SettingsError(
-                (
-                    f"{display_name(source)}: {parameter.opts[-1]} is not available for a pose "
-                    "graph."
-                ),
+                f"{display_name(source)}: {parameter.opts[-1]} is not available for a pose graph.",
                 "Use only --g2o FILE, --json FILE and --robust.",
             )
     outputs.check_targets([json_path, g2o])

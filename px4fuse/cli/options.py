@@ -1,6 +1,6 @@
 """Option types of the command line, and options that several commands share.
 
-Numbers are typed without their unit; for a number with a unit the error shows the right number.
+Users type numbers without a unit. If a unit is typed, the error shows the converted number.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 def parse_columns(text: str) -> tuple[str, ...]:
-    """Parse comma-separated names or numbers of columns."""
+    """Parse comma-separated column names, or column numbers, of a position file."""
     return tuple(text.split(","))
 
 
@@ -62,20 +62,18 @@ class NonEmptyPath(click.Path):
         super().__init__(path_type=path_type)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Convert the typed text to a path."""
         if value == "":
-            self.fail("the name is empty.", param, ctx)
+            self.fail("the file name is empty.", param, ctx)
         return super().convert(value, param, ctx)
 
 
 class InputPath(NonEmptyPath):
-    """File or folder to read, which no output may overwrite.
+    """Input file or folder, which no output may overwrite.
 
     A log may be followed by the name of a track: ``LOG:vio``.
     """
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Convert the typed text to a path and register it as an input."""
         path = super().convert(value, param, ctx)
         file, colon, _ = str(path).rpartition(":")
         add_input(Path(file) if colon and not Path(path).exists() else Path(path))
@@ -83,16 +81,16 @@ class InputPath(NonEmptyPath):
 
 
 class TypedQuantity(click.ParamType["float | str"]):
-    """Number in a fixed unit.
+    """Option type of a number in a fixed unit.
 
     Parameters
     ----------
     unit : str
         One of :data:`px4fuse.units.NAMES`.
     example : float
-        Number in the error message if the typed text is not a number.
+        Number that the error message suggests if the typed text is not a number.
     auto : bool
-        Accept ``auto`` in addition.
+        True to accept the text "auto" in addition.
     """
 
     name = "number"
@@ -101,14 +99,13 @@ class TypedQuantity(click.ParamType["float | str"]):
         self.unit, self.example, self.auto = unit, example, auto
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
-        """Return the unit, which --help shows for the value."""
+        """Return the unit in capital letters, which --help prints for the value of the option."""
         unit = "DEG" if self.unit == "°" else self.unit.upper() or "NUMBER"
         return f"{unit}|auto" if self.auto else unit
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float | str:
-        """Convert the typed text to a number, or to "auto"."""
         if self.auto and value == AUTO:
             return str(value)
         unit = f" in {NAMES[self.unit]}" if self.unit else ""
@@ -124,7 +121,7 @@ class TypedQuantity(click.ParamType["float | str"]):
                 ctx,
             )
         if not math.isfinite(number):
-            self.fail(f"{value} is not a finite number.", param, ctx)
+            self.fail(f"{value!r} is not a finite number.", param, ctx)
         return number
 
 
@@ -134,25 +131,25 @@ def _set_max_size(ctx: click.Context, _: click.Parameter, megabytes: int | None)
         ctx.call_on_close(lambda: max_log_bytes.reset(token))
 
 
-# The limit depends on the computer and does not change results, so no request contains it
+# No request contains this limit, because it depends on the computer and does not affect results
 max_size_option = click.option(
     "--max-size",
     type=click.IntRange(1),
     metavar="MB",
     expose_value=False,
     callback=_set_max_size,
-    help=f"Maximum size of a log.  [default: {max_log_bytes.get() // 1_000_000}]",
+    help="Maximum size of a log (MB); a larger log is rejected.  "
+    f"[default: {max_log_bytes.get() // 1_000_000}]",
 )
 
 
 def _json_option(more_text: str = "") -> Option:
-    """Declare --json."""
     return click.option(
         "--json",
         "json_path",
         type=NonEmptyPath(),
         metavar="FILE",
-        help=f"Write the results as JSON; - prints them to standard output.{more_text}",
+        help=f"Results to write (JSON); - prints them to standard output.{more_text}",
     )
 
 
@@ -160,8 +157,15 @@ def _json_option(more_text: str = "") -> Option:
 json_option = _json_option()
 
 
+def input_option(name: str, metavar: str, text: str, **details: Any) -> Option:
+    return click.option(name, type=InputPath(), metavar=metavar, help=text, **details)
+
+
 def output_option(metavar: str, text: str, **details: Any) -> Option:
-    """Declare -o for a file or folder; ``details``: further arguments of ``click.option``."""
+    """Declare -o for an output file or folder.
+
+    Further arguments of ``click.option`` are in ``details``.
+    """
     return click.option(
         "-o", "--output", type=NonEmptyPath(), metavar=metavar, help=text, **details
     )
@@ -169,101 +173,101 @@ def output_option(metavar: str, text: str, **details: Any) -> Option:
 
 def report_options(text: str) -> Option:
     """Declare -o for the PDF report and --json for its results."""
-    json_text = "With --json and without -o, no report is written.  [default: beside the report]"
-    return _combine_options(output_option("FILE.pdf", text), _json_option(f" {json_text}"))
+    json_text = " With --json and without -o, no report is written.  [default: beside the report]"
+    return _combine_options(output_option("FILE.pdf", text), _json_option(json_text))
 
 
 def fail_option(severities: tuple[str, ...], text: str) -> Option:
-    """Declare --fail-on for a command that ends with exit code 1 on a finding."""
+    """Declare --fail-on: exit code 1 on a finding of a severity."""
     return click.option("--fail-on", type=Choice(severities), help=text)
 
 
 def _open_flag(*names: str) -> Option:
-    """Declare a flag to open the output; :func:`~px4fuse.cli.outputs.write_and_print` opens it."""
     return click.option(
         *names,
         is_flag=True,
         expose_value=False,
         callback=lambda ctx, _, value: ctx.meta.update({OPEN_KEY: value}),
-        help="Open the written file in its default program.",
+        help="Open the written report or page in its default program.",
     )
 
 
-#: --open of commands that write a report or a page
+#: Option --open of commands that write a report or a page
 open_option = _open_flag("--open", "--show", "opened")
-#: --show of px4fuse loop, whose --open means an open loop
+#: Option --show of px4fuse loop, whose option --open declares a flight that is not a loop
 show_option = _open_flag("--show", "shown")
-#: Student, notes and answers
-person_options = _combine_options(
-    click.option("--student", metavar="NAME", help="Student name, printed on the report."),
-    click.option("--id", "student_id", metavar="ID", help="Student id, printed on the report."),
+#: Options for the student's name and id, notes and answer form
+student_options = _combine_options(
+    click.option("--student", metavar="NAME", help="Name of the student, printed on the report."),
     click.option(
-        "--notes",
-        type=InputPath(),
-        metavar="FILE.md",
-        help="Your own text in Markdown, printed in the report.",
+        "--id", "student_id", metavar="ID", help="Id of the student, printed on the report."
     ),
-    click.option(
+    input_option(
+        "--notes",
+        "FILE.md",
+        "Text of the student (Markdown), printed in the report.",
+    ),
+    input_option(
         "--answers",
-        type=InputPath(),
-        metavar="FILE.toml",
-        help="Completed form from px4fuse answers.",
+        "FILE.toml",
+        "Completed answer form of px4fuse answers, which the report contains.",
     ),
 )
 system_option = click.option(
     "--system",
     type=click.IntRange(0, 255),
     metavar="ID",
-    help="MAVLink system id of the vehicle.  [default: the id with the most messages]",
+    help="MAVLink system id of the vehicle to analyse.  [default: the id with the most messages]",
 )
 _clock_option = click.option(
     "--clock-offset",
     "clock_offset_s",
     type=TypedQuantity("s", auto=True),
-    help="Seconds to add to the timestamps of the position source; auto estimates them.  "
-    "[default: 0; auto with --position]",
+    help="Time (s) to add to the timestamps of the position source; auto estimates it.  [default: "
+    "0; auto with --position]",
 )
-#: Recordings of one flight, for commands that read it as logged
+#: Options for the recordings of one flight
 recording_options = _combine_options(
     click.option(
         "--mavlink",
         type=InputPath(str),
         metavar="FILE.tlog",
-        help="MAVLink recording of the same flight; adds the data that are missing in LOG.",
+        help="MAVLink recording of the same flight, which adds the data that LOG does not contain.",
     ),
     system_option,
 )
-#: Position file; its parameters begin with ``position``
+#: Options for a position file; the names of their parameters begin with ``position``
 position_options = _combine_options(
     click.option(
         "--position",
         type=InputPath(str),
         metavar="FILE.csv",
-        help="Position file of the positioning system (CSV): time, x, y, z. Replaces the position "
-        "in LOG.",
+        help="Recording of the positioning system (CSV: time, x, y, z), used instead of the "
+        "positions in LOG.",
     ),
     click.option(
         "--position-frame",
         type=Choice(("ned", "enu", "nwu")),
-        help="Frame of x, y, z in the position file.  [default: from the column names, else the "
-        "frame that fits EKF2 best]",
+        help="Coordinate frame of x, y, z in the position file.  [default: from the column names, "
+        "else the frame with the best fit to EKF2]",
     ),
     click.option(
         "--position-yaw",
         type=TypedQuantity("°", 30.0, auto=True),
-        help="Rotate the position file by this yaw, clockwise seen from above; auto estimates yaw "
-        "and origin.  [default: 0]",
+        help="Yaw angle (°, clockwise seen from above) by which the positions in the file are "
+        "rotated; auto estimates yaw and origin.  [default: 0]",
     ),
     click.option(
         "--position-columns",
         type=parse_columns,
         metavar="TIME,X,Y,Z[,SIGMA]",
-        help="Names or numbers of the columns of the position file.  [default: recognised by name]",
+        help="Names or numbers of the columns of the position file; SIGMA is the standard "
+        "deviation of the position.  [default: detected from the names]",
     ),
     click.option(
         "--position-time-unit",
         type=Choice(("s", "ms", "us", "ns")),
-        help="Unit of the time column in the position file.  [default: detected]",
+        help="Unit of the times in the position file.  [default: detected]",
     ),
     click.option(
         "--position-unit",
@@ -271,36 +275,35 @@ position_options = _combine_options(
         help="Unit of x, y, z in the position file.  [default: detected]",
     ),
 )
-#: Settings and segment, for commands that run KF
+#: Options for the KF settings, the axes, the time span and the position source
 filter_options = _combine_options(
     click.option(
         "--sigma-a",
         "sigma_a_m_s2",
         type=TypedQuantity("m/s²", SIGMA_A_M_S2),
         default=SIGMA_A_M_S2,
-        help="KF process noise SIGMA_A (acceleration, 1 σ over DT), {:g} to {:g}.".format(
-            *SIGMA_A_RANGE_M_S2
-        ),
+        help="KF process noise SIGMA_A: σ of the acceleration error over one step DT, {:g} to {:g} "
+        "m/s².".format(*SIGMA_A_RANGE_M_S2),
     ),
     click.option(
         "--sigma-z",
         "sigma_z_m",
         type=TypedQuantity("m"),
-        help="KF measurement noise SIGMA_Z (position, 1 σ), {:g} to {:g}.  [default: 0.1; for GNSS "
-        "the R that EKF2 uses]".format(*SIGMA_Z_RANGE_M),
+        help="KF measurement noise SIGMA_Z: σ of a measured position, {:g} to {:g} m.  [default: "
+        "0.1; for GNSS √R of EKF2]".format(*SIGMA_Z_RANGE_M),
     ),
     click.option(
         "--dt",
         "dt_s",
         type=TypedQuantity("s"),
         default=DT_S,
-        help="KF prediction step DT, {:g} to {:g}.".format(*DT_RANGE_S),
+        help="KF prediction interval DT, {:g} to {:g} s.".format(*DT_RANGE_S),
     ),
     click.option(
         "--input",
         type=Choice(("imu", "zero")),
-        help="KF input: acceleration from the IMU, or zero (constant velocity).  [default: imu if "
-        "logged]",
+        help="KF input: acceleration measured by the IMU, or zero (constant velocity).  [default: "
+        "imu if logged]",
     ),
     click.option(
         "--axis",
@@ -314,52 +317,52 @@ filter_options = _combine_options(
         "--heading",
         "heading_deg",
         type=TypedQuantity("°", 30.0),
-        help="Heading of the aisle axis, clockwise from north.  [default: main direction of the "
-        "track]",
+        help="Heading (°, clockwise from north) of the axis aisle.  [default: main direction of "
+        "the track]",
     ),
     click.option(
         "--start",
         "start_s",
         type=TypedQuantity("s", 20.0),
-        help="Start of the analysis, in seconds after the first data.  [default: take-off]",
+        help="Start of the analysed time span (s after the first data).  [default: take-off]",
     ),
     click.option(
         "--end",
         "end_s",
         type=TypedQuantity("s", 60.0),
-        help="End of the analysis, in seconds after the first data.  [default: landing]",
+        help="End of the analysed time span (s after the first data).  [default: landing]",
     ),
     click.option(
         "--position-source",
         metavar="NAME",
-        help="Position source to use, for example vehicle_gps_position; px4fuse info lists them.  "
-        "[default: the most direct one logged]",
+        help="Position source for KF, for example vehicle_gps_position; px4fuse info lists all "
+        "sources.  [default: the logged source with the fewest processing steps]",
     ),
     click.option(
         "--source-kind",
         type=Choice(get_args(SourceKind)),
-        help="Kind of the position source. VIO drifts; motion capture in the same messages does "
-        "not.  [default: vio if the source sends a changing orientation]",
+        help="Kind of the position source; only vio may drift.  [default: from the messages; vio "
+        "if they contain a changing orientation]",
     ),
     click.option(
         "--height",
         type=Choice(("gnss", "barometer")),
-        help="Height source of --axis down on a GNSS flight.  [default: the one that EKF2 fused, "
-        "GNSS first]",
+        help="Height source of the axis down on a flight with GNSS.  [default: the source that "
+        "EKF2 fused, GNSS first]",
     ),
 )
-#: Recordings of one flight, position file and clock offset
+#: Options for the recordings of one flight, the position file and the clock offset
 flight_options = _combine_options(
     recording_options, position_options, _clock_option, max_size_option
 )
-#: Settings, segment and recordings, for commands that run KF on one flight
+#: Options of commands that run KF on one flight
 analysis_options = _combine_options(filter_options, flight_options)
-#: Settings that apply to many logs, so without the files of one flight
+#: Options of commands that run KF on many logs: all except the files of one flight
 settings_options = _combine_options(filter_options, system_option, _clock_option, max_size_option)
 
 
 def comparison_request(log: Path, option_values: dict[str, Any]) -> ComparisonRequest:
-    """Make a request from the values of :func:`flight_options` or :func:`analysis_options`.
+    """Make a request from the values of ``flight_options`` or ``analysis_options``.
 
     Raises
     ------
@@ -383,7 +386,7 @@ def _position_file(option_values: dict[str, Any]) -> PositionFile | None:
 
 
 def typed_parameters() -> Iterator[click.Parameter]:
-    """Yield the parameters that the user typed."""
+    """Yield the options and arguments that the user typed, without those at their defaults."""
     context = click.get_current_context()
     for parameter in context.command.params:
         if context.get_parameter_source(parameter.name or "") == ParameterSource.COMMANDLINE:
@@ -391,12 +394,12 @@ def typed_parameters() -> Iterator[click.Parameter]:
 
 
 def read_student(option_values: dict[str, Any]) -> Student:
-    """Remove the values of :func:`person_options` from the option values and read their files.
+    """Take the values of ``student_options`` out of the option values, and read their files.
 
     Raises
     ------
     SettingsError
-        The notes or the answers cannot be read, or the notes cannot be printed.
+        The notes or the answer form cannot be read, or the notes cannot be printed.
     """
     from msgspec import UNSET
 
@@ -406,10 +409,10 @@ def read_student(option_values: dict[str, Any]) -> Student:
     name, student_id = option_values.pop("student") or "", option_values.pop("student_id") or ""
     notes_path, answers_path, notes = option_values.pop("notes"), option_values.pop("answers"), ""
     if notes_path is not None:
-        from px4fuse.report.notes import parse  # slow import
+        from px4fuse.report.notes import parse  # imported on demand, because it is slow
 
         notes = read_text(notes_path, SettingsError, MAX_NOTES_BYTES, name=f"--notes {notes_path}")
-        parse(notes, f"--notes {notes_path}")  # report errors before the analysis
+        parse(notes, f"--notes {notes_path}")  # report errors in the notes before the analysis
     answers = UNSET if answers_path is None else read_answers(answers_path)
     student = Student(replace_unencodable(name), replace_unencodable(student_id), notes, answers)
     _warn_missing_fonts(student.name + student.id + student.notes)
@@ -417,7 +420,6 @@ def read_student(option_values: dict[str, Any]) -> Student:
 
 
 def _warn_missing_fonts(text: str) -> None:
-    """Warn before the analysis if no installed font has a character of the text."""
     if text.isascii():
         return
     from px4fuse.report.fonts import font_advice, missing_characters
@@ -427,5 +429,5 @@ def _warn_missing_fonts(text: str) -> None:
 
 
 def replace_unencodable(text: str) -> str:
-    """Replace bytes of a command line that are not valid text."""
+    """Replace bytes of a command line that are not valid UTF-8 by question marks."""
     return text.encode(errors="replace").decode()

@@ -28,31 +28,32 @@ if TYPE_CHECKING:
     from px4fuse.request import Request
     from px4fuse.results.contract import Results
 
-# Maximum bytes of a report's name (file systems allow 255), and of the start of a longer name
+# Maximum length (bytes) of a default report name, because file systems allow 255; of a longer name
+# the first KEPT_STEM_BYTES bytes are used
 MAX_NAME_BYTES, KEPT_STEM_BYTES = 200, 180
-# Name and id on a report without a student
-NO_PERSON = ("", "")
-# In characters; longer than any paragraph
+# Name and id of the student in a report without a student
+NO_STUDENT_NAME = ("", "")
+# Line width (characters) in a pipe: longer than any paragraph
 UNWRAPPED_WIDTH = 10_000
-# Key in click's context: files that this run has written, for the message if it ends early
+# Key in the context of click for the list of files that this run has written
 WRITTEN_KEY = "px4fuse.written"
-# Key in click's context: True if the output is to be opened
+# Key in the context of click: True if px4fuse opens the output in its default program
 OPEN_KEY = "px4fuse.opened"
-# --open opens the first file with one of these suffixes, in this order
+# Suffixes of files that --open can open, the preferred suffix first
 OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
-# Command and SHA-256 of the log in the head of a web page
+# Element in the head of a web page with the command and the SHA-256 of its log
 GENERATOR = re.compile('<meta name="generator" content="([^"]*)">')
 
 
-class Interrupted(Exception):  # noqa: N818 - the user ends the run: no error
-    """End of a run by Ctrl-C or a signal.
+class Interrupted(Exception):  # noqa: N818 - no error, because the user ends the run
+    """End of a run by Ctrl-C or a termination signal.
 
     Parameters
     ----------
     interrupt : KeyboardInterrupt
-        Contains the number of the signal, except for Ctrl-C.
+        Its argument is the number of the signal, except for Ctrl-C.
     files_sentence : str
-        Sentence on the files that the run has written.
+        Sentence that lists the files that the run has written.
     """
 
     def __init__(self, interrupt: KeyboardInterrupt, files_sentence: str) -> None:
@@ -61,26 +62,27 @@ class Interrupted(Exception):  # noqa: N818 - the user ends the run: no error
 
 
 class ShowProgress(Protocol):
-    """Function that shows the current activity, with counts if the work can be counted."""
+    """Function that shows the current activity of a run, and the count of finished items."""
 
-    def __call__(self, activity: str, done_count: int = 0, total_count: int | None = None) -> None:
-        """Show the activity."""
+    def __call__(
+        self, activity: str, done_count: int = 0, total_count: int | None = None
+    ) -> None: ...
 
 
 def show_nothing(activity: str, done_count: int = 0, total_count: int | None = None) -> None:
-    """Do nothing: no progress is shown."""
+    """Show no progress, in place of a function that shows the activity of a run."""
 
 
 @contextmanager
 def progress(output: Path | None = None) -> Iterator[ShowProgress]:
-    """Show a progress bar on the terminal with the current activity and the remaining time.
+    """Provide a function that shows progress: current activity, counts and remaining time (s).
 
-    Nothing is shown in a pipe, or if the output is written to standard output.
+    In a pipe, or if ``output`` is standard output, the function shows nothing.
     """
     from rich.console import Console
 
     console = Console(stderr=True)
-    # Older versions of rich print an empty line after a disabled bar
+    # no disabled progress bar: older versions of rich print an empty line after it
     if not console.is_terminal or output == STANDARD_OUTPUT:
         yield show_nothing
         return
@@ -107,12 +109,12 @@ def progress(output: Path | None = None) -> Iterator[ShowProgress]:
 
 
 def default_report(stem: str, settings: str, results: Results) -> Path:
-    """Return the path of a report without -o: log name and changed settings.
+    """Return the default path of a report, which consists of the log name and changed settings.
 
     Raises
     ------
     OutputError
-        A file of that name exists and is not a report of the same files and student.
+        A file with this path exists and is not a report on the same input files and student.
     """
     from px4fuse.results.reading import read_results
     from px4fuse.verification.pdf_input import attached_results
@@ -122,27 +124,26 @@ def default_report(stem: str, settings: str, results: Results) -> Path:
         short_stem = os.fsencode(name)[:KEPT_STEM_BYTES].decode(errors="ignore")
         name = f"{short_stem}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
     path = Path("reports", f"{name}.pdf")
-    kind = "a report of the same files and student by this version"
+    kind = "a report on the same input files and student by this version of px4fuse"
     _check_default(path, kind, partial(_is_same_report, results, attached_results))
     _check_default(path.with_suffix(".json"), kind, partial(_is_same_report, results, read_results))
     return path
 
 
 def check_default_page(path: Path, page: str) -> None:
-    """Check the default path of a web page.
+    """Check that a web page may be written to its default path.
 
     Raises
     ------
     OutputError
-        A file of that name exists and is not a page of the same command and log.
+        A file with this path exists and is not a web page of the same command and log.
     """
     generator = GENERATOR.findall(page)
-    kind = "a page of the same command and log by this version"
+    kind = "a web page of the same command and log by this version of px4fuse"
     _check_default(path, kind, lambda content: GENERATOR.findall(content.decode()) == generator)
 
 
 def _check_default(path: Path, kind: str, is_replaceable: Callable[[bytes], bool]) -> None:
-    """Raise an error if the file of a default path exists and its content is of another kind."""
     try:
         may_replace = not path.exists() or is_replaceable(path.read_bytes())
     except (OSError, UnicodeDecodeError, ResultsError):
@@ -157,27 +158,29 @@ def _check_default(path: Path, kind: str, is_replaceable: Callable[[bytes], bool
 def _is_same_report(
     results: Results, read: Callable[[bytes, str], Results], content: bytes
 ) -> bool:
-    """Return True if an existing report has the same input files, and no other student."""
+    """Return True if an existing report is on the same input files, and not of another student."""
     from px4fuse.results.contract import file_hashes_in, to_json
 
     existing = read(content, "report")
     same_files = file_hashes_in(to_json(existing)) == file_hashes_in(to_json(results))
-    return same_files and _person(existing) in (NO_PERSON, _person(results))
+    return same_files and _student_name_and_id(existing) in (
+        NO_STUDENT_NAME,
+        _student_name_and_id(results),
+    )
 
 
-def _person(results: Results) -> tuple[str, str]:
-    """Return name and id of the student on a report."""
+def _student_name_and_id(results: Results) -> tuple[str, str]:
     student = getattr(results, "student", None)
-    return NO_PERSON if student is None else (student.name, student.id)
+    return NO_STUDENT_NAME if student is None else (student.name, student.id)
 
 
 def web_page(output: Path | None, default: Path) -> Path:
-    """Return the path of a web page.
+    """Return the path of the web page to write: the value of -o, else the default path.
 
     Raises
     ------
     OutputError
-        The name does not end in .html or .htm; also errors of :func:`check_targets`.
+        The name does not end in .html or .htm, or the path is not possible.
     """
     target = output or default
     if target.suffix.lower() not in (".html", ".htm") and target != STANDARD_OUTPUT:
@@ -187,14 +190,15 @@ def web_page(output: Path | None, default: Path) -> Path:
 
 
 def report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
-    """Return the paths of a report and its results; without --json the results are beside it.
+    """Return the paths of a report (PDF) and its results (JSON), from the values of -o and --json.
 
-    Without -o the list does not contain the report, because its name is determined later.
+    Without --json the results are written beside the report. Without -o the list does not contain
+    the report, because its name is determined after the analysis.
 
     Raises
     ------
     OutputError
-        The name does not end in .pdf; also errors of :func:`check_targets`.
+        The name of the report does not end in .pdf, or a path is not possible.
     """
     if output is not None and output.suffix.lower() != ".pdf":
         raise OutputError(f"{output}: the output is a PDF. Give a name ending in .pdf (-o).")
@@ -221,7 +225,7 @@ def result_files(
     json_path, output : Path or None
         Values of --json and -o.
     analysis : object, optional
-        Analysis that the report shows; without it no report is written.
+        Analysis that the report shows; without an analysis no report is made.
     show_progress : callable
     """
     from px4fuse.results.contract import to_json
@@ -239,12 +243,12 @@ def result_files(
 
 
 def write_outputs(contents: Mapping[Path, bytes]) -> None:
-    """Write all outputs of a command and remember them for messages.
+    """Write all outputs of a command, and add them to the list of written files.
 
     Raises
     ------
     OutputError
-        A target cannot be written; also errors of :func:`check_targets`.
+        A path is not possible, or an output cannot be written.
     """
     check_targets(contents)
     written: list[Path] = click.get_current_context().meta.setdefault(WRITTEN_KEY, [])
@@ -252,13 +256,13 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
 
 
 def written_so_far(context: click.Context) -> str:
-    """List the files that this run has written, for the message if it ends early."""
+    """Format a sentence with the files that this run has written, for a run that ends early."""
     written: list[Path] = context.meta.get(WRITTEN_KEY, [])
     return f"{written_before(written)}." if written else "nothing was written."
 
 
 def write_new(path: Path, content: bytes) -> None:
-    """Write a file that does not exist yet, and print its name.
+    """Write a new file and print its name; an existing file is not overwritten.
 
     Raises
     ------
@@ -266,31 +270,31 @@ def write_new(path: Path, content: bytes) -> None:
         The file exists.
     """
     if path.exists():
-        raise OutputError(f"{path} exists and was not overwritten. Choose another name.")
+        raise OutputError(f"{path} exists and was not overwritten. Choose another file name.")
     write_and_print({path: content})
 
 
 def check_targets(targets: Iterable[Path | None]) -> None:
-    """Reject impossible output paths before the analysis begins.
+    """Check output paths before the analysis begins; None and standard output are ignored.
 
     Raises
     ------
     OutputError
-        Two targets are the same file, a target is a folder or an input of this command, or its
-        path is not possible.
+        Two outputs are the same file, an output is a folder or an input of this command, or a path
+        is not possible.
     """
     files = [target for target in targets if target not in (None, STANDARD_OUTPUT)]
     if len({file.resolve() for file in files}) < len(files):
-        raise OutputError("two outputs have the same file name. Give them different names.")
+        raise OutputError("two outputs have the same file name. Give different names.")
     for target in files:
         try:
             if stat.S_ISDIR(target.stat().st_mode):
                 raise OutputError(f"{target} is a folder. Give a file name.")
         except FileNotFoundError:
             continue
-        except OSError as error:  # The name is too long, or a parent is a file
+        except OSError as error:  # the file name is too long, or a parent folder is a file
             raise OutputError(
-                f"{target} cannot be written ({error.strerror}). Choose another place."
+                f"{target} cannot be written ({error.strerror}). Choose another path."
             ) from error
     check_outputs(files)
 
@@ -301,18 +305,18 @@ def write_and_print(
     request: Request | None = None,
     written: Iterable[Path] = (),
 ) -> None:
-    """Write all outputs, print the results and the file names, and open one file if requested.
+    """Write all outputs, print the results and the file names, and open one file for --open.
 
     Parameters
     ----------
     contents : mapping from Path to bytes
-        With standard output among the paths, nothing else is printed.
+        Outputs. If one of the paths is standard output, nothing else is printed.
     page : Page, optional
         Results to print.
     request : Request, optional
-        Files and options that complete the commands on the page, so that they can be pasted.
+        Request of the analysis, whose files and options complete the printed commands.
     written : iterable of Path
-        Files that the command has written already.
+        Files that the command has already written; their names are printed too.
     """
     from px4fuse.report.screen import print_line, show
 
@@ -324,25 +328,24 @@ def write_and_print(
             show(console, page.blocks, request)
         for path in files:
             print_line(console, "Wrote", to_one_line(str(path)), "bold")
-    openable = [
+    openable_files = [
         path for suffix in OPENABLE_SUFFIXES for path in files if path.suffix.lower() == suffix
     ]
-    if click.get_current_context().meta.get(OPEN_KEY) and openable:
-        click.launch(str(openable[0].resolve()))
+    if click.get_current_context().meta.get(OPEN_KEY) and openable_files:
+        click.launch(str(openable_files[0].resolve()))
 
 
 def show_page(page: Page) -> None:
-    """Print a page on the terminal."""
     from px4fuse.report.screen import show
 
     show(terminal(), page.blocks)
 
 
 def terminal() -> Console:
-    """Return a console on standard output; it raises BrokenPipeError if the reader has ended.
+    """Return a console on standard output, which raises BrokenPipeError if a pipe has no reader.
 
     Lines have the width of the terminal. In a pipe a paragraph is one line, unless the environment
-    variable COLUMNS gives the width.
+    variable COLUMNS contains a width (characters).
     """
     from rich.console import Console
 
@@ -354,6 +357,6 @@ def terminal() -> Console:
     columns_text = os.environ.get("COLUMNS", "")
     if not console.is_terminal and not (columns_text.isdecimal() and int(columns_text)):
         console.width = UNWRAPPED_WIDTH
-    elif console.width < 1:  # The environment variable COLUMNS is 0
+    elif console.width < 1:  # the environment variable COLUMNS is 0
         console.width = shutil.get_terminal_size().columns
     return console

@@ -1,4 +1,4 @@
-"""``px4fuse practice``: writes a quiz page with simulated flights and hidden mistakes."""
+"""Command ``px4fuse practice``: writes a quiz page with simulated flights and hidden mistakes."""
 
 import secrets
 import sys
@@ -15,26 +15,29 @@ from px4fuse.cli.outputs import OPEN_KEY, check_default_page, progress, web_page
     "--seed",
     type=click.IntRange(0, 2**32 - 1),
     metavar="N",
-    help="Random seed; the same number gives the same flights.  [default: random]",
+    help="Seed of the random numbers: the same N gives the same flights.  [default: random]",
 )
 @click.option(
     "--level",
     type=click.IntRange(1, 3),
     metavar="N",
     default=1,
-    help="Difficulty. 1: one large mistake; 2: one smaller mistake; 3: small mistakes, sometimes "
-    "two.",
+    help="Difficulty of the flights. 1: one large mistake; 2: one smaller mistake; 3: one or two "
+    "small mistakes.",
 )
 @click.option(
     "--flights",
     type=click.IntRange(1, 20),
     metavar="N",
     default=10,
-    help="Number of flights.",
+    help="Number of simulated flights on the page.",
 )
-@output_option("FILE.html", "Output file.  [default: reports/practice_SEED.html]")
+@output_option("FILE.html", "Web page to write.  [default: reports/practice_SEED.html]")
 @click.option(
-    "--open/--no-open", "opened", default=None, help="Open the page.  [default: on a terminal]"
+    "--open/--no-open",
+    "opened",
+    default=None,
+    help="Open the page in the browser.  [default: --open on a terminal]",
 )
 @click.pass_context
 def practice(
@@ -47,8 +50,8 @@ def practice(
 ) -> None:
     """Write a quiz page with simulated flights and hidden mistakes.
 
-    For each flight: inspect the plots, test a setting, choose the mistake, then see the solution.
-    For practice only: the page contains the solutions.
+    For each flight: inspect the plots, test a setting, choose the mistake, and compare with the
+    solution. Not for exams: the page contains the solutions.
     """
     seed = secrets.randbelow(10**6) if seed is None else seed
     target = web_page(output, Path("reports", f"practice_{seed}.html"))

@@ -1,4 +1,4 @@
-"""``px4fuse sample``: writes the sample logs."""
+"""Command ``px4fuse sample``: writes the sample logs."""
 
 from pathlib import Path
 
@@ -34,14 +34,14 @@ def sample_log() -> Path:
         except ModuleNotFoundError:
             raise MissingDataError(
                 "No log was given, and the sample logs are not installed.",
-                f"Give a LOG, or run {INSTALL}.",
+                f"Give the path of a log, or run {INSTALL}.",
             ) from None
     click.echo(f"No log was given: the sample log {SAMPLE} is used.", err=True)
     return sample_path
 
 
 @click.command()
-@output_option("DIR", "Output folder.", default=FOLDER)
+@output_option("DIR", "Folder to write the sample logs to.", default=FOLDER)
 def sample(output: Path) -> None:
     """Write the sample logs (aisle with UWB, loop with VIO) to a folder."""
     from importlib.resources import files

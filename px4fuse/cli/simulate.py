@@ -1,4 +1,4 @@
-"""``px4fuse simulate``: flights with known ground truth and chosen mistakes."""
+"""Command ``px4fuse simulate``: simulates flights with ground truth and chosen mistakes."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import click
 
 from px4fuse.cli.options import (
     Choice,
-    InputPath,
     NonEmptyPath,
     TypedQuantity,
+    input_option,
     output_option,
     typed_parameters,
 )
@@ -41,7 +41,7 @@ _DEFAULT = Scenario()
 MIXED = "mixed"
 OUTDOOR: Kind = "outdoor"
 SOURCES = {"aisle": "UWB", "loop": "VIO", OUTDOOR: "GNSS"}
-# Parameters that require --assignment, and all parameters that are allowed with it
+# Options that require --assignment, and all options that are allowed together with it
 ASSIGNMENT_ONLY_OPTIONS = ("secret_file", "mistakes", "preview")
 ASSIGNMENT_OPTIONS = (
     "output",
@@ -56,7 +56,7 @@ Command = TypeVar("Command", bound=Callable[..., None])
 
 
 def _scenario_options(command: Command) -> Command:
-    """Add an option for each number of the scenario; its field has the default and the help."""
+    """Add an option for each number of a scenario; the field defines default and help."""
     for field, quantity in reversed(quantities(Scenario).items()):
         if not quantity.meaning:
             continue
@@ -69,11 +69,10 @@ def _scenario_options(command: Command) -> Command:
 
 
 class WithMistakes(click.Command):
-    """Command whose help ends with the table of mistakes."""
+    """Command of click whose help ends with the table of mistakes."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Add the table of mistakes to the help."""
-        with formatter.section("Mistakes [value without =VALUE]"):
+        with formatter.section("Mistakes for --mistake [default VALUE]"):
             formatter.write_dl(
                 [
                     (
@@ -87,73 +86,74 @@ class WithMistakes(click.Command):
 
 @click.command(cls=WithMistakes)
 @output_option(
-    "FLIGHT.ulg|DIR", "Output log, or with --assignment the folder for the class.", required=True
+    "FLIGHT.ulg|DIR",
+    "Log to write (ULog); with --assignment, the folder for the logs of the class.",
+    required=True,
 )
-@click.option(
+@input_option(
     "--assignment",
-    type=InputPath(),
-    metavar="ROSTER.csv",
-    help="Class list (student id, name): write one flight per student, with individual noises and "
+    "ROSTER.csv",
+    "Class list (student id, name): writes one flight per student, with individual noises and "
     "mistakes, and the answer key beside the folder.",
 )
-@click.option(
+@input_option(
     "--secret-file",
-    type=InputPath(),
-    metavar="FILE",
-    help="File with the secret for --assignment; the same secret and id give the same flight.  "
-    "[default: generated, and stored in the answer key]",
+    "FILE",
+    "File with the secret for --assignment; the same secret and student id give the same "
+    "flight.  [default: generated, and stored in the answer key]",
 )
 @click.option(
     "--mistakes",
     type=int,
     metavar="N",
-    help="Number of mistakes in each assigned flight.  [default: random, 0 to 2]",
+    help="Number of mistakes in each flight of --assignment.  [default: random, 0 to 2]",
 )
 @click.option(
     "--preview",
     is_flag=True,
-    help="Print the flights that --assignment would draw; write no files.",
+    help="Print the flights that --assignment draws, and write no files.",
 )
 @click.option(
     "--kind",
     type=Choice((*get_args(Kind), MIXED)),
     default=_DEFAULT.kind,
-    help="aisle: passes along an aisle with UWB. loop: laps of a square with drifting VIO. "
-    "outdoor: laps with GNSS. mixed (--assignment only): one third loops, the rest aisles.",
+    help="Kind of flight. aisle: passes along an aisle with UWB; loop: laps of a square with "
+    "drifting VIO; outdoor: laps of a square with GNSS; mixed: with --assignment, loop for one "
+    "third of the students and aisle for the others.",
 )
 @click.option(
     "--seed",
     type=int,
     metavar="N",
     default=_DEFAULT.seed,
-    help="Random seed; the same number gives the same flight.",
+    help="Seed of the random numbers: the same N gives the same flight.",
 )
 @click.option(
     "--mistake",
     metavar="NAME[=VALUE]",
     multiple=True,
-    help="Mistake to simulate (listed below); repeatable.",
+    help="Mistake to simulate, from the table below; repeatable.  [default: no mistake]",
 )
 @click.option(
     "--answer",
     type=NonEmptyPath(),
     metavar="FILE.json",
-    help="Write the solution: mistakes, biases, outliers, clock offset. Not for students.  "
-    "[default with --assignment: DIR_answers.json]",
+    help="Answer key to write: mistakes, biases, outliers and clock offset of the flight; not for "
+    "students.  [default with --assignment: DIR_answers.json]",
 )
-@click.option("--no-truth", is_flag=True, help="Do not log ground truth.")
-@click.option("--no-ekf2", is_flag=True, help="Do not simulate EKF2 (faster).")
+@click.option("--no-truth", is_flag=True, help="Write no ground truth to the log.")
+@click.option("--no-ekf2", is_flag=True, help="Do not simulate EKF2, which is faster.")
 @click.option(
     "--passes",
     type=int,
     metavar="N",
-    help="Number of passes [6], or of laps of the square [1; outdoors 3].",
+    help="Number of passes along the aisle [6], or of laps of the square [1; outdoors 3].",
 )
 @click.option(
     "--yaw",
     type=Choice(get_args(Yaw)),
-    help="Heading of the vehicle: fixed, or along the flight direction.  [default: fixed; follow "
-    "on a square]",
+    help="Heading of the vehicle: fixed, or follow (along the flight direction).  [default: fixed; "
+    "follow on a square]",
 )
 @_scenario_options
 def simulate(
@@ -176,8 +176,8 @@ def simulate(
     """Simulate a flight with known ground truth and chosen mistakes.
 
     Writes a PX4 ULog for exercises and exams, with ground truth unless --no-truth. The log states
-    that it is simulated, but not which mistakes it contains. EKF2 in it is px4fuse's model, not
-    PX4's code.
+    that it is simulated, but not which mistakes it contains. The EKF2 data in the log are from
+    px4fuse's model of EKF2, not from PX4's code.
 
     For example, px4fuse simulate -o s07.ulg --seed 7 --mistake nlos=5% --answer s07.json
 
@@ -218,7 +218,7 @@ def simulate(
 
 
 def _check_options(assignment: Path | None) -> None:
-    """Reject options that cannot be combined with or without --assignment."""
+    """Reject options that are not possible with --assignment, or require it."""
     if assignment is not None and click.get_current_context().params["kind"] == OUTDOOR:
         raise SettingsError(
             f"--kind {OUTDOOR} is not available with --assignment.",
@@ -227,9 +227,9 @@ def _check_options(assignment: Path | None) -> None:
     for parameter in typed_parameters():
         if assignment is not None and parameter.name not in ASSIGNMENT_OPTIONS:
             raise SettingsError(
-                f"{parameter.opts[0]} is not available with --assignment, which draws it at random "
-                "for each student",
-                "Omit it.",
+                f"{parameter.opts[0]} is not available with --assignment, which draws its value at "
+                "random for each student",
+                f"Omit {parameter.opts[0]}.",
             )
         if assignment is None and parameter.name in ASSIGNMENT_ONLY_OPTIONS:
             raise SettingsError(f"{parameter.opts[0]} requires --assignment ROSTER.csv.")
@@ -242,7 +242,11 @@ def _read_secret(file: Path | None) -> bytes | None:
         return None
     name = f"--secret-file {file}"
     text = read_text(
-        file, SettingsError, MAX_SECRET_BYTES, name=name, size_remedy="Give a line of text"
+        file,
+        SettingsError,
+        MAX_SECRET_BYTES,
+        name=name,
+        size_remedy="Give a file with one line of text",
     )
     return encode_secret(text, name)
 
@@ -258,7 +262,7 @@ def _write_assignment(
     truth: bool,
     preview: bool,
 ) -> None:
-    """Write one flight per student and the answer key, or only print what would be drawn."""
+    """Write one flight per student and the answer key; with ``preview``, only print the flights."""
     from px4fuse.assignment import assignment
     from px4fuse.assignment.random_assignment import EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
     from px4fuse.assignment.roster import read_roster
@@ -284,7 +288,7 @@ def _write_assignment(
         ]
         page.table(("student", "name", "flight", "mistakes", "difficulty"), rows, right=(4,))
         closing_texts["Preview"] = (
-            "nothing was written. Not for students: the table lists the mistakes of each flight."
+            "no file was written. Not for students: the table lists the mistakes of each flight."
         )
     else:
         with progress() as show_progress:
@@ -296,15 +300,15 @@ def _write_assignment(
         folder_text, key_text = (to_one_line(str(path)) for path in (folder, key_file))
         existing_count = len(drawn_flights) - written
         closing_texts["Flights"] = (
-            f"{folder_text} ({written} written, {existing_count} existed already)"
+            f"{folder_text} ({written} logs written, {existing_count} existed already)"
         )
         closing_texts["Answers"] = (
             f"{key_text} (not for students: it lists the mistakes of each flight)"
         )
         if key.secret:
             closing_texts["Secret"] = (
-                "generated, and stored in the answers. With that file the same flights can be "
-                "written again, and students can be added later."
+                "generated, and stored in the answer key. With --secret-file, the same flights can "
+                "be written again and students can be added later."
             )
     counts = Counter(
         mistake.partition("=")[0] for typed, _ in drawn_flights for mistake in typed or ("none",)
@@ -315,8 +319,8 @@ def _write_assignment(
             "Class": f"{len(drawn_flights)} student{'s' * (len(drawn_flights) != 1)}, {kind}",
             "Mistakes": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
             "Difficulty": f"{min(difficulties):.2f} to {max(difficulties):.2f}, drawn between "
-            f"{EASIEST_DIFFICULTY:g} and {HARDEST_DIFFICULTY:g}: size that px4fuse detects in 19 "
-            "of 20 flights, divided by the drawn size, for the most difficult mistake",
+            f"{EASIEST_DIFFICULTY:g} and {HARDEST_DIFFICULTY:g}: value of the most difficult "
+            "mistake that px4fuse detects in 19 of 20 flights, divided by the value in the flight",
             **closing_texts,
         }
     )
@@ -324,7 +328,6 @@ def _write_assignment(
 
 
 def _page(simulation: Simulation, answer: Path | None) -> Page:
-    """Describe the simulated flight for the terminal."""
     from px4fuse.report.page import Page
 
     scenario, page = simulation.scenario, Page()
@@ -348,8 +351,8 @@ def _page(simulation: Simulation, answer: Path | None) -> Page:
     ]
     page.write_labelled("Mistakes", *(mistake_texts or ["none"]))
     page.write_labelled("Truth", "logged" if scenario.truth else "not logged")
-    none = "not simulated and not in the log"
-    page.write_labelled("EKF2", "px4fuse's model of EKF2" if scenario.ekf2 else none)
+    ekf2_text = "px4fuse's model of EKF2" if scenario.ekf2 else "not simulated and not in the log"
+    page.write_labelled("EKF2", ekf2_text)
     if answer is not None:
         page.write_labelled("Answer", f"{to_one_line(str(answer))} (not for students)")
     return page

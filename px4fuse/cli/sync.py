@@ -1,4 +1,4 @@
-"""``px4fuse sync``: time offset between position source and IMU."""
+"""Command ``px4fuse sync``: estimates the time offset between position source and IMU."""
 
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,8 @@ from px4fuse.cli.outputs import check_targets, progress, result_files, write_and
 def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
     """Estimate the time offset between position source and IMU.
 
-    Estimates the seconds to add to the timestamps of the position source, with a 95 % interval,
-    from IMU and positions alone (EKF2's attitude is not used). LOG is a PX4 ULog or a MAVLink
+    Estimates the time (s) to add to the timestamps of the position source, with a 95 % interval,
+    from the IMU and the positions (EKF2's attitude is not used). LOG is a PX4 ULog or a MAVLink
     recording.
     """
     from px4fuse.analysis import prepare_comparison

@@ -1,4 +1,4 @@
-"""``px4fuse tune``: maximum-likelihood estimates of SIGMA_A and SIGMA_Z."""
+"""Command ``px4fuse tune``: estimates SIGMA_A and SIGMA_Z by maximum likelihood."""
 
 from __future__ import annotations
 
@@ -25,9 +25,10 @@ TUNING_HEAD = (
     "lag 1\nbefore after",
 )
 TUNING_NOTE = (
-    "gain: increase of the log-likelihood per measurement over the chosen settings. held out: gain "
-    "on the second half of the data with noises estimated on the first half. lag 1: "
-    "autocorrelation of the innovations."
+    "gain: increase of the log-likelihood per measurement (nats) from the chosen settings to the "
+    "estimates. held out: gain on the second half of the data with noises estimated on the first "
+    "half. lag 1: autocorrelation of the innovations at lag 1, with the chosen settings and with "
+    "the estimates."
 )
 
 
@@ -38,8 +39,8 @@ TUNING_NOTE = (
 def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
     """Estimate SIGMA_A and SIGMA_Z by maximum likelihood.
 
-    Prints the maximum-likelihood estimates with 95 % intervals, and compares them with --sigma-a
-    and --sigma-z. LOG is a PX4 ULog or a MAVLink recording.
+    Prints the estimates for each axis with 95 % intervals, and compares them with --sigma-a and
+    --sigma-z. LOG is a PX4 ULog or a MAVLink recording.
     """
     from px4fuse.analysis import prepare_comparison
     from px4fuse.comparison.estimates import tuned as tuned_noises
@@ -64,7 +65,7 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
 
 
 def format_noise_estimate(noise: Noise) -> str:
-    """Format a noise estimate and its 95 % interval, without the unit."""
+    """Format a maximum-likelihood noise and its 95 % interval, without the unit."""
     if noise.value is None:
         bounds = (("at most", noise.high), ("at least", noise.low))
         texts = (f"{prefix} {bound:.2g}" for prefix, bound in bounds if bound is not None)

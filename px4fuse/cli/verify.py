@@ -1,4 +1,4 @@
-"""``px4fuse verify``: repeats the analysis of a report and compares all numbers and pages."""
+"""Command ``px4fuse verify``: repeats the analysis of a report, compares numbers and pages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from px4fuse.verification.model import Verdict
 
 SCHEMA = {"name": "px4fuse-verification", "version": "3.0"}
-# The analysis of a flight of 10 minutes takes about 60 s
+# Maximum time (s) to repeat an analysis; a flight of 10 minutes takes about 60 s
 TIMEOUT_S = 1800.0
 
 
@@ -29,7 +29,7 @@ TIMEOUT_S = 1800.0
 @click.argument("report", type=InputPath(), metavar="REPORT.pdf")
 @click.argument("logs", type=InputPath(), nargs=-1, metavar="[LOG ...]")
 @max_size_option
-@output_option("FILE.pdf", "Write the report again, from the log.")
+@output_option("FILE.pdf", "Report to write again from the log (PDF).  [default: no report]")
 @json_option
 @open_option
 def verify(
@@ -37,25 +37,27 @@ def verify(
 ) -> None:
     """Verify that the numbers of REPORT.pdf follow from its log.
 
-    LOG is the flight log with all files used besides it, or folders with them; px4fuse finds them
-    by SHA-256. Repeats the analysis with the recorded settings and lists numbers and pages that
-    differ; -o writes the report again from the log. Verifies the numbers, not the author. Without
-    LOG nothing is verified.
+    LOG is the flight log and all other input files of the report, or folders with these files;
+    px4fuse finds them by SHA-256. Repeats the analysis with the settings in the report, and lists
+    numbers and pages that differ. Verifies the numbers, not the author. Without LOG nothing is
+    verified.
 
-    Exit code 0: verified; 1: differences, other log or not verifiable; 2: invalid input.
+    Exit code 0: verified; 1: differences, another log, or not verifiable; 2: invalid input.
     """
     from px4fuse.verification.pdf_input import MAX_BYTES, read_report
     from px4fuse.verification.verification import verify as verify_report
     from px4fuse.workers import JobFailure, run_one_bounded
 
-    content = read_bytes_limited(report, LogError, MAX_BYTES, size_remedy="Reports are below 2 MB")
+    content = read_bytes_limited(
+        report, LogError, MAX_BYTES, size_remedy="Give a report, which has less than 2 MB"
+    )
     recorded = read_report(content, display_name(report))
     with progress(json_path) as show_progress:
-        show_progress("hashing the logs")
+        show_progress("computing the SHA-256 of the logs")
         files = files_by_sha256(logs)
         check_targets([json_path, output])
         if logs and not files:
-            raise LogError("LOG contains no files. Give the flight log or its folder.")
+            raise LogError("The folders LOG contain no files. Give the flight log or its folder.")
         show_progress("repeating the analysis")
         verdict = run_one_bounded(
             partial(verify_report, pdf=content, logs=files), recorded, TIMEOUT_S
@@ -101,7 +103,7 @@ def _page(name: str, verdict: Verdict, output: Path | None) -> Page:
     for sentence in sentences:
         page.write(sentence, indent=12.0)
     if output is not None and not verdict.redrawn:
-        page.write("No report was written (-o), because the analysis was not repeated.")
+        page.write("The report of -o was not written, because the analysis was not repeated.")
     elif output is None and verdict.pages:
         page.write(
             "Action: write the report again from the log with -o FILE.pdf, and read that report."

@@ -1,4 +1,4 @@
-"""``px4fuse whatif``: replays EKF2 with changed parameters."""
+"""Command ``px4fuse whatif``: replays EKF2 with changed parameters."""
 
 from __future__ import annotations
 
@@ -22,27 +22,29 @@ if TYPE_CHECKING:
     "changes",
     metavar="NAME=VALUE",
     multiple=True,
-    help="Parameter to change, in PX4's unit; repeatable.  [default: the maximum-likelihood noise "
-    "and delay]",
+    help="EKF2 parameter and its value in the replay, in PX4's unit; repeatable.  [default: the "
+    "maximum-likelihood noise and delay of the position source]",
 )
 @click.option(
     "--sweep",
     metavar="NAME=LOW:HIGH[:COUNT]",
-    help="Replay with COUNT values of one parameter, from LOW to HIGH.  [default COUNT: 9]",
+    help="Replay EKF2 with COUNT values of one parameter, from LOW to HIGH in PX4's unit.  "
+    "[default COUNT: 9]",
 )
 @click.option(
     "--without",
     metavar="AID",
     multiple=True,
-    help="Aid that EKF2 no longer fuses, for example gnss_pos, gnss_vel, baro_hgt, mag or ev_pos; "
-    "repeatable.",
+    help="Aiding source that EKF2 does not fuse in the replay, for example gnss_pos, gnss_vel, "
+    "baro_hgt, mag or ev_pos; repeatable.",
 )
 @click.option(
     "--from",
     "start_s",
     type=options.TypedQuantity("s", 60.0),
     metavar="SECONDS",
-    help="Time from which EKF2 does not fuse the aids of --without.  [default: from the start]",
+    help="Time after the first data (s) from which EKF2 does not fuse the aiding sources of "
+    "--without.  [default: 0]",
 )
 @options.recording_options
 @options.max_size_option
@@ -58,11 +60,12 @@ def whatif(
 ) -> None:
     """Replay EKF2 with changed parameters.
 
-    Replays EKF2 from LOG as flown and with the changes, side by side. Uses px4fuse's model of EKF2
-    and reports results only if the model reproduces the logged innovations. For example,
-    px4fuse whatif log.ulg --set EKF2_EVP_NOISE=0.1. Without --set, --sweep and --without, uses the
-    maximum-likelihood noise and delay (see tune and sync). --without gnss_pos --from 60 removes
-    GNSS positions from 60 s on.
+    Replays EKF2 from LOG with the parameters as flown and with changed ones, and compares the
+    results. Uses px4fuse's model of EKF2, and prints results only if the model reproduces the
+    logged innovations. For example, px4fuse whatif log.ulg --set EKF2_EVP_NOISE=0.1. Without
+    --set, --sweep and --without, the changes are the maximum-likelihood noise and delay (see
+    px4fuse tune and px4fuse sync). --without gnss_pos --from 60 omits the GNSS positions from 60 s
+    on.
     """
     from px4fuse.analysis import run_what_if
     from px4fuse.report.whatif import summary
@@ -94,7 +97,7 @@ def _parse_changes(texts: tuple[str, ...]) -> dict[str, float]:
                 f"--set {text} is not NAME=VALUE. Give for example --set EKF2_EVP_NOISE=0.1."
             )
         if name in changes:
-            raise SettingsError(f"--set {name} is given twice. Give it once.")
+            raise SettingsError(f"--set {name} is given twice. Give each parameter once.")
         changes[name] = _parse_number(f"--set {text}", name, value)
     return changes
 

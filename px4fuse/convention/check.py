@@ -129,11 +129,6 @@ def _decide(found: list[Hypothesis], positions: Positions, drift: float) -> Conv
     if not positions.position_m[:, 2].any():  # without height, up and down are equivalent
         rivals = [one for one in rivals if one.axes[:2] != best.axes[:2]]
     log_odds = best.score - rivals[0].score if rivals else None
-    rotations_deg = [
-        -float(np.degrees(one.remainder_rad)) * one.has_rotation
-        for one in found
-        if one.score > best.score - MIN_LOG_ODDS and one.has_meaning_of(best)
-    ]
     noise_m = UNITS[best.unit] * white_noise(positions.position_m)
     explained_m = np.hypot(np.sqrt(SECOND_DIFFERENCE) * noise_m, IMU_ERROR_M)
     verdict: Verdict = "determined"
@@ -147,15 +142,13 @@ def _decide(found: list[Hypothesis], positions: Positions, drift: float) -> Conv
         verdict = "doubtful"
     elif log_odds is not None and log_odds < MIN_LOG_ODDS:
         verdict = "ambiguous"
-    is_wide = np.ptp(rotations_deg) > np.degrees(SMALL_ROTATION)
     names: dict[str, Any] = dict(zip("xyz", best.axes, strict=True))
     names |= {"unit": best.unit, "heading_from": best.heading_from}
     return Convention(
         verdict=verdict,
         **names,
         is_mirrored=best.family.is_mirrored,
-        rotation_deg=rotations_deg[0],
-        rotations_deg=(min(rotations_deg), max(rotations_deg)) if is_wide else None,
+        rotation_deg=-float(np.degrees(best.remainder_rad)) * best.has_rotation,
         late_s=best.offset_s,
         clock_drift=drift,
         scale=best.scale,

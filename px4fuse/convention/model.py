@@ -24,9 +24,8 @@ class OrientationConvention(Record, frozen=True, kw_only=True):
     heading_error_deg : float or None
         Heading of the orientation relative to the positions, clockwise from above; None if it
         cannot be determined.
-    tilt_difference_deg, heading_difference_deg : float
-        Median differences from the attitude of the gyroscopes, after the conversion and without
-        the mean heading.
+    tilt_difference_deg : float
+        Median difference from the attitude of the gyroscopes, after the conversion.
     """
 
     verdict: Literal["determined", "ambiguous", "copied", "unrelated"]
@@ -34,7 +33,6 @@ class OrientationConvention(Record, frozen=True, kw_only=True):
     frames: Frames = "FRD to NED"
     heading_error_deg: float | None = None
     tilt_difference_deg: NotNegative = 0.0
-    heading_difference_deg: NotNegative = 0.0
 
 
 class Convention(Record, frozen=True, kw_only=True):
@@ -51,8 +49,6 @@ class Convention(Record, frozen=True, kw_only=True):
         True for a left-handed frame.
     rotation_deg : float
         Rotation of the positions beyond these axes: clockwise from above, 0 if not significant.
-    rotations_deg : (float, float) or None
-        Range of ``rotation_deg`` that fits about as well; None if narrow.
     heading_from : {"EKF2", "gyroscopes"}
         Heading that fits the positions: as logged, or integrated from the start of the log.
     late_s : float
@@ -77,7 +73,6 @@ class Convention(Record, frozen=True, kw_only=True):
     unit: Literal["m", "cm", "mm", "feet"] = "m"
     is_mirrored: bool = False
     rotation_deg: float = 0.0
-    rotations_deg: tuple[float, float] | None = None
     heading_from: Literal["EKF2", "gyroscopes"] = "EKF2"
     late_s: float = 0.0
     clock_drift: float = 0.0

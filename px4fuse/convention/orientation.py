@@ -105,7 +105,6 @@ def check_orientation(
         order=best.order,  # type: ignore[arg-type]
         frames=cast(Frames, best.frames),
         tilt_difference_deg=best.tilt_deg,
-        heading_difference_deg=best.heading_deg,
     )
     return convention, time, best.attitude
 

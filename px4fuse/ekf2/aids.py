@@ -1,4 +1,4 @@
-"""Consistency of each EKF2 aid (measurement source), tested with its logged innovations.
+"""Consistency of each aiding source of EKF2, tested with the logged innovations.
 
 Definitions: :mod:`px4fuse.filter.consistency`. Logged fields: PX4's ``EKF/aid_sources`` and
 ``EKF/ekf_helper.cpp``, v1.13 to main.
@@ -26,48 +26,53 @@ AidVerdict = Literal[
     "disabled",
     "too few samples",
 ]
-# Minimum |mean ν| / RMS ν and minimum |mean ν| / √S of a biased aid: above both, the mean does not
-# average out, and EKF2 follows the bias
-MIN_BIAS_SHARE, MIN_BIAS_IN_SIGMA = 0.5, 0.2
-# Detection of a change of mean ν/√S in flight: window length (s), minimum number of samples per
-# window, minimum number of windows before the change, minimum change (√S), and minimum ratio of the
-# change to the scatter of the earlier window means
-WINDOW_S, MIN_WINDOW_SAMPLES, MIN_WINDOWS_BEFORE, MIN_CHANGE_IN_SIGMA, MIN_CHANGE_SCATTER_RATIO = (
-    10.0,
-    5,
-    2,
-    0.5,
-    6.0,
-)
-# Maximum time (s) without a fused sample of an enabled aid, in a log with frequent samples. EKF2
-# resets to an aid after 7 s (reset_timeout_max); the default logging profile records at least 2 Hz
+# Minimum |mean innovation| / RMS innovation of a biased aiding source: EKF2 then follows the bias
+MIN_BIAS_SHARE = 0.5
+# Minimum |mean innovation| / √S of a biased aiding source
+MIN_BIAS_IN_SIGMA = 0.2
+# Length (s) of the windows in which the normalised innovations ν/√S are averaged, to detect a
+# change of their mean in flight
+WINDOW_S = 10.0
+# Minimum number of innovations for the mean of a window
+MIN_WINDOW_SAMPLES = 5
+# Minimum number of windows before a change of the mean normalised innovation
+MIN_WINDOWS_BEFORE = 2
+# Minimum change (√S) of the mean normalised innovation
+MIN_CHANGE_IN_SIGMA = 0.5
+# Minimum ratio of a change of the mean to the scatter of the means of the earlier windows
+MIN_CHANGE_SCATTER_RATIO = 6.0
+# Maximum time (s) without a fused sample of an enabled aiding source. EKF2 resets its state to the
+# source after 7 s (reset_timeout_max)
 NOT_FUSED_LIMIT_S = 5.0
-NOT_FUSED_INTERVALS = 10.0  # the same maximum in median intervals between logged fused samples
-# Maximum relative difference between √R and a noise parameter that count as equal
+# Maximum time without a fused sample in median intervals between logged samples, for topics that
+# are logged at a reduced rate
+NOT_FUSED_INTERVALS = 10.0
+# Maximum relative difference between √R and a noise parameter from which R is derived
 NOISE_TOLERANCE = 0.02
-# Minimum height (m) above ground at which aids are evaluated; half of the maximum height in a low
-# flight. Near the ground rotor downwash disturbs the barometer, and the land detector may be wrong
+# Minimum height (m) above ground at which innovations are evaluated, or half of the maximum height
+# of a low flight: rotor downwash disturbs the barometer, and PX4's land detector may fail
 MIN_HEIGHT_M = 2.0
 
 
 class AidAxis(Record, frozen=True, kw_only=True):
-    """Innovation statistics of one aid along one axis, in the unit of the aid.
+    """Innovation statistics of one aiding source along one axis, in the unit of its measurements.
 
     Attributes
     ----------
     samples : int
-        Number of samples that EKF2 fused or rejected while the aid was enabled.
+        Number of samples that EKF2 fused or rejected while the aiding source was enabled.
     innovation_mean, innovation_std : float
     s_sqrt_median : float
         Median of √S.
     nis_mean, nis_band, sigma_ratio
         See :class:`~px4fuse.filter.consistency.NisVerdict`.
     rejected_fraction : float
-        Share of samples outside the gate along this axis.
+        Fraction of samples outside the gate along this axis.
     lag1_autocorrelation, ljung_box_p, bias_p : float
         See :class:`~px4fuse.filter.consistency.Consistency`.
     change : (float, float) or None
-        Time (s) and size (√S) of the largest significant change of mean ν/√S in flight.
+        Time (s) and amount (√S) of the largest significant change in flight of the mean normalised
+        innovation ν/√S.
     """
 
     samples: Count
@@ -85,30 +90,30 @@ class AidAxis(Record, frozen=True, kw_only=True):
 
     @property
     def mean_normalised_innovation(self) -> float:
-        """Mean innovation divided by the median √S, with sign."""
+        """Mean innovation divided by the median √S."""
         return self.innovation_mean / self.s_sqrt_median
 
 
 class AidResult(Record, frozen=True, kw_only=True):
-    """Fusion and consistency of one aid in flight.
+    """Fusion and consistency of one aiding source of EKF2 in flight.
 
     Attributes
     ----------
     label, unit, topic : str
     enabled_fraction : float or None
-        Share of the flight in which EKF2 enabled the aid; None if not logged.
+        Fraction of the flight time in which EKF2 enabled the aiding source; None if not logged.
     fused_fraction : float
-        Share of fused samples, of all samples received while the aid was enabled.
+        Fraction of the samples that EKF2 fused, while the aiding source was enabled.
     fused_logged : bool
         True if the log contains EKF2's decision (fused or not) on each sample; False if px4fuse
         applies the gate instead.
     rejected_fraction : float
-        Share of samples rejected along any axis, of all samples received while the aid was enabled.
+        Fraction of the samples that EKF2 rejected along any axis, while the source was enabled.
     longest_gap_s : (float, float)
-        Start and end of the longest time without a fused sample. Only times that began while the
-        aid was enabled count.
+        Start and end of the longest time without a fused sample, among the times that began while
+        the aiding source was enabled.
     resets : int
-        Number of resets of EKF2 to the aid; the samples of resets are excluded.
+        Number of resets of EKF2's state to the aiding source; samples of resets are excluded.
     gate : float
         Innovation gate in √S.
     noise : float or None
@@ -137,53 +142,57 @@ class AidResult(Record, frozen=True, kw_only=True):
 
     @property
     def longest_gap_duration_s(self) -> float:
-        """Longest time without a fused sample (s)."""
+        """Duration (s) of the longest time without a fused sample."""
         return self.longest_gap_s[1] - self.longest_gap_s[0]
 
     @property
     def is_faulty(self) -> bool:
-        """Return True if the aid is biased, overconfident, or enabled but not fused.
+        """True if the aiding source is biased, overconfident, or enabled but not fused.
 
-        An underconfident aid is not a fault: PX4's default settings are underconfident.
+        An underconfident source is not a fault: PX4's default settings are underconfident.
         """
         return self.verdict in ("not_fused", "biased", "overconfident")
 
     @property
     def nis_mean(self) -> float:
-        """Mean NIS over all axes; NaN without axes."""
+        """Mean NIS over all axes; NaN with too few samples."""
         return _mean_nis(self.axes)
 
 
-def flight_span(flight: Flight) -> tuple[float, float] | Unavailable:
+def flight_span(flight: Flight) -> Span | Unavailable:
     """Return start and end of the flight (s), without take-off and landing close to the ground."""
     if isinstance(flight.airborne, Unavailable):
         return 0.0, flight.log.duration_s
     if not flight.airborne:
-        return Unavailable("aids of EKF2", "the vehicle never took off", "Record a flight.")
-    start, end = flight.airborne[0][0], flight.airborne[-1][1]
+        return Unavailable("EKF2 aids", "the vehicle never took off", "Record a flight.")
+    start = flight.airborne[0][0]
+    end = flight.airborne[-1][1]
     if isinstance(flight.ekf2, Ekf2):
         down = flight.ekf2.state["down_m"].loc[start:end]
         height = (down.iloc[0] if len(down) else 0.0) - down
         high = height.index[height > min(MIN_HEIGHT_M, height.max() / 2.0)]
         if len(high):
-            start, end = float(high[0]), float(high[-1])
+            start = float(high[0])
+            end = float(high[-1])
     return start, end
 
 
 def evaluate_aids(flight: Flight) -> dict[str, AidResult] | Unavailable:
-    """Evaluate all logged aids of EKF2 in flight.
+    """Evaluate all logged aiding sources of EKF2 in flight.
 
     Returns
     -------
-    mapping from PX4's name to AidResult, in the order of :data:`~px4fuse.ekf2_parameters.AIDS`;
-    or Unavailable without EKF2, without innovations, or without a flight.
+    mapping from PX4's name of the aiding source to AidResult, or Unavailable
+        In the order of :data:`~px4fuse.ekf2_parameters.AIDS`. Unavailable without EKF2, without
+        innovations, or without a flight.
     """
     if isinstance(flight.ekf2, Unavailable):
         return flight.ekf2
     if not flight.ekf2.aids:
         return Unavailable(
             "EKF2 aids",
-            "no estimator_aid_src topic, estimator_innovations or ekf2_innovations in flight",
+            "the log contains no EKF2 innovations in flight (estimator_aid_src topics, "
+            "estimator_innovations or ekf2_innovations)",
             "Record a ULog with SDLOG_PROFILE bit 0 (default).",
         )
     span = flight_span(flight)
@@ -208,23 +217,24 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
     if log.enabled is not None:
         enabled = np.asarray(step_values_at(log.enabled, samples.index) > 0.0)
         grid = pd.Index(np.arange(start_s, end_s, 0.1))
-        enabled_fraction = (
-            float(np.mean(step_values_at(log.enabled, grid) > 0.0)) if len(grid) else 0.0
-        )
+        is_enabled = np.asarray(step_values_at(log.enabled, grid) > 0.0)
+        enabled_fraction = _fraction(is_enabled, np.ones(len(grid), bool))
     fused_logged = "fused" in samples
     fused: BoolArray
     rejected: BoolArray
     if fused_logged:
         fused, rejected = (samples[flag].to_numpy() > 0.0 for flag in ("fused", "rejected"))
         noise = samples[[f"noise_{axis}" for axis in log.axes]].to_numpy()
-        # for a sample to which EKF2 resets its state, it logs innovation 0 and S = R
+        # EKF2 logs innovation 0 and S = R for a sample to which it resets its state
         is_reset = ((innovation == 0.0) & np.isclose(variance, noise)).all(axis=1)
         noise_median = float(np.median(np.sqrt(noise[fused, 0]))) if fused.any() else None
     else:
         rejected = np.max(innovation**2 / variance, axis=1, initial=0.0) > gate**2
-        fused, is_reset, noise_median = ~rejected, np.zeros(len(samples), bool), None
+        fused = ~rejected
+        is_reset = np.zeros(len(samples), bool)
+        noise_median = None
     is_evaluated = (fused | rejected) & enabled & ~is_reset
-    unfused_span_s = _longest_gap(times, fused & enabled, log, start_s, end_s)
+    longest_gap_s = _longest_gap(times, fused & enabled, log, start_s, end_s)
     axes = {}
     for number, axis in enumerate(log.axes):
         assessment = assess(innovation[is_evaluated, number], variance[is_evaluated, number], gate)
@@ -246,7 +256,6 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
                     innovation[is_evaluated, number] / np.sqrt(variance[is_evaluated, number]),
                 ),
             )
-    is_disabled = not is_evaluated.any()
     return AidResult(
         label=aid.label,
         unit=aid.unit,
@@ -255,54 +264,42 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
         fused_fraction=_fraction(fused & enabled, enabled),
         fused_logged=fused_logged,
         rejected_fraction=_fraction(rejected & enabled, enabled),
-        longest_gap_s=unfused_span_s,
+        longest_gap_s=longest_gap_s,
         resets=int(is_reset.sum()),
         gate=gate,
         noise=noise_median,
         noise_from=_noise_origin(aid, log, noise_median),
         axes=axes,
-        verdict="disabled"
-        if is_disabled
-        else _verdict(
-            axes, unfused_span_s[1] - unfused_span_s[0], times[fused & (not fused_logged)]
-        ),
+        verdict=_verdict(axes, longest_gap_s, times[fused & (not fused_logged)])
+        if is_evaluated.any()
+        else "disabled",
     )
 
 
 def _largest_mean_change(time_s: Array, normalised: Array) -> Span | None:
-    """Return time (s) and size (√S) of the largest significant change of mean ν/√S, or None.
+    """Detect the largest change of the mean normalised innovation; return time (s) and amount (√S).
 
-    Each window is a candidate: the mean of the two windows after it is compared with the mean of
-    all windows before it. The change begins in the candidate window if the mean of that window
-    differs from the mean before by at least a third of the change.
+    For each window, the mean of the two windows after it is compared with the mean of all windows
+    before it. The change begins in the window if the window's mean differs from the mean before by
+    at least a third of the change. Return None without a significant change.
     """
     window = np.floor((time_s - time_s[0]) / WINDOW_S)
-    window_statistics = (
-        pd.Series(normalised)
-        .groupby(window)
-        .agg(["mean", "size"])
-        .query("size >= @MIN_WINDOW_SAMPLES")
-    )
-    mean, largest_change = window_statistics["mean"].to_numpy(), None
-    for window_index in range(MIN_WINDOWS_BEFORE, len(mean) - 2):
-        mean_change = float(
-            np.mean(mean[window_index + 1 : window_index + 3]) - np.mean(mean[:window_index])
-        )
-        earlier = normalised[window < window_statistics.index[window_index]]
-        standard_error = float(np.std(earlier)) / math.sqrt(
-            2.0 * window_statistics["size"].iloc[:window_index].median()
-        )
-        scatter = max(float(np.std(mean[:window_index], ddof=1)), standard_error)
-        if abs(mean_change) > max(
-            MIN_CHANGE_IN_SIGMA,
-            MIN_CHANGE_SCATTER_RATIO * scatter,
-            abs(largest_change[1]) if largest_change else 0.0,
-        ):
-            has_begun = (
-                abs(mean[window_index] - np.mean(mean[:window_index])) > abs(mean_change) / 3.0
-            )
-            first_window = window_statistics.index[window_index if has_begun else window_index + 1]
+    windows = pd.Series(normalised).groupby(window).agg(["mean", "size"])
+    windows = windows[windows["size"] >= MIN_WINDOW_SAMPLES]
+    mean = windows["mean"].to_numpy()
+    largest_change = None
+    min_change = MIN_CHANGE_IN_SIGMA
+    for index in range(MIN_WINDOWS_BEFORE, len(mean) - 2):
+        mean_before = np.mean(mean[:index])
+        mean_change = float(np.mean(mean[index + 1 : index + 3]) - mean_before)
+        innovation_std = np.std(normalised[window < windows.index[index]])
+        standard_error = innovation_std / math.sqrt(2.0 * windows["size"].iloc[:index].median())
+        scatter = max(np.std(mean[:index], ddof=1), standard_error)
+        if abs(mean_change) > max(min_change, MIN_CHANGE_SCATTER_RATIO * scatter):
+            has_begun = abs(mean[index] - mean_before) > abs(mean_change) / 3.0
+            first_window = windows.index[index if has_begun else index + 1]
             largest_change = float(time_s[0] + WINDOW_S * first_window), mean_change
+            min_change = abs(mean_change)
     return largest_change
 
 
@@ -311,7 +308,7 @@ def _fraction(is_selected: BoolArray, is_in_set: BoolArray) -> float:
 
 
 def _effective_gate(aid: Aid, log: AidLog) -> float:
-    """Return the gate in √S, from the logged test ratios or else from the parameter."""
+    """Return EKF2's gate (√S) from the logged test ratios ν²/(gate² S), or from the parameter."""
     axis = log.axes[0]
     if f"ratio_{axis}" in log.samples:
         rows = log.samples[log.samples[f"ratio_{axis}"] > 0.0]
@@ -322,11 +319,11 @@ def _effective_gate(aid: Aid, log: AidLog) -> float:
 
 
 def _noise_origin(aid: Aid, log: AidLog, noise: float | None) -> str:
-    """Return the name of the parameter from which R is derived, or "reported accuracy"."""
+    """Return the name of the parameter that equals √R, or the text ``Aid.noise_origin``."""
     value = log.parameters.get(aid.noise)
     if noise is None or value is None:
         return "" if noise is None else aid.noise_origin
-    # EKF2 multiplies the noise of GNSS heights by 1.5
+    # EKF2 multiplies EKF2_GPS_P_NOISE by 1.5 for GNSS heights
     for expected in (value, 1.5 * value, np.sqrt(value)):
         if abs(noise - expected) <= NOISE_TOLERANCE * expected:
             return aid.noise
@@ -334,12 +331,11 @@ def _noise_origin(aid: Aid, log: AidLog, noise: float | None) -> str:
 
 
 def _longest_gap(times: Array, fused: BoolArray, log: AidLog, start_s: float, end_s: float) -> Span:
-    """Return start and end (s) of the longest time without a fused sample, see AidResult."""
-    ends = np.concatenate([[start_s], times[fused], [end_s]])
+    ends = np.r_[start_s, times[fused], end_s]
     starts = ends[:-1]
     enabled = np.ones(len(starts), bool)
     if log.enabled is not None:
-        # EKF2 disables an aid up to 1 s after its last fused sample
+        # EKF2 disables an aiding source up to 1 s after the last fused sample
         enabled = step_values_at(log.enabled, pd.Index(starts + 1.0)) > 0.0
     longest = int(np.argmax(np.diff(ends) * enabled))
     if not enabled[longest]:
@@ -347,24 +343,20 @@ def _longest_gap(times: Array, fused: BoolArray, log: AidLog, start_s: float, en
     return float(ends[longest]), float(ends[longest + 1])
 
 
-def _verdict(axes: dict[str, AidAxis], longest_gap_duration_s: float, fused_s: Array) -> AidVerdict:
-    # topics of old releases are logged at a reduced rate, so the limit is in logged intervals
+def _verdict(axes: dict[str, AidAxis], longest_gap_s: Span, fused_s: Array) -> AidVerdict:
     interval_s = float(np.median(np.diff(fused_s))) if len(fused_s) > 1 else 0.0
-    if longest_gap_duration_s > max(NOT_FUSED_LIMIT_S, NOT_FUSED_INTERVALS * interval_s):
+    if longest_gap_s[1] - longest_gap_s[0] > max(
+        NOT_FUSED_LIMIT_S, NOT_FUSED_INTERVALS * interval_s
+    ):
         return "not_fused"
     if not axes:
         return "too few samples"
-    if any(_is_biased(axis) for axis in axes.values()):
-        return "biased"
-    nis = _mean_nis(axes)
-    return classify_mean_nis(nis, nis_band(sum(axis.samples for axis in axes.values())))
+    for axis in axes.values():
+        min_bias = max(MIN_BIAS_IN_SIGMA, MIN_BIAS_SHARE * math.sqrt(axis.nis_mean))
+        if abs(axis.mean_normalised_innovation) > min_bias:
+            return "biased"
+    return classify_mean_nis(_mean_nis(axes), nis_band(sum(axis.samples for axis in axes.values())))
 
 
 def _mean_nis(axes: Mapping[str, AidAxis]) -> float:
     return float(np.mean([axis.nis_mean for axis in axes.values()] or [np.nan]))
-
-
-def _is_biased(axis: AidAxis) -> bool:
-    return abs(axis.mean_normalised_innovation) > max(
-        MIN_BIAS_IN_SIGMA, MIN_BIAS_SHARE * math.sqrt(axis.nis_mean)
-    )

@@ -1,4 +1,6 @@
-"""Bias of a sensor relative to EKF2's reference sensor, estimated outside EKF2's Kalman filter.
+"""Bias of a height or vision sensor relative to EKF2's reference sensor.
+
+EKF2 estimates this bias with a separate scalar Kalman filter for each axis.
 
 Source: PX4-Autopilot ``EKF/bias_estimator`` (``bias_estimator.cpp``; before v1.15
 ``EKF/bias_estimator.cpp``).
@@ -8,12 +10,20 @@ import numpy as np
 
 from px4fuse.arrays import Array, BoolArray
 
-# Noise density of the bias random walk (m/s/√Hz; bias_nsd, common.h), minimum variance of the bias
-# (m²), minimum measurement variance (m²), and gate (√S)
-BIAS_DENSITY, MIN_VARIANCE_M2, MIN_NOISE_M2, BIAS_GATE = 0.13, 1e-8, 1e-4, 3.0
-# Maximum mean signed test ratio with the normal random walk (isOffsetDetected), factor on the
-# variance of the random walk above it, and averaging time of the test ratio (s)
-MAX_MEAN_SIGNED_RATIO, NOISE_FACTOR, FILTER_S = 0.2, 1e3, 10.0
+# Noise density (m/s/√Hz) of the random walk of the bias (bias_nsd, common.h)
+BIAS_DENSITY = 0.13
+# Minimum variance (m²) of the bias
+MIN_VARIANCE_M2 = 1e-8
+# Minimum measurement variance (m²) in updates of the bias
+MIN_NOISE_M2 = 1e-4
+# Innovation gate (√S) in updates of the bias
+BIAS_GATE = 3.0
+# Maximum mean of test ratio times sign of the innovation; above, EKF2 multiplies the variance of
+# the random walk by NOISE_FACTOR (isOffsetDetected)
+MAX_MEAN_SIGNED_RATIO = 0.2
+NOISE_FACTOR = 1e3
+# Time constant (s) of the low-pass filter that averages the signed test ratio
+FILTER_S = 10.0
 
 
 class BiasEstimator:
@@ -22,15 +32,18 @@ class BiasEstimator:
     Parameters
     ----------
     value_m, variance_m2 : ndarray, shape (S,) or (S, k)
-        Initial bias, which is added to innovations, and its variance.
+        Initial bias (it is added to innovations), and variance of the bias.
     start_s : float
+        Time of the initial bias.
     step_s : float
         Prediction step of EKF2.
     """
 
     def __init__(self, value_m: Array, variance_m2: Array, start_s: float, step_s: float) -> None:
-        self.value_m, self.variance_m2 = value_m, variance_m2
-        self.mean_signed_ratio, self.last_s = np.zeros_like(value_m), np.full_like(value_m, start_s)
+        self.value_m = value_m
+        self.variance_m2 = variance_m2
+        self.mean_signed_ratio = np.zeros_like(value_m)
+        self.last_s = np.full_like(value_m, start_s)
         self.filter_weight = step_s / (FILTER_S + step_s)
 
     def remove_bias(
@@ -48,28 +61,29 @@ class BiasEstimator:
         Parameters
         ----------
         nu, predicted_variance, noise_m2 : ndarray
-            Innovation without bias, HPH' and R.
+            Innovation without the bias (m), HPH' and R (m²).
         time_s, has_sample, updates_bias : ndarray
-            For each configuration: sample time, True with a sample, True if it updates the bias.
+            Per filter configuration: sample time, True with a sample, True to update the bias.
         weight : float
-            Number of samples in EKF2 that the logged sample represents.
+            Number of samples that EKF2 fused per logged sample.
         """
-        updates_now, bounded_noise = has_sample & updates_bias, np.maximum(noise_m2, MIN_NOISE_M2)
+        updates_now = has_sample & updates_bias
         density_factor = np.where(
             np.abs(self.mean_signed_ratio) > MAX_MEAN_SIGNED_RATIO, NOISE_FACTOR, 1.0
         )
         variance_growth = BIAS_DENSITY**2 * (time_s - self.last_s) * density_factor * updates_now
-        variance = np.minimum(self.variance_m2 + variance_growth, bounded_noise)
-        nu, R = nu + self.value_m, noise_m2 + variance
+        max_variance = np.maximum(noise_m2, MIN_NOISE_M2)
+        variance = np.minimum(self.variance_m2 + variance_growth, max_variance)
+        nu = nu + self.value_m
+        R = noise_m2 + variance
         S = variance + np.maximum((noise_m2 + predicted_variance) / weight, MIN_NOISE_M2)
         ratio = nu * nu / (BIAS_GATE**2 * S)
         K = variance / S * (updates_now & (ratio < 1.0))
         self.value_m = self.value_m - K * nu
         self.variance_m2 = np.maximum(variance * (1.0 - K), MIN_VARIANCE_M2)
-        signed = np.minimum(ratio, 1.0) * np.sign(-nu)
+        change = np.minimum(ratio, 1.0) * np.sign(-nu) - self.mean_signed_ratio
         self.mean_signed_ratio = (
-            self.mean_signed_ratio
-            + self.filter_weight * weight * updates_now * (signed - self.mean_signed_ratio)
+            self.mean_signed_ratio + self.filter_weight * weight * updates_now * change
         )
         self.last_s = np.where(has_sample, time_s, self.last_s)
         return nu, R

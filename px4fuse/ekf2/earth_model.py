@@ -1,7 +1,7 @@
-"""Earth rotation rate and curvature radii as used by EKF2.
+"""Earth rotation rate and radii of curvature of the earth, as used by EKF2.
 
-From v1.16 on EKF2 stores latitude and longitude. EKF2 converts them to metres with curvature radii
-internally, but publishes positions in metres on a sphere.
+From PX4 v1.16 on EKF2's state contains latitude and longitude. EKF2 converts them to metres with
+the radii of curvature of an ellipsoid, but publishes positions in metres on a sphere.
 
 Sources: PX4-Autopilot ``lib/lat_lon_alt/lat_lon_alt.cpp`` (computeRadiiOfCurvature; PX4's meridian
 radius uses q to the power 2.5, an ellipsoid's has 1.5), ``EKF/ekf_helper.cpp`` (calcEarthRateNED),
@@ -25,7 +25,7 @@ def earth_rate_rad_s(record: FusionRecord) -> Array:
 
 
 def ekf2_metres_per_metre(record: FusionRecord) -> tuple[float, float, float]:
-    """Return the ratio of EKF2's internal metres to published metres: north, east, down."""
+    """Return the ratio of EKF2's internal metres to published metres along north, east and down."""
     if np.isnan(record.latitude_deg) or not record.stores_latitude:
         return 1.0, 1.0, 1.0
     squared = ECCENTRICITY**2

@@ -1,9 +1,9 @@
-"""Filter recursion of the EKF2 replay: several variants run through one segment together.
+"""Filter recursion of the EKF2 replay: several filter configurations run through one segment.
 
-A variant is one configuration of the filter (parameters, states, aids). An event is the end of an
-interval without measurements: a position sample is fused at this time or, in a gap of the source,
-only height and heading. Array shapes: E events, S variants, n states. x, P: state and covariance;
-R: measurement noise; S in an equation: innovation variance.
+A filter configuration consists of parameters, estimated states and fused aiding sources. An event
+is the end of an interval without measurements: a position sample is fused at this time or, in a gap
+of the position source, only height and heading. Array shapes: E events, S filter configurations, n
+states. x, P: state and covariance; R: measurement noise; S in an equation: innovation variance.
 
 Sources: PX4-Autopilot ``EKF/covariance.cpp`` (limits of the biases), ``EKF/position_fusion.cpp``
 and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, resets).
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.ekf2.flow import fuse_flow
 from px4fuse.ekf2.heights import MIN_GATE, MIN_SIGMA, SENSORS, HeightFilter, barometer_samples
 from px4fuse.ekf2.inputs import FusionRules, Inputs
@@ -29,7 +29,7 @@ from px4fuse.ekf2.replay_segments import (
     GRAVITY_M_S2,
     GYRO_BIAS,
     IMU_STATE_COUNT,
-    STATES,
+    STATE_COUNT,
     THETA,
     VELOCITY,
     ReplaySegment,
@@ -38,62 +38,67 @@ from px4fuse.ekf2.vision import VisionFilter, set_states, vision_samples
 from px4fuse.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
 from px4fuse.notebook_display import one_line_repr
 
-# Length (s) of a first pass over the segment that estimates the initial correlations
+# Flight time (s) of a preliminary filter run that estimates the correlations of the initial state
 CORRELATION_PASS_S = 8.0
-MIN_VARIANCE = 1e-30  # minimum of a variance before division
-# Samples with NIS / gate² from 1/2 to 2 are near the gate limit. If their rejection is not logged,
-# it is inferred from the published position
+MIN_VARIANCE = 1e-30  # minimum state variance, to avoid a division by zero
+# A position sample with NIS / gate² from 1/2 to 2 is near the gate limit. If EKF2's rejection of
+# this sample is not logged, the rejection is inferred from the published position
 GATE_EDGE_RATIO = 2.0
-# Number of events whose intervals are stacked together, to limit memory
+# Number of events for which transition matrices are copied at once: more events need more memory
 EVENT_BATCH_SIZE = 64
 # Measurement variance (m² or rad²) that is so large that the measurement has no effect
 IGNORED_VARIANCE = 1e9
 # Acceleration noise (m/s²) while EKF2 reports a bad or clipped acceleration (BADACC_BIAS_PNOISE,
 # common.h; covariance.cpp)
 BAD_ACCELERATION_NOISE = 4.9
-# Variance factors of GNSS velocity: EKF2 multiplies the vertical σ by 1.5 (gps_control.cpp)
+# Factors on the GNSS velocity variance, NED: EKF2 multiplies the vertical σ by 1.5
+# (gps_control.cpp)
 VERTICAL_SCALE = np.array([1.0, 1.0, 2.25])
 HEIGHT_SCALE = 1.5  # factor on EKF2_GPS_P_NOISE for GNSS height (gnss_height_control.cpp)
-# EKF2's limits of bias variances (covariance.cpp): maximum σ 0.1 g, minimum ratio of the variance
-# of an axis to the largest variance
+# Maximum σ (m/s²) of EKF2's accelerometer bias: 0.1 g (covariance.cpp)
 MAX_BIAS_SIGMA_M_S2 = 0.1 * 9.80665
+# Minimum accelerometer bias variance of an axis, relative to the largest of the three axes
+# (covariance.cpp)
 MIN_BIAS_VARIANCE_RATIO = 0.01
+# Indices of heading error and position in the state
 HEADING, NORTH, EAST, DOWN = 2, 6, 7, 8
-BIAS_NORTH, BIAS_EAST = 12, 13  # accelerometer bias rotated to NED
+BIAS_NORTH, BIAS_EAST = 12, 13  # state indices of the accelerometer bias, rotated to NED
 GRAVITY = float(GRAVITY_M_S2[2])
 MEASURED = np.array([HEADING, DOWN, NORTH, EAST])
-# Indices of states. Slices are used because they give views; index arrays would copy
+# State indices of heading error and height: a slice, because an index array would copy the states
 LOGGED_STATES = slice(HEADING, DOWN + 1, DOWN - HEADING)
 HORIZONTAL = slice(NORTH, EAST + 1)
-# Indices of the states that a position sample measures (velocity and position), and the positions
-# of velocity and horizontal position within them
-MEASURED_STATES, VELOCITY_COLUMNS, POSITION_COLUMNS = slice(3, 9), slice(0, 3), slice(3, 5)
+# State indices of velocity and position, both of which a GNSS sample measures
+MEASURED_STATES = slice(3, 9)
+# Columns of velocity and of horizontal position in arrays of these six measured states
+VELOCITY_COLUMNS = slice(0, 3)
+POSITION_COLUMNS = slice(3, 5)
 
 
 @dataclass(frozen=True)
-class Variant:
-    """One filter configuration to run.
+class FilterConfiguration:
+    """Configuration of the modelled EKF2: parameters, estimated states and fused aiding sources.
 
     Attributes
     ----------
     settings : dict
-        All parameters of the model, by PX4 name.
+        Values of all EKF2 parameters in the model, by PX4 name.
     biases : bool
         True if the accelerometer bias is a state; else the bias is 0.
     attitude : bool
         True if attitude and gyro bias are states; else the published attitude is used.
     velocity : bool
-        True if velocity is fused when EKF2 fuses velocity.
+        True to fuse velocity in flights in which EKF2 fuses velocity.
     reported : bool
-        True if the noise reported by the sender is used when EKF2 uses the reported noise.
+        True to use the variance reported by the position source if EKF2 uses the reported variance.
     has_gate : bool
-        True if samples are rejected and positions reset.
+        True if an innovation gate rejects samples and the position is reset after rejections.
     uses_logged_decisions : bool
-        True if logged rejections and resets replace those of the gate.
-    without : mapping from PX4's name of an aid to float
-        Time (s) from which the aid is not fused.
+        True if EKF2's logged rejections and resets are used instead of the gate.
+    without : mapping from PX4's name of an aiding source to float
+        Time (s) from which the aiding source is not fused.
     timestamp_offset_s : float or None
-        Time to add to the timestamps (s); None: EKF2's delay parameter is subtracted instead.
+        Time (s) to add to the timestamps of positions; None to subtract EKF2's delay parameter.
     """
 
     settings: dict[str, float]
@@ -107,17 +112,17 @@ class Variant:
     timestamp_offset_s: float | None = None
 
     def timing(self, inputs: Inputs) -> Timing:
-        """Return the age of a position at its timestamp, and the fusion horizon's delay (s)."""
+        """Return the age of a position at its timestamp, and the delay of the fusion horizon."""
         if self.timestamp_offset_s is not None:
             return Timing(-self.timestamp_offset_s - 0.5 * inputs.step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
-        known = self.settings.keys() & {GNSS_POS.delay, EV_POS.delay}
-        most_ms = max(self.settings[name] for name in known)
+        delay_names = self.settings.keys() & {GNSS_POS.delay, EV_POS.delay}
+        max_delay_ms = max(self.settings[name] for name in delay_names)
         if inputs.rules.horizon_by_delay:  # the length of the IMU buffer is the largest delay
-            length = math.ceil(most_ms * 1e-3 / inputs.predict_s)
+            length = math.ceil(max_delay_ms * 1e-3 / inputs.predict_s)
             return Timing(delay_s, max(inputs.horizon_s, (length - 1) * inputs.step_s))
-        # at start EKF2 raises EKF2_DELAY_MAX to the largest delay (EKF2.cpp)
-        longest_ms = max(self.settings["EKF2_DELAY_MAX"], most_ms)
+        # at its start EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
+        longest_ms = max(self.settings["EKF2_DELAY_MAX"], max_delay_ms)
         if longest_ms == inputs.settings["EKF2_DELAY_MAX"]:
             return Timing(delay_s, inputs.horizon_s)
         # number of samples in the IMU buffer (initialise_interface, estimator_interface.cpp)
@@ -127,14 +132,14 @@ class Variant:
 
 @dataclass(frozen=True)
 class SegmentRun:
-    """Results of S variants in one segment with E events.
+    """Results of S filter configurations in one segment with E events (ends of intervals).
 
     Attributes
     ----------
     segment : ReplaySegment
-    variants : tuple of Variant
+    configurations : tuple of FilterConfiguration
     events : tuple of recarray
-        Events of each variant, see :data:`~px4fuse.ekf2.intervals.EVENT`.
+        Events of each filter configuration, see :data:`~px4fuse.ekf2.intervals.EVENT`.
     innovation : ndarray, shape (E, S, 6)
         Measurement minus state of velocity (m/s) and position (m), NED; NaN without a sample or
         without velocity fusion.
@@ -145,7 +150,7 @@ class SegmentRun:
     rejected, fused, reset : ndarray of bool, shape (E, S)
         Decisions on the position sample of each event.
     position_reset_m : ndarray, shape (E, S, 2)
-        Size of the position reset, north and east.
+        Change of the position by a reset at each event, north and east.
     state, variance : ndarray, shape (E + 1, S, n)
         State and its variance at the start and after each event; n is 15, or 21 with magnetic
         fields as states.
@@ -161,7 +166,7 @@ class SegmentRun:
     """
 
     segment: ReplaySegment
-    variants: tuple[Variant, ...]
+    configurations: tuple[FilterConfiguration, ...]
     events: tuple[Events, ...]
     innovation: Array
     innovation_variance: Array
@@ -183,16 +188,21 @@ class SegmentRun:
 def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
     inputs: Inputs,
     segment: ReplaySegment,
-    variants: Sequence[Variant],
+    configurations: Sequence[FilterConfiguration],
     intervals: Sequence[Intervals],
 ) -> SegmentRun:
-    """Run variants through one segment; ``intervals`` has one element per variant."""
-    size, events = len(variants), len(intervals[0].events)
+    """Run filter configurations through one segment.
+
+    ``intervals`` contains the intervals between fusion events, one element per configuration.
+    """
+    configuration_count = len(configurations)
+    events = len(intervals[0].events)
     parameters = {
-        name: np.array([v.settings[name] for v in variants]) for name in variants[0].settings
+        name: np.array([configuration.settings[name] for configuration in configurations])
+        for name in configurations[0].settings
     }
     biases, attitude, has_gate, uses_logged_decisions, reported, fuses_velocity = (
-        np.array([getattr(variant, name) for variant in variants])
+        np.array([getattr(configuration, name) for configuration in configurations])
         for name in (
             "biases",
             "attitude",
@@ -203,32 +213,39 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         )
     )
     distinct_intervals = list(dict.fromkeys(intervals))
-    variant_intervals = (
-        [distinct_intervals.index(each) for each in intervals]
+    configuration_intervals = (
+        list(map(distinct_intervals.index, intervals))
         if len(distinct_intervals) > 1
         else slice(None)
     )
 
     def stacked(name: str, rows: slice = slice(None)) -> Any:
-        """Stack a field of all variants' intervals, shape (E, S, ...)."""
-        return np.stack(
-            [getattr(one_interval, name)[rows] for one_interval in distinct_intervals], axis=1
-        )[:, variant_intervals]
+        arrays = [getattr(interval_arrays, name)[rows] for interval_arrays in distinct_intervals]
+        return np.stack(arrays, axis=1)[:, configuration_intervals]
 
     event = stacked("events")
     action = np.where(has_gate, event["action"], np.where(event["usable"], FUSE, IDLE))
-    event_steps, is_active = event["end_step"], action > IDLE
-    event_time_s, has_sample = segment.time_s[event_steps], np.any(is_active, axis=1).tolist()
+    event_steps = event["end_step"]
+    is_active = action > IDLE
+    event_time_s = segment.time_s[event_steps]
+    has_sample = np.any(is_active, axis=1).tolist()
     enabled = {
-        aid.name: event_time_s < np.array([v.without.get(aid.name, np.inf) for v in variants])
+        aid.name: event_time_s
+        < np.array(
+            [configuration.without.get(aid.name, np.inf) for configuration in configurations]
+        )
         for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, EV_POS, *SENSORS)
     }
     can_fuse_velocity = (action == FUSE) & enabled[GNSS_VEL.name] & fuses_velocity
     sample = np.maximum(intervals[0].events.sample, 0)
     measured, noise = _measurements(inputs, segment, sample, event_steps, parameters, reported)
-    is_sequential, has_speed = inputs.aid == GNSS_POS, inputs.received.velocity_m_s is not None
-    gates = [parameters.get(GNSS_VEL.gate, np.ones(size)), parameters[inputs.aid.gate]]
-    gate2 = np.maximum(np.repeat(np.stack(gates, axis=1), 3, axis=1), MIN_GATE) ** 2
+    is_sequential = inputs.aid == GNSS_POS
+    has_speed = inputs.received.velocity_m_s is not None
+    gates = [
+        parameters.get(GNSS_VEL.gate, np.ones(configuration_count)),
+        parameters[inputs.aid.gate],
+    ]
+    gate_squared = np.maximum(np.repeat(np.stack(gates, axis=1), 3, axis=1), MIN_GATE) ** 2
     # logged EKF2 values are used as measurements of height and, without magnetometer, of heading
     logged_values = np.stack(
         [segment.attitude_error_rad[event_steps, HEADING], segment.down_m[event_steps]], axis=-1
@@ -240,58 +257,59 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     field_samples = heights = flow_samples = vision = None
     has_field, has_flow = np.zeros((2, events), bool)
 
-    def means(source_aid: Aid, samples_per_interval: Sequence[EventSamples]) -> EventSamples:
-        """Return the samples of an aid for all variants, until each variant disables the aid."""
+    def enabled_means(source_aid: Aid, samples: Sequence[EventSamples]) -> EventSamples:
         stacked_fields = (
-            np.stack(axis_values, axis=1)[:, variant_intervals]
-            for axis_values in zip(*samples_per_interval, strict=True)
+            np.stack(axis_values, axis=1)[:, configuration_intervals]
+            for axis_values in zip(*samples, strict=True)
         )
         mean_samples = EventSamples(*stacked_fields)
         return mean_samples._replace(
             sample_count=np.where(enabled[source_aid.name], mean_samples.sample_count, 0.0)
         )
 
-    ends = [one.events.end_step for one in distinct_intervals]
+    ends = [interval_arrays.events.end_step for interval_arrays in distinct_intervals]
     if (field := segment.field) is not None:
-        field_samples = means(MAG, [mean_by_event(field, one) for one in ends])
+        field_samples = enabled_means(MAG, [mean_by_event(field, end_steps) for end_steps in ends])
         has_field = np.asarray(field_samples.sample_count.any(axis=1))
     if (flow := segment.flow) is not None:
-        flow_samples = means(
-            FLOW, [mean_by_event(flow, one, segment.imu_velocity_m_s) for one in ends]
+        flow_samples = enabled_means(
+            FLOW, [mean_by_event(flow, end_steps, segment.imu_velocity_m_s) for end_steps in ends]
         )
         has_flow = np.asarray(flow_samples.sample_count.any(axis=1))
     if segment.heights is not None:
-        samples = barometer_samples(segment, ends)
-        barometer_arrays = np.stack(samples, axis=-1)[..., variant_intervals]
+        barometer = np.stack(barometer_samples(segment, ends), axis=-1)[
+            ..., configuration_intervals
+        ]
         heights = HeightFilter(
-            segment, barometer_arrays, event["time_s"], is_active, enabled, parameters, has_gate
+            segment, barometer, event["time_s"], is_active, enabled, parameters, has_gate
         )
     if inputs.vision is not None:
-        timings = [variant.timing(inputs) for variant in variants]
-        vision_by_variant = [
-            vision_samples(inputs, segment, each.events.end_step, variant.settings, at.horizon_s)
-            for each, variant, at in zip(intervals, variants, timings, strict=True)
+        vision_by_configuration = [
+            vision_samples(
+                inputs,
+                segment,
+                interval_arrays.events.end_step,
+                configuration.settings,
+                configuration.timing(inputs).horizon_s,
+            )
+            for interval_arrays, configuration in zip(intervals, configurations, strict=True)
         ]
-        vision = VisionFilter(segment, vision_by_variant, enabled, parameters, has_gate, reported)
-    gyro_noise2 = np.where(attitude, parameters["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
+        vision = VisionFilter(
+            segment, vision_by_configuration, enabled, parameters, has_gate, reported
+        )
+    gyro_variance = np.where(attitude, parameters["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     variance_increment, variance_limit = _variance_growth(
         inputs, segment, parameters, biases, attitude
     )
     steps = np.diff(event_steps, axis=0, prepend=0)[:, :, None]
-    acceleration_noise2 = np.broadcast_to(parameters["EKF2_ACC_NOISE"] ** 2, is_active.shape)[
+    acceleration_variance = np.tile(parameters["EKF2_ACC_NOISE"] ** 2, (events, 1))[
         :, :, None, None
     ]
-    if segment.bad_acceleration_share is not None:  # share of each interval with a bad acceleration
-        sums = np.diff(
-            np.cumsum(segment.bad_acceleration_share)[event_steps],
-            axis=0,
-            prepend=segment.bad_acceleration_share[0],
-        )
-        share = (sums[:, :, None] / np.maximum(steps, 1))[..., None]
-        acceleration_noise2 = (
-            1.0 - share
-        ) * acceleration_noise2 + share * BAD_ACCELERATION_NOISE**2
-    floor = inputs.rules.bias_floor
+    if (share := segment.bad_acceleration_share) is not None:
+        # mean over each interval of the share of accelerometer axes with a larger noise
+        share_sums = np.diff(np.cumsum(share)[event_steps], axis=0, prepend=share[0])
+        mean_share = (share_sums[:, :, None] / np.maximum(steps, 1))[..., None]
+        acceleration_variance += mean_share * (BAD_ACCELERATION_NOISE**2 - acceleration_variance)
     x, P = _start_state(segment, biases, attitude)
     logged_decisions = inputs.received.rejected[sample], inputs.received.reset[sample]
     is_aid_enabled = enabled[inputs.aid.name]
@@ -304,39 +322,43 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         uses_logged_decisions,
     )
     fusion = _Fusion(inputs.rules, segment.time_s[0], *action_inputs, *logged_decisions)
-    innovations, variances = np.full((2, events, size, 6), np.nan)
-    field_record = np.full((0 if field_samples is None else events, 3, size, 3), np.nan)
-    rejected, fused, reset = np.zeros((3, events, size), bool)
-    position_reset_m = np.zeros((events, size, 2))
-    states, state_variances = np.empty((2, events + 1, size, x.shape[1]))
-    states[0], state_variances[0] = x, _diagonal(P)
-    innovation, R = np.empty((2, size, 4))
+    innovations, variances = np.full((2, events, configuration_count, 6), np.nan)
+    field_record = np.full(
+        (0 if field_samples is None else events, 3, configuration_count, 3), np.nan
+    )
+    rejected, fused, reset = np.zeros((3, events, configuration_count), bool)
+    position_reset_m = np.zeros((events, configuration_count, 2))
+    states, state_variances = np.empty((2, events + 1, configuration_count, x.shape[1]))
+    states[0] = x
+    state_variances[0] = _diagonal(P)
+    innovation, R = np.empty((2, configuration_count, 4))
     measured_slice = slice(0 if has_speed else POSITION_COLUMNS.start, POSITION_COLUMNS.stop)
-    is_component_fused = np.zeros((size, POSITION_COLUMNS.stop), bool)
+    is_component_fused = np.zeros((configuration_count, POSITION_COLUMNS.stop), bool)
     for e in range(events):
-        block_index = e % EVENT_BATCH_SIZE
-        if not block_index:  # intervals are long: stack a few at a time
+        batch_index = e % EVENT_BATCH_SIZE
+        if not batch_index:  # copy the arrays of a few events at a time, to limit memory
             event_batch = slice(e, e + EVENT_BATCH_SIZE)
             transition = stacked("transition", event_batch)
             state_input = stacked("acceleration_input", event_batch) + attitude[:, None] * stacked(
                 "correction_input", event_batch
             )
-            added_noise = gyro_noise2 * stacked("gyro_noise", event_batch)
-            added_noise = added_noise + acceleration_noise2[event_batch] * stacked(
+            added_noise = gyro_variance * stacked("gyro_noise", event_batch)
+            added_noise = added_noise + acceleration_variance[event_batch] * stacked(
                 "accelerometer_noise", event_batch
             )
             variance_growth = variance_increment * steps[event_batch]
-        phi = transition[block_index]
+        phi = transition[batch_index]
         # x = Φx + u, P = ΦPΦ' + Q
-        x[:, :STATES] = (phi @ x[:, :STATES, None])[:, :, 0] + state_input[block_index]
-        P[:, :STATES] = phi @ P[:, :STATES]
-        P[:, :, :STATES] = P[:, :, :STATES] @ np.swapaxes(phi, 1, 2)
-        P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += added_noise[block_index]
+        x[:, :STATE_COUNT] = (phi @ x[:, :STATE_COUNT, None])[:, :, 0] + state_input[batch_index]
+        P[:, :STATE_COUNT] = phi @ P[:, :STATE_COUNT]
+        P[:, :, :STATE_COUNT] = P[:, :, :STATE_COUNT] @ np.swapaxes(phi, 1, 2)
+        P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += added_noise[batch_index]
         bias_variance = _diagonal(P)[:, BIASES.start :]
-        bias_variance += (bias_variance < variance_limit) * variance_growth[block_index]
-        if floor is not None:
-            _limit_bias(P, floor, biases)
-        innovation[:, 2:], R[:, 2:] = 0.0, IGNORED_VARIANCE
+        bias_variance += (bias_variance < variance_limit) * variance_growth[batch_index]
+        if inputs.rules.bias_floor is not None:
+            _limit_bias(P, inputs.rules.bias_floor, biases)
+        innovation[:, 2:] = 0.0
+        R[:, 2:] = IGNORED_VARIANCE
         if field_samples is not None and has_field[e]:
             field_now = EventSamples(*(axis_values[e] for axis_values in field_samples))
             x, P, field_record[e] = fuse_field(
@@ -351,8 +373,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         if has_sample[e]:
             nu = measured[e] - x[:, MEASURED_STATES]
             S = _diagonal(P)[:, MEASURED_STATES] + noise[e]
-            innovations[e], variances[e] = nu, S
-            is_outside_gate = nu * nu > gate2 * S
+            innovations[e] = nu
+            variances[e] = S
+            is_outside_gate = nu * nu > gate_squared * S
             is_velocity_fused = can_fuse_velocity[e] & ~(
                 is_outside_gate[:, VELOCITY_COLUMNS].any(axis=1) & has_gate
             )
@@ -360,7 +383,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             if logged_correction_m is not None:
                 is_on_edge, was_rejected = _rejection_by_output(
                     logged_correction_m[sample[e]],
-                    *(each[:, POSITION_COLUMNS] for each in (nu, S, noise[e], gate2)),
+                    *(array[:, POSITION_COLUMNS] for array in (nu, S, noise[e], gate_squared)),
                 )
                 is_outside_gate = np.where(
                     uses_logged_decisions & is_on_edge, was_rejected, is_outside_gate
@@ -370,12 +393,12 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             )
             if is_sequential:
                 if field_samples is None:
+                    # reduce the tilt variance to its logged value; without logged magnetometer
+                    # samples, the correction of the tilt is unknown
                     for row in range(HEADING):
                         _, P = _reduce_variance_to(P, row, attitude_variance[e, :, row])
-                is_component_fused[:, VELOCITY_COLUMNS], is_component_fused[:, POSITION_COLUMNS] = (
-                    is_velocity_fused[:, None],
-                    fused[e, :, None],
-                )
+                is_component_fused[:, VELOCITY_COLUMNS] = is_velocity_fused[:, None]
+                is_component_fused[:, POSITION_COLUMNS] = fused[e, :, None]
                 x, P = _sequential_update(
                     x, P, nu, S, noise[e], measured_slice, is_component_fused[:, measured_slice]
                 )
@@ -384,7 +407,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 R[fused[e], 2:] = noise[e, fused[e], POSITION_COLUMNS]
         if heights is not None:
             x, P = heights.fuse(e, x, P, measured[e, :, 5], noise[e, :, 5])
-        # with magnetic fields as states, only the height is set to its logged value
+        # the magnetometer corrects the heading, so only the height is set to EKF2's logged value
         elif field_samples is not None:
             K, P = _reduce_variance_to(P, DOWN, logged_variance[e, :, 1])
             x = x + K * (logged_values[e, :, 1] - x[:, DOWN])[:, None]
@@ -416,14 +439,17 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         if vision is not None:
             vision.bias.value_m = vision.bias.value_m + position_reset_m[e]
             x, P = vision.fuse(e, x, P, True, fusion.last_position_s)
-            if inputs.rules.with_velocity:  # a fused position of GNSS or of vision is sufficient
+            # EKF2 resets after a time without any fused position, from GNSS or from vision
+            if inputs.rules.with_velocity:
                 fusion.last_position_s = np.maximum(fusion.last_position_s, vision.fused_s)
-        states[e + 1], state_variances[e + 1] = x, _diagonal(P)
-    innovations[~is_active], variances[~is_active] = np.nan, np.nan
+        states[e + 1] = x
+        state_variances[e + 1] = _diagonal(P)
+    innovations[~is_active] = np.nan
+    variances[~is_active] = np.nan
     return SegmentRun(
         segment,
-        tuple(variants),
-        tuple(each.events for each in intervals),
+        tuple(configurations),
+        tuple(interval_arrays.events for interval_arrays in intervals),
         innovations,
         variances,
         noise,
@@ -440,7 +466,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     )
 
 
-def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> tuple[Array, Array]:
+def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
     """Fuse all measurements together: K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP."""
     HP = np.take(P, MEASURED, axis=1)
     HPH = np.take(HP, MEASURED, axis=2)
@@ -451,11 +477,10 @@ def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> tuple[Arra
     return x, 0.5 * (P + np.swapaxes(P, 1, 2))
 
 
-def _reduce_variance_to(P: Array, row: int, target: Array) -> tuple[Array, Array]:
-    """Apply a scalar update that reduces P[row, row] to ``target``; return gain and P.
+def _reduce_variance_to(P: Array, row: int, target: Array) -> ArrayPair:
+    """Return Kalman gain and covariance after a scalar update that reduces P[row, row].
 
-    In EKF2 the magnetometer also corrects the tilt. The magnetometer is not always logged, so the
-    tilt state is not changed.
+    ``target`` is the variance of state ``row`` after the update.
     """
     variance = P[:, row, row]
     R = _noise_to_reach(variance, target)
@@ -465,21 +490,19 @@ def _reduce_variance_to(P: Array, row: int, target: Array) -> tuple[Array, Array
 
 def _sequential_update(
     x: Array, P: Array, nu: Array, S: Array, R: Array, components: slice, is_fused: BoolArray
-) -> tuple[Array, Array]:
-    """Fuse the components of a sample one after the other, with the initial innovations and S.
+) -> ArrayPair:
+    """Fuse the components of a measurement one after the other, like EKF2.
 
+    All components use the innovations and innovation variances from before the first update.
     Source: fuseDirectStateMeasurement (``ekf_helper.cpp``). The Joseph form is valid for any gain.
     With c = PH' and K = wc: P - KHP - (KHP)' + K(HPH' + R)K' = P - bcc', b = w(2 - w(HPH' + R)).
-    ``components`` are the measured components to fuse; ``is_fused`` has shape (S, number of
-    components) or (S, 1).
+    ``is_fused`` has shape (S, number of components).
     """
-    nu, S, R = (each[:, components] for each in (nu, S, R))
+    nu, S, R = (array[:, components] for array in (nu, S, R))
     weight = is_fused / S
     square = weight * weight
-    b, rows = (
-        2.0 * weight - square * R,
-        slice(MEASURED_STATES.start + components.start, MEASURED_STATES.start + components.stop),
-    )
+    b = 2.0 * weight - square * R
+    rows = slice(MEASURED_STATES.start + components.start, MEASURED_STATES.start + components.stop)
     columns = P[:, rows].copy()
     for j in range(nu.shape[1]):
         column = columns[:, j]
@@ -495,15 +518,16 @@ def _sequential_update(
 
 
 def _rejection_by_output(
-    observed_correction_m: Array, nu: Array, S: Array, R: Array, gate2: Array
+    observed_correction_m: Array, nu: Array, S: Array, R: Array, gate_squared: Array
 ) -> tuple[BoolArray, BoolArray]:
-    """Return for each variant: True if the sample is near the gate limit, True if EKF2 rejected it.
+    """Infer EKF2's rejection of a position sample from the published position.
 
-    A sample counts as rejected if the correction of the published position
+    Return two masks of filter configurations: True if the sample is near the gate limit, and True
+    if EKF2 rejected the sample. It counts as rejected if the correction of the published position
     (``observed_correction_m``, north and east) is less than half of the expected correction,
     (1 - R/S)ν. The other arrays have shape (S, 2).
     """
-    ratio = (nu * nu / (gate2 * S)).max(axis=1)
+    ratio = (nu * nu / (gate_squared * S)).max(axis=1)
     is_near_gate = (
         (ratio > 1.0 / GATE_EDGE_RATIO)
         & (ratio < GATE_EDGE_RATIO)
@@ -517,12 +541,12 @@ def _rejection_by_output(
 
 @dataclass
 class _Fusion:
-    """State machine for rejection, fusion and reset of each variant, event by event.
+    """State machine for rejection, fusion and reset of the position in each filter configuration.
 
     Source: updateEvPosFusion and startEvPosFusion (``ev_pos_control.cpp``). After a time without
     fusion the position is reset. After several resets in a row fusion stops until a sample with
-    ``can_start``. Arrays have shape (E, S), (S,) or (E,). ``rejected`` and ``reset`` are the logged
-    decisions.
+    ``can_start``. Arrays have shape (E, S), (S,) or (E,). ``rejected`` and ``reset`` are EKF2's
+    logged decisions.
     """
 
     rules: FusionRules
@@ -536,14 +560,12 @@ class _Fusion:
     reset: BoolArray
 
     def __post_init__(self) -> None:
-        size = len(self.has_gate)
+        configuration_count = len(self.has_gate)
 
-        self.last_position_s, self.last_velocity_s = np.full((2, size), self.start_s)
-        self.is_stopped, self.remaining_resets = (
-            np.zeros(size, bool),
-            np.full(size, self.rules.resets),
-        )
-        # True for events at which the gate alone decides, without the state machine
+        self.last_position_s, self.last_velocity_s = np.full((2, configuration_count), self.start_s)
+        self.is_stopped = np.zeros(configuration_count, bool)
+        self.remaining_resets = np.full(configuration_count, self.rules.resets)
+        # True for events at which all configurations fuse or reject by the gate, without a reset
         self.only_gate_decides = (
             (self.action == FUSE).all(axis=1) & ~self.reset & ~(self.rejected > 0.0)
         )
@@ -551,7 +573,7 @@ class _Fusion:
     def decide(
         self, e: int, is_outside_gate: BoolArray, is_velocity_fused: BoolArray
     ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
-        """Return four masks of variants: position rejected, fused, reset; and velocity fused.
+        """Return masks of configurations with position rejected, fused, reset; velocity fused.
 
         Parameters
         ----------
@@ -562,9 +584,13 @@ class _Fusion:
         is_velocity_fused : ndarray of bool, shape (S,)
             True if the velocity innovation is inside its gate.
         """
-        rules, now_s, action = self.rules, self.time_s[e], self.action[e]
-        has_gate, follows_log = self.has_gate, self.uses_logged_decisions
-        may_fuse, is_decision_logged = action == FUSE, math.isfinite(self.rejected[e])
+        rules = self.rules
+        now_s = self.time_s[e]
+        action = self.action[e]
+        has_gate = self.has_gate
+        follows_log = self.uses_logged_decisions
+        may_fuse = action == FUSE
+        is_decision_logged = math.isfinite(self.rejected[e])
         self.last_velocity_s = np.where(is_velocity_fused, now_s, self.last_velocity_s)
         if self.only_gate_decides[e] and not (is_outside_gate.any() or self.is_stopped.any()):
             self.last_position_s = now_s
@@ -602,8 +628,11 @@ def _variance_growth(
     parameters: dict[str, Array],
     biases: BoolArray,
     attitude: BoolArray,
-) -> tuple[Array, Array]:
-    """Return the variance that biases and fields gain per step, and the limit of their variance."""
+) -> ArrayPair:
+    """Return the variance that sensor biases and magnetic fields gain in one prediction step.
+
+    Return also the variance above which they gain none.
+    """
     field_parameters = ("MAG_E", "MAG_B") if segment.field is not None else ()
     noise_density = np.stack(
         [parameters[f"EKF2_{name}_NOISE"] for name in ("GYR_B", "ACC_B", *field_parameters)],
@@ -623,18 +652,19 @@ def _variance_growth(
 
 
 def with_correlation(inputs: Inputs, segment: ReplaySegment, intervals: Intervals) -> ReplaySegment:
-    """Add the correlations of the initial state to a segment; the log has variances only.
+    """Estimate the correlations of the initial state of a segment; the log has variances only.
 
-    Without correlations the first updates would divide the error differently between tilt and
-    accelerometer bias than EKF2. The correlations are estimated from the flight before the segment,
+    Without correlations, the first updates would divide the error differently than EKF2 between
+    tilt and accelerometer bias. The correlations are estimated from the flight before the segment,
     or else from the first seconds of the segment.
     """
-    flown_variant, inputs = Variant(inputs.settings), replace(inputs, vision=None)
+    flown_configuration = FilterConfiguration(inputs.settings)
+    inputs = replace(inputs, vision=None)
     if (history := segment.history) is not None:
         history = replace(history, correlation=_settled_correlation(history))
-        history_intervals = make_intervals(inputs, history, flown_variant.timing(inputs))
+        history_intervals = make_intervals(inputs, history, flown_configuration.timing(inputs))
         correlation = _correlation(
-            run_segment(inputs, history, [flown_variant], [history_intervals]).covariance[0]
+            run_segment(inputs, history, [flown_configuration], [history_intervals]).covariance[0]
         )
     else:
         ends_s = segment.time_s[intervals.events.end_step]
@@ -643,29 +673,32 @@ def with_correlation(inputs: Inputs, segment: ReplaySegment, intervals: Interval
             *(getattr(intervals, field.name)[:count] for field in fields(intervals))
         )
         correlation = _correlation(
-            run_segment(inputs, segment, [flown_variant], [first_intervals]).covariance[0]
+            run_segment(inputs, segment, [flown_configuration], [first_intervals]).covariance[0]
         )
     if segment.field is not None:
         # EKF2 has just reset heading and fields, so these states are uncorrelated with all others
-        correlation = block_diag(correlation[:STATES, :STATES], np.eye(len(segment.state) - STATES))
-        correlation[HEADING], correlation[:, HEADING] = 0.0, 0.0
+        correlation = block_diag(
+            correlation[:STATE_COUNT, :STATE_COUNT], np.eye(len(segment.state) - STATE_COUNT)
+        )
+        correlation[HEADING] = 0.0
+        correlation[:, HEADING] = 0.0
         correlation[HEADING, HEADING] = 1.0
     return replace(segment, correlation=correlation)
 
 
 def _correlation(P: Array) -> Array:
-    # the lower limit avoids a division by zero: a bias that EKF2 does not estimate has variance 0
+    # the lower limit avoids a division by zero: a bias that is not estimated has variance 0
     deviation = np.sqrt(np.maximum(np.diagonal(P), MIN_VARIANCE))
     return np.asarray(P / deviation[:, None] / deviation)
 
 
 def _settled_correlation(segment: ReplaySegment) -> Array:
-    """Return the correlations of a state that EKF2 has after a long time of velocity fusion.
+    """Return the correlations of EKF2's state errors after a long time of velocity fusion.
 
     Errors of tilt and accelerometer bias become correlated, because their effects on the
     acceleration cancel: θ × f = Rb.
     """
-    to_earth = np.eye(STATES)
+    to_earth = np.eye(STATE_COUNT)
     to_earth[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.rotation[0]
     P = np.diag(np.diagonal(to_earth @ np.diag(segment.variance) @ to_earth.T))
     for tilt, bias, acceleration_per_rad in ((1, BIAS_NORTH, -GRAVITY), (0, BIAS_EAST, GRAVITY)):
@@ -676,14 +709,11 @@ def _settled_correlation(segment: ReplaySegment) -> Array:
 
 
 def _diagonal(P: Array) -> Array:
-    """Return the variances as a view, not a copy."""
+    """Return the state variances of all filter configurations as a view of P, not a copy."""
     return P.reshape(len(P), -1)[:, :: P.shape[1] + 1]
 
 
-def _start_state(
-    segment: ReplaySegment, biases: BoolArray, attitude: BoolArray
-) -> tuple[Array, Array]:
-    """Return initial states and covariances; 0 for states that a variant does not estimate."""
+def _start_state(segment: ReplaySegment, biases: BoolArray, attitude: BoolArray) -> ArrayPair:
     x = np.tile(segment.state, (len(biases), 1))
     deviation = np.sqrt(segment.variance)
     P = np.tile(deviation[:, None] * segment.correlation * deviation, (len(biases), 1, 1))
@@ -700,10 +730,10 @@ def _start_state(
 
 
 def _noise_to_reach(variance: Array, target: Array) -> Array:
-    """Return the measurement noise R with which an update reduces a variance to a target.
+    """Return the measurement noise R with which an update reduces a state variance to a target.
 
     1/R = 1/target - 1/variance. Height and heading sensors are logged at a reduced rate. EKF2's
-    published values are fused instead, with an R that reproduces the logged variances.
+    published height and heading are fused instead, with an R that reproduces the logged variances.
     """
     surplus = variance - target
     noise = np.full(surplus.shape, IGNORED_VARIANCE)
@@ -712,7 +742,7 @@ def _noise_to_reach(variance: Array, target: Array) -> Array:
 
 
 def _limit_bias(P: Array, floor: float, biases: BoolArray) -> None:
-    """Limit the bias variance like PX4 up to v1.14 (fixCovarianceErrors)."""
+    """Limit the accelerometer bias variance like PX4 up to v1.14 (fixCovarianceErrors)."""
     variance = _diagonal(P)[:, ACCELEROMETER_BIAS]
     min_variance = np.maximum(MIN_BIAS_VARIANCE_RATIO * variance.max(axis=1, keepdims=True), floor)
     variance[biases] = np.clip(variance, min_variance, MAX_BIAS_SIGMA_M_S2**2)[biases]
@@ -725,9 +755,10 @@ def _measurements(
     event_steps: IntArray,
     parameters: dict[str, Array],
     uses_reported_noise: BoolArray,
-) -> tuple[Array, Array]:
-    """Return measured velocity and position, and their variances, each of shape (E, S, 6)."""
-    received, aid = inputs.received, inputs.aid
+) -> ArrayPair:
+    """Return measured velocity and position (NED), and their variances, each of shape (E, S, 6)."""
+    received = inputs.received
+    aid = inputs.aid
     offset_m = (np.stack([parameters[name] for name in aid.lever_arm], -1) - inputs.imu_offset_m)[
         :, :, None
     ]

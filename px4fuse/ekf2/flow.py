@@ -1,9 +1,9 @@
 """Fusion of optical flow in the EKF2 replay, as horizontal velocity in the body frame.
 
-The log contains a low-pass filtered velocity, which is converted to the mean velocity between two
-rows. Each mean is fused at the next event (end of an interval, see :mod:`px4fuse.ekf2.intervals`).
-The velocity change that the IMU measured until the event is added. The logged range to the ground
-is used.
+The log contains a low-pass filtered velocity. It is converted to the mean velocity between two
+logged samples. Each mean is fused at the next event (end of an interval, see
+:mod:`px4fuse.ekf2.intervals`), after adding the velocity change that the IMU measured until the
+event. The range to the ground is EKF2's logged range.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/optical_flow`` (``optical_flow_control.cpp``: velocity and
 low-pass filter; ``optical_flow_fusion.cpp``: R and gate).
@@ -27,13 +27,14 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     ----------
     segment : ReplaySegment
     flow : DataFrame
-        See :attr:`px4fuse.flight.FusionRecord.flow`.
+        Logged optical flow, see :attr:`px4fuse.flight.FusionRecord.flow`.
     gate : float
         Innovation gate in √S.
     """
     begin_s = flow.index - (flow["samples"] - 1.0) * flow["interval_s"]
     flow = flow[(begin_s > segment.time_s[0]) & (flow.index <= segment.time_s[-1])]
-    count, interval_s = flow["samples"].to_numpy(), flow["interval_s"].to_numpy()
+    count = flow["samples"].to_numpy()
+    interval_s = flow["interval_s"].to_numpy()
     step, weight = low_pass_weights(
         segment, flow.index.to_numpy(), count, interval_s, FLOW_FILTER_WEIGHT
     )
@@ -41,20 +42,20 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     imu_velocity = np.einsum(
         "ki,kiab,kib->ka", weight, rotation_to_body, segment.imu_velocity_m_s[step]
     )
-    velocity, mean = (
-        flow[["forward_m_s", "right_m_s"]],
-        np.einsum("ki,kiab->kab", weight, rotation_to_body),
-    )
-    sample_fields = (
+    samples = SensorSamples(
         step[:, 0],
-        velocity.to_numpy() - imu_velocity,
-        mean,
+        flow[["forward_m_s", "right_m_s"]].to_numpy() - imu_velocity,
+        np.einsum("ki,kiab->kab", weight, rotation_to_body),
         count,
         flow["noise_m2_s2"].to_numpy(),
+        gate,
     )
-    return replace(segment, flow=SensorSamples(*sample_fields, gate))
+    return replace(segment, flow=samples)
 
 
 def fuse_flow(x: Array, P: Array, flow_samples: EventSamples, gate: float) -> tuple[Array, Array]:
-    """Return state and covariance of all filter configurations after fusing one event's flow."""
+    """Return state and covariance after fusing the mean flow of one event.
+
+    All filter configurations are updated.
+    """
     return fuse_mean(x, P, flow_samples, flow_samples.noise, np.full(len(x), gate), VELOCITY)[:2]

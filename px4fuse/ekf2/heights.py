@@ -3,7 +3,7 @@
 EKF2 estimates a bias of the sensor that is not the height reference. Barometer samples between two
 events (ends of intervals, see :mod:`px4fuse.ekf2.intervals`) are fused at the later event. The
 vertical motion from sample to event is computed from the state and the IMU. Array shapes: E events,
-S variants (filter configurations), k samples per event.
+S filter configurations, k samples per event.
 
 Sources: PX4-Autopilot ``EKF/aid_sources`` (``barometer/baro_height_control.cpp``,
 ``gnss/gnss_height_control.cpp``), before v1.16 ``EKF/baro_height_control.cpp`` and
@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.ekf2.bias import BiasEstimator
 from px4fuse.ekf2.replay_segments import (
     HeightSamples,
@@ -28,42 +28,48 @@ from px4fuse.ekf2.replay_segments import (
 from px4fuse.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, fuses_by_mask
 from px4fuse.flight import GROUND_EFFECT, Ekf2, Flight, FusionRecord, step_values_at
 
-VELOCITY_DOWN, DOWN = 5, 8
+VELOCITY_DOWN, DOWN = 5, 8  # indices in the state
 SENSORS = (BAROMETER, GNSS_HGT)
 HEIGHTS = (*SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
-DEFAULT_DEAD_ZONE_M = 4.0  # m; default of EKF2_GND_EFF_DZ
-HEIGHT_REFERENCES = {0: BAROMETER.name, 1: GNSS_HGT.name}  # values of EKF2_HGT_REF
-# Maximum time (s) from the start of the replay to the first logged height bias (logged at 2 Hz)
+DEFAULT_DEAD_ZONE_M = 4.0  # default of EKF2_GND_EFF_DZ, the barometer's dead zone near the ground
+HEIGHT_REFERENCES = {0: BAROMETER.name, 1: GNSS_HGT.name}  # by value of EKF2_HGT_REF
+# Maximum time (s) from the start of the replay to the first logged height bias: the bias is logged
+# at 2 Hz
 MAX_BIAS_LOG_DELAY_S = 1.0
-# Barometer rate (Hz) in EKF2 from v1.15 on and before v1.15, and minimum logged rate for a replay.
-# If the logged rate is below EKF2's rate, one logged sample represents several
-BAROMETER_HZ, OLD_BAROMETER_HZ, MIN_BAROMETER_LOG_HZ = 10.0, 15.0, 4.0
-# Minimum gate (√S), and minimum noise of position (m) and velocity (m/s)
-MIN_GATE, MIN_SIGMA = 1.0, 0.01
+# Rate (Hz) at which EKF2 fuses the barometer, from PX4 v1.15 on
+BAROMETER_HZ = 10.0
+# Rate (Hz) at which EKF2 fuses the barometer, before PX4 v1.15
+OLD_BAROMETER_HZ = 15.0
+# Minimum rate (Hz) of the logged barometer for a replay of its fusion
+MIN_BAROMETER_LOG_HZ = 4.0
+# Minimum innovation gate (√S) in EKF2
+MIN_GATE = 1.0
+# Minimum measurement noise in EKF2, of positions (m) and of velocities (m/s)
+MIN_SIGMA = 0.01
 
 
 def add_heights(
     flight: Flight, ekf2: Ekf2, record: FusionRecord, segments: Sequence[ReplaySegment]
 ) -> tuple[ReplaySegment, ...] | str:
-    """Add height samples to the segments, or return the reason why the log is not sufficient."""
-    parameters, times = record.parameters, np.concatenate([segment.time_s for segment in segments])
+    """Add height measurements to the segments, or return the reason why the log is insufficient."""
+    parameters = record.parameters
+    times = np.concatenate([segment.time_s for segment in segments])
     if fuses_by_mask(parameters):
         return "EKF2 before PX4 v1.14 fuses only one height sensor"
-    enabled = {name: log.enabled for name, log in ekf2.aids.items() if log.enabled is not None}
-    enabled_shares = {
-        name: float(np.mean(step_values_at(is_enabled, times) > 0.0))
-        for name, is_enabled in enabled.items()
+    enabled_fractions = {
+        name: np.mean(step_values_at(log.enabled, times) > 0.0)
+        for name, log in ekf2.aids.items()
+        if log.enabled is not None
     }
-    fused = [aid.name for aid in SENSORS if enabled_shares.get(aid.name) == 1.0]
-    if other_aids := [
-        aid for aid in HEIGHTS if enabled_shares.get(aid.name) and aid.name not in fused
-    ]:
-        return f"EKF2 also fused {other_aids[0].label} in part of the flight"
+    fused = [aid.name for aid in SENSORS if enabled_fractions.get(aid.name) == 1.0]
+    for aid in HEIGHTS:
+        if enabled_fractions.get(aid.name) and aid.name not in fused:
+            return f"EKF2 also fused {aid.label} in part of the flight"
     reference = HEIGHT_REFERENCES.get(int(parameters.get("EKF2_HGT_REF", 1.0)))
     if len(fused) == 1:  # a single sensor is the reference
         (reference,) = fused
     if reference not in fused:
-        return "the height reference is neither GNSS nor barometer, or not logged"
+        return "EKF2's height reference is neither GNSS nor barometer, or not logged"
     measured_at_s, down_m = np.zeros((2, 0))
     if BAROMETER.name in fused and flight.barometer is not None:
         measured_at_s = flight.barometer.index.to_numpy() - 0.5 * ekf2.step_s
@@ -71,9 +77,11 @@ def add_heights(
     effect_height_m = parameters.get("EKF2_GND_EFF_DZ", DEFAULT_DEAD_ZONE_M)
     dead_zone_m = np.where(record.was_in_state(GROUND_EFFECT, measured_at_s), effect_height_m, 0.0)
     ekf2_rate_hz = OLD_BAROMETER_HZ if record.per_step_biases else BAROMETER_HZ
-    new_segments, delayed = [], record.delayed["down_m"]
+    new_segments = []
+    delayed = record.delayed["down_m"]
     for segment in segments:
-        start_s, bias = float(segment.time_s[0]), (0.0, 0.0)
+        start_s = float(segment.time_s[0])
+        bias = (0.0, 0.0)
         for aid_name in {*fused} - {reference}:
             logged_bias = record.height_bias.get(aid_name)
             if (
@@ -82,9 +90,10 @@ def add_heights(
             ):
                 return f"EKF2's bias of the {AIDS[aid_name].label} is not logged"
             value, variance = (
-                np.interp(start_s, logged_bias.index, logged_bias[name]) for name in logged_bias
+                float(np.interp(start_s, logged_bias.index, logged_bias[name]))
+                for name in logged_bias
             )
-            bias = float(value), float(variance)
+            bias = value, variance
         samples = barometer_samples_inside(segment, measured_at_s, down_m, dead_zone_m)
         rate_hz = len(samples[0]) / float(segment.time_s[-1] - start_s)
         if BAROMETER.name in fused and rate_hz < MIN_BAROMETER_LOG_HZ:
@@ -100,37 +109,33 @@ def add_heights(
 def barometer_samples_inside(
     segment: ReplaySegment, measured_at_s: Array, down_m: Array, dead_zone_m: Array
 ) -> tuple[IntArray, Array, Array, Array]:
-    """Return prediction step, time (s), height (m, down) and dead zone (m) of barometer samples."""
+    """Select the barometer samples inside a segment.
+
+    Return the prediction step after which each is fused, its time (s), height (m, down) and dead
+    zone (m).
+    """
     step, is_inside = sample_steps(segment, measured_at_s)
     return step, measured_at_s[is_inside], down_m[is_inside], dead_zone_m[is_inside]
 
 
 def barometer_samples(segment: ReplaySegment, ends: Sequence[IntArray]) -> list[Array]:
-    """Return barometer samples by the event at which they are fused, one array per ``ends``.
+    """Return the barometer samples that are fused at each event, one array per set of events.
 
     Each element of ``ends`` contains the prediction steps of E events. Each array has shape
-    (5, k, E). Rows: height (m, down), see
+    (5, k, E). Its rows are height (m, down), see
     :func:`~px4fuse.ekf2.replay_segments.samples_by_event`; sample age (s); sample time (s); dead
     zone (m); and 1. All are 0 without a sample.
     """
     heights = segment.heights
     assert heights is not None
-    sample_columns = (
-        heights.down_m[:, None],
-        slice(2, 3),
-        heights.measured_at_s,
-        heights.dead_zone_m,
-    )
+    columns = heights.down_m[:, None], slice(2, 3), heights.measured_at_s, heights.dead_zone_m
     return pad_samples(
-        [
-            samples_by_event(segment, event_steps, heights.step, *sample_columns)
-            for event_steps in ends
-        ]
+        [samples_by_event(segment, event_steps, heights.step, *columns) for event_steps in ends]
     )
 
 
 class HeightFilter:
-    """Height fusion of S variants through one segment, event by event.
+    """Height fusion in S filter configurations through one segment, event by event.
 
     Parameters
     ----------
@@ -139,11 +144,11 @@ class HeightFilter:
         Result of :func:`barometer_samples`.
     fix_s, has_fix : ndarray, shape (E, S) or (E, 1)
         Measurement time of the GNSS fix of each event, and mask of the events with a fix.
-    enabled : mapping from PX4's name of an aid to ndarray of bool, shape (E, S)
-        True while the aid is fused.
+    enabled : mapping from PX4's name of an aiding source to ndarray of bool, shape (E, S)
+        True while the aiding source is fused.
     parameters : mapping from parameter name to ndarray, shape (S,)
     has_gate : ndarray of bool, shape (S,)
-        True for variants that apply the gate.
+        True for filter configurations that apply the gate.
 
     Attributes
     ----------
@@ -162,57 +167,53 @@ class HeightFilter:
         parameters: Mapping[str, Array],
         has_gate: BoolArray,
     ) -> None:
-        heights, size = segment.heights, len(has_gate)
+        heights = segment.heights
+        configuration_count = len(has_gate)
         assert heights is not None
         self.fused = heights.fused
         self.down_m, self.age_s, measured_at_s, self.dead_zone_m, is_sample = barometer
         self.time_s = [*measured_at_s, fix_s]
-        self.update_log = np.full((len(fix_s), len(self.time_s), 3, size), np.nan)
+        self.update_log = np.full((len(fix_s), len(self.time_s), 3, configuration_count), np.nan)
         has_fix = has_fix & enabled[GNSS_HGT.name] & (GNSS_HGT.name in heights.fused)
         self.has_sample = [*((is_sample > 0.0) & enabled[BAROMETER.name]), has_fix]
-        self.any = [np.any(each, axis=1).tolist() for each in self.has_sample]
+        self.any_sample = [np.any(mask, axis=1).tolist() for mask in self.has_sample]
         self.in_ground_effect = self.dead_zone_m.any(axis=2)
         gates = [np.maximum(parameters.get(aid.gate, MIN_GATE), MIN_GATE) for aid in SENSORS]
         self.gate2 = [np.where(has_gate, gate**2, np.inf) for gate in gates]
         self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SIGMA), MIN_SIGMA) ** 2
         self.biased = [aid.name != heights.reference for aid in SENSORS]
-        self.weight, self.learning = (heights.weight, 1.0), enabled[heights.reference]
-        value_m, variance_m2 = (np.full(size, part) for part in heights.bias)
-        start_s, step_s = float(segment.time_s[0]), float(np.median(segment.step_s))
+        self.weight = (heights.weight, 1.0)
+        self.learning = enabled[heights.reference]
+        value_m, variance_m2 = (np.full(configuration_count, value) for value in heights.bias)
+        start_s = float(segment.time_s[0])
+        step_s = float(np.median(segment.step_s))
         self.bias = BiasEstimator(value_m, variance_m2, start_s, step_s)
 
-    def updates(self, sensor: str, variant: int, end_s: Array) -> pd.DataFrame:
-        """Return the updates of one variant with one sensor, indexed by EKF2's measurement time.
+    def updates(self, sensor: str, configuration: int, end_s: Array) -> pd.DataFrame:
+        """Return the updates of one filter configuration with one sensor.
 
-        ``end_s`` is the time of each event.
+        The index is EKF2's measurement time; ``end_s`` is the time of each event.
         """
-        rows, slots = [], len(self.down_m)
+        rows = []
+        slots = len(self.down_m)
         for slot in [slots] if sensor == GNSS_HGT.name else range(slots):
-            times, has_sample = self.time_s[slot], self.has_sample[slot][:, variant]
-            measured_s = times[has_sample, min(variant, times.shape[1] - 1)]
-            rows.append(
-                np.vstack(
-                    [
-                        measured_s,
-                        self.update_log[has_sample, slot, :, variant].T,
-                        end_s[has_sample],
-                    ]
-                )
-            )
+            times = self.time_s[slot]
+            has_sample = self.has_sample[slot][:, configuration]
+            measured_s = times[has_sample, min(configuration, times.shape[1] - 1)]
+            updates = self.update_log[has_sample, slot, :, configuration].T
+            rows.append(np.vstack([measured_s, updates, end_s[has_sample]]))
         measured_s, nu, S, fused, end_s = np.hstack(rows)
         columns = {"innovation_down_m": nu, "innovation_variance_down_m2": S}
         columns |= {"rejected": 1.0 - fused, "fused": fused, "fused_at_s": end_s}
         return pd.DataFrame(columns, pd.Index(measured_s, name="time_s")).sort_index()
 
-    def fuse(
-        self, e: int, x: Array, P: Array, gnss_m: Array, gnss_m2: Array
-    ) -> tuple[Array, Array]:
+    def fuse(self, e: int, x: Array, P: Array, gnss_m: Array, gnss_m2: Array) -> ArrayPair:
         """Return state and covariance after fusing barometer and GNSS height at one event.
 
-        ``gnss_m`` and ``gnss_m2`` are the GNSS height (m, down) and its R.
+        ``gnss_m`` is the GNSS height (m, down), ``gnss_m2`` its measurement variance R (m²).
         """
         for slot in range(len(self.down_m)):
-            if self.any[slot][e]:
+            if self.any_sample[slot][e]:
                 age_s = self.age_s[slot, e]
                 column = P[:, :, DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
                 predicted_variance = column[:, DOWN] - age_s * column[:, VELOCITY_DOWN]
@@ -220,8 +221,9 @@ class HeightFilter:
                 x, P = self._fuse_innovation(
                     e, slot, 0, x, P, column, predicted_variance, nu, self.noise_m2
                 )
-        if self.any[-1][e]:
-            column, nu = P[:, :, DOWN], gnss_m - x[:, DOWN]
+        if self.any_sample[-1][e]:
+            column = P[:, :, DOWN]
+            nu = gnss_m - x[:, DOWN]
             x, P = self._fuse_innovation(e, -1, 1, x, P, column, column[:, DOWN], nu, gnss_m2)
         return x, P
 
@@ -236,16 +238,15 @@ class HeightFilter:
         predicted_variance: Array,
         nu: Array,
         R: Array,
-    ) -> tuple[Array, Array]:
-        """Fuse one innovation; ``column`` is PH', ``predicted_variance`` HPH'."""
+    ) -> ArrayPair:
+        """Fuse one height innovation ``nu``; ``column`` is PH', ``predicted_variance`` HPH'."""
         if self.biased[sensor_index]:
-            has_sample, time_s = self.has_sample[slot][e], self.time_s[slot][e]
             nu, R = self.bias.remove_bias(
                 nu,
                 predicted_variance,
                 R,
-                time_s,
-                has_sample,
+                self.time_s[slot][e],
+                self.has_sample[slot][e],
                 self.learning[e],
                 self.weight[sensor_index],
             )

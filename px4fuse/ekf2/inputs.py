@@ -1,4 +1,4 @@
-"""Inputs of the EKF2 replay, read from a flight, or the reason why the log is not sufficient.
+"""Inputs of the EKF2 replay, read from a flight, or the reason why the log is insufficient.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/external_vision/ev_pos_control.cpp`` and, before v1.15,
 ``EKF/ev_pos_control.cpp`` (frames), ``logged_topics.cpp`` (logging rates).
@@ -51,23 +51,23 @@ from px4fuse.position_source import POSITION_FILE
 from px4fuse.readers.px4_innovations import fused_aid, with_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE
-from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_matrix
+from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, rotate, to_matrix
 
 ANALYSIS_NAME = "EKF2 replay"
-# Note in logs that px4fuse simulated: their EKF2 data are from this model
+# Note in simulated logs: their EKF2 data are from px4fuse's EKF2 model
 MODEL_NOTE = (
     "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
 )
-# Logging interval (s) of the topics with a copy of the vision samples (logged_topics.cpp)
+# Logging interval (s) of the topics with copies of the vision positions (logged_topics.cpp)
 VISION_COPY_INTERVALS_S = {
     "estimator_visual_odometry_aligned": 0.2,
     "estimator_aid_src_ev_pos": 0.5,
 }
-ROTATE_VISION_BIT = 64  # EKF2_AID_MASK, up to v1.13
-# Maximum time difference (s) of a logged innovation and its sample: estimator_aid_src topics
-# contain EKF2's measurement time within about 1 ms
+ROTATE_VISION_BIT = 64  # bit in EKF2_AID_MASK, up to PX4 v1.13
+# Maximum time difference (s) between a logged innovation and the measurement time of its sample:
+# estimator_aid_src topics contain EKF2's measurement time within about 1 ms
 SAMPLE_MATCH_TOLERANCE_S = 0.006
-GNSS_VELOCITY_BIT = 4  # bit in EKF2_GPS_CTRL; before v1.14 GNSS velocity is always fused
+GNSS_VELOCITY_BIT = 4  # bit in EKF2_GPS_CTRL; before PX4 v1.14 GNSS velocity is always fused
 GNSS_LABELS = (GNSS_POS.label, GNSS_VEL.label)
 # Maximum time (s) from a reset to its publication: vehicle_local_position is logged every 0.1 s
 MAX_RESET_PUBLICATION_S = 0.2
@@ -76,9 +76,11 @@ MAX_RESET_PUBLICATION_S = 0.2
 MAX_IMU_INTERVAL_S = 0.012
 # Maximum fraction of IMU samples that EKF2 received but the log does not contain, outside gaps
 MAX_LOST_SHARE = 0.1
-# First release with the time of the fusion horizon in estimator_states
+# First release in which estimator_states has the time of the fusion horizon
 FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
+# Maximum number of position resets in a row, for releases without a limit
 UNLIMITED_RESETS = 1_000_000
+# Maximum interval (s) between height and heading measurements in a gap of the position source
 MAX_INTERVAL_S = 0.25
 
 
@@ -105,8 +107,8 @@ class ReceivedPositions:
     uses_sender_times : bool
         True if EKF2 uses the measurement times of the sender instead of the delay parameter.
     correction_m : ndarray, shape (m, 2), or None
-        EKF2's position correction by each sample (m, north and east), estimated from the published
-        position. None if it is not needed: all rejections are logged, or none occurred.
+        EKF2's position correction by each sample (north and east), estimated from the published
+        position. None if all rejections are logged, or none occurred.
     """
 
     stamp_s: Array
@@ -126,7 +128,7 @@ class ReceivedPositions:
 
 @dataclass(frozen=True)
 class FusionRules:
-    """Release-dependent rules for start, stop and reset of the horizontal position.
+    """Rules for start, stop and reset of horizontal position fusion in one PX4 release.
 
     Attributes
     ----------
@@ -140,7 +142,7 @@ class FusionRules:
         Number of resets in a row after which fusion stops, until a sample with which fusion may
         start.
     reset_scale : float
-        Ratio of the position variance after a reset to the variance of the sample.
+        Ratio of the position variance after a reset to the measurement variance of the sample.
     with_velocity : bool
         True if velocity is reset together with position. Both are then reset after both were
         rejected for ``reset_s``, or after position was rejected for twice that time.
@@ -163,17 +165,17 @@ class FusionRules:
 
 @dataclass(frozen=True)
 class Inputs:
-    """All data of a flight that the EKF2 replay needs.
+    """Data of a flight that the EKF2 replay needs.
 
     Attributes
     ----------
     settings : dict
-        Logged values of the parameters that the model uses, by PX4 name.
+        Logged values of the EKF2 parameters in the model, by PX4 name.
     segments : tuple of ReplaySegment
     received : ReceivedPositions
         Samples of the horizontal position source.
     aid : Aid
-        EKF2 aid that fused these positions: GNSS or external vision.
+        EKF2's name and parameters of this position source: GNSS or external vision.
     rules : FusionRules
     step_s : float
         Mean prediction step.
@@ -186,12 +188,12 @@ class Inputs:
     imu_offset_m : ndarray, shape (3,)
         Position of the IMU, EKF2_IMU_POS, body FRD.
     max_interval_s : float
-        Maximum interval between height and heading measurements in a gap of the source.
+        Maximum interval between height and heading measurements in a gap of the position source.
     vision : ReceivedPositions or None
         External vision that EKF2 fused in addition to GNSS; NaN while disabled.
     height_reason : str
-        In a flight with GNSS, reason why the logged EKF2 height is used; empty if heights are
-        fused.
+        Reason why the replay of a flight with GNSS uses the logged EKF2 height; empty if it fuses
+        height sensors.
     """
 
     settings: dict[str, float]
@@ -214,17 +216,19 @@ class Inputs:
 def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     flight: Flight, doubtful: Mapping[str, str] = MappingProxyType({})
 ) -> Inputs | Unavailable:
-    """Return the inputs of the replay, or the reason why the log is not sufficient.
+    """Return the inputs of the EKF2 replay, or the reason why the log is insufficient.
 
     Parameters
     ----------
     flight : Flight
-    doubtful : mapping from PX4's name of an aid to str
-        Aids with a replay that disagrees with the log, and the reasons. Height sensors among them
-        are replaced by the logged EKF2 height. Without optical flow the replay is interrupted in
-        gaps of the source. Vision in addition to GNSS is omitted.
+    doubtful : mapping from PX4's name of an aiding source to str
+        Aiding sources with a replay that disagrees with the log, and the reasons. They are omitted:
+        height sensors are replaced by the logged EKF2 height; without optical flow the replay is
+        interrupted in gaps of the position source.
     """
-    imu, attitude, ekf2 = flight.imu, flight.attitude, flight.ekf2
+    imu = flight.imu
+    attitude = flight.attitude
+    ekf2 = flight.ekf2
     if isinstance(imu, Unavailable):
         return imu
     if isinstance(attitude, Unavailable):
@@ -232,10 +236,12 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if isinstance(ekf2, Unavailable):
         return ekf2
     aid = replayed_aid(ekf2)
-    is_gnss, logged_ekf2 = aid == GNSS_POS, ekf2
+    is_gnss = aid == GNSS_POS
+    logged_ekf2 = ekf2
     if is_gnss:
         ekf2 = with_gnss_innovations(ekf2)
-    record, horizon_s = ekf2.record, ekf2.horizon_s
+    record = ekf2.record
+    horizon_s = ekf2.horizon_s
     if isinstance(record, Unavailable):
         return record
     if MODEL_NOTE in flight.log.notes:  # the simulated earth is a sphere without rotation
@@ -243,16 +249,12 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
     modelled_aids = (*GNSS_LABELS, *([FLOW.label] if len(record.flow) else [])) if is_gnss else ()
-    if unmodelled_aids := [
-        aid_name for aid_name in record.other_aiding if aid_name not in modelled_aids
-    ]:
-        fused, disable_gnss = (
-            ("GNSS", "") if is_gnss else ("vision position", f", {GNSS_POS.switch} 0")
-        )
+    if unmodelled_aids := [label for label in record.other_aiding if label not in modelled_aids]:
+        disable_gnss = "" if is_gnss else f", {GNSS_POS.switch} 0"
         return Unavailable(
-            "EKF2 replay",
-            f"EKF2 fused horizontal aids besides {fused} that the model does not contain "
-            f"({', '.join(unmodelled_aids)})",
+            ANALYSIS_NAME,
+            f"EKF2 fused horizontal aids besides {'GNSS' if is_gnss else 'vision position'} that "
+            f"the model does not contain ({', '.join(unmodelled_aids)})",
             f"Fly with EKF2_OF_CTRL 0{disable_gnss} and without bit 2 of {EV_POS.switch}.",
         )
     if missing := _missing_imu(imu.index.to_numpy()):
@@ -264,37 +266,38 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         return position_samples
     if not len(position_samples.stamp_s):
         return Unavailable(
-            "EKF2 replay",
-            f"the log has no sample of {aid.label} at a time at which EKF2 reports its fusion",
-            "Record estimator_status_flags and the source for the whole flight.",
+            ANALYSIS_NAME,
+            f"the log has no sample of {aid.label} while EKF2 reports its fusion",
+            "Record estimator_status_flags and the position source for the whole flight.",
         )
-    uses_vision = is_gnss and EV_POS.name not in doubtful
     vision = (
-        _read_vision_besides_gnss(flight, logged_ekf2, record, attitude) if uses_vision else None
+        _read_vision_besides_gnss(flight, logged_ekf2, record, attitude)
+        if is_gnss and EV_POS.name not in doubtful
+        else None
     )
     if isinstance(vision, Unavailable):
         return vision
-    # since v1.17 each receiver has a separate lever arm, which is logged in its messages
+    # from PX4 v1.17 on each GNSS receiver has a separate lever arm, logged in the GNSS messages
     track = _gnss_track(flight) if is_gnss else None
     lever_arm = {} if track is None else dict(zip(aid.lever_arm, track.lever_arm_m, strict=True))
     if isinstance(horizon_s, Unavailable):
         if not flight.log.firmware.startswith(FIRST_RELEASE_WITH_HORIZON_TIMES):
             return Unavailable(ANALYSIS_NAME, horizon_s.reason, horizon_s.remedy)
-        horizon_s = 0.0  # EKF2_EV_DELAY is at most EKF2_PREDICT_US, so the buffer has one step
-    aiding_s, flow = position_samples.stamp_s, record.flow if is_gnss else record.flow.iloc[:0]
+        # the fusion horizon has no delay if EKF2_EV_DELAY is at most one prediction step
+        horizon_s = 0.0
+    aiding_s = position_samples.stamp_s
+    flow = record.flow if is_gnss else record.flow.iloc[:0]
     if len(flow) and FLOW.name not in doubtful:
         aiding_s = np.union1d(aiding_s, flow.index)
     segments = find_replay_segments(flight, imu, attitude, ekf2, record, aiding_s, is_gnss=is_gnss)
     if not segments:
-        fused = aid.label.removesuffix(", position")
         return Unavailable(
-            "EKF2 replay",
-            f"{fused} was never fused for {MIN_SEGMENT_S:g} s in flight without a gap in "
-            "it or in the IMU",
-            "Record without dropouts (faster SD card, fewer topics) and with a steady "
-            "position source.",
+            ANALYSIS_NAME,
+            f"EKF2 never fused {aid.label.removesuffix(', position')} for {MIN_SEGMENT_S:g} s in "
+            "flight without a gap in the position source or the IMU",
+            "Record without dropouts (faster SD card, fewer topics) and with a steady position "
+            "source.",
         )
-    fusing = ekf2.fusing
     if len(flow):
         gate = record.parameters.get(FLOW.gate, FLOW.default_gate)
         segments = tuple(add_flow_samples(segment, flow, gate) for segment in segments)
@@ -321,8 +324,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         horizon_s=horizon_s,
         predict_s=predict_s(record),
         vision_height=not is_gnss
-        and isinstance(fusing, pd.DataFrame)
-        and bool(fusing["vertical"].mean() > 0.5),
+        and isinstance(ekf2.fusing, pd.DataFrame)
+        and bool(ekf2.fusing["vertical"].mean() > 0.5),
         imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
         aid=aid,
         height_reason=height_reason,
@@ -331,44 +334,42 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
 
 
 def lost_imu_fraction(time_s: Array) -> float:
-    """Return the fraction of the IMU samples that the log lacks, outside gaps."""
+    """Return the fraction of IMU samples that are missing from the log, outside gaps.
+
+    ``time_s`` are the times of the logged samples.
+    """
     intervals = np.diff(time_s)
-    regular_intervals = intervals[intervals <= IMU_GAP_S]
-    lost_counts = np.rint(regular_intervals / np.median(intervals)) - 1.0
+    lost_counts = np.rint(intervals[intervals <= IMU_GAP_S] / np.median(intervals)) - 1.0
     lost_count = lost_counts.clip(0.0).sum()
     return float(lost_count / (lost_count + len(time_s)))
 
 
 def _missing_imu(time_s: Array) -> Unavailable | None:
-    """Return Unavailable if the IMU samples at ``time_s`` are too few for predictions."""
-    intervals = np.diff(time_s)
-    interval = float(np.median(intervals))
+    """Return Unavailable if too few IMU samples are logged; ``time_s`` are their times."""
+    interval = float(np.median(np.diff(time_s)))
     if interval > MAX_IMU_INTERVAL_S:
         return Unavailable(
-            "EKF2 replay",
+            ANALYSIS_NAME,
             f"the IMU is logged at {1.0 / interval:.0f} Hz, below EKF2's prediction rate",
             "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate.",
         )
-    lost_fraction = lost_imu_fraction(time_s)
-    return (
-        None
-        if lost_fraction <= MAX_LOST_SHARE
-        else Unavailable(
-            "EKF2 replay",
+    if (lost_fraction := lost_imu_fraction(time_s)) > MAX_LOST_SHARE:
+        return Unavailable(
+            ANALYSIS_NAME,
             f"{100.0 * lost_fraction:.0f} % of the IMU samples are missing from the log",
             "Use a faster SD card, or log fewer topics (SDLOG_PROFILE).",
         )
-    )
+    return None
 
 
 def _rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules:
-    """Return the rules for starts, stops and resets in the PX4 release of the log."""
     bias_floor = 5e-8 / step_s**2 if record.per_step_biases else None
     is_horizon_from_delay = "EKF2_DELAY_MAX" not in record.parameters
     if is_gnss:
-        # resetHorizontalPositionTo, gps_control.cpp: variance doubled from v1.16 on. In PX4 main
-        # since 2026 each aid (position, velocity) has a separate timeout and reset
+        # a reset doubles the variance of the sample from v1.16 on (resetHorizontalPositionTo,
+        # gps_control.cpp)
         reset_scale = 2.0 if record.stores_latitude else 1.0
+        # in PX4 main since 2026, position and velocity have separate timeouts and resets
         resets_together = GNSS_MODE not in record.parameters
         return FusionRules(
             np.inf,
@@ -380,14 +381,15 @@ def _rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules
             reset_scale,
             resets_together,
         )
-    # Limits: EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
-    is_old_release = fuses_by_mask(record.parameters)
-    intervals = (np.inf, 7.0, 7.0, UNLIMITED_RESETS) if is_old_release else (0.2, 0.4, 1.0, 5)
-    return FusionRules(*intervals, bias_floor, is_horizon_from_delay)
+    # times: EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
+    limits = (np.inf, 7.0, 7.0, UNLIMITED_RESETS)
+    if not fuses_by_mask(record.parameters):
+        limits = (0.2, 0.4, 1.0, 5)
+    return FusionRules(*limits, bias_floor, is_horizon_from_delay)
 
 
 def replayed_aid(ekf2: Ekf2) -> Aid:
-    """Return the aid of EKF2's horizontal position: GNSS if it was fused, else external vision."""
+    """Return the position source to replay: GNSS if EKF2 fused GNSS, else external vision."""
     vision = ekf2.aids.get(EV_POS.name)
     is_vision_used = vision is not None and (vision.enabled is None or bool(vision.enabled.any()))
     has_gnss = _enabled_log(ekf2, GNSS_POS) is not None
@@ -395,7 +397,10 @@ def replayed_aid(ekf2: Ekf2) -> Aid:
 
 
 def _enabled_log(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
-    """Return the series "aid enabled" (1 or 0); None if never enabled or not logged."""
+    """Return the times at which an aiding source is enabled (1) or disabled (0).
+
+    None if the source was never enabled, or if this is not logged.
+    """
     log = ekf2.aids.get(aid.name)
     return (
         log.enabled if log is not None and log.enabled is not None and log.enabled.any() else None
@@ -410,26 +415,29 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
     """Return the GNSS fixes that EKF2 received (NED), or the reason why they are incomplete."""
     track = _gnss_track(flight)
     if track is None or track.velocity is None:
-        return Unavailable(ANALYSIS_NAME, "no vehicle_gps_position in the log", DEFAULT_PROFILE)
+        return Unavailable(
+            ANALYSIS_NAME, "the log has no topic vehicle_gps_position", DEFAULT_PROFILE
+        )
     if track.rate_hz < MAX_DOWNSAMPLED_HZ:
         return Unavailable(
-            "EKF2 replay",
+            ANALYSIS_NAME,
             f"GNSS is logged at {track.rate_hz:.1f} Hz, below the rate that EKF2 fused",
             "Set bit 1 of SDLOG_PROFILE to log all fixes.",
         )
     parameters = record.parameters
     switch = int(parameters.get(GNSS_POS.switch, 7.0))
-    samples, velocities = track.samples, track.velocity
-    # EKF2 does not use fixes while GNSS is disabled
+    samples = track.samples
+    velocities = track.velocity
+    # EKF2 ignores GNSS fixes while GNSS is disabled
     if (enabled := ekf2.aids[GNSS_POS.name].enabled) is not None:
         is_enabled = step_values_at(enabled, samples.index) > 0.0
-        samples, velocities = samples[is_enabled], velocities[is_enabled]
-    # the track has measurement times; the delay is added to get timestamps, because the replay
-    # subtracts it again
+        samples = samples[is_enabled]
+        velocities = velocities[is_enabled]
+    # the track has measurement times: add the delay, because the replay subtracts it again
     flown = effective_settings(parameters, GNSS_POS)
     flown_s = flown[GNSS_POS.delay] * 1e-3
     timestamp_s = samples.index.to_numpy() + flown_s
-    # maximum GNSS position noise (m) in EKF2 (gps_control.cpp)
+    # EKF2's upper limit of the reported position noise (m; gps_control.cpp)
     max_noise_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
     reported_variance = samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=max_noise_m**2)
     velocity = velocities[Columns.VELOCITY].to_numpy()
@@ -456,7 +464,10 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
 def _position_corrections(
     ekf2: Ekf2, measured_s: Array, rejected: Array, tau_s: float
 ) -> Array | None:
-    """Return EKF2's position correction by each sample; None if all rejections are logged."""
+    """Estimate EKF2's position correction (m) by each GNSS fix from the published position.
+
+    Return None if all rejections are logged, or none occurred.
+    """
     if not (rejected > 0.0).any() or np.isfinite(rejected).all():
         return None
     if isinstance(ekf2.horizon_s, Unavailable):
@@ -468,7 +479,7 @@ def _position_corrections(
     for reset in ekf2.resets:
         if reset.quantity == "position":
             position = position - (times >= reset.time_s)[:, None] * np.array(reset.delta[:2])
-    # EKF2 fuses the fix half a step earlier; the correction is in the next published row
+    # the correction is in the next published position after the prediction step that fuses the fix
     before_sample_s = measured_s + ekf2.horizon_s - 1.5 * ekf2.step_s
     return corrections(times, velocity, position, before_sample_s, tau_s)
 
@@ -476,15 +487,9 @@ def _position_corrections(
 def read_vision(
     flight: Flight, ekf2: Ekf2, record: FusionRecord, attitude: pd.DataFrame
 ) -> ReceivedPositions | Unavailable:
-    """Return the vision samples that EKF2 received (NED), or the reason why they are incomplete.
+    """Return the vision positions that EKF2 received (NED), or the reason why they are incomplete.
 
-    Parameters
-    ----------
-    flight : Flight
-    ekf2 : Ekf2
-    record : FusionRecord
-    attitude : DataFrame
-        Published attitude, with which samples in FRD are rotated to NED.
+    ``attitude`` is the published attitude, which rotates positions in an FRD frame to NED.
     """
     track = _vision_track(flight)
     if isinstance(track, Unavailable):
@@ -499,9 +504,9 @@ def read_vision(
     if track.frame == "FRD" and is_rotated_by_ekf2:
         if track.orientation is None:
             return Unavailable(
-                "EKF2 replay",
-                f"{track.name} is in its own frame (FRD) and has no orientation to rotate it "
-                "into NED",
+                ANALYSIS_NAME,
+                f"the positions of {track.name} are in an FRD frame, without an orientation to "
+                "rotate them to NED",
                 "Send the position in NED, or with an orientation.",
             )
         ekf2_attitude, source_attitude = (
@@ -509,12 +514,13 @@ def read_vision(
             for frame in (attitude, track.orientation)
         )
         rotation = to_matrix(multiply(ekf2_attitude, conjugate(source_attitude)))
-        position = np.einsum("nij,nj->ni", rotation, position)
-        variance = np.einsum("nij,nj->ni", rotation**2, variance)
+        position = rotate(rotation, position)
+        variance = rotate(rotation**2, variance)
     age = record.vision_age_s
-    arrival = np.full(len(timestamp_s), -np.inf)  # arrival times unknown: no sample counts as late
+    # without arrival times no sample is treated as late
+    arrival = np.full(len(timestamp_s), -np.inf)
     if len(age) and "vehicle_visual_odometry" in track.topics:
-        arrival = timestamp_s + np.interp(timestamp_s, age.index.to_numpy(), age.to_numpy())
+        arrival = timestamp_s + np.interp(timestamp_s, age.index, age)
     decisions = _logged_decisions(ekf2, record, timestamp_s)
     return ReceivedPositions(timestamp_s, arrival, position, variance, *decisions, track.name)
 
@@ -522,15 +528,15 @@ def read_vision(
 def _read_vision_besides_gnss(
     flight: Flight, ekf2: Ekf2, record: FusionRecord, attitude: pd.DataFrame
 ) -> ReceivedPositions | Unavailable | None:
-    """Return the vision samples of a flight with GNSS; None if EKF2 did not fuse vision."""
+    """Return the vision positions of a flight with GNSS; None if EKF2 did not fuse vision."""
     if (enabled := _enabled_log(ekf2, EV_POS)) is None:
         return None
     if fuses_by_mask(record.parameters):
         return Unavailable(
-            "EKF2 replay",
-            f"{flight.log.firmware} fuses relative vision positions besides GNSS, which "
-            "the model does not contain",
-            "Use PX4 v1.14 or newer, or fly with only one of the two.",
+            ANALYSIS_NAME,
+            f"{flight.log.firmware} fuses changes of the vision position besides GNSS, which the "
+            "model does not contain",
+            "Use PX4 v1.14 or newer, or fly with GNSS only or with vision only.",
         )
     received = read_vision(flight, ekf2, record, attitude)
     if isinstance(received, Unavailable):
@@ -543,21 +549,22 @@ def _read_vision_besides_gnss(
 def _logged_decisions(
     ekf2: Ekf2, record: FusionRecord, timestamp_s: Array, aid: Aid = EV_POS
 ) -> tuple[Array, BoolArray]:
-    """Return the logged rejection and reset of each sample, matched by measurement time."""
-    rejected, reset = np.full(len(timestamp_s), np.nan), np.zeros(len(timestamp_s), dtype=bool)
-    innovations, horizon_s = ekf2.innovations["north"], ekf2.horizon_s
-    has_own_topic = aid_source(aid) in ekf2.innovation_topics
+    """Return EKF2's logged rejection and reset at each position sample."""
+    rejected = np.full(len(timestamp_s), np.nan)
+    reset = np.zeros(len(timestamp_s), dtype=bool)
+    innovations = ekf2.innovations["north"]
+    horizon_s = ekf2.horizon_s
     if (
         isinstance(innovations, Unavailable)
         or isinstance(horizon_s, Unavailable)
-        or not has_own_topic
+        or aid_source(aid) not in ekf2.innovation_topics
     ):
         return rejected, reset
     delay_s = effective_settings(record.parameters, aid)[aid.delay] * 1e-3
     measured_s = timestamp_s - delay_s - 0.5 * ekf2.step_s
     sample_row = same_sample(innovations.index.to_numpy(), measured_s)
     rejected[sample_row >= 0] = innovations["rejected"].to_numpy()[sample_row[sample_row >= 0]]
-    # a reset is visible in the next published row, one fusion horizon later than the measurement
+    # a reset is visible in the next published state, one fusion horizon later than the measurement
     publication_s = measured_s + horizon_s
     for reset_s in horizontal_resets_s(ekf2):
         earlier_rows = np.flatnonzero((publication_s <= reset_s) & (rejected != 0.0))
@@ -570,33 +577,36 @@ def _logged_decisions(
 
 
 def aid_source(aid: Aid) -> str:
-    """Return the topic with the innovations of an aid."""
+    """Return the name of the uORB topic with the innovations of an aiding source."""
     return f"estimator_aid_src_{aid.name}"
 
 
 def same_sample(sample_s: Array, measurement_s: Array) -> IntArray:
     """Return the index of the sample at each measurement time; -1 without a sample."""
-    row = np.clip(
-        np.searchsorted(sample_s, measurement_s - SAMPLE_MATCH_TOLERANCE_S), 0, len(sample_s) - 1
-    )
+    row = np.searchsorted(sample_s, measurement_s - SAMPLE_MATCH_TOLERANCE_S)
+    row = np.minimum(row, len(sample_s) - 1)
     return np.where(np.abs(sample_s[row] - measurement_s) <= SAMPLE_MATCH_TOLERANCE_S, row, -1)
 
 
 def horizontal_resets_s(ekf2: Ekf2) -> Array:
     """Return the times (s) of horizontal position resets in the published state."""
     return np.array(
-        [r.time_s for r in ekf2.resets if r.quantity == "position" and any(r.delta[:2])]
+        [
+            reset.time_s
+            for reset in ekf2.resets
+            if reset.quantity == "position" and any(reset.delta[:2])
+        ]
     )
 
 
 def _vision_track(flight: Flight) -> PositionTrack | Unavailable:
     """Return the track with all vision positions that EKF2 received."""
-    reasons = ["no vehicle_visual_odometry"]
-    for track in sorted(flight.positions, key=lambda t: t.origin == POSITION_FILE):
+    reasons = ["the log has no topic vehicle_visual_odometry"]
+    for track in sorted(flight.positions, key=lambda track: track.origin == POSITION_FILE):
         if track.origin.is_vision and track.origin.has_all_samples:
             return track
         if track.name in VISION_COPY_INTERVALS_S:
-            interval = float(np.median(np.diff(track.samples.index.to_numpy())))
+            interval = float(np.median(np.diff(track.samples.index)))
             if interval < 0.9 * VISION_COPY_INTERVALS_S[track.name] and interval <= 0.25:
                 return track
             reasons.append(
@@ -604,7 +614,7 @@ def _vision_track(flight: Flight) -> PositionTrack | Unavailable:
                 "more samples"
             )
     return Unavailable(
-        "EKF2 replay",
+        ANALYSIS_NAME,
         "; ".join(reasons),
         "Set SDLOG_PROFILE to 129 (default and vision), or add the MAVLink recording (--mavlink).",
     )

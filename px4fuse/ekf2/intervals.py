@@ -1,11 +1,11 @@
-"""Intervals between fusion events: state transition and process noise, the same for all parameters.
+"""Intervals between fusion events in the EKF2 replay, with state transition and process noise.
 
-An event is the end of an interval: the fusion of a position sample or, in a gap of the source, of
-height and heading only. E is the number of events.
+An event is the end of an interval: the fusion of a position sample or, in a gap of the position
+source, of height and heading only. E is the number of events.
 
 With changed parameters, attitude and biases of a replay hardly differ from the logged values.
 Therefore the state transition about the nominal (published) attitude is computed once and used for
-all parameters. All intervals are integrated together, one prediction step at a time.
+all parameter values. All intervals are integrated together, one prediction step at a time.
 
 Error state: attitude error δθ (earth frame, estimate = exp(δθ) · nominal), velocity, position,
 errors of gyro bias b_g and accelerometer bias b_a. The equations are from PX4-Autopilot
@@ -28,45 +28,45 @@ from px4fuse.ekf2.replay_segments import (
     GRAVITY_M_S2,
     IMU_STATE_COUNT,
     POSITION,
-    STATES,
+    STATE_COUNT,
     THETA,
     VELOCITY,
     ReplaySegment,
 )
 from px4fuse.notebook_display import one_line_repr
-from px4fuse.trajectory.rotation import skew
+from px4fuse.trajectory.rotation import rotate, skew
 
 # Maximum time (s) from the passage of the fusion horizon to the arrival of a sample that EKF2 still
 # fuses (RingBuffer.h, pop_first_older_than)
 MAX_LATENESS_S = 0.1
 # Minimum delay (s) of the fusion of a sample that counts as late (3 cm at 1 m/s)
 MIN_LATENESS_S = 0.03
-# Action on a sample: none, update of the state, or start of fusion with a reset
+# Action on a position sample: none, update of the state, or start of fusion with a reset
 IDLE, FUSE, START = 0, 1, 2
-# Columns of an interval's sensitivity matrix: initial attitude error, gyro bias and accelerometer
-# bias (3 columns each), correction of the nominal attitude, and acceleration
+# Number of columns of the sensitivity of an interval's final state: initial attitude error, gyro
+# bias and accelerometer bias (3 columns each), correction of the nominal attitude, acceleration
 EFFECT_COLUMNS = 11
 CORRECTION_COLUMN, INPUT_COLUMN = 9, 10
 
-# Events (ends of intervals) in time order
+# Array with one row per event (end of an interval), in time order
 Events = np.recarray[Any, Any]
 EVENT = np.dtype(
     [
         ("end_step", np.intp),  # index of the prediction step after which the event occurs
         ("sample", np.intp),  # index of the position sample, -1 without a sample
         ("action", np.intp),
-        ("usable", bool),  # sample arrived early enough to be fused
-        ("can_start", bool),  # EKF2 may start fusion with this sample after a stop
-        ("late", bool),  # sample arrived after the fusion horizon had passed, and is fused late
-        ("lost", bool),  # sample arrived too late and is never fused
-        ("time_s", float),  # s, measurement time in EKF2: timestamp - delay - half a step
+        ("usable", bool),  # True if the sample arrived early enough to be fused
+        ("can_start", bool),  # True if EKF2 may start fusion with this sample after a stop
+        ("late", bool),  # True if the fusion horizon passed before arrival: fused late
+        ("lost", bool),  # True if the sample arrived too late and is never fused
+        ("time_s", float),  # measurement time in EKF2 (s): timestamp - delay - half a step
     ]
 )
 
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """Intervals of one segment, each ending in one of E events.
+    """Intervals between the fusion events of one segment; each ends in one of E events.
 
     Attributes
     ----------
@@ -74,8 +74,8 @@ class Intervals:
         Events with the fields of :data:`EVENT`.
     transition : ndarray, shape (E, 15, 15)
     correction_input, acceleration_input : ndarray, shape (E, 15)
-        Change of the state due to the correction of the nominal attitude, and due to the
-        acceleration.
+        Change of the state during an interval due to the correction of the nominal attitude, and
+        due to the acceleration.
     gyro_noise, accelerometer_noise : ndarray, shape (E, 9, 9)
         Process noise of attitude, velocity and position for a sensor noise of 1 rad/s or 1 m/s².
     """
@@ -92,39 +92,43 @@ class Intervals:
 
 @dataclass(frozen=True)
 class Timing:
-    """Age of a position at its timestamp, and delay of the fusion horizon (s)."""
+    """Age of a position at its timestamp (s), and delay of EKF2's fusion horizon (s)."""
 
     delay_s: float
     horizon_s: float
 
 
 def make_intervals(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Intervals:
-    """Compute the intervals of a segment; ``timing`` does not change number and order of events."""
+    """Compute the intervals between the fusion events of a segment.
+
+    Number and order of the events do not depend on ``timing``.
+    """
     events = _events(inputs, segment, timing)
-    start, end = np.concatenate([[0], events.end_step[:-1]]), events.end_step
-    count, duration_s = len(end), segment.time_s[end] - segment.time_s[start]
-    transition = np.tile(np.eye(STATES), (count, 1, 1))
-    correction_input, acceleration_input = np.zeros((2, count, STATES))
+    start = np.append(0, events.end_step[:-1])
+    end = events.end_step
+    count = len(end)
+    duration_s = segment.time_s[end] - segment.time_s[start]
+    transition = np.tile(np.eye(STATE_COUNT), (count, 1, 1))
+    correction_input, acceleration_input = np.zeros((2, count, STATE_COUNT))
     effects = _effects(segment, start, end)
-    transition[:, :IMU_STATE_COUNT, THETA], transition[:, :IMU_STATE_COUNT, BIASES] = (
-        effects[..., :3],
-        effects[..., 3:9],
-    )
-    correction_input[:, :IMU_STATE_COUNT], acceleration_input[:, :IMU_STATE_COUNT] = (
-        effects[..., CORRECTION_COLUMN],
-        effects[..., INPUT_COLUMN],
-    )
+    transition[:, :IMU_STATE_COUNT, THETA] = effects[..., :3]
+    transition[:, :IMU_STATE_COUNT, BIASES] = effects[..., 3:9]
+    correction_input[:, :IMU_STATE_COUNT] = effects[..., CORRECTION_COLUMN]
+    acceleration_input[:, :IMU_STATE_COUNT] = effects[..., INPUT_COLUMN]
     transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
     noises = _noises((end - start).astype(float), duration_s, transition[:, VELOCITY, THETA])
     return Intervals(events, transition, correction_input, acceleration_input, *noises)
 
 
 def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
-    received, time_s = inputs.received, segment.time_s
+    received = inputs.received
+    time_s = segment.time_s
     first, last_row = np.searchsorted(received.stamp_s, time_s[[0, -1]])
-    stamp, last = received.stamp_s[first:last_row], len(time_s) - 1
+    stamp = received.stamp_s[first:last_row]
+    last = len(time_s) - 1
     measured_s = stamp - timing.delay_s - 0.5 * inputs.step_s
-    # a sample that arrives after the fusion horizon has passed its time is fused late, or never
+    # a sample that arrives after the fusion horizon has passed its measurement time is fused late
+    # or never
     due_s = np.maximum(measured_s, received.arrival_s[first:last_row] - timing.horizon_s)
     end = np.searchsorted(time_s, due_s - 1e-9)
     is_inside = (end > 0) & (end <= last)
@@ -133,25 +137,19 @@ def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
     is_usable = is_inside & is_in_time
     is_usable[:-1] &= end[1:] > end[:-1]  # of two samples in one step EKF2 fuses only the newer
     action, can_start = _actions(inputs, segment, measured_s, end, is_usable)
-    # additional events in gaps of the source; their number does not depend on the delay
-    gap_s = np.diff(np.concatenate([time_s[:1], stamp, time_s[-1:]]))
+    # additional events in gaps of the position source; their number does not depend on the delay
+    gap_s = np.diff(np.r_[time_s[0], stamp, time_s[-1]])
     extra_events = np.maximum(np.ceil(gap_s / inputs.max_interval_s).astype(int) - 1, 0)
-    sample_places, total = (
-        np.cumsum(extra_events[:-1] + 1) - 1,
-        len(stamp) + int(extra_events.sum()),
-    )
-    known_places, ends = (
-        np.concatenate([[-1], sample_places, [total]]),
-        np.concatenate([[0], end, [last]]),
-    )
+    sample_places = np.cumsum(extra_events[:-1] + 1) - 1
+    total = len(stamp) + int(extra_events.sum())
     events = np.zeros(total, EVENT)
-    events["end_step"] = np.rint(np.interp(np.arange(total), known_places, ends))
-    events["sample"], events["time_s"] = -1, time_s[events["end_step"]]
-    late, lost = (
-        is_inside & is_in_time & (due_s - measured_s > MIN_LATENESS_S),
-        is_inside & ~is_in_time,
+    events["end_step"] = np.rint(
+        np.interp(np.arange(total), np.r_[-1, sample_places, total], np.r_[0, end, last])
     )
+    events["sample"], events["time_s"] = -1, time_s[events["end_step"]]
+    late = is_inside & is_in_time & (due_s - measured_s > MIN_LATENESS_S)
     samples = np.arange(first, last_row)
+    lost = is_inside & ~is_in_time
     events[sample_places] = np.rec.fromarrays(
         [end, samples, action, is_usable, can_start, late, lost, measured_s], dtype=EVENT
     )
@@ -165,9 +163,9 @@ def _actions(
     end: IntArray,
     is_usable: BoolArray,
 ) -> tuple[IntArray, BoolArray]:
-    """Return the action on each sample, and a mask of samples that may start fusion.
+    """Return the action on each position sample, and a mask of samples that may start fusion.
 
-    Source: ``ev_control.cpp``.
+    Source: PX4-Autopilot ``ev_control.cpp``.
     """
     rules = inputs.rules
     action = np.full(len(measured_at_s), IDLE)
@@ -175,7 +173,7 @@ def _actions(
     usable_rows = np.flatnonzero(is_usable)
     interval = np.diff(measured_at_s[usable_rows], prepend=-np.inf)
     can_start[usable_rows] = interval < rules.start_interval_s
-    # age (s) of the previous usable sample, one step before each sample is fused
+    # age (s) of the previous usable sample, one prediction step before each sample is fused
     gaps_s = segment.time_s[end[usable_rows] - 1] - np.concatenate(
         [[np.inf], measured_at_s[usable_rows[:-1]]]
     )
@@ -191,27 +189,30 @@ def _actions(
 
 
 def _effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
-    """Return the sensitivities of attitude, velocity and position at each event.
+    """Return the sensitivities of attitude, velocity and position at the end of each interval.
 
     Shape (E, 9, EFFECT_COLUMNS).
     """
     length = end - start
-    # integrate step 1 of all intervals, then step 2, ...: longer intervals are first, so the
-    # intervals that still have a next step are the first rows
+    # integrate the first prediction step of all intervals, then the second step, and so on. Longer
+    # intervals are sorted first, so the intervals with a next step are the first rows
     longest_first = np.argsort(-length, kind="stable")
     first = start[longest_first]
     attitude, velocity, position = effects = np.zeros((3, len(end), 3, EFFECT_COLUMNS))
     attitude[:, :, 0:3] = np.eye(3)
-    force_m_s2 = np.einsum("nij,nj->ni", segment.rotation[1:], segment.force_m_s2)
+    force_m_s2 = rotate(segment.rotation[1:], segment.force_m_s2)
     steps = np.arange(int(length.max(initial=0)))
     for step_number, count in zip(
         steps, np.searchsorted(-length[longest_first], -steps), strict=True
     ):
-        step, rows = first[:count] + step_number, slice(count)
-        dt, force = segment.step_s[step][:, None, None], force_m_s2[step]
-        rotation_step = -segment.rotation[1:][step] * dt  # ∂δθ/∂b_g and ∂v/∂b_a of one step
+        step = first[:count] + step_number
+        rows = slice(count)
+        dt = segment.step_s[step][:, None, None]
+        force = force_m_s2[step]
+        # sensitivity of attitude to gyro bias, and of velocity to accelerometer bias, in one step
+        rotation_step = -segment.rotation[1:][step] * dt
         position[rows] += 0.5 * dt * velocity[rows]
-        velocity[rows] += (-skew(force) * dt) @ attitude[rows]  # ∂v/∂δθ of one step
+        velocity[rows] += (-skew(force) * dt) @ attitude[rows]
         velocity[rows, :, 6:9] += rotation_step
         velocity[rows, :, INPUT_COLUMN] += (force + GRAVITY_M_S2) * dt[:, :, 0]
         position[rows] += 0.5 * dt * velocity[rows]
@@ -222,15 +223,15 @@ def _effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
 
 
 def _noises(steps: Array, duration_s: Array, tilt: Array) -> tuple[Array, Array]:
-    """Return the process noises of each interval for unit gyro noise and unit accelerometer noise.
+    """Return the process noise of each interval for unit gyro noise, and unit accelerometer noise.
 
-    Closed form for n equal steps with the mean specific force of the interval. Unit noise adds dt²
-    to the variance of attitude or velocity in each step. Gyro noise has a small effect on velocity
-    and position, so only the leading terms are used.
+    Closed form for n equal prediction steps d with the mean specific force of the interval. Unit
+    noise adds d² to the variance of attitude or velocity in each step. Gyro noise has a small
+    effect on velocity and position, so only the leading terms are used.
     """
     n = np.maximum(steps, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n
-    m = tilt / n  # mean ∂v/∂δθ of one step
+    m = tilt / n  # mean sensitivity of velocity to the attitude error in one step
     mm = m @ m.transpose(0, 2, 1)
     eye = np.eye(3)
     gyro, accelerometer = np.zeros((2, len(steps), IMU_STATE_COUNT, IMU_STATE_COUNT))

@@ -1,8 +1,8 @@
 """Fusion of all three magnetometer axes in the EKF2 replay, with earth and body fields as states.
 
 The samples between two events (ends of intervals, see :mod:`px4fuse.ekf2.intervals`) are averaged,
-and their mean is fused at the later event, because the attitude error hardly changes in between.
-Array shapes: E events, S variants (filter configurations).
+and their mean is fused at the later event: the attitude error hardly changes between the events.
+Array shapes: E events, S filter configurations.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/magnetometer`` (``mag_fusion.cpp``: fuseMag;
 ``mag_control.cpp``: R and its lower limit), ``EKF/covariance.cpp`` (process noise of the fields).
@@ -16,17 +16,17 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.ekf2.replay_segments import BODY_FIELD, EARTH_FIELD, THETA, SensorSamples
 from px4fuse.trajectory.rotation import skew
 
-MIN_SIGMA_GAUSS = 0.01  # lower limit of EKF2_MAG_NOISE
+MIN_SIGMA_GAUSS = 0.01  # minimum noise (gauss) of the magnetometer in EKF2
 EYE = np.eye(3)
-CROSS = skew(EYE).reshape(3, 9)  # v @ CROSS is the cross product matrix [v]×
+CROSS = skew(EYE).reshape(3, 9)  # for a vector v, v @ CROSS is the cross product matrix [v]×
 
 
 class EventSamples(NamedTuple):
-    """Means of the samples that are fused at each event; shape (E, ...), or (E, S, ...).
+    """Means of the sensor samples that are fused at each event; shape (E, ...), or (E, S, ...).
 
-    For ``value`` and ``rotation_to_body`` see
-    :class:`~px4fuse.ekf2.replay_segments.SensorSamples`; velocities refer to the event.
-    ``sample_count`` is the number of samples that EKF2 received, ``noise`` is R of one sample.
+    ``value`` is the mean magnetic field (gauss, FRD), or the velocity forward and right (m/s) at
+    the event. ``rotation_to_body`` is the mean rotation from NED to the body axes, ``sample_count``
+    the number of samples that EKF2 received, ``noise`` the variance R of one sample.
     """
 
     value: Array
@@ -38,18 +38,19 @@ class EventSamples(NamedTuple):
 def mean_by_event(
     sensor_samples: SensorSamples, event_steps: IntArray, imu_velocity_m_s: Array | None = None
 ) -> EventSamples:
-    """Return the means of the samples fused at each event.
+    """Return the means of the sensor samples that are fused at each event.
 
-    For velocity samples, ``imu_velocity_m_s`` of the segment
-    (:class:`~px4fuse.ekf2.replay_segments.ReplaySegment`) is required.
+    Velocity samples require ``imu_velocity_m_s``: the velocity change that the IMU measured since
+    the start of the segment (m/s, NED).
     """
     event = np.searchsorted(event_steps, sensor_samples.step)
-    is_inside, size = event < len(event_steps), len(event_steps)
+    is_inside = event < len(event_steps)
+    event_count = len(event_steps)
     event = event[is_inside]
-    count = np.maximum(np.bincount(event, minlength=size), 1)
+    count = np.maximum(np.bincount(event, minlength=event_count), 1)
 
     def mean(rows: Array) -> Array:
-        total = np.zeros((size, *rows.shape[1:]))
+        total = np.zeros((event_count, *rows.shape[1:]))
         np.add.at(total, event, rows[is_inside])
         return np.asarray((total.T / count).T)
 
@@ -58,7 +59,7 @@ def mean_by_event(
     )
     if imu_velocity_m_s is not None:
         value = value + np.einsum("eab,eb->ea", rotation_to_body, imu_velocity_m_s[event_steps])
-    sample_count = np.bincount(event, sensor_samples.sample_count[is_inside], size)
+    sample_count = np.bincount(event, sensor_samples.sample_count[is_inside], event_count)
     return EventSamples(value, rotation_to_body, np.asarray(sample_count, float), noise)
 
 
@@ -83,20 +84,23 @@ def fuse_mean(
     rows: slice,
     bias_rows: slice | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Return state, covariance and innovations (see :func:`fuse_field`) after fusing a mean.
+    """Fuse the mean of a sensor's samples at one event in all filter configurations.
+
+    Return state, covariance and innovations, see :func:`fuse_field`.
 
     Parameters
     ----------
     sample_mean : EventSamples
         Mean of one event.
     R, gate : ndarray, shape (S,)
-        Variance of one sample, and innovation gate (in √ of the innovation variance).
+        Variance of one sample, and innovation gate (√ of the innovation variance).
     rows : slice
-        Indices of the vector state (NED) that the sensor measures in the body frame.
+        Indices of the vector in the state (NED) that the sensor measures in the body frame.
     bias_rows : slice, optional
-        Indices of a body-frame bias state that adds to the measurement.
+        Indices of a sensor bias in the state (body frame) that adds to the measurement.
     """
-    state, sample_count = x[:, rows], sample_mean.sample_count
+    state = x[:, rows]
+    sample_count = sample_mean.sample_count
     cross_state, cross_theta = (
         (vectors @ CROSS).reshape(-1, 3, 3) for vectors in (state, x[:, THETA])
     )
@@ -107,11 +111,13 @@ def fuse_mean(
     if bias_rows is not None:
         H[:, :, bias_rows] = EYE
         predicted += x[:, bias_rows]
-    nu, HP = sample_mean.value - predicted, H @ P
+    nu = sample_mean.value - predicted
+    HP = H @ P
     S = HP @ H.transpose(0, 2, 1)
-    diagonal = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]  # a view of the diagonal of S
+    diagonal = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]  # view, to add R to S in place
     innovation_record = np.empty((3, *nu.shape))
-    innovation_record[0], innovation_record[1] = nu, diagonal + R[:, None]
+    innovation_record[0] = nu
+    innovation_record[1] = diagonal + R[:, None]
     has_sample = sample_count > 0.0
     is_fused = has_sample & (nu * nu <= gate[:, None] ** 2 * innovation_record[1]).all(axis=1)
     innovation_record[2] = is_fused[:, None]

@@ -6,8 +6,8 @@ positions; in a flight with GNSS also velocities and, if logged, the magnetomete
 measurements (height; heading without the magnetometer) are replaced by EKF2's published values.
 :mod:`px4fuse.ekf2.replay` tests for each log if the model agrees with EKF2.
 
-A *variant* is one configuration of the filter: parameters, estimated states, fused aids and gate.
-All variants run together, to save time.
+A filter configuration consists of parameters, estimated states, fused aiding sources and gate. All
+filter configurations run together, to save time.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,8 +24,8 @@ from px4fuse.arrays import Array
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
     POSITION_COLUMNS,
+    FilterConfiguration,
     SegmentRun,
-    Variant,
     run_segment,
     with_correlation,
 )
@@ -66,33 +66,35 @@ from px4fuse.errors import SettingsError
 from px4fuse.flight import Columns, Ekf2, Flight, Unavailable
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.readers.px4_innovations import with_gnss_innovations
+from px4fuse.record import Span
+from px4fuse.trajectory.rotation import rotate
 
-MAX_HORIZON_S = 1.0  # maximum delay of the fusion horizon: maximum of EKF2_DELAY_MAX
+# Maximum delay (s) of the fusion horizon: PX4's maximum of EKF2_DELAY_MAX
+MAX_HORIZON_S = 1.0
 
-# Fields of Agreement that do not have the name of the aid, by aid
+# Fields of Agreement that do not have the name of the aiding source, by PX4's name of the source
 AGREEMENT_FIELDS = {FLOW.name: "carried_difference_m"}
 
-RequestVariants = Callable[[Inputs], Sequence[Variant]]
+RequestConfigurations = Callable[[Inputs], Sequence[FilterConfiguration]]
 
 
 @dataclass(frozen=True)
 class Model:
-    """Flight prepared for replays.
+    """Flight prepared for EKF2 replays.
 
     Attributes
     ----------
     flight : Flight
     inputs : Inputs
     intervals : mapping from Timing to tuple of Intervals
-        Intervals of each segment with the logged delay; empty if not yet computed.
+        Intervals between fusion events of each segment, by delay; empty if not yet computed.
     flown : Ekf2Replay
         Replay with the logged parameters.
     agreement : Agreement
         Agreement of ``flown`` with the log.
     runs : list of SegmentRun
-        One run per segment, with the filter configurations (variants) already computed: logged
-        parameters, logged parameters with logged rejections, and the result of
-        ``request_variants``.
+        One run per segment, with the filter configurations already computed: logged parameters,
+        logged parameters with logged rejections, and the result of ``request_configurations``.
     """
 
     flight: Flight
@@ -106,16 +108,16 @@ class Model:
 
 
 def open_model(
-    flight: Flight, request_variants: RequestVariants = lambda _: ()
+    flight: Flight, request_configurations: RequestConfigurations = lambda _: ()
 ) -> Model | Unavailable:
     """Prepare a flight for EKF2 replays, and replay it with the logged parameters.
 
     Parameters
     ----------
     flight : Flight
-    request_variants : callable
-        Function that returns filter configurations (variants) that are needed later. Running all
-        variants together saves time.
+    request_configurations : callable
+        Function that returns the filter configurations that are needed later. Running all
+        configurations together saves time.
 
     Returns
     -------
@@ -123,7 +125,7 @@ def open_model(
     """
     failed_agreements: dict[str, Agreement] = {}
     while not isinstance(
-        model := _open_without_aids(flight, request_variants, failed_agreements), Unavailable
+        model := _open_without_aids(flight, request_configurations, failed_agreements), Unavailable
     ):
         if not (more := model.agreement.doubtful.keys() - failed_agreements.keys()):
             break
@@ -132,56 +134,64 @@ def open_model(
 
 
 def _open_without_aids(
-    flight: Flight, request_variants: RequestVariants, failed_agreements: Mapping[str, Agreement]
+    flight: Flight,
+    request_configurations: RequestConfigurations,
+    failed_agreements: Mapping[str, Agreement],
 ) -> Model | Unavailable:
-    """Prepare the EKF2 replay without the aids in ``failed_agreements``, keyed by aid name."""
-    doubtful = {name: doubt.doubtful[name] for name, doubt in failed_agreements.items()}
+    """Prepare the EKF2 replay without the aiding sources in ``failed_agreements``.
+
+    Keys are PX4's names of the sources; values, the agreement that shows the wrong replay.
+    """
+    doubtful = {name: agreement.doubtful[name] for name, agreement in failed_agreements.items()}
     inputs = prepare_inputs(flight, doubtful)
     if isinstance(inputs, Unavailable):
         return structs.replace(inputs, what=ANALYSIS_NAME)
     if inputs.aid == GNSS_POS and isinstance(flight.ekf2, Ekf2):
         flight = replace(flight, ekf2=with_gnss_innovations(flight.ekf2))
-    flown_variant = Variant(inputs.settings)
-    timing = flown_variant.timing(inputs)
+    flown_configuration = FilterConfiguration(inputs.settings)
+    timing = flown_configuration.timing(inputs)
     intervals = tuple(make_intervals(inputs, segment, timing) for segment in inputs.segments)
-    segments = tuple(
-        with_correlation(inputs, segment, variant)
-        for segment, variant in zip(inputs.segments, intervals, strict=True)
+    segments = (
+        with_correlation(inputs, *pair) for pair in zip(inputs.segments, intervals, strict=True)
     )
-    inputs = replace(inputs, segments=segments)
-    variants = [flown_variant, replace(flown_variant, uses_logged_decisions=True)]
-    for variant in request_variants(inputs):
-        variants += [] if variant in variants else [variant]
-    known_intervals = {timing: intervals}
-    runs = run_variants(inputs, variants, known_intervals)
-    replay = _make_replay(inputs, runs, flown_variant, {})
+    inputs = replace(inputs, segments=tuple(segments))
+    configurations = [flown_configuration, replace(flown_configuration, uses_logged_decisions=True)]
+    for configuration in request_configurations(inputs):
+        configurations += [] if configuration in configurations else [configuration]
+    intervals_by_timing = {timing: intervals}
+    runs = run_configurations(inputs, configurations, intervals_by_timing)
+    replay = _make_replay(inputs, runs, flown_configuration, {})
     agreement = agreement_with_log(flight, replay)
     if isinstance(agreement, Unavailable):
         return agreement
     rejected_share = max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
     if rejected_share > MANY_REJECTIONS_SHARE and np.isfinite(inputs.received.rejected).any():
-        logged_agreement = agreement_with_log(flight, _make_replay(inputs, runs, variants[1], {}))
+        logged_agreement = agreement_with_log(
+            flight, _make_replay(inputs, runs, configurations[1], {})
+        )
         if isinstance(logged_agreement, Agreement):
             has_all_decisions = inputs.received.correction_m is not None
             agreement = with_logged_rejections(
                 agreement, logged_agreement, has_all_decisions=has_all_decisions
             )
-    of_doubted = {AGREEMENT_FIELDS.get(name, name): name for name in failed_agreements}
+    # the numbers of an omitted aiding source are from the replay that contained it
+    failed_fields = {
+        (field_name := AGREEMENT_FIELDS.get(name, name)): getattr(failed_agreement, field_name)
+        for name, failed_agreement in failed_agreements.items()
+    }
     agreement = structs.replace(
-        agreement,
-        doubtful={**doubtful, **agreement.doubtful},
-        **{of: getattr(failed_agreements[name], of) for of, name in of_doubted.items()},
+        agreement, doubtful={**doubtful, **agreement.doubtful}, **failed_fields
     )
     replay = structs.replace(replay, agreement=agreement)
-    model = Model(flight, inputs, known_intervals, replay, agreement)
+    model = Model(flight, inputs, intervals_by_timing, replay, agreement)
     model.runs.extend(runs)
     return model
 
 
 def replay_with_logged_rejections(model: Model) -> Ekf2Replay:
     """Replay EKF2 with logged parameters, and logged rejections and resets instead of the gate."""
-    variant = Variant(model.inputs.settings, uses_logged_decisions=True)
-    return _make_replay(model.inputs, _run_model(model, [variant]), variant, {})
+    configuration = FilterConfiguration(model.inputs.settings, uses_logged_decisions=True)
+    return _make_replay(model.inputs, _run_model(model, [configuration]), configuration, {})
 
 
 def replay_settings(
@@ -190,7 +200,7 @@ def replay_settings(
     excluded_s: Array | None = None,
     without: Mapping[str, float] | None = None,
 ) -> tuple[Ekf2Replay, ...]:
-    """Replay EKF2 with several sets of changed parameters at once.
+    """Replay EKF2 with several sets of changed parameters.
 
     Parameters
     ----------
@@ -198,16 +208,17 @@ def replay_settings(
     settings : sequence of mapping
         Changed parameters of each replay, by PX4 name and in PX4's units.
     excluded_s : ndarray, optional
-        Timestamps of samples that are not fused and not listed as updates.
-    without : mapping from PX4's name of an aid to float, optional
-        Time (s) from which the aid is not fused.
+        Timestamps of position samples that are neither fused nor listed as updates.
+    without : mapping from PX4's name of an aiding source to float, optional
+        Time (s) from which the aiding source is not fused.
 
     Raises
     ------
     SettingsError
-        Unknown parameter or aid, or a value outside PX4's range.
+        Unknown parameter or aiding source, or a value outside PX4's range.
     """
-    changes, inputs = [check_parameters(change) for change in settings], model.inputs
+    changes = [check_parameters(change) for change in settings]
+    inputs = model.inputs
     unmodelled = PARAMETERS.keys() - inputs.settings.keys()
     unused_parameters = dict.fromkeys(unmodelled, f"EKF2 fused {inputs.aid.label} in this log")
     height_text = f"the replay uses the logged EKF2 height ({inputs.height_reason})"
@@ -230,12 +241,13 @@ def replay_settings(
     for name in [name for change in changes for name in change if name in unused_parameters]:
         raise SettingsError(f"{name} has no effect in this log: {unused_parameters[name]}.")
     without = without or {}
-    for name in without:
-        if name not in (fused_aids := modelled_aids(inputs)):
-            height_note = f"; {height_text}" if inputs.height_reason else ""
-            raise SettingsError(
-                f"{name}: in this log the replay fuses only {', '.join(fused_aids)}{height_note}."
-            )
+    fused_aids = modelled_aids(inputs) if without else []
+    if unknown_aids := without.keys() - set(fused_aids):
+        height_note = f"; {height_text}" if inputs.height_reason else ""
+        raise SettingsError(
+            f"{min(unknown_aids)}: in this log the replay fuses only {', '.join(fused_aids)}"
+            f"{height_note}."
+        )
     if not changes:
         return ()
     uses_logged_decisions = excluded_s is not None
@@ -249,51 +261,48 @@ def replay_settings(
             received=replace(inputs.received, rejected=rejected, reset=no_reset, correction_m=None),
         )
         model = replace(model, inputs=inputs)
-    variants = [
-        Variant(
+    configurations = [
+        FilterConfiguration(
             {**inputs.settings, **change},
             uses_logged_decisions=uses_logged_decisions,
             without=without,
         )
         for change in changes
     ]
-    runs = _run_model(model, variants)
-    replays = [_make_replay(inputs, runs, *each) for each in zip(variants, changes, strict=True)]
-    if excluded_s is not None:
-        replays = [_without_updates(inputs, each, excluded_s) for each in replays]
-    return tuple(structs.replace(each, agreement=model.agreement) for each in replays)
+    runs = _run_model(model, configurations)
+    replays = []
+    for configuration, change in zip(configurations, changes, strict=True):
+        replay = _make_replay(inputs, runs, configuration, change)
+        updates = replay.updates
+        if excluded_s is not None:
+            age_s = configuration.settings[inputs.aid.delay] * 1e-3 + 0.5 * inputs.step_s
+            rows = same_sample(updates.index.to_numpy(), excluded_s - age_s)
+            updates = updates.iloc[np.delete(np.arange(len(updates)), rows[rows >= 0])]
+        replays.append(structs.replace(replay, updates=updates, agreement=model.agreement))
+    return tuple(replays)
 
 
 def modelled_aids(inputs: Inputs) -> list[str]:
-    """Return PX4's names of the aids that the model fuses."""
-    velocity = [GNSS_VEL.name] if inputs.received.velocity_m_s is not None else []
-    magnetic = [MAG.name] if MAG.noise in inputs.settings else []
-    flow = [FLOW.name] if inputs.segments[0].flow is not None else []
-    vision = [EV_POS.name] if inputs.vision is not None else []
-    heights = inputs.segments[0].heights
-    height_aids = heights.fused if heights else ()
-    return [inputs.aid.name, *velocity, *vision, *magnetic, *flow, *height_aids]
-
-
-def _without_updates(inputs: Inputs, replay: Ekf2Replay, excluded_s: Array) -> Ekf2Replay:
-    """Remove the updates of excluded samples from a replay."""
-    age_s = replay.settings[inputs.aid.delay] * 1e-3 + 0.5 * inputs.step_s
-    excluded_rows = same_sample(replay.updates.index.to_numpy(), excluded_s - age_s)
-    remaining_rows = np.delete(np.arange(len(replay.updates)), excluded_rows[excluded_rows >= 0])
-    return structs.replace(replay, updates=replay.updates.iloc[remaining_rows])
+    """Return PX4's names of the aiding sources that the EKF2 replay fuses."""
+    segment = inputs.segments[0]
+    is_fused = {
+        inputs.aid: True,
+        GNSS_VEL: inputs.received.velocity_m_s is not None,
+        EV_POS: inputs.aid == EV_POS or inputs.vision is not None,
+        MAG: MAG.noise in inputs.settings,
+        FLOW: segment.flow is not None,
+    }
+    height_aids = segment.heights.fused if segment.heights else ()
+    return [*(aid.name for aid in is_fused if is_fused[aid]), *height_aids]
 
 
 def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
     """Return the model with noise added to every position that EKF2 received.
 
-    Parameters
-    ----------
-    model : Model
-    sigma_m : float
-        Standard deviation of the noise (m), per axis.
-    seed : int
+    ``sigma_m`` is the standard deviation of the noise (m) along each axis.
     """
-    inputs, rng = model.inputs, np.random.default_rng(seed)
+    inputs = model.inputs
+    rng = np.random.default_rng(seed)
     new_inputs: dict[str, Any] = {}
     for name, samples in {"received": inputs.received, "vision": inputs.vision}.items():
         if samples is not None:
@@ -306,12 +315,7 @@ def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
 def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float) -> Model:
     """Return the model with every received position rotated, and its timestamp delayed.
 
-    Parameters
-    ----------
-    model : Model
-    rotation_deg : float
-        Rotation, clockwise seen from above.
-    delay_s : float
+    ``rotation_deg`` is clockwise seen from above.
     """
     if not rotation_deg and not delay_s:
         return model
@@ -328,31 +332,38 @@ def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float)
     return replace(model, inputs=replace(model.inputs, received=received), intervals=intervals)
 
 
-def delayed_variants(model: Model, variants: Sequence[Variant]) -> Iterator[pd.DataFrame]:
-    """Yield the track of each filter configuration (variant) at its fusion horizon.
+def delayed_tracks(
+    model: Model, configurations: Sequence[FilterConfiguration]
+) -> Iterator[pd.DataFrame]:
+    """Yield position and velocity of each filter configuration at the fusion horizon.
 
     The tracks are computed one at a time and without the output predictor, to limit memory and
     time.
     """
-    runs = _run_model(model, variants)
-    for variant_index in map(runs[0].variants.index, variants):
-        yield pd.concat([_track(run, delayed_states(run, variant_index)[0]) for run in runs])
+    runs = _run_model(model, configurations)
+    for configuration_index in map(runs[0].configurations.index, configurations):
+        yield pd.concat([_track(run, delayed_states(run, configuration_index)[0]) for run in runs])
 
 
-def _run_model(model: Model, variants: Sequence[Variant]) -> list[SegmentRun]:
-    """Run filter configurations, or return the model's stored runs if they contain them."""
-    if model.runs and all(variant in model.runs[0].variants for variant in variants):
+def _run_model(model: Model, configurations: Sequence[FilterConfiguration]) -> list[SegmentRun]:
+    """Run filter configurations, or return the stored runs of the model if these contain all."""
+    if model.runs and all(
+        configuration in model.runs[0].configurations for configuration in configurations
+    ):
         return model.runs
-    return run_variants(model.inputs, variants, model.intervals)
+    return run_configurations(model.inputs, configurations, model.intervals)
 
 
-def run_variants(
+def run_configurations(
     inputs: Inputs,
-    variants: Sequence[Variant],
+    configurations: Sequence[FilterConfiguration],
     computed_intervals: Mapping[Timing, Sequence[Intervals]],
 ) -> list[SegmentRun]:
-    """Run filter configurations through every segment, with ``computed_intervals`` if available."""
-    timings = [variant.timing(inputs) for variant in variants]
+    """Run filter configurations through every segment.
+
+    ``computed_intervals`` contains intervals between fusion events that need no new computation.
+    """
+    timings = [configuration.timing(inputs) for configuration in configurations]
     runs = []
     for segment_index, segment in enumerate(inputs.segments):
         intervals = {
@@ -361,7 +372,7 @@ def run_variants(
         for timing in set(timings) - computed_intervals.keys():
             intervals[timing] = make_intervals(inputs, segment, timing)
         runs.append(
-            run_segment(inputs, segment, variants, [intervals[timing] for timing in timings])
+            run_segment(inputs, segment, configurations, [intervals[timing] for timing in timings])
         )
     return runs
 
@@ -374,13 +385,16 @@ def _track(run: SegmentRun, state: Array) -> pd.DataFrame:
 
 
 def _make_replay(
-    inputs: Inputs, runs: Sequence[SegmentRun], variant: Variant, changed: Mapping[str, float]
+    inputs: Inputs,
+    runs: Sequence[SegmentRun],
+    configuration: FilterConfiguration,
+    changed: Mapping[str, float],
 ) -> Ekf2Replay:
-    variant_index = runs[0].variants.index(variant)
-    tracks = [_delayed_and_published(inputs, run, variant_index) for run in runs]
-    updates = [_position_updates(run, variant_index) for run in runs]
+    configuration_index = runs[0].configurations.index(configuration)
+    tracks = [_delayed_and_published(inputs, run, configuration_index) for run in runs]
+    updates = [_position_updates(run, configuration_index) for run in runs]
     return Ekf2Replay(
-        settings=variant.settings,
+        settings=configuration.settings,
         changed=dict(changed),
         updates=pd.concat(updates),
         flow_only_spans_s=tuple(
@@ -391,117 +405,128 @@ def _make_replay(
         ),
         delayed=pd.concat([delayed for delayed, _ in tracks]),
         published=pd.concat([published for _, published in tracks]),
-        other_aid_updates=_other_aid_updates(runs, variant_index),
+        other_aid_updates=_other_aid_updates(runs, configuration_index),
         stretches_s=tuple(tuple(run.segment.time_s[[0, -1]].tolist()) for run in runs),
         source=inputs.received.source,
-        late=sum(int(run.events[variant_index].late.sum()) for run in runs),
-        lost=sum(int(run.events[variant_index].lost.sum()) for run in runs),
+        late=sum(int(run.events[configuration_index].late.sum()) for run in runs),
+        lost=sum(int(run.events[configuration_index].lost.sum()) for run in runs),
     )
 
 
-def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[tuple[float, float]]:
-    """Return times between fused positions (s) that are longer than RESTART_GAP_S."""
+def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[Span]:
+    """Return the times between fused positions that are longer than RESTART_GAP_S."""
     is_used = (updates["fused"] > 0.0) | (updates["reset"] > 0.0)
     ends = [*updates.loc[is_used, "fused_at_s"], float(segment.time_s[-1])]
     return [(a, b) for a, b in pairwise(ends) if b - a > RESTART_GAP_S]
 
 
-def _other_aid_updates(runs: Sequence[SegmentRun], variant_index: int) -> dict[str, pd.DataFrame]:
-    """Return the updates of all fused aids except the position, by PX4's name of the aid."""
+def _other_aid_updates(
+    runs: Sequence[SegmentRun], configuration_index: int
+) -> dict[str, pd.DataFrame]:
+    """Return the updates with height and vision in addition to the position source.
+
+    Keys are PX4's names of the aiding sources.
+    """
     updates_by_aid: dict[str, list[pd.DataFrame]] = {}
     for run in runs:
-        end_s = run.segment.time_s[run.events[variant_index].end_step]
+        end_s = run.segment.time_s[run.events[configuration_index].end_step]
         if (heights := run.heights) is not None:
             for name in heights.fused:
                 updates_by_aid.setdefault(name, []).append(
-                    heights.updates(name, variant_index, end_s)
+                    heights.updates(name, configuration_index, end_s)
                 )
         if run.vision is not None:
             updates_by_aid.setdefault(EV_POS.name, []).append(
-                run.vision.updates(variant_index, end_s)
+                run.vision.updates(configuration_index, end_s)
             )
     return {name: pd.concat(update_frames) for name, update_frames in updates_by_aid.items()}
 
 
-def _position_updates(run: SegmentRun, variant_index: int) -> pd.DataFrame:
-    events = run.events[variant_index]
-    sampled_events = np.flatnonzero(
-        np.isfinite(run.innovation[:, variant_index, POSITION_COLUMNS.start])
+def _position_updates(run: SegmentRun, configuration_index: int) -> pd.DataFrame:
+    events = run.events[configuration_index]
+    has_innovation = np.isfinite(run.innovation[:, configuration_index, POSITION_COLUMNS.start])
+    rows = np.flatnonzero(has_innovation)
+    flags = np.stack([run.rejected, run.fused, run.reset], axis=-1)[rows, configuration_index]
+    nu, S, R = (
+        array[rows, configuration_index]
+        for array in (run.innovation, run.innovation_variance, run.noise)
     )
-    variance_after = run.variance[sampled_events + 1, variant_index]
-    flags = np.stack([run.rejected, run.fused, run.reset], axis=-1)[sampled_events, variant_index]
-    innovation_arrays = run.innovation, run.innovation_variance, run.noise
-    nu, s, r = (each[sampled_events, variant_index, POSITION_COLUMNS] for each in innovation_arrays)
-    speed = [each[sampled_events, variant_index, :3] for each in innovation_arrays[:2]]
-    fused_at_s = run.segment.time_s[events.end_step[sampled_events], None]
-    values = np.hstack(
-        [nu, s, flags, variance_after[:, 6:8], variance_after[:, 3:5], r, fused_at_s, *speed]
-    )
-    index, columns = pd.Index(events.time_s[sampled_events], name="time_s"), UPDATE_COLUMNS
-    updates = pd.DataFrame(values, index, [*columns, *VELOCITY_UPDATE_COLUMNS])
-    return updates if np.isfinite(speed[0]).any() else updates[columns]
+    variance_after = run.variance[rows + 1, configuration_index]
+    fused_at_s = run.segment.time_s[events.end_step[rows], None]
+    # position along north and east (m), then velocity along north, east and down (m/s)
+    position = [nu[:, 3:5], S[:, 3:5], flags, variance_after[:, 6:8], variance_after[:, 3:5]]
+    values = np.hstack([*position, R[:, 3:5], fused_at_s, nu[:, :3], S[:, :3]])
+    index = pd.Index(events.time_s[rows], name="time_s")
+    updates = pd.DataFrame(values, index, [*UPDATE_COLUMNS, *VELOCITY_UPDATE_COLUMNS])
+    return updates if np.isfinite(nu[:, :3]).any() else updates[UPDATE_COLUMNS]
 
 
 def _delayed_and_published(
-    inputs: Inputs, run: SegmentRun, variant_index: int
+    inputs: Inputs, run: SegmentRun, configuration_index: int
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return the state at the fusion horizon and the published state at each prediction step."""
-    segment, variant = run.segment, run.variants[variant_index]
-    state, reset = delayed_states(run, variant_index)
-    horizon_s = min(variant.timing(inputs).horizon_s, MAX_HORIZON_S)
+    segment = run.segment
+    configuration = run.configurations[configuration_index]
+    state, reset = delayed_states(run, configuration_index)
+    horizon_s = min(configuration.timing(inputs).horizon_s, MAX_HORIZON_S)
     lag = max(round(horizon_s / inputs.step_s), 1)
     published_rotation = np.zeros((len(state), 3))
-    if variant.attitude:  # the nominal (published) attitude already follows EKF2's logged attitude
+    # without attitude states, the nominal (published) attitude already is EKF2's logged attitude
+    if configuration.attitude:
         attitude_difference = state[:, THETA] - segment.attitude_error_rad
         published_rotation = follow_attitude(attitude_difference, lag, inputs.step_s, horizon_s)
-    published = publish(segment, state, reset, published_rotation, lag, variant.settings)
+    published = publish(segment, state, reset, published_rotation, lag, configuration.settings)
     heading = np.arctan2(segment.rotation[:, 1, 0], segment.rotation[:, 0, 0]) + state[:, HEADING]
     delayed = _track(run, state).assign(heading_rad=heading)
     return delayed, _track(run, np.hstack([state[:, THETA], *published]))
 
 
-def delayed_states(run: SegmentRun, variant_index: int) -> tuple[Array, Array]:
-    """Return the state of one variant at each prediction step, and the sum of position resets.
+def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Array]:
+    """Return the state of one filter configuration at each prediction step.
 
     Returns
     -------
     state : ndarray, shape (n + 1, 15)
     reset_m : ndarray, shape (n + 1, 3)
+        Sum of position resets until each step.
     """
-    event_steps, variant = run.events[variant_index].end_step, run.variants[variant_index]
-    segment, event_states = run.segment, run.state[:, variant_index]
-    count, rotation, dt = len(segment.step_s), segment.rotation[1:], segment.step_s[:, None]
+    event_steps = run.events[configuration_index].end_step
+    configuration = run.configurations[configuration_index]
+    segment = run.segment
+    event_states = run.state[:, configuration_index]
+    count = len(segment.step_s)
+    rotation = segment.rotation[1:]
+    dt = segment.step_s[:, None]
     interval = np.searchsorted(event_steps, np.arange(count), side="right")
     first_step = np.searchsorted(interval, interval)
-    state = event_states[np.concatenate([[0], interval])]
+    state = event_states[np.append(0, interval)]
 
     def sum_since_event(increments: Array) -> Array:
-        """Return the sum of the steps' increments since the last event."""
         total = np.cumsum(increments, axis=0)
         return np.asarray(total - (total - increments)[first_step])
 
     def value_before_step(after_step: Array, rows: slice) -> Array:
-        """Return the value before each step."""
         shifted = np.concatenate([after_step[:1], after_step[:-1]])
         return np.where(
             (first_step == np.arange(count))[:, None], event_states[interval, rows], shifted
         )
 
-    # the equations in the docstring of px4fuse.ekf2.intervals, evaluated for this state only
-    rotation_steps = -np.einsum("nij,nj->ni", rotation, state[1:, GYRO_BIAS]) * dt
-    if variant.attitude:
+    # state equations of px4fuse.ekf2.intervals, evaluated for this state only
+    rotation_steps = -rotate(rotation, state[1:, GYRO_BIAS]) * dt
+    if configuration.attitude:
         rotation_steps -= segment.correction_rad
     state[1:, THETA] += sum_since_event(rotation_steps)
-    force = np.einsum("nij,nj->ni", rotation, segment.force_m_s2)
+    force = rotate(rotation, segment.force_m_s2)
     acceleration = (
         np.cross(value_before_step(state[1:, THETA], THETA), force) + force + GRAVITY_M_S2
     )
-    acceleration -= np.einsum("nij,nj->ni", rotation, state[1:, ACCELEROMETER_BIAS])
+    acceleration -= rotate(rotation, state[1:, ACCELEROMETER_BIAS])
     state[1:, VELOCITY] += sum_since_event(acceleration * dt)
     speed = state[1:, VELOCITY]
     state[1:, POSITION] += sum_since_event(0.5 * dt * (value_before_step(speed, VELOCITY) + speed))
     state[event_steps] = event_states[1:]
-    reset, position_reset_m = np.zeros((count + 1, 3)), run.position_reset_m[:, variant_index]
+    reset = np.zeros((count + 1, 3))
+    position_reset_m = run.position_reset_m[:, configuration_index]
     for e in np.flatnonzero(position_reset_m.any(axis=1)):
         reset[event_steps[e] :, :2] += position_reset_m[e]
     return state, reset

@@ -1,8 +1,8 @@
 """Output predictor of EKF2: from the state at the fusion horizon to the published state.
 
-The output predictor propagates the delayed state to the present with the IMU. In each step it
-compares the buffered output at the fusion horizon with the state. Velocity and position of the
-whole buffer are corrected by gain · error + 0.1 · gain² · Σ error, with gain = step / τ. This
+The output predictor propagates the delayed state to the present with the IMU. In each prediction
+step it compares the buffered output at the fusion horizon with the state. Velocity and position of
+the whole buffer are corrected by gain · error + 0.1 · gain² · Σ error, with gain = step / τ. This
 recursion is linear with constant coefficients, so it is computed as a recursive (IIR) filter for a
 whole segment.
 
@@ -25,16 +25,21 @@ from px4fuse.ekf2.replay_segments import (
     VELOCITY,
     ReplaySegment,
 )
+from px4fuse.trajectory.rotation import rotate
 
+# Gain of the integrated error in the corrections of velocity and position (output_predictor.cpp)
 INTEGRAL_GAIN = 0.1
-# Time after which the effect of a correction is neglected, in time constants τ
+# Time after which the effect of a position correction is neglected, in time constants τ
 MAX_TIME_CONSTANTS = 5.0
-# Weight of the prior "correction 0", which makes the least squares solvable for two corrections
-# between the same rows
+# Weight of the prior "correction 0": without it, least squares could not separate two corrections
+# between the same two logged positions
 PRIOR_WEIGHT = 1e-3
-# Maximum interval between rows, in median intervals, without missing rows; and minimum fraction of
-# a correction that must be visible in the logged rows
-MAX_ROW_INTERVALS, MIN_VISIBLE_SHARE = 3.0, 0.5
+# Maximum interval between logged positions, in median intervals: in a longer interval positions are
+# missing
+MAX_ROW_INTERVALS = 3.0
+# Minimum fraction of a position correction that is visible in the logged positions
+MIN_VISIBLE_SHARE = 0.5
+# Gain of the correction of the published attitude per fusion horizon delay (output_predictor.cpp)
 ATTITUDE_GAIN = 0.5
 
 
@@ -52,7 +57,7 @@ def publish(
     ----------
     segment : ReplaySegment
     state : ndarray, shape (n + 1, 15) or more
-        State at the fusion horizon; rows are at the time to which the state refers.
+        State at the fusion horizon; each row is at the time to which the state refers.
     reset_m : ndarray, shape (n + 1, 3)
         Sum of position resets up to each state.
     attitude_difference_rad : ndarray, shape (n + 1, 3)
@@ -65,12 +70,13 @@ def publish(
     Returns
     -------
     velocity_m_s, position_m : ndarray, shape (n + 1, 3)
-        Published state. Until step ``lag`` it is dead reckoning from the first state.
+        Published state. Before step ``lag`` it is dead reckoning from the first state.
     """
-    step_s, mean_step = segment.step_s[:, None], float(np.mean(segment.step_s))
+    step_s = segment.step_s[:, None]
+    mean_step = float(np.mean(segment.step_s))
     # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
     force = segment.force_m_s2 - delay_by(state[:, ACCELEROMETER_BIAS], lag)[1:]
-    force = np.einsum("nij,nj->ni", segment.rotation[1:], force)
+    force = rotate(segment.rotation[1:], force)
     velocity_increments = (
         force + np.cross(attitude_difference_rad[1:], force) + GRAVITY_M_S2
     ) * step_s
@@ -118,7 +124,7 @@ def corrections(
     Parameters
     ----------
     time_s : ndarray, shape (n,)
-        Times of the published rows.
+        Times of the published positions.
     velocity_m_s, position_m : ndarray, shape (n, a)
     sample_s : ndarray, shape (m,)
         Increasing times, each one step before a correction becomes visible.
@@ -128,7 +134,7 @@ def corrections(
     Returns
     -------
     ndarray, shape (m, a)
-        Corrections along a axes; NaN if rows of the log are missing after the sample.
+        Corrections (m) along a axes; NaN if logged positions are missing after the sample.
     """
     interval_s = np.diff(time_s)
     dead_reckoned = 0.5 * (velocity_m_s[1:] + velocity_m_s[:-1]) * interval_s[:, None]
@@ -145,45 +151,47 @@ def corrections(
         & (row < len(correction_increments))
         & is_usable[np.clip(row, 0, len(correction_increments) - 1)]
     )
-    row, sample_index = row[is_inside], np.nonzero(is_inside)[1]
+    row = row[is_inside]
+    sample_index = np.nonzero(is_inside)[1]
     decay_start, decay_end = (
-        np.exp(-np.maximum(time_s[each] - sample_s[sample_index], 0.0) / tau_s)
-        for each in (row, row + 1)
+        np.exp(-np.maximum(time_s[step] - sample_s[sample_index], 0.0) / tau_s)
+        for step in (row, row + 1)
     )
-    shares = csr_array(
+    visible_shares = csr_array(
         (decay_start - decay_end, (row, sample_index)),
         shape=(len(correction_increments), len(sample_s)),
     )
-    normal = shares.T @ shares + PRIOR_WEIGHT * eye_array(len(sample_s))
+    normal = visible_shares.T @ visible_shares + PRIOR_WEIGHT * eye_array(len(sample_s))
     result = np.reshape(
-        spsolve(normal.tocsc(), shares.T @ correction_increments), (len(sample_s), -1)
+        spsolve(normal.tocsc(), visible_shares.T @ correction_increments), (len(sample_s), -1)
     )
-    return np.where(shares.sum(axis=0)[:, None] > MIN_VISIBLE_SHARE, result, np.nan)
+    return np.where(visible_shares.sum(axis=0)[:, None] > MIN_VISIBLE_SHARE, result, np.nan)
 
 
 def delay_by(values: Array, lag: int) -> Array:
-    """Delay values by ``lag`` steps; before, the first value is repeated."""
+    """Delay values by ``lag`` prediction steps; the first value is repeated ``lag`` times."""
     return np.concatenate([np.repeat(values[:1], lag, axis=0), values])[: len(values)]
 
 
 def follow_attitude(error_rad: Array, lag: int, step_s: float, horizon_s: float) -> Array:
     """Return the correction with which the published attitude follows the filter's attitude error.
 
-    Each step corrects the newest attitude by 0.5 · step / horizon of the error at the fusion
-    horizon.
+    Each prediction step corrects the newest attitude by the fraction 0.5 · step / horizon of the
+    attitude error at the fusion horizon.
 
     Parameters
     ----------
     error_rad : ndarray, shape (n + 1, 3)
-        Attitude error at the fusion horizon (rotation vectors); rows are at the time to which the
-        error refers.
+        Attitude error at the fusion horizon (rotation vectors); each row is at the time to which
+        the error refers.
     lag : int
         Number of steps between fusion horizon and present.
     step_s, horizon_s : float
     """
     gain = ATTITUDE_GAIN * step_s / max(horizon_s, step_s)
     numerator, denominator = np.zeros((2, lag + 2))
-    numerator[-1], denominator[:2] = gain, (1.0, -1.0)
+    numerator[-1] = gain
+    denominator[:2] = (1.0, -1.0)
     denominator[-1] += gain
     return _recursive_filter(numerator, denominator, error_rad)
 

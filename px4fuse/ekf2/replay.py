@@ -9,9 +9,9 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
 from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.inputs import aid_source, replayed_aid, same_sample
+from px4fuse.ekf2.inputs import ANALYSIS_NAME, aid_source, replayed_aid, same_sample
 from px4fuse.ekf2.replay_segments import SETTLING_S
-from px4fuse.ekf2_parameters import AIDS, EV_POS, FLOW, GNSS_HGT, GNSS_POS, GNSS_VEL, MAG
+from px4fuse.ekf2_parameters import AIDS, FLOW, GNSS_HGT, GNSS_VEL, MAG
 from px4fuse.filter import signals
 from px4fuse.filter.frame_rotation import heading_rad
 from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Columns, Ekf2, Flight, Truth, Unavailable
@@ -41,41 +41,45 @@ VELOCITY_UPDATE_COLUMNS = [
     *(f"innovation_{axis}_m_s" for axis in AXIS_NAMES),
     *(f"innovation_variance_{axis}_m2_s2" for axis in AXIS_NAMES),
 ]
-MIN_SAMPLES = 20
+MIN_SAMPLES = 20  # minimum number of logged innovations for a comparison with the replay
 CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
-# Maximum time (s) from an update to its logged innovation: topics of old releases repeat a sample
+# Maximum time (s) from an update to its logged innovation: estimator_innovations repeats a sample
 # with later timestamps until the next fusion
 MAX_REPEAT_S = 0.5
-# Minimum correlation of replayed and logged innovations, and maximum deviation of the median ratio
-# of S from 1, for agreement. In simulated flights of v1.13 to main with complete logs the
-# correlation is above 0.997 and the S ratio within 0.3 %. With a downsampled source or IMU dropouts
-# S differs by more than 5 % or the correlation is below 0.9 (tests/benchmarks/bench_ekf2.py)
+# Minimum correlation of replayed and logged innovations: above 0.997 in simulated flights with
+# complete logs, below 0.9 with a downsampled source or IMU dropouts (see
+# tests/benchmarks/bench_ekf2.py)
 MIN_CORRELATION = 0.95
+# Maximum deviation from 1 of the median ratio of replayed to logged innovation variance S: below
+# 0.003 in simulated flights with complete logs; above 0.05 with a downsampled source
 MAX_S_DIFFERENCE = 0.05
-# Maximum difference (m, RMS) of the published position: with complete logs it is below 0.013 m
+# Maximum RMS difference (m) of replayed and logged published position: below 0.013 m with complete
+# logs
 MAX_PUBLISHED_DIFFERENCE_M = 0.10
-# Maximum difference (m) while optical flow is the only horizontal aid: larger, because flow is
-# logged at a reduced rate
+# Maximum difference (m) of the published position while optical flow is the only horizontal aiding
+# source: larger, because optical flow is logged at a reduced rate
 MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
-# Maximum rejected share for a comparison of single innovations. With more rejections one sample
-# near the gate limit changes many later samples: then only rejected share and mean NIS must agree,
-# and single innovations are compared in a replay with logged rejections
+# Maximum rejected fraction for a comparison of single innovations. With more rejections one sample
+# near the gate limit changes many later samples. Then only rejected fraction and mean NIS are
+# compared, and single innovations in another replay with logged rejections
 MANY_REJECTIONS_SHARE = 0.1
+# Maximum difference of the rejected fractions of replay and log
 MAX_REJECTED_DIFFERENCE = 0.05
+# Maximum relative difference of the mean NIS of replay and log
 MAX_NIS_DIFFERENCE = 0.25
-# Factor on MAX_PUBLISHED_DIFFERENCE_M if most samples are rejected
+# Factor on MAX_PUBLISHED_DIFFERENCE_M for the replay with logged rejections
 REJECTING_TOLERANCE_FACTOR = 3.0
 
 
 class AxisAgreement(Record, frozen=True, kw_only=True):
-    """Agreement of the replay (with logged parameters) with the log, along one axis.
+    """Agreement of the EKF2 replay (with logged parameters) with the log, along one axis.
 
     Attributes
     ----------
     innovation_correlation : float
         Correlation of replayed and logged innovations.
     innovation_rms_difference : float
-        RMS of replayed minus logged innovations, in the unit of the aid (m for a position).
+        RMS of replayed minus logged innovations, in their unit (m for positions).
     s_ratio_median, s_ratio_p5, s_ratio_p95 : float
         Replayed over logged innovation variance: median, and 5 and 95 % quantiles.
     nis_mean_logged, nis_mean_replayed : float
@@ -95,14 +99,14 @@ class AxisAgreement(Record, frozen=True, kw_only=True):
 
 
 class Agreement(Record, frozen=True, kw_only=True):
-    """Agreement of the replay (with logged parameters) with the log of EKF2.
+    """Agreement of the EKF2 replay (with logged parameters) with the log.
 
     Attributes
     ----------
     north, east : AxisAgreement
-        Agreement of the horizontal position aid: GNSS or, without GNSS, external vision.
+        Agreement of the position innovations: of GNSS or, without GNSS, of external vision.
     ev_pos, gnss_pos : mapping from "north" and "east" to AxisAgreement
-        Agreement by aid, including vision that is fused in addition to GNSS.
+        Agreement of external vision (also in addition to GNSS), and of GNSS positions.
     gnss_vel : mapping from "north", "east" and "down" to AxisAgreement
         Agreement of the GNSS velocity; "down" only if GNSS height is also fused.
     gnss_hgt, baro_hgt : mapping from "down" to AxisAgreement
@@ -111,23 +115,23 @@ class Agreement(Record, frozen=True, kw_only=True):
         Number of compared logged innovations, without the first seconds of each segment
         (:data:`~px4fuse.ekf2.replay_segments.SETTLING_S`).
     rejected_fraction_logged, rejected_fraction_replayed : float
-        Share of the compared samples that EKF2 rejected, and that the replay rejected.
+        Fraction of the compared samples that EKF2 rejected, and that the replay rejected.
     decisions_same : float
-        Share of the compared samples that are rejected in both or in neither.
+        Fraction of the compared samples that EKF2 and replay both rejected or both accepted.
     published_rms_difference_m : float
         RMS of the difference of the published horizontal position, replay minus log.
     heading_rms_difference_deg : float or None
         RMS of the heading difference, replay minus log; None if the replay uses the logged heading.
     carried_difference_m : float or None
-        Largest horizontal difference while optical flow was the only aid; the other numbers exclude
-        these times. None if there were no such times.
-    doubtful : mapping from PX4's name of an aid to str
-        Aids with a replay that does not agree with the log, and the reasons. For the effect on the
-        replay see :func:`~px4fuse.ekf2.inputs.prepare_inputs`.
+        Largest horizontal position difference while optical flow was the only horizontal aiding
+        source; the other numbers exclude these times. None without such times.
+    doubtful : mapping from PX4's name of an aiding source to str
+        Aiding sources with a replay that does not agree with the log, and the reasons. The replay
+        omits them, see :func:`~px4fuse.ekf2.inputs.prepare_inputs`.
     good : bool
         True if the replay agrees with the log.
     reason : str
-        One sentence with the numbers.
+        Sentence with the numbers on which ``good`` is based.
     """
 
     north: AxisAgreement
@@ -150,11 +154,11 @@ class Agreement(Record, frozen=True, kw_only=True):
 
     @property
     def axes(self) -> Mapping[str, AxisAgreement]:
-        """Agreement of the horizontal position by axis."""
+        """Agreement of the position innovations by horizontal axis."""
         return {"north": self.north, "east": self.east}
 
     def as_unavailable(self, what: str) -> Unavailable:
-        """Return Unavailable for the result ``what``, which requires a replay that agrees."""
+        """Return Unavailable for the result ``what``, because the replay does not agree."""
         profile = "3 (default and full rates)" if self.gnss_pos else "129 (default and vision)"
         return Unavailable(
             what,
@@ -175,8 +179,8 @@ class Replayed(Record, frozen=True, kw_only=True, omit_defaults=False):
     settings : mapping
         All parameters of the model, by PX4 name, in PX4's units.
     late, lost : int
-        Number of samples that arrived after the fusion horizon had passed their time: fused late,
-        and never fused.
+        Number of samples that arrived after the fusion horizon had passed their measurement time:
+        fused late, and never fused.
     agreement : Agreement or None
         Agreement of the replay with logged parameters; None while the agreement is computed.
     """
@@ -195,7 +199,7 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
     Attributes
     ----------
     changed : mapping
-        Parameters with values that differ from the log.
+        Values of the parameters that differ from the log, by PX4 name.
     updates : DataFrame, shape (m, 14), or (m, 20) with velocity
         One row per position sample, at EKF2's measurement time (timestamp - delay - half a step).
         Columns: :data:`UPDATE_COLUMNS`, and with velocity :data:`VELOCITY_UPDATE_COLUMNS`.
@@ -207,7 +211,7 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
         ``fused`` and ``fused_at_s``. Vision has innovations north and east, and ``reset``. A sample
         with which only the bias of vision was reset has no row.
     flow_only_spans_s : tuple of (float, float)
-        Times between positions in which optical flow was the only horizontal aid.
+        Times between positions in which optical flow was the only horizontal aiding source.
     delayed : DataFrame, shape (n, 7)
         Position and velocity (m, m/s, NED) and ``heading_rad`` of the state at the fusion horizon,
         at the end of each prediction step.
@@ -227,7 +231,7 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
 
     @property
     def evaluated_s(self) -> Spans:
-        """Evaluated spans: each segment without its first seconds and without flow-only times."""
+        """Evaluated times: the segments without their first seconds and without flow-only times."""
         spans = []
         for start, end in self.stretches_s:
             begin = start + SETTLING_S
@@ -241,14 +245,7 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
 
 
 def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavailable:
-    """Compare a replay (with logged parameters) with EKF2's logged innovations and state.
-
-    Parameters
-    ----------
-    flight : Flight
-    replay : Ekf2Replay
-        Replay with the logged parameters.
-    """
+    """Compare a replay (with logged parameters) with EKF2's logged innovations and state."""
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     is_own_topic = aid_source(replayed_aid(ekf2)) in ekf2.innovation_topics
@@ -257,37 +254,37 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     )
     if len(log) < MIN_SAMPLES:
         return Unavailable(
-            "EKF2 replay",
-            f"only {len(log)} logged innovations to compare with (at least {MIN_SAMPLES} "
-            "are needed)",
-            "Fly longer on external vision, and record with SDLOG_PROFILE bit 0 (default).",
+            ANALYSIS_NAME,
+            f"the log contains only {len(log)} innovations in the replayed time (at least "
+            f"{MIN_SAMPLES} are needed)",
+            "Fly longer with the position source, and record with SDLOG_PROFILE bit 0 (default).",
         )
     if not inside_spans(ekf2.state.index, replay.evaluated_s).any():
         return Unavailable(
-            "EKF2 replay",
+            ANALYSIS_NAME,
             "EKF2's position is not logged in the replayed time",
             "Record vehicle_local_position during the whole flight.",
         )
     if _has_constant_innovations(log, model, HORIZONTAL):
         return Unavailable(
-            "EKF2 replay",
-            "the logged innovations are constant, so agreement cannot be tested",
+            ANALYSIS_NAME,
+            CONSTANT_INNOVATIONS,
             "Record a flight with motion and real measurements.",
         )
     axes: dict[str, AxisAgreement]
     axes = {axis: _axis_agreement(axis, log, model, ekf2, replay) for axis in HORIZONTAL}
-    north, east = axes["north"], axes["east"]
+    north = axes["north"]
+    east = axes["east"]
     rejected_in_log, rejected_in_model = (
         frame["rejected"].to_numpy() > 0 for frame in (log, model)
     )
-    shares = float(rejected_in_log.mean()), float(rejected_in_model.mean())
-    good, reason = _agreement_verdict(axes, *shares)
-    on_gnss = replayed_aid(ekf2) == GNSS_POS
+    rejected_fractions = float(rejected_in_log.mean()), float(rejected_in_model.mean())
+    good, reason = _agreement_verdict(axes, *rejected_fractions)
     other_agreements, doubtful = _other_agreements(ekf2, replay)
     velocity, constant = _velocity_agreement(ekf2, replay, is_own_topic=is_own_topic)
     if constant:
         doubtful[GNSS_VEL.name] = CONSTANT_INNOVATIONS
-    position = {GNSS_POS.name if on_gnss else EV_POS.name: axes}
+    position = {replayed_aid(ekf2).name: axes}
     distance_m = np.hypot(north.position_rms_difference_m, east.position_rms_difference_m)
     flow_only_m = _flow_only_error_m(ekf2, replay)
     if flow_only_m is not None and flow_only_m > MAX_FLOW_ONLY_DIFFERENCE_M:
@@ -303,8 +300,8 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
         **(position | other_agreements),
         doubtful=doubtful,
         samples=len(log),
-        rejected_fraction_logged=shares[0],
-        rejected_fraction_replayed=shares[1],
+        rejected_fraction_logged=rejected_fractions[0],
+        rejected_fraction_replayed=rejected_fractions[1],
         decisions_same=float(np.mean(rejected_in_log == rejected_in_model)),
         published_rms_difference_m=float(distance_m),
         good=good,
@@ -315,38 +312,39 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
 
 
 def _flow_only_error_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
-    """Return the largest horizontal difference (m) to the log with flow only; None if no flow."""
-    times = ekf2.state.index
-    is_inside = inside_spans(times, replay.flow_only_spans_s)
-    if not is_inside.any():
+    """Return the largest horizontal position difference (m) between replay and log with flow only.
+
+    None if optical flow was never the only horizontal aiding source.
+    """
+    times = ekf2.state.index[inside_spans(ekf2.state.index, replay.flow_only_spans_s)].to_numpy()
+    if not len(times):
         return None
     north, east = (
-        along(replay.published, Columns.POSITION, axis_direction, times[is_inside].to_numpy())
-        - along(ekf2.state, Columns.POSITION, axis_direction, times[is_inside].to_numpy())
-        for axis_direction in np.eye(3)[:2]
+        along(replay.published, Columns.POSITION, direction, times)
+        - along(ekf2.state, Columns.POSITION, direction, times)
+        for direction in np.eye(3)[:2]
     )
     return float(np.hypot(north, east).max())
 
 
 def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
-    """Return the RMS heading difference (°) of replay and log; None without magnetometer."""
+    """Return the RMS heading difference (°) between replay and log; None without magnetometer."""
     if MAG.noise not in replay.settings or isinstance(ekf2.record, Unavailable):
         return None
     logged = ekf2.record.delayed
     logged = logged[inside_spans(logged.index, replay.evaluated_s)]
     if logged.empty:
         return None
-    replayed_heading = replay.delayed["heading_rad"]
-    error = np.interp(
-        logged.index, replayed_heading.index, np.unwrap(replayed_heading)
-    ) - heading_rad(logged)
-    return float(np.degrees(rms(np.angle(np.exp(1j * error)))))
+    heading = replay.delayed["heading_rad"]
+    replayed_rad = np.interp(logged.index, heading.index, np.unwrap(heading))
+    difference_rad = np.angle(np.exp(1j * (replayed_rad - heading_rad(logged))))
+    return float(np.degrees(rms(difference_rad)))
 
 
 def _has_constant_innovations(
     logged: pd.DataFrame, model: pd.DataFrame, axes: Iterable[AxisName]
 ) -> bool:
-    """Return True if innovations of an axis are constant, so that they have no correlation."""
+    """Return True if logged or replayed innovations are constant: they have no correlation."""
     columns = [f"innovation_{axis}_m" for axis in axes]
     return not all(np.ptp(frame[columns], axis=0).all() for frame in (logged, model))
 
@@ -364,13 +362,15 @@ def _velocity_agreement(
     logged, model = _matched_samples(replay, replay.updates, log.samples, is_own_topic=is_own_topic)
     if len(logged) < MIN_SAMPLES:
         return {}, False
-    names: dict[str, str] = {}  # rename velocity columns to the names of position columns
+    # give the velocity columns the names of position columns, which _axis_agreement reads
+    names: dict[str, str] = {}
     for axis in AXIS_NAMES:
-        nu, S = f"innovation_{axis}_m", f"innovation_variance_{axis}_m2"
+        nu = f"innovation_{axis}_m"
+        S = f"innovation_variance_{axis}_m2"
         names |= {f"{nu}_s": nu, f"{S}_s2": S, f"innovation_{axis}": nu, f"variance_{axis}": S}
     logged = logged.rename(columns=names)
     model = model[VELOCITY_UPDATE_COLUMNS].rename(columns=names)
-    # compare down only if heights are fused: else the logged EKF2 height is used
+    # compare the axis down only if the replay fuses heights: else it uses the logged EKF2 height
     axes = AXIS_NAMES if GNSS_HGT.name in replay.other_aid_updates else HORIZONTAL
     if _has_constant_innovations(logged, model, axes):
         return {}, True
@@ -378,7 +378,10 @@ def _velocity_agreement(
 
 
 def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the agreement of all aids except the position, and the reason of each disagreement."""
+    """Return the agreement of height sensors and of vision in addition to GNSS, by PX4 name.
+
+    Return also the reason of each disagreement, by PX4 name.
+    """
     agreements: dict[str, dict[str, AxisAgreement]] = {}
     doubtful = {}
     for name, updates in replay.other_aid_updates.items():
@@ -387,7 +390,7 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
         rows = logged_aid_innovations(name, log)
         logged, model = _matched_samples(replay, updates, rows, is_own_topic=is_own_topic)
         if len(logged) < MIN_SAMPLES:
-            doubtful[name] = f"only {len(logged)} logged innovations to compare with"
+            doubtful[name] = f"only {len(logged)} innovations are logged in the replayed time"
             continue
         if _has_constant_innovations(logged, model, axes_of(updates)):
             doubtful[name] = CONSTANT_INNOVATIONS
@@ -395,15 +398,15 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
         agreements[name] = {
             axis: _axis_agreement(axis, logged, model, ekf2, replay) for axis in axes_of(updates)
         }
-        shares = (float(np.mean(frame["rejected"] > 0.0)) for frame in (logged, model))
-        good, reason = _agreement_verdict(agreements[name], *shares)
+        rejected_fractions = (float(np.mean(frame["rejected"] > 0.0)) for frame in (logged, model))
+        good, reason = _agreement_verdict(agreements[name], *rejected_fractions)
         if not good:
             doubtful[name] = reason
     return agreements, doubtful
 
 
 def logged_aid_innovations(name: str, log: AidLog) -> pd.DataFrame:
-    """Return innovations, variances and rejections of the aid with PX4's name ``name``."""
+    """Return logged innovations, S and rejections of the aiding source with PX4's name ``name``."""
     gate = log.parameters.get(AIDS[name].gate, AIDS[name].default_gate)
     axes = [axis for axis in AXIS_NAMES if axis in log.axes]
     return _columns_by_axis({axis: innovations_along(log, axis, gate) for axis in axes})
@@ -417,14 +420,14 @@ def axes_of(updates: pd.DataFrame) -> list[AxisName]:
 def _matched_samples(
     replay: Ekf2Replay, updates: pd.DataFrame, logged: pd.DataFrame, *, is_own_topic: bool
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the evaluated logged innovations and the updates of the same samples."""
+    """Return the logged innovations in the evaluated times, and the updates of the same samples."""
     matched = match_updates(updates, logged.index.to_numpy(), is_own_topic=is_own_topic)
     is_used = (matched >= 0) & inside_spans(logged.index, replay.evaluated_s)
     return logged[is_used], updates.iloc[matched[is_used]]
 
 
 def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
-    """Return the logged innovations, variances and rejections, north and east, by sample."""
+    """Return the logged position innovations north and east, with S and rejections."""
     return _columns_by_axis({axis: ekf2.innovations[axis] for axis in HORIZONTAL})
 
 
@@ -451,7 +454,7 @@ def inside_spans(times_s: ArrayLike, spans: Spans) -> BoolArray:
 def match_updates(updates: pd.DataFrame, times: Array, *, is_own_topic: bool) -> IntArray:
     """Return the index of the update of each logged innovation; -1 without an update.
 
-    ``is_own_topic`` is True if the innovations are from a separate topic of the aid, which has
+    ``is_own_topic`` is True if the innovations are from an estimator_aid_src topic, which contains
     measurement times.
     """
     if is_own_topic:
@@ -466,8 +469,8 @@ def _axis_agreement(
     axis: AxisName, log: pd.DataFrame, model: pd.DataFrame, ekf2: Ekf2, replay: Ekf2Replay
 ) -> AxisAgreement:
     nu, nu_log = (frame[f"innovation_{axis}_m"].to_numpy() for frame in (model, log))
-    s, s_log = (frame[f"innovation_variance_{axis}_m2"].to_numpy() for frame in (model, log))
-    low, middle, high = np.percentile(s / s_log, [5, 50, 95])
+    S, S_log = (frame[f"innovation_variance_{axis}_m2"].to_numpy() for frame in (model, log))
+    s_ratio_p5, s_ratio_median, s_ratio_p95 = np.percentile(S / S_log, [5, 50, 95]).tolist()
     times = ekf2.state.index[inside_spans(ekf2.state.index, replay.evaluated_s)].to_numpy()
     direction = np.eye(3)[AXIS_NAMES.index(axis)]
     position, velocity = (
@@ -478,28 +481,28 @@ def _axis_agreement(
     return AxisAgreement(
         innovation_correlation=float(np.corrcoef(nu, nu_log)[0, 1]),
         innovation_rms_difference=rms(nu - nu_log),
-        s_ratio_median=float(middle),
-        s_ratio_p5=float(low),
-        s_ratio_p95=float(high),
-        nis_mean_logged=float(np.mean(nu_log**2 / s_log)),
-        nis_mean_replayed=float(np.mean(nu**2 / s)),
+        s_ratio_median=s_ratio_median,
+        s_ratio_p5=s_ratio_p5,
+        s_ratio_p95=s_ratio_p95,
+        nis_mean_logged=float(np.mean(nu_log**2 / S_log)),
+        nis_mean_replayed=float(np.mean(nu**2 / S)),
         position_rms_difference_m=rms(position),
         velocity_rms_difference_m_s=rms(velocity),
     )
 
 
 def along(frame: pd.DataFrame, columns: list[str], direction: Array, times: Array) -> Array:
-    """Interpolate the component of a time-indexed vector along a direction."""
-    summed = signals.weighted_sum(frame, columns, direction[: len(columns)])
-    return np.asarray(np.interp(times, frame.index, summed))
+    """Interpolate the component of a vector (NED columns of ``frame``) along a direction."""
+    component = signals.weighted_sum(frame, columns, direction[: len(columns)])
+    return np.asarray(np.interp(times, frame.index, component))
 
 
 def rms_to_truth(flight: Flight, position: Array, direction: Array, times: Array) -> float | None:
     """Return the position RMSE (m) along a direction; None without ground truth."""
     if not isinstance(flight.truth, Truth):
         return None
-    needed = Columns.POSITION[2:] if direction[2] else Columns.POSITION[:2]
-    truth = flight.truth.samples.dropna(subset=needed)
+    columns = Columns.POSITION[2:] if direction[2] else Columns.POSITION[:2]
+    truth = flight.truth.samples.dropna(subset=columns)
     if truth.empty:
         return None
     is_inside = (times >= truth.index[0]) & (times <= truth.index[-1])
@@ -514,15 +517,17 @@ def rms(values: Array) -> float:
 
 def _agreement_verdict(
     axes: Mapping[str, AxisAgreement],
-    logged_share: float,
-    replayed_share: float,
+    rejected_in_log: float,
+    rejected_in_replay: float,
     published_factor: float = 1.0,
 ) -> tuple[bool, str]:
     """Return True if the replay agrees with the log, and the reason with numbers.
 
-    ``published_factor`` multiplies the limit of the published position.
+    ``rejected_in_log`` and ``rejected_in_replay`` are fractions of the samples;
+    ``published_factor`` multiplies MAX_PUBLISHED_DIFFERENCE_M.
     """
-    ratio = max((axis.s_ratio_median for axis in axes.values()), key=lambda s: abs(s - 1.0))
+    s_ratios = (axis.s_ratio_median for axis in axes.values())
+    ratio = max(s_ratios, key=lambda s_ratio: abs(s_ratio - 1.0))
     if abs(ratio - 1.0) > MAX_S_DIFFERENCE:
         return False, (
             f"S ratio replay / log is {ratio:.2f} (tolerance {MAX_S_DIFFERENCE:.0%}): EKF2 fused "
@@ -540,20 +545,23 @@ def _agreement_verdict(
                 "lacks an input of EKF2's output predictor"
             )
         return True, f"{correlation_text} or better"
-    if max(logged_share, replayed_share) < MANY_REJECTIONS_SHARE:
+    if max(rejected_in_log, rejected_in_replay) < MANY_REJECTIONS_SHARE:
         return False, f"{correlation_text} only (at least {MIN_CORRELATION:g})"
-    rejected_difference = abs(replayed_share - logged_share)
-    nis = max(abs(a.nis_mean_replayed / a.nis_mean_logged - 1.0) for a in axes.values())
-    text = f"rejected {replayed_share:.1%} (log {logged_share:.1%}); mean NIS differs by {nis:.0%}"
+    rejected_difference = abs(rejected_in_replay - rejected_in_log)
+    nis = max(abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) for axis in axes.values())
+    text = (
+        f"the replay rejected {rejected_in_replay:.1%} of the samples (log "
+        f"{rejected_in_log:.1%}), and its mean NIS differs by {nis:.0%}"
+    )
     if rejected_difference > MAX_REJECTED_DIFFERENCE or nis > MAX_NIS_DIFFERENCE:
         return False, (
             f"{text} (limits {MAX_REJECTED_DIFFERENCE:.0%} and {MAX_NIS_DIFFERENCE:.0%})"
         )
-    return True, f"{text}; single innovations differ: each rejection changes the next ones"
+    return True, f"{text}; single innovations differ, because a rejection changes later innovations"
 
 
 def _format_beyond(value: float, limit: float) -> str:
-    """Format a value with at least two decimals, with more if needed to show it above a limit."""
+    """Format a value with at least two decimals, and so many that it is above ``limit``."""
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 
 

@@ -1,4 +1,4 @@
-"""Segments of a flight without gaps for the EKF2 replay: prediction steps and initial state.
+"""Parts of a flight without gaps for the EKF2 replay: prediction steps and initial state.
 
 Source: PX4-Autopilot ``EKF/imu_down_sampler/imu_down_sampler.cpp``.
 """
@@ -12,65 +12,67 @@ import numpy as np
 import pandas as pd
 from scipy.linalg import block_diag
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.flight import BAD_ACCELERATION, Columns, Ekf2, Flight, FusionRecord, Unavailable
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.readers.px4_ekf2 import rows_of_timestamps, samples_per_step
+from px4fuse.record import Span
 from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
     from_vector,
     interpolate,
     multiply,
+    rotate,
     to_matrix,
     to_vector,
 )
 
-# Maximum gap (s) in the source or IMU within a segment. After a longer gap the replay restarts from
-# the logged state: in the gap EKF2 fuses gravity, fake positions or zero velocity, which the model
-# does not contain
+# Maximum gap (s) in the position source within a segment. After a longer gap the replay restarts
+# from the logged state: in the gap EKF2 fuses gravity, fake positions or zero velocity, which the
+# model does not contain
 RESTART_GAP_S = 2.0
 # Maximum IMU interval (s): PX4 limits a prediction step to 2 EKF2_PREDICT_US, so EKF2 loses the
 # motion in a longer gap
 IMU_GAP_S = 0.05
-# Minimum time (s) of fusion before the replay starts
+# Minimum time (s) from EKF2's first position fusion to the start of the replay
 MIN_FUSION_S = 1.0
-# Minimum time (s) in the air before the replay starts: on the ground EKF2 fuses zero velocity and
-# gravity, and only the motion after take-off makes tilt and accelerometer bias distinguishable
+# Minimum time (s) from take-off to the start of the replay: on the ground EKF2 fuses zero velocity
+# and gravity, and only motion in the air distinguishes tilt from accelerometer bias
 MIN_AIRBORNE_S = 4.0
 SETTLING_S = 5.0  # time (s) from the start of a replay to the start of its evaluation
-# Time (s) from the first logged three-axis magnetometer sample until the log contains the magnetic
+# Time (s) from the first logged fusion of all magnetometer axes until the log contains the magnetic
 # field states that EKF2 resets after take-off
 FIELD_RESET_S = 1.0
-# Flight time (s) before the start of the replay from which the initial correlations are estimated
+# Flight time (s) before the replay that is used to estimate correlations of the initial state
 CORRELATION_HISTORY_S = 20.0
-# Rate (Hz) at which EKF2 fuses the magnetometer (SENS_MAG_RATE 15), and minimum logged rate for a
-# replay. A logged sample may represent several samples in EKF2
-MAG_FUSION_HZ, MIN_MAG_LOG_HZ = 14.0, 1.5
+# Rate (Hz) at which EKF2 fuses the magnetometer (SENS_MAG_RATE 15)
+MAG_FUSION_HZ = 14.0
+# Minimum rate (Hz) of the logged magnetometer for a replay of its fusion
+MIN_MAG_LOG_HZ = 1.5
 # Time constant (s) of EKF2's low-pass filter of innovations (updateAidSourceStatus, ekf_helper.cpp)
 FILTER_S = 0.5
-MIN_SEGMENT_S = 10.0
+MIN_SEGMENT_S = 10.0  # minimum length of a replayed segment
 # Maximum delay (s) from a reset to its publication: largest delay of the fusion horizon plus one
 # logging interval
 MAX_RESET_DELAY_S = 0.5
 # Maximum fraction of clipped IMU samples within 1 s; above, the replay is interrupted
 MAX_CLIPPED_SHARE = 0.05
 
-GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # CONSTANTS_ONE_G
+GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # NED; CONSTANTS_ONE_G in PX4
 
-
-# Index ranges in ReplaySegment.state
-STATES = 15
-IMU_STATE_COUNT = 9  # states that the IMU propagates: all except the biases
+STATE_COUNT = 15  # number of states without magnetic fields
+IMU_STATE_COUNT = 9  # number of states that the IMU propagates: all except the biases
+# Indices in the state
 THETA, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS, BIASES = slice(9, 12), slice(12, 15), slice(9, 15)
-EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)  # NED and FRD, if fused
+EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)  # NED and FRD, with 21 states
 
 
 @dataclass(frozen=True)
 class SensorSamples:
-    """Magnetometer or optical flow data of one segment: m means, each of several samples.
+    """Magnetometer or optical flow data of one segment: m means, each over several samples.
 
     k is the number of measured components: 3 for a magnetometer, 2 for optical flow.
 
@@ -86,9 +88,9 @@ class SensorSamples:
     sample_count : ndarray, shape (m,)
         Number of samples that EKF2 received, for each mean.
     noise : ndarray, shape (m,)
-        R of one sample; 0 if R is given by the parameters.
+        Variance R of one sample; 0 if R is a parameter of the replay.
     gate : float
-        Innovation gate in √S; infinite if the gate is given by the parameters.
+        Innovation gate in √S; infinite if the gate is a parameter of the replay.
     """
 
     step: IntArray
@@ -103,7 +105,7 @@ class SensorSamples:
 
 @dataclass(frozen=True)
 class HeightSamples:
-    """Height measurements of one segment.
+    """Height measurements of one segment of the EKF2 replay.
 
     Attributes
     ----------
@@ -112,7 +114,7 @@ class HeightSamples:
     reference : str
         PX4's name of the reference sensor, which has no bias.
     bias : (float, float)
-        Initial bias of the other sensor (m, positive: too high), and its variance (m²).
+        Initial bias of the other sensor (m, positive: too high), and variance of the bias (m²).
     step : ndarray of int, shape (m,)
         Prediction step after which EKF2 fuses each barometer sample.
     measured_at_s, down_m : ndarray, shape (m,)
@@ -121,7 +123,7 @@ class HeightSamples:
         Dead zone: in ground effect, EKF2 ignores a height that is below the state by up to this
         distance.
     weight : float
-        Number of samples in EKF2 per logged sample.
+        Number of barometer samples that EKF2 fused per logged sample.
     """
 
     fused: tuple[str, ...]
@@ -162,7 +164,7 @@ class ReplaySegment:
         Initial attitude error, velocity, position, errors of gyro and accelerometer bias, and with
         21 states the magnetic fields of earth and body.
     variance : ndarray, shape (15,) or (21,)
-        Initial variances, in the same order.
+        Initial variances of the states.
     down_m : ndarray, shape (n + 1,)
         Published height (positive down).
     attitude_variance_rad2 : ndarray, shape (n + 1, 3)
@@ -174,15 +176,14 @@ class ReplaySegment:
     correlation : ndarray, shape (15, 15) or (21, 21)
         Correlations of the initial state; estimated, because the log contains variances only.
     fusing : bool
-        True if EKF2 fuses the source at the start.
+        True if EKF2 fuses the position source at the start.
     field : SensorSamples or None
         Magnetometer samples (with 21 states); None if the logged EKF2 heading is used.
     heights : HeightSamples or None
         Height samples; None if the height of EKF2 or of external vision is used.
     bad_acceleration_share : ndarray, shape (n + 1,), or None
-        Share of accelerometer axes with a larger noise in the step that ends at each time: all axes
-        while EKF2 reports a bad vertical acceleration, else the clipped axes. None if the share is
-        always 0.
+        Fraction of accelerometer axes with a larger noise in the step until each time: all axes
+        while EKF2 reports a bad vertical acceleration, else the clipped axes. None if always 0.
     flow : SensorSamples or None
         Optical flow samples, if EKF2 fused optical flow.
     metres : (float, float, float)
@@ -216,14 +217,17 @@ class ReplaySegment:
 
     @cached_property
     def imu_velocity_m_s(self) -> Array:
-        """Velocity change since the start, from the IMU (m/s, NED), shape (n + 1, 3)."""
-        force = np.einsum("nij,nj->ni", self.rotation[1:], self.force_m_s2) + GRAVITY_M_S2
+        """Velocity change since the start, integrated from the IMU (m/s, NED), shape (n + 1, 3)."""
+        force = rotate(self.rotation[1:], self.force_m_s2) + GRAVITY_M_S2
         velocity_increments = np.cumsum(force * self.step_s[:, None], axis=0)
         return np.concatenate([np.zeros((1, 3)), velocity_increments])
 
     @cached_property
     def imu_displacement_m(self) -> Array:
-        """Displacement since the start by the IMU, initially at rest (m, NED), shape (n + 1, 3)."""
+        """Displacement since the start (m, NED), integrated from the IMU with initial velocity 0.
+
+        Shape (n + 1, 3).
+        """
         speed = self.imu_velocity_m_s
         path = np.cumsum(0.5 * (speed[1:] + speed[:-1]) * self.step_s[:, None], axis=0)
         return np.concatenate([np.zeros((1, 3)), path])
@@ -237,10 +241,9 @@ def samples_by_event(
     axes: slice,
     *more: Array,
 ) -> Array:
-    """Sort position samples by the event at which they are fused, in k slots per event.
+    """Sort position samples by the event (end of an interval) at which they are fused.
 
-    k is the largest number of samples between two events (ends of intervals), E the number of
-    events.
+    Each of E events has k slots; k is the largest number of samples between two events.
 
     Parameters
     ----------
@@ -254,30 +257,28 @@ def samples_by_event(
     axes : slice
         Range of the a axes within north, east and down.
     *more : ndarray, shape (m,)
-        Further columns.
+        Further quantities of each sample.
 
     Returns
     -------
     ndarray, shape (a + 2 + len(more), k, E)
-        Position plus the displacement up to the event due to the IMU acceleration; age at the
-        event; ``more``; and 1. All are 0 in empty slots.
+        Position plus the displacement up to the event due to the IMU acceleration; sample age (s)
+        at the event; ``more``; and 1. All are 0 in empty slots.
     """
     event = np.searchsorted(event_steps, measurement_step)
     event = event[event < len(event_steps)]
     count = len(event)
-    measurement_step, event_step = measurement_step[:count], event_steps[event]
+    measurement_step = measurement_step[:count]
+    event_step = event_steps[event]
     age_s = segment.time_s[event_step] - segment.time_s[measurement_step]
-    path, speed = segment.imu_displacement_m[:, axes], segment.imu_velocity_m_s[:, axes]
-    position_m = (
-        position_m[:count]
-        + path[event_step]
-        - path[measurement_step]
-        - speed[event_step] * age_s[:, None]
-    )
+    path = segment.imu_displacement_m[:, axes]
+    speed = segment.imu_velocity_m_s[:, axes]
+    displacement = path[event_step] - path[measurement_step] - speed[event_step] * age_s[:, None]
     slot = np.arange(count) - np.searchsorted(event, event)
-    sample_columns = *position_m.T, age_s, *(each[:count] for each in more), np.ones(count)
-    samples = np.zeros((len(sample_columns), slot.max(initial=-1) + 1, len(event_steps)))
-    samples[:, slot, event] = sample_columns
+    position_m = position_m[:count] + displacement
+    columns = *position_m.T, age_s, *(column[:count] for column in more), np.ones(count)
+    samples = np.zeros((len(columns), slot.max(initial=-1) + 1, len(event_steps)))
+    samples[:, slot, event] = columns
     return samples
 
 
@@ -285,7 +286,8 @@ def pad_samples(sample_arrays: Sequence[Array]) -> list[Array]:
     """Pad the arrays of :func:`samples_by_event` to the same number of slots."""
     max_slots = max(samples.shape[1] for samples in sample_arrays)
     return [
-        np.pad(each, ((0, 0), (0, max_slots - each.shape[1]), (0, 0))) for each in sample_arrays
+        np.pad(samples, ((0, 0), (0, max_slots - samples.shape[1]), (0, 0)))
+        for samples in sample_arrays
     ]
 
 
@@ -299,24 +301,16 @@ def find_replay_segments(
     *,
     is_gnss: bool = False,
 ) -> tuple[ReplaySegment, ...]:
-    """Find the parts of a flight without gaps in IMU and positions, after EKF2 started to fuse.
+    """Find the parts of a flight without gaps in IMU and positions, after EKF2's first fusion.
 
-    Parameters
-    ----------
-    flight : Flight
-        Flight, for the times in the air.
-    imu, attitude : DataFrame
-    ekf2 : Ekf2
-    record : FusionRecord
-    source_s : ndarray
-        Timestamps of the position samples.
-    is_gnss : bool
-        True if EKF2 fuses GNSS. Magnetic fields are then states if the log contains the
-        magnetometer samples, and a bad or clipped acceleration has a larger noise.
+    ``source_s`` are the timestamps of the position samples. With GNSS (``is_gnss``), magnetic
+    fields are states if the log contains the magnetometer samples, and a bad or clipped
+    acceleration has a larger noise.
     """
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
-    fused, states = innovations.index.to_numpy(), record.delayed.index.to_numpy()
+    fused = innovations.index.to_numpy()
+    states = record.delayed.index.to_numpy()
     time = imu.index.to_numpy()
     cuts = [time[0], time[-1]]
     for stamps, limit in ((time, IMU_GAP_S), (source_s, RESTART_GAP_S)):
@@ -335,9 +329,8 @@ def find_replay_segments(
         fused_inside = fused[(fused >= low) & (fused <= high)]
         if not len(fused_inside):
             continue
-        starts = [take_off_s + MIN_AIRBORNE_S for take_off_s, _ in airborne if take_off_s < high][
-            :1
-        ]
+        # the first take-off before the end of the segment
+        starts = [start_s + MIN_AIRBORNE_S for start_s, _ in airborne[:1] if start_s < high]
         if field_span and low <= field_span[0] < high:
             starts.append(field_span[0])
         start_row = int(np.searchsorted(states, max([fused_inside[0] + MIN_FUSION_S, *starts])))
@@ -346,22 +339,20 @@ def find_replay_segments(
         is_covered = (time[1:] > states[start_row]) & (time[:-1] < high)
         if not np.all(np.diff(time)[is_covered] <= IMU_GAP_S):
             continue
-        stretch_inputs = imu, attitude, ekf2, record
+        segment_inputs = imu, attitude, ekf2, record
         if not is_gnss:
-            segments.append(_make_segment(*stretch_inputs, start_row, high))
+            segments.append(_make_segment(*segment_inputs, start_row, high))
             continue
-        segment = _make_gnss_segment(*stretch_inputs, start_row, high)
+        segment = _make_gnss_segment(*segment_inputs, start_row, high)
         history_row = int(
             np.searchsorted(states, max(first, states[start_row] - CORRELATION_HISTORY_S))
         )
         if history_row < start_row:
-            segment = replace(
-                segment, history=_make_gnss_segment(*stretch_inputs, history_row, states[start_row])
-            )
-        has_field = field_span and field_span[0] <= states[start_row] and high <= field_span[1]
-        segments.append(
-            _add_field(segment, record, start_row, ekf2.step_s) if has_field else segment
-        )
+            history = _make_gnss_segment(*segment_inputs, history_row, states[start_row])
+            segment = replace(segment, history=history)
+        if field_span and field_span[0] <= states[start_row] and high <= field_span[1]:
+            segment = _add_field(segment, record, start_row, ekf2.step_s)
+        segments.append(segment)
     return tuple(segments)
 
 
@@ -373,18 +364,10 @@ def _make_gnss_segment(
     start_row: int,
     end_s: float,
 ) -> ReplaySegment:
-    """Make a segment with earth rotation and a larger noise of bad or clipped accelerations."""
-    segment = _add_earth_rotation(
-        _make_segment(imu, attitude, ekf2, record, start_row, end_s), record
-    )
-    return replace(
-        segment, bad_acceleration_share=_bad_acceleration_share(imu, record, segment.time_s)
-    )
-
-
-def _add_earth_rotation(segment: ReplaySegment, record: FusionRecord) -> ReplaySegment:
-    """Add earth rotation, and convert the published position to EKF2's internal metres."""
-    metres, state = ekf2_metres_per_metre(record), segment.state.copy()
+    """Make a segment with earth rotation, EKF2's internal metres and noise of bad accelerations."""
+    segment = _make_segment(imu, attitude, ekf2, record, start_row, end_s)
+    metres = ekf2_metres_per_metre(record)
+    state = segment.state.copy()
     state[POSITION] *= metres
     earth_rotation_rad = earth_rate_rad_s(record) * segment.step_s[:, None]
     return replace(
@@ -392,6 +375,7 @@ def _add_earth_rotation(segment: ReplaySegment, record: FusionRecord) -> ReplayS
         state=state,
         metres=metres,
         correction_rad=segment.correction_rad + earth_rotation_rad,
+        bad_acceleration_share=_bad_acceleration_share(imu, record, segment.time_s),
     )
 
 
@@ -419,7 +403,7 @@ def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
 
 
 def _bad_acceleration_share(imu: pd.DataFrame, record: FusionRecord, time_s: Array) -> Array:
-    """Return the share of accelerometer axes with a larger noise, at the end of each step."""
+    """Return the fraction of accelerometer axes with a larger noise in the step until each time."""
     share_by_step = record.was_in_state(BAD_ACCELERATION, time_s).astype(float)
     if "clipped" in imu:  # one bit per axis
         clipped = imu.loc[(imu["clipped"] > 0.0) & (imu.index <= time_s[-1]), "clipped"]
@@ -440,7 +424,8 @@ def _make_segment(
     time = imu.index.to_numpy()
     first_row = int(np.argmin(np.abs(time - record.delayed.index[start_row])))
     rows = slice(first_row, int(np.searchsorted(time, end_s, side="right")))
-    time, imu = time[rows], imu.iloc[rows]
+    time = time[rows]
+    imu = imu.iloc[rows]
     interval = np.diff(time)
     end_stamps = rows_of_timestamps(time, record.delayed.index)
     ends = step_ends(interval, end_stamps, predict_s(record))
@@ -450,32 +435,28 @@ def _make_segment(
     rotation_vectors, velocity_increments = downsample_imu(
         rate * interval[:, None], force * interval[:, None], ends
     )
-    times = time[np.concatenate([[0], ends])]
+    times = time[np.append(0, ends)]
     step = np.diff(times)
     gyro = cumulative_product(
         np.concatenate([[[1.0, 0.0, 0.0, 0.0]], from_vector(rotation_vectors)])
     )
 
-    def attitude_beyond(
-        frame: pd.DataFrame, early_s: float, end_stamps: Array
-    ) -> tuple[Array, Array]:
-        """Return the times of a frame, and its attitudes relative to the attitude of each step."""
-        is_inside = (frame.index >= times[0] - early_s) & (frame.index <= times[-1])
-        at_s, attitude_samples = (
-            frame.index[is_inside].to_numpy(),
-            frame.loc[is_inside, Columns.QUATERNION].to_numpy(),
-        )
-        return at_s, multiply(attitude_samples, conjugate(interpolate(at_s, times, end_stamps)))
+    def relative_attitude(frame: pd.DataFrame, early_s: float, end_attitude: Array) -> ArrayPair:
+        frame = frame.loc[times[0] - early_s : times[-1]]
+        at_s = frame.index.to_numpy()
+        rotation = conjugate(interpolate(at_s, times, end_attitude))
+        return at_s, multiply(frame[Columns.QUATERNION].to_numpy(), rotation)
 
-    # rotation from the integrated gyro attitude to the published attitude, in the earth frame
-    extra_rotation = interpolate(times, *attitude_beyond(attitude, 0.0, gyro))
+    # rotation (NED) from the attitude integrated from the gyro to the published attitude
+    extra_rotation = interpolate(times, *relative_attitude(attitude, 0.0, gyro))
     nominal = multiply(extra_rotation, gyro)
-    states, turned_states = attitude_beyond(record.delayed, 1e-4, nominal)
-    error = to_vector(turned_states)
+    states, state_rotation = relative_attitude(record.delayed, 1e-4, nominal)
+    error = to_vector(state_rotation)
     published = [np.interp(times[0], ekf2.state.index, ekf2.state[c]) for c in Columns.POSITION]
     position = start[Columns.POSITION].to_numpy()
     position = np.where(np.isfinite(position), position, published)
-    position[2] = published[2]  # altitude and height have different origins from v1.16 on
+    # from PX4 v1.16 on, state and published height have different origins
+    position[2] = published[2]
     return ReplaySegment(
         time_s=times,
         step_s=step,
@@ -497,10 +478,11 @@ def _make_segment(
     )
 
 
-def _field_span(record: FusionRecord) -> tuple[float, float] | None:
-    """Return start and end (s) of continuous three-axis magnetometer fusion, or None."""
+def _field_span(record: FusionRecord) -> Span | None:
+    """Return start and end (s) of EKF2's fusion of all magnetometer axes; None if interrupted."""
     fused = record.field_gauss["fused_3d"] if len(record.field_gauss) else pd.Series(dtype=float)
-    times, is_fused = fused.index.to_numpy(), fused.to_numpy() > 0.0
+    times = fused.index.to_numpy()
+    is_fused = fused.to_numpy() > 0.0
     if not is_fused.any() or 1.0 / np.median(np.diff(times)) < MIN_MAG_LOG_HZ:
         return None
     first, last = np.flatnonzero(is_fused)[[0, -1]]
@@ -513,7 +495,8 @@ def _add_field(
     segment: ReplaySegment, record: FusionRecord, start_row: int, step_s: float
 ) -> ReplaySegment:
     """Add the logged magnetic fields to the states of a segment."""
-    start, frame = record.delayed.iloc[start_row], record.field_gauss
+    start = record.delayed.iloc[start_row]
+    frame = record.field_gauss
     stamps = frame.index.to_numpy()
     age_s = record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     weight = max(MAG_FUSION_HZ * float(np.median(np.diff(stamps))), 1.0)
@@ -532,15 +515,16 @@ def _add_field(
 def _mean_field(
     segment: ReplaySegment, delayed: pd.DataFrame, measured_at_s: Array, filtered_gauss: Array
 ) -> SensorSamples:
-    """Reconstruct the mean measured field between two rows from low-pass filtered innovations.
+    """Reconstruct the mean magnetic field between two logged rows from filtered innovations.
 
-    EKF2 logs the low-pass filtered difference of predicted and measured field, and the states from
-    which the field is predicted.
+    EKF2 logs the low-pass filtered difference of predicted and measured field (FRD, gauss), and the
+    states from which the field is predicted.
     """
     between_s = np.diff(measured_at_s)
     is_inside = (measured_at_s[:-1] > segment.time_s[0]) & (measured_at_s[1:] <= segment.time_s[-1])
     rows = np.flatnonzero(is_inside & (between_s > 0.0) & (between_s < RESTART_GAP_S)) + 1
-    measured_at_s, between_s = measured_at_s[rows], between_s[rows - 1]
+    measured_at_s = measured_at_s[rows]
+    between_s = between_s[rows - 1]
     count = np.maximum(np.rint(MAG_FUSION_HZ * between_s), 1.0)
     share = between_s / (between_s + count * FILTER_S)
     decay = ((1.0 - share) ** count)[:, None]
@@ -567,7 +551,7 @@ def low_pass_weights(
     Parameters
     ----------
     newest_s, count, interval_s : ndarray, shape (m,)
-        Of each mean: time of the newest sample, number of samples, and their interval.
+        For each mean: time of the newest sample, number of samples, and interval between samples.
     share : float or ndarray, shape (m,)
         Weight of a new sample in the low-pass filter.
 
@@ -576,10 +560,10 @@ def low_pass_weights(
     step, weight : ndarray, shape (m, k)
         Newest sample first; k is the largest number of samples in a mean.
     """
-    back = np.arange(int(count.max(initial=1.0)))
-    weight = np.where(back < count[:, None], (1.0 - np.reshape(share, (-1, 1))) ** back, 0.0)
+    age = np.arange(int(count.max(initial=1.0)))  # in sample intervals
+    weight = np.where(age < count[:, None], (1.0 - np.reshape(share, (-1, 1))) ** age, 0.0)
     weight /= weight.sum(axis=1, keepdims=True)
-    measured_at_s = newest_s[:, None] - back * interval_s[:, None]
+    measured_at_s = newest_s[:, None] - age * interval_s[:, None]
     return np.searchsorted(segment.time_s, measured_at_s - 1e-9), weight
 
 
@@ -598,12 +582,13 @@ def add_field_states(
     measured_at_s, gauss : ndarray, shape (m,) and (m, 3)
         Magnetometer samples (body FRD) at EKF2's measurement time.
     weight : float
-        Number of samples in EKF2 per logged sample.
+        Number of samples that EKF2 fused per logged sample.
     fields, variance : ndarray, shape (6,)
         Magnetic fields of earth (NED) and body (FRD) at the start, and their variances.
     """
     step, is_inside = sample_steps(segment, measured_at_s)
-    rotation_to_body, count = segment.rotation[step].transpose(0, 2, 1), len(step)
+    rotation_to_body = segment.rotation[step].transpose(0, 2, 1)
+    count = len(step)
     return replace(
         segment,
         state=np.concatenate([segment.state, fields]),
@@ -616,14 +601,14 @@ def add_field_states(
 
 
 def sample_steps(segment: ReplaySegment, measured_at_s: Array) -> tuple[IntArray, BoolArray]:
-    """Return the fusion step of each sample in the segment, and the mask of these samples."""
+    """Return the prediction step that fuses each sample, and a mask of samples in the segment."""
     step = np.searchsorted(segment.time_s, measured_at_s - 1e-9)
     is_inside = (step > 0) & (step < len(segment.time_s))
     return step[is_inside], is_inside
 
 
 def predict_s(record: FusionRecord) -> float:
-    """Return the configured prediction interval EKF2_PREDICT_US in s."""
+    """Return EKF2's configured prediction interval EKF2_PREDICT_US (s)."""
     return record.parameters.get("EKF2_PREDICT_US", 10_000.0) * 1e-6
 
 
@@ -632,7 +617,7 @@ def _interpolate(series: pd.Series, times: Array) -> Array:
 
 
 def step_ends(interval_s: Array, logged_ends: IntArray, target_s: float) -> IntArray:
-    """Return the ends of EKF2's prediction steps, in IMU intervals from the start.
+    """Return the index of the IMU sample at the end of each prediction step of EKF2.
 
     A step ends after :func:`samples_per_step` IMU samples, or when it is longer than the target.
     The count of samples restarts at each logged end.
@@ -652,31 +637,31 @@ def step_ends(interval_s: Array, logged_ends: IntArray, target_s: float) -> IntA
         Ends of steps; the last end is at most n.
     """
     samples_needed = samples_per_step(target_s, float(np.median(interval_s)), logged_ends)
-    known_ends = set(logged_ends.tolist())
-    ends, count, total = [], 0, 0.0
+    logged_end_set = set(logged_ends.tolist())
+    ends = []
+    count = 0
+    total = 0.0
     for sample, interval in enumerate(interval_s.tolist(), start=1):
-        count, total = count + 1, total + interval
+        count = count + 1
+        total = total + interval
         is_complete = count >= samples_needed and total > 0.5 * target_s
-        if is_complete or total > target_s or sample in known_ends:
+        if is_complete or total > target_s or sample in logged_end_set:
             ends.append(sample)
-            count, total = 0, 0.0
+            count = 0
+            total = 0.0
     return np.array(ends, dtype=np.intp)
 
 
 def downsample_imu(
     rotation_vectors: Array, velocity_increments: Array, ends: IntArray
-) -> tuple[Array, Array]:
-    """Return rotation and velocity change of each step, in the body frame at the step's end."""
-    starts = np.concatenate([[0], ends[:-1]])
+) -> ArrayPair:
+    """Return rotation and velocity change of each prediction step, body frame at the step's end."""
+    starts = np.append(0, ends[:-1])
     summed_rotation = np.concatenate([np.zeros((1, 3)), np.cumsum(rotation_vectors, axis=0)])
+    end_rotation = np.repeat(summed_rotation[ends], ends - starts, axis=0)
+    count = len(end_rotation)
+    middle_rotation = 0.5 * (summed_rotation[:count] + summed_rotation[1 : count + 1])
+    increments = velocity_increments[:count]
+    increments = increments - np.cross(end_rotation - middle_rotation, increments)
     step_rotation = summed_rotation[ends] - summed_rotation[starts]
-    count = ends - starts
-    step_of_row = np.repeat(np.arange(len(ends)), count)
-    used_rows = slice(0, int(ends[-1]))
-    remaining_rotation = summed_rotation[ends][step_of_row] - 0.5 * (
-        summed_rotation[:-1][used_rows] + summed_rotation[1:][used_rows]
-    )
-    increments_at_end = velocity_increments[used_rows] - np.cross(
-        remaining_rotation, velocity_increments[used_rows]
-    )
-    return step_rotation, np.add.reduceat(increments_at_end, starts, axis=0)
+    return step_rotation, np.add.reduceat(increments, starts, axis=0)

@@ -1,16 +1,18 @@
 """Sequence of filters that changes KF into EKF2, one property at a time, to explain KF - EKF2.
 
-Each filter of the sequence (step) is a replay of the whole flight with one more property of EKF2.
-The order is fixed: sample times, noises, estimated states, gate, and output predictor. The mean
-square difference from the logged EKF2 changes with each step. The changes of all steps and the
-remainder after the last step add up to the mean square difference KF - EKF2. The first step keeps
-the filter equations of KF, but uses the samples and prediction steps of EKF2.
+Each filter of the sequence is a replay of the whole flight with one more property of EKF2. Each
+replacement of a property is called a step. The order is fixed: sample times, noises, estimated
+states, gate, and output predictor. The mean square difference from the logged EKF2 changes with
+each step. The changes of all steps and the remainder after the last step add up to the mean square
+difference KF - EKF2. The first step keeps the filter equations of KF, but uses the samples and
+prediction steps of EKF2.
 
 Biases precede process noise, because without bias states EKF2's small process noise would increase
 the error. The last replays use the logged rejections, because with many rejections one sample near
 the gate limit would change all later samples.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import chain
@@ -19,9 +21,9 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
-from px4fuse.ekf2.filter_recursion import Variant
+from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.model import Model, delayed_variants, modelled_aids, replay_with_logged_rejections
+from px4fuse.ekf2.model import Model, delayed_tracks, modelled_aids, replay_with_logged_rejections
 from px4fuse.ekf2.replay import Ekf2Replay, Spans, along, inside_spans, rms_to_truth
 from px4fuse.ekf2_parameters import EV_POS, FLOW, GNSS_POS, MAG
 from px4fuse.filter.kalman import Replay, state_at
@@ -29,7 +31,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.flight import Columns, Ekf2, Truth, Unavailable
 from px4fuse.notebook_display import one_line_repr
-from px4fuse.record import Count, NotNegative, Record
+from px4fuse.record import Count, NotNegative, Record, Span
 
 ANALYSIS_NAME = "difference KF - EKF2"
 OTHER_TIME = Unavailable(
@@ -37,8 +39,9 @@ OTHER_TIME = Unavailable(
     "ground truth and replay do not overlap in time",
     "Record both at the same time.",
 )
-# Names of the steps. For the step PROCESS, velocity variance per second: KF adds SIGMA_A² · DT,
-# EKF2 adds EKF2_ACC_NOISE² · Δt² per prediction step Δt, which is EKF2_ACC_NOISE² · Δt per second
+# EKF2 properties that replace those of KF, one after the other. Increase of the velocity variance
+# per second by the process noise: SIGMA_A² · DT in KF, EKF2_ACC_NOISE² · Δt in EKF2 with the
+# prediction step Δt
 SAMPLES = "samples and time steps"
 STAMPS = "timestamps and delay"
 NOISE = "measurement noise"
@@ -51,28 +54,28 @@ FLOW_STEP = "optical flow"
 VISION_STEP = "external vision"
 GATE = "gate, missed samples and resets"
 OUTPUT = "output predictor"
-# Steps of every flight. Steps of other aids are inserted before GATE if EKF2 fuses these aids
+# EKF2 properties in every flight. Those of other aiding sources precede GATE if EKF2 fuses them
 STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
 class Step(Record, frozen=True, kw_only=True):
-    """One step of the sequence from KF to EKF2: a replay with one more property of EKF2.
+    """Replacement of one property of KF by that of EKF2, and its effect on KF - EKF2.
 
     Attributes
     ----------
     name : str
-        One of :data:`STEPS`, :data:`FIELD_STEP`, :data:`VELOCITY_STEP`, :data:`FLOW_STEP` or
-        :data:`VISION_STEP`.
+        Name of the property: one of :data:`STEPS`, :data:`FIELD_STEP`, :data:`VELOCITY_STEP`,
+        :data:`FLOW_STEP` or :data:`VISION_STEP`.
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
         Reduction of the mean square difference from the logged EKF2; negative for an increase.
     position_moved_m : float
-        Largest change of the position by this step.
+        Largest change of the position by the replacement.
     moved_at_s : float
         Time of the largest change.
     position_rmse_to_truth_m : float or None
-        Position RMSE against ground truth after the step; None without ground truth.
+        Position RMSE against ground truth after the replacement; None without ground truth.
     """
 
     name: str
@@ -84,7 +87,7 @@ class Step(Record, frozen=True, kw_only=True):
 
 
 class RejectionRun(Record, frozen=True, kw_only=True):
-    """Longest run of rejected samples in flight.
+    """Longest run of consecutive position samples that EKF2 rejected in flight.
 
     Attributes
     ----------
@@ -104,8 +107,8 @@ class RejectionRun(Record, frozen=True, kw_only=True):
     distance_m: NotNegative
 
 
-class UnreplayedPart(Record, frozen=True):
-    """Largest difference KF - EKF2 at times without replay (EKF2 starts or does not fuse).
+class UnreplayedDifference(Record, frozen=True):
+    """Largest position difference KF - EKF2 at times without replay: EKF2 starts or does not fuse.
 
     Attributes
     ----------
@@ -120,7 +123,9 @@ class UnreplayedPart(Record, frozen=True):
 
 
 class DifferenceSteps(Record, frozen=True, kw_only=True):
-    """Mean square of KF - EKF2 along one axis: sum over steps (:class:`Step`) and a remainder.
+    """Mean square difference KF - EKF2 along one axis, explained by differences of the filters.
+
+    The mean square is the sum of the contributions of ``steps`` and a remainder.
 
     Attributes
     ----------
@@ -129,6 +134,7 @@ class DifferenceSteps(Record, frozen=True, kw_only=True):
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
         Mean square difference between KF and the logged EKF2.
     steps : tuple of Step
+        Replacements of one property of KF after the other by that of EKF2.
     unexplained_mean_square_m2, unexplained_velocity_mean_square_m2_s2 : float
         Remainder: mean square difference between the complete replay and the logged EKF2.
     position_rmse_to_truth_m : mapping from "kf" and "ekf2" to float or Unavailable
@@ -137,7 +143,7 @@ class DifferenceSteps(Record, frozen=True, kw_only=True):
         Spans of the flight over which means are taken.
     longest_rejection : RejectionRun or None
         Longest run of rejections; None without rejections.
-    outside : UnreplayedPart or None
+    outside : UnreplayedDifference or None
         Largest difference at times without replay; None if the replay covers the analysed segment.
     corrected : mapping from field of Settings to value
         Wrong settings of KF that were corrected first.
@@ -154,25 +160,25 @@ class DifferenceSteps(Record, frozen=True, kw_only=True):
     position_rmse_to_truth_m: Mapping[str, NotNegative | Unavailable]
     spans_s: Spans
     longest_rejection: RejectionRun | None = None
-    outside: UnreplayedPart | None = None
+    outside: UnreplayedDifference | None = None
     corrected: Mapping[str, float] = {}
     sentences: tuple[str, ...] = ()
 
     @property
     def unexplained_fraction(self) -> float:
-        """Share of the mean square position difference that the steps do not explain."""
+        """Fraction of the mean square position difference that ``steps`` do not explain."""
         return self.unexplained_mean_square_m2 / self.position_mean_square_m2
 
 
 class DifferenceExplanation(DifferenceSteps, frozen=True, kw_only=True, eq=False):
-    """:class:`DifferenceSteps` with the time series.
+    """Explanation of the difference KF - EKF2 along one axis, with time series.
 
     Attributes
     ----------
     times_s, kf_minus_ekf2_m, unexplained_m : ndarray
-        EKF2 sample times; position differences KF - EKF2 and replay - EKF2.
+        EKF2 sample times; position differences KF - EKF2 and complete replay - EKF2.
     cause : str
-        Sentence about the step with the largest contribution.
+        Sentence about the property with the largest contribution.
     """
 
     schema_type = DifferenceSteps
@@ -187,16 +193,18 @@ class DifferenceExplanation(DifferenceSteps, frozen=True, kw_only=True, eq=False
 def explain_by_steps(
     model: Model, settings: Settings | None = None, runs: Mapping[str, Replay] | None = None
 ) -> dict[str, DifferenceExplanation] | Unavailable:
-    """Compute the sequence of filters from KF to EKF2, without explanatory sentences.
+    """Replace the properties of KF by those of EKF2, one after the other, and compare with EKF2.
+
+    The result is without explanatory sentences.
 
     Parameters
     ----------
     model : Model
     settings : Settings, optional
-        Settings of KF. Its time offset must refer to the source that EKF2 fused.
+        Settings of KF. The time offset must refer to the position source that EKF2 fused.
     runs : mapping from axis name to Replay, optional
-        Runs of KF along horizontal axes. By default the first step replaces KF, along north and
-        east: KF with EKF2's samples and prediction steps.
+        Runs of KF along horizontal axes. By default KF is replaced, along north and east, by the
+        first filter of the sequence: KF with EKF2's samples and prediction steps.
 
     Returns
     -------
@@ -207,12 +215,11 @@ def explain_by_steps(
         return model.agreement.as_unavailable(ANALYSIS_NAME)
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    variants = step_variants(model.inputs, settings or Settings())
-    delayed, flown = (
-        delayed_variants(model, list(variants.values())),
-        replay_with_logged_rejections(model),
-    )
-    evaluated_spans, times = model.flown.evaluated_s, ekf2.state.index.to_numpy()
+    configurations = step_configurations(model.inputs, settings or Settings())
+    delayed = delayed_tracks(model, list(configurations.values()))
+    flown = replay_with_logged_rejections(model)
+    evaluated_spans = model.flown.evaluated_s
+    times = ekf2.state.index.to_numpy()
     is_inside = inside_spans(times, evaluated_spans)
     # compare only at times that the replay and all KF runs cover
     for index in (flown.delayed.index, *(run.steps.index for run in (runs or {}).values())):
@@ -227,10 +234,11 @@ def explain_by_steps(
     span = float(times[0]), float(times[-1])
     directions = {name: run.axis.direction for name, run in (runs or {}).items()}
     directions = directions or {"north": np.eye(3)[0], "east": np.eye(3)[1]}
-    without_gate, stages = flown.delayed, []
+    without_gate = flown.delayed
+    stages = []
     # one track at a time, to limit memory
     tracks = chain(delayed, (flown.published, ekf2.state))
-    for stage, track in zip((*variants, OUTPUT, "EKF2 as logged"), tracks, strict=True):
+    for stage, track in zip((*configurations, OUTPUT, "EKF2 as logged"), tracks, strict=True):
         stages.append(
             [
                 [along(track, columns, direction, times) for columns in COLUMNS]
@@ -243,15 +251,16 @@ def explain_by_steps(
             VELOCITY_STEP,
             FLOW_STEP,
             VISION_STEP,
-        ):  # the last step before the gate is added
+        ):  # the last of these replays has all properties except gate and output predictor
             without_gate = track
     spans = Segment(*span, "").cut(evaluated_spans)
     longest_rejection = _longest_rejection(flown, without_gate, span, evaluated_spans)
-    truth, steps_by_axis = model.flight.truth, {}
+    truth = model.flight.truth
+    steps_by_axis = {}
     no_truth = OTHER_TIME if isinstance(truth, Truth) else truth
     for axis_index, (axis, direction) in enumerate(directions.items()):
         kf_state = state_at(runs[axis], times) if runs else stages[0][axis_index]
-        # position and velocity of KF, of each step, and of the logged EKF2: shape (k + 2, 2, n)
+        # position and velocity of KF, of k replays, and of the logged EKF2: shape (k + 2, 2, n)
         positions_by_step = np.array([kf_state, *(stage[axis_index] for stage in stages)])
         difference = positions_by_step - positions_by_step[-1]
         errors = [
@@ -268,7 +277,7 @@ def explain_by_steps(
                 moved_at_s=float(times[position_change[step_index - 1].argmax()]),
                 position_rmse_to_truth_m=errors[step_index],
             )
-            for step_index, name in enumerate((*variants, OUTPUT), start=1)
+            for step_index, name in enumerate((*configurations, OUTPUT), start=1)
         )
         filter_errors = {"kf": errors[0], "ekf2": errors[-1]}
         steps_by_axis[axis] = DifferenceExplanation(
@@ -284,29 +293,30 @@ def explain_by_steps(
             spans_s=spans,
             longest_rejection=longest_rejection,
             times_s=times,
-            # copies: a view would keep all steps in memory
+            # copies, because a view would keep the tracks of all replays in memory
             kf_minus_ekf2_m=difference[0, 0].copy(),
             unexplained_m=difference[-2, 0].copy(),
         )
     return steps_by_axis
 
 
-def step_variants(inputs: Inputs, kf_settings: Settings) -> dict[str, Variant]:
-    """Return the filter configuration of each step except the last, the output predictor."""
-    flown, aid, received = inputs.settings, inputs.aid, inputs.received
-    kf_process_noise = {
-        "EKF2_ACC_NOISE": float(
-            kf_settings.sigma_a_m_s2 * np.sqrt(kf_settings.dt_s / inputs.step_s)
-        )
-    }
-    kf_parameters = {**flown, **kf_process_noise, aid.noise: kf_settings.sigma_z_m}
-    # the timestamps of KF's GNSS positions are measurement times: the delay is already subtracted
+def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, FilterConfiguration]:
+    """Return the filter configurations from KF to EKF2 without output predictor.
+
+    Keys are the names of the EKF2 properties that replace those of KF, one after the other.
+    """
+    flown = inputs.settings
+    aid = inputs.aid
+    acceleration_noise = kf_settings.sigma_a_m_s2 * math.sqrt(kf_settings.dt_s / inputs.step_s)
+    kf_process_noise = {**flown, "EKF2_ACC_NOISE": acceleration_noise}
+    kf_parameters = {**kf_process_noise, aid.noise: kf_settings.sigma_z_m}
+    # KF's GNSS positions have measurement times as timestamps: the delay is already subtracted
     applied_delay_s = flown[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     offset_s = kf_settings.clock_offset_s - applied_delay_s
     without_lever_arm = {**kf_parameters, **dict.fromkeys(aid.lever_arm, 0.0)}
     aids = modelled_aids(inputs)
     other_aids = [name for name in (FLOW.name, EV_POS.name) if name in aids[1:]]
-    kf_variant = Variant(
+    kf_configuration = FilterConfiguration(
         kf_parameters,
         biases=False,
         attitude=False,
@@ -315,50 +325,52 @@ def step_variants(inputs: Inputs, kf_settings: Settings) -> dict[str, Variant]:
         has_gate=False,
         without=dict.fromkeys((MAG.name, *other_aids), 0.0),
     )
-    variants = {
-        SAMPLES: replace(kf_variant, settings=without_lever_arm, timestamp_offset_s=offset_s),
-        STAMPS: kf_variant,
-        NOISE: (
-            noise := replace(kf_variant, settings={**flown, **kf_process_noise}, reported=True)
-        ),
+    configurations = {
+        SAMPLES: replace(kf_configuration, settings=without_lever_arm, timestamp_offset_s=offset_s),
+        STAMPS: kf_configuration,
+        NOISE: (noise := replace(kf_configuration, settings=kf_process_noise, reported=True)),
         BIASES: replace(noise, biases=True),
         PROCESS: replace(noise, settings=flown, biases=True),
-        ATTITUDE: (variant := replace(noise, settings=flown, biases=True, attitude=True)),
+        ATTITUDE: (configuration := replace(noise, settings=flown, biases=True, attitude=True)),
     }
     if MAG.name in aids:
-        variants[FIELD_STEP] = variant = replace(variant, without=dict.fromkeys(other_aids, 0.0))
-    if received.velocity_m_s is not None:
-        variants[VELOCITY_STEP] = variant = replace(variant, velocity=True)
+        configurations[FIELD_STEP] = configuration = replace(
+            configuration, without=dict.fromkeys(other_aids, 0.0)
+        )
+    if inputs.received.velocity_m_s is not None:
+        configurations[VELOCITY_STEP] = configuration = replace(configuration, velocity=True)
     for position, name in enumerate(other_aids, start=1):
         step = FLOW_STEP if name == FLOW.name else VISION_STEP
-        variants[step] = variant = replace(
-            variant, without=dict.fromkeys(other_aids[position:], 0.0)
+        configurations[step] = configuration = replace(
+            configuration, without=dict.fromkeys(other_aids[position:], 0.0)
         )
-    return variants | {GATE: Variant(flown, uses_logged_decisions=True)}
+    return configurations | {GATE: FilterConfiguration(flown, uses_logged_decisions=True)}
 
 
 def _longest_rejection(
-    flown: Ekf2Replay, without_gate: pd.DataFrame, span: tuple[float, float], spans: Spans
+    flown: Ekf2Replay, without_gate: pd.DataFrame, span: Span, spans: Spans
 ) -> RejectionRun | None:
     updates = flown.updates[inside_spans(flown.updates.index, spans)]
     updates = updates[updates["fused_at_s"].between(*span)]
-    rejected, time = updates["rejected"].to_numpy() > 0, updates["fused_at_s"].to_numpy()
+    rejected = updates["rejected"].to_numpy() > 0
+    time = updates["fused_at_s"].to_numpy()
     if not rejected.any():
         return None
-    # a run lasts from its first rejected sample to the first sample that is fused again
+    # a run of rejections lasts from the first rejected sample to the next fused sample
     change = np.diff(rejected.astype(int), prepend=0, append=0)
-    starts, ends = np.flatnonzero(change == 1), np.flatnonzero(change == -1)
+    starts = np.flatnonzero(change == 1)
+    ends = np.flatnonzero(change == -1)
     longest = int(np.argmax(ends - starts))
-    begin, end = time[starts[longest]], time[min(ends[longest], len(time) - 1)]
-    rejected_part = flown.delayed.loc[begin:end]
-    ungated_difference = [
-        rejected_part[column]
-        - np.interp(rejected_part.index, without_gate.index, without_gate[column])
+    begin = time[starts[longest]]
+    end = time[min(ends[longest], len(time) - 1)]
+    with_gate = flown.delayed.loc[begin:end]
+    position_difference = [
+        with_gate[column] - np.interp(with_gate.index, without_gate.index, without_gate[column])
         for column in Columns.POSITION[:2]
     ]
     return RejectionRun(
         start_s=float(begin),
         samples=int(ends[longest] - starts[longest]),
         duration_s=float(end - begin),
-        distance_m=float(np.max(np.hypot(*ungated_difference))),
+        distance_m=float(np.max(np.hypot(*position_difference))),
     )

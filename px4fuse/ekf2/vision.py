@@ -1,10 +1,10 @@
 """Fusion of external vision in addition to GNSS in the EKF2 replay, with a vision frame bias.
 
-The bias adapts within seconds, so vision determines the relative motion and GNSS the position.
-Without GNSS there is no bias: EKF2 then resets its position to the vision position. Samples between
-two events (ends of intervals, see :mod:`px4fuse.ekf2.intervals`) are fused at the later event. The
-motion from sample to event is computed from the state and the IMU. Array shapes: E events, S
-variants (filter configurations), k samples per event.
+The estimated bias adapts within seconds, so vision determines the relative motion and GNSS the
+position. Without GNSS there is no bias: EKF2 then resets its position to the vision position.
+Samples between two events (ends of intervals, see :mod:`px4fuse.ekf2.intervals`) are fused at the
+later event. The motion from sample to event is computed from the state and the IMU. Array shapes:
+E events, S filter configurations, k samples per event.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/external_vision`` (``ev_pos_control.cpp``; before v1.16
 ``EKF/ev_pos_control.cpp``), ``EKF/control.cpp`` (vision is fused after GNSS and heights).
@@ -15,28 +15,22 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.ekf2.bias import BiasEstimator
 from px4fuse.ekf2.heights import MIN_GATE, MIN_SIGMA
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.intervals import MAX_LATENESS_S
+from px4fuse.ekf2.replay import UPDATE_COLUMNS
 from px4fuse.ekf2.replay_segments import ReplaySegment, pad_samples, samples_by_event
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 
+# State indices of horizontal velocity and horizontal position
 SPEED, HORIZONTAL = slice(3, 5), slice(6, 8)
-# Maximum time (s) without a sample before fusion stops (2 EV_MAX_INTERVAL, ev_control.cpp), and
-# maximum time (s) outside the gate before EKF2 resets bias or position (no_aid_timeout_max,
-# common.h)
-MAX_SAMPLE_GAP_S, MAX_REJECTED_S = 0.4, 1.0
-COLUMNS = [
-    "innovation_north_m",
-    "innovation_east_m",
-    "innovation_variance_north_m2",
-    "innovation_variance_east_m2",
-    "rejected",
-    "fused",
-    "reset",
-]
+# Maximum time (s) without a vision sample before fusion stops (2 EV_MAX_INTERVAL, ev_control.cpp)
+MAX_SAMPLE_GAP_S = 0.4
+# Maximum time (s) of vision samples outside the gate before EKF2 resets the vision bias or the
+# position (no_aid_timeout_max, common.h)
+MAX_REJECTED_S = 1.0
 
 
 def vision_samples(
@@ -46,12 +40,14 @@ def vision_samples(
     settings: Mapping[str, float],
     horizon_s: float,
 ) -> Array:
-    """Return vision samples by the event at which they are fused, shape (8, k, E).
+    """Return the vision samples that are fused at each event, shape (8, k, E).
 
-    Rows: north and east (see :func:`~px4fuse.ekf2.replay_segments.samples_by_event`), age,
-    measurement time, fusion time, reported variances north and east, and 1.
+    The rows are position north and east (m), see
+    :func:`~px4fuse.ekf2.replay_segments.samples_by_event`; age, measurement time and fusion time
+    (s); reported variances north and east (m²); and 1.
     """
-    vision, time_s = inputs.vision, segment.time_s
+    vision = inputs.vision
+    time_s = segment.time_s
     assert vision is not None
     measured_at_s = vision.stamp_s - settings[EV_POS.delay] * 1e-3 - 0.5 * inputs.step_s
     due_s = np.maximum(measured_at_s, vision.arrival_s - horizon_s)
@@ -67,27 +63,27 @@ def vision_samples(
 
 
 class VisionFilter:
-    """Vision fusion of S variants through one segment, event by event.
+    """Vision fusion in S filter configurations through one segment, event by event.
 
     Parameters
     ----------
     segment : ReplaySegment
     sample_arrays : sequence of S ndarrays, shape (8, k, E)
         Results of :func:`vision_samples`.
-    enabled : mapping from PX4's name of an aid to ndarray of bool, shape (E, S)
-        True while the aid is fused.
+    enabled : mapping from PX4's name of an aiding source to ndarray of bool, shape (E, S)
+        True while the aiding source is fused.
     parameters : mapping from parameter name to ndarray, shape (S,)
     has_gate, reported : ndarray of bool, shape (S,)
-        For each variant: True if the gate is applied, True if reported variances are used.
+        For each filter configuration: True to apply the gate, True to use reported variances.
 
     Attributes
     ----------
     update_log : ndarray, shape (E, k, 7, S)
-        For each sample: innovation north and east (m, measurement minus state), their variances,
-        and 1 if rejected, 1 if fused, 1 if followed by a reset. NaN if EKF2 did not evaluate the
-        sample.
+        For each sample: innovation north and east (m, measurement minus state), both innovation
+        variances, and 1 if rejected, 1 if fused, 1 if EKF2 reset its position to the sample. NaN
+        for a sample without an innovation.
     position_reset_m : ndarray, shape (E, S, 2)
-        Size of the position reset at each event, north and east.
+        Change of the position by a reset at each event, north and east.
     fused_s : ndarray, shape (S,)
         Time of the last position fusion or reset.
     """
@@ -104,43 +100,42 @@ class VisionFilter:
         samples = np.stack(pad_samples(sample_arrays), axis=-1)
         self.position_m = np.moveaxis(samples[:2], 0, -1)
         self.age_s, self.measured_at_s, self.now_s = samples[2:5]
-        _, count, events, size = samples.shape
-        self.update_log = np.full((events, count, 7, size), np.nan)
-        self.position_reset_m = np.zeros((events, size, 2))
+        _, count, events, configuration_count = samples.shape
+        self.update_log = np.full((events, count, 7, configuration_count), np.nan)
+        self.position_reset_m = np.zeros((events, configuration_count, 2))
         has_sample = (samples[7] > 0.0) & enabled[EV_POS.name]
-        # samples of the last step of an interval are fused after GNSS, earlier samples before
+        # EKF2 fuses GNSS before vision in the same prediction step: samples of an interval's last
+        # step are fused after GNSS, earlier samples before GNSS
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
-        self.has_gate, self.without_gnss = has_gate, ~enabled[GNSS_POS.name]
+        self.has_gate = has_gate
+        self.without_gnss = ~enabled[GNSS_POS.name]
         self.gate2 = np.maximum(parameters[EV_POS.gate], MIN_GATE)[:, None] ** 2
         reported_variance = samples[5:7] * (reported & (parameters[EV_POS.noise_mode] != 1.0))
         min_variance = np.maximum(parameters[EV_POS.noise], MIN_SIGMA) ** 2
-        with_gnss_innovations = np.where(self.without_gnss, 0.0, parameters[GNSS_POS.noise] ** 2)
+        gnss_variance = np.where(self.without_gnss, 0.0, parameters[GNSS_POS.noise] ** 2)
         self.noise_m2 = np.moveaxis(
-            np.maximum(reported_variance, np.maximum(min_variance, with_gnss_innovations)), 0, -1
+            np.maximum(reported_variance, np.maximum(min_variance, gnss_variance)), 0, -1
         )
         start_s = float(segment.time_s[0])
-        unknown_variance = np.full((size, 2), np.inf)
-        self.bias = BiasEstimator(
-            np.zeros((size, 2)), unknown_variance, start_s, float(np.median(segment.step_s))
-        )
-        self.last_sample_s, self.last_attempt_s = np.full((2, size), -np.inf)
-        self.fused_s, self.was_without_gnss = np.full(size, start_s), self.without_gnss[0]
+        bias = np.zeros((configuration_count, 2))
+        self.bias = BiasEstimator(bias, bias + np.inf, start_s, float(np.median(segment.step_s)))
+        self.last_sample_s, self.last_attempt_s = np.full((2, configuration_count), -np.inf)
+        self.fused_s = np.full(configuration_count, start_s)
+        self.was_without_gnss = self.without_gnss[0]
 
-    def updates(self, variant: int, end_s: Array) -> pd.DataFrame:
-        """Return the updates of one variant at EKF2's measurement times.
+    def updates(self, configuration: int, end_s: Array) -> pd.DataFrame:
+        """Return the vision updates of one filter configuration at EKF2's measurement times.
 
         ``end_s`` is the time of each event.
         """
-        update_log = self.update_log[..., variant]
-        event, place = np.nonzero(np.isfinite(update_log[:, :, 0]))
-        index = pd.Index(self.measured_at_s[place, event, variant], name="time_s")
-        frame = pd.DataFrame(update_log[event, place], index, COLUMNS)
-        return frame.assign(fused_at_s=end_s[event])
+        update_log = self.update_log[..., configuration]
+        event, slot = np.nonzero(np.isfinite(update_log[:, :, 0]))
+        index = pd.Index(self.measured_at_s[slot, event, configuration], name="time_s")
+        updates = pd.DataFrame(update_log[event, slot], index, UPDATE_COLUMNS[:7])
+        return updates.assign(fused_at_s=end_s[event])
 
-    def fuse(
-        self, e: int, x: Array, P: Array, at_event: bool, gnss_fused_s: Array
-    ) -> tuple[Array, Array]:
-        """Return state and covariance after fusing the samples of one event.
+    def fuse(self, e: int, x: Array, P: Array, at_event: bool, gnss_fused_s: Array) -> ArrayPair:
+        """Return state and covariance after fusing the vision samples of one event.
 
         Parameters
         ----------
@@ -151,20 +146,22 @@ class VisionFilter:
         gnss_fused_s : ndarray, shape (S,)
             Time of the last position fusion from GNSS.
         """
-        for place, has_sample in enumerate(self.has_sample[at_event][:, e]):
+        for slot, has_sample in enumerate(self.has_sample[at_event][:, e]):
             if has_sample.any():
-                x, P = self._fuse_sample(e, place, has_sample, x, P, gnss_fused_s)
+                x, P = self._fuse_sample(e, slot, has_sample, x, P, gnss_fused_s)
         return x, P
 
     def _fuse_sample(
-        self, e: int, place: int, has_sample: BoolArray, x: Array, P: Array, gnss_fused_s: Array
-    ) -> tuple[Array, Array]:
-        age_s, now_s = self.age_s[place, e][:, None], self.now_s[place, e]
-        without_gnss, noise_m2 = self.without_gnss[e], self.noise_m2[place, e]
+        self, e: int, slot: int, has_sample: BoolArray, x: Array, P: Array, gnss_fused_s: Array
+    ) -> ArrayPair:
+        age_s = self.age_s[slot, e][:, None]
+        now_s = self.now_s[slot, e]
+        without_gnss = self.without_gnss[e]
+        noise_m2 = self.noise_m2[slot, e]
         HP = P[:, HORIZONTAL] - age_s[:, None] * P[:, SPEED]
         S = HP[:, :, HORIZONTAL] - age_s[:, None] * HP[:, :, SPEED]
-        diagonal = S.reshape(len(S), -1)[:, ::3]  # a view of the diagonal of S
-        distance_m = self.position_m[place, e] - x[:, HORIZONTAL] + age_s * x[:, SPEED]
+        diagonal = S.reshape(len(S), -1)[:, ::3]  # view, to add R to S in slot
+        distance_m = self.position_m[slot, e] - x[:, HORIZONTAL] + age_s * x[:, SPEED]
         sample_state = now_s[:, None], has_sample[:, None], ~without_gnss[:, None]
         nu, R = self.bias.remove_bias(distance_m, diagonal.copy(), noise_m2, *sample_state)
         diagonal += R
@@ -175,13 +172,11 @@ class VisionFilter:
             (nu * nu > self.gate2 * diagonal).any(axis=1) & self.has_gate & ~has_restarted
         )
         is_failing = is_outside_gate & (now_s - self.last_attempt_s > MAX_REJECTED_S)
-        restarts, is_fused = (
-            has_sample & (has_restarted | is_failing),
-            has_sample & ~is_outside_gate & ~has_restarted,
-        )
+        restarts = has_sample & (has_restarted | is_failing)
+        is_fused = has_sample & ~is_outside_gate & ~has_restarted
         reset = restarts & (without_gnss | (is_failing & (now_s - gnss_fused_s > MAX_REJECTED_S)))
         is_evaluated = has_sample & ~has_restarted | reset
-        # EKF2 logs innovation 0 for a sample to which it resets
+        # EKF2 logs innovation 0 for a sample to which it resets its position
         update_log = (
             *np.where(reset, 0.0, nu.T),
             *diagonal.T,
@@ -189,16 +184,18 @@ class VisionFilter:
             is_fused,
             reset,
         )
-        self.update_log[e, place] = np.where(is_evaluated, np.stack(update_log), np.nan)
+        self.update_log[e, slot] = np.where(is_evaluated, np.stack(update_log), np.nan)
         K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
-        x, P = x + (K @ nu[:, :, None])[:, :, 0], P - K @ HP
+        x = x + (K @ nu[:, :, None])[:, :, 0]
+        P = P - K @ HP
         if reset.any():
             position_reset_m = np.where(without_gnss[:, None], distance_m, nu) * reset[:, None]
             variance = np.where(without_gnss[:, None], noise_m2, R)
             set_states(x, P, reset, HORIZONTAL, x[:, HORIZONTAL] + position_reset_m, variance)
             self.position_reset_m[e] += position_reset_m
         if restarts.any():
-            new_bias, no_bias = (restarts & ~reset)[:, None], (reset & without_gnss)[:, None]
+            new_bias = (restarts & ~reset)[:, None]
+            no_bias = (reset & without_gnss)[:, None]
             self.bias.value_m = np.where(
                 new_bias, -distance_m, np.where(no_bias, 0.0, self.bias.value_m)
             )
@@ -213,7 +210,7 @@ class VisionFilter:
 def set_states(
     x: Array, P: Array, is_selected: BoolArray, rows: slice, value: Array, variance: Array
 ) -> None:
-    """Set states of selected filter configurations to measured values, with their variance."""
+    """Set ``rows`` of the states to measured values, uncorrelated with the other states."""
     x[is_selected, rows] = value[is_selected]
     P[is_selected, :, rows] = 0.0
     P[is_selected, rows, :] = 0.0

@@ -1,4 +1,4 @@
-"""EKF2 with other parameters: what-if table with columns logged, replayed, and changed.
+"""Comparison of EKF2 as logged, replayed, and replayed with other parameters (what-if table).
 
 All columns of the table are evaluated over the same times.
 """
@@ -35,16 +35,12 @@ from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record, Share
 
 ANALYSIS_NAME = "EKF2 what-if"
-# Minimum fraction of the replayed samples in the log, to measure the time between logged fusions
+# Minimum ratio of logged to replayed innovations: with fewer, the time between fusions is unknown
 MIN_COMPLETE_SHARE = 0.9
 NO_TRUTH = Unavailable(
     "RMSE against ground truth",
     "the log has no ground truth",
     "Record motion capture (ATT_POS_MOCAP) besides the position source, or fly in simulation.",
-)
-# Notes for flights with GNSS
-HEADING_REPLAYED_NOTE = (
-    "Heading is replayed with the magnetometer (as flown it differs from the log by {:.1f}° RMS)"
 )
 HEADING_LOGGED_NOTE = (
     "The logged EKF2 heading is used in all columns: the log does not contain all fused "
@@ -52,36 +48,41 @@ HEADING_LOGGED_NOTE = (
 )
 HEIGHT_REPLAYED_NOTE = "Height is replayed with the logged height sensors"
 HEIGHT_LOGGED_NOTE = "The logged EKF2 height is used in all columns"
-HEADING_NOT_REPLAYED, HEIGHT_NOT_REPLAYED = (
-    Unavailable(
-        "heading error",
-        "with external vision the replay uses the logged EKF2 heading",
-        "Read the heading in the log.",
-    ),
-    Unavailable(
-        "height error", "the replay uses the logged EKF2 height", "Read the height in the log."
-    ),
+HEADING_NOT_REPLAYED = Unavailable(
+    "heading error",
+    "with external vision the replay uses the logged EKF2 heading",
+    "Read the heading in the log.",
 )
-# Minimum evaluated time (s) after an aid is disabled
+HEIGHT_NOT_REPLAYED = Unavailable(
+    "height error", "the replay uses the logged EKF2 height", "Read the height in the log."
+)
+# Minimum evaluated time (s) after an aiding source is disabled
 MIN_EVALUATED_S = 5.0
+# Number of parameter values of a sweep, by default and at most
 SWEEP_VALUES = 9
 MAX_SWEEP_VALUES = 200
-# Test of predictability: position noise (m) added in repeated runs, and number of these runs. A
-# result is predictable if the noise hardly changes it
-DISTURBANCE_M, DISTURBANCE_RUNS = 0.002, 4
-# Minimum rejected share for which the repeated runs are needed, and maximum rejected share of a
-# predictable result
-MIN_REJECTED_SHARE, MAX_REJECTED_SHARE = 0.02, 0.35
+# Position noise (m) that is added in repeated replays: the result of a replay is predictable if
+# this noise hardly changes the result
+DISTURBANCE_M = 0.002
+# Number of repeated replays with added position noise
+DISTURBANCE_RUNS = 4
+# Minimum rejected fraction for which replays are repeated to test if the result is predictable
+MIN_REJECTED_SHARE = 0.02
+# Maximum rejected fraction of a predictable result
+MAX_REJECTED_SHARE = 0.35
 # Time (s) without height fusion after which EKF2 resets the height (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
-# Maximum differences between repeated runs of a predictable result: ratio of mean NIS, difference
-# of the rejected share, and ratio of the position RMSE
-MAX_NIS_RATIO, MAX_REJECTED_SPREAD, MAX_RMSE_RATIO = 1.10, 0.03, 1.15
+# Maximum ratio of the mean NIS of two repeated replays of a predictable result
+MAX_NIS_RATIO = 1.10
+# Maximum difference of the rejected fractions of two repeated replays of a predictable result
+MAX_REJECTED_SPREAD = 0.03
+# Maximum ratio of the position RMSE of two repeated replays of a predictable result
+MAX_RMSE_RATIO = 1.15
 
 
 class AxisSummary(Record, frozen=True):
-    """Statistics of one axis in one column of the what-if table.
+    """EKF2 statistics along one axis in one column of the what-if table.
 
     Attributes
     ----------
@@ -104,16 +105,7 @@ class AxisSummary(Record, frozen=True):
 
 
 class HeightSummary(Record, frozen=True):
-    """Statistics of one height sensor, or of vision that is fused in addition to GNSS.
-
-    Attributes
-    ----------
-    nis_mean : float
-    nis_band : (float, float)
-    innovation_std_m : float
-    rejected_fraction : float
-    longest_without_fusion_s : float
-    """
+    """Statistics of one height sensor, or of vision that EKF2 fuses in addition to GNSS."""
 
     nis_mean: NotNegative
     nis_band: tuple[NotNegative, NotNegative]
@@ -123,20 +115,20 @@ class HeightSummary(Record, frozen=True):
 
     @property
     def is_predictable(self) -> bool:
-        """Return True with few rejections and no height reset, which the replay does not model."""
-        is_without_reset = self.longest_without_fusion_s <= HEIGHT_TIMEOUT_S
-        return is_without_reset and self.rejected_fraction <= MAX_REJECTED_SHARE
+        """True with few rejections and without a height reset, which the replay does not model."""
+        has_reset = self.longest_without_fusion_s > HEIGHT_TIMEOUT_S
+        return not has_reset and self.rejected_fraction <= MAX_REJECTED_SHARE
 
 
 class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
-    """One column of the what-if table: logged, replayed, or replayed with other parameters.
+    """Column of the what-if table: EKF2 logged, replayed, or replayed with other parameters.
 
     Attributes
     ----------
     changed : mapping
-        Changed parameters and their values, by PX4 name.
-    without : mapping from PX4's name of an aid to float
-        Time (s) from which the aid is not fused.
+        Values of the changed parameters, by PX4 name.
+    without : mapping from PX4's name of an aiding source to float
+        Time (s) from which the aiding source is not fused.
     north, east : AxisSummary
     samples : int
     rejected_fraction : float
@@ -145,16 +137,16 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
         Number of resets of the horizontal position.
     heading_error_mean_deg : float or Unavailable
         Mean of heading minus true heading, clockwise seen from above.
-    heights : mapping from PX4's name of an aid to HeightSummary
+    heights : mapping from PX4's name of a height sensor to HeightSummary
         Replayed height sensors; empty if the logged EKF2 height is used.
-    others : mapping from PX4's name of an aid to HeightSummary
+    others : mapping from PX4's name of an aiding source to HeightSummary
         Vision that is fused in addition to GNSS, north and east together; empty without it.
     height_rmse_to_truth_m : float or Unavailable
     late, lost : int
-        Number of samples that arrived after the fusion horizon had passed their time: fused late,
-        and never fused.
+        Number of samples that arrived after the fusion horizon had passed their measurement time:
+        fused late, and never fused.
     is_predictable : bool
-        False if single rejections change the result.
+        False if the rejection of a single sample may change the result.
     """
 
     changed: Mapping[str, float]
@@ -175,7 +167,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
 
     @property
     def axes(self) -> dict[str, AxisSummary]:
-        """Statistics by axis."""
+        """Statistics by horizontal axis."""
         return {"north": self.north, "east": self.east}
 
     @property
@@ -196,12 +188,12 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
 
 @dataclass(frozen=True)
 class WhatIf:
-    """Comparison of EKF2 logged, replayed, and replayed with other parameters (what-if table).
+    """Table of EKF2 logged, replayed, and replayed with other parameters (what-if table).
 
     Attributes
     ----------
     agreement : Agreement
-        Agreement of the replay with the log. All other results require it.
+        Agreement of the replay with the log; all other results require a good agreement.
     logged, replayed : Summary
         Column from the log, and column from the replay with the logged parameters.
     whatif : tuple of Summary
@@ -234,8 +226,8 @@ def what_if(
     model : Model
     settings : sequence of mapping
         Changed parameters of each replay, by PX4 name and in PX4's units.
-    without : mapping from PX4's name of an aid to float, optional
-        Time (s) from which the aid is not fused; all columns are evaluated from this time on.
+    without : mapping from PX4's name of an aiding source to float, optional
+        Time (s) from which the aiding source is not fused, and all columns are evaluated.
 
     Returns
     -------
@@ -245,16 +237,17 @@ def what_if(
     Raises
     ------
     SettingsError
-        Unknown parameter or aid, a value outside PX4's range, or nothing left to evaluate.
+        Unknown parameter or aiding source, value outside PX4's range, or no time to evaluate.
     """
     if not model.agreement.good:
         return model.agreement.as_unavailable(ANALYSIS_NAME)
     without = without or {}
     replays = replay_settings(model, settings, without=without)
-    flight, evaluated_s = model.flight, model.flown.evaluated_s
+    flight = model.flight
+    evaluated_s = model.flown.evaluated_s
     if without:
         disabled_s = min(without.values())
-        # later segments are not used: they start from a logged state that contains the aid
+        # later segments are not used: they start from a logged state with the disabled source
         remaining_spans = [
             (max(start, disabled_s), end)
             for start, end in evaluated_s
@@ -293,11 +286,12 @@ def what_if(
 
 def _heading_and_height_notes(model: Model) -> tuple[str, str]:
     difference_deg = model.agreement.heading_rms_difference_deg
-    heading = (
-        HEADING_LOGGED_NOTE
-        if difference_deg is None
-        else HEADING_REPLAYED_NOTE.format(difference_deg)
-    )
+    heading = HEADING_LOGGED_NOTE
+    if difference_deg is not None:
+        heading = (
+            "Heading is replayed with the magnetometer (as flown it differs from the log by "
+            f"{difference_deg:.1f}° RMS)"
+        )
     return heading, HEIGHT_LOGGED_NOTE if model.inputs.height_reason else HEIGHT_REPLAYED_NOTE
 
 
@@ -309,7 +303,7 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) 
     Raises
     ------
     SettingsError
-        Unknown name, a value outside PX4's range, limits in the wrong order, or an invalid count.
+        Unknown parameter, value outside PX4's range, limits in wrong order, or invalid count.
 
     Examples
     --------
@@ -319,9 +313,11 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) 
     check_parameters({name: low})
     check_parameters({name: high})
     if not low < high:
-        raise SettingsError(f"{name}={low:g}:{high:g}: give the smaller value first.")
+        raise SettingsError(f"{name}={low:g}:{high:g}: give the smaller parameter value first.")
     if not 2 <= count <= MAX_SWEEP_VALUES:
-        raise SettingsError(f"{count} values: give 2 to {MAX_SWEEP_VALUES}.")
+        raise SettingsError(
+            f"{count} parameter values for a sweep: give a number from 2 to {MAX_SWEEP_VALUES}."
+        )
     values = np.geomspace(low, high, count) if low > 0 else np.linspace(low, high, count)
     values[[0, -1]] = low, high
     return [float(value) for value in values]
@@ -338,58 +334,51 @@ def _mark_unpredictable(
         if repeated_runs[0].changed
         and MIN_REJECTED_SHARE < repeated_runs[0].rejected_fraction <= MAX_REJECTED_SHARE
     ]
-    for seed in range(DISTURBANCE_RUNS if uncertain_runs else 0):
+    changes = [repeated_runs[0].changed for repeated_runs in uncertain_runs]
+    for seed in range(DISTURBANCE_RUNS if changes else 0):
         noisy_model = with_position_noise(model, DISTURBANCE_M, seed)
-        repeated_replays = replay_settings(
-            noisy_model,
-            [repeated_runs[0].changed for repeated_runs in uncertain_runs],
-            without=without,
-        )
-        for repeated_runs, replay in zip(uncertain_runs, repeated_replays, strict=True):
+        replays = replay_settings(noisy_model, changes, without=without)
+        for repeated_runs, replay in zip(uncertain_runs, replays, strict=True):
             repeated_runs.append(_summarise_replay(model.flight, replay, evaluated_s))
-    return tuple(
-        replace(
-            summary,
-            is_predictable=all(height.is_predictable for height in summary.heights.values())
-            and all(
-                noisy_model.rejected_fraction <= MAX_REJECTED_SHARE
-                for noisy_model in summary.others.values()
-            )
-            and (
-                not summary.changed
-                or (summary.rejected_fraction <= MAX_REJECTED_SHARE and _agree(repeated_runs))
-            ),
-            without=without,
+    marked_summaries = []
+    for summary, *noisy_summaries in runs:
+        rejected_fractions = [other.rejected_fraction for other in summary.others.values()]
+        if summary.changed:
+            rejected_fractions.append(summary.rejected_fraction)
+        is_predictable = (
+            all(height.is_predictable for height in summary.heights.values())
+            and max(rejected_fractions, default=0.0) <= MAX_REJECTED_SHARE
+            and _agree([summary, *noisy_summaries])
         )
-        for summary, repeated_runs in zip(summaries, runs, strict=True)
-    )
+        marked_summaries.append(replace(summary, is_predictable=is_predictable, without=without))
+    return tuple(marked_summaries)
 
 
 def _agree(runs: Sequence[Summary]) -> bool:
-    """Return True if consistency, rejections and RMSE of all runs agree within the limits."""
-    rmse = [e for summary in runs if isinstance(e := summary.position_rmse_to_truth_m, float)]
-    shares = [summary.rejected_fraction for summary in runs]
+    """Return True if NIS, rejected fraction and RMSE of all runs agree within the limits."""
+    rmse = [
+        error for summary in runs if isinstance(error := summary.position_rmse_to_truth_m, float)
+    ]
+    rejected_fractions = [summary.rejected_fraction for summary in runs]
     nis = [[summary.axes[axis].nis_mean for summary in runs] for axis in HORIZONTAL]
     return (
         all(max(values) <= MAX_NIS_RATIO * min(values) for values in nis)
-        and max(shares) - min(shares) <= MAX_REJECTED_SPREAD
+        and max(rejected_fractions) - min(rejected_fractions) <= MAX_REJECTED_SPREAD
         and (not rmse or max(rmse) <= MAX_RMSE_RATIO * min(rmse))
     )
 
 
 def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Summary:
     updates = replay.updates
-    evaluated_updates, fused_at_s = (
-        updates[inside_spans(updates.index, evaluated_s)],
-        updates["fused_at_s"].to_numpy(),
-    )
+    evaluated_updates = updates[inside_spans(updates.index, evaluated_s)]
+    fused_at_s = updates["fused_at_s"].to_numpy()
     if evaluated_updates.empty:
         raise SettingsError(
             f"{_change_text(replay)}: {replay.source} would never be fused in the evaluated time; "
             f"{replay.lost} samples arrive after the fusion horizon",
-            "Choose another value.",
+            "Choose another parameter value.",
         )
-    # the variance grows between updates and drops at an update: interpolate with both values
+    # the variance grows between updates and drops at an update: use the values before and after
     variance = pd.DataFrame(index=np.column_stack([fused_at_s - 1e-6, fused_at_s]).ravel())
     for axis in HORIZONTAL:
         s, r = (
@@ -470,8 +459,8 @@ def _make_summary(
 ) -> Summary:
     """Compute a column of the what-if table.
 
-    ``variance`` is interpolated to the times of the logged variance; if None, the logged variance
-    is used. ``more`` contains further fields of :class:`Summary`.
+    ``variance`` is the position variance, interpolated to the times of the logged variance; if
+    None, the logged variance is used. ``more`` contains further fields of :class:`Summary`.
     """
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
@@ -489,23 +478,21 @@ def _make_summary(
             sigma = logged
         else:
             variance_s = logged.index[inside_spans(logged.index, evaluated_s)].to_numpy()
-            known_variance = logged if variance is None else variance
-            sigma_variance = np.interp(
-                variance_s, known_variance.index, known_variance[f"{axis}_m2"]
-            )
-            sigma = float(np.sqrt(np.median(sigma_variance)))
+            series = (logged if variance is None else variance)[f"{axis}_m2"]
+            sigma = float(np.sqrt(np.median(np.interp(variance_s, series.index, series))))
         more[axis] = AxisSummary(
             *_innovation_statistics(evaluated_updates, axis), sigma, error_m(direction)
         )
     heights = {
         name: _summarise_aid(evaluated, evaluated_s)
-        for name, each in other_aid_updates.items()
-        if len(evaluated := each[inside_spans(each.index, evaluated_s)])
+        for name, updates in other_aid_updates.items()
+        if len(evaluated := updates[inside_spans(updates.index, evaluated_s)])
     }
     if vision := heights.pop(EV_POS.name, None):
         more["others"] = {EV_POS.name: vision}
     if other_aid_updates.keys() - {EV_POS.name}:
-        more["heights"], more["height_rmse_to_truth_m"] = heights, error_m(np.eye(3)[2])
+        more["heights"] = heights
+        more["height_rmse_to_truth_m"] = error_m(np.eye(3)[2])
     return Summary(
         samples=len(evaluated_updates),
         rejected_fraction=float(evaluated_updates["rejected"].mean()),
@@ -517,17 +504,19 @@ def _make_summary(
 def _innovation_statistics(
     updates: pd.DataFrame, *axes: AxisName
 ) -> tuple[float, tuple[float, float], float]:
-    """Return mean NIS, its 95 % band and the innovation standard deviation over some axes."""
+    """Return mean NIS, its 95 % band and the standard deviation of the innovations of all axes."""
     nu = updates[[f"innovation_{axis}_m" for axis in axes]].to_numpy().ravel()
-    s = updates[[f"innovation_variance_{axis}_m2" for axis in axes]].to_numpy().ravel()
-    return float(np.mean(nu**2 / s)), nis_band(len(nu)), float(np.std(nu))
+    S = updates[[f"innovation_variance_{axis}_m2" for axis in axes]].to_numpy().ravel()
+    return float(np.mean(nu**2 / S)), nis_band(len(nu)), float(np.std(nu))
 
 
 def _summarise_aid(evaluated_updates: pd.DataFrame, evaluated_s: Spans) -> HeightSummary:
     rejected = evaluated_updates["rejected"].to_numpy()
     fused_s = evaluated_updates.index.to_numpy()[rejected == 0.0]
-    fusions_by_span = ((fused_s[(fused_s > a) & (fused_s < b)], ((a, b),)) for a, b in evaluated_s)
-    longest_s = max(_longest_between_fusions(*part) for part in fusions_by_span)
+    longest_s = max(
+        _longest_between_fusions(fused_s[inside_spans(fused_s, (span,))], (span,))
+        for span in evaluated_s
+    )
     return HeightSummary(
         *_innovation_statistics(evaluated_updates, *axes_of(evaluated_updates)),
         float(rejected.mean()),
@@ -538,22 +527,22 @@ def _summarise_aid(evaluated_updates: pd.DataFrame, evaluated_s: Spans) -> Heigh
 def _heading_error(
     flight: Flight, replay: Ekf2Replay, heading: pd.Series, evaluated_s: Spans
 ) -> float | Unavailable:
-    """Return the mean difference (°) of a heading (rad) and the true heading."""
+    """Return the mean of ``heading`` (rad) minus true heading, in degrees."""
     if GNSS_POS.noise not in replay.settings:
         return HEADING_NOT_REPLAYED
     true_attitude = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude
     if true_attitude is None:
         return replace(NO_TRUTH, what="heading error", reason="the log has no true attitude")
-    evaluated_heading = heading[inside_spans(heading.index, evaluated_s)]
-    true_at_samples = np.interp(
-        evaluated_heading.index, true_attitude.index, heading_rad(true_attitude), np.nan, np.nan
+    heading = heading[inside_spans(heading.index, evaluated_s)]
+    true_heading = np.interp(
+        heading.index, true_attitude.index, heading_rad(true_attitude), np.nan, np.nan
     )
-    error = np.angle(np.exp(1j * (evaluated_heading.to_numpy() - true_at_samples)))
+    error = np.angle(np.exp(1j * (heading.to_numpy() - true_heading)))
     return float(np.degrees(np.nanmean(error)))
 
 
 def _longest_between_fusions(fused_s: Array, evaluated_s: Spans) -> float:
-    """Return the longest time (s) without a fusion within the evaluated times."""
+    """Return the longest time (s) without a fusion, from start to end of the evaluated times."""
     ends = [evaluated_s[0][0], evaluated_s[-1][1]]
     return float(np.max(np.diff(np.sort(np.concatenate([fused_s, ends])))))
 
@@ -561,16 +550,12 @@ def _longest_between_fusions(fused_s: Array, evaluated_s: Spans) -> float:
 def _deviation_note(
     model: Model, replay: Ekf2Replay, without: Mapping[str, float], evaluated_s: Spans
 ) -> str:
-    """Describe the position difference between the replays without and with the disabled aids."""
-    flown, changed_position = (
-        replay_run.published.loc[
-            inside_spans(replay_run.published.index, evaluated_s), Columns.POSITION
-        ]
-        for replay_run in (model.flown, replay)
-    )
-    *horizontal, down = np.abs((changed_position - flown).to_numpy()).T
+    """Describe the position difference between replays with and without an aiding source."""
+    difference = replay.published[Columns.POSITION] - model.flown.published[Columns.POSITION]
+    difference = difference[inside_spans(difference.index, evaluated_s)]
+    *horizontal, down = np.abs(difference.to_numpy()).T
     distance = np.hypot(*horizontal)
-    lost_text = ", ".join(f"{name} from {since:g} s on" for name, since in without.items())
+    aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in without.items())
     heights = {*model.flown.other_aid_updates} - {EV_POS.name}
     horizontal_aids = {*modelled_aids(model.inputs)} - {MAG.name} - heights
     height = f"; the height by at most {down.max():.3g} m" if heights & {*without} else ""
@@ -578,9 +563,9 @@ def _deviation_note(
         "; without a horizontal aid EKF2 stops providing a position after EKF2_NOAID_TOUT (5 s), "
         "while the replay dead-reckons"
     )
-    at_s = changed_position.index[distance.argmax()]
+    at_s = difference.index[distance.argmax()]
     return (
-        f"Without {lost_text} the published position differs from the replay as flown by at most "
+        f"Without {aids_text} the published position differs from the replay as flown by at most "
         f"{distance.max():.3g} m (at {at_s:.1f} s), {distance[-1]:.3g} m at the end{height}"
         + (give_up_note if horizontal_aids <= without.keys() else "")
     )
@@ -590,12 +575,12 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
     min_noise = replay.settings.get(GNSS_POS.noise, 0.0)
     if min_noise >= replay.changed.get(EV_POS.noise, np.inf):
         yield (
-            f"While EKF2 fuses GNSS, it uses at least {GNSS_POS.noise} ({min_noise:g} m) as "
-            "noise of vision positions"
+            f"While EKF2 fuses GNSS, the noise of vision positions is at least {GNSS_POS.noise} "
+            f"({min_noise:g} m)"
         )
     if replay.late or replay.lost:
         remedy = "" if model.inputs.rules.horizon_by_delay else ": raise EKF2_DELAY_MAX"
-        # of two samples in one step EKF2 fuses only the newer, so updates may be fewer than samples
+        # EKF2 fuses only the newer of two samples in a prediction step: updates may be fewer
         samples = max(len(replay.updates), replay.late) + replay.lost
         yield (
             f"{_change_text(replay)}: {replay.late + replay.lost} of {samples} samples would "

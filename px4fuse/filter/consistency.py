@@ -1,4 +1,6 @@
-"""NIS, bias, whiteness and verdict of innovations, with the same functions for KF and EKF2.
+"""Consistency of innovations with their reported variance: NIS, bias, whiteness and verdict.
+
+The same functions evaluate KF and EKF2.
 
 Definitions: Bar-Shalom, Li and Kirubarajan (2001), Estimation with Applications to Tracking and
 Navigation, section 5.4; Ljung and Box (1978), Biometrika 65(2).
@@ -10,24 +12,23 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import chdtrc, gammaincinv, stdtr
 
-from px4fuse.arrays import Array
+from px4fuse.arrays import Array, ArrayPair
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Unavailable
 
 # "underconfident": the reported σ is too large; "overconfident": the reported σ is too small
 Verdict = Literal["consistent", "underconfident", "overconfident"]
 
-# With fewer innovations the 95 % band of the mean NIS is wider than 0.3 to 2.1
+Interval = tuple[float, float]
+# Minimum number of innovations for a verdict: with fewer, the 95 % band of the mean NIS is wider
+# than 0.3 to 2.1
 MIN_INNOVATIONS = 10
 CONFIDENCE_LEVEL = 0.95
-LJUNG_BOX_LAGS = 10
-# Ratios of actual to reported σ that are consistent. Against the source R is a rule of thumb, and
-# tracks hardly change. Against ground truth the ratio of EKF2 is 0.84 to 1.22 on clean simulated
-# flights: its output predictor lags, and σ does not describe that.
+LJUNG_BOX_LAGS = 10  # number of lags of the Ljung-Box whiteness test
+# Ratios of actual to reported σ that count as consistent. Against ground truth, the ratio of EKF2
+# is 0.84 to 1.22 in simulated flights without faults, because its σ excludes the lag of its output
+# predictor
 Reference = Literal["source", "truth"]
-CONSISTENT_RATIOS: Mapping[Reference, tuple[float, float]] = {
-    "source": (0.8, 1.25),
-    "truth": (0.67, 1.5),
-}
+CONSISTENT_RATIOS: Mapping[Reference, Interval] = {"source": (0.8, 1.25), "truth": (0.67, 1.5)}
 DEFAULT_GATE = 5.0  # √S; default of EKF2_EVP_GATE, for KF and for logs without a gate
 
 
@@ -55,7 +56,7 @@ class NisVerdict(Record, frozen=True, kw_only=True):
 
     @property
     def sigma_error_factor(self) -> float:
-        """Larger of reported and actual σ over the smaller; ``verdict`` gives the direction."""
+        """Factor, at least 1, between reported and actual σ; ``verdict`` gives the direction."""
         return float(max(self.nis_mean, 1.0 / self.nis_mean) ** 0.5)
 
 
@@ -66,13 +67,13 @@ class Consistency(NisVerdict, frozen=True, kw_only=True):
     ----------
     innovation_mean_m, innovation_std_m : float
     sqrt_s_median_m : float
-        Median of √S, the standard deviation that the filter expects.
+        Median of √S, the standard deviation that the filter expects of the innovations.
     fraction_outside_two_sigma : float
-        Fraction outside ±2√S; expected 0.046.
+        Fraction of the innovations outside ±2√S; expected 0.046.
     fraction_outside_gate : float
-        Fraction outside the gate.
+        Fraction of the innovations outside the gate.
     bias_t, bias_p : float
-        Student's t of the mean against zero, and its two-sided p-value.
+        Student's t statistic of the mean innovation against zero, and the two-sided p-value.
     lag1_autocorrelation : float
         Lag-1 autocorrelation of ν/√S; positive if the filter lags behind the positions.
     ljung_box_p : float
@@ -99,7 +100,7 @@ class HorizontalNis(NisVerdict, frozen=True, kw_only=True):
     """
 
 
-def nis_band(count: int, dimensions: int = 1) -> tuple[float, float]:
+def nis_band(count: int, dimensions: int = 1) -> Interval:
     """Return the two-sided 95 % band of the mean of ``count`` NIS values, per dimension.
 
     The expected mean is 1 for any number of ``dimensions``.
@@ -108,26 +109,18 @@ def nis_band(count: int, dimensions: int = 1) -> tuple[float, float]:
     >>> round(2 * low, 2), round(2 * high, 2)
     (1.67, 2.36)
     """
-    degrees_of_freedom = count * dimensions
-    low = (
-        2.0
-        * float(gammaincinv(degrees_of_freedom / 2.0, (1 - CONFIDENCE_LEVEL) / 2))
-        / degrees_of_freedom
-    )
-    high = (
-        2.0
-        * float(gammaincinv(degrees_of_freedom / 2.0, (1 + CONFIDENCE_LEVEL) / 2))
-        / degrees_of_freedom
+    shape = 0.5 * count * dimensions  # of the gamma distribution of half of the summed NIS
+    low, high = (
+        float(gammaincinv(shape, (1 + sign * CONFIDENCE_LEVEL) / 2)) / shape for sign in (-1, 1)
     )
     return low, high
 
 
-def classify_ratio(
-    ratio: float, against: Reference, interval: tuple[float, float] | None = None
-) -> Verdict:
+def classify_ratio(ratio: float, against: Reference, interval: Interval | None = None) -> Verdict:
     """Return the verdict on a ratio of actual to reported σ.
 
-    Consistent inside :data:`CONSISTENT_RATIOS`, or if the 95 % interval contains 1.
+    The filter is consistent inside :data:`CONSISTENT_RATIOS`, or if the 95 % ``interval`` of the
+    ratio contains 1.
     """
     low, high = CONSISTENT_RATIOS[against]
     if low <= ratio <= high or (interval is not None and interval[0] <= 1.0 <= interval[1]):
@@ -135,18 +128,19 @@ def classify_ratio(
     return "overconfident" if ratio > 1.0 else "underconfident"
 
 
-def ratio_interval(nis_mean: float, band: tuple[float, float]) -> tuple[float, float]:
-    """Return the 95 % interval of √(mean NIS) from the 95 % band of a consistent filter."""
+def ratio_interval(nis_mean: float, band: Interval) -> Interval:
+    """Return the 95 % interval of √(mean NIS) from the mean NIS band of a consistent filter."""
     return (nis_mean / band[1]) ** 0.5, (nis_mean / band[0]) ** 0.5
 
 
-def classify_mean_nis(nis_mean: float, band: tuple[float, float]) -> Verdict:
-    """Return the verdict on a mean NIS with its 95 % band."""
+def classify_mean_nis(nis_mean: float, band: Interval) -> Verdict:
+    """Return the verdict on a filter from the mean NIS and its 95 % band."""
     return classify_ratio(nis_mean**0.5, "source", ratio_interval(nis_mean, band))
 
 
 def _verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
-    mean, band = float(np.mean(nis)) / dimensions, nis_band(len(nis), dimensions)
+    mean = float(np.mean(nis)) / dimensions
+    band = nis_band(len(nis), dimensions)
     return {
         "count": len(nis),
         "nis_mean": mean,
@@ -159,7 +153,7 @@ def _verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
 def autocorrelation(values: Array, lags: int) -> Array:
     """Return the autocorrelation of a series at lags 1 to ``lags``: Σ ν(k) ν(k+l) / Σ ν(k)².
 
-    The mean is not subtracted: it has a separate test (``bias_p``).
+    The mean is not subtracted, because ``bias_p`` tests the mean separately.
     """
     square_sum = float(np.dot(values, values))
     return np.array(
@@ -170,28 +164,18 @@ def autocorrelation(values: Array, lags: int) -> Array:
 def assess(
     innovation_m: Array, innovation_variance_m2: Array, gate: float = DEFAULT_GATE
 ) -> Consistency | Unavailable:
-    """Test innovations against the innovation variances S that the filter reports.
+    """Test innovations (in time order) against the innovation variances S that the filter reports.
 
-    Parameters
-    ----------
-    innovation_m : ndarray, shape (n,)
-        Measurement minus predicted measurement, in time order.
-    innovation_variance_m2 : ndarray, shape (n,)
-        S, positive.
-    gate : float
-        Gate in √S.
-
-    Returns
-    -------
-    Consistency, or Unavailable with fewer than ten finite innovations.
+    Return Unavailable with fewer than ten finite innovations. ``gate`` is in √S.
     """
     is_usable = np.isfinite(innovation_m) & (innovation_variance_m2 > 0)
-    nu_m, variance_m2 = innovation_m[is_usable], innovation_variance_m2[is_usable]
+    nu_m = innovation_m[is_usable]
+    variance_m2 = innovation_variance_m2[is_usable]
     count = len(nu_m)
     if count < MIN_INNOVATIONS:
         return Unavailable(
             "consistency test",
-            f"only {count} innovations (at least {MIN_INNOVATIONS} are needed)",
+            f"the filter has only {count} innovations (at least {MIN_INNOVATIONS} are needed)",
             "Analyse a longer segment, or log the source at a higher rate.",
         )
     if np.ptp(nu_m) == 0.0:
@@ -205,9 +189,7 @@ def assess(
     bias_t = float(np.sqrt(count) * np.mean(nu_m) / std_m)
     lags = min(LJUNG_BOX_LAGS, count // 5)
     correlations = autocorrelation(normalised, lags)
-    ljung_box_q = (
-        count * (count + 2) * float(np.sum(correlations**2 / (count - np.arange(1, lags + 1))))
-    )
+    q_terms = correlations**2 / (count - np.arange(1, lags + 1))
     return Consistency(
         **_verdict_fields(normalised**2),
         innovation_mean_m=float(np.mean(nu_m)),
@@ -218,23 +200,16 @@ def assess(
         bias_t=bias_t,
         bias_p=float(2.0 * stdtr(count - 1, -abs(bias_t))),
         lag1_autocorrelation=float(correlations[0]),
-        ljung_box_p=float(chdtrc(lags, ljung_box_q)),
+        ljung_box_p=float(chdtrc(lags, count * (count + 2) * q_terms.sum())),
         ljung_box_lags=lags,
     )
 
 
-def assess_horizontal(
-    north: tuple[Array, Array], east: tuple[Array, Array]
-) -> HorizontalNis | None:
+def assess_horizontal(north: ArrayPair, east: ArrayPair) -> HorizontalNis | None:
     """Test the innovations of north and east together; both have the same timestamps.
 
-    Parameters
-    ----------
-    north, east : (innovation_m, innovation_variance_m2), each of shape (n,)
-
-    Returns
-    -------
-    HorizontalNis, or None below ten innovations.
+    ``north`` and ``east`` contain innovations (m) and innovation variances (m²), shape (n,) each.
+    Return None with fewer than ten innovations.
     """
     is_usable = (north[1] > 0) & (east[1] > 0) & np.isfinite(north[0]) & np.isfinite(east[0])
     nis = np.sum([nu[is_usable] ** 2 / s[is_usable] for nu, s in (north, east)], axis=0)

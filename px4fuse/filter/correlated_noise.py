@@ -1,8 +1,8 @@
-"""Time correlation of the errors of a position source: a low pass, or time-correlated noise.
+"""Time correlation of position errors, by a low-pass filter of the source or by correlated noise.
 
 The models (white noise, low pass, time-correlated noise) are compared by the likelihood of the same
 positions given the motion from the IMU. Biases, tilt and scale factor error are marginalised
-(:mod:`px4fuse.filter.imu_motion`), and each model has its own maximum-likelihood noises. The
+(:mod:`px4fuse.filter.imu_motion`), and each model has separate maximum-likelihood noises. The
 SIGMA_A of KF is not used: it includes the effect of biases and would hide slow errors.
 
 A low pass of first order, z_k = (1 - ρ) u_k + ρ z_(k-1), ρ = exp(-Δt/τ), correlates the noise of
@@ -43,38 +43,48 @@ MIN_MEASUREMENTS = 100
 # Maximum number of measurements, to limit the computing time: only the middle of a longer flight is
 # used
 MAX_MEASUREMENTS = 2000
-# Maximum interval between measurements for the low pass, in median intervals: correlation across
-# longer intervals is negligible
+# Maximum interval between positions that a low pass correlates, in median intervals: correlation
+# over longer intervals is negligible
 MAX_INTERVAL_RATIO = 3.0
-# Grid of the coarse search for time-correlated noise: τ, time-correlated share of the variance
-# SIGMA_Z², factors on SIGMA_A, and (COARSE_SCALES) factors on all noises
-COARSE_TAUS_S, COARSE_VARIANCE_SHARES, COARSE_SIGMA_A_FACTORS = (
-    (0.2, 0.6, 2.0, 6.0),
-    (0.12, 0.35, 0.8),
-    (0.4, 0.9),
-)
+# Time constants (s) of the coarse search for time-correlated noise
+COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
+# Time-correlated fractions of the variance SIGMA_Z² in the coarse search
+COARSE_VARIANCE_SHARES = (0.12, 0.35, 0.8)
+# Factors on SIGMA_A in the coarse search
+COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
+# Factors on all noises together in the coarse search
 COARSE_SCALES = np.geomspace(0.7, 1.6, 12)
+# Approximate number of measurements in the coarse search
 COARSE_MEASUREMENTS = 1000
-# Minimum gain of log-likelihood over white noise, in the coarse search and in the full fit
-MIN_COARSE_GAIN_NATS, MIN_GAIN_NATS = 0.5, 2.0
+# Minimum gain of log-likelihood over white noise in the coarse search: below, there is no full fit
+MIN_COARSE_GAIN_NATS = 0.5
+# Minimum gain of log-likelihood over white noise in the full fit
+MIN_GAIN_NATS = 2.0
 # Penalty on the log-likelihood of time-correlated noise with a time offset, compared with a low
-# pass: 1 for each of its two additional parameters (Akaike 1974)
+# pass: 1 for each of two additional parameters (Akaike 1974)
 OFFSET_PENALTY_NATS = 2.0
-# Search range of the low pass's time constant, and tolerance of ln τ
-LOW_PASS_TAU_S, LOG_TAU_TOLERANCE = (0.02, 3.0), 0.05
-# Fit to ground truth: maximum number of measurements; minimum gain of log-likelihood over white
-# noise (likelihood ratio 150, for two more parameters); maximum time from a measurement to a sample
-# of ground truth (s; interpolation error at 2 m/s²: 1 cm)
-MAX_TRUTH_MEASUREMENTS, MIN_TRUTH_GAIN_NATS, MAX_TRUTH_DISTANCE_S = 300, 5.0, 0.1
-# Fit to ground truth: number of parts of the flight, each with a separate time offset
+# Search range (s) of the time constant of a low pass
+LOW_PASS_TAU_S = (0.02, 3.0)
+LOG_TAU_TOLERANCE = 0.05  # tolerance of ln τ of a low pass
+# Maximum number of measurements in the fit to ground truth, to limit the computing time
+MAX_TRUTH_MEASUREMENTS = 300
+# Minimum gain of log-likelihood over white noise in the fit to ground truth: likelihood ratio 150,
+# for two more parameters
+MIN_TRUTH_GAIN_NATS = 5.0
+# Maximum time (s) from a measurement to a sample of ground truth: at 2 m/s² the interpolation error
+# is then 1 cm
+MAX_TRUTH_DISTANCE_S = 0.1
+# Number of parts of the flight with separate time offsets in the fit to ground truth
 OFFSET_PARTS = 12
-# Fit to ground truth: grid of time constants (s) and of time-correlated shares of the variance
-TRUTH_TAUS_S, TRUTH_SHARES = np.geomspace(0.3, 80.0, 17), np.linspace(0.05, 0.999, 20)
+# Time constants (s) of the fit to ground truth
+TRUTH_TAUS_S = np.geomspace(0.3, 80.0, 17)
+# Time-correlated fractions of the error variance in the fit to ground truth
+TRUTH_SHARES = np.linspace(0.05, 0.999, 20)
 
 
 @dataclass(frozen=True)
 class SourceLowPass:
-    """Low-pass filter of the position source.
+    """Low-pass filter by which the sender averages the positions.
 
     Attributes
     ----------
@@ -82,7 +92,7 @@ class SourceLowPass:
         Correlation of the noise of successive positions; 0 without a low pass.
     lag_s : float
         Lag of the positions during steady motion, Δt ρ / (1 - ρ): the time constant minus about
-        half an interval.
+        half a measurement interval.
     gain_nats : float
         Gain of log-likelihood over white noise with the logged or the shifted timestamps.
     sigma_z_m : float
@@ -125,11 +135,11 @@ class TimeCorrelatedNoise:
 
     @property
     def share(self) -> float:
-        """Share of the variance that is time-correlated."""
+        """Time-correlated fraction of the variance of the position errors."""
         return self.slow_m**2 / (self.slow_m**2 + self.white_m**2)
 
 
-def fit_time_correlation(
+def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     flight: Flight,
     axes: tuple[Axis, ...],
     settings: Settings,
@@ -139,7 +149,7 @@ def fit_time_correlation(
     clock_offset_s: float,
     jumps: Sequence[Jump] = (),
 ) -> tuple[SourceLowPass, TimeCorrelatedNoise | Unavailable] | Unavailable:
-    """Fit two models to the errors of the position source: a low pass and time-correlated noise.
+    """Fit two models of correlated position errors: a low-pass filter and time-correlated noise.
 
     Parameters
     ----------
@@ -162,30 +172,29 @@ def fit_time_correlation(
         return too_few_measurements("time-correlated errors", len(time_s), MIN_MEASUREMENTS)
     first_row = max(0, (len(time_s) - MAX_MEASUREMENTS) // 2)
     rows = slice(first_row, first_row + MAX_MEASUREMENTS)
-    time_s, measured_m = time_s[rows], np.column_stack([axis.measurement_m[rows] for axis in axes])
+    time_s = time_s[rows]
+    measured_m = np.column_stack([axis.measurement_m[rows] for axis in axes])
     for jump in jumps:
         measured_m = measured_m - np.outer(
             time_s >= jump.time_s, [step.value for step in jump.step_m]
         )
-    interval_s, is_outlier = np.diff(time_s, prepend=time_s[0]), np.isin(time_s, outlier_time_s)
+    interval_s = np.diff(time_s, prepend=time_s[0])
+    is_outlier = np.isin(time_s, outlier_time_s)
     is_short_interval = (interval_s < MAX_INTERVAL_RATIO * np.median(interval_s[1:])) & (
         interval_s > 0.0
     )
-    directions, signals = np.array([axis.direction for axis in axes]), SignalCache()
+    directions = np.array([axis.direction for axis in axes])
+    signals = SignalCache()
 
     def undo_low_pass(tau_s: float) -> tuple[PreparedMotion | Unavailable, float]:
-        """Return the positions before a low pass, and the Jacobian's contribution to -ln p."""
-        rho = (
-            np.where(is_short_interval, np.exp(-interval_s / tau_s), 0.0)
-            if tau_s
-            else np.zeros(len(time_s))
-        )
+        """Return the positions before a low pass, and the contribution of its Jacobian to -ln p."""
+        rho = np.zeros(len(time_s))
+        if tau_s:
+            rho[is_short_interval] = np.exp(-interval_s[is_short_interval] / tau_s)
         previous_m = np.concatenate([measured_m[:1], measured_m[:-1]])
         unfiltered_m = (measured_m - rho[:, None] * previous_m) / (1.0 - rho)[:, None]
         # the inversion spreads an outlier to the next position: all models exclude both positions
-        is_used_position = ~(
-            is_outlier | (is_short_interval & np.concatenate([[False], is_outlier[:-1]]))
-        )
+        is_used_position = ~(is_outlier | (is_short_interval & np.append(False, is_outlier[:-1])))
         prepared_motion = prepare_motion(
             flight,
             time_s[is_used_position],
@@ -196,7 +205,7 @@ def fit_time_correlation(
         )
         if isinstance(prepared_motion, Unavailable):
             return prepared_motion, 0.0
-        # the first position of a segment sets the initial state, so it has no likelihood
+        # the first position of an IMU segment sets the initial state, so it has no likelihood
         is_used = np.isin(time_s, np.delete(prepared_motion.time_s, prepared_motion.edges[:-1]))
         return prepared_motion, len(axes) * float(np.sum(np.log1p(-rho[is_used])))
 
@@ -204,7 +213,8 @@ def fit_time_correlation(
     if isinstance(prepared_motion, Unavailable):
         return prepared_motion
     offsets = sorted({0.0, clock_offset_s})
-    sigma_z_m, coarse_motion = noises.sigma_z_m, prepared_motion.downsample(COARSE_MEASUREMENTS)
+    sigma_z_m = noises.sigma_z_m
+    coarse_motion = prepared_motion.downsample(COARSE_MEASUREMENTS)
     low_pass = SourceLowPass(0.0, 0.0, 0.0, sigma_z_m)
     correlated_noises = [
         replace(
@@ -216,8 +226,8 @@ def fit_time_correlation(
         for share, tau in product(COARSE_VARIANCE_SHARES, COARSE_TAUS_S)
     ]
     (white_score, _), (correlated_score, correlated_start) = (
-        _best_of_grid(coarse_motion, offsets, candidates)
-        for candidates in ([noises], correlated_noises)
+        _best_of_grid(coarse_motion, offsets, candidate_noises)
+        for candidate_noises in ([noises], correlated_noises)
     )
     label = "time-correlated noise of the source"
     no_correlation = Unavailable(label, "its errors are not time-correlated", "")
@@ -226,15 +236,12 @@ def fit_time_correlation(
     (white_fit, _), (correlated_fit, offset_s) = (
         min(
             ((_fit_noises_at(prepared_motion, offset, start_noises), offset) for offset in offsets),
-            key=lambda pair: _score_of_fit(pair[0]),
+            key=lambda fit_and_offset: _score_of_fit(fit_and_offset[0]),
         )
         for start_noises in (noises, correlated_start)
     )
-    white_full_score, white_noises, correlated_score = (
-        _score_of_fit(white_fit),
-        white_fit.noises,
-        _score_of_fit(correlated_fit),
-    )
+    white_full_score = _score_of_fit(white_fit)
+    correlated_score = _score_of_fit(correlated_fit)
     # time-correlated noise explains much of the effect of a low pass, so a low pass is only fitted
     # if time-correlated noise is significant
     if white_full_score - correlated_score < MIN_GAIN_NATS:
@@ -242,35 +249,35 @@ def fit_time_correlation(
 
     def fit_low_pass(log_tau: float) -> tuple[float, Noises]:
         prepared_motion, jacobian_term = undo_low_pass(float(np.exp(log_tau)))
-        # cannot fail: the same measurements were available for the white-noise model
+        # always available: the white-noise model used the same measurements
         assert not isinstance(prepared_motion, Unavailable)
-        fit = _fit_noises_at(prepared_motion, 0.0, white_noises)
+        fit = _fit_noises_at(prepared_motion, 0.0, white_fit.noises)
         return _score_of_fit(fit) + jacobian_term, fit.noises
 
-    low, high = np.log(LOW_PASS_TAU_S).tolist()
+    low, high = np.log(LOW_PASS_TAU_S)
     log_tau = minimize_scalar(
         lambda log_tau: fit_low_pass(log_tau)[0],
         bounds=(low, high),
         options={"xatol": LOG_TAU_TOLERANCE},
     ).x
-    (score, filtered_noises), tau_s = fit_low_pass(log_tau), float(np.exp(log_tau))
+    score, filtered_noises = fit_low_pass(log_tau)
     if score < white_full_score:
-        correlation = float(np.exp(-np.median(np.diff(time_s)) / tau_s))
-        lag_s = float(np.median(np.diff(time_s))) * correlation / (1.0 - correlation)
+        median_s = float(np.median(np.diff(time_s)))
+        correlation = float(np.exp(-median_s / np.exp(log_tau)))
+        lag_s = median_s * correlation / (1.0 - correlation)
         low_pass = SourceLowPass(
             correlation, lag_s, white_full_score - score, filtered_noises.sigma_z_m
         )
-    fitted_noises, lag_nats = (
-        correlated_fit.noises,
-        correlated_score - score + (OFFSET_PENALTY_NATS if offset_s else 0.0),
-    )
-    values = (
+    fitted_noises = correlated_fit.noises
+    return low_pass, TimeCorrelatedNoise(
+        fitted_noises.tau_s,
+        fitted_noises.tau_s,
+        np.inf,
         fitted_noises.correlated_sigma_m,
         fitted_noises.sigma_z_m,
         white_full_score - correlated_score,
-        lag_nats,
+        correlated_score - score + (OFFSET_PENALTY_NATS if offset_s else 0.0),
     )
-    return low_pass, TimeCorrelatedNoise(fitted_noises.tau_s, fitted_noises.tau_s, np.inf, *values)
 
 
 def fit_time_correlation_to_truth(
@@ -283,23 +290,22 @@ def fit_time_correlation_to_truth(
 ) -> TimeCorrelatedNoise | Unavailable:
     """Fit time-correlated noise to the position errors against ground truth.
 
-    Return ``imu_fit`` if its log-likelihood gain is larger or the ground truth is insufficient.
+    Return ``imu_fit`` if it has a larger gain of log-likelihood or ground truth is insufficient.
 
     Parameters
     ----------
     axes, outlier_time_s, clock_offset_s, jumps
         See :func:`fit_time_correlation`.
     truths : sequence of DataFrame
-        True ``position_m`` along each axis.
+        Ground truth with the column ``position_m``, along each axis.
     imu_fit : TimeCorrelatedNoise or Unavailable
         Result of :func:`fit_time_correlation`; its ``lag_nats`` is copied to the result.
     """
-    min_gain, lag_nats = MIN_TRUTH_GAIN_NATS, 0.0
+    min_gain = MIN_TRUTH_GAIN_NATS
+    lag_nats = 0.0
     if isinstance(imu_fit, TimeCorrelatedNoise):
-        min_gain, lag_nats = (
-            max(MIN_TRUTH_GAIN_NATS, imu_fit.gain_nats),
-            imu_fit.lag_nats,
-        )
+        min_gain = max(MIN_TRUTH_GAIN_NATS, imu_fit.gain_nats)
+        lag_nats = imu_fit.lag_nats
     true_track = pd.concat([truth["position_m"] for truth in truths], axis=1).dropna()
     time = np.setdiff1d(axes[0].measurement_time_s, outlier_time_s)
     time = time[
@@ -318,7 +324,9 @@ def fit_time_correlation_to_truth(
     residual_basis = np.linalg.qr(nuisance_columns, mode="complete")[0][
         :, nuisance_columns.shape[1] :
     ]
-    residuals, shares, grid_scores = residual_basis.T @ (measured_m - true_m), TRUTH_SHARES, []
+    residuals = residual_basis.T @ (measured_m - true_m)
+    shares = TRUTH_SHARES
+    grid_scores = []
     half_counts = 0.5 * np.array([len(axes), len(residuals)])
     for tau in TRUTH_TAUS_S:
         correlation = (
@@ -341,7 +349,7 @@ def fit_time_correlation_to_truth(
         mean_square[tau_index, share_index]
         * np.array([shares[share_index], 1.0 - shares[share_index]])
     )
-    return TimeCorrelatedNoise(*np.concatenate([tau_s, sizes_m, [gain.max(), lag_nats]]).tolist())
+    return TimeCorrelatedNoise(*np.r_[tau_s, sizes_m, gain.max(), lag_nats].tolist())
 
 
 def _fit_noises_at(
@@ -357,15 +365,15 @@ def _score_of_fit(fit: NoiseFit) -> float:
 
 
 def _best_of_grid(
-    prepared_motion: PreparedMotion, offsets_s: Sequence[float], candidates: Sequence[Noises]
+    prepared_motion: PreparedMotion, offsets_s: Sequence[float], candidate_noises: Sequence[Noises]
 ) -> tuple[float, Noises]:
-    """Return the lowest -ln p over all time offsets, candidates and scales, and its noises.
+    """Return the lowest -ln p over all time offsets and scaled candidate noises, and its noises.
 
-    First SIGMA_A and then all noises together are scaled.
+    First SIGMA_A and then all noises together are multiplied by the factors of the coarse search.
     """
     results = []
     for positions in map(prepared_motion.at, offsets_s):
-        for candidate, factor in product(candidates, COARSE_SIGMA_A_FACTORS):
+        for candidate, factor in product(candidate_noises, COARSE_SIGMA_A_FACTORS):
             noises = replace(candidate, sigma_a_m_s2=factor * candidate.sigma_a_m_s2)
             totals = fit_noises([positions], noises, prepared_motion.weight).scores(COARSE_SCALES)[
                 :, 0

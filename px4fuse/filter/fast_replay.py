@@ -1,4 +1,4 @@
-"""Fast replay of KF in plain floats, for re-runs."""
+"""Fast replay of KF with Python floats instead of arrays, for repeated runs."""
 
 import numpy as np
 
@@ -10,22 +10,21 @@ from px4fuse.filter.steps import make_timeline
 
 
 def quick_replay(axis: Axis, settings: Settings) -> Replay:
-    """Run KF as :func:`~px4fuse.filter.kalman.replay`: the same result to 1e-9, much faster.
-
-    Parameters
-    ----------
-    axis : Axis
-    settings : Settings
+    """Run KF along one axis: same result as :func:`~px4fuse.filter.kalman.replay` to 1e-9, faster.
 
     Raises
     ------
     SettingsError
-        See :func:`~px4fuse.filter.kalman.replay`.
+        ``settings.input`` is "imu" and the axis has no acceleration.
     """
     timeline = make_timeline(axis, settings)
-    measured_m, variance = axis.measurement_m.tolist(), settings.sigma_z_m**2
-    p, v, covariance = measured_m[0], 0.0, INITIAL_COVARIANCE
-    states, updates = [(p, v, *covariance)], []
+    measured_m = axis.measurement_m.tolist()
+    variance = settings.sigma_z_m**2
+    p = measured_m[0]
+    v = 0.0
+    covariance = INITIAL_COVARIANCE
+    states = [(p, v, *covariance)]
+    updates = []
     for dt_s, acceleration, noise_density, measurement_index in zip(
         np.diff(timeline.time_s).tolist(),
         timeline.acceleration_m_s2.tolist(),

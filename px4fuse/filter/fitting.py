@@ -2,10 +2,10 @@
 
 The innovations of a filter with correct noises are white and have the expected variance. The
 correct noises maximise the likelihood of the innovations (Schweppe 1965). Outliers are modelled as
-measurements from a normal
-distribution that is many times wider (Tukey 1960). Expectation maximisation estimates the share of
-outliers, their width (σ of outliers over SIGMA_Z) and the probability that a measurement is an
-outlier. This probability uses the errors of all axes of a measurement given all data.
+measurements from a normal distribution that is many times wider (Tukey 1960). Expectation
+maximisation estimates the fraction of outliers, their width (σ of outliers over SIGMA_Z) and the
+probability that a measurement is an outlier. This probability uses the errors of all axes of a
+measurement given all data.
 """
 
 from collections.abc import Iterable, Sequence
@@ -28,28 +28,31 @@ from px4fuse.filter.marginal_likelihood import (
 )
 from px4fuse.filter.model import INITIAL_COVARIANCE
 
-SIGMA_A_SEARCH_M_S2 = (1e-3, 30.0)
-# The lower end (1 mm) is better than any positioning system
+SIGMA_A_SEARCH_M_S2 = (1e-3, 30.0)  # search range of the acceleration noise
+# Search range of the measurement noise: no positioning system is better than 1 mm
 SIGMA_Z_SEARCH_M = (1e-3, 10.0)
-RANDOM_WALK_SEARCH_M = (1e-4, 1.0)
-CORRELATED_SIGMA_SEARCH_M, CORRELATION_TIME_SEARCH_S = (1e-3, 10.0), (0.05, 60.0)
+# Maximum number of expectation maximisation iterations that estimate the outliers
 MAX_OUTLIER_ITERATIONS = 12
-# Maximum iterations of L-BFGS-B: in the last run, and while the outlier probabilities still change
+# Maximum number of iterations of L-BFGS-B: with final outlier probabilities, and while these
+# probabilities still change
 MAX_STEPS, COARSE_MAX_STEPS = 50, 3
 # Minimum ratio of the outliers' σ to SIGMA_Z: outliers with a smaller σ cannot be distinguished
 MIN_OUTLIER_WIDTH = 3.0
-START_OUTLIER_SHARE, START_OUTLIER_WIDTH, MAX_OUTLIER_SHARE = 0.005, 10.0, 0.4
-# Upper limit of SIGMA_Z relative to its estimate from the median square
+# Initial values of the fraction of outliers, and of the ratio of their σ to SIGMA_Z
+START_OUTLIER_SHARE, START_OUTLIER_WIDTH = 0.005, 10.0
+MAX_OUTLIER_SHARE = 0.4  # maximum fraction of outliers
+# Maximum ratio of SIGMA_Z to its estimate from the median of the squared errors
 MAX_SIGMA_Z_RATIO = 1.2
+# Maximum change of an outlier probability in the last iteration
 MAX_PROBABILITY_CHANGE = 0.01
-# Substitute for -ln p per measurement if it cannot be computed: larger than any computed value
+# Value that replaces -ln p per measurement if it cannot be computed: larger than any computed value
 UNCOMPUTABLE_SCORE = 1e6
-# Step in ln σ for derivatives
+# Step of ln σ for numerical derivatives of the likelihood
 DERIVATIVE_LOG_STEP = 1e-4
-# Number of interpolation nodes and their distance in ln σ: in the last run, and while the outlier
-# probabilities still change
+# Number and distance (in ln σ) of the nodes between which the likelihood is interpolated: with
+# final outlier probabilities, and while these probabilities still change
 NODES, COARSE_NODES = (10, 0.25), (6, 0.2)
-# Precision (1/m², s²/m²) of a known initial state: 1 µm, 1 µm/s
+# Precision of a known initial position (1/m²) and velocity (s²/m²): σ of 1 µm and 1 µm/s
 KNOWN_START_PRECISION = 1e12
 
 
@@ -60,7 +63,7 @@ class Noises:
     Attributes
     ----------
     sigma_a_m_s2, sigma_z_m : float
-        Noise of the acceleration (defined as KF's SIGMA_A) and of each measurement.
+        Noise of the acceleration (defined as KF's SIGMA_A), and of each position measurement.
     random_walk_m : float
         Random walk of the source (m/√s); 0 for a source that does not drift.
     correlated_sigma_m, tau_s : float
@@ -74,33 +77,34 @@ class Noises:
     tau_s: float = 0.0
 
 
-# Search ranges by field of Noises
+# Search range of each noise, by field of Noises
 SEARCH_RANGES = {
     "sigma_a_m_s2": SIGMA_A_SEARCH_M_S2,
     "sigma_z_m": SIGMA_Z_SEARCH_M,
-    "random_walk_m": RANDOM_WALK_SEARCH_M,
-    "correlated_sigma_m": CORRELATED_SIGMA_SEARCH_M,
-    "tau_s": CORRELATION_TIME_SEARCH_S,
+    "random_walk_m": (1e-4, 1.0),
+    "correlated_sigma_m": (1e-3, 10.0),
+    "tau_s": (0.05, 60.0),
 }
 
 
 class Likelihood:
-    """-ln p of the measurements (without a constant) as a function of the noises.
+    """Negative log-likelihood of the measurements (without a constant) as a function of the noises.
 
-    With acceleration and measurement noise only, -ln p is a smooth function of
-    ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z. It is computed on demand at nodes and interpolated with
-    polynomials. Its singularities are π/2 from the real axis, so the interpolation error is at the
-    level of rounding.
+    With acceleration and measurement noise only, it is a smooth function of ln(SIGMA_A/SIGMA_Z) and
+    ln SIGMA_Z. The function is computed on demand at nodes and interpolated with polynomials. Its
+    singularities are π/2 from the real axis, so the interpolation error is at the level of
+    rounding.
 
     Parameters
     ----------
     axis_positions : sequence of Positions
         Positions with one time offset only.
     weight : ndarray, shape (m,)
+        Weight of each measurement: its variance is SIGMA_Z² / weight.
     sigma_z_m : float
-        Approximate SIGMA_Z. The limits that decide if an initial state is known are relative to it.
+        Approximate SIGMA_Z, to which the limit for a known initial state is relative.
     is_coarse : bool
-        True if an approximate maximum is enough.
+        True to interpolate between fewer nodes, if an approximate maximum is sufficient.
     """
 
     def __init__(
@@ -110,7 +114,9 @@ class Likelihood:
         sigma_z_m: float,
         is_coarse: bool = False,
     ) -> None:
-        self.axis_positions, self.weight, self.sigma_z_m = axis_positions, weight, sigma_z_m
+        self.axis_positions = axis_positions
+        self.weight = weight
+        self.sigma_z_m = sigma_z_m
         self.is_tabulated = not any(positions.noise_fixed.any() for positions in axis_positions)
         self.nodes, self.step = nodes, step = COARSE_NODES if is_coarse else NODES
 
@@ -130,19 +136,19 @@ class Likelihood:
 
         @cache
         def scores_at_nodes(ratio_index: int, z_index: int) -> Array:
-            """Return -ln p at all interpolation nodes from the given indices on."""
             return np.array([scores_at_ratio(ratio_index + node, z_index) for node in range(nodes)])
 
         self._scores_at_nodes = scores_at_nodes
 
     def __call__(self, noises: Noises) -> float:
-        """Return -ln p for given noises."""
+        """Return -ln p of the measurements, without a constant."""
         if noises.random_walk_m or noises.correlated_sigma_m or not self.is_tabulated:
             return negative_log_likelihood(self.axis_positions, noises, self.weight)
         ln_z = log(noises.sigma_z_m) / self.step
         ln_ratio = log(noises.sigma_a_m_s2) / self.step - ln_z
         node_offset = (self.nodes - 1) // 2
-        first_ratio, first_z = floor(ln_ratio) - node_offset, floor(ln_z) - node_offset
+        first_ratio = floor(ln_ratio) - node_offset
+        first_z = floor(ln_z) - node_offset
         ratio_weights = _interpolation_weights(ln_ratio - first_ratio, self.nodes)
         z_weights = _interpolation_weights(ln_z - first_z, self.nodes)
         return float(ratio_weights @ self._scores_at_nodes(first_ratio, first_z) @ z_weights)
@@ -170,7 +176,7 @@ def fit_ratios(
     weight: Array,
     sigma_z_m: float,
 ) -> list[FittedPositions]:
-    """Fit positions for given ratios SIGMA_A / SIGMA_Z, with all noises in units of SIGMA_Z.
+    """Fit positions for several ratios SIGMA_A / SIGMA_Z, with all noises in units of SIGMA_Z.
 
     Parameters
     ----------
@@ -181,6 +187,7 @@ def fit_ratios(
     random_walk : float
         Random walk of the source / SIGMA_Z, per √s.
     weight : ndarray, shape (m,)
+        Weight of each measurement: its variance is SIGMA_Z² / weight.
     sigma_z_m : float
     """
     scaled_batches = (
@@ -201,15 +208,16 @@ def fit_ratios(
 def fit_noises(
     position_batches: Iterable[Positions], noises: Noises, weight: Array
 ) -> FittedPositions:
-    """Fit positions with given noises and weights."""
+    """Fit positions with one set of noises; a measurement has the variance SIGMA_Z² / weight."""
     sigma = noises.sigma_z_m
-    ratio, random_walk = noises.sigma_a_m_s2 / sigma, noises.random_walk_m / sigma
     if noises.correlated_sigma_m:
         position_batches = (
             replace(positions, correlated_noise=(noises.correlated_sigma_m, noises.tau_s))
             for positions in position_batches
         )
-    return fit_ratios(position_batches, [ratio], random_walk, weight, sigma)[0].scaled(sigma)
+    ratio = noises.sigma_a_m_s2 / sigma
+    (fit,) = fit_ratios(position_batches, [ratio], noises.random_walk_m / sigma, weight, sigma)
+    return fit.scaled(sigma)
 
 
 def negative_log_likelihood(
@@ -229,7 +237,7 @@ class NoiseFit:
     ----------
     noises : Noises
     weight : ndarray, shape (m,)
-        Weight of each measurement: 1 for a good one, 1/width² for an outlier.
+        Weight of each measurement: 1 for a good measurement, 1/width² for an outlier.
     outlier_probability : ndarray, shape (m,)
         Probability that the measurement is an outlier.
     score : Likelihood
@@ -247,17 +255,17 @@ class NoiseFit:
 
 
 def filter_positions(intervals: Preintegrated) -> Positions:
-    """Convert the input of KF; the unknown constants are the errors of KF's initial state."""
+    """Convert the input of KF to positions with unknown constants: errors of KF's initial state."""
     count = len(intervals.measurement_m)
     prior_precision = np.zeros((count + 1, 2))
     prior_precision[0] = KNOWN_START_PRECISION
-    measured_m = np.concatenate([[np.nan], intervals.measurement_m - intervals.initial.position_m])[
-        :, None
-    ]
+    measured_m = np.append(np.nan, intervals.measurement_m - intervals.initial.position_m)[:, None]
     dp, dv = np.zeros((2, 1, 1, 3, count))
-    dp[0, 0, 0], dv[0, 0, 0] = intervals.delta_position_m, intervals.delta_velocity_m_s
+    dp[0, 0, 0] = intervals.delta_position_m
+    dv[0, 0, 0] = intervals.delta_velocity_m_s
     # an error of the initial state acts as an increment in the first interval
-    dp[0, 0, 1:, 0], dv[0, 0, 2, 0] = (1.0, intervals.length_s[0]), 1.0
+    dp[0, 0, 1:, 0] = (1.0, intervals.length_s[0])
+    dv[0, 0, 2, 0] = 1.0
     return centre_on_path(
         Positions(
             measurement_m=measured_m,
@@ -276,7 +284,7 @@ def filter_positions(intervals: Preintegrated) -> Positions:
 def maximise_likelihood(
     axis_positions: Sequence[Positions], start: Noises, weight: Array, outliers: bool = True
 ) -> NoiseFit:
-    """Estimate the noises and, if requested, the outliers.
+    """Estimate the noises and, if ``outliers`` is True, the outliers by maximum likelihood.
 
     Parameters
     ----------
@@ -290,7 +298,9 @@ def maximise_likelihood(
         True to estimate the outliers; False to keep the weights.
     """
     outlier_probability = np.zeros_like(weight)
-    share, width, noises = START_OUTLIER_SHARE, START_OUTLIER_WIDTH, start
+    outlier_share = START_OUTLIER_SHARE
+    width = START_OUTLIER_WIDTH
+    noises = start
     for iteration in range(MAX_OUTLIER_ITERATIONS if outliers else 0):
         likelihood = Likelihood(axis_positions, weight, start.sigma_z_m, is_coarse=True)
         noises = _maximise_by_gradient(
@@ -299,25 +309,22 @@ def maximise_likelihood(
         square, count = _expected_squares_of_axes(axis_positions, noises, weight)
         # outliers increase the estimated SIGMA_Z, which would hide them; the median is robust
         median_square = float(np.median(square / count) / (chdtri(count[0], 0.5) / count[0]))
-        if (
-            median_square > SIGMA_Z_SEARCH_M[1] ** 2
-        ):  # noise beyond the search range is not due to outliers
+        # noise above the search range is not due to outliers
+        if median_square > SIGMA_Z_SEARCH_M[1] ** 2:
             break
         variance = min(noises.sigma_z_m**2, MAX_SIGMA_Z_RATIO**2 * median_square)
-        probability = _outlier_probability(square / variance, count, share, width)
+        probability = _outlier_probability(square / variance, count, outlier_share, width)
         if probability.sum() < 1.0 and probability.max() < 0.5 and not outlier_probability.any():
             break
-        share = float(np.clip(probability.mean(), 0.5 / len(probability), MAX_OUTLIER_SHARE))
-        square_width = (
-            float(np.sum(probability * square) / max(np.sum(probability * count), 1e-9)) / variance
+        outlier_share = float(
+            np.clip(probability.mean(), 0.5 / len(probability), MAX_OUTLIER_SHARE)
         )
-        width = max(MIN_OUTLIER_WIDTH, float(np.sqrt(square_width)))
+        outlier_square = np.sum(probability * square) / max(np.sum(probability * count), 1e-9)
+        width = max(MIN_OUTLIER_WIDTH, float(np.sqrt(outlier_square / variance)))
         weight = 1.0 - probability * (1.0 - width**-2.0)
-        is_settled = bool(
-            np.max(np.abs(probability - outlier_probability)) < MAX_PROBABILITY_CHANGE
-        )
+        change = np.abs(probability - outlier_probability)
         outlier_probability = probability
-        if is_settled:
+        if change.max() < MAX_PROBABILITY_CHANGE:
             break
         noises = replace(noises, sigma_z_m=float(np.sqrt(variance)))
     likelihood = Likelihood(axis_positions, weight, start.sigma_z_m)
@@ -334,7 +341,10 @@ def maximise_likelihood(
 def _expected_squares_of_axes(
     axis_positions: Sequence[Positions], noises: Noises, weight: Array
 ) -> tuple[Array, Array]:
-    """Return :func:`expected_squares` summed over axes, with the maximum-likelihood constants."""
+    """Return the expected squared error (m²) and number of axes of each measurement.
+
+    The unknown constants have their maximum-likelihood values, see :func:`expected_squares`.
+    """
     results = []
     for positions in axis_positions:
         constants = fit_noises([positions], noises, weight).constants()[:, 0]
@@ -346,43 +356,37 @@ def _expected_squares_of_axes(
     return square, count
 
 
-def _outlier_probability(square: Array, count: Array, share: float, width: float) -> Array:
-    log_odds = np.log(share / (1.0 - share)) - count * np.log(width)
+def _outlier_probability(square: Array, count: Array, outlier_share: float, width: float) -> Array:
+    log_odds = np.log(outlier_share / (1.0 - outlier_share)) - count * np.log(width)
     return np.asarray(expit(log_odds + 0.5 * square * (1.0 - width**-2.0)))
 
 
 def outlier_variance_factor(
     square: Array, count: Array, outlier_probability: Array, width: float
 ) -> float:
-    """Return the variance of ln σ, relative to the variance if the outliers were known.
+    """Return the variance of ln SIGMA_Z, relative to the variance if the outliers were known.
 
     The Fisher information with known outliers minus the missing information is the information of
     the data (Louis 1982). The missing information is the covariance of the score over the possible
-    sets of outliers. Parameters are ln σ, ln width and the log odds of the share of outliers.
+    sets of outliers. Parameters are ln σ, ln width and the log odds of the fraction of outliers.
 
     Parameters
     ----------
     square : ndarray, shape (m,)
         Squared error of each measurement / σ², summed over its axes.
     count : ndarray, shape (m,)
-        Number of axes.
+        Number of axes of each measurement.
     outlier_probability : ndarray, shape (m,)
     width : float
-        σ of the outliers over σ.
+        σ of the outliers over σ of good measurements.
     """
-    share = float(np.mean(outlier_probability))
-    sigma_information, outlier_information = (
-        2.0 * float(np.sum(count)),
-        2.0 * float(np.sum(count * outlier_probability)),
-    )
-    share_information, inverse_square_width = len(square) * share * (1.0 - share), width**-2.0
-    complete_information = np.array(
-        [
-            [sigma_information, outlier_information, 0.0],
-            [outlier_information, outlier_information, 0.0],
-            [0.0, 0.0, share_information],
-        ]
-    )
+    outlier_share = np.mean(outlier_probability)
+    sigma_information = 2.0 * float(np.sum(count))
+    inverse_square_width = width**-2.0
+    complete_information = np.zeros((3, 3))
+    complete_information[:2, :2] = 2.0 * np.sum(count * outlier_probability)
+    complete_information[0, 0] = sigma_information
+    complete_information[2, 2] = len(square) * outlier_share * (1.0 - outlier_share)
     scores = np.stack(
         [
             square * (inverse_square_width - 1.0),
@@ -392,7 +396,7 @@ def outlier_variance_factor(
     )
     missing_information = (scores * (outlier_probability * (1.0 - outlier_probability))) @ scores.T
     observed_information = complete_information - missing_information
-    # singular with hardly any outlier: estimating the outliers then adds no uncertainty
+    # with hardly any outlier the information is singular, and the outliers add no uncertainty
     if np.linalg.eigvalsh(observed_information)[0] <= 0.0:
         return 1.0
     return max(1.0, sigma_information * float(np.linalg.inv(observed_information)[0, 0]))
@@ -409,9 +413,8 @@ def _maximise_by_gradient(
         # -ln p per measurement limits the first step of L-BFGS-B to about 1
         try:
             return likelihood(to_noises(logs)) / count
-        except (
-            np.linalg.LinAlgError
-        ):  # far from the maximum, rounding dominates: the line search shortens the step
+        # far from the maximum rounding errors dominate: a large value shortens the search step
+        except np.linalg.LinAlgError:
             return UNCOMPUTABLE_SCORE
 
     def to_noises(logs: Array) -> Noises:

@@ -2,12 +2,12 @@
 
 KF is linear, so an error in the measurements or in the acceleration adds its response to the
 innovations. Each hypothetical error is therefore a column of a design matrix: the response of the
-innovations to an error of size 1. Generalised least squares (whitened by √S) gives the size of the
-error, its standard deviation and its likelihood (generalised likelihood ratio, Willsky and Jones
-1976). Effects that could be confused with each other are fitted together: constant accelerometer
-biases, a rotation of the frame, and a slow acceleration error as caused by tilt.
+innovations to an error of one unit. Generalised least squares (whitened by √S) estimates the error,
+its standard deviation and its likelihood (generalised likelihood ratio, Willsky and Jones 1976).
+Effects that could be confused with each other are fitted together: constant accelerometer biases, a
+rotation of the frame, and a slow acceleration error as caused by tilt.
 
-A scale factor multiplies the noise of the acceleration, too, which would bias the regression
+A scale factor also multiplies the noise of the acceleration, which would bias the regression
 (errors in variables). So the residuals at each scale are weighted with their variance at that scale
 (Deming 1943).
 """
@@ -27,7 +27,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from px4fuse.arrays import Array, BoolArray, IntArray, cumulative_integral
+from px4fuse.arrays import Array, ArrayPair, BoolArray, IntArray, cumulative_integral
 from px4fuse.filter.likelihood import (
     Preintegrated,
     innovations,
@@ -43,40 +43,44 @@ from px4fuse.notebook_display import one_line_repr
 
 ANALYSIS_NAME = "causes beyond noise"
 MIN_MEASUREMENTS = 50
-# Slow error of the logged attitude (rad, RMS), and spacing (s) of the knots between which it is
-# interpolated
+# RMS of the slow tilt error of the logged attitude
 TILT_SIGMA_RAD = 0.002
+# Interval (s) between the knots of the slow acceleration error, which is linear between knots
 KNOT_SPACING_S = 15.0
 MAX_KNOTS = 40
+# Columns of the design matrix: accelerometer biases forward and right, rotation of the frame
 FORWARD, RIGHT, ROTATION = range(3)
 CONSTANT_COUNT = 3
 # Grid of factors on KF's SIGMA_A: less acceleration noise remains after biases and tilt are fitted
 SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
-SCALE_GRID = np.linspace(0.7, 1.3, 7)
-# Maximum number of times at which a jump is tested. A jump is modelled as a lasting step
+SCALE_GRID = np.linspace(0.7, 1.3, 7)  # scale factors of the source that are tested
+# Maximum number of times at which a jump of the positions is tested
 MAX_TESTED_TIMES = 800
-# Number of step times per batch, to limit the memory of the responses
+# Number of jump times that are tested together, to limit memory
 STEP_BATCH_SIZE = 200
-# Time (s) after a step in which measurements are ignored, so that a burst of outliers is not
-# detected as a step
+# Time (s) after a jump in which measurements are ignored, so that a burst of outliers is not
+# detected as a jump
 OUTLIER_BURST_S = 1.0
-# Time (s) after a step in which outliers are tested again: they may be good measurements after it
+# Time (s) after a jump in which outliers are tested again: they may be good measurements after it
 OUTLIERS_AFTER_STEP_S = 6.0
-# Maximum probability of a false detection of a step, per flight
+# Maximum probability of a false detection of a jump, per flight
 MAX_STEP_FALSE_ALARM_P = 1e-3
-# Maximum probability that a good measurement near a step is classified as an outlier, and maximum
-# number of candidate times per step
-MAX_FALSE_OUTLIER_P, MAX_CANDIDATE_TIMES = 1e-3, 6
+# Maximum probability that a good measurement near a jump is classified as an outlier
+MAX_FALSE_OUTLIER_P = 1e-3
+# Maximum number of times that are compared to locate a jump
+MAX_CANDIDATE_TIMES = 6
 MAX_JUMPS = 3
-MIN_BIAS_M_S2 = 0.2  # minimum bias for a finding: half of EKF2's limit, EKF2_ABL_LIM
-MIN_BIAS_SIGMAS = 4.0  # minimum bias in σ: false alarm probability 6e-5
-# Minimum number of measurements on each side of a step
+# Minimum accelerometer bias for a finding: half of EKF2's limit EKF2_ABL_LIM
+MIN_BIAS_M_S2 = 0.2
+# Minimum accelerometer bias in σ for a finding: false alarm probability 6e-5
+MIN_BIAS_SIGMAS = 4.0
+# Minimum number of measurements before and after a jump
 MIN_SIDE_MEASUREMENTS = 8
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Value with its standard deviation."""
+    """Estimated value with its standard deviation."""
 
     value: float
     sigma: float
@@ -84,7 +88,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Jump:
-    """Lasting jump of the source: time (s), size along each axis (m), and its χ²."""
+    """Lasting jump of the positions: time (s), length along each axis (m), test statistic χ²."""
 
     time_s: float
     step_m: tuple[Estimate, ...]
@@ -109,7 +113,7 @@ class BiasScaleJumpFit:
         Rotation of the source's frame relative to the attitude (rad, clockwise from above),
         fitted together with the biases.
     scale : Estimate
-        Distances of the source over distances from the IMU, minus 1.
+        Scale factor error: distances of the source over distances from the IMU, minus 1.
     jumps : tuple of Jump
     sigma_a_m_s2 : float
         White noise of the acceleration that remains after the fit.
@@ -127,7 +131,8 @@ class BiasScaleJumpFit:
     @property
     def bias(self) -> Estimate:
         """Magnitude of the horizontal accelerometer bias (m/s²)."""
-        forward, right = self.forward_bias, self.right_bias
+        forward = self.forward_bias
+        right = self.right_bias
         return Estimate(
             math.hypot(forward.value, right.value), math.hypot(forward.sigma, right.sigma)
         )
@@ -156,7 +161,7 @@ def fit_bias_scale_jumps(
     axes : tuple of Axis
         Horizontal axes with the same measurement times.
     settings : Settings
-        Only ``dt_s`` is used: SIGMA_A refers to it.
+        Only ``dt_s`` is used, to which SIGMA_A refers.
     sigma_a_m_s2, sigma_z_m : float
         KF's maximum-likelihood noises.
     outlier_time_s : ndarray
@@ -191,7 +196,7 @@ def fit_bias_scale_jumps(
 def _fit_sigma_a(
     design: DesignMatrix, sigma_a_grid: Array, is_skipped: BoolArray
 ) -> tuple[float, DesignFit]:
-    """Return the maximum-likelihood SIGMA_A of a grid, and the fit with it."""
+    """Return the maximum-likelihood SIGMA_A of a grid, and the fit of the design matrix with it."""
     fit_at = cache(lambda index: design.fit(float(sigma_a_grid[index]), is_skipped))
     best_index = _index_of_minimum(lambda index: fit_at(index).score, len(sigma_a_grid))
     return float(sigma_a_grid[best_index]), fit_at(best_index)
@@ -207,22 +212,17 @@ def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
 
 
 def _fit_scale(design: DesignMatrix, sigma_a: float, is_skipped: BoolArray) -> Estimate:
-    """Estimate the scale factor error on a grid of scales, corrected for the frame's rotation."""
+    """Estimate the scale factor error from a grid of scales, corrected for the frame's rotation."""
     fit_at = cache(
         lambda grid_index: design.fit(sigma_a, is_skipped, float(SCALE_GRID[grid_index]))
     )
-    # the term ln S is omitted: it grows with the scale and would bias the estimate towards zero
+    # ln S is omitted from the score: it grows with the scale and would bias the estimate to zero
     lowest_index = _index_of_minimum(
         lambda grid_index: fit_at(grid_index).square_sum, len(SCALE_GRID)
     )
     grid_index = int(np.clip(lowest_index, 1, len(SCALE_GRID) - 2))
-    scores = np.array(
-        [
-            fit_at(neighbour).square_sum / 2.0
-            for neighbour in (grid_index - 1, grid_index, grid_index + 1)
-        ]
-    )
-    vertex_shift, curvature = parabola_vertex(scores, 1)
+    scores = [fit_at(grid_index + shift).square_sum / 2.0 for shift in (-1, 0, 1)]
+    vertex_shift, curvature = parabola_vertex(np.array(scores), 1)
     step = float(SCALE_GRID[1] - SCALE_GRID[0])
     if curvature <= 0.0:
         return Estimate(0.0, float("inf"))
@@ -235,12 +235,12 @@ def _fit_scale(design: DesignMatrix, sigma_a: float, is_skipped: BoolArray) -> E
 def _find_jumps(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray
 ) -> tuple[tuple[Jump, ...], BoolArray]:
-    """Detect lasting jumps of the source; return the jumps in time order, and an outlier mask.
+    """Detect lasting jumps of the positions; return the jumps in time order, and an outlier mask.
 
-    Candidate times are from a scan over all times, and the starts of runs of outliers: the first
-    measurements after a jump look like outliers. Each candidate is tested without the measurements
+    Tested times are the best of a scan over all times, and the starts of runs of outliers: the
+    first measurements after a jump look like outliers. Each time is tested without the measurements
     of the next second, so that a burst of outliers is not detected as a jump. The exact time is
-    determined last; the size of the jump depends on it.
+    determined last, because the length of the jump depends on it.
     """
     jumps: list[Jump] = []
     for _ in range(MAX_JUMPS):
@@ -248,23 +248,22 @@ def _find_jumps(
             design, step_columns=unit_steps(design.time_s, [jump.time_s for jump in jumps])
         )
         outlier_run_starts = design.time_s[
-            np.flatnonzero(is_skipped & ~np.concatenate([[False], is_skipped[:-1]]))
+            np.flatnonzero(is_skipped & ~np.append(False, is_skipped[:-1]))
         ]
-        candidate_times = [
+        jump_times = [
             *_significant_step_times(design, sigma_a, is_skipped, outlier_run_starts),
             *_significant_step_times(design, sigma_a, is_skipped)[:1],
         ]
         false_alarm_p = MAX_STEP_FALSE_ALARM_P / max(len(outlier_run_starts), 1)
-        candidates = [
-            _test_step(design, sigma_a, is_skipped, time_s, false_alarm_p)
-            for time_s in candidate_times
+        significant_jumps = [
+            jump
+            for time_s in jump_times
+            if (jump := _test_step(design, sigma_a, is_skipped, time_s, false_alarm_p)) is not None
         ]
-        significant = [jump for jump in candidates if jump is not None]
-        if not significant:
+        if not significant_jumps:
             break
-        best_jump, is_skipped = _locate_jump(
-            design, sigma_a, is_skipped, max(significant, key=lambda jump: jump.chi_square)
-        )
+        best_jump = max(significant_jumps, key=lambda jump: jump.chi_square)
+        best_jump, is_skipped = _locate_jump(design, sigma_a, is_skipped, best_jump)
         jumps.append(best_jump)
     return tuple(sorted(jumps, key=lambda jump: jump.time_s)), is_skipped
 
@@ -276,7 +275,7 @@ def _is_in_window(time_s: Array, start_s: float, length_s: float) -> BoolArray:
 def _significant_step_times(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, times: Array | None = None
 ) -> list[float]:
-    """Return the significant step times of ``times`` (by default all), largest χ² first."""
+    """Return the times (by default of all measurements) of significant jumps, largest χ² first."""
     if times is None:
         times = design.time_s[MIN_SIDE_MEASUREMENTS:-MIN_SIDE_MEASUREMENTS]
         times = times[:: max(1, -(-len(times) // MAX_TESTED_TIMES))]
@@ -291,7 +290,7 @@ def _significant_step_times(
 def _step_chi_squares(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, times: Array
 ) -> Array:
-    """Return χ² of a step at each time: reduction of the residual squares, summed over axes."""
+    """Return χ² of a jump at each time: reduction of the squared residuals, summed over axes."""
     data, columns, log_s_sum = design.whitened_design(sigma_a, is_skipped)
     base_fit = design.regress(data, columns, log_s_sum, is_skipped)
     chi_square = np.zeros(len(times))
@@ -302,10 +301,8 @@ def _step_chi_squares(
                 zero_signal = np.broadcast_to(0.0, step_signals.shape)
                 step_interval = _replace_signals(intervals, zero_signal, zero_signal, step_signals)
                 step_response = design.whitened(step_interval, sigma_a, is_skipped)[0][~is_skipped]
-            residual, cross_product = (
-                base_fit.residual[base_fit.axis == axis],
-                columns[axis][~is_skipped].T @ step_response,
-            )
+            residual = base_fit.residual[base_fit.axis == axis]
+            cross_product = columns[axis][~is_skipped].T @ step_response
             information = np.sum(step_response**2, axis=0) - np.sum(
                 cross_product * (base_fit.covariance @ cross_product), axis=0
             )
@@ -318,37 +315,24 @@ def _step_chi_squares(
 def _locate_jump(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, jump: Jump
 ) -> tuple[Jump, BoolArray]:
-    """Find the time and size of a jump near its candidate time; also return an outlier mask."""
+    """Determine time and length of a jump near its detected time; also return an outlier mask."""
     is_near = np.abs(design.time_s - jump.time_s) <= OUTLIER_BURST_S
-    # exclude measurements close to the step; later outliers that agree with the step are used again
+    # exclude measurements close to the jump; use later outliers again if they agree with the jump
     chi_square = design.with_step(jump.time_s)[0].residual_squares(sigma_a, is_skipped | is_near)
     is_after = is_near | _is_in_window(design.time_s, jump.time_s, OUTLIERS_AFTER_STEP_S)
-    is_skipped = np.where(
-        is_after & ~is_near,
-        chi_square > chdtri(len(design.intervals), MAX_FALSE_OUTLIER_P),
-        is_skipped,
-    )
+    threshold = chdtri(len(design.intervals), MAX_FALSE_OUTLIER_P)
+    is_skipped = np.where(is_after & ~is_near, chi_square > threshold, is_skipped)
     times = design.time_s[is_near]
     best_indices = np.argsort(-_step_chi_squares(design, sigma_a, is_skipped & ~is_near, times))[
         :MAX_CANDIDATE_TIMES
     ]
-    candidates = []
-    for candidate_s in times[best_indices].tolist():
-        chi_square = design.with_step(candidate_s)[0].residual_squares(
-            sigma_a, is_skipped | is_near
-        )
-        candidates.append(
-            (
-                candidate_s,
-                np.where(
-                    is_near,
-                    chi_square > chdtri(len(design.intervals), MAX_FALSE_OUTLIER_P),
-                    is_skipped,
-                ),
-            )
-        )
-    # a wrong step time makes good measurements outliers: choose the time with the fewest outliers
-    time_s, is_skipped = min(candidates, key=lambda candidate: np.count_nonzero(candidate[1]))
+    outliers_by_time = {}
+    for jump_s in times[best_indices].tolist():
+        chi_square = design.with_step(jump_s)[0].residual_squares(sigma_a, is_skipped | is_near)
+        outliers_by_time[jump_s] = np.where(is_near, chi_square > threshold, is_skipped)
+    # a wrong jump time makes good measurements outliers: choose the time with the fewest outliers
+    time_s = min(outliers_by_time, key=lambda jump_s: np.count_nonzero(outliers_by_time[jump_s]))
+    is_skipped = outliers_by_time[time_s]
     stepped_design, columns = design.with_step(time_s)
     design_fit = stepped_design.fit(sigma_a, is_skipped)
     step_m = tuple(design_fit.estimate(int(column)) for column in columns)
@@ -368,10 +352,8 @@ def _test_step(
     ):
         return None
     design_fit = design.fit(sigma_a, is_skipped_with_burst)
-    size, covariance = (
-        design_fit.coefficients[columns],
-        design_fit.covariance[np.ix_(columns, columns)],
-    )
+    size = design_fit.coefficients[columns]
+    covariance = design_fit.covariance[np.ix_(columns, columns)]
     size = size / design_fit.axis_rms
     chi_square = float(size @ np.linalg.solve(covariance, size))
     if chi_square < chdtri(len(columns), false_alarm_p):
@@ -422,38 +404,39 @@ class DesignFit:
 class DesignMatrix:
     """Innovations of all axes and the columns of all hypotheses, before whitening.
 
-    Symbols in shapes: m measurements, a axes, k columns, h hat functions, j steps.
+    Symbols in shapes: m measurements, a axes, k columns, h hat functions, j jumps.
 
     Attributes
     ----------
     time_s : ndarray, shape (m,)
         Timestamps of the measurements.
     intervals : tuple of Preintegrated
-        Each axis integrated between measurements. Columns: the data, then the effect of a unit bias
-        forward, a unit bias right, and a unit rotation of the frame.
+        Input of KF along each axis, integrated between measurements. Columns: the data, then the
+        effects of unit biases forward and right, and of a unit rotation of the frame.
     hat_signals : (ndarray, ndarray), shape (m, h)
         Position and velocity increments by a slow acceleration error, interpolated between knots
         (hat functions of time); each axis has separate coefficients.
     prior_sigma : ndarray, shape (k,)
-        Prior standard deviations of the coefficients, without the steps.
+        Prior standard deviations of the coefficients, without those of the jumps.
     sigma_z_m : float
     step_columns : ndarray, shape (m, j)
-        Unit steps of the measurements: j more columns per axis.
+        Unit jumps of the measurements: j more columns per axis.
     """
 
     time_s: Array
     intervals: tuple[Preintegrated, ...]
-    hat_signals: tuple[Array, Array]
+    hat_signals: ArrayPair
     prior_sigma: Array
     sigma_z_m: float
     step_columns: Array
 
     def with_step(self, time_s: float) -> tuple[DesignMatrix, IntArray]:
-        """Return the design matrix with one more step, and the step's column of each axis."""
+        """Return the design matrix with one more jump, and the column of the jump for each axis."""
         design = replace(
             self, step_columns=np.hstack([self.step_columns, unit_steps(self.time_s, [time_s])])
         )
-        first_step_column, count = len(self.prior_sigma), design.step_columns.shape[1]
+        first_step_column = len(self.prior_sigma)
+        count = design.step_columns.shape[1]
         return design, first_step_column + count * (1 + np.arange(len(self.intervals))) - 1
 
     @cached_property
@@ -469,7 +452,7 @@ class DesignMatrix:
     def whitened(
         self, intervals: Preintegrated, sigma_a: float, is_skipped: BoolArray
     ) -> tuple[Array, float]:
-        """Return innovations over √S of k signals, (m, k), and Σ ln S of fused measurements."""
+        """Return ν/√S of k signals, shape (m, k), and Σ ln S of the fused measurements."""
         nu, s = innovations(intervals, sigma_a, self.sigma_z_m, is_skipped)
         nu /= np.sqrt(s)[:, None]
         return nu, float(np.sum(np.log(s[~is_skipped])))
@@ -477,27 +460,27 @@ class DesignMatrix:
     def fit(self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0) -> DesignFit:
         """Fit all columns, with a scale factor on the acceleration and on its noise.
 
-        Parameters
-        ----------
-        sigma_a : float
-        is_skipped : ndarray of bool, shape (m,)
-            Measurements to exclude from filter and fit.
-        scale : float
+        ``is_skipped`` are the measurements to exclude from filter and fit, shape (m,).
         """
         return self.regress(*self.whitened_design(sigma_a, is_skipped, scale), is_skipped)
 
     def regress(
         self, data: Array, columns: Array, log_s_sum: float, is_skipped: BoolArray
     ) -> DesignFit:
-        """Fit the output of :meth:`whitened_design` without the skipped measurements."""
+        """Fit whitened innovations with whitened columns, without the skipped measurements.
+
+        ``data``, ``columns`` and ``log_s_sum`` are the result of :meth:`whitened_design`.
+        """
         axis = np.repeat(np.arange(len(data)), np.count_nonzero(~is_skipped))
-        data, columns = data[:, ~is_skipped].ravel(), columns[:, ~is_skipped].reshape(len(axis), -1)
+        data = data[:, ~is_skipped].ravel()
+        columns = columns[:, ~is_skipped].reshape(len(axis), -1)
         count = columns.shape[1]
         prior_sigma = np.append(self.prior_sigma, np.full(count - len(self.prior_sigma), np.inf))
         information = np.diag(prior_sigma**-2.0) + columns.T @ columns
-        # the small diagonal keeps the matrix regular if a column is zero (rotation in hover)
+        # a small diagonal keeps the matrix regular if a column is zero, as the rotation in hover
         information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(count)
-        moment, factor = columns.T @ data, cho_factor(information)
+        moment = columns.T @ data
+        factor = cho_factor(information)
         covariance = cho_solve(factor, np.eye(count))
         coefficients = covariance @ moment
         square_sum = float(data @ data - coefficients @ moment)
@@ -507,7 +490,7 @@ class DesignMatrix:
         return DesignFit(axis, residual, coefficients, covariance, square_sum, score, residual_rms)
 
     def residual_squares(self, sigma_a: float, is_skipped: BoolArray) -> Array:
-        """Return residual² / variance of each measurement, summed over axes."""
+        """Return the squared normalised residual of each measurement, summed over axes."""
         data, columns, log_s_sum = self.whitened_design(sigma_a, is_skipped)
         fit = self.regress(data, columns, log_s_sum, is_skipped)
         residual = data - columns @ fit.coefficients
@@ -516,19 +499,18 @@ class DesignMatrix:
     def whitened_design(
         self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0
     ) -> tuple[Array, Array, float]:
-        """Return whitened innovations (a, m) and columns (a, m, k) of all axes, and Σ ln S."""
-        hat_count, step_count, axes = (
-            self.hat_signals[0].shape[1],
-            self.step_columns.shape[1],
-            len(self.intervals),
-        )
+        """Return whitened innovations, shape (a, m), and columns, shape (a, m, k), and Σ ln S."""
+        hat_count = self.hat_signals[0].shape[1]
+        step_count = self.step_columns.shape[1]
+        axes = len(self.intervals)
         column_count = len(self.prior_sigma)
         data = np.empty((axes, len(is_skipped)))
         columns = np.zeros((axes, len(is_skipped), column_count + axes * step_count))
         # the scale multiplies the measured acceleration and its rotation, but not the biases
         scale_factors = np.ones(1 + CONSTANT_COUNT)
         scale_factors[[0, 1 + ROTATION]] = scale
-        zero_signal, log_s_sum = np.zeros_like(self.hat_signals[0]), 0.0
+        zero_signal = np.zeros_like(self.hat_signals[0])
+        log_s_sum = 0.0
         for axis_group in self.axis_groups:
             intervals = [self.intervals[axis] for axis in axis_group]
             dp = [
@@ -553,10 +535,8 @@ class DesignMatrix:
             )
             for axis, signals in zip(axis_group, axis_signals, strict=True):
                 data[axis] = signals[:, 0]
-                first_hat, first_step = (
-                    CONSTANT_COUNT + hat_count * axis,
-                    column_count + step_count * axis,
-                )
+                first_hat = CONSTANT_COUNT + hat_count * axis
+                first_step = column_count + step_count * axis
                 columns[axis][:, :CONSTANT_COUNT] = signals[:, 1:]
                 common_columns = np.r_[
                     first_hat : first_hat + hat_count, first_step : first_step + step_count
@@ -578,21 +558,12 @@ def make_design_matrix(
     sigma_z: float,
     clock_offset_s: float,
 ) -> DesignMatrix | Unavailable:
-    """Build the design matrix without steps.
+    """Build the design matrix without jumps.
 
-    Parameters
-    ----------
-    flight : Flight
-    axes : tuple of Axis
-        Horizontal axes with the same measurement times.
-    settings : Settings
-        Only ``dt_s`` is used: SIGMA_A refers to it.
-    sigma_z : float
-        Measurement noise (m).
-    clock_offset_s : float
-        Time offset added to the timestamps.
+    The axes have the same measurement times; ``clock_offset_s`` is added to the timestamps.
     """
-    acceleration, attitude = ned_acceleration(flight), flight.attitude
+    acceleration = ned_acceleration(flight)
+    attitude = flight.attitude
     for input_data in (acceleration, axes[0].acceleration, attitude):
         if isinstance(input_data, Unavailable):
             return input_data
@@ -617,7 +588,7 @@ def make_design_matrix(
         ]
         dp, dv = (np.stack(arrays, axis=1) for arrays in zip(*columns, strict=True))
         measured_m = np.zeros_like(dp)
-        # positions relative to the first measurement, at which KF starts
+        # positions relative to the first measurement, which is KF's initial position
         measured_m[:, 0] = interval_input.measurement_m - interval_input.initial.position_m
         initial = replace(interval_input.initial, position_m=0.0)
         intervals.append(
@@ -636,9 +607,7 @@ def make_design_matrix(
     )
 
 
-def _integrate_signal(
-    acceleration_m_s2: Array, time_s: ArrayLike, timeline: Timeline
-) -> tuple[Array, Array]:
+def _integrate_signal(acceleration_m_s2: Array, time_s: ArrayLike, timeline: Timeline) -> ArrayPair:
     """Integrate an acceleration to Δp (m) and Δv (m/s) between the measurements."""
     time = np.asarray(time_s, dtype=np.float64)
     velocity = np.interp(timeline.time_s, time, cumulative_integral(acceleration_m_s2, time))
@@ -648,10 +617,7 @@ def _integrate_signal(
 def _common_accelerations(
     attitude: pd.DataFrame, acceleration: pd.DataFrame
 ) -> list[tuple[pd.Index, Array]]:
-    """Return the NED accelerations of unit biases forward and right and of a unit rotation.
-
-    Each is a pair of times and accelerations.
-    """
+    """Return times and NED accelerations of unit biases forward and right, and a unit rotation."""
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
     biases = [(attitude.index, body_to_ned.apply(np.eye(3)[axis])) for axis in (FORWARD, RIGHT)]
@@ -659,8 +625,8 @@ def _common_accelerations(
     return [*biases, (acceleration.index, np.column_stack([-east, north, 0.0 * north]))]
 
 
-def _hat_functions(start_s: float, end_s: float) -> tuple[Array, Array]:
-    """Return times (s), shape (n,), and the hat functions of a linear interpolation, (h, n)."""
+def _hat_functions(start_s: float, end_s: float) -> ArrayPair:
+    """Return times (s), shape (n,), and hat functions for linear interpolation, shape (h, n)."""
     knot_count = int(np.clip(np.ceil((end_s - start_s) / KNOT_SPACING_S), 1, MAX_KNOTS)) + 1
     time = np.linspace(start_s, end_s, 20 * (knot_count - 1) + 1)
     knots = np.linspace(start_s, end_s, knot_count)
@@ -668,5 +634,5 @@ def _hat_functions(start_s: float, end_s: float) -> tuple[Array, Array]:
 
 
 def unit_steps(time_s: Array, starts_s: Iterable[float]) -> Array:
-    """Return unit steps at ``starts_s``, sampled at ``time_s``: shape (m, j)."""
+    """Return unit step functions that start at ``starts_s``, at the times ``time_s``: (m, j)."""
     return np.asarray(time_s[:, None] >= np.fromiter(starts_s, float)[None, :], dtype=np.float64)

@@ -7,9 +7,9 @@ the delay of the positions.
 
 To first order the acceleration is linear in ten unknown constants of each segment: errors of the
 initial attitude (rad, NED), gyro biases (rad/s, body), accelerometer biases (m/s², body) and the
-scale of the positions. The signal of a constant is the sensitivity of the motion to it. The signals
-are integrated once; a time offset only changes the times at which the integrals are read. The
-signal of the scale is the acceleration of the smooth path of
+scale of the positions. The signal of a constant is the sensitivity of the motion to this constant.
+The signals are integrated once; a time offset only changes the times at which the integrals are
+interpolated. The signal of the scale is the acceleration of the smooth path of
 :func:`px4fuse.filter.marginal_likelihood.centre_on_path`. The acceleration of the IMU is not
 suitable: much of its noise would be explained as scale (errors in variables, Fuller 1987).
 """
@@ -30,20 +30,25 @@ from px4fuse.filter.marginal_likelihood import Positions, centre_on_path
 from px4fuse.filter.model import continuous_noise_unit
 from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight import Columns, Flight, Unavailable
-from px4fuse.trajectory.rotation import cumulative_product, from_vector, multiply, to_matrix
+from px4fuse.record import Span
+from px4fuse.trajectory.rotation import cumulative_product, from_vector, multiply, rotate, to_matrix
 
 # Prior σ of the unknown constants, wide for consumer sensors: initial tilt and heading (rad), gyro
 # bias (rad/s), accelerometer bias (m/s²), scale of the positions (1)
 CONSTANT_SIGMAS = np.repeat([0.05, 0.004, 0.3, 0.1], [3, 3, 3, 1])
-# Maximum length (s) of a segment: the linearisation needs small angles. In 30 s a gyro bias of
+# Maximum length (s) of a segment: the linearisation requires small angles. In 30 s a gyro bias of
 # 0.004 rad/s rotates the attitude by 0.12 rad, with a second-order error of 0.07 m/s²
 MAX_SEGMENT_S = 30.0
 # Largest time offset (s) of the search
 MAX_OFFSET_S = 0.6
-# Coarse search: number of offsets, and approximate number of measurements
-COARSE_OFFSETS, COARSE_MEASUREMENTS = 25, 600
-# Maximum number of signal values per batch (memory), and minimum number of offsets per batch
-SIGNALS_PER_BATCH, MIN_BATCH_OFFSETS = 2**16, 3
+# Number of time offsets in the coarse search
+COARSE_OFFSETS = 25
+# Approximate number of measurements in the coarse search for a time offset
+COARSE_MEASUREMENTS = 600
+# Maximum number of signal values that are computed together, to limit memory
+SIGNALS_PER_BATCH = 2**16
+# Minimum number of time offsets that are computed together
+MIN_BATCH_OFFSETS = 3
 # Minimum number of measurements in all segments together, and in each segment
 MIN_MEASUREMENTS, MIN_SEGMENT_MEASUREMENTS = 30, 15
 # Minimum number of measurements in a segment after downsampling
@@ -51,26 +56,27 @@ MIN_KEPT_MEASUREMENTS = 5
 # Interval (s) over which the IMU is averaged before integration
 INTEGRATION_STEP_S = 0.02
 # Prior precision of position (1/m²) and velocity (s²/m²) at the start of a segment: negligible, but
-# the equations stay regular for an axis with hardly any measurement
+# it keeps the equations regular for an axis with hardly any measurement
 START_PRECISION = 1e-6, 1e-4
-# Maximum median interval (s) of the IMU: with a longer one, motion between samples is unknown
+# Maximum median interval (s) of IMU samples: in a longer interval the motion is unknown
 MAX_IMU_INTERVAL_S = 0.025
 
 
 @dataclass(frozen=True)
 class Signals:
-    """Motion of one segment from the IMU, and its sensitivity to each unknown constant.
+    """Motion of one segment from the IMU, and sensitivity of the motion to each unknown constant.
 
-    ``table`` has shape (n, 3, 3, 1 + constants): at each time position, velocity and acceleration,
-    along each axis of NED. Its last index is 0 for the motion with all constants zero, then one per
-    constant except the scale. Each acceleration applies until the next time.
+    ``table`` contains position, velocity and acceleration along each axis of NED at each time; its
+    shape is (n, 3, 3, 1 + constants). Index 0 of the last dimension is the motion with all
+    constants zero, followed by the sensitivities to all constants except the scale. Each
+    acceleration applies until the next time.
     """
 
     time_s: Array
     table: Array
 
     def at(self, time_s: Array) -> tuple[Array, Array]:
-        """Return position and velocity at other times, shape (..., 3, 1 + constants)."""
+        """Interpolate position and velocity at other times, shape (..., 3, 1 + constants)."""
         last_index = len(self.time_s) - 1
         row = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
         elapsed_s = (time_s - self.time_s[row])[..., None, None]
@@ -81,19 +87,19 @@ class Signals:
 
 
 # Signals of one flight by time span (s), for reuse
-SignalCache = dict[tuple[float, float], Signals]
+SignalCache = dict[Span, Signals]
 
 
 @dataclass(frozen=True)
 class PreparedMotion:
-    """Positions of one source and the motion from the IMU, in segments, for any time offset.
+    """Positions of one source and motion from the IMU, in segments, for any time offset.
 
     Attributes
     ----------
     time_s : ndarray, shape (m,)
         Timestamps of the measurements in segments.
     measurement_m : ndarray, shape (m, a)
-        Positions along each axis relative to the first of each segment; NaN if missing.
+        Positions along each axis relative to the segment's first position; NaN if missing.
     weight : ndarray, shape (m,)
         Weight of each measurement.
     edges : ndarray of int, shape (s + 1,)
@@ -120,7 +126,7 @@ class PreparedMotion:
     heading_sigma_rad: float = float(CONSTANT_SIGMAS[2])
 
     def downsample(self, count: int) -> PreparedMotion:
-        """Keep about ``count`` of the measurements; all if no segment would have enough left."""
+        """Keep about ``count`` of the measurements; all if these would be too few per segment."""
         is_kept = np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / count)) == 0
         counts = np.add.reduceat(is_kept.astype(int), self.edges[:-1])
         keeps_enough = counts >= MIN_KEPT_MEASUREMENTS
@@ -130,20 +136,11 @@ class PreparedMotion:
         arrays = {
             name: getattr(self, name)[is_kept] for name in ("time_s", "measurement_m", "weight")
         }
-        signals = tuple(
-            segment_signals
-            for segment_signals, is_good in zip(self.signals, keeps_enough, strict=True)
-            if is_good
-        )
+        signals = tuple(self.signals[index] for index in np.flatnonzero(keeps_enough))
         return replace(self, **arrays, edges=np.cumsum([0, *counts[keeps_enough]]), signals=signals)
 
     def positions(self, offset_s: Array) -> Positions:
-        """Return positions and integrated IMU data for T time offsets, without a scale error.
-
-        Parameters
-        ----------
-        offset_s : ndarray, shape (T,)
-        """
+        """Return positions and integrated IMU data for each time offset, without scale error."""
         length_s = np.diff(self.time_s)
         noise_unit = self.dt_s * np.stack(continuous_noise_unit(length_s))
         prior_precision = np.zeros((len(self.time_s), 2))
@@ -167,19 +164,17 @@ class PreparedMotion:
             noise_unit=noise_unit,
             noise_fixed=np.zeros_like(noise_unit),
             prior_precision=prior_precision,
-            constant_sigma=np.concatenate(
-                [CONSTANT_SIGMAS[:2], [self.heading_sigma_rad], CONSTANT_SIGMAS[3:]]
-            ),
+            constant_sigma=np.r_[CONSTANT_SIGMAS[:2], self.heading_sigma_rad, CONSTANT_SIGMAS[3:]],
             delta_position_m=dp,
             delta_velocity_m_s=dv,
         )
 
     def at(self, offset_s: float) -> Positions:
-        """Return positions relative to a smooth path, at one time offset, with unknown scale."""
+        """Return the positions minus a smooth path for one time offset, with unknown scale."""
         return next(self.position_batches(np.array([offset_s])))
 
     def position_batches(self, offset_s: Array, *, scaled: bool = True) -> Iterator[Positions]:
-        """Yield positions for time offsets in batches, with or without an unknown scale."""
+        """Yield positions for batches of time offsets; ``scaled`` adds an unknown scale."""
         signal_count = len(self.time_s) * len(self.directions) * (1 + len(CONSTANT_SIGMAS))
         batch_size = max(MIN_BATCH_OFFSETS, SIGNALS_PER_BATCH // signal_count)
         for batch in np.split(offset_s, range(batch_size, len(offset_s), batch_size)):
@@ -189,7 +184,7 @@ class PreparedMotion:
     def search_offset(
         self, noises: Noises, factors: Sequence[float] = (1.0,), *, scaled: bool = True
     ) -> tuple[float, Noises]:
-        """Return the time offset and the noises with the greatest likelihood on a coarse grid.
+        """Return the time offset and the noises with the maximum likelihood on a coarse grid.
 
         Parameters
         ----------
@@ -234,20 +229,22 @@ def prepare_motion(
     directions, dt_s, weight, heading_sigma_rad
         See :class:`PreparedMotion`; weights are 1 by default.
     signals : dict, optional
-        Signals of this flight to reuse. Newly computed signals are added.
+        Signals of this flight to reuse; new signals are added to it.
 
     Returns
     -------
     PreparedMotion, or Unavailable without IMU or attitude or with too few measurements.
     """
-    imu, attitude = flight.imu, flight.attitude
+    imu = flight.imu
+    attitude = flight.attitude
     if isinstance(imu, Unavailable):
         return imu
     if isinstance(attitude, Unavailable):
         return attitude
     signals = {} if signals is None else signals
     segment_signals: list[Signals] = []
-    imu_s, attitude_s = imu.index.to_numpy(), attitude.index.to_numpy()
+    imu_s = imu.index.to_numpy()
+    attitude_s = attitude.index.to_numpy()
     rows_by_segment: list[IntArray] = []
     for begin, end in _covered_spans(imu_s, attitude_s):
         covered_rows = np.flatnonzero(
@@ -271,17 +268,16 @@ def prepare_motion(
     used_rows = np.concatenate([np.zeros(0, dtype=np.intp), *rows_by_segment])
     if len(used_rows) < MIN_MEASUREMENTS:
         return Unavailable(
-            "clock offset",
-            f"only {len(used_rows)} measurements have IMU and attitude data (at least "
+            "time offset",
+            f"only {len(used_rows)} positions have IMU and attitude data (at least "
             f"{MIN_MEASUREMENTS} are needed)",
             "Analyse a longer segment.",
         )
     edges = np.cumsum([0, *map(len, rows_by_segment)])
-    # relative positions are small, which limits rounding; the initial position is unknown anyway
+    # relative positions are small, which limits rounding errors; initial positions are unknown
     measured_m = pd.DataFrame(measurement_m[used_rows])
-    first_m = measured_m.groupby(
-        np.repeat(np.arange(len(rows_by_segment)), np.diff(edges))
-    ).transform("first")
+    segment_index = np.repeat(np.arange(len(rows_by_segment)), np.diff(edges))
+    first_m = measured_m.groupby(segment_index).transform("first")
     return PreparedMotion(
         time_s[used_rows],
         (measured_m - first_m).to_numpy(),
@@ -295,7 +291,7 @@ def prepare_motion(
     )
 
 
-def _covered_spans(imu_s: Array, attitude_s: Array) -> list[tuple[float, float]]:
+def _covered_spans(imu_s: Array, attitude_s: Array) -> list[Span]:
     """Return the spans (s) without a gap in IMU or attitude; none if the IMU rate is too low."""
     if len(imu_s) < 2 or np.median(np.diff(imu_s)) > MAX_IMU_INTERVAL_S:
         return []
@@ -305,34 +301,37 @@ def _covered_spans(imu_s: Array, attitude_s: Array) -> list[tuple[float, float]]
     return list(zip(begins.tolist(), ends.tolist(), strict=True))
 
 
-def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, float]) -> Signals:
-    """Compute the motion in NED from the IMU, and its sensitivity to each unknown constant."""
+def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -> Signals:
+    """Compute the motion in NED from the IMU, and the sensitivity to each unknown constant."""
     time = imu.index.to_numpy()
     first_row, end_row = np.searchsorted(
         time, [span[0] - 2 * INTEGRATION_STEP_S, span[1] + 2 * INTEGRATION_STEP_S], side="left"
     )
-    samples, time = imu.iloc[first_row:end_row], time[first_row:end_row]
+    samples = imu.iloc[first_row:end_row]
+    time = time[first_row:end_row]
     columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
     integral = cumulative_integral(samples[columns].to_numpy(), time)
     step_times_s = np.arange(time[0], time[-1], INTEGRATION_STEP_S)
     integrals = np.column_stack([np.interp(step_times_s, time, column) for column in integral.T])
-    force, angle = integrals[:, :3], integrals[:, 3:]
+    force = integrals[:, :3]
+    angle = integrals[:, 3:]
     attitude_quaternion = _integrate_gyros(step_times_s, angle, attitude)
     # the mean specific force of each step is rotated by the attitude in the middle of the step
     mean_force = np.diff(force, axis=0) / INTEGRATION_STEP_S
     body_to_ned = to_matrix(
         multiply(attitude_quaternion[:-1], from_vector(np.diff(angle, axis=0) / 2.0))
     )
-    force_ned = np.einsum("nij,nj->ni", body_to_ned, mean_force)
+    force_ned = rotate(body_to_ned, mean_force)
     table = np.zeros((len(mean_force), 3, 3, len(CONSTANT_SIGMAS)))
     position, velocity, acceleration = np.moveaxis(table, 1, 0)
     acceleration[:, :, 0] = force_ned
     acceleration[:, 2, 0] += constants.g
-    # a rotation of the attitude by a small θ adds θ × f to the acceleration; for a gyro bias b,
-    # θ = -∫ R b dt
+    # a rotation of the attitude by a small angle θ adds θ × f to the acceleration; a gyro bias b
+    # causes the rotation θ = -∫ R b dt
     gyro_bias_rotation = -INTEGRATION_STEP_S * (np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0)
     for axis in range(3):
-        next_axis, last_axis = (axis + 1) % 3, (axis + 2) % 3
+        next_axis = (axis + 1) % 3
+        last_axis = (axis + 2) % 3
         acceleration[:, next_axis, 1 + axis] = -force_ned[:, last_axis]
         acceleration[:, last_axis, 1 + axis] = force_ned[:, next_axis]
         acceleration[:, axis, 4:7] = gyro_bias_rotation[:, next_axis] * force_ned[:, [last_axis]]
@@ -345,9 +344,9 @@ def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: tuple[float, f
 
 
 def _integrate_gyros(step_times_s: Array, angle: Array, attitude: pd.DataFrame) -> Array:
-    """Integrate the gyroscopes to an attitude (body to NED, w first) from the logged attitude.
+    """Integrate the gyroscopes from the logged attitude at the start of a segment.
 
-    ``angle`` is the integral of the angular rate (rad).
+    ``angle`` is the integral of the angular rate (rad). Return quaternions body to NED, w first.
     """
     attitude_s = attitude.index.to_numpy()
     near_rows = slice(

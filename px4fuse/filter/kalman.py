@@ -1,4 +1,4 @@
-"""KF: the lesson's two-state Kalman filter, computed with filterpy.
+"""KF: the two-state Kalman filter of the lesson UAT 366, module 2, computed with filterpy.
 
 State x = [position, velocity] along one axis; the input u is the acceleration over the step::
 
@@ -6,7 +6,8 @@ State x = [position, velocity] along one axis; the input u is the acceleration o
     update     y = z - Hx         S = HPHᵀ + R      K = PHᵀS⁻¹
                x = x + Ky         P = (I - KH)P
 
-F, B, Q and H are defined in :mod:`px4fuse.filter.model`, the steps in :mod:`px4fuse.filter.steps`.
+F, B, Q and H are defined in :mod:`px4fuse.filter.model`, the prediction steps in
+:mod:`px4fuse.filter.steps`.
 :mod:`~px4fuse.filter.fast_replay` and :mod:`~px4fuse.filter.likelihood` run KF many times; their
 faster recursions have the same results to 1e-9.
 """
@@ -17,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.filter import model
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
@@ -48,8 +49,8 @@ class Replay:
     settings : Settings
     steps : DataFrame, shape (n, 7)
         State after each prediction and its update, if any: ``position_m, velocity_m_s,
-        position_variance_m2, covariance_m2_s, velocity_variance_m2_s2``. Input of the step that
-        starts at this time (0 in the last row): ``acceleration_m_s2``, and
+        position_variance_m2, covariance_m2_s, velocity_variance_m2_s2``. Input of the prediction
+        step that starts at this time (0 in the last row): ``acceleration_m_s2``, and
         ``input_variance_m2_s4``, which is added to SIGMA_A² in gaps of the IMU.
     updates : DataFrame, shape (m, 8)
         At each measurement after the first: ``measurement_m, innovation_m`` (z - Hx⁻),
@@ -80,10 +81,6 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
         By default the position of the first measurement and velocity zero; the first measurement is
         then not fused.
 
-    Returns
-    -------
-    Replay
-
     Raises
     ------
     SettingsError
@@ -100,7 +97,8 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     kalman.H = model.H
     kalman.R = np.array([[settings.sigma_z_m**2]])
     kalman.inv = np.reciprocal  # S is 1 by 1
-    states, updates = [_state_row(kalman.x, kalman.P)], []
+    states = [_state_row(kalman.x, kalman.P)]
+    updates = []
     for dt_s, acceleration, gap_variance, measurement_index in zip(
         np.diff(timeline.time_s),
         timeline.acceleration_m_s2,
@@ -119,8 +117,11 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
         if measurement_index >= 0:
             z = axis.measurement_m[measurement_index]
             kalman.update(z)
-            y, S, K = kalman.y[0, 0], kalman.S[0, 0], kalman.K[:, 0]
-            x, P = kalman.x_prior, kalman.P_prior
+            y = kalman.y[0, 0]
+            S = kalman.S[0, 0]
+            K = kalman.K[:, 0]
+            x = kalman.x_prior
+            P = kalman.P_prior
             updates.append((z, y, S, *K, x[0, 0], P[0, 0], P[1, 1]))
         states.append(_state_row(kalman.x, kalman.P))
     return make_replay(axis, settings, timeline, states, updates)
@@ -133,7 +134,7 @@ def make_replay(
     states: Sequence[StateRow],
     updates: Sequence[StateRow],
 ) -> Replay:
-    """Build a replay from the rows of its tables ``steps`` (state, covariance) and ``updates``."""
+    """Build a run of KF from the rows (state, covariance) of ``steps`` and those of ``updates``."""
     time_arrays = timeline.time_s, timeline.time_s[timeline.measurement_index >= 0]
     time, update_index = (pd.Index(times_s, name="time_s") for times_s in time_arrays)
     steps = pd.DataFrame(states, index=time, columns=model.STATES + model.COVARIANCES)
@@ -149,12 +150,14 @@ def make_replay(
 
 
 def _state_row(x: Array, P: Array) -> StateRow:
-    """Return state and covariance as a row of ``Replay.steps``."""
     return x[0, 0], x[1, 0], P[0, 0], P[0, 1], P[1, 1]
 
 
 def _step_before(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
-    """Return the last step before each time, the time since it (s), and a mask of outside times."""
+    """Return the last prediction step before each time, and the time since that step (s).
+
+    Return also a mask of times outside the run.
+    """
     step_times_s = run.steps.index.to_numpy()
     step_index = np.clip(
         np.searchsorted(step_times_s, times_s, side="right") - 1, 0, len(step_times_s) - 1
@@ -166,11 +169,11 @@ def _step_before(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArra
     )
 
 
-def state_at(run: Replay, times_s: Array) -> tuple[Array, Array]:
-    """Predict position (m) and velocity (m/s) at each time from the last step before that time.
+def state_at(run: Replay, times_s: Array) -> ArrayPair:
+    """Predict position (m) and velocity (m/s) at each time from KF's last step before that time.
 
-    Interpolation between two steps would use a measurement before it is received. The result is NaN
-    outside the replay.
+    Interpolation between two prediction steps would use a measurement before it is received. The
+    result is NaN outside the run.
     """
     index, elapsed_s, is_outside = _step_before(run, times_s)
     position, velocity, acceleration = (
@@ -180,16 +183,14 @@ def state_at(run: Replay, times_s: Array) -> tuple[Array, Array]:
     return np.where(is_outside, np.nan, position), np.where(is_outside, np.nan, velocity)
 
 
-def variance_at(run: Replay, times_s: Array) -> tuple[Array, Array]:
+def variance_at(run: Replay, times_s: Array) -> ArrayPair:
     """Return the variances (m², m²/s²) of the results of :func:`state_at`: FPFᵀ + Q."""
     index, elapsed_s, is_outside = _step_before(run, times_s)
     p00, p01, p11 = run.steps[model.COVARIANCES].to_numpy()[index].T
     gap_variance = run.steps["input_variance_m2_s4"].to_numpy()[index]
     noise_density = (run.settings.sigma_a_m_s2**2 + gap_variance) * run.settings.dt_s
-    (p00, _, p11), (q00, _, q11) = (
-        model.propagate_covariance((p00, p01, p11), elapsed_s),
-        model.process_noise_unit(elapsed_s),
-    )
+    p00, _, p11 = model.propagate_covariance((p00, p01, p11), elapsed_s)
+    q00, _, q11 = model.process_noise_unit(elapsed_s)
     return np.where(is_outside, np.nan, p00 + noise_density * q00), np.where(
         is_outside, np.nan, p11 + noise_density * q11
     )

@@ -1,8 +1,8 @@
 """KF for grids of settings: innovations, likelihood and 95 % intervals.
 
-The input is integrated between position measurements, so KF needs one step per measurement instead
-of one per DT. Each step handles all settings of a grid as an array. For SIGMA_A and SIGMA_Z of at
-least 1e-3 the results equal those of :func:`px4fuse.filter.kalman.replay` to 1e-9.
+The input is integrated between position measurements, so KF needs one prediction per measurement
+instead of one per DT. All settings of a grid are computed together as an array. For SIGMA_A and
+SIGMA_Z of at least 1e-3 the results equal those of :func:`px4fuse.filter.kalman.replay` to 1e-9.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 from scipy.special import chdtri
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.filter.model import (
     INITIAL_COVARIANCE,
     Symmetric,
@@ -32,17 +32,18 @@ from px4fuse.filter.steps import Timeline, make_timeline
 
 # Drop of the log-likelihood (nats) at the ends of a 95 % interval: half of the 95 % point of χ²(1)
 PROFILE_DROP = float(chdtri(1, 0.05)) / 2.0
-# Distance in ln σ from the maximum at which the search for the end of an interval starts
+# Distance in ln σ from the maximum at which the search for the end of a 95 % interval starts
 START_LOG_DISTANCE = 0.05
-# Minimisation by parabolas: step in ln σ of the second differences, maximum number of these steps
-# per iteration, and maximum number of iterations
+# Step of ln σ between the three points of a parabola whose minimum is searched
 CURVATURE_STEP = 0.05
-MAX_PARABOLA_STEPS, MAX_PARABOLA_ITERATIONS = 6.0, 4
+# Maximum change of ln σ in one iteration of the search, in units of CURVATURE_STEP
+MAX_PARABOLA_STEPS = 6.0
+MAX_PARABOLA_ITERATIONS = 4
 
 
 @dataclass(frozen=True)
 class Preintegrated:
-    """Input of KF, integrated over each interval between measurements; arrays of shape (m,).
+    """Input of KF, integrated over each interval between measurements; arrays have shape (m,).
 
     Attributes
     ----------
@@ -52,7 +53,7 @@ class Preintegrated:
     noise_unit : ndarray, shape (m, 3)
         Elements 00, 01, 11 of Q for SIGMA_A = 1 m/s².
     noise_fixed : ndarray, shape (m, 3)
-        Additional Q in gaps of the IMU, independent of SIGMA_A.
+        Elements of the additional Q in gaps of the IMU, independent of SIGMA_A.
     measurement_m : ndarray
     initial : InitialState
     """
@@ -86,31 +87,29 @@ def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
         propagate_covariance(process_noise_unit(np.diff(time)), remaining_s), 1
     )
     dp, dv = integrate_acceleration(timeline, timeline.acceleration_m_s2)
+
+    def sum_by_interval(values: Array) -> Array:
+        return np.stack([np.bincount(interval_index, column) for column in values.T], 1)
+
     return Preintegrated(
-        length_s=np.diff(time[np.concatenate([[0], last_steps])]),
+        length_s=np.diff(time[np.append(0, last_steps)]),
         delta_position_m=dp,
         delta_velocity_m_s=dv,
-        noise_unit=np.stack([np.bincount(interval_index, noise_unit[:, i]) for i in range(3)], 1),
-        noise_fixed=np.stack(
-            [
-                np.bincount(interval_index, noise_unit[:, i] * timeline.input_variance_m2_s4)
-                for i in range(3)
-            ],
-            1,
-        ),
+        noise_unit=sum_by_interval(noise_unit),
+        noise_fixed=sum_by_interval(noise_unit * timeline.input_variance_m2_s4[:, None]),
         measurement_m=axis.measurement_m[timeline.measurement_index[last_steps]],
         initial=InitialState(float(time[0]), float(axis.measurement_m[0])),
     )
 
 
-def integrate_acceleration(timeline: Timeline, acceleration_m_s2: Array) -> tuple[Array, Array]:
+def integrate_acceleration(timeline: Timeline, acceleration_m_s2: Array) -> ArrayPair:
     """Integrate an acceleration to Δp (m) and Δv (m/s) between the measurements.
 
     Parameters
     ----------
     timeline : Timeline
     acceleration_m_s2 : ndarray, shape (n - 1,)
-        Acceleration of each step.
+        Acceleration of each prediction step.
 
     Returns
     -------
@@ -123,25 +122,22 @@ def integrate_acceleration(timeline: Timeline, acceleration_m_s2: Array) -> tupl
         zeros,
         remaining_s,
     )
-    # numpy's stubs declare weighted bincounts as integers
+    # the type annotations of numpy declare weighted bincounts as integers
     return np.asarray(np.bincount(interval_index, dp), float), np.asarray(
         np.bincount(interval_index, dv), float
     )
 
 
 def _interval_index(timeline: Timeline) -> tuple[IntArray, IntArray, Array]:
-    """Return the last step of each interval between measurements.
+    """Return the last prediction step of each interval between measurements.
 
-    Return also, for each step, its interval and the time from the step to the end of the interval
-    (s).
+    Return also, for each prediction step, the index of its interval and the time (s) from the step
+    to the end of this interval.
     """
     last_steps = np.flatnonzero(timeline.measurement_index >= 0)
     interval_index = np.searchsorted(last_steps, np.arange(1, len(timeline.time_s)))
-    return (
-        last_steps,
-        interval_index,
-        timeline.time_s[last_steps[interval_index]] - timeline.time_s[1:],
-    )
+    remaining_s = timeline.time_s[last_steps[interval_index]] - timeline.time_s[1:]
+    return last_steps, interval_index, remaining_s
 
 
 def innovations(
@@ -149,21 +145,11 @@ def innovations(
     sigma_a_m_s2: ArrayLike,
     sigma_z_m: ArrayLike,
     is_skipped: BoolArray | None = None,
-) -> tuple[Array, Array]:
-    """Compute innovations and their variances for every combination of settings.
+) -> ArrayPair:
+    """Compute innovations (m) and innovation variances (m²) of KF for a grid of settings.
 
-    Parameters
-    ----------
-    intervals : Preintegrated
-    sigma_a_m_s2, sigma_z_m : array_like
-        Broadcast against each other to a grid of shape (...).
-    is_skipped : ndarray of bool, shape (m,), optional
-        Measurements with an innovation but without an update.
-
-    Returns
-    -------
-    innovation_m, innovation_variance_m2 : ndarray, shape (m, ...)
-        With k columns of input (:func:`run_filter`) and one pair of settings: (m, k) and (m,).
+    For the parameters see :func:`run_filter`. Both results have the shape (m, ...) for a grid of
+    shape (...). With k columns of input and one pair of settings, the shapes are (m, k) and (m,).
     """
     steps = run_filter(intervals, sigma_a_m_s2, sigma_z_m, is_skipped)
     nu, s = zip(*(step[:2] for step in steps), strict=True)
@@ -184,13 +170,9 @@ class FilterStates:
 def filter_states(
     intervals: Preintegrated, sigma_a_m_s2: ArrayLike, sigma_z_m: ArrayLike
 ) -> FilterStates:
-    """Compute gain, velocity, reported σ and NIS for every combination of settings.
+    """Compute gain, velocity, reported σ and NIS of KF for every combination of settings.
 
-    Parameters
-    ----------
-    intervals : Preintegrated
-    sigma_a_m_s2, sigma_z_m : array_like
-        Broadcast against each other to a grid of shape (...).
+    ``sigma_a_m_s2`` and ``sigma_z_m`` are broadcast against each other to a grid.
     """
     rows = [
         (k0, v, np.sqrt(p00), np.sqrt(p11), nu**2 / s)
@@ -230,11 +212,10 @@ def run_filter(
     squares = (np.square(np.asarray(sigma, float)) for sigma in (sigma_a_m_s2, sigma_z_m))
     q, r = np.broadcast_arrays(*squares)
     if not q.ndim:  # floats are fifty times faster than arrays of a single element
-        q, r = q.item(), r.item()
-    p, v = (
-        intervals.initial.position_m,
-        intervals.initial.velocity_m_s + 0.0 * q,
-    )  # shape of the grid
+        q = q.item()
+        r = r.item()
+    p = intervals.initial.position_m
+    v = intervals.initial.velocity_m_s + 0.0 * q  # adding 0 · q gives the shape of the grid
     covariance: Symmetric[Any] = INITIAL_COVARIANCE
     sigma_z_squared = r
     for dt, dp, dv, noise_unit, noise_fixed, z, skips_update, weight_k in zip(
@@ -250,7 +231,8 @@ def run_filter(
     ):
         r = sigma_z_squared / weight_k
         # x = Fx + Ba, P = FPFᵀ + Q
-        p, v = p + dt * v + dp, v + dv
+        p = p + dt * v + dp
+        v = v + dv
         p00, p01, p11 = propagate_covariance(covariance, dt)
         p00 = p00 + q * noise_unit[0] + noise_fixed[0]
         p01 = p01 + q * noise_unit[1] + noise_fixed[1]
@@ -263,22 +245,17 @@ def run_filter(
 
 
 def _values_by_measurement(values: Array) -> list[Any]:
-    """Return the values of each measurement: a number, or an array with several columns."""
+    """Return a list with the value of each measurement: a number, or an array of k columns."""
     return values.tolist() if values.ndim == 1 else list(values)
 
 
 def score_grid(
     intervals: list[Preintegrated], sigma_a_m_s2: Array, sigma_z_m: Array, weight: Array
 ) -> Array:
-    """Compute -ln p of all axes (without a constant) on the grid of settings.
+    """Compute KF's -ln p of all axes (without a constant) on a grid of settings.
 
-    Parameters
-    ----------
-    intervals : list of Preintegrated
-    sigma_a_m_s2, sigma_z_m : ndarray
-        Broadcast against each other.
-    weight : ndarray, shape (m,)
-        Weight of each measurement: its variance is SIGMA_Z² / weight.
+    ``sigma_a_m_s2`` and ``sigma_z_m`` are broadcast against each other. The variance of each
+    measurement is SIGMA_Z² / weight.
     """
     total = np.zeros(np.broadcast(sigma_a_m_s2, sigma_z_m).shape)
     for interval in intervals:
@@ -293,16 +270,16 @@ def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
     Parameters
     ----------
     profile : ndarray, shape (n,)
-        Values at equal steps.
+        Negative log-likelihood at parameter values with equal steps.
     index : int
         Index of the middle point, 1 to n - 2.
 
     Returns
     -------
     shift : float
-        From the middle point to the minimum, in steps; 0 without a minimum.
+        Distance from the middle point to the minimum, in steps; 0 without a minimum.
     curvature : float
-        Second difference, per square step.
+        Second difference of the profile at the middle point.
     """
     left, middle, right = profile[index - 1 : index + 2]
     curvature = left - 2.0 * middle + right
@@ -312,30 +289,25 @@ def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
 def profile_interval(
     grid: Array, profile: Array, max_drop: float = PROFILE_DROP
 ) -> tuple[float | None, float | None]:
-    """Return the ends of the 95 % interval of a profile; None for an end outside the grid.
+    """Return the 95 % interval of a parameter; None for an end outside the grid.
 
     Parameters
     ----------
     grid, profile : ndarray, shape (n,)
-        Parameter values and their negative log-likelihood, interpolated linearly.
+        Parameter values, and negative log-likelihood at these values; interpolated linearly.
     max_drop : float
         Increase of the negative log-likelihood from the minimum to the ends of the interval.
     """
     drop = profile - profile.min()
-    inside_indices = np.flatnonzero(drop <= max_drop)
-    ends: list[float | None] = []
-    for edge_index, outside_index in (
-        (inside_indices[0], inside_indices[0] - 1),
-        (inside_indices[-1], inside_indices[-1] + 1),
-    ):
-        if 0 <= outside_index < len(grid):
-            fraction = (max_drop - drop[edge_index]) / (drop[outside_index] - drop[edge_index])
-            ends.append(
-                float(grid[edge_index] + fraction * (grid[outside_index] - grid[edge_index]))
-            )
-        else:
-            ends.append(None)
-    return ends[0], ends[1]
+    first, last = np.flatnonzero(drop <= max_drop)[[0, -1]]
+
+    def interpolate_end(inside: int, outside: int) -> float | None:
+        if not 0 <= outside < len(grid):
+            return None
+        fraction = (max_drop - drop[inside]) / (drop[outside] - drop[inside])
+        return float(grid[inside] + fraction * (grid[outside] - grid[inside]))
+
+    return interpolate_end(first, first - 1), interpolate_end(last, last + 1)
 
 
 def profile_ends(
@@ -344,13 +316,13 @@ def profile_ends(
     bounds: tuple[float, float],
     variance_factor: float = 1.0,
 ) -> tuple[float | None, float | None]:
-    """Return the ends of a 95 % profile-likelihood interval; None for an end beyond a bound.
+    """Return the 95 % profile-likelihood interval of a parameter; None for an end beyond a bound.
 
     Parameters
     ----------
     score : callable
-        -ln p as a function of the logarithms of the parameter and of one other parameter. The other
-        parameter is optimised at each value.
+        Negative log-likelihood as a function of the logarithms of the parameter and of one other
+        parameter. The other parameter is optimised at each value of the parameter.
     best_logs : (float, float)
         Both logarithms at the minimum.
     bounds : (float, float)
@@ -358,20 +330,21 @@ def profile_ends(
     variance_factor : float
         Factor on the parameter's variance, for uncertainty that ``score`` does not include.
     """
-    best_score, max_root_drop = score(*best_logs), float(np.sqrt(PROFILE_DROP * variance_factor))
+    best_score = score(*best_logs)
+    max_root_drop = float(np.sqrt(PROFILE_DROP * variance_factor))
 
     def find_end(direction: float, bound: float) -> float | None:
         other_log = best_logs[1]
 
-        @cache  # the search for the other parameter starts at the previous result
+        # zero at the end of the interval: the root of the likelihood drop is nearly linear. The
+        # search for the other parameter starts at the previous result
+        @cache
         def excess(distance: float) -> float:
-            """Return √(likelihood drop) minus its value at the interval's end; nearly linear."""
             nonlocal other_log
             if distance == 0.0:
                 return -max_root_drop
             lowest_score, other_log = _minimise_by_parabolas(
-                lambda other_log_value: score(best_logs[0] + direction * distance, other_log_value),
-                other_log,
+                lambda log_value: score(best_logs[0] + direction * distance, log_value), other_log
             )
             return float(np.sqrt(max(lowest_score - best_score, 0.0)) - max_root_drop)
 
@@ -381,22 +354,18 @@ def profile_ends(
             if distance_limit == max_distance:
                 return None
             distance_limit = min(2.0 * distance_limit, max_distance)
-        return float(
-            np.exp(
-                best_logs[0]
-                + direction * brentq(excess, 0.0, distance_limit, xtol=1e-3 * distance_limit)
-            )
-        )
+        distance = brentq(excess, 0.0, distance_limit, xtol=1e-3 * distance_limit)
+        return float(np.exp(best_logs[0] + direction * distance))
 
     return find_end(-1.0, bounds[0]), find_end(1.0, bounds[1])
 
 
 def _minimise_by_parabolas(score: Callable[[float], float], position: float) -> tuple[float, float]:
-    """Return the minimum of a score and its position, by parabolas that start at ``position``."""
+    """Return the minimum of a score, and its position; the search starts at ``position``."""
     for _ in range(MAX_PARABOLA_ITERATIONS):
         profile = np.array([score(position + k * CURVATURE_STEP) for k in (-1.0, 0.0, 1.0)])
         middle_score = float(profile[1])
-        if np.ptp(profile) == 0.0:  # there is no other parameter
+        if np.ptp(profile) == 0.0:  # the score does not depend on another parameter
             return middle_score, position
         shift, curvature = parabola_vertex(profile, 1)
         step = shift if curvature > 0.0 else np.sign(profile[0] - profile[2]) * MAX_PARABOLA_STEPS

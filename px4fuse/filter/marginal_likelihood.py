@@ -1,13 +1,13 @@
 """Likelihood of positions along a few axes, with constant errors of each segment marginalised.
 
-A segment is a part of the flight without a gap in the IMU data. It has its own initial state and
-its own unknown constants: biases and other constant errors.
+A segment is a part of the flight without a gap in the IMU data. Each segment has a separate initial
+state and separate unknown constants: biases and other constant errors.
 
 Given the acceleration, -2 ln p of the states x_k = [p, v] at the measurements is a sum of squares:
 x_{k+1} - Fx_k - [Δp, Δv] of each interval over its Q, and z - p of each measurement over its
 variance. The matrix A of this quadratic form has three bands below the diagonal, so LAPACK
 factorises a flight in a millisecond. The marginal likelihood of the measurements equals the
-likelihood of KF's innovations (Schweppe 1965). It follows from log|A| and the residual squares at
+likelihood of KF's innovations (Schweppe 1965). It follows from log|A| and the squared residuals at
 the minimum.
 
 Signals are inputs that enter linearly: the data, and the sensitivity of the data to each unknown
@@ -21,6 +21,7 @@ Symbols in shapes: m measurements, a axes, s segments, T time offsets, c constan
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -29,19 +30,19 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import lapack
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.arrays import Array, ArrayPair, BoolArray, IntArray
 
 UNIT_SCALE = np.ones(1)
-# SIGMA_A (m/s²) and SIGMA_Z (m) of the smoother for the path that is subtracted
+# SIGMA_A (m/s²) and SIGMA_Z (m) of the smooth path that is subtracted from the positions
 PATH_NOISES = 0.5, 0.1
 # Minimum precision (1/m²) of an initial position that counts as known
 MIN_KNOWN_START_PRECISION = 1e-3
 # Minimum position noise of an interval, relative to the measurement noise and to the interval's Q:
 # it makes Q invertible if Q is from a single step (rank one) or zero
 MIN_NOISE_SHARE = 1e-5
-# Signals per batch; larger batches need more memory and are not faster
+# Number of signals that are computed together: more need more memory and are not faster
 SIGNAL_BATCH_SIZE = 8
-# Minimum determinant of Q, relative to its terms: smaller values are rounding errors
+# Minimum determinant of Q, relative to its two terms: smaller values are rounding errors
 MIN_DETERMINANT_SHARE = 1e-12
 
 
@@ -52,14 +53,14 @@ class Positions:
     Attributes
     ----------
     measurement_m : ndarray, shape (m, a)
-        NaN if an axis has no measurement.
+        Measured positions; NaN if an axis has no measurement.
     segment_starts : ndarray of int, shape (s,)
         Index of the first measurement of each segment.
     length_s : ndarray, shape (m - 1,)
-        Intervals between successive measurements, also between segments.
+        Intervals between successive measurements, including those between segments.
     noise_unit, noise_fixed : ndarray, shape (3, m - 1)
-        Elements 00, 01, 11 of each interval's Q: for SIGMA_A = 1 m/s², and the part of Q that does
-        not depend on SIGMA_A.
+        Elements 00, 01, 11 of the process noise Q of each interval: for SIGMA_A = 1 m/s², and the
+        component of Q that does not depend on SIGMA_A.
     prior_precision : ndarray, shape (m, 2)
         Prior precision of position and velocity; 0 without a prior.
     constant_sigma : ndarray, shape (c,)
@@ -84,7 +85,7 @@ class Positions:
 
     @cached_property
     def segments(self) -> list[tuple[int, int]]:
-        """Index of each segment's first measurement, and of the measurement after its last."""
+        """Index of each segment's first measurement, and last index plus 1."""
         return list(pairwise([*self.segment_starts.tolist(), len(self.measurement_m)]))
 
     @cached_property
@@ -95,7 +96,7 @@ class Positions:
     def in_sigma_z_units(
         self, sigma_z_m: float, random_walk: float, weight: Array
     ) -> tuple[Positions, Array]:
-        """Return the positions with noises in units of SIGMA_Z, and measurement variances, (m,).
+        """Return the positions with noises in units of SIGMA_Z, and the measurement variances.
 
         Parameters
         ----------
@@ -103,15 +104,14 @@ class Positions:
         random_walk : float
             Random walk of the source / SIGMA_Z, per √s.
         weight : ndarray
-            Weight of each measurement, except a first measurement that is KF's initial state.
+            Weight of each measurement, without a first measurement that is KF's initial state.
         """
         noise_fixed = self.noise_fixed / sigma_z_m**2
         noise_fixed[0] += self.length_s * random_walk**2
         start_weights = np.ones(len(self.measurement_m) - len(weight))
-        correlated_noise = self.correlated_noise and (
-            self.correlated_noise[0] / sigma_z_m,
-            self.correlated_noise[1],
-        )
+        correlated_noise = self.correlated_noise
+        if correlated_noise:
+            correlated_noise = correlated_noise[0] / sigma_z_m, correlated_noise[1]
         scaled_positions = replace(
             self,
             noise_fixed=noise_fixed,
@@ -123,9 +123,10 @@ class Positions:
     def factorised_systems(
         self, sigma_a_m_s2: float, variance_m2: Array
     ) -> Iterator[tuple[list[int], BandedSystem, int]]:
-        """Yield banded systems, each with its axes and degrees of freedom.
+        """Yield factorised normal equations, each with the axes to which they apply.
 
-        Axes that are measured at the same times share a system.
+        Axes that are measured at the same times have the same equations. The third value is the
+        number of degrees of freedom of one axis.
         """
         is_measured = np.isfinite(self.measurement_m)
         noise = sigma_a_m_s2**2 * self.noise_unit + self.noise_fixed
@@ -137,8 +138,8 @@ class Positions:
             ]
             axes_left = [axis for axis in axes_left if axis not in axes]
             precision = self.prior_precision.copy()
-            # fewer than two measurements in a segment do not determine its initial state: the
-            # segment gets a prior and has no likelihood
+            # fewer than two measurements do not determine the initial state of a segment: it gets a
+            # prior and does not contribute to the likelihood
             has_too_few = np.add.reduceat(is_axis_measured.astype(int), self.segment_starts) < 2
             is_used = is_axis_measured & ~np.repeat(
                 has_too_few, np.diff([*self.segment_starts, len(is_measured)])
@@ -152,7 +153,7 @@ class Positions:
             system = factorise(
                 self.length_s, noise, self.is_joined, precision, self.correlated_noise
             )
-            # the weak prior of a practically unknown initial state must not count in the likelihood
+            # the weak prior of an unknown initial state must not contribute to the likelihood
             log_unknown_precision = float(np.sum(np.log(precision[(precision > 0.0) & ~is_known])))
             system = replace(system, log_determinant=system.log_determinant + log_unknown_precision)
             yield axes, system, int(np.count_nonzero(is_known)) - 2 * len(self.segment_starts)
@@ -160,7 +161,7 @@ class Positions:
 
 @dataclass(frozen=True)
 class FittedPositions:
-    """Positions fitted with one pair of noises, for T time offsets.
+    """Likelihood of positions with one SIGMA_A and SIGMA_Z, for T time offsets.
 
     Attributes
     ----------
@@ -169,8 +170,8 @@ class FittedPositions:
         with the inverse covariance.
     log_determinant : float
     degrees_of_freedom : int
-        Number of measured positions minus the number needed for initial states: -ln p contains this
-        number times ln(scale of all noises).
+        Number of measured positions minus the number that determines initial states. If all noises
+        are multiplied by a factor, -ln p increases by this number times ln(factor).
     constant_sigma : ndarray, shape (c,)
     """
 
@@ -180,24 +181,19 @@ class FittedPositions:
     constant_sigma: Array
 
     def scaled(self, sigma: float) -> FittedPositions:
-        """Return the fit with all noises multiplied by ``sigma``."""
-        log_determinant = self.log_determinant + 2.0 * self.degrees_of_freedom * float(
-            np.log(sigma)
-        )
+        """Return the likelihood with all noises multiplied by ``sigma``."""
+        log_determinant = self.log_determinant + 2.0 * self.degrees_of_freedom * math.log(sigma)
         return replace(self, gram=self.gram / sigma**2, log_determinant=log_determinant)
 
     def constants(self) -> Array:
-        """Return the maximum-likelihood constants, shape (s, T, c)."""
+        """Return the maximum-likelihood values of the unknown constants, shape (s, T, c)."""
         information = self.gram[..., 1:, 1:] + np.diag(self.constant_sigma**-2.0)
         return np.asarray(-np.linalg.solve(information, self.gram[..., 1:, :1])[..., 0])
 
     def scores_by_segment(self, scales: Array = UNIT_SCALE) -> Array:
         """Return -ln p of each segment without the log-determinant, shape (k, s, T).
 
-        Parameters
-        ----------
-        scales : ndarray, shape (k,)
-            Factors on all noises.
+        ``scales`` are k factors on all noises.
         """
         gram = self.gram / scales[:, None, None, None, None] ** 2
         sigma = self.constant_sigma
@@ -206,12 +202,11 @@ class FittedPositions:
         cholesky = np.linalg.cholesky(information)
         solution = np.linalg.solve(information, cross[..., None])[..., 0]
         log_diagonal = np.log(np.diagonal(cholesky, axis1=-2, axis2=-1)).sum(axis=-1)
-        return np.asarray(
-            0.5 * (gram[..., 0, 0] - np.sum(cross * solution, axis=-1)) + log_diagonal
-        )
+        square_sum = gram[..., 0, 0] - np.sum(cross * solution, axis=-1)
+        return np.asarray(0.5 * square_sum + log_diagonal)
 
     def scores(self, scales: Array = UNIT_SCALE) -> Array:
-        """Return -ln p of all segments for scaled noises, except a constant, shape (k, T)."""
+        """Return -ln p of all segments (without a constant) for scaled noises, shape (k, T)."""
         determinant_terms = 0.5 * self.log_determinant + self.degrees_of_freedom * np.log(scales)
         return np.asarray(self.scores_by_segment(scales).sum(axis=1) + determinant_terms[:, None])
 
@@ -228,16 +223,18 @@ def fit_positions(
     variance_m2 : ndarray, shape (m,)
         Variance of each measurement.
     measured_m : ndarray, shape (a, 1 or T, 1 + c, m), optional
-        Measured positions, then their sensitivity to each unknown constant. By default
-        ``positions.measurement_m``; otherwise that only gives the axes and times with measurements.
+        Measured positions, then their sensitivity to each unknown constant; by default
+        ``positions.measurement_m``, which otherwise only determines the measured axes and times.
     """
     if measured_m is None:
-        states, axes = positions.measurement_m.shape
-        measured_m = np.zeros((axes, 1, 1 + len(positions.constant_sigma), states))
+        measurement_count, axes = positions.measurement_m.shape
+        measured_m = np.zeros((axes, 1, 1 + len(positions.constant_sigma), measurement_count))
         measured_m[:, 0, 0] = np.nan_to_num(positions.measurement_m.T)
-    dp, dv = positions.delta_position_m, positions.delta_velocity_m_s
+    dp = positions.delta_position_m
+    dv = positions.delta_velocity_m_s
     gram = np.zeros((len(positions.segment_starts), *dp.shape[1:3], dp.shape[2]))
-    log_determinant, degrees_of_freedom = 0.0, 0
+    log_determinant = 0.0
+    degrees_of_freedom = 0
     for axes, system, axis_degrees_of_freedom in positions.factorised_systems(
         sigma_a_m_s2, variance_m2
     ):
@@ -248,7 +245,7 @@ def fit_positions(
         signals = (np.sqrt(system.precision[:, 0]) * data, *intervals, explained)
         for segment_index, (begin, end) in enumerate(positions.segments):
             rows = slice(begin, end - 1)
-            states = slice(system.states * begin, system.states * end)
+            states = slice(system.state_count * begin, system.state_count * end)
             for sign, array, columns in zip(
                 (1.0, 1.0, 1.0, -1.0), signals, (slice(begin, end), rows, rows, states), strict=True
             ):
@@ -258,7 +255,7 @@ def fit_positions(
 
 
 def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
-    """Subtract a smooth path through the positions from measurements and increments.
+    """Subtract a smooth path through the positions from positions and IMU increments.
 
     The likelihood is unchanged in theory. Its rounding errors are smaller, because it is no longer
     the small difference of large squares. The path starts at zero in each segment.
@@ -271,7 +268,8 @@ def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
         sensitivity to this constant.
     """
     measured = positions.measurement_m.copy()
-    dp, dv = positions.delta_position_m.copy(), positions.delta_velocity_m_s.copy()
+    dp = positions.delta_position_m.copy()
+    dv = positions.delta_velocity_m_s.copy()
     sigma_a, sigma_z = PATH_NOISES
     for axes, system, _ in positions.factorised_systems(
         sigma_a, np.full(len(measured), sigma_z**2)
@@ -279,7 +277,8 @@ def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
         data = np.nan_to_num(measured[:, axes].T)[:, None]
         state = system.solve(data, dp[axes, :, 0], dv[axes, :, 0])
         state[:, :, positions.segment_starts] = 0.0
-        path, speed = state[..., 0], state[..., 1]
+        path = state[..., 0]
+        speed = state[..., 1]
         measured[:, axes] -= path[:, 0].T
         path_increment = np.diff(path) - positions.length_s * speed[..., :-1]
         # the path of the first time offset is subtracted at all offsets; the sensitivity to the
@@ -293,7 +292,7 @@ def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
 
 def expected_squares(
     positions: Positions, sigma_a_m_s2: float, variance_m2: Array, constants: Array
-) -> tuple[Array, Array]:
+) -> ArrayPair:
     """Return the expected square of each measurement error given all data, summed over axes.
 
     Parameters
@@ -302,6 +301,7 @@ def expected_squares(
         Positions with one time offset only.
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
+        Variance of each measurement.
     constants : ndarray, shape (s, c)
         Maximum-likelihood estimates of the unknown constants of each segment.
 
@@ -309,10 +309,10 @@ def expected_squares(
     -------
     square_m2 : ndarray, shape (m,)
     count : ndarray, shape (m,)
-        Number of measured axes.
+        Number of axes with a measurement.
     """
     coefficients = np.concatenate([np.ones((len(constants), 1)), constants], axis=1)
-    # the coefficients of an interval are those of the segment in which the interval ends
+    # the constants of an interval are those of the segment in which the interval ends
     interval_coefficients = np.repeat(
         coefficients, np.diff([*positions.segment_starts, len(variance_m2)]), axis=0
     )[1:]
@@ -339,9 +339,10 @@ def products_by_segment(
     Parameters
     ----------
     positions : Positions
-        One time offset only; ``measurement_m`` only gives the axes and times with measurements.
+        Positions with one time offset; ``measurement_m`` only determines measured axes and times.
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
+        Variance of each measurement.
     signals : three ndarray, shape (a, k, m) and twice (a, k, m - 1)
         Measurements, Δp and Δv of k signals.
     measured_m : ndarray, shape (a, k, m)
@@ -356,7 +357,7 @@ def products_by_segment(
     results = []
     for begin in range(0, measured_m.shape[1], SIGNAL_BATCH_SIZE):
         batch = np.s_[:, begin : begin + SIGNAL_BATCH_SIZE]
-        # columns: first set of signals, second set, sensitivities to the constants
+        # columns: first set of signals, second set of signals, sensitivities to the constants
         dp, dv = (
             np.concatenate([increment[batch], 0.0 * increment[batch], constant_signal], axis=1)[
                 :, None
@@ -367,10 +368,8 @@ def products_by_segment(
         first_rows, second_rows, constant_rows = np.split(
             np.arange(dp.shape[2]), np.array([1, 2]) * first_measured_m[batch].shape[1]
         )
-        measured[:, 0, first_rows], measured[:, 0, second_rows] = (
-            first_measured_m[batch],
-            measured_m[batch],
-        )
+        measured[:, 0, first_rows] = first_measured_m[batch]
+        measured[:, 0, second_rows] = measured_m[batch]
         all_signals = replace(positions, delta_position_m=dp, delta_velocity_m_s=dv)
         gram = fit_positions(all_signals, sigma_a_m_s2, variance_m2, measured).gram[:, 0]
         information = gram[:, constant_rows[:, None], constant_rows] + np.diag(
@@ -393,8 +392,8 @@ class BandedSystem:
     Attributes
     ----------
     precision : ndarray, shape (m, 2)
-        Precision of the measured position (1/m²), and of the prior velocity zero (s²/m²); 0 if
-        there is none.
+        Precision of the measured position (1/m²), and of the prior velocity zero (s²/m²); 0
+        without a measurement or prior.
     length_s : ndarray, shape (m - 1,)
         Intervals between successive states.
     inverse_q : ndarray, shape (3, m - 1)
@@ -416,12 +415,12 @@ class BandedSystem:
     log_determinant: float
 
     @property
-    def states(self) -> int:
+    def state_count(self) -> int:
         """Number of states per time: position, velocity and, if any, time-correlated noise."""
         return len(self.bands) - 2
 
-    def whiten(self, measured_m: Array, dp: Array, dv: Array) -> tuple[tuple[Array, Array], Array]:
-        """Whiten signals, which makes their inner products under the inverse covariance simple.
+    def whiten(self, measured_m: Array, dp: Array, dv: Array) -> tuple[ArrayPair, Array]:
+        """Whiten signals, so that inner products under the inverse covariance are plain products.
 
         An inner product is the product of ``intervals``, minus the product of ``explained``, plus
         the product of the measurements over their σ (zero for most signals).
@@ -437,7 +436,7 @@ class BandedSystem:
         intervals : two ndarray, shape (..., m - 1)
             Whitened Δp and Δv; zero between segments.
         explained : ndarray, shape (..., states · m)
-            Part of the signals that is explained by the states.
+            Component of the signals that is explained by the states.
         """
         intervals, right_side = self._interval_sides(measured_m, dp, dv)
         explained, _ = lapack.dtbtrs(self.lower, right_side.T, uplo="L", overwrite_b=1)
@@ -447,23 +446,24 @@ class BandedSystem:
         """Return the estimated states, position and velocity first, shape (..., m, states)."""
         _, right_side = self._interval_sides(measured_m, dp, dv)
         state, _ = lapack.dpbtrs(self.lower, right_side.T, lower=1, overwrite_b=1)
-        return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.states))
+        return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.state_count))
 
-    def _interval_sides(
-        self, measured_m: Array, dp: Array, dv: Array
-    ) -> tuple[tuple[Array, Array], Array]:
-        """Return whitened intervals, and the right side of the normal equations.
+    def _interval_sides(self, measured_m: Array, dp: Array, dv: Array) -> tuple[ArrayPair, Array]:
+        """Return whitened intervals, and the right-hand side of the normal equations.
 
-        The right side has shape (columns, states · m).
+        The right-hand side has the shape (signals, states · m).
         """
         i00, i01, _ = self.inverse_q
         # Q⁻¹ = UᵀU; zero between segments
         u00 = np.sqrt(i00)
         u01 = np.divide(i01, u00, out=np.zeros_like(i01), where=u00 > 0.0)
-        whitened_0, whitened_1 = u00 * dp + u01 * dv, self.inverse_sqrt_q11 * dv
-        g0, g1 = u00 * whitened_0, u01 * whitened_0 + self.inverse_sqrt_q11 * whitened_1
-        right_side = np.zeros((*dp.shape[:-1], len(self.precision), self.states))
-        right_side[..., 1:, 0], right_side[..., 1:, 1] = g0, g1
+        whitened_0 = u00 * dp + u01 * dv
+        whitened_1 = self.inverse_sqrt_q11 * dv
+        g0 = u00 * whitened_0
+        g1 = u01 * whitened_0 + self.inverse_sqrt_q11 * whitened_1
+        right_side = np.zeros((*dp.shape[:-1], len(self.precision), self.state_count))
+        right_side[..., 1:, 0] = g0
+        right_side[..., 1:, 1] = g1
         right_side[..., :-1, 0] -= g0
         g0 *= self.length_s
         g0 += g1
@@ -472,7 +472,9 @@ class BandedSystem:
             weighted_m = self.precision[:, 0] * measured_m
             right_side[..., 0] += weighted_m
             right_side[..., 2:] += weighted_m[..., None]
-        return (whitened_0, whitened_1), right_side.reshape(-1, self.states * len(self.precision))
+        return (whitened_0, whitened_1), right_side.reshape(
+            -1, self.state_count * len(self.precision)
+        )
 
     def position_variance(self) -> Array:
         """Return the variance of each state's position given all data (m²), shape (m,).
@@ -482,13 +484,16 @@ class BandedSystem:
         Potter 1969).
         """
         # A with reversed rows and columns
-        reversed_bands, size = np.zeros_like(self.bands), self.bands.shape[1]
+        reversed_bands = np.zeros_like(self.bands)
+        size = self.bands.shape[1]
         for below in range(4):
             reversed_bands[below, : size - below] = self.bands[below, : size - below][::-1]
         reversed_lower, _ = lapack.dpbtrf(reversed_bands, lower=1, overwrite_ab=1)
-        (a, c), b = (self.lower[0, at::2] for at in (0, 1)), self.lower[1, 0::2]
-        # blocks of the reversed matrix have the velocity first
-        (d, f), e = (reversed_lower[0, at::2][::-1] for at in (0, 1)), reversed_lower[1, 0::2][::-1]
+        (a, c) = (self.lower[0, at::2] for at in (0, 1))
+        b = self.lower[1, 0::2]
+        # in the blocks of the reversed matrix, velocity precedes position
+        (d, f) = (reversed_lower[0, at::2][::-1] for at in (0, 1))
+        e = reversed_lower[1, 0::2][::-1]
         p00 = a**2 + e**2 + f**2 - self.bands[0, 0::2]
         p01 = a * b + d * e - self.bands[1, 0::2]
         p11 = b**2 + c**2 + d**2 - self.bands[0, 1::2]
@@ -528,7 +533,8 @@ def factorise(
     min_noise = MIN_NOISE_SHARE**2 * (
         1.0 / np.median(measured_precision[measured_precision > 0.0]) + q00
     )
-    # Q of a single step has rank one and is invertible by min_noise only, which rounding can hide
+    # Q of a single prediction step has rank one. Rounding errors of its determinant must not hide
+    # min_noise, which makes Q invertible
     product = q00 * q11
     raw_determinant = product - q01**2
     determinant = (
@@ -540,9 +546,10 @@ def factorise(
     slope = i00 * length_s
     cross = slope + i01
     # A = Σ precision + [-F I]ᵀ Q⁻¹ [-F I], by columns as in LAPACK's band storage
-    states = 2 if correlated_noise is None else 3
-    columns = np.zeros((len(precision), states, states + 2))
-    position, velocity = columns[:, 0], columns[:, 1]
+    state_count = 2 if correlated_noise is None else 3
+    columns = np.zeros((len(precision), state_count, state_count + 2))
+    position = columns[:, 0]
+    velocity = columns[:, 1]
     position[:, 0], velocity[:, 0] = precision.T
     position[1:, 0] += i00
     position[1:, 1] = i01
@@ -550,25 +557,26 @@ def factorise(
     position[:-1, 0] += i00
     position[:-1, 1] += cross
     velocity[:-1, 0] += (cross + i01) * length_s + i11
-    position[:-1, states], position[:-1, states + 1] = -i00, -i01
-    velocity[:-1, states - 1], velocity[:-1, states] = -cross, -(i01 * length_s + i11)
+    position[:-1, state_count] = -i00
+    position[:-1, state_count + 1] = -i01
+    velocity[:-1, state_count - 1] = -cross
+    velocity[:-1, state_count] = -(i01 * length_s + i11)
     log_noise = np.sum(np.log(determinant[is_joined]))
     if correlated_noise is not None:
         correlated_sigma_m, tau_s = correlated_noise
         rho = np.where(is_joined, np.exp(-length_s / tau_s), 0.0)
-        correlated_variance = correlated_sigma_m**2 * np.append(
-            1.0, 1.0 - rho**2
-        )  # variance of the noise that is new at each time
+        # variance that is added to the time-correlated noise at each time
+        correlated_variance = correlated_sigma_m**2 * np.append(1.0, 1.0 - rho**2)
         correlated = columns[:, 2]
         position[:, 2] = measured_precision
         correlated[:, 0] = measured_precision + 1.0 / correlated_variance
         correlated[:-1, 0] += rho**2 / correlated_variance[1:]
-        correlated[:-1, states] = -rho / correlated_variance[1:]
+        correlated[:-1, state_count] = -rho / correlated_variance[1:]
         log_noise += np.sum(np.log(correlated_variance))
-    bands = columns.reshape(-1, states + 2).T
+    bands = columns.reshape(-1, state_count + 2).T
     lower, is_singular = lapack.dpbtrf(bands, lower=1)
     if is_singular:
-        raise np.linalg.LinAlgError("a segment has too few measurements")
+        raise np.linalg.LinAlgError("a segment has too few position measurements")
     log_lower = 2.0 * np.sum(np.log(lower[0]))
     log_determinant = log_lower + log_noise - np.sum(np.log(precision[precision > 0.0]))
     inverse_sqrt_q11 = np.where(is_joined, 1.0 / np.sqrt(q11), 0.0)

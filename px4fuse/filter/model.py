@@ -5,8 +5,9 @@ State x = [position, velocity]; input a, the acceleration averaged over the step
     F = [[1, dt], [0, 1]]    B = [dt²/2, dt]    H = [1, 0]    R = SIGMA_Z²
     Q(dt) = SIGMA_A² · DT · [[dt³/4, dt²/2], [dt²/2, dt]]
 
-With dt = DT, Q equals the lesson's SIGMA_A² · [[dt⁴/4, dt³/2], [dt³/2, dt²]]. For any other dt the
-velocity noise per second is the same, so SIGMA_A does not depend on the measurement rate.
+With dt = DT, Q equals SIGMA_A² · [[dt⁴/4, dt³/2], [dt³/2, dt²]] of the lesson UAT 366, module 2.
+For any other dt the velocity noise per second is the same, so SIGMA_A does not depend on the
+measurement rate.
 
 The functions accept floats (one filter) and arrays (many filters); floats are fifty times faster
 than arrays of one element. A covariance is the tuple of its elements 00, 01, 11.
@@ -20,7 +21,7 @@ from px4fuse.arrays import Array
 
 STATES = ["position_m", "velocity_m_s"]
 COVARIANCES = ["position_variance_m2", "covariance_m2_s", "velocity_variance_m2_s2"]
-# Initial standard deviations (m, m/s) of the lesson: P₀ = diag(0.5², 1.0²)
+# Initial standard deviations in the lesson UAT 366, module 2: P₀ = diag(0.5², 1.0²)
 INITIAL_SIGMA_P_M = 0.5
 INITIAL_SIGMA_V_M_S = 1.0
 INITIAL_COVARIANCE = (INITIAL_SIGMA_P_M**2, 0.0, INITIAL_SIGMA_V_M_S**2)
@@ -32,31 +33,31 @@ Symmetric = tuple[T, T, T]
 
 
 def symmetric_matrix(covariance: Symmetric[float]) -> Array:
-    """Return the symmetric matrix of elements 00, 01, 11, shape (2, 2)."""
+    """Return the 2 × 2 matrix with the elements 00, 01, 11 of a covariance."""
     p00, p01, p11 = covariance
     return np.array([[p00, p01], [p01, p11]])
 
 
 def transition(dt_s: float) -> Array:
-    """Return the transition matrix F, shape (2, 2)."""
+    """Return KF's transition matrix F, shape (2, 2)."""
     return np.array([[1.0, dt_s], [0.0, 1.0]])
 
 
 def input_matrix(dt_s: float) -> Array:
-    """Return the input matrix B, shape (2, 1)."""
+    """Return KF's input matrix B, shape (2, 1)."""
     return np.array([[dt_s**2 / 2.0], [dt_s]])
 
 
 def process_noise_unit(dt_s: T) -> Symmetric[T]:
-    """Return the process noise of one step, Q(dt) / (SIGMA_A² · DT): elements 00, 01, 11."""
+    """Return the process noise Q / (SIGMA_A² · DT) of one prediction step: elements 00, 01, 11."""
     return dt_s**3 / 4.0, dt_s**2 / 2.0, dt_s
 
 
 def continuous_noise_unit(dt_s: T) -> Symmetric[T]:
-    """Return the process noise of many short steps with the total length ``dt_s``.
+    """Return the process noise of many short prediction steps with the total length ``dt_s``.
 
-    Unit: SIGMA_A² · DT. In the limit of ΣFQFᵀ, the position element dt³/4 of one step becomes
-    dt³/3, because the acceleration may change within the interval.
+    Elements 00, 01, 11 of Q / (SIGMA_A² · DT). Compared with a single step, the position element is
+    dt³/3 instead of dt³/4, because the acceleration may change within the interval.
     """
     return dt_s**3 / 3.0, dt_s**2 / 2.0, dt_s
 
@@ -68,7 +69,7 @@ def propagate_state(position: T, velocity: T, acceleration: T, dt_s: T) -> tuple
 
 
 def propagate_covariance(covariance: Symmetric[T], dt_s: T) -> Symmetric[T]:
-    """Return FPFᵀ by elements 00, 01, 11; Q is not added."""
+    """Return the predicted covariance FPFᵀ without Q: elements 00, 01, 11."""
     p00, p01, p11 = covariance
     return p00 + 2.0 * dt_s * p01 + dt_s**2 * p11, p01 + dt_s * p11, p11
 
@@ -80,10 +81,8 @@ def predict_step(
 
     ``noise_density`` (m²/s³) is the increase of the velocity variance per second, SIGMA_A² · DT.
     """
-    (p00, p01, p11), (q00, q01, q11) = (
-        propagate_covariance(covariance, dt_s),
-        process_noise_unit(dt_s),
-    )
+    p00, p01, p11 = propagate_covariance(covariance, dt_s)
+    q00, q01, q11 = process_noise_unit(dt_s)
     predicted = p00 + noise_density * q00, p01 + noise_density * q01, p11 + noise_density * q11
     position, velocity = propagate_state(position, velocity, acceleration, dt_s)
     return position, velocity, predicted
@@ -100,7 +99,9 @@ def update_step(
         ν (m), S (m²) and the two gains; then position, velocity and covariance after the update.
     """
     p00, p01, p11 = covariance
-    nu, s = measured_m - position, p00 + variance
-    k0, k1 = p00 / s, p01 / s
+    nu = measured_m - position
+    s = p00 + variance
+    k0 = p00 / s
+    k1 = p01 / s
     updated = variance * k0, variance * k1, p11 - k1 * p01
     return (nu, s, k0, k1), (position + k0 * nu, velocity + k1 * nu, updated)

@@ -1,4 +1,4 @@
-"""Settings of KF with their valid ranges."""
+"""Settings of KF (noises, prediction interval, input, time offset) with valid ranges."""
 
 from dataclasses import dataclass
 from typing import get_args
@@ -8,7 +8,7 @@ from px4fuse.request import DT_S, SIGMA_A_M_S2, SIGMA_Z_M, InputName
 
 INPUT_NAMES: tuple[InputName, ...] = get_args(InputName)
 
-# Valid ranges of the settings: values outside are typing errors
+# Valid ranges of KF's settings: values outside are typing errors
 SIGMA_A_RANGE_M_S2 = (1e-4, 100.0)
 SIGMA_Z_RANGE_M = (1e-4, 100.0)
 DT_RANGE_S = (1e-3, 1.0)
@@ -20,7 +20,7 @@ UNITS = {"sigma_a_m_s2": "m/s²", "sigma_z_m": "m", "dt_s": "s", "clock_offset_s
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of KF.
+    """Settings of KF: noises, prediction interval, input and time offset.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class Settings:
     dt_s : float
         Prediction interval DT.
     input : {"imu", "zero"}
-        Acceleration measured by the IMU, or zero: the lesson's constant-velocity model.
+        Acceleration measured by the IMU, or zero: constant-velocity model.
     clock_offset_s : float
         Time offset added to the timestamps of the position source.
 
@@ -50,17 +50,19 @@ class Settings:
     def __post_init__(self) -> None:
         for (name, unit), (low, high) in zip(UNITS.items(), _RANGES, strict=True):
             value = getattr(self, name)
-            if not low <= value <= high:  # false for NaN too
+            if not low <= value <= high:  # also rejects NaN
                 raise SettingsError(
                     f"`{name}` {value:g} is out of range: give {low:g} to {high:g} {unit}."
                 )
         if self.input not in INPUT_NAMES:
-            raise SettingsError(f"`input` {self.input}: give {' or '.join(INPUT_NAMES)}.")
+            raise SettingsError(
+                f"`input` {self.input} is not an input of KF: give {' or '.join(INPUT_NAMES)}."
+            )
 
 
 @dataclass(frozen=True)
 class InitialState:
-    """Initial state of KF: time (s), position (m) and velocity (m/s), with the lesson's P₀."""
+    """Initial state of KF: time (s), position (m) and velocity (m/s)."""
 
     time_s: float
     position_m: float

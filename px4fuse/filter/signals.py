@@ -19,25 +19,27 @@ from px4fuse.arrays import Array, BoolArray, cumulative_integral
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import AXIS_NAMES, Columns, Flight, PositionTrack, Unavailable
 from px4fuse.notebook_display import one_line_repr
+from px4fuse.record import Span
 
 AISLE = "aisle"
 # Minimum ratio of length to width of a track that counts as flown along an aisle
 MIN_AISLE_ELONGATION = 3.0
-# Maximum IMU interval, in s and in median intervals: a longer interval is a gap
+# Maximum interval (s) between IMU samples: a longer interval is a gap
 IMU_GAP_S = 0.1
+# Maximum interval between IMU samples in median intervals: a longer interval is a gap
 IMU_GAP_INTERVALS = 5.0
-MIN_MEASUREMENTS = 3
+MIN_MEASUREMENTS = 3  # minimum number of position measurements along an axis
 
 
 @dataclass(frozen=True)
 class Segment:
-    """Analysed part of the flight: start and end (s), and the reason for the choice."""
+    """Analysed part of a flight: start and end (s), and the reason for choosing it."""
 
     start_s: float
     end_s: float
     reason: str
 
-    def cut(self, spans: Iterable[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
+    def cut(self, spans: Iterable[Span]) -> tuple[Span, ...]:
         """Return the parts of time spans (s) that are inside the segment."""
         clipped_spans = ((max(start, self.start_s), min(end, self.end_s)) for start, end in spans)
         return tuple((start, end) for start, end in clipped_spans if end > start)
@@ -45,7 +47,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class Acceleration:
-    """Acceleration along one axis.
+    """Acceleration along one axis, the input of KF.
 
     Attributes
     ----------
@@ -58,7 +60,7 @@ class Acceleration:
         Integral along the axis (trapezoidal, from the first sample); differences give the mean
         acceleration of a prediction step.
     gap_time_s, gap_integral_s : ndarray, shape (k,)
-        Start and end times of the IMU gaps and of the IMU data; total gap time until each.
+        Start and end times of the IMU gaps and of the IMU data; total gap length until each time.
     rms_m_s2 : float
         Root mean square of the acceleration: standard deviation of the input in a gap.
     """
@@ -92,13 +94,13 @@ class Axis:
     heading_deg : float or None
         Heading of a horizontal axis, clockwise from north.
     note : str
-        Explanation of the aisle's direction; empty for other axes.
+        Source of the heading of the axis "aisle"; empty for other axes.
     measurement_time_s, measurement_m : ndarray, shape (n,)
         Position measurements along the axis; n ≥ 3.
     acceleration : Acceleration or Unavailable
         Input of KF.
     elongation : float or None
-        Ratio of the track's length to its width; None if the heading was given.
+        Ratio of the track's length to its width; None if the user chose the heading.
     """
 
     name: str
@@ -114,7 +116,7 @@ class Axis:
 
     @property
     def label(self) -> str:
-        """Name in messages; "the aisle" only for an elongated track or with --heading."""
+        """Name of the axis in messages; "the aisle" for an elongated track or with --heading."""
         if self.name != AISLE:
             return self.name
         is_aisle = self.elongation is None or self.elongation >= MIN_AISLE_ELONGATION
@@ -216,7 +218,7 @@ def make_axes(
         raise SettingsError(f"`heading_deg` {heading_deg:g} is not between 0 and 360 degrees.")
     if unknown := [name for name in axis_names if name not in valid_names]:
         raise SettingsError(
-            f"Axis {unknown[0]} is not known.", f"Use one of {', '.join(valid_names)}."
+            f"Axis {unknown[0]} is not known.", f"Choose from the axes {', '.join(valid_names)}."
         )
     source_label = f"{flight.log.name}: {track.name}"
     axes = []
@@ -252,7 +254,7 @@ def too_few_measurements(name: str, count: int, min_count: int) -> Unavailable:
 
 
 def weighted_sum(frame: pd.DataFrame, columns: list[str], weights: Array) -> Array:
-    """Return the weighted sum of columns; columns with weight zero may be NaN."""
+    """Return the weighted sum of columns of a table; columns with weight zero may be NaN."""
     total = np.zeros(len(frame))
     for column, weight in zip(columns, weights, strict=True):
         if weight != 0.0:
@@ -271,7 +273,8 @@ def _axis_direction(
         axis_heading_deg, elongation = aisle_heading(track, segment)
         note = f"main direction of the track, length / width {elongation:.1f}"
     else:
-        axis_heading_deg, note = heading_deg, "given with --heading"
+        axis_heading_deg = heading_deg
+        note = "heading from the option --heading"
     angle_rad = np.radians(axis_heading_deg)
     return np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0]), axis_heading_deg, note, elongation
 
@@ -279,14 +282,9 @@ def _axis_direction(
 def project_acceleration(
     acceleration: pd.DataFrame | Unavailable, direction: Array, segment: Segment
 ) -> Acceleration | Unavailable:
-    """Project the acceleration onto a direction.
+    """Project the acceleration (m/s², NED) onto a direction.
 
-    Parameters
-    ----------
-    acceleration : DataFrame, shape (n, 3), m/s², NED, or Unavailable
-    direction : ndarray, shape (3,)
-    segment : Segment
-        Time span of the root mean square.
+    The root mean square is over the segment.
     """
     if isinstance(acceleration, Unavailable):
         return acceleration
@@ -301,7 +299,8 @@ def project_acceleration(
             "Choose --start and --end within the IMU data.",
         )
     is_gap = imu_gaps(time_s)
-    gap_rows, gap_sum_s = np.flatnonzero(is_gap), np.cumsum(np.where(is_gap, np.diff(time_s), 0.0))
+    gap_rows = np.flatnonzero(is_gap)
+    gap_sum_s = np.cumsum(np.where(is_gap, np.diff(time_s), 0.0))
     gap_ends = np.unique([0, *gap_rows, *(gap_rows + 1), len(time_s) - 1])
     return Acceleration(
         time_s=time_s,
@@ -321,13 +320,13 @@ def imu_gaps(time_s: Array) -> BoolArray:
 
 
 def step_means(acceleration: Acceleration, edges: ArrayLike) -> tuple[Array, Array]:
-    """Return the mean acceleration over each step, and the fraction of the step in an IMU gap.
+    """Return the mean acceleration over each prediction step, and its fraction in an IMU gap.
 
     Parameters
     ----------
     acceleration : Acceleration
     edges : array_like, shape (n + 1,)
-        Strictly increasing times in s.
+        Strictly increasing start and end times (s) of the prediction steps.
 
     Returns
     -------
@@ -347,5 +346,5 @@ def step_means(acceleration: Acceleration, edges: ArrayLike) -> tuple[Array, Arr
 
 
 def cut_to_segment(frame: pd.DataFrame, segment: Segment) -> pd.DataFrame:
-    """Return the rows of a time-indexed frame inside a segment, both ends included."""
+    """Return the rows of a time-indexed table inside a segment, both ends included."""
     return frame[(frame.index >= segment.start_s) & (frame.index <= segment.end_s)]

@@ -10,13 +10,13 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis, step_means
 from px4fuse.flight import Unavailable
 
-# Maximum difference (s) of times that count as equal: timestamps have a resolution of 1 µs
+# Maximum difference (s) of two times that count as equal: timestamps have a resolution of 1 µs
 MAX_SAME_TIME_S = 5e-7
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """Times of the DT grid and of the measurements, and the input of each step between them.
+    """Prediction steps of KF: times of the DT grid and of the measurements, and inputs.
 
     Attributes
     ----------
@@ -25,7 +25,7 @@ class Timeline:
     measurement_index : ndarray of int, shape (n,)
         Index of the measurement at each time; -1 without a measurement.
     acceleration_m_s2 : ndarray, shape (n - 1,)
-        Mean acceleration over each step.
+        Mean acceleration over each prediction step.
     input_variance_m2_s4 : ndarray, shape (n - 1,)
         Variance that is added to SIGMA_A² in gaps of the IMU.
     input_gap_s : float
@@ -55,7 +55,7 @@ def make_timeline(axis: Axis, settings: Settings, initial: InitialState | None =
         raise SettingsError(f"axis {axis.name}: no measurement after the start at {start_s:.2f} s.")
     count = int(np.floor((measured_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
     grid_s = start_s + settings.dt_s * np.arange(count)
-    # a measurement's timestamp replaces a grid time that coincides with it
+    # the timestamp of a measurement replaces an equal time of the grid
     next_s = measured_s[np.clip(np.searchsorted(measured_s, grid_s), 0, len(measured_s) - 1)]
     previous_s = measured_s[
         np.clip(np.searchsorted(measured_s, grid_s) - 1, 0, len(measured_s) - 1)
@@ -63,7 +63,7 @@ def make_timeline(axis: Axis, settings: Settings, initial: InitialState | None =
     distance_s = np.minimum(np.abs(next_s - grid_s), np.abs(previous_s - grid_s))
     time_s = np.union1d(grid_s[distance_s > MAX_SAME_TIME_S], measured_s)
     if time_s[0] > start_s + MAX_SAME_TIME_S:
-        time_s = np.concatenate([[start_s], time_s])
+        time_s = np.append(start_s, time_s)
     measurement_index = np.full(len(time_s), -1, dtype=np.intp)
     measurement_index[np.searchsorted(time_s, measured_s)] = np.flatnonzero(is_usable)
     step_count = len(time_s) - 1

@@ -1,10 +1,10 @@
 """Time offset between position source and IMU, by joint maximum likelihood.
 
-Positions with timestamps that are wrong by τ lag or lead the measured acceleration. KF follows the
-positions, so innovations hardly grow with τ. Only the comparison of positions and acceleration
-shows the offset. So the likelihood of the positions given the acceleration is maximised over τ, and
-at every τ over the noises. Constant errors that could be confused with τ (biases, tilt, scale; see
-:mod:`px4fuse.filter.imu_motion`) are marginalised.
+Positions with timestamps that are wrong by a time offset τ lag or lead the measured acceleration.
+KF follows the positions, so innovations hardly grow with τ. Only the comparison of positions and
+acceleration shows the offset. So the likelihood of the positions given the acceleration is
+maximised over τ, and at every τ over the noises. Constant errors that could be confused with τ
+(biases, tilt, scale; see :mod:`px4fuse.filter.imu_motion`) are marginalised.
 
 The noise of the IMU looks like motion that the positions do not contain, and τ shifts this noise,
 too. The noise does not bias the estimate of τ, but increases its variance above the value from the
@@ -39,26 +39,30 @@ from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record, Share, Span
 
-FINE_OFFSETS, CURVE_OFFSETS = 11, 121
+# Number of time offsets at which the likelihood is computed near its maximum
+FINE_OFFSETS = 11
+# Number of points of the likelihood curve, interpolated between these offsets
+CURVE_OFFSETS = 121
 # Prior σ (rad) of EKF2's heading, by default and with GNSS. With a GNSS delay that is wrong by
 # 0.2 s, EKF2 rotates its heading by 5° to fit the positions: a narrow prior would hide the offset
 HEADING_SIGMA_RAD, GNSS_HEADING_SIGMA_RAD = float(CONSTANT_SIGMAS[2]), 0.2
 # Maximum half-width (s) of the 95 % interval of a time offset that counts as determined
 MAX_HALF_INTERVAL_S = 0.15
-# Maximum σ (s) of the offset in a part of the flight that is used to detect a change of the offset
+# Maximum σ (s) of the time offset in a part of the flight: parts with a larger σ are ignored in the
+# test for a change of the offset
 MAX_PART_SIGMA_S = 0.15
-# Maximum p-value of a constant offset at which the offset counts as changing
+# Maximum p-value of a constant time offset for an offset that changes in flight
 MAX_CHANGE_P = 0.005
-# Minimum significant offset, in σ: false alarm probability 0.3 %
+# Minimum significant time offset, in σ: false alarm probability 0.3 %
 OFFSET_SIGMAS = 3.0
-# Number of simulations of the IMU noise
+# Number of simulations of the IMU noise, to estimate the variance of the time offset
 SIMULATION_COUNT = 96
-# Step of ln σ for the derivatives with respect to the noises
+# Step of ln σ for numerical derivatives of the likelihood with respect to the noises
 LOG_SIGMA_STEP = 0.1
 
 
 class PartOffset(Record, frozen=True):
-    """Time offset of one part of the flight: start, end, offset and its σ, all in s."""
+    """Time offset in one part of the flight: start, end, offset and σ of the offset, all in s."""
 
     start_s: float
     end_s: float
@@ -108,22 +112,22 @@ class Clock(Record, frozen=True, kw_only=True):
 
     @property
     def remaining_s(self) -> float:
-        """Offset that remains to be added to the shifted timestamps: estimate minus applied (s)."""
+        """Offset (s) still to be added to the timestamps: estimate minus applied offset."""
         return self.offset_s - self.applied_s
 
     @property
     def three_sigma_s(self) -> float:
-        """Limit of a significant offset: ``OFFSET_SIGMAS`` standard deviations (s)."""
+        """Minimum significant offset: ``OFFSET_SIGMAS`` standard deviations (s)."""
         return OFFSET_SIGMAS * self.sigma_s
 
 
 class ClockOffset(Clock, frozen=True, kw_only=True, eq=False):
-    """:class:`Clock` with its likelihood curve.
+    """Time offset of the position source, with the likelihood curve.
 
     Attributes
     ----------
     curve_s, curve_drop : ndarray, shape (n,)
-        Offsets, and at each offset the maximum log-likelihood minus the log-likelihood.
+        Time offsets (s), and at each offset the maximum log-likelihood minus the log-likelihood.
     sigma_a_m_s2, sigma_z_m : float
         Noises at the maximum of the likelihood.
     """
@@ -156,7 +160,7 @@ def estimate_time_offset(
         Track with the logged timestamps.
     segment : Segment
     settings : Settings
-        Only ``dt_s`` and the applied offset are used: SIGMA_A refers to ``dt_s``.
+        Only ``clock_offset_s`` and ``dt_s`` are used; SIGMA_A refers to ``dt_s``.
     noises : Noises
         Initial values for a model with biases. The random walk is not zero if the source may drift
         (odometry).
@@ -175,7 +179,7 @@ def estimate_time_offset(
     samples = cut_to_segment(track.samples, segment)[Columns.POSITION[:axes]]
     samples = samples.dropna(subset=Columns.POSITION[:2])
     if outlier_time_s is not None:
-        samples = samples[~np.isin(samples.index.to_numpy(), outlier_time_s)]
+        samples = samples[~np.isin(samples.index, outlier_time_s)]
     prepared_motion = prepare_motion(
         flight,
         samples.index.to_numpy(),
@@ -190,7 +194,8 @@ def estimate_time_offset(
     progress("time offset")
     coarse_motion = prepared_motion.downsample(COARSE_MEASUREMENTS)
     offset_s, _ = prepared_motion.search_offset(noises)
-    sigma_s, half_width_s = 0.0, 0.1
+    sigma_s = 0.0
+    half_width_s = 0.1
     for motion in (coarse_motion, prepared_motion):
         noises = maximise_likelihood(
             [motion.at(offset_s)], noises, motion.weight, outliers=False
@@ -213,17 +218,18 @@ def estimate_time_offset(
             break
         half_width_s *= 2.0
     offset_s = _minimum_and_sigma(curve_s, scores)[0]
-    # an IMU sample is the mean over an interval, and its timestamp may be anywhere in the interval
+    # an IMU sample is the mean over an interval, and its timestamp may be anywhere in this interval
     resolution_s = 0.5 * prepared_motion.imu_interval_s
     ends_s = curve_s[0] if low_s is None else low_s, curve_s[-1] if high_s is None else high_s
     half_intervals_s = np.hypot(np.array(ends_s) - offset_s, 1.96 * resolution_s)
-    low_s, high_s = float(offset_s - half_intervals_s[0]), float(offset_s + half_intervals_s[1])
+    low_s = float(offset_s - half_intervals_s[0])
+    high_s = float(offset_s + half_intervals_s[1])
     reason = ""
     if not is_closed or (high_s - low_s) / 2.0 > MAX_HALF_INTERVAL_S:
-        range_text = (
-            f"offsets from {low_s:+.2f} s to {high_s:+.2f} s have nearly the same likelihood"
+        reason = (
+            f"offsets from {low_s:+.2f} s to {high_s:+.2f} s have nearly the same likelihood: too "
+            "little acceleration, or too much position noise"
         )
-        reason = f"{range_text}: too little acceleration, or too much position noise"
     parts: tuple[PartOffset, ...] = ()
     change_p_value = None
     if not reason:
@@ -251,22 +257,21 @@ def estimate_time_offset(
 
 
 def _offset_grid(centre_s: float, half_width_s: float, count: int) -> Array:
-    """Return equally spaced offsets around ``centre_s``, within the search range."""
-    low, high = np.clip(
-        [centre_s - half_width_s, centre_s + half_width_s], -MAX_OFFSET_S, MAX_OFFSET_S
-    ).tolist()
-    return np.linspace(low, high, count)
+    """Return equally spaced time offsets around ``centre_s``, within the search range."""
+    low_s = max(centre_s - half_width_s, -MAX_OFFSET_S)
+    return np.linspace(low_s, min(centre_s + half_width_s, MAX_OFFSET_S), count)
 
 
 def _profile_over_noises(
     prepared_motion: PreparedMotion, offsets_s: Array, noises: Noises, best_offset_s: float
 ) -> Array:
-    """Compute -ln p over offsets, minimised over the noises at each offset by a Newton step.
+    """Compute -ln p at time offsets, minimised over the noises at each offset by a Newton step.
 
     The gradient is evaluated at each offset; the Hessian hardly changes and is evaluated at
     ``best_offset_s`` only.
     """
-    sigma_z, sigma_a = noises.sigma_z_m, noises.sigma_a_m_s2
+    sigma_z = noises.sigma_z_m
+    sigma_a = noises.sigma_a_m_s2
     all_offsets_s = np.append(offsets_s, best_offset_s)
     ratios = sigma_a / sigma_z * np.exp(LOG_SIGMA_STEP * np.array([-1.0, 0.0, 1.0]))
 
@@ -301,19 +306,18 @@ def _profile_over_noises(
 def _simulate_variance_factor(
     prepared_motion: PreparedMotion, offset_s: float, noises: Noises, information: float
 ) -> float:
-    """Return the simulated variance of the offset over its variance from the curvature.
+    """Return the simulated variance of the time offset over its variance from the curvature.
 
     The score of τ is eᵀM(v + n): e are the residuals, v the velocity, n the velocity noise of the
     IMU, and M the inverse covariance with constant errors marginalised. The term eᵀMn is random
     even without motion, because e contains the same noise n.
     """
     positions = prepared_motion.at(offset_s)
-    is_joined, count, axes = (
-        positions.is_joined,
-        len(prepared_motion.time_s),
-        len(prepared_motion.directions),
-    )
-    interval_count, rng = int(np.count_nonzero(is_joined)), np.random.default_rng(count)
+    is_joined = positions.is_joined
+    count = len(prepared_motion.time_s)
+    axes = len(prepared_motion.directions)
+    interval_count = int(np.count_nonzero(is_joined))
+    rng = np.random.default_rng(count)
 
     def draw_normal(size: int) -> Array:
         return rng.standard_normal((size, axes, SIMULATION_COUNT)).transpose(1, 2, 0)
@@ -344,7 +348,7 @@ def _simulate_variance_factor(
 
 
 def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
-    """Return the position of a profile's minimum by a parabola, and σ from its curvature."""
+    """Return the minimum of a profile by a parabola, and σ from the curvature of the parabola."""
     index = int(np.clip(np.argmin(profile), 1, len(grid) - 2))
     step = grid[1] - grid[0]
     shift, curvature = parabola_vertex(profile, index)
@@ -356,7 +360,7 @@ def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
 def _offset_per_part(
     prepared_motion: PreparedMotion, offset_s: float, noises: Noises, variance_factor: float
 ) -> tuple[tuple[PartOffset, ...], float | None]:
-    """Estimate the offset of each segment, and the p-value of a constant offset."""
+    """Estimate the time offset of each segment, and the p-value of a constant offset."""
     coarse_s = offset_s + np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSETS)
     coarse_s = coarse_s[np.abs(coarse_s) <= MAX_OFFSET_S]
     coarse_profiles = fit_noises(
@@ -364,7 +368,8 @@ def _offset_per_part(
     ).scores_by_segment()[0]
     grid_s = np.linspace(coarse_s[0], coarse_s[-1], CURVE_OFFSETS)
     profiles = CubicSpline(coarse_s, coarse_profiles, axis=1)(grid_s)
-    part_offsets, drops = [], []
+    part_offsets = []
+    drops = []
     for begin, end, profile in zip(
         prepared_motion.edges, prepared_motion.edges[1:], profiles, strict=False
     ):

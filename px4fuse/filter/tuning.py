@@ -1,4 +1,4 @@
-"""Maximum-likelihood SIGMA_A and SIGMA_Z with 95 % intervals, and a held-out check.
+"""Maximum-likelihood SIGMA_A and SIGMA_Z with 95 % intervals and a held-out check.
 
 Constant errors are not noise. With IMU data, biases, tilt and time offset are therefore also fitted
 (:mod:`px4fuse.filter.imu_motion`). SIGMA_A is then the noise of the acceleration alone, and SIGMA_Z
@@ -44,14 +44,17 @@ HORIZONTAL = "horizontal"
 NoiseInterval = tuple[NotNegative, NotNegative | None]
 # Number of grid points along each side of the likelihood map
 GRID_SIZE = 40
-# Extent of the likelihood map on each side, in σ of the estimate
+# Half-width of the likelihood map along each side, in σ of the estimate
 MAP_SIGMAS = 4.5
-MIN_MEASUREMENTS = 30
+MIN_MEASUREMENTS = 30  # minimum number of positions for an estimate of the noises
+# Maximum fraction of outliers for an estimate of the noises
 MAX_OUTLIER_SHARE = 0.3
-# Initial values of the fit: factors on KF's SIGMA_A, and random walk of a drifting source (m/√s)
+# Factors on KF's SIGMA_A that give initial values for the fit with biases
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
+# Initial value of the random walk (m/√s) of a source that may drift
 START_RANDOM_WALK_M = 0.02
-# Maximum ratio of a value to an end of the search range at which it counts as at the end
+# Minimum ratio between an estimate and the ends of the search range: with a smaller ratio the
+# likelihood has its maximum at the end
 MAX_SEARCH_END_RATIO = 1.001
 
 
@@ -73,7 +76,7 @@ class Noise(Record, frozen=True):
 
     @classmethod
     def of(cls, value: float | None, interval: NoiseInterval | None) -> Noise:
-        """Make a noise from the fields of :class:`NoiseEstimate`."""
+        """Make a noise from estimate and interval as stored in :class:`NoiseEstimate`."""
         low, high = interval or (0.0, None)
         return cls(value, low or None, high)
 
@@ -86,7 +89,7 @@ class Noise(Record, frozen=True):
 
 @dataclass(frozen=True)
 class LikelihoodMap:
-    """Maximum minus value of the log-likelihood, shape (n, m), for n SIGMA_A and m SIGMA_Z."""
+    """Decrease of the log-likelihood from its maximum, (n, m), at n SIGMA_A and m SIGMA_Z."""
 
     sigma_a_m_s2: Array
     sigma_z_m: Array
@@ -96,7 +99,7 @@ class LikelihoodMap:
 
 
 class HeldOutCheck(Record, frozen=True):
-    """Held-out check: noises estimated on the first half of the flight, tested on the second.
+    """Held-out check: noises from the first half of the flight, tested with the second half.
 
     Attributes
     ----------
@@ -116,7 +119,7 @@ class HeldOutCheck(Record, frozen=True):
 
 
 class NoiseEstimate(Record, frozen=True, kw_only=True):
-    """Noises of one axis, or of the horizontal axes together, with 95 % intervals.
+    """Estimated noises of one axis, or of both horizontal axes together, with 95 % intervals.
 
     A value is None if the likelihood has its maximum at an end of the search range; the interval
     then gives the bound. The lower end of an interval is 0 if the noise may be zero. The upper end
@@ -164,22 +167,24 @@ class NoiseEstimate(Record, frozen=True, kw_only=True):
 
     @property
     def sigma_a_two_state(self) -> Noise:
-        """SIGMA_A that KF needs (m/s²)."""
+        """SIGMA_A that KF needs, because it has no states for biases (m/s²)."""
         return Noise.of(self.sigma_a_two_state_m_s2, self.sigma_a_two_state_m_s2_interval)
 
     @property
     def sigma_z(self) -> Noise:
-        """SIGMA_Z (m)."""
+        """Measurement noise SIGMA_Z (m)."""
         return Noise.of(self.sigma_z_m, self.sigma_z_m_interval)
 
 
 class AxisTuning(NoiseEstimate, frozen=True, kw_only=True, eq=False, dict=True):
-    """:class:`NoiseEstimate` with the outliers and the likelihood map.
+    """Estimated noises of one axis, or of both horizontal axes, with outliers and likelihood map.
 
     Attributes
     ----------
     name : str
+        Axis name, or "horizontal".
     outlier_time_s : ndarray, shape (k,)
+        Timestamps of the outliers.
     noises : Noises
         Maximum-likelihood noises, including the random walk of a drifting source.
     make_map : callable
@@ -196,7 +201,7 @@ class AxisTuning(NoiseEstimate, frozen=True, kw_only=True, eq=False, dict=True):
 
     @cached_property
     def map(self) -> LikelihoodMap:
-        """Map of KF's likelihood around the maximum."""
+        """Map of KF's log-likelihood around the maximum."""
         return self.make_map()
 
 
@@ -278,13 +283,14 @@ def tune_axes(
     axis_positions = [filter_positions(interval_input) for interval_input in intervals]
     chosen_noises = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
     kf_fit = maximise_likelihood(axis_positions, chosen_noises, np.ones(count))
-    motion_fit = None  # fit with biases, tilt and time offset
+    motion_fit = None  # becomes the fit with biases, tilt and time offset
     if flight is not None and settings.input == "imu":
         measured_m = np.column_stack([axis.measurement_m for axis in axes])
         # KF starts at the first measurement, so the fit of KF has no weight for that measurement
         weight = np.concatenate([np.ones(len(measured_m) - count), kf_fit.weight])
         axis_directions = np.array([axis.direction for axis in axes])
-        time_s, dt_s = axes[0].measurement_time_s, settings.dt_s
+        time_s = axes[0].measurement_time_s
+        dt_s = settings.dt_s
         prepared_motion = prepare_motion(
             flight,
             time_s,
@@ -321,8 +327,7 @@ def tune_axes(
         # without biases and tilt the noise cannot be estimated; KF's SIGMA_A is an upper bound
         sigma_a = Noise(None, None, kf_sigma_a.high)
     final_noises = Noises(
-        kf_sigma_a.value or kf_sigma_a.high or kf_fit.noises.sigma_a_m_s2,
-        final_sigma_z_m,
+        kf_sigma_a.value or kf_sigma_a.high or kf_fit.noises.sigma_a_m_s2, final_sigma_z_m
     )
     gain_nats = kf_fit.score(chosen_noises) - kf_fit.score(final_noises)
     return AxisTuning(
@@ -344,7 +349,7 @@ def tune_axes(
 
 
 def _estimate_noise(fit: NoiseFit, noise_index: int) -> Noise:
-    """Estimate SIGMA_A (0) or SIGMA_Z (1) with its 95 % profile-likelihood interval."""
+    """Estimate SIGMA_A (index 0) or SIGMA_Z (index 1) with its 95 % profile-likelihood interval."""
     values = fit.noises.sigma_a_m_s2, fit.noises.sigma_z_m
 
     def score(log_value: float, log_other: float) -> float:
@@ -379,7 +384,7 @@ def _noise_with_interval(
     search_range: tuple[float, float],
     variance_factor: float = 1.0,
 ) -> Noise:
-    """Return a noise with its interval; the value is None at an end of the search range."""
+    """Return a noise with its 95 % interval, without a value at an end of the search range."""
     value = float(np.exp(best_logs[0]))
     low, high = profile_ends(score, best_logs, search_range, variance_factor)
     is_inside = (
@@ -396,19 +401,15 @@ def _make_map(
     sigma_z: Noise,
     best_noises: Noises,
 ) -> LikelihoodMap:
-    """Compute the map of KF's likelihood around the maximum."""
     grids = []
     for noise, best_value, (low, high) in (
         (sigma_a, best_noises.sigma_a_m_s2, SIGMA_A_SEARCH_M_S2),
         (sigma_z, best_noises.sigma_z_m, SIGMA_Z_SEARCH_M),
     ):
-        interval_low, interval_high = noise.low or low, noise.high or high
-        width_factor = MAP_SIGMAS / 1.96
-        ends = (
-            best_value * (interval_low / best_value) ** width_factor,
-            best_value * (interval_high / best_value) ** width_factor,
-        )
-        grids.append(np.geomspace(max(ends[0], low), min(ends[1], high), GRID_SIZE))
+        interval = np.array([noise.low or low, noise.high or high])
+        ends = best_value * (interval / best_value) ** (MAP_SIGMAS / 1.96)
+        first, last = np.clip(ends, low, high)
+        grids.append(np.geomspace(first, last, GRID_SIZE))
     sigma_a_grid, sigma_z_grid = grids
     scores = score_grid(intervals, sigma_a_grid[:, None], sigma_z_grid[None, :], weight)
     return LikelihoodMap(sigma_a_grid, sigma_z_grid, scores - scores.min())
@@ -424,7 +425,7 @@ def _assess_innovations(
 def _check_held_out(
     name: str, intervals: list[Preintegrated], chosen_noises: Noises, fit: NoiseFit
 ) -> HeldOutCheck | Unavailable:
-    """Estimate the noises on the first half of the measurements and test them on the second."""
+    """Estimate the noises with the first half of the measurements, test them with the second."""
     half_count = len(fit.weight) // 2
     if half_count < MIN_MEASUREMENTS:
         return Unavailable(

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.convention.axes import UNITS
-from px4fuse.convention.correction import Faults, find_faults
+from px4fuse.convention.axes import UNITS, Axes
+from px4fuse.convention.correction import MIN_REMAINDER_DEG, Faults, find_faults
 from px4fuse.convention.model import Convention
-from px4fuse.convention.texts import axes_as_sent, describe_axes, describe_unit
+from px4fuse.convention.texts import FRAME_AXES, axes_as_sent, describe_axes, describe_unit
 from px4fuse.findings.cause_grouping import CONVENTION, MISLEADING, UNUSABLE
 from px4fuse.findings.model import CATALOGUE, Finding, Findings, Severity, finding
 from px4fuse.flight import PositionTrack, positions_of, source_name
@@ -54,7 +54,7 @@ def detect(analysis: Comparison) -> Findings:
         return
     if faults.orientation:
         yield _orientation_finding(analysis, convention, faults)
-    if faults.axes:
+    if faults.axes or (faults.rotation_deg and _axes_of_file(analysis.source, convention)):
         yield _axes_finding(analysis, convention, faults)
     elif faults.rotation_deg:
         yield _rotation_finding(analysis, convention, faults)
@@ -120,6 +120,14 @@ def _basis(convention: Convention) -> str:
     )
 
 
+def _axes_of_file(source: PositionTrack, convention: Convention) -> Axes | None:
+    """Return the axes of a position file if they are NED, ENU or NWU, and not as stated."""
+    if source.alignment is None or abs(convention.rotation_deg) > MIN_REMAINDER_DEG:
+        return None
+    axes = axes_as_sent((convention.x, convention.y, convention.z), source.alignment.frame.upper())
+    return axes if axes in FRAME_AXES.values() else None
+
+
 def _axes_finding(analysis: Comparison, convention: Convention, faults: Faults) -> Finding:
     """Make the finding of axes that are not those of NED."""
     alignment, orientation = analysis.source.alignment, convention.orientation
@@ -128,7 +136,7 @@ def _axes_finding(analysis: Comparison, convention: Convention, faults: Faults) 
     fault, action = describe_axes(
         axes, stated, is_mirrored=convention.is_mirrored, is_file=alignment is not None
     )
-    if faults.rotation_deg:
+    if faults.rotation_deg and axes not in FRAME_AXES.values():
         fault += f", rotated by {faults.rotation_deg:+.0f}° (clockwise from above)"
     if orientation is not None and orientation.frames.startswith("FLU"):
         action += " Convert the orientation, too: q_NED = (0, √½, √½, 0) ⊗ q ⊗ (0, 1, 0, 0)."

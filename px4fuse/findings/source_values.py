@@ -14,7 +14,7 @@ from px4fuse.findings.model import Findings, error, warning
 from px4fuse.findings.source_intervals import CHECKS, state_errors_after
 from px4fuse.flight import Columns, Ekf2, Unavailable, positions_of, source_name
 from px4fuse.record import Span
-from px4fuse.text import capitalise_first, format_metres
+from px4fuse.text import capitalise_first
 
 MIN_STEP_M = 0.05  # m; its error (1 σ) is 0.29 of it, so smaller steps are below the noise of UWB
 MIN_OFFSET_M = 0.1  # m between two senders; the noise of good UWB
@@ -35,7 +35,7 @@ INVALID: Mapping[str, tuple[str, str, str]] = {
     "held": (
         "source_position_held",
         "repeat the last position: the sender lost tracking and holds it",
-        "Stop sending while tracking is lost, or send NaN. Take the tracking state from the sensor.",
+        "Stop sending while tracking is lost, or send NaN (check the state of the tracking).",
     ),
     "NaN": (
         "source_without_position",
@@ -167,7 +167,8 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
     state = ekf2.state.dropna()
     if len(samples) < WINDOW or len(state) < WINDOW:
         return
-    differences = [_difference_m(samples.to_numpy(), samples.index - d, state) for d in DELAYS_S]
+    time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
+    differences = [_difference_m(position_m, time_s - d, state) for d in DELAYS_S]
     best = int(np.nanargmin(differences)) if np.isfinite(differences).any() else 0
     fusing = ekf2.fusing
     is_fused = isinstance(fusing, Unavailable) or bool(

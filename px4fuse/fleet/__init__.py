@@ -1,4 +1,4 @@
-"""Many logs in one table (``batch``), and differences between two (``diff``)."""
+"""Comparison of many logs (``px4fuse batch``), and of two logs (``px4fuse diff``)."""
 
-# s; default time limit for one log
+# Default maximum time (s) for the analysis of one log
 TIMEOUT_S = 600.0

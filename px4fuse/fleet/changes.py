@@ -10,6 +10,7 @@ from px4fuse.comparison.model import FilterSummary
 from px4fuse.fleet.inputs import DiffInput, Progress, Results, read_inputs
 from px4fuse.fleet.measures import (
     ABSOLUTE_TOLERANCE,
+    FILTER_LABELS,
     RELATIVE_TOLERANCE,
     ComparedNumber,
     collect_numbers,
@@ -19,19 +20,18 @@ from px4fuse.results import contract
 from px4fuse.results.model import provenance, schema_of
 from px4fuse.text import format_factor, format_number
 
-# Maximum √(mean NEES) of a consistent filter; its inverse is the minimum. The errors of one flight
-# are correlated, and EKF2's published position includes the lag of its output predictor
+# Maximum √(mean NEES) of a consistent filter; the minimum is 1 / maximum. The limits are wide,
+# because errors in a flight are correlated and EKF2's output predictor delays its position
 MAX_NEES_SIGMA_RATIO = 2.0
-FILTER_LABELS = {"kf": "KF", "ekf2": "EKF2"}
-# Settings and flight data that diff compares, with their path in the results
+# Label of each setting or property of a flight that px4fuse diff compares, and path in the results
 SETTINGS = {
     "SIGMA_A (m/s²)": "settings.sigma_a_m_s2",
     "SIGMA_Z (m)": "settings.sigma_z_m",
     "DT (s)": "settings.dt_s",
     "input": "settings.input",
-    "time offset added (s)": "settings.clock_offset_s",
-    "start (s)": "settings.start_s",
-    "end (s)": "settings.end_s",
+    "added time offset (s)": "settings.clock_offset_s",
+    "start of the analysis (s)": "settings.start_s",
+    "end of the analysis (s)": "settings.end_s",
     "position source": "source.name",
     "firmware": "log.firmware",
     "firmware hash": "log.firmware_hash",
@@ -48,38 +48,38 @@ def diff(
     Parameters
     ----------
     a, b : str or Path
-        Flight logs, reports of ``px4fuse compare`` or results as JSON. A log is
-        analysed with the settings of the other report or results, if there is one.
+        Flight logs, or reports (PDF) or results (JSON) of ``px4fuse compare``. If one input is a
+        log, it is analysed with the settings in the other input.
     progress : callable
-        Receives the name of each step.
+        Function that receives the name of each step of the computation.
 
     Raises
     ------
     LogError, MissingDataError, ResultsError
-        A file cannot be read, or is not from ``px4fuse compare``; A and B are the same file.
+        A file cannot be read or is not from ``px4fuse compare``, or A and B are the same file.
     """
     return list_changes(*read_inputs(Path(a), Path(b), progress))
 
 
 def list_changes(a: DiffInput, b: DiffInput) -> contract.ChangeResults:
-    """List the differences of two comparisons."""
+    """List the settings, numbers and findings that differ between two results of comparisons."""
     findings = tuple(_finding_changes(a.results, b.results))
     return contract.ChangeResults(
         schema=schema_of(contract.CHANGES),
         a=_describe_input(a),
         b=_describe_input(b),
         settings=tuple(_setting_changes(a.results, b.results)),
-        numbers=tuple(number_changes(collect_numbers(a.results), collect_numbers(b.results))),
+        numbers=tuple(compare_numbers(collect_numbers(a.results), collect_numbers(b.results))),
         findings=findings,
         worse=tuple(_worse_verdicts(a.results, b.results, findings)),
-        provenance=provenance(shlex.join(["px4fuse", "diff", a.given, b.given])),
+        provenance=provenance(shlex.join(["px4fuse", "diff", a.file_name, b.file_name])),
     )
 
 
 def _describe_input(diff_input: DiffInput) -> contract.DiffInput:
     log = diff_input.results.log
     return contract.DiffInput(
-        given=diff_input.given,
+        given=diff_input.file_name,
         kind=diff_input.kind,
         log=log.name,
         log_sha256=log.sha256,
@@ -88,7 +88,6 @@ def _describe_input(diff_input: DiffInput) -> contract.DiffInput:
 
 
 def _setting_changes(a: Results, b: Results) -> Iterator[contract.SettingChange]:
-    """Yield settings, flight data and PX4 parameters that differ."""
     values_a, values_b = (
         {name: value_at(results, path) for name, path in SETTINGS.items()} | _parameters(results)
         for results in (a, b)
@@ -99,20 +98,20 @@ def _setting_changes(a: Results, b: Results) -> Iterator[contract.SettingChange]
 
 
 def _parameters(results: Results) -> dict[str, float]:
-    """Return the PX4 parameters of log and EKF2 replay, rounded to 6 digits (logged as float32)."""
+    """Return the PX4 parameters in the results, rounded to 6 digits because they are float32."""
     parameters = (value_at(results, "ekf2_replay.settings") or {}) | dict(results.log.parameters)
     return {name: float(f"{parameters[name]:.6g}") for name in sorted(parameters)}
 
 
-def number_changes(
+def compare_numbers(
     numbers_a: Mapping[str, ComparedNumber], numbers_b: Mapping[str, ComparedNumber]
 ) -> Iterator[contract.NumberChange]:
-    """Yield the numbers that differ, and those that only A or only B contains.
+    """Yield the numbers that differ between A and B, or that only one of them contains.
 
     Parameters
     ----------
     numbers_a, numbers_b : mapping
-        Numbers of A and B by their path in the results.
+        Numbers of A and B, by their path in the results.
     """
     for path in {**numbers_a, **numbers_b}:
         a, b = numbers_a.get(path), numbers_b.get(path)
@@ -138,9 +137,8 @@ def number_changes(
 
 
 def _finding_changes(a: Results, b: Results) -> Iterator[contract.FindingChange]:
-    """Yield the findings that only A or only B contains, compared by id and severity."""
-    sides: tuple[tuple[Results, Results, contract.DiffSide], ...]
-    sides = ((b, a, "B"), (a, b, "A"))
+    """Yield the findings that only A or only B contains with the same id and severity."""
+    sides: tuple[tuple[Results, Results, contract.DiffSide], ...] = ((b, a, "B"), (a, b, "A"))
     for results, other, only_in in sides:
         ids = {(finding.id, finding.severity) for finding in other.findings}
         for finding in results.findings:
@@ -151,20 +149,20 @@ def _finding_changes(a: Results, b: Results) -> Iterator[contract.FindingChange]
 def _worse_verdicts(
     a: Results, b: Results, findings: Iterable[contract.FindingChange]
 ) -> Iterator[str]:
-    """Yield a sentence for each verdict that is worse in B, and for each new error."""
+    """Yield a sentence for each verdict that is worse in B, and for each new error finding."""
     verdicts_a, verdicts_b = _verdicts(a), _verdicts(b)
     for name, (value_a, was_consistent) in verdicts_a.items():
         value_b, is_consistent = verdicts_b.get(name, (value_a, True))
         if was_consistent and not is_consistent:
             ratio = value_b**0.5
-            factor = f"{format_factor(max(ratio, 1.0 / ratio))} times too"
-            verdict = (
-                f"overconfident, σ {factor} small"
-                if ratio > 1.0
-                else f"underconfident, σ {factor} large"
+            factor = format_factor(max(ratio, 1.0 / ratio))
+            verdict, size = (
+                ("overconfident", "small") if ratio > 1.0 else ("underconfident", "large")
             )
-            values = f"{format_number(value_a)} (consistent) → {format_number(value_b)}"
-            yield f"{name}: {values} ({verdict})."
+            yield (
+                f"{name}: {format_number(value_a)} (consistent) → {format_number(value_b)} "
+                f"({verdict}, σ {factor} times too {size})."
+            )
     error_ids = [
         finding.id for finding in findings if (finding.only_in, finding.severity) == ("B", "error")
     ]
@@ -173,7 +171,7 @@ def _worse_verdicts(
 
 
 def _verdicts(results: Results) -> dict[str, tuple[float, bool]]:
-    """Return mean NIS and mean NEES by label (filter and axis), with True if consistent."""
+    """Return mean NIS and mean NEES by label ("Mean NIS of KF, north"), with True if consistent."""
     verdicts: dict[str, tuple[float, bool]] = {}
     for axis, result in (value_at(results, "axes") or {}).items():
         for name, label in FILTER_LABELS.items():

@@ -1,7 +1,7 @@
-"""Execution of jobs on this computer or on a Dask cluster.
+"""Execution of the jobs of ``px4fuse batch`` on this computer or on a Dask cluster.
 
-Each job runs in a process of :mod:`px4fuse.workers`, with limits of time and memory. On a cluster,
-the Dask workers start these processes.
+Each job analyses one log in a process of :mod:`px4fuse.workers`, with limits of time and memory. On
+a cluster, the Dask workers start these processes.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from px4fuse.workers import Job, JobFailure, Result
 if TYPE_CHECKING:
     from distributed import Client
 
-# s; maximum time until the scheduler answers, and until it has a worker
+# Maximum time (s) until the Dask scheduler answers, and until it has a worker
 CONNECT_TIMEOUT_S = 15.0
-# Jobs per Dask task: the imports of a process take 2 s, so several jobs share one process
+# Number of logs per Dask task: they share one process, because its imports take 2 s
 JOBS_PER_TASK = 4
 
 
 @contextmanager
 def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
-    """Connect to a Dask cluster; yield its client, or None to run the jobs on this computer.
+    """Connect to a Dask cluster; provide its client, or None to run the jobs on this computer.
 
     Parameters
     ----------
     scheduler : str, optional
-        Address of a running Dask scheduler; by default the Dask client of this Python session, if
-        there is one.
+        Address of a running Dask scheduler; default: the Dask client of this Python session, if
+        there is one, else this computer.
 
     Raises
     ------
@@ -58,12 +58,12 @@ def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
             "--scheduler requires Dask.", 'Run pip install "px4fuse[batch]".'
         ) from error
     try:
-        # a client whose connection fails must not become the default client of this session
+        # a client whose connection fails must not become the Dask client of this Python session
         client = Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise SettingsError(
             f"--scheduler {scheduler}: no Dask scheduler answers ({one_line(str(error), 120)}).",
-            "Start one with: dask scheduler",
+            "Start a Dask scheduler with: dask scheduler",
         ) from error
     # without this, Dask prints tracebacks when the scheduler ends
     with silence_logging_cmgr(logging.CRITICAL), client, client.as_current():
@@ -84,14 +84,13 @@ def _session_client() -> Client | None:
 
 
 def _check_workers(client: Client) -> None:
-    """Raise an error if the cluster has no workers or other versions of px4fuse."""
     address = client.scheduler_info()["address"]
     try:
         client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
     except TimeoutError as error:
         raise SettingsError(
-            f"Scheduler {address} has no workers.",
-            f"Start them with: dask worker {address} --nthreads 1",
+            f"The Dask scheduler {address} has no workers.",
+            f"Start workers with: dask worker {address} --nthreads 1",
         ) from error
     own_version = metadata.version("px4fuse")
     for name, worker_version in client.run(metadata.version, "px4fuse", on_error="return").items():
@@ -100,8 +99,8 @@ def _check_workers(client: Client) -> None:
                 f"px4fuse {worker_version}" if isinstance(worker_version, str) else "no px4fuse"
             )
             raise SettingsError(
-                f"Worker {name} has {worker_text}; this computer has px4fuse {own_version}.",
-                "Install the same version of px4fuse on both.",
+                f"Dask worker {name} has {worker_text}; this computer has px4fuse {own_version}.",
+                "Install the same version of px4fuse on the worker and on this computer.",
             )
 
 
@@ -120,7 +119,7 @@ def run_jobs(
     work : callable
         :func:`~px4fuse.workers.run_bounded` with its function and limits.
     processes : int, optional
-        Parallel processes on this computer; by default the number of cores.
+        Number of parallel processes on this computer; default: number of cores.
 
     Raises
     ------
@@ -142,7 +141,7 @@ def run_jobs(
             chunk = futures.pop(future)
             if future.status not in ("finished", "error"):
                 raise Px4FuseError("the connection to the Dask scheduler was lost.")
-            # error: the worker process ended several times, or cannot load the job
+            # the worker process ended several times, or cannot load the job
             error = future.exception()
             failure = JobFailure(one_line(f"{type(error).__name__}: {error}", 300))
             results = [failure] * len(chunk) if error else future.result()
@@ -153,8 +152,8 @@ def run_jobs(
 
 
 def _run_chunk(work: Callable[..., Iterator[tuple[int, Any]]], jobs: Sequence[Any]) -> list[Any]:
-    """Run the jobs of one Dask task one after the other, in a child process of the worker."""
-    # a Dask worker is a daemon process by default, and a daemon must not start child processes
+    """Run the jobs of one Dask task in sequence, in a child process of the Dask worker."""
+    # a Dask worker is a daemon process by default, which Python does not allow to start processes
     multiprocessing.current_process().daemon = False
     results_by_index = dict(work(jobs, processes=1))
     return [results_by_index[index] for index in range(len(jobs))]

@@ -1,4 +1,4 @@
-"""Inputs of ``diff``: a log, a report with its attached results, or results as JSON."""
+"""Inputs of ``px4fuse diff``: a log, a report (PDF) with its results, or results (JSON)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,17 +21,17 @@ from px4fuse.verification.pdf_input import attached_results
 Kind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]
 Results = ComparisonResults | AidsResults
-# Settings that the analysis of a log takes from the other input. The settings of the second list
-# are taken only if both inputs are of the same log
+# Settings with which px4fuse diff analyses a log: those in the results of the other input. Settings
+# in _SEGMENT_FIELDS are used only if both inputs are of the same log
 _FILTER_FIELDS = ("sigma_a_m_s2", "sigma_z_m", "dt_s", "input", "axes", "clock_offset_s")
 _SEGMENT_FIELDS = ("heading_deg", "start_s", "end_s", "position_source", "source_kind", "height")
 
 
 @dataclass(frozen=True)
 class DiffInput:
-    """Input A or B of diff, with its results; ``given`` is the file name."""
+    """Results of the input A or B of ``px4fuse diff``."""
 
-    given: str
+    file_name: str
     kind: Kind
     results: Results
 
@@ -39,14 +39,14 @@ class DiffInput:
 def read_inputs(
     a: Path, b: Path, progress: Progress = lambda _: None
 ) -> tuple[DiffInput, DiffInput]:
-    """Read both inputs; analyse a log with the settings in the results of the other input.
+    """Read the inputs A and B; analyse a log with the settings in the results of the other input.
 
     Raises
     ------
     LogError, MissingDataError
         A log cannot be read, or does not contain the required data.
     ResultsError
-        An input cannot be read, or is not from ``px4fuse compare``; A and B are the same file.
+        An input cannot be read or is not from ``px4fuse compare``, or A and B are the same file.
     """
     first, second = (_read_attached(path) for path in (a, b))
     if a.samefile(b):
@@ -58,19 +58,23 @@ def read_inputs(
 
 
 def _read_attached(path: Path) -> DiffInput | None:
-    """Read the results from a report or a JSON file; None for a log."""
+    """Return the results in a report (PDF) or a JSON file; None for a log."""
     name, head = display_name(path), read_head(path, 64, LogError)
     is_report = head.startswith(b"%PDF-")
     if not is_report and not head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
         return None
     limit = MAX_REPORT_BYTES if is_report else MAX_RESULTS_BYTES
-    advice = "Reports are below 2 MB" if is_report else "Give results of px4fuse compare"
+    advice = (
+        "Give a report, which has less than 2 MB"
+        if is_report
+        else "Give results of px4fuse compare"
+    )
     content = read_bytes_limited(path, ResultsError, limit, size_remedy=advice)
     results = (attached_results if is_report else read_results)(content, name)
     if not isinstance(results, Results):
         raise ResultsError(
-            f"{name} contains {results.schema.name}, which px4fuse diff cannot compare. "
-            "Give a log, or a report or results of px4fuse compare."
+            f"{name} contains results with the schema {results.schema.name}, which px4fuse diff "
+            "cannot compare. Give a log, or a report or results of px4fuse compare."
         )
     return DiffInput(name, "report" if is_report else "results", results)
 
@@ -84,7 +88,7 @@ def _analyse_log(path: Path, other: DiffInput | None, progress: Progress) -> Dif
             request, **{name: getattr(other.results.request, name) for name in fields}
         )
     result = run_or_evaluate_aids(request, progress)
-    text = to_json(outcome_results(request, result))  # rounds numbers as in a report
+    text = to_json(outcome_results(request, result))  # to_json rounds the numbers as in a report
     results = read_results(text.encode())
     assert isinstance(results, Results)
     return DiffInput(display_name(path), "log", results)

@@ -1,4 +1,4 @@
-"""Job of ``px4fuse batch``: analyses one log and returns its rows, results and report."""
+"""Job of ``px4fuse batch``: analysis of one log, with its table rows, results and report."""
 
 import re
 from dataclasses import dataclass
@@ -15,20 +15,20 @@ from px4fuse.request import ComparisonRequest, with_options
 
 @dataclass(frozen=True)
 class Job:
-    """Log to analyse, with settings and limits.
+    """Log that ``px4fuse batch`` analyses, with settings and limits.
 
     Attributes
     ----------
     address : str
-        Absolute path or URL.
+        Absolute path or URL of the log.
     request : ComparisonRequest
-        Settings of the analysis; its log is replaced by ``address``.
+        Settings of the analysis; ``address`` replaces the log in the request.
     with_report : bool
         True to make the PDF report.
     max_bytes : int
-        Maximum size of a log (bytes).
+        Maximum size of the log (bytes).
     finished_hashes : frozenset of str
-        SHA-256 of the logs of this file size whose results exist already.
+        SHA-256 of all logs with the size of this log whose results already exist.
     """
 
     address: str
@@ -40,17 +40,17 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Rows, results and report of one log.
+    """Table rows, results and report of one log in ``px4fuse batch``.
 
     Attributes
     ----------
     sha256 : str
-        SHA-256 of the log; empty if it could not be read.
+        SHA-256 of the log; empty if the log could not be read.
     rows : tuple of Row
         One row per axis. A single row if the log could not be compared. No row if the results of
-        the log exist already.
+        the log already exist.
     results, report : bytes
-        JSON and PDF; empty if not made.
+        Results (JSON) and report (PDF); empty if not made.
     """
 
     sha256: str
@@ -60,13 +60,7 @@ class Outcome:
 
 
 def analyse(job: Job) -> Outcome:
-    """Compare one log as ``px4fuse compare`` does.
-
-    Returns
-    -------
-    Outcome
-        With one row that contains the reason, if the log cannot be compared.
-    """
+    """Compare one log as ``px4fuse compare`` does; after an error, one row contains the reason."""
     sha256 = ""
     max_log_bytes.set(job.max_bytes)
     try:
@@ -84,13 +78,13 @@ def analyse(job: Job) -> Outcome:
 
 
 def failure_row(error: Px4FuseError, status: str, name: str = "") -> Row:
-    """Return the row of a log that could not be compared, with reason and action."""
+    """Return the table row of a log that could not be compared, with reason and action."""
     reason = with_options(error.reason).removeprefix(f"{name}: ")
     return {"status": status, "reason": reason, "remedy": with_options(error.remedy)}
 
 
 def _compare_log(job: Job, path: Path, sha256: str) -> Outcome:
-    # imported here: only workers need these modules
+    # imported here, because only the worker processes need these modules
     from px4fuse.analysis import AidsOnlyAnalysis, read_flight, run_or_evaluate_aids  # noqa: PLC0415
     from px4fuse.findings import find_aids  # noqa: PLC0415
     from px4fuse.results.build import log_record, results  # noqa: PLC0415
@@ -126,7 +120,7 @@ def _sha256(path: Path) -> str:
 
 
 def file_stem(name: str, sha256: str) -> str:
-    """Return a file name for the outputs of a log: its safe name and the start of its hash.
+    """Return a file name for the outputs of a log: its name and the start of its SHA-256.
 
     >>> file_stem("Flug 3.ulg", "ab" * 32)
     'Flug_3-abababababab'

@@ -1,4 +1,4 @@
-"""Search for logs in files, folders, globs and URLs (fsspec)."""
+"""Search for logs among files, folders, globs and URLs (with fsspec)."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from px4fuse.results.reading import one_line
 if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
 
-#: Suffixes by which logs in a folder are found; a file given by its name may have any suffix
+#: Suffixes of the files in a folder that are logs; a file that the user names may have any suffix
 SUFFIXES = (".ulg", ".tlog", ".bin")
 
 
 @dataclass(frozen=True, order=True)
-class FoundLog:
-    """Address and size of a log, before the log is read.
+class LogAddress:
+    """Name, address and size of a log, before the log is read.
 
     Attributes
     ----------
     name : str
         File name without folder.
     log : str
-        Path or URL for the table; relative to the working directory if the argument is relative.
+        Path or URL in the table; relative to the working directory if the user's argument is.
     address : str
-        Absolute path or URL, with which a worker opens the log.
+        Absolute path or URL, with which a worker process opens the log.
     size_bytes : int or None
-        None if the file system does not provide it.
+        Size of the log; None if the file system does not provide it.
     """
 
     name: str
@@ -44,13 +44,13 @@ class FoundLog:
     size_bytes: int | None
 
 
-def find_logs(patterns: Iterable[str]) -> list[FoundLog]:
-    """Find the logs in files, folders, globs and URLs, each once, sorted by name.
+def find_logs(patterns: Iterable[str]) -> list[LogAddress]:
+    """Find the different logs among files, folders, globs and URLs, sorted by name.
 
     Parameters
     ----------
     patterns : iterable of str
-        Files, folders (all logs in them, by their suffixes), globs and URLs.
+        Files, folders (in which files with SUFFIXES are logs), globs and URLs.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def find_logs(patterns: Iterable[str]) -> list[FoundLog]:
     return sorted(logs_by_address.values())
 
 
-def _logs_in(pattern: str) -> list[FoundLog]:
+def _logs_in(pattern: str) -> list[LogAddress]:
     if not pattern:
         raise SettingsError("the name of a log is empty", "Give files, folders, globs or URLs.")
     file_system, root = _file_system(pattern)
@@ -75,7 +75,7 @@ def _logs_in(pattern: str) -> list[FoundLog]:
                 for path, info in all_files.items()
                 if PurePosixPath(path).suffix.lower() in SUFFIXES
             }
-        elif file_system.exists(root):  # the worker rejects a device or a pipe
+        elif file_system.exists(root):  # a worker process rejects devices and pipes
             info_by_path = {root: file_system.info(root) if file_system.isfile(root) else {}}
         else:
             all_files = (
@@ -86,7 +86,7 @@ def _logs_in(pattern: str) -> list[FoundLog]:
             info_by_path = {
                 path: info for path, info in all_files.items() if info["type"] == "file"
             }
-    # OSError, or an exception of the package for this type of URL (no account, no such bucket)
+    # OSError, or an exception of the package for this type of URL (unknown account or bucket)
     except Exception as error:
         raise SettingsError(
             f"{pattern}: cannot be read ({one_line(str(error), 200) or type(error).__name__})."
@@ -101,7 +101,7 @@ def _logs_in(pattern: str) -> list[FoundLog]:
         address = path if _is_local(file_system) else file_system.unstrip_protocol(path)
         is_relative = _is_local(file_system) and not Path(pattern).is_absolute()
         log = os.path.relpath(path) if is_relative else address
-        found_logs.append(FoundLog(_file_name(path), log, address, info.get("size")))
+        found_logs.append(LogAddress(_file_name(path), log, address, info.get("size")))
         if _is_local(file_system):
             add_input(Path(path))
     return found_logs
@@ -109,12 +109,7 @@ def _logs_in(pattern: str) -> list[FoundLog]:
 
 @contextmanager
 def local_file(address: str) -> Iterator[Path]:
-    """Provide a log as a local file; a downloaded file is deleted at the end.
-
-    Parameters
-    ----------
-    address : str
-        Absolute path or URL.
+    """Provide the path of a log on this computer; the log of a URL is downloaded temporarily.
 
     Raises
     ------
@@ -144,12 +139,12 @@ def _file_system(address: str) -> tuple[AbstractFileSystem, str]:
 
     try:
         file_system, path = url_to_fs(address)
-    except ImportError as error:  # the cause contains the name of the missing package
-        package = getattr(error.__cause__, "name", None) or "the package of this URL type"
+    except ImportError as error:  # the cause of the error names the missing package
+        package = getattr(error.__cause__, "name", None) or "the package of this type of URL"
         raise SettingsError(
-            f"{address}: this type of URL requires a package.", f'Run pip install "{package}".'
+            f"{address}: this type of URL requires {package}.", f'Run pip install "{package}".'
         ) from error
-    except ValueError as error:  # unknown protocol
+    except ValueError as error:  # the protocol of the URL is unknown
         raise SettingsError(f"{address}: {error}", "Give a path or another URL.") from error
     return file_system, path
 
@@ -161,5 +156,5 @@ def _is_local(file_system: AbstractFileSystem) -> bool:
 
 
 def _file_name(path: str) -> str:
-    """Return the file name of a path or URL, without the query of a URL."""
+    """Return the file name in a path or URL, without the query of a URL."""
     return PurePosixPath(path.partition("?")[0]).name or "log"

@@ -19,11 +19,12 @@ from px4fuse.webpage import frame
 from px4fuse.webpage.frame import Cell, Column, Row, Section
 from px4fuse.webpage.safe import clean, load_template, local_link
 
-# Columns of the four ratios, in the order of the verdicts of a card
+# Columns of the four σ ratios (KF and EKF2, against source and ground truth), in the order of the
+# verdicts of a diagnosis card
 RATIOS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
 SEVERITIES = ("error", "warning", "note", "clean", "refused")
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
-# Columns that the page shows if the user opens a row: one value per axis, and one per log
+# Columns that the page shows after a click on a row: one value per axis (AXIS_COLUMNS) or per log
 AXIS_COLUMNS = [name for name, path in RESULT_PATHS.items() if "{" in path]
 LOG_COLUMNS = [
     name
@@ -45,23 +46,24 @@ LOG_COLUMNS = [
         "report",
     )
 ]
-# Group of the columns that are hidden at first
-MORE = "numbers"
-FILTERS = (
-    ("Diagnosis", "severity", "All"),
-    ("Status", "status", "All"),
-    ("Vehicle", "vehicle", "All"),
-    ("Firmware", "firmware", "All"),
-    ("Finding", "finding", "All"),
-    ("Action", "remedy", "All"),
-)
-# Axes whose numbers are shown for the log: the aisle if it exists, else north and east, else down
+# Name of the group of columns that the page shows on request
+EXTRA_COLUMNS = "numbers"
+# Label of each page filter, by the first word of its tags
+FILTERS = {
+    "severity": "Diagnosis",
+    "status": "Status",
+    "vehicle": "Vehicle",
+    "firmware": "Firmware",
+    "finding": "Finding",
+    "remedy": "Action",
+}
+# Axes whose numbers represent the log in the table: the aisle, else north and east, else down
 MAIN_AXES = (("aisle",), ("north", "east"), ("down",))
 
-#: Entry of one log: the non-empty columns of its rows, of the main axes if present, and
-#: ``severity`` (also of logs without a result), ``words`` (of the four verdicts), ``status``
-#: ("done" if one axis is), ``lacking`` (reasons for missing results, with actions),
-#: ``axes`` (rows with an axis), ``findings`` (ids) and ``tags`` (label by page filter value)
+#: One log on the page: the non-empty columns of its rows, preferably of MAIN_AXES, and
+#: ``severity`` (also of logs without a result), ``verdict_texts`` (four verdicts), ``status``
+#: ("done" if one axis is done), ``missing_results`` (reasons for missing results, with actions),
+#: ``axes`` (rows with an axis), ``findings`` (ids) and ``tags`` (labels by value of page filters)
 Log = Mapping[str, Any]
 
 
@@ -73,13 +75,10 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     table : DataFrame
         One row per log and axis, with the columns of :data:`px4fuse.fleet.rows.COLUMN_TYPES`; a log
         that could not be read has one row without axis.
+    title : str
+        Title of the page.
     made_with : str
         Name and version of px4fuse.
-
-    Returns
-    -------
-    str
-        HTML to write as UTF-8; equal for equal input, because it does not contain the date.
     """
     logs = sort_logs(logs_of(table))
     names = short_names(logs)
@@ -92,7 +91,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
         ("error", "with an error"),
         ("warning", "with a warning"),
         ("clean", "without a fault"),
-        ("refused", "refused"),
+        ("refused", "not analysed"),
     )
     count_text = ", ".join(f"{counts[name]} {text}" for name, text in parts if counts[name])
     return frame.page(
@@ -110,15 +109,18 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
                 for owner, against in (name.split("_") for name in RATIOS)
             ),
             Column("KF − EKF2 (m)", "number", visible_from="tablet"),
-            *(Column(label, "line", MORE) for label in ("Date (UTC)", "Vehicle", "Firmware")),
-            Column("SIGMA_Z estimate (m)", "number", MORE),
-            Column("Time offset (s)", "number", MORE),
-            Column("Findings", "rank", MORE),
+            *(
+                Column(label, "line", EXTRA_COLUMNS)
+                for label in ("Date (UTC)", "Vehicle", "Firmware")
+            ),
+            Column("SIGMA_Z estimate (m)", "number", EXTRA_COLUMNS),
+            Column("Time offset (s)", "number", EXTRA_COLUMNS),
+            Column("Findings", "rank", EXTRA_COLUMNS),
         ),
         rows=rows,
         filters=_filters(logs),
-        groups=[(MORE, "more columns")],
-        placeholder="name, vehicle, firmware, finding",
+        groups=[(EXTRA_COLUMNS, "more columns")],
+        placeholder="search by name, vehicle, firmware or finding",
         full_table_note="All rows are in fleet.csv.",
         ratio_axis={"bands": BANDS, "ends": AXIS_ENDS, "marks": MARK_PATHS},
     )
@@ -135,7 +137,7 @@ def _cells(log: Log, names: Mapping[str, str]) -> tuple[Cell, ...]:
         Cell(log["headline"], log["headline"], action, style_class=style),
         *(
             _ratio_cell(log.get(f"{name}_ratio"), name, word)
-            for name, word in zip(RATIOS, log["words"], strict=True)
+            for name, word in zip(RATIOS, log["verdict_texts"], strict=True)
         ),
         _value_cell(log.get("difference_rms_m"), format_metres),
         frame.text_cell(log.get("date", "")[:10]),
@@ -151,14 +153,14 @@ def _cells(log: Log, names: Mapping[str, str]) -> tuple[Cell, ...]:
 
 def _ratio_cell(ratio: float | None, name: str, word: str) -> Cell:
     owner, _, against = name.partition("_")
-    loud = " loud" if word in ("overconfident", "underconfident") else ""
+    emphasis = " loud" if word in ("overconfident", "underconfident") else ""
     if ratio is None:
         return Cell()
-    return Cell(format_ratio(ratio), ratio, style_class=f"{owner} {against}{loud}")
+    return Cell(format_ratio(ratio), ratio, style_class=f"{owner} {against}{emphasis}")
 
 
 def sort_logs(logs: Iterable[Log]) -> list[Log]:
-    """Sort logs by severity, then by their largest |ln ratio|, then by position RMSE."""
+    """Sort logs by severity, then by the largest |ln(σ ratio)|, then by position RMSE."""
 
     def rank(log: Log) -> tuple[float, ...]:
         ratios = [log[key] for name in RATIOS if log.get(key := f"{name}_ratio")]
@@ -181,9 +183,13 @@ def _details(log: Log) -> tuple[Section, ...]:
     titles = ["", *(axis["axis"] for axis in log["axes"])]
     return (
         frame.list_section(
-            "Missing results", [reason for reason, _ in log["lacking"] if reason], is_warning=True
+            "Missing results",
+            [reason for reason, _ in log["missing_results"] if reason],
+            is_warning=True,
         ),
-        frame.list_section("Actions", list(dict.fromkeys(r for _, r in log["lacking"] if r))),
+        frame.list_section(
+            "Actions", list(dict.fromkeys(r for _, r in log["missing_results"] if r))
+        ),
         frame.list_section(
             "Findings", [f"{finding_title(id_)} ({id_})" for id_ in log["findings"]]
         ),
@@ -207,28 +213,28 @@ def _format_value(value: str | float) -> str:
 
 
 def _filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Return the selection lists of the page with their options, most frequent option first."""
+    """Return the page filters with their options and log counts, most frequent option first."""
     counts = Counter(tag for log in logs for tag in log["tags"])
     label_by_tag: Mapping[str, str] = {
         tag: label for log in logs for tag, label in log["tags"].items()
     }
     filters = []
-    for label, kind, all_label in FILTERS:
+    for kind, label in FILTERS.items():
         options = [
             (tag, f"{clean(label_by_tag[tag], 60)} ({count})")
             for tag, count in counts.most_common()
             if tag.startswith(f"{kind}:")
         ]
         if options:
-            filters.append((label, [("", all_label), *options]))
+            filters.append((label, [("", "All"), *options]))
     return filters
 
 
-# -------------------- one entry per log
+# -------------------- combination of the table rows of each log
 
 
 def logs_of(table: pd.DataFrame) -> list[Log]:
-    """Combine the rows of each log into one :data:`Log`, in the order of the table."""
+    """Combine the table rows of each log into one :data:`Log`, in the order of the table."""
     rows: dict[str, list[dict[str, Any]]] = defaultdict(list)
     present = (table.notna() & (table != "")).to_numpy()
     for row, is_present in zip(table.to_dict("records"), present, strict=True):
@@ -253,7 +259,7 @@ def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
     log |= {
         "name": log.get("name") or PurePosixPath(log["log"]).name or "unnamed",
         "status": DONE if any(row["status"] == DONE for row in rows) else rows[0]["status"],
-        "lacking": tuple(dict.fromkeys(pair for pair in reasons_and_remedies if any(pair))),
+        "missing_results": tuple(dict.fromkeys(pair for pair in reasons_and_remedies if any(pair))),
         "axes": axes,
         "findings": [id_ for id_ in log.get("findings", "").split(FINDING_SEPARATOR) if id_],
     }
@@ -262,7 +268,7 @@ def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
         "severity": log.get("severity", "refused"),
         "headline": log.get("headline", f"{refused}: {log.get('reason', '')}"),
         "action": log.get("action") or log.get("remedy", "") * ("headline" not in log),
-        "words": (log.get("verdicts", "").split(FINDING_SEPARATOR) + [""] * 4)[:4],
+        "verdict_texts": (log.get("verdicts", "").split(FINDING_SEPARATOR) + [""] * 4)[:4],
     }
     return log | {"tags": _tags(log)}
 
@@ -275,11 +281,13 @@ def _tags(log: Log) -> dict[str, str]:
     for name in ("vehicle", "firmware"):
         tags[f"{name}:{log.get(name, '')}"] = log.get(name, f"{name} unknown")
     tags |= {f"finding:{finding}": finding_title(finding) for finding in log["findings"]}
-    return tags | {f"remedy:{remedy}": remedy or "no action" for _, remedy in log["lacking"]}
+    return tags | {
+        f"remedy:{remedy}": remedy or "no action" for _, remedy in log["missing_results"]
+    }
 
 
 def short_names(logs: Sequence[Log]) -> dict[str, str]:
-    """Shorten ids of flight controllers above 20 characters to the last 8 if these are unique."""
+    """Map long ids of flight controllers (above 20 characters) to their last 8, if all differ."""
     long_ids = {vehicle for log in logs if len(vehicle := log.get("vehicle", "")) > 20}
     short_ids = {vehicle: f"…{vehicle[-8:]}" for vehicle in long_ids}
     return short_ids if len(set(short_ids.values())) == len(short_ids) else {}

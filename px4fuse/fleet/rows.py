@@ -1,4 +1,4 @@
-"""Rows of the table of ``px4fuse batch``: one per axis of a log, made of the results."""
+"""Rows of the table of ``px4fuse batch``: one row per axis of a log, from its results."""
 
 import csv
 import shlex
@@ -20,7 +20,7 @@ from px4fuse.text import utc_time
 
 DONE, NOT_COMPARED, FAILED = "done", "not compared", "failed"
 FINDING_SEPARATOR = ";"
-# Tuning result of each axis; an axis that is not listed has a result of its name
+# Name of the noise estimate of an axis, if it is not the name of the axis
 _TUNING_OF_AXIS = {"north": "horizontal", "east": "horizontal"}
 
 
@@ -31,9 +31,9 @@ def read_rows(name: str) -> list[dict[str, str]]:
 
 
 _COLUMNS = read_rows("columns.csv")
-#: Path in the results of each column; empty if the value is composed of several fields
+#: Path of each table column in the results; empty if a column combines several fields
 RESULT_PATHS = {row["column"]: row["path"] for row in _COLUMNS}
-#: Data type of each column; missing numbers are NA, missing texts are empty
+#: Data type of each table column; missing numbers are NA, and missing texts are empty
 COLUMN_TYPES = {row["column"]: row["type"] for row in _COLUMNS}
 
 Row = dict[str, Any]
@@ -51,11 +51,10 @@ def value_at(results: object, path: str) -> Any:
 
 
 def axis_rows(results: ComparisonResults) -> list[Row]:
-    """Return the rows of one log, one per axis; columns without a value are absent.
+    """Return the table rows of one log, one per axis; columns without a value are absent.
 
-    ``kf_sigma_ratio`` and ``ekf2_sigma_ratio`` are actual σ over reported σ: above 1 the filter is
-    overconfident. SIGMA_Z and SIGMA_A are maximum-likelihood estimates; north and east have a
-    common estimate. A time offset that the flight does not determine is absent.
+    SIGMA_Z and SIGMA_A are maximum-likelihood estimates; north and east have a common estimate. A
+    time offset that is not determinable from the flight is absent.
     """
     common = log_columns(results.log) | finding_columns(results.findings, results.aids)
     common |= card_columns(results.card)
@@ -78,7 +77,7 @@ def axis_rows(results: ComparisonResults) -> list[Row]:
 
 
 def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) -> Row:
-    """Return ids and severities of findings that no other finding causes, and verdicts on aids."""
+    """Return findings that no other finding causes, and verdicts on EKF2's aiding sources."""
     causes = [finding for finding in findings if finding.caused_by is None]
     fused = [f"{name} {aid.verdict}" for name, aid in aids.items() if aid.verdict != "disabled"]
     return {
@@ -89,7 +88,7 @@ def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) 
 
 
 def card_columns(card: Card) -> Row:
-    """Return the columns of the diagnosis card, which are the same for all axes of a log."""
+    """Return the table columns of a diagnosis card, which are equal for all axes of a log."""
     rmse_m = card.effect.position_rmse_m.values() if card.effect else ()
     return {
         "severity": card.severity,
@@ -107,7 +106,7 @@ def card_columns(card: Card) -> Row:
 
 
 def first_action(card: Card) -> str:
-    """Return the commands of the first action against the first cause, else its sentence."""
+    """Return the commands, else the sentence, of the first action on a diagnosis card."""
     if not card.causes:
         return ""
     first = card.causes[0]
@@ -119,11 +118,11 @@ def first_action(card: Card) -> str:
     return card.do_this[0] if card.do_this else ""
 
 
-def typed_action(row: Row, path: str) -> Row:
-    """Replace the file name in the command of a row by the path of the log.
+def with_log_path(row: Row, path: str) -> Row:
+    """Replace the file name in the command of a table row by the path of the log.
 
     >>> row = {"name": "a.ulg", "action": "px4fuse compare a.ulg --sigma-a 0.4"}
-    >>> typed_action(row, "my logs/a.ulg")["action"]
+    >>> with_log_path(row, "my logs/a.ulg")["action"]
     "px4fuse compare 'my logs/a.ulg' --sigma-a 0.4"
     """
     action = row.get("action", "")
@@ -134,7 +133,6 @@ def typed_action(row: Row, path: str) -> Row:
 
 
 def log_columns(log: Log) -> Row:
-    """Return the columns that describe the log."""
     start, values = utc_time(log.start_unix_s), {"log": log}
     paths = {name: path for name, path in RESULT_PATHS.items() if path.startswith("log.")}
     return {name: value_at(values, path) for name, path in paths.items()} | {
@@ -144,14 +142,13 @@ def log_columns(log: Log) -> Row:
 
 
 def make_table(rows: Iterable[Row]) -> pd.DataFrame:
-    """Make the table of all rows, with the columns and types of COLUMN_TYPES."""
     text_columns = dict.fromkeys((name for name, kind in COLUMN_TYPES.items() if kind == "str"), "")
     filled_rows = [text_columns | clean_row(row) for row in rows]
     return pd.DataFrame(filled_rows, columns=list(COLUMN_TYPES)).astype(COLUMN_TYPES)
 
 
 def clean_row(row: Row) -> Row:
-    """Remove missing values, and replace bytes that are not UTF-8, as in file names."""
+    """Remove missing values from a row, and replace bytes of file names that are not UTF-8."""
     return {
         name: value.encode(errors="replace").decode() if isinstance(value, str) else value
         for name, value in row.items()
@@ -160,7 +157,7 @@ def clean_row(row: Row) -> Row:
 
 
 def csv_bytes(table: pd.DataFrame) -> bytes:
-    """Write the table as CSV for Excel and LibreOffice, without active formulas."""
+    """Format the table as CSV for Excel and LibreOffice, without active formulas."""
     text_columns = {
         name: table[name].map(neutralise_formulas)
         for name, kind in COLUMN_TYPES.items()

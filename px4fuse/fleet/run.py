@@ -1,4 +1,4 @@
-"""Run of ``px4fuse batch``: compares each log in a worker, caches its rows, writes the table."""
+"""Run of ``px4fuse batch``: compares logs in worker processes, and writes the table."""
 
 import io
 from collections import defaultdict
@@ -20,7 +20,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.fleet import TIMEOUT_S
 from px4fuse.fleet.engine import connect_cluster, run_jobs
 from px4fuse.fleet.job import Job, Outcome, analyse, failure_row, file_stem
-from px4fuse.fleet.logs import FoundLog, find_logs
+from px4fuse.fleet.logs import LogAddress, find_logs
 from px4fuse.fleet.page import html_text
 from px4fuse.fleet.rows import (
     FAILED,
@@ -29,7 +29,7 @@ from px4fuse.fleet.rows import (
     clean_row,
     csv_bytes,
     make_table,
-    typed_action,
+    with_log_path,
 )
 from px4fuse.input_files import check_output_folder
 from px4fuse.reading import max_log_bytes
@@ -37,7 +37,7 @@ from px4fuse.request import ComparisonRequest, command_line
 from px4fuse.workers import MEMORY_BYTES, JobFailure, run_bounded
 from px4fuse.writing import write_all
 
-# Columns of the table with the paths of a log's outputs, relative to the output folder
+# Table columns with the paths of a log's outputs, relative to the output folder
 FILE_COLUMNS = ("results", "report")
 RESUME_NOTE = "Finished results are kept. Run the same command to continue."
 
@@ -46,7 +46,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class BatchResult:
-    """Table of many logs, and written files.
+    """Table and written files of a run of ``px4fuse batch``.
 
     Attributes
     ----------
@@ -56,6 +56,8 @@ class BatchResult:
         Number of logs whose results are from an earlier run.
     severities : frozenset of str
         Severities of all findings.
+    written : tuple of Path
+        Files of the table.
     """
 
     table: pd.DataFrame
@@ -65,7 +67,7 @@ class BatchResult:
 
 
 class CachedRows(msgspec.Struct, frozen=True):
-    """Rows of a log for one version of px4fuse and one set of settings."""
+    """Table rows of a log in a cache file, for one version of px4fuse and one set of settings."""
 
     sha256: str
     px4fuse: str
@@ -75,22 +77,21 @@ class CachedRows(msgspec.Struct, frozen=True):
 
     @property
     def file(self) -> str:
-        """Path of the cache file, relative to the output folder."""
         return f"rows/{self.sha256}.json"
 
 
 @dataclass(frozen=True)
 class _RunState:
-    """Output folder, px4fuse version, settings, and the logs that are finished so far."""
+    """State of a run of ``px4fuse batch``: settings, and the logs that are finished so far."""
 
     output: Path
     px4fuse: str
     settings: str
-    # SHA-256 by address, for the logs that did not fail
+    # SHA-256 of the logs that did not fail, by address
     hash_by_address: dict[str, str] = field(default_factory=dict)
-    # First log by SHA-256; only the first of several logs with the same content has rows
-    first_log_by_hash: dict[str, FoundLog] = field(default_factory=dict)
-    # Rows of logs that failed, by address
+    # first of the logs with the same content, by SHA-256; only this log has table rows
+    first_log_by_hash: dict[str, LogAddress] = field(default_factory=dict)
+    # table rows of the logs that failed, by address
     failed_rows: dict[str, Row] = field(default_factory=dict)
     # SHA-256 of the logs whose results are from an earlier run
     reused_hashes: set[str] = field(default_factory=set)
@@ -103,10 +104,9 @@ def batch(
     reports: bool = False,
     **settings: Any,
 ) -> pd.DataFrame:
-    """Compare many logs, on this computer or a Dask cluster.
+    """Compare many logs as :func:`px4fuse.compare` does, on this computer or a Dask cluster.
 
-    If the Python session has a Dask client (``distributed.Client``), its cluster does
-    the work.
+    If the Python session has a Dask client (``distributed.Client``), its cluster is used.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def batch(
         Files, folders, globs and URLs.
     output : str or Path, optional
         Folder for the table and the results of each log; a second run processes only new and
-        failed logs. By default no file is kept.
+        failed logs. By default no file is written.
     reports : bool
         True to write a PDF report for each log.
     timeout_s : float
@@ -122,11 +122,11 @@ def batch(
     scheduler : str, optional
         Address of a Dask scheduler.
     workers : int, optional
-        Processes on this computer; by default the number of cores.
+        Number of processes on this computer; by default the number of cores.
     memory_gb : float
-        Address space for one log, of which libraries use 0.6 GB; enforced on Linux only.
+        Maximum address space for one log, of which libraries use 0.6 GB; only on Linux.
     progress : callable
-        Called with the activity, the number of finished logs, and the number of all logs.
+        Function of the activity, the number of finished logs, and the number of all logs.
     **settings
         The arguments above, and those of :func:`px4fuse.compare`, such as ``sigma_z_m``.
 
@@ -164,13 +164,13 @@ def run(
     scheduler: str | None = None,
     workers: int | None = None,
     memory_gb: float = MEMORY_BYTES / 1e9,
-    progress: Progress = lambda what, done, of: None,
+    progress: Progress = lambda *_: None,
     **settings: Any,
 ) -> BatchResult:
-    """Compare many logs like :func:`batch`, into a folder; return the table with written files.
+    """Compare many logs as :func:`batch` does, and write table and results to a folder.
 
     If the run ends early (Ctrl-C, full disk, lost cluster), the folder contains the finished
-    results, and a table of them if it can be written.
+    results, and a table of them if the table can be written.
 
     Raises
     ------
@@ -190,15 +190,14 @@ def run(
     try:
         request = ComparisonRequest(log="LOG", **settings)
     except TypeError as error:
-        raise SettingsError(f"unknown setting ({error}).") from error
+        raise SettingsError(f"a setting is unknown ({error}).") from error
     if request.mavlink is not None or request.position is not None:
         raise SettingsError(
             "`mavlink` and `position` are files of one flight and not available for many logs."
         )
     sigma_z_m = Settings().sigma_z_m if request.sigma_z_m is None else request.sigma_z_m
-    Settings(
-        request.sigma_a_m_s2, sigma_z_m, request.dt_s
-    )  # raises an error for values out of range
+    # raises an error if a setting is out of range
+    Settings(request.sigma_a_m_s2, sigma_z_m, request.dt_s)
     state = _RunState(output, metadata.version("px4fuse"), command_line(request))
     hashes_by_size = _cached_hashes(state, reports)
     log_by_address = {log.address: log for log in logs}
@@ -219,12 +218,12 @@ def run(
         connect_cluster(scheduler) as client,
         closing(run_jobs(client, run_in_processes, jobs, workers)) as finished_jobs,
     ):
-        progress("comparing", 0, len(jobs))
+        progress("comparing logs", 0, len(jobs))
         try:
             try:
                 for number, (job, outcome) in enumerate(finished_jobs, 1):
                     _cache_outcome(state, log_by_address[job.address], outcome)
-                    progress(f"comparing, {len(state.failed_rows)} failed", number, len(jobs))
+                    progress(f"comparing logs, {len(state.failed_rows)} failed", number, len(jobs))
             finally:
                 batch_result = _write_table(state, logs)
         except Px4FuseError as error:
@@ -233,7 +232,7 @@ def run(
 
 
 def _cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]]:
-    """Return the SHA-256 of the logs whose rows and output files exist, by size of the log."""
+    """Return the SHA-256 of the logs with finished outputs in the folder, by size of the log."""
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
     for cached in load_cached_rows(state.output, state.px4fuse, state.settings):
         first_row = cached.rows[0]
@@ -244,18 +243,18 @@ def _cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]
 
 
 def load_cached_rows(folder: Path, px4fuse: str, settings: str) -> Iterator[CachedRows]:
-    """Yield the cached rows of this px4fuse version and these settings."""
+    """Yield the cached table rows in a folder for this px4fuse version and these settings."""
     for file in sorted((folder / "rows").glob("*.json")):
         try:
             cached = msgspec.json.decode(file.read_bytes(), type=CachedRows)
         except (OSError, msgspec.MsgspecError):
-            continue  # not a cache file of this version: the log is compared again
+            continue  # no cache file of this px4fuse version, so the log is compared again
         if (cached.px4fuse, cached.settings) == (px4fuse, settings):
             yield cached
 
 
-def _cache_outcome(state: _RunState, log: FoundLog, outcome: Outcome | JobFailure) -> None:
-    """Add the outcome of a log to the state, and write its results to the output folder."""
+def _cache_outcome(state: _RunState, log: LogAddress, outcome: Outcome | JobFailure) -> None:
+    """Add the outcome of a log to the state of the run, and write its results to the folder."""
     if isinstance(outcome, JobFailure):
         remedy = "Increase --timeout or --memory, or run px4fuse compare on this log."
         outcome = Outcome("", (failure_row(LogError(outcome.reason.rstrip("."), remedy), FAILED),))
@@ -271,8 +270,7 @@ def _cache_outcome(state: _RunState, log: FoundLog, outcome: Outcome | JobFailur
     state.first_log_by_hash[outcome.sha256] = first_log
 
 
-def _write_log(state: _RunState, log: FoundLog, outcome: Outcome) -> None:
-    """Write the results, the report and the cached rows of a log."""
+def _write_log(state: _RunState, log: LogAddress, outcome: Outcome) -> None:
     stem = f"results/{file_stem(log.name, outcome.sha256)}"
     named_contents = {f"{stem}.json": outcome.results, f"{stem}.pdf": outcome.report}
     files = {
@@ -285,25 +283,25 @@ def _write_log(state: _RunState, log: FoundLog, outcome: Outcome) -> None:
     write_all({state.output / name: content for name, content in contents.items() if content})
 
 
-def _write_table(state: _RunState, logs: Iterable[FoundLog]) -> BatchResult:
-    """Write the table of all logs that are finished so far, as CSV, Parquet and web page."""
+def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
+    """Write the table of the logs that are finished so far, as CSV, Parquet and web page."""
     severities: set[str] = set()
     rows_by_hash = {
         cached.sha256: cached.rows
         for cached in load_cached_rows(state.output, state.px4fuse, state.settings)
     }
 
-    def rows_of_log(log: FoundLog) -> Iterable[Row]:
+    def rows_of_log(log: LogAddress) -> Iterable[Row]:
         if log.address not in state.hash_by_address:
             return [state.failed_rows[log.address]] if log.address in state.failed_rows else []
         sha256 = state.hash_by_address[log.address]
         first_log = state.first_log_by_hash[sha256]
         if first_log is log and sha256 in rows_by_hash:
             return rows_by_hash[sha256]
-        status, reason = NOT_COMPARED, f"identical to {first_log.log}, whose rows have the results"
+        status, reason = NOT_COMPARED, f"the log is identical to {first_log.log}, see its rows"
         if first_log is log:
-            reason = "another px4fuse batch with the same output folder replaced the rows"
-            status, reason = FAILED, f"{reason} of this log"
+            status = FAILED
+            reason = "another px4fuse batch with this output folder replaced the rows of this log"
         return [{"status": status, "log_sha256": sha256, "reason": reason}]
 
     def rows() -> Iterator[Row]:
@@ -312,7 +310,7 @@ def _write_table(state: _RunState, logs: Iterable[FoundLog]) -> BatchResult:
             common |= {"px4fuse": state.px4fuse, "settings": state.settings}
             for row in rows_of_log(log):
                 severities.update(row.get("severities", ()))
-                yield typed_action(row, log.log) | common
+                yield with_log_path(row, log.log) | common
 
     table = make_table(rows())
     page = html_text(table, state.output.resolve().name, f"px4fuse {state.px4fuse}")

@@ -17,43 +17,45 @@ from px4fuse.text import format_number
 if TYPE_CHECKING:
     from px4fuse.fleet.run import BatchResult
 
-# Maximum number of reasons, and of logs, in the summary
+# Maximum numbers of reasons for missing results, and of logs, that the summary lists
 MAX_LISTED, MAX_DIAGNOSES = 8, 40
-RATIO_NOTE = "Actual ÷ reported: ● innovation ÷ √S, ◆ error ÷ σ (ground truth)"
+RATIO_NOTE = "Ratio of actual to reported σ: ● innovation ÷ √S, ◆ error ÷ σ (ground truth)"
 RED, YELLOW = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warning"]
 NUMBER_HEADS = ("number", "A", "95 %", "B", "95 %", "unit")
 
 
 def format_summary(batch_result: BatchResult) -> Page:
-    """Format the reasons for failed logs, and a diagnosis with four ratios for each log."""
+    """Format a run of ``px4fuse batch``: reasons for missing results, and diagnoses of all logs."""
     page, logs = Page(), batch_result.table.drop_duplicates("log")
     uncompared = logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)["log"]
     causes = uncompared.agg(["count", "first"]).reset_index()
     sorted_causes = causes.sort_values("count", ascending=False, kind="stable")
     for cause in sorted_causes.head(MAX_LISTED).to_dict("records"):
-        prefix = "" if cause["count"] == 1 else f"{cause['count']} logs, for example "
-        text = "{first}: {status}: {reason}. {remedy}".format_map(cause).rstrip()
-        page.write(prefix + text, colour=RED if cause["status"] == FAILED else YELLOW)
+        template = "{first}: {status}: {reason}. {remedy}"
+        if cause["count"] > 1:
+            template = "{count} logs, for example {first}: {status}: {reason}. {remedy}"
+        page.write(
+            template.format_map(cause).rstrip(), colour=RED if cause["status"] == FAILED else YELLOW
+        )
     if len(sorted_causes) > MAX_LISTED:
         remaining_count = len(sorted_causes) - MAX_LISTED
-        page.write(f"fleet.html lists {remaining_count} further reasons for logs without a result.")
+        page.write(f"fleet.html lists {remaining_count} more reasons for logs without a result.")
     entries = sort_logs(logs_of(batch_result.table))
     if entries:
         rows = [_diagnosis(log) for log in entries[:MAX_DIAGNOSES]]
         page.table(("", "log", "diagnosis", "KF ●", "◆", "EKF2 ●", "◆"), rows, right=(3, 4, 5, 6))
         page.write(RATIO_NOTE, colour=MUTED_COLOUR)
     if len(entries) > MAX_DIAGNOSES:
-        page.write(f"and {len(entries) - MAX_DIAGNOSES} more: fleet.html")
+        page.write(f"fleet.html lists {len(entries) - MAX_DIAGNOSES} more logs.")
     counts = logs["status"].value_counts()
     status_counts = ", ".join(f"{count} {status}" for status, count in counts.items())
     retry_note = " Run the same command to repeat failed logs." if FAILED in counts else ""
-    reused = f"{batch_result.reused_count} reused from an earlier run"
-    page.write(f"{len(logs)} logs: {status_counts}; {reused}.{retry_note}")
+    reused_text = f"{batch_result.reused_count} reused from an earlier run"
+    page.write(f"{len(logs)} logs: {status_counts}; {reused_text}.{retry_note}")
     return page
 
 
 def _diagnosis(log: Log) -> tuple[Cell, ...]:
-    """Return sign, name, headline and the four ratios of a log."""
     colour = SEVERITY_COLOURS.get(log["severity"], MUTED_COLOUR)
     ratios = (log.get(f"{name}_ratio") for name in RATIOS)
     return (
@@ -65,7 +67,7 @@ def _diagnosis(log: Log) -> tuple[Cell, ...]:
 
 
 def format_differences(results: ChangeResults) -> Page:
-    """Format settings, numbers and findings that differ, and verdicts that are worse in B."""
+    """Format the output of ``px4fuse diff``: differences, and verdicts that are worse in B."""
     page = Page()
     for name, diff_input in (("A", results.a), ("B", results.b)):
         log = (
@@ -104,7 +106,7 @@ def format_differences(results: ChangeResults) -> Page:
     for text in results.worse:
         page.write_labelled("Worse", styled_text(text, 8.0, RED))
     if not results.worse:
-        page.write("No verdict is worse in B.")
+        page.write("No verdict is worse in B than in A.")
     return page
 
 

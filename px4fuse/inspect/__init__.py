@@ -1,1 +1,1 @@
-"""Contents of a log: list for ``info`` and tables for ``extract``."""
+"""Contents of a log: list for ``px4fuse info``, and tables for ``px4fuse extract``."""

@@ -30,9 +30,9 @@ from px4fuse.text import capitalise_first, to_json_types, utc_time
 
 SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"
-# Fields of Flight that the JSON output contains unchanged
+# Fields of Flight that the JSON output of px4fuse info contains without change
 FLIGHT_FIELDS = ("log", "airborne", "clocks", "missing", "unused", "inputs")
-# Displayed name of each part of a flight (kind of data), by its name in Flight.streams
+# Displayed name of each kind of data in a flight, by its name in Flight.streams
 PART_LABELS = {
     "imu": "IMU",
     "attitude": "attitude",
@@ -44,7 +44,7 @@ PART_LABELS = {
     "truth": "ground truth",
     "airborne": "land detector",
 }
-# Analyses of compare, with the data (EKF2 or ground truth) that each requires
+# Analyses of px4fuse compare, with the data (EKF2 or ground truth) that each of them requires
 PARTS_OF_COMPARE = {
     "EKF2 states": "ekf2_state",
     "EKF2 variances": "ekf2_variance",
@@ -57,7 +57,7 @@ TimeSpans = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class AnalysisOption:
-    """Analysis of px4fuse; ``reason``: data that it uses, or the reason why it is not possible."""
+    """Analysis of px4fuse; ``reason``: data that it uses, or why the analysis is not possible."""
 
     name: str
     possible: bool
@@ -66,7 +66,7 @@ class AnalysisOption:
 
 @dataclass(frozen=True)
 class LoggingAdvice:
-    """Action before the next flight, and the analyses or data that the action improves."""
+    """Action before the next flight, and the analyses or data that the action makes possible."""
 
     remedy: str
     improves: tuple[str, ...]
@@ -74,16 +74,16 @@ class LoggingAdvice:
 
 @dataclass(frozen=True)
 class Gaps:
-    """Gaps in one kind of data: intervals between samples that are longer than ``limit_s``.
+    """Gaps in one kind of data: sample intervals that are longer than ``limit_s``.
 
     Attributes
     ----------
     count : int
     total_s, longest_s : float
-        Sum and maximum of the gaps; 0 without gaps.
+        Sum and maximum of the gap lengths; 0 without gaps.
     limit_s : float
-        IMU: the longer of 0.1 s and five median intervals, as in KF. Other data: the longer of 1 s
-        and five median intervals.
+        IMU: the larger of 0.1 s and five median sample intervals, as in KF. Other data: the larger
+        of 1 s and five median sample intervals.
     """
 
     count: int
@@ -94,26 +94,26 @@ class Gaps:
 
 @dataclass(frozen=True)
 class Source:
-    """Kind of data in the flight with its topics, or the reason why it is missing.
+    """Kind of data in a flight with topics, rate and gaps, or the reason why the data are missing.
 
     Attributes
     ----------
     part : str
-        "IMU", "attitude", "position", "EKF2 state", ..., see :data:`PART_LABELS`.
+        Kind of data: a value of :data:`PART_LABELS`.
     name : str
-        Name of a position track, else of the first topic; empty if unavailable.
+        Name of a position track, else of the first topic; empty if the data are missing.
     topics : tuple of str
     clock, log : str
-        Clock of its timestamps, and name of the file.
+        Clock of the timestamps, and name of the file.
     samples : int or None
-        None for the land detector, of which the reader keeps no samples.
+        Number of samples; None for the land detector, of which a Flight contains no samples.
     rate_hz : float or None
-        Median rate, so that gaps have no effect; None with less than two samples.
+        Median rate, on which gaps have no effect; None with less than two samples.
     gaps : Gaps or None
     start_s, end_s : float or None
-        First and last sample, in seconds after the first data.
+        Times of the first and last sample, in seconds after the first data.
     chosen : bool
-        True if ``px4fuse compare`` uses this position.
+        True for the position source that ``px4fuse compare`` uses by default.
     description : str
         Description of a position track.
     unavailable : str
@@ -142,20 +142,20 @@ class Inventory:
     Attributes
     ----------
     flight : Flight
-        Flight with the EKF2 innovations of the position source that compare selects.
+        Flight with the EKF2 innovations of the default position source.
     start_utc : str or None
         UTC of the first data, ISO 8601.
     sources : tuple of Source
-        All kinds of data in the flight and all position tracks, of which the most direct is first.
+        All kinds of data in the flight, and all position tracks in order of preference.
     source_reason : str
-        Reason why compare selects its position source, or finds none.
+        Reason for the position source that ``px4fuse compare`` uses, or why there is none.
     segment : Segment or None
-        Segment that compare analyses.
+        Time span that ``px4fuse compare`` analyses by default.
     abilities : tuple of AnalysisOption
     advice : tuple of LoggingAdvice
-        Each action once, the most important first.
+        Different actions, the most important first.
     notes : tuple of str
-        Sentences of the reader about damage, clocks and the estimator.
+        Sentences about damage of the file, clocks and EKF2 data.
     """
 
     flight: Flight
@@ -169,13 +169,7 @@ class Inventory:
 
 
 def take_inventory(flight: Flight) -> Inventory:
-    """List the contents of a flight, the possible analyses and the advice on logging.
-
-    Parameters
-    ----------
-    flight : Flight
-        Flight in which any data may be missing.
-    """
+    """List the contents of a flight, the possible analyses and the advice on logging."""
     comparison, reason, remedy = None, "", ""
     try:
         comparison = compare(flight)
@@ -212,7 +206,7 @@ def take_inventory(flight: Flight) -> Inventory:
 
 
 def to_plain(inventory: Inventory) -> dict[str, Any]:
-    """Convert the inventory to JSON types; unknown values are absent."""
+    """Convert the inventory of a log to JSON types; unknown values are absent."""
     inventory_fields = {field.name: getattr(inventory, field.name) for field in fields(inventory)}
     flight: Flight = inventory_fields.pop("flight")
     flight_fields = {name: getattr(flight, name) for name in FLIGHT_FIELDS}
@@ -225,27 +219,20 @@ def to_plain(inventory: Inventory) -> dict[str, Any]:
 def _data_by_part(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unavailable]:
     """Return all data of a flight except positions, by their names in Flight.streams.
 
-    If the log contains no EKF2 data, only the EKF2 state is returned as unavailable. The EKF2
-    innovations are those of the axis with the most samples.
+    Without EKF2 data, the result contains the EKF2 state as unavailable, and no other EKF2 data.
+    EKF2 innovations are those of the axis with the most samples.
     """
     ekf2, truth = flight.ekf2, flight.truth
     data_by_part = {"imu": flight.imu, "attitude": flight.attitude}
     if isinstance(ekf2, Unavailable):
         data_by_part["ekf2_state"] = ekf2
     else:
-        innovations_by_axis = ekf2.innovations.values()
-        innovation_tables = [
-            innovations
-            for innovations in innovations_by_axis
-            if isinstance(innovations, pd.DataFrame)
-        ]
-        longest_innovations = (
-            max(innovation_tables, key=len)
-            if innovation_tables
-            else next(iter(innovations_by_axis))
+        innovations = max(
+            ekf2.innovations.values(),
+            key=lambda samples: len(samples) if isinstance(samples, pd.DataFrame) else -1,
         )
         data_by_part |= {"ekf2_state": ekf2.state, "ekf2_variance": ekf2.variance}
-        data_by_part |= {"ekf2_innovations": longest_innovations, "ekf2_fusing": ekf2.fusing}
+        data_by_part |= {"ekf2_innovations": innovations, "ekf2_fusing": ekf2.fusing}
     samples = truth if isinstance(truth, Unavailable) else truth.samples
     return {**data_by_part, "truth": samples, "airborne": flight.airborne}
 
@@ -256,13 +243,14 @@ def _sources(flight: Flight, comparison: Comparison | None, reason: str) -> Iter
         if key in data_by_part:
             yield _source(name, data_by_part[key], flight.streams.get(key))
         for track in flight.positions if key == "position" else ():
-            is_chosen = comparison is not None and track.name == comparison.source.name
-            track_fields = {
-                "name": track.name,
-                "description": track.description,
-                "chosen": is_chosen,
-            }
-            yield _source(name, track.samples, track, **track_fields)
+            yield _source(
+                name,
+                track.samples,
+                track,
+                name=track.name,
+                description=track.description,
+                chosen=comparison is not None and track.name == comparison.source.name,
+            )
         if key == "position" and not flight.positions:
             yield Source(name, unavailable=reason)
 
@@ -273,7 +261,6 @@ def _source(
     stream: Stream | PositionTrack | None,
     **source_fields: Any,
 ) -> Source:
-    """Describe one kind of data by samples, rate, gaps, topics and clock."""
     if isinstance(data, Unavailable):
         return Source(part, unavailable=data.reason)
     if stream is not None:
@@ -313,7 +300,6 @@ def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
 def _analysis_options(
     flight: Flight, comparison: Comparison | None, reason: str
 ) -> Iterator[AnalysisOption]:
-    """Yield all analyses with their data, or the reason why they are not possible."""
     acceleration: object = ned_acceleration(flight)
     rows_by_name: dict[str, tuple[object, str]] = {}
     if comparison is None:
@@ -321,12 +307,10 @@ def _analysis_options(
     else:
         source, segment = comparison.source, comparison.segment
         count, span = len(cut_to_segment(source.samples, segment)), (segment.start_s, segment.end_s)
-        description = "KF with {}, {} samples, {:.1f} s to {:.1f} s"
+        description = "KF with position source {}, {} samples, {:.1f} s to {:.1f} s"
         yield AnalysisOption("compare", True, description.format(source.name, count, *span))
-        acceleration, rows_by_name = (
-            comparison.lines[0].acceleration,
-            _ekf2_and_truth_rows(comparison),
-        )
+        acceleration = comparison.lines[0].acceleration
+        rows_by_name = _ekf2_and_truth_rows(comparison)
     imu_reason = " ".join(finding.message for finding in imu.detect_low_rates(flight))
     if isinstance(acceleration, Unavailable):
         imu_reason = f"{acceleration.reason}; KF assumes constant velocity"
@@ -334,13 +318,11 @@ def _analysis_options(
     yield AnalysisOption("acceleration", not imu_reason, imu_reason or acceleration_text)
     data_by_part = _data_by_part(flight)
     for name, key in PARTS_OF_COMPARE.items():
-        logged, (result, description) = (
-            data_by_part.get(key, flight.ekf2),
-            rows_by_name.get(name, (NO_COMPARISON, "")),
-        )
-        yield _analysis_option(
-            name, logged if isinstance(logged, Unavailable) else result, description
-        )
+        result, description = rows_by_name.get(name, (NO_COMPARISON, ""))
+        logged = data_by_part.get(key, flight.ekf2)
+        if isinstance(logged, Unavailable):
+            result = logged
+        yield _analysis_option(name, result, description)
     aids, ekf2 = evaluate_aids(flight), flight.ekf2
     if isinstance(aids, dict) and isinstance(ekf2, Ekf2):
         rates = (f"{aid.label} {_rate_text(ekf2.aids[name].samples)}" for name, aid in aids.items())
@@ -354,19 +336,16 @@ def _analysis_options(
 
 
 def _rate_text(samples: pd.DataFrame) -> str:
-    """Format the rate (Hz) of samples; "1 sample" if there is only one."""
     return f"{sample_rate(samples):.2g} Hz" if len(samples) > 1 else "1 sample"
 
 
 def _analysis_option(name: str, part: object, description: str) -> AnalysisOption:
-    """Return an analysis with its description, or with the reason if its data are unavailable."""
     if isinstance(part, Unavailable):
         return AnalysisOption(name, False, part.reason)
     return AnalysisOption(name, True, description)
 
 
 def _ekf2_and_truth_rows(comparison: Comparison) -> dict[str, tuple[object, str]]:
-    """Return result and description of each analysis in PARTS_OF_COMPARE."""
     first_axis, truth = next(iter(comparison.axes.values())), comparison.flight.truth
     innovations = {name: axis.ekf2_innovations for name, axis in comparison.axes.items()}
     counts = [f"{n} {len(f)}" for n, f in innovations.items() if isinstance(f, pd.DataFrame)]
@@ -377,7 +356,7 @@ def _ekf2_and_truth_rows(comparison: Comparison) -> dict[str, tuple[object, str]
     return {
         "EKF2 states": (
             first_axis.difference,
-            f"{_count_text(first_axis.ekf2_state)} of position and velocity",
+            f"{_count_text(first_axis.ekf2_state)} of EKF2 position and velocity",
         ),
         "EKF2 variances": (first_axis.ekf2_variance, _count_text(first_axis.ekf2_variance)),
         "EKF2 consistency": (
@@ -385,7 +364,7 @@ def _ekf2_and_truth_rows(comparison: Comparison) -> dict[str, tuple[object, str]
                 (summary for summary in summaries if not isinstance(summary, Unavailable)),
                 summaries[0],
             ),
-            f"innovations: {', '.join(counts)}",
+            f"number of EKF2 innovations: {', '.join(counts)}",
         ),
         "error": (
             first_axis.truth,
@@ -401,7 +380,7 @@ def _count_text(part: pd.DataFrame | Unavailable) -> str:
 def _logging_advice(
     flight: Flight, comparison: Comparison | None, remedy: str
 ) -> tuple[LoggingAdvice, ...]:
-    """Collect the actions of findings about the recording, and of unavailable data, each once."""
+    """Collect the different actions of findings about the recording, and of missing data."""
     findings = [*recording.detect_lost_data(flight), *recording.detect_clocks_set_back(flight)]
     actions_and_purposes = [(remedy, "position")] if remedy else []
     if comparison is not None:
@@ -417,7 +396,7 @@ def _logging_advice(
     actions_and_purposes += [
         (finding.remedy, finding_title(finding.id)) for finding in findings if finding.remedy
     ]
-    # other missing data can be logged by PX4 only, so advice about them is for ULogs only
+    # advice on data other than main_parts is for ULogs, because only PX4 can log these data
     main_parts = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
     actions_and_purposes += [
         (part.remedy, part.what)

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from io import StringIO
 from typing import Any
 
 import numpy as np
@@ -19,21 +20,27 @@ from px4fuse.text import to_json_types
 
 SCHEMA_NAME = "px4fuse-flight"
 SCHEMA_VERSION = "1.0"
+# Components of a vector or quaternion, by the word that represents them in columns.csv
+COMPONENTS = {
+    "AXIS": ("north", "east", "down"),
+    "BODY": ("forward", "right", "down"),
+    "WXYZ": ("w", "x", "y", "z"),
+}
 DICTIONARY_COLUMNS = ["table", "column", "unit", "frame", "meaning", "source_topic", "clock"]
-# Characters that are not allowed in file names, or need quotes on the command line
+# Characters of track names that are not used in file names, as some systems do not allow them
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9_-]+")
-# Maximum characters of a table name, which is a file name
+# Maximum length (characters) of a table name, which is a file name
 MAX_NAME_LENGTH = 80
 NO_POSITION = Unavailable(
     "external position",
-    "the log contains no position track. px4fuse info LOG lists how to log one",
+    "the log contains no position track. px4fuse info LOG lists settings to log one",
     "",
 )
 
 
 @dataclass(frozen=True)
 class DescribedTable:
-    """Table, with one row of the data dictionary (``columns``) per column."""
+    """Exported table; ``columns`` has one row of the data dictionary per column of ``data``."""
 
     name: str
     data: pd.DataFrame
@@ -41,7 +48,7 @@ class DescribedTable:
 
 
 def with_best_source(flight: Flight) -> Flight:
-    """Return the flight with the EKF2 innovations of the position source that compare selects."""
+    """Return the flight with the EKF2 innovations of the default position source."""
     try:
         return select_innovations(flight, choose_source(flight)[0])
     except MissingDataError:
@@ -54,19 +61,19 @@ def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:
     Returns
     -------
     mapping from table name to DataFrame
-        The first column of a time series is ``time_s``. Names are valid file names. Unavailable
-        data have no table; see :func:`unavailable_parts`.
+        The first column of a time series is ``time_s``. Table names are valid file names. Data that
+        are missing in the log have no table; see :func:`unavailable_parts`.
     """
     return {table.name: table.data for table in _tables(flight)}
 
 
 def data_dictionary(flight: Flight) -> pd.DataFrame:
-    """Return the data dictionary: one row per column of every table.
+    """Return the data dictionary, with one row per column of every table.
 
     Returns
     -------
     DataFrame
-        Columns table, column, unit (ASCII), frame, meaning, source_topic, clock.
+        Columns of :data:`DICTIONARY_COLUMNS`; units are ASCII.
     """
     descriptions = [table.columns for table in _tables(flight)]
     if not descriptions:
@@ -75,7 +82,7 @@ def data_dictionary(flight: Flight) -> pd.DataFrame:
 
 
 def unavailable_parts(flight: Flight) -> tuple[Unavailable, ...]:
-    """List the data of the flight that have no table, with the reasons."""
+    """List the missing data of a flight, which have no table, with the reasons."""
     ekf2 = flight.ekf2
     sections: list[object] = [flight.imu, flight.attitude, ekf2]
     if isinstance(ekf2, Ekf2):
@@ -90,7 +97,7 @@ def unavailable_parts(flight: Flight) -> tuple[Unavailable, ...]:
 
 
 def description(flight: Flight) -> dict[str, Any]:
-    """Describe log, topics, clocks and missing data, in JSON types for ``flight.json``."""
+    """Return log, topics, clocks and missing data of a flight, in JSON types for flight.json."""
     ekf2 = flight.ekf2
     description_fields: dict[str, Any] = {
         "schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION},
@@ -111,9 +118,15 @@ def description(flight: Flight) -> dict[str, Any]:
 
 @cache
 def _column_descriptions() -> pd.DataFrame:
-    """Read unit, frame and meaning of all columns from columns.csv, by table."""
-    with files("px4fuse.inspect").joinpath("columns.csv").open(encoding="utf-8") as file:
-        return pd.read_csv(file, index_col="table", keep_default_na=False)
+    """Read columns.csv: unit, frame and meaning of each column, indexed by table."""
+    lines = files("px4fuse.inspect").joinpath("columns.csv").read_text("utf-8").splitlines()
+    for word, names in COMPONENTS.items():
+        lines = [
+            line.replace(word, name)
+            for line in lines
+            for name in (names if word in line else [word])
+        ]
+    return pd.read_csv(StringIO("\n".join(lines)), index_col="table", keep_default_na=False)
 
 
 def _table(
@@ -123,18 +136,17 @@ def _table(
     described_name: str = "",
     **values: str,
 ) -> DescribedTable:
-    """Make a table with the columns that columns.csv lists for ``name``, or for ``described_name``.
+    """Make a table with the columns in columns.csv for ``described_name``, by default ``name``.
 
     Parameters
     ----------
     origin : (tuple of str, str)
         Topics and clock of the data.
     **values
-        Values for the names in braces in the descriptions.
+        Values for the names in braces in columns.csv.
     """
-    columns = (
-        _column_descriptions().loc[described_name or name].map(lambda cell: cell.format(**values))
-    )
+    tables_in_csv = ["any table"] * ("time_s" in data) + [described_name or name]
+    columns = _column_descriptions().loc[tables_in_csv].map(lambda cell: cell.format(**values))
     topics, clock = origin
     columns = columns.assign(table=name, source_topic=" ".join(topics), clock=clock)
     return DescribedTable(name, data.reindex(columns=columns["column"].tolist()), columns)
@@ -143,7 +155,6 @@ def _table(
 def _stream_table(
     flight: Flight, name: str, data: pd.DataFrame | Unavailable
 ) -> Iterator[DescribedTable]:
-    """Yield the table of a time series, unless it is unavailable."""
     if isinstance(data, pd.DataFrame):
         yield _table(name, _with_time_column(data), _topics_and_clock(flight, name))
 
@@ -158,10 +169,8 @@ def _tables(flight: Flight) -> Iterator[DescribedTable]:
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, pd.DataFrame):
         data = acceleration.set_axis(["north_m_s2", "east_m_s2", "down_m_s2"], axis=1)
-        (imu, clock), (attitude, _) = (
-            _topics_and_clock(flight, "imu"),
-            _topics_and_clock(flight, "attitude"),
-        )
+        imu, clock = _topics_and_clock(flight, "imu")
+        attitude, _ = _topics_and_clock(flight, "attitude")
         yield _table("acceleration_ned", _with_time_column(data), ((*imu, *attitude), clock))
     for name, track in _named_tracks(flight):
         values = {"frame": track.frame, "description": track.description}
@@ -191,12 +200,12 @@ def _tables(flight: Flight) -> Iterator[DescribedTable]:
         yield _table("parameters", pd.DataFrame(parameters.items(), columns=["name", "value"]))
     if flight.clocks:
         clock_table = pd.DataFrame([structs.asdict(clock) for clock in flight.clocks])
-        # a float column: distinct_stamps is NaN for a usable clock
+        # the column must be float, because distinct_stamps is NaN for a usable clock
         yield _table("clocks", clock_table.astype({"distinct_stamps": np.float64}))
 
 
 def _parameters(flight: Flight) -> dict[str, float]:
-    """Return the PX4 parameters of log, EKF2 replay and aids."""
+    """Return the PX4 parameters that the log, the EKF2 replay and the aiding sources use."""
     logged_values = dict(flight.log.parameters)
     if isinstance(flight.ekf2, Ekf2):
         for record_or_aid in (flight.ekf2.record, *flight.ekf2.aids.values()):
@@ -228,7 +237,7 @@ def _ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
     resets["time_s"] = np.array([reset.time_s for reset in ekf2.resets], np.float64)
     resets["quantity"] = np.array([reset.quantity for reset in ekf2.resets], object)
     yield _table("resets", resets, origin)
-    # the reader sets the start time of the first EKF2 instance to minus infinity
+    # the start time of the first EKF2 instance is minus infinity in a Flight
     first_time_s = min(float(ekf2.state.index[0]), 0.0)
     instance_rows = [(max(time_s, first_time_s), instance) for time_s, instance in ekf2.instances]
     instances = _numeric_table(["time_s", "instance"], instance_rows).astype({"instance": np.int64})
@@ -236,10 +245,10 @@ def _ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
 
 
 def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
-    """Yield each position track with a table name; names differ in more than case."""
+    """Yield each position track with a table name; ignoring case, all names are different."""
     used_names: set[str] = set()
     for track in flight.positions:
-        # the prefix avoids file names that Windows reserves (con, aux, ...)
+        # with the prefix, no name is one that Windows reserves (con, aux, ...)
         stem = _UNSAFE_CHARACTERS.sub("_", f"position_{track.name}")[:MAX_NAME_LENGTH].rstrip("_")
         name, number = stem, 1
         while name.lower() in used_names:
@@ -250,6 +259,5 @@ def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
 
 
 def _topics_and_clock(flight: Flight, part: str) -> tuple[tuple[str, ...], str]:
-    """Return topics and clock of one kind of data."""
     stream = flight.streams.get(part)
     return ((), "") if stream is None else (stream.topics, stream.clock)

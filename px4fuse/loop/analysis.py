@@ -22,16 +22,16 @@ from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Trajectory, components_by_axis, cumulative_distance
 
-# Minimum time (s) in options that is UNIX time, if the timestamps are UNIX time; smaller times
-# count from the first pose
+# Minimum time (s) in options that counts as UNIX time, if the timestamps of the trajectory are UNIX
+# time: smaller times count from the first pose
 MIN_UNIX_TIME_S = 1e6
 # Minimum path length (m) of a loop
 MIN_PATH_M = 2.0
-# Conditions for a loop analysis in ``px4fuse compare``: minimum path length (m), and maximum
-# distance between both ends as fraction of the path length
+# Limits for a loop analysis in ``px4fuse compare``: minimum path length (m), and maximum distance
+# between both ends of the path as fraction of the path length
 MIN_FLIGHT_LOOP_PATH_M = 10.0
 MAX_END_DISTANCE_FRACTION = 0.10
-# Maximum value (m or °) of options
+# Maximum value (m or °) of the options for drift, key frame spacing and σ
 MAX_OPTION_VALUE = 100.0
 
 
@@ -46,7 +46,7 @@ def analyse(
     Parameters
     ----------
     source : LoopSource
-        Trajectory, and its flight, if any.
+        Trajectory, and the flight of which it is a track, if any.
     request : LoopRequest, optional
         Options. Times are on the clock of the trajectory; with UNIX timestamps, small times count
         from the first pose. The default landing place is from the ground truth in the log, or else
@@ -63,7 +63,8 @@ def analyse(
     noise = OdometryNoise(request.position_drift_m, request.heading_drift_deg)
     _require_in_range("position_drift_m", noise.position_m, 1e-4)
     _require_in_range("heading_drift_deg", noise.heading_deg, 1e-4)
-    trajectory, flight = source.trajectory, source.flight
+    trajectory = source.trajectory
+    flight = source.flight
     zero_s = float(trajectory.time_s[0]) if trajectory.unix_offset_s == 0.0 else 0.0
 
     def to_track_time(time_s: float) -> float:
@@ -91,11 +92,7 @@ def analyse(
     closures_with_end: list[ClosureWithEnd] = [(closure, None) for closure in given_closures]
     if not isinstance(true_end, Unavailable):
         closures_with_end.insert(
-            0,
-            (
-                GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m),
-                true_end,
-            ),
+            0, (GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m), true_end)
         )
     spacing_m = request.key_frames_m
     spacing_m = default_key_frame_spacing_m(path.position_m) if spacing_m is None else spacing_m
@@ -108,10 +105,8 @@ def analyse(
     graph_corrections, gated_closures = solve_pose_graphs(
         path, nodes, graph, gated_closures, progress
     )
-    end_m, heading_deg = (
-        path.position_m[-1] - path.position_m[0],
-        loop_segment.heading_change_deg(path),
-    )
+    end_m = path.position_m[-1] - path.position_m[0]
+    heading_deg = loop_segment.heading_change_deg(path)
     misclosure_m = true_end if isinstance(true_end, Unavailable) else end_m - true_end.displacement
     heading_error_deg = _compute_heading_error(true_end, heading_deg)
     landing = gated_closures[0] if gated_closures and gated_closures[0].source == LANDING else None
@@ -121,10 +116,8 @@ def analyse(
     references = tuple(track for track in (truth, reference) if track is not None)
     error_m = error_axes_m = None
     if not isinstance(misclosure_m, Unavailable):
-        error_m, error_axes_m = (
-            float(np.linalg.norm(misclosure_m)),
-            components_by_axis(path.frame, misclosure_m),
-        )
+        error_m = float(np.linalg.norm(misclosure_m))
+        error_axes_m = components_by_axis(path.frame, misclosure_m)
     return Loop(
         track=path.name,
         kind=path.kind,
@@ -159,20 +152,20 @@ def analyse(
 def _find_true_end(
     path: Trajectory, request: LoopRequest, truth_end: TrueEnd | str | None
 ) -> TrueEnd | Unavailable:
-    """Return the landing place: measured, else from ground truth, else the take-off place."""
+    """Return the landing place: as measured, or from ground truth, or else the take-off place."""
     if request.landed_at is not None:
         if not request.closed_loop:
             raise SettingsError(
-                "`landed_at` and `closed_loop` exclude each other.", "Omit one of them."
+                "`landed_at` and `closed_loop` exclude each other.", "Omit one of both."
             )
         return loop_segment.convert_measured_end(path, request.landed_at)
     if not request.closed_loop:
-        return Unavailable("closure error", "the loop is declared open (--open)", "Remove --open.")
+        return Unavailable("loop closure error", "--open declares the loop open", "Omit --open.")
     return truth_end if isinstance(truth_end, TrueEnd) else loop_segment.assume_end_at_takeoff(path)
 
 
 def _is_absolute(trajectory: Trajectory, flight: Flight) -> bool:
-    """Return True if the track follows an external position source without odometry."""
+    """Return True if the track follows an external position source that is not odometry."""
     has_vision = any(track.origin.is_vision for track in flight.positions)
     no_odometry = isinstance(find_odometry(flight), Unavailable)
     return trajectory.kind in ("ekf2", "kf") and has_vision and no_odometry
@@ -185,9 +178,9 @@ def _choose_key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Ar
     distance_m = cumulative_distance(path.position_m[frame_indices])
     if not distance_m[-1] >= max(MIN_PATH_M * min(1.0, spacing_m / 0.5), 1e-6):
         raise TrajectoryError(
-            f"{path.name}: the path is only {distance_m[-1]:.2f} m long (key frame spacing "
-            f"{spacing_m:g} m), too short for a loop.",
-            "Choose a longer part (--from, --to) or a smaller --key-frames.",
+            f"{path.name}: the path of {distance_m[-1]:.2f} m is too short for key frames every "
+            f"{spacing_m:g} m",
+            "Change --from, --to or --key-frames.",
         )
     return frame_indices, np.interp(path.time_s, path.time_s[frame_indices], distance_m)
 
@@ -200,13 +193,12 @@ def _require_in_range(name: str, value: float, min_value: float) -> None:
 
 
 def _require_valid_closure(closure: GivenClosure, path: Trajectory) -> None:
-    """Raise TrajectoryError if times or σ of a closure are out of range."""
     (start_s, end_s), times = path.time_s[[0, -1]], (closure.time_1_s, closure.time_2_s)
     label = f"{path.name}: closure {times[0]:.12g},{times[1]:.12g}"
     if not start_s <= times[0] < times[1] <= end_s:
         raise TrajectoryError(
-            f"{label}: the times must be in ascending order and on the path "
-            f"({start_s:.2f} s to {end_s:.2f} s)."
+            f"{label}: the times must be in ascending order, between {start_s:.2f} s and "
+            f"{end_s:.2f} s."
         )
     if not 1e-4 <= closure.sigma_m <= MAX_OPTION_VALUE:
         raise TrajectoryError(
@@ -217,7 +209,6 @@ def _require_valid_closure(closure: GivenClosure, path: Trajectory) -> None:
 def _compute_heading_error(
     end: TrueEnd | Unavailable, heading_deg: float | None
 ) -> float | Unavailable:
-    """Return the heading error at the end (°), or Unavailable."""
     name = "heading error of the loop"
     if isinstance(end, Unavailable):
         return end
@@ -226,9 +217,9 @@ def _compute_heading_error(
     if end.heading_change_deg is None:
         return Unavailable(
             name,
-            f"the final heading differs by {heading_deg:+.0f}° from the initial heading, and "
-            "the true rotation is not known",
-            "Give the true rotation as third number of --landed-at FORWARD,RIGHT,DEG.",
+            f"the final heading differs by {heading_deg:+.0f}° from the initial heading, and the "
+            "true difference is unknown",
+            "Give the true difference as DEG in --landed-at FORWARD,RIGHT,DEG.",
         )
     return float(np.degrees(lie.wrap(np.radians(heading_deg - end.heading_change_deg))))
 
@@ -251,10 +242,10 @@ def analyse_flight_loop(
     odometry = find_odometry(flight)
     try:
         trajectory = trajectory_of(flight, "vio")
-    except MissingDataError as error:  # there are too few poses, or none
+    except MissingDataError as error:  # the odometry has too few poses, or is missing
         reason = odometry.reason if isinstance(odometry, Unavailable) else str(error).rstrip(".")
         return Unavailable(
-            "loop closure", reason, "A loop needs visual-inertial odometry, sent as ODOMETRY."
+            "loop closure", reason, "Send visual-inertial odometry to PX4 as ODOMETRY."
         )
     segment, _ = loop_segment.choose_loop_segment(flight, trajectory, None, None)
     time = trajectory.time_s
@@ -269,8 +260,8 @@ def analyse_flight_loop(
     ):
         return Unavailable(
             "loop closure",
-            f"the odometry ends {gap_m:.1f} m from its start and spans {extent_m:.1f} m, so "
-            "it is not a loop",
+            f"the odometry has an extent of {extent_m:.1f} m and ends {gap_m:.1f} m from its "
+            "start, so it is not a loop",
             "Fly back to the take-off place, or use px4fuse loop with --closure.",
         )
     return analyse(LoopSource(trajectory, flight), progress=progress)

@@ -13,30 +13,30 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Frame, Trajectory, cumulative_distance
 
 DOWN = np.array([0.0, 0.0, 1.0])
-# By frame: indices of forward (or north), right (or east), down in (x, y, z); their signs; new
-# frame; note
+# Conversion to a frame with z down, by original frame: indices of forward (or north), right (or
+# east) and down in (x, y, z), their signs, new frame, note for the user
 _TO_Z_DOWN: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
     "ENU": (
         [1, 0, 2],
         [1.0, 1.0, -1.0],
         "NED",
-        "converted from east, north, up to north, east, down",
+        "the axes were converted from east, north, up to north, east, down",
     ),
     "camera": (
         [2, 0, 1],
         [1.0, 1.0, 1.0],
         "FRD",
-        "converted from the camera's right, down, forward to forward, right, down",
+        "the axes were converted from right, down, forward (camera) to forward, right, down",
     ),
     "unknown": (
         [0, 1, 2],
         [1.0, -1.0, -1.0],
         "FRD",
-        "the frame is unknown; z is assumed to be up",
+        "the frame is unknown, so z is assumed to be up",
     ),
 }
-# Key frame spacing as fraction of the path's extent, and limits of the spacing (m). The radius of
-# curves grows with the extent of a path, so the spacing may grow, too
+# Default key frame spacing as fraction of the extent of the path: the radius of curves grows with
+# the extent, so the spacing may grow, too. Then minimum and maximum spacing (m)
 SPACING_FRACTION = 0.02
 MIN_SPACING_M, MAX_SPACING_M = 0.02, 0.5
 
@@ -67,7 +67,7 @@ def from_z_down(trajectory: Trajectory, frame: Frame) -> Trajectory:
 
 
 def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
-    """Rotate poses to another frame; convert camera axes to body axes or back."""
+    """Rotate poses to another frame, and convert camera axes to body axes or back."""
     rotation = Rotation.from_matrix(matrix)
     rotated = replace(
         trajectory.with_positions(trajectory.position_m @ matrix.T, rotation), frame=frame
@@ -97,7 +97,7 @@ def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
             frame_indices.append(index)
             last_frame_m = position
     if len(frame_indices) > 1 and np.linalg.norm(position_m[-1] - last_frame_m) < spacing_m / 2.0:
-        frame_indices.pop()  # too near to the end: the distance would be mostly noise
+        frame_indices.pop()  # too near to the last pose: the distance would be mostly noise
     return np.array([*frame_indices, len(position_m) - 1])
 
 
@@ -128,12 +128,11 @@ def distribute_by_distance(
     Bowditch (1808); UAT 366 module 2, Example 2.
     """
     cumulative = cumulative_distance(position_m) if cumulative_m is None else cumulative_m
-    fraction = cumulative / cumulative[-1]
-    return np.asarray(position_m - fraction[:, np.newaxis] * misclosure_m)
+    return np.asarray(position_m - (cumulative / cumulative[-1])[:, None] * misclosure_m)
 
 
 def heading_change_rad(rotation: Rotation) -> float:
-    """Return the part about the vertical (rad) of a rotation in a frame with z down.
+    """Return the angle (rad) about the vertical of a rotation in a frame with z down.
 
     It is the twist of the swing-twist decomposition about z; positive is clockwise from above.
     """
@@ -169,8 +168,9 @@ def correct_by_distance(
     middle_rotation = Rotation.from_rotvec(
         np.outer(-middle_fraction * misclosure_heading_rad, DOWN)
     )
-    steps_m = middle_rotation.apply(np.diff(position_m, axis=0))
-    rotated_m = position_m[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(steps_m, axis=0)])
+    rotated_m = position_m[0] + np.concatenate(
+        [np.zeros((1, 3)), np.cumsum(middle_rotation.apply(np.diff(position_m, axis=0)), axis=0)]
+    )
     remaining_m = rotated_m[-1] - (position_m[-1] - misclosure_m)
     return trajectory.with_positions(
         distribute_by_distance(rotated_m, remaining_m, cumulative_m), rotation

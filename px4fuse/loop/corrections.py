@@ -24,7 +24,7 @@ from px4fuse.trajectory.model import Trajectory
 UNCORRECTED = "uncorrected"
 POSITIONS_ONLY = "by distance, positions only"
 BY_DISTANCE = "by distance, headings too"
-# Labels of the corrections
+# Labels of the path corrections, by the key in results.json
 CORRECTION_LABELS: Mapping[str, str] = {
     "uncorrected": UNCORRECTED,
     "by_distance_plain": POSITIONS_ONLY,
@@ -34,8 +34,8 @@ CORRECTION_LABELS: Mapping[str, str] = {
 SINGLE_LOOP_REASON = (
     "A single loop has no redundancy: only the gate can reject it, robust optimisation cannot."
 )
-# Corrected path with the pose graph solution (None without a pose graph), or reason why it is
-# missing
+# Corrected path and the pose graph solution (None without a pose graph), or the reason why the
+# corrected path is missing
 Corrected = tuple[Trajectory, Solution | None] | Unavailable
 
 
@@ -46,7 +46,7 @@ def correct_paths_by_distance(
     heading_error_deg: float | Unavailable,
     landing: Closure | None,
 ) -> dict[CorrectionName, Corrected]:
-    """Correct the path by distance: only positions (as in the lesson); positions and headings."""
+    """Correct the path by distance: positions only (UAT 366, Example 2), and also headings."""
     if landing is not None and not landing.accepted:
         misclosure_m = _unavailable_by_gate("correction by distance", landing)
     if isinstance(misclosure_m, Unavailable):
@@ -65,17 +65,15 @@ def correct_paths_by_distance(
 def _unavailable_by_gate(correction_name: str, closure: Closure) -> Unavailable:
     return Unavailable(
         correction_name,
-        f"the gate rejects {closure} (d² {closure.d2:.1f}, p {closure.p:.1g}); "
-        "enforcing it would deform the whole path",
-        "Measure the landing place (--landed-at), leave the landing out (--open), "
-        "or increase --drift if this odometry drifts more.",
+        f"the gate rejects {closure} (d² {closure.d2:.1f}, p {closure.p:.1g})",
+        "Measure the landing place (--landed-at), give --open, or increase --drift.",
     )
 
 
 def gate_closures(
     graph: PoseGraph | Unavailable, closures_with_end: Sequence[ClosureWithEnd]
 ) -> tuple[Closure, ...]:
-    """Test each closure against odometry; closures are the last edges. Empty without a graph."""
+    """Test each closure, the last edges of the graph, against odometry; empty without a graph."""
     if isinstance(graph, Unavailable):
         return ()
     edges = np.arange(len(graph.first) - len(closures_with_end), len(graph.first))
@@ -99,27 +97,29 @@ def solve_pose_graphs(
     closures: tuple[Closure, ...],
     progress: Callable[[str], None],
 ) -> tuple[dict[CorrectionName, Corrected], tuple[Closure, ...]]:
-    """Optimise the graph with all closures, with the closures accepted by the gate, and robustly.
+    """Optimise the graph with all closures, with accepted closures only, and by robust methods.
 
     Return the corrected paths, and the closures with their weights from robust optimisation.
     """
     corrections: dict[Any, Corrected] = {}
     if isinstance(graph, Unavailable) or not closures:
-        no_closure = Unavailable("pose graph", "no loop closure", "Give one with --closure.")
+        no_closure = Unavailable("pose graph", "the path has no loop closure", "Give --closure.")
         unavailable = graph if isinstance(graph, Unavailable) else no_closure
         corrections |= {f"pose_graph_{solution_name}": unavailable for solution_name in SOLUTIONS}
         return corrections, ()
     edges = np.arange(len(graph.first))
     is_closure = edges >= len(edges) - len(closures)
-    is_rejected = np.zeros(len(edges), dtype=np.bool_)
+    is_rejected = np.zeros(len(edges), bool)
     is_rejected[is_closure] = [not closure.accepted for closure in closures]
     for solution_name, label in SOLUTIONS.items():
-        name, robust = f"pose_graph_{solution_name}", ROBUST_METHODS.get(solution_name, "none")
+        name = f"pose_graph_{solution_name}"
+        robust = ROBUST_METHODS.get(solution_name, "none")
         is_gated = solution_name == "gated"
         progress(f"optimising: {label}")
         if robust != "none" and len(closures) < 2:
-            action = "Give further closures with --closure."
-            corrections[name] = Unavailable(label, SINGLE_LOOP_REASON, action)
+            corrections[name] = Unavailable(
+                label, SINGLE_LOOP_REASON, "Give further closures with --closure."
+            )
         elif is_gated and is_rejected[is_closure].all():
             corrections[name] = _unavailable_by_gate("pose graph", closures[0])
         elif is_gated and not is_rejected.any():
@@ -143,7 +143,7 @@ def solve_pose_graphs(
 def _interpolate_corrections(
     path: Trajectory, nodes: IntArray, graph_poses: Array, solved_poses: Array
 ) -> Trajectory:
-    """Correct all poses by interpolation between the corrections of the neighbouring nodes."""
+    """Correct all poses by interpolation between the corrections of neighbouring graph nodes."""
     rotation = (
         Rotation.from_quat(solved_poses[:, 3:]) * Rotation.from_quat(graph_poses[:, 3:]).inv()
     )
@@ -157,7 +157,7 @@ def _interpolate_corrections(
         solved_poses[node, :3] + rotation[node].apply(path.position_m - graph_poses[node, :3])
         for node in (previous_node, previous_node + 1)
     ]
-    weight = np.clip(fraction, 0.0, 1.0)[:, np.newaxis]
+    weight = np.clip(fraction, 0.0, 1.0)[:, None]
     position = (1.0 - weight) * corrected[0] + weight * corrected[1]
     return path.with_positions(position, Slerp(time[nodes], rotation)(time))
 
@@ -167,7 +167,7 @@ def score_paths(
     corrected_paths: Mapping[CorrectionName, Corrected],
     references: tuple[Trajectory, ...],
 ) -> dict[CorrectionName, CorrectedPath | Unavailable]:
-    """Score odometry and corrected paths; all use the time offset of the odometry."""
+    """Compute ATE and RPE of odometry and corrected paths, with the time offset of the odometry."""
     offsets: dict[str, float] = {}
 
     def score(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:
@@ -176,8 +176,9 @@ def score_paths(
         try:
             return evaluate(path, reference, time_offset_s=offset_s)
         except Px4FuseError as error:
-            analysis_name = f"score against {reference.name}"
-            return Unavailable(analysis_name, str(error), "Give another --reference.")
+            return Unavailable(
+                f"score against {reference.name}", str(error), "Give another --reference."
+            )
 
     def score_path(
         name: CorrectionName, path: Trajectory, solution: Solution | None

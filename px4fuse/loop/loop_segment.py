@@ -12,19 +12,20 @@ from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.closure import DOWN, heading_change_rad
 from px4fuse.loop.model import TrueEnd
 from px4fuse.request import Landing
-from px4fuse.trajectory.model import MIN_POSES, Trajectory, components_by_axis
+from px4fuse.trajectory.model import MIN_POSES, Trajectory, components_by_axis, format_vector
 
-# Averaging time (s) of poses on the ground, and maximum range (m) of positions at rest in that time
+# Time (s) over which poses on the ground are averaged, and maximum range (m) of their positions:
+# with a larger range the vehicle is not at rest
 REST_TIME_S = 1.0
 MAX_REST_RANGE_M = 0.15
-# Maximum heading change (°) from odometry for which the true heading change is assumed to be zero
+# Maximum heading change (°) of the odometry for which the true heading change is assumed to be zero
 MAX_SAME_HEADING_DEG = 15.0
 
 
 def cut_trajectory(
     trajectory: Trajectory, segment: Segment, rests_at_ends: bool = False
 ) -> Trajectory:
-    """Cut a trajectory to a segment; average the poses on the ground if ``rests_at_ends``.
+    """Cut a trajectory to a segment; average the poses at rest on the ground if ``rests_at_ends``.
 
     Raises
     ------
@@ -35,9 +36,8 @@ def cut_trajectory(
     is_inside = (time >= segment.start_s) & (time <= segment.end_s)
     if is_inside.sum() < MIN_POSES:
         raise TrajectoryError(
-            f"{trajectory.name}: only {int(is_inside.sum())} poses between {segment.start_s:.2f} s "
-            f"and {segment.end_s:.2f} s (at least {MIN_POSES} are needed). The trajectory is from "
-            f"{time[0]:.2f} s to {time[-1]:.2f} s."
+            f"{trajectory.name} ({time[0]:.2f} s to {time[-1]:.2f} s) has {is_inside.sum()} poses "
+            f"between {segment.start_s:.2f} s and {segment.end_s:.2f} s; {MIN_POSES} are needed"
         )
     segment_track = trajectory[is_inside]
     if not rests_at_ends:
@@ -46,7 +46,7 @@ def cut_trajectory(
     quaternions = None if segment_track.rotation is None else segment_track.rotation.as_quat()
     for index, rest_start_s in ((0, segment.start_s - REST_TIME_S), (-1, segment.end_s)):
         resting = trajectory[(time >= rest_start_s) & (time <= rest_start_s + REST_TIME_S)]
-        # not at rest: the pose at the end of the segment is kept
+        # Without rest, the single pose at this end of the segment is used
         if (
             not len(resting)
             or np.linalg.norm(np.ptp(resting.position_m, axis=0)) > MAX_REST_RANGE_M
@@ -81,19 +81,21 @@ def choose_loop_segment(
     if flight is None:
         reason = "the whole trajectory"
     elif isinstance(flight.airborne, Unavailable) or not flight.airborne:
-        reason = "the whole track (no land detector in the log)"
+        reason = "the whole track, because the log has no land detector"
     else:
-        low_s, high_s = max(low_s, flight.airborne[0][0]), min(high_s, flight.airborne[-1][1])
+        low_s = max(low_s, flight.airborne[0][0])
+        high_s = min(high_s, flight.airborne[-1][1])
         reason = "from take-off to landing, by the land detector"
         if len(flight.airborne) > 1:
             reason = f"from the first take-off to the last of {len(flight.airborne)} landings"
         rests_at_ends = start_s is None and end_s is None
     if start_s is not None or end_s is not None:
-        low_s, high_s = low_s if start_s is None else start_s, high_s if end_s is None else end_s
+        low_s = low_s if start_s is None else start_s
+        high_s = high_s if end_s is None else end_s
         reason = "chosen with --from or --to"
     if not low_s < high_s:
         raise SettingsError(
-            f"No poses between {low_s:.12g} s and {high_s:.12g} s; the track is from "
+            f"The track has no poses between {low_s:.12g} s and {high_s:.12g} s; it is from "
             f"{span_s[0]:.2f} s to {span_s[1]:.2f} s.",
             "Change --from or --to.",
         )
@@ -118,19 +120,19 @@ def assume_end_at_takeoff(path: Trajectory) -> TrueEnd:
     """
     change_deg = heading_change_deg(path)
     is_same_heading = change_deg is not None and abs(change_deg) <= MAX_SAME_HEADING_DEG
-    heading_text = " with the same heading" if is_same_heading else "; final heading unknown"
+    heading_text = " with the same heading" if is_same_heading else "; the final heading is unknown"
     return TrueEnd(
         displacement_m=components_by_axis(path.frame, np.zeros(3)),
         heading_change_deg=0.0 if is_same_heading else None,
         sigma_m=0.10,
         sigma_heading_deg=5.0 if is_same_heading else None,
-        source=f"assumed: landing at the take-off place{heading_text}",
+        source=f"assumed: the landing place is the take-off place{heading_text}",
         assumed=True,
     )
 
 
 def convert_measured_end(path: Trajectory, landing: Landing) -> TrueEnd:
-    """Convert the measured landing place to the frame of the trajectory."""
+    """Convert the landing place from ``--landed-at`` to the frame of the trajectory."""
     forward_m, right_m, heading_change_deg = structs.astuple(landing)
     heading_rad = 0.0
     if path.rotation is not None:
@@ -142,9 +144,8 @@ def convert_measured_end(path: Trajectory, landing: Landing) -> TrueEnd:
         heading_change_deg=heading_change_deg,
         sigma_m=0.05,
         sigma_heading_deg=None if heading_change_deg is None else 2.0,
-        source=f"measured: landing {abs(forward_m):g} m "
-        f"{'behind' if forward_m < 0 else 'ahead'} and {abs(right_m):g} m "
-        f"{'left' if right_m < 0 else 'right'} of the take-off place (--landed-at)",
+        source=f"measured: landing {format_vector({'forward': forward_m, 'right': right_m})} of "
+        "the take-off place (--landed-at)",
         assumed=False,
     )
 
@@ -160,7 +161,8 @@ def read_end_from_truth(
         true_path = cut_trajectory(truth, segment, rests_at_ends)
     except TrajectoryError as error:
         return str(error)
-    ned_displacement_m, change_deg = true_path.position_m[-1] - true_path.position_m[0], None
+    ned_displacement_m = true_path.position_m[-1] - true_path.position_m[0]
+    change_deg = None
     landed_m = np.linalg.norm(ned_displacement_m)
     if path.rotation is not None and true_path.rotation is not None:
         heading_difference_rad = heading_change_rad(path.rotation[0] * true_path.rotation[0].inv())
@@ -169,9 +171,7 @@ def read_end_from_truth(
         )
         change_deg = heading_change_deg(true_path)
     elif path.frame != true_path.frame:
-        return (
-            "the ground truth has no orientation, so it cannot be rotated into the odometry frame"
-        )
+        return "the ground truth cannot be rotated to the odometry frame without orientation"
     return TrueEnd(
         displacement_m=components_by_axis(path.frame, ned_displacement_m),
         heading_change_deg=change_deg,

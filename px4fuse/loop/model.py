@@ -25,6 +25,7 @@ CorrectionName = Literal[
     "pose_graph_dcs",
     "pose_graph_gnc",
 ]
+# Source of the loop closure between take-off and landing
 LANDING = "landing"
 
 
@@ -39,7 +40,7 @@ class TrueEnd(Record, frozen=True, kw_only=True):
     sigma_m, sigma_heading_deg : float
         Standard deviations of position and heading; None for an unknown heading.
     source : str
-        Description of the data from which the landing place is known.
+        Description of the data from which the landing place is computed.
     assumed : bool
         True if landing at the take-off place is assumed without a measurement.
     """
@@ -96,7 +97,7 @@ class Closure(Record, frozen=True, kw_only=True):
     sigma_m : float
         Standard deviation of the displacement between the two times, per axis.
     source : str
-        "landing" for the landing place, "given" for an option.
+        "landing" for the closure of take-off and landing, "given" for ``--closure``.
     distance_m : float
         Closure error of the odometry: odometry minus true displacement.
     d2, degrees_of_freedom, p, accepted
@@ -124,7 +125,7 @@ class Closure(Record, frozen=True, kw_only=True):
 
 
 class Correction(Record, frozen=True, kw_only=True):
-    """Size of a path correction, cost of its pose graph, and scores against each reference."""
+    """Size (m) of a path correction, cost of its pose graph, and scores against each reference."""
 
     correction_max_m: NotNegative
     correction_rms_m: NotNegative
@@ -145,7 +146,7 @@ class CorrectedPath(Correction, frozen=True, kw_only=True, eq=False):
     trajectory : Trajectory
         All poses of the segment, corrected.
     moved_m : ndarray, shape (n,)
-        Size of the correction of each pose.
+        Distance by which each pose was corrected.
     solution : Solution or None
         Solution of the pose graph; None for a correction without pose graph.
     """
@@ -161,12 +162,12 @@ class CorrectedPath(Correction, frozen=True, kw_only=True, eq=False):
 
 
 class LoopResult(Record, frozen=True, kw_only=True):
-    """Loop: path, landing place, closure errors and corrections, for results.json.
+    """Loop analysis for results.json: path, landing place, closure errors and corrections.
 
     ``closure_error_m`` is the distance between measured and true end, and ``closure_percent`` this
     distance in per cent of the path length. ``is_absolute_track`` is True if the track follows a
     positioning system and does not drift. The correction ``by_distance_plain`` changes positions
-    only (Example 2 of the lesson). ``by_distance`` also changes headings, if the heading error is
+    only (UAT 366, Example 2). ``by_distance`` also changes headings, if the heading error is
     known.
     """
 
@@ -229,12 +230,13 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
     @property
     def paths(self) -> dict[CorrectionName, CorrectedPath]:
         """Available paths by name; the odometry is first."""
-        every = self.corrections.items()
-        return {name: path for name, path in every if isinstance(path, CorrectedPath)}
+        return {
+            name: path for name, path in self.corrections.items() if isinstance(path, CorrectedPath)
+        }
 
     @property
     def reported_paths(self) -> tuple[CorrectedPath, ...]:
-        """Paths for reports, without paths that equal another path."""
+        """Paths for reports: all available paths that differ from the other paths."""
         duplicates: set[CorrectionName] = set()
         if all(closure.accepted for closure in self.closures):
             duplicates.add("pose_graph_all")
@@ -244,7 +246,7 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
 
     @property
     def best(self) -> CorrectedPath:
-        """Pose graph with gated closures, else correction by distance, else odometry."""
+        """Most reliable path: pose graph with gated closures, or by distance, or else odometry."""
         names: tuple[CorrectionName, ...] = ("pose_graph_gated", "by_distance", "uncorrected")
         return next(self.paths[name] for name in names if name in self.paths)
 
@@ -263,7 +265,6 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
         """
         if isinstance(self.graph, Unavailable):
             raise MissingDataError(f"{self.graph.what}: {self.graph.reason}.")
-        gated, plain = self.paths.get("pose_graph_gated"), self.paths.get("pose_graph_all")
-        solved = gated or plain
+        solved = self.paths.get("pose_graph_gated") or self.paths.get("pose_graph_all")
         solution = None if solved is None else solved.solution
         return self.graph if solution is None else replace(self.graph, poses=solution.poses)

@@ -14,12 +14,15 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
-# Minimum ratio of late to early reported variances, for variances that are used as drift
+# Minimum ratio of the reported variances at the end of the path to those at the start, for
+# variances that are used as drift
 MIN_VARIANCE_GROWTH = 2.0
-# Minimum variance, as fraction of the default drift, because a reported variance may be zero
+# Minimum variance of an odometry edge as fraction of the default drift: a reported growth may be
+# zero
 MIN_VARIANCE_FRACTION = 1e-2
-END_FRACTION = 0.1  # fraction of the path at both ends with early and with late variances
-# Loop closure; also the landing place if the closure is from landing
+# Fraction of the path at both ends from which start and end variances are taken
+END_FRACTION = 0.1
+# Loop closure, and the landing place if it is the closure of take-off and landing
 ClosureWithEnd = tuple[GivenClosure, TrueEnd | None]
 
 
@@ -53,24 +56,28 @@ def odometry_variances(
     heading = heading + np.radians(noise.heading_deg_per_root_s) ** 2 * duration_s
     tilt = noise.tilt_share**2 * heading
     rotation = np.column_stack([tilt, tilt, heading])
-    drift_origin = "default" if noise == OdometryNoise() else "as given"
+    drift_origin = "default" if noise == OdometryNoise() else "from options"
     drift_text = f"position {noise.position_m:g} m and heading {noise.heading_deg:g}° after 100 m"
-    origin_texts = [f"odometry drift: {drift_text} (1 σ, {drift_origin})"]
+    origin_texts = [f"the odometry drift is {drift_text} (1 σ, {drift_origin})"]
     position_growth = _variance_growth(path.position_variance_m2, nodes)
     if position_growth is not None:
         translation = np.maximum(position_growth.mean(axis=1), MIN_VARIANCE_FRACTION * translation)
-        origin_texts.append("translation: growth of the logged position variances")
+        origin_texts.append(
+            "the translation variances are the growth of the logged position variances"
+        )
     elif path.position_variance_m2 is not None:
-        origin_texts.append("the logged position variances do not grow and are not used as drift")
+        origin_texts.append("the logged position variances do not grow, so they are not used")
     rotation_growth = _variance_growth(path.rotation_variance_rad2, nodes)
     if rotation_growth is not None:
         rotation = np.maximum(rotation_growth, MIN_VARIANCE_FRACTION * rotation)
-        origin_texts.append("rotation: growth of the logged orientation variances")
+        origin_texts.append(
+            "the rotation variances are the growth of the logged orientation variances"
+        )
     return translation, rotation, "; ".join(origin_texts)
 
 
 def _variance_growth(variance: Array | None, nodes: IntArray) -> Array | None:
-    """Return the growth of variances between nodes, shape (k - 1, 3); None if it is too small."""
+    """Return the growth of reported variances between nodes, (k - 1, 3); None if too small."""
     if variance is None:
         return None
     end_count = max(1, int(END_FRACTION * len(variance)))
@@ -108,25 +115,34 @@ def build_pose_graph(
         Sentence on the origin of the variances.
     """
     if path.rotation is None:
-        reason = "the trajectory has no orientations"
-        remedy = "Use a trajectory with orientations."
-        return Unavailable("pose graph", reason, remedy), frames, ""
+        return (
+            Unavailable(
+                "pose graph",
+                "the trajectory has no orientations",
+                "Use a trajectory with orientations.",
+            ),
+            frames,
+            "",
+        )
     closure_times_s = np.array(
         [(closure.time_1_s, closure.time_2_s) for closure, _ in closures_with_end]
     ).reshape(-1, 2)
     pose_indices = np.abs(path.time_s - closure_times_s[..., None]).argmin(axis=-1)
     nodes = np.union1d(frames, pose_indices).astype(np.intp)
     end_nodes = np.searchsorted(nodes, pose_indices)
-    position, rotation = path.position_m[nodes], path.rotation[nodes]
+    position = path.position_m[nodes]
+    rotation = path.rotation[nodes]
     translation_m2, rotation_rad2, statement = odometry_variances(path, nodes, noise)
     steps = np.arange(len(nodes) - 1)
-    first, second = np.append(steps, end_nodes[:, 0]), np.append(steps + 1, end_nodes[:, 1])
+    first = np.append(steps, end_nodes[:, 0])
+    second = np.append(steps + 1, end_nodes[:, 1])
     information = np.zeros((len(first), 6, 6))
     diagonal = np.column_stack(
         [np.repeat(1.0 / translation_m2[:, None], 3, axis=1), 1.0 / rotation_rad2]
     )
     information[steps[:, None], range(6), range(6)] = diagonal
-    first_inverse, second_rotation = rotation[first].inv(), rotation[second]
+    first_inverse = rotation[first].inv()
+    second_rotation = rotation[second]
     translation_measured = first_inverse.apply(position[second] - position[first])
     for row, (closure, end) in enumerate(closures_with_end, start=len(steps)):
         translation_measured[row] = (

@@ -44,7 +44,7 @@ def find_odometry(flight: Flight) -> PositionTrack | Unavailable:
 
 
 def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
-    """Return a track of a flight as trajectory.
+    """Return one track of a flight as a trajectory.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
         track_name
     ]
     if isinstance(track_data, PositionTrack):
-        # if the log does not contain the frame, FRD is assumed: x is forward at the start
+        # If the log does not contain the frame, FRD is assumed: x is forward at the start
         frame: Frame = "NED" if track_data.frame == "NED" else "FRD"
         note = f"{track_data.name}: {track_data.description}"
         return _make_trajectory(
@@ -75,13 +75,15 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
         )
     if not isinstance(track_data, Ekf2):
         raise MissingDataError(
-            f"{flight.log.name}:{track_name}: {track_data.reason}", f"{track_data.remedy}"
+            f"{flight.log.name}:{track_name}: {track_data.reason}", track_data.remedy
         )
-    state, notes = track_data.state, ["EKF2 position as published"]
+    state = track_data.state
+    notes = ["EKF2 position as published"]
     source = next((t for t in flight.positions if t.origin.is_vision), None)
     if source is not None:
-        log_segment = Segment(0.0, flight.log.duration_s, "the whole log")
-        state, resets = continuous_state(track_data, source, log_segment)
+        state, resets = continuous_state(
+            track_data, source, Segment(0.0, flight.log.duration_s, "the whole log")
+        )
         notes += [resets] if resets else []
     return _make_trajectory(flight, track_name, state, flight.attitude, tuple(notes))
 
@@ -104,9 +106,10 @@ def _make_trajectory(
     notes: tuple[str, ...],
     frame: Frame = "NED",
 ) -> Trajectory:
-    """Make a trajectory with the times of the positions and interpolated orientation (slerp)."""
+    """Make a trajectory at the times of the positions, with interpolated orientations (slerp)."""
     samples = finite_rows(samples, Columns.POSITION)
-    rotation, rotation_variance = None, None
+    rotation = None
+    rotation_variance = None
     if isinstance(orientation, pd.DataFrame):
         orientation_s = orientation.index.to_numpy()
         covered_samples = samples[
@@ -114,8 +117,9 @@ def _make_trajectory(
         ]
         if len(covered_samples) >= MIN_POSES:
             samples = covered_samples
-            quaternions = orientation[Columns.QUATERNION].to_numpy(copy=True)
-            rotations = Rotation.from_quat(quaternions, scalar_first=True)
+            rotations = Rotation.from_quat(
+                orientation[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
+            )
             rotation = Slerp(orientation_s, rotations)(samples.index.to_numpy())
             reported_variance = _complete_variances(orientation, Columns.ROTATION_VARIANCE)
             if reported_variance is not None:
@@ -126,8 +130,7 @@ def _make_trajectory(
                 rotation_variance = np.column_stack(columns)
     if len(samples) < MIN_POSES:
         raise MissingDataError(
-            f"{flight.log.name}:{track_name}: only {len(samples)} poses (at least {MIN_POSES} are "
-            "needed)."
+            f"{flight.log.name}:{track_name} has {len(samples)} poses; {MIN_POSES} are needed"
         )
     return Trajectory(
         name=f"{flight.log.name}:{track_name}",
@@ -182,7 +185,7 @@ def split_part(argument: str) -> tuple[Path, TrackName | None]:
         return Path(path), track_name
     if Path(path).is_file():
         raise TrajectoryError(
-            f"{display_name(Path(path))}:{track_name}: {track_name!r} is not a track of a flight.",
+            f"{display_name(Path(path))}: {track_name!r} is not a track of a flight",
             f"Use one of {', '.join(TRACK_NAMES)}.",
         )
     return full_path, None
@@ -215,7 +218,7 @@ def read_source(
     ----------
     argument : str
         See :func:`split_part`.
-    default : FlightPart, optional
+    default : {"vio", "ekf2", "kf", "truth"}, optional
         Track of a log if ``argument`` contains none; by default odometry, else EKF2's track.
     frame : Frame, optional
         Frame of a trajectory file; by default detected.
@@ -242,20 +245,20 @@ def read_source(
         if track_name is not None:
             raise TrajectoryError(
                 f"{display_name(path)} is a trajectory file and has no track {track_name!r}.",
-                "Omit it.",
+                f"Omit :{track_name}.",
             )
         trajectory = read_trajectory(path)
         return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)
     if frame is not None:
         raise SettingsError(
-            f"--frame {frame.lower()} is only for trajectory files; {display_name(path)} "
-            "is a flight log, which defines its frame.",
+            f"--frame is only for trajectory files, but {display_name(path)} is a flight log",
             "Omit --frame.",
         )
     flight = read_log(path, system=system)
     chosen = track_name or default
     if chosen is None:
-        odometry, chosen = find_odometry(flight), "vio"
+        odometry = find_odometry(flight)
+        chosen = "vio"
         if isinstance(odometry, Unavailable):
             chosen = "ekf2"
             if isinstance(flight.ekf2, Unavailable):

@@ -8,28 +8,33 @@ from px4fuse.reading import display_name, read_head, read_log_bytes
 
 _SNIFF_BYTES = 16
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
-# Unsupported files that users often give by mistake: first bytes, suffixes, description, action
+# Unsupported formats that users often give by mistake: first bytes of the file, suffixes of its
+# name, fault for the error message, action for the error message
 _FOREIGN_FORMATS = (
     # Header bytes of ArduPilot, libraries/AP_Logger/LogStructure.h
     (
         b"\xa3\x95",
         (),
-        "an ArduPilot DataFlash log, not a PX4 ULog",
+        "the file is an ArduPilot DataFlash log, not a PX4 ULog",
         "Give the .tlog that the ground station wrote.",
     ),
-    (b"%PDF-", (), "a PDF, not a flight log", "To check a report: px4fuse verify {name} LOG."),
+    (
+        b"%PDF-",
+        (),
+        "the file is a PDF, not a flight log",
+        "Check a report with px4fuse verify {name} LOG.",
+    ),
     (
         b"",
         (".csv", ".tsv"),
-        "a table, not a flight log",
-        "If it contains positions, give it in addition to the log: px4fuse compare LOG "
-        "--position {name}.",
+        "the file is a table, not a flight log",
+        "If the table contains positions, use px4fuse compare LOG --position {name}.",
     ),
     (
         b"",
         (".tum", ".g2o"),
-        "a trajectory or a pose graph, not a flight log",
-        "Compute its errors with px4fuse evaluate, or correct its loop: px4fuse loop {name}.",
+        "the file is a trajectory or pose graph, not a flight log",
+        "Use px4fuse evaluate or px4fuse loop {name}.",
     ),
 )
 
@@ -58,9 +63,7 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
     # Imports are local, because importing pyulog or pymavlink takes a noticeable time
     if head.startswith(ULOG_MAGIC):
         if system is not None:
-            raise SettingsError(
-                f"{name}: `system` is only for MAVLink recordings, and this file is a ULog."
-            )
+            raise SettingsError(f"{name}: `system` is only for MAVLink recordings.")
         from px4fuse.readers.ulog import read_ulog  # noqa: PLC0415
 
         return read_ulog(name, read_log_bytes(path))

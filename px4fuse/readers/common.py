@@ -6,12 +6,13 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.flight import Columns, Ekf2, FlightMode, Unavailable
+from px4fuse.flight import Columns, Ekf2, FlightMode, Spans, Unavailable
 
-# Limit (SI units) of valid positions, velocities, accelerations, angles: larger values are damage
+# Maximum absolute value (SI units) of valid positions, velocities, accelerations and angles:
+# larger values are from damaged bytes
 MAX_VALID_VALUE = 1e9
-# Limit (m/s², rad/s) of valid IMU data: above the range of accelerometers (400 g) and gyros
-# (4000 °/s)
+# Maximum absolute value (m/s², rad/s) of valid IMU data: above the range of accelerometers (400 g)
+# and gyros (4000 °/s)
 MAX_IMU_VALUE = 1e4
 # Minimum distance (m) of rows 0, 0, 0 from the positions beside them: 3 σ of good UWB (0.1 m)
 MIN_ZERO_DISTANCE_M = 0.3
@@ -20,32 +21,27 @@ MIN_ZERO_DISTANCE_M = 0.3
 MIN_HELD_S, MIN_HELD_COUNT = 1.0, 5
 MAX_HELD_FRACTION = 0.5  # of the rows; a source that is at rest for longer may repeat its position
 MAX_MULTIPLE_ERROR = 0.01  # distance from whole multiples of a rounding step
-MIN_QUATERNION_NORM = 0.5  # a quaternion with a smaller norm means "no attitude"
+# Minimum norm of a valid quaternion: senders without attitude send zeros
+MIN_QUATERNION_NORM = 0.5
 
 
-def collect_unavailable(*flight_parts: object) -> tuple[Unavailable, ...]:
+def collect_unavailable(*flight_data: object) -> tuple[Unavailable, ...]:
     """Return the unavailable data of a flight, including the unavailable data of EKF2."""
-    for flight_part in flight_parts:
-        if isinstance(flight_part, Ekf2):
-            flight_parts += (
-                flight_part.variance,
-                *flight_part.innovations.values(),
-                flight_part.fusing,
-            )
-    return tuple(
-        flight_part for flight_part in flight_parts if isinstance(flight_part, Unavailable)
-    )
+    for data in flight_data:
+        if isinstance(data, Ekf2):
+            flight_data += (data.variance, *data.innovations.values(), data.fusing)
+    return tuple(data for data in flight_data if isinstance(data, Unavailable))
 
 
 def constant_spans(values: pd.Series, end_s: float) -> list[tuple[float, float, Any]]:
-    """Return start (s), end (s) and value of each interval with a constant value."""
+    """Return start (s), end (s) and value of each interval in which a time series is constant."""
     changes = values[values.ne(values.shift())]
     starts = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0)).tolist()
     spans = zip(starts, [*starts[1:], end_s], changes, strict=False)
     return [(start, end, value) for start, end, value in spans if end > start]
 
 
-def flight_spans(landed: pd.Series, duration_s: float) -> tuple[tuple[float, float], ...]:
+def flight_spans(landed: pd.Series, duration_s: float) -> Spans:
     """Return the intervals (s) in flight, in which ``landed`` is 0 or False."""
     return tuple(
         (start, end)
@@ -54,16 +50,14 @@ def flight_spans(landed: pd.Series, duration_s: float) -> tuple[tuple[float, flo
     )
 
 
-def ends_in_flight(
-    airborne: tuple[tuple[float, float], ...] | Unavailable, duration_s: float
-) -> bool:
+def ends_in_flight(airborne: Spans | Unavailable, duration_s: float) -> bool:
     """Return True if the last interval in flight lasts until the end of the data."""
     last_span = () if isinstance(airborne, Unavailable) else airborne[-1:]
     return any(span_end_s >= duration_s for _, span_end_s in last_span)
 
 
 def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
-    """Format the sentence on a file that ends within a ``unit`` ("frame" or "message")."""
+    """Format the sentence on a file that ends within a ``unit``: "frame" or "message"."""
     flying = ", in flight" if in_flight else ""
     return f"the file ends within a {unit} after {duration_s:.1f} s{flying}; later data are missing"
 
@@ -88,9 +82,10 @@ def find_invalid(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
     """
     values, time_s = samples[columns].to_numpy(), samples.index.to_numpy()
     reason = pd.Series("", index=samples.index)
-    reason[~(np.abs(values) < MAX_VALID_VALUE).all(axis=1)] = "NaN"
-    is_zero = ~values.any(axis=1)
-    others, zeros = np.flatnonzero((reason == "") & ~is_zero), np.flatnonzero(is_zero)
+    is_number: BoolArray = (np.abs(values) < MAX_VALID_VALUE).all(axis=1)
+    reason[~is_number] = "NaN"
+    is_zero: BoolArray = (values == 0.0).all(axis=1)
+    others, zeros = np.flatnonzero(is_number & ~is_zero), np.flatnonzero(is_zero)
     if len(others):
         after = np.searchsorted(others, zeros)
         beside = others[np.clip([after - 1, after], 0, len(others) - 1)]
@@ -120,7 +115,7 @@ def rounding_step(values: Array) -> float:
 
 
 def join_nearest(samples: pd.DataFrame, others: pd.DataFrame, tolerance_s: float) -> pd.DataFrame:
-    """Join each row with the nearest row of ``others`` in time; NaN beyond ``tolerance_s``."""
+    """Join each row with the row of ``others`` nearest in time; NaN if none is in the tolerance."""
     return pd.merge_asof(
         samples,
         others,
@@ -132,13 +127,13 @@ def join_nearest(samples: pd.DataFrame, others: pd.DataFrame, tolerance_s: float
 
 
 def with_attitude(samples: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with a valid quaternion ``w, x, y, z``; norm 0 means "not sent"."""
+    """Return the rows with a valid quaternion ``w, x, y, z``; an attitude not sent has norm 0."""
     norm: Array = np.linalg.norm(samples[Columns.QUATERNION].to_numpy(), axis=1)
     return samples[(norm > MIN_QUATERNION_NORM) & (norm < MAX_VALID_VALUE)]
 
 
 def read_orientation(samples: pd.DataFrame) -> pd.DataFrame | None:
-    """Extract the orientations of samples; None without two different orientations.
+    """Return the orientation of each sample; None if the orientation never changes.
 
     Parameters
     ----------

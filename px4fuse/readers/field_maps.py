@@ -11,8 +11,8 @@ import msgspec
 
 from px4fuse.flight import Columns
 
-# Limit of valid fields: larger values are damage. The largest valid values are UNIX times in µs
-# (1.8e15)
+# Maximum absolute value of valid fields: larger values are from damaged bytes. The largest valid
+# values are UNIX times in µs (1.8e15)
 MAX_FIELD_VALUE = 1e17
 GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
 
@@ -40,7 +40,7 @@ class Layout:
 
 
 def expand_layouts(rows: Mapping[str, Any]) -> dict[str, Layout]:
-    """Convert the rows of a table to layouts, with abbreviated columns expanded."""
+    """Convert the rows of a table to layouts, with abbreviated column names written in full."""
     return {
         name: replace(
             row,

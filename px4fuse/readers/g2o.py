@@ -15,27 +15,27 @@ from px4fuse.trajectory.graph.initialisation import initialise
 from px4fuse.trajectory.graph.model import FROM_FILE, PoseGraph
 
 MAX_FILE_BYTES = 500_000_000
-# By tag: number of vertex ids, and number of values after the ids
+# Number of vertex ids, and number of values after the ids, by tag at the beginning of the line
 _TAGS = {
     "VERTEX_SE2": (1, 3),
     "VERTEX_SE3:QUAT": (1, 7),
     "EDGE_SE2": (2, 3 + 6),
     "EDGE_SE3:QUAT": (2, 7 + 21),
 }
-# Beginnings of tags that are skipped: laser scans and parameters contain no poses or edges
+# Beginnings of the tags of lines that are skipped: laser scans and parameters
 _SKIPPED_TAGS = ("PARAMS", "ROBOTLASER", "RAWLASER", "FLASER", "RLASER")
 _REMEDY = (
-    "Supported are poses (VERTEX_SE2 or VERTEX_SE3:QUAT) and edges between them (EDGE_SE2 or "
-    "EDGE_SE3:QUAT). Remove other lines; convert TORO files to g2o."
+    "Give poses as VERTEX_SE2 or VERTEX_SE3:QUAT, and edges as EDGE_SE2 or EDGE_SE3:QUAT. Remove "
+    "other lines."
 )
 _VERTEX_ID = re.compile("[+-]?[0-9]{1,18}")
-# Maximum ratio of a negative eigenvalue to the largest eigenvalue that is a rounding error of the
-# printed digits
+# Maximum ratio of a negative eigenvalue of an information matrix to its largest eigenvalue: a
+# smaller ratio is a rounding error of the printed digits
 _EIGENVALUE_TOLERANCE = 1e-9
-# Maximum deviation from norm 1 that is not corrected: it is a rounding error of float64
+# Maximum deviation of a quaternion from norm 1 that is not corrected: a rounding error of float64
 _UNIT_NORM_TOLERANCE = 1e-15
-# Limits (1/m², 1/rad²) of valid information: real measurements are inside, and their squares do not
-# overflow
+# Minimum and maximum valid entry (1/m², 1/rad²) of an information matrix: real measurements are
+# inside, and squares of the limits do not overflow
 _MIN_INFORMATION, _MAX_INFORMATION = 1e-50, 1e50
 
 
@@ -57,7 +57,7 @@ def read_g2o(path: str | Path) -> PoseGraph:
     path_object = Path(path)
     text = decode_text(read_bytes_limited(path_object, TrajectoryError, MAX_FILE_BYTES))
     if text is None:
-        raise TrajectoryError(f"{display_name(path_object)}: not a text file", _REMEDY)
+        raise TrajectoryError(f"{display_name(path_object)} is not a text file", _REMEDY)
     return parse_g2o(text, display_name(path_object))
 
 
@@ -68,11 +68,6 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     ----------
     name : str
         File name for error messages.
-
-    Raises
-    ------
-    TrajectoryError
-        As :func:`read_g2o`.
     """
     rows_by_tag = _rows_by_tag(text, name)
     in_plane = any(rows.lines for tag, rows in rows_by_tag.items() if tag.endswith("SE2"))
@@ -80,8 +75,9 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     for tag, rows in rows_by_tag.items():
         if rows.lines and not tag.endswith(tag_kind):
             fault = "the file contains both SE2 and SE3 poses or edges"
-            raise rows.row_error(0, fault, "Use one kind per file.")
-    vertices, edges = rows_by_tag[f"VERTEX_{tag_kind}"], rows_by_tag[f"EDGE_{tag_kind}"]
+            raise rows.row_error(0, fault, "Use either SE2 or SE3 in a file.")
+    vertices = rows_by_tag[f"VERTEX_{tag_kind}"]
+    edges = rows_by_tag[f"EDGE_{tag_kind}"]
     if not edges.lines:
         raise TrajectoryError(f"{name}: the file contains no edges", _REMEDY)
     edge_vertex_ids, edge_values = _parse(edges, f"EDGE_{tag_kind}")
@@ -91,17 +87,21 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     if vertices.lines:
         vertex_ids, poses = _parse(vertices, f"VERTEX_{tag_kind}")
         order = np.argsort(vertex_ids[:, 0], kind="stable")
-        ids, poses = vertex_ids[order, 0], _normalise_quaternions(vertices, poses)[order]
-        is_repeated = np.zeros(len(ids), dtype=np.bool_)
+        ids = vertex_ids[order, 0]
+        poses = _normalise_quaternions(vertices, poses)[order]
+        is_repeated = np.zeros(len(ids), bool)
         is_repeated[order[1:]] = ids[1:] == ids[:-1]
         vertices.raise_where(is_repeated, "this vertex id is repeated", "Remove one of the lines.")
     vertex_index = np.minimum(np.searchsorted(ids, edge_vertex_ids), len(ids) - 1)
-    fault = "an edge to a vertex that is not in the file"
-    remedy = "Add the VERTEX line, or remove all VERTEX lines."
-    edges.raise_where(ids[vertex_index] != edge_vertex_ids, fault, remedy)
+    fault = "the edge connects a vertex that is not in the file"
+    edges.raise_where(
+        ids[vertex_index] != edge_vertex_ids,
+        fault,
+        "Add the VERTEX line, or remove all VERTEX lines.",
+    )
     edges.raise_where(
         edge_vertex_ids[:, 0] == edge_vertex_ids[:, 1],
-        "an edge from a vertex to itself",
+        "the edge connects a vertex to itself",
         "Remove the line.",
     )
     graph = PoseGraph(
@@ -142,7 +142,6 @@ def g2o_text(graph: PoseGraph) -> str:
 
 
 def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
-    """Return the vertex and edge lines, grouped by tag."""
     rows_by_tag = {tag: Rows(name) for tag in _TAGS}
     fixed_ids: set[str] = set()
     for line_number, raw_line in enumerate(text.split("\n"), start=1):
@@ -155,14 +154,18 @@ def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
         elif tag == "FIX":
             fixed_ids.update(" ".join(values).split())
             if len(fixed_ids) > 1:
-                remedy = "Only one pose can be fixed: remove the line, or connect both by an edge."
                 raise TrajectoryError(
-                    format_line_error(name, line_number, "FIX of a second vertex", remedy)
+                    format_line_error(
+                        name,
+                        line_number,
+                        "the line fixes a second vertex",
+                        "Remove the line, or connect both vertices by an edge.",
+                    )
                 )
         elif not tag.startswith(_SKIPPED_TAGS):
             raise TrajectoryError(
                 format_line_error(
-                    name, line_number, f"{quote(tag)} lines are not supported", _REMEDY
+                    name, line_number, f"lines with the tag {quote(tag)} are not supported", _REMEDY
                 )
             )
     return rows_by_tag
@@ -173,26 +176,32 @@ def _parse(rows: Rows, tag: str) -> tuple[np.ndarray[Any, np.dtype[np.int64]], A
     vertex_count, value_count = _TAGS[tag]
     cells, numbers = rows.parse(1 + vertex_count, value_count)
     is_invalid_id = np.array([_VERTEX_ID.fullmatch(word) is None for word in cells[:, 1:].flat])
-    fault = "the vertex number is not an integer of at most 18 digits"
-    rows.raise_where(is_invalid_id.reshape(-1, vertex_count), fault, "Give an integer.")
+    rows.raise_where(
+        is_invalid_id.reshape(-1, vertex_count),
+        "a vertex id is not an integer of at most 18 digits",
+        "Give an integer as vertex id.",
+    )
     remedy = "Correct or remove the line."
     rows.raise_where(~np.isfinite(numbers), "a number is not finite", remedy)
-    # The first three numbers are the position (m) or, in SE2, x, y (m) and the angle (rad)
+    # The first three numbers are x, y, z (m) or, in SE2, x, y (m) and the angle (rad)
     is_too_large = np.abs(numbers[:, :3]) >= MAX_COORDINATE_M
-    rows.raise_where(is_too_large, f"a value is outside ±{MAX_COORDINATE_M:.0e}", remedy)
+    rows.raise_where(
+        is_too_large, f"a position or angle is outside ±{MAX_COORDINATE_M:.0e}", remedy
+    )
     return cells[:, 1:].astype(np.int64), numbers
 
 
 def _normalise_quaternions(rows: Rows, poses: Array) -> Array:
-    """Return the poses with unit quaternions; SE2 poses unchanged."""
     if poses.shape[1] == 3:
         return poses
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(poses[:, 3:], axis=1)
-    fault = "the quaternion does not have unit length"
-    remedy = "Give the unit quaternion qx qy qz qw after the position."
-    rows.raise_where((norm < 1e-6) | ~(norm < 1e6), fault, remedy)
-    # Unit quaternions stay unchanged, so that a file is read exactly as it was written
+    rows.raise_where(
+        (norm < 1e-6) | ~(norm < 1e6),
+        "the quaternion does not have unit length",
+        "Give the unit quaternion qx qy qz qw after the position.",
+    )
+    # Unit quaternions are not changed, so that a written file is read back with the same digits
     norm[np.abs(norm - 1.0) <= _UNIT_NORM_TOLERANCE] = 1.0
     return np.hstack([poses[:, :3], poses[:, 3:] / norm[:, None]])
 
@@ -205,8 +214,7 @@ def _information(rows: Rows, numbers: Array, size: int) -> Array:
     magnitude = np.abs(numbers)
     is_too_small = (row == column) & (magnitude > 0.0) & (magnitude < _MIN_INFORMATION)
     fault = "the information matrix has an invalid entry"
-    usual_range = f"{_MIN_INFORMATION:g} to {_MAX_INFORMATION:g}"
-    remedy = f"Give 0 for directions without information, else {usual_range}."
+    remedy = f"Give 0, or {_MIN_INFORMATION:g} to {_MAX_INFORMATION:g}."
     rows.raise_where(is_too_small | (magnitude > _MAX_INFORMATION), fault, remedy)
     eigenvalues = np.linalg.eigvalsh(matrices)
     fault = "the information matrix has a negative eigenvalue"

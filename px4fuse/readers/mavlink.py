@@ -17,7 +17,16 @@ from px4fuse.ekf2_parameters import (
     effective_settings,
     replace_invalid_parameters,
 )
-from px4fuse.flight import AXIS_NAMES, Columns, Ekf2, Flight, FlightMode, Unavailable
+from px4fuse.flight import (
+    AXIS_NAMES,
+    Columns,
+    Ekf2,
+    Flight,
+    FlightMode,
+    Spans,
+    TableOrUnavailable,
+    Unavailable,
+)
 from px4fuse.log import LogInfo, UnusedData
 from px4fuse.readers import common
 from px4fuse.readers import mavlink_messages as messages
@@ -32,10 +41,10 @@ from px4fuse.readers.mavlink_recording import (
     read_recording,
 )
 from px4fuse.readers.px4_positions import barometer
-from px4fuse.readers.ulog_topics import NO_SELECTOR, dropped_note
+from px4fuse.readers.ulog_topics import NO_SELECTOR, dropped_notes
 
 VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
-# MAV_PARAM_TYPE_REAL32: smaller numbers of MAV_PARAM_TYPE are integer types
+# MAV_PARAM_TYPE_REAL32; types with smaller numbers are integers
 REAL32_PARAMETER_TYPE = 9
 
 
@@ -88,7 +97,8 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     pressure_hpa = recording.read(messages.LAYOUTS["pressure"])["pressure_hpa"]
     modes = _read_modes(recording) if autopilot == "PX4" else messages.NO_MODES
     return Flight(
-        # After all other reads, because the description lists the samples that they dropped
+        # Evaluated after all readers, because the log description counts the samples that they
+        # dropped
         log=_describe_log(recording, parameters, parameter_faults, autopilot, in_flight),
         imu=imu,
         attitude=attitude,
@@ -109,7 +119,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     )
 
 
-def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
+def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
     candidates = [(layout, recording.rows(layout.topic)) for layout in messages.IMU_LAYOUTS]
     # HIGHRES_IMU is preferred (SI units, µs timestamps), otherwise the message with most samples
     layout, rows = (
@@ -120,11 +130,13 @@ def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
     if len(rows) < 2:
         raw_count = len(recording.rows("RAW_IMU"))
         ignored_note = (
-            f"; {raw_count} RAW_IMU messages were not used: raw counts have no unit"
+            f"; {raw_count} RAW_IMU messages were not used, because raw counts have no unit"
             if raw_count
             else ""
         )
-        return Unavailable("IMU", f"no HIGHRES_IMU or SCALED_IMU{ignored_note}", remedy)
+        return Unavailable(
+            "IMU", f"the recording contains no HIGHRES_IMU or SCALED_IMU{ignored_note}", remedy
+        )
     table = recording.frames.table(layout.topic, rows)
     if "id" in (table.dtype.names or ()):
         rows = rows[table["id"] == np.bincount(table["id"]).argmax()]
@@ -141,13 +153,15 @@ def _read_imu(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
     return imu
 
 
-def _read_attitude(recording: Recording, remedy: str) -> pd.DataFrame | Unavailable:
+def _read_attitude(recording: Recording, remedy: str) -> TableOrUnavailable:
     layout = max(messages.ATTITUDE_LAYOUTS, key=lambda layout: len(recording.rows(layout.topic)))
     attitude = common.with_attitude(recording.read(layout))[Columns.QUATERNION]
     if len(attitude) < 2:
         *other_topics, last_topic = (layout.topic for layout in messages.ATTITUDE_LAYOUTS)
         return Unavailable(
-            "attitude", f"no usable {', '.join(other_topics)} or {last_topic}", remedy
+            "attitude",
+            f"the recording contains no usable {', '.join(other_topics)} or {last_topic}",
+            remedy,
         )
     recording.record_stream("attitude", layout.topic)
     return attitude
@@ -156,7 +170,6 @@ def _read_attitude(recording: Recording, remedy: str) -> pd.DataFrame | Unavaila
 def _read_ekf2(
     recording: Recording, parameters: Mapping[str, float], autopilot: str
 ) -> Ekf2 | Unavailable:
-    """Read EKF2's position, velocity and variances from the autopilot's messages."""
     remedies, replay_unavailable = messages.remedies_of_autopilot(autopilot)
     counts = {layout.topic: len(recording.rows(layout.topic)) for layout in messages.STATE_LAYOUTS}
     # ODOMETRY has variances, so it is preferred unless its rate is below half of the highest rate
@@ -169,7 +182,7 @@ def _read_ekf2(
     message = layout.topic
     if counts[message] < 2:
         return Unavailable(
-            "EKF2", "the autopilot sent no ODOMETRY or LOCAL_POSITION_NED", f"{remedies['state']}"
+            "EKF2", "the autopilot sent no ODOMETRY or LOCAL_POSITION_NED", remedies["state"]
         )
     samples = recording.read(layout)
     state = samples[Columns.STATE].dropna()
@@ -180,34 +193,32 @@ def _read_ekf2(
             "Wait until EKF2 has started before recording.",
         )
     recording.record_stream("ekf2_state", message)
-    notes = [f"EKF2 state from {message}, as sent by the autopilot"]
+    notes = [f"the EKF2 state is from {message}, which the autopilot sent"]
     if autopilot != "PX4":
-        notes.append(f"autopilot {autopilot}: 'EKF2' means the estimator of this autopilot")
+        notes.append(f"'EKF2' means the estimator of the autopilot {autopilot}")
     if "reset_counter" in samples and (
         reset_count := np.count_nonzero(samples["reset_counter"].diff()[1:])
     ):
-        reset_text = f"EKF2 reset its state {reset_count} times in the recording"
         notes.append(
-            f"{reset_text}; ODOMETRY does not contain their size, so they were not removed"
+            f"EKF2 reset its state {reset_count} times; the resets were not removed, because "
+            "ODOMETRY does not contain their size"
         )
     variance_rows = samples.reindex(columns=VARIANCE_COLUMNS)
     variance_rows = variance_rows[(variance_rows > 0.0).all(axis=1)]
     if variance_rows.empty:
-        message, variance_rows = (
-            messages.LAYOUTS["accuracy"].topic,
-            _variance_from_accuracy(recording),
-        )
+        message = messages.LAYOUTS["accuracy"].topic
+        variance_rows = _variance_from_accuracy(recording)
         if len(variance_rows):
             notes.append(
-                "EKF2 position variances from ESTIMATOR_STATUS: half of the squared horizontal "
-                "accuracy on each horizontal axis; velocity variances are not sent"
+                "the EKF2 position variances are from ESTIMATOR_STATUS (on each horizontal axis "
+                "half of the squared horizontal accuracy); velocity variances are not sent"
             )
-    variance: pd.DataFrame | Unavailable = variance_rows
+    variance: TableOrUnavailable = variance_rows
     if variance_rows.empty:
         variance = Unavailable(
             "EKF2 variances",
             "the autopilot sent no ODOMETRY with covariance and no ESTIMATOR_STATUS",
-            f"{remedies['variance']}",
+            remedies["variance"],
         )
     else:
         recording.record_stream("ekf2_variance", message)
@@ -218,7 +229,7 @@ def _read_ekf2(
             axis: Unavailable(
                 f"EKF2 innovations, {axis}",
                 "MAVLink does not transmit EKF2 innovations",
-                f"{remedies['inside']}",
+                remedies["innovations"],
             )
             for axis in AXIS_NAMES
         },
@@ -226,7 +237,7 @@ def _read_ekf2(
         fusing=Unavailable(
             "EKF2 fusion flags",
             "MAVLink does not transmit EKF2 fusion flags",
-            f"{remedies['inside']}",
+            remedies["innovations"],
         ),
         resets=(),
         instances=NO_SELECTOR,
@@ -249,10 +260,7 @@ def _variance_from_accuracy(recording: Recording) -> pd.DataFrame:
     return variance[(variance[Columns.POSITION_VARIANCE] > 0.0).all(axis=1)]
 
 
-def _read_airborne(
-    recording: Recording, remedy: str
-) -> tuple[tuple[float, float], ...] | Unavailable:
-    """Read the intervals (s) from take-off to touch-down according to the land detector."""
+def _read_airborne(recording: Recording, remedy: str) -> Spans | Unavailable:
     rows = recording.rows("EXTENDED_SYS_STATE")
     states = recording.frames.table("EXTENDED_SYS_STATE", rows)
     is_known = states["landed_state"] > 0
@@ -306,7 +314,8 @@ def _describe_log(
         if frames.ends_in_frame
         else ()
     )
-    firmware, firmware_hash = f"{autopilot} (version not in the recording)", "unknown"
+    firmware = f"{autopilot} (version not in the recording)"
+    firmware_hash = "unknown"
     vehicle = ""
     rows = recording.rows("AUTOPILOT_VERSION")
     if len(rows):
@@ -319,13 +328,10 @@ def _describe_log(
         uid = bytes(version["uid2"]).hex()
         vehicle = uid if uid.strip("0") else ""
     heartbeats = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))
-    vehicle_type = next(iter(heartbeats["type"].tolist()), -1)
-    vehicle_name = messages.VEHICLE_TYPES.get(vehicle_type, "vehicle")
-    timestamp_fault = "zero, go back, or are outside the recording"
-    dropped_notes = [
-        dropped_note(n, message, timestamp_fault)
-        for message, n in sorted(recording.dropped.items())
-    ]
+    vehicle_name = messages.VEHICLE_TYPES.get(
+        next(iter(heartbeats["type"].tolist()), -1), "vehicle"
+    )
+    dropped = sorted(recording.dropped.items())
     return LogInfo(
         name=frames.name,
         sha256=frames.sha256,
@@ -337,10 +343,10 @@ def _describe_log(
         boot_time_s=recording.zero_s,
         duration_s=recording.duration_s,
         parameters=MappingProxyType(parameters),
-        notes=(*recording.notes, *parameter_faults, *dropped_notes),
+        notes=(*recording.notes, *parameter_faults, *dropped_notes(dropped)),
         restarts=recording.restarts,
         receive_time_reversals=recording.receive_time_reversals,
-        dropped=dict(sorted(recording.dropped.items())),
+        dropped=dict(dropped),
         autopilot=autopilot,
         start_unix_s=_start_unix_s(recording),
         senders=senders.describe_senders(recording),
@@ -352,7 +358,7 @@ def _describe_log(
 
 
 def _start_unix_s(recording: Recording) -> float | None:
-    """Return the UNIX time (s) at flight time zero.
+    """Return the UNIX time (s) at flight time zero; None if the recording contains no UNIX time.
 
     The autopilot's clock is preferred to the clock of the recording computer.
     """

@@ -16,28 +16,30 @@ from scipy.stats import theilslopes
 from px4fuse.arrays import Array
 from px4fuse.log import ClockMap
 
-# Maximum median difference (s) between timestamps and the boot time of receipt, for timestamps that
-# count as boot time
+# Maximum median difference (s) between the timestamps of a sender and the boot time of receipt, for
+# timestamps that count as boot time
 MAX_BOOT_CLOCK_DISTANCE_S = 10.0
-# Minimum reduction (s) of the difference to the receive time by TIMESYNC, for a sender that counts
-# as having a separate clock
+# Minimum reduction (s) of the difference between timestamps and receive time by TIMESYNC, for a
+# sender that counts as having a separate clock
 MIN_TIMESYNC_IMPROVEMENT_S = 0.1
-# Minimum UNIX time (s), 2001-09-09: smaller times count from boot
+# Minimum time (s) that counts as UNIX time, 2001-09-09: smaller times count from boot
 MIN_UNIX_TIME_S = 1e9
-# Interval (s) of which the envelope uses only the message with the smallest delay
+# Length (s) of the intervals of which the lower envelope uses the message with the least delay
 ENVELOPE_INTERVAL_S = 2.0
 MAX_ENVELOPE_INTERVALS = 200
-# Minimum time span (s) to estimate a drift; below, both clocks are assumed to have the same rate
+# Minimum time span (s) to estimate a clock drift: in a shorter span both clocks are assumed to have
+# the same rate
 MIN_DRIFT_SPAN_S = 30.0
-# Maximum ratio of clock rates minus 1 of two real clocks: a larger difference is from a replayed
-# link, and is estimated for any time span
+# Maximum relative difference of the rates of two real clocks: a larger difference is from a
+# replayed link, and is estimated for any time span
 MAX_RATE_DIFFERENCE = 0.01
-# Maximum ratio of clock rates: above any replay speed or wrong unit of time (s for ns: 1e9)
+# Maximum ratio of the rates of two clocks: above any replay speed or wrong unit of time (s for ns
+# is 1e9)
 MAX_RATE_RATIO = 1e12
 MIN_TIMESYNC_PAIRS = 3
-# Minimum fraction of distinct timestamps of a clock
+# Minimum fraction of distinct timestamps of a running clock
 MIN_DISTINCT_FRACTION = 0.1
-# Maximum interval (s) between positions; a longer interval is a gap
+# Maximum regular interval (s) between positions: a longer interval is a gap
 MAX_REGULAR_INTERVAL_S = 1.0
 
 
@@ -78,7 +80,8 @@ def fit_least_delay(x: Array, y: Array) -> Line:
         The slope is 1 if the span is too short to estimate a drift.
     """
     order = np.argsort(x, kind="stable")
-    x, y = x[order], y[order]
+    x = x[order]
+    y = y[order]
     x0 = float(x[len(x) // 2])
     span_s = float(x[-1] - x[0])
     interval_count = int(np.clip(span_s / ENVELOPE_INTERVAL_S, 1, MAX_ENVELOPE_INTERVALS))
@@ -102,8 +105,7 @@ def fit_least_delay(x: Array, y: Array) -> Line:
             slope = corrected_slope if _is_rate_ratio(corrected_slope) else 1.0
             residual = y - slope * (x - x0)
             envelope_rows = [rows[np.argmin(residual[rows])] for rows in interval_rows]
-    y0 = float(np.median(residual[envelope_rows]))
-    return Line(x0, y0, slope, robust_std(residual), len(x))
+    return Line(x0, float(np.median(residual[envelope_rows])), slope, robust_std(residual), len(x))
 
 
 def _median_slope(x: Array, y: Array) -> float:
@@ -113,12 +115,11 @@ def _median_slope(x: Array, y: Array) -> float:
 
 
 def _is_rate_ratio(slope: float) -> bool:
-    """Return True if the slope is a possible ratio of two clock rates: positive and finite."""
     return 1.0 / MAX_RATE_RATIO < slope < MAX_RATE_RATIO
 
 
 def is_running_clock(stamp_s: Array) -> bool:
-    """Return True if enough timestamps are distinct (see MIN_DISTINCT_FRACTION)."""
+    """Return True if at least MIN_DISTINCT_FRACTION of the timestamps are distinct."""
     return len(np.unique(stamp_s)) >= max(MIN_DISTINCT_FRACTION * len(stamp_s), 2)
 
 
@@ -129,14 +130,14 @@ def robust_std(values: Array) -> float:
 
 @dataclass(frozen=True)
 class ClockMapping:
-    """Map from a sender's timestamps to the boot clock, with its description.
+    """Map from a sender's timestamps to the boot clock, and its description for results.
 
     ``to_boot`` is None if the timestamps are not from a running clock; the receive time is then
     used instead.
     """
 
     to_boot: Line | None
-    statement: ClockMap
+    description: ClockMap
 
 
 def map_clock(
@@ -175,8 +176,10 @@ def map_clock(
     boot_at_receipt = boot_of_receipt.at(received_s)
     if not is_running_clock(stamp_s):
         distinct_count = len(np.unique(stamp_s))
-        few_values = f"its {len(stamp_s)} timestamps have only {distinct_count} distinct values"
-        note = f"{few_values}; the {time_source} is used instead"
+        note = (
+            f"the {len(stamp_s)} timestamps have only {distinct_count} distinct values, so the "
+            f"{time_source} is used instead"
+        )
         # Jitter of the receive time if samples are sent at regular intervals; gaps are excluded
         intervals_s = np.diff(received_s)
         regular_intervals_s = intervals_s[intervals_s < MAX_REGULAR_INTERVAL_S]
@@ -203,32 +206,31 @@ def map_clock(
         and improvement_s < MIN_TIMESYNC_IMPROVEMENT_S
     ):
         line = Line(float(stamp_s[0]), float(stamp_s[0]), 1.0, 0.0, len(stamp_s))
-        note = "its timestamps already use the boot clock"
+        note = "the timestamps of the sender are on the boot clock"
         return ClockMapping(line, ClockMap(name, "boot clock", len(stamp_s), 0.0, 0.0, 0.0, note))
-    clock_kind = "UNIX time" if float(np.median(stamp_s)) > MIN_UNIX_TIME_S else "own clock"
+    clock_kind = "UNIX time" if float(np.median(stamp_s)) > MIN_UNIX_TIME_S else "clock"
     clock_name = f"{clock_kind} of {name}"
     candidates = [] if timesync_line is None else [("TIMESYNC", timesync_line, "")]
     if clock_kind == "UNIX time" and map_boot_to_unix is not None:
-        unix_note = "assumes the same UNIX time at sender and autopilot"
+        unix_note = "sender and autopilot are assumed to have the same UNIX time"
         candidates.append(("SYSTEM_TIME", map_boot_to_unix.inverse(), unix_note))
     for method, line, note in candidates:
         # A map that moves messages far from their receive time belongs to another clock
         if abs(float(np.median(line.at(stamp_s) - boot_at_receipt))) <= MAX_BOOT_CLOCK_DISTANCE_S:
             return ClockMapping(line, _clock_map(clock_name, method, line, stamp_s, note))
     receipt_line = fit_least_delay(stamp_s, received_s)
-    boot_y0_s, slope = (
-        float(boot_of_receipt.at(receipt_line.y0)),
-        receipt_line.slope * boot_of_receipt.slope,
-    )
+    boot_y0_s = float(boot_of_receipt.at(receipt_line.y0))
+    slope = receipt_line.slope * boot_of_receipt.slope
     boot_line = replace(receipt_line, y0=boot_y0_s, slope=slope)
-    note = "no usable TIMESYNC or SYSTEM_TIME; late by the minimum link delay"
+    note = "without TIMESYNC and SYSTEM_TIME the mapped times are late by the minimum link delay"
     return ClockMapping(boot_line, _clock_map(clock_name, time_source, boot_line, stamp_s, note))
 
 
 def _fit_timesync(replies: tuple[Array, Array], answers: tuple[Array, Array]) -> Line | None:
     """Map the sender's clock to the boot clock by TIMESYNC, averaged over both directions.
 
-    For ``replies`` and ``answers`` see :func:`map_clock`. None if both have too few pairs.
+    ``replies`` and ``answers`` are pairs of clock readings, see :func:`map_clock`. None if both
+    have fewer than MIN_TIMESYNC_PAIRS.
     """
     lines = []
     if len(replies[0]) >= MIN_TIMESYNC_PAIRS:
@@ -246,5 +248,6 @@ def _fit_timesync(replies: tuple[Array, Array], answers: tuple[Array, Array]) ->
 
 def _clock_map(clock: str, method: str, line: Line, stamp_s: Array, note: str) -> ClockMap:
     middle_s = float(0.5 * (stamp_s.min() + stamp_s.max()))
-    offset_s, drift_ppm = float(line.at(middle_s)) - middle_s, (line.slope - 1.0) * 1e6
+    offset_s = float(line.at(middle_s)) - middle_s
+    drift_ppm = (line.slope - 1.0) * 1e6
     return ClockMap(clock, method, line.pairs, offset_s, drift_ppm, line.jitter, note)

@@ -33,15 +33,15 @@ SIGNED_FLAG = 0x01
 MAX_FRAME_BYTES = HEADER_BYTES_2 + 255 + CHECKSUM_BYTES + SIGNATURE_BYTES
 # Receive time that QGroundControl and MAVProxy write before each frame: µs, big-endian
 RECEIVE_TIME_BYTES = 8
-# Number of bytes scanned at once, to limit the memory for malicious files
+# Number of bytes in which frames are searched at once, to limit the memory for malicious files
 BLOCK_BYTES = 1 << 16
-# Number of frames decoded at once, to limit the memory
+# Number of frames that are decoded at once, to limit the memory
 DECODE_BATCH_SIZE = 1 << 12
 # Minimum fraction of a MAVLink recording's bytes that are in valid frames. Random data contain one
 # valid frame in about eight million bytes.
 MIN_VALID_FRACTION = 0.01
-# Maximum difference (µs) of a receive time from the median (limit of pymavlink): a receive time
-# with a larger difference is damaged
+# Maximum difference (µs) of a receive time from the median receive time (limit of pymavlink): a
+# receive time with a larger difference is damaged
 MAX_RECEIVE_TIME_DISTANCE_US = 3 * 24 * 3600 * 1_000_000
 MESSAGE_IDS: Mapping[str, int] = {
     message.msgname: at for at, message in dialect.mavlink_map.items()
@@ -130,7 +130,8 @@ class Frames:
         layout = wire_layout(MESSAGE_IDS[message])
         payload = np.zeros((len(rows), layout.itemsize), dtype=np.uint8)
         source = np.frombuffer(self.content, dtype=np.uint8)
-        starts, lengths = self.payload_start[rows], self.payload_length[rows]
+        starts = self.payload_start[rows]
+        lengths = self.payload_length[rows]
         for length in np.unique(lengths).tolist():
             byte_count = min(length, layout.itemsize)
             if byte_count:
@@ -179,14 +180,13 @@ def read_frames(name: str, content: bytes) -> Frames:
     LogError
         The content is not MAVLink.
     """
-    start, end, message_id = _remove_overlapping(_find_valid_frames(content)).T
+    start, end, message_id = _remove_nested_frames(_find_valid_frames(content)).T
     time_bytes = RECEIVE_TIME_BYTES if len(start) and _has_receive_times(start, end) else 0
-    valid_bytes = int(np.sum(end - start))
-    if valid_bytes < MIN_VALID_FRACTION * len(content) or not len(start):
+    if int(np.sum(end - start)) < MIN_VALID_FRACTION * len(content) or not len(start):
         raise LogError(
-            f"{name}: neither a PX4 ULog nor a MAVLink recording ({len(start)} frames "
+            f"{name}: the file is neither a PX4 ULog nor a MAVLink recording ({len(start)} frames "
             f"with a valid checksum in {len(content)} bytes).",
-            "Give the .ulg from the vehicle, or a .tlog or raw MAVLink stream.",
+            "Give a .ulg, a .tlog or a raw MAVLink stream.",
         )
     source = np.frombuffer(content, dtype=np.uint8)
     is_version_2 = source[start] == MAGIC_BYTE_2
@@ -218,11 +218,12 @@ def read_frames(name: str, content: bytes) -> Frames:
 
 
 def _find_valid_frames(content: bytes) -> Integers:
-    """Return start, end and message id, shape (n, 3), of all valid frames. Frames may overlap."""
-    source, view = np.frombuffer(content, dtype=np.uint8), memoryview(content)
+    """Return start, end and message id, shape (n, 3), of all frames with valid checksums."""
+    source = np.frombuffer(content, dtype=np.uint8)
+    view = memoryview(content)
     valid_frames = [np.zeros((0, 3), dtype=np.int64)]
     for block_start in range(0, len(source), BLOCK_BYTES):
-        frames, crc_end = _find_candidates(source, block_start)
+        frames, crc_end = _find_possible_frames(source, block_start)
         checked_ranges = zip((frames[:, 0] + 1).tolist(), crc_end.tolist(), strict=True)
         crc = np.array([mcrf4xx(view[a:b]) for a, b in checked_ranges], dtype=np.uint16)
         crc = (crc >> 8) ^ _BYTE_CHECKSUMS[
@@ -233,7 +234,7 @@ def _find_valid_frames(content: bytes) -> Integers:
     return np.concatenate(valid_frames)
 
 
-def _remove_overlapping(frames: Integers) -> Integers:
+def _remove_nested_frames(frames: Integers) -> Integers:
     """Remove frames that begin inside the previous frame.
 
     The payload of one frame may contain another frame (TUNNEL). A receive time can look like the
@@ -241,8 +242,11 @@ def _remove_overlapping(frames: Integers) -> Integers:
     """
     if not np.any(frames[1:, 0] < frames[:-1, 1]):
         return frames
-    start, end = frames[:, 0].tolist(), frames[:, 1].tolist()
-    kept_rows, previous_end, starts = [], 0, {*start}
+    start = frames[:, 0].tolist()
+    end = frames[:, 1].tolist()
+    kept_rows = []
+    previous_end = 0
+    starts = {*start}
     for row, frame_start in enumerate(start):
         next_starts = previous_end, previous_end + RECEIVE_TIME_BYTES
         if frame_start >= previous_end and (
@@ -253,8 +257,8 @@ def _remove_overlapping(frames: Integers) -> Integers:
     return frames[kept_rows]
 
 
-def _find_candidates(source: NDArray[np.uint8], block_start: int) -> tuple[Integers, Integers]:
-    """Return start, end and message id of possible frames in a block, and checksum offsets."""
+def _find_possible_frames(source: NDArray[np.uint8], block_start: int) -> tuple[Integers, Integers]:
+    """Return start, end and message id of possible frames, and the offset of their checksums."""
     block = source[block_start : block_start + BLOCK_BYTES]
     start = (
         np.flatnonzero((block == MAGIC_BYTE_1) | (block == MAGIC_BYTE_2)).astype(np.int64)
@@ -262,7 +266,8 @@ def _find_candidates(source: NDArray[np.uint8], block_start: int) -> tuple[Integ
     )
     header_bytes = np.where(source[start] == MAGIC_BYTE_2, HEADER_BYTES_2, HEADER_BYTES_1)
     has_whole_header = start + header_bytes + CHECKSUM_BYTES <= len(source)
-    start, header_bytes = start[has_whole_header], header_bytes[has_whole_header]
+    start = start[has_whole_header]
+    header_bytes = header_bytes[has_whole_header]
     is_version_2 = header_bytes == HEADER_BYTES_2
     start_2 = start[is_version_2]
     message_id = source[start + 5].astype(np.int64)
@@ -279,10 +284,8 @@ def _find_candidates(source: NDArray[np.uint8], block_start: int) -> tuple[Integ
 def _has_receive_times(start: Integers, end: Integers) -> bool:
     """Return True if most frames are separated by the eight bytes of a receive time."""
     gap_bytes = start[1:] - end[:-1]
-    stamped_count, bare_count = (
-        np.count_nonzero(gap_bytes == RECEIVE_TIME_BYTES),
-        np.count_nonzero(gap_bytes == 0),
-    )
+    stamped_count = np.count_nonzero(gap_bytes == RECEIVE_TIME_BYTES)
+    bare_count = np.count_nonzero(gap_bytes == 0)
     return (
         bool(stamped_count > bare_count)
         if stamped_count + bare_count
@@ -307,8 +310,11 @@ def _count_other_bytes(
     bool
         True if the file ends within a frame.
     """
-    unknown_frame_count, bad_bytes, last_bytes = 0, 0, b""
-    gap_starts, gap_ends = np.append(0, end), np.append(start, len(content))
+    unknown_frame_count = 0
+    bad_bytes = 0
+    last_bytes = b""
+    gap_starts = np.append(0, end)
+    gap_ends = np.append(start, len(content))
     for gap_start, gap_end in np.column_stack([gap_starts, gap_ends])[
         gap_starts < gap_ends
     ].tolist():
@@ -334,7 +340,8 @@ def _unknown_frames(content: bytes, offset: int, gap_end: int, time_bytes: int) 
     """Yield the sizes (bytes) of consecutive frames of unknown messages, from their headers."""
     while offset + time_bytes + HEADER_BYTES_1 + CHECKSUM_BYTES <= gap_end:
         header = content[offset + time_bytes : offset + time_bytes + HEADER_BYTES_2]
-        message_id, size = header[5], time_bytes + header[1] + HEADER_BYTES_1 + CHECKSUM_BYTES
+        message_id = header[5]
+        size = time_bytes + header[1] + HEADER_BYTES_1 + CHECKSUM_BYTES
         if header[0] == MAGIC_BYTE_2:
             message_id = int.from_bytes(header[7:10], "little")
             size += HEADER_BYTES_2 - HEADER_BYTES_1 + SIGNATURE_BYTES * (header[2] & SIGNED_FLAG)

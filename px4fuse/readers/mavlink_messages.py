@@ -27,9 +27,9 @@ NO_MODES = Unavailable(
 ARDUPILOT_REPLAY = Unavailable(
     "estimator replay",
     "px4fuse has no model of ArduPilot's estimator (EKF3)",
-    "Use its logged state.",
+    "Use the logged state of EKF3.",
 )
-# Messages with the boot clock in time_usec; in other messages time_usec may be of another clock
+# Messages with the boot time in time_usec; in other messages time_usec may be from another clock
 STAMPED_BY_BOOT_CLOCK = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
 # Messages that only an autopilot sends; they identify the autopilot among the senders
 AUTOPILOT_MESSAGES = (
@@ -66,12 +66,12 @@ class PositionInput:
 
     @property
     def layout(self) -> Layout:
-        """Fields of the message."""
+        """Message with its fields and their DataFrame columns."""
         return LAYOUTS[self.row]
 
     @property
     def origin(self) -> Origin:
-        """Origin of the position."""
+        """Kind of the position source, and path of the positions to the log."""
         return find_origin(self.kind, "as received")
 
     @property
@@ -112,10 +112,7 @@ GNSS_LAYOUTS = (LAYOUTS["gnss"], replace(LAYOUTS["gnss"], topic="GPS2_RAW"))
 
 
 def remedies_of_autopilot(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
-    """Return the action to record each kind of missing data, and the reason for no EKF2 replay.
-
-    The texts for PX4 are returned for all autopilots except ArduPilot.
-    """
+    """Return the action to record each kind of missing data, and the reason for no EKF2 replay."""
     if autopilot == "ArduPilot":
         return _TABLE["remedies"][autopilot], ARDUPILOT_REPLAY
     return _TABLE["remedies"]["PX4"], RECORD_NOT_LOGGED

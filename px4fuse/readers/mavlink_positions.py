@@ -21,11 +21,11 @@ from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Recordi
 from px4fuse.readers.mavlink_senders import senders_of
 from px4fuse.readers.px4_positions import GeodeticPosition, project_to_ned, unproject
 
-# Maximum median difference (s) between GNSS timestamps and the boot time of receipt, for timestamps
-# that count as boot time
+# Maximum median difference (s) between GNSS timestamps and the boot time of receipt: with a larger
+# difference the timestamps are not boot time
 MAX_BOOT_CLOCK_DISTANCE_S = 5.0
-# Maximum time difference (s) between a global and a local position that give the origin: error of
-# 5 cm at 1 m/s
+# Maximum time difference (s) between the global and the local position from which the origin is
+# computed: error of 5 cm at 1 m/s
 MAX_STATE_DISTANCE_S = 0.05
 
 
@@ -53,8 +53,11 @@ def read_positions(
             if source.message == message
             if (track := _read_track(recording, source, sender, clocks[sender], remedy, senders))
         ]
-        reason = f"no {message} to the autopilot in the recording"
-        tracks_and_missing += tracks or [px4_positions.unavailable(message, reason, remedy)]
+        tracks_and_missing += tracks or [
+            px4_positions.unavailable(
+                message, f"the recording contains no {message} to the autopilot", remedy
+            )
+        ]
     fixes = (_read_gnss(recording, layout, delay_s) for layout in messages.GNSS_LAYOUTS)
     tracks_and_missing += [track for track in fixes if track]
     missing = tuple(item for item in tracks_and_missing if isinstance(item, Unavailable))
@@ -71,12 +74,13 @@ def _read_track(
     remedy: str,
     senders: list[Address],
 ) -> PositionTrack | Unavailable | None:
-    """Read the positions of one input from one sender; None if the sender did not send any."""
+    """Read the positions in one message type from one sender; None if the sender sent none."""
     rows = recording.rows(source.message, sender)
     table = recording.frames.table(source.message, rows)
     if source.estimator is not None:
         is_of_estimator = table["estimator_type"] == source.estimator
-        rows, table = rows[is_of_estimator], table[is_of_estimator]
+        rows = rows[is_of_estimator]
+        table = table[is_of_estimator]
     if not len(rows):
         return None
     name = source.name + (f"_{sender[0]}_{sender[1]}" if len(senders) > 1 else "")
@@ -93,10 +97,7 @@ def _read_track(
     if source.drops_covariance:
         samples[Columns.POSITION_VARIANCE + Columns.ROTATION_VARIANCE] = np.nan
     orientation = read_orientation(samples)
-    clock_map = clock.statement
-    mapping_text = (
-        "" if clock_map.method == "boot clock" else f", mapped to boot time by {clock_map.method}"
-    )
+    clock_map = clock.description
     return px4_positions.make_track(
         name,
         samples,
@@ -104,7 +105,9 @@ def _read_track(
         remedy=remedy,
         description=source.description,
         frame=frame,
-        clock=clock_map.clock + mapping_text,
+        clock=clock_map.clock
+        if clock_map.method == "boot clock"
+        else f"{clock_map.clock}, mapped to boot time by {clock_map.method}",
         topics=(source.message,),
         log=recording.frames.name,
         clock_map=clock_map,
@@ -122,8 +125,7 @@ def _read_gnss(
     global position.
     """
     rows = recording.rows(layout.topic)
-    timestamp_us = recording.frames.table(layout.topic, rows)["time_usec"]
-    rows = rows[np.diff(timestamp_us, prepend=0) > 0]
+    rows = rows[np.diff(recording.frames.table(layout.topic, rows)["time_usec"], prepend=0) > 0]
     boot_s = recording.frames.table(layout.topic, rows)["time_usec"] * 1e-6
     receipt_s = recording.receipt_boot_s(rows)
     if len(rows) and np.median(np.abs(receipt_s - boot_s)) > MAX_BOOT_CLOCK_DISTANCE_S:
@@ -157,22 +159,21 @@ def pressure_altitude(pressure_hpa: pd.Series[float]) -> pd.Series[float]:
 def local_origin(recording: Recording) -> GeodeticPosition | None:
     """Return latitude, longitude (degrees) and altitude (m) of the autopilot's local origin.
 
-    The origin is from a message, or else computed from global and local positions. None if unknown.
+    The origin is from GPS_GLOBAL_ORIGIN, or else computed from global and local positions. None if
+    the recording contains neither.
     """
     sent_origin = recording.read(messages.LAYOUTS["origin"]).dropna()
     if len(sent_origin):
         return tuple(sent_origin[GLOBAL_COLUMNS].iloc[-1].tolist())
-    state = recording.read(messages.STATE_LAYOUTS[-1])[Columns.POSITION]
-    global_state = recording.read(messages.LAYOUTS["global_state"])
-    joined = join_nearest(global_state, state, MAX_STATE_DISTANCE_S).dropna()
+    joined = join_nearest(
+        recording.read(messages.LAYOUTS["global_state"]),
+        recording.read(messages.STATE_LAYOUTS[-1])[Columns.POSITION],
+        MAX_STATE_DISTANCE_S,
+    ).dropna()
     joined = joined[joined["latitude_deg"] != 0.0]
     if joined.empty:
         return None
-    global_positions, local_positions = (
-        joined[GLOBAL_COLUMNS].to_numpy(),
-        joined[Columns.POSITION].to_numpy(),
-    )
-    pairs = zip(global_positions, local_positions, strict=True)
+    pairs = zip(joined[GLOBAL_COLUMNS].to_numpy(), joined[Columns.POSITION].to_numpy(), strict=True)
     origins = [
         (*unproject(-n, -e, tuple(position[:2])), position[2] + d) for position, (n, e, d) in pairs
     ]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array, IntArray
-from px4fuse.flight import Columns
+from px4fuse.flight import Columns, time_index
 from px4fuse.log import Stream
 from px4fuse.readers.common import MIN_QUATERNION_NORM
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
@@ -31,11 +31,12 @@ MIN_RESTART_STEP_S = 5.0
 # Distance (messages) before and after a suspected restart at which boot times are compared to
 # confirm the restart
 RESTART_CHECK_MESSAGES = 20
-# Minimum size of a valid separate group of timestamps, relative to the largest group
+# Minimum number of timestamps in a valid group between gaps, relative to the largest group
 MIN_GROUP_FRACTION = 0.01
-# Maximum distance (s) of valid timestamps from all others, and from the session
+# Maximum gap (s) between valid timestamps, and maximum distance (s) of valid timestamps from the
+# analysed session
 MAX_OUTSIDE_S = 60.0
-# Maximum fraction of bytes outside of frames in a file that is not damaged
+# Maximum fraction of bytes outside of MAVLink frames in a file that counts as not damaged
 MAX_LOST_FRACTION = 0.002
 # Minimum number of equal boot timestamps that show that the field is not a clock
 MIN_CONSTANT_TIMESTAMPS = 10
@@ -134,8 +135,12 @@ class Recording:
             )
         del table
         values[~(np.abs(values) < MAX_FIELD_VALUE)] = np.nan
-        times = pd.Index(boot_s[selected_rows] - self.zero_s, name="time_s")
-        samples = pd.DataFrame(values, times, list(layout.columns), copy=False)
+        samples = pd.DataFrame(
+            values,
+            time_index(boot_s[selected_rows] - self.zero_s),
+            list(layout.columns),
+            copy=False,
+        )
         if "roll" in samples:
             attitude = Rotation.from_euler("ZYX", samples[["yaw", "pitch", "roll"]].to_numpy())
             samples[Columns.QUATERNION] = attitude.as_quat(scalar_first=True)
@@ -174,9 +179,9 @@ class Recording:
             np.where(is_boot_time, timestamp_s, self.receipt_boot_s(rows)), dtype=np.float64
         )
 
-    def record_stream(self, flight_part: str, *messages: str, clock: str = BOOT_CLOCK) -> None:
+    def record_stream(self, data_kind: str, *messages: str, clock: str = BOOT_CLOCK) -> None:
         """Record the messages and the clock of one kind of data, such as "imu"."""
-        self.streams[flight_part] = Stream(messages, clock, self.frames.name)
+        self.streams[data_kind] = Stream(messages, clock, self.frames.name)
 
 
 def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
@@ -196,7 +201,9 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     used_frames = {*samples["frame_id"].unique(), *samples["child_frame_id"].unique()}
     for number in used_frames & FRAMES_OF_REFERENCE.keys():
         frame = FRAMES_OF_REFERENCE[number]
-        order, signs, is_body = frame.order, frame.signs, frame.body
+        order = frame.order
+        signs = frame.signs
+        is_body = frame.body
         frame_samples = samples[(samples["frame_id"] == number) & (not is_body)]
         position = frame_samples[Columns.POSITION].to_numpy()[:, order]
         variance = frame_samples[Columns.POSITION_VARIANCE].to_numpy()[:, order]
@@ -210,8 +217,9 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
         velocity = child_samples[Columns.VELOCITY].to_numpy()[:, order] * signs
         velocity_variance = child_samples[Columns.VELOCITY_VARIANCE].to_numpy()[:, order]
         if is_body and len(child_samples):
-            quaternion = child_samples[Columns.QUATERNION].to_numpy(copy=True)
-            rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+            rotation = Rotation.from_quat(
+                child_samples[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
+            ).as_matrix()
             velocity = np.einsum("nij,nj->ni", rotation, velocity)
             # Variances: diagonal of R diag(σ²) Rᵀ
             velocity_variance = np.einsum("nij,nj->ni", rotation**2, velocity_variance)
@@ -223,30 +231,32 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
 def _read_boot_times(frames: Frames, address: Address) -> tuple[IntArray, Array]:
     """Return the autopilot frames that contain the boot time, and the boot time (s) of each."""
     is_from_autopilot = frames.sent_by(address)
-    all_rows, all_times_s = [np.zeros(0, dtype=np.intp)], [np.zeros(0)]
+    all_rows = [np.zeros(0, dtype=np.intp)]
+    all_times_s = [np.zeros(0)]
     for message_id in np.unique(frames.message_id[is_from_autopilot]).tolist():
         name = message_name(message_id)
         if "time_boot_ms" in (wire_layout(message_id).names or ()):
-            field_name, unit = "time_boot_ms", 1e-3
+            field_name = "time_boot_ms"
+            unit = 1e-3
         elif name in STAMPED_BY_BOOT_CLOCK:
-            field_name, unit = "time_usec", 1e-6
+            field_name = "time_usec"
+            unit = 1e-6
         else:
             continue
         rows = frames.rows(name)
         rows = rows[is_from_autopilot[rows]]
         all_rows.append(rows)
         all_times_s.append(frames.table(name, rows)[field_name] * unit)
-    rows, times_s = np.concatenate(all_rows), np.concatenate(all_times_s)
-    is_boot_time, is_unix_time = (
-        (times_s > 0.0) & (times_s < MIN_UNIX_TIME_S),
-        times_s >= MIN_UNIX_TIME_S,
-    )
-    is_usable = is_boot_time if np.any(is_boot_time) else is_unix_time
+    rows = np.concatenate(all_rows)
+    times_s = np.concatenate(all_times_s)
+    is_boot_time = (times_s > 0.0) & (times_s < MIN_UNIX_TIME_S)
+    is_usable = is_boot_time if np.any(is_boot_time) else (times_s >= MIN_UNIX_TIME_S)
     if np.count_nonzero(is_usable) >= MIN_CONSTANT_TIMESTAMPS and not is_running_clock(
         times_s[is_usable]
     ):
         is_usable = np.zeros_like(is_usable)
-    rows, times_s = rows[is_usable], times_s[is_usable]
+    rows = rows[is_usable]
+    times_s = times_s[is_usable]
     order = np.argsort(rows, kind="stable")
     return rows[order], times_s[order]
 
@@ -277,16 +287,18 @@ def read_recording(frames: Frames, address: Address) -> Recording:
         )
         session = slice(first_frame, end_frame)
         used_fraction = len(rows_of_session) / len(rows)
-        rows, boot_s = rows[rows_of_session], boot_s[rows_of_session]
+        rows = rows[rows_of_session]
+        boot_s = boot_s[rows_of_session]
         notes.append(
-            f"the boot clock restarted {_format_times(len(restarts))}: only part "
-            f"{longest_index + 1} of {len(session_rows)} is used, {boot_s[0]:.1f} s to "
-            f"{boot_s[-1]:.1f} s after boot ({used_fraction:.0%} of the data)"
+            f"restarts of the boot clock: {len(restarts)}; session {longest_index + 1} of "
+            f"{len(session_rows)} is used, {boot_s[0]:.1f} s to {boot_s[-1]:.1f} s after boot "
+            f"({used_fraction:.0%} of the data)"
         )
     increasing_rows = _remove_stray_timestamps(
         boot_s, longest_increasing_run(np.rint(boot_s * 1e6).astype(np.int64))
     )
-    rows, boot_s = rows[increasing_rows], boot_s[increasing_rows]
+    rows = rows[increasing_rows]
+    boot_s = boot_s[increasing_rows]
     line = Line(0.0, 0.0, 1.0, 0.0, len(rows))
     received_s = np.zeros(len(frames))
     if frames.received_us is not None:
@@ -300,20 +312,19 @@ def read_recording(frames: Frames, address: Address) -> Recording:
         )
         received_s = boot_s[previous_row]
     else:
-        notes.append("no message in the stream contains a time, so the data have no time")
+        notes.append("the messages in the stream contain no time")
     receipt_reversals = int(np.count_nonzero(np.diff(received_s) < 0.0))
-    unknown_count, damaged_count = frames.unknown_frame_count, frames.damaged_receive_times
-    if unknown_count:
-        notes.append(f"frames of unknown message types, ignored: {unknown_count}")
-    if damaged_count:
-        notes.append(f"damaged receive times, interpolated: {damaged_count}")
+    if unknown_count := frames.unknown_frame_count:
+        notes.append(f"ignored frames of unknown message types: {unknown_count}")
+    if damaged_count := frames.damaged_receive_times:
+        notes.append(f"damaged receive times that were interpolated: {damaged_count}")
     if receipt_reversals:
-        notes.append(f"the receive time went back {_format_times(receipt_reversals)}")
+        notes.append(f"backward steps of the receive time: {receipt_reversals}")
     lost_fraction = frames.bad_bytes / len(frames.content)
     lost_text = (
         f"{frames.bad_bytes:,} bytes ({lost_fraction:.2%}) are not part of a complete MAVLink frame"
     )
-    # An incomplete first or last frame does not count as damage
+    # Incomplete frames at the beginning and end of the file do not count as damage
     bytes_inside = frames.bad_bytes - 2 * MAX_FRAME_BYTES
     is_damaged = bytes_inside > MAX_LOST_FRACTION * len(frames.content)
     damage = (f"the file is damaged: {lost_text}",) if is_damaged else ()
@@ -321,7 +332,8 @@ def read_recording(frames: Frames, address: Address) -> Recording:
         notes.append(lost_text)
     # Without a boot clock, flight time is receive time
     data_span_s = boot_s if len(boot_s) else np.array([0.0, received_s.max()])
-    zero_s, end_s = float(data_span_s[0]), float(data_span_s[-1])
+    zero_s = float(data_span_s[0])
+    end_s = float(data_span_s[-1])
     return Recording(
         frames,
         address,
@@ -337,14 +349,10 @@ def read_recording(frames: Frames, address: Address) -> Recording:
     )
 
 
-def _format_times(count: int) -> str:
-    return f"{count} time" if count == 1 else f"{count} times"
-
-
 def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
-    """Remove small groups of timestamps at either end that are far from all others.
+    """Remove groups of timestamps at both ends that are small and follow or precede a long gap.
 
-    Small is below MIN_GROUP_FRACTION of the largest group; far is more than MAX_OUTSIDE_S.
+    Small is below MIN_GROUP_FRACTION of the largest group; long is more than MAX_OUTSIDE_S.
     """
     groups = np.split(rows, np.flatnonzero(np.diff(times_s[rows]) > MAX_OUTSIDE_S) + 1)
     min_count = MIN_GROUP_FRACTION * max(len(group) for group in groups)
@@ -355,7 +363,8 @@ def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
 def map_boot_to_unix(recording: Recording) -> Line | None:
     """Map the boot clock to UNIX time by SYSTEM_TIME; None if SYSTEM_TIME has no UNIX time."""
     table = recording.frames.table("SYSTEM_TIME", recording.rows("SYSTEM_TIME"))
-    boot_s, unix_s = table["time_boot_ms"] * 1e-3, table["time_unix_usec"] * 1e-6
+    boot_s = table["time_boot_ms"] * 1e-3
+    unix_s = table["time_unix_usec"] * 1e-6
     is_known = unix_s > MIN_UNIX_TIME_S
     if not np.any(is_known):
         return None

@@ -20,10 +20,10 @@ from px4fuse.readers.mavlink_clocks import (
 from px4fuse.readers.mavlink_frames import Address, Frames
 from px4fuse.readers.mavlink_recording import MIN_RESTART_STEP_S, Recording, map_boot_to_unix
 
-# Maximum number of senders that are read and described: the senders with most messages
+# Maximum number of senders that are read and described; those with most messages are chosen
 MAX_SENDERS = 32
-# Maximum fraction of lost messages: with a larger fraction, the sender does not set sequence
-# numbers, and they are ignored
+# Maximum fraction of lost messages: a larger fraction shows that the sender does not set sequence
+# numbers, which are then ignored
 MAX_LOST_FRACTION = 0.9
 # Maximum lateness, in sequence numbers, of a message that counts as received over a slower link
 MAX_LATE_MESSAGES = 16
@@ -32,17 +32,14 @@ MAX_LATE_MESSAGES = 16
 MAX_SAME_CLOCK_DISTANCE_S = 1e5
 
 
-def _vehicle_types(frames: Frames) -> dict[Address, tuple[int, int]]:
-    """Return MAV_TYPE and MAV_AUTOPILOT from each sender's first heartbeat."""
+def _read_vehicle_types(frames: Frames) -> dict[Address, tuple[int, int]]:
     rows = frames.rows("HEARTBEAT")
     heartbeats = frames.table("HEARTBEAT", rows)
     types = zip(heartbeats["type"].tolist(), heartbeats["autopilot"].tolist(), strict=True)
-    types_by_sender = [*zip(_read_addresses(frames, rows), types, strict=True)]
-    return dict(types_by_sender[::-1])
+    return dict([*zip(_read_addresses(frames, rows), types, strict=True)][::-1])
 
 
 def _read_addresses(frames: Frames, rows: IntArray | slice) -> Iterator[Address]:
-    """Return the sender address of each frame."""
     return zip(frames.system[rows].tolist(), frames.component[rows].tolist(), strict=True)
 
 
@@ -69,7 +66,7 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
         No autopilot has the given system id.
     """
     counts = dict(_count_frames(frames))
-    vehicles = _vehicle_types(frames)
+    vehicles = _read_vehicle_types(frames)
     vehicle_addresses = [s for s in counts if s in vehicles and _is_vehicle(*vehicles[s])]
     rows = np.concatenate([frames.rows(name) for name in messages.AUTOPILOT_MESSAGES])
     autopilot_counts = dict(_count_frames(frames, rows))
@@ -82,7 +79,7 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
         or vehicle_addresses
     )
     candidates = candidates or [s for s in counts if s[1] == messages.AUTOPILOT_COMPONENT_ID]
-    # The recording may contain no message from the autopilot itself
+    # The recording may contain no message that the autopilot sent
     candidates = candidates or [(s[0], messages.AUTOPILOT_COMPONENT_ID) for s in counts]
     if system is not None:
         candidates = [
@@ -104,9 +101,12 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
 
 def senders_of(recording: Recording, message: str) -> list[Address]:
     """Return the senders of a message, except this vehicle's autopilot and other vehicles."""
-    frames, own_address = recording.frames, recording.address
+    frames = recording.frames
+    own_address = recording.address
     other_vehicles = {
-        s[0] for s, vehicle_type in _vehicle_types(frames).items() if _is_vehicle(*vehicle_type)
+        s[0]
+        for s, vehicle_type in _read_vehicle_types(frames).items()
+        if _is_vehicle(*vehicle_type)
     } - {own_address[0]}
     counts = _count_frames(frames, recording.rows_of_all_senders(message))
     return [s for s, _ in counts if s != own_address and s[0] not in other_vehicles][:MAX_SENDERS]
@@ -124,7 +124,8 @@ def _map_sender_clock(
     recording: Recording, sender: Address, unix_line: Line | None
 ) -> ClockMapping:
     frames = recording.frames
-    timestamps_s, received_s = [], []
+    timestamps_s = []
+    received_s = []
     for source in messages.POSITION_INPUTS:
         rows = recording.rows(source.message, sender)
         timestamps_s.append(frames.table(source.message, rows)[source.stamp] * 1e-6)
@@ -133,7 +134,8 @@ def _map_sender_clock(
     has_running_clock = is_running_clock(np.concatenate(timestamps_s))
     rows = recording.rows("TIMESYNC", sender)
     timesync = frames.table("TIMESYNC", rows)
-    reply_s, request_s = timesync["tc1"] * 1e-9, timesync["ts1"] * 1e-9
+    reply_s = timesync["tc1"] * 1e-9
+    request_s = timesync["ts1"] * 1e-9
     # Replies to another sender's request contain that sender's clock, so they are excluded
     is_reply = (reply_s != 0.0) & (
         np.abs(request_s - recording.receipt_boot_s(rows)) <= MIN_RESTART_STEP_S
@@ -148,10 +150,8 @@ def _map_sender_clock(
     timestamps_s.append(request_s[is_request])
     received_s.append(recording.received_s[rows][is_request])
     autopilot_timesync = frames.table("TIMESYNC", recording.rows("TIMESYNC"))
-    answer_s, answered_request_s = (
-        autopilot_timesync["tc1"] * 1e-9,
-        autopilot_timesync["ts1"] * 1e-9,
-    )
+    answer_s = autopilot_timesync["tc1"] * 1e-9
+    answered_request_s = autopilot_timesync["ts1"] * 1e-9
     is_answer = (answer_s != 0.0) & (
         np.abs(answered_request_s - median_timestamp_s) < MAX_SAME_CLOCK_DISTANCE_S
     )
@@ -180,31 +180,44 @@ def clock_maps(
     recording: Recording, clock_mappings: dict[Address, ClockMapping]
 ) -> tuple[ClockMap, ...]:
     """Return the maps from sender clocks and receive time to the boot clock."""
-    clocks = [mapping.statement for mapping in clock_mappings.values()]
-    received_us, line = recording.frames.received_us, recording.boot_of_receipt
+    clocks = [mapping.description for mapping in clock_mappings.values()]
+    received_us = recording.frames.received_us
+    line = recording.boot_of_receipt
     if received_us is not None and line.pairs:
-        name = "receive time (UNIX time of the recording computer)"
-        note = "the recording speed differs from real time (replayed link?)"
+        note = "the recording was not in real time"
         if abs(line.slope - 1.0) < MAX_RATE_DIFFERENCE:
-            note = "from the messages with least delay; used only to order messages and map clocks"
+            note = (
+                "from the messages with least delay, used only to order messages and to map clocks"
+            )
         offset_s = line.y0 - line.x0 - float(received_us[0]) * 1e-6
         line_values = line.pairs, offset_s, (line.slope - 1.0) * 1e6, line.jitter
-        clocks.append(ClockMap(name, "receive time", *line_values, note))
+        clocks.append(
+            ClockMap(
+                "receive time (UNIX time of the recording computer)",
+                "receive time",
+                *line_values,
+                note,
+            )
+        )
     return tuple(clocks)
 
 
 def describe_senders(recording: Recording) -> tuple[Sender, ...]:
     """Describe the senders in the recording, most messages first."""
-    frames, vehicles = recording.frames, _vehicle_types(recording.frames)
+    frames = recording.frames
+    vehicles = _read_vehicle_types(recording.frames)
     sender_rows = []
     for address, count in _count_frames(frames)[:MAX_SENDERS]:
-        description = "no heartbeat"
+        description = "sender without heartbeat"
         if address in vehicles:
             vehicle_type, autopilot = vehicles[address]
-            description = messages.VEHICLE_TYPES.get(vehicle_type, f"type {vehicle_type}")
+            description = messages.VEHICLE_TYPES.get(
+                vehicle_type, f"vehicle of MAV_TYPE {vehicle_type}"
+            )
             if autopilot != messages.INVALID_AUTOPILOT:
                 description = f"{messages.AUTOPILOTS.get(autopilot, 'autopilot')} {description}"
-        lost_fraction, is_chosen = _lost_fraction(frames, address), address == recording.address
+        lost_fraction = _lost_fraction(frames, address)
+        is_chosen = address == recording.address
         sender_rows.append(Sender(*address, description, count, lost_fraction, is_chosen))
     return tuple(sender_rows)
 

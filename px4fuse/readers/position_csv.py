@@ -17,8 +17,9 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array
+from px4fuse.arrays import Array, median_interval
 from px4fuse.errors import LogError, SettingsError
+from px4fuse.flight import time_index
 from px4fuse.readers import position_names
 from px4fuse.readers.common import find_invalid, rounding_step
 from px4fuse.readers.position_names import LENGTH_UNITS, TIME_UNITS, ColumnMeaning, read_column_name
@@ -29,17 +30,19 @@ from px4fuse.reading import display_name, read_bytes_limited
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
 
-MAX_FILE_BYTES = 500_000_000  # several days of UWB positions
+# Maximum file size: several days of UWB positions
+MAX_FILE_BYTES = 500_000_000
 MIN_ROWS = 3
 # Limits (s) of plausible intervals: UWB systems have rates of 0.2 Hz to 200 Hz, with 10 % variation
 MIN_INTERVAL_S, MAX_INTERVAL_S = 0.9 / 200, 1.1 / 0.2
-# Maximum interval (s) of UNIX time in s; distinguishes it from boot time in µs, which has equally
-# large values half an hour after boot
+# Maximum interval (s) between positions with UNIX time in s: boot time in µs has equally large
+# values half an hour after boot, but larger intervals
 MAX_UNIX_TIME_INTERVAL_S = 60.0
-# Maximum extent (m) of an indoor flight, to detect the unit of length
+# Maximum extent (m) of an indoor flight: a larger extent shows that the unit of length is mm
 MAX_SPREAD_M = 200.0
-MAX_COORDINATE = 1e9  # in any unit of length; larger values are timestamps or damage
-# Length of the part at the beginning of the file in which the header is searched
+# Maximum absolute coordinate in any unit of length: larger values are timestamps or damaged text
+MAX_COORDINATE = 1e9
+# Number of lines and characters at the beginning of the file in which the header is searched
 MAX_HEADER_LINES, MAX_HEADER_CHARS = 1000, 200_000
 MAX_COLUMNS = 200
 _COLUMNS_OPTION = "`columns` TIME,X,Y,Z"
@@ -78,9 +81,6 @@ class PositionRecording:
         Rows that are no measurement, as in :class:`~px4fuse.flight.PositionTrack`.
     step_m : float
         Rounding step of the coarsest horizontal coordinate; 0 if there is none.
-    stamp_count : int
-        Number of rows that share the timestamps of ``samples``, if most rows repeat a timestamp;
-        else 0.
     """
 
     name: str
@@ -95,12 +95,11 @@ class PositionRecording:
     metres_per_unit: float = 1.0
     invalid: "pd.Series[str]" = field(default_factory=lambda: pd.Series(dtype=str))
     step_m: float = 0.0
-    stamp_count: int = 0
 
 
 @dataclass(frozen=True)
 class _Table:
-    """Table in a text file: column names and rows."""
+    """Column names and rows of the table in a text file."""
 
     file_name: str
     separator: str
@@ -118,7 +117,7 @@ class _Table:
         return ", ".join([*labels][:12]) + (", ..." if len(labels) > 12 else "")
 
     def texts(self, columns: Iterable[int]) -> pd.DataFrame:
-        """Return the cells of columns as text, without empty rows."""
+        """Return the cells of the columns as text, without empty rows."""
         column_indices = sorted({*columns})
         try:
             texts = pd.read_csv(
@@ -134,7 +133,7 @@ class _Table:
             )
         except ValueError as error:
             raise LogError(
-                f"{self.file_name} contains no table of numbers.",
+                f"{self.file_name} contains no table of numbers",
                 "Export the positions as CSV again.",
             ) from error
         return texts.dropna(how="all")
@@ -189,15 +188,13 @@ def read_position_csv(
     has_time = np.isfinite(numbers[time])
     is_usable = has_time & (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
     if unusable_count := int(np.count_nonzero(~is_usable)):
-        notes.insert(0, f"{_format_row_count(unusable_count)} dropped: no valid time or position")
-    without_position = numbers[time][has_time & ~is_usable].to_numpy()
+        notes.insert(0, f"dropped rows without valid time or position: {unusable_count}")
+    empty_times = numbers.loc[has_time & ~is_usable, time].to_numpy()
     for tag in (at for at, m in enumerate(meanings) if m.kind == "tag"):
         tags = sorted({*texts[tag].dropna()})
         if tags[1:]:
-            some_tags = ", ".join(map(quote, tags[:2]))
             notes.append(
-                f"the file contains positions of {len(tags)} tags (such as {some_tags}): keep the "
-                "rows of one tag only"
+                f"the file contains {len(tags)} tags (such as {quote(tags[0])}): keep one only"
             )
     numbers = numbers[is_usable]
     times = numbers[time].to_numpy()
@@ -208,41 +205,35 @@ def read_position_csv(
     # Ranks instead of times, because the function requires positive values
     ranks = np.unique(seconds[usable_rows], return_inverse=True)[1].astype(np.int64)
     kept_rows = usable_rows[longest_increasing_run(ranks + 1)]
-    dropped = len(seconds) - len(kept_rows)
-    if stamp_count := len(seconds) * (dropped > 0.5 * len(seconds)):
-        dropped = 0
-    if dropped:
+    if dropped := len(seconds) - len(kept_rows):
         notes.append(
-            f"{_format_row_count(dropped)} dropped: timestamps repeat, go back or are out of range"
+            f"dropped rows with timestamps that repeat, decrease or are after 2100: {dropped}"
         )
     if len(kept_rows) < MIN_ROWS:
         raise LogError(
             f"{table.file_name} contains {len(kept_rows)} usable rows; at least {MIN_ROWS} are "
             f"needed{''.join('; ' + note for note in notes)}",
-            f"Export the file with decimal points, or name the columns with {_COLUMNS_OPTION}.",
+            f"Use decimal points, or name the columns with {_COLUMNS_OPTION}.",
         )
-    numbers = numbers.iloc[kept_rows].set_index(pd.Index(seconds[kept_rows], name="time_s"))
-    median_interval_s = float(np.median(np.diff(numbers.index)))
+    numbers = numbers.iloc[kept_rows].set_index(time_index(seconds[kept_rows]))
+    median_interval_s = median_interval(numbers.index)
     if not MIN_INTERVAL_S <= median_interval_s <= MAX_INTERVAL_S:
-        rate_text = f"one sample per {median_interval_s:.3g} s (median)"
-        notes.append(f"{rate_text} is not a plausible UWB rate: check --position-time-unit")
+        notes.append(
+            f"a median interval of {median_interval_s:.3g} s is not plausible for UWB: check "
+            "--position-time-unit"
+        )
     scales, length_text = _length_units(numbers, axes, meanings, length_unit)
     column_of_name = zip(SAMPLE_COLUMNS, (*position, *sigma), strict=True)
     columns_m = {
         name: np.nan if at is None else numbers[at] * scales[at] for name, at in column_of_name
     }
-    samples = pd.DataFrame(columns_m, index=numbers.index)
-    samples = samples.where(np.isfinite(samples))
-    step_m = max(rounding_step(samples[name].to_numpy()) for name in ("x_m", "y_m"))
+    samples = pd.DataFrame(columns_m, index=numbers.index).replace([np.inf, -np.inf], np.nan)
     reason = find_invalid(samples, SAMPLE_COLUMNS[: len(axes)])
+    invalid = reason[reason != ""], pd.Series("NaN", empty_times / round(1.0 / TIME_UNITS[unit]))
     samples = samples[reason == ""]
-    rows_by_reason = [
-        pd.Series("NaN", without_position / round(1.0 / TIME_UNITS[unit])),
-        reason[reason != ""],
-    ]
     is_not_positive = samples[SIGMA_COLUMNS] <= 0.0
     if bad_row_count := int(is_not_positive.any(axis=1).sum()):
-        notes.append(f"sigma is zero or negative in {bad_row_count} rows and was ignored there")
+        notes.append(f"ignored sigmas that are zero or negative: {bad_row_count}")
         samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_not_positive)
     is_unix = UNIX_START_S <= float(np.median(numbers.index)) < UNIX_END_S
     clock: Literal["UNIX", "local"] = "UNIX" if is_unix else "local"
@@ -257,17 +248,17 @@ def read_position_csv(
         frame=frame,
         dropped=dropped,
         detected=(
-            f"table: {_SEPARATORS[table.separator]} between columns, header in line "
+            f"the separator is {_SEPARATORS[table.separator]}, the header is line "
             f"{table.header_line}",
-            f"time: {time_text}, {clock} clock, in {unit_text}",
-            f"position: {table.label(*position)} as {axis_names}{height_text}, in {length_text}",
-            f"sigma: {table.label(*sigma) or 'none'}",
+            f"time: column {time_text}, {clock} clock, in {unit_text}",
+            f"position: columns {table.label(*position)} as {axis_names}{height_text}, in "
+            f"{length_text}",
+            f"sigma: columns {table.label(*sigma) or 'none'}",
         ),
         notes=tuple(notes),
         metres_per_unit=scales[axes[0]],
-        invalid=pd.concat(rows_by_reason).sort_index(),
-        step_m=step_m,
-        stamp_count=stamp_count,
+        invalid=pd.concat(invalid).sort_index(),
+        step_m=max(rounding_step(samples[name].to_numpy()) for name in ("x_m", "y_m")),
     )
 
 
@@ -289,12 +280,7 @@ def _check_options(
         )
 
 
-def _format_row_count(rows: int) -> str:
-    return "1 row was" if rows == 1 else f"{rows} rows were"
-
-
 def _split_line(line: str, separator: str) -> list[str]:
-    """Split one line into its fields."""
     if separator == " ":  # a name with unit, such as "x [mm]", is one field
         return re.sub(r" +(?=[\[(])", "", line.strip()).split()
     return [field.strip() for field in line.split(separator)]
@@ -303,19 +289,18 @@ def _split_line(line: str, separator: str) -> list[str]:
 def _find_table(
     file_name: str, content: bytes, columns: tuple[str, ...] | None
 ) -> tuple[_Table, list[str]]:
-    """Find the table in a text file; also return a note if the last line was dropped."""
+    """Find the table in a text file; also return a note if an incomplete last line was dropped."""
     text = decode_text(content)
     if text is None:
         raise LogError(
             f"{file_name} is a binary file, not a text table",
-            "Give the CSV file of the positioning system. A flight log is given as LOG, without "
-            "--position.",
+            "Give a CSV file.",
         )
     notes = []
     whole_lines, _, last_line = text.replace('"', "").rpartition("\n")
     text = f"{whole_lines}\n"
     if last_line.strip():
-        notes.append("the last line was dropped: it has no line end and may be incomplete")
+        notes.append("the last line was dropped, because it has no line end")
     lines = text[: text.rfind("\n", 0, MAX_HEADER_CHARS) + 1].split("\n")[:MAX_HEADER_LINES]
     wanted_names = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
     headers = (
@@ -331,7 +316,7 @@ def _find_table(
         raise LogError(
             f"{file_name}: the first {len(lines)} lines contain no header with the columns "
             f"{title_list}. The first line is {quote(lines[0])}.",
-            f"Give a CSV file with a header, or name its columns with {_COLUMNS_OPTION}.",
+            f"Name the columns with {_COLUMNS_OPTION}.",
         )
     body = re.sub(r"(?m)^[ \t]*[#%].*", "", text.split("\n", header_line)[header_line])
     first_row = body[:MAX_HEADER_CHARS].lstrip("\n").partition("\n")[0].rstrip(f"{separator} ")
@@ -339,7 +324,7 @@ def _find_table(
     if row_width > len(names):
         raise LogError(
             f"{file_name}: the header has {len(names)} columns, but the rows have {row_width}.",
-            "Export the file with decimal points and a name for each column.",
+            "Use decimal points, and name each column.",
         )
     return _Table(file_name, separator, names, body, header_line), notes
 
@@ -354,7 +339,6 @@ def _is_header(fields: list[str], wanted_names: set[str]) -> bool:
 
 
 def _column_indices(table: _Table, columns: tuple[str, ...]) -> list[int]:
-    """Return the indices of the columns in the option ``columns``."""
     names = [name.casefold() for name in table.names]
     numbers = [str(at + 1) for at in range(len(names))]
     indices = []
@@ -362,8 +346,8 @@ def _column_indices(table: _Table, columns: tuple[str, ...]) -> list[int]:
         wanted_name = column.strip().casefold()
         if wanted_name not in names + numbers:
             raise SettingsError(
-                f"{table.file_name} has no column {quote(column)} (its columns are "
-                f"{table.label(*range(len(names)))})",
+                f"{table.file_name} has no column {quote(column)}; the columns are "
+                f"{table.label(*range(len(names)))}",
                 f"Name the columns with {_COLUMNS_OPTION}.",
             )
         indices.append((names if wanted_name in names else numbers).index(wanted_name))
@@ -386,7 +370,8 @@ def _choose_columns(
     if that column is not empty, is preferred to the time of recording.
     """
     if chosen_columns:
-        time, time_text = chosen_columns[0], table.label(chosen_columns[0])
+        time = chosen_columns[0]
+        time_text = table.label(chosen_columns[0])
         # The column names may contain the frame, which determines the order of the axes
         chosen_meanings = [
             m if at in chosen_columns[1:4] else ColumnMeaning() for at, m in enumerate(meanings)
@@ -422,10 +407,10 @@ def _choose_columns(
 def _time_unit(times: Array, name_unit: str, option: str | None) -> tuple[str, str]:
     """Return the unit of the time column and its description."""
     if option is not None:
-        return option, f"{option} from --position-time-unit"
+        return option, f"{option} (given with --position-time-unit)"
     median = float(np.median(times)) if len(times) else 0.0
     if name_unit and abs(median) * TIME_UNITS[name_unit] < UNIX_END_S:
-        return name_unit, f"{name_unit} from its name"
+        return name_unit, f"{name_unit} (from the column name)"
     steps = np.diff(times)
     steps = steps[steps > 0]
     median_step = float(np.median(steps)) if len(steps) else 0.0
@@ -433,17 +418,17 @@ def _time_unit(times: Array, name_unit: str, option: str | None) -> tuple[str, s
     for unit, scale in TIME_UNITS.items():
         is_unix = UNIX_START_S <= median * scale < UNIX_END_S
         if is_unix and median_step * scale <= MAX_UNIX_TIME_INTERVAL_S:
-            return unit, f"{unit} from its magnitude"
+            return unit, f"{unit} (from the magnitude of UNIX time)"
         if MIN_INTERVAL_S <= median_step * scale <= MAX_INTERVAL_S:
             plausible_units.append(unit)
     if not plausible_units:
         return "s", (
-            "s assumed: no unit gives a plausible UWB rate (--position-time-unit overrides)"
+            "s (assumed: no unit gives a plausible UWB rate; else give --position-time-unit)"
         )
     unit = plausible_units[0]
-    description = f"{unit} from its interval of {median_step * TIME_UNITS[unit]:.3g} s"
+    description = f"{unit} (from the median interval {median_step * TIME_UNITS[unit]:.3g} s)"
     if plausible_units[1:]:
-        description += f" ({plausible_units[1]} is also possible: then give --position-time-unit)"
+        description += f"; if {plausible_units[1]}, give --position-time-unit"
     return unit, description
 
 
@@ -452,23 +437,27 @@ def _length_units(
 ) -> tuple[dict[int, float], str]:
     """Return metres per unit of each column, and the description of the unit of the positions."""
     name_units = {at: m.unit for at, m in enumerate(meanings) if m.unit in LENGTH_UNITS}
-    # Percentiles, because outliers must not determine the unit
+    # Extent from 5 % to 95 % of the coordinates, because outliers must not determine the unit
     spreads = numbers[axes].quantile(0.95) - numbers[axes].quantile(0.05)
     max_spread = float(spreads.max())
-    unit, reason = "m", "no unit in the column names"
+    unit = "m"
+    reason = "assumed: the column names contain no unit"
     if option is not None:
-        unit, name_units, reason = option, {}, "from --position-unit"
+        unit = option
+        name_units = {}
+        reason = "given with --position-unit"
     elif axis_units := [name_units[at] for at in axes if at in name_units]:
-        unit, reason = axis_units[0], "from the column names"
+        unit = axis_units[0]
+        reason = "from the column names"
     elif MAX_SPREAD_M < max_spread <= MAX_SPREAD_M / LENGTH_UNITS["mm"]:
         unit = "mm"
         reason = (
             f"{max_spread:.0f} m is too large for an indoor flight; if cm, give --position-unit"
         )
     elif max_spread > MAX_SPREAD_M:
-        reason = "assumed: no unit gives the size of an indoor flight; else give --position-unit"
+        reason = "assumed: no unit gives the extent of an indoor flight; else give --position-unit"
     units = {at: name_units.get(at, unit) for at in map(int, numbers.columns)}
     scales = {at: LENGTH_UNITS[name] for at, name in units.items()}
     span_m = max(float(spreads[at]) * scales[at] for at in axes)
     used_units = ", ".join(dict.fromkeys(units[at] for at in axes))
-    return scales, f"{used_units} ({reason}); 90 % of the positions within {span_m:.3g} m"
+    return scales, f"{used_units} ({reason}); 90 % of the positions are within {span_m:.3g} m"

@@ -10,9 +10,8 @@ from px4fuse.record import table
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
+# Column indices of x, y and z; None without height
 Position = tuple[int, int, int | None]
-
-
 _TABLE = table(__file__, "position_names.toml", dict[str, dict[str, str]])
 _UNITS, _AXES = (
     {
@@ -26,8 +25,10 @@ _ROLES = {role: {*column_words.split()} for role, column_words in _TABLE["roles"
 _TIME_ROLES = _ROLES["time"] | _ROLES["measured"] | _ROLES["recorded"] | _ROLES["context"]
 # Kinds of time columns, in order of preference
 TIME_KINDS = ["time of measurement", "time", "time of recording"]
+# Names without separator, such as "px" (position, x) and "xstd" (x, sigma)
 _GLUED_NAMES = re.compile(r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)")
-# Coordinate frame and names of its axes; the first row with both horizontal axes in a file is used
+# Coordinate frame and names of its axes; the first row is used of which both horizontal axes are
+# in the file
 _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
     ("ned", ("north", "east", "down")),
     ("enu", ("east", "north", "up")),
@@ -44,7 +45,7 @@ class ColumnMeaning:
     kind: str = ""  # "time", "position", "sigma" or "tag"
     key: str = ""  # axis name, or element of `TIME_KINDS`
     unit: str = ""
-    group: str = ""  # rest of the name without axis and unit: the same for x, y and z of a position
+    group: str = ""  # name without axis and unit: the same for x, y and z of one position
 
 
 def read_column_name(name: str) -> ColumnMeaning:
@@ -60,24 +61,19 @@ def read_column_name(name: str) -> ColumnMeaning:
         return ColumnMeaning("time", TIME_KINDS[kinds.index(True)], unit)
     if word_set and word_set <= _ROLES["tag"]:
         return ColumnMeaning("tag")
-    parts: list[str] = []
+    position_words = _ROLES["sigma"] | _ROLES["context"]
+    split_words: list[str] = []
     for word in column_words:
-        glued_match = (
-            None if word in _ROLES["sigma"] | _ROLES["context"] else _GLUED_NAMES.fullmatch(word)
-        )
-        parts += [part for part in glued_match.groups() if part] if glued_match else [word]
-    axes = [_AXES[part] for part in parts if part in _AXES]
-    other_parts = [part for part in parts if part not in _AXES]
-    if (
-        unit in TIME_UNITS
-        or len(axes) > 1
-        or not {*other_parts} <= _ROLES["sigma"] | _ROLES["context"]
-    ):
+        match = None if word in position_words else _GLUED_NAMES.fullmatch(word)
+        split_words += [group for group in match.groups() if group] if match else [word]
+    axes = [_AXES[word] for word in split_words if word in _AXES]
+    other_words = [word for word in split_words if word not in _AXES]
+    if unit in TIME_UNITS or len(axes) > 1 or not {*other_words} <= position_words:
         return ColumnMeaning()
-    if {*other_parts} & _ROLES["sigma"]:
+    if {*other_words} & _ROLES["sigma"]:
         return ColumnMeaning("sigma", "".join(axes), unit)
     return (
-        ColumnMeaning("position", axes[0], unit, ".".join(other_parts)) if axes else ColumnMeaning()
+        ColumnMeaning("position", axes[0], unit, ".".join(other_words)) if axes else ColumnMeaning()
     )
 
 
@@ -103,7 +99,7 @@ def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, Positi
 
 
 def find_sigma(meanings: Sequence[ColumnMeaning], frame: str | None) -> tuple[int | None, ...]:
-    """Return the sigma column of each axis of a frame; a sigma without axis is for all axes."""
+    """Return the index of the sigma column of each axis; a sigma column without axis is for all."""
     # Reversed, so that the first of several columns with the same meaning is used
     sigmas = {m.key: at for at, m in [*enumerate(meanings)][::-1] if m.kind == "sigma"}
     axes = next(axes for name, axes in _FRAMES if name == frame)

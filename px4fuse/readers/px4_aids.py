@@ -1,4 +1,4 @@
-"""Innovations, variances and fusion results of all EKF2 aids (measurement sources) in a ULog.
+"""Innovations, variances and fusion results of all aiding sources of EKF2 in a ULog.
 
 Source: PX4-Autopilot ``EKF2.cpp`` (PublishInnovations, PublishAidSourceStatus), v1.8 to main. The
 field names are in ``ekf2_parameters.toml``.
@@ -6,37 +6,37 @@ field names are in ``ekf2_parameters.toml``.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
 from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, Aid
-from px4fuse.flight import AidLog, step_values_at
+from px4fuse.flight import AidLog, StepFunctions, step_values_at
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import join_nearest
 from px4fuse.readers.field_maps import Layout
 from px4fuse.readers.ulog_topics import Topics
 
-# Maximum time difference (s) between an innovation and its variance S: the default profile logs
-# each topic every 0.5 s, and S changes little in that time
+# Maximum time difference (s) between an innovation and the logged variance S: the default logging
+# profile logs both topics every 0.5 s, and S changes little in that time
 JOIN_TOLERANCE_S = 0.6
 
 
-def read_aids(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> dict[str, AidLog]:
-    """Read all aids with innovations in the log, by PX4 name.
+def read_aids(topics: Topics, enabled: StepFunctions) -> dict[str, AidLog]:
+    """Read all aiding sources with innovations in the log, by PX4 name.
 
     ``enabled`` is the result of :func:`read_enabled_aids`. An aid's topic ``estimator_aid_src_...``
-    is preferred: it contains each fusion attempt with time and result. The older common topics
-    repeat each value until the next fusion; repeated values are removed.
+    is preferred: it contains each fusion attempt with time and result. The older topics that are
+    common to all aids repeat each value until the next fusion; repeated values are removed.
     """
     logs = {}
     for name, aid in AIDS.items():
         aid_enabled = enabled.get(name)
         log = _read_aid_topic(topics, aid, aid_enabled)
-        # For an aid that was never enabled, the common topics contain outdated values or values of
-        # another aid
+        # Without fusion of an aid, the common topics contain outdated values or values of other
+        # aids
         if log is None and (name.startswith("ev_") if aid_enabled is None else aid_enabled.any()):
             log = _read_common_topics(topics, aid, aid_enabled)
         if log is not None:
@@ -45,12 +45,13 @@ def read_aids(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> dict[s
 
 
 def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
-    """Read one step function per aid: 1 while its fusion is enabled, otherwise 0.
+    """Read a step function for each aiding source: 1 while its fusion is enabled, otherwise 0.
 
     The source is ``estimator_status_flags``, or the control bits of ``estimator_status`` in older
     logs.
     """
-    enabled, tables = {}, topics.of(px4.STATUS_FLAGS)
+    enabled = {}
+    tables = topics.of(px4.STATUS_FLAGS)
     all_aids = (*AIDS.values(), *DISTURBANCES.values())
     flag_names = {flag for aid in all_aids for group in aid.flags for flag in group}
     logged_flags = sorted(flag_names.intersection(*tables)) if tables else []
@@ -72,7 +73,6 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
 
 
 def _read_aid_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) -> AidLog | None:
-    """Read an aid from its ``estimator_aid_src`` topic."""
     count = len(aid.axes)
     elements = [""] if count == 1 else [f"[{number}]" for number in range(count)]
     columns = {
@@ -99,7 +99,6 @@ def _read_aid_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) 
 def _read_common_topics(
     topics: Topics, aid: Aid, enabled: pd.Series[float] | None
 ) -> AidLog | None:
-    """Read an aid from the common topics, which contain the last values of all aids."""
     is_in_gauss = aid.name == "mag_heading" and any(
         "cs_mag" in table for table in topics.of(px4.STATUS_FLAGS)
     )
@@ -108,20 +107,20 @@ def _read_common_topics(
         if is_in_gauss or not aid.fields
         else [
             tuple(
-                Layout(topic, _columns(quantity, aid, aid.fields))
+                Layout(topic, _columns_by_axis(quantity, aid, aid.fields))
                 for topic, quantity in zip(px4.INNOVATIONS, ("innovation", "variance"), strict=True)
             )
         ]
     )
     if aid.old_fields:
-        fields = _columns("innovation", aid, aid.old_fields)
+        fields = _columns_by_axis("innovation", aid, aid.old_fields)
         variance_fields = (field.replace("innov", "innov_var") for field in aid.old_fields)
-        fields |= _columns("variance", aid, variance_fields)
+        fields |= _columns_by_axis("variance", aid, variance_fields)
         layouts.append((Layout(px4.OLD_INNOVATIONS, fields),) * 2)
     for values, variances in layouts:
         samples = topics.primary_samples(values, select=_drop_repeats)
         if variances is not values:
-            # The logger decimates each topic separately; S changes slowly
+            # Nearest rows, because the logger decimates each topic separately, and S changes slowly
             variance_samples = topics.primary_samples(variances).dropna()
             samples = join_nearest(samples, variance_samples, JOIN_TOLERANCE_S)
         excluded_count = len(samples) - len(samples := samples.dropna())
@@ -140,7 +139,7 @@ def _drop_repeats(frame: pd.DataFrame) -> pd.DataFrame:
     return finite_frame[first_column.ne(first_column.shift()) & (first_column != 0.0)]
 
 
-def _columns(name: str, aid: Aid, fields: Iterable[str]) -> dict[str, str]:
+def _columns_by_axis(name: str, aid: Aid, fields: Iterable[str]) -> dict[str, str]:
     return {f"{name}_{axis}": field for axis, field in zip(aid.axes, fields, strict=True)}
 
 
@@ -151,12 +150,12 @@ def _make_aid_log(
     enabled: pd.Series[float] | None,
     excluded_count: int = 0,
 ) -> AidLog | None:
-    """Build the log of an aid from rows with positive variance; None without such rows.
+    """Build the log of an aiding source from rows with positive variance; None without such rows.
 
     Innovations are negated, because PX4 logs predicted minus measured.
     """
     samples = samples[(samples[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
-    negated = {column: -samples[column] for column in _columns("innovation", aid, aid.axes)}
+    negated = {column: -samples[column] for column in _columns_by_axis("innovation", aid, aid.axes)}
     aid_log = AidLog(
         topics, aid.axes, samples.assign(**negated), enabled, excluded_count=excluded_count
     )

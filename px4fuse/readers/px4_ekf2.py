@@ -4,9 +4,6 @@ Sources: PX4-Autopilot ``EKF2.cpp`` (PublishStates), ``EKF/common.h`` (order of 
 ``msg/EstimatorStatusFlags.msg`` and ``msg/EstimatorStatus.msg`` (horizontal aiding).
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
@@ -14,9 +11,19 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from px4fuse import flight
-from px4fuse.arrays import Array, IntArray
+from px4fuse.arrays import Array, IntArray, median_interval
 from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, EV_POS, FLOW, effective_settings
-from px4fuse.flight import Columns, Ekf2, FusionRecord, Reset, Unavailable, step_values_at
+from px4fuse.flight import (
+    Columns,
+    Ekf2,
+    FusionRecord,
+    Reset,
+    StepFunctions,
+    TableOrUnavailable,
+    Unavailable,
+    step_values_at,
+    time_index,
+)
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.field_maps import Layout, expand_columns
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, read_aids, read_enabled_aids
@@ -24,14 +31,19 @@ from px4fuse.readers.px4_innovations import innovations_by_axis
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
 VISION_TOPIC = "vehicle_visual_odometry"
-STATE_COUNT = 22  # attitude, velocity, position, biases, magnetic fields; wind and terrain follow
-MAG_3D_BIT = 5  # filter_control_status_u, common.h
-MIN_COMPLETE_FIELD_HZ = 10.0  # a topic with a higher rate has all samples (EKF2 uses 14 per second)
-# Distance (IMU samples) from n + 0.5 below which EKF2 may round up or down
+# Number of EKF2 states that are read: attitude, velocity, position, biases and magnetic fields, but
+# not wind and terrain
+STATE_COUNT = 22
+# Bit of filter_control_status_u (common.h) that is set while EKF2 fuses the 3D magnetic field
+MAG_3D_BIT = 5
+# Minimum rate (Hz) of a magnetometer topic that contains all samples: EKF2 uses 14 per second
+MIN_COMPLETE_FIELD_HZ = 10.0
+# Maximum distance (IMU samples) of the prediction interval from n + 0.5 samples, for which EKF2 may
+# round up or down
 MAX_HALF_DISTANCE = 0.05
-# Maximum interval (s) between two rows of optical flow
+# Maximum interval (s) between two optical flow velocities whose difference is used
 MAX_FLOW_INTERVAL_S = 0.5
-# Aids of the horizontal state other than vision position
+# Aiding sources of horizontal position and velocity other than external vision position
 OTHER_HORIZONTAL_AIDS = (
     "gnss_pos",
     "gnss_vel",
@@ -43,7 +55,7 @@ OTHER_HORIZONTAL_AIDS = (
 VARIANCES_NOT_LOGGED = Unavailable(
     "EKF2 variances",
     "estimator_states (estimator_status before v1.12) is not logged or not usable",
-    "Record with SDLOG_PROFILE bit 0 (default). The topic is also missing if EKF2 had not started.",
+    f"{px4.DEFAULT_PROFILE} Wait until EKF2 has started.",
 )
 _RESET_FIELDS: tuple[tuple[Literal["position", "velocity"], str, tuple[str, str, str]], ...] = (
     ("position", "xy_reset_counter", ("delta_north_m", "delta_east_m", "")),
@@ -57,11 +69,11 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     """Read EKF2's published state, variances, innovations and fusion flags."""
     parameters = topics.log.parameters
     if parameters.get("EKF2_EN") == 0.0:
-        return Unavailable("EKF2", "EKF2_EN is 0: EKF2 did not run", "Set EKF2_EN to 1.")
+        return Unavailable("EKF2", "EKF2 did not run, because EKF2_EN is 0", "Set EKF2_EN to 1.")
     if (estimator_group := parameters.get("SYS_MC_EST_GROUP", 2.0)) != 2.0:
         return Unavailable(
             "EKF2",
-            f"SYS_MC_EST_GROUP is {estimator_group:.0f}, so another estimator was running",
+            f"another estimator was running, because SYS_MC_EST_GROUP is {estimator_group:.0f}",
             "Set SYS_MC_EST_GROUP to 2.",
         )
     local_position = topics.read(px4.LOCAL_POSITION)
@@ -83,14 +95,14 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     if innovation_topics:
         topics.record_stream("ekf2_innovations", *innovation_topics)
     notes = [
-        f"{topic} has no measurement time in this release: the times of EKF2 innovations are "
-        "publication times, up to 0.2 s later"
+        f"the times of EKF2 innovations are publication times, up to 0.2 s late, because {topic} "
+        "has no measurement time"
         for topic in innovation_topics[:1]
         if not any("timestamp_sample" in table for table in topics.of(topic))
     ]
     notes += [
-        f"{log.excluded_count} samples of {log.topics[0]} ({', '.join(log.axes)}) were dropped: "
-        f"no {log.topics[-1]} within {JOIN_TOLERANCE_S:g} s"
+        f"{log.excluded_count} samples of {log.topics[0]} ({', '.join(log.axes)}) were dropped, "
+        f"because {log.topics[-1]} has no sample within {JOIN_TOLERANCE_S:g} s"
         for log in (aids[name] for name in ("ev_pos", "ev_hgt") if name in aids)
         if log.excluded_count
     ]
@@ -118,7 +130,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
 
 
 def _state_vector(topics: Topics) -> tuple[str, int]:
-    """Return the topic with EKF2's state vector and the number of attitude variances in it.
+    """Return the topic with the state vector of EKF2, and its number of attitude variances.
 
     The topic is "" if it is not logged. The number is 0 if the array lengths are unknown.
     """
@@ -131,7 +143,7 @@ def _state_vector(topics: Topics) -> tuple[str, int]:
     return "", 0
 
 
-def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavailable:
+def _read_delayed_state(topics: Topics, step_s: float) -> TableOrUnavailable:
     """Read EKF2's state and variances at the fusion horizon, in one layout for all releases.
 
     ``step_s`` is the prediction interval (s). It is needed for releases that log biases as
@@ -143,7 +155,7 @@ def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavail
     if not attitude:
         return Unavailable(
             "EKF2 variances",
-            f"the array lengths of {topic} are not known to px4fuse",
+            f"{topic} has unknown array lengths",
             "Report the PX4 version in a px4fuse issue.",
         )
     states = [f"states[{i}]" for i in range(STATE_COUNT)]
@@ -152,7 +164,8 @@ def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavail
         Layout(topic, {name: name for name in states + variances})
     ).dropna()
     raw = raw[(raw[variances] >= 0.0).all(axis=1)]
-    state, variance = raw[states].to_numpy(copy=True), raw[variances].to_numpy(copy=True)
+    state = raw[states].to_numpy(copy=True)
+    variance = raw[variances].to_numpy(copy=True)
     if attitude == px4.QUATERNION_FILTER:
         state[:, 10:16] /= step_s
         variance = np.hstack([_attitude_variance(state[:, :4], variance[:, :4]), variance[:, 4:]])
@@ -161,8 +174,7 @@ def _read_delayed_state(topics: Topics, step_s: float) -> pd.DataFrame | Unavail
     return pd.DataFrame(np.hstack([state, variance]), index=raw.index, columns=columns)
 
 
-def _variance(delayed: pd.DataFrame | Unavailable) -> pd.DataFrame | Unavailable:
-    """Return the rows with positive variances of position (m²) and velocity (m²/s²)."""
+def _variance(delayed: TableOrUnavailable) -> TableOrUnavailable:
     if isinstance(delayed, Unavailable):
         return delayed
     variance = delayed[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
@@ -176,26 +188,28 @@ def target_step_s(topics: Topics) -> float:
 
 
 def _step_s(topics: Topics) -> float:
-    """Return the actual prediction interval (s): whole IMU samples (ImuDownSampler.cpp)."""
+    """Return the actual prediction interval (s): whole IMU intervals (ImuDownSampler.cpp)."""
     target_s = target_step_s(topics)
     imu = topics.read(px4.IMU)
     if len(imu) < 2:
         return target_s
     imu_s = imu.index.to_numpy()
-    interval_s = float(np.median(np.diff(imu_s)))
+    interval_s = median_interval(imu_s)
     if interval_s >= target_s:
         return target_s
-    layout = Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})
-    step_ends_s = topics.primary_samples(layout).index
+    step_ends_s = topics.primary_samples(
+        Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})
+    ).index
     return (
         samples_per_step(target_s, interval_s, rows_of_timestamps(imu_s, step_ends_s)) * interval_s
     )
 
 
-def rows_of_timestamps(times_s: Array, known_s: ArrayLike) -> IntArray:
-    """Return the indices of the ``times_s`` that are also in ``known_s``, rounded to 1 µs."""
-    known_us = np.rint(np.asarray(known_s, dtype=float) * 1e6)
-    return np.flatnonzero(np.isin(np.rint(times_s * 1e6), known_us))
+def rows_of_timestamps(times_s: Array, other_s: ArrayLike) -> IntArray:
+    """Return the indices of the ``times_s`` that are also in ``other_s``, compared in whole µs."""
+    return np.flatnonzero(
+        np.isin(np.rint(times_s * 1e6), np.rint(np.asarray(other_s, dtype=float) * 1e6))
+    )
 
 
 def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -> int:
@@ -211,7 +225,7 @@ def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -
     2
     """
     rounded_ratio = target_s / interval_s + 0.5
-    # The margin makes the result independent of the rounding of timestamps to µs
+    # The added 1e-6 makes the result independent of the rounding of timestamps to µs
     samples = max(int(rounded_ratio + 1e-6), 1)
     gaps = np.diff(np.asarray(ends, dtype=float))
     if samples > 1 and abs(rounded_ratio - samples) < MAX_HALF_DISTANCE and len(gaps):
@@ -222,10 +236,7 @@ def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -
     return samples
 
 
-def _accelerometer_bias(
-    topics: Topics, delayed: pd.DataFrame | Unavailable
-) -> pd.DataFrame | Unavailable:
-    """Read the accelerometer bias (m/s²) from estimator_sensor_bias or the state vector."""
+def _accelerometer_bias(topics: Topics, delayed: TableOrUnavailable) -> TableOrUnavailable:
     if len(bias := topics.primary_samples(px4.LAYOUTS["sensor_bias"]).dropna()):
         return bias
     if isinstance(delayed, Unavailable) or delayed.empty:
@@ -234,7 +245,7 @@ def _accelerometer_bias(
 
 
 def _horizon_s(topics: Topics, step_s: float) -> float | Unavailable:
-    """Return the median delay (s) from fusion horizon to publication.
+    """Return the median delay (s) from EKF2's fusion horizon to publication.
 
     Before v1.13, timestamp_sample is the time of the newest IMU sample. The delay is then below one
     prediction interval, and the horizon is unavailable.
@@ -250,22 +261,20 @@ def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
     for table in topics.of(topic)[:1]:
         if "timestamp_sample" in table:
             measured_us = measurement_time_us(table)
-            times = pd.Index((measured_us - topics.zero_us) * 1e-6, name="time_s")
+            times = time_index((measured_us - topics.zero_us) * 1e-6)
             age_us = table["timestamp"].astype(np.int64) - measured_us
             return pd.Series(age_us * 1e-6, index=times)
     return pd.Series(dtype=np.float64)
 
 
-def _read_fusing(
-    topics: Topics, enabled: Mapping[str, pd.Series[float]]
-) -> pd.DataFrame | Unavailable:
+def _read_fusing(topics: Topics, enabled: StepFunctions) -> TableOrUnavailable:
     """Read the fusion flags of external vision: horizontal and vertical position, and yaw."""
     vision = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
     if not {*vision.values()} <= enabled.keys():
         return Unavailable(
             "EKF2 fusion flags",
             "estimator_status_flags and estimator_status are not logged",
-            "Record with SDLOG_PROFILE bit 0 (default).",
+            px4.DEFAULT_PROFILE,
         )
     flags = pd.DataFrame({group: enabled[aid] for group, aid in vision.items()}).dropna()
     topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS
@@ -292,9 +301,9 @@ def read_resets(local: pd.DataFrame) -> tuple[Reset, ...]:
 
 def _read_record(
     topics: Topics,
-    delayed: pd.DataFrame | Unavailable,
+    delayed: TableOrUnavailable,
     local: pd.DataFrame,
-    enabled: Mapping[str, pd.Series[float]],
+    enabled: StepFunctions,
     step_s: float,
 ) -> FusionRecord | Unavailable:
     """Read the data for a replay of EKF2; ``local`` is the published local position."""
@@ -305,7 +314,8 @@ def _read_record(
     usable_state = delayed[np.abs(norm - 1.0) < 0.01].copy()
     if usable_state.empty:
         return flight.RECORD_NOT_LOGGED
-    horizontal, altitude_m = Columns.POSITION[:2], 0.0
+    horizontal = Columns.POSITION[:2]
+    altitude_m = 0.0
     # Since v1.16 EKF2 stores latitude and longitude, which are logged as zero. Once EKF2 has an
     # origin, the height is altitude above sea level (ekf_helper.cpp)
     if not usable_state[horizontal].to_numpy().any():
@@ -337,7 +347,6 @@ def _read_record(
 
 
 def _last_finite(frame: pd.DataFrame, column: str, default: float) -> float:
-    """Return the last finite value of a column, or ``default``."""
     finite_values = frame[column].dropna().to_numpy() if column in frame else np.zeros(0)
     return float(finite_values[-1]) if len(finite_values) else default
 
@@ -351,8 +360,13 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
     candidates = []
     for topic, name in px4.MAGNETOMETER:
         measured_columns = expand_columns({"forward_gauss right_gauss down_gauss": f"{name}[]"})
-        innovation_columns = expand_columns({"FIELD_INNOVATION": "innovation_filtered[]"})
-        frame = topics.primary_samples(Layout(topic, measured_columns, innovation_columns)).dropna()
+        frame = topics.primary_samples(
+            Layout(
+                topic,
+                measured_columns,
+                expand_columns({"FIELD_INNOVATION": "innovation_filtered[]"}),
+            )
+        ).dropna()
         if name == "observation":  # EKF2 subtracts delay and half a step from measurement times
             delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3
             frame = frame.set_axis(frame.index + delay_s + 0.5 * step_s)
@@ -369,7 +383,7 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
     return field.assign(fused_3d=(flags >> MAG_3D_BIT & 1).astype(float))
 
 
-def _read_flow(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> pd.DataFrame:
+def _read_flow(topics: Topics, enabled: StepFunctions) -> pd.DataFrame:
     """Compute the mean flow velocity between consecutive rows of EKF2's low-pass filtered flow."""
     velocity, interval, noise = (
         topics.primary_samples(px4.LAYOUTS[f"flow_{quantity}"]).dropna()
@@ -379,7 +393,7 @@ def _read_flow(topics: Topics, enabled: Mapping[str, pd.Series[float]]) -> pd.Da
     if not interval_s > 0.0 or noise.empty:
         return pd.DataFrame()
     times = velocity.index.to_numpy()
-    # After longer intervals the low-pass filter no longer contains the previous row's samples
+    # After longer intervals the low-pass filter no longer contains the samples of the previous row
     rows = (
         np.flatnonzero(
             (np.diff(times) > 0.5 * interval_s) & (np.diff(times) <= MAX_FLOW_INTERVAL_S)

@@ -4,26 +4,28 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.arrays import Array
-from px4fuse.flight import Columns, Ekf2, Unavailable
+from px4fuse.flight import Columns, Ekf2, Unavailable, time_index
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.readers.ulog_topics import Topics
 
-# Maximum time difference (s) of rows of the same fix; the interval of fixes is at least 0.05 s
+# Maximum time difference (s) of a logged fix and an EKF2 observation of the same fix: receivers
+# send a fix every 0.05 s or less often
 MAX_SAME_FIX_S = 0.01
-# Maximum difference (°, about 100 km) of an observation in degrees from the logged latitude; a
-# larger difference shows that the observation is in m
+# Maximum difference (°, about 100 km) between the observed and the logged latitude: a larger
+# difference shows that the observation is in m
 MAX_LATITUDE_DISTANCE_DEG = 1.0
-# Candidates for the receiver's interval (s): receivers send 4 to 20 fixes per second
+# Possible intervals (s) of a GNSS receiver: receivers send 4 to 20 fixes per second
 PERIODS_S = np.arange(0.05, 0.26, 0.0005)
-# Maximum deviation (s) of a logged interval from a multiple of the receiver's interval, for EKF2's
-# prediction step and clock jitter
+# Maximum deviation (s) of a logged interval from a multiple of the receiver's interval: half of an
+# EKF2 prediction interval, plus clock jitter
 MAX_GRID_ERROR_S = 0.006
-# Minimum number of logged fixes to check the reconstruction
+# Minimum number of logged fixes to measure the error of reconstructed fixes
 MIN_LOGGED_FIXES = 10
-# Minimum number of logged intervals of n, and of n + 1, receiver intervals, to estimate the latter
+# Minimum number of logged intervals with n, and with n + 1, receiver intervals, to estimate the
+# receiver interval
 MIN_REPEATED_INTERVALS = 3
-# Maximum reconstruction error (m, RMS), measured at fixes that are also logged
+# Maximum error (m, RMS) of reconstructed fixes, measured at fixes that are also logged
 MAX_RECONSTRUCTION_ERROR_M = 0.1
 
 
@@ -38,14 +40,14 @@ def read_unlogged_fixes(
     if isinstance(ekf2, Unavailable) or not all(map(topics.find, layouts)):
         return pd.DataFrame()
     position, velocity = map(topics.primary_samples, layouts)
-    # Rows that are neither fused nor rejected contain no new fix
+    # Rows of EKF2's GNSS topic that are neither fused nor rejected contain no new fix
     is_fix = position[["fused", "rejected"]].any(axis=1)
     position = position.loc[is_fix].drop(columns=["fused", "rejected"])
     # EKF2 shifts GNSS times back by half a prediction step (estimator_interface.cpp)
     fixes = position.join(velocity, how="inner").dropna()
     # Unless GNSS is the height reference, EKF2's estimate of the GNSS bias is part of the height
-    height, reference = px4.LAYOUTS["fused_height"], topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0)
-    if topics.find(height) and reference == 1.0:
+    height = px4.LAYOUTS["fused_height"]
+    if topics.find(height) and topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0) == 1.0:
         fixes = fixes.join(topics.primary_samples(height))
     fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
     next_row = np.clip(np.searchsorted(gps.index, fixes.index), 1, len(gps) - 1)
@@ -53,10 +55,8 @@ def read_unlogged_fixes(
         *(np.abs(gps.index.to_numpy()[next_row - k] - fixes.index) for k in (0, 1))
     )
     is_between_fixes = (fixes.index > gps.index[0]) & (fixes.index < gps.index[-1])
-    logged_fixes, unlogged_fixes = (
-        fixes[distance_s <= MAX_SAME_FIX_S],
-        fixes[(distance_s > MAX_SAME_FIX_S) & is_between_fixes],
-    )
+    logged_fixes = fixes[distance_s <= MAX_SAME_FIX_S]
+    unlogged_fixes = fixes[(distance_s > MAX_SAME_FIX_S) & is_between_fixes]
     # Before v1.16 the observation is a local position in m
     is_in_degrees = (
         logged_fixes["latitude_deg"].sub(gps["latitude_deg"].median()).abs().median()
@@ -94,23 +94,24 @@ def reconstruct_fixes(
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.horizon_s, Unavailable) or len(fixes) < 3:
         return no_fixes, ()
     gnss_innovations = with_gnss_innovations(ekf2).innovations
-    north, east = gnss_innovations["north"], gnss_innovations["east"]
+    north = gnss_innovations["north"]
+    east = gnss_innovations["east"]
     interval_s = _interval_s(fixes.index.to_numpy())
     if interval_s is None or isinstance(north, Unavailable) or isinstance(east, Unavailable):
         return no_fixes, ()
     delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
-    fix_s, innovation_s = fixes.index.to_numpy(), north.index.to_numpy()
+    fix_s = fixes.index.to_numpy()
+    innovation_s = north.index.to_numpy()
     previous_fix = np.searchsorted(fix_s, innovation_s - delay_beyond_horizon_s) - 1
     is_between_fixes = (previous_fix >= 0) & (previous_fix < len(fix_s) - 1)
-    innovation_s, previous_fix = innovation_s[is_between_fixes], previous_fix[is_between_fixes]
+    innovation_s = innovation_s[is_between_fixes]
+    previous_fix = previous_fix[is_between_fixes]
     intervals_passed = (innovation_s - delay_beyond_horizon_s - fix_s[previous_fix]) / interval_s
     # Skip innovations logged within one EKF2 step of a fix, because they may belong to either fix
     is_unambiguous = intervals_passed % 1.0 > ekf2.step_s / interval_s
-    innovation_s, previous_fix, intervals_passed = (
-        innovation_s[is_unambiguous],
-        previous_fix[is_unambiguous],
-        np.floor(intervals_passed[is_unambiguous]),
-    )
+    innovation_s = innovation_s[is_unambiguous]
+    previous_fix = previous_fix[is_unambiguous]
+    intervals_passed = np.floor(intervals_passed[is_unambiguous])
     fix_time_s = fix_s[previous_fix] + intervals_passed * interval_s
     reconstructed = pd.DataFrame(
         {
@@ -124,7 +125,7 @@ def reconstruct_fixes(
             + innovations["innovation_m"].to_numpy()[is_between_fixes][is_unambiguous]
             for column, innovations in zip(Columns.POSITION, (north, east), strict=False)
         },
-        index=pd.Index(fix_time_s, name="time_s"),
+        index=time_index(fix_time_s),
     )
     is_logged = intervals_passed == 0.0
     error = (reconstructed - fixes[reconstructed.columns].to_numpy()[previous_fix])[
@@ -141,9 +142,8 @@ def reconstruct_fixes(
         if column in fixes:
             reconstructed[column] = np.interp(reconstructed.index, fix_s, fixes[column])
     return reconstructed, (
-        f"{len(reconstructed)} GNSS fixes that were not logged are reconstructed as EKF2 position "
-        f"plus innovation, with interpolated heights (RMS error {error_m:.2f} m per axis at "
-        f"{len(error)} logged fixes)",
+        f"{len(reconstructed)} unlogged GNSS fixes are reconstructed as EKF2 position plus "
+        f"innovation (RMS error {error_m:.2f} m per axis at {len(error)} logged fixes)",
     )
 
 
@@ -160,12 +160,11 @@ def _interval_s(times: Array) -> float | None:
     if not len(fitting_periods):
         return None
     longest_period_s = PERIODS_S[fitting_periods[-1]]
-    # Refine to the best fit near the longest period
+    # Use the interval with the smallest error within 10 % of the longest possible interval
     near_periods = np.flatnonzero(np.abs(PERIODS_S - longest_period_s) < 0.1 * longest_period_s)
     best_period_s = PERIODS_S[near_periods[np.argmin(worst_error_s[near_periods])]]
     interval_multiples = np.round(gaps[:, 0] / best_period_s)
-    counts = np.bincount(interval_multiples.astype(int))
-    is_frequent = counts >= MIN_REPEATED_INTERVALS
+    is_frequent = np.bincount(interval_multiples.astype(int)) >= MIN_REPEATED_INTERVALS
     if not np.any(is_frequent[1:] & is_frequent[:-1]):
         return None
     return float(np.median(gaps[:, 0] / interval_multiples))

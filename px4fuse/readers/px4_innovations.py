@@ -8,14 +8,14 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.ekf2_parameters import GNSS_POS, TABLES
-from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Ekf2, Unavailable
+from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Ekf2, TableOrUnavailable, Unavailable
 
-Innovations = dict[AxisName, pd.DataFrame | Unavailable]
+Innovations = dict[AxisName, TableOrUnavailable]
 
 
 @dataclass(frozen=True)
 class Ekf2Source:
-    """Position source of EKF2: name, aids, and actions to enable and to log these aids.
+    """Position source of EKF2, its aids by PX4 name, and actions to enable and to log these aids.
 
     ``height`` is the name of a separate height sensor; "" if the source also gives the height.
     """
@@ -35,7 +35,7 @@ VISION, GNSS, GNSS_AND_BAROMETER = (
 
 
 def fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
-    """Return True if EKF2 fused the aid at any time; if fusion is not logged, if it enabled it."""
+    """Return True if EKF2 fused the aid at any time, or enabled it if fusion is not logged."""
     log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get(aid)
     if log is None:
         return False
@@ -49,8 +49,8 @@ def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
         for group, name in (("horizontal", source.horizontal), ("vertical", source.vertical))
         if (log := ekf2.aids.get(name)) is not None and log.enabled is not None
     }
-    fusing: pd.DataFrame | Unavailable = Unavailable(
-        "EKF2 fusion flags", "the log does not contain when EKF2 fused GNSS", GNSS.to_log
+    fusing: TableOrUnavailable = Unavailable(
+        "EKF2 fusion flags", "the log does not contain the fusion flags of GNSS", GNSS.to_log
     )
     if enabled:
         columns = ["horizontal", "vertical", "yaw"]
@@ -66,7 +66,7 @@ def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
 
 def innovations_by_axis(
     aids: Mapping[str, AidLog],
-    fusing: pd.DataFrame | Unavailable,
+    fusing: TableOrUnavailable,
     gate: float,
     source: Ekf2Source = VISION,
 ) -> tuple[Innovations, tuple[str, ...]]:
@@ -94,9 +94,9 @@ def innovations_by_axis(
             remedy = source.remedies[group]
         elif log is None or axis_innovations is None or axis_innovations.empty:
             reason = (
-                f"no usable estimator_aid_src_{source.horizontal}, "
-                f"estimator_aid_src_{source.vertical}, estimator_innovations or ekf2_innovations "
-                f"sample while {sensor} was fused"
+                f"while {sensor} was fused, the log has no usable sample of "
+                f"estimator_aid_src_{source.horizontal}, estimator_aid_src_{source.vertical}, "
+                "estimator_innovations or ekf2_innovations"
             )
             remedy = source.to_log
         else:

@@ -19,6 +19,7 @@ from px4fuse.flight import (
     Unavailable,
     sample_rate,
     sort_by_preference,
+    time_index,
 )
 from px4fuse.log import SENDER_CLOCK, SHARED_STAMPS, ClockMap
 from px4fuse.position_source import Origin, with_orientation
@@ -43,11 +44,13 @@ EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo
 GPS_3D_FIX = 3
 # Maximum publication delay (µs) of a sample with the arrival time instead of the measurement time
 MAX_ARRIVAL_DELAY_US = 100
-# Minimum fraction of samples with arrival time in a topic that counts as having only arrival times
+# Minimum fraction of samples with arrival time, for a topic that counts as having arrival times
+# only
 MIN_ARRIVAL_FRACTION = 0.9
-# Maximum time difference (s) of height and position: 2.5 cm error at a climb rate of 0.5 m/s
+# Maximum time difference (s) of a height and a horizontal position that are joined: 2.5 cm error at
+# a climb rate of 0.5 m/s
 HEIGHT_TOLERANCE_S = 0.05
-# GNSS rate (Hz) below which the logger must have decimated the fixes (receivers send 5 to 20 Hz)
+# Maximum logged GNSS rate (Hz) of decimated fixes: receivers send 5 to 20 fixes per second
 MAX_DOWNSAMPLED_HZ = 4.0
 STATUS_COLUMNS = ["reset_counter", "quality"]
 # Units of timestamps by name, in µs
@@ -61,7 +64,7 @@ GeodeticPosition = tuple[float, ...]
 def read_positions(
     topics: Topics, ekf2: Ekf2 | Unavailable
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
-    """Read all external positions, in order of preference; return also reasons for missing ones."""
+    """Read all external position tracks, best first, and the reasons for missing tracks."""
     fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
     # EKF2's position observations contain no orientation; if EKF2 also fused the source's yaw, the
     # source is odometry
@@ -93,7 +96,7 @@ def make_track(
     remedy: str = "",
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """Make a track of the samples with valid position; Unavailable with too few samples.
+    """Make a position track of the valid samples; Unavailable with fewer than three valid samples.
 
     Parameters
     ----------
@@ -114,8 +117,11 @@ def make_track(
         reason = find_invalid(samples, needed_columns)
         samples, invalid = samples[reason == ""], reason[reason != ""]
     if len(samples) < MIN_TRACK_SAMPLES:
-        reason = f"only {len(samples)} finite samples (at least {MIN_TRACK_SAMPLES} are needed)"
-        return unavailable(name, reason, remedy)
+        return unavailable(
+            name,
+            f"only {len(samples)} finite samples (at least {MIN_TRACK_SAMPLES} are needed)",
+            remedy,
+        )
     variance = samples[Columns.POSITION_VARIANCE]
     samples = samples.assign(**variance.where(variance > 0))
     return PositionTrack(
@@ -159,14 +165,15 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
     layout = topics.find(*px4.layouts_of_track(name))
     if layout is None:
         return unavailable(name, f"{name} is not logged")
-    is_ekf2 = layout.topic.startswith("estimator_")  # topics with one instance per EKF2 instance
+    # Topics of EKF2 have one topic instance per EKF2 instance
+    is_ekf2 = layout.topic.startswith("estimator_")
     samples = topics.primary_samples(layout) if is_ekf2 else topics.frame(layout)
     frame = "unknown"
     for field, names in px4.FRAMES.items():
         if field in samples and len(samples):
             frame = names.get(int(samples[field].iloc[-1]), "unknown")
     if name == "estimator_visual_odometry_aligned":
-        frame = "NED"  # EKF2 rotated the positions to NED; the field contains the frame before
+        frame = "NED"  # the field contains the frame before EKF2 rotated the positions to NED
     orientation = read_orientation(samples)
     return _make_ulog_track(
         topics,
@@ -181,7 +188,7 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
 
 
 def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
-    """Describe the clock of a topic whose measurement times are arrival times; otherwise None.
+    """Describe the clock of a topic with arrival times instead of measurement times; else None.
 
     PX4 uses the arrival time until it has received 500 TIMESYNC replies (``Timesync.cpp``). px4fuse
     uses it if ``timestamp_sample`` is not the boot clock in microseconds.
@@ -225,7 +232,8 @@ def _read_ev_pos_aid(topics: Topics, turns: bool) -> PositionTrack | Unavailable
     layout = topics.find(px4.LAYOUTS["kept_horizontal"])
     if layout is None:
         return unavailable(px4.FUSED_OBSERVATION, f"{px4.FUSED_OBSERVATION} is not logged")
-    samples, used_topics = topics.primary_samples(layout), [layout.topic]
+    samples = topics.primary_samples(layout)
+    used_topics = [layout.topic]
     notes: tuple[str, ...] = ()
     vertical = topics.find(px4.LAYOUTS["kept_vertical"])
     if vertical is not None:
@@ -246,7 +254,7 @@ def _read_ev_pos_aid(topics: Topics, turns: bool) -> PositionTrack | Unavailable
 
 
 def _shift_times(samples: pd.DataFrame, by_s: float) -> pd.DataFrame:
-    return samples.set_axis(pd.Index(samples.index.to_numpy() + by_s, name="time_s"))
+    return samples.set_axis(time_index(samples.index.to_numpy() + by_s))
 
 
 def _with_height(
@@ -259,9 +267,9 @@ def _with_height(
     """
     joined = join_nearest(samples, height.assign(_found=True), HEIGHT_TOLERANCE_S)
     without_height = int(joined.pop("_found").isna().sum())
-    limit_text = f"within {1e3 * HEIGHT_TOLERANCE_S:.0f} ms"
     note = (
-        f"{without_height} of {len(joined)} external vision positions have no height {limit_text}"
+        f"{without_height} of {len(joined)} external vision positions have no height within "
+        f"{1e3 * HEIGHT_TOLERANCE_S:.0f} ms"
     )
     return joined, (note,) if without_height else ()
 
@@ -312,11 +320,15 @@ def project(
 
     Source: PX4 ``MapProjection::project``, src/lib/geo/geo.cpp (Snyder 1987, equation 25-2).
     """
-    latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
-    latitude_0, longitude_0 = np.radians(origin[0]), np.radians(origin[1])
-    difference = longitude - longitude_0
-    sine, cosine, cosine_difference = np.sin(latitude), np.cos(latitude), np.cos(difference)
-    sine_0, cosine_0 = np.sin(latitude_0), np.cos(latitude_0)
+    latitude = np.radians(latitude_deg)
+    longitude = np.radians(longitude_deg)
+    latitude_0 = np.radians(origin[0])
+    difference = longitude - np.radians(origin[1])
+    sine = np.sin(latitude)
+    cosine = np.cos(latitude)
+    cosine_difference = np.cos(difference)
+    sine_0 = np.sin(latitude_0)
+    cosine_0 = np.cos(latitude_0)
     angle = np.arccos(np.clip(sine_0 * sine + cosine_0 * cosine * cosine_difference, -1.0, 1.0))
     arc_over_chord = np.where(angle > 0, angle / np.where(angle > 0, np.sin(angle), 1.0), 1.0)
     north = arc_over_chord * (cosine_0 * sine - sine_0 * cosine * cosine_difference)
@@ -329,12 +341,15 @@ def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[
 
     Source: PX4 ``MapProjection::reproject``, src/lib/geo/geo.cpp (Snyder 1987, equation 20-14).
     """
-    x, y = north_m / EARTH_RADIUS_M, east_m / EARTH_RADIUS_M
-    latitude_0, longitude_0 = np.radians(origin[0]), np.radians(origin[1])
+    x = north_m / EARTH_RADIUS_M
+    y = east_m / EARTH_RADIUS_M
+    latitude_0 = np.radians(origin[0])
+    longitude_0 = np.radians(origin[1])
     angle = np.hypot(x, y)
     # sin(c)/c, with the limit 1 at the origin
     sine_ratio = np.sinc(angle / np.pi)
-    sine, cosine = np.sin(latitude_0), np.cos(latitude_0)
+    sine = np.sin(latitude_0)
+    cosine = np.cos(latitude_0)
     latitude = np.arcsin(np.cos(angle) * sine + x * sine_ratio * cosine)
     longitude = longitude_0 + np.arctan2(
         y * sine_ratio, cosine * np.cos(angle) - x * sine * sine_ratio
@@ -390,23 +405,24 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     delay_ms = 0.0 if has_driver_times else effective_settings(parameters, GNSS_POS)[GNSS_POS.delay]
     clock = "autopilot boot clock, measurement times of the receiver driver"
     if not has_driver_times:
-        gps = gps.set_axis(pd.Index(published_s - delay_ms * 1e-3, name="time_s"))
+        gps = gps.set_axis(time_index(published_s - delay_ms * 1e-3))
         clock = f"autopilot boot clock minus {delay_ms:g} ms ({GNSS_POS.delay})"
     unlogged_fixes = read_unlogged_fixes(topics, gps, ekf2)
     if len(unlogged_fixes):
         gps = pd.concat([gps, unlogged_fixes]).sort_index()
         interpolated = int(gps["altitude_m"].isna().sum())
-        # The reconstructed rows lack some fields: these are copied from the previous fix
+        # Fields that unlogged fixes lack are copied from the previous fix
         gps = gps.assign(altitude_m=gps["altitude_m"].interpolate("index")).ffill()
     samples = project_to_ned(gps, _local_origin(topics))
     if {"eph_m", "epv_m"} <= set(gps.columns):
         # EKF2 uses the horizontal accuracy as σ of each horizontal axis (gps_control.cpp)
         samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2
         samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
-    # The velocity is joined before the check, so that it is dropped together with a damaged fix
+    # The velocity is added before the check, so that it is dropped together with a damaged position
     samples = samples.assign(**_velocity(gps).set_axis(samples.index))
     samples = finite_rows(samples, Columns.POSITION)
-    rate_hz, notes = sample_rate(samples), tuple[str, ...]()
+    rate_hz = sample_rate(samples)
+    notes = tuple[str, ...]()
     if rate_hz < MAX_DOWNSAMPLED_HZ and not len(unlogged_fixes):
         reconstructed_fixes, notes = reconstruct_fixes(samples, ekf2, delay_ms * 1e-3)
         samples = (
@@ -416,8 +432,8 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
         )
     if rate_hz < MAX_DOWNSAMPLED_HZ:
         notes = (
-            f"GNSS fixes are logged at {rate_hz:.1f} Hz, below the rate of receivers: the logger "
-            "dropped fixes. Set SDLOG_PROFILE bit 1 to log all",
+            f"the logger dropped GNSS fixes (logged rate {rate_hz:.1f} Hz). Set SDLOG_PROFILE bit "
+            "1 to log all",
             *notes,
         )
     if len(unlogged_fixes):
@@ -445,7 +461,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
 
 
 def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFrame | None:
-    """Return the barometer height as ``down_m``, ``delay_s`` earlier; None if few samples."""
+    """Return the barometer height as ``down_m``, ``delay_s`` earlier; None below three samples."""
     heights = altitude_m[np.isfinite(altitude_m)]
     if len(heights) < MIN_TRACK_SAMPLES:
         return None
@@ -476,21 +492,21 @@ def read_truth(
             local = _move_to_origin(local, project_to_ned(global_positions, _local_origin(topics)))
         return Truth(px4.LAYOUTS["truth_local"].topic, local, attitude)
     if len(global_positions):
-        velocity = global_positions.reindex(columns=Columns.VELOCITY)
-        samples = project_to_ned(global_positions, _local_origin(topics)).join(velocity)
+        samples = project_to_ned(global_positions, _local_origin(topics)).join(
+            global_positions.reindex(columns=Columns.VELOCITY)
+        )
         return Truth(px4.LAYOUTS["truth_global"].topic, samples, attitude)
     mocap_truth = motion_capture(positions, "vehicle_mocap_odometry")
     if mocap_truth is None and len(logged_local):
         return Unavailable(
             "ground truth",
-            f"{px4.LAYOUTS['truth_local'].topic} has no sample with finite positions and "
-            "velocities below 1e9 m and m/s",
+            f"{px4.LAYOUTS['truth_local'].topic} has no finite sample",
             "Check the simulation that writes the ground truth.",
         )
     return mocap_truth or Unavailable(
         "ground truth",
         "the log has neither simulation ground truth nor motion capture",
-        "On real flights, send motion capture as ATT_POS_MOCAP.",
+        px4.TRACKS["vehicle_mocap_odometry"].remedy,
     )
 
 
@@ -511,6 +527,9 @@ def motion_capture(positions: tuple[PositionTrack, ...], topic: str) -> Truth | 
     if any(track.origin.is_vision for track in positions):
         for track in positions:
             if track.topics[0] == topic:
-                state = track.samples.reindex(columns=Columns.STATE)
-                return Truth(track.name, state, read_attitude(track.orientation))
+                return Truth(
+                    track.name,
+                    track.samples.reindex(columns=Columns.STATE),
+                    read_attitude(track.orientation),
+                )
     return None

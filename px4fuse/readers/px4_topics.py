@@ -20,7 +20,7 @@ from px4fuse.record import table
 
 @dataclass(frozen=True)
 class TrackSource:
-    """Position track that a ULog may contain. Its key in TRACKS is for ``--position-source``.
+    """Position track that a ULog may contain. The key in TRACKS is the ``--position-source`` name.
 
     ``kind`` and ``path`` define the origin of the track, ``remedy`` is the action to log the
     track, and ``layouts`` are the layouts of its topic, if any.
@@ -34,7 +34,7 @@ class TrackSource:
 
     @property
     def origin(self) -> Origin:
-        """Origin of the track."""
+        """Kind of the position source, and path of the positions to the log."""
         return find_origin(self.kind, self.path)
 
 
@@ -50,7 +50,7 @@ HEIGHT_BIAS = {name: LAYOUTS[f"bias_of_{name}"] for name in ("baro_hgt", "gnss_h
 DEFAULT_PROFILE = "Record with SDLOG_PROFILE bit 0 (default)."
 # Topics with EKF2's state vector and variances, in order of preference
 ESTIMATOR_STATES = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
-# Topic and field of the magnetic field: sensor, and EKF2's observation (since v1.14)
+# Topic and field of the measured magnetic field: magnetometer, and EKF2's observation (since v1.14)
 MAGNETOMETER = (
     ("vehicle_magnetometer", "magnetometer_ga"),
     ("estimator_aid_src_mag", "observation"),
@@ -84,13 +84,13 @@ OLD_INNOVATIONS = "ekf2_innovations"
 
 
 def layouts_of_track(track: str) -> list[Layout]:
-    """Return the layouts of a track in order of preference; the default topic is the track name."""
+    """Return the layouts of a track, best first; the default topic has the name of the track."""
     rows = [LAYOUTS[name] for name in TRACKS[track].layouts]
     return [replace(row, topic=row.topic or track) for row in rows]
 
 
 def topics() -> list[str]:
-    """Return the sorted names of all topics that the readers decode."""
+    """Return the sorted names of all PX4 topics that the ULog reader decodes."""
     named_topics = {row.topic for track in TRACKS for row in layouts_of_track(track)}
     named_topics |= {row.topic for row in LAYOUTS.values() if row.topic}
     named_topics |= {f"estimator_aid_src_{name}" for name in AIDS}

@@ -12,9 +12,10 @@ import numpy as np
 from px4fuse.arrays import Array, BoolArray
 from px4fuse.errors import TrajectoryError
 
-# Limits (s) of valid UNIX times: 2000 and 2100
+# Minimum and maximum valid UNIX time (s): the years 2000 and 2100
 UNIX_START_S, UNIX_END_S = 946_684_800.0, 4_102_444_800.0
-# Number of first characters in which a control character shows a binary file; NUL shows it anywhere
+# Number of characters at the beginning in which a control character shows that a file is binary; a
+# NUL anywhere shows the same
 _CHECKED_CHARS = 100_000
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # byte order marks, written by Windows shells
 _CONTROL = re.compile("[\x00-\x08\x0e-\x1b]")
@@ -29,8 +30,7 @@ def decode_text(content: bytes) -> str | None:
     The encoding is UTF-8, UTF-16 with byte order mark, or otherwise Latin-1.
     """
     if content.startswith(_UTF_16):
-        even_bytes = content[: len(content) // 2 * 2]
-        text = even_bytes.decode("utf-16", errors="replace")
+        text = content[: len(content) // 2 * 2].decode("utf-16", errors="replace")
     else:
         content = content.rstrip(b"\0\x1a")  # NUL at the end after a power loss, 0x1a from DOS
         try:
@@ -63,7 +63,7 @@ def format_line_error(name: str, number: int, description: str, remedy: str) -> 
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of a table in a text file.
+    """Rows of a text table, for error messages with the file name and the line number.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class Rows:
     lines: list[tuple[int, str]] = field(default_factory=list)
 
     def row_error(self, row: int, description: str, remedy: str) -> TrajectoryError:
-        """Return an error with the line number of a row."""
+        """Return a TrajectoryError that contains the line number of a row."""
         return TrajectoryError(
             format_line_error(self.file_name, self.lines[row][0], description, remedy)
         )
@@ -122,6 +122,9 @@ class Rows:
                 for fields in row_fields
             )
             row = next((row for row, is_row_valid in enumerate(is_valid) if not is_row_valid), 0)
-            description = f"{quote(texts[row])} is not {words + values} columns of numbers"
-            raise self.row_error(row, description, "Correct or remove that line.") from error
+            raise self.row_error(
+                row,
+                f"{quote(texts[row])} is not {words + values} columns of numbers",
+                "Correct or remove that line.",
+            ) from error
         return table["words"], np.ascontiguousarray(table["values"])

@@ -23,31 +23,40 @@ from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
 MAX_FILE_BYTES = 500_000_000
 TUM_COLUMNS = 8
+# Numbers of columns in EuRoC files: pose only, or also velocity and biases of gyro and
+# accelerometer
+EUROC_COLUMNS = (8, 17)
+# Maximum median interval (s) between poses without a note on the unit of time: a longer interval
+# may be in milliseconds
 MAX_USUAL_INTERVAL_S = 10.0
-EUROC_COLUMNS = (8, 17)  # pose only, or also velocity and biases of gyro and accelerometer
-# Limits (s) of plausible median intervals: key frames may have minutes between them, and frame
-# rates are below 1 kHz
+# Maximum and minimum plausible median interval (s) between poses: key frames may have minutes
+# between them, and frame rates are below 1 kHz
 MAX_INTERVAL_S, MIN_INTERVAL_S = 1000.0, 1e-3
 UNITS_PER_SECOND = {"nanoseconds": 10**9, "microseconds": 10**6, "milliseconds": 10**3}
+# Maximum deviation of a valid quaternion from norm 1
 MAX_NORM_ERROR = 0.1
-MAX_COORDINATE_M = 1e9  # larger values are timestamps or damage
-# Maximum deviation from norm 1 that is not corrected, so that a file is read exactly as written
+# Maximum absolute coordinate (m): larger values are timestamps or damaged text
+MAX_COORDINATE_M = 1e9
+# Maximum deviation of a quaternion from norm 1 that is not corrected: a rounding error of float64
 UNIT_NORM_TOLERANCE = 1e-15
-MAX_REPEATED_FRACTION = (
-    0.01  # of repeated timestamps; a larger fraction shows that timestamps have too few digits
-)
+# Maximum fraction of repeated timestamps: a larger fraction shows that timestamps have too few
+# digits
+MAX_REPEATED_FRACTION = 0.01
+# Maximum position (m) and rotation (rad) of a first pose that counts as the identity
 MAX_IDENTITY_M, MAX_IDENTITY_RAD = 1e-6, 1e-6
-# Level motion, by the RMS extents along the three principal axes: maximum third over second extent,
-# minimum second over first extent, and maximum angle between the third axis and y
+# Limits for motion that counts as level, from its RMS extents along the three principal axes:
+# maximum ratio of third to second extent, minimum ratio of second to first extent, and maximum
+# angle between the third axis and y
 MAX_THICKNESS_RATIO, MIN_WIDTH_RATIO, MAX_TILT_RAD = 1 / 3, 0.1, math.radians(20.0)
-# Regular frame rate: minimum fraction of intervals close to the median, and maximum relative
-# deviation of an interval that counts as close
+# Limits for a regular frame rate: minimum fraction of intervals that are close to the median, and
+# maximum relative deviation of these intervals from the median
 MIN_REGULAR_FRACTION, MAX_INTERVAL_DEVIATION = 0.9, 0.5
+# Minimum interval between poses that counts as a gap, in median intervals and in s
 MIN_GAP_INTERVALS, MIN_GAP_S = 2.5, 0.3
 
 _TUM = "TUM (time x y z qx qy qz qw)"
 _EUROC = "EuRoC (time, x, y, z, qw, qx, qy, qz with commas)"
-# Matches "q_RS_w []" and "qw"
+# Column names of quaternion components in EuRoC headers, such as "q_RS_w []" and "qw"
 _QUATERNION_NAME = re.compile(r"\bq(?:\w*_)?([wxyz])\b")
 _TRUTH_WORDS = re.compile(r"truth|vicon|leica|mocap|(?<![a-z])gt(?![a-z])", re.IGNORECASE)
 _REMEDY = f"Export the trajectory as {_TUM}, in seconds."
@@ -82,7 +91,8 @@ def read_trajectory(path: str | Path) -> Trajectory:
     )
     rows, comments, truncation_note = _split_rows(name, content)
     first_row = rows.lines[0][1].partition("#")[0]
-    separator, columns = ("," if "," in first_row else None), len(_fields(first_row))
+    separator = "," if "," in first_row else None
+    columns = len(_fields(first_row))
     if columns not in ((TUM_COLUMNS,) if separator is None else EUROC_COLUMNS):
         raise rows.row_error(
             0,
@@ -93,17 +103,22 @@ def read_trajectory(path: str | Path) -> Trajectory:
     is_w_first, format_name = _detect_quaternion_order(rows, separator, comments)
     timestamps, values = rows.parse(1, columns - 1, separator)
     time, time_note = _convert_timestamps(rows, timestamps[:, 0].tolist())
-    fault = f"a value is not finite, or above {MAX_COORDINATE_M:.0e}"
-    rows.raise_where(~(np.abs(values[:, :7]) < MAX_COORDINATE_M), fault, "Remove that line.")
-    position, rotation = values[:, :3], _read_rotation(rows, values[:, 3:7], is_w_first)
+    rows.raise_where(
+        ~(np.abs(values[:, :7]) < MAX_COORDINATE_M),
+        f"a value is not finite, or above {MAX_COORDINATE_M:.0e}",
+        "Remove that line.",
+    )
+    position = values[:, :3]
+    rotation = _read_rotation(rows, values[:, 3:7], is_w_first)
     is_kept, dropped_note = _increasing_rows(rows, time)
-    time, position, rotation = time[is_kept], position[is_kept], rotation[is_kept]
+    time = time[is_kept]
+    position = position[is_kept]
+    rotation = rotation[is_kept]
     kind, kind_note = _detect_kind(path, columns, comments, position, rotation)
     frame, frame_note = _detect_frame(kind, position)
     is_unix = UNIX_START_S <= time[0] < UNIX_END_S
-    clock_text = "its timestamps are UNIX time" if is_unix else "its timestamps are not UNIX time"
     reader_notes = (
-        f"Recognised as {format_name}; {clock_text}.",
+        f"The format is {format_name}; the timestamps are {'' if is_unix else 'not '}UNIX time.",
         time_note,
         kind_note,
         frame_note,
@@ -140,8 +155,8 @@ def tum_text(trajectory: Trajectory) -> str:
     """
     if trajectory.rotation is None:
         raise TrajectoryError(
-            f"{trajectory.name}: a TUM file needs orientations, but this track has positions only",
-            "Choose a track with orientation.",
+            f"{trajectory.name} has no orientations, which a TUM file needs",
+            "Choose a track with orientations.",
         )
     time = trajectory.time_s + (trajectory.unix_offset_s or 0.0)
     table = np.column_stack((time, trajectory.position_m, trajectory.rotation.as_quat()))
@@ -154,9 +169,11 @@ def _split_rows(name: str, content: bytes) -> tuple[Rows, str, str]:
     text = decode_text(content)
     if text is None:
         is_ulog = content.startswith(b"ULog")
-        fault = "a PX4 log" if is_ulog else "a binary file"
         remedy = f"Choose a track of the log: {name}:vio or {name}:ekf2." if is_ulog else _REMEDY
-        raise TrajectoryError(f"{name}: {fault}, not a trajectory file", remedy)
+        raise TrajectoryError(
+            f"{name} is {'a PX4 log' if is_ulog else 'a binary file'}, not a trajectory file",
+            remedy,
+        )
     lines = [(number, line) for number, line in enumerate(text.split("\n"), 1) if line.strip()]
     comments = [line for _, line in lines if line.lstrip().startswith("#")]
     numeric_rows = [row for row in lines if not row[1].lstrip().startswith("#")]
@@ -167,26 +184,26 @@ def _split_rows(name: str, content: bytes) -> tuple[Rows, str, str]:
     ):
         comments.append(numeric_rows.pop(0)[1])  # header without #
     if numeric_rows and not _is_numeric_row(numeric_rows[0][1]):
-        fault = f"not a trajectory file: its first line is {quote(numeric_rows[0][1])}"
-        raise TrajectoryError(f"{name}: {fault}", _REMEDY)
+        raise TrajectoryError(
+            f"{name} is not a trajectory file: the first line is {quote(numeric_rows[0][1])}",
+            _REMEDY,
+        )
     truncation_note = ""
     is_short = len(numeric_rows) > 1 and len(_fields(numeric_rows[-1][1])) < len(
         _fields(numeric_rows[0][1])
     )
     if is_short and not text.endswith("\n"):
-        truncation_note = f"The last line ({numeric_rows[-1][0]}) was dropped: it is incomplete."
+        truncation_note = f"The incomplete last line ({numeric_rows[-1][0]}) was dropped."
         numeric_rows.pop()
     if len(numeric_rows) < MIN_POSES:
         raise TrajectoryError(
             f"{name} contains {len(numeric_rows)} poses; at least {MIN_POSES} are needed",
-            "Export the trajectory again. The file is almost empty if SLAM lost tracking at the "
-            "start.",
+            "Export the trajectory again.",
         )
     return Rows(name, numeric_rows), "\n".join(comments), truncation_note
 
 
 def _fields(line: str) -> list[str]:
-    """Split a row at commas, or at blanks if it has no comma."""
     line = line.partition("#")[0]
     return line.split("," if "," in line else None)
 
@@ -209,14 +226,13 @@ def _detect_quaternion_order(rows: Rows, separator: str | None, comments: str) -
         if not is_w_first:
             raise rows.row_error(
                 0,
-                "the position of the quaternion's w is unknown: the header does not name it",
-                "Add the line '#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z' with the columns in "
-                "their order.",
+                "the header does not contain the order of the quaternion components",
+                "Add a header such as '#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z'.",
             )
     if is_w_first == (separator is not None):
         return is_w_first, _EUROC if is_w_first else _TUM
-    order = "blanks, quaternion w first" if is_w_first else "commas, quaternion w last"
-    return is_w_first, f"columns separated by {order}, according to the header"
+    order = "blanks and quaternion w first" if is_w_first else "commas and quaternion w last"
+    return is_w_first, f"a table with {order}, according to the header"
 
 
 def _convert_timestamps(rows: Rows, timestamps: list[str]) -> tuple[Array, str]:
@@ -229,24 +245,21 @@ def _convert_timestamps(rows: Rows, timestamps: list[str]) -> tuple[Array, str]:
     median_interval = float(np.median(np.abs(np.diff(values))))
     if median_interval <= MAX_INTERVAL_S and np.abs(values).max() < UNIX_END_S:
         interval_note = (
-            f"The timestamps are read as seconds, with an interval of {median_interval:.0f} s. "
-            "Check that they are not milliseconds."
+            f"The timestamps are read as seconds; the median interval is {median_interval:.0f} s. "
+            "Check that the unit is not milliseconds."
         )
         return values, interval_note if median_interval >= MAX_USUAL_INTERVAL_S else ""
     for unit, units_per_second in UNITS_PER_SECOND.items():
-        first, last = (
-            float(values[0]) / units_per_second,
-            float(np.abs(values).max()) / units_per_second,
-        )
+        first = float(values[0]) / units_per_second
+        last = float(np.abs(values).max()) / units_per_second
         # Times that are not UNIX time must be in nanoseconds, as ORB-SLAM3 writes them
-        is_accepted = first >= UNIX_START_S or unit == "nanoseconds"
         if (
-            is_accepted
+            (first >= UNIX_START_S or unit == "nanoseconds")
             and last < UNIX_END_S
             and MIN_INTERVAL_S <= median_interval / units_per_second <= MAX_INTERVAL_S
         ):
             counts = np.array([int(Decimal(timestamp)) for timestamp in timestamps], dtype=np.int64)
-            unit_note = f"Its timestamps are {unit} and were divided by {units_per_second:.0e}."
+            unit_note = f"The timestamps are {unit} and were divided by {units_per_second:.0e}."
             # Seconds and remainder are divided separately: float64 cannot represent UNIX time in ns
             return (
                 counts // units_per_second + counts % units_per_second / units_per_second,
@@ -260,26 +273,31 @@ def _convert_timestamps(rows: Rows, timestamps: list[str]) -> tuple[Array, str]:
 
 
 def _increasing_rows(rows: Rows, time: Array) -> tuple[BoolArray, str]:
-    """Return a mask without repeated timestamps, and a note on the dropped rows."""
+    """Return a mask of the rows without repeated timestamps, and a note on the dropped rows."""
     steps = np.diff(time, prepend=-np.inf)
-    remedy = "Sort the lines by time, or separate the recordings."
-    fault = "the timestamp is before that of the line above"
-    rows.raise_where(steps < 0.0, fault, remedy)
+    rows.raise_where(
+        steps < 0.0,
+        "the timestamp is earlier than in the line above",
+        "Sort the lines by time, or separate the recordings.",
+    )
     repeated_count = int((steps == 0.0).sum())
     if repeated_count > MAX_REPEATED_FRACTION * len(steps):
-        lines = f"{repeated_count} of {len(steps)} lines"
-        fault = f"the timestamp is the same as in the line above, as in {lines}"
-        remedy = "Export the timestamps with all digits (%.9f)."
-        rows.raise_where(steps == 0.0, fault, remedy)
+        rows.raise_where(
+            steps == 0.0,
+            f"this timestamp and {repeated_count - 1} others are the same as in the line above",
+            "Export the timestamps with all digits (%.9f).",
+        )
     note = f"Dropped poses with a repeated timestamp: {repeated_count}." if repeated_count else ""
     return steps > 0.0, note
 
 
 def _read_rotation(rows: Rows, quaternion: Array, is_w_first: bool) -> Rotation:
     norms = np.linalg.norm(quaternion, axis=1)
-    fault = "columns 5 to 8 are not a quaternion: its norm is not 1"
-    remedy = f"Remove that line, or check the order of the columns. {_REMEDY}"
-    rows.raise_where(np.abs(norms - 1.0) > MAX_NORM_ERROR, fault, remedy)
+    rows.raise_where(
+        np.abs(norms - 1.0) > MAX_NORM_ERROR,
+        "columns 5 to 8 are not a quaternion with norm 1",
+        f"Remove that line, or check the order of the columns. {_REMEDY}",
+    )
     norms[np.abs(norms - 1.0) < UNIT_NORM_TOLERANCE] = 1.0
     quaternion = np.roll(quaternion, -1, axis=1) if is_w_first else quaternion
     return Rotation(quaternion / norms[:, None], normalize=False)
@@ -288,22 +306,23 @@ def _read_rotation(rows: Rows, quaternion: Array, is_w_first: bool) -> Rotation:
 def _detect_kind(
     path: Path, columns: int, comments: str, position: Array, rotation: Rotation
 ) -> tuple[Kind, str]:
-    """Return the kind of trajectory and the reason."""
     if columns == EUROC_COLUMNS[1]:
-        return "truth", "Ground truth: it has the 17 columns of EuRoC ground truth."
+        return (
+            "truth",
+            "The kind is ground truth, according to its 17 columns.",
+        )
     # EuRoC files are always called data.csv; their folder name indicates the kind
     folder = path.absolute().parent.name if path.name == "data.csv" else ""
     text_by_source = {"a comment": comments, "the file name": path.name, "the folder name": folder}
     for source, text in text_by_source.items():
         if _TRUTH_WORDS.search(text):
-            return "truth", f"Ground truth, according to {source}."
+            return "truth", f"The kind is ground truth, according to {source}."
     if np.abs(position[0]).max() < MAX_IDENTITY_M and rotation[0].magnitude() < MAX_IDENTITY_RAD:
-        return "slam", "SLAM: the first pose is the identity, so the world is the first key frame."
+        return "slam", "The kind is SLAM, because the first pose is the identity."
     return "unknown", ""
 
 
 def _detect_frame(kind: Kind, position: Array) -> tuple[Frame, str]:
-    """Return the convention of the world frame's axes, and the reason."""
     if kind != "slam":
         return "unknown", ""
     centred = position - position.mean(axis=0)
@@ -314,27 +333,28 @@ def _detect_frame(kind: Kind, position: Array) -> tuple[Frame, str]:
     if not is_level or tilt > MAX_TILT_RAD:
         return "unknown", ""
     return "camera", (
-        "Camera frame (x right, y down, z forward): the motion is level, "
-        f"with an extent of {length:.2g}, {width:.2g} and {height:.2g} m (RMS). The vertical is "
-        f"{math.degrees(tilt):.0f}° from y."
+        "The frame is that of a camera (x right, y down, z forward), because the motion is level "
+        f"and its vertical is {math.degrees(tilt):.0f}° from y."
     )
 
 
 def _describe_gaps(time: Array, kind: Kind) -> str:
-    """Return a note on missing frames or an irregular rate (key frames); "" if regular."""
+    """Return a note on gaps between poses or an irregular pose rate; "" if the rate is regular."""
     intervals_s = np.diff(time)
     median_s = float(np.median(intervals_s))
     is_regular: BoolArray = np.abs(intervals_s - median_s) <= MAX_INTERVAL_DEVIATION * median_s
     if is_regular.mean() < MIN_REGULAR_FRACTION:
-        interval_text = f"interval {median_s:.3g} s (median), {intervals_s.max():.3g} s (maximum)"
-        return f"Poses have no regular rate ({interval_text}): key frames only, or many poses lost."
+        return (
+            f"The poses are key frames, or many poses are missing: their intervals are irregular "
+            f"(median {median_s:.3g} s, maximum {intervals_s.max():.3g} s)."
+        )
     gaps = np.flatnonzero(intervals_s > max(MIN_GAP_INTERVALS * median_s, MIN_GAP_S))
     if not len(gaps):
         return ""
     lost_s = intervals_s[gaps] - median_s
-    missing_count = int((np.rint(intervals_s[gaps] / median_s) - 1).sum())
     longest_start_s = time[gaps[np.argmax(lost_s)]] - time[0]
-    event = "Tracking lost" if kind == "slam" else "No poses"
-    longest_text = f"in {len(gaps)} gaps, the longest " if len(gaps) > 1 else ""
-    location = f"{longest_text}at {longest_start_s:.1f} s after the start"
-    return f"{event} for {lost_s.sum():.1f} s {location}, {missing_count} frames missing."
+    return (
+        f"{'Tracking was lost' if kind == 'slam' else 'Poses are missing'} for "
+        f"{lost_s.sum():.1f} s in {len(gaps)} gaps, the longest at {longest_start_s:.1f} s after "
+        "the start."
+    )

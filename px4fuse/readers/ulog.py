@@ -5,19 +5,30 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.ekf2_parameters import BAROMETER
-from px4fuse.flight import MODES_NOT_LOGGED, Columns, Flight, FlightMode, Truth, Unavailable
+from px4fuse.flight import (
+    MODES_NOT_LOGGED,
+    Columns,
+    Flight,
+    FlightMode,
+    Spans,
+    TableOrUnavailable,
+    Truth,
+    Unavailable,
+    time_index,
+)
 from px4fuse.log import UnusedData
 from px4fuse.readers import common
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.field_maps import Layout
 from px4fuse.readers.px4_ekf2 import read_ekf2
 from px4fuse.readers.px4_positions import GPS_3D_FIX, barometer, read_positions, read_truth
-from px4fuse.readers.ulog_topics import Topics, dropped_note, longest_increasing_run, read_topics
+from px4fuse.readers.ulog_topics import Topics, dropped_notes, longest_increasing_run, read_topics
 
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
-# Minimum interval (s) between IMU samples that counts as missing data
+# Minimum interval (s) between IMU samples that counts as missing data: normal intervals are 4 ms
 MIN_IMU_GAP_S = 0.2
-# Limits (UNIX time, s) of a receiver's valid UTC: PX4's GPS_EPOCH_SECS (gps_helper.h), and 2100
+# Minimum and maximum valid UTC (UNIX time, s) of a GNSS receiver: GPS_EPOCH_SECS of PX4
+# (gps_helper.h), and the year 2100
 UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
 
 
@@ -46,13 +57,12 @@ def read_ulog(name: str, content: bytes) -> Flight:
     altitude_m = topics.read(px4.LAYOUTS["barometer"])["altitude_m"]
     delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
     in_flight = common.ends_in_flight(airborne, topics.log.duration_s)
-    dropped_counts = [(topic, count) for (topic, _), count in sorted(topics.dropped.items())]
-    notes = (dropped_note(count, topic, "zero or go back") for topic, count in dropped_counts)
+    dropped = [(topic, count) for (topic, _), count in sorted(topics.dropped.items())]
     return Flight(
         log=structs.replace(
             topics.log,
-            notes=(*topics.log.notes, *notes),
-            dropped=dict(dropped_counts),
+            notes=(*topics.log.notes, *dropped_notes(dropped)),
+            dropped=dict(dropped),
             start_unix_s=_start_unix_s(topics),
             damage=_describe_damage(topics, imu, in_flight),
             ends_in_flight=in_flight,
@@ -76,22 +86,18 @@ def read_ulog(name: str, content: bytes) -> Flight:
     )
 
 
-def _describe_damage(
-    topics: Topics, imu: pd.DataFrame | Unavailable, in_flight: bool
-) -> tuple[str, ...]:
-    """Return sentences on missing and damaged parts of the file."""
+def _describe_damage(topics: Topics, imu: TableOrUnavailable, in_flight: bool) -> tuple[str, ...]:
     end_s = topics.log.duration_s
     damage_sentences = []
     if topics.is_cut:
         damage_sentences.append(common.format_truncation("message", end_s, in_flight))
     if topics.is_damaged:
-        missing_text = "all IMU data are missing"
+        missing_s = end_s
         if not isinstance(imu, Unavailable):
             steps_s = np.diff(imu.index.to_numpy())
             missing_s = float(steps_s[steps_s > MIN_IMU_GAP_S].sum())
-            missing_text = f"{missing_s:.1f} s of {end_s:.1f} s of IMU data are missing"
         damage_sentences.append(
-            f"the file is damaged: {missing_text}; invalid messages were skipped"
+            f"the file is damaged: {missing_s:.1f} s of {end_s:.1f} s of IMU data are missing"
         )
     return tuple(damage_sentences)
 
@@ -110,7 +116,7 @@ def _start_unix_s(topics: Topics) -> float | None:
 
 def _require_samples(
     topics: Topics, samples: pd.DataFrame, name: str, layout: Layout, remedy: str
-) -> pd.DataFrame | Unavailable:
+) -> TableOrUnavailable:
     """Return the samples and record their topic; Unavailable with fewer than two samples."""
     topic = layout.topic
     if topics.find(layout) is None:
@@ -128,26 +134,24 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
         imu = imu[offset_us != ACCELEROMETER_OFFSET_INVALID_US]
         time_us = np.rint(imu.index.to_numpy() * 1e6 + offset_us[imu.index].to_numpy())
         kept_rows = longest_increasing_run(time_us.astype(np.int64) + topics.zero_us)
-        imu = imu.iloc[kept_rows].set_axis(pd.Index(time_us[kept_rows] * 1e-6, name="time_s"))
+        imu = imu.iloc[kept_rows].set_axis(time_index(time_us[kept_rows] * 1e-6))
     columns = Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE
     return common.finite_rows(imu, columns, common.MAX_IMU_VALUE)
 
 
-def _read_airborne(topics: Topics) -> tuple[tuple[float, float], ...] | Unavailable:
-    """Read the intervals (s) from take-off to touch-down according to the land detector."""
+def _read_airborne(topics: Topics) -> Spans | Unavailable:
     land_detected = topics.read(px4.LAYOUTS["land_detected"], step=True)
     if land_detected.empty:
         return Unavailable(
             "land detector",
             "vehicle_land_detected is not logged or not usable",
-            "Record with SDLOG_PROFILE bit 0 (default), or give --start and --end.",
+            f"{px4.DEFAULT_PROFILE} Or give --start and --end.",
         )
     topics.record_stream("airborne", px4.LAYOUTS["land_detected"].topic)
     return common.flight_spans(land_detected["landed"], topics.log.duration_s)
 
 
-def _read_tumble_spans(topics: Topics) -> tuple[tuple[float, float], ...]:
-    """Read the intervals (s) with a roll or pitch failure according to PX4's failure detector."""
+def _read_tumble_spans(topics: Topics) -> Spans:
     is_upright = (
         topics.read(px4.LAYOUTS["failure"], step=True)[["roll", "pitch"]].max(axis=1) == 0.0
     )

@@ -9,7 +9,7 @@ import hashlib
 import io
 import struct
 from bisect import bisect_left
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from types import MappingProxyType
@@ -24,6 +24,7 @@ from pyulog.exceptions import ULogException
 from px4fuse.arrays import IntArray
 from px4fuse.ekf2_parameters import REPORTED, replace_invalid_parameters
 from px4fuse.errors import LogError
+from px4fuse.flight import time_index
 from px4fuse.log import Dropout, LogInfo, Stream
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
@@ -33,17 +34,19 @@ _MICROSECOND = 1e-6
 # Maximum delay (s) from measurement to publication: with a longer delay the measurement time is not
 # boot time (GPS topics before v1.16 have receiver time, ground truth in v1.13 has 0)
 MAX_PUBLICATION_LAG_S = 10.0
-# Maximum distance (s) of valid samples from the time span of the data; samples further outside are
-# outdated
+# Maximum distance (s) of valid samples from the time span of the IMU data: samples further outside
+# are outdated
 MAX_OUTSIDE_S = 2.0
+# Last byte of ver_sw_release in a PX4 release
 RELEASE_TYPE = 255
-# ULog info message with a note of the log's author to its users
+# ULog info message with a note from the author of the log to its users
 NOTE_KEY = "px4fuse_note"
-# Maximum gap (s) of the IMU timestamps in one flight; after a longer gap samples are from another
+# Maximum gap (s) of the IMU timestamps in one flight: samples after a longer gap are from another
 # boot
 MAX_DATA_GAP_S = 600.0
 # Maximum number of fields of all subscriptions (300 bytes of memory each); real logs have 3,300
 MAX_FIELDS = 200_000
+# Length of a ULog message header
 HEADER_BYTES = 3
 # Exceptions that pyulog may raise when it parses damaged bytes as messages
 _PARSE_ERRORS = (
@@ -63,6 +66,9 @@ _PARSE_ERRORS = (
 )
 
 
+# Arrays of one topic instance by PX4 field name, and all topics by name and instance
+Table = dict[str, NDArray[Any]]
+Tables = dict[tuple[str, int], Table]
 # (start time in s, primary EKF2 instance from then on)
 Instances = tuple[tuple[float, int], ...]
 # Without the selector topic there is one EKF2 instance
@@ -104,7 +110,7 @@ class _Content(io.BytesIO):
 
 
 def _skip_if_short(parse: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate a parser to raise ValueError instead of struct.error for short messages.
+    """Decorate a message parser to raise ValueError instead of struct.error for short messages.
 
     pyulog skips a message after ValueError, but stops reading the file after struct.error.
     """
@@ -155,7 +161,7 @@ class _Reader(ULog):  # type: ignore[misc]
 
         self.fields += count(self.parse_string(data[3:]))
         if self.fields > MAX_FIELDS:
-            raise ULogException(f"its topics have more than {MAX_FIELDS:,} fields")
+            raise ULogException(f"the topics have more than {MAX_FIELDS:,} fields")
         return ULog._MessageAddLogged(data, header, formats)
 
 
@@ -184,7 +190,7 @@ class Topics:
     """
 
     log: LogInfo
-    tables: dict[tuple[str, int], dict[str, NDArray[Any]]]
+    tables: Tables
     zero_us: int
     dropped: dict[tuple[str, int], int]
     ekf2_parameters: Mapping[str, float]
@@ -196,7 +202,7 @@ class Topics:
         """Return the sorted instance numbers of a topic with data."""
         return sorted(instance for name, instance in self.tables if name == topic)
 
-    def of(self, topic: str) -> list[dict[str, NDArray[Any]]]:
+    def of(self, topic: str) -> list[Table]:
         """Return the tables of a topic's instances, in order."""
         return [self.tables[topic, number] for number in self.instances(topic)]
 
@@ -212,7 +218,7 @@ class Topics:
         return tuple((float(at), int(number)) for at, number in zip(times, changes, strict=True))
 
     def find(self, *layouts: Layout) -> Layout | None:
-        """Return the first layout with all required fields in the log, or None."""
+        """Return the first layout with all required fields in the log; None if none has them."""
         for layout in layouts:
             if any({*layout.columns.values()} <= table.keys() for table in self.of(layout.topic)):
                 return layout
@@ -254,14 +260,14 @@ class Topics:
                     * layout.scale.get(column, 1.0)
                     for column, field_name in columns.items()
                 },
-                index=pd.Index((time_us[kept_rows] - self.zero_us) * _MICROSECOND, name="time_s"),
+                index=time_index((time_us[kept_rows] - self.zero_us) * _MICROSECOND),
             )
         frame = frame.where(np.abs(frame) < MAX_FIELD_VALUE)  # damaged values become NaN
         end_s = self.log.duration_s + MAX_OUTSIDE_S
         return frame if step else frame[(frame.index >= -MAX_OUTSIDE_S) & (frame.index <= end_s)]
 
     def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
-        """Read the first layout that is in the log with :meth:`frame`; empty if none is."""
+        """Read the first layout that is in the log, see :meth:`frame`; empty if none is."""
         layout = self.find(*layouts)
         return _empty_frame(layouts[0]) if layout is None else self.frame(layout, step=step)
 
@@ -297,26 +303,29 @@ class Topics:
         joined_frames = pd.concat(primary_frames).sort_index()
         return joined_frames[~joined_frames.index.duplicated()]
 
-    def record_stream(self, flight_part: str, *topics: str) -> None:
-        """Record the topics and the clock (measurement or publication time) of one kind of data."""
+    def record_stream(self, data_kind: str, *topics: str) -> None:
+        """Record topics and clock (measurement or publication time) of data such as "imu"."""
         # The timestamp of sensor_combined is the gyro's measurement time
-        has_measurement_time = flight_part == "imu" or any(
+        has_measurement_time = data_kind == "imu" or any(
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
             for table in self.of(topics[0])
         )
-        clock = (
-            f"autopilot boot clock, at {'measurement' if has_measurement_time else 'publication'}"
+        self.streams[data_kind] = Stream(
+            topics,
+            f"autopilot boot clock, at {'measurement' if has_measurement_time else 'publication'}",
+            self.log.name,
         )
-        self.streams[flight_part] = Stream(topics, clock, self.log.name)
 
 
 def _empty_frame(layout: Layout) -> pd.DataFrame:
-    """Return an empty frame with the columns of a layout."""
-    times = pd.Index([], dtype=np.float64, name="time_s")
-    return pd.DataFrame(columns=list(layout.columns), index=times, dtype=np.float64)
+    return pd.DataFrame(
+        columns=list(layout.columns),
+        index=time_index(np.zeros(0)),
+        dtype=np.float64,
+    )
 
 
-def measurement_time_us(table: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
+def measurement_time_us(table: Table) -> NDArray[np.int64]:
     """Return the measurement time (µs): ``timestamp_sample`` if it is boot time.
 
     Otherwise the publication time ``timestamp`` is returned, which is up to 0.2 s later in EKF2
@@ -345,10 +354,9 @@ def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
     times = time_us[indices]
     if len(times) < 2 or np.all(np.diff(times) > 0):
         return indices
-    last_times: list[
-        int
-    ] = []  # smallest last timestamp of an increasing subsequence of each length
-    last_indices: list[int] = []  # index of that timestamp
+    # Smallest last timestamp of an increasing subsequence of each length, and its index
+    last_times: list[int] = []
+    last_indices: list[int] = []
     previous_index = np.empty(len(times), dtype=np.intp)
     for index, time in enumerate(times.tolist()):
         length = bisect_left(last_times, time)
@@ -363,16 +371,12 @@ def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
     return indices[np.array(run[::-1], dtype=np.intp)]
 
 
-def dropped_note(count: int, name: str, fault: str) -> str:
-    """Format the note on samples that were dropped because of invalid timestamps.
-
-    >>> dropped_note(1, "ATTITUDE", "zero")
-    '1 sample of ATTITUDE was dropped: its timestamp is zero'
-    """
-    if count == 1:
-        fault = fault.replace("go back", "goes back").replace("are outside", "is outside")
-        return f"1 sample of {name} was dropped: its timestamp is {fault}"
-    return f"{count} samples of {name} were dropped: their timestamps are {fault}"
+def dropped_notes(topic_counts: Iterable[tuple[str, int]]) -> tuple[str, ...]:
+    """Format the notes on samples that were dropped because of invalid timestamps."""
+    return tuple(
+        f"samples of {topic} dropped because of an invalid timestamp: {count}"
+        for topic, count in topic_counts
+    )
 
 
 def read_topics(name: str, content: bytes) -> Topics:
@@ -383,7 +387,8 @@ def read_topics(name: str, content: bytes) -> Topics:
     LogError
         The content is not a ULog, or contains no data with valid timestamps.
     """
-    source, size = _Content(content), len(content)
+    source = _Content(content)
+    size = len(content)
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # pyulog prints its warnings
             ulog = _Reader(source, message_name_filter_list=topics())
@@ -398,12 +403,14 @@ def read_topics(name: str, content: bytes) -> Topics:
     notes: tuple[str, ...] = ()
     if not time_tables:
         raise LogError(
-            f"{name}: this ULog contains no data (no IMU, no position, no EKF2)",
-            "If the file is incomplete, copy it again. Otherwise record with SDLOG_PROFILE 129.",
+            f"{name}: the ULog contains no samples",
+            "Copy the file again, or record with SDLOG_PROFILE 129.",
         )
     if not tables:
         names = sorted({topic for topic, _ in time_tables})
-        notes += (f"px4fuse uses none of the topics in this log ({join_first(names, 5)})",)
+        notes += (
+            f"the log contains only topics that px4fuse does not use ({join_first(names, 5)})",
+        )
     if NOTE_KEY in ulog.msg_info_dict:
         notes += (_printable_text(ulog.msg_info_dict, NOTE_KEY, ""),)
     zero_us, end_us = _data_span(time_tables, name)
@@ -441,9 +448,9 @@ def read_topics(name: str, content: bytes) -> Topics:
     )
 
 
-def _read_tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:
+def _read_tables(ulog: ULog) -> Tables:
     """Return the topic tables; two subscriptions to a topic are merged to their common fields."""
-    tables: dict[tuple[str, int], dict[str, NDArray[Any]]] = {}
+    tables: Tables = {}
     for data in ulog.data_list:
         if "timestamp" not in data.data:
             continue
@@ -462,9 +469,7 @@ def _read_tables(ulog: ULog) -> dict[tuple[str, int], dict[str, NDArray[Any]]]:
     return tables
 
 
-def _data_span(
-    tables: dict[tuple[str, int], dict[str, NDArray[Any]]], name: str
-) -> tuple[int, int]:
+def _data_span(tables: Tables, name: str) -> tuple[int, int]:
     """Return the first and last time (µs) of the IMU, or else of the topic with most samples."""
     for key in sorted(
         tables, key=lambda key: (key[0] != IMU.topic, -len(tables[key]["timestamp"]))
@@ -477,15 +482,13 @@ def _data_span(
             longest_us = max(np.split(increasing_us, breaks), key=len)
             return int(longest_us[0]), int(longest_us[-1])
     raise LogError(
-        f"{name}: all timestamps are zero, so the data have no time",
-        "The logger started before the clock of the autopilot. Record again.",
+        f"{name}: all timestamps are zero",
+        "Record again.",
     )
 
 
 def _printable_text(info: dict[str, Any], key: str, default: str) -> str:
-    """Return a text from the log without control characters, which could disturb a terminal."""
-    text = str(info.get(key, default))
-    return "".join(c for c in text if c.isprintable()) or default
+    return "".join(c for c in str(info.get(key, default)) if c.isprintable()) or default
 
 
 def _firmware(info: dict[str, Any]) -> str:

@@ -176,7 +176,7 @@ def zoom_sentence(result: AxisComparison) -> str:
 
 def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the other axes, one column each; no page if the comparison has one axis only."""
-    others = analysis.others
+    others = analysis.secondary_axes
     if not others:
         return
     page = Page(

@@ -111,7 +111,7 @@ def write_errors(page: Page, analysis: Analysis) -> None:
 
     RMS differences KF - EKF2 and RMSE against ground truth are columns if the log contains them.
     """
-    axes = (analysis.main, *analysis.others)
+    axes = (analysis.main, *analysis.secondary_axes)
     has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
     has_truth = isinstance(analysis.flight.truth, Truth)
 

@@ -50,7 +50,7 @@ def column_heads(analysis: WhatIfAnalysis) -> list[str]:
         f"without {name} from {start_s:g} s" for name, start_s in analysis.without.items()
     ]
     change_text = ", ".join(change_texts)
-    ml_note = " (maximum-likelihood estimate)" if analysis.asked else ""
+    ml_note = " (maximum-likelihood estimate)" if analysis.uses_estimates else ""
     return [
         "logged",
         "replayed",
@@ -71,7 +71,7 @@ def rows(analysis: WhatIfAnalysis) -> list[list[str]]:
     summaries = [
         whatif_result.logged,
         whatif_result.replayed,
-        *whatif_result.whatif[: analysis.first],
+        *whatif_result.whatif[: analysis.sweep_start],
     ]
     return [
         [
@@ -122,7 +122,7 @@ def sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
 
 def sweep_summaries(analysis: WhatIfAnalysis) -> tuple[Summary, ...]:
     """Return the summary of the replay with each value of the sweep."""
-    return analysis.whatif.whatif[analysis.first :]
+    return analysis.whatif.whatif[analysis.sweep_start :]
 
 
 def swept_parameter(analysis: WhatIfAnalysis) -> str:

@@ -1,1 +1,1 @@
-"""Results: the JSON contract, its schema, and how results are written and read."""
+"""Results of the commands: types, JSON Schema, writing and reading."""

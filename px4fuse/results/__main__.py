@@ -1,4 +1,4 @@
-"""``python -m px4fuse.results`` prints the JSON Schema of the results."""
+"""Print the JSON Schema of the results (``python -m px4fuse.results``)."""
 
 import sys
 

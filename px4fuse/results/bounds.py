@@ -1,6 +1,6 @@
-"""Bounds of the numbers in results: a number outside them is left out, with the reason.
+"""Bounds of the numbers in results: a number outside its bounds is replaced by the reason.
 
-The bounds follow from the name of a field, which contains its quantity and unit.
+The bounds depend on the name of a field, which contains quantity and unit.
 """
 
 import math
@@ -16,9 +16,9 @@ from msgspec.structs import fields, replace
 from px4fuse.errors import ResultsError
 from px4fuse.record import Unavailable
 
-# Upper bounds of lengths (m) and of ratios of two quantities in a flight
+# Maximum absolute length (m), and ratio of two quantities, in results of a flight
 MAX_LENGTH_M, MAX_RATIO = 1e9, 1e6
-# Bounds by pattern of the field name; the first match applies
+# Minimum and maximum of a number by pattern of its field name; the first match applies
 BOUNDS = {
     r"(^|_)(nis|nees)($|_)": (0.0, MAX_RATIO),
     r"(enabled|fused|lost|rejected)_fraction($|_)": (0.0, 1.0),
@@ -31,11 +31,11 @@ T = TypeVar("T", bound=msgspec.Struct)
 
 
 class _OutsideError(Exception):
-    """A number is outside its bounds; the text contains its path."""
+    """A number in results is outside its bounds; the text contains the path of the number."""
 
 
 def bounds_of(name: str) -> tuple[float, float]:
-    """Return the bounds of a field from its name.
+    """Return minimum and maximum of a number in results from the name of its field.
 
     >>> bounds_of("nis_mean"), bounds_of("position_rmse_m"), bounds_of("start_s")
     ((0.0, 1000000.0), (-1000000000.0, 1000000000.0), (-inf, inf))
@@ -45,21 +45,21 @@ def bounds_of(name: str) -> tuple[float, float]:
 
 
 def within_bounds(results: T) -> T:
-    """Remove numbers outside their bounds from results; without any, return the same object.
+    """Remove numbers outside their bounds from results; without such numbers, return the argument.
 
-    An optional number is left out. For a required number, its record is replaced by an Unavailable
-    or left out. The reasons are added to ``missing`` or ``notes`` of the results.
+    An optional number is omitted. If a required number is outside its bounds, its record is omitted
+    or replaced by an Unavailable. The reasons are added to ``missing`` or ``notes`` of the results.
 
     Raises
     ------
     ResultsError
-        A required number is outside its bounds, and no record around it can be left out.
+        A required number is outside its bounds, and no record that contains it is optional.
     """
     reasons: list[str] = []
     try:
         checked: T = _check_value(results, None, "", reasons)
     except _OutsideError as error:
-        raise ResultsError(f"no results: {error}", REMEDY) from error
+        raise ResultsError(f"the results are not usable: {error}", REMEDY) from error
     if not reasons:
         return results
     if hasattr(checked, "missing"):
@@ -71,7 +71,7 @@ def within_bounds(results: T) -> T:
 
 
 def types_of(kind: Any) -> tuple[Any, ...]:
-    """Return the types that a field accepts."""
+    """Return the types that the annotation of a field accepts."""
     if get_origin(kind) is Annotated:
         return types_of(get_args(kind)[0])
     if get_origin(kind) in (Union, UnionType):
@@ -80,7 +80,6 @@ def types_of(kind: Any) -> tuple[Any, ...]:
 
 
 def _check_value(value: Any, kind: Any, path: str, reasons: list[str]) -> Any:
-    """Remove numbers outside their bounds from a record; raise an error for a number."""
     if isinstance(value, float):
         low, high = bounds_of(path.rpartition(".")[2])
         if not math.isfinite(value):
@@ -117,13 +116,13 @@ def _check_mapping(value: Mapping[str, Any], kind: Any, path: str, reasons: list
         (get_args(member)[1] for member in types_of(kind) if len(get_args(member)) == 2), Any
     )
     checked: dict[str, Any] = {}
-    for key, old in value.items():
+    for key, item in value.items():
         name = f"{path}.{key}"
         try:
-            checked[key] = _check_value(old, value_type, name, reasons)
+            checked[key] = _check_value(item, value_type, name, reasons)
         except _OutsideError as error:
             try:
-                checked[key] = _make_unavailable(old, value_type, name, error, reasons)
+                checked[key] = _make_unavailable(item, value_type, name, error, reasons)
             except _OutsideError:
                 reasons.append(str(error))
     if not checked and any(getattr(meta, "min_length", 0) for meta in get_args(kind)[1:]):
@@ -133,16 +132,13 @@ def _check_mapping(value: Mapping[str, Any], kind: Any, path: str, reasons: list
 
 
 def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple[Any, ...]:
-    """Remove records with numbers outside their bounds from a tuple.
-
-    For a tuple of numbers (a vector) the error is raised, so that the whole vector is left out.
-    """
+    # an error in a tuple of numbers (a vector) is raised, so that the whole vector is omitted
     checked = []
-    for old in value:
+    for item in value:
         try:
-            checked.append(_check_value(old, Any, path, reasons))
+            checked.append(_check_value(item, Any, path, reasons))
         except _OutsideError as error:
-            if not isinstance(old, msgspec.Struct):
+            if not isinstance(item, msgspec.Struct):
                 raise
             reasons.append(str(error))
     is_unchanged = len(checked) == len(value) and all(map(is_, value, checked))
@@ -150,16 +146,15 @@ def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple
 
 
 def _make_unavailable(
-    old: Any, kind: Any, path: str, error: _OutsideError, reasons: list[str]
+    item: Any, kind: Any, path: str, error: _OutsideError, reasons: list[str]
 ) -> Unavailable:
-    """Return the Unavailable that replaces a record; raise the error if the type has none."""
     for member in types_of(kind):
         if isinstance(member, type) and issubclass(member, Unavailable):
             texts = {"what": path, "reason": str(error), "remedy": REMEDY}
             other_fields = {
-                field.name: _check_value(getattr(old, field.name), field.type, path, reasons)
+                field.name: _check_value(getattr(item, field.name), field.type, path, reasons)
                 for field in fields(member)
-                if field.name not in texts and hasattr(old, field.name)
+                if field.name not in texts and hasattr(item, field.name)
             }
             return member(**texts, **other_fields)
     raise error

@@ -1,4 +1,4 @@
-"""Conversion of an analysis to the results of the JSON contract."""
+"""Conversion of analyses to the results that px4fuse writes as JSON."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -29,7 +29,7 @@ from px4fuse.results.model import NO_STUDENT, Student, provenance, schema_of
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import SolvedGraph
 
-# Fields of an analysis that are written without change
+# Fields of an Analysis that the results contain without change
 _COPIED_FIELDS = (
     "axes",
     "horizontal",
@@ -50,7 +50,7 @@ _COPIED_FIELDS = (
 def results(
     request: ComparisonRequest, analysis: Analysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults:
-    """Return all results of a comparison, as the report shows them."""
+    """Return the results of ``px4fuse compare`` on a flight with positions for KF."""
     findings = find(analysis)
     return within_bounds(
         contract.ComparisonResults(
@@ -69,7 +69,7 @@ def results(
 def outcome_results(
     request: ComparisonRequest, outcome: Analysis | AidsOnlyAnalysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults | contract.AidsResults:
-    """Return the results of ``px4fuse compare``; only EKF2's aids without position source."""
+    """Return the results of ``px4fuse compare``, also for a flight without positions for KF."""
     if isinstance(outcome, Analysis):
         return results(request, outcome, student)
     findings = find_aids(outcome.aids)
@@ -92,7 +92,6 @@ def tuning_results(
     comparison: Comparison,
     tuned: Mapping[str, AxisTuning | Unavailable],
 ) -> contract.TuningResults:
-    """Return the results of ``px4fuse tune``."""
     common = _flight_fields("px4fuse-tuning", request, comparison, "tune")
     return within_bounds(contract.TuningResults(**common, tuning=to_serializable(tuned)))
 
@@ -100,7 +99,6 @@ def tuning_results(
 def sync_results(
     request: ComparisonRequest, comparison: Comparison, clock: ClockOffset | Unavailable
 ) -> contract.SyncResults:
-    """Return the results of ``px4fuse sync``."""
     common = _flight_fields("px4fuse-sync", request, comparison, "sync")
     return within_bounds(contract.SyncResults(**common, clock=to_serializable(clock)))
 
@@ -108,14 +106,13 @@ def sync_results(
 def whatif_results(
     request: WhatIfRequest, counterfactual: WhatIfAnalysis
 ) -> contract.WhatIfResults:
-    """Return the results of ``px4fuse whatif``."""
-    whatif_result, sweep_start = counterfactual.whatif, counterfactual.first
+    whatif_result, sweep_start = counterfactual.whatif, counterfactual.sweep_start
     return within_bounds(
         contract.WhatIfResults(
             **_common_fields(contract.WHATIF, request, counterfactual.flight),
             agreement=whatif_result.agreement,
             evaluated_s=whatif_result.evaluated_s,
-            asked=counterfactual.asked,
+            asked=counterfactual.uses_estimates,
             logged=whatif_result.logged,
             replayed=whatif_result.replayed,
             whatif=whatif_result.whatif[0] if sweep_start else None,
@@ -128,7 +125,6 @@ def whatif_results(
 def loop_results(
     request: LoopRequest, loop: Loop, student: Student = NO_STUDENT
 ) -> contract.LoopResults:
-    """Return the results of ``px4fuse loop``."""
     return within_bounds(
         contract.LoopResults(
             schema=schema_of(contract.LOOP),
@@ -144,7 +140,6 @@ def loop_results(
 
 
 def evaluation_results(request: EvaluationRequest, score: Evaluation) -> contract.EvaluationResults:
-    """Return the results of ``px4fuse evaluate``."""
     return within_bounds(
         contract.EvaluationResults(
             schema=schema_of("px4fuse-evaluation"),
@@ -157,7 +152,7 @@ def evaluation_results(request: EvaluationRequest, score: Evaluation) -> contrac
 
 
 def graph_results(solved: SolvedGraph, command: str) -> contract.GraphResults:
-    """Return the results of ``px4fuse loop`` for a pose graph, with the file's vertex numbers."""
+    """Return the results of ``px4fuse loop`` for a pose graph file."""
     return within_bounds(
         contract.GraphResults(
             schema_of("px4fuse-graph"), to_serializable(solved), provenance(command)
@@ -166,7 +161,7 @@ def graph_results(solved: SolvedGraph, command: str) -> contract.GraphResults:
 
 
 def log_record(flight: Flight) -> Log:
-    """Describe a flight's log, with joined files and clocks."""
+    """Return the description of a flight's log, with other input files and clocks."""
     return Log(**msgspec.structs.asdict(flight.log), joined=flight.inputs, clocks=flight.clocks)
 
 
@@ -176,7 +171,6 @@ def _common_fields(
     flight: Flight,
     command: str | None = None,
 ) -> dict[str, Any]:
-    """Return the fields that all results of a flight have: schema, request, log, provenance."""
     return {
         "schema": schema_of(name),
         "request": request.without_paths(),
@@ -188,7 +182,6 @@ def _common_fields(
 def _flight_fields(
     name: str, request: ComparisonRequest, comparison: Comparison, command: str | None = None
 ) -> dict[str, Any]:
-    """Return the fields that all results of a comparison have, with source and settings."""
     track, segment, settings = comparison.source, comparison.segment, comparison.settings
     origin, parameters = track.origin, comparison.flight.log.parameters
     file_offset_s = 0.0 if track.alignment is None else track.alignment.clock_offset_s
@@ -198,14 +191,8 @@ def _flight_fields(
         reason=comparison.source_reason,
         rate_hz=track.rate_hz,
         available=tuple(
-            AvailableTrack(
-                track.name,
-                track.origin.kind,
-                track.origin.path,
-                len(track.samples),
-                track.rate_hz,
-            )
-            for track in comparison.flight.positions
+            AvailableTrack(a.name, a.origin.kind, a.origin.path, len(a.samples), a.rate_hz)
+            for a in comparison.flight.positions
         ),
         missing=tuple(part for part in comparison.missing if part.source),
     )

@@ -1,7 +1,7 @@
-"""Contract of the results: one JSON object per command, its schema, and how it is written.
+"""Types of the results: one JSON object per command, with JSON Schema and writing.
 
-px4fuse reads all results with its own major version of the schema; fields of a newer minor version
-are ignored.
+px4fuse reads results whose schema has the same major version; fields of a newer minor version are
+ignored.
 """
 
 import json
@@ -42,20 +42,18 @@ LOOP = "px4fuse-loop"
 WHATIF = "px4fuse-whatif"
 AIDS = "px4fuse-aids"
 CHANGES = "px4fuse-changes"
-# Significant digits of written numbers
+# Maximum number of significant digits of a number in the results
 SIGNIFICANT_DIGITS = 10
 
 
 class Log(LogInfo, frozen=True, kw_only=True):
-    """Log, the files that were joined with it, and the clocks that were mapped."""
+    """Log of a flight, with its other input files and the clocks mapped to the boot clock."""
 
     joined: tuple[InputFile, ...]
     clocks: tuple[ClockMap, ...]
 
 
 class AvailableTrack(Record, frozen=True):
-    """Position track of the flight."""
-
     name: str
     kind: PositionKind
     path: DataPath
@@ -66,9 +64,9 @@ class AvailableTrack(Record, frozen=True):
 class PositionSource(Record, frozen=True, kw_only=True):
     """Position source with which KF and EKF2 are compared.
 
-    ``kind`` is the type of sensor, ``path`` the path of the data into the log.
+    ``kind`` is the type of sensor, and ``path`` states how the positions reached the log.
     ``ekf2_parameters`` are the logged EKF2 parameters of the source, by PX4 name and in PX4's
-    units. ``log`` is the file with the data.
+    units. ``log`` is the name of the file that contains the positions.
     """
 
     name: str
@@ -89,7 +87,7 @@ class PositionSource(Record, frozen=True, kw_only=True):
 
 
 class ChosenSettings(Record, frozen=True, kw_only=True):
-    """Settings of KF; ``clock_offset_s`` was added to the timestamps of the source."""
+    """Settings of KF and time span; ``clock_offset_s`` was added to the source's timestamps."""
 
     sigma_a_m_s2: Positive
     sigma_z_m: Positive
@@ -101,7 +99,7 @@ class ChosenSettings(Record, frozen=True, kw_only=True):
     clock_offset_s: float
 
 
-# Field of NoiseEstimate with the maximum-likelihood estimate of each KF setting
+# Field of NoiseEstimate that contains the maximum-likelihood estimate, by KF setting
 TUNED_FIELDS = {"sigma_a_m_s2": "sigma_a_two_state_m_s2", "sigma_z_m": "sigma_z_m"}
 
 
@@ -111,7 +109,7 @@ Interval = tuple[float, float | None]
 
 
 class DiffInput(Record, frozen=True, kw_only=True):
-    """One of the two inputs of ``px4fuse diff``: the given file, and the log it belongs to."""
+    """Input A or B of ``px4fuse diff``: file that the user named, and log that it refers to."""
 
     given: str
     kind: Literal["log", "report", "results"]
@@ -128,9 +126,9 @@ class NumberChange(Record, frozen=True, kw_only=True):
     path : str
         Path in the results: ``axes.aisle.filters.ekf2.nis_mean``.
     label, unit : str
-        Name for the user, and unit; "share" is a fraction of 0 to 1.
+        Name for the user, and unit ("share" for a fraction from 0 to 1).
     a, b : float
-        Values; one is absent if only the other input has the number.
+        Value in A and in B; absent if the results of that input do not contain the number.
     a_interval, b_interval : (float, float or None)
         95 % intervals; absent if the results contain none.
     """
@@ -145,7 +143,7 @@ class NumberChange(Record, frozen=True, kw_only=True):
 
 
 class SettingChange(Record, frozen=True):
-    """Setting, PX4 parameter or property of the flight that differs; absent values are unknown."""
+    """Setting, PX4 parameter or property of a flight that differs between the inputs A and B."""
 
     name: str
     a: float | str | None = None
@@ -153,7 +151,7 @@ class SettingChange(Record, frozen=True):
 
 
 class FindingChange(Record, frozen=True):
-    """Finding that only one of the inputs A and B has."""
+    """Finding that the results of only one of the inputs A and B contain."""
 
     id: str
     severity: Literal["error", "warning", "note"]
@@ -162,7 +160,7 @@ class FindingChange(Record, frozen=True):
 
 
 class _FlightResults(Record, frozen=True):
-    """Base class of the results of a comparison."""
+    """Base class of the results for one flight with positions for KF."""
 
     schema: Schema
     request: ComparisonRequest
@@ -191,20 +189,20 @@ class ComparisonResults(_FlightResults, frozen=True):
     ekf2_replay : Replayed
         Replay of EKF2 from the log, and its agreement with the logged EKF2.
     difference_steps : mapping of axis name to DifferenceSteps
-        Differences between EKF2 and KF, by filter step.
+        Differences KF - EKF2 after each replacement of one EKF2 property by that of KF.
     trials : tuple of Trial
-        Re-runs along the main axis, with all statistics before and after.
+        Re-runs along the main axis, with all statistics before and after the change.
     causes : tuple of Intervention
-        Re-runs with one change each, and how much of an inconsistency each change explains.
+        Re-runs with one change each, and the fraction of an inconsistency that it explains.
     aids : mapping of PX4's name to AidResult
-        Sensors that EKF2 fused, each with statistics of its innovations; empty without innovations.
+        Aiding sources of EKF2 with statistics of their innovations; empty without innovations.
     loop : LoopResult
     card : Card
-        Diagnosis at a glance: what cover, terminal, web page and batch table show.
+        Diagnosis that cover, terminal, web page and batch table show.
     findings : tuple of Finding
         Most severe first; of the same severity, missing data before noises.
     notes : tuple of str
-        Choices of the analysis.
+        Sentences on choices of the analysis.
     missing : tuple of Unavailable
         Missing data, with reasons and actions.
     student : Student
@@ -235,7 +233,7 @@ class ComparisonResults(_FlightResults, frozen=True):
 
 
 class AidsResults(Record, frozen=True):
-    """Results of ``px4fuse compare`` on a flight without position source: EKF2's aids only."""
+    """Results of ``px4fuse compare`` without positions for KF: EKF2's aiding sources only."""
 
     schema: Schema
     request: ComparisonRequest
@@ -249,7 +247,7 @@ class AidsResults(Record, frozen=True):
 
 
 class TuningResults(_FlightResults, frozen=True):
-    """Results of ``px4fuse tune``: maximum-likelihood noises by axis."""
+    """Results of ``px4fuse tune``: maximum-likelihood estimates of the noises, by axis."""
 
     tuning: dict[str, OrUnavailable[NoiseEstimate]]
     provenance: Provenance
@@ -263,7 +261,7 @@ class SyncResults(_FlightResults, frozen=True):
 
 
 class LoopResults(Record, frozen=True):
-    """Results of ``px4fuse loop`` on a flight or a trajectory, attached to its report."""
+    """Results of ``px4fuse loop`` on a flight or a trajectory."""
 
     schema: Schema
     request: LoopRequest
@@ -276,7 +274,7 @@ class LoopResults(Record, frozen=True):
 
 
 class GraphResults(Record, frozen=True):
-    """Results of ``px4fuse loop`` on a pose graph."""
+    """Results of ``px4fuse loop`` on a pose graph file."""
 
     schema: Schema
     graph: Graph
@@ -295,8 +293,9 @@ class EvaluationResults(Score, frozen=True, kw_only=True):
 class WhatIfResults(Record, frozen=True, kw_only=True):
     """Results of ``px4fuse whatif``: EKF2 as logged, as replayed, and with other parameters.
 
-    All statistics are over the spans ``evaluated_s``. ``asked`` is True if the changes of
-    ``whatif`` are the maximum-likelihood estimates; ``sweep`` contains one summary per value.
+    All statistics are over the time spans ``evaluated_s``. ``asked`` is True if the parameters in
+    ``whatif`` are the maximum-likelihood estimates. ``sweep`` contains one summary per value of the
+    swept parameter.
     """
 
     schema: Schema
@@ -324,7 +323,7 @@ class ChangeResults(Record, frozen=True, kw_only=True):
     numbers : tuple of NumberChange
     findings : tuple of FindingChange
     worse : tuple of str
-        Verdicts that are worse in B, one sentence each; if there are any, the exit code is 1.
+        One sentence for each verdict that is worse in B; the exit code is 1 if there is one.
     provenance : Provenance
     """
 
@@ -349,7 +348,7 @@ Results = (
     | WhatIfResults
     | ChangeResults
 )
-# Types of results by the name in their schema
+# Type of the results by the name of their schema
 KINDS: dict[str, type[Results]] = {
     COMPARISON: ComparisonResults,
     LOOP: LoopResults,
@@ -364,7 +363,7 @@ KINDS: dict[str, type[Results]] = {
 
 
 def schema() -> dict[str, Any]:
-    """Return the JSON Schema (draft 2020-12) of all results."""
+    """Return the JSON Schema (draft 2020-12) of the results of all commands."""
     kinds: dict[type, None] = dict.fromkeys(KINDS.values())
     components: dict[str, Any] = {}
 
@@ -373,7 +372,7 @@ def schema() -> dict[str, Any]:
         return {"anyOf": [{"$ref": f"#/$defs/{member.__name__}"} for member in kind.union_members]}
 
     count = 0
-    # each pass adds the types inside RecordOrUnavailable, which msgspec does not resolve
+    # each iteration adds the types inside RecordOrUnavailable, which msgspec does not resolve
     while count < len(kinds):
         count = len(kinds)
         _, components = msgspec.json.schema_components(
@@ -397,16 +396,16 @@ def schema() -> dict[str, Any]:
 
 
 def to_plain(results: msgspec.Struct) -> dict[str, Any]:
-    """Convert results to dicts, lists and numbers, by their JSON names."""
+    """Convert results to dicts, lists and numbers, with the field names of the JSON file."""
     plain_results: dict[str, Any] = msgspec.to_builtins(results, enc_hook=_plain)
     return plain_results
 
 
 def round_number(value: float) -> float:
-    """Round to ten significant digits, or to six decimals if that is more precise.
+    """Round a number to ten significant digits, or to six decimals if that is more precise.
 
-    UNIX times need the six decimals. Further digits depend on the processor, as linear algebra
-    libraries add in different orders.
+    UNIX times (s) need the six decimals. More digits depend on the processor, because linear
+    algebra libraries add in different orders.
 
     >>> round_number(0.1 + 0.2), round_number(1795251250.2020123)
     (0.3, 1795251250.202012)
@@ -415,22 +414,14 @@ def round_number(value: float) -> float:
 
 
 def _round_numbers(value: Any) -> Any:
-    """Round all floats by :func:`round_number`."""
     if isinstance(value, dict):
-        return {name: _round_numbers(part) for name, part in value.items()}
+        return {key: _round_numbers(child) for key, child in value.items()}
     if isinstance(value, list | tuple):
-        return [_round_numbers(part) for part in value]
+        return list(map(_round_numbers, value))
     return round_number(value) if isinstance(value, float) else value
 
 
 def _plain(value: Any) -> float | dict[str, Any]:
-    """Convert a numpy number to a float, and a mapping to a dict.
-
-    Raises
-    ------
-    NotImplementedError
-        The value is neither.
-    """
     if isinstance(value, Mapping):
         return dict(value)
     if isinstance(value, float):
@@ -444,7 +435,7 @@ def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
     Raises
     ------
     ValueError
-        A number is not finite.
+        The results contain a number that is not finite.
     """
     plain_results = to_plain(results) if isinstance(results, msgspec.Struct) else results
     plain = _round_numbers(plain_results)
@@ -452,5 +443,5 @@ def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
 
 
 def file_hashes_in(text: str) -> list[str]:
-    """Return the SHA-256 of all input files named in results (JSON text), in order."""
+    """Return the SHA-256 of all input files that results (JSON text) contain, in order."""
     return re.findall(r'"([0-9a-f]{64})"', text)

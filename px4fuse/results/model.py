@@ -1,4 +1,4 @@
-"""Common parts of all results: schema name, student and provenance."""
+"""Records that results of several commands contain: schema, student and provenance."""
 
 import platform
 from importlib import metadata
@@ -10,9 +10,9 @@ from msgspec import Meta
 from px4fuse.answer_form import Answers
 from px4fuse.record import Record
 
-# Readers compare the major version; a new field increases the minor version
+# Version of the results schema: a new field increases the minor version, another change the major
 VERSION = "4.0"
-# Libraries that affect the numbers
+# Libraries that affect the numbers in the results
 LIBRARIES = ("numpy", "scipy", "pandas", "pyulog", "pymavlink", "filterpy", "matplotlib", "pypdf")
 MAX_NOTES_BYTES = 200_000
 MAX_PERSON_LENGTH = 10_000
@@ -21,23 +21,14 @@ Version = Annotated[str, Meta(pattern="^[0-9A-Za-z.+!_-]{1,60}$")]
 
 
 class Schema(Record, frozen=True):
-    """Name of the results, and version of their schema."""
+    """Name and version of the schema of results."""
 
     name: str
     version: Annotated[str, Meta(pattern=r"^4\.[0-9]{1,4}$")]
 
 
 class Student(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Student of a report; every field may be empty.
-
-    Attributes
-    ----------
-    name, id : str
-    notes : str
-        Text of the student, Markdown.
-    answers : Answers or UNSET
-        Completed answer form.
-    """
+    """Student who made a report, with notes (Markdown) and the completed answer form."""
 
     name: Annotated[str, Meta(max_length=MAX_PERSON_LENGTH)] = ""
     id: Annotated[str, Meta(max_length=MAX_PERSON_LENGTH)] = ""
@@ -49,15 +40,15 @@ NO_STUDENT = Student()
 
 
 class Provenance(Record, frozen=True):
-    """Versions and command line; no other data of the computer are recorded.
+    """Versions and command line with which results were made.
 
     Attributes
     ----------
     px4fuse, python : str
     libraries : mapping of str to str
-        Versions of the libraries that affect the numbers.
+        Versions of the libraries that affect the numbers in the results.
     command : str
-        Command line for the reader; the request contains files and settings.
+        Command line for people; programs use the request, which has the same files and settings.
     """
 
     px4fuse: Version
@@ -67,12 +58,10 @@ class Provenance(Record, frozen=True):
 
 
 def schema_of(name: str) -> Schema:
-    """Return name and version of a schema."""
     return Schema(name, VERSION)
 
 
 def provenance(command: str) -> Provenance:
-    """Return the versions of this installation, with the command line."""
     return Provenance(
         px4fuse=metadata.version("px4fuse"),
         python=platform.python_version(),

@@ -1,4 +1,4 @@
-"""Strict reading of results, which may come from an untrusted source."""
+"""Strict reading of results (JSON), which may come from an untrusted source."""
 
 import json
 import re
@@ -15,24 +15,17 @@ from px4fuse.results.bounds import types_of
 from px4fuse.results.contract import KINDS, Results
 from px4fuse.results.model import VERSION
 
-MAX_BYTES = 5_000_000
-INTEGER_BITS = 64
+# Maximum size of results (bytes), and of an integer in them (bits)
+MAX_BYTES, INTEGER_BITS = 5_000_000, 64
 
 
 def read_results(data: bytes, name: str = "results.json") -> Results:
-    """Read results of px4fuse from untrusted bytes.
-
-    Parameters
-    ----------
-    data : bytes
-        Content of the file.
-    name : str
-        File name for error messages.
+    """Read results of px4fuse from untrusted bytes; ``name`` is the file name for messages.
 
     Returns
     -------
     Results
-        Of the type that its schema names. Texts are cleaned by :func:`clean_text`.
+        Results whose texts are cleaned by :func:`clean_text`.
 
     Raises
     ------
@@ -56,11 +49,11 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     if not re.fullmatch(rf"{major}\.[0-9]{{1,4}}", version):
         provenance = value.get("provenance")
         writer = provenance.get("px4fuse") if isinstance(provenance, dict) else None
-        wrote = f"px4fuse {one_line(str(writer), 60)}" if writer else "the px4fuse that wrote it"
+        reader = f"px4fuse {one_line(str(writer), 60)}" if writer else "the px4fuse that reader it"
         raise ResultsError(
             f"{name} uses schema version {one_line(version, 20)}; this px4fuse reads version "
             f"{major}.",
-            f"Create the report again, or read it with {wrote}.",
+            f"Create the report again, or read it with {reader}.",
         )
     if int(version.partition(".")[2]) > int(minor):
         value = _known_fields(value, kind)
@@ -74,44 +67,46 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
 
 
 def _known_fields(value: Any, kind: Any) -> Any:
-    """Drop the fields of plain data that a newer minor version of the schema has added."""
-    kinds = types_of(kind)
+    """Remove fields that a newer minor version of the schema has added from decoded JSON."""
+    types = types_of(kind)
     if isinstance(value, dict):
-        records = [one for one in kinds if hasattr(one, "__struct_fields__")]
-        known = {field.encode_name: field.type for one in records for field in fields(one)}
-        if records:
-            return {key: _known_fields(value[key], known[key]) for key in value if key in known}
-        value_type = next((get_args(one)[1] for one in kinds if len(get_args(one)) == 2), Any)
-        return {key: _known_fields(part, value_type) for key, part in value.items()}
+        records = [record for record in types if hasattr(record, "__struct_fields__")]
+        field_types = {field.encode_name: field.type for r in records for field in fields(r)}
+        value_type = next((args[1] for args in map(get_args, types) if len(args) == 2), Any)
+        return {
+            key: _known_fields(child, field_types.get(key, value_type))
+            for key, child in value.items()
+            if key in field_types or not records
+        }
     if isinstance(value, list):
-        item_type = next((get_args(one)[0] for one in kinds if get_args(one)), Any)
-        return [_known_fields(part, item_type) for part in value]
+        item_type = next((args[0] for args in map(get_args, types) if args), Any)
+        return [_known_fields(item, item_type) for item in value]
     return value
 
 
 def _require_unique_keys(pairs: list[tuple[str, Any]]) -> None:
-    """Raise an error for repeated keys: programs differ in the value that they read."""
+    # for a repeated key, other programs may read another value
     if len(dict(pairs)) < len(pairs):
         raise ValueError("a key is repeated")
 
 
 def _clean_values(value: Any) -> Any:
-    """Clean all texts in plain data by :func:`clean_text`; reject integers above 64 bits."""
+    """Clean all texts in decoded JSON by :func:`clean_text`; reject integers above 64 bits."""
     if isinstance(value, str):
         return clean_text(value)
     if isinstance(value, dict):
-        return {clean_text(name): _clean_values(part) for name, part in value.items()}
+        return {clean_text(key): _clean_values(child) for key, child in value.items()}
     if isinstance(value, int) and value.bit_length() > INTEGER_BITS:
         raise ValueError("an integer is too large")
-    return [_clean_values(part) for part in value] if isinstance(value, list) else value
+    return list(map(_clean_values, value)) if isinstance(value, list) else value
 
 
 def clean_text(text: str) -> str:
-    r"""Remove characters that change a terminal, a page or the direction of text.
+    r"""Remove characters that control a terminal, a page layout or the text direction.
 
-    Control characters other than newline and tab, bidirectional embeddings, overrides and
-    isolates, line and paragraph separators, tag characters, noncharacters and lone surrogates are
-    removed. Letters and symbols of all languages remain.
+    These are control characters other than newline and tab, bidirectional embeddings, overrides
+    and isolates, line and paragraph separators, tag characters, noncharacters and lone surrogates.
+    Letters and symbols of all languages remain.
 
     >>> clean_text("Zo\u00eb\x1b[2J \u202egnp.exe\ud800")
     'Zoë[2J gnp.exe'
@@ -120,12 +115,12 @@ def clean_text(text: str) -> str:
 
 
 def one_line(text: str, length: int) -> str:
-    r"""Clean a text and shorten it to one line of at most ``length`` characters.
+    r"""Clean a text (see :func:`clean_text`) and shorten it to one line of ``length`` characters.
 
     >>> one_line("a\nb\t c", 4)
     'a b…'
     """
-    # cut first, so that a text of millions of characters is processed fast
+    # the text is cut first, because cleaning millions of characters would be slow
     line = " ".join(clean_text(text[: 10 * length]).split())
     return line if len(line) <= length else line[: length - 1].rstrip() + "…"
 

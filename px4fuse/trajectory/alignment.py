@@ -1,4 +1,4 @@
-"""Alignment of an estimate with a reference by a transform that does not count as error.
+"""Alignment of an estimated trajectory with a reference: transform that does not count as error.
 
 Estimators that use gravity are aligned in yaw and position (4 degrees of freedom), so tilt counts
 as error (Zhang & Scaramuzza 2018). SLAM with the frame of its first key frame is aligned in
@@ -17,11 +17,12 @@ from px4fuse.trajectory.model import MIN_POSES
 
 AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 
-# Minimum motion that determines a rotation: extent as fraction of the largest extent, and RMS (m)
+# Minimum extent of a motion that determines a rotation: as fraction of the largest extent, and RMS
+# (m)
 MIN_EXTENT_FRACTION, MIN_EXTENT_M = 1e-6, 1e-6
-# Maximum ratios of residual to extent for a determined rotation: in the plane, and around a line.
-# The standard deviation of the rotation is residual / (extent · √n). Pure noise has a ratio of √2
-# in the plane and √6 around a line
+# Maximum ratios of the residual to the extent of the motion that determine a rotation: in the
+# plane, and around a line. The standard deviation of the rotation is residual / (extent · √n). Pure
+# noise has a ratio of √2 in the plane and √6 around a line
 MAX_PLANE_RATIO, MAX_LINE_RATIO = 1.0, 2.0
 
 
@@ -47,7 +48,7 @@ class Transform(Record, frozen=True):
 
     @property
     def rotation(self) -> Rotation:
-        """Rotation R."""
+        """Rotation R from the frame of the estimate to the frame of the reference."""
         return Rotation.from_quat(self.quaternion_wxyz, scalar_first=True)
 
     def apply(self, position_m: Array) -> Array:
@@ -82,9 +83,8 @@ def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) ->
     """
     if len(estimate_m) < MIN_POSES:
         raise TrajectoryError(
-            f"Only {len(estimate_m)} poses match in time; an alignment needs {MIN_POSES}.",
-            "Check that both trajectories are of the same flight and use the same clock "
-            "(--time-offset auto).",
+            f"{len(estimate_m)} poses match in time; an alignment needs at least {MIN_POSES}",
+            "Check that both are of the same flight, or give `time_offset_s` auto.",
         )
     if kind == "none":
         return Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0)
@@ -94,7 +94,8 @@ def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) ->
         transform = _align_means(Rotation.from_euler("z", heading), estimate_m, reference_m, 1.0, 4)
         _require_determined(transform, estimate_m, reference_m, kind)
         return transform
-    # the test fits a scale, too, because a scale factor error does not make the rotation uncertain
+    # The motion is tested with a fitted scale, because a scale factor error does not make the
+    # rotation uncertain
     similarity = umeyama(estimate_m, reference_m, with_scale=True)
     _require_determined(similarity, estimate_m, reference_m, kind)
     return similarity if kind == "sim3" else umeyama(estimate_m, reference_m, with_scale=False)
@@ -111,7 +112,8 @@ def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Trans
     with_scale : bool
         True for Sim(3); the scale is 1 if the estimate does not move.
     """
-    x, y = estimate_m - estimate_m.mean(axis=0), reference_m - reference_m.mean(axis=0)
+    x = estimate_m - estimate_m.mean(axis=0)
+    y = reference_m - reference_m.mean(axis=0)
     u, d, vt = np.linalg.svd(y.T @ x / len(x))  # eq. 38
     s = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])  # eq. 43
     variance = float((x * x).sum() / len(x))  # eq. 36
@@ -137,7 +139,7 @@ def _principal_extents(position_m: Array) -> Array:
 
 
 def rms_m(difference_m: Array) -> float:
-    """Return the RMS length of vectors, shape (n, d)."""
+    """Return the RMS length (m) of vectors, shape (n, d)."""
     return float(np.sqrt((difference_m * difference_m).sum(axis=1).mean()))
 
 
@@ -149,27 +151,26 @@ def _require_determined(
     Horizontal motion determines yaw. A full rotation also needs an extent across a line (the second
     singular value).
     """
-    estimate_extents, reference_extents = (
-        _principal_extents(estimate_m),
-        _principal_extents(reference_m),
-    )
+    estimate_extents = _principal_extents(estimate_m)
+    reference_extents = _principal_extents(reference_m)
     if kind == "yaw":
         extent_m = min(
             float(np.hypot(*_principal_extents(m[:, :2]))) for m in (estimate_m, reference_m)
         )
         residual_m = rms_m((reference_m - transform.apply(estimate_m))[:, :2])
-        length, limit = float(np.linalg.norm(reference_extents)), MAX_PLANE_RATIO
-        motion_text, alternative = "horizontal motion (RMS) is", "`alignment` none"
+        length = float(np.linalg.norm(reference_extents))
+        limit = MAX_PLANE_RATIO
+        motion_text = "horizontal motion (RMS) is"
+        alternative = "`alignment` none"
     else:
         length, extent_m, _ = np.minimum(transform.scale * estimate_extents, reference_extents)
         residual_m = rms_m(reference_m - transform.apply(estimate_m))
         limit = MAX_LINE_RATIO
         motion_text = f"motion is along a line: {length:.2g} m (RMS), across it"
-        alternative = "`alignment` yaw if z is vertical in both, or `alignment` none"
+        alternative = "`alignment` yaw or none"
     if extent_m < max(MIN_EXTENT_M, MIN_EXTENT_FRACTION * length) or residual_m > limit * extent_m:
         raise TrajectoryError(
-            f"Alignment {kind} cannot be estimated: the {motion_text} {extent_m:.2g} m, and the "
-            f"residual is {residual_m:.2g} m. The vehicle moved too little, or the estimate does "
-            "not follow its motion.",
+            f"the alignment {kind} cannot be estimated: the {motion_text} {extent_m:.2g} m, and "
+            f"the residual is {residual_m:.2g} m",
             f"Use {alternative}.",
         )

@@ -6,21 +6,22 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Slerp
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.arrays import Array, BoolArray, IntArray, median_interval
 from px4fuse.errors import TrajectoryError
 from px4fuse.record import Count, NotNegative, Record
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
 Method = Literal["interpolate", "nearest"]
 
-# Default of the longest interval that is interpolated: number of median intervals, at least the
-# second value (s)
+# Default of the longest interval of the reference that is interpolated: number of median intervals,
+# but at least MIN_GAP_LIMIT_S (s)
 MAX_GAP_INTERVALS, MIN_GAP_LIMIT_S = 3.0, 0.1
-MAX_NEAREST_DIFFERENCE_S = 0.01  # maximum time difference of a pair; default of the evo package
+# Maximum time difference (s) of two poses that are paired: default of the evo package
+MAX_NEAREST_DIFFERENCE_S = 0.01
 
 
 class Association(Record, frozen=True):
-    """Association of poses by time, with the numbers of unused poses.
+    """Association of the poses of two trajectories by time, with the numbers of unused poses.
 
     Attributes
     ----------
@@ -85,29 +86,26 @@ def associate(
         )
         matched_reference = reference[reference_indices]
     else:
-        limit_s, end_tolerance_s = (
-            gap_limit(reference.time_s) if max_gap_s is None else max_gap_s,
-            0.0,
-        )
+        limit_s = gap_limit(reference.time_s) if max_gap_s is None else max_gap_s
+        end_tolerance_s = 0.0
         pose_indices = np.flatnonzero(is_bracketed(time_s, reference.time_s, limit_s))
         matched_reference = _interpolate_poses(reference, time_s[pose_indices])
     if len(pose_indices) < MIN_POSES:
-        count_text = f"only {len(pose_indices)}" if len(pose_indices) else "no"
         offset_text = f" (with the time offset {time_offset_s:.12g} s)" if time_offset_s else ""
         raise TrajectoryError(
-            f"{estimate.name}: {count_text} poses match in time. The estimate is from "
+            f"{estimate.name}: {len(pose_indices)} poses match in time. The estimate is from "
             f"{time_s[0]:.3f} to {time_s[-1]:.3f} s{offset_text}, the reference {reference.name} "
             f"from {first_s:.3f} to {last_s:.3f} s.",
-            "Check that both are of the same flight. If their clocks differ, give "
-            "`time_offset_s` auto.",
+            "Check that both are of the same flight. If clocks differ, give `time_offset_s` auto.",
         )
     outside = int(
         ((time_s < first_s - end_tolerance_s) | (time_s > last_s + end_tolerance_s)).sum()
     )
     steps_s = np.diff(time_s[pose_indices])
-    max_step_s = max(5.0 * float(np.median(np.diff(estimate.time_s))), 0.5)
+    max_step_s = max(5.0 * median_interval(estimate.time_s), 0.5)
     covered_fraction = float(steps_s[steps_s <= max_step_s].sum() / (last_s - first_s))
-    used_count, all_poses = len(np.unique(pose_indices)), len(estimate)
+    used_count = len(np.unique(pose_indices))
+    all_poses = len(estimate)
     association = Association(
         method=method,
         poses=len(pose_indices),
@@ -121,8 +119,8 @@ def associate(
 
 
 def gap_limit(time_s: Array, min_limit_s: float = MIN_GAP_LIMIT_S) -> float:
-    """Return the longest interval (s) between timestamps that is interpolated."""
-    return max(MAX_GAP_INTERVALS * float(np.median(np.diff(time_s))), min_limit_s)
+    """Return the longest interval (s) between successive timestamps that is interpolated."""
+    return max(MAX_GAP_INTERVALS * median_interval(time_s), min_limit_s)
 
 
 def is_bracketed(time_s: Array, reference_s: Array, limit_s: float) -> BoolArray:
@@ -131,7 +129,8 @@ def is_bracketed(time_s: Array, reference_s: Array, limit_s: float) -> BoolArray
     Times that equal a reference time are included.
     """
     right = np.clip(np.searchsorted(reference_s, time_s), 1, len(reference_s) - 1)
-    previous_s, next_s = reference_s[right - 1], reference_s[right]
+    previous_s = reference_s[right - 1]
+    next_s = reference_s[right]
     is_between = (previous_s <= time_s) & (time_s <= next_s) & (next_s - previous_s <= limit_s)
     return np.asarray(is_between | (previous_s == time_s) | (next_s == time_s))
 
@@ -141,8 +140,11 @@ def _interpolate_poses(trajectory: Trajectory, time_s: Array) -> Trajectory:
     rotation = trajectory.rotation
     if rotation is not None and len(time_s):
         rotation = Slerp(trajectory.time_s, rotation)(time_s)
-    interpolated = trajectory.with_positions(positions_at(trajectory, time_s))
-    return replace(interpolated, rotation=rotation, time_s=time_s)
+    return replace(
+        trajectory.with_positions(positions_at(trajectory, time_s)),
+        rotation=rotation,
+        time_s=time_s,
+    )
 
 
 def positions_at(trajectory: Trajectory, time_s: Array) -> Array:
@@ -154,11 +156,11 @@ def positions_at(trajectory: Trajectory, time_s: Array) -> Array:
 def _pair_nearest(
     estimate_s: Array, reference_s: Array, limit_s: float, offset_s: float
 ) -> tuple[IntArray, IntArray]:
-    """Return the indices of pairs: each time of the shorter series with the nearest of the longer.
+    """Pair each time of the shorter series with the nearest time of the longer; return indices.
 
     Pairs with a time difference above ``limit_s`` are omitted.
     """
-    # the offset is added to the longer series, to have the same rounding as evo
+    # The offset is added to the longer series, to have the same rounding as evo
     has_more = len(estimate_s) > len(reference_s)
     fewer_s = reference_s if has_more else estimate_s
     more_s = estimate_s + offset_s if has_more else reference_s - offset_s

@@ -34,7 +34,7 @@ class Moments:
 
 
 def moments(a: Series, b: Series, is_known_a: BoolArray, is_known_b: BoolArray) -> Moments:
-    """Compute the moments of two series on the same grid at all lags (Padfield 2012, eqs. 3 to 9).
+    """Compute the moments of two series on one time grid at all lags (Padfield 2012, eqs. 3 to 9).
 
     Parameters
     ----------
@@ -43,13 +43,14 @@ def moments(a: Series, b: Series, is_known_a: BoolArray, is_known_b: BoolArray) 
     is_known_a, is_known_b : ndarray of bool, shapes (n,) and (m,)
         Mask of known samples, at least one per series.
     """
-    # the means are subtracted first, which improves the numerical precision
+    # The means are subtracted first, which improves the numerical precision
     masked_series = (a, is_known_a), (b, is_known_b)
     a, b = (
         np.where(is_known, values - np.mean(values[is_known]), 0.0)
         for values, is_known in masked_series
     )
-    mask_a, mask_b = is_known_a.astype(float), is_known_b.astype(float)
+    mask_a = is_known_a.astype(float)
+    mask_b = is_known_b.astype(float)
     count = np.rint(_correlate(mask_b, mask_a).real)
     weight = 1.0 / np.maximum(count, 1.0)
     sum_a, sum_b = _correlate(mask_b, a), _correlate(b, mask_a)  # conjugate of Σ a
@@ -69,7 +70,7 @@ def autocovariance(values: Array | Complex) -> Array:
 
 def _correlate(a: Array | Complex, b: Array | Complex) -> Complex:
     """Compute Σ a conj(b) over the overlap, at each lag."""
-    # local import, because it takes 0.1 s and most flights need no correlation
+    # Local import, because it takes 0.1 s and most flights need no correlation
     from scipy.signal import correlate  # noqa: PLC0415
 
     return np.asarray(correlate(a, b, mode="full", method="fft"))

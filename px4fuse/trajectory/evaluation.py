@@ -6,7 +6,7 @@ accumulate in it.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import structs
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array
+from px4fuse.arrays import Array, median_interval
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight import Unavailable
 from px4fuse.notebook_display import one_line_repr
@@ -27,14 +27,21 @@ from px4fuse.trajectory.model import Trajectory, cumulative_distance
 from px4fuse.trajectory.scores import Delta, Interval, RelativeError, Statistics
 from px4fuse.trajectory.time_offset import TimeOffset, clock_difference, estimate_time_offset
 
-MAX_SCALE_ERROR = 0.1  # maximum scale factor error without a warning
-MIN_COVERAGE = 0.5  # minimum fraction of used poses or covered time without a warning
-MIN_DOUBTFUL_OFFSET_S = 0.1  # minimum time offset for a warning: the lag of a filter is smaller
-# Maximum ratio of the reference's to the estimate's interval; above, they seem interchanged
+# Maximum scale factor error of the estimate without a warning
+MAX_SCALE_ERROR = 0.1
+# Minimum fraction of used poses, and of covered time of the reference, without a warning
+MIN_COVERAGE = 0.5
+# Minimum estimated time offset (s) for a warning: the lag of a filter is smaller
+MIN_DOUBTFUL_OFFSET_S = 0.1
+# Maximum ratio of the pose interval of the reference to that of the estimate: with a larger ratio,
+# the two are probably interchanged
 MAX_INTERVAL_RATIO = 5.0
 
+# Frames with vertical z axis
 _Z_DOWN_FRAMES, _Z_UP_FRAMES = ("NED", "FRD"), ("ENU",)
-_KINDS_WITHOUT_VERTICAL = ("slam", "unknown")  # kinds with a frame of unknown vertical
+# Kinds of trajectories in a frame with unknown vertical direction
+_KINDS_WITHOUT_VERTICAL = ("slam", "unknown")
+# File names of monocular SLAM, of which the scale is unknown
 _MONOCULAR_NAME = re.compile(r"(?<![a-z])mono(?![a-z])|monocular", re.IGNORECASE)
 
 
@@ -77,7 +84,7 @@ class Score(Record, frozen=True, kw_only=True):
 
 
 class Evaluation(Score, frozen=True, kw_only=True, eq=False):
-    """Scores of an estimate against a reference, with the error of each pose.
+    """ATE and RPE of an estimate against a reference, with the error of each pose.
 
     Attributes
     ----------
@@ -152,7 +159,7 @@ def evaluate(
     matched_estimate, matched_reference, matched = associate(
         estimate, reference, method=association, max_gap_s=max_gap_s, time_offset_s=added_offset_s
     )
-    reason = "Requested alignment."
+    reason = "The alignment is as requested."
     if alignment is None:
         alignment, reason = choose_alignment(matched_estimate, matched_reference)
     transform = fit_alignment(matched_estimate.position_m, matched_reference.position_m, alignment)
@@ -207,7 +214,7 @@ def evaluate(
 
 
 def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[AlignmentKind, str]:
-    """Choose the alignment by the kinds of the trajectories; also return a sentence of reason.
+    """Choose the alignment by the kinds of the trajectories; also return the reason, a sentence.
 
     Ground truth is not aligned. Estimators that use gravity are aligned in yaw and position. SLAM
     is aligned in rotation and position, and in scale if it is monocular or the scale factor error
@@ -220,7 +227,7 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     """
     same_frame = estimate.frame == reference.frame != "unknown"
     if estimate.kind == "truth" and (same_frame or reference.kind == "truth"):
-        return "none", "No alignment: the estimate is ground truth."
+        return "none", "Without alignment, because the estimate is ground truth."
     frames = f"{estimate.frame} and {reference.frame}"
     is_upright = any(
         {estimate.frame, reference.frame} <= set(vertical_frames)
@@ -243,16 +250,16 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
             "Yaw and position (4 degrees of freedom): the motion is along a line, and z is "
             f"vertical in both frames ({frames})."
         )
-    frame_reason = f"the frames {frames} have no common vertical"
+    frame_reason = f"the frames {frames} have no common vertical direction"
     if tracks_without_vertical:
         is_slam = tracks_without_vertical[0].kind == "slam"
-        frame_reason = f"{tracks_without_vertical[0].name} has no known vertical " + (
-            "(SLAM: its frame is that of the first key frame)" if is_slam else "(unknown system)"
+        frame_reason = f"{tracks_without_vertical[0].name} has an unknown vertical direction " + (
+            "(SLAM in the frame of the first key frame)" if is_slam else "(kind unknown)"
         )
     monocular = [
         track.name for track in (estimate, reference) if _MONOCULAR_NAME.search(track.name)
     ]
-    scale_reasons = [f"{name} is monocular by its name" for name in monocular]
+    scale_reasons = [f"{name} is monocular according to the name" for name in monocular]
     if abs(scale - 1.0) > MAX_SCALE_ERROR:
         scale_reasons.append(
             f"the scale factor {scale:.3g} differs from 1 by more than {MAX_SCALE_ERROR:.0%}"
@@ -270,7 +277,9 @@ def _choose_time_offset(
 ) -> tuple[TimeOffset, list[str]]:
     """Return the offset to add to the timestamps of the estimate, and warnings."""
     if isinstance(given_s, float | int):
-        return TimeOffset(offset_s=given_s, is_determinable=True, reason="Requested offset."), []
+        return TimeOffset(
+            offset_s=given_s, is_determinable=True, reason="The time offset is as requested."
+        ), []
     clock_offset_s = clock_difference(estimate, reference)
     clock_text = "UNIX time of both clocks" if clock_offset_s else "unchanged timestamps"
     clock_offset = TimeOffset(
@@ -280,7 +289,7 @@ def _choose_time_offset(
     )
     start_s, end_s = estimate.time_s[[0, -1]] + (clock_offset_s or 0.0)
     is_disjoint = start_s > reference.time_s[-1] or end_s < reference.time_s[0]
-    # the boot clock of a flight log and the clock of a file are unrelated
+    # The boot clock of a flight log and the clock of a trajectory file are unrelated
     are_clocks_unrelated = clock_offset_s is None and estimate.is_of_log != reference.is_of_log
     is_estimated = given_s == "auto" or is_disjoint
     if not (is_estimated or are_clocks_unrelated):
@@ -290,62 +299,52 @@ def _choose_time_offset(
         if estimated.is_determinable:
             return estimated, []
         fallback = structs.replace(clock_offset, is_determinable=False, reason=estimated.reason)
-        return fallback, [f"{estimated.reason} {capitalise_first(clock_text)} used instead."]
+        return fallback, [f"{estimated.reason} Instead, px4fuse uses {clock_text}."]
     offset_s, (low_s, high_s) = estimated.offset_s or 0.0, estimated.interval_s or (0.0, 0.0)
     is_doubtful = not low_s <= 0.0 <= high_s and abs(offset_s) >= MIN_DOUBTFUL_OFFSET_S
     warning = (
-        f"The timestamps are used unchanged, but the motions match best with {offset_s:+.3f} s "
-        "added to the estimate. If the clocks are unrelated, give --time-offset auto."
+        f"The timestamps are unchanged, but the motions match best with {offset_s:+.3f} s added "
+        "to the estimate. For unrelated clocks, give --time-offset auto."
     )
     return clock_offset, [warning] if is_doubtful else []
 
 
-def _swap_warnings(estimate: Trajectory, reference: Trajectory) -> list[str]:
-    """Return warnings if estimate and reference seem interchanged."""
+def _swap_warnings(estimate: Trajectory, reference: Trajectory) -> Iterator[str]:
     if reference.kind == "truth" != estimate.kind:
-        return []
-    estimate_interval_s, reference_interval_s = (
-        float(np.median(np.diff(track.time_s))) for track in (estimate, reference)
-    )
-    conditions_by_text = {
-        f"{estimate.name} is ground truth and {reference.name} is not": (
-            estimate.kind == "truth" != reference.kind
-        ),
-        f"The reference has a pose every {reference_interval_s:.3g} s, the estimate every "
-        f"{estimate_interval_s:.3g} s": (
-            reference_interval_s > MAX_INTERVAL_RATIO * estimate_interval_s
-        ),
-    }
-    action = "Check the order of the arguments: the estimate is the first one."
-    return [f"{text}. {action}" for text, holds in conditions_by_text.items() if holds]
+        return
+    estimate_interval_s = median_interval(estimate.time_s)
+    reference_interval_s = median_interval(reference.time_s)
+    action = "Check the order of the arguments: first the estimate, then the reference."
+    if estimate.kind == "truth" != reference.kind:
+        yield f"{estimate.name} is ground truth, but {reference.name} is not. {action}"
+    if reference_interval_s > MAX_INTERVAL_RATIO * estimate_interval_s:
+        yield (
+            f"The reference has a pose every {reference_interval_s:.3g} s, the estimate every "
+            f"{estimate_interval_s:.3g} s. {action}"
+        )
 
 
 def _comparison_warnings(
-    estimate: Trajectory,
-    reference: Trajectory,
-    matched: Association,
-    alignment: AlignmentKind,
-) -> list[str]:
-    """Return warnings on low coverage and on a scale factor error."""
-    estimate_m, reference_m = estimate.position_m, reference.position_m
-    # the scale is known even if the motion does not determine the rotation
-    scale = umeyama(estimate_m, reference_m, with_scale=True).scale
-    has_motion = (
-        min(float(np.ptp(position, axis=0).max()) for position in (estimate_m, reference_m)) > 0.0
-    )
-    conditions_by_text = {
-        f"Only {matched.coverage_estimate:.0%} of the poses of the estimate have a "
-        f"reference ({matched.outside} are outside of the time of the reference, "
-        f"{matched.in_gaps} in its gaps).": (matched.coverage_estimate < MIN_COVERAGE),
-        f"The estimate covers only {matched.coverage_reference:.0%} of the reference's "
-        "time. The rest of the reference is not evaluated.": matched.coverage_reference
-        < MIN_COVERAGE,
-        f"Scale factor error of the estimate: a factor of {scale:.3g} fits best. The alignment "
-        f"({alignment}) does not correct the scale.": (
-            alignment != "sim3" and has_motion and abs(scale - 1.0) > MAX_SCALE_ERROR
-        ),
-    }
-    return [text for text, holds in conditions_by_text.items() if holds]
+    estimate: Trajectory, reference: Trajectory, matched: Association, alignment: AlignmentKind
+) -> Iterator[str]:
+    if matched.coverage_estimate < MIN_COVERAGE:
+        yield (
+            f"Only {matched.coverage_estimate:.0%} of the poses of the estimate are evaluated; the "
+            "reference has no poses at the other times."
+        )
+    if matched.coverage_reference < MIN_COVERAGE:
+        yield (
+            f"The estimate covers only {matched.coverage_reference:.0%} of the time of the "
+            "reference."
+        )
+    # A scale is also estimated if the motion does not determine the rotation
+    scale = umeyama(estimate.position_m, reference.position_m, with_scale=True).scale
+    has_motion = np.ptp(reference.position_m, axis=0).any()
+    if alignment != "sim3" and has_motion and abs(scale - 1.0) > MAX_SCALE_ERROR:
+        yield (
+            f"The estimate has a scale factor error: {scale:.3g} fits best. The alignment "
+            f"{alignment} does not correct the scale."
+        )
 
 
 def _estimate_body_rotation(
@@ -364,7 +363,6 @@ def _estimate_body_rotation(
     # chordal mean (Hartley 2013, section 5.3)
     rotation = (aligned.rotation.inv() * reference.rotation).mean()
     return rotation, (
-        "The body axes differ (camera and vehicle). Rotation errors exclude an estimated constant "
-        f"rotation of {np.degrees(rotation.magnitude()):.1f}°. The lever arm between camera and "
-        "vehicle is part of the position errors.",
+        "Rotation errors exclude the estimated constant rotation from vehicle to camera axes, "
+        f"{np.degrees(rotation.magnitude()):.1f}°. Position errors include their lever arm.",
     )

@@ -32,7 +32,7 @@ AXES_OF_FRAME: Mapping[Frame, tuple[str, str, str]] = {
 AxisComponents = Annotated[dict[str, float], Meta(min_length=3, max_length=3)]
 
 
-# Name of the opposite of each direction
+# Name of the opposite direction of each direction
 OPPOSITE_DIRECTIONS = {
     "north": "south",
     "east": "west",
@@ -58,7 +58,7 @@ def format_vector(vector_m: Mapping[str, float]) -> str:
 
 
 def components_by_axis(frame: Frame, vector_m: Array) -> dict[str, float]:
-    """Return the components of a vector by the axis names of its frame."""
+    """Return the components of a vector, by the names of the axes of its frame."""
     return dict(zip(AXES_OF_FRAME[frame], vector_m.tolist(), strict=True))
 
 
@@ -79,7 +79,7 @@ class Track(Record, frozen=True):
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Poses over time.
+    """Positions and orientations over time.
 
     Attributes
     ----------
@@ -147,7 +147,7 @@ class Trajectory:
     def with_positions(
         self, position_m: Array, world_rotation: Rotation | None = None
     ) -> Trajectory:
-        """Return the poses with other positions, rotated, and without reported variances.
+        """Return the trajectory with other positions, rotated, and without reported variances.
 
         ``world_rotation`` is one rotation of the frame, or one rotation for each pose.
         """
@@ -163,7 +163,7 @@ class Trajectory:
         return replace(self, position_m=position_m, rotation=rotation, **no_variances)
 
     def track(self) -> Track:
-        """Return the description for results.json."""
+        """Return the description of the trajectory for results.json."""
         track_fields = ("name", "sha256", "size_bytes", "kind", "frame", "notes")
         return Track(
             **{name: getattr(self, name) for name in track_fields},
@@ -176,5 +176,4 @@ class Trajectory:
 
 def cumulative_distance(position_m: Array) -> Array:
     """Return the path length (m) from the start to each of the positions (n, d), shape (n,)."""
-    steps = np.linalg.norm(np.diff(position_m, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position_m, axis=0), axis=1))])

@@ -1,4 +1,4 @@
-"""Quaternions (w, x, y, z) as arrays of shape (..., 4); Hamilton product, as in PX4."""
+"""Operations on quaternions (w, x, y, z), shape (..., 4), with the Hamilton product as in PX4."""
 
 import numpy as np
 
@@ -40,7 +40,7 @@ def to_vector(q: Array) -> Array:
 
 
 def from_elements(*rows: tuple[Array | float, ...]) -> Array:
-    """Build matrices from rows of elements, which are arrays of the same shape or numbers."""
+    """Build matrices from their elements, row by row: numbers, or arrays of the same shape."""
     shape = np.broadcast_shapes(*(np.shape(element) for row in rows for element in row))
     matrices = np.empty((*shape, len(rows), len(rows[0])))
     for i, row in enumerate(rows):
@@ -57,6 +57,11 @@ def to_matrix(q: Array) -> Array:
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
+
+
+def rotate(matrices: Array, vectors: Array) -> Array:
+    """Multiply each of n vectors with its matrix, shape (n, 3)."""
+    return np.asarray(np.einsum("nij,nj->ni", matrices, vectors))
 
 
 def skew(v: Array) -> Array:
@@ -76,7 +81,7 @@ def cumulative_product(quaternions: Array) -> Array:
     rows = -(-n // width)
     identity = np.array([1.0, 0.0, 0.0, 0.0])
     padded = np.concatenate([quaternions, np.tile(identity, (rows * width - n, 1))])
-    # row r contains quaternions r·width to (r+1)·width
+    # Row r contains the quaternions r·width to (r+1)·width
     row_products = padded.reshape(rows, width, 4).copy()
     for column in range(1, width):
         row_products[:, column] = multiply(row_products[:, column - 1], row_products[:, column])
@@ -88,7 +93,7 @@ def cumulative_product(quaternions: Array) -> Array:
 
 
 def interpolate(times: Array, known_times: Array, quaternions: Array) -> Array:
-    """Interpolate quaternions with small differences: linearly, then normalised."""
+    """Interpolate quaternions linearly and normalise them, for small angles between them."""
     signs_between = np.sign(np.sum(quaternions[1:] * quaternions[:-1], axis=1))
     signs = np.concatenate([[1.0], np.cumprod(np.where(signs_between == 0.0, 1.0, signs_between))])
     continuous = quaternions * signs[:, None]

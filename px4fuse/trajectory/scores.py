@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, stdtrit
 
-from px4fuse.arrays import Array, IntArray
+from px4fuse.arrays import Array, IntArray, median_interval
 from px4fuse.errors import SettingsError
 from px4fuse.flight import Unavailable
 from px4fuse.notebook_display import one_line_repr
@@ -20,19 +20,23 @@ from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 Unit = Literal["frames", "m", "s"]
 
-# Maximum relative deviation of a pair's distance from delta if all pairs are used; default of the
-# evo package
+# Maximum relative deviation of the distance of an RPE pair from delta, if all pairs are used:
+# default of the evo package
 DELTA_TOLERANCE = 0.1
-# Default deltas of the RPE, which are used if they are between MIN_DELTA_FRACTION and
-# MAX_DELTA_FRACTION of path length or duration
+# Default distances and times of RPE pairs, which are used if they are between MIN_DELTA_FRACTION
+# and MAX_DELTA_FRACTION of path length or duration
 DEFAULT_DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
 DEFAULT_TIMES_S = (1.0, 10.0, 60.0)
 MAX_DEFAULT_DISTANCES, MAX_DEFAULT_TIMES = 3, 2
 MIN_DELTA_FRACTION, MAX_DELTA_FRACTION = 1 / 200, 1 / 5
+# Number of resamples and random seed of the bootstrap, and probability of its interval
 BOOTSTRAP_RESAMPLES, BOOTSTRAP_SEED, CONFIDENCE_LEVEL = 2000, 20120101, 0.95
-BLOCK_TIMES = 3.0  # block length, in autocorrelation times
-WINDOW_TIMES = 5.0  # window of the sum of autocorrelations, in autocorrelation times (Sokal 1997)
-MIN_BLOCKS = 5.0  # minimum number of blocks for an interval
+# Length of a bootstrap block, in integrated autocorrelation times of the squared errors
+BLOCK_TIMES = 3.0
+# Number of lags in the sum of autocorrelations, in integrated autocorrelation times (Sokal 1997)
+WINDOW_TIMES = 5.0
+# Minimum number of bootstrap blocks for a 95 % interval
+MIN_BLOCKS = 5.0
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,7 @@ class Delta:
 
 
 class Statistics(Record, frozen=True):
-    """Statistics of ``count`` errors, in their unit; ``std`` divides by ``count``, as in evo."""
+    """Statistics of ``count`` errors in the unit of the errors; ``std`` divides by ``count``."""
 
     count: Count
     rmse: NotNegative
@@ -77,7 +81,7 @@ class Interval(Record, frozen=True):
 
 
 class RelativeError(Record, frozen=True):
-    """RPE of pairs with a distance of ``delta``.
+    """RPE of pairs of poses with a distance of ``delta``.
 
     Attributes
     ----------
@@ -103,7 +107,7 @@ class RelativeError(Record, frozen=True):
 
     @property
     def delta_text(self) -> str:
-        """Distance of a pair, with unit."""
+        """Distance between the two poses of a pair, with unit."""
         return str(Delta(self.delta, self.unit))
 
 
@@ -128,7 +132,7 @@ class PairwiseError(RelativeError, frozen=True, kw_only=True, eq=False):
 
 
 def statistics(errors: Array) -> Statistics:
-    """Compute the statistics of at least one error, shape (n,)."""
+    """Compute the statistics of errors, shape (n,), n ≥ 1."""
     return Statistics(
         count=len(errors),
         rmse=float(np.sqrt(np.mean(errors**2))),
@@ -142,16 +146,13 @@ def statistics(errors: Array) -> Statistics:
 
 def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
     """Choose distances and times for the RPE that fit path length and duration of the flight."""
-    length_m, span_s = float(distance_m[-1]), float(time_s[-1] - time_s[0])
-    # a delta must be at least two intervals between poses
-    median_step_m, median_interval_s = (
-        float(np.median(np.diff(distance_m))),
-        float(np.median(np.diff(time_s))),
-    )
-    min_distance_m, max_distance_m = (
-        max(MIN_DELTA_FRACTION * length_m, 2.0 * median_step_m),
-        MAX_DELTA_FRACTION * length_m,
-    )
+    length_m = float(distance_m[-1])
+    span_s = float(time_s[-1] - time_s[0])
+    # The minimum distance or time of a pair is two median intervals between poses
+    median_step_m = median_interval(distance_m)
+    median_interval_s = median_interval(time_s)
+    min_distance_m = max(MIN_DELTA_FRACTION * length_m, 2.0 * median_step_m)
+    max_distance_m = MAX_DELTA_FRACTION * length_m
     distances = [
         value for value in DEFAULT_DISTANCES_M if min_distance_m <= value <= max_distance_m
     ][-MAX_DEFAULT_DISTANCES:]
@@ -162,11 +163,7 @@ def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
 
 
 def find_pairs(
-    position_m: Array,
-    time_s: Array,
-    delta: Delta,
-    *,
-    all_pairs: bool = True,
+    position_m: Array, time_s: Array, delta: Delta, *, all_pairs: bool = True
 ) -> tuple[IntArray, IntArray]:
     """Find pairs of poses with a distance of ``delta``.
 
@@ -203,21 +200,21 @@ def find_pairs(
     if not all_pairs:
         return _consecutive_pairs(np.diff(travelled), delta.value)
     start = np.arange(n - 1)
-    # the neighbours of the found pose are tested, too, because of rounding errors
+    # Neighbours of the nearest pose are tested, too, because of rounding errors
     nearest_guess = np.searchsorted(travelled, travelled + delta.value)[:-1]
     candidates = np.clip(nearest_guess[:, None] + np.arange(-2, 2), start[:, None] + 1, n - 1)
     distance_error = np.abs(travelled[candidates] - travelled[start, None] - delta.value)
     best_candidate = np.argmin(distance_error, axis=1)
-    # of several poses with equal distance (at rest) the first is used
+    # Of several poses with equal distance (at rest) the first is used
     first_equal = np.searchsorted(travelled, travelled[candidates[start, best_candidate]])
     is_near = distance_error[start, best_candidate] <= DELTA_TOLERANCE * delta.value
     return start[is_near], np.maximum(first_equal, start + 1)[is_near]
 
 
 def _consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
-    """Return consecutive pairs, each with the shortest distance of at least ``delta``."""
-    # the distance of each pair is summed from zero, to have the same rounding as evo
-    ends, travelled = [0], 0.0
+    # The distance of each pair is summed from zero, to have the same rounding as evo
+    ends = [0]
+    travelled = 0.0
     for index, step in enumerate(steps.tolist(), 1):
         travelled += step
         if travelled >= delta:
@@ -228,11 +225,7 @@ def _consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
 
 
 def relative_error(
-    aligned: Trajectory,
-    reference: Trajectory,
-    delta: Delta,
-    *,
-    all_pairs: bool = True,
+    aligned: Trajectory, reference: Trajectory, delta: Delta, *, all_pairs: bool = True
 ) -> PairwiseError:
     """Compute the RPE over one delta: E = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j), Sturm (2012), eq. 1.
 
@@ -268,12 +261,10 @@ def relative_error(
         reference_motion = reference_inverse.apply(
             reference.position_m[end] - reference.position_m[start]
         )
-        # the rotation Q_j⁻¹ Q_i in E does not change the length of the translation
+        # The rotation Q_j⁻¹ Q_i in E does not change the length of the translation
         translation = np.linalg.norm(estimate_motion - reference_motion, axis=1)
-        estimate_rotation, reference_rotation = (
-            estimate_inverse * rotations[0][end],
-            reference_inverse * rotations[1][end],
-        )
+        estimate_rotation = estimate_inverse * rotations[0][end]
+        reference_rotation = reference_inverse * rotations[1][end]
         rotation = np.degrees((reference_rotation.inv() * estimate_rotation).magnitude())
         overlap = int(np.median(end - start)) if all_pairs else 1
         interval = rmse_interval(translation, analysis_name, min_block=overlap)
@@ -294,11 +285,14 @@ def relative_error(
 def get_rotations(
     aligned: Trajectory, reference: Trajectory, analysis_name: str
 ) -> tuple[Rotation, Rotation] | Unavailable:
-    """Return the rotations of both trajectories; Unavailable if either has none."""
+    """Return the orientations of both trajectories; Unavailable if either has none."""
     if aligned.rotation is not None and reference.rotation is not None:
         return aligned.rotation, reference.rotation
-    reason = f"the {'estimate' if aligned.rotation is None else 'reference'} has no orientation"
-    return Unavailable(analysis_name, reason, "Give a trajectory with orientation.")
+    return Unavailable(
+        analysis_name,
+        f"the {'estimate' if aligned.rotation is None else 'reference'} has no orientation",
+        "Give a trajectory with orientation.",
+    )
 
 
 def rmse_interval(
@@ -330,12 +324,14 @@ def rmse_interval(
     if n < MIN_BLOCKS * length:
         return Unavailable(
             f"interval of the {analysis_name} RMSE",
-            f"errors are correlated over {length} of {n} samples, so fewer than "
-            f"{MIN_BLOCKS:.0f} independent blocks remain",
+            f"the errors are correlated over {length} of {n} samples, so there are fewer than "
+            f"{MIN_BLOCKS:.0f} independent blocks",
             "Use a longer flight.",
         )
     sums = np.concatenate(([0.0], np.cumsum(np.concatenate((squares, squares[: length - 1])))))
-    block_means = (sums[length:] - sums[:-length]) / length  # one per start of a circular block
+    block_means = (
+        sums[length:] - sums[:-length]
+    ) / length  # mean squared error of each circular block
     blocks = n / length
     block_starts = np.random.default_rng(BOOTSTRAP_SEED).integers(0, n, (resamples, round(blocks)))
     means = block_means[block_starts].mean(axis=1)

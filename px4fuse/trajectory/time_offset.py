@@ -10,8 +10,6 @@ file with EKF2 or the IMU. A position file is in metres with z vertical and has 
 positions are correlated, and yaw and origin are fitted robustly.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,37 +19,47 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Slerp
 from scipy.special import stdtrit
 
-from px4fuse.arrays import Array, BoolArray
+from px4fuse.arrays import Array, BoolArray, median_interval
 from px4fuse.record import Record, Span
 from px4fuse.trajectory.alignment import Transform, rms_m, umeyama
 from px4fuse.trajectory.association import gap_limit, is_bracketed, positions_at
 from px4fuse.trajectory.correlation import autocovariance, moments
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
-GRID_STEP_S, MAX_GRID_SAMPLES = 0.05, 200_000  # step and maximum size of the search grid
-SMOOTHING_S = 0.25  # smoothing time of speeds, because differentiated positions are noisy
-# Minimum overlap of the trajectories, in s and as fraction of the shorter trajectory
+# Step (s) and maximum number of samples of the time grid on which speeds are correlated
+GRID_STEP_S, MAX_GRID_SAMPLES = 0.05, 200_000
+# Standard deviation (s) of the filter for speeds, because differentiated positions are noisy
+SMOOTHING_S = 0.25
+# Minimum overlap in time of the two trajectories, in s and as fraction of the shorter trajectory
 MIN_OVERLAP_S, MIN_OVERLAP_FRACTION = 5.0, 0.5
-MIN_POSES_FRACTION = 0.3  # minimum fraction of the poses in the time of the shorter trajectory
-MAX_CANDIDATES = 12  # maximum number of correlation peaks for which the ATE is computed
+# Minimum fraction of the poses in the time of the shorter trajectory that overlap the other
+# trajectory
+MIN_POSES_FRACTION = 0.3
+# Maximum number of correlation peaks for which the ATE is computed
+MAX_CANDIDATES = 12
 # Half-width (s) of the least-squares search: around a correlation peak, and around the first result
 SEARCH_WINDOW_S, FINE_SEARCH_WINDOW_S = 0.5, 0.1
-MIN_PEAK_DISTANCE_S = 1.0  # minimum distance of two peaks
+# Minimum distance (s) between two correlation peaks
+MIN_PEAK_DISTANCE_S = 1.0
+# Minimum correlation of the speeds at a peak
 MIN_CORRELATION = 0.3
 # Minimum ratio of another offset's residual (RMS) to the best offset's residual. Below, both fit
 # equally well: 95 % limit for two sets of 80 independent residuals, half a minute of flight
 # (F-test, F = 1.2², 80 and 80 degrees of freedom)
 MIN_SECOND_PEAK_RATIO = 1.2
-MAX_FITTED_POSES = 2000  # maximum number of poses in the least squares
-# Ratio of residual to extent: maximum of an accepted fit, and value below which fits are equally
-# good
+# Maximum number of poses in the least-squares fit
+MAX_FITTED_POSES = 2000
+# Ratio of the residual to the extent of the motion: maximum of an accepted fit, and value below
+# which two fits are equally good
 MAX_MISFIT, MIN_MISFIT = 0.5, 1e-3
-# Part of the velocity that a similarity transform cannot explain, which determines the offset:
-# minimum fraction of the speed (RMS), and minimum correlation between the two trajectories, which
-# excludes noise
+# Limits for the part of the velocity that a similarity transform cannot explain, which determines
+# the time offset: minimum fraction of the speed (RMS), and minimum correlation between the two
+# trajectories, which excludes noise
 MIN_FREE_SPEED_FRACTION, MIN_FREE_CORRELATION = 0.05, 0.5
-WINDOW_CORRELATION_LENGTHS = 4  # window of the score's long-run variance, in correlation lengths
-MAX_HALF_INTERVAL_S = 0.5  # maximum half-width of the 95 % interval of an accepted offset
+# Window of the long-run variance of the likelihood score, in correlation lengths
+WINDOW_CORRELATION_LENGTHS = 4
+# Maximum half-width (s) of the 95 % interval of an accepted time offset
+MAX_HALF_INTERVAL_S = 0.5
 CONFIDENCE_LEVEL = 0.95
 
 
@@ -101,8 +109,8 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
         with constant speed along a line or circle: a time offset is then equivalent to another
         position or rotation.
     """
-    # the trajectory with the shorter intervals is interpolated
-    if _median_step(estimate) >= _median_step(reference):
+    # The trajectory with the shorter pose intervals is interpolated
+    if median_interval(estimate.time_s) >= median_interval(reference.time_s):
         return _search_offset(estimate, reference)
     reversed_offset = _search_offset(reference, estimate)
     if reversed_offset.offset_s is None or reversed_offset.interval_s is None:
@@ -111,10 +119,6 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
     return structs.replace(
         reversed_offset, offset_s=-reversed_offset.offset_s, interval_s=(-high_s, -low_s)
     )
-
-
-def _median_step(trajectory: Trajectory) -> float:
-    return float(np.median(np.diff(trajectory.time_s)))
 
 
 def _search_offset(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
@@ -133,8 +137,7 @@ def _search_offset(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
     accepted_fits.sort(key=lambda fit: fit.misfit)
     if not accepted_fits:
         return _not_determinable(
-            "the offsets with correlated speeds do not fit the positions, or the overlap is "
-            "too short"
+            "the offsets with correlated speeds do not fit the positions, or the overlap is short"
         )
     best_fit = accepted_fits[0]
     similar_fits = [
@@ -144,7 +147,7 @@ def _search_offset(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
         fit for fit in similar_fits if abs(fit.offset_s - best_fit.offset_s) > MIN_PEAK_DISTANCE_S
     ]
     if clock_offset_s is not None:
-        # of several offsets that fit equally well, use the nearest to the UNIX time
+        # Of several offsets that fit equally well, the nearest to the UNIX time is used
         best_fit = min(similar_fits, key=lambda fit: abs(fit.offset_s - clock_offset_s))
     elif distant_fits:
         return _not_determinable(
@@ -152,7 +155,7 @@ def _search_offset(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
             f"{abs(distant_fits[0].offset_s - best_fit.offset_s):.1f} s the ATE is "
             f"{distant_fits[0].rms_m:.3g} m instead of {best_fit.rms_m:.3g} m"
         )
-    # the fit is repeated with all poses that overlap at offsets near the result
+    # The fit is repeated with all poses that overlap at offsets near the first result
     best_fit = _refine_offset(sparse, dense, best_fit.offset_s, FINE_SEARCH_WINDOW_S) or best_fit
     half_interval_s = _half_interval(sparse, dense, best_fit)
     if not half_interval_s <= MAX_HALF_INTERVAL_S:
@@ -165,8 +168,8 @@ def _search_offset(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
         offset_s=best_fit.offset_s,
         interval_s=(best_fit.offset_s - half_interval_s, best_fit.offset_s + half_interval_s),
         is_determinable=True,
-        reason="Maximum speed correlation over all lags, refined by minimum ATE "
-        f"({best_fit.rms_m:.3g} m after a similarity alignment, {len(best_fit.time_s)} poses).",
+        reason="The time offset has the maximum speed correlation and the minimum ATE "
+        f"({best_fit.rms_m:.3g} m, {len(best_fit.time_s)} poses).",
     )
 
 
@@ -180,31 +183,30 @@ def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]
     """Return a regular time grid and the smoothed velocities on it."""
     time = trajectory.time_s
     grid = time[0] + step_s * np.arange(int((time[-1] - time[0]) / step_s) + 1)
-    sigma = max(SMOOTHING_S, _median_step(trajectory)) / step_s
+    sigma = max(SMOOTHING_S, median_interval(trajectory.time_s)) / step_s
     smooth: Array = gaussian_filter1d(positions_at(trajectory, grid), sigma, axis=0, order=1)
     return grid, smooth / step_s
 
 
 def _velocity(trajectory: Trajectory, time_s: Array) -> Array:
-    """Return the smoothed velocity at times within the trajectory, shape (n, 3)."""
+    """Return the smoothed velocity (m/s) at times within the trajectory, shape (n, 3)."""
     span = float(trajectory.time_s[-1] - trajectory.time_s[0])
     grid, velocity = _grid_velocity(trajectory, max(GRID_STEP_S, span / MAX_GRID_SAMPLES))
-    columns = [np.interp(time_s, grid, column) for column in velocity.T]
-    return np.stack(columns, axis=1)
+    return np.stack([np.interp(time_s, grid, column) for column in velocity.T], axis=1)
 
 
 def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArray]:
     """Return speed, and angular speed if known, on a grid, and a mask of known samples."""
     time = trajectory.time_s
     grid, velocity = _grid_velocity(trajectory, step_s)
-    # interpolate between key frames, but not across lost tracking
-    is_known = is_bracketed(grid, time, max(10.0 * _median_step(trajectory), 0.5))
+    # Interpolated between key frames, but not across gaps with lost tracking
+    is_known = is_bracketed(grid, time, max(10.0 * median_interval(trajectory.time_s), 0.5))
     speeds = [np.linalg.norm(velocity, axis=1)]
     if trajectory.rotation is not None:
         rotations = Slerp(time, trajectory.rotation)(grid)
         rates = (rotations[:-1].inv() * rotations[1:]).as_rotvec() / step_s
         rates = np.concatenate((rates, rates[-1:]))
-        sigma = max(SMOOTHING_S, _median_step(trajectory)) / step_s
+        sigma = max(SMOOTHING_S, median_interval(trajectory.time_s)) / step_s
         speeds.append(np.linalg.norm(gaussian_filter1d(rates, sigma, axis=0), axis=1))
     return speeds, is_known
 
@@ -223,7 +225,7 @@ def _find_candidates(sparse: Trajectory, dense: Trajectory) -> list[float]:
     correlations = []
     for a, b in zip(sparse_speeds, dense_speeds, strict=False):  # angular speeds if both have them
         speed_moments = moments(a, b, is_known_sparse, is_known_dense)
-        # exclude parts at rest, in which the variance is only rounding error
+        # Exclude lags at which a trajectory is at rest: its variance is a rounding error
         is_usable = speed_moments.count >= min_count
         for values, is_known, power in (
             (a, is_known_sparse, speed_moments.power_a),
@@ -239,7 +241,7 @@ def _find_candidates(sparse: Trajectory, dense: Trajectory) -> list[float]:
         (mean_correlation == local_maximum) & (mean_correlation > MIN_CORRELATION)
     )
     order = order[np.argsort(-mean_correlation[order])][:MAX_CANDIDATES]
-    # at index k the first sample of sparse is at sample k - (n - 1) of dense
+    # At index k the first sample of sparse is at sample k - (n - 1) of dense
     lags_s = (
         (order - (len(is_known_sparse) - 1)) * step_s
         + float(dense.time_s[0])
@@ -271,13 +273,13 @@ class _OffsetFit:
 
     @property
     def rms_m(self) -> float:
-        """RMS of the residuals."""
+        """RMS (m) of the residuals."""
         return rms_m(self.target_m - self.aligned_m)
 
     @property
     def misfit(self) -> float:
         """RMS of the residuals over RMS extent of the motion, to compare fits."""
-        # extent of the target, because a bad fit shrinks the estimate to a point
+        # Extent of the dense trajectory, because a bad fit shrinks the sparse one to a point
         extent = float(np.sqrt(self.target_m.var(axis=0).sum()))
         return max(self.rms_m / extent, MIN_MISFIT) if extent > 0.0 else float("inf")
 
@@ -287,12 +289,13 @@ def _half_interval(sparse: Trajectory, dense: Trajectory, fit: _OffsetFit) -> fl
 
     Infinite if a change of position, rotation or scale has the same effect as a time offset.
     """
-    n, centred_m = len(fit.time_s), fit.aligned_m - fit.aligned_m.mean(axis=0)
+    n = len(fit.time_s)
+    centred_m = fit.aligned_m - fit.aligned_m.mean(axis=0)
     dense_velocity = _velocity(dense, fit.time_s + fit.offset_s)
     sparse_velocity = fit.transform.rotation.apply(
         fit.transform.scale * _velocity(sparse, fit.time_s)
     )
-    # remove the part of a time offset's effect that equals a translation, small rotation or scale
+    # Remove the effect of a time offset that equals a translation, small rotation or scale
     columns = [np.tile(axis, (n, 1)) for axis in np.eye(3)]
     columns += [np.cross(axis, centred_m) for axis in np.eye(3)]
     similarity_columns = np.stack([*columns, centred_m], axis=-1).reshape(3 * n, 7)
@@ -308,7 +311,7 @@ def _half_interval(sparse: Trajectory, dense: Trajectory, fit: _OffsetFit) -> fl
     ):
         return float("inf")
     score = (velocities[:, 0].reshape(n, 3) * (fit.target_m - fit.aligned_m)).sum(axis=1)
-    # the window of the weights must be longer than the correlation
+    # The window of the weights must be longer than the correlation
     lags = min(max(1, WINDOW_CORRELATION_LENGTHS * _correlation_length(score)), n // 4)
     weights = 1.0 - np.arange(1, lags + 1) / (lags + 1.0)
     products = [float(score[k:] @ score[:-k]) for k in range(1, lags + 1)]
@@ -329,24 +332,25 @@ def _refine_offset(
     sparse: Trajectory, dense: Trajectory, lag_s: float, window_s: float
 ) -> _OffsetFit | None:
     """Minimise the ATE over offsets around a candidate; None if too few poses overlap."""
-    time, gap_limit_s = sparse.time_s, max(gap_limit(dense.time_s), 0.5 * gap_limit(sparse.time_s))
-    # the same poses are used at every offset, so that the objective is continuous
+    time = sparse.time_s
+    gap_limit_s = max(gap_limit(dense.time_s), 0.5 * gap_limit(sparse.time_s))
+    # The same poses are used at every offset, so that the objective is continuous
     window_offsets = (lag_s + shift for shift in (-window_s, 0.0, window_s))
     is_known = np.all(
         [is_bracketed(time + offset, dense.time_s, gap_limit_s) for offset in window_offsets],
         axis=0,
     )
     pose_indices = np.flatnonzero(is_known)
-    span_s = float(time[-1] - time[0])
-    time_fraction = min(1.0, float(dense.time_s[-1] - dense.time_s[0]) / span_s)
+    time_fraction = min(1.0, float(dense.time_s[-1] - dense.time_s[0]) / float(time[-1] - time[0]))
     if len(pose_indices) < max(2 * MIN_POSES, MIN_POSES_FRACTION * time_fraction * len(time)):
         return None
     pose_indices = pose_indices[:: -(-len(pose_indices) // MAX_FITTED_POSES)]
-    time, position = time[pose_indices], sparse.position_m[pose_indices]
+    time = time[pose_indices]
+    position = sparse.position_m[pose_indices]
 
     def fit_at(shift_s: float) -> _OffsetFit:
         target = positions_at(dense, time + (lag_s + shift_s))
-        # the sparse trajectory is transformed: a transformed target could get the scale zero
+        # The sparse trajectory is transformed: a transformed target could get the scale zero
         transform = umeyama(position, target, with_scale=True)
         return _OffsetFit(lag_s + shift_s, transform, time, transform.apply(position), target)
 
@@ -354,7 +358,7 @@ def _refine_offset(
         fit = fit_at(shift_s)
         return float(((fit.target_m - fit.aligned_m) ** 2).sum())
 
-    # the shift is optimised instead of the offset: with UNIX time against boot time, the relative
+    # The shift is optimised instead of the offset: with UNIX time against boot time, the relative
     # tolerance of the optimiser would be seconds
     shifts_s = window_s * np.linspace(-1.0, 1.0, 21)
     best_index = int(np.argmin([cost(shift) for shift in shifts_s]))

@@ -12,20 +12,21 @@ from px4fuse.trajectory.graph.covariance import GateResult, gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import GraphSolution, Robust, Solution, solve
 
-MAX_ROBUST_CLOSURES = 1000  # by default no robust optimisation with more closures: it takes minutes
-# Labels by solution
+# Maximum number of closures for robust optimisation by default: with more it takes minutes
+MAX_ROBUST_CLOSURES = 1000
+# Labels of the pose graph solutions, by the key in results.json
 SOLUTIONS: Mapping[str, str] = {
     "all": "pose graph, all closures",
     "gated": "pose graph, gated",
     "dcs": "pose graph, DCS",
     "gnc": "pose graph, GNC",
 }
-# Robust method by solution
+# Robust method of each solution that uses one
 ROBUST_METHODS: Mapping[str, Robust] = {"dcs": "dcs", "gnc": "gnc"}
 
 
 class Graph(Record, frozen=True, kw_only=True):
-    """Summary of a pose graph, the tests of its closures, and its solutions, for results.json.
+    """Pose graph for results.json: size, tests of the closures, and solutions.
 
     Attributes
     ----------
@@ -68,7 +69,7 @@ def analyse_graph(
     *,
     run_robust: bool | None = None,
 ) -> SolvedGraph:
-    """Test the closures of a graph; optimise the graph by least squares and by robust methods.
+    """Test the closures of a pose graph, and optimise it by least squares and by robust methods.
 
     Edges between successive vertices are odometry, all other edges are closures.
 

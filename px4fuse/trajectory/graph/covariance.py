@@ -12,12 +12,13 @@ from px4fuse.trajectory.graph import lie, model
 
 # Probability that the gate rejects a true closure
 GATE_ALPHA = 0.001
-# Minimum eigenvalue of a correlation matrix; smaller eigenvalues are rounding errors
+# Minimum valid eigenvalue of a covariance matrix with unit diagonal: smaller ones are rounding
+# errors
 _MIN_EIGENVALUE = 1e-13
 
 
 class GateResult(Record, frozen=True):
-    """Test of a closure against odometry.
+    """Test of a loop closure against odometry.
 
     Attributes
     ----------
@@ -72,22 +73,23 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
     if not len(tested_edges):
         return []
     chain = model.odometry_chain(graph, tested_edges)
-    first, second = graph.first[tested_edges], graph.second[tested_edges]
-    first_pose, last_pose = int(min(first.min(), second.min())), int(max(first.max(), second.max()))
-    chain_edges = chain[first_pose:last_pose]
+    first = graph.first[tested_edges]
+    second = graph.second[tested_edges]
+    first_pose = int(min(first.min(), second.min()))
+    chain_edges = chain[first_pose : int(max(first.max(), second.max()))]
     missing_steps = np.flatnonzero(chain_edges < 0)
     if len(missing_steps):
         vertex = first_pose + int(missing_steps[0])
         raise TrajectoryError(
-            f"No odometry edge connects vertices {graph.ids[vertex]} and {graph.ids[vertex + 1]}, "
-            "so the closure cannot be tested against odometry.",
-            "Add the edge, or test shorter closures.",
+            f"The closures cannot be tested, because no odometry edge connects vertices "
+            f"{graph.ids[vertex]} and {graph.ids[vertex + 1]}",
+            "Add the edge.",
         )
     poses = lie.chain(model.odometry_steps(graph, chain_edges))
     step_adjoints = lie.adjoint(poses[1:])
     step_covariances = (
         step_adjoints @ _covariances(graph, chain_edges) @ step_adjoints.transpose(0, 2, 1)
-    )  # in the axes of the first pose of the chain
+    )  # in the axes of the first pose of the odometry chain
     cumulative_covariance = np.concatenate(
         [np.zeros((1, *step_covariances.shape[1:])), np.cumsum(step_covariances, axis=0)]
     )
@@ -118,11 +120,9 @@ def _test_edge(graph: model.PoseGraph, edge: int, residual: Array, covariance: A
         <= _MIN_EIGENVALUE
     ):
         raise TrajectoryError(
-            f"The closure from vertex {vertices[0]} to {vertices[1]} cannot be tested: it has no "
-            "information, or the ratio of odometry and closure covariance exceeds the "
-            "numerical precision.",
-            "Give the closure's inverse covariance, and odometry information of a "
-            "similar magnitude.",
+            f"The closure from vertex {vertices[0]} to {vertices[1]} cannot be tested: its "
+            "information is zero, or differs too much from the odometry information",
+            "Give information matrices of similar magnitude.",
         )
     d2 = float(observed_residual @ np.linalg.solve(residual_covariance, observed_residual))
     p = float(chdtrc(degrees_of_freedom, d2))
@@ -137,8 +137,7 @@ def _covariances(graph: model.PoseGraph, chain_edges: IntArray) -> Array:
         edge = chain_edges[int(np.argmin(is_full_rank))]
         raise TrajectoryError(
             f"The odometry edge from vertex {graph.ids[graph.first[edge]]} to "
-            f"{graph.ids[graph.second[edge]]} has no information in one direction, so "
-            "its error is unbounded.",
+            f"{graph.ids[graph.second[edge]]} has no information in one direction",
             "Give information in all directions.",
         )
     covariance = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])

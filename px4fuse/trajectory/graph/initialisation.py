@@ -1,7 +1,5 @@
 """Initial poses of a pose graph from its edges."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -43,7 +41,9 @@ def initialise(graph: PoseGraph) -> PoseGraph:
     composed_graph = model.compose_odometry(graph)
     try:
         return min(composed_graph, _chordal(graph), key=model.cost)
-    except TrajectoryError:  # some edges have no rotation; composed edges determine all poses
+    except (
+        TrajectoryError
+    ):  # Some edges have no rotation; the composed odometry edges determine all poses
         return composed_graph
 
 
@@ -61,7 +61,7 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
     model.require_connected(graph, rotation_information > 0.0, "edges with rotation")
     measured_rotation = lie.rotation_matrix(graph.measurements)
     eye = np.broadcast_to(np.eye(d), measured_rotation.shape)
-    # minimise the sum of weight |Z' Y_i - Y_j|^2 over the transposed rotations Y
+    # Minimise the sum of weight |Z' Y_i - Y_j|^2 over the transposed rotations Y
     relaxed_rotation = _solve_positions(
         graph,
         measured_rotation.transpose(0, 2, 1),
@@ -71,7 +71,7 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
         lie.rotation_matrix(graph.poses[0]).T,
     )
     rotation = _nearest_rotations(relaxed_rotation.transpose(0, 2, 1))
-    # residual of an edge in the axes of the measured pose: (R_i Z)' (t_j - t_i - R_i z)
+    # Residual of an edge in the axes of the measured pose: (R_i Z)' (t_j - t_i - R_i z)
     first_rotation = rotation[graph.first]
     axes = first_rotation @ measured_rotation
     information = axes @ graph.information[:, :d, :d] @ axes.transpose(0, 2, 1)
@@ -80,8 +80,7 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
         graph, -eye, eye, information, translation, graph.poses[0, :d, None]
     )[..., 0]
     if d == 2:
-        heading = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
-        poses = np.column_stack([position, heading])
+        poses = np.column_stack([position, np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])])
     else:
         poses = np.column_stack([position, Rotation.from_matrix(rotation).as_quat()])
     poses[0] = graph.poses[0]
@@ -103,7 +102,7 @@ def _solve_positions(
         )
     )
     if solution is None:
-        raise TrajectoryError("The edges do not determine the initial poses.", "Give VERTEX lines.")
+        raise TrajectoryError("The edges do not determine the initial poses", "Give VERTEX lines.")
     return np.concatenate([first_pose[None], solution.reshape(-1, *first_pose.shape)])
 
 

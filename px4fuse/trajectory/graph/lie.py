@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from px4fuse.arrays import Array
 from px4fuse.trajectory.rotation import from_elements, skew
 
-# Maximum angle for power series instead of quotients, which lose precision at small angles. Five
-# terms are accurate to 1e-14
+# Maximum angle (rad) for power series instead of quotients, which lose precision at small angles:
+# five terms of the series are accurate to 1e-14
 SMALL_ANGLE_RAD = 0.3
 _COT_SERIES = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
 _COT_SLOPE_SERIES = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
@@ -35,13 +35,14 @@ def rotation_matrix(pose: Array) -> Array:
     ndarray, shape (..., 2, 2) or (..., 3, 3)
     """
     if pose.shape[-1] == 3:
-        c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+        c = np.cos(pose[..., 2])
+        s = np.sin(pose[..., 2])
         return from_elements((c, -s), (s, c))
     return _rotation_of(pose).as_matrix()
 
 
 def identity(width: int) -> Array:
-    """Return the identity pose; ``width`` 3 in the plane, 7 in space."""
+    """Return the identity pose; ``width`` is 3 in the plane, 7 in space."""
     pose = np.zeros(width)
     pose[6:] = 1.0  # w of the quaternion
     return pose
@@ -63,13 +64,14 @@ def compose(a: Array, b: Array) -> Array:
 
 
 def inverse(pose: Array) -> Array:
-    """Return the inverse poses."""
+    """Return the inverses of poses."""
     return between(pose, identity(pose.shape[-1]))
 
 
 def between(a: Array, b: Array) -> Array:
     """Return the poses b relative to a: the inverse of a, times b."""
-    d, inverse_rotation = _dimension(a), np.swapaxes(rotation_matrix(a), -1, -2)
+    d = _dimension(a)
+    inverse_rotation = np.swapaxes(rotation_matrix(a), -1, -2)
     rotation = (
         b[..., 2:] - a[..., 2:] if d == 2 else (_rotation_of(a).inv() * _rotation_of(b)).as_quat()
     )
@@ -85,7 +87,8 @@ def exp(tangent: Array) -> Array:
         Rotation below 2 pi.
     """
     d = _dimension(tangent)
-    rho, phi = tangent[..., :d], tangent[..., d:]
+    rho = tangent[..., :d]
+    phi = tangent[..., d:]
     position = np.linalg.solve(_left_jacobian_inverse(phi), rho[..., None])[..., 0]
     rotation = phi if d == 2 else Rotation.from_rotvec(phi).as_quat()
     return np.concatenate([position, rotation], axis=-1)
@@ -139,8 +142,9 @@ def right_jacobian_inverse(tangent: Array) -> Array:
     commutator = _commutator(tangent)
     commutator_squared = commutator @ commutator
     theta = np.linalg.norm(tangent[..., _dimension(tangent) :], axis=-1)[..., None, None]
-    c, slope = _cot_term(theta), 0.5 * _cot_term_slope(theta)
-    # series of x / (1 - exp(-x)) with x = ad, reduced by ad^5 = -2 theta^2 ad^3 - theta^4 ad
+    c = _cot_term(theta)
+    slope = 0.5 * _cot_term_slope(theta)
+    # Series of x / (1 - exp(-x)) with x = ad, reduced by ad^5 = -2 theta^2 ad^3 - theta^4 ad
     jacobian: Array = (
         np.eye(commutator.shape[-1])
         + 0.5 * commutator
@@ -161,7 +165,7 @@ def _commutator(tangent: Array) -> Array:
 
 
 def chain(steps: Array) -> Array:
-    """Return the products of the first 0, 1, ..., n motions (log2(n) vectorised operations).
+    """Return the products of the first 0, 1, ..., n relative motions, in log2(n) operations.
 
     Parameters
     ----------
@@ -180,7 +184,6 @@ def chain(steps: Array) -> Array:
 
 
 def _dimension(values: Array) -> int:
-    """Return the dimension of poses or tangents: 2 or 3."""
     return 2 if values.shape[-1] == 3 else 3
 
 
@@ -198,11 +201,10 @@ def _left_jacobian_inverse(phi: Array) -> Array:
         skew_matrix = from_elements((0.0, -phi[..., 0]), (phi[..., 0], 0.0))
     else:
         skew_matrix = skew(phi)
-    theta = np.linalg.norm(phi, axis=-1)[..., None, None]
     return (
         np.eye(skew_matrix.shape[-1])
         - 0.5 * skew_matrix
-        + _cot_term(theta) * (skew_matrix @ skew_matrix)
+        + _cot_term(np.linalg.norm(phi, axis=-1)[..., None, None]) * (skew_matrix @ skew_matrix)
     )
 
 

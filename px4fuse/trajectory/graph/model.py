@@ -13,9 +13,10 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.trajectory.graph import lie
 
-# Minimum eigenvalue of the information matrix, scaled to unit diagonal, of a direction that counts
-# as measured
+# Minimum eigenvalue of an information matrix with unit diagonal: directions with smaller
+# eigenvalues count as not measured
 MIN_OBSERVED_EIGENVALUE = 1e-9
+# Sources of the initial poses
 FROM_FILE = "the file's vertices"
 FROM_ODOMETRY = "odometry edges composed"
 FROM_CHORDAL = "chordal initialisation"
@@ -23,7 +24,7 @@ FROM_CHORDAL = "chordal initialisation"
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """Poses, and measurements of relative poses (edges).
+    """Poses (vertices) and measurements of relative poses (edges).
 
     Attributes
     ----------
@@ -101,7 +102,7 @@ class Residuals:
 
 
 def residuals(graph: PoseGraph, poses: Array) -> Residuals:
-    """Compute the residuals of all edges at given poses, shape (n, 3) or (n, 7)."""
+    """Compute the residuals of all edges at the poses, shape (n, 3) or (n, 7)."""
     relative = lie.between(poses[graph.first], poses[graph.second])
     residual = lie.log(lie.between(graph.measurements, relative))
     weighted = (graph.information @ residual[..., None])[..., 0]
@@ -162,9 +163,10 @@ def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> 
         The message contains the number of separate parts and a vertex that is not connected.
     """
     if not len(graph.first):
-        raise TrajectoryError("The pose graph has no edges.", "Give a file with EDGE lines.")
+        raise TrajectoryError("The pose graph has no edges", "Give a file with EDGE lines.")
     is_informative = is_used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
-    ends, n = (graph.first[is_informative], graph.second[is_informative]), len(graph)
+    ends = (graph.first[is_informative], graph.second[is_informative])
+    n = len(graph)
     links = sparse.coo_array((np.ones(len(ends[0])), ends), shape=(n, n))
     component_count, component = connected_components(links, directed=False)
     if component_count > 1:
@@ -178,8 +180,7 @@ def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> 
 
 def compose_odometry(graph: PoseGraph) -> PoseGraph:
     """Return the graph with poses composed from odometry. Odometry must connect all poses."""
-    steps = odometry_steps(graph, odometry_chain(graph))
-    poses = lie.compose(graph.poses[:1], lie.chain(steps))
+    poses = lie.compose(graph.poses[:1], lie.chain(odometry_steps(graph, odometry_chain(graph))))
     return replace(graph, poses=poses, initialised=FROM_ODOMETRY)
 
 
@@ -197,7 +198,7 @@ def odometry_chain(graph: PoseGraph, excluded_edges: IntArray | None = None) -> 
     if excluded_edges is not None:
         odometry_edges = np.setdiff1d(odometry_edges, excluded_edges)
     next_edge = np.full(len(graph) - 1, -1, dtype=np.intp)
-    # assign backwards, so that the first of several edges remains
+    # Assigned in reverse order, so that the first of several edges remains
     odometry_edges = odometry_edges[::-1]
     next_edge[np.minimum(graph.first[odometry_edges], graph.second[odometry_edges])] = (
         odometry_edges

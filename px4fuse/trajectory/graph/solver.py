@@ -1,7 +1,5 @@
 """Pose graph optimisation by Levenberg-Marquardt, optionally robust against false closures."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -18,31 +16,36 @@ from px4fuse.trajectory.graph.model import PoseGraph, Residuals
 from px4fuse.trajectory.graph.system import normal_equations, solve_normal_equations
 
 Robust = Literal["none", "dcs", "gnc"]
-# Robust kernel: from the squared residuals of all edges, return weights of the information and
-# costs
+# Robust kernel: computes weights of the information and costs of all edges from their squared
+# residuals
 Kernel = Callable[[Array], tuple[Array, Array]]
 
 MAX_ITERATIONS = 100
-# Defaults of GTSAM's LevenbergMarquardtParams
+# Defaults of LevenbergMarquardtParams in GTSAM
 _INITIAL_DAMPING, _DAMPING_FACTOR, _MAX_DAMPING = 1e-5, 10.0, 1e5
 _MIN_FIDELITY = 1e-3
 _TOLERANCE = 1e-10
 _FLOAT_EPSILON = float(np.finfo(float).eps)
-# Tolerance and iterations in the intermediate stages of graduated non-convexity, which need less
-# precision
+# Tolerance and maximum number of iterations in the intermediate stages of graduated non-convexity,
+# which need less precision
 _STAGE_TOLERANCE, _STAGE_ITERATIONS = 1e-6, 20
 
-DCS_PHI = 1.0  # parameter Phi of "dcs" (Agarwal 2013, section IV)
-GNC_PROBABILITY = 0.99  # probability that the squared residual of a true closure is not truncated
-DROP_PROBABILITY = 0.999  # probability that keeping a true closure costs less than dropping it
-_GNC_FACTOR = 1.4  # factor on the control parameter per stage (Yang 2020, section V)
+# Parameter Phi of dynamic covariance scaling (Agarwal 2013, section IV)
+DCS_PHI = 1.0
+# Probability that the squared residual of a true closure is not truncated by "gnc"
+GNC_PROBABILITY = 0.99
+# Probability that the cost of a true closure is below the cost of dropping it
+DROP_PROBABILITY = 0.999
+# Factor on the control parameter of graduated non-convexity per stage (Yang 2020, section V)
+_GNC_FACTOR = 1.4
 _MAX_GNC_STAGES = 100
-_MAX_RETRIED_CLOSURES = 20  # maximum dropped closures tested again: each test is a minimisation
+# Maximum number of dropped closures that are tested again: each test is a minimisation
+_MAX_RETRIED_CLOSURES = 20
 _MAX_TRUNCATION_ROUNDS = 20
 
 
 class GraphSolution(Record, frozen=True, kw_only=True):
-    """Summary of a pose graph's solution, for results.json.
+    """Solution of a pose graph for results.json: costs, iterations and dropped edges.
 
     Attributes
     ----------
@@ -87,7 +90,7 @@ class Solution(GraphSolution, frozen=True, kw_only=True, eq=False):
 
 @dataclass(frozen=True)
 class _Minimum:
-    """Result of a minimisation."""
+    """Result of one minimisation by Levenberg-Marquardt."""
 
     state: Residuals
     cost: float
@@ -96,10 +99,7 @@ class _Minimum:
 
 
 def solve(
-    graph: PoseGraph,
-    *,
-    robust: Robust = "none",
-    is_closure: BoolArray | None = None,
+    graph: PoseGraph, *, robust: Robust = "none", is_closure: BoolArray | None = None
 ) -> Solution:
     """Optimise the poses by Levenberg-Marquardt, as GTSAM does.
 
@@ -136,13 +136,13 @@ def solve(
         The graph has no edges, is not connected, contains a number that is not finite, or ``gnc``
         drops all edges to some poses.
     """
-    model.require_connected(graph, np.ones(len(graph.first), dtype=bool), "the edges")
+    model.require_connected(graph, np.ones(len(graph.first), bool), "the edges")
     is_doubtful = ~graph.is_successive if is_closure is None else is_closure
     start = model.residuals(graph, graph.poses)
     cost_initial = 0.5 * float(np.sum(start.chi2))
     if not np.isfinite(cost_initial):
         raise TrajectoryError(
-            "The pose graph contains a pose or measurement that is not finite or too large.",
+            "The pose graph contains a pose or measurement that is not finite or too large",
             "Correct the number, or remove the edge.",
         )
     plain_minimum = _minimise(graph, start, _least_squares_kernel(np.ones(len(is_doubtful))))
@@ -178,8 +178,9 @@ def _minimise(
     tolerance: float = _TOLERANCE,
     max_iterations: int = MAX_ITERATIONS,
 ) -> _Minimum:
-    """Minimise the cost from given poses like GTSAM's LevenbergMarquardtOptimizer."""
-    damping, iterations = _INITIAL_DAMPING, 0
+    """Minimise the cost from the poses of ``state``, like GTSAM's LevenbergMarquardtOptimizer."""
+    damping = _INITIAL_DAMPING
+    iterations = 0
     weights, costs = kernel(state.chi2)
     cost = float(np.sum(costs))
     while iterations < max_iterations and cost > _TOLERANCE:
@@ -194,14 +195,17 @@ def _minimise(
             -state.residual[..., None],
         )
         while True:
-            drop, predicted_drop, is_flat = 0.0, 0.0, False
+            drop = 0.0
+            predicted_drop = 0.0
+            is_flat = False
             step = solve_normal_equations(matrix, gradient, damping)
             if step is not None:
-                # decrease of the linearised cost
+                # Decrease of the linearised cost
                 predicted_drop = 0.5 * float(np.sum(step * (damping * step + gradient)))
                 tangent = np.concatenate([np.zeros(graph.degrees_of_freedom), step[:, 0]])
-                motion = lie.exp(tangent.reshape(len(graph), -1))
-                trial = model.residuals(graph, lie.compose(state.poses, motion))
+                trial = model.residuals(
+                    graph, lie.compose(state.poses, lie.exp(tangent.reshape(len(graph), -1)))
+                )
                 trial_weights, costs = kernel(trial.chi2)
                 drop = cost - float(np.sum(costs))
                 is_flat = abs(drop) < tolerance * cost
@@ -213,7 +217,10 @@ def _minimise(
             damping *= _DAMPING_FACTOR
         if not is_accepted:
             return _Minimum(state, cost, iterations, is_flat)
-        state, weights, cost_before, cost = trial, trial_weights, cost, cost - drop
+        state = trial
+        weights = trial_weights
+        cost_before = cost
+        cost = cost - drop
         iterations += 1
         damping /= _DAMPING_FACTOR
         if drop <= max(tolerance * cost_before, _TOLERANCE):
@@ -226,8 +233,6 @@ def _least_squares_kernel(weights: Array) -> Kernel:
 
 
 def _dcs_kernel(is_doubtful: BoolArray) -> Kernel:
-    """Return the kernel of dynamic covariance scaling for the edges that may be false."""
-
     def kernel(chi2: Array) -> tuple[Array, Array]:
         is_beyond = is_doubtful & (chi2 > DCS_PHI)
         scale = np.where(is_beyond, 2.0 * DCS_PHI / (DCS_PHI + chi2), 1.0)
@@ -253,7 +258,8 @@ def _solve_gnc(
     def truncated_cost(state: Residuals, edge_weights: Array) -> float:
         return 0.5 * float(np.sum(np.where(edge_weights > 0.0, state.chi2, drop_cost)))
 
-    iteration_count, solutions = plain_minimum.iterations, []
+    iteration_count = plain_minimum.iterations
+    solutions = []
     for start_state in (plain_minimum.state, start):
         minimum, weights = _descend_graduated(graph, start_state, bound)
         iteration_count += minimum.iterations
@@ -266,15 +272,18 @@ def _solve_gnc(
         trial = _minimise(graph, minimum.state, _least_squares_kernel(trial_weights))
         iteration_count += trial.iterations
         if (cost := truncated_cost(trial.state, trial_weights)) < lowest_cost:
-            lowest_cost, minimum, weights = cost, trial, trial_weights
+            lowest_cost = cost
+            minimum = trial
+            weights = trial_weights
     model.require_connected(graph, weights > 0.0, "the edges that gnc did not drop")
     return _Minimum(minimum.state, minimum.cost, iteration_count, minimum.converged), weights
 
 
 def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tuple[_Minimum, Array]:
     """Run graduated non-convexity from one start (Yang 2020, algorithm 1, eq. 13 and 14)."""
-    state, iteration_count = start, 0
-    # edges that cannot be false have an infinite bound
+    state = start
+    iteration_count = 0
+    # Edges that cannot be false have an infinite bound, so their excess is -1
     excess = 2.0 * state.chi2 / bound - 1.0
     if np.max(excess) > 0.0:
         control = 1.0 / float(np.max(excess))
@@ -284,15 +293,17 @@ def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tupl
             stage = _minimise(
                 graph, state, _least_squares_kernel(weights), _STAGE_TOLERANCE, _STAGE_ITERATIONS
             )
-            state, iteration_count = stage.state, iteration_count + stage.iterations
+            state = stage.state
+            iteration_count = iteration_count + stage.iterations
             if np.all((weights < 1e-6) | (weights > 1.0 - 1e-6)):
                 break
             control *= _GNC_FACTOR
     weights = (state.chi2 <= bound).astype(float)
     for _ in range(_MAX_TRUNCATION_ROUNDS):
         minimum = _minimise(graph, state, _least_squares_kernel(weights))
-        state, iteration_count = minimum.state, iteration_count + minimum.iterations
-        # each round decreases the truncated cost, so the loop ends
+        state = minimum.state
+        iteration_count = iteration_count + minimum.iterations
+        # Each round decreases the truncated cost, so the iteration ends
         new_weights = (state.chi2 <= bound).astype(float)
         if np.array_equal(new_weights, weights):
             break
