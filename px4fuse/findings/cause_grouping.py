@@ -37,6 +37,8 @@ UNUSABLE = (
     "source_positions_rounded",
     "source_timestamps_shared",
 )
+# Evidence key of a jump that the source announced: it set a new origin
+ANNOUNCED = "reset_at_s"
 MISLEADING = ("source_timestamp_unit", "source_position_held", "source_zero_positions")
 # Kind of cause of no_motion: the vehicle stayed on the ground
 GROUND = "never took off"

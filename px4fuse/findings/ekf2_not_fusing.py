@@ -121,7 +121,7 @@ def _reason_and_action(analysis: Comparison, ekf2: Ekf2) -> tuple[str, str, str]
         )
     clock, minimum = analysis.source.clock_map, parameters.get("EKF2_EV_QMIN", 0)
     if clock is not None and clock.clock in STAMP_FAULTS:
-        return f"their timestamps are {STAMP_FAULTS[clock.clock]}", "", SET_TIMESTAMP
+        return f": their timestamps are {STAMP_FAULTS[clock.clock]}", "", SET_TIMESTAMP
     quality = analysis.source.status.get("quality", pd.Series(dtype=float))
     quality = quality[analysis.segment.start_s : analysis.segment.end_s]
     if minimum > 0 and len(quality) and np.mean(quality < minimum) > MIN_FUSING_SHARE_ERROR:
@@ -155,7 +155,7 @@ def _low_quality(quality: float, minimum: int) -> tuple[str, str, str]:
             "Send ODOMETRY with a quality: VISION_POSITION_ESTIMATE has none, which EKF2 reads as 0"
         )
     return (
-        f"their quality is {quality:.0f}, EKF2_EV_QMIN is {minimum}",
+        f": their quality is {quality:.0f}, EKF2_EV_QMIN is {minimum}",
         "EKF2 (v1.14 and later) fuses external vision only with this quality or a better one.",
         f"{action}. Lower EKF2_EV_QMIN only if the positions are correct.",
     )

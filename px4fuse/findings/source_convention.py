@@ -12,7 +12,7 @@ from px4fuse.convention.axes import UNITS, Axes
 from px4fuse.convention.correction import MIN_REMAINDER_DEG, Faults, find_faults
 from px4fuse.convention.model import Convention
 from px4fuse.convention.texts import FRAME_AXES, axes_as_sent, describe_axes, describe_unit
-from px4fuse.findings.cause_grouping import CONVENTION, MISLEADING, UNUSABLE
+from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION, MISLEADING, UNUSABLE
 from px4fuse.findings.model import CATALOGUE, Finding, Findings, Severity, finding
 from px4fuse.flight import PositionTrack, positions_of, source_name
 from px4fuse.text import capitalise_first
@@ -85,7 +85,7 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
         ]
     elif faults.orientation == "copied" and not faults.of_positions:
         roots = []
-    roots += [one for one in findings if one.id in MISLEADING]
+    roots += [one for one in findings if one.id in MISLEADING or ANNOUNCED in one.evidence]
     if not roots:
         return [*findings]
     others = [one for one in findings if one not in roots and one.id not in FALSE_AFTER]

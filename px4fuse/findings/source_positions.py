@@ -19,7 +19,7 @@ from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, Bi
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings.cause_grouping import CAUSE, GROUND
+from px4fuse.findings.cause_grouping import ANNOUNCED, CAUSE, GROUND
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
 from px4fuse.findings.missing import MIN_INNOVATION_SHARE
 from px4fuse.findings.model import (
@@ -167,7 +167,9 @@ def detect_jumps(analysis: Analysis) -> Findings:
         positions = capitalise_first(positions_of(analysis.source))
         causes, action = JUMP_CAUSES[analysis.source.origin.kind]
         cause = f"Possible causes: {causes}."
+        evidence = {"count": len(large), "size_m": size_m, "at_s": at_s, "sigma_m": sigma}
         if np.any(np.abs(reset_s - at_s) < MAX_RESET_DISTANCE_S):
+            evidence[ANNOUNCED] = float(reset_s[np.argmin(np.abs(reset_s - at_s))])
             cause = "The source announced it (reset_counter): it relocalised or set a new origin."
         extent = f"by {size_m:.2f} m"
         if len(large) > 1:
@@ -179,7 +181,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
             f"motion (± {1.96 * sigma:.2f} m, 95 %). {cause} The frames before and after it differ "
             "by its size: after the jump KF and EKF2 are wrong by it, with consistent innovations.",
             f"{action} Analyse one side of the jump (--start, --end).",
-            {"count": len(large), "size_m": size_m, "at_s": at_s, "sigma_m": sigma},
+            evidence,
             zero_length_spans(jump.time_s for jump in large),
         )
 
