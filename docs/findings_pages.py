@@ -31,6 +31,7 @@ from exchange import replace  # noqa: E402
 from flights import aisle_flight, unexplained, with_noises  # noqa: E402
 from source_errors import coloured, held, laid_over, two_levels, white  # noqa: E402
 from test_aids import aid_log, outage_free, steps  # noqa: E402
+from test_convention import examples as convention_examples  # noqa: E402
 from test_findings import FAULTS  # noqa: E402
 from test_loop import LAP_S, TRUE, GivenClosure, OdometryNoise, laps  # noqa: E402
 
@@ -124,6 +125,7 @@ def examples() -> dict[str, Example]:
         made_of = {**options, "source": f"{ROOT}/{options['source']}"}
         typed = f"px4fuse loop {options['source']} {drift_option}".strip()
         keep(find_loop(px4fuse.close_loop(**made_of)), f"`{typed}`")
+    keep(convention_examples(), "a simulated loop with changed positions")
     _, odometry = laps(3, 5, OdometryNoise())
     wrong = GivenClosure(20.0, 21.5 + LAP_S, 0.05)
     keep(

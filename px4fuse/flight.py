@@ -187,8 +187,13 @@ class PositionTrack:
         the position of the sensor.
     notes : tuple of str
         Sentences on joined and dropped samples.
+    invalid : Series
+        Rows of the source that are no measurement and not in ``samples``, by time, with the reason:
+        "NaN", "zero" (0, 0, 0 without a position) or "held" (the last position sent again).
     status : DataFrame
         ``reset_counter`` and ``quality`` at the times of the source; only those that are logged.
+    step_m : float
+        Rounding step of the coarsest horizontal coordinate as sent; 0 if there is none.
     """
 
     name: str
@@ -207,7 +212,9 @@ class PositionTrack:
     barometer: pd.DataFrame | None = None
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     notes: tuple[str, ...] = ()
+    invalid: pd.Series[str] = field(default_factory=lambda: pd.Series(dtype=str))
     status: pd.DataFrame = field(default_factory=pd.DataFrame)
+    step_m: float = 0.0
 
     __repr__ = one_line_repr
 

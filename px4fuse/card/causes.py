@@ -30,6 +30,7 @@ from px4fuse.comparison.trials import (
 )
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.findings.cause_grouping import CONVENTION
 from px4fuse.findings.model import CATALOGUE, Finding
 from px4fuse.flight import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
@@ -140,7 +141,7 @@ def _is_setting(finding: Finding) -> bool:
 
 
 def _tier(finding: Finding, trials: Iterable[Trial]) -> int:
-    if finding.id in MEANINGLESS:
+    if finding.id in MEANINGLESS or CONVENTION in finding.evidence:
         return 0
     if any(enters_band(trial) for trial in trials):
         return 1

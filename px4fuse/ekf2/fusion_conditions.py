@@ -14,7 +14,6 @@ import pandas as pd
 from px4fuse.ekf2.intervals import MAX_LATENESS_S
 from px4fuse.ekf2_parameters import AID_MASK, Aid
 from px4fuse.flight import Columns, Ekf2, FusionRecord, PositionTrack, step_values_at
-from px4fuse.log import SENDER_CLOCK
 from px4fuse.record import Span
 
 T = TypeVar("T", pd.DataFrame, "pd.Series[float]")
@@ -27,6 +26,22 @@ BUFFER_COUNT = 20  # samples; longer waits for a timestamp in the future overwri
 GATE_TIME_S = 1.0  # s; EKF2 stops fusion after rejections for this time (no_aid_timeout_max)
 MAX_CONSTANT_M = 1e-3  # range of positions that contain no measurement
 MIN_FAILED_FRACTION = 0.1  # of the time; EKF2 waits 10 s after each failure of a check
+SET_TIMESTAMP = (
+    "Set timestamp_sample to the time of measurement in microseconds since the autopilot's boot."
+)
+SYNCHRONISE = (
+    "Synchronise the clocks: UXRCE_DDS_SYNCT 1 with the uXRCE-DDS agent, or answer TIMESYNC of "
+    "MAVLink. Send microseconds."
+)
+# Clocks of timestamp_sample that EKF2 cannot use, and the effect on EKF2
+STAMP_FAULTS = {
+    **dict.fromkeys(("0", "milliseconds", "seconds"), "too old"),
+    **dict.fromkeys(
+        ("another clock", "an unknown clock", "UNIX time in seconds"), "too old or in the future"
+    ),
+    **{f"UNIX time in {unit}seconds": "in the future" for unit in ("nano", "micro", "milli")},
+    "nanoseconds": "in the future",
+}
 # Checks of GNSS by bit of gps_check_fail_flags, with parameter and unit of the limit. The bit of
 # EKF2_GPS_CHECK is lower by one; the fix is always checked
 GNSS_CHECKS = (
@@ -163,17 +178,14 @@ def _check_gap(attempt: Attempt) -> Unmet | None:
 
 def _check_clock(attempt: Attempt) -> Unmet | None:
     clock_map = attempt.source.clock_map
-    if clock_map is None or clock_map.method != "arrival time" or clock_map.clock == SENDER_CLOCK:
+    if clock_map is None or clock_map.clock not in STAMP_FAULTS:
         return None
     clock = clock_map.clock
-    is_unit = clock.endswith("seconds") and "UNIX" not in clock
     return Unmet(
-        f"the timestamps are {'in ' if is_unit else ''}{clock}",
-        "EKF2 reads timestamp_sample in microseconds since boot of the autopilot. It fuses no "
-        f"position that is older than {attempt.horizon_s + MAX_LATENESS_S:.2f} s or in the future.",
-        "Send the time of measurement in microseconds"
-        if is_unit or clock == "0"
-        else "Synchronise the clocks: TIMESYNC (MAVLink), UXRCE_DDS_SYNCT 1 (uXRCE-DDS)",
+        f"the timestamps are {clock if clock == '0' else f'in {clock}'}",
+        "EKF2 reads timestamp_sample in microseconds since the autopilot's boot: for it the "
+        f"positions are {STAMP_FAULTS[clock]}.",
+        SYNCHRONISE if "UNIX" in clock or "clock" in clock else SET_TIMESTAMP,
     )
 
 
@@ -187,7 +199,7 @@ def _check_age(attempt: Attempt) -> Unmet | None:
         return Unmet(
             f"the timestamps are {-age_s:.2f} s in the future",
             f"EKF2 waits for this time, but buffers only {BUFFER_COUNT} positions.",
-            "Synchronise the clocks: TIMESYNC (MAVLink), UXRCE_DDS_SYNCT 1 (uXRCE-DDS).",
+            SYNCHRONISE,
         )
     if not age_s > attempt.horizon_s + MAX_LATENESS_S:
         return None

@@ -53,7 +53,14 @@ def detect(analysis: Analysis) -> Findings:
 
 def detect_source_gaps(analysis: Analysis) -> Findings:
     """Detect gaps in the position source."""
-    spans = source_gaps(analysis.lines[0].measurement_time_s, analysis.source.rate_hz)
+    invalid_s = analysis.source.invalid.index
+    spans = tuple(
+        (start_s, end_s)
+        for start_s, end_s in source_gaps(
+            analysis.lines[0].measurement_time_s, analysis.source.rate_hz
+        )
+        if not np.any((invalid_s > start_s) & (invalid_s < end_s))  # reported by source_values
+    )
     if spans:
         start_s, end_s = longest_s = max(spans, key=lambda gap: gap[1] - gap[0])
         count = len(spans)
@@ -61,14 +68,14 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
         yield warning(
             "source_gap",
             f"No position for {end_s - start_s:.1f} s{longest}. "
-            f"{_state_errors_after(analysis, longest_s)}",
+            f"{state_errors_after(analysis, longest_s)}",
             f"Check {CHECKS[analysis.source.origin.kind]} at {start_s:.1f} s.",
             {"count": count, "longest_s": end_s - start_s, "at_s": start_s},
             spans,
         )
 
 
-def _state_errors_after(analysis: Analysis, gap_s: Span) -> str:
+def state_errors_after(analysis: Analysis, gap_s: Span) -> str:
     """State the aids that each filter used in a gap, and error and reported σ at its end."""
     result, (start_s, end_s) = analysis.main, gap_s
     before_end_s = np.array([start_s, end_s - SMALLEST_TIME_S])
