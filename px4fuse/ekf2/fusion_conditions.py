@@ -223,7 +223,8 @@ def _check_quality(attempt: Attempt) -> Unmet | None:
         return None
     median = float(quality.median())
     action = (
-        "Improve the light, the texture in view or the speed of flight. Then decrease EKF2_EV_QMIN."
+        "Improve light and texture in view, or fly slower. Set EKF2_EV_QMIN to "
+        f"{max(median, 0.0):.0f} only if the positions are correct."
     )
     note = ""
     if not quality.any():

@@ -37,6 +37,7 @@ EFFECTS = (
     "ekf2_resets",
     "ekf2_fusion_interrupted",
     "ekf2_not_fusing",
+    "ekf2_position_invalid",
     "aid_not_fused",
     "aid_overconfident",
 )
