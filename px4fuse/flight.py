@@ -191,7 +191,8 @@ class PositionTrack:
         Rows of the source that are no measurement and not in ``samples``, by time, with the reason:
         "NaN", "zero" (0, 0, 0 without a position) or "held" (the last position sent again).
     status : DataFrame
-        ``reset_counter`` and ``quality`` at the times of the source; only those that are logged.
+        ``reset_counter``, ``quality`` and ``age_s`` (arrival - timestamp) at the times of the
+        source; only those that are logged.
     step_m : float
         Rounding step of the coarsest horizontal coordinate as sent; 0 if there is none.
     """
@@ -446,9 +447,9 @@ class Ekf2:
     aids : mapping from PX4 name to AidLog
         Logged data of all aids that EKF2 can fuse.
     states : mapping from name to Series
-        Step functions, only those that are logged: ``tilt_align``, ``yaw_align``, ``gnss_fault``,
-        the keys of :attr:`FusionRecord.states`, ``xy_valid``, ``xy_global``, and ``failed_checks``,
-        the bits of ``estimator_status.gps_check_fail_flags``.
+        Step functions, only those that are logged: 1 while an aid is enabled, by its PX4 name;
+        ``tilt_align``, ``yaw_align``, ``gnss_fault``, and the keys of :attr:`FusionRecord.states`;
+        ``xy_valid``, ``xy_global``; ``failed_checks``: ``estimator_status.gps_check_fail_flags``.
     parameters : mapping
         All EKF2_ parameters at the start of the log, by PX4 name, in PX4 units.
     """

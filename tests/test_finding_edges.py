@@ -61,7 +61,7 @@ from px4fuse.findings import (
 )
 from px4fuse.findings.cause_grouping import ELSEWHERE, GAP
 from px4fuse.findings.model import fraction_on, spans_with_value, zero_length_spans
-from px4fuse.flight import Columns, FusionRecord, Reset, Unavailable
+from px4fuse.flight import Columns, Reset, Unavailable
 from px4fuse.log import Dropout
 from px4fuse.position_source import (
     ALIGNED,
@@ -186,12 +186,11 @@ def test_ekf2_not_fusing_severity_follows_fraction_of_time(
 
 def never_fusing(rate_hz: float = 5.0, age_s: float | None = None, **parts: Any) -> Any:
     """Make a flight on which EKF2 never fuses; samples have this age, the horizon is 0.2 s."""
-    record: Any = NONE
     if age_s is not None:
-        age = pd.Series([9.0, age_s, age_s, age_s, 9.0], index=[9.0, 20.0, 30.0, 40.0, 111.0])
-        record = made(FusionRecord, vision_age_s=age)
+        ages = [9.0, age_s, age_s, age_s, 9.0]
+        parts["status"] = pd.DataFrame({"age_s": ages}, index=[9.0, 20.0, 30.0, 40.0, 111.0])
     horizon, parameters = parts.pop("horizon_s", 0.2), parts.pop("parameters", {})
-    ekf2 = {**with_fusion((0.0, 0.0)), "record": record, "horizon_s": horizon}
+    ekf2 = {**with_fusion((0.0, 0.0)), "horizon_s": horizon}
     fed = source(rate_hz=rate_hz, **parts)
     return analysis(ekf2=ekf2, log=log(parameters=parameters), source=fed)
 
@@ -224,12 +223,12 @@ UNKNOWN = "The log does not contain the reason"
         (never_fusing(5.0, parameters={"EKF2_EV_CTRL": 15.0}), UNKNOWN, "SDLOG_PROFILE"),
         (never_fusing(age_s=0.29), UNKNOWN, "SDLOG_PROFILE"),
         (never_fusing(age_s=1.0, horizon_s=NONE), UNKNOWN, "SDLOG_PROFILE"),
-        (never_fusing(age_s=5.0, horizon_s=NONE), "the positions are 5.00 s old", "EKF2_DELAY_MAX"),
+        (never_fusing(age_s=5.0, horizon_s=NONE), "the positions are 5.00 s old", "TIMESYNC"),
         (never_fusing(age_s=-4.1), "the timestamps are 4.10 s in the future", "TIMESYNC"),
         (
             never_fusing(age_s=0.31),
             "the positions are 0.31 s old at arrival. EKF2 buffers only 0.20 s",
-            "EKF2_DELAY_MAX",
+            "EKF2_DELAY_MAX to 350 ms",
         ),
         (
             never_fusing(age_s=0.28, parameters={"EKF2_EV_DELAY": 50.0}),

@@ -13,7 +13,7 @@ import pandas as pd
 
 from px4fuse.ekf2.intervals import MAX_LATENESS_S
 from px4fuse.ekf2_parameters import AID_MASK, Aid
-from px4fuse.flight import Columns, Ekf2, FusionRecord, PositionTrack, step_values_at
+from px4fuse.flight import Columns, Ekf2, PositionTrack, step_values_at
 from px4fuse.record import Span
 
 T = TypeVar("T", pd.DataFrame, "pd.Series[float]")
@@ -23,6 +23,7 @@ EV_STOP_INTERVAL_S = 0.4  # two times EV_MAX_INTERVAL, ev_pos_control.cpp
 OLD_EV_STOP_S = GNSS_STOP_S = 7.0  # v1.13; reset_timeout_max
 MAX_HORIZON_S = 1.0  # s; maximum of the delay parameters of EKF2
 BUFFER_COUNT = 20  # samples; longer waits for a timestamp in the future overwrite the sample
+TIME_STEP_S = 5e-7  # s; half of the resolution of timestamps
 GATE_TIME_S = 1.0  # s; EKF2 stops fusion after rejections for this time (no_aid_timeout_max)
 MAX_CONSTANT_M = 1e-3  # range of positions that contain no measurement
 MIN_FAILED_FRACTION = 0.1  # of the time; EKF2 waits 10 s after each failure of a check
@@ -101,9 +102,10 @@ class Attempt:
 
     @property
     def horizon_s(self) -> float:
-        """Age that EKF2 buffers; its upper limit if it is not logged."""
+        """Age that EKF2 buffers; if it is not logged, EKF2_DELAY_MAX or else an upper limit."""
         horizon_s = self.ekf2.horizon_s
-        return horizon_s if isinstance(horizon_s, float) else MAX_HORIZON_S
+        limit_s = 1e-3 * self.parameters.get("EKF2_DELAY_MAX", 1e3 * MAX_HORIZON_S)
+        return horizon_s if isinstance(horizon_s, float) else limit_s
 
     @property
     def interval_s(self) -> float:
@@ -190,11 +192,10 @@ def _check_clock(attempt: Attempt) -> Unmet | None:
 
 
 def _check_age(attempt: Attempt) -> Unmet | None:
-    record = attempt.ekf2.record
-    if not isinstance(record, FusionRecord):
+    if "age_s" not in attempt.source.status:
         return None
     delay_s = attempt.parameters.get(attempt.aid.delay, 0.0) * 1e-3
-    age_s = float(attempt.within(record.vision_age_s).median()) + delay_s
+    age_s = float(attempt.within(attempt.source.status["age_s"]).median()) + delay_s
     if -age_s > BUFFER_COUNT * attempt.interval_s:
         return Unmet(
             f"the timestamps are {-age_s:.2f} s in the future",
@@ -207,7 +208,10 @@ def _check_age(attempt: Attempt) -> Unmet | None:
         f"the positions are {age_s:.2f} s old at arrival",
         f"EKF2 buffers only {attempt.horizon_s:.2f} s. Timestamps that are too early have the same "
         "effect.",
-        "Check the clock of the sender. Then increase EKF2_DELAY_MAX (v1.15 and later).",
+        f"Check the clock of the sender. Then set EKF2_DELAY_MAX to {50 * np.ceil(20.0 * age_s):.0f} "
+        "ms (v1.15 and later)."
+        if age_s < MAX_HORIZON_S
+        else SYNCHRONISE,
     )
 
 
@@ -242,7 +246,7 @@ def _check_interval(attempt: Attempt) -> Unmet | None:
     intervals_s = np.diff(attempt.within(attempt.source.samples).index)
     # the rate of a reconstructed source is that of the logger
     is_unknown = attempt.source.origin.reconstructed or not attempt.has_switch
-    if is_unknown or not len(intervals_s) or intervals_s.min() < EV_START_INTERVAL_S:
+    if is_unknown or not len(intervals_s) or intervals_s.min() < EV_START_INTERVAL_S - TIME_STEP_S:
         return None
     return Unmet(
         f"the positions come at {attempt.source.rate_hz:.2g} Hz",
@@ -285,12 +289,13 @@ def _check_gnss_fault(attempt: Attempt) -> Unmet | None:
 
 def _check_gnss_quality(attempt: Attempt) -> Unmet | None:
     mask = int(attempt.parameters.get("EKF2_GPS_CHECK", -1)) << 1 | 1
-    fractions = [
-        (attempt.fraction("failed_checks", bit), bit)
+    fractions = {
+        bit: attempt.fraction("failed_checks", bit)
         for bit in range(len(GNSS_CHECKS))
         if mask >> bit & 1
-    ]
-    failed = sorted((each for each in fractions if each[0] > MIN_FAILED_FRACTION), reverse=True)
+    }
+    failed = [bit for bit, fraction in fractions.items() if fraction > MIN_FAILED_FRACTION]
+    failed.sort(key=lambda bit: -fractions[bit])
     if not failed:
         return None
     samples, velocity = attempt.within(attempt.source.samples), attempt.source.velocity
@@ -298,16 +303,17 @@ def _check_gnss_quality(attempt: Attempt) -> Unmet | None:
     if velocity is not None:
         squares[5] = attempt.within(velocity)["north_m2_s2"]
     texts = []
-    for fraction, bit in failed[:3]:
-        name, limit, unit = GNSS_CHECKS[bit]
-        text = f"{name} ({100.0 * fraction:.0f} % of the time"
-        if bit in squares and squares[bit].notna().any():
-            text += f", median {float(np.sqrt(squares[bit].median())):.2f}{unit}"
-        if limit in attempt.parameters:
-            text += f", limit {limit} {attempt.parameters[limit]:g}{unit}"
+    for bit in failed[:3]:
+        name, parameter, unit = GNSS_CHECKS[bit]
+        text = f"{name} ({100.0 * fractions[bit]:.0f} % of the time"
+        limit = attempt.parameters.get(parameter, np.nan)
+        value = float(np.sqrt(squares[bit].median())) if bit in squares else np.nan
+        # positions without a fix are not in the samples
+        text += f", median {value:.2f}{unit}" if value > limit else ""
+        text += f", limit {parameter} {limit:g}{unit}" if np.isfinite(limit) else ""
         texts.append(f"{text})")
     return Unmet(
-        f"GNSS fails EKF2's check of the {GNSS_CHECKS[failed[0][1]][0]}",
+        f"GNSS fails EKF2's check of the {GNSS_CHECKS[failed[0]][0]}",
         f"Failed checks: {'; '.join(texts)}. EKF2 starts to fuse GNSS after "
         f"{attempt.parameters.get('EKF2_REQ_GPS_H', 10.0):g} s without a failure.",
         "Give the antenna a free view of the sky and wait for the checks before take-off.",

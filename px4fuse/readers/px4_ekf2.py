@@ -273,9 +273,8 @@ def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
 def _read_states(topics: Topics, local: pd.DataFrame, enabled: StepFunctions) -> StepFunctions:
     """Read the step functions of :attr:`Ekf2.states`."""
     checks = topics.primary_samples(px4.LAYOUTS["gnss_checks"], step=True)["failed"].dropna()
-    states = {name: enabled[name] for name in DISTURBANCES if name in enabled}
-    states |= {name: local[name] for name in ("xy_valid", "xy_global") if name in local}
-    return states | ({"failed_checks": checks} if len(checks) else {})
+    validity = {name: local[name] for name in ("xy_valid", "xy_global") if name in local}
+    return {**enabled, **validity, **({"failed_checks": checks} if len(checks) else {})}
 
 
 def _read_fusing(topics: Topics, enabled: StepFunctions) -> TableOrUnavailable:

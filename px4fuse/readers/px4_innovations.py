@@ -54,9 +54,9 @@ def fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
 def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
     """Replace the innovations of external vision by those of GNSS."""
     enabled = {
-        group: log.enabled
+        group: ekf2.states[name]
         for group, name in (("horizontal", source.horizontal), ("vertical", source.vertical))
-        if (log := ekf2.aids.get(name)) is not None and log.enabled is not None
+        if name in ekf2.states
     }
     fusing: TableOrUnavailable = Unavailable(
         "EKF2 fusion flags", "the log does not contain the fusion flags of GNSS", GNSS.to_log

@@ -52,7 +52,7 @@ MIN_ARRIVAL_FRACTION = 0.9
 MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
 # Maximum logged GNSS rate (Hz) of decimated fixes: receivers send 5 to 20 fixes per second
 MAX_DOWNSAMPLED_HZ = 4.0
-STATUS_COLUMNS = ["reset_counter", "quality"]
+STATUS_COLUMNS = ["reset_counter", "quality", "age_s"]
 # Units of timestamps by name, in µs
 STAMP_UNITS = {"microseconds": 1.0, "milliseconds": 1e3, "seconds": 1e6, "nanoseconds": 1e-3}
 MAX_RATE_ERROR = 0.05  # of a clock, to recognise the unit of its timestamps
@@ -174,6 +174,9 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
             frame = names.get(int(samples[field].iloc[-1]), "unknown")
     if name == "estimator_visual_odometry_aligned":
         frame = "NED"  # the field contains the frame before EKF2 rotated the positions to NED
+    if "published_us" in samples:
+        published_s = 1e-6 * (samples["published_us"] - topics.zero_us)
+        samples["age_s"] = published_s - samples.index
     orientation = read_orientation(samples)
     return _make_ulog_track(
         topics,
