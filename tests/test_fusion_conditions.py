@@ -1,5 +1,6 @@
 """First condition of EKF2 that a position source does not meet."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -7,12 +8,14 @@ import pandas as pd
 import pytest
 from findings_tools import NONE, analysis, made, moving, named, only, positions, source
 
+from px4fuse.comparison.comparison import compare
 from px4fuse.ekf2.fusion_conditions import Attempt, find_unmet
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.findings import ekf2_not_fusing
 from px4fuse.flight import AidLog, Ekf2
 from px4fuse.log import ClockMap
 from px4fuse.position_source import GNSS, POSITION_FILE
+from px4fuse.readers import read_log
 from px4fuse.readers.px4_innovations import fused_aid
 
 SPAN_S = (20.0, 60.0)
@@ -143,6 +146,31 @@ def test_invalid_position_is_reported_with_its_error(valid_until_s: float, expec
     for finding in ekf2_not_fusing.detect(one):
         assert "1999910 m" in finding.message or "1999960 m" in finding.message
         assert finding.spans_s == ((valid_until_s, 110.0),)
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize(
+    ("path", "source_name", "texts"),
+    [
+        ("cases/case19.ulg", "vehicle_visual_odometry", ("quality is 20", "EKF2_EV_QMIN 50")),
+        ("cases/case10.ulg", "vehicle_visual_odometry", ("UNIX time", "UXRCE_DDS_SYNCT")),
+        ("logs/conventions/quality_low.ulg", None, ("quality is 30", "EKF2_EV_QMIN 50")),
+        ("logs/conventions/stamps_ms.ulg", None, ("in milliseconds", "microseconds")),
+        ("logs/gps/main202603_gps_outage_flow.ulg", None, ("3D fix (96 %", "23.9 s")),
+        ("logs/simulated/v1.16.1_aisle_nlos.ulg", None, ("no position for 8.2 s",)),
+        ("logs/conventions/clean_uwb.ulg", None, ()),
+        ("logs/flown/eg1_base.ulg", None, ()),
+    ],
+)
+def test_logged_flight_has_first_unmet_condition(
+    path: str, source_name: str | None, texts: tuple[str, ...], shared_logs: Path
+) -> None:
+    flight = read_log(shared_logs.parent / path)
+    compared = compare(flight, position_source=source_name)
+    found = [one for one in ekf2_not_fusing.detect(compared) if "condition" in one.evidence]
+    assert len(found) == bool(texts)
+    for text in texts:
+        assert text in f"{found[0].message} {found[0].remedy}"
 
 
 def test_global_position_shows_gnss_fusion_without_flags() -> None:

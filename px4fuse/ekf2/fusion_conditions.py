@@ -204,14 +204,18 @@ def _check_age(attempt: Attempt) -> Unmet | None:
         )
     if not age_s > attempt.horizon_s + MAX_LATENESS_S:
         return None
+    action = SYNCHRONISE
+    if age_s < MAX_HORIZON_S:
+        delay_ms = 50.0 * np.ceil(20.0 * age_s)
+        action = (
+            f"Check the clock of the sender. Then set EKF2_DELAY_MAX to {delay_ms:.0f} ms (v1.15 "
+            "and later)."
+        )
     return Unmet(
         f"the positions are {age_s:.2f} s old at arrival",
         f"EKF2 buffers only {attempt.horizon_s:.2f} s. Timestamps that are too early have the same "
         "effect.",
-        f"Check the clock of the sender. Then set EKF2_DELAY_MAX to {50 * np.ceil(20.0 * age_s):.0f} "
-        "ms (v1.15 and later)."
-        if age_s < MAX_HORIZON_S
-        else SYNCHRONISE,
+        action,
     )
 
 
