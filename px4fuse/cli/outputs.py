@@ -82,7 +82,7 @@ def progress(output: Path | None = None) -> Iterator[ShowProgress]:
     from rich.console import Console
 
     console = Console(stderr=True)
-    # no disabled progress bar: older versions of rich print an empty line after it
+    # no progress bar, not even a disabled one: older versions of rich print an empty line after it
     if not console.is_terminal or output == STANDARD_OUTPUT:
         yield show_nothing
         return

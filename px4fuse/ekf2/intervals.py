@@ -43,8 +43,9 @@ MAX_LATENESS_S = 0.1
 MIN_LATENESS_S = 0.03
 # Action on a position sample: none, update of the state, or start of fusion with a reset
 IDLE, FUSE, START = 0, 1, 2
-# Number of columns of the sensitivity of an interval's final state: initial attitude error, gyro
-# bias and accelerometer bias (3 columns each), correction of the nominal attitude, acceleration
+# Number of columns of the sensitivities of the state at the end of an interval: to initial attitude
+# error, gyro bias and accelerometer bias (3 columns each), to the correction of the nominal
+# attitude, and to the acceleration
 EFFECT_COLUMNS = 11
 CORRECTION_COLUMN, INPUT_COLUMN = 9, 10
 

@@ -44,7 +44,7 @@ def vision_samples(
 
     The rows are position north and east (m), see
     :func:`~px4fuse.ekf2.replay_segments.samples_by_event`; age, measurement time and fusion time
-    (s); reported variances north and east (m²); and 1.
+    (s); reported variances north and east (m²); and 1 for a sample. All are 0 without a sample.
     """
     vision = inputs.vision
     time_s = segment.time_s
@@ -176,7 +176,7 @@ class VisionFilter:
         is_fused = has_sample & ~is_outside_gate & ~has_restarted
         reset = restarts & (without_gnss | (is_failing & (now_s - gnss_fused_s > MAX_REJECTED_S)))
         is_evaluated = has_sample & ~has_restarted | reset
-        # EKF2 logs innovation 0 for a sample to which it resets its position
+        # if EKF2 resets its position to a sample, it logs innovation 0 for this sample
         update_log = (
             *np.where(reset, 0.0, nu.T),
             *diagonal.T,

@@ -128,7 +128,7 @@ def batch(
     progress : callable
         Function of the activity, the number of finished logs, and the number of all logs.
     **settings
-        The arguments above, and those of :func:`px4fuse.compare`, such as ``sigma_z_m``.
+        The arguments above, and the arguments of :func:`px4fuse.compare`, such as ``sigma_z_m``.
 
     Returns
     -------
