@@ -448,7 +448,7 @@ def _make_segment(
         rotation = conjugate(interpolate(at_s, times, end_attitude))
         return at_s, multiply(frame[Columns.QUATERNION].to_numpy(), rotation)
 
-    # rotation (NED) from the attitude integrated from the gyro to the published attitude
+    # rotation (NED) between the attitude integrated from the gyro and the published attitude
     extra_rotation = interpolate(times, *relative_attitude(attitude, 0.0, gyro))
     nominal = multiply(extra_rotation, gyro)
     states, state_rotation = relative_attitude(record.delayed, 1e-4, nominal)

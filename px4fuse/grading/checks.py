@@ -387,7 +387,7 @@ class ConsistencyItem(RubricItem, frozen=True, tag="consistent"):
     factor: Factor = 2.0
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
-        """Score the verdict on the joint NIS of the axes north and east."""
+        """Score the verdict on the joint NIS of KF along north and east."""
         comparison = check_input.comparison
         if comparison is None:
             return NO_COMPARISON

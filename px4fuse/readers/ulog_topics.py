@@ -225,8 +225,7 @@ class Topics:
         return None
 
     def frame(self, layout: Layout, instance: int = 0, *, step: bool = False) -> pd.DataFrame:
-        """Read the fields of one layout as a DataFrame of float64, indexed by measurement time in
-        s.
+        """Read the fields of a layout as a DataFrame of float64, indexed by measurement time (s).
 
         Parameters
         ----------
