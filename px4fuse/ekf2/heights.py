@@ -44,7 +44,7 @@ OLD_BAROMETER_HZ = 15.0
 MIN_BAROMETER_LOG_HZ = 4.0
 # Minimum innovation gate (√S) in EKF2
 MIN_GATE = 1.0
-# Minimum measurement noise in EKF2, of positions (m) and of velocities (m/s)
+# Minimum measurement noise (σ) in EKF2, of positions (m) and of velocities (m/s)
 MIN_SIGMA = 0.01
 
 

@@ -54,7 +54,7 @@ def vision_samples(
     step = np.maximum.accumulate(np.searchsorted(time_s, due_s - 1e-9))
     is_usable = (step > 0) & (step < len(time_s)) & (due_s < measured_at_s + MAX_LATENESS_S)
     is_usable &= np.isfinite(vision.position_m[:, 0])
-    is_usable[:-1] &= step[1:] > step[:-1]  # of two samples in one step EKF2 fuses only the newer
+    is_usable[:-1] &= step[1:] > step[:-1]  # EKF2 fuses only the newer of two samples in one step
     step = step[is_usable]
     lever_arm_m = np.array([settings[name] for name in EV_POS.lever_arm]) - inputs.imu_offset_m
     position_m = (vision.position_m[is_usable] - segment.rotation[step] @ lever_arm_m)[:, :2]

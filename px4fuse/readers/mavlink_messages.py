@@ -15,7 +15,7 @@ from px4fuse.readers.field_maps import Layout, expand_layouts
 from px4fuse.record import table
 
 AUTOPILOT_COMPONENT_ID = 1  # MAV_COMP_ID_AUTOPILOT1
-INVALID_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a ground station, a camera, a companion computer
+INVALID_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: sent by ground stations, cameras, companions
 GROUND_STATION_TYPE = 6  # MAV_TYPE_GCS
 ON_GROUND_STATE = 1  # MAV_LANDED_STATE_ON_GROUND
 AUTO_MAIN_MODE = 4  # PX4_CUSTOM_MAIN_MODE_AUTO
