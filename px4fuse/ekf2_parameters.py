@@ -98,7 +98,7 @@ class Parameter(NamedTuple):
 
     @property
     def printed_unit(self) -> str:
-        """Unit with superscripts."""
+        """Unit with superscripts: "m/s²" for "m/s^2"."""
         return self.unit.replace("^2", "²").replace("^3", "³")
 
     def describe_range_error(self, value: float) -> str:

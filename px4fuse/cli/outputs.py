@@ -336,7 +336,7 @@ def write_and_print(
 
 
 def show_page(page: Page, *, is_error: bool = False) -> None:
-    """Print a page on the terminal, an error on standard error."""
+    """Print a page on standard output or, if it reports an error, on standard error."""
     from px4fuse.report.screen import show
 
     show(terminal(is_error=is_error), page.blocks)
