@@ -55,7 +55,7 @@ FINDING_WITH_TIME = {
     "dropout": "source_gap",
 }
 NO_MISTAKE = "No mistake: about 5 % of the innovations are outside ±2√S, and they are white."
-# Name of the mistake "SIGMA_Z of KF is too small", which is not in the log
+# Name of the mistake "SIGMA_Z of KF is too small", which is a wrong setting and no fault in the log
 NOISY_UWB = "noisy-uwb"
 
 

@@ -29,7 +29,7 @@ from px4fuse.reading import display_name, read_bytes_limited
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
 
-# Maximum file size: several days of UWB positions
+# Maximum file size (bytes): several days of UWB positions
 MAX_FILE_BYTES = 500_000_000
 MIN_ROWS = 3
 # Limits (s) of plausible intervals: UWB systems have rates of 0.2 Hz to 200 Hz, with 10 % variation
