@@ -426,6 +426,12 @@ def _reconcile(
             "The two verdicts of each filter differ: both filters follow the wrong positions, so "
             "the innovations stay small and cannot show it. Ground truth does."
         )
+    if corrected.issuperset(differing):
+        filters = " and ".join(FILTER_NAMES[owner] for owner in differing)
+        return (
+            f"The two verdicts of {filters} differ: innovations hardly show this fault, ground truth "
+            "does. The re-run above removes most of the error."
+        )
     tuned = analysis.tuning.get(HORIZONTAL)
     if analysis.source.origin.may_drift:
         noise = ""
