@@ -49,6 +49,9 @@ SOURCE_NAMES: Mapping[PositionKind, str] = {
 }
 
 
+NO_INVALID_ROWS: pd.Series[str] = pd.Series(dtype=str, index=pd.Index([], dtype=np.float64))
+
+
 class Columns:
     """Column names of all tables of a flight, with units."""
 
@@ -214,7 +217,7 @@ class PositionTrack:
     barometer: pd.DataFrame | None = None
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     notes: tuple[str, ...] = ()
-    invalid: pd.Series[str] = field(default_factory=lambda: pd.Series(dtype=str))
+    invalid: pd.Series[str] = field(default_factory=lambda: NO_INVALID_ROWS)
     status: pd.DataFrame = field(default_factory=pd.DataFrame)
     step_m: float = 0.0
 

@@ -24,6 +24,7 @@ from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
 from px4fuse.findings.missing import MIN_INNOVATION_SHARE
 from px4fuse.findings.model import (
     Findings,
+    Severity,
     error,
     finding,
     format_count,
@@ -313,13 +314,16 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
         direction, doubt = "small" if variance_ratio < 1.0 else "large", ""
         if direction == "large" and error_m is None:
             doubt = " It may cover time-correlated errors."
+        severity: Severity = "error" if ratio >= MIN_VARIANCE_RATIO_ERROR else "warning"
+        use = "EKF2 takes R from the report (EKF2_EV_NOISE_MD 0), but not less than EKF2_EVP_NOISE."
+        if analysis.flight.log.parameters.get("EKF2_EV_NOISE_MD") == 1:
+            severity, use = "note", "EKF2 does not use the report (EKF2_EV_NOISE_MD 1)."
         yield finding(
-            "error" if ratio >= MIN_VARIANCE_RATIO_ERROR else "warning",
+            severity,
             "source_reported_variance_wrong",
             f"The variance that {source_name(source)} reports is {format_factor(ratio)} times too "
             f"{direction}. Reported σ {reported_m:.3g} m; noise {noise_m:.3g} m (95 % {low:.3g} to "
-            f"{high:.3g} m). EKF2 takes R from the report (EKF2_EV_NOISE_MD 0), but not less than "
-            f"EKF2_EVP_NOISE.{doubt}",
+            f"{high:.3g} m). {use}{doubt}",
             f"Report a variance of {noise_m**2:.2g} m² with each position.",
             {
                 "reported_sigma_m": reported_m,

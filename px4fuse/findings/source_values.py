@@ -9,8 +9,9 @@ from scipy.interpolate import CubicHermiteSpline
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.flight_events import max_interval_s
+from px4fuse.convention.lever_arm import estimate_lever_arm
 from px4fuse.filter.signals import cut_to_segment
-from px4fuse.findings.model import Findings, error, warning
+from px4fuse.findings.model import Findings, error, note, warning
 from px4fuse.findings.source_intervals import CHECKS, state_errors_after
 from px4fuse.flight import Columns, Ekf2, Unavailable, positions_of, source_name
 from px4fuse.record import Span
@@ -49,6 +50,7 @@ def detect(analysis: Analysis) -> Findings:
     """Detect values that are no measurement of the vehicle's position."""
     yield from detect_invalid_rows(analysis)
     yield from detect_rounding(analysis)
+    yield from detect_lever_arm(analysis)
     yield from detect_two_senders(analysis)
     yield from detect_copied_estimate(analysis)
 
@@ -81,10 +83,11 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
         times = f"{len(spans)} times between {spans[0][0]:.1f} s and {spans[-1][1]:.1f} s"
         if len(spans) <= 3:
             times = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
-        effect = ""
+        effect, make_finding = "", note if reason == "NaN" else warning
         if duration_s > max_interval_s(1.0 / source.rate_hz):
+            make_finding = warning
             effect = f" {state_errors_after(analysis, _valid_around(analysis, longest_s))}"
-        yield warning(
+        yield make_finding(
             name,
             f"{count} {positions_of(source)} {fault}. They are sent {times}, {total_s:.1f} s in "
             f"total. KF does not use them.{effect}",
@@ -120,6 +123,30 @@ def detect_rounding(analysis: Analysis) -> Findings:
         "Estimates from the positions are left out.",
         action,
         {"step_m": step_m},
+    )
+
+
+def detect_lever_arm(analysis: Analysis) -> Findings:
+    """Detect a sensor that is mounted away from the IMU without a lever arm in EKF2."""
+    source, convention = analysis.source, analysis.convention
+    is_received = source.origin.has_all_samples and not source.origin.is_gnss
+    if not is_received or convention is None or convention.verdict != "determined":
+        return
+    arm = estimate_lever_arm(analysis.flight, source)
+    if arm is None:
+        return
+    forward_m, right_m, _ = source.lever_arm_m
+    size_m = float(np.hypot(arm.forward_m, arm.right_m))
+    sensor = "sensor" if source.origin.kind == "file" else f"{source_name(source)} sensor"
+    yield warning(
+        "source_lever_arm",
+        f"The {sensor} is mounted {size_m:.2f} m from the position that EKF2 assumes: "
+        f"{arm.forward_m:+.2f} m forward, {arm.right_m:+.2f} m right (± {1.96 * arm.sigma_m:.2f} "
+        "m, 95 %). In each turn the positions move relative to the vehicle by up to twice this "
+        "lever arm. Estimates from the positions are left out.",
+        "Measure the position of the sensor relative to the IMU. Set EKF2_EV_POS_X to "
+        f"{forward_m + arm.forward_m:.2f} m and EKF2_EV_POS_Y to {right_m + arm.right_m:.2f} m.",
+        {"forward_m": arm.forward_m, "right_m": arm.right_m, "sigma_m": arm.sigma_m},
     )
 
 

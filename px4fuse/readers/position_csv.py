@@ -19,7 +19,7 @@ import pandas as pd
 
 from px4fuse.arrays import Array, median_interval
 from px4fuse.errors import LogError, SettingsError
-from px4fuse.flight import time_index
+from px4fuse.flight import NO_INVALID_ROWS, time_index
 from px4fuse.readers import position_names
 from px4fuse.readers.common import find_invalid, rounding_step
 from px4fuse.readers.position_names import LENGTH_UNITS, TIME_UNITS, ColumnMeaning, read_column_name
@@ -93,7 +93,7 @@ class PositionRecording:
     notes: tuple[str, ...]
     dropped: int = 0
     metres_per_unit: float = 1.0
-    invalid: "pd.Series[str]" = field(default_factory=lambda: pd.Series(dtype=str))
+    invalid: "pd.Series[str]" = field(default_factory=lambda: NO_INVALID_ROWS)
     step_m: float = 0.0
 
 

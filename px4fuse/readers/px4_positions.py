@@ -12,6 +12,7 @@ from msgspec import structs
 from px4fuse.arrays import Array, IntArray
 from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, effective_settings
 from px4fuse.flight import (
+    NO_INVALID_ROWS,
     Columns,
     Ekf2,
     PositionTrack,
@@ -113,7 +114,7 @@ def make_track(
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
     step_m = max(rounding_step(samples[name].to_numpy()) for name in needed_columns[:2])
     if origin.is_gnss:  # a receiver at rest may repeat its position
-        samples, invalid = finite_rows(samples, needed_columns), pd.Series(dtype=str)
+        samples, invalid = finite_rows(samples, needed_columns), NO_INVALID_ROWS
     else:
         reason = find_invalid(samples, needed_columns)
         samples, invalid = samples[reason == ""], reason[reason != ""]
