@@ -117,13 +117,15 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
     distance_m = _largest_distance_m(analysis, ekf2, spans)
     if distance_m < MIN_INVALID_DISTANCE_M:
         return
+    reference = "ground truth" if isinstance(analysis.flight.truth, Truth) else "source"
+    distance = f" Its distance to the {reference} is up to {format_metres(distance_m)} m."
+    if not np.isfinite(distance_m):
+        distance = ""
     yield finding(
         "error" if share > MIN_FUSING_SHARE_ERROR else "warning",
         "ekf2_position_invalid",
         f"EKF2's horizontal position is invalid {format_percent(share)} of the time. EKF2 sets "
-        "xy_valid to 0, and PX4 does not use the position. Its distance to the "
-        f"{'ground truth' if isinstance(analysis.flight.truth, Truth) else 'source'} is up to "
-        f"{format_metres(distance_m)} m.",
+        f"xy_valid to 0, and PX4 does not use the position.{distance}",
         "Correct the fusion first. Errors of EKF2 in this time do not depend on its noises.",
         {"invalid_fraction": share, "distance_m": distance_m},
         spans,
@@ -131,12 +133,16 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
 
 
 def _largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...]) -> float:
-    """Return the largest horizontal distance (m) of EKF2 to the ground truth, or to the source."""
+    """Return the largest horizontal distance (m) of EKF2 to the ground truth, or to the source.
+
+    NaN if neither covers the spans.
+    """
     truth, axes = analysis.flight.truth, ["north_m", "east_m"]
     reference = truth.samples if isinstance(truth, Truth) else analysis.source.samples
     state = pd.concat([ekf2.state[axes].loc[start:end] for start, end in spans])
     errors = [
-        state[axis] - np.interp(state.index, reference.index, reference[axis]) for axis in axes
+        state[axis] - np.interp(state.index, reference.index, reference[axis], np.nan, np.nan)
+        for axis in axes
     ]
     return float(np.hypot(*errors).max())
 
