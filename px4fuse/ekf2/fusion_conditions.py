@@ -20,7 +20,7 @@ T = TypeVar("T", pd.DataFrame, "pd.Series[float]")
 
 EV_START_INTERVAL_S = 0.2  # EV_MAX_INTERVAL, PX4 v1.14 and later, ev_control.cpp
 EV_STOP_INTERVAL_S = 0.4  # two times EV_MAX_INTERVAL, ev_pos_control.cpp
-OLD_EV_STOP_S = GNSS_STOP_S = 7.0  # v1.13; reset_timeout_max
+STOP_S = 7.0  # s without GNSS, or without vision up to v1.13; reset_timeout_max
 MAX_HORIZON_S = 1.0  # s; maximum of the delay parameters of EKF2
 BUFFER_COUNT = 20  # samples; longer waits for a timestamp in the future overwrite the sample
 TIME_STEP_S = 5e-7  # s; half of the resolution of timestamps
@@ -159,9 +159,8 @@ def _check_frame(attempt: Attempt) -> Unmet | None:
 
 
 def _check_gap(attempt: Attempt) -> Unmet | None:
-    limit_s = OLD_EV_STOP_S if attempt.is_vision else GNSS_STOP_S
-    if attempt.is_vision and attempt.has_switch:
-        limit_s = EV_STOP_INTERVAL_S
+    is_short = attempt.is_vision and attempt.has_switch
+    limit_s = EV_STOP_INTERVAL_S if is_short else STOP_S
     times_s = attempt.source.samples.index.to_numpy()
     start_s, end_s = attempt.span_s
     # fusion stops when the gap has lasted for the limit

@@ -38,12 +38,16 @@ UNKNOWN = Unmet(
 
 
 def detect(analysis: Comparison) -> Findings:
-    """Detect that EKF2 fused the source only in a small part of the segment, and its position."""
+    """Detect an invalid position of EKF2, and a source that EKF2 does not fuse."""
+    if isinstance(analysis.flight.ekf2, Ekf2):
+        yield from _detect_invalid_position(analysis, analysis.flight.ekf2)
+    yield from detect_missing_fusion(analysis)
+
+
+def detect_missing_fusion(analysis: Comparison) -> Findings:
+    """Detect that EKF2 fused the source only in a small part of the segment."""
     ekf2, source = analysis.flight.ekf2, _received_source(analysis)
-    if not isinstance(ekf2, Ekf2):
-        return
-    yield from _detect_invalid_position(analysis, ekf2)
-    if isinstance(ekf2.fusing, Unavailable):
+    if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusing, Unavailable):
         return
     fusing = ekf2.fusing["horizontal"]
     share = fraction_on(fusing, analysis.segment)
