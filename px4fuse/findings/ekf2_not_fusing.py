@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.comparison.model import Comparison
+from px4fuse.filter.signals import cut_to_segment
 from px4fuse.findings.model import (
     Findings,
     error,
@@ -122,10 +123,10 @@ def _reason_and_action(analysis: Comparison, ekf2: Ekf2) -> tuple[str, str, str]
     clock, minimum = analysis.source.clock_map, parameters.get("EKF2_EV_QMIN", 0)
     if clock is not None and clock.clock in STAMP_FAULTS:
         return f": their timestamps are {STAMP_FAULTS[clock.clock]}", "", SET_TIMESTAMP
-    quality = analysis.source.status.get("quality", pd.Series(dtype=float))
-    quality = quality[analysis.segment.start_s : analysis.segment.end_s]
-    if minimum > 0 and len(quality) and np.mean(quality < minimum) > MIN_FUSING_SHARE_ERROR:
-        return _low_quality(float(quality.median()), int(minimum))
+    if minimum > 0 and "quality" in analysis.source.status:
+        quality = cut_to_segment(analysis.source.status, analysis.segment)["quality"]
+        if np.mean(quality < minimum) > MIN_FUSING_SHARE_ERROR:
+            return _low_quality(float(quality.median()), int(minimum))
     horizon_s, age_s = ekf2.horizon_s, _age_s(analysis, ekf2)
     if isinstance(horizon_s, float) and age_s > horizon_s + MAX_LATENESS_S:
         return (
