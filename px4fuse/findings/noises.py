@@ -63,7 +63,8 @@ INTERVAL_WIDENING = (
 MIN_LAG1_AUTOCORRELATION = 0.3  # of the innovations; white ones: below 2/√n, 0.2 for n = 100
 
 MIN_SIGMA_RATIO_ERROR = 2.0  # reported over actual σ, or its inverse, for an error
-NOISE_RATIO_TOLERANCE = 1.25  # maximum ratio of two equal noises (σ): 2 σ of a median of n = 100
+# Maximum ratio of two estimates of one noise: twice the standard error of a median of 100 values
+NOISE_RATIO_TOLERANCE = 1.25
 # Actions if no re-run explains an inconsistent variance
 NOT_EXPLAINED = (
     "No tested change of noise, time offset, frame or outliers explains this. Check the IMU "
