@@ -136,11 +136,12 @@ def _axes_finding(analysis: Comparison, convention: Convention, faults: Faults) 
 def _rotation_finding(analysis: Comparison, convention: Convention, faults: Faults) -> Finding:
     """Make the finding of a frame that is rotated about the vertical."""
     positions, turn_deg = positions_of(analysis.source), faults.rotation_deg
-    reference = "north" if convention.heading_from == "EKF2" else "the heading at take-off"
+    reference = "EKF2's heading" if convention.heading_from == "EKF2" else "the heading at take-off"
     message = (
-        f"{capitalise_first(positions)} are rotated by {turn_deg:+.0f}° relative to {reference}: "
-        "their x axis is not north. The rotation is clockwise from above and constant. "
-        f"{_basis(convention)} The analysis uses the positions rotated to NED."
+        f"{capitalise_first(positions)} are rotated by {turn_deg:+.0f}° relative to {reference}. "
+        "The rotation is clockwise from above and constant. The x axis of the source is not north, "
+        f"unless this heading is wrong. {_basis(convention)} The analysis uses the positions "
+        "rotated to NED."
     )
     action = (
         "Align the frame of the positioning system with north, or rotate positions and "
