@@ -40,7 +40,7 @@ MAX_STEP_S = 0.15  # of the time offset per iteration
 PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
 CLOCKWISE = ("north", "east", "south", "west")
 Axes = tuple[str, str, str]
-# Log prior odds of axes. Left-handed frames: one sign forgotten, or x and y exchanged
+# Log prior odds of axes. Left-handed frames: one wrong sign, or x and y exchanged
 AXES_ODDS: Final[dict[Axes, float]] = {
     ("north", "east", "down"): 1.0,  # as stated
     ("east", "north", "up"): -0.5,
