@@ -57,6 +57,15 @@ def format_number(value: float, digits: int = 3) -> str:
     return f"{Decimal(f'{value:.{digits}g}'):,f}"
 
 
+def count_noun(count: int, noun: str) -> str:
+    """Format a count with its noun.
+
+    >>> count_noun(1, "innovation"), count_noun(2, "innovation")
+    ('1 innovation', '2 innovations')
+    """
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def format_factor(factor: float) -> str:
     """Format a factor with 2 significant digits, or 3 below 2.
 
@@ -68,6 +77,11 @@ def format_factor(factor: float) -> str:
 
 def capitalise_first(text: str) -> str:
     return text[:1].upper() + text[1:]
+
+
+def lower_first(text: str) -> str:
+    """Return a sentence as the continuation of another one; acronyms such as UWB stay."""
+    return text if text[1:2].isupper() else text[:1].lower() + text[1:]
 
 
 def join_first(names: Sequence[str], max_count: int, separator: str = ", ") -> str:

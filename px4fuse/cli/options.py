@@ -131,7 +131,8 @@ def _set_max_size(ctx: click.Context, _: click.Parameter, megabytes: int | None)
         ctx.call_on_close(lambda: max_log_bytes.reset(token))
 
 
-# No request contains this limit, because it depends on the computer and does not affect results
+# Size limit of logs: not part of a request, because the limit depends on the computer and does not
+# affect results
 max_size_option = click.option(
     "--max-size",
     type=click.IntRange(1),
@@ -310,15 +311,15 @@ filter_options = _combine_options(
         "axes",
         type=Choice(get_args(AxisName)),
         multiple=True,
-        help="Axis to analyse; repeatable.  [default: all axes with a position; for GNSS the "
-        "horizontal axes]",
+        help="Axis to analyse, repeatable; aisle is the main axis of the track.  [default: all "
+        "axes with a position; for GNSS the horizontal axes]",
     ),
     click.option(
         "--heading",
         "heading_deg",
         type=TypedQuantity("°", 30.0),
-        help="Heading (°, clockwise from north) of the axis aisle.  [default: main direction of "
-        "the track]",
+        help="Heading (°, clockwise from north) of the main axis.  [default: main direction of the "
+        "track]",
     ),
     click.option(
         "--start",

@@ -82,7 +82,7 @@ def progress(output: Path | None = None) -> Iterator[ShowProgress]:
     from rich.console import Console
 
     console = Console(stderr=True)
-    # no disabled progress bar: older versions of rich print an empty line after it
+    # no progress bar, not even a disabled one: older versions of rich print an empty line after it
     if not console.is_terminal or output == STANDARD_OUTPUT:
         yield show_nothing
         return
@@ -335,14 +335,15 @@ def write_and_print(
         click.launch(str(openable_files[0].resolve()))
 
 
-def show_page(page: Page) -> None:
+def show_page(page: Page, *, is_error: bool = False) -> None:
+    """Print a page on standard output or, if it reports an error, on standard error."""
     from px4fuse.report.screen import show
 
-    show(terminal(), page.blocks)
+    show(terminal(is_error=is_error), page.blocks)
 
 
-def terminal() -> Console:
-    """Return a console on standard output, which raises BrokenPipeError if a pipe has no reader.
+def terminal(*, is_error: bool = False) -> Console:
+    """Return a console; it raises BrokenPipeError if the reader of standard output has ended.
 
     Lines have the width of the terminal. In a pipe a paragraph is one line, unless the environment
     variable COLUMNS contains a width (characters).
@@ -353,7 +354,7 @@ def terminal() -> Console:
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError
 
-    console = PipeConsole(highlight=False)
+    console = PipeConsole(highlight=False, stderr=is_error)
     columns_text = os.environ.get("COLUMNS", "")
     if not console.is_terminal and not (columns_text.isdecimal() and int(columns_text)):
         console.width = UNWRAPPED_WIDTH

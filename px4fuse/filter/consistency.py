@@ -14,6 +14,7 @@ from scipy.special import chdtrc, gammaincinv, stdtr
 
 from px4fuse.arrays import Array, ArrayPair
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Unavailable
+from px4fuse.text import count_noun
 
 # "underconfident": the reported σ is too large; "overconfident": the reported σ is too small
 Verdict = Literal["consistent", "underconfident", "overconfident"]
@@ -29,7 +30,8 @@ LJUNG_BOX_LAGS = 10  # number of lags of the Ljung-Box whiteness test
 # predictor
 Reference = Literal["source", "truth"]
 CONSISTENT_RATIOS: Mapping[Reference, Interval] = {"source": (0.8, 1.25), "truth": (0.67, 1.5)}
-DEFAULT_GATE = 5.0  # √S; default of EKF2_EVP_GATE, for KF and for logs without a gate
+# Innovation gate (√S) for KF and for logs without a gate parameter: default of EKF2_EVP_GATE
+DEFAULT_GATE = 5.0
 
 
 class NisVerdict(Record, frozen=True, kw_only=True):
@@ -175,7 +177,8 @@ def assess(
     if count < MIN_INNOVATIONS:
         return Unavailable(
             "consistency test",
-            f"the filter has only {count} innovations (at least {MIN_INNOVATIONS} are needed)",
+            f"the filter has only {count_noun(count, 'innovation')} (at least {MIN_INNOVATIONS} "
+            "are needed)",
             "Analyse a longer segment, or log the source at a higher rate.",
         )
     if np.ptp(nu_m) == 0.0:

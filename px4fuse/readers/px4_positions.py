@@ -43,15 +43,16 @@ from px4fuse.readers.ulog_topics import MAX_PUBLICATION_LAG_S, Topics
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 GPS_3D_FIX = 3
-# Maximum publication delay (µs) of a sample with the arrival time instead of the measurement time
+# Maximum delay (µs) from timestamp to publication of a sample whose timestamp is the arrival time
 MAX_ARRIVAL_DELAY_US = 100
 # Minimum fraction of samples with arrival time, for a topic that counts as having arrival times
 # only
 MIN_ARRIVAL_FRACTION = 0.9
 # Maximum time difference (s) of a height and a horizontal position that are joined: 2.5 cm error at
 # a climb rate of 0.5 m/s
-HEIGHT_TOLERANCE_S = 0.05
-# Maximum logged GNSS rate (Hz) of decimated fixes: receivers send 5 to 20 fixes per second
+MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
+# Maximum rate (Hz) of logged GNSS fixes that count as downsampled: receivers send 5 to 20 fixes per
+# second
 MAX_DOWNSAMPLED_HZ = 4.0
 STATUS_COLUMNS = ["reset_counter", "quality"]
 # Units of timestamps by name, in µs
@@ -266,11 +267,11 @@ def _with_height(
     Height and horizontal position of a vision sample have the same timestamp, but the logger
     decimates their topics separately.
     """
-    joined = join_nearest(samples, height.assign(_found=True), HEIGHT_TOLERANCE_S)
+    joined = join_nearest(samples, height.assign(_found=True), MAX_HEIGHT_TIME_DIFFERENCE_S)
     without_height = int(joined.pop("_found").isna().sum())
     note = (
         f"{without_height} of {len(joined)} external vision positions have no height within "
-        f"{1e3 * HEIGHT_TOLERANCE_S:.0f} ms"
+        f"{1e3 * MAX_HEIGHT_TIME_DIFFERENCE_S:.0f} ms"
     )
     return joined, (note,) if without_height else ()
 
