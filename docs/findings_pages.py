@@ -34,6 +34,7 @@ from test_aids import aid_log, outage_free, steps  # noqa: E402
 from test_convention import examples as convention_examples  # noqa: E402
 from test_findings import FAULTS  # noqa: E402
 from test_loop import LAP_S, TRUE, GivenClosure, OdometryNoise, laps  # noqa: E402
+from test_source_values import examples as value_examples  # noqa: E402
 
 import px4fuse  # noqa: E402
 from px4fuse.analysis import Analysis, explain  # noqa: E402
@@ -42,7 +43,7 @@ from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
 from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
 from px4fuse.findings import TITLES, Finding, find, find_aids, find_loop, source_frame  # noqa: E402
-from px4fuse.findings.cause_grouping import CONSEQUENCES, RECORDING, SETTINGS, effect_ids  # noqa: E402
+from px4fuse.findings.cause_grouping import CONSEQUENCES, RECORDING, effect_ids  # noqa: E402
 from px4fuse.findings.model import CATALOGUE, GROUPS  # noqa: E402
 from px4fuse.flight import Columns, Unavailable  # noqa: E402
 from px4fuse.report.panels import (  # noqa: E402
@@ -126,6 +127,7 @@ def examples() -> dict[str, Example]:
         typed = f"px4fuse loop {options['source']} {drift_option}".strip()
         keep(find_loop(px4fuse.close_loop(**made_of)), f"`{typed}`")
     keep(convention_examples(), "a simulated loop with changed positions")
+    keep(value_examples(), "a flight of the tests")
     _, odometry = laps(3, 5, OdometryNoise())
     wrong = GivenClosure(20.0, 21.5 + LAP_S, 0.05)
     keep(
@@ -152,7 +154,7 @@ def examples() -> dict[str, Example]:
         if fault.id in made:
             continue
         comparison = compare(fault.fly(), Settings(**fault.settings))
-        tuned = fault.id in SETTINGS or "sigma_z_asked_m" in fault.evidence
+        tuned = fault.id.startswith("sigma_") or "sigma_z_asked_m" in fault.evidence
         analysis = with_noises(comparison) if tuned else unexplained(comparison)
         keep(
             [one for one in find(analysis) if one.id == fault.id], "a flight of the tests", analysis

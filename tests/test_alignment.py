@@ -285,6 +285,21 @@ def test_align_position_file_of_misaligned_frame_warns(flight, yaw_deg, origin_m
     assert alignment.misplaced == alignment.warnings == ()
 
 
+@pytest.mark.parametrize(("unit_m", "message", "remedy"), [
+    (0.01, "in centimetres, not in metres", "Run again with --position-unit cm."),
+    (0.3048, "in feet, not in metres", "Multiply x, y and z by 0.3048 in the file."),
+])  # fmt: skip
+def test_align_position_file_in_another_unit_names_the_unit(
+    sample_flight: Flight, unit_m: float, message: str, remedy: str
+) -> None:
+    file = uwb_file(sample_flight)
+    file.samples[["x_m", "y_m", "z_m"]] /= unit_m
+    with pytest.raises(MissingDataError) as refusal:
+        align(sample_flight, file, frame="enu")
+    assert message in str(refusal.value)
+    assert remedy in str(refusal.value)
+
+
 def test_align_position_file_uses_given_clock_offset(flight: Flight) -> None:
     wrong, _ = align(flight, uwb_file(flight), frame="enu", clock_offset_s=OFFSET_S + 11.0)
     (warning,) = wrong.warnings

@@ -16,6 +16,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import prepare
 from px4fuse.convention.axes import CLOCKWISE, FAMILIES, UNITS, Axes
 from px4fuse.convention.check import check_convention
+from px4fuse.convention.correction import Faults, find_faults
 from px4fuse.convention.model import Convention, OrientationConvention
 from px4fuse.findings import source_convention
 from px4fuse.findings.cause_grouping import CONVENTION
@@ -279,6 +280,39 @@ def test_prepare_copied_orientation_is_left_out():
 def test_detect_clean_source_has_no_finding():
     assert not list(source_convention.detect(prepare(flown())))
     assert not list(source_convention.detect(compared(sent(flown()))))
+
+
+def test_detect_orientation_in_enu_of_ned_positions_names_the_conversion():
+    time, attitude = oriented(flown())
+    quaternion = multiply(multiply(np.array(NED_TO["ENU"]), attitude), np.array(NED_TO["NWU"]))
+    (found,) = source_convention.detect(compared(with_orientation(sent(flown()), quaternion, time)))
+    assert found.evidence[CONVENTION] == "frames"
+    assert "q_NED = (0, √½, √½, 0) ⊗ q ⊗ (0, 1, 0, 0)" in found.remedy
+
+
+def fused(flight: Flight) -> Flight:
+    """Return a flight in which EKF2 fused the position and the yaw of the source."""
+    fusing = pd.DataFrame({"horizontal": [1.0], "vertical": [0.0], "yaw": [1.0]}, index=[0.0])
+    return replace(flight, ekf2=replace(flight.ekf2, fusing=fusing))
+
+
+@pytest.mark.parametrize(("axes", "rotation_deg", "expected"), [
+    (("west", "south", "up"), 20.0, Faults(axes=True, affects_ekf2=True, is_north_unknown=True)),
+    (("west", "north", "down"), -32.0, Faults()),
+])  # fmt: skip
+def test_find_faults_heading_from_source_has_no_rotation(axes, rotation_deg, expected):
+    convention = Convention(
+        verdict="determined", **dict(zip("xyz", axes, strict=True)), rotation_deg=rotation_deg,
+        heading_from="gyroscopes", orientation=OrientationConvention(verdict="determined",
+        frames="FLU to ENU" if axes[2] == "up" else "FRD to NED"),
+    )  # fmt: skip
+    assert find_faults(convention, fused(flown()), "NED") == expected
+
+
+def test_find_faults_of_frd_has_no_rotation():
+    convention = Convention(verdict="determined", x="west", y="north", rotation_deg=-32.0)
+    assert not find_faults(convention, flown(), "FRD")
+    assert find_faults(convention, flown(), "NED").rotation_deg == pytest.approx(58.0)
 
 
 def test_detect_ambiguous_axes_are_listed():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 
 import numpy as np
 import pandas as pd
@@ -13,13 +14,18 @@ from flights import Estimator, Uwb, aisle_flight, unexplained
 from studies.expected_cases import judge, run
 from ulog_tools import make_log, odometry
 
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
-from px4fuse.convention.lever_arm import estimate_lever_arm
 from px4fuse.convention.model import Convention
-from px4fuse.findings import source_convention, source_stamps, source_values
-from px4fuse.findings.ekf2_not_fusing import detect as detect_not_fusing
-from px4fuse.findings.model import finding
-from px4fuse.findings.source_intervals import detect_source_gaps
+from px4fuse.findings import (
+    ekf2_not_fusing,
+    source_convention,
+    source_intervals,
+    source_stamps,
+    source_values,
+)
+from px4fuse.findings.cause_grouping import group_by_cause
+from px4fuse.findings.model import Finding, finding
 from px4fuse.flight import Columns, Flight
 from px4fuse.log import SHARED_STAMPS, ClockMap
 from px4fuse.readers import read_log
@@ -127,81 +133,126 @@ def with_track(flight: Flight, **changes: object) -> Flight:
     return replace(flight, positions=(replace(flight.positions[0], **changes),))
 
 
-def found(flight: Flight, detect=source_values.detect):
-    """Return the findings of one detector by id."""
-    return {one.id: one for one in detect(unexplained(compare(flight)))}
-
-
 def test_detect_invalid_rows_states_times_and_effect():
     flight = aisle_flight(uwb=Uwb(gap_s=(40.0, 46.0)))
     at = pd.Index([*np.arange(40.2, 46.0, 0.2), 80.1, 80.2])
     reasons = pd.Series(["held"] * (len(at) - 2) + ["zero"] * 2, at)
-    zero, held = found(with_track(flight, invalid=reasons)).values()
-    assert (zero.id, zero.evidence["count"]) == ("source_zero_positions", 2)
-    assert held.id == "source_position_held"
+    findings = {one.id: one for one in detected(with_track(flight, invalid=reasons))}
+    assert set(findings) == {"source_zero_positions", "source_position_held"}
+    assert findings["source_zero_positions"].evidence["count"] == 2
+    held = findings["source_position_held"]
     assert held.spans_s[0] == pytest.approx((40.2, 45.8))
     assert "40.2 s to 45.8 s" in held.message
-    assert "KF relies on the IMU alone" in held.message
-    assert not found(with_track(flight, invalid=reasons), detect_source_gaps)
-    assert found(flight, detect_source_gaps)
+    assert "rely on the IMU alone" in held.message
+    assert [one.id for one in detected(flight)] == ["source_gap"]
 
 
 def test_detect_single_row_without_position_is_a_note():
     invalid_rows = pd.Series(["NaN"], pd.Index([60.05]))
-    (one,) = found(with_track(aisle_flight(), invalid=invalid_rows)).values()
+    (one,) = detected(with_track(aisle_flight(), invalid=invalid_rows))
     assert (one.id, one.severity) == ("source_without_position", "note")
 
 
 @pytest.mark.parametrize(("step_m", "words"), [(0.5, "double precision"), (0.1, "more digits")])
 def test_detect_rounding_names_the_remedy(step_m, words):
-    one = found(with_track(aisle_flight(), step_m=step_m))["source_positions_rounded"]
+    (one,) = detected(with_track(aisle_flight(), step_m=step_m))
     assert words in one.remedy
+
+
+def alternating(flight: Flight, lost: int = 0) -> Flight:
+    """Move every other position by 1 m; one sample may be lost."""
+    samples = flight.positions[0].samples.copy()
+    samples.iloc[1::2, :2] += [0.6, -0.8]
+    return with_track(flight, samples=samples.drop(samples.index[[200] * lost]))
+
+
+def copied(flight: Flight, sigma_m: float = 0.0) -> Flight:
+    """Send EKF2's position back 0.03 s later, with noise."""
+    truth = flight.truth.samples
+    time = np.arange(1.0, flight.log.duration_s - 1.0, 0.2)
+    samples = flight.positions[0].samples.iloc[: len(time)].set_axis(time + 0.03)
+    for name in Columns.POSITION:
+        samples[name] = np.interp(time, truth.index, truth[name])
+    samples += np.random.default_rng(1).normal(0.0, sigma_m, samples.shape)
+    return with_track(replace(flight, ekf2=replace(flight.ekf2, state=truth)), samples=samples)
+
+
+def without_rows(flight: Flight, reason: str) -> Flight:
+    """Leave out the rows of 6 s."""
+    samples = flight.positions[0].samples
+    is_invalid = (samples.index > 40.0) & (samples.index < 46.0)
+    return with_track(
+        flight,
+        samples=samples[~is_invalid],
+        invalid=pd.Series(reason, samples.index[is_invalid]),
+    )
+
+
+def with_clock(flight: Flight, name: str, note: str = "", distinct: int | None = None) -> Flight:
+    clock = ClockMap(name, "arrival time", 600, 0.0, 0.0, 0.0, note, distinct)
+    return with_track(flight, clock_map=clock)
+
+
+FAULTS = {
+    "source_is_ekf2_estimate": copied,
+    "source_two_senders": alternating,
+    "source_positions_rounded": lambda flight: with_track(flight, step_m=0.5),
+    "source_timestamp_unit": lambda flight: with_clock(flight, "milliseconds"),
+    "source_timestamps_shared": lambda flight: with_clock(flight, "local", SHARED_STAMPS, 120),
+    "source_position_held": lambda flight: without_rows(flight, "held"),
+    "source_zero_positions": lambda flight: without_rows(flight, "zero"),
+    "source_without_position": lambda flight: without_rows(flight, "NaN"),
+}
+
+
+def detected(flight: Flight) -> tuple[Finding, ...]:
+    analysis = unexplained(compare(flight))
+    detectors = (source_values, source_stamps, source_intervals, ekf2_not_fusing)
+    findings = [one for detector in detectors for one in detector.detect(analysis)]
+    return group_by_cause(source_convention.apply_convention(analysis, findings))
+
+
+def examples() -> Iterator[Finding]:
+    """Return examples of the findings about values and timestamps, for their pages."""
+    for name, change in FAULTS.items():
+        yield from (one for one in detected(change(aisle_flight())) if one.id == name)
+    yield from source_values.detect_lever_arm(mounted((0.4, -0.3)))
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_detect_fault_is_the_only_finding(name):
+    assert [one.id for one in detected(FAULTS[name](aisle_flight()))] == [name]
 
 
 @pytest.mark.parametrize("lost", [0, 1])
 def test_detect_two_senders_states_the_distance(lost):
-    flight = aisle_flight(uwb=Uwb(rate_hz=10.0))
-    samples = flight.positions[0].samples.copy()
-    samples.iloc[1::2, :2] += [0.6, -0.8]
-    samples = samples.drop(samples.index[[200] * lost])
-    one = found(with_track(flight, samples=samples))["source_two_senders"]
+    (one,) = detected(alternating(aisle_flight(uwb=Uwb(rate_hz=10.0)), lost))
     assert one.evidence["distance_m"] == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.parametrize("is_fused", [True, False])
-def test_detect_copied_estimate_needs_equal_positions(is_fused):
-    flight = aisle_flight(ekf2=Estimator(fusing=((0.0, float(is_fused)),)))
-    truth = flight.truth.samples
-    flight = replace(flight, ekf2=replace(flight.ekf2, state=truth))
-    time = np.arange(1.0, 119.0, 0.2)
-    copied = np.column_stack([np.interp(time, truth.index, truth[c]) for c in Columns.POSITION])
-    samples = flight.positions[0].samples.iloc[: len(time)].set_axis(time + 0.03)
-    samples[Columns.POSITION] = copied
-    one = found(with_track(flight, samples=samples))["source_is_ekf2_estimate"]
-    assert one.evidence["delay_s"] == pytest.approx(0.03, abs=0.01)
-    noisy = samples + np.random.default_rng(1).normal(0.0, 0.02, samples.shape)
-    assert not found(with_track(flight, samples=noisy))
+@pytest.mark.parametrize("is_fused", [0.0, 1.0])
+def test_detect_copied_estimate_states_the_delay(is_fused):
+    flight = aisle_flight(ekf2=Estimator(fusing=((0.0, is_fused),)))
+    first, *_ = detected(copied(flight))
+    assert first.evidence["delay_s"] == pytest.approx(0.03, abs=0.01)
+    assert "source_is_ekf2_estimate" not in {one.id for one in detected(copied(flight, 0.02))}
 
 
 def test_detect_clean_flight_has_no_finding():
-    assert not found(aisle_flight())
+    assert detected(aisle_flight()) == ()
 
 
 def test_detect_timestamp_unit_states_that_ekf2_never_fused():
-    clock = ClockMap("milliseconds", "arrival time", 600, 0.0, 0.0, 0.0)
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, 0.0),)))
     flight = replace(flight, log=replace(flight.log, parameters={"EKF2_EV_CTRL": 15}))
-    one = found(with_track(flight, clock_map=clock), source_stamps.detect)["source_timestamp_unit"]
-    assert "in milliseconds" in one.message
-    assert "EKF2 never fused the positions" in one.message
-    reason = found(with_track(flight, clock_map=clock), detect_not_fusing)["ekf2_not_fusing"]
-    assert "their timestamps are too old" in reason.title
+    first, second = detected(with_clock(flight, "milliseconds"))
+    assert "in milliseconds" in first.message
+    assert "EKF2 never fused the positions" in first.message
+    assert "their timestamps are too old" in second.title
 
 
 def test_detect_shared_timestamps_states_the_resolution():
-    clock = ClockMap("local", "as sent", 600, 0.0, 0.0, 0.0, SHARED_STAMPS, 120)
-    flight = aisle_flight(uwb=Uwb(rate_hz=1.0))
-    (one,) = found(with_track(flight, clock_map=clock), source_stamps.detect).values()
+    (one,) = detected(with_clock(aisle_flight(uwb=Uwb(rate_hz=1.0)), "local", SHARED_STAMPS, 120))
     assert one.evidence["resolution_s"] == pytest.approx(1.0)
     assert "(5 Hz)" in one.message
 
@@ -212,7 +263,7 @@ def test_detect_low_quality_is_the_reason(quality, words):
     parameters = {"EKF2_EV_CTRL": 15, "EKF2_EV_QMIN": 50}
     flight = replace(flight, log=replace(flight.log, parameters=parameters))
     status = pd.DataFrame({"quality": quality}, flight.positions[0].samples.index)
-    one = found(with_track(flight, status=status), detect_not_fusing)["ekf2_not_fusing"]
+    (one,) = detected(with_track(flight, status=status))
     assert f"quality is {quality:.0f}, EKF2_EV_QMIN is 50" in one.title
     assert words in one.remedy
 
@@ -228,23 +279,27 @@ def test_find_unusable_source_leaves_no_other_estimate():
     assert left[1].remedy == source_convention.CORRECT_FIRST
 
 
-@pytest.mark.parametrize("arm_m", [(0.4, -0.3), (0.0, 0.0)])
-def test_estimate_lever_arm_equals_truth(arm_m):
+def mounted(arm_m: tuple[float, float]) -> Analysis:
+    """Return a flight whose sensor is mounted away from the IMU."""
     flight = simulate_flight(Scenario(seed=3, kind="loop", passes=2), parse(()))
     source, attitude = flight.positions[0], flight.truth.attitude
     time = source.samples.index.to_numpy()
     rotation = to_matrix(interpolate(time, attitude.index.to_numpy(), attitude.to_numpy()))
     samples = source.samples.copy()
     samples[Columns.POSITION] += rotation @ [*arm_m, 0.0]
-    arm = estimate_lever_arm(flight, replace(source, samples=samples))
-    if not any(arm_m):
-        assert arm is None
-        return
-    assert (arm.forward_m, arm.right_m) == pytest.approx(arm_m, abs=0.1)
     analysis = unexplained(compare(with_track(flight, samples=samples)))
-    analysis = replace(analysis, convention=Convention(verdict="determined"))
-    (one,) = source_values.detect_lever_arm(analysis)
+    return replace(analysis, convention=Convention(verdict="determined"))
+
+
+def test_detect_lever_arm_equals_truth():
+    (one,) = source_values.detect_lever_arm(mounted((0.4, -0.3)))
+    found_m = one.evidence["forward_m"], one.evidence["right_m"]
+    assert found_m == pytest.approx((0.4, -0.3), abs=0.1)
     assert "Set EKF2_EV_POS_X to 0." in one.remedy
+
+
+def test_detect_no_lever_arm_has_no_finding():
+    assert not [*source_values.detect_lever_arm(mounted((0.0, 0.0)))]
 
 
 @pytest.mark.reallogs

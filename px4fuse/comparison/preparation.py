@@ -9,7 +9,7 @@ from msgspec import structs
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.projection import observation_variance
 from px4fuse.convention.check import check_convention
-from px4fuse.convention.correction import correct
+from px4fuse.convention.correction import correct, find_faults
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.errors import MissingDataError, SettingsError, suggest_name
 from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
@@ -102,6 +102,8 @@ def prepare(
         track = replace(track, origin=structs.replace(track.origin, kind=kind))
     track = shift_clock(track, settings.clock_offset_s)
     convention = None if track.origin.is_gnss else check_convention(flight, track)
+    late_s = find_faults(convention, flight, track.frame).late_s
+    settings = replace(settings, clock_offset_s=settings.clock_offset_s - late_s)
     flight, track = correct(flight, track, convention)
     track = _move_to_vehicle(track, flight)
     track = _use_barometer_height(track, flight, choices.get("height"))

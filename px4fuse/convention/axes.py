@@ -40,7 +40,7 @@ MAX_STEP_S = 0.15  # of the time offset per iteration
 PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
 CLOCKWISE = ("north", "east", "south", "west")
 Axes = tuple[str, str, str]
-# Log prior odds of axes. Left-handed frames: one sign forgotten, or x and y exchanged
+# Log prior odds of axes. Left-handed frames: one wrong sign, or x and y exchanged
 AXES_ODDS: Final[dict[Axes, float]] = {
     ("north", "east", "down"): 1.0,  # as stated
     ("east", "north", "up"): -0.5,
@@ -122,8 +122,9 @@ class Hypothesis:
     has_rotation : bool
         False for a multiple of 90°.
     has_clock_drift : bool
-    scale : float
-        Ratio of the distances in the source to those of the IMU, in addition to the unit.
+    scale, max_scale : float
+        Ratio of the distances in the source to those of the IMU, in addition to the unit: lower
+        limit, with IMU noise only, and upper limit, with noise of the source only.
     sigma_m : float
         Scale of the horizontal residuals.
     windows : float
@@ -138,6 +139,7 @@ class Hypothesis:
     has_rotation: bool = True
     has_clock_drift: bool = False
     scale: float = 1.0
+    max_scale: float = 1.0
     sigma_m: float = 0.0
     windows: float = 0.0
     heading_from: str = "EKF2"
@@ -271,7 +273,10 @@ def _evaluate(
     gain -= sum(student_score(column**2, 1, 1e-6)[0] for column in sent.T[is_known])
     weight = 1.0 / (np.array([[sigma_m**2], [sigma_down_m**2]]) + squares / FREEDOM)
     weight *= row_s / WINDOW_S
-    products = [weight[0] @ (x[:, :2] * measured[:, :2]) for x in (ned, measured)]
+    products = [
+        float(np.sum(weight[0] @ (first[:, :2] * second[:, :2])))
+        for first, second in ((ned, ned), (ned, measured), (measured, measured))
+    ]
     jacobian = np.zeros((len(index), 3, len(PRECISION)))
     jacobian[..., 0] = imu.rate_m_s[index]
     jacobian[:, 0, 1], jacobian[:, 1, 1] = -horizontal.imag, horizontal.real
@@ -290,7 +295,8 @@ def _evaluate(
     scored = replace(
         one,
         score=float(windows * gain - 0.5 * PRECISION @ one.parameters**2),
-        scale=float(np.sum(products[0]) / np.sum(products[1])),
+        scale=products[1] / products[2],
+        max_scale=products[0] / products[1],
         sigma_m=sigma_m,
         windows=windows,
     )

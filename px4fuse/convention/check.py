@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from msgspec import structs
 
-from px4fuse.arrays import Array
 from px4fuse.convention.axes import (
     MAX_OFFSET_S,
     SMALL_ROTATION,
@@ -31,8 +30,9 @@ from px4fuse.convention.orientation import check_orientation
 from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
 
 MIN_LOG_ODDS = 4.0  # to the best other convention
-MIN_GAIN, MIN_GAIN_PER_WINDOW = 8.0, 0.4  # log likelihood over no relation; and per window
-MAX_SCALE_ERROR = 0.12
+MIN_GAIN = 8.0  # log likelihood over no relation
+MIN_GAIN_PER_WINDOW = (0.15, 0.4)  # of a determined and of an ambiguous convention
+MIN_SCALE, MAX_SCALE = 0.88, 1.12
 # Residuals over those that explain the noise of the source and the minimum error (m) of the IMU
 MAX_RESIDUAL_RATIO, IMU_ERROR_M = 2.4, 0.05
 MAX_LOGGED_DEFICIT = 20.0  # by which the logged heading may fit worse than the gyro's
@@ -129,19 +129,17 @@ def _decide(found: list[Hypothesis], positions: Positions, drift: float) -> Conv
     if not positions.position_m[:, 2].any():  # without height, up and down are equivalent
         rivals = [one for one in rivals if one.axes[:2] != best.axes[:2]]
     log_odds = best.score - rivals[0].score if rivals else None
-    noise_m = UNITS[best.unit] * white_noise(positions.position_m)
-    explained_m = np.hypot(np.sqrt(SECOND_DIFFERENCE) * noise_m, IMU_ERROR_M)
-    verdict: Verdict = "determined"
+    is_ambiguous = log_odds is not None and log_odds < MIN_LOG_ODDS
+    verdict: Verdict = "ambiguous" if is_ambiguous else "determined"
     if best.score < MIN_GAIN:
         verdict = "not determinable"
     elif (
-        best.score < MIN_GAIN_PER_WINDOW * best.windows
-        or abs(best.scale - 1.0) > MAX_SCALE_ERROR
-        or best.sigma_m > MAX_RESIDUAL_RATIO * explained_m
+        best.score < MIN_GAIN_PER_WINDOW[is_ambiguous] * best.windows
+        or best.scale > MAX_SCALE
+        or best.max_scale < MIN_SCALE
+        or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO
     ):
         verdict = "doubtful"
-    elif log_odds is not None and log_odds < MIN_LOG_ODDS:
-        verdict = "ambiguous"
     names: dict[str, Any] = dict(zip("xyz", best.axes, strict=True))
     names |= {"unit": best.unit, "heading_from": best.heading_from}
     return Convention(
@@ -167,17 +165,21 @@ def _describe(one: Hypothesis) -> str:
     return f"x {x}, y {y}, z {z}, {one.unit}{rotation}, timestamps {one.offset_s:+.1f} s late"
 
 
-def white_noise(position: Array) -> float:
-    """Return the white noise (1 σ) of positions, from third differences: without motion."""
-    third = np.diff(position, 3, axis=0)
-    deviation = float(np.median(np.abs(third - np.median(third, axis=0))))
-    return 1.4826 * deviation / float(np.sqrt(THIRD_DIFFERENCE))
+def residual_ratio(one: Hypothesis, positions: Positions) -> float:
+    """Return the residuals over those that noise of the source and error of the IMU explain.
+
+    The noise is that of third differences, which contain hardly any motion.
+    """
+    third = np.diff(positions.position_m, 3, axis=0)
+    deviation = 1.4826 * float(np.median(np.abs(third - np.median(third, axis=0))))
+    noise_m = UNITS[one.unit] * deviation * np.sqrt(SECOND_DIFFERENCE / THIRD_DIFFERENCE)
+    return float(one.sigma_m / np.hypot(noise_m, IMU_ERROR_M))
 
 
 def _clock_drift(positions: Positions, imu: ImuMotion, best: Hypothesis) -> float:
     """Return the most likely drift of the clock; if nothing fits, drifts of 5 % are tried."""
     start = 0.0
-    if best.score < MIN_GAIN_PER_WINDOW * best.windows:
+    if best.score < MIN_GAIN or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO:
         gains = []
         for drift in DRIFTS:
             source = positions.with_clock_drift(drift).motion(imu)

@@ -44,6 +44,8 @@ class Faults:
         Fault of the orientation; "" if there is none.
     affects_ekf2 : bool
         True if EKF2 fused a faulty source, so that its attitude is wrong, too.
+    is_north_unknown : bool
+        True if EKF2's heading came from the source, so that the rotation is unknown.
     is_ambiguous : bool
         True if other conventions than NED in metres fit equally well, but NED does not.
     """
@@ -55,6 +57,7 @@ class Faults:
     clock_drift: float = 0.0
     orientation: OrientationFault = ""
     affects_ekf2: bool = False
+    is_north_unknown: bool = False
     is_ambiguous: bool = False
 
     @property
@@ -100,6 +103,7 @@ def find_faults(convention: Convention | None, flight: Flight, frame: str) -> Fa
         late_s=late_s,
         clock_drift=convention.clock_drift,
         orientation=fault,
+        is_north_unknown=axes and has_own_heading,
     )
     is_wrong = faults.of_positions or has_wrong_heading
     return replace(faults, affects_ekf2=is_fused and is_wrong)

@@ -86,3 +86,15 @@ def describe_unit(
         return fault, f"Run again with --position-unit {unit}."
     where = "in the file" if is_file else "before they are sent"
     return fault, f"Multiply x, y and z by {UNITS[unit]:g} {where}."
+
+
+def describe_conversion(frames: str) -> str:
+    """Return the action for an orientation in other frames.
+
+    >>> describe_conversion("FLU to NWU")
+    'Convert the orientation: q_NED = (0, 1, 0, 0) ⊗ q ⊗ (0, 1, 0, 0), in the order w, x, y, z.'
+    """
+    body, _, world = frames.partition(" to ")
+    left = {"ENU": "(0, √½, √½, 0) ⊗ ", "NWU": "(0, 1, 0, 0) ⊗ "}.get(world, "")
+    right = " ⊗ (0, 1, 0, 0)" if body == "FLU" else ""
+    return f"Convert the orientation: q_NED = {left}q{right}, in the order w, x, y, z."

@@ -112,7 +112,7 @@ def clock_offset_option_s(comparison: Comparison, clock: ClockOffset) -> float:
     For a position file, the offset in use is part of its alignment.
     """
     alignment = comparison.source.alignment
-    return clock.offset_s if alignment is None else alignment.clock_offset_s + clock.remaining_s
+    return clock.offset_s + (0.0 if alignment is None else alignment.clock_offset_s)
 
 
 def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:

@@ -11,7 +11,13 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.convention.axes import UNITS, Axes
 from px4fuse.convention.correction import MIN_REMAINDER_DEG, Faults, find_faults
 from px4fuse.convention.model import Convention
-from px4fuse.convention.texts import FRAME_AXES, axes_as_sent, describe_axes, describe_unit
+from px4fuse.convention.texts import (
+    FRAME_AXES,
+    axes_as_sent,
+    describe_axes,
+    describe_conversion,
+    describe_unit,
+)
 from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION, MISLEADING, UNUSABLE
 from px4fuse.findings.model import CATALOGUE, Finding, Findings, Severity, finding
 from px4fuse.flight import PositionTrack, positions_of, source_name
@@ -134,25 +140,30 @@ def _axes_finding(analysis: Comparison, convention: Convention, faults: Faults) 
     alignment, orientation = analysis.source.alignment, convention.orientation
     stated = "NED" if alignment is None else alignment.frame.upper()
     axes = axes_as_sent((convention.x, convention.y, convention.z), stated)
+    limit = " The analysis uses the positions converted to NED."
+    if faults.is_north_unknown and orientation is not None and axes not in FRAME_AXES.values():
+        axes = FRAME_AXES.get(orientation.frames[-3:], axes)
+        limit = " EKF2's heading came from this source, so the direction of north is unknown."
     fault, action = describe_axes(
         axes, stated, is_mirrored=convention.is_mirrored, is_file=alignment is not None
     )
-    if faults.rotation_deg and axes not in FRAME_AXES.values():
+    if faults.axes and faults.rotation_deg:
         fault += f", rotated by {faults.rotation_deg:+.0f}° (clockwise from above)"
     if orientation is not None and orientation.frames.startswith("FLU"):
-        action += " Convert the orientation, too: q_NED = (0, √½, √½, 0) ⊗ q ⊗ (0, 1, 0, 0)."
-    message = f"{fault}. {_basis(convention)} The analysis uses the positions converted to NED."
+        action += f" {describe_conversion(orientation.frames)}"
+    message = f"{fault}. {_basis(convention)}{limit}"
     return _fault("error", "source_axes_wrong", "axes", message, action, convention)
 
 
 def _rotation_finding(analysis: Comparison, convention: Convention, faults: Faults) -> Finding:
     """Make the finding of a frame that is rotated about the vertical."""
     positions, turn_deg = positions_of(analysis.source), faults.rotation_deg
-    reference = "north" if convention.heading_from == "EKF2" else "the heading at take-off"
+    reference = "EKF2's heading" if convention.heading_from == "EKF2" else "the heading at take-off"
     message = (
-        f"{capitalise_first(positions)} are rotated by {turn_deg:+.0f}° relative to {reference}: "
-        "their x axis is not north. The rotation is clockwise from above and constant. "
-        f"{_basis(convention)} The analysis uses the positions rotated to NED."
+        f"{capitalise_first(positions)} are rotated by {turn_deg:+.0f}° relative to {reference}. "
+        "The rotation is clockwise from above and constant. The x axis of the source is not north, "
+        f"unless this heading is wrong. {_basis(convention)} The analysis uses the positions "
+        "rotated to NED."
     )
     action = (
         "Align the frame of the positioning system with north, or rotate positions and "
@@ -250,7 +261,7 @@ def _orientation_finding(analysis: Comparison, convention: Convention, faults: F
             f"The orientation of {name} is {orientation.frames}; PX4 reads FRD to NED, as the "
             "positions are. In that frame roll and pitch agree with the vehicle (median difference "
             f"{orientation.tilt_difference_deg:.1f}°)",
-            "Convert the orientation: q_NED = (0, √½, √½, 0) ⊗ q_ENU ⊗ (0, 1, 0, 0) as w, x, y, z.",
+            describe_conversion(orientation.frames),
         ),
         "heading": (
             f"The heading of the orientation of {name} differs by {error_deg:+.0f}° from its own "
