@@ -32,6 +32,7 @@ from px4fuse.card.model import (
 )
 from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.card.verdicts import verdicts as make_verdicts
+from px4fuse.comparison.flight_events import MIN_GAP_S
 from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth
 from px4fuse.comparison.projection import project_horizon
 from px4fuse.comparison.remedy import aid_of
@@ -203,15 +204,7 @@ def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
 
 def _effect(analysis: Analysis) -> Effect:
     result = analysis.main
-    ekf2, segment = analysis.flight.ekf2, analysis.segment
-    resets = None
-    if isinstance(ekf2, Ekf2):
-        resets = sum(
-            reset.quantity == "position"
-            and any(reset.delta[:2])
-            and segment.start_s < reset.time_s <= segment.end_s
-            for reset in ekf2.resets
-        )
+    has_ekf2 = isinstance(analysis.flight.ekf2, Ekf2)
     difference = result.difference
     return Effect(
         axis=describe_axis(analysis, result),
@@ -223,7 +216,7 @@ def _effect(analysis: Analysis) -> Effect:
         horizontal_rmse_m=_horizontal_rmse_m(analysis),
         difference_rms_m=None if isinstance(difference, Unavailable) else difference.position_rms_m,
         rejected_fraction=result.rejected_fraction,
-        horizontal_resets=resets,
+        horizontal_resets=len(analysis.events.horizontal_resets_s) if has_ekf2 else None,
     )
 
 
@@ -251,12 +244,14 @@ def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
 
 def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]) -> str:
     """Make the sentences about errors, their ratios to σ, rejections and resets."""
-    sentences = []
+    sentences, segment = [], analysis.segment
+    is_part = segment.before_s + segment.after_s > MIN_GAP_S
+    when = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s" if is_part else ""
     if analysis.flight.airborne == ():
         return "The vehicle stayed on the ground, so the errors of the filters are not evaluated."
     if effect.position_rmse_m:
         sentences.append(
-            f"Position RMSE against ground truth along {analysis.main.axis.label}: "
+            f"Position RMSE against ground truth along {analysis.main.axis.label}{when}: "
             f"{_by_filter(effect.position_rmse_m)}"
             f"{_in_brackets('horizontal', effect.horizontal_rmse_m)}."
         )

@@ -19,7 +19,7 @@ MIN_GAP_INTERVALS = 5.0
 
 @dataclass(frozen=True)
 class Events:
-    """Events in the segment of a comparison; times in s from the first data.
+    """Events of a flight, also before and after the segment; times in s from the first data.
 
     Attributes
     ----------
@@ -34,6 +34,8 @@ class Events:
         Empty if not logged.
     resets_s : tuple of float
         Times of resets of EKF2's position or velocity.
+    horizontal_resets_s : tuple of float
+        Times of resets of EKF2's horizontal position.
     rejected_s : mapping from axis name to ndarray
         Times of measurements that EKF2 rejected.
     """
@@ -45,6 +47,7 @@ class Events:
     landing_s: tuple[float, ...]
     modes: tuple[FlightMode, ...]
     resets_s: tuple[float, ...]
+    horizontal_resets_s: tuple[float, ...]
     rejected_s: Mapping[str, Array]
 
 
@@ -68,9 +71,10 @@ def source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
 
 
 def collect_events(comparison: Comparison) -> Events:
-    """Collect the events in the segment of a comparison."""
-    flight, segment = comparison.flight, comparison.segment
+    """Collect the events in the segment of a comparison, and in flight before and after it."""
+    flight, segment = comparison.flight, comparison.segment.flight
     low, high = segment.start_s, segment.end_s
+    time_s = np.concatenate([[low], comparison.lines[0].measurement_time_s, [high]])
 
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     edges = [low, *(time for span in airborne for time in span), high]
@@ -78,7 +82,7 @@ def collect_events(comparison: Comparison) -> Events:
     modes = () if isinstance(flight.modes, Unavailable) else flight.modes
     resets = flight.ekf2.resets if isinstance(flight.ekf2, Ekf2) else ()
     return Events(
-        gaps=source_gaps(comparison.lines[0].measurement_time_s, comparison.source.rate_hz),
+        gaps=source_gaps(time_s, comparison.source.rate_hz),
         dropouts=segment.cut(
             (dropout.start_s, dropout.start_s + dropout.duration_s)
             for dropout in flight.log.dropouts
@@ -92,6 +96,11 @@ def collect_events(comparison: Comparison) -> Events:
             if mode.start_s < high and mode.end_s > low
         ),
         resets_s=tuple(sorted({reset.time_s for reset in resets if low <= reset.time_s <= high})),
+        horizontal_resets_s=tuple(
+            reset.time_s
+            for reset in resets
+            if reset.quantity == "position" and any(reset.delta[:2]) and low < reset.time_s <= high
+        ),
         rejected_s={
             result.axis.name: frame.index[frame["rejected"] > 0].to_numpy()
             for result in comparison.axes.values()

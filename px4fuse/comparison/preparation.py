@@ -315,17 +315,21 @@ def choose_segment(
     """
     source_span_s = track.samples.index[[0, -1]].tolist()
     low, high = max(source_span_s[0], 0.0), min(source_span_s[1], flight.log.duration_s)
+    before_s = after_s = 0.0
     if isinstance(flight.airborne, Unavailable):
         reason = "whole duration of the source (no land detector in the log)"
     elif not flight.airborne:
         reason = "whole duration of the source (the vehicle never took off)"
     else:
         reason = "whole duration of the source (no positions in flight)"
-        flight_span_s = max(low, flight.airborne[0][0]), min(high, flight.airborne[-1][1])
-        if flight_span_s[0] < flight_span_s[1]:
-            (low, high), reason = flight_span_s, "source available and vehicle airborne"
+        take_off_s, landing_s = flight.airborne[0][0], flight.airborne[-1][1]
+        before_s, after_s = max(low - take_off_s, 0.0), max(landing_s - high, 0.0)
+        if max(low, take_off_s) < min(high, landing_s):
+            low, high = max(low, take_off_s), min(high, landing_s)
+            reason = "source available and vehicle airborne"
     if start_s is not None or end_s is not None:
-        low, high = low if start_s is None else start_s, high if end_s is None else end_s
+        low, before_s = (low, before_s) if start_s is None else (start_s, 0.0)
+        high, after_s = (high, after_s) if end_s is None else (end_s, 0.0)
         options = {"--start": start_s, "--end": end_s}
         option_names = [text for text, value in options.items() if value is not None]
         reason = f"chosen with {' and '.join(option_names)}"
@@ -339,7 +343,7 @@ def choose_segment(
             f"source runs from {source_span_s[0]:.2f} s to {source_span_s[1]:.2f} s. Change "
             "--start or --end."
         )
-    segment = Segment(low, high, reason)
+    segment = Segment(low, high, reason, before_s, after_s)
     count = len(cut_to_segment(track.samples, segment))
     if count < MIN_MEASUREMENTS:
         raise SettingsError(

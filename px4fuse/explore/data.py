@@ -58,6 +58,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
         "log": analysis.flight.log.name,
         "settings": _settings_data(analysis.settings),
         "main": analysis.main.axis.name,
+        "shown": [analysis.segment.flight.start_s, analysis.segment.flight.end_s],
         **signals,
         "axes": [
             axis_signals | _axis_data(analysis, result, packer)
@@ -198,8 +199,8 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
         "bands": _nis_bands(len(result.axis.measurement_time_s), packer),
         # horizontal axes share their likelihood map if it exists
         "map": HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name,
-        "ekf2": _ekf2_data(analysis, result, packer),
-        "truth": _truth_data(result, packer),
+        "ekf2": _ekf2_data(result.in_flight, packer),
+        "truth": _truth_data(result.in_flight, packer),
     }
 
 
@@ -216,7 +217,7 @@ def _nis_bands(count: int, packer: Packer) -> list[int]:
     ]
 
 
-def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
+def _ekf2_data(result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
     """Return EKF2's states, σ, innovations and statistics, or the reason why they are missing."""
     if isinstance(result.ekf2_state, Unavailable):
         return result.ekf2_state.reason

@@ -5,6 +5,8 @@ The aisle is the main horizontal direction of the flight.
 NED acceleration = R(q) · specific force + [0, 0, g] (Groves 2013, eq. 5.52 without earth rate).
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
@@ -33,11 +35,21 @@ MIN_MEASUREMENTS = 3  # minimum number of position measurements along an axis
 
 @dataclass(frozen=True)
 class Segment:
-    """Analysed part of a flight: start and end (s), and the reason for choosing it."""
+    """Analysed part of a flight: start and end (s), and the reason for choosing it.
+
+    ``before_s`` and ``after_s`` are the times (s) in flight before and after it without positions.
+    """
 
     start_s: float
     end_s: float
     reason: str
+    before_s: float = 0.0
+    after_s: float = 0.0
+
+    @property
+    def flight(self) -> Segment:
+        """Segment with the times in flight before and after it."""
+        return Segment(self.start_s - self.before_s, self.end_s + self.after_s, self.reason)
 
     def cut(self, spans: Iterable[Span]) -> tuple[Span, ...]:
         """Return the parts of time spans (s) that are inside the segment."""

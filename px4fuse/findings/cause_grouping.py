@@ -35,6 +35,7 @@ _UNDERCONFIDENT = ("kf_underconfident", "ekf2_underconfident")
 _KF_VARIANCES = ("kf_underconfident", "kf_overconfident")
 SETTINGS = ("sigma_a_too_large", "sigma_a_too_small", "sigma_z_too_large", "sigma_z_too_small")
 _VARIANCES_AND_SETTINGS = (*_KF_VARIANCES, "ekf2_underconfident", "ekf2_overconfident", *SETTINGS)
+_SPAN_EFFECTS = (("ekf2_resets", GAP), ("aid_not_fused", SENSOR))
 NOISES = frozenset((*_VARIANCES_AND_SETTINGS, "process_noise_near_zero"))
 # Consequences by id of the cause; a pair applies only to findings with this kind of cause in their
 # evidence. A finding is attached to the first cause of this table that is present, so a cause that
@@ -191,6 +192,8 @@ CONSEQUENCES: Mapping[str, tuple[str | tuple[str, str], ...]] = {
         "ekf2_resets",
         ("aid_not_fused", SENSOR),
     ),
+    "source_stops": _SPAN_EFFECTS,
+    "source_begins": _SPAN_EFFECTS,
     "logger_dropouts": ("imu_gap",),
     "imu_samples_missing": ("logger_dropouts", "imu_gap"),
     # without a position PX4 does not take off
@@ -207,9 +210,12 @@ RECORDING = frozenset(
         "logger_dropouts",
         "imu_rate_too_low",
         "source_rate_limited_by_logger",
+        "source_begins",
         "source_gap",
+        "source_gap_in_log",
         "source_not_logged",
         "source_samples_lost",
+        "source_stops",
         "too_few_innovations",
     }
 )

@@ -171,7 +171,8 @@ def _draw_strips(
         is_last = strip is strips[-1]
         axes_height = height - _head_height(page, strip.title) - BELOW[is_last]
         axes = page.panel(strip.title, "", axes_height, above=4.0, left=LEFT, is_compact=True)
-        axes.set_xlim(analysis.segment.start_s, analysis.segment.end_s)
+        shown = analysis.segment.flight
+        axes.set_xlim(shown.start_s, shown.end_s)
         axes.locator_params(axis="x", nbins=_tick_count(page))
         strip.draw(axes)
         style.label_time_axis(axes, is_last)
@@ -205,7 +206,7 @@ def _head_height(page: Page, title: str) -> float:
 
 def _error_strips(analysis: Analysis, card: Card) -> list[Strip]:
     """Return a strip of the errors of each filter, or of KF - EKF2 without ground truth."""
-    result = analysis.main
+    result = analysis.main.in_flight
     found = {
         owner: errors
         for owner in FILTERS
@@ -275,7 +276,7 @@ def _error_drawing(
 
 def _difference_strip(analysis: Analysis, card: Card) -> list[Strip]:
     """Return the strip of KF - EKF2 with ±2σ of both; none without EKF2."""
-    result = analysis.main
+    result = analysis.main.in_flight
     if not isinstance(result.ekf2_state, pd.DataFrame):
         return []
     time_s = result.ekf2_state.index.to_numpy()
@@ -344,26 +345,13 @@ def _draw_spans(axes: Axes, analysis: Analysis) -> None:
 
 def _draw_ekf2_events(axes: Axes, analysis: Analysis) -> None:
     """Draw EKF2's rejections and horizontal resets."""
-    for time_s in horizontal_resets(analysis):
+    for time_s in analysis.events.horizontal_resets_s:
         axes.axvline(time_s, **RESET_LINE)
     _draw_at_edge(axes, _rejected(analysis), 0.06, REJECTED_MARK)
 
 
 def _rejected(analysis: Analysis) -> Array:
     return np.asarray(analysis.events.rejected_s.get(analysis.main.axis.name, ()), np.float64)
-
-
-def horizontal_resets(analysis: Analysis) -> list[float]:
-    """Return the times (s) of EKF2's horizontal position resets in the segment."""
-    ekf2, segment = analysis.flight.ekf2, analysis.segment
-    resets = ekf2.resets if isinstance(ekf2, Ekf2) else ()
-    return [
-        reset.time_s
-        for reset in resets
-        if reset.quantity == "position"
-        and any(reset.delta[:2])
-        and segment.start_s < reset.time_s <= segment.end_s
-    ]
 
 
 def _draw_at_edge(axes: Axes, times: Array, height: float, mark: Mapping[str, Any]) -> None:
@@ -431,8 +419,8 @@ def _innovation_strip(result: AxisComparison) -> Strip:
 
 
 def _tracks(analysis: Analysis) -> dict[str, Coordinates]:
-    """Return north and east (m) of each track within the segment."""
-    segment, flight = analysis.segment, analysis.flight
+    """Return north and east (m) of each track in flight."""
+    segment, flight = analysis.segment.flight, analysis.flight
 
     def cut(frame: pd.DataFrame) -> Coordinates:
         inside = cut_to_segment(frame, segment)
@@ -597,7 +585,7 @@ def _legend_entries(analysis: Analysis) -> list[Artist]:
         ("landing", events.landing_s, LANDING_MARK),
         ("outlier", outlier_times(analysis), OUTLIER_MARK),
         ("EKF2 rejected", _rejected(analysis), REJECTED_MARK),
-        ("EKF2 reset", horizontal_resets(analysis), RESET_LINE),
+        ("EKF2 reset", analysis.events.horizontal_resets_s, RESET_LINE),
     )
     entries += [Line2D([], [], **mark, label=label) for label, found, mark in marks if len(found)]
     bands: Sequence[tuple[str, Any, dict[str, Any]]] = (

@@ -69,7 +69,7 @@ def _marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[Mar
 def draw_marks(
     axes: Axes, analysis: Analysis, *, axis: str | None = None, with_mode_names: bool = False
 ) -> None:
-    """Draw the events behind the curves, and set the limits of the time axis to the segment.
+    """Draw the events behind the curves, and set the limits of the time axis to the flight.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def draw_marks(
     from matplotlib.collections import PolyCollection  # noqa: PLC0415
     from matplotlib.lines import Line2D  # noqa: PLC0415
 
-    segment, x_transform = analysis.segment, axes.get_xaxis_transform()
+    segment, x_transform = analysis.segment.flight, axes.get_xaxis_transform()
     axes.set_xlim(segment.start_s, segment.end_s)
     name = analysis.main.axis.name if axis is None else axis
     marks = _marks(analysis, analysis.events.rejected_s.get(name, ()))
