@@ -244,8 +244,8 @@ def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
 
 def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]) -> str:
     """Make the sentences about errors, their ratios to σ, rejections and resets."""
-    sentences, segment = [], analysis.segment
-    is_part = segment.before_s + segment.after_s > MIN_GAP_S
+    sentences, segment, flight = [], analysis.segment, analysis.segment.flight
+    is_part = max(segment.start_s - flight.start_s, flight.end_s - segment.end_s) > MIN_GAP_S
     when = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s" if is_part else ""
     if analysis.flight.airborne == ():
         return "The vehicle stayed on the ground, so the errors of the filters are not evaluated."

@@ -37,19 +37,19 @@ MIN_MEASUREMENTS = 3  # minimum number of position measurements along an axis
 class Segment:
     """Analysed part of a flight: start and end (s), and the reason for choosing it.
 
-    ``before_s`` and ``after_s`` are the times (s) in flight before and after it without positions.
+    ``flight_s`` also contains the times in flight (or chosen) before and after it, which have no
+    positions; None if there are none.
     """
 
     start_s: float
     end_s: float
     reason: str
-    before_s: float = 0.0
-    after_s: float = 0.0
+    flight_s: Span | None = None
 
     @property
     def flight(self) -> Segment:
-        """Segment with the times in flight before and after it."""
-        return Segment(self.start_s - self.before_s, self.end_s + self.after_s, self.reason)
+        """Segment with the times without positions before and after it."""
+        return Segment(*(self.flight_s or (self.start_s, self.end_s)), self.reason)
 
     def cut(self, spans: Iterable[Span]) -> tuple[Span, ...]:
         """Return the parts of time spans (s) that are inside the segment."""
