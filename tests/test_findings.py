@@ -22,7 +22,7 @@ from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import TITLES, Finding, find, group_by_root
 from px4fuse.findings.model import CATALOGUE, GROUPS, load_examples
-from px4fuse.flight import AXIS_NAMES, Columns, Flight, Reset, Unavailable
+from px4fuse.flight import AXIS_NAMES, AidLog, Columns, Flight, Reset, Unavailable
 from px4fuse.log import ClockMap, Dropout
 from px4fuse.position_source import ALIGNED, LOGGED_BY_EKF2
 from px4fuse.readers import read_log
@@ -92,6 +92,16 @@ def as_recording(flight: Flight) -> Flight:
     none = Unavailable("EKF2 innovations", "MAVLink does not carry them", "")
     recorded = with_ekf2(innovations=dict.fromkeys(AXIS_NAMES, none))(flight)
     return with_log(format="MAVLink tlog")(recorded)
+
+
+def with_fused(flight: Flight, end_s: float) -> Flight:
+    """Log that EKF2 fused a position each 0.5 s until some time."""
+    values = {
+        "fused": 1.0, "rejected": 0.0, "innovation_north": 0.1, "variance_north": 0.02,
+        "noise_north": 0.01, "ratio_north": 0.02,
+    }  # fmt: skip
+    samples = pd.DataFrame(values, index=np.arange(0.0, end_s, 0.5))
+    return with_ekf2(aids={"ev_pos": AidLog(("a_topic",), ("north",), samples, None)})(flight)
 
 
 def with_ekf2_bias(flight: Flight) -> Flight:
@@ -193,6 +203,15 @@ FAULTS = [
     Fault("source_frame_frd", "note", flight={"uwb": Uwb(frame="FRD")}),
     Fault("source_gap", "warning", {"longest_s": about(8.0, 1e-9), "at_s": about(40.0, 1e-9)},
           {"uwb": Uwb(gap_s=(40.0, 48.0))}),
+    Fault("source_stops", "warning",
+          {"at_s": about(80.0, 1e-9), "duration_s": about(40.0, 1e-9)},
+          {"uwb": Uwb(gap_s=(80.0, 130.0))}),
+    Fault("source_stops", "error", {"at_s": about(80.0, 1e-9), "sigma_m": about(0.07, 0.1)},
+          {"uwb": Uwb(gap_s=(80.0, 130.0)), "truth": False}, change=lambda f: with_fused(f, 80.0)),
+    Fault("source_begins", "warning", {"at_s": about(40.0, 1e-9), "duration_s": about(40.0, 1e-9)},
+          {"uwb": Uwb(gap_s=(-1.0, 40.0))}),
+    Fault("source_gap_in_log", "warning", {"count": 1, "longest_s": about(8.0, 1e-9)},
+          {"uwb": Uwb(gap_s=(40.0, 48.0))}, change=lambda f: with_fused(f, 120.0)),
     Fault("source_drift", "error",
           {"filter": "ekf2", "ekf2_nees_position_mean": about(300, 0.2)},
           change=lambda f: as_odometry(with_offset_truth(f, grows=True))),
