@@ -729,9 +729,8 @@ class _Ekf2Rerun(_FilterRerun):
     def other_candidates(self, tuned: AxisTuning | None) -> list[Change]:
         """Return PX4's default of the gate and other parameters, and a noise for vibration."""
         aid, flown = self.inputs.aid, self.inputs.settings
-        default_values = {
-            name: PARAMETERS[name].default for name in (aid.gate, *PARAMETERS_OF_EKF2)
-        }
+        log = self.comparison.flight.log
+        default_values = {name: log.default_of(name) for name in (aid.gate, *PARAMETERS_OF_EKF2)}
         changes: list[Change] = [
             {name: value}
             for name, value in default_values.items()

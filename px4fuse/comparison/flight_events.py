@@ -34,8 +34,6 @@ class Events:
         Flight modes of PX4; empty if not logged.
     resets_s : tuple of float
         Times of resets of EKF2's position or velocity.
-    horizontal_resets_s : tuple of float
-        Times of resets of EKF2's horizontal position.
     rejected_s : mapping from axis name to ndarray
         Times of measurements that EKF2 rejected.
     """
@@ -47,7 +45,6 @@ class Events:
     landing_s: tuple[float, ...]
     modes: tuple[FlightMode, ...]
     resets_s: tuple[float, ...]
-    horizontal_resets_s: tuple[float, ...]
     rejected_s: Mapping[str, Array]
 
 
@@ -102,11 +99,6 @@ def collect_events(comparison: Comparison) -> Events:
             if mode.start_s < high and mode.end_s > low
         ),
         resets_s=tuple(sorted({reset.time_s for reset in resets if low <= reset.time_s <= high})),
-        horizontal_resets_s=tuple(
-            reset.time_s
-            for reset in resets
-            if reset.quantity == "position" and any(reset.delta[:2]) and low < reset.time_s <= high
-        ),
         rejected_s={
             result.axis.name: frame.index[frame["rejected"] > 0].to_numpy()
             for result in comparison.axes.values()

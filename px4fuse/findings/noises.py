@@ -27,7 +27,7 @@ from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, Filter
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of, format_settings, noise_change
 from px4fuse.comparison.trials import can_improve, find_trial
-from px4fuse.ekf2_parameters import BAROMETER, PARAMETERS
+from px4fuse.ekf2_parameters import BAROMETER
 from px4fuse.filter.settings import UNITS, Settings
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
@@ -386,8 +386,9 @@ def _has_default_noises(
         kf, defaults = analysis.settings, Settings()
         return all(getattr(kf, name) == getattr(defaults, name) for name in (SIGMA_Z, SIGMA_A))
     parameter = aid_of(analysis, result.axis.name).noise
-    default = PARAMETERS[parameter].default
-    is_parameter_default = analysis.flight.log.parameters.get(parameter, default) == default
+    log = analysis.flight.log
+    default = log.default_of(parameter)
+    is_parameter_default = log.parameters.get(parameter, default) == default
     # a variance that the sender reports is a choice of the user, not a default
     return is_parameter_default and not abs(np.log(ekf2_noise_m(result) / default)) > np.log(
         NOISE_RATIO_TOLERANCE
