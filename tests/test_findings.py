@@ -15,6 +15,7 @@ from exchange import replace
 from flights import Estimator, Imu, Uwb, aisle_flight, given_placement, unexplained, with_noises
 from golden_tools import assert_matches_golden, rounded, value
 
+from px4fuse.analysis import run_comparison
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.inputs import MODEL_NOTE
@@ -26,6 +27,7 @@ from px4fuse.flight import AXIS_NAMES, AidLog, Columns, Flight, Reset, Unavailab
 from px4fuse.log import ClockMap, Dropout
 from px4fuse.position_source import ALIGNED, LOGGED_BY_EKF2
 from px4fuse.readers import read_log
+from px4fuse.request import ComparisonRequest, PositionFile
 
 ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
 NO_VISION = {"EKF2_EVP_NOISE": 0.1, "SDLOG_PROFILE": 1.0}
@@ -324,6 +326,35 @@ def test_crash_flight_lists_tumbling_as_first_finding(shared_logs: Path) -> None
     assert "--end 67.0" in first.remedy
     assert second.evidence["count"] == 202
     assert second.spans_s[0][0] == pytest.approx(24.9, abs=0.1)
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize(("log", "file", "finding", "at_s", "error_m"), [
+    ("conventions/stops_in_flight", None, "source_stops", 33.4, 12.2),
+    ("simulated/v1.16.1_aisle_nominal", "case17.csv", "source_stops", 50.9, 0.12),
+    ("simulated/v1.16.1_aisle_10hz", "case18.csv", "source_begins", 63.3, 0.05),
+])  # fmt: skip
+def test_source_of_part_of_flight_is_first_finding(
+    log: str, file: str | None, finding: str, at_s: float, error_m: float, shared_logs: Path
+) -> None:
+    cases = shared_logs.parent / "cases"
+    position = file and PositionFile(path=str(cases / file), frame="enu")
+    request = ComparisonRequest(log=str(shared_logs / f"{log}.ulg"), position=position or None)
+    first, *_ = found(run_comparison(request))
+    # EKF2 fused its own source besides the file
+    assert (first.id, first.severity) == (finding, "warning" if file else "error")
+    assert f"in flight at {at_s} s: EKF2's error is " in first.title
+    assert first.evidence["error_m"] == pytest.approx(error_m, rel=0.05)
+    assert ("dead reckoning" in first.message) == (file is None)
+
+
+def test_positions_lost_by_logger_are_no_gap_of_the_source(sample_flight: Flight) -> None:
+    samples = sample_flight.positions[0].samples
+    lost = with_source(samples=samples.drop(samples.loc[40.0:60.0].index))(sample_flight)
+    lost = replace(lost, positions=(*lost.positions, *sample_flight.positions[1:]))
+    (finding,) = (one for one in found(compare(lost)) if "source" in one.id)
+    assert (finding.id, finding.evidence["count"]) == ("source_gap_in_log", 1)
+    assert finding.spans_s == (pytest.approx((40.0, 60.0), abs=0.2),)
 
 
 def test_each_finding_has_a_test_with_a_simulated_fault() -> None:

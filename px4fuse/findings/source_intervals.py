@@ -13,6 +13,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import reported_sigma
 from px4fuse.comparison.flight_events import max_interval_s
+from px4fuse.ekf2.aids import NOT_FUSED_LIMIT_S
 from px4fuse.ekf2_parameters import AIDS, EV_POS, Aid
 from px4fuse.filter.kalman import state_at, variance_at
 from px4fuse.filter.signals import cut_to_segment
@@ -34,6 +35,9 @@ MIN_NEIGHBOURS_SHARE, MIN_MULTIPLE_SHARE = 0.85, 0.1
 # 0.03 with the jitter of a source
 MAX_MULTIPLE_RMS = 0.06
 MAX_DIVISOR = 4  # median interval over source interval that is tested
+# Minimum flight time without a source that begins or stops in flight: the land detector is seconds
+# late
+MIN_PARTIAL_S = 3.0
 SMALLEST_TIME_S = 1e-6  # s; KF at this time before a position has not used the position
 # Things to check after a gap in the position source, by its kind
 CHECKS: Mapping[PositionKind, str] = {
@@ -61,7 +65,8 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
         if source.origin.aid in aids and source.alignment is None:
             logged_spans.append(span)
         elif span[0] == flight.start_s or span[1] == flight.end_s:
-            yield _partial_source(analysis, span, aids)
+            if span[1] - span[0] > MIN_PARTIAL_S:
+                yield _partial_source(analysis, span, aids)
         else:
             spans.append(span)
     positions = capitalise_first(positions_of(source))
@@ -105,10 +110,10 @@ def _partial_source(analysis: Analysis, span_s: Span, aids: list[Aid]) -> Findin
     """Make the finding of a source that begins or stops in flight, with EKF2's error then."""
     (start_s, end_s), source = span_s, analysis.source
     stops = end_s == analysis.segment.flight.end_s
-    event, at_s, check = (
-        ("stop", start_s, f"Check {CHECKS[source.origin.kind]} at {start_s:.1f} s.")
+    event, at_s, when, action = (
+        ("stop", start_s, "after", "")
         if stops
-        else ("begin", end_s, "Start the source, and wait for its positions, before take-off.")
+        else ("begin", end_s, "before", " Take off only when positions arrive.")
     )
     at_end, duration_s = _ekf2_at_end(analysis, span_s), end_s - start_s
     later = f"after {duration_s:.1f} s" if stops else "just before"
@@ -123,11 +128,11 @@ def _partial_source(analysis: Analysis, span_s: Span, aids: list[Aid]) -> Findin
         labels = " and ".join(aid.label for aid in aids) or "the IMU alone (dead reckoning)"
         aiding = f"For {duration_s:.1f} s EKF2 relied on {labels}. "
     return finding(
-        "error" if has_aids and not aids else "warning",
+        "error" if has_aids and not aids and duration_s > NOT_FUSED_LIMIT_S else "warning",
         "source_stops" if stops else "source_begins",
         f"{capitalise_first(positions_of(source))} {event} in flight at {at_s:.1f} s{effect}. "
         f"{aiding}KF, RMSE and verdicts do not include this time.",
-        check,
+        f"Check {CHECKS[source.origin.kind]} {when} {at_s:.1f} s.{action}",
         {"at_s": at_s, "duration_s": duration_s, **at_end},
         (span_s,),
     )
