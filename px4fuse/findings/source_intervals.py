@@ -110,11 +110,8 @@ def _partial_source(analysis: Analysis, span_s: Span, aids: list[Aid]) -> Findin
     """Make the finding of a source that begins or stops in flight, with EKF2's error then."""
     (start_s, end_s), source = span_s, analysis.source
     stops = end_s == analysis.segment.flight.end_s
-    event, at_s, when, action = (
-        ("stop", start_s, "after", "")
-        if stops
-        else ("begin", end_s, "before", " Take off only when positions arrive.")
-    )
+    event, at_s, when = ("stop", start_s, "after") if stops else ("begin", end_s, "before")
+    action = "" if stops or source.alignment else " Take off only when positions arrive."
     at_end, duration_s = _ekf2_at_end(analysis, span_s), end_s - start_s
     later = f"after {duration_s:.1f} s" if stops else "just before"
     effect = f", {duration_s:.1f} s {'before the end' if stops else 'after the start'}"
