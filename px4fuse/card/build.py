@@ -54,7 +54,7 @@ from px4fuse.flight import Ekf2, Unavailable, source_name
 from px4fuse.log import LogInfo
 from px4fuse.reading import display_name, file_size, read_head
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
-from px4fuse.text import with_log_name
+from px4fuse.text import lower_first, with_log_name
 
 MAX_ACTIONS = 3
 # Minimum fraction of positions rejected by EKF2 that the effect on the card states
@@ -203,7 +203,7 @@ def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
     if causes:
         first, *others = causes
         for other in others:
-            both = f"{first.title}; {other.title[0].lower()}{other.title[1:]}"
+            both = f"{first.title}; {lower_first(other.title)}"
             if other.severity == "error" and len(both) <= MAX_HEADLINE_LENGTH:
                 return both
         return first.title
@@ -429,6 +429,12 @@ def _reconcile(
             "The two verdicts of each filter differ: both filters follow the wrong positions, so "
             "the innovations stay small and cannot show it. Ground truth does."
         )
+    if corrected.issuperset(differing):
+        filters = " and ".join(FILTER_NAMES[owner] for owner in differing)
+        return (
+            f"The two verdicts of {filters} differ: innovations hardly show this fault, ground "
+            "truth does. The re-run above removes most of the error."
+        )
     tuned = analysis.tuning.get(HORIZONTAL)
     if analysis.source.origin.may_drift:
         noise = ""
@@ -443,9 +449,9 @@ def _reconcile(
             "Innovations show only the error that changes from sample to sample. Both filters "
             "follow the slow part, so it shows against ground truth alone."
         )
-    if "source_outliers" in ids and "ekf2" in differing:
-        return _gate_sentence(analysis)
-    return HEADING_HIDES_ERROR if "ekf2_heading_error" in ids else UNEXPLAINED
+    unexplained = HEADING_HIDES_ERROR if "ekf2_heading_error" in ids else UNEXPLAINED
+    is_gated = "source_outliers" in ids and "ekf2" in differing
+    return _gate_sentence(analysis) if is_gated else unexplained
 
 
 def _differ(source: Verdict, truth: Verdict, *, is_corrected: bool) -> bool:

@@ -24,6 +24,7 @@ from px4fuse.comparison.trials import (
     halves,
     has_effect,
     improvement,
+    leaves_error,
     preference,
     ratios,
     reduction,
@@ -108,7 +109,8 @@ def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCaus
 
     First come findings that make the verdicts meaningless, then those whose re-run makes a filter
     consistent, then those whose re-run halves |ln ratio|, then other errors and warnings. A fault
-    of the source precedes a setting that would only hide it.
+    of the source precedes a setting that would only hide it, or that leaves the error against
+    ground truth as it is.
     """
     ranked = []
     for finding in roots:
@@ -128,7 +130,7 @@ def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCaus
         ranked,
         key=lambda each: (
             each.tier,
-            each.tier in (1, 2) and _is_setting(each.finding),
+            each.tier in (1, 2, 3) and _is_setting(each.finding),
             -each.reduction,
         ),
     )
@@ -142,6 +144,8 @@ def _is_setting(finding: Finding) -> bool:
 def _tier(finding: Finding, trials: Iterable[Trial]) -> int:
     if finding.id in MEANINGLESS:
         return 0
+    if _is_setting(finding) and any(map(leaves_error, trials)):
+        return 3
     if any(enters_band(trial) for trial in trials):
         return 1
     if any(halves(trial) for trial in trials):

@@ -12,7 +12,8 @@ from px4fuse.trajectory.graph.covariance import GateResult, gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import GraphSolution, Robust, Solution, solve
 
-# Maximum number of closures for robust optimisation by default: with more it takes minutes
+# Maximum number of closures for robust optimisation by default: with more closures the optimisation
+# takes minutes
 MAX_ROBUST_CLOSURES = 1000
 # Labels of the pose graph solutions, by the key in results.json
 SOLUTIONS: Mapping[str, str] = {
@@ -21,7 +22,7 @@ SOLUTIONS: Mapping[str, str] = {
     "dcs": "pose graph, DCS",
     "gnc": "pose graph, GNC",
 }
-# Robust method of each solution that uses one
+# Robust optimisation method by key of the solution
 ROBUST_METHODS: Mapping[str, Robust] = {"dcs": "dcs", "gnc": "gnc"}
 
 
