@@ -119,8 +119,7 @@ def _partial_source(analysis: Analysis, span_s: Span, aids: list[Aid]) -> Findin
         effect = f": EKF2's error is {format_metres(at_end['error_m'])} m {later}"
     elif "sigma_m" in at_end:
         effect = f": EKF2's reported σ is {format_metres(at_end['sigma_m'])} m {later}"
-    has_aids = isinstance(analysis.flight.ekf2, Ekf2) and analysis.flight.ekf2.aids
-    aiding = ""
+    has_aids, aiding = _has_aids(analysis.flight.ekf2), ""
     if has_aids:
         labels = " and ".join(aid.label for aid in aids) or "the IMU alone (dead reckoning)"
         aiding = f"For {duration_s:.1f} s EKF2 relied on {labels}. "
@@ -174,7 +173,8 @@ def _state_errors_after(analysis: Analysis, gap_s: Span) -> str:
     texts = []
     aiding = "KF relies on the IMU alone."
     if isinstance(ekf2, pd.DataFrame) and len(before := ekf2["position_m"].loc[:end_s]):
-        aiding = "KF and EKF2 rely on the IMU alone."
+        if _has_aids(analysis.flight.ekf2):
+            aiding = "KF and EKF2 rely on the IMU alone."
         if other_aids := _continuously_fused_aids(analysis.flight.ekf2, gap_s):
             labels = " and ".join(aid.label for aid in other_aids)
             aiding = f"KF relies on the IMU alone, EKF2 also on {labels}."
@@ -189,6 +189,11 @@ def _state_errors_after(analysis: Analysis, gap_s: Span) -> str:
     kf_sigma_m = float(np.sqrt(variance_at(result.replay, before_end_s)[0][1]))
     texts.append(f"KF {format_metres(kf_error_m)} m (σ {format_metres(kf_sigma_m)} m)")
     return f"{aiding} {quantity} along {axis.label}: {', '.join(texts)}."
+
+
+def _has_aids(ekf2: Ekf2 | Unavailable) -> bool:
+    """Return True if the log shows which aids EKF2 fused."""
+    return isinstance(ekf2, Ekf2) and bool(ekf2.aids)
 
 
 def _continuously_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[Aid]:
