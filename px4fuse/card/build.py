@@ -320,12 +320,15 @@ def _in_brackets(label: str, lengths_m: Mapping[FilterName, float]) -> str:
 
 
 def _do_this(causes: Sequence[Cause]) -> tuple[str, ...]:
-    """Return at most three actions of the causes; first the alternative that is listed first."""
+    """Return at most three actions, with the number of the cause if there are several causes."""
     texts: list[str] = []
-    for cause in causes:
-        for alternative in cause.alternatives[:1]:
-            texts += [_sentence(action) for action in alternative]
-        texts += [_sentence(action) for action in cause.actions if _is_change(action)]
+    for number, cause in enumerate(causes, 1):
+        sentences = [_sentence(action) for action in cause.actions if _is_change(action)]
+        if cause.alternatives:
+            either = [_sentence(action) for group in cause.alternatives for action in group]
+            sentences.insert(0, ", or ".join([*(text[:-1] for text in either[:-1]), either[-1]]))
+        label = f"({number}) " if len(causes) > 1 else ""
+        texts += [f"{label}{sentence}" for sentence in sentences]
     return tuple(dict.fromkeys(texts))[:MAX_ACTIONS] if causes else ("Change nothing.",)
 
 
@@ -426,8 +429,8 @@ def _reconcile(
         return ""
     if not SHIFTED_SOURCE.isdisjoint(ids):
         return (
-            "The two verdicts of each filter differ: both filters follow the wrong positions, so "
-            "the innovations stay small and cannot show it. Ground truth does."
+            "Both filters follow the faulty positions, so their innovations show little of the "
+            "error. Ground truth shows it."
         )
     if corrected.issuperset(differing):
         filters = " and ".join(FILTER_NAMES[owner] for owner in differing)

@@ -30,6 +30,7 @@ from px4fuse.comparison.trials import (
     reduction,
 )
 from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings.model import CATALOGUE, Finding
 from px4fuse.flight import PositionTrack, Unavailable
@@ -392,4 +393,7 @@ def _closing_sentence(
         default = analysis.flight.log.default_of(name)
         if (tuned.sigma_z.low or 0.0) <= default <= (tuned.sigma_z.high or 0.0):
             return f"PX4's default, {default:g} m, is inside the 95 % interval: it is as good."
+    after = [math.sqrt(trial.after.nees_mean) for trial in useful if trial.after.nees_mean]
+    if after and classify_ratio(min(after), "truth") == "overconfident":
+        return "Against ground truth, σ stays too small after this fix: another error remains."
     return ""
