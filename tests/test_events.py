@@ -81,6 +81,8 @@ def test_time_without_source_is_shown_but_not_in_statistics() -> None:
     flight = aisle_flight(uwb=Uwb(gap_s=(80.0, 130.0)), ekf2=Estimator(resets=resets))
     whole, covered = compare(flight), compare(flight, end_s=80.0)
     assert (whole.segment.end_s, whole.segment.flight.end_s) == (80.0, 120.0)
+    chosen = compare(flight, end_s=100.0).segment
+    assert (chosen.end_s, chosen.flight.end_s) == (80.0, 100.0)
     events = collect_events(whole)
     assert (events.gaps, events.resets_s, events.landing_s) == (
         ((80.0, 120.0),),

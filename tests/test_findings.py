@@ -348,6 +348,19 @@ def test_source_of_part_of_flight_is_first_finding(
     assert ("dead reckoning" in first.message) == (file is None)
 
 
+@pytest.mark.parametrize(("gap_s", "reset_s", "cause"), [
+    ((-1.0, 40.0), 40.4, "source_begins"), ((80.0, 130.0), 90.0, "source_stops"),
+])  # fmt: skip
+def test_reset_in_time_without_source_has_it_as_cause(
+    gap_s: tuple[float, float], reset_s: float, cause: str
+) -> None:
+    resets = (Reset(reset_s, "position", (16.0, 0.0, 0.0)),)
+    flight = aisle_flight(uwb=Uwb(gap_s=gap_s), ekf2=Estimator(resets=resets))
+    first, reset = found(compare(flight))[:2]
+    assert (first.id, reset.id, reset.caused_by) == (cause, "ekf2_resets", cause)
+    assert "by up to 16.00 m" in reset.message
+
+
 def test_positions_lost_by_logger_are_no_gap_of_the_source(sample_flight: Flight) -> None:
     samples = sample_flight.positions[0].samples
     lost = with_source(samples=samples.drop(samples.loc[40.0:60.0].index))(sample_flight)
