@@ -18,8 +18,8 @@ from px4fuse.record import Span
 
 T = TypeVar("T", pd.DataFrame, "pd.Series[float]")
 
-EV_START_INTERVAL_S = 0.2  # EV_MAX_INTERVAL, PX4 v1.14 and later, ev_control.cpp
-EV_STOP_INTERVAL_S = 0.4  # two times EV_MAX_INTERVAL, ev_pos_control.cpp
+EV_START_INTERVAL_S = 0.2  # s; EV_MAX_INTERVAL of PX4 v1.14 and later (ev_control.cpp)
+EV_STOP_INTERVAL_S = 0.4  # s; two times EV_MAX_INTERVAL (ev_pos_control.cpp)
 STOP_S = 7.0  # s without GNSS, or without vision up to v1.13; reset_timeout_max
 MAX_HORIZON_S = 1.0  # s; maximum of the delay parameters of EKF2
 BUFFER_COUNT = 20  # samples; longer waits for a timestamp in the future overwrite the sample

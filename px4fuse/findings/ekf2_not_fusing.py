@@ -25,9 +25,9 @@ from px4fuse.position_source import POSITION_FILE
 from px4fuse.record import Span
 from px4fuse.text import capitalise_first, format_metres
 
-MIN_FUSING_SHARE_ERROR = 0.5  # of the segment; below, EKF2's track mostly uses other sensors
-MIN_FUSING_SHARE_WARNING = 0.98  # of the segment; 2 % of a minute are about 1 s
-MIN_LIMITING_INTERVAL_S = 0.18  # s; jitter of 10 % prevents a start at EV_START_INTERVAL_S
+MIN_FUSING_SHARE_ERROR = 0.5  # fused fraction of the segment; below, other sensors dominate: error
+MIN_FUSING_SHARE_WARNING = 0.98  # fused fraction of the segment; 2 % of a minute are about 1 s
+MIN_LIMITING_INTERVAL_S = 0.18  # s; 10 % of jitter reaches EV_START_INTERVAL_S: fusion starts late
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
 MIN_INVALID_DISTANCE_M = 1.0  # m; less before take-off, where EKF2 needs no position
 UNKNOWN = Unmet(
