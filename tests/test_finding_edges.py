@@ -206,11 +206,11 @@ UNKNOWN = "The log does not contain the reason"
         (
             never_fusing(parameters={"EKF2_EV_CTRL": 15.0, "EKF2_AID_MASK": 1.0}),
             UNKNOWN,
-            "SDLOG_PROFILE",
+            "ekf2 status",
         ),
         (never_fusing(parameters={"EKF2_AID_MASK": 1.0}), "EKF2_AID_MASK is 1. Bit 3", "to 9."),
-        (never_fusing(parameters={"EKF2_AID_MASK": 9.0}), UNKNOWN, "SDLOG_PROFILE"),
-        (never_fusing(2.0), UNKNOWN, "SDLOG_PROFILE"),  # releases before v1.14 have no limit
+        (never_fusing(parameters={"EKF2_AID_MASK": 9.0}), UNKNOWN, "ekf2 status"),
+        (never_fusing(2.0), UNKNOWN, "ekf2 status"),  # releases before v1.14 have no limit
         (
             never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}),
             "the positions come at 2 Hz",
@@ -221,9 +221,9 @@ UNKNOWN = "The log does not contain the reason"
             UNKNOWN,
             "SDLOG_PROFILE",
         ),
-        (never_fusing(5.0, parameters={"EKF2_EV_CTRL": 15.0}), UNKNOWN, "SDLOG_PROFILE"),
-        (never_fusing(age_s=0.29), UNKNOWN, "SDLOG_PROFILE"),
-        (never_fusing(age_s=1.0, horizon_s=NONE), UNKNOWN, "SDLOG_PROFILE"),
+        (never_fusing(5.0, parameters={"EKF2_EV_CTRL": 15.0}), UNKNOWN, "ekf2 status"),
+        (never_fusing(age_s=0.29), UNKNOWN, "ekf2 status"),
+        (never_fusing(age_s=1.0, horizon_s=NONE), UNKNOWN, "ekf2 status"),
         (never_fusing(age_s=5.0, horizon_s=NONE), "the positions are 5.00 s old", "TIMESYNC"),
         (never_fusing(age_s=-4.1), "the timestamps are 4.10 s in the future", "TIMESYNC"),
         (

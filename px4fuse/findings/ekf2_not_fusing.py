@@ -33,7 +33,7 @@ MIN_INVALID_DISTANCE_M = 1.0  # m; less before take-off, where EKF2 needs no pos
 UNKNOWN = Unmet(
     "",
     "The log does not contain the reason: the logged conditions of EKF2 are met.",
-    "Record with SDLOG_PROFILE 129 (default and vision), and check `ekf2 status` in the console.",
+    "Check `ekf2 status` in the console of PX4.",
 )
 
 
@@ -76,6 +76,9 @@ def detect_missing_fusion(analysis: Comparison) -> Findings:
     parameters = {**analysis.flight.log.parameters, **ekf2.parameters}
     found = find_unmet(Attempt(ekf2, source, aid, parameters, longest_s))
     name, unmet = found or ("", UNKNOWN)
+    action = unmet.action
+    if not found and not source.origin.has_all_samples:
+        action = f"Record with SDLOG_PROFILE 129 (default and vision). {action}"
     extent = f"EKF2 fused the {positions} only {format_percent(share)} of the time"
     if not share:
         extent = f"EKF2 never fused the {positions}"
@@ -86,7 +89,7 @@ def detect_missing_fusion(analysis: Comparison) -> Findings:
             "note" if unmet.is_intended or is_reference else "error",
             "ekf2_not_fusing",
             f"{title}. {unmet.reason}",
-            unmet.action,
+            action,
             {**evidence, "condition": name},
             spans if share else (),
         )
@@ -95,7 +98,7 @@ def detect_missing_fusion(analysis: Comparison) -> Findings:
             "ekf2_fusion_interrupted",
             f"{title}. {unmet.reason} EKF2 relied on its other sensors for up to "
             f"{longest_s[1] - longest_s[0]:.1f} s.",
-            unmet.action,
+            action,
             {**evidence, "condition": name},
             spans,
         )
