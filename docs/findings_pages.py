@@ -45,13 +45,11 @@ from px4fuse.filter.settings import Settings  # noqa: E402
 from px4fuse.findings import TITLES, Finding, find, find_aids, find_loop, source_frame  # noqa: E402
 from px4fuse.findings.cause_grouping import CONSEQUENCES, RECORDING, effect_ids  # noqa: E402
 from px4fuse.findings.model import CATALOGUE, GROUPS  # noqa: E402
-from px4fuse.flight import Columns, Unavailable  # noqa: E402
+from px4fuse.flight import Columns  # noqa: E402
 from px4fuse.report.panels import (  # noqa: E402
-    ERROR,
     INNOVATIONS,
     POSITION,
     SIGMA_P,
-    error_reference,
 )
 from px4fuse.simulation.flights import simulate_flight  # noqa: E402
 from px4fuse.simulation.mistakes import parse  # noqa: E402
@@ -283,9 +281,8 @@ def picture(name: str, example: Example, folder: Path) -> str:
     axis = example.finding.evidence.get("axis")
     assert example.analysis is not None
     shown = example.analysis.axes.get(str(axis)) or example.analysis.main
-    error = POSITION if isinstance(error_reference(shown), Unavailable) else ERROR
     figure, panels = pyplot.subplots(3, sharex=True, figsize=(8, 7), layout="constrained")
-    for axes, panel in zip(panels, (error, INNOVATIONS, SIGMA_P), strict=True):
+    for axes, panel in zip(panels, (POSITION, INNOVATIONS, SIGMA_P), strict=True):
         panel.draw(axes, shown)
         axes.set_ylabel(fill(panel.full_title(shown), LABEL_WIDTH))
     panels[0].set_title(shown.axis.name)
