@@ -442,7 +442,7 @@ def test_position_gap_above_1_s_and_five_intervals_is_reported(
 ) -> None:
     """The limit is five intervals, but at least 1 s."""
     for gap_s, there in ((least_s, False), (least_s + 0.25, True)):
-        monkeypatch.setattr(source_intervals, "_state_errors_after", lambda *_: "Errors.")
+        monkeypatch.setattr(source_intervals, "state_errors_after", lambda *_: "Errors.")
         time = np.concatenate([np.arange(10.0, 20.5, 0.5), [20.0 + gap_s, 20.5 + gap_s]])
         one = analysis(axes=(axis(),), source=source(rate_hz=rate_hz))
         one.lines[0].measurement_time_s = time
