@@ -62,7 +62,7 @@ from px4fuse.findings import (
 from px4fuse.findings.cause_grouping import ELSEWHERE, GAP
 from px4fuse.findings.model import fraction_on, spans_with_value, zero_length_spans
 from px4fuse.flight import Columns, FusionRecord, Reset, Unavailable
-from px4fuse.log import Dropout
+from px4fuse.log import ClockMap, Dropout
 from px4fuse.position_source import (
     ALIGNED,
     FROM_INNOVATIONS,
@@ -627,7 +627,7 @@ def bias_of_ekf2(*bias: float) -> dict[str, Any]:
 
 
 def clock_map(method: str = "TIMESYNC", distinct: int | None = None, jitter_s: float = 0.02) -> Any:
-    return SimpleNamespace(method=method, distinct_stamps=distinct, jitter_s=jitter_s, pairs=600)
+    return ClockMap("UNIX time", method, 600, 0.0, 0.0, jitter_s, "", distinct)
 
 
 def at_multiples(multiples: list[int], base_s: float = 0.125, **parts: Any) -> Any:
