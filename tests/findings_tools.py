@@ -21,7 +21,7 @@ from px4fuse.filter.signals import Segment
 from px4fuse.filter.time_offset import ClockOffset, PartOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings import Finding
-from px4fuse.flight import Columns, Ekf2, FusionRecord, Unavailable
+from px4fuse.flight import NO_INVALID_ROWS, Columns, Ekf2, FusionRecord, Unavailable
 from px4fuse.position_source import RECEIVED
 
 T = TypeVar("T")
@@ -84,6 +84,7 @@ def source(**parts: Any) -> Any:
         "frame": "NED",
         "clock_map": None, "alignment": None, "rate_hz": 5.0, "age_s": 0.0,
         "samples": moving(parts.get("rate_hz", 5.0)), "status": pd.DataFrame(), "velocity": None,
+        "invalid": NO_INVALID_ROWS,
     }  # fmt: skip
     made = {**usual, **parts}
     return SimpleNamespace(aid=lambda axis: made["origin"].aid, **made)

@@ -63,7 +63,7 @@ from px4fuse.findings import (
 from px4fuse.findings.cause_grouping import ELSEWHERE, GAP
 from px4fuse.findings.model import fraction_on, spans_with_value, zero_length_spans
 from px4fuse.flight import Columns, Reset, Unavailable
-from px4fuse.log import Dropout
+from px4fuse.log import ClockMap, Dropout
 from px4fuse.position_source import (
     ALIGNED,
     FROM_INNOVATIONS,
@@ -441,7 +441,7 @@ def test_position_gap_above_1_s_and_five_intervals_is_reported(
 ) -> None:
     """The limit is five intervals, but at least 1 s."""
     for gap_s, there in ((least_s, False), (least_s + 0.25, True)):
-        monkeypatch.setattr(source_intervals, "_state_errors_after", lambda *_: "Errors.")
+        monkeypatch.setattr(source_intervals, "state_errors_after", lambda *_: "Errors.")
         time = np.concatenate([np.arange(10.0, 20.5, 0.5), [20.0 + gap_s, 20.5 + gap_s]])
         gaps = source_gaps(time, rate_hz)
         one = analysis(
@@ -628,7 +628,7 @@ def bias_of_ekf2(*bias: float) -> dict[str, Any]:
 
 
 def clock_map(method: str = "TIMESYNC", distinct: int | None = None, jitter_s: float = 0.02) -> Any:
-    return SimpleNamespace(method=method, distinct_stamps=distinct, jitter_s=jitter_s, pairs=600)
+    return ClockMap("UNIX time", method, 600, 0.0, 0.0, jitter_s, "", distinct)
 
 
 def at_multiples(multiples: list[int], base_s: float = 0.125, **parts: Any) -> Any:
