@@ -21,13 +21,13 @@ from px4fuse.convention.motion import (
     WINDOW_S,
     ImuMotion,
     Inertial,
-    heading,
     motion_from_imu,
     read_inertial,
     replace_heading,
 )
 from px4fuse.convention.orientation import check_orientation
 from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
+from px4fuse.trajectory.rotation import heading
 
 MIN_LOG_ODDS = 4.0  # to the best other convention
 MIN_GAIN = 8.0  # log likelihood over no relation
