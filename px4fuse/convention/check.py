@@ -112,8 +112,7 @@ def _search(positions: Positions, motions: dict[str, ImuMotion]) -> list[Hypothe
         if (
             one.heading_from == "EKF2"
             and one.score > found[0].score - MAX_LOGGED_DEFICIT
-            and one.has_meaning_of(found[0])
-            and abs(one.remainder_rad - found[0].remainder_rad) < SMALL_ROTATION
+            and one.has_meaning_of(found[0], SMALL_ROTATION)
         ):
             return [
                 replace(one, score=found[0].score),
