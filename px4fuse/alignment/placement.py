@@ -26,7 +26,7 @@ from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
 from px4fuse.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Alignment, Flight, PositionTrack, Unavailable
-from px4fuse.log import InputFile
+from px4fuse.log import SHARED_STAMPS, ClockMap, InputFile
 from px4fuse.position_source import POSITION_FILE
 from px4fuse.readers.common import finite_rows
 from px4fuse.readers.position_csv import PositionRecording
@@ -36,6 +36,7 @@ from px4fuse.readers.position_csv import PositionRecording
 MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}
 # Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
 # indicates another flight
+MAX_DISTINCT_FRACTION = 0.5  # of the rows, if their timestamps are too coarse
 MAX_UNIX_DIFFERENCE_S = 60.0
 
 
@@ -113,6 +114,7 @@ def align_position_file(
     )
     clock_source = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
+    clock_map = _shared_timestamps(recording)
     track = PositionTrack(
         name=recording.name,
         origin=POSITION_FILE,
@@ -125,11 +127,16 @@ def align_position_file(
         topics=(recording.name,),
         log=recording.name,
         alignment=alignment,
+        clock_map=clock_map,
+        invalid=recording.invalid.set_axis(
+            recording.invalid.index + (aligned_samples.index[0] - start_s)
+        ),
+        step_m=recording.step_m,
     )
     reader_notes = tuple(
         f"{recording.name}: {text}" for text in (*recording.detected, *recording.notes)
     )
-    dropped = {recording.name: recording.dropped} if recording.dropped else {}
+    dropped = {recording.name: recording.dropped} if recording.dropped and not clock_map else {}
     notes = (*flight.log.notes, *reader_notes)
     dropped = {**flight.log.dropped, **dropped}
     log = structs.replace(flight.log, notes=notes, dropped=dropped)
@@ -138,6 +145,14 @@ def align_position_file(
         InputFile(recording.name, recording.sha256, recording.size_bytes, "position"),
     )
     return replace(flight, log=log, positions=(track, *flight.positions), inputs=inputs)
+
+
+def _shared_timestamps(recording: PositionRecording) -> ClockMap | None:
+    """Describe a clock whose timestamps are shared by most rows; None for another clock."""
+    distinct, count = len(recording.samples), len(recording.samples) + recording.dropped
+    if distinct > MAX_DISTINCT_FRACTION * count:
+        return None
+    return ClockMap(recording.clock, "as sent", count, 0.0, 0.0, 0.0, SHARED_STAMPS, distinct)
 
 
 def _check_options(

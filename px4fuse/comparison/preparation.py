@@ -300,7 +300,7 @@ def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
         return track
     shifted_frames = {
         name: frame.set_axis(frame.index + clock_offset_s)
-        for name in ("samples", "orientation", "velocity")
+        for name in ("samples", "orientation", "velocity", "invalid", "status")
         if (frame := getattr(track, name)) is not None
     }
     return replace(track, **shifted_frames)

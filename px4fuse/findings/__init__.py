@@ -31,6 +31,7 @@ from px4fuse.findings import (
     source_noise,
     source_positions,
     source_stamps,
+    source_values,
 )
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.model import TITLES, Finding, Findings, Severity, group_by_root
@@ -67,6 +68,7 @@ DETECTORS: tuple[Callable[[Analysis], Findings], ...] = (
     source_noise.detect,
     source_positions.detect,
     source_stamps.detect,
+    source_values.detect,
 )
 
 

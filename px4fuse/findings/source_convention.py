@@ -18,8 +18,8 @@ from px4fuse.convention.texts import (
     describe_conversion,
     describe_unit,
 )
-from px4fuse.findings.cause_grouping import CONVENTION
-from px4fuse.findings.model import Finding, Findings, Severity, finding
+from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION, MISLEADING, UNUSABLE
+from px4fuse.findings.model import CATALOGUE, Finding, Findings, Severity, finding
 from px4fuse.flight import PositionTrack, positions_of, source_name
 from px4fuse.text import capitalise_first
 
@@ -43,10 +43,11 @@ EFFECTS = (
     "ekf2_resets",
     "ekf2_fusion_interrupted",
     "ekf2_not_fusing",
+    "ekf2_position_invalid",
     "aid_not_fused",
     "aid_overconfident",
 )
-# Groups of findings that an ambiguous convention leaves
+# Groups of findings that do not depend on the positions
 UNAFFECTED_GROUPS = ("logging", "IMU")
 
 
@@ -81,10 +82,21 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
     """
     faults = _faults(analysis)
     roots = [one for one in findings if CONVENTION in one.evidence]
-    if not roots or (faults.orientation == "copied" and not faults.of_positions):
+    unusable = [one for one in findings if one.id in UNUSABLE]
+    if unusable:
+        roots = unusable
+        findings = [
+            one
+            for one in findings
+            if one in unusable or one.id in EFFECTS or CATALOGUE[one.id].group in UNAFFECTED_GROUPS
+        ]
+    elif faults.orientation == "copied" and not faults.of_positions:
+        roots = []
+    roots += [one for one in findings if one.id in MISLEADING or ANNOUNCED in one.evidence]
+    if not roots:
         return [*findings]
     others = [one for one in findings if one not in roots and one.id not in FALSE_AFTER]
-    if faults.is_ambiguous:
+    if faults.is_ambiguous and not unusable:
         return [*roots, *(one for one in others if one.id in EFFECTS or one.severity == "note")]
     effects = [
         replace(one, message=f"{one.title}.", remedy=CORRECT_FIRST, caused_by=roots[0].id)
