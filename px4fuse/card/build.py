@@ -75,8 +75,22 @@ HEADING_HIDES_ERROR = (
 UNEXPLAINED = "The two verdicts differ, and no tested change explains it."
 NO_FAULT = "No fault found: KF and EKF2 are consistent"
 # Findings of errors that both filters follow, so that innovations do not show them
-SHIFTED_SOURCE = frozenset(
-    {"source_time_offset", "source_scale_error", "source_frame_misaligned", "source_position_jump"}
+# Findings about the source with the sentence on verdicts that differ
+SENTENCES_BY_SOURCE_FAULT = (
+    (
+        {"source_axes_wrong", "source_orientation_wrong", "source_unit_wrong"},
+        "KF runs with the corrected source. EKF2 used the source as it was sent.",
+    ),
+    (
+        {
+            "source_time_offset",
+            "source_scale_error",
+            "source_frame_misaligned",
+            "source_position_jump",
+        },
+        "Both filters follow the faulty positions, so their innovations show little of the error. "
+        "Ground truth shows it.",
+    ),
 )
 
 
@@ -344,8 +358,8 @@ def _sentence(action: Action) -> str:
     if action.where == "shell":
         options = action.commands[0].partition(" --")[2]
         return f"KF: {action.sentence or 'run again with'} --{options}."
-    text = action.sentence.rstrip(".")
-    return f"{action.target[0].upper()}{action.target[1:]}: {text[0].lower()}{text[1:]}."
+    text = lower_first(action.sentence.rstrip("."))
+    return f"{action.target[0].upper()}{action.target[1:]}: {text}."
 
 
 def _mark_explained(
@@ -427,11 +441,9 @@ def _reconcile(
     ]
     if not differing:
         return ""
-    if not SHIFTED_SOURCE.isdisjoint(ids):
-        return (
-            "Both filters follow the faulty positions, so their innovations show little of the "
-            "error. Ground truth shows it."
-        )
+    for ids_of_source, sentence in SENTENCES_BY_SOURCE_FAULT:
+        if not ids_of_source.isdisjoint(ids):
+            return sentence
     if corrected.issuperset(differing):
         filters = " and ".join(FILTER_NAMES[owner] for owner in differing)
         return (
