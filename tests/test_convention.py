@@ -14,10 +14,10 @@ from flights import given_placement
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import prepare
-from px4fuse.convention.axes import CLOCKWISE, FAMILIES, UNITS, Axes
+from px4fuse.convention.axes import CLOCKWISE, FAMILIES, UNITS
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import Faults, find_faults
-from px4fuse.convention.model import Convention, OrientationConvention
+from px4fuse.convention.model import Axes, Convention, OrientationConvention
 from px4fuse.findings import source_convention
 from px4fuse.findings.cause_grouping import CONVENTION
 from px4fuse.findings.model import Finding, finding

@@ -103,10 +103,9 @@ def test_first_unmet_condition_has_values_limits_and_action(
     tried: Attempt, name: str | None, texts: tuple[str, ...]
 ) -> None:
     found = find_unmet(tried)
-    assert (None if found is None else found[0]) == name
+    assert found.condition == (name or "")
     for text in texts:
-        assert found is not None
-        assert text in " ".join((found[1].fault, found[1].reason, found[1].action))
+        assert text in f"{found.fault} {found.reason} {found.action}"
 
 
 def unfused(**parts: Any) -> Any:

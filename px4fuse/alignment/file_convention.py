@@ -41,7 +41,7 @@ def explain_mismatch(
     convention = check_convention(flight, track, **reach)
     if convention is None or convention.verdict != "determined":
         return None
-    axes, faults = (convention.x, convention.y, convention.z), []
+    axes, faults = convention.axes, []
     if UNITS[convention.unit] != metres_per_unit:
         stated = next(name for unit, name in UNIT_NAMES.items() if UNITS[unit] == metres_per_unit)
         faults.append(describe_unit(convention.unit, "the positions", stated, is_file=True))

@@ -18,6 +18,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from px4fuse.arrays import Array, IntArray
+from px4fuse.convention.model import Axes, Direction, HeadingSource, Unit
 from px4fuse.convention.motion import GRID_S, WINDOW_S, ImuMotion, SourceMotion
 
 MAX_OFFSET_S = 10.0
@@ -25,7 +26,7 @@ MIN_OVERLAP_S = 10.0
 # Minimum scale (m) of the residuals: IMU noise, tilt and interpolation over T
 MIN_SIGMA_M, MIN_SIGMA_DOWN_M = 0.05, 0.08
 FREEDOM = 4.0
-UNITS: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}  # m
+UNITS: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}  # m
 SMALL_ROTATION = np.radians(8.0)  # a smaller rotation is not another convention
 SMALL_OFFSET_S = 0.3
 # Log prior odds of a rotation, a time offset and a unit other than metres
@@ -38,8 +39,7 @@ MAX_STEP_S = 0.15  # of the time offset per iteration
 # Prior precision of time offset (s), rotation (rad), drift of the gyro's heading (σ 0.05 °/s),
 # clock drift, accelerometer bias (σ 0.3 m/s²)
 PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
-CLOCKWISE = ("north", "east", "south", "west")
-Axes = tuple[str, str, str]
+CLOCKWISE: tuple[Direction, ...] = ("north", "east", "south", "west")
 # Log prior odds of axes. Left-handed frames: one wrong sign, or x and y exchanged
 AXES_ODDS: Final[dict[Axes, float]] = {
     ("north", "east", "down"): 1.0,  # as stated
@@ -67,7 +67,7 @@ class Family(NamedTuple):
 
     def axes(self, quarter: int) -> Axes:
         """Return the directions of x, y, z if axis a points to ``CLOCKWISE[quarter]``."""
-        names = ["down" if self.sign > 0 else "up"] * 3
+        names: list[Direction] = ["down" if self.sign > 0 else "up"] * 3
         names[self.a] = CLOCKWISE[quarter % 4]
         names[self.b] = CLOCKWISE[(quarter + self.hand) % 4]
         return names[0], names[1], names[2]
@@ -96,8 +96,7 @@ class Positions:
 
     def with_clock_drift(self, drift: float) -> "Positions":
         """Return the positions with the drift removed from the timestamps."""
-        middle = float(np.mean(self.time_s))
-        return replace(self, time_s=middle + (self.time_s - middle) / (1.0 + drift))
+        return replace(self, time_s=without_drift(self.time_s, drift))
 
     def motion(self, imu: ImuMotion) -> SourceMotion:
         """Return the motion on the grid of the IMU, extended by the largest time offset."""
@@ -133,7 +132,7 @@ class Hypothesis:
     """
 
     family: Family
-    unit: str
+    unit: Unit
     parameters: Array
     score: float
     has_rotation: bool = True
@@ -142,7 +141,7 @@ class Hypothesis:
     max_scale: float = 1.0
     sigma_m: float = 0.0
     windows: float = 0.0
-    heading_from: str = "EKF2"
+    heading_from: HeadingSource = "EKF2"
 
     @property
     def offset_s(self) -> float:
@@ -171,7 +170,13 @@ class Hypothesis:
         return bool(is_similar and (self.family, self.unit) == (other.family, other.unit))
 
 
-def search(positions: Positions, imu: ImuMotion, heading_from: str) -> list[Hypothesis]:
+def without_drift(time_s: Array, drift: float) -> Array:
+    """Return timestamps of a clock without its drift; their mean remains."""
+    middle = float(np.mean(time_s))
+    return middle + (time_s - middle) / (1.0 + drift)
+
+
+def search(positions: Positions, imu: ImuMotion, heading_from: HeadingSource) -> list[Hypothesis]:
     """Return the refined hypotheses, best first; empty without enough overlap."""
     source, refined = positions.motion(imu), []
     for candidate in find_candidates(source, imu):

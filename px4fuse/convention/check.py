@@ -1,7 +1,6 @@
 """Decision on the convention of a position source, before anything is estimated from it."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from msgspec import structs
@@ -16,7 +15,12 @@ from px4fuse.convention.axes import (
     refine,
     search,
 )
-from px4fuse.convention.model import Convention, OrientationConvention, Verdict
+from px4fuse.convention.model import (
+    Convention,
+    HeadingSource,
+    OrientationConvention,
+    Verdict,
+)
 from px4fuse.convention.motion import (
     WINDOW_S,
     ImuMotion,
@@ -26,7 +30,8 @@ from px4fuse.convention.motion import (
     replace_heading,
 )
 from px4fuse.convention.orientation import check_orientation
-from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
+from px4fuse.convention.texts import format_axes
+from px4fuse.flight import Columns, Flight, PositionTrack
 from px4fuse.trajectory.rotation import heading
 
 MIN_LOG_ODDS = 4.0  # to the best other convention
@@ -61,23 +66,22 @@ def check_convention(
     Convention, or None without IMU or attitude.
     """
     inertial = read_inertial(flight)
-    if isinstance(inertial, Unavailable):
+    if inertial is None:
         return None
     positions = _read_positions(flight, track, max_offset_s)
     motions = {
-        "EKF2": motion_from_imu(inertial, inertial.with_logged_heading),
-        "gyroscopes": motion_from_imu(inertial, inertial.gyro),
+        name: motion_from_imu(inertial, attitude) for name, attitude in inertial.attitudes.items()
     }
     found = _search(positions, motions)
     if not found:
         return Convention(verdict="not determinable")
-    drift = _clock_drift(positions, motions[found[0].heading_from], found[0])
-    corrected = positions.with_clock_drift(drift)
-    with_drift = _search(corrected, motions) if drift else []
-    if with_drift and with_drift[0].score > found[0].score + MIN_DRIFT_GAIN:
-        found, positions = with_drift, corrected
-    else:
-        drift = 0.0
+    if drift := _clock_drift(positions, motions[found[0].heading_from], found[0]):
+        corrected = positions.with_clock_drift(drift)
+        with_drift = _search(corrected, motions)
+        if with_drift and with_drift[0].score > found[0].score + MIN_DRIFT_GAIN:
+            found, positions = with_drift, corrected
+        else:
+            drift = 0.0
     convention = _decide(found, positions, drift)
     if track.orientation is None:
         return convention
@@ -100,7 +104,7 @@ def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -
     return Positions(samples.index.to_numpy(), samples.to_numpy(), max_offset_s, heights)
 
 
-def _search(positions: Positions, motions: dict[str, ImuMotion]) -> list[Hypothesis]:
+def _search(positions: Positions, motions: dict[HeadingSource, ImuMotion]) -> list[Hypothesis]:
     """Return the hypotheses with both headings, best first.
 
     If the logged heading fits about as well as the gyro's, it is preferred: it refers to north, the
@@ -114,10 +118,8 @@ def _search(positions: Positions, motions: dict[str, ImuMotion]) -> list[Hypothe
             and one.score > found[0].score - MAX_LOGGED_DEFICIT
             and one.has_meaning_of(found[0], SMALL_ROTATION)
         ):
-            return [
-                replace(one, score=found[0].score),
-                *(other for other in found if other is not one),
-            ]
+            others = [other for other in found if other is not one]
+            return [replace(one, score=found[0].score), *others]
     return found
 
 
@@ -139,11 +141,15 @@ def _decide(found: list[Hypothesis], positions: Positions, drift: float) -> Conv
         or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO
     ):
         verdict = "doubtful"
-    names: dict[str, Any] = dict(zip("xyz", best.axes, strict=True))
-    names |= {"unit": best.unit, "heading_from": best.heading_from}
+    x, y, z = best.axes
+    likely = [_describe(one) for one in rivals if one.score > best.score - MIN_LOG_ODDS]
     return Convention(
         verdict=verdict,
-        **names,
+        x=x,
+        y=y,
+        z=z,
+        unit=best.unit,
+        heading_from=best.heading_from,
         is_mirrored=best.family.is_mirrored,
         rotation_deg=-float(np.degrees(best.remainder_rad)) * best.has_rotation,
         late_s=best.offset_s,
@@ -151,17 +157,15 @@ def _decide(found: list[Hypothesis], positions: Positions, drift: float) -> Conv
         scale=best.scale,
         log_odds=log_odds,
         log_likelihood_gain=best.score,
-        alternatives=tuple(
-            dict.fromkeys(_describe(one) for one in rivals if one.score > best.score - MIN_LOG_ODDS)
-        ),
+        alternatives=tuple(dict.fromkeys(likely)),
     )
 
 
 def _describe(one: Hypothesis) -> str:
     """Describe a hypothesis in words."""
-    x, y, z = one.axes
     rotation = f", rotated by {-np.degrees(one.remainder_rad):+.0f}°" if one.has_rotation else ""
-    return f"x {x}, y {y}, z {z}, {one.unit}{rotation}, timestamps {one.offset_s:+.1f} s late"
+    axes = format_axes(one.axes, one.unit)
+    return f"{axes}{rotation}, timestamps {one.offset_s:+.1f} s late"
 
 
 def residual_ratio(one: Hypothesis, positions: Positions) -> float:
@@ -179,14 +183,14 @@ def _clock_drift(positions: Positions, imu: ImuMotion, best: Hypothesis) -> floa
     """Return the most likely drift of the clock; if nothing fits, drifts of 5 % are tried."""
     start = 0.0
     if best.score < MIN_GAIN or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO:
-        gains = []
-        for drift in DRIFTS:
-            source = positions.with_clock_drift(drift).motion(imu)
-            gains.append(max((one.score for one in find_candidates(source, imu)), default=-np.inf))
-        start = float(DRIFTS[int(np.argmax(gains))])
+        found = [
+            (candidates[0], drift)
+            for drift in DRIFTS.tolist()
+            if (candidates := find_candidates(positions.with_clock_drift(drift).motion(imu), imu))
+        ]
+        candidate, start = max(found, key=lambda pair: pair[0].score)
+        best = replace(candidate, heading_from=best.heading_from)
         positions = positions.with_clock_drift(start)
-        candidates = find_candidates(positions.motion(imu), imu)
-        best = replace(candidates[0], heading_from=best.heading_from) if candidates else best
     one = refine(replace(best, has_clock_drift=True), positions, positions.motion(imu), imu)
     drift = (1.0 + start) / (1.0 - float(one.parameters[3])) - 1.0
     return drift if start or one.score > best.score + MIN_DRIFT_GAIN else 0.0

@@ -8,23 +8,19 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.arrays import Array
-from px4fuse.convention.axes import CLOCKWISE, UNITS
+from px4fuse.convention.axes import CLOCKWISE, UNITS, without_drift
 from px4fuse.convention.model import Convention
 from px4fuse.convention.motion import read_inertial, replace_heading
 from px4fuse.convention.orientation import to_attitude
-from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Unavailable
-from px4fuse.trajectory.rotation import heading
+from px4fuse.convention.texts import FRAME_AXES, OPPOSITE, format_axes
+from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, time_index
+from px4fuse.trajectory.rotation import from_elements, heading
 
 # Minimum rotation (°) of a frame with other axes, and of a frame that is only rotated: smaller
 # ones are in the reach of the estimate of the heading error
 MIN_REMAINDER_DEG, MIN_ROTATION_DEG = 8.0, 15.0
 MIN_LATE_S = 0.5  # smaller time offsets are in the reach of the estimate of the time offset
 MIN_HEADING_ERROR_DEG = 10.0  # of an orientation relative to its own positions
-# Directions of positive and negative axes
-DIRECTIONS = {
-    "north": (1, 0, 0), "east": (0, 1, 0), "down": (0, 0, 1),
-    "south": (-1, 0, 0), "west": (0, -1, 0), "up": (0, 0, -1),
-}  # fmt: skip
 OrientationFault = Literal["", "copied", "order", "frames", "heading"]
 
 
@@ -75,33 +71,31 @@ def find_faults(convention: Convention | None, flight: Flight, frame: str) -> Fa
     """Return the faults of a convention; ``frame`` is the stated frame of the source."""
     if convention is None:
         return Faults()
-    orientation, fault = convention.orientation, _orientation_fault(convention)
+    fault = _orientation_fault(convention)
     if convention.verdict == "ambiguous":
-        is_usual = "x north, y east, z down, m" in (
-            f"x {convention.x}, y {convention.y}, z {convention.z}, {convention.unit}",
-            *(text.partition(", rotated")[0].partition(", timestamps")[0]
-              for text in convention.alternatives),
-        )  # fmt: skip
-        return Faults(orientation=fault, is_ambiguous=not is_usual)
+        ned = format_axes(FRAME_AXES["NED"], "m")
+        likely = (format_axes(convention.axes, convention.unit), *convention.alternatives)
+        is_ned_likely = any(f"{text},".startswith(f"{ned},") for text in likely)
+        return Faults(orientation=fault, is_ambiguous=not is_ned_likely)
     if convention.verdict != "determined":
         return Faults(orientation=fault)
-    ekf2 = flight.ekf2
-    fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
+    fusing = flight.ekf2.fusing if isinstance(flight.ekf2, Ekf2) else None
     is_fused = isinstance(fusing, pd.DataFrame) and bool((fusing > 0).any(axis=None))
     axes, rotation_deg = _axes_and_rotation(convention)
     has_wrong_heading = fault in ("order", "heading")
     is_drifting = convention.heading_from == "gyroscopes"
     # if EKF2's heading came from the orientation, the positions have no reference to north
-    has_own_heading = is_fused and is_drifting and orientation is not None and fault != "copied"
+    has_own_heading = (
+        is_fused and is_drifting and convention.orientation is not None and fault != "copied"
+    )
     is_other_drift = is_drifting and not is_fused and not axes
     if has_wrong_heading or has_own_heading or is_other_drift or frame == "FRD":
         rotation_deg = 0.0
-    late_s = convention.late_s if abs(convention.late_s) >= MIN_LATE_S else 0.0
     faults = Faults(
         axes=axes,
         rotation_deg=rotation_deg,
         unit=convention.unit != "m",
-        late_s=late_s,
+        late_s=convention.late_s if abs(convention.late_s) >= MIN_LATE_S else 0.0,
         clock_drift=convention.clock_drift,
         orientation=fault,
         is_north_unknown=axes and has_own_heading,
@@ -112,16 +106,13 @@ def find_faults(convention: Convention | None, flight: Flight, frame: str) -> Fa
 
 def _axes_and_rotation(convention: Convention) -> tuple[bool, float]:
     """Return True for axes other than NED, and the significant rotation (°) of the positions."""
-    axes, rotation_deg = (convention.x, convention.y, convention.z), convention.rotation_deg
-    is_rotated = abs(rotation_deg) > MIN_REMAINDER_DEG
-    if convention.is_mirrored or convention.z not in ("up", "down"):
-        return True, rotation_deg * is_rotated
-    if convention.z == "up" and axes in (("east", "north", "up"), ("north", "west", "up")):
-        return True, rotation_deg * is_rotated
-    start_deg = 0.0 if convention.z == "down" else 90.0
-    total_deg = rotation_deg - 90.0 * CLOCKWISE.index(convention.x) + start_deg
+    rotation_deg, is_up = convention.rotation_deg, convention.z == "up"
+    is_known = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])
+    if convention.is_mirrored or is_known or convention.z not in ("up", "down"):
+        return True, rotation_deg * (abs(rotation_deg) > MIN_REMAINDER_DEG)
+    total_deg = rotation_deg - 90.0 * CLOCKWISE.index(convention.x) + 90.0 * is_up
     total_deg = (total_deg + 180.0) % 360.0 - 180.0
-    return convention.z == "up", total_deg * (abs(total_deg) > MIN_ROTATION_DEG)
+    return is_up, total_deg * (abs(total_deg) > MIN_ROTATION_DEG)
 
 
 def _orientation_fault(convention: Convention) -> OrientationFault:
@@ -132,15 +123,11 @@ def _orientation_fault(convention: Convention) -> OrientationFault:
         return "copied"
     if orientation.order != "w x y z":
         return "order"
-    error_deg = orientation.heading_error_deg
     is_ned = convention.verdict == "determined" and convention.z == "down"
-    if orientation.frames in {"FLU to NED", "FRD to ENU"} or (
-        is_ned and orientation.frames != "FRD to NED"
-    ):
+    usual = {"FRD to NED"} if is_ned else {"FRD to NED", "FLU to ENU", "FLU to NWU"}
+    if orientation.frames not in usual:
         return "frames"
-    if error_deg is not None and abs(error_deg) > MIN_HEADING_ERROR_DEG:
-        return "heading"
-    return ""
+    return "heading" if abs(orientation.heading_error_deg or 0.0) > MIN_HEADING_ERROR_DEG else ""
 
 
 def correct(
@@ -155,38 +142,34 @@ def correct(
     faults = find_faults(convention, flight, track.frame)
     if convention is None or not faults:
         return flight, track
-    samples, orientation = track.samples, track.orientation
+    samples, orientation, origin = track.samples, track.orientation, track.origin
     to_ned = _matrix(convention, faults)
     position = samples[Columns.POSITION].to_numpy() @ to_ned.T
     variance = samples[Columns.POSITION_VARIANCE].to_numpy()
-    known = np.nan_to_num(variance) @ (to_ned**2).T
-    variance = np.where(np.isnan(variance).all(axis=1, keepdims=True), np.nan, known)
+    is_unknown = np.isnan(variance).all(axis=1, keepdims=True)
+    variance = np.where(is_unknown, np.nan, np.nan_to_num(variance) @ (to_ned**2).T)
     samples = pd.DataFrame(
         np.hstack([position, variance]),
         _corrected_times(samples.index, faults),
         Columns.POSITION + Columns.POSITION_VARIANCE,
     )
-    origin = track.origin
     if faults.orientation == "copied" and origin.kind == "vio":
         origin = structs.replace(origin, kind="uwb")
     if faults.orientation in ("copied", "heading"):
         orientation = None
     elif orientation is not None and convention.orientation is not None:
         quaternion = orientation[Columns.QUATERNION].to_numpy()
-        attitude = to_attitude(quaternion, convention.orientation)
-        orientation = orientation.assign(**dict(zip(Columns.QUATERNION, attitude.T, strict=True)))
         orientation = orientation.set_axis(_corrected_times(orientation.index, faults))
+        orientation[Columns.QUATERNION] = to_attitude(quaternion, convention.orientation)
     track = replace(track, samples=samples, orientation=orientation, origin=origin)
     inertial = read_inertial(flight) if faults.affects_ekf2 else None
-    if inertial is None or isinstance(inertial, Unavailable):
+    if inertial is None:
         return flight, track
-    attitude = inertial.gyro
-    if convention.heading_from == "EKF2":
-        attitude = inertial.with_logged_heading
+    attitude = inertial.attitudes[convention.heading_from]
     if not faults.axes and not faults.rotation_deg:  # the positions refer to north
         turn_deg = convention.rotation_deg - 90.0 * CLOCKWISE.index(convention.x)
         attitude = replace_heading(attitude, heading(attitude) + np.radians(turn_deg))
-    table = pd.DataFrame(attitude, pd.Index(inertial.time_s, name="time_s"), Columns.QUATERNION)
+    table = pd.DataFrame(attitude, time_index(inertial.time_s), Columns.QUATERNION)
     return replace(flight, attitude=table), track
 
 
@@ -195,16 +178,17 @@ def _matrix(convention: Convention, faults: Faults) -> Array:
     scale = UNITS[convention.unit]
     if not faults.axes and not faults.rotation_deg:
         return scale * np.eye(3)
-    columns = np.array([DIRECTIONS[name] for name in (convention.x, convention.y, convention.z)])
+    permutation = [
+        [(axis == name) - (OPPOSITE[axis] == name) for axis in convention.axes]
+        for name in FRAME_AXES["NED"]
+    ]
     is_rotated = abs(convention.rotation_deg) > MIN_REMAINDER_DEG
     angle = -np.radians(convention.rotation_deg) * is_rotated
     cosine, sine = np.cos(angle), np.sin(angle)
-    rotation = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(scale * rotation @ columns.T)
+    rotation = from_elements((cosine, -sine, 0.0), (sine, cosine, 0.0), (0.0, 0.0, 1.0))
+    return np.asarray(scale * rotation @ np.array(permutation))
 
 
 def _corrected_times(times: "pd.Index[float]", faults: Faults) -> "pd.Index[float]":
     """Return timestamps without delay and clock drift."""
-    middle = float(times.to_numpy().mean())
-    corrected = middle + (times.to_numpy() - middle) / (1.0 + faults.clock_drift) - faults.late_s
-    return pd.Index(corrected, name="time_s")
+    return time_index(without_drift(times.to_numpy(), faults.clock_drift) - faults.late_s)

@@ -6,6 +6,10 @@ from px4fuse.record import NotNegative, Positive, Record
 
 Verdict = Literal["determined", "ambiguous", "doubtful", "not determinable"]
 Direction = Literal["north", "east", "south", "west", "up", "down"]
+Axes = tuple[Direction, Direction, Direction]
+Unit = Literal["m", "cm", "mm", "feet"]
+HeadingSource = Literal["EKF2", "gyroscopes"]
+Order = Literal["w x y z", "x y z w"]
 Frames = Literal["FRD to NED", "FLU to ENU", "FLU to NWU", "FLU to NED", "FRD to ENU"]
 
 
@@ -29,7 +33,7 @@ class OrientationConvention(Record, frozen=True, kw_only=True):
     """
 
     verdict: Literal["determined", "ambiguous", "copied", "unrelated"]
-    order: Literal["w x y z", "x y z w"] = "w x y z"
+    order: Order = "w x y z"
     frames: Frames = "FRD to NED"
     heading_error_deg: float | None = None
     tilt_difference_deg: NotNegative = 0.0
@@ -70,10 +74,10 @@ class Convention(Record, frozen=True, kw_only=True):
     x: Direction = "north"
     y: Direction = "east"
     z: Direction = "down"
-    unit: Literal["m", "cm", "mm", "feet"] = "m"
+    unit: Unit = "m"
     is_mirrored: bool = False
     rotation_deg: float = 0.0
-    heading_from: Literal["EKF2", "gyroscopes"] = "EKF2"
+    heading_from: HeadingSource = "EKF2"
     late_s: float = 0.0
     clock_drift: float = 0.0
     scale: Positive = 1.0
@@ -81,3 +85,7 @@ class Convention(Record, frozen=True, kw_only=True):
     log_likelihood_gain: float = 0.0
     alternatives: tuple[str, ...] = ()
     orientation: OrientationConvention | None = None
+
+    @property
+    def axes(self) -> Axes:
+        return self.x, self.y, self.z

@@ -10,10 +10,13 @@ acceleration (tilt, bias).
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from px4fuse.arrays import Array, BoolArray, cumulative_integral
+from px4fuse.convention.model import HeadingSource
+from px4fuse.ekf2.replay import inside_spans
 from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.trajectory.association import gap_limit, is_bracketed
@@ -24,6 +27,7 @@ from px4fuse.trajectory.rotation import (
     heading,
     interpolate,
     multiply,
+    rotate,
     to_matrix,
     to_vector,
 )
@@ -63,9 +67,9 @@ class Inertial:
     valid_spans_s: tuple[tuple[float, float], ...]
 
     @property
-    def with_logged_heading(self) -> Array:
-        """Attitude with the tilt of ``gyro`` and the heading of ``logged``."""
-        return replace_heading(self.gyro, heading(self.logged))
+    def attitudes(self) -> dict[HeadingSource, Array]:
+        """Attitudes with the tilt of ``gyro``, by the source of their heading."""
+        return {"EKF2": replace_heading(self.gyro, heading(self.logged)), "gyroscopes": self.gyro}
 
 
 @dataclass(frozen=True)
@@ -108,28 +112,24 @@ class ImuMotion:
     rate_m_s: Array
 
 
-def read_inertial(flight: Flight) -> Inertial | Unavailable:
-    """Integrate the gyroscopes of a flight to an attitude that no position affects."""
+def read_inertial(flight: Flight) -> Inertial | None:
+    """Integrate the gyroscopes of a flight to an attitude that no position affects.
+
+    None without IMU and attitude over at least 8 s.
+    """
     imu, attitude = flight.imu, flight.attitude
-    if isinstance(imu, Unavailable):
-        return imu
-    if isinstance(attitude, Unavailable):
-        return attitude
+    if isinstance(imu, Unavailable) or isinstance(attitude, Unavailable):
+        return None
     imu_s, attitude_s = imu.index.to_numpy(), attitude.index.to_numpy()
     time_s = np.arange(max(imu_s[0], attitude_s[0]), min(imu_s[-1], attitude_s[-1]), STEP_S)
     if len(time_s) < 4 * WINDOW_S / STEP_S:
-        return Unavailable(
-            "convention of the positions",
-            "IMU and attitude cover less than 8 s together",
-            "Log both during the flight.",
-        )
+        return None
     columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
     integral = cumulative_integral(imu[columns].to_numpy(), imu_s)
     steps = np.diff([np.interp(time_s, imu_s, column) for column in integral.T]).T
     force = steps[:, :3] / STEP_S
     logged = interpolate(time_s, attitude_s, attitude[Columns.QUATERNION].to_numpy())
-    gyro = _integrate_gyros(steps[:, 3:], logged)
-    gyro = _level(gyro, force)
+    gyro = _level(_integrate_gyros(steps[:, 3:], logged), force)
     airborne = flight.airborne
     if isinstance(airborne, Unavailable):
         airborne = ((float(time_s[0]), float(time_s[-1])),)
@@ -156,10 +156,9 @@ def _integrate_gyros(angle_rad: Array, logged: Array) -> Array:
 
 def _level(attitude: Array, force_m_s2: Array) -> Array:
     """Correct the tilt: the mean specific force is vertical."""
-    mean = np.einsum("nij,nj->ni", to_matrix(attitude[:-1]), force_m_s2)
-    is_all = np.ones(len(mean), dtype=bool)
+    mean = rotate(to_matrix(attitude[:-1]), force_m_s2)
     for _ in range(2):
-        mean = running_mean(mean, is_all, round(LEVELLING_S / STEP_S))
+        mean = running_mean(mean, np.ones(len(mean), dtype=bool), round(LEVELLING_S / STEP_S))
     up = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1.0)
     correction = from_vector(np.cross(up, [0.0, 0.0, -1.0]))
     return multiply(np.concatenate([correction, correction[-1:]]), attitude)
@@ -204,13 +203,9 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
     window, every = round(WINDOW_S / STEP_S), round(GRID_S / STEP_S)
     second = second_difference(position, window)[::every]
     time_s = inertial.time_s[window:-window][::every]
-    is_valid = np.zeros(len(time_s), dtype=bool)
-    for start, end in inertial.valid_spans_s:
-        # the land detector already excludes the ground; a gap excludes T on both sides
-        is_valid |= (time_s >= start) & (time_s <= end)
-    for (_, end), (start, _) in zip(
-        inertial.valid_spans_s, inertial.valid_spans_s[1:], strict=False
-    ):
+    # the land detector already excludes the ground; a gap excludes T on both sides
+    is_valid = inside_spans(time_s, inertial.valid_spans_s)
+    for (_, end), (start, _) in pairwise(inertial.valid_spans_s):
         is_valid &= (time_s < end - WINDOW_S) | (time_s > start + WINDOW_S)
     filtered = high_pass(second, is_valid)
     return ImuMotion(time_s, is_valid, filtered, np.gradient(filtered[..., 0], GRID_S, axis=0))

@@ -5,26 +5,29 @@ scored by the median difference of the tilt and of the heading, the heading abou
 """
 
 from itertools import product
-from typing import Final, NamedTuple, cast
+from typing import Final, NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
 from px4fuse.arrays import Array
-from px4fuse.convention.model import Frames, OrientationConvention
+from px4fuse.convention.model import Frames, Order, OrientationConvention
 from px4fuse.convention.motion import Inertial
-from px4fuse.trajectory.rotation import heading, interpolate, multiply
+from px4fuse.ekf2.replay import inside_spans
+from px4fuse.trajectory.rotation import from_vector, heading, interpolate, multiply, to_matrix
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 FRD_FLU = np.array([0.0, 1.0, 0.0, 0.0])  # half a turn about x
 ENU_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 # Rotations of world and body to NED and FRD
-FRAMES: Final[dict[str, tuple[Array, Array]]] = {
+FRAMES: Final[dict[Frames, tuple[Array, Array]]] = {
     "FRD to NED": (IDENTITY, IDENTITY),
     "FLU to ENU": (ENU_NED, FRD_FLU),
     "FLU to NWU": (FRD_FLU, FRD_FLU),
     "FLU to NED": (IDENTITY, FRD_FLU),
     "FRD to ENU": (ENU_NED, IDENTITY),
 }
+ORDERS: tuple[Order, Order] = ("w x y z", "x y z w")
 MAX_COPY_DEG = 0.15  # copies differ by up to 0.03°, fused motion capture by more than 0.2°
 COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
 MAX_TILT_DEG, MAX_HEADING_DEG = 6.0, 12.0  # median differences of a correct convention
@@ -35,20 +38,16 @@ MAX_SAMPLES, MIN_SAMPLES = 600, 20
 
 
 class Candidate(NamedTuple):
-    """Hypothesis on an orientation; its rotation to FRD and NED, without ``body_quarters``."""
+    """Hypothesis on an orientation, its differences from the reference, and its log likelihood."""
 
+    convention: OrientationConvention
+    heading_difference_deg: float
     score: float
-    order: str
-    frames: str
-    body_quarters: int
-    tilt_deg: float
-    heading_deg: float
-    attitude: Array
 
     @property
     def meaning(self) -> tuple[str, str]:
         """Convention without headings: ENU and NWU differ by a rotation about the vertical."""
-        return self.order, self.frames.replace("ENU", "NWU")
+        return self.convention.order, self.convention.frames.replace("ENU", "NWU")
 
 
 def check_orientation(
@@ -72,92 +71,57 @@ def check_orientation(
     attitude : ndarray, shape (m, 4)
         Orientation at these times, rotates FRD to NED.
     """
-    in_flight = np.zeros(len(time_s), dtype=bool)
-    for start, end in inertial.valid_spans_s:
-        in_flight |= (time_s >= start) & (time_s <= end)
-    rows = np.flatnonzero(in_flight)
+    rows = np.flatnonzero(inside_spans(time_s, inertial.valid_spans_s))
     if len(rows) < MIN_SAMPLES:
         return None
     rows = rows[:: -(-len(rows) // MAX_SAMPLES)]
     time, sent = time_s[rows], quaternion[rows]
     sent = sent / np.linalg.norm(sent, axis=1, keepdims=True)
-    angles_deg = [
-        np.median(angle_deg(sent, interpolate(time - delay, inertial.time_s, inertial.logged)))
-        for delay in COPY_DELAYS_S
-    ]
-    if min(angles_deg) < MAX_COPY_DEG:
-        return OrientationConvention(verdict="copied"), time, sent
+    for delay_s in COPY_DELAYS_S:
+        logged = interpolate(time - delay_s, inertial.time_s, inertial.logged)
+        cosine = np.clip(np.abs(np.sum(sent * logged, axis=1)), 0.0, 1.0)
+        if np.median(2.0 * np.arccos(cosine)) < np.radians(MAX_COPY_DEG):
+            return OrientationConvention(verdict="copied"), time, sent
     reference = interpolate(time, inertial.time_s, inertial.gyro)
-    candidates = sorted(
-        (
-            _make_candidate(time, sent, reference, order, frames, quarters)
-            for order, frames, quarters in product(("w x y z", "x y z w"), FRAMES, range(4))
-        ),
-        key=lambda candidate: -candidate.score,
-    )
+    candidates = [
+        _make_candidate(time, sent, reference, order, frames, quarters)
+        for order, frames, quarters in product(ORDERS, FRAMES, range(4))
+    ]
+    candidates.sort(key=lambda candidate: -candidate.score)
     best = candidates[0]
     rival = next(one for one in candidates if one.meaning != best.meaning)
-    verdict = "determined" if best.score - rival.score >= MIN_LOG_ODDS else "ambiguous"
-    if best.tilt_deg > MAX_TILT_DEG or best.heading_deg > MAX_HEADING_DEG:
-        verdict = "unrelated"
-    convention = OrientationConvention(
-        verdict=verdict,  # type: ignore[arg-type]
-        order=best.order,  # type: ignore[arg-type]
-        frames=cast(Frames, best.frames),
-        tilt_difference_deg=best.tilt_deg,
-    )
-    return convention, time, best.attitude
+    convention = best.convention
+    tilt_deg = convention.tilt_difference_deg
+    if tilt_deg > MAX_TILT_DEG or best.heading_difference_deg > MAX_HEADING_DEG:
+        convention = replace(convention, verdict="unrelated")
+    elif best.score - rival.score < MIN_LOG_ODDS:
+        convention = replace(convention, verdict="ambiguous")
+    return convention, time, to_attitude(sent, convention)
 
 
-def to_attitude(quaternion: Array, convention: OrientationConvention) -> Array:
+def to_attitude(sent: Array, convention: OrientationConvention) -> Array:
     """Convert an orientation as sent to the attitude (w, x, y, z; FRD to NED)."""
-    return _convert(quaternion, convention.order, convention.frames)
-
-
-def _convert(sent: Array, order: str, frames: str) -> Array:
-    world, body = FRAMES[frames]
-    return multiply(multiply(world, sent if order == "w x y z" else np.roll(sent, 1, 1)), body)
+    world, body = FRAMES[convention.frames]
+    w_first = sent if convention.order == "w x y z" else np.roll(sent, 1, 1)
+    return multiply(multiply(world, w_first), body)
 
 
 def _make_candidate(
-    time: Array,
-    sent: Array,
-    reference: Array,
-    order: str,
-    frames: str,
-    quarters: int,
+    time: Array, sent: Array, reference: Array, order: Order, frames: Frames, body_quarters: int
 ) -> Candidate:
     """Convert an orientation by a hypothesis and compare it with the reference."""
-    attitude = _convert(sent, order, frames)
-    half = quarters * np.pi / 4.0
-    turned = multiply(attitude, np.array([np.cos(half), 0.0, 0.0, np.sin(half)]))
-    difference = np.exp(1j * (heading(turned) - heading(reference)))
-    mean = np.mean(difference)
-    offset_rad = float(np.angle(mean))
-    heading_deg = float(
-        np.median(np.abs(np.degrees(np.angle(difference / np.exp(1j * offset_rad)))))
-    )
-    cosine = np.sum(down_in_body(turned) * down_in_body(reference), axis=1)
-    tilt_deg = float(np.median(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))))
-    score = (
-        -SCORE_PER_S
-        * float(time[-1] - time[0])
-        * float(
-            np.log(max(tilt_deg, MIN_DIFFERENCE_DEG)) + np.log(max(heading_deg, MIN_DIFFERENCE_DEG))
-        )
-    )
+    convention = OrientationConvention(verdict="determined", order=order, frames=frames)
+    turn = from_vector(np.array([0.0, 0.0, body_quarters * np.pi / 2.0]))
+    attitude = multiply(to_attitude(sent, convention), turn)
+    difference = np.exp(1j * (heading(attitude) - heading(reference)))
+    offset_rad = np.angle(np.mean(difference))
+    spread_rad = np.abs(np.angle(difference * np.exp(-1j * offset_rad)))
+    cosine = np.sum(to_matrix(attitude)[:, 2] * to_matrix(reference)[:, 2], axis=1)
+    tilt_rad = np.arccos(np.clip(cosine, -1.0, 1.0))
+    tilt_deg, heading_deg = np.degrees(np.median([tilt_rad, spread_rad], axis=1)).tolist()
+    logs = np.log(np.maximum([tilt_deg, heading_deg], MIN_DIFFERENCE_DEG))
+    score = -SCORE_PER_S * (time[-1] - time[0]) * float(np.sum(logs))
     score -= 4.0 * (order != "w x y z") + 2.0 * (frames != "FRD to NED")
-    score -= 2.0 * (quarters != 0) + 1.0 * (abs(offset_rad) > np.radians(8.0))
-    return Candidate(score, order, frames, quarters, tilt_deg, heading_deg, attitude)
-
-
-def down_in_body(q: Array) -> Array:
-    """Return the unit vector down in the body frame."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    return np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1)
-
-
-def angle_deg(a: Array, b: Array) -> Array:
-    """Return the angles between quaternions."""
-    cosine = np.clip(np.abs(np.sum(a * b, axis=-1)), 0.0, 1.0)
-    return np.asarray(np.degrees(2.0 * np.arccos(cosine)))
+    score -= 2.0 * (body_quarters != 0) + 1.0 * (abs(offset_rad) > np.radians(8.0))
+    convention = replace(convention, tilt_difference_deg=tilt_deg)
+    return Candidate(convention, heading_deg, score)

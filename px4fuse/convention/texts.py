@@ -1,24 +1,29 @@
-"""Faults of axes and unit in words, with the action for a sender or a position file."""
+"""Faults of axes, unit and orientation in words, with the action."""
 
-from px4fuse.convention.axes import UNITS, Axes
-from px4fuse.convention.correction import DIRECTIONS
+from collections.abc import Sequence
 
+from px4fuse.convention.axes import UNITS
+from px4fuse.convention.model import Axes, Direction, Unit
+
+# In this order, opposite directions are symmetric about the middle
+DIRECTIONS: tuple[Direction, ...] = ("north", "east", "down", "up", "west", "south")
+OPPOSITE = dict(zip(DIRECTIONS, DIRECTIONS[::-1], strict=True))
 FRAME_AXES: dict[str, Axes] = {
     "NED": ("north", "east", "down"),
     "ENU": ("east", "north", "up"),
     "NWU": ("north", "west", "up"),
 }
-UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "feet": "feet"}
+UNIT_NAMES: dict[Unit, str] = {
+    "m": "metres",
+    "cm": "centimetres",
+    "mm": "millimetres",
+    "feet": "feet",
+}
 
 
-def opposite(direction: str) -> str:
-    """Return the opposite direction.
-
-    >>> opposite("north"), opposite("up")
-    ('south', 'down')
-    """
-    negated = tuple(-value for value in DIRECTIONS[direction])
-    return next(name for name, vector in DIRECTIONS.items() if vector == negated)
+def with_opposites(axes: Axes) -> list[Direction]:
+    """Return the directions of x, y, z, -z, -y, -x."""
+    return [*axes, *(OPPOSITE[direction] for direction in axes[::-1])]
 
 
 def axes_as_sent(axes: Axes, frame: str) -> Axes:
@@ -31,12 +36,13 @@ def axes_as_sent(axes: Axes, frame: str) -> Axes:
     frame : {"NED", "ENU", "NWU"}
         Frame from which they were converted.
     """
-    direction_by_name = dict(zip(FRAME_AXES["NED"], axes, strict=True))
-    direction_by_name |= {
-        opposite(name): opposite(direction) for name, direction in direction_by_name.items()
-    }
-    x, y, z = (direction_by_name[name] for name in FRAME_AXES[frame])
+    true_directions = dict(zip(DIRECTIONS, with_opposites(axes), strict=True))
+    x, y, z = (true_directions[name] for name in FRAME_AXES[frame])
     return x, y, z
+
+
+def format_axes(axes: Sequence[str], unit: str) -> str:
+    return "x {}, y {}, z {}, {}".format(*axes, unit)
 
 
 def describe_axes(axes: Axes, stated: str, *, is_mirrored: bool, is_file: bool) -> tuple[str, str]:
@@ -46,35 +52,33 @@ def describe_axes(axes: Axes, stated: str, *, is_mirrored: bool, is_file: bool) 
     ('ENU read as NED: x is east, y north, z up', 'Run again with --position-frame enu.')
     """
     x, y, z = axes
-    name = next((frame for frame, known in FRAME_AXES.items() if known == axes), "")
+    name = next((frame for frame in FRAME_AXES if FRAME_AXES[frame] == axes), "")
     title = f"The axes are not {stated}"
     if name:
         title = f"{name} {'read' if is_file else 'sent'} as {stated}"
     elif z == "up" and is_mirrored:
         title = "z points up"
-    elif (x, y, z) == ("east", "north", "down"):
+    elif axes == ("east", "north", "down"):
         title = "x and y are exchanged"
     elif y == "up":
         title = "y points up"
     fault = f"{title}: x is {x}, y {y}, z {z}{' (left-handed frame)' if is_mirrored else ''}"
-    columns = dict(zip(axes, "xyz", strict=True))
-    columns |= {opposite(direction): f"-{column}" for direction, column in columns.items()}
-    ned = ", ".join(columns[direction] for direction in FRAME_AXES["NED"])
+    columns = dict(zip(with_opposites(axes), ("x", "y", "z", "-z", "-y", "-x"), strict=True))
+    ned = f"(north, east, down) = ({', '.join(columns[one] for one in FRAME_AXES['NED'])})"
     if is_file and name:
         return fault, f"Run again with --position-frame {name.lower()}."
     if is_file:
-        return fault, f"Write (north, east, down) = ({ned}), and give --position-frame ned."
-    action = f"Send (north, east, down) = ({ned})."
+        return fault, f"Write {ned}, and give --position-frame ned."
     if name == "ENU":
-        action = (
+        return fault, (
             "MAVROS converts to NED: publish ENU and FLU on vision_pose/pose. Own sender or ROS 2: "
-            f"send (north, east, down) = ({ned})."
+            f"send {ned}."
         )
-    return fault, action
+    return fault, f"Send {ned}."
 
 
 def describe_unit(
-    unit: str, positions: str, stated: str = "metres", *, is_file: bool
+    unit: Unit, positions: str, stated: str = "metres", *, is_file: bool
 ) -> tuple[str, str]:
     """Return the fault of a unit other than the stated one, and the action.
 
@@ -94,7 +98,6 @@ def describe_conversion(frames: str) -> str:
     >>> describe_conversion("FLU to NWU")
     'Convert the orientation: q_NED = (0, 1, 0, 0) ⊗ q ⊗ (0, 1, 0, 0), in the order w, x, y, z.'
     """
-    body, _, world = frames.partition(" to ")
-    left = {"ENU": "(0, √½, √½, 0) ⊗ ", "NWU": "(0, 1, 0, 0) ⊗ "}.get(world, "")
-    right = " ⊗ (0, 1, 0, 0)" if body == "FLU" else ""
+    left = {"ENU": "(0, √½, √½, 0) ⊗ ", "NWU": "(0, 1, 0, 0) ⊗ "}.get(frames[-3:], "")
+    right = " ⊗ (0, 1, 0, 0)" if frames.startswith("FLU") else ""
     return f"Convert the orientation: q_NED = {left}q{right}, in the order w, x, y, z."

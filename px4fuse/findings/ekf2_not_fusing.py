@@ -8,7 +8,6 @@ from px4fuse.ekf2.fusion_conditions import (
     EV_START_INTERVAL_S,
     EV_STOP_INTERVAL_S,
     Attempt,
-    Unmet,
     find_unmet,
 )
 from px4fuse.findings.model import (
@@ -30,11 +29,6 @@ MIN_FUSING_SHARE_WARNING = 0.98  # fused fraction of the segment; 2 % of a minut
 MIN_LIMITING_INTERVAL_S = 0.18  # s; 10 % of jitter reaches EV_START_INTERVAL_S: fusion starts late
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
 MIN_INVALID_DISTANCE_M = 1.0  # m; less before take-off, where EKF2 needs no position
-UNKNOWN = Unmet(
-    "",
-    "The log does not contain the reason: the logged conditions of EKF2 are met.",
-    "Check `ekf2 status` in the console of PX4.",
-)
 
 
 def detect(analysis: Comparison) -> Findings:
@@ -74,23 +68,23 @@ def detect_missing_fusion(analysis: Comparison) -> Findings:
     spans = spans_with_value(0.0, fusing, analysis.segment)
     longest_s = max(spans, key=lambda span: span[1] - span[0])
     parameters = {**analysis.flight.log.parameters, **ekf2.parameters}
-    found = find_unmet(Attempt(ekf2, source, aid, parameters, longest_s))
-    name, unmet = found or ("", UNKNOWN)
+    unmet = find_unmet(Attempt(ekf2, source, aid, parameters, longest_s))
+    evidence["condition"] = unmet.condition
     action = unmet.action
-    if not found and not source.origin.has_all_samples:
+    if not unmet.condition and not source.origin.has_all_samples:
         action = f"Record with SDLOG_PROFILE 129 (default and vision). {action}"
     extent = f"EKF2 fused the {positions} only {format_percent(share)} of the time"
     if not share:
         extent = f"EKF2 never fused the {positions}"
     title = f"{extent}: {unmet.fault}" if unmet.fault else extent
     if share < MIN_FUSING_SHARE_ERROR:
-        is_reference = source.origin.fused_as_gnss and name == "switch"
+        is_reference = source.origin.fused_as_gnss and unmet.condition == "switch"
         yield finding(
             "note" if unmet.is_intended or is_reference else "error",
             "ekf2_not_fusing",
             f"{title}. {unmet.reason}",
             action,
-            {**evidence, "condition": name},
+            evidence,
             spans if share else (),
         )
     else:
@@ -99,7 +93,7 @@ def detect_missing_fusion(analysis: Comparison) -> Findings:
             f"{title}. {unmet.reason} EKF2 relied on its other sensors for up to "
             f"{longest_s[1] - longest_s[0]:.1f} s.",
             action,
-            {**evidence, "condition": name},
+            evidence,
             spans,
         )
 

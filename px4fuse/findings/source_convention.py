@@ -3,23 +3,24 @@
 Sources: MAVROS ``vision_pose`` (``transform_frame_enu_ned``), PX4 ``VehicleOdometry.msg``, REP 103.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from msgspec.structs import replace
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.convention.axes import UNITS, Axes
+from px4fuse.convention.axes import UNITS
 from px4fuse.convention.correction import MIN_REMAINDER_DEG, Faults, find_faults
-from px4fuse.convention.model import Convention
+from px4fuse.convention.model import Convention, OrientationConvention
 from px4fuse.convention.texts import (
     FRAME_AXES,
     axes_as_sent,
     describe_axes,
     describe_conversion,
     describe_unit,
+    format_axes,
 )
 from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION, MISLEADING, UNUSABLE
-from px4fuse.findings.model import CATALOGUE, Finding, Findings, Severity, finding
+from px4fuse.findings.model import CATALOGUE, Finding, Findings, error, warning
 from px4fuse.flight import PositionTrack, positions_of, source_name
 from px4fuse.text import capitalise_first
 
@@ -51,28 +52,25 @@ EFFECTS = (
 UNAFFECTED_GROUPS = ("logging", "IMU")
 
 
+# Id of the finding, kind of the fault, message and action
+Fault = tuple[str, str, str, str]
+
+
 def detect(analysis: Comparison) -> Findings:
     """Detect faults of the convention, the cause of others first."""
-    convention, faults = (
-        analysis.convention,
-        find_faults(analysis.convention, analysis.flight, analysis.source.frame),
-    )
-    if convention is None or not faults:
+    convention, faults = analysis.convention, _faults(analysis)
+    if convention is None:
         return
-    if faults.orientation:
-        yield _orientation_finding(analysis, convention, faults)
-    if faults.axes or (faults.rotation_deg and _axes_of_file(analysis.source, convention)):
-        yield _axes_finding(analysis, convention, faults)
-    elif faults.rotation_deg:
-        yield _rotation_finding(analysis, convention, faults)
-    if faults.unit:
-        yield _unit_finding(analysis.source, convention)
-    if faults.clock_drift:
-        yield _clock_drift_finding(convention)
-    elif faults.late_s:
-        yield _time_offset_finding(analysis.source, convention)
-    if faults.is_ambiguous:
-        yield _ambiguity_finding(analysis.source, convention)
+    for name, kind, message, action in (
+        *_orientation_faults(convention.orientation, faults, source_name(analysis.source)),
+        *_position_faults(convention, faults, analysis.source),
+    ):
+        gain = round(convention.log_likelihood_gain, 1)
+        evidence: dict[str, float | str] = {CONVENTION: kind, "log_likelihood": gain}
+        if kind == "rotation":
+            evidence["misalignment_deg"] = faults.rotation_deg
+        make_finding = warning if kind in ("copied", "ambiguous") else error
+        yield make_finding(name, message, action, evidence)
 
 
 def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[Finding]:
@@ -110,167 +108,135 @@ def _faults(analysis: Comparison) -> Faults:
     return find_faults(analysis.convention, analysis.flight, analysis.source.frame)
 
 
-def _fault(
-    severity: Severity, name: str, kind: str, message: str, remedy: str, convention: Convention
-) -> Finding:
-    gain = round(convention.log_likelihood_gain, 1)
-    return finding(severity, name, message, remedy, {CONVENTION: kind, "log_likelihood": gain})
-
-
-def _basis(convention: Convention) -> str:
-    """State the evidence for axes, unit or clock."""
+def _position_faults(
+    convention: Convention, faults: Faults, source: PositionTrack
+) -> Iterator[Fault]:
+    """Describe the faults of axes, unit and clock."""
+    positions, alignment = positions_of(source), source.alignment
+    is_file = alignment is not None
     odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
-    more = "above " if odds == 99.0 else ""
-    return (
+    basis = (
         "The motion measured by the IMU fits this better than any other convention (log likelihood "
-        f"ratio {more}{odds:.0f})."
+        f"ratio {'above ' if odds == 99.0 else ''}{odds:.0f})."
     )
-
-
-def _axes_of_file(source: PositionTrack, convention: Convention) -> Axes | None:
-    """Return the axes of a position file if they are NED, ENU or NWU, and not as stated."""
-    if source.alignment is None or abs(convention.rotation_deg) > MIN_REMAINDER_DEG:
-        return None
-    axes = axes_as_sent((convention.x, convention.y, convention.z), source.alignment.frame.upper())
-    return axes if axes in FRAME_AXES.values() else None
-
-
-def _axes_finding(analysis: Comparison, convention: Convention, faults: Faults) -> Finding:
-    """Make the finding of axes that are not those of NED."""
-    alignment, orientation = analysis.source.alignment, convention.orientation
-    stated = "NED" if alignment is None else alignment.frame.upper()
-    axes = axes_as_sent((convention.x, convention.y, convention.z), stated)
-    limit = " The analysis uses the positions converted to NED."
-    if faults.is_north_unknown and orientation is not None and axes not in FRAME_AXES.values():
-        axes = FRAME_AXES.get(orientation.frames[-3:], axes)
-        limit = " EKF2's heading came from this source, so the direction of north is unknown."
-    fault, action = describe_axes(
-        axes, stated, is_mirrored=convention.is_mirrored, is_file=alignment is not None
-    )
-    if faults.axes and faults.rotation_deg:
-        fault += f", rotated by {faults.rotation_deg:+.0f}° (clockwise from above)"
-    if orientation is not None and orientation.frames.startswith("FLU"):
-        action += f" {describe_conversion(orientation.frames)}"
-    message = f"{fault}. {_basis(convention)}{limit}"
-    return _fault("error", "source_axes_wrong", "axes", message, action, convention)
-
-
-def _rotation_finding(analysis: Comparison, convention: Convention, faults: Faults) -> Finding:
-    """Make the finding of a frame that is rotated about the vertical."""
-    positions, turn_deg = positions_of(analysis.source), faults.rotation_deg
-    reference = "EKF2's heading" if convention.heading_from == "EKF2" else "the heading at take-off"
-    message = (
-        f"{capitalise_first(positions)} are rotated by {turn_deg:+.0f}° relative to {reference}. "
-        "The rotation is clockwise from above and constant. The x axis of the source is not north, "
-        f"unless this heading is wrong. {_basis(convention)} The analysis uses the positions "
-        "rotated to NED."
-    )
-    action = (
-        "Align the frame of the positioning system with north, or rotate positions and "
-        f"orientation by {-turn_deg:+.0f}° before they are sent."
-    )
-    if analysis.source.alignment is not None:
-        action = "Run again with --position-yaw auto."
-    found = _fault("error", "source_frame_misaligned", "rotation", message, action, convention)
-    return replace(found, evidence={**found.evidence, "misalignment_deg": turn_deg})
-
-
-def _unit_finding(source: PositionTrack, convention: Convention) -> Finding:
-    """Make the finding of positions that are not in metres."""
-    positions = capitalise_first(positions_of(source))
-    fault, action = describe_unit(convention.unit, positions, is_file=source.alignment is not None)
-    factor = convention.scale / UNITS[convention.unit]
-    message = (
-        f"{fault}. Distances are {factor:.3g} times those that the IMU measures. "
-        f"{_basis(convention)} The analysis uses the positions in metres."
-    )
-    return _fault("error", "source_unit_wrong", "unit", message, action, convention)
-
-
-def _time_offset_finding(source: PositionTrack, convention: Convention) -> Finding:
-    """Make the finding of a time offset beyond the reach of the usual estimate."""
-    size_s, is_late = abs(convention.late_s), convention.late_s > 0.0
-    message = (
-        f"Position timestamps are {size_s:.2f} s {'late' if is_late else 'early'}. "
-        f"{_basis(convention)} The analysis uses corrected timestamps."
-    )
-    action = "Run again with --clock-offset auto."
-    if source.alignment is None:
+    stated = alignment.frame.upper() if alignment else "NED"
+    axes, turn_deg = axes_as_sent(convention.axes, stated), faults.rotation_deg
+    is_other_frame = is_file and abs(convention.rotation_deg) <= MIN_REMAINDER_DEG
+    if faults.axes or (turn_deg and is_other_frame and axes in FRAME_AXES.values()):
+        orientation = convention.orientation
+        limit = "The analysis uses the positions converted to NED."
+        if faults.is_north_unknown and orientation and axes not in FRAME_AXES.values():
+            axes = FRAME_AXES.get(orientation.frames[-3:], axes)
+            limit = "EKF2's heading came from this source, so the direction of north is unknown."
+        fault, action = describe_axes(
+            axes, stated, is_mirrored=convention.is_mirrored, is_file=is_file
+        )
+        if faults.axes and turn_deg:
+            fault += f", rotated by {turn_deg:+.0f}° (clockwise from above)"
+        if orientation and orientation.frames.startswith("FLU"):
+            action += f" {describe_conversion(orientation.frames)}"
+        yield "source_axes_wrong", "axes", f"{fault}. {basis} {limit}", action
+    elif turn_deg:
+        heading = (
+            "EKF2's heading" if convention.heading_from == "EKF2" else "the heading at take-off"
+        )
+        message = (
+            f"{capitalise_first(positions)} are rotated by {turn_deg:+.0f}° relative to {heading}. "
+            "The rotation is clockwise from above and constant. The x axis of the source is not "
+            f"north, unless this heading is wrong. {basis} The analysis uses the positions rotated "
+            "to NED."
+        )
+        action = (
+            "Align the frame of the positioning system with north, or rotate positions and "
+            f"orientation by {-turn_deg:+.0f}° before they are sent."
+        )
+        if is_file:
+            action = "Run again with --position-yaw auto."
+        yield "source_frame_misaligned", "rotation", message, action
+    if faults.unit:
+        fault, action = describe_unit(convention.unit, capitalise_first(positions), is_file=is_file)
+        factor = convention.scale / UNITS[convention.unit]
+        message = (
+            f"{fault}. Distances are {factor:.3g} times those that the IMU measures. {basis} The "
+            "analysis uses the positions in metres."
+        )
+        yield "source_unit_wrong", "unit", message, action
+    late_s, percent = convention.late_s, 100.0 * faults.clock_drift
+    if percent:
+        message = (
+            f"The clock of the position timestamps is {abs(percent):.1f} % "
+            f"{'fast' if percent > 0 else 'slow'}, and {late_s:+.2f} s late in the middle. {basis} "
+            "The analysis uses corrected timestamps."
+        )
+        action = (
+            "Take the timestamps from a clock. Timestamps that are counted (frame number over "
+            "nominal rate) drift."
+        )
+        yield "source_time_offset_changes", "clock drift", message, action
+    elif faults.late_s:
+        message = (
+            f"Position timestamps are {abs(late_s):.2f} s {'late' if late_s > 0 else 'early'}. "
+            f"{basis} The analysis uses corrected timestamps."
+        )
         action = (
             "Synchronise the clocks (TIMESYNC; uXRCE-DDS: UXRCE_DDS_SYNCT 1) and set the timestamp "
             "at the time of measurement."
         )
-    return _fault("error", "source_time_offset", "time offset", message, action, convention)
+        if is_file:
+            action = "Run again with --clock-offset auto."
+        yield "source_time_offset", "time offset", message, action
+    if faults.is_ambiguous:
+        axes_text = format_axes(convention.axes, convention.unit)
+        message = (
+            f"The axes of the {positions} are not NED, and ambiguous: {axes_text}; or "
+            f"{'; '.join(convention.alternatives[:3])}. The motion of this flight fits each of "
+            "them. Estimates from the positions are left out."
+        )
+        action = "Fly a square with climb and descent, or state the frame (--position-frame)."
+        yield "source_convention_ambiguous", "ambiguous", message, action
 
 
-def _clock_drift_finding(convention: Convention) -> Finding:
-    """Make the finding of a clock that runs too fast or too slowly."""
-    percent, late_s = 100.0 * convention.clock_drift, convention.late_s
-    message = (
-        f"The clock of the position timestamps is {abs(percent):.1f} % "
-        f"{'fast' if percent > 0 else 'slow'}, and {late_s:+.2f} s late in the middle. "
-        f"{_basis(convention)} The analysis uses corrected timestamps."
-    )
-    action = (
-        "Take the timestamps from a clock. Timestamps that are counted (frame number over nominal "
-        "rate) drift."
-    )
-    name = "source_time_offset_changes"
-    return _fault("error", name, "clock drift", message, action, convention)
-
-
-def _ambiguity_finding(source: PositionTrack, convention: Convention) -> Finding:
-    """Make the finding of axes, unit or clock that the motion does not determine."""
-    best = f"x {convention.x}, y {convention.y}, z {convention.z}, {convention.unit}"
-    others = "; ".join(convention.alternatives[:3])
-    message = (
-        f"The axes of the {positions_of(source)} are not NED, and ambiguous: {best}; or {others}. "
-        "The motion of this flight fits each of them. Estimates from the positions are left out."
-    )
-    action = "Fly a square with climb and descent, or state the frame (--position-frame)."
-    name = "source_convention_ambiguous"
-    return _fault("warning", name, "ambiguous", message, action, convention)
-
-
-def _orientation_finding(analysis: Comparison, convention: Convention, faults: Faults) -> Finding:
-    """Make the finding of a wrong orientation."""
-    orientation, name = convention.orientation, source_name(analysis.source)
-    assert orientation is not None
-    kind: str = faults.orientation
-    if kind == "copied":
-        return _fault(
-            "warning",
-            "source_orientation_copied",
-            kind,
+def _orientation_faults(
+    orientation: OrientationConvention | None, faults: Faults, source: str
+) -> Iterator[Fault]:
+    """Describe the fault of the orientation of a source with this name."""
+    if orientation is None or not faults.orientation:
+        return
+    if faults.orientation == "copied":
+        message = (
             "The orientation of the source is the autopilot's own attitude, sent back. The median "
             "difference is below 0.15°. It contains no measurement, so the source is analysed as a "
-            "positioning system without orientation.",
-            "Send no orientation (q NaN), and fuse the position only (EKF2_EV_CTRL without bit 3).",
-            convention,
+            "positioning system without orientation."
         )
-    error_deg = orientation.heading_error_deg or 0.0
+        action = (
+            "Send no orientation (q NaN), and fuse the position only (EKF2_EV_CTRL without bit 3)."
+        )
+        yield "source_orientation_copied", "copied", message, action
+        return
+    agreement = (
+        "roll and pitch agree with the vehicle (median difference "
+        f"{orientation.tilt_difference_deg:.1f}°)"
+    )
     fault, action = {
         "order": (
-            f"The quaternion of {name} is sent in the order x, y, z, w; PX4 reads w, x, y, z. In "
-            "the order x, y, z, w roll and pitch agree with the vehicle (median difference "
-            f"{orientation.tilt_difference_deg:.1f}°)",
+            f"The quaternion of {source} is sent in the order x, y, z, w; PX4 reads w, x, y, z. In "
+            f"the order x, y, z, w {agreement}",
             "Write w first (px4_msgs: q[0] is w). Eigen coeffs(), SciPy as_quat() and "
             "geometry_msgs have the order x, y, z, w.",
         ),
         "frames": (
-            f"The orientation of {name} is {orientation.frames}; PX4 reads FRD to NED, as the "
-            "positions are. In that frame roll and pitch agree with the vehicle (median difference "
-            f"{orientation.tilt_difference_deg:.1f}°)",
+            f"The orientation of {source} is {orientation.frames}; PX4 reads FRD to NED, as the "
+            f"positions are. In that frame {agreement}",
             describe_conversion(orientation.frames),
         ),
         "heading": (
-            f"The heading of the orientation of {name} differs by {error_deg:+.0f}° from its own "
-            "positions (clockwise from above). The positions move in another direction than the "
-            "orientation and the IMU say",
+            f"The heading of the orientation of {source} differs by "
+            f"{orientation.heading_error_deg or 0.0:+.0f}° from its own positions (clockwise from "
+            "above). The positions move in another direction than the orientation and the IMU say",
             "Define the rigid body with x forward. An error of 90° is often an ENU heading, which "
             "counts from east, that was not converted.",
         ),
-    }[kind]
+    }[faults.orientation]
     message = f"{fault}. A filter that fuses this yaw gets a wrong heading."
     action += " Do not fuse the yaw (EKF2_EV_CTRL bit 3) before."
-    return _fault("error", "source_orientation_wrong", kind, message, action, convention)
+    yield "source_orientation_wrong", faults.orientation, message, action

@@ -135,18 +135,18 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     arm = estimate_lever_arm(analysis.flight, source)
     if arm is None:
         return
-    forward_m, right_m, _ = source.lever_arm_m
-    size_m = float(np.hypot(arm.forward_m, arm.right_m))
+    forward_m, right_m, sigma_m = arm
     sensor = "sensor" if source.origin.kind == "file" else f"{source_name(source)} sensor"
     yield warning(
         "source_lever_arm",
-        f"The {sensor} is mounted {size_m:.2f} m from the position that EKF2 assumes: "
-        f"{arm.forward_m:+.2f} m forward, {arm.right_m:+.2f} m right (± {1.96 * arm.sigma_m:.2f} "
+        f"The {sensor} is mounted {np.hypot(forward_m, right_m):.2f} m from the position that EKF2 "
+        f"assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± {1.96 * sigma_m:.2f} "
         "m, 95 %). In each turn the positions move relative to the vehicle by up to twice this "
         "lever arm. Estimates from the positions are left out.",
         "Measure the position of the sensor relative to the IMU. Set EKF2_EV_POS_X to "
-        f"{forward_m + arm.forward_m:.2f} m and EKF2_EV_POS_Y to {right_m + arm.right_m:.2f} m.",
-        {"forward_m": arm.forward_m, "right_m": arm.right_m, "sigma_m": arm.sigma_m},
+        f"{source.lever_arm_m[0] + forward_m:.2f} m and EKF2_EV_POS_Y to "
+        f"{source.lever_arm_m[1] + right_m:.2f} m.",
+        {"forward_m": forward_m, "right_m": right_m, "sigma_m": sigma_m},
     )
 
 
