@@ -183,8 +183,9 @@ def search(positions: Positions, imu: ImuMotion, heading_from: HeadingSource) ->
         start = replace(candidate, heading_from=heading_from)
         refined.append(refine(start, positions, source, imu))
         if abs(candidate.remainder_rad) < 3.0 * SMALL_ROTATION:
-            nearest = [0.0, candidate.remainder_rad, *[0.0] * 5]
-            start = replace(start, parameters=start.parameters - nearest, has_rotation=False)
+            parameters = start.parameters.copy()
+            parameters[1] -= candidate.remainder_rad
+            start = replace(start, parameters=parameters, has_rotation=False)
             refined.append(refine(start, positions, source, imu))
     return sorted(refined, key=lambda one: -one.score)
 
@@ -263,34 +264,33 @@ def _evaluate(
     flown_s = time_s - time_s[0]
     fraction = (at[used] - index)[:, None, None]
     table = (1.0 - fraction) * imu.table[index] + fraction * imu.table[index + 1]
-    sent, family, unit = source.table[rows[used]], one.family, UNITS[one.unit]
-    horizontal = sent[:, family.a] + 1j * family.hand * sent[:, family.b]
-    horizontal = unit * np.exp(1j * (angle + heading_drift * flown_s)) * horizontal
-    down = unit * family.sign * sent[:, family.vertical]
-    ned = np.column_stack([horizontal.real, horizontal.imag, down])
+    sent, (vertical, sign, a, b, hand) = source.table[rows[used]], one.family
+    unit = UNITS[one.unit]
+    turn = unit * np.exp(1j * (angle + heading_drift * flown_s))
+    horizontal = turn * (sent[:, a] + 1j * hand * sent[:, b])
+    ned = np.column_stack([horizontal.real, horizontal.imag, unit * sign * sent[:, vertical]])
     measured = table[..., 0] - table[..., 1:] @ bias
     residual = ned - measured
-    squares = np.stack([np.abs(horizontal - measured[:, 0] - 1j * measured[:, 1]), residual[:, 2]])
-    squares = squares**2
+    squares = np.stack([np.sum(residual[:, :2] ** 2, axis=1), residual[:, 2] ** 2])
     gain, sigma_m = student_score(squares[0], 2, MIN_SIGMA_M)
     gain_down, sigma_down_m = student_score(squares[1], 1, MIN_SIGMA_DOWN_M)
     is_known = sent.any(axis=0)  # False for a missing height
-    gain += gain_down * is_known[family.vertical] + np.log(unit) * np.count_nonzero(is_known)
+    gain += gain_down * is_known[vertical] + np.log(unit) * np.count_nonzero(is_known)
     gain -= sum(student_score(column**2, 1, 1e-6)[0] for column in sent.T[is_known])
     weight = 1.0 / (np.array([[sigma_m**2], [sigma_down_m**2]]) + squares / FREEDOM)
     weight *= row_s / WINDOW_S
-    products = [
-        float(np.sum(weight[0] @ (first[:, :2] * second[:, :2])))
+    ned_square, product, square = (
+        float(np.sum(weight[0] @ (first * second)[:, :2]))
         for first, second in ((ned, ned), (ned, measured), (measured, measured))
-    ]
+    )
     jacobian = np.zeros((len(index), 3, len(PRECISION)))
     jacobian[..., 0] = imu.rate_m_s[index]
     jacobian[:, 0, 1], jacobian[:, 1, 1] = -horizontal.imag, horizontal.real
     jacobian[..., 2] = jacobian[..., 1] * flown_s[:, None]
     jacobian[..., 3] = jacobian[..., 0] * (time_s - middle_s)[:, None]
     jacobian[..., 4:] = table[..., 1:]
-    free = np.array([True, one.has_rotation, one.heading_from != "EKF2", one.has_clock_drift])
-    free = np.append(free, np.ones(3, dtype=bool))
+    is_drifting = one.heading_from != "EKF2"
+    free = np.array([True, one.has_rotation, is_drifting, one.has_clock_drift, *[True] * 3])
     weights, columns = weight[[0, 0, 1]].T.ravel(), jacobian[..., free].reshape(-1, free.sum())
     weighted = columns.T * weights
     normal = weighted @ columns + np.diag(PRECISION[free] + 1e-9)
@@ -301,8 +301,8 @@ def _evaluate(
     scored = replace(
         one,
         score=float(windows * gain - 0.5 * PRECISION @ one.parameters**2),
-        scale=products[1] / products[2],
-        max_scale=products[0] / products[1],
+        scale=product / square,
+        max_scale=ned_square / product,
         sigma_m=sigma_m,
         windows=windows,
     )

@@ -55,14 +55,8 @@ def detect(analysis: Analysis) -> Findings:
     yield from detect_copied_estimate(analysis)
 
 
-def invalid_spans(analysis: Analysis, reason: str = "") -> tuple[Span, ...]:
-    """Return the spans of consecutive rows without a measurement, by default for all reasons."""
-    source, segment = analysis.source, analysis.segment
-    invalid = source.invalid[segment.start_s : segment.end_s]
-    time_s = invalid[invalid == reason].index if reason else invalid.index
-    valid_s = source.samples.index.to_numpy()
-    if time_s.empty:
-        return ()
+def _consecutive_spans(time_s: Array, valid_s: Array) -> tuple[Span, ...]:
+    """Return the spans of consecutive rows without a valid sample between them."""
     # rows of one span have the same valid sample before them
     before = np.searchsorted(valid_s, time_s)
     starts = np.flatnonzero(np.diff(before, prepend=-1))
@@ -75,9 +69,10 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
     source, segment = analysis.source, analysis.segment
     invalid = source.invalid[segment.start_s : segment.end_s]
     for reason, (name, fault, action) in INVALID.items():
-        spans, count = invalid_spans(analysis, reason), int((invalid == reason).sum())
-        if not count:
+        time_s = invalid[invalid == reason].index.to_numpy()
+        if not (count := len(time_s)):
             continue
+        spans = _consecutive_spans(time_s, source.samples.index.to_numpy())
         longest_s = max(spans, key=lambda span: span[1] - span[0])
         duration_s, total_s = longest_s[1] - longest_s[0], sum(end - start for start, end in spans)
         times = f"{len(spans)} times between {spans[0][0]:.1f} s and {spans[-1][1]:.1f} s"
@@ -154,7 +149,7 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     """Detect positions of two systems in turn: every other position is off by a constant."""
     samples = cut_to_segment(analysis.source.samples, analysis.segment)[Columns.POSITION]
     samples = samples.dropna(axis=1, how="all").dropna()
-    count = (len(samples) - 2) // WINDOW
+    count, rate_hz = (len(samples) - 2) // WINDOW, analysis.source.rate_hz
     if count < MIN_WINDOWS:
         return
     time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
@@ -169,7 +164,6 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     size_m = float(np.linalg.norm(offset))
     if size_m < max(MIN_OFFSET_M, MIN_OFFSET_SIGMAS * scatter_m):
         return
-    rate_hz = analysis.source.rate_hz
     axes = ", ".join(
         f"{abs(part):.2f} m {name.partition('_')[0]}"
         for part, name in zip(offset, samples.columns, strict=True)
@@ -204,8 +198,8 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
     if not differences[best] < (MAX_FOLLOWED_COPY_M if is_fused else MAX_COPY_M):
         return
     convention = analysis.convention
-    orientation = convention.orientation if convention is not None else None
-    is_copied = orientation is not None and orientation.verdict == "copied"
+    orientation = convention.orientation if convention else None
+    is_copied = orientation and orientation.verdict == "copied"
     quantity = "position and attitude" if is_copied else "position"
     yield error(
         "source_is_ekf2_estimate",
