@@ -1,6 +1,5 @@
 """Convention of a position file that matches neither EKF2 nor the IMU as stated."""
 
-import numpy as np
 import pandas as pd
 
 from px4fuse.alignment.matching import AlignmentProblem
@@ -8,7 +7,7 @@ from px4fuse.convention.axes import UNITS
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import MIN_ROTATION_DEG
 from px4fuse.convention.texts import FRAME_AXES, UNIT_NAMES, describe_axes, describe_unit
-from px4fuse.flight import Columns, Flight, PositionTrack
+from px4fuse.flight import Columns, Flight, PositionTrack, time_index
 from px4fuse.position_source import POSITION_FILE
 
 MAX_SPAN_S = 7200.0  # of file and log; the search takes 1 s per hour
@@ -32,10 +31,7 @@ def explain_mismatch(
         return None
     time_s = samples.index - samples.index[0] + (problem.lag_s or 0.0)
     positions = samples[["x_m", "y_m", "z_m"]] / metres_per_unit
-    values = np.hstack([positions, np.full((len(samples), 3), np.nan)])
-    table = pd.DataFrame(
-        values, pd.Index(time_s, name="time_s"), Columns.POSITION + Columns.POSITION_VARIANCE
-    )
+    table = pd.DataFrame(positions.to_numpy(), time_index(time_s.to_numpy()), Columns.POSITION)
     track = PositionTrack("", POSITION_FILE, "", table, "unknown", "", ())
     reach = {} if problem.lag_s is not None else {"max_offset_s": span_s}
     convention = check_convention(flight, track, **reach)

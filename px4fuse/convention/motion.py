@@ -178,12 +178,9 @@ def running_mean(values: Array, is_valid: BoolArray, width: int) -> Array:
 
 def high_pass(values: Array, is_valid: BoolArray) -> Array:
     """Subtract the running mean; invalid rows are 0."""
-    shape = (-1, *[1] * (values.ndim - 1))
-    return np.where(
-        is_valid.reshape(shape),
-        values - running_mean(values, is_valid, round(HIGH_PASS_S / GRID_S)),
-        0.0,
-    )
+    filtered = values - running_mean(values, is_valid, round(HIGH_PASS_S / GRID_S))
+    filtered[~is_valid] = 0.0
+    return filtered
 
 
 def second_difference(position: Array, window: int) -> Array:

@@ -6,7 +6,7 @@ Source: PX4-Autopilot ``src/modules/ekf2``, v1.13.3 to main: ``RingBuffer.h``, `
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -15,8 +15,6 @@ from px4fuse.ekf2.intervals import MAX_LATENESS_S
 from px4fuse.ekf2_parameters import AID_MASK, Aid
 from px4fuse.flight import Columns, Ekf2, PositionTrack, step_values_at
 from px4fuse.record import Span
-
-T = TypeVar("T", pd.DataFrame, "pd.Series[float]")
 
 EV_START_INTERVAL_S = 0.2  # s; EV_MAX_INTERVAL of PX4 v1.14 and later (ev_control.cpp)
 EV_STOP_INTERVAL_S = 0.4  # s; two times EV_MAX_INTERVAL (ev_pos_control.cpp)
@@ -122,7 +120,7 @@ class Attempt:
     def interval_s(self) -> float:
         return 1.0 / self.source.rate_hz
 
-    def within(self, samples: T, before_s: float = 0.0) -> T:
+    def within(self, samples: pd.DataFrame, before_s: float = 0.0) -> pd.DataFrame:
         """Return the samples in the span, and those up to ``before_s`` before it."""
         return samples.loc[self.span_s[0] - before_s : self.span_s[1]]
 
@@ -199,7 +197,7 @@ def _check_timestamps(attempt: Attempt) -> Iterator[Unmet]:
     if "age_s" not in status:
         return
     delay_s = attempt.parameters.get(attempt.aid.delay, 0.0) * 1e-3
-    age_s = float(attempt.within(status["age_s"]).median()) + delay_s
+    age_s = float(attempt.within(status)["age_s"].median()) + delay_s
     if -age_s > BUFFER_COUNT * attempt.interval_s:
         yield Unmet(
             "age",
@@ -227,7 +225,7 @@ def _check_quality(attempt: Attempt) -> Iterator[Unmet]:
     minimum, status = attempt.parameters.get("EKF2_EV_QMIN", 0.0), attempt.source.status
     if minimum <= 0.0 or "quality" not in status:
         return
-    quality = attempt.within(status["quality"])
+    quality = attempt.within(status)["quality"]
     # the sample, the one before it, and the newest in the buffer must be good
     count = int(np.ceil(attempt.horizon_s / attempt.interval_s)) + 2
     is_good = (quality >= minimum).astype(float)

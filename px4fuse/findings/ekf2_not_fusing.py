@@ -76,13 +76,13 @@ def detect_missing_fusion(analysis: Comparison) -> Findings:
     extent = f"EKF2 fused the {positions} only {format_percent(share)} of the time"
     if not share:
         extent = f"EKF2 never fused the {positions}"
-    title = f"{extent}: {unmet.fault}" if unmet.fault else extent
+    message = f"{extent}{unmet.fault and ': '}{unmet.fault}. {unmet.reason}"
     if share < MIN_FUSING_SHARE_ERROR:
         is_reference = source.origin.fused_as_gnss and unmet.condition == "switch"
         yield finding(
             "note" if unmet.is_intended or is_reference else "error",
             "ekf2_not_fusing",
-            f"{title}. {unmet.reason}",
+            message,
             action,
             evidence,
             spans if share else (),
@@ -90,7 +90,7 @@ def detect_missing_fusion(analysis: Comparison) -> Findings:
     else:
         yield warning(
             "ekf2_fusion_interrupted",
-            f"{title}. {unmet.reason} EKF2 relied on its other sensors for up to "
+            f"{message} EKF2 relied on its other sensors for up to "
             f"{longest_s[1] - longest_s[0]:.1f} s.",
             action,
             evidence,
@@ -160,9 +160,9 @@ def _detect_slow_restart(analysis: Comparison, ekf2: Ekf2, fusing: pd.Series) ->
     late_spans = []
     for start_s, end_s in spans_with_value(0.0, fusing, analysis.segment):
         after_gap_s = resumed_s[(resumed_s > start_s - EV_STOP_INTERVAL_S) & (resumed_s < end_s)]
-        waiting_s = (
-            time_s[(time_s >= after_gap_s[-1]) & (time_s < end_s)] if len(after_gap_s) else []
-        )
+        if not len(after_gap_s):
+            continue
+        waiting_s = time_s[(time_s >= after_gap_s[-1]) & (time_s < end_s)]
         if len(waiting_s) > 2 and waiting_s[1] - waiting_s[0] >= EV_START_INTERVAL_S:
             late_spans.append((float(waiting_s[0]), end_s))
     if late_spans:
