@@ -11,6 +11,7 @@ north and east and one for down. The log likelihood is relative to positions wit
 motion, and contains the Jacobian of the unit: small units make residuals small.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Final, NamedTuple
@@ -176,17 +177,19 @@ def without_drift(time_s: Array, drift: float) -> Array:
     return middle + (time_s - middle) / (1.0 + drift)
 
 
-def search(positions: Positions, imu: ImuMotion, heading_from: HeadingSource) -> list[Hypothesis]:
+def search(positions: Positions, motions: Mapping[HeadingSource, ImuMotion]) -> list[Hypothesis]:
     """Return the refined hypotheses, best first; empty without enough overlap."""
-    source, refined = positions.motion(imu), []
-    for candidate in find_candidates(source, imu):
-        start = replace(candidate, heading_from=heading_from)
-        refined.append(refine(start, positions, source, imu))
-        if abs(candidate.remainder_rad) < 3.0 * SMALL_ROTATION:
-            parameters = start.parameters.copy()
-            parameters[1] -= candidate.remainder_rad
-            start = replace(start, parameters=parameters, has_rotation=False)
+    refined = []
+    for heading_from, imu in motions.items():
+        source = positions.motion(imu)
+        for candidate in find_candidates(source, imu):
+            start = replace(candidate, heading_from=heading_from)
             refined.append(refine(start, positions, source, imu))
+            if abs(candidate.remainder_rad) < 3.0 * SMALL_ROTATION:
+                parameters = start.parameters.copy()
+                parameters[1] -= candidate.remainder_rad
+                start = replace(start, parameters=parameters, has_rotation=False)
+                refined.append(refine(start, positions, source, imu))
     return sorted(refined, key=lambda one: -one.score)
 
 

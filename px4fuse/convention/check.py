@@ -110,8 +110,7 @@ def _search(positions: Positions, motions: dict[HeadingSource, ImuMotion]) -> li
     If the logged heading fits about as well as the gyro's, it is preferred: it refers to north, the
     gyro's only to the heading at the start.
     """
-    found = [one for name in motions for one in search(positions, motions[name], name)]
-    found.sort(key=lambda one: -one.score)
+    found = search(positions, motions)
     for one in found:
         if (
             one.heading_from == "EKF2"
@@ -224,7 +223,7 @@ def _check_orientation(
     directions_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(convention.frames, [0.0, 90.0])
     if best.family.sign > 0:
         directions_deg = [0.0]
-    for one in search(positions, motion, "EKF2"):
+    for one in search(positions, {"EKF2": motion}):
         if (one.family, one.unit, one.has_rotation) == (best.family, best.unit, True):
             x_deg = float(np.degrees(one.parameters[1]))
             errors = [(x_deg - at_deg + 180.0) % 360.0 - 180.0 for at_deg in directions_deg]

@@ -100,8 +100,7 @@ def find_faults(convention: Convention | None, flight: Flight, frame: str) -> Fa
         orientation=fault,
         is_north_unknown=axes and has_own_heading,
     )
-    is_wrong = faults.of_positions or has_wrong_heading
-    return replace(faults, affects_ekf2=is_fused and is_wrong)
+    return replace(faults, affects_ekf2=is_fused and (faults.of_positions or has_wrong_heading))
 
 
 def _axes_and_rotation(convention: Convention) -> tuple[bool, float]:
