@@ -31,8 +31,10 @@ from exchange import replace  # noqa: E402
 from flights import aisle_flight, unexplained, with_noises  # noqa: E402
 from source_errors import coloured, held, laid_over, two_levels, white  # noqa: E402
 from test_aids import aid_log, outage_free, steps  # noqa: E402
+from test_convention import examples as convention_examples  # noqa: E402
 from test_findings import FAULTS  # noqa: E402
 from test_loop import LAP_S, TRUE, GivenClosure, OdometryNoise, laps  # noqa: E402
+from test_source_values import examples as value_examples  # noqa: E402
 
 import px4fuse  # noqa: E402
 from px4fuse.analysis import Analysis, explain  # noqa: E402
@@ -118,6 +120,8 @@ def examples() -> dict[str, Example]:
         made_of = {**options, "source": f"{ROOT}/{options['source']}"}
         typed = f"px4fuse loop {options['source']} {drift_option}".strip()
         keep(find_loop(px4fuse.close_loop(**made_of)), f"`{typed}`")
+    keep(convention_examples(), "a simulated loop with changed positions")
+    keep(value_examples(), "a flight of the tests")
     _, odometry = laps(3, 5, OdometryNoise())
     wrong = GivenClosure(20.0, 21.5 + LAP_S, 0.05)
     keep(

@@ -25,11 +25,13 @@ from px4fuse.findings import (
     noises,
     recording,
     source_clock,
+    source_convention,
     source_frame,
     source_intervals,
     source_noise,
     source_positions,
     source_stamps,
+    source_values,
 )
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.model import TITLES, Finding, Findings, Severity, group_by_root
@@ -60,11 +62,13 @@ DETECTORS: tuple[Callable[[Analysis], Findings], ...] = (
     noises.detect,
     recording.detect,
     source_clock.detect,
+    source_convention.detect,
     source_frame.detect,
     source_intervals.detect,
     source_noise.detect,
     source_positions.detect,
     source_stamps.detect,
+    source_values.detect,
 )
 
 
@@ -77,7 +81,8 @@ def find(subject: Analysis | Comparison) -> tuple[Finding, ...]:
         For a comparison, the re-runs with changed settings are computed first (some seconds).
     """
     analysis = subject if isinstance(subject, Analysis) else explain(subject)
-    return group_by_cause(finding for detect in DETECTORS for finding in detect(analysis))
+    findings = [found for detect in DETECTORS for found in detect(analysis)]
+    return group_by_cause(source_convention.apply_convention(analysis, findings))
 
 
 def find_loop(loop: Loop) -> tuple[Finding, ...]:

@@ -43,6 +43,7 @@ _COPIED_FIELDS = (
     "loop",
     "notes",
     "missing",
+    "convention",
 )
 
 
