@@ -636,9 +636,12 @@ def test_gnss_reset_rule_depends_on_px4_release(north_m, parameters, scale, with
     (110.0, 0.0, -0.15, None),  # EKF2 uses the driver's times
 ])  # fmt: skip
 def test_gnss_time_offset_advice_names_delay_parameter(delay_ms, age_s, remaining_s, expected):
-    source = SimpleNamespace(origin=GNSS, age_s=age_s, alignment=None, aid=lambda _: GNSS.aid)
+    source = SimpleNamespace(
+        origin=GNSS, age_s=age_s, alignment=None, aid=lambda _: GNSS.aid, frame="NED"
+    )
     log = SimpleNamespace(name="x.ulg", parameters={"EKF2_GPS_DELAY": delay_ms})
-    comparison = SimpleNamespace(source=source, flight=SimpleNamespace(log=log))
+    flight = SimpleNamespace(log=log)
+    comparison = SimpleNamespace(source=source, flight=flight, convention=None)
     clock = late(remaining_s, drift_ppm=None, drift_sigma_ppm=None)
     advice = clock_advice(comparison, clock).get("PX4")  # type: ignore[arg-type]
     assert all(text in (advice or "") for text in expected or ())

@@ -15,7 +15,7 @@ from px4fuse.card.build import describe_axis
 from px4fuse.card.model import AXIS_ENDS, SIGMA_RATIO_BANDS
 from px4fuse.card.verdicts import verdicts
 from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth
-from px4fuse.comparison.preparation import choose_source
+from px4fuse.comparison.preparation import shift_clock
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.explore.packing import COARSE_SCALE, Packer
@@ -105,8 +105,8 @@ def ranges() -> Data:
 
 
 def raw_source(comparison: Comparison) -> PositionTrack:
-    """Return the position source with its original timestamps."""
-    return choose_source(comparison.flight, comparison.source.name)[0]
+    """Return the position source without the applied time offset."""
+    return shift_clock(comparison.source, -comparison.settings.clock_offset_s)
 
 
 def _settings_data(settings: Settings) -> Data:

@@ -14,7 +14,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 import pandas as pd
 from msgspec import structs
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from px4fuse.arrays import Array, ArrayPair, cumulative_integral
@@ -31,6 +30,7 @@ from px4fuse.filter.signals import (
 from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import NotNegative, Record, Share
+from px4fuse.trajectory.rotation import heading
 
 # Length (s) of the parts of the flight over which the heading error is averaged
 PART_LENGTH_S = 2.0
@@ -215,9 +215,7 @@ def _mean_per_part(time_s: Array, rotation_rad: Array, sigma_rad: Array) -> tupl
 
 def heading_rad(quaternions: pd.DataFrame) -> Array:
     """Return the headings of attitude quaternions (rad, clockwise from above), unwrapped."""
-    values = quaternions[Columns.QUATERNION].to_numpy(copy=True)
-    angles: Array = Rotation.from_quat(values, scalar_first=True).as_euler("ZYX")[:, 0]
-    return np.unwrap(angles)
+    return heading(quaternions[Columns.QUATERNION].to_numpy())
 
 
 def _compare_orientations(
