@@ -277,7 +277,7 @@ def write_examples() -> None:
 
 
 def picture(name: str, example: Example, folder: Path) -> str:
-    """Draw error, innovations and σ of the example's axis; return the file name."""
+    """Draw position, innovations and σ of the example's axis; return the file name."""
     axis = example.finding.evidence.get("axis")
     assert example.analysis is not None
     shown = example.analysis.axes.get(str(axis)) or example.analysis.main

@@ -278,6 +278,8 @@ def _evaluate(
         float(np.sum(weight[0] @ (first[:, :2] * second[:, :2])))
         for first, second in ((ned, ned), (ned, measured), (measured, measured))
     ]
+    if 0.0 in products:  # at rest, no hypothesis can be scored
+        return replace(one, score=-np.inf), np.zeros(len(one.parameters))
     jacobian = np.zeros((len(index), 3, len(PRECISION)))
     jacobian[..., 0] = imu.rate_m_s[index]
     jacobian[:, 0, 1], jacobian[:, 1, 1] = -horizontal.imag, horizontal.real
