@@ -425,7 +425,7 @@ def _check_finite(**values: float | str | None) -> None:
             raise SettingsError(f"`{name}` {value:g} is not a finite number.")
 
 
-def run_loop(request: LoopRequest, progress: Progress = ignore_progress) -> Loop:
+def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progress) -> Loop:
     """Read a flight or a trajectory, measure its loop closure error and correct the path.
 
     Raises

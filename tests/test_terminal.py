@@ -95,9 +95,9 @@ def test_terminal_summary_wraps_without_cutting_text(document, monkeypatch) -> N
     assert sorted(summaries[WIDTH].split()) == sorted(whole.split())
     assert "\x1b" not in whole
     # the card comes first, also in a pipe; below it a paragraph is one line there
-    first = [text for line in card_lines(card) for text in line.wrapped(card_text.WIDTH)]
+    first = [text for line in card_lines(card) for text in line.wrapped(card_text.CARD_WIDTH)]
     assert whole.splitlines()[: len(first) + 1] == [*first, ""]
-    assert max(map(len, whole.splitlines()[len(first) :])) > card_text.WIDTH
+    assert max(map(len, whole.splitlines()[len(first) :])) > card_text.CARD_WIDTH
 
 
 def test_terminal_paragraph_has_hanging_indent(capsys) -> None:

@@ -289,7 +289,7 @@ def planned_configurations(
         for change in ekf2_changes.candidates(*discrepancy)
     ]
     if isinstance(comparison.main.filters["ekf2"], FilterSummary):
-        changes += ekf2_changes.main_axis_candidates(comparison.main)
+        changes += ekf2_changes.requested_axis_changes(comparison.main)
     return [
         FilterConfiguration({**flown, **change})
         for change in changes
@@ -412,7 +412,7 @@ def _try_on_main_axis(changed: _FilterRerun) -> list[Trial]:
     result, owner = changed.comparison.main, changed.filter_name
     if not isinstance(result.filters[owner], FilterSummary):
         return []
-    candidates = changed.main_axis_candidates(result)
+    candidates = changed.requested_axis_changes(result)
     if not candidates or (before := changed.flown_outcome(result)) is None:
         return []
 
@@ -479,7 +479,8 @@ class _FilterRerun:
         return [
             (result, statistic)
             for result in self.comparison.axes.values()
-            if self.filter_name == "kf" or result.axis.name != "down"  # EKF2 replay: horizontal
+            # EKF2 can be replayed along horizontal axes only
+            if self.filter_name == "kf" or result.axis.name != "down"
             for statistic in _find_discrepancies(result.filters[self.filter_name])
         ]
 
@@ -517,8 +518,8 @@ class _FilterRerun:
         """
         return self.outcome(result, {})
 
-    def main_axis_candidates(self, result: AxisComparison) -> list[Change]:
-        """Return the changes to be re-run along the main axis, each once."""
+    def requested_axis_changes(self, result: AxisComparison) -> list[Change]:
+        """Return each changed setting that is re-run on the requested axis, for NIS or NEES."""
         changes = self.candidates(result, "nis")
         return changes + [
             change for change in self.candidates(result, "nees") if change not in changes
@@ -566,9 +567,9 @@ class _KfRerun(_FilterRerun):
     def kind_of(self, name: str) -> str:
         return KF_KINDS[name]
 
-    def main_axis_candidates(self, result: AxisComparison) -> list[Change]:
+    def requested_axis_changes(self, result: AxisComparison) -> list[Change]:
         """Return the single changes, both noises together, and the default settings."""
-        changes = super().main_axis_candidates(result)
+        changes = super().requested_axis_changes(result)
         noises = [change for change in changes if change.keys() <= SETTING_CHANGES]
         if len(noises) > 1:
             changes.append({name: value for change in noises for name, value in change.items()})
@@ -706,9 +707,9 @@ class _Ekf2Rerun(_FilterRerun):
         )
         return in_log if _agrees(in_log, self.outcome(result, {})) else None
 
-    def main_axis_candidates(self, result: AxisComparison) -> list[Change]:
-        """Return the single changes; a delay also as a shift of the position timestamps."""
-        changes = super().main_axis_candidates(result)
+    def requested_axis_changes(self, result: AxisComparison) -> list[Change]:
+        """Return changes of one setting; a delay also as a shift of the position timestamps."""
+        changes = super().requested_axis_changes(result)
         delays = [change for change in changes if self.inputs.aid.delay in change]
         offsets = super().time_offset_candidates() if delays else []
         return [*changes, *(offset for offset in offsets if offset not in changes)]

@@ -100,7 +100,7 @@ def analyse_graph(
     if count > 1 and (count <= MAX_ROBUST_CLOSURES if run_robust is None else run_robust):
         for solution, method in ROBUST_METHODS.items():
             progress(f"optimising: {SOLUTIONS[solution]}")
-            solutions[solution] = solve(graph, robust=method, is_closure=is_closure)
+            solutions[solution] = solve(graph, robust_method=method, is_closure=is_closure)
     return SolvedGraph(
         name=name,
         dimension=graph.dimension,
