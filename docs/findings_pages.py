@@ -35,8 +35,9 @@ from test_findings import FAULTS  # noqa: E402
 from test_loop import LAP_S, TRUE, GivenClosure, OdometryNoise, laps  # noqa: E402
 
 import px4fuse  # noqa: E402
-from px4fuse.analysis import Analysis, explain  # noqa: E402
+from px4fuse.analysis import Analysis  # noqa: E402
 from px4fuse.comparison.comparison import compare  # noqa: E402
+from px4fuse.diagnose import explain  # noqa: E402
 from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
 from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402

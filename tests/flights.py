@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
+from px4fuse.comparison.flight_events import collect_events
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.signals import Axis, Segment, project_acceleration
 from px4fuse.filter.tuning import HORIZONTAL, tune
@@ -339,9 +340,11 @@ def unexplained(comparison: Comparison) -> Analysis:
     parts = {part.name: getattr(comparison, part.name) for part in fields(Comparison)}
     return Analysis(
         **parts, tuning={}, clock=unavailable("clock offset"),
-        ekf2_model=unavailable("EKF2 replay"), difference_steps={},
+        heading=unavailable("heading error"), bias_scale_jump_fit=unavailable("causes"),
+        source_low_pass=unavailable("causes"), time_correlated_noise=unavailable("causes"),
+        ekf2_model=unavailable("EKF2 replay"), difference_steps={}, causes=(), trials=(),
+        events=collect_events(comparison), aids=unavailable("EKF2 innovations"),
         loop=unavailable("loop closure"),
-        heading=unavailable("heading error"),
     )  # fmt: skip
 
 

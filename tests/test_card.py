@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from exchange import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card
@@ -92,7 +93,7 @@ def test_diagnosis_keeps_time_offset_cause_without_ground_truth() -> None:
 
 
 def test_diagnosis_card_of_clean_flight_advises_no_change(sample: Analysis) -> None:
-    card = build_card(sample, (), REQUEST)
+    card = build_card(replace(sample, findings=()), REQUEST)
     assert (card.severity, card.id, card.causes) == ("clean", "", ())
     assert card.headline == "No fault found: KF and EKF2 are consistent"
     assert card.do_this == ("Change nothing.",)

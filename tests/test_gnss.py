@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from ulog_tools import Log, gnss_log, position, seconds_of, stamps, take, topic
 
 import px4fuse
-from px4fuse.analysis import prepare_comparison
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import choose_source, prepare
+from px4fuse.diagnose import prepare_comparison
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.inputs import _rules, read_gnss
 from px4fuse.ekf2.inputs import prepare_inputs as prepare_replay

@@ -47,8 +47,8 @@ from scipy.spatial.transform import Rotation
 from time_limit import time_limit
 
 from px4fuse.comparison.comparison import compare
+from px4fuse.diagnose import explain
 from px4fuse.errors import LogError, MissingDataError
-from px4fuse.findings import find
 from px4fuse.flight import Columns, Ekf2, Flight, Truth, Unavailable
 from px4fuse.inspect.inventory import take_inventory
 from px4fuse.position_source import MOTION_CAPTURE, RECEIVED
@@ -431,7 +431,11 @@ def test_ardupilot_messages_contain_no_px4_advice(read, missing_messages):
     texts = [str(part) for part in take_inventory(flight).advice]
     texts += [str(part) for part in flight.missing]
     if flight.positions:
-        texts += [f"{f.message} {f.remedy}" for f in find(compare(flight)) if f.id != "not_px4"]
+        texts += [
+            f"{f.message} {f.remedy}"
+            for f in explain(compare(flight)).findings
+            if f.id != "not_px4"
+        ]
     else:
         with pytest.raises(MissingDataError) as refused:
             compare(flight)

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
-from px4fuse.analysis import Analysis, explain
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import (
     POSITION_VARIANCES,
     ROTATION,
@@ -26,6 +26,7 @@ from px4fuse.comparison.causal_replays import (
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.projection import project as project_state
 from px4fuse.comparison.remedy import aid_of
+from px4fuse.diagnose import explain
 from px4fuse.ekf2.model import replay_settings
 from px4fuse.ekf2.whatif import HEADING_LOGGED_NOTE, what_if
 from px4fuse.errors import SettingsError

@@ -6,12 +6,13 @@ from functools import cache
 import pytest
 from exchange import replace
 
-from px4fuse.analysis import Analysis, explain
+from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy as remedies
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import ml_ekf2_parameters, noise_used_m
 from px4fuse.comparison.trials import Outcome, Trial, find_trial, has_effect, improvement
+from px4fuse.diagnose import explain
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, ekf2_rejecting, find, source_clock

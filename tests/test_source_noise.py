@@ -9,8 +9,9 @@ import source_errors as errors
 from exchange import replace
 from scipy.interpolate import CubicSpline
 
-from px4fuse.analysis import Analysis, explain
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
+from px4fuse.diagnose import explain
 from px4fuse.filter import correlated_noise
 from px4fuse.filter.correlated_noise import fit_time_correlation
 from px4fuse.filter.fitting import Noises

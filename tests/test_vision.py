@@ -16,8 +16,8 @@ import pytest
 from ekf2_tools import opened, step_matrix, step_noise, step_state
 from exchange import replace
 
-from px4fuse.analysis import explain, run_what_if
 from px4fuse.comparison.comparison import compare
+from px4fuse.diagnose import explain, run_what_if
 from px4fuse.ekf2 import steps
 from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun, run_segment
 from px4fuse.ekf2.inputs import Inputs, ReceivedPositions

@@ -40,7 +40,8 @@ from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings.model import Finding, group_by_root
+from px4fuse.finding import Finding
+from px4fuse.findings.model import group_by_root
 from px4fuse.flight import Ekf2, Unavailable, source_name
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
 from px4fuse.text import with_log_name
@@ -65,25 +66,20 @@ SHIFTED_SOURCE = frozenset(
 
 
 def build_card(
-    analysis: Analysis,
-    findings: Sequence[Finding],
-    request: ComparisonRequest,
-    student: tuple[str, str] = ("", ""),
+    analysis: Analysis, request: ComparisonRequest, student: tuple[str, str] = ("", "")
 ) -> Card:
     """Return the diagnosis card of a comparison.
 
     Parameters
     ----------
     analysis : Analysis
-    findings : sequence of Finding
-        Most severe first, consequences behind their cause.
     request : ComparisonRequest
         Makes the commands; without paths, they are for the folder of the log.
     student : (str, str)
         Name and id.
     """
     result = analysis.main
-    roots = [group[0] for group in group_by_root(findings)]
+    roots = [group[0] for group in group_by_root(analysis.findings)]
     verdicts = make_verdicts(result)
     ranked = rank_causes(analysis, roots)
     causes = tuple(make_cause(analysis, each, verdicts, request) for each in ranked[:MAX_CAUSES])
@@ -92,7 +88,7 @@ def build_card(
     horizon_ratio = None if causes else _horizon_ratio(analysis)
     if horizon_ratio is not None:
         verdicts = (*verdicts[:-1], replace(verdicts[-1], is_explained=True))
-    reconcile = _reconcile(analysis, verdicts, causes, [one.id for one in findings])
+    reconcile = _reconcile(analysis, verdicts, causes, [one.id for one in analysis.findings])
     if not reconcile and any(verdict.is_explained for verdict in verdicts) and may_drift:
         reconcile = DRIFT_HIDES_ERROR
     if horizon_ratio is not None:
@@ -119,13 +115,10 @@ def build_card(
 
 
 def build_aids_card(
-    analysis: AidsOnlyAnalysis,
-    findings: Sequence[Finding],
-    request: ComparisonRequest,
-    student: tuple[str, str] = ("", ""),
+    analysis: AidsOnlyAnalysis, request: ComparisonRequest, student: tuple[str, str] = ("", "")
 ) -> Card:
     """Return the card of a flight without positions: EKF2's aiding sources only."""
-    roots = [group[0] for group in group_by_root(findings)]
+    roots = [group[0] for group in group_by_root(analysis.findings)]
     faults = [one for one in roots if one.severity != "note"]
     causes = tuple(make_plain_cause(one) for one in faults[:MAX_CAUSES])
     missing = analysis.missing_data

@@ -30,7 +30,8 @@ from px4fuse.comparison.trials import (
 )
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings.model import CATALOGUE, Finding
+from px4fuse.finding import Finding
+from px4fuse.findings.model import CATALOGUE
 from px4fuse.flight import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 from px4fuse.text import with_log_name

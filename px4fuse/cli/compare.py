@@ -53,7 +53,8 @@ def compare(
     mistakes and how to fix them. Writes a PDF report and the results as JSON, for example
     reports/LOG_sigma-z-0.05.pdf and .json.
     """
-    from px4fuse.analysis import failed_checks, run_or_evaluate_aids
+    from px4fuse.analysis import failed_checks
+    from px4fuse.diagnose import diagnose_or_check_aids
     from px4fuse.memory import release_free_memory
     from px4fuse.report.terminal import closing, summary
     from px4fuse.results.build import outcome_results
@@ -64,7 +65,7 @@ def compare(
         output, json_path
     )  # report an invalid output path before the long analysis
     with outputs.progress(json_path) as show_progress:
-        outcome = run_or_evaluate_aids(request, show_progress)
+        outcome = diagnose_or_check_aids(request, show_progress)
         results = outcome_results(request, outcome, student)
         release_free_memory()  # the report modules, imported next, need memory
         if output is None and json_path is None:

@@ -11,7 +11,7 @@ is preferred: the setting would only hide the fault.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple, TypeGuard
 
@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import difference, error_statistics, kf_error_statistics
-from px4fuse.comparison.estimates import Tuning, first_axis_tuning
+from px4fuse.comparison.estimates import Estimates, Tuning, first_axis_tuning
 from px4fuse.comparison.model import (
     AxisComparison,
     Comparison,
@@ -40,6 +40,7 @@ from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings, with_misaligned_positions
 from px4fuse.ekf2.replay import HORIZONTAL as HORIZONTAL_AXES
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Ekf2Replay, inside_spans
+from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2_parameters import EV_POS, GNSS_VEL, PARAMETERS
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.fast_replay import quick_replay
@@ -231,35 +232,59 @@ def error_above_reported_sigma(
     return ErrorAboveSigma(nees, rmse_m, reported_sigma_m, summary.nis_mean)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Reruns:
+    """Re-runs of KF and EKF2 with changes.
+
+    Attributes
+    ----------
+    ekf2_model : Model or Unavailable
+        Model of EKF2 for replays; ``agreement`` compares a replay with the log.
+    difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
+        Differences KF - EKF2 after each replacement of one KF property by that of EKF2.
+    causes : tuple of Intervention
+        Re-runs with one change each, and the fraction of an inconsistency that it explains.
+    trials : tuple of Trial
+        Re-runs along the main axis, with all statistics before and after the change.
+    """
+
+    ekf2_model: Model | Unavailable
+    difference_steps: Mapping[str, DifferenceExplanation | Unavailable]
+    causes: tuple[Intervention, ...]
+    trials: tuple[Trial, ...]
+
+
 def run_interventions(
-    comparison: Comparison,
-    tuning: Tuning,
-    clock: ClockOffset | Unavailable,
-    heading: HeadingError | Unavailable,
-    bias_scale_jump_fit: BiasScaleJumpFit | Unavailable,
-    model: Model | Unavailable,
+    comparison: Comparison, estimates: Estimates, model: Model | Unavailable
 ) -> tuple[tuple[Intervention, ...], tuple[Trial, ...]]:
     """Re-run every candidate change for every discrepancy, and along the main axis.
 
-    Parameters
-    ----------
-    comparison : Comparison
-    tuning : mapping from axis name, or "horizontal", to AxisTuning or Unavailable
-    clock : ClockOffset or Unavailable
-    heading : HeadingError or Unavailable
-    bias_scale_jump_fit : BiasScaleJumpFit or Unavailable
-        Contains the accelerometer biases.
-    model : Model or Unavailable
-        EKF2 of the same flight.
+    ``model`` is EKF2 of the same flight.
     """
-    estimates = comparison, tuning, clock, heading
-    filters: list[_FilterRerun] = [_KfRerun(*estimates, bias_scale_jump_fit)]
+    filters: list[_FilterRerun] = [
+        _KfRerun(
+            comparison,
+            estimates.tuning,
+            estimates.clock,
+            estimates.heading,
+            estimates.bias_scale_jump_fit,
+        )
+    ]
     if (
         isinstance(model, Model)
         and model.agreement.good
         and is_fused_source(comparison, model.inputs)
     ):
-        filters.append(_Ekf2Rerun(*estimates, model.inputs, model))
+        filters.append(
+            _Ekf2Rerun(
+                comparison,
+                estimates.tuning,
+                estimates.clock,
+                estimates.heading,
+                model.inputs,
+                model,
+            )
+        )
     rows: list[Intervention] = []
     for filter_changes in filters:
         for result, statistic in filter_changes.discrepancies():
@@ -273,16 +298,15 @@ def run_interventions(
 
 
 def planned_configurations(
-    comparison: Comparison,
-    tuning: Tuning,
-    clock: ClockOffset | Unavailable,
-    heading: HeadingError | Unavailable,
-    inputs: Inputs,
+    comparison: Comparison, estimates: Estimates, inputs: Inputs
 ) -> list[FilterConfiguration]:
     """Return the EKF2 filter configurations that :func:`run_interventions` replays in any case."""
     if not is_fused_source(comparison, inputs):
         return []
-    ekf2_changes, flown = _Ekf2Rerun(comparison, tuning, clock, heading, inputs), inputs.settings
+    flown = inputs.settings
+    ekf2_changes = _Ekf2Rerun(
+        comparison, estimates.tuning, estimates.clock, estimates.heading, inputs
+    )
     changes = [
         change
         for discrepancy in ekf2_changes.discrepancies()

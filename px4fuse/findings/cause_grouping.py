@@ -7,7 +7,8 @@ from collections.abc import Iterable, Mapping
 
 from msgspec.structs import replace
 
-from px4fuse.findings.model import SEVERITIES, TITLES, Finding, group_by_root
+from px4fuse.finding import SEVERITIES, Finding
+from px4fuse.findings.model import TITLES, group_by_root
 
 # Evidence key of findings about a variance: kind of the cause that the re-runs show
 CAUSE = "cause"

@@ -31,6 +31,7 @@ from px4fuse.ekf2_parameters import BAROMETER, PARAMETERS
 from px4fuse.filter.settings import UNITS, Settings
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
+from px4fuse.finding import SEVERITIES, Finding, Severity
 from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, NOISE
 from px4fuse.findings.cause_text import (
     classify_cause,
@@ -39,16 +40,7 @@ from px4fuse.findings.cause_text import (
     is_refuted,
 )
 from px4fuse.findings.hidden_errors import find_hidden_errors
-from px4fuse.findings.model import (
-    SEVERITIES,
-    Finding,
-    Findings,
-    Severity,
-    error,
-    finding,
-    format_percent,
-    lower_severity,
-)
+from px4fuse.findings.model import Findings, error, finding, format_percent, lower_severity
 from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight import Columns, Unavailable, sample_rate
 from px4fuse.request import COMPARISON_OPTIONS

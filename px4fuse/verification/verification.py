@@ -162,7 +162,7 @@ def split_track(source: str) -> tuple[str, str]:
 def _repeat_comparison(
     submitted: ComparisonResults, link_file: _LinkFile
 ) -> tuple[object, ReportedResults]:
-    from px4fuse.analysis import run  # noqa: PLC0415
+    from px4fuse.diagnose import diagnose  # noqa: PLC0415
     from px4fuse.results.build import results  # noqa: PLC0415
 
     recorded = submitted.request
@@ -177,12 +177,12 @@ def _repeat_comparison(
     if (position := recorded.position) is not None:
         link = link_file(position.path, hash_by_role.get("position"), "--position")
         request = replace(request, position=replace(position, path=link))
-    analysis = run(request)
+    analysis = diagnose(request)
     return analysis, results(recorded, analysis, submitted.student)
 
 
 def _repeat_loop(submitted: LoopResults, link_file: _LinkFile) -> tuple[object, ReportedResults]:
-    from px4fuse.analysis import run_loop  # noqa: PLC0415
+    from px4fuse.diagnose import run_loop  # noqa: PLC0415
     from px4fuse.results.build import loop_results  # noqa: PLC0415
 
     recorded = submitted.request

@@ -34,8 +34,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from px4fuse.analysis import explain
 from px4fuse.comparison.comparison import compare
+from px4fuse.diagnose import explain
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
 from px4fuse.flight import Columns, Flight, Unavailable
