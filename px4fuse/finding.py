@@ -57,10 +57,5 @@ class Finding(Record, frozen=True, omit_defaults=False):
             for start, end in self.spans_s
         )
 
-    @property
-    def has_time_in_message(self) -> bool:
-        """Return True if the message contains the time; the evidence then contains it, too."""
-        return not {"at_s", "first_s", "until_s"}.isdisjoint(self.evidence)
-
     def __repr__(self) -> str:
         return f"<{self.severity} {self.id}: {self.message} {self.remedy}>"

@@ -96,7 +96,15 @@ def analysis(
     usual_flight = {"imu": NONE, "attitude": NONE, "positions": (), "streams": {}, "airborne": NONE}
     flown = {**usual_flight, **(flight or {})}
     usual = dict.fromkeys(
-        ("clock", "ekf2_model", "loop", "heading", "bias_scale_jump_fit", "smoothing", "coloured"),
+        (
+            "clock",
+            "ekf2_model",
+            "loop",
+            "heading",
+            "bias_scale_jump_fit",
+            "source_low_pass",
+            "time_correlated_noise",
+        ),
         NONE,
     )
     by_name = {each.axis.name: each for each in axes}

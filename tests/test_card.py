@@ -11,7 +11,7 @@ from exchange import replace
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card
 from px4fuse.card.causes import make_cause, rank_causes
-from px4fuse.comparison.trials import Outcome, Trial, improvement
+from px4fuse.comparison.trials import RunStatistics, Trial, improvement
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding
 from px4fuse.position_source import RECEIVED
@@ -25,17 +25,23 @@ CHANGES = {
 }
 
 
-def outcome(source: float, truth: float | None = None, rmse_m: float | None = None) -> Outcome:
+def outcome(
+    source: float, truth: float | None = None, rmse_m: float | None = None
+) -> RunStatistics:
     """Return an outcome with these ratios of actual to reported σ."""
     nees = None if truth is None else truth**2
-    return Outcome(innovations=600, nis_mean=source**2, nees_mean=nees, position_rmse_m=rmse_m)
+    return RunStatistics(
+        innovations=600, nis_mean=source**2, nees_mean=nees, position_rmse_m=rmse_m
+    )
 
 
 FLOWN = outcome(1.0, 3.0, 0.3)
 CORRECTED = outcome(1.0, 1.1, 0.1)
 
 
-def trial(kind: str, after: Outcome, before: Outcome = FLOWN, owner: Any = "kf") -> Trial:
+def trial(
+    kind: str, after: RunStatistics, before: RunStatistics = FLOWN, owner: Any = "kf"
+) -> Trial:
     return Trial(filter=owner, kinds=(kind,), change=CHANGES[kind], before=before, after=after)
 
 

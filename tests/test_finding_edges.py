@@ -34,7 +34,7 @@ from findings_tools import (
     with_bias,
 )
 
-from px4fuse.comparison.trials import Outcome, Trial
+from px4fuse.comparison.trials import RunStatistics, Trial
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.frame_rotation import HeadingError, HeadingPart
 from px4fuse.filter.frame_rotation import combine_heading_parts as together
@@ -214,7 +214,11 @@ UNKNOWN = "The log does not contain the reason"
         (never_fusing(parameters={"EKF2_AID_MASK": 1.0}), "EKF2_AID_MASK is 1. Bit 3", "to 9."),
         (never_fusing(parameters={"EKF2_AID_MASK": 9.0}), UNKNOWN, "EKF2_EV_CTRL"),
         (never_fusing(2.0), UNKNOWN, "EKF2_EV_CTRL"),  # releases before v1.14 have no limit
-        (never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}), "they come at 2 Hz", "10 Hz"),
+        (
+            never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}),
+            "the positions come at 2 Hz",
+            "10 Hz",
+        ),
         (
             never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}, origin=LOGGED_BY_EKF2),
             UNKNOWN,
@@ -225,12 +229,12 @@ UNKNOWN = "The log does not contain the reason"
         (never_fusing(age_s=5.0, horizon_s=NONE), UNKNOWN, "Check"),
         (
             never_fusing(age_s=0.31),
-            "they are 0.31 s old at arrival. EKF2 buffers only 0.20 s",
+            "the positions are 0.31 s old at arrival. EKF2 buffers only 0.20 s",
             "EKF2_DELAY_MAX",
         ),
         (
             never_fusing(age_s=0.28, parameters={"EKF2_EV_DELAY": 50.0}),
-            "they are 0.33 s old",
+            "the positions are 0.33 s old",
             "EKF2_DELAY_MAX",
         ),
     ],
@@ -282,8 +286,8 @@ def test_recommended_action_must_halve_ekf2_rejections() -> None:
     ):  # fmt: skip
         trial = Trial(
             filter="ekf2", kinds=("noise",), change={"EKF2_EVP_NOISE": 0.1},
-            before=Outcome(nis_mean=9.0, rejected_fraction=0.2),
-            after=Outcome(nis_mean=1.0 if improves else 8.0, rejected_fraction=after),
+            before=RunStatistics(nis_mean=9.0, rejected_fraction=0.2),
+            after=RunStatistics(nis_mean=1.0 if improves else 8.0, rejected_fraction=after),
         )  # fmt: skip
         one = analysis(ekf2={"gate": 5.0}, axes=(axis("north", ekf2_innovations=frame),),
                        trials=(trial,))  # fmt: skip
@@ -352,7 +356,7 @@ def test_error_beyond_sigma_finding_states_aligned_rmse(
     if finding.id == "source_drift":
         assert finding.message.startswith(
             "VIO drifts: horizontal position RMSE 0.55 m after the best alignment. Before the "
-            "alignment: 1.00 m."
+            "alignment the RMSE is 1.00 m."
         )
     assert (finding.remedy == hidden_errors.FRAME_REMEDY) is frame
 
@@ -625,7 +629,7 @@ def at_multiples(multiples: list[int], base_s: float = 0.125, **parts: Any) -> A
 
 
 def low_pass(gain: float, lag_s: float, **parts: Any) -> Any:
-    usual = {"smoothing": SourceLowPass(0.5, lag_s, gain, 0.1), "clock": late(0.0)}
+    usual = {"source_low_pass": SourceLowPass(0.5, lag_s, gain, 0.1), "clock": late(0.0)}
     return analysis(**{**usual, **parts})
 
 
@@ -659,7 +663,7 @@ def stating(reported: float, noise: float, interval: Any = None, **parts: Any) -
     """Make a source that reports one standard deviation (m) and has another one."""
     low, high = interval or (0.99 * noise, 1.01 * noise)
     states = source(samples=positions(np.arange(0.0, 120.0), variance_m2=reported**2))
-    usual = {"smoothing": SourceLowPass(0.0, 0.0, 0.0, noise), "source": states,
+    usual = {"source_low_pass": SourceLowPass(0.0, 0.0, 0.0, noise), "source": states,
              "tuning": tuned(Noise(noise, low, high), count=100)}  # fmt: skip
     return analysis(**{**usual, **parts})
 
@@ -729,9 +733,11 @@ SOURCE_EDGES = [
         (6.0, 0.05, "warning"), (5.9, 0.05, None), (6.0, 0.049, None),
         (6.0, 0.0999, "warning"), (6.0, 0.1, "error"))),
     # correlated errors without a lag are not from a low pass
-    *((source_positions.detect_low_pass, low_pass(99.0, 1.0, coloured=slow(99.0, lag)), expected)
+    *((source_positions.detect_low_pass, low_pass(99.0, 1.0,
+       time_correlated_noise=slow(99.0, lag)), expected)
       for lag, expected in ((0.9, None), (1.0, "error"))),
-    *((source_noise.detect_time_correlated_noise, analysis(coloured=slow(gain, lag)), expected)
+    *((source_noise.detect_time_correlated_noise, analysis(
+       time_correlated_noise=slow(gain, lag)), expected)
       for gain, lag, expected in (
           (5.0, 0.9, "warning"), (4.9, 0.0, None), (99.0, 1.0, None))),
     *((source_noise.detect_repeated_positions, repeating(again, count), expected)
@@ -739,11 +745,11 @@ SOURCE_EDGES = [
         (10, 200, "warning"), (9, 100, None), (10, 201, None), (30, 100, "error"),
         (29, 100, "warning"))),
     (source_noise.detect_repeated_positions, repeating(50, 100, moved_m=0.5), None),
-    *((source_noise.detect, analysis(coloured=slow(99.0, 0.0), **parts), None)
+    *((source_noise.detect, analysis(time_correlated_noise=slow(99.0, 0.0), **parts), None)
       for parts in (ODOMETRY, REBUILT)),
-    (JUMPS, jumping(jump(0.0, 0.9), coloured=slow(0.0, 0.0, 0.2)), None),
-    (JUMPS, jumping(jump(0.0, 1.0), coloured=slow(0.0, 0.0, 0.2)), "error"),
-    (SCALE, scaled(0.5, coloured=slow(0.0, 0.0)), None),
+    (JUMPS, jumping(jump(0.0, 0.9), time_correlated_noise=slow(0.0, 0.0, 0.2)), None),
+    (JUMPS, jumping(jump(0.0, 1.0), time_correlated_noise=slow(0.0, 0.0, 0.2)), "error"),
+    (SCALE, scaled(0.5, time_correlated_noise=slow(0.0, 0.0)), None),
     (SCALE, scaled(0.5, ekf2=ages(20, 20)), None),
     (source_positions.detect, low_pass(99.0, 1.0, **ODOMETRY), None),
     (source_positions.detect, low_pass(99.0, 1.0, **REBUILT), None),
@@ -762,7 +768,7 @@ SOURCE_EDGES = [
       for which, of in ((SCALE, partial(scaled, 0.5)),
                         (source_positions.detect_low_pass, partial(low_pass, 99.0, 1.0)))
       for clock, expected in ((NONE, None), (late(0.0, is_determinable=False), "error"))),
-    (SCALE, scaled(0.5, smoothing=SourceLowPass(0.5, 1.0, 99.0, 0.1)), None),
+    (SCALE, scaled(0.5, source_low_pass=SourceLowPass(0.5, 1.0, 99.0, 0.1)), None),
     *((source_positions.detect, scaled(0.5, **parts), None) for parts in (ODOMETRY, REBUILT)),
     *((source_positions.detect_outliers,
        analysis(tuning=tuned(outlier_time_s=20.0 + np.arange(outliers), count=count)), expected)
@@ -777,7 +783,8 @@ SOURCE_EDGES = [
     *((STATED, stating(3.0, 1.0, interval), None) for interval in (
         (0.1, 9.0), (None, 9.0), (0.1, None))),
     (STATED, stating(3.0, 1.0, tuning=tuned(Noise(None, None, 9.0))), None),
-    (STATED, stating(3.0, 1.0, tuning={}), None), (STATED, stating(3.0, 1.0, smoothing=NONE), None),
+    (STATED, stating(3.0, 1.0, tuning={}), None),
+    (STATED, stating(3.0, 1.0, source_low_pass=NONE), None),
     (STATED, stating(np.nan, 1.0), None),
     (source_positions.detect, stating(3.0, 1.0, **ODOMETRY), None),
     *((CLOCK, analysis(clock=late(sign * offset_s, sigma_s)), expected)
@@ -787,7 +794,7 @@ SOURCE_EDGES = [
           (0.101, 0.001, "error"), (0.0625, 0.0208, "warning"), (0.0625, 0.0209, None))),
     *((CLOCK, analysis(**{"clock": late(0.2), **parts}), None) for parts in (
         {"clock": late(0.2, is_determinable=False)}, REBUILT, {"ekf2": ages(20, 20)},
-        {"smoothing": SourceLowPass(0.5, 0.2, 99.0, 0.1)})),
+        {"source_low_pass": SourceLowPass(0.5, 0.2, 99.0, 0.1)})),
     *((wrong_delay, delayed(delay_ms, late(0.0, sigma_s)), expected)
       for delay_ms, sigma_s, expected in (
           (30.0, 0.001, "warning"), (29.0, 0.001, None), (40.0, 0.01, "warning"),
@@ -966,7 +973,7 @@ def test_time_offset_that_increases_true_error_has_no_finding(after_m, there) ->
 
 def rerun(owner: Any, kind: str, change: dict[str, float], after_m: float) -> Trial:
     """Make a re-run that changes the position RMSE from 1 m."""
-    before, after = Outcome(position_rmse_m=1.0), Outcome(position_rmse_m=after_m)
+    before, after = RunStatistics(position_rmse_m=1.0), RunStatistics(position_rmse_m=after_m)
     return Trial(filter=owner, kinds=(kind,), change=change, before=before, after=after)
 
 

@@ -257,7 +257,7 @@ def test_down_axis_uses_unfused_barometer_only_on_request(tmp_path):
     with pytest.raises(MissingDataError, match="no barometer height in the log"):
         prepare(bare, height="barometer")
     vision = simulate_flight(make_scenario("aisle", seed=1))
-    with pytest.raises(SettingsError, match="`height` needs a GNSS position"):
+    with pytest.raises(SettingsError, match="`height` needs GNSS as position source"):
         prepare(vision, height="gnss")
 
 

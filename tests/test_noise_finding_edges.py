@@ -30,7 +30,7 @@ from findings_tools import (
     tuned,
 )
 
-from px4fuse.comparison.trials import Outcome, Trial
+from px4fuse.comparison.trials import RunStatistics, Trial
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import Noise
@@ -50,8 +50,8 @@ def trial(
     change: dict[str, float], after: float = 1.0, owner: Any = "kf", kind: str = "noises"
 ) -> Trial:
     """Make a re-run that changes the mean NIS from 16 to ``after``."""
-    return Trial(filter=owner, kinds=(kind,), change=change, before=Outcome(nis_mean=16.0),
-                 after=Outcome(nis_mean=after))  # fmt: skip
+    return Trial(filter=owner, kinds=(kind,), change=change, before=RunStatistics(nis_mean=16.0),
+                 after=RunStatistics(nis_mean=after))  # fmt: skip
 
 
 # ---------------------------------------------------------------- SIGMA_Z and SIGMA_A
@@ -125,7 +125,7 @@ def test_rerun_of_consistent_kf_does_not_refute_noise_estimate(
     nis_mean: float, rmse_m: float | None, expected: tuple[str, str]
 ) -> None:
     """A re-run shows no improvement if σ is consistent before and the position error unknown."""
-    as_flown = Outcome(innovations=100, nis_mean=nis_mean, position_rmse_m=rmse_m)
+    as_flown = RunStatistics(innovations=100, nis_mean=nis_mean, position_rmse_m=rmse_m)
     rerun = replace(trial(SIGMA_A_TO_0_1), before=as_flown, after=as_flown)
     fitted = tuned(None, Noise(0.1, 0.09, 0.11))
     finding = only(
@@ -145,8 +145,9 @@ def test_wrong_noise_finding_states_factor_and_estimate() -> None:
     )
     small = tuned(Noise(2.0, 1.9, 2.1), Noise(9.0, 8.9, None))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=small))
-    assert "too small: KF lags. SIGMA_A 1 m/s²; maximum-likelihood estimate 9 m/s². P" in (
-        worse.message
+    assert (
+        "too small: KF lags the motion. SIGMA_A 1 m/s²; maximum-likelihood estimate 9 m/s². P"
+        in (worse.message)
     )
     assert named(noises.detect_wrong_settings, analysis(source=MOVING)) == {}
 
@@ -407,7 +408,7 @@ def test_overconfident_ekf2_without_replay_gets_noise_advice(
          ("ekf2_noise_too_small", "error", "UWB noise is 4 times what EKF2 assumes")),
         (0.5, "gnss", 0.44,
          ("ekf2_noise_too_small", "error", "GNSS noise is 4 times what both filters assume: EKF2 "
-          "rejects 44 %")),
+          "rejects 44 % of the positions")),
     ],
 )  # fmt: skip
 def test_wrong_ekf2_noise_finding_names_parameter_or_sensor(
@@ -415,10 +416,10 @@ def test_wrong_ekf2_noise_finding_names_parameter_or_sensor(
 ) -> None:
     aid = GNSS_POS if kind == "gnss" else EV_POS
     estimate_m = 4.0 * flown_m if flown_m == PARAMETERS[aid.noise].default else 0.1
-    outcome = Outcome(nis_mean=16.0 if estimate_m > flown_m else 0.1)
+    outcome = RunStatistics(nis_mean=16.0 if estimate_m > flown_m else 0.1)
     change = {aid.noise: estimate_m}
     rerun = Trial(filter="ekf2", kinds=("noise",), change=change, before=outcome,
-                  after=Outcome(nis_mean=1.0))  # fmt: skip
+                  after=RunStatistics(nis_mean=1.0))  # fmt: skip
     model = SimpleNamespace(inputs=SimpleNamespace(settings={aid.noise: flown_m}))
     result = axis("north", rejected_fraction=rejected)
     origin = GNSS if kind == "gnss" else RECEIVED
@@ -431,7 +432,7 @@ def test_wrong_ekf2_noise_finding_names_parameter_or_sensor(
     assert finding.remedy == f"Set {aid.noise} to {estimate_m:.3g} m."
     assert finding.message.endswith(f"KF takes SIGMA_Z from {aid.noise}.") is (kind == "gnss")
     # innovations outside their band after the change, or a change of EKF2_ACC_NOISE
-    worse = replace(rerun, after=Outcome(nis_mean=2.0))
+    worse = replace(rerun, after=RunStatistics(nis_mean=2.0))
     other = replace(rerun, kinds=("process noise",))
     for trials in ((worse,), (other,), ()):
         assert not [*ekf2_noise.detect(analysis(axes=(result,), trials=trials, ekf2_model=model))]

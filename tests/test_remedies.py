@@ -11,7 +11,7 @@ from px4fuse.comparison import remedy as remedies
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import ml_ekf2_parameters, noise_used_m
-from px4fuse.comparison.trials import Outcome, Trial, find_trial, has_effect, improvement
+from px4fuse.comparison.trials import RunStatistics, Trial, find_trial, has_effect, improvement
 from px4fuse.diagnose import explain
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
@@ -95,8 +95,8 @@ def test_drifting_vio_is_the_first_finding(seed, mistakes) -> None:
     assert estimated.get("EKF2_EVP_NOISE", flown_with) >= flown_with
 
 
-def trial(after: Outcome, change: str = "sigma_z_m", kind: str = "noises") -> Trial:
-    before = Outcome(nis_mean=16.0, nees_mean=9.0, position_rmse_m=0.5)
+def trial(after: RunStatistics, change: str = "sigma_z_m", kind: str = "noises") -> Trial:
+    before = RunStatistics(nis_mean=16.0, nees_mean=9.0, position_rmse_m=0.5)
     return Trial(filter="kf", kinds=(kind,), change={change: 1.0}, before=before, after=after)
 
 
@@ -114,13 +114,16 @@ def trial(after: Outcome, change: str = "sigma_z_m", kind: str = "noises") -> Tr
     ],
 )
 def test_filter_rerun_improvement_names_improved_quantity(nis, nees, rmse_m, expected, has) -> None:
-    one = trial(Outcome(nis_mean=nis, nees_mean=nees, position_rmse_m=rmse_m))
+    one = trial(RunStatistics(nis_mean=nis, nees_mean=nees, position_rmse_m=rmse_m))
     assert improvement(one) == expected
     assert has_effect(one) is has
 
 
 def test_recommended_rerun_is_smallest_sufficient_change() -> None:
-    right, near = Outcome(nis_mean=1.0, nees_mean=1.0), Outcome(nis_mean=1.2, nees_mean=1.2)
+    right, near = (
+        RunStatistics(nis_mean=1.0, nees_mean=1.0),
+        RunStatistics(nis_mean=1.2, nees_mean=1.2),
+    )
     pair = replace(trial(right), change={"sigma_z_m": 1.0, "sigma_a_m_s2": 1.0})
     alone, bias = trial(near), trial(right, "bias_forward_m_s2", "bias")
     trials = (pair, alone, bias)

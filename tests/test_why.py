@@ -116,10 +116,10 @@ def test_kf_ekf2_difference_sentence_states_largest_step(sample, share, text) ->
     reasons = {name: f"Reason of {name}" for name in STEPS}
     explained = add_sentences(replace(explanation, steps=steps), "the aisle", reasons)
     assert f"along the aisle: {first.name}." in explained.cause
-    assert f"It is {text}" in explained.sentences[0]
+    assert f"This step is {text}" in explained.sentences[0]
     assert explained.cause.endswith(f"Reason of {first.name}.")
     assert explained.sentences[0].startswith(explained.cause)
-    assert f"Largest effect at {first.moved_at_s:.1f} s" in explained.sentences[0]
+    assert f" m at {first.moved_at_s:.1f} s." in explained.sentences[0]
 
 
 def test_kf_ekf2_difference_names_a_wrong_kf_setting_first(sample: Analysis) -> None:

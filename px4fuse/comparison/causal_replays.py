@@ -1,11 +1,11 @@
-"""Causes of inconsistency, found by re-running a filter with one change at a time.
+"""Causes of inconsistent filters, found by re-running a filter with one change at a time.
 
-A discrepancy is a mean NIS outside its band, or errors larger than the reported σ (mean NEES). Each
-candidate change is re-run alone; if none suffices, the best change is combined with each other one.
-The cause is the smallest change that brings the statistic into its band, or else explains at least
-half of the logarithm of the statistic. A smaller noise is not a cause if the reported σ would then
-be smaller than the errors against ground truth. A sensor fault that explains as much as a setting
-is preferred: the setting would only hide the fault.
+A discrepancy of a filter is a mean NIS outside its band, or a mean NEES that shows errors larger
+than the reported σ. Changes that may explain it are re-run one by one; if none suffices, the best
+change is combined with each other one. The cause is the smallest change that brings the statistic
+into its band, or else explains at least half of the logarithm of the statistic. A smaller noise is
+not a cause if the reported σ would then be smaller than the errors against ground truth. A sensor
+fault that explains as much as a setting is preferred: the setting would only hide the fault.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from px4fuse.comparison.model import (
 )
 from px4fuse.comparison.projection import project, project_truth
 from px4fuse.comparison.remedy import is_fused_source, ml_delay_change, noise_change
-from px4fuse.comparison.trials import Change, Outcome, Statistic, Trial, distance_from_one
+from px4fuse.comparison.trials import Change, RunStatistics, Statistic, Trial, distance_from_one
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings, with_misaligned_positions
@@ -59,28 +59,28 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Columns, Unavailable
 from px4fuse.record import Positive, Record
 
-# Mean NEES from which errors count as larger than the reported σ (2 σ); flights without a fault
-# have less than 3
+# Mean NEES from which position errors are larger than the reported σ: errors of 2 σ; flights
+# without a fault have less than 3
 MIN_NEES_FINDING = 4.0
-# Limit of the mean NEES after a change to a smaller noise, if the mean NEES was above 1 before
+# Maximum mean NEES after a change to a smaller noise, if the mean NEES was above 1 before
 MAX_NEES_AFTER_CHANGE = 2.0
-# Mean NIS above which the innovations already show that the σ is too small
+# Maximum mean NIS with which innovations do not show that the reported σ is too small
 MAX_UNREMARKABLE_NIS = 1.5
-# Share of ln(statistic) that a cause explains: at least 0.5, at most 1.5 (overshoot)
+# Minimum fraction of ln(statistic) that a cause removes; at most 1.5 may be removed (overshoot)
 MIN_EXPLAINED_SHARE = 0.5
-# Maximum distance of the explained share from 1 at which a sensor fault alone is the cause; the
-# noises of the re-run are approximate
+# Maximum deviation from 1 of the explained fraction of ln(statistic) for a sensor fault to be the
+# only cause: the noises of the re-run are approximate
 SENSOR_CAUSE_TOLERANCE = 0.25
-# Share of ln(statistic) that a change must explain to be combined with the best one
+# Minimum fraction of ln(statistic) that a change removes to be combined with the best change
 MIN_HELPFUL_SHARE = 0.1
 CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
 FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
-# Changes that correct a sensor; they precede changes of settings
+# Changes that correct a sensor fault; they are preferred to changes of settings
 SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
-# m; minimum SIGMA_Z of a re-run: accuracy of motion capture in flight
+# Minimum SIGMA_Z (m) of a re-run: accuracy of motion capture in flight
 SMALLEST_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
-# Kind of a change by its name
+# Kind of a change of KF, by the name of the changed setting or data
 KF_KINDS = {
     SIGMA_A: "noises",
     SIGMA_Z: "noises",
@@ -90,14 +90,14 @@ KF_KINDS = {
     FORWARD_BIAS: "bias",
     RIGHT_BIAS: "bias",
 }
-# Parameters that another change requires; they do not count as separate changes
+# Parameters that a change of another parameter requires; they do not count as separate changes
 ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
 SETTING_CHANGES = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
-# Minimum ratio of SIGMA_A to EKF2_ACC_NOISE for a larger EKF2_ACC_NOISE: SIGMA_A also covers tilt
-# error and bias
+# Minimum ratio of the estimated SIGMA_A to EKF2_ACC_NOISE for a re-run with a larger
+# EKF2_ACC_NOISE: SIGMA_A also covers tilt error and bias
 VIBRATION_FACTOR = 3.0
-# Parameters of EKF2 that are re-run with PX4's default if another value was flown
+# EKF2 parameters that are re-run with PX4's default value if another value was flown
 PARAMETERS_OF_EKF2 = (
     ACC_NOISE,
     "EKF2_GYR_NOISE",
@@ -106,23 +106,23 @@ PARAMETERS_OF_EKF2 = (
     GNSS_VEL.noise,
     GNSS_VEL.gate,
 )
-# Columns of north and east
+# Columns of an EKF2 replay for north and east
 INNOVATION_COLUMNS, INNOVATION_VARIANCE_COLUMNS = UPDATE_COLUMNS[:2], UPDATE_COLUMNS[2:4]
 POSITION_VARIANCES = [f"position_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 OBSERVATION_VARIANCES = [f"observation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 NO_DIFFERENCE = Unavailable(
     "difference KF - EKF2", "the filters use different frames after the change", ""
 )
-# Ratio of replay and log as flown within which a prediction of EKF2 is printed
+# Maximum ratio of a statistic in the replay as flown and in the log, for re-runs to be valid
 MAX_REPLAY_FACTOR = 1.10
-# Further changes that are combined with the best one
+# Maximum number of changes that are combined with the best change
 MAX_PAIRS = 4
-# σ; smaller misalignments are not significant
+# Minimum misalignment in standard deviations of its estimate for a re-run with rotated positions
 HEADING_SIGMAS = 3.0
 
 
 class Intervention(Record, frozen=True, kw_only=True):
-    """Re-run of a filter with a change: a statistic before and after.
+    """One statistic of a filter with and without a change, from a re-run.
 
     Attributes
     ----------
@@ -137,8 +137,8 @@ class Intervention(Record, frozen=True, kw_only=True):
     before, after : float
         Statistic without the change (EKF2: from the log) and with it (from a re-run).
     explained_fraction : float
-        Share of ln(statistic) that the change removes; above 1 the change overshoots. For the RMS
-        difference, the share of the mean square.
+        Fraction of ln(statistic) that the change removes; above 1 the change overshoots. For the
+        RMS difference, the fraction of the mean square.
     is_sufficient : bool
         True if the mean NIS is in its 95 % band, or the mean NEES below
         :data:`MIN_NEES_FINDING`.
@@ -158,7 +158,7 @@ class Intervention(Record, frozen=True, kw_only=True):
 
     @property
     def is_cause(self) -> bool:
-        """True if the explained share of ln(statistic) is 0.5 to 1.5."""
+        """True if the change explains 50 to 150 % of the logarithm of the mean NIS or NEES."""
         return (
             MIN_EXPLAINED_SHARE <= self.explained_fraction <= 2.0 - MIN_EXPLAINED_SHARE
             and not self.contradicts_truth
@@ -166,12 +166,12 @@ class Intervention(Record, frozen=True, kw_only=True):
 
     @property
     def corrects_sensor(self) -> bool:
-        """True if the change corrects a sensor, which precedes changes of settings."""
+        """True if the change corrects a sensor fault instead of a setting."""
         return not SENSOR_CHANGES.isdisjoint(self.change)
 
     @property
     def is_complete_cause(self) -> bool:
-        """True if the statistic is in its band, or a sensor fault explains nearly all of it."""
+        """True if the mean NIS or NEES is then in its band, or a sensor fault explains it."""
         return self.is_sufficient or (
             self.corrects_sensor and abs(self.explained_fraction - 1.0) <= SENSOR_CAUSE_TOLERANCE
         )
@@ -180,7 +180,7 @@ class Intervention(Record, frozen=True, kw_only=True):
 def interventions_for(
     causes: Iterable[Intervention], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> list[Intervention]:
-    """Return the re-runs that test causes of one discrepancy."""
+    """Return the re-runs that test causes of a mean NIS or NEES outside its limits."""
     return [
         intervention
         for intervention in causes
@@ -192,7 +192,7 @@ def interventions_for(
 def find_cause(
     causes: Iterable[Intervention], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> Intervention | None:
-    """Return the cause of one discrepancy, or None if no re-run explains it."""
+    """Return the cause of a mean NIS or NEES outside its limits; None if no re-run explains it."""
     return min(
         (
             intervention
@@ -210,7 +210,7 @@ def find_cause(
 
 
 class ErrorAboveSigma(NamedTuple):
-    """Position error against ground truth larger than the reported σ: mean NEES, RMSE, σ, NIS."""
+    """Position error against ground truth that is larger than the reported σ."""
 
     nees: float
     rmse_m: float
@@ -257,7 +257,7 @@ class Reruns:
 def run_interventions(
     comparison: Comparison, estimates: Estimates, model: Model | Unavailable
 ) -> tuple[tuple[Intervention, ...], tuple[Trial, ...]]:
-    """Re-run every candidate change for every discrepancy, and along the main axis.
+    """Re-run both filters with each change that may explain a discrepancy, and along the main axis.
 
     ``model`` is EKF2 of the same flight.
     """
@@ -324,32 +324,29 @@ def planned_configurations(
 def _difference_reduction(
     cause: Intervention, result: AxisComparison, filter_changes: _FilterRerun
 ) -> list[Intervention]:
-    """Compute the RMS difference KF - EKF2 (m) with and without a cause."""
     before, after = (
         filter_changes.outcome(result, change).difference_rms_m for change in ({}, cause.change)
     )
     if not before or not after:
         return []
-    explained_share = 1.0 - (after / before) ** 2
     return [
         structs.replace(
             cause,
             statistic="difference",
             before=before,
             after=after,
-            explained_fraction=explained_share,
+            explained_fraction=1.0 - (after / before) ** 2,
             is_sufficient=False,
         )
     ]
 
 
 def is_inconsistent(statement: FilterSummary | UntestedFilter) -> TypeGuard[FilterSummary]:
-    """Return True if the filter was tested and is not consistent."""
+    """Return True if the filter was tested and is over- or underconfident."""
     return not isinstance(statement, Unavailable) and statement.verdict != "consistent"
 
 
 def _find_discrepancies(summary: FilterSummary | UntestedFilter) -> list[Statistic]:
-    """Return the statistics of a filter that are outside their limits."""
     statistics: list[Statistic] = ["nees"] if error_above_reported_sigma(summary) else []
     return [*statistics, "nis"] if is_inconsistent(summary) else statistics
 
@@ -357,11 +354,8 @@ def _find_discrepancies(summary: FilterSummary | UntestedFilter) -> list[Statist
 def _try_candidates(
     filter_changes: _FilterRerun, result: AxisComparison, statistic: Statistic
 ) -> list[Intervention]:
-    """Re-run all candidate changes alone; if none suffices, the best with each other one."""
-    summary, candidates = (
-        result.filters[filter_changes.filter_name],
-        filter_changes.candidates(result, statistic),
-    )
+    """Re-run each change that may explain a discrepancy; if none suffices, also pairs."""
+    summary = result.filters[filter_changes.filter_name]
     assert isinstance(summary, FilterSummary)  # else it has no discrepancy
     truth = summary.truth
     nees = None if isinstance(truth, Unavailable) else truth.nees_position_mean
@@ -393,7 +387,11 @@ def _try_candidates(
             )
         ]
 
-    single_changes = [intervention for change in candidates for intervention in rerun(change)]
+    single_changes = [
+        intervention
+        for change in filter_changes.candidates(result, statistic)
+        for intervention in rerun(change)
+    ]
     helpful_changes = sorted(
         (
             intervention
@@ -418,11 +416,10 @@ def _outcome(
     errors: ErrorsAgainstTruth | Unavailable,
     kf_minus_ekf2: Difference | Unavailable,
     rejected_fraction: float | None = None,
-) -> Outcome:
-    """Collect the statistics of one run; those that cannot be computed are None."""
+) -> RunStatistics:
     truth = errors if isinstance(errors, ErrorsAgainstTruth) else None
     has_innovations = len(innovation_m) > 0
-    return Outcome(
+    return RunStatistics(
         innovations=len(innovation_m),
         nis_mean=float(np.mean(innovation_m**2 / variance_m2)) if has_innovations else None,
         position_rmse_m=None if truth is None else truth.position_rmse_m,
@@ -435,15 +432,12 @@ def _outcome(
 
 
 def _try_on_main_axis(changed: _FilterRerun) -> list[Trial]:
-    """Run all candidate changes along the main axis, and the best one with each other one."""
+    """Re-run each change along the main axis, and the best one with each other one."""
     result, owner = changed.comparison.main, changed.filter_name
     if not isinstance(result.filters[owner], FilterSummary):
         return []
     candidates = changed.main_axis_candidates(result)
-    if not candidates:
-        return []
-    before = changed.flown_outcome(result)
-    if before is None:
+    if not candidates or (before := changed.flown_outcome(result)) is None:
         return []
 
     def run(change: Change) -> Trial:
@@ -470,8 +464,7 @@ def _try_on_main_axis(changed: _FilterRerun) -> list[Trial]:
     return singles + [run({**best.change, **other.change}) for other in others[:MAX_PAIRS]]
 
 
-def _agrees(logged: Outcome, replayed: Outcome) -> bool:
-    """Return True if a replay as flown has the RMSE and the ratios of the log within 10 %."""
+def _agrees(logged: RunStatistics, replayed: RunStatistics) -> bool:
     pairs = (
         (logged.position_rmse_m, replayed.position_rmse_m, MAX_REPLAY_FACTOR),
         (logged.nis_mean, replayed.nis_mean, MAX_REPLAY_FACTOR**2),
@@ -485,18 +478,18 @@ def _agrees(logged: Outcome, replayed: Outcome) -> bool:
 
 
 def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
-    """Return the tuning of an axis; for a horizontal axis that of both axes if available."""
+    """Return the noise estimate of an axis; of both horizontal axes together if available."""
     return first_axis_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
 def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
-    """Return a direction in the frame of positions that are rotated clockwise from above."""
+    """Return an NED direction in the frame of positions that are rotated clockwise."""
     return np.asarray(Rotation.from_euler("z", -rotation_deg, degrees=True).apply(direction))
 
 
 @dataclass(frozen=True)
 class _FilterRerun:
-    """Candidate changes of one filter, and statistics of re-runs with a change."""
+    """Changes of one filter that may explain a discrepancy, and statistics of their re-runs."""
 
     comparison: Comparison
     tuning: Tuning
@@ -506,11 +499,11 @@ class _FilterRerun:
     filter_name: ClassVar[FilterName]
 
     def discrepancies(self) -> list[tuple[AxisComparison, Statistic]]:
-        """Return axis and statistic of each discrepancy; for EKF2 of horizontal axes only."""
+        """Return axis and statistic (mean NIS or NEES) of each discrepancy of the filter."""
         return [
             (result, statistic)
             for result in self.comparison.axes.values()
-            if self.filter_name == "kf" or result.axis.name != "down"
+            if self.filter_name == "kf" or result.axis.name != "down"  # EKF2 replay: horizontal
             for statistic in _find_discrepancies(result.filters[self.filter_name])
         ]
 
@@ -518,15 +511,15 @@ class _FilterRerun:
     def noise_candidates(
         self, summary: FilterSummary, tuned: AxisTuning, is_underconfident: bool
     ) -> list[Change]:
-        """Return maximum-likelihood noises whose interval excludes the value in use."""
+        """Return changes to the estimated noises whose 95 % interval excludes the flown value."""
 
     @abstractmethod
     def other_candidates(self, tuned: AxisTuning | None) -> list[Change]:
-        """Return further candidates; pass ``tuned`` None if the reported σ is too large."""
+        """Return changes of other settings; ``tuned`` is None if the reported σ is too large."""
 
     @abstractmethod
-    def outcome(self, result: AxisComparison, change: Change) -> Outcome:
-        """Run the filter along an axis with a change; without one, as flown."""
+    def outcome(self, result: AxisComparison, change: Change) -> RunStatistics:
+        """Return the statistics of the filter along an axis with a change, or as flown without."""
 
     @abstractmethod
     def kind_of(self, name: str) -> str:
@@ -541,7 +534,7 @@ class _FilterRerun:
         """Return the change to the default settings; empty if there is none."""
         return {}
 
-    def flown_outcome(self, result: AxisComparison) -> Outcome | None:
+    def flown_outcome(self, result: AxisComparison) -> RunStatistics | None:
         """Return the statistics as flown, of the same samples as a re-run.
 
         None if a re-run without a change has other statistics, so that nothing is comparable.
@@ -549,16 +542,14 @@ class _FilterRerun:
         return self.outcome(result, {})
 
     def main_axis_candidates(self, result: AxisComparison) -> list[Change]:
-        """Return the candidate changes along the main axis, each once."""
-        changes: list[Change] = []
-        for statistic in ("nis", "nees"):
-            changes += [
-                change for change in self.candidates(result, statistic) if change not in changes
-            ]
-        return changes
+        """Return the changes to be re-run along the main axis, each once."""
+        changes = self.candidates(result, "nis")
+        return changes + [
+            change for change in self.candidates(result, "nees") if change not in changes
+        ]
 
     def candidates(self, result: AxisComparison, statistic: Statistic) -> list[Change]:
-        """Return the candidate changes for a discrepancy along an axis."""
+        """Return the changes that may explain a mean NIS or NEES outside its limits."""
         summary, origin = result.filters[self.filter_name], self.comparison.source.origin
         assert isinstance(summary, FilterSummary)  # else it has no discrepancy
         is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
@@ -580,33 +571,27 @@ class _FilterRerun:
         return changes + self.other_candidates(None if is_underconfident else tuned)
 
     def time_offset_candidates(self) -> list[Change]:
-        """Return the time offset if the part that the filter does not yet apply is significant."""
+        """Return a change of the time offset, if its part not yet applied is significant."""
         if isinstance(self.clock, Unavailable) or not self.clock.is_determinable:
             return []
         applied_s = self.comparison.settings.clock_offset_s
         offset_s = applied_s + self.clock.remaining_s
         unapplied_s = offset_s - (applied_s if self.filter_name == "kf" else 0.0)
-        return (
-            [{CLOCK_OFFSET: round(offset_s, 3)}]
-            if abs(unapplied_s) > self.clock.three_sigma_s
-            else []
-        )
+        is_significant = abs(unapplied_s) > self.clock.three_sigma_s
+        return [{CLOCK_OFFSET: round(offset_s, 3)}] if is_significant else []
 
 
 @dataclass(frozen=True)
 class _KfRerun(_FilterRerun):
-    """Re-runs of KF."""
-
     bias_scale_jump_fit: BiasScaleJumpFit | Unavailable
 
     filter_name = "kf"
 
     def kind_of(self, name: str) -> str:
-        """Return the kind of a change of KF."""
         return KF_KINDS[name]
 
     def main_axis_candidates(self, result: AxisComparison) -> list[Change]:
-        """Return the candidates, both noises together, and the default settings."""
+        """Return the single changes, both noises together, and the default settings."""
         changes = super().main_axis_candidates(result)
         noises = [change for change in changes if change.keys() <= SETTING_CHANGES]
         if len(noises) > 1:
@@ -615,7 +600,7 @@ class _KfRerun(_FilterRerun):
         return [*changes, *([defaults] if defaults and noises else [])]
 
     def default_change(self) -> Change:
-        """Return the default of each noise that was set; SIGMA_Z of GNSS is that of EKF2."""
+        """Return the default of each noise that the user set; GNSS uses SIGMA_Z from EKF2."""
         chosen, default = self.comparison.settings, Settings()
         names = (SIGMA_A,) if self.comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
         return {
@@ -627,7 +612,7 @@ class _KfRerun(_FilterRerun):
     def noise_candidates(
         self, summary: FilterSummary, tuned: AxisTuning, is_underconfident: bool
     ) -> list[Change]:
-        """Return SIGMA_A and SIGMA_Z whose interval excludes the value in use."""
+        """Return SIGMA_A and SIGMA_Z estimates whose 95 % interval excludes the setting."""
         changes = list[Change]()
         for name, noise in ((SIGMA_A, tuned.sigma_a_two_state), (SIGMA_Z, tuned.sigma_z)):
             chosen_sigma = getattr(self.comparison.settings, name)
@@ -644,19 +629,16 @@ class _KfRerun(_FilterRerun):
         return changes
 
     def other_candidates(self, tuned: AxisTuning | None) -> list[Change]:
-        """Return the accelerometer biases if they are significant."""
-        if (
-            isinstance(self.bias_scale_jump_fit, Unavailable)
-            or not self.bias_scale_jump_fit.has_bias
-        ):
+        """Return the removal of the accelerometer biases, if they are significant."""
+        fit = self.bias_scale_jump_fit
+        if isinstance(fit, Unavailable) or not fit.has_bias:
             return []
-        forward, right = self.bias_scale_jump_fit.forward_bias, self.bias_scale_jump_fit.right_bias
-        return [{FORWARD_BIAS: round(forward.value, 3), RIGHT_BIAS: round(right.value, 3)}]
+        biases = {FORWARD_BIAS: fit.forward_bias, RIGHT_BIAS: fit.right_bias}
+        return [{name: round(bias.value, 3) for name, bias in biases.items()}]
 
     def _acceleration_without_bias(
         self, change: Change, direction: Array
     ) -> Acceleration | Unavailable:
-        """Return the acceleration along a direction after removal of the accelerometer biases."""
         flight, imu = self.comparison.flight, self.comparison.flight.imu
         if isinstance(imu, Unavailable):
             return imu
@@ -667,8 +649,7 @@ class _KfRerun(_FilterRerun):
             return corrected_ned
         return project_acceleration(corrected_ned, direction, self.comparison.segment)
 
-    def outcome(self, result: AxisComparison, change: Change) -> Outcome:
-        """Run KF with the change."""
+    def outcome(self, result: AxisComparison, change: Change) -> RunStatistics:
         source, segment, axis = self.comparison.source, self.comparison.segment, result.axis
         kf_settings: dict[str, Any] = {
             name: change[name] for name in change if name in vars(Settings())
@@ -681,9 +662,8 @@ class _KfRerun(_FilterRerun):
                 cut_to_segment(source.samples, segment), Columns.POSITION, rotated_direction
             )
             axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
-            if (
-                is_gnss_rotation
-            ):  # GNSS and ground truth refer to true north; the attitude is misaligned
+            if is_gnss_rotation:
+                # GNSS and ground truth refer to true north, so the attitude is misaligned
                 rotated_axis = replace(axis, direction=rotated_direction)
                 truth = project_truth(self.comparison.flight.truth, rotated_axis, segment)
         if FORWARD_BIAS in change:
@@ -713,7 +693,7 @@ class _KfRerun(_FilterRerun):
 
 @dataclass(frozen=True)
 class _Ekf2Rerun(_FilterRerun):
-    """Re-runs of EKF2, if EKF2 fused the analysed source; without ``model`` candidates only."""
+    """Re-runs of EKF2, which fused the analysed source; without ``model`` only their changes."""
 
     inputs: Inputs
     model: Model | None = None
@@ -722,7 +702,6 @@ class _Ekf2Rerun(_FilterRerun):
     filter_name = "ekf2"
 
     def kind_of(self, name: str) -> str:
-        """Return the kind of a change of EKF2."""
         aid = self.inputs.aid
         kinds = {aid.noise: "noise", aid.gate: "gate", aid.delay: "delay"}
         return KF_KINDS.get(name) or kinds.get(name, "process noise")
@@ -732,7 +711,7 @@ class _Ekf2Rerun(_FilterRerun):
         """Time (s) from which the replay is evaluated."""
         return None if self.model is None else self.model.flown.evaluated_s[0][0]
 
-    def flown_outcome(self, result: AxisComparison) -> Outcome | None:
+    def flown_outcome(self, result: AxisComparison) -> RunStatistics | None:
         """Return the statistics of the log in the replayed spans; None if the replay differs."""
         logged, innovations = result.ekf2_state, result.ekf2_innovations
         if self.model is None or isinstance(logged, Unavailable):
@@ -752,7 +731,7 @@ class _Ekf2Rerun(_FilterRerun):
         return in_log if _agrees(in_log, self.outcome(result, {})) else None
 
     def main_axis_candidates(self, result: AxisComparison) -> list[Change]:
-        """Return the candidates; a delay also as a shift of the timestamps by the sender."""
+        """Return the single changes; a delay also as a shift of the position timestamps."""
         changes = super().main_axis_candidates(result)
         delays = [change for change in changes if self.inputs.aid.delay in change]
         offsets = super().time_offset_candidates() if delays else []
@@ -772,7 +751,7 @@ class _Ekf2Rerun(_FilterRerun):
         return [delay] if delay else super().time_offset_candidates()
 
     def other_candidates(self, tuned: AxisTuning | None) -> list[Change]:
-        """Return the default gate, other PX4 defaults, and the process noise for vibration."""
+        """Return PX4's default of the gate and other parameters, and a noise for vibration."""
         aid, flown = self.inputs.aid, self.inputs.settings
         default_values = {
             name: PARAMETERS[name].default for name in (aid.gate, *PARAMETERS_OF_EKF2)
@@ -803,7 +782,7 @@ class _Ekf2Rerun(_FilterRerun):
     def noise_candidates(
         self, summary: FilterSummary, tuned: AxisTuning, is_underconfident: bool
     ) -> list[Change]:
-        """Return the source's measurement noise if its interval excludes EKF2's value."""
+        """Return the estimated position noise if its 95 % interval excludes EKF2's value."""
         noise = tuned.sigma_z
         if (noise.low or 0.0) <= self.flown_noise_m <= (noise.high or np.inf):
             return []
@@ -812,20 +791,15 @@ class _Ekf2Rerun(_FilterRerun):
             ml_noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
         return [noise_change(self.inputs.aid, self.inputs.settings, self.flown_noise_m, ml_noise_m)]
 
-    def outcome(self, result: AxisComparison, change: Change) -> Outcome:
+    def outcome(self, result: AxisComparison, change: Change) -> RunStatistics:
         """Replay EKF2 with the change; without a change the difference is that of the log."""
         assert self.model is not None
-        compared_s, axis, segment = (
-            self.model.flown.evaluated_s,
-            result.axis,
-            self.comparison.segment,
-        )
+        compared_s, axis = self.model.flown.evaluated_s, result.axis
         ekf2_replay = self._replay_with(self.model, change)
         if ROTATION in change and self.comparison.source.origin.is_gnss:
             # the change corrects the attitude, so the axis keeps its direction relative to north
             axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))
-        weights = axis.direction[:2]
-        updates = ekf2_replay.updates
+        weights, updates = axis.direction[:2], ekf2_replay.updates
         updates = updates[inside_spans(updates.index, compared_s)]
         innovation_variance_m2 = weighted_sum(updates, INNOVATION_VARIANCE_COLUMNS, weights**2)
         prior_m2 = innovation_variance_m2 - weighted_sum(updates, OBSERVATION_VARIANCES, weights**2)
@@ -837,13 +811,11 @@ class _Ekf2Rerun(_FilterRerun):
             },
             index=pd.Index(updates["fused_at_s"].to_numpy()),
         )
-        published = project(ekf2_replay.published, axis, segment)
+        published = project(ekf2_replay.published, axis, self.comparison.segment)
         published = published[inside_spans(published.index, compared_s)]
-        logged = result.ekf2_state
+        logged, compared = result.ekf2_state, published
         if not change and not isinstance(logged, Unavailable):
             compared = logged[inside_spans(logged.index, compared_s)]
-        else:
-            compared = published
         return _outcome(
             weighted_sum(updates, INNOVATION_COLUMNS, weights),
             innovation_variance_m2,
@@ -853,7 +825,6 @@ class _Ekf2Rerun(_FilterRerun):
         )
 
     def _replay_with(self, model: Model, change: Change) -> Ekf2Replay:
-        """Return the replay of EKF2 with a change, from the cache if available."""
         if not change:
             return model.flown
         key = tuple(sorted(change.items()))
@@ -864,13 +835,9 @@ class _Ekf2Rerun(_FilterRerun):
             )
             excluded_s, tuned = None, tuning_of_axis(self.tuning, HORIZONTAL)
             if OUTLIERS in change and tuned is not None:
-                delay_s = 1e-3 * self.inputs.settings[self.inputs.aid.delay]
-                is_gnss_source = self.comparison.source.origin.fused_as_gnss
                 excluded_s = tuned.outlier_time_s - self.comparison.settings.clock_offset_s
-                excluded_s = (
-                    excluded_s
-                    + (delay_s if is_gnss_source else 0.0)
-                    + change.get(CLOCK_OFFSET, 0.0)
-                )
+                if self.comparison.source.origin.fused_as_gnss:
+                    excluded_s += 1e-3 * self.inputs.settings[self.inputs.aid.delay]
+                excluded_s += change.get(CLOCK_OFFSET, 0.0)
             (self.replays[key],) = replay_settings(model, [settings], excluded_s)
         return self.replays[key]

@@ -1,4 +1,4 @@
-"""Comparison of KF with EKF2 and with ground truth, axis by axis."""
+"""Comparison of KF with EKF2, and of both with ground truth, axis by axis."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -56,33 +56,32 @@ def compare(
 def compare_prepared(
     prepared: Comparison, progress: Callable[[str], None] = lambda _: None
 ) -> Comparison:
-    """Run KF on a prepared comparison; fill in its axes and its horizontal NIS."""
+    """Run KF on a prepared comparison, and add the results per axis and the horizontal NIS."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, note = projection.continuous_state(ekf2, prepared.source, prepared.segment)
         notes += [f"EKF2 {note}"] if note else []
         notes += ekf2.notes
-        # after the removal of a reset, positions at the fusion horizon are in another frame than
-        # the published state
-        is_unchanged = state.equals(ekf2.state)
-        ekf2 = (
-            ekf2 if is_unchanged else replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
-        )
+        if not state.equals(ekf2.state):
+            # without its resets, the state is in another frame than positions at the fusion horizon
+            ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
     progress(", ".join(line.name for line in prepared.lines))
     axes = {
         line.name: _compare_axis(prepared, ekf2, replay(line, prepared.settings))
         for line in prepared.lines
     }
-    nis_by_filter: dict[FilterName, HorizontalNis | None] = {
-        "kf": _horizontal_nis({name: axis.replay.updates for name, axis in axes.items()}),
-        "ekf2": _horizontal_nis({name: axis.ekf2_innovations for name, axis in axes.items()}),
+    innovations: dict[FilterName, dict[str, Frame]] = {
+        "kf": {name: axis.replay.updates for name, axis in axes.items()},
+        "ekf2": {name: axis.ekf2_innovations for name, axis in axes.items()},
     }
-    horizontal = {name: nis for name, nis in nis_by_filter.items() if nis is not None}
+    horizontal = {
+        name: nis for name, frames in innovations.items() if (nis := _horizontal_nis(frames))
+    }
     return replace(prepared, notes=tuple(notes), axes=axes, horizontal=horizontal)
 
 
 def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay) -> AxisComparison:
-    """Compare one axis; ``ekf2`` is EKF2 after the treatment of its resets."""
+    """Compare KF and EKF2 along one axis; ``ekf2`` is without the removed resets."""
     axis, segment, flight = kf_run.axis, prepared.segment, prepared.flight
     truth = projection.project_truth(flight.truth, axis, segment)
     state: Frame
@@ -135,7 +134,6 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
 def _summarise_filter(
     innovations: Frame, variance: Frame, truth: ErrorsAgainstTruth | Unavailable, gate: float
 ) -> FilterSummary | UntestedFilter:
-    """Summarise a filter from its innovations, its variances and its errors."""
     sigmas: dict[str, Any] = {
         name: float(np.sqrt(values.median())) if len(values) else None
         for name, values in (
@@ -155,12 +153,11 @@ def _summarise_filter(
 
 
 def _known_values(frame: Frame, column: str) -> pd.Series:
-    """Return the values of a column without NaN; empty if the frame is Unavailable."""
     return pd.Series(dtype=float) if isinstance(frame, Unavailable) else frame[column].dropna()
 
 
 def difference(kf_run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailable:
-    """Compute KF - EKF2 along one axis at EKF2's sample times."""
+    """Compute the difference KF - EKF2 along one axis at EKF2's sample times."""
     kf_minus_ekf2 = (
         np.array(state_at(kf_run, ekf2_state.index.to_numpy()))
         - ekf2_state[[*STATE_COLUMNS]].to_numpy().T
@@ -169,7 +166,7 @@ def difference(kf_run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavail
     if len(position) < projection.MIN_COMMON_SAMPLES:
         return Unavailable(
             "difference KF - EKF2",
-            f"only {len(position)} common samples in the segment",
+            f"KF and EKF2 have only {len(position)} common samples in the segment",
             "Choose a segment in which EKF2 runs.",
         )
     return Difference(
@@ -184,16 +181,20 @@ def difference(kf_run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavail
 
 
 def _rmse(error: Array) -> float:
-    """Return the root mean square of the known errors."""
     return float(np.sqrt(np.nanmean(error**2)))
 
 
 def kf_error_statistics(
     kf_run: Replay, truth: Frame, ekf2_state: Frame
 ) -> ErrorsAgainstTruth | Unavailable:
-    """Compute KF's errors against ground truth at EKF2's sample times, else at KF's steps."""
-    times = (kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state).index.to_numpy()
-    return error_statistics(*kf_state_and_variance(kf_run, times), truth)
+    """Compute KF's errors against ground truth at EKF2's sample times, else at each prediction."""
+    return error_statistics(*_kf_track(kf_run, ekf2_state), truth)
+
+
+def _kf_track(kf_run: Replay, ekf2_state: Frame) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return state and variances of KF at EKF2's sample times, else at each prediction."""
+    frame = kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state
+    return kf_state_and_variance(kf_run, frame.index.to_numpy())
 
 
 def kf_state_and_variance(kf_run: Replay, times: Array) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -210,8 +211,8 @@ def error_statistics(
 ) -> ErrorsAgainstTruth | Unavailable:
     """Compute errors of a filter against ground truth along one axis, and its mean NEES.
 
-    All numbers are of the times of ``state``. Variances are interpolated to them, because EKF2's
-    are logged at a tenth of the rate.
+    Variances are interpolated to the times of ``state``, because PX4 logs those of EKF2 at a tenth
+    of the rate.
     """
     if isinstance(state, Unavailable):
         return state
@@ -220,10 +221,12 @@ def error_statistics(
     position_m, velocity_m_s = (_errors(state, truth, column) for column in STATE_COLUMNS)
     if np.isfinite(position_m).sum() < projection.MIN_COMMON_SAMPLES:
         return Unavailable(
-            "error against ground truth", "no common samples", "Choose a segment with ground truth."
+            "error against ground truth",
+            "filter and ground truth have no common samples",
+            "Choose a segment with ground truth.",
         )
     nees_position, nees_velocity = (
-        _mean_nees(normalise_errors(state.index.to_numpy(), error, variance, column))
+        _mean_nees(error / reported_sigma(state.index.to_numpy(), variance, column))
         for error, column in zip((position_m, velocity_m_s), VARIANCE_COLUMNS, strict=True)
     )
     return ErrorsAgainstTruth(
@@ -236,18 +239,13 @@ def error_statistics(
 
 
 def _errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Array:
-    """Return state minus ground truth at the times of the state; NaN if one is unknown."""
+    """Return the errors of a state against ground truth at its times; NaN if unknown."""
     true = np.interp(state.index, truth.index, truth[column], np.nan, np.nan)
     return np.asarray(state[column].to_numpy() - true)
 
 
-def normalise_errors(time_s: Array, error: Array, variance: Frame, column: str) -> Array:
-    """Return errors over the reported σ, interpolated to their times; NaN where unknown."""
-    return np.asarray(error / reported_sigma(time_s, variance, column))
-
-
 def reported_sigma(time_s: Array, variance: Frame, column: str) -> Array:
-    """Return the reported σ interpolated to other times (s); NaN where unknown."""
+    """Return the reported σ, interpolated to other times (s); NaN where unknown."""
     known = _known_values(variance, column)
     if known.empty:
         return np.full(len(time_s), np.nan)
@@ -262,22 +260,19 @@ def _mean_nees(normalised: Array) -> float | None:
 def position_errors(result: AxisComparison, owner: FilterName) -> Frame:
     """Return position errors (m) and reported σ (m) of one filter along an axis.
 
-    Times are those of EKF2's published state, or KF's steps without EKF2.
+    Times are those of EKF2's published state, without EKF2 those of KF's predictions.
 
     Returns
     -------
     DataFrame or Unavailable
-        ``error_m`` against ground truth and ``sigma_m``, NaN if one is unknown.
+        ``error_m`` against ground truth, and ``sigma_m``; NaN if unknown.
     """
     if isinstance(result.truth, Unavailable):
         return result.truth
     state: pd.DataFrame
     variance: Frame
     if owner == "kf":
-        times = (
-            result.replay.steps if isinstance(result.ekf2_state, Unavailable) else result.ekf2_state
-        ).index.to_numpy()
-        state, variance = kf_state_and_variance(result.replay, times)
+        state, variance = _kf_track(result.replay, result.ekf2_state)
     elif isinstance(result.ekf2_state, Unavailable):
         return result.ekf2_state
     else:
@@ -291,7 +286,7 @@ def position_errors(result: AxisComparison, owner: FilterName) -> Frame:
 def normalised_position_errors(
     result: AxisComparison, owner: FilterName
 ) -> tuple[Array, Array] | Unavailable:
-    """Return times (s) and :func:`position_errors` over the reported σ where both are known."""
+    """Return times (s), and position errors against ground truth divided by the reported σ."""
     errors = position_errors(result, owner)
     if isinstance(errors, Unavailable):
         return errors
@@ -302,7 +297,7 @@ def normalised_position_errors(
         return Unavailable(
             "error against ground truth",
             "no sample has both a reported σ and ground truth",
-            "Choose a segment with both.",
+            "Choose a segment with a reported σ and ground truth.",
         )
     return normalised.index.to_numpy(), normalised.to_numpy()
 
@@ -316,6 +311,6 @@ def _horizontal_nis(frames: Mapping[str, Frame]) -> HorizontalNis | None:
     ]
     if len(frames_of_axes) < 2:
         return None
-    # horizontal NIS needs both components of an update, which have the same timestamp
+    # the horizontal NIS needs north and east of an update, which have the same timestamp
     joint = pd.concat(frames_of_axes, axis=1, join="inner").to_numpy().T
     return assess_horizontal((joint[0], joint[1]), (joint[2], joint[3]))

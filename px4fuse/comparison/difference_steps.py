@@ -1,8 +1,8 @@
-"""Explanation of the difference KF - EKF2 along each horizontal axis, step by step.
+"""Explanation of the difference KF - EKF2 along each horizontal axis.
 
-The steps of :mod:`px4fuse.ekf2.steps` lead from KF with the chosen settings to the logged EKF2. For
-the largest steps, sentences state the behaviour of KF and EKF2, the share of the difference, and
-the time of the largest effect.
+Each step of :mod:`px4fuse.ekf2.steps` replaces one property of KF by that of EKF2, until KF has
+become the logged EKF2. For the steps with the largest effect, sentences state the behaviour of KF
+and EKF2, the fraction of the difference, and the time of the largest effect.
 """
 
 from collections.abc import Mapping
@@ -31,16 +31,16 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
-# Relative difference of two position RMSEs below which a text calls them equal
+# Maximum relative difference of the position RMSEs of KF and EKF2 that texts call equal
 EQUAL_RMSE_TOLERANCE = 0.05
-# Share of the mean square below which a text omits the second step
+# Minimum fraction of the mean square difference for the second largest step to be mentioned
 MIN_NOTABLE_SHARE = 0.05
-# Ratio of a setting and its maximum-likelihood estimate from which it is corrected first
+# Minimum ratio of a KF noise setting and its estimate for the setting to be corrected first
 MIN_SETTING_RATIO = 4.0
-# m; largest change of the position below which a step has equal settings and is not listed
+# Minimum change of the KF position (m) by a listed step: KF and EKF2 differ in this property
 MIN_STEP_EFFECT_M = 1e-6
-# Minimum difference outside the replayed parts that is reported: m, and factor on the largest
-# replayed difference
+# Minimum difference KF - EKF2 outside the replayed times that is reported: in m, and as a factor on
+# the largest difference in the replayed times
 MIN_UNREPLAYED_M, MIN_UNREPLAYED_RATIO = 0.5, 3.0
 
 
@@ -65,16 +65,13 @@ def explain_ekf2_difference(
     Returns
     -------
     mapping from axis name to DifferenceExplanation or Unavailable
-        "down" only if no other axis was compared: the replay covers horizontal positions only.
+        "down" only if no horizontal axis was compared: the replay is horizontal only.
     """
     results = {name: result for name, result in comparison.axes.items() if name != "down"}
     if not results:
         reason = "the EKF2 replay covers horizontal positions only"
-        return {
-            "down": Unavailable(
-                steps.ANALYSIS_NAME, reason, "Analyse a horizontal axis too (--axis)."
-            )
-        }
+        action = "Analyse a horizontal axis, too (--axis)."
+        return {"down": Unavailable(steps.ANALYSIS_NAME, reason, action)}
     if isinstance(model, Unavailable):
         return {name: structs.replace(model, what=steps.ANALYSIS_NAME) for name in results}
     settings = _settings(comparison, model.inputs, corrected)
@@ -87,7 +84,7 @@ def explain_ekf2_difference(
     if isinstance(explanations, Unavailable):
         return dict.fromkeys(results, explanations)
     reasons = _step_reasons(replace(comparison, settings=changed), model, clock)
-    sentences_by_axis: dict[str, DifferenceExplanation | Unavailable] = {}
+    explanation_by_axis: dict[str, DifferenceExplanation | Unavailable] = {}
     for name, explanation in explanations.items():
         with_unreplayed_part = structs.replace(
             explanation,
@@ -97,17 +94,17 @@ def explain_ekf2_difference(
             ),
             outside=_unreplayed_part(results[name], runs[name], explanation.spans_s),
         )
-        sentences_by_axis[name] = add_sentences(
+        explanation_by_axis[name] = add_sentences(
             with_unreplayed_part, comparison.axes[name].axis.label, reasons
         )
-    return sentences_by_axis
+    return explanation_by_axis
 
 
 def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, float]:
-    """Return the maximum-likelihood value of each noise of KF that was set far from it.
+    """Return the estimate of each noise of KF that the user set far from its estimate.
 
-    A wrong setting is a separate cause. If it were left, later steps would share its effect: each
-    of them alone would remove nearly the whole difference.
+    A wrong setting is a separate cause of the difference. Without its correction, each step alone
+    would remove nearly the whole difference.
     """
     axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
     if axis_tuning is None or comparison.source.origin.is_gnss:
@@ -135,7 +132,7 @@ def explanation_configurations(
 
 
 def _settings(comparison: Comparison, inputs: Inputs, corrected: Mapping[str, float]) -> Settings:
-    """Return KF's corrected settings; without time offset if EKF2 fused another source."""
+    """Return KF's corrected settings; no time offset if EKF2 fused another source."""
     settings = _with_changes(comparison.settings, corrected)
     is_same_source = comparison.source.name == inputs.received.source
     return settings if is_same_source else replace(settings, clock_offset_s=0.0)
@@ -163,7 +160,7 @@ def _unreplayed_part(
 def add_sentences(
     explanation: DifferenceExplanation, axis_label: str, reasons: dict[str, str]
 ) -> DifferenceExplanation:
-    """Add sentences: the steps that explain the difference along an axis, largest first.
+    """Add sentences on the EKF2 properties that cause the difference KF - EKF2, largest first.
 
     Parameters
     ----------
@@ -171,7 +168,7 @@ def add_sentences(
     axis_label : str
         Name of the axis in a sentence.
     reasons : dict
-        Texts on the behaviour of EKF2 and KF, by step.
+        Clauses on the behaviour of KF and EKF2, by step.
     """
     reasons = {**reasons, steps.GATE: f"{reasons[steps.GATE]}{_rejection_text(explanation)}"}
     first, second, *_ = sorted(explanation.steps, key=lambda step: -step.position_mean_square_m2)
@@ -181,11 +178,11 @@ def add_sentences(
     )
     sentences = [
         *_corrected_sentences(explanation),
-        f"{cause} {_moment_text(first)} It is {_format_share(first, explanation)}.",
+        f"{cause} {_moment_text(first)} This step is {_format_share(first, explanation)}.",
     ]
     if second.position_mean_square_m2 >= MIN_NOTABLE_SHARE * explanation.position_mean_square_m2:
         sentences.append(
-            f"Second: {second.name} ({_format_share(second, explanation)}). "
+            f"Second largest contribution: {second.name} ({_format_share(second, explanation)}). "
             f"{reasons[second.name]}. "
             f"{_moment_text(second)}"
         )
@@ -195,39 +192,37 @@ def add_sentences(
     )
     if explanation.outside is not None and explanation.outside.maximum_m > min_reported_m:
         sentences.append(
-            "Outside the replayed parts (EKF2 starting or not fusing the source) KF and "
-            f"EKF2 differ by up to {explanation.outside.maximum_m:.1f} m (at "
+            "Outside the replayed times (EKF2 starting or not fusing the source) the positions of "
+            f"KF and EKF2 differ by up to {explanation.outside.maximum_m:.1f} m (at "
             f"{explanation.outside.at_s:.0f} s)."
         )
     return structs.replace(explanation, sentences=tuple(sentences), cause=cause)
 
 
 def _corrected_sentences(explanation: DifferenceExplanation) -> list[str]:
-    """State the settings with which KF was run for this explanation."""
     if not explanation.corrected:
         return []
     texts = (
         f"{COMPARISON_OPTIONS[name]} {value:g}" for name, value in explanation.corrected.items()
     )
     return [
-        f"KF was run with {' and '.join(texts)} for this page: the wrong setting is corrected "
-        "first, and the steps explain the rest."
+        f"KF was run with {' and '.join(texts)} for this explanation: the wrong setting is "
+        "corrected first, and the steps explain the remaining difference KF - EKF2."
     ]
 
 
 def _format_share(step: Step, explanation: DifferenceExplanation) -> str:
     share = step.position_mean_square_m2 / explanation.position_mean_square_m2
-    if share > 1.0:  # shares of other steps are negative, because all shares add up to 100 %
-        return "more than the whole mean square; other steps reduce it"
-    return f"{100 * share:.0f} % of the mean square"
+    if share > 1.0:  # the fractions of all steps add up to 100 %, so other steps are negative
+        return "more than the whole mean square difference; other steps reduce it"
+    return f"{100 * share:.0f} % of the mean square difference"
 
 
 def _moment_text(step: Step) -> str:
-    return f"Largest effect at {step.moved_at_s:.1f} s ({step.position_moved_m:.2f} m)."
+    return f"Largest position effect: {step.position_moved_m:.2f} m at {step.moved_at_s:.1f} s."
 
 
 def _rejection_text(explanation: DifferenceExplanation) -> str:
-    """Format the longest run of rejected samples as a sentence; empty without one."""
     rejection_run = explanation.longest_rejection
     if rejection_run is None:
         return ""
@@ -243,7 +238,6 @@ def _rejection_text(explanation: DifferenceExplanation) -> str:
 def _step_reasons(
     comparison: Comparison, model: Model, clock: ClockOffset | Unavailable
 ) -> dict[str, str]:
-    """Format the behaviour of KF and EKF2 at each step."""
     settings, inputs, source = comparison.settings, model.inputs, comparison.source
     flown, aid = inputs.settings, inputs.aid
     samples_text = (
@@ -262,7 +256,7 @@ def _step_reasons(
         ends_s = (clock.offset_s, *clock.interval_s[::-1])
         ml_delay_ms, low, high = (1e3 * (source.age_s - at) for at in ends_s)
         delay_text += (
-            f". The maximum-likelihood estimate is {ml_delay_ms:.0f} ms "
+            f". The maximum-likelihood estimate of their age is {ml_delay_ms:.0f} ms "
             f"(95 % {low:.0f} to {high:.0f} ms)"
         )
     equivalent_sigma_a = flown["EKF2_ACC_NOISE"] * np.sqrt(inputs.step_s / settings.dt_s)
@@ -288,16 +282,16 @@ def _step_reasons(
         steps.FIELD_STEP: (
             "EKF2 estimates heading with the magnetometer; KF uses EKF2's published heading"
         ),
-        steps.VELOCITY_STEP: "EKF2 also fuses GNSS velocity; KF only GNSS position",
-        steps.FLOW_STEP: "EKF2 also fuses optical flow; KF only positions",
-        steps.VISION_STEP: "EKF2 fuses external vision and GNSS; KF only one of them",
+        steps.VELOCITY_STEP: "EKF2 also fuses GNSS velocity; KF uses GNSS position only",
+        steps.FLOW_STEP: "EKF2 also fuses optical flow; KF uses positions only",
+        steps.VISION_STEP: "EKF2 fuses external vision and GNSS; KF uses only one of them",
         steps.GATE: (
             f"EKF2 rejects {100 * model.agreement.rejected_fraction_logged:.1f} % of the samples; "
             "KF has no gate"
         ),
         steps.OUTPUT: (
-            f"EKF2 runs {1e3 * inputs.horizon_s:.0f} ms behind and predicts to the present with "
-            f"the IMU, smoothed with EKF2_TAU_POS {flown['EKF2_TAU_POS']:g} s; KF has no delay"
+            f"EKF2 fuses {1e3 * inputs.horizon_s:.0f} ms late and predicts to the present with the "
+            f"IMU, smoothed with EKF2_TAU_POS {flown['EKF2_TAU_POS']:g} s; KF has no delay"
         ),
     }
 
@@ -306,23 +300,20 @@ def _velocity_sentence(explanation: DifferenceExplanation) -> str:
     position, velocity = explanation.position_mean_square_m2, explanation.velocity_mean_square_m2_s2
     first = max(explanation.steps, key=lambda step: step.velocity_mean_square_m2_s2)
     share = first.velocity_mean_square_m2_s2 / velocity
-    # a step with a share above 1 compensates an earlier step, so it is not the largest contribution
-    largest = (
-        f" Largest contribution in velocity: {first.name} ({100 * share:.0f} %)."
-        if share <= 1.0
-        else ""
-    )
+    # a step with a fraction above 1 compensates an earlier step: it is not the largest contribution
+    largest = f" Largest contribution to the velocity: {first.name} ({100 * share:.0f} %)."
     velocity_left_share = explanation.unexplained_velocity_mean_square_m2_s2 / velocity
     return (
-        f"RMS difference KF - EKF2 over the replayed parts: {np.sqrt(position):.3f} m and "
-        f"{np.sqrt(velocity):.3f} m/s.{largest} Share of the mean square that the replay does not "
-        f"explain: {_unexplained_text(explanation.unexplained_fraction)} in position, "
+        f"RMS difference KF - EKF2 over the replayed times: {np.sqrt(position):.3f} m and "
+        f"{np.sqrt(velocity):.3f} m/s.{largest if share <= 1.0 else ''} Fraction of the mean "
+        "square that the replay does not explain: "
+        f"{_unexplained_text(explanation.unexplained_fraction)} in position, "
         f"{_unexplained_text(velocity_left_share)} in velocity."
     )
 
 
 def _unexplained_text(share: float) -> str:
-    """Format the unexplained share of a mean square; "all" above 1.
+    """Format the fraction of a mean square that the replay does not explain; "all" above 1.
 
     >>> _unexplained_text(0.0071), _unexplained_text(4.2)
     ('0.7 %', 'all')

@@ -1,10 +1,9 @@
 """Estimates of noises, time offset and frame misalignment from the data of a comparison.
 
-Innovations compare a filter with its source only. Odometry is smooth over seconds and drifts by
-metres within minutes. A filter that follows odometry closely has small innovations and a large
-error, so the innovations do not give the measurement noise. Scale and heading errors of odometry
-resemble a changing time offset. ``Origin.may_drift`` marks such sources; :func:`widen_for_drift`
-widens the interval of their time offset.
+Odometry is smooth over seconds and drifts by metres within minutes. A filter that follows odometry
+has small innovations and a large error, so innovations do not give the measurement noise of
+odometry (``Origin.may_drift``). Its scale and heading errors resemble a changing time offset, so
+:func:`widen_for_drift` widens the interval of the time offset.
 """
 
 from collections.abc import Callable, Mapping
@@ -31,17 +30,18 @@ from px4fuse.filter.time_offset import MAX_HALF_INTERVAL_S, ClockOffset, estimat
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
 from px4fuse.flight import Flight, Unavailable
 
-# Minimum IMU rate for a time offset
+# Minimum IMU rate (Hz) for an estimate of the time offset
 MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
-# Hz; rate of vehicle_imu (IMU_INTEG_RATE); telemetry with a lower rate skips samples
+# Minimum IMU rate (Hz) of telemetry: PX4 publishes vehicle_imu at 200 Hz (IMU_INTEG_RATE), and a
+# lower telemetry rate skips samples
 MIN_TELEMETRY_IMU_HZ = 200.0
-# Measured stream rates are up to 2 % below the nominal rate
+# Ratio of measured to nominal IMU rate that is sufficient: measured rates are up to 2 % lower
 CLOCK_RATE_MARGIN = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
-# s; a smaller step of the time offset may be drift of the source (0.1 m at 1 m/s, the noise of UWB)
+# Minimum change (s) of the time offset in flight; drift of the source may cause a smaller one
 MIN_CHANGE_S = 0.10
-# Minimum number of parts on each side of a step, from which the scatter is estimated
+# Minimum number of parts of the flight before and after a change of the time offset
 MIN_PARTS = 2
 
 # Axes of the noise estimates in a report; north and east have one estimate
@@ -84,12 +84,9 @@ def ignore_progress(_: str) -> None:
 
 
 def first_axis_tuning(tuning: Tuning, *names: str) -> AxisTuning | None:
-    """Return the tuning of the first name for which it is available."""
-    candidates = map(tuning.get, names)
-    return next(
-        (candidate for candidate in candidates if isinstance(candidate, AxisTuning)),
-        None,
-    )
+    """Return the noise estimate of the first axis name for which it is available."""
+    estimates = map(tuning.get, names)
+    return next((each for each in estimates if isinstance(each, AxisTuning)), None)
 
 
 def value_or_bound(noise: Noise, fallback: float) -> float:
@@ -118,7 +115,7 @@ def tuned(
     progress: Progress = ignore_progress,
     cache: SignalCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
-    """Estimate the noises of a comparison's axes; without biases if the IMU rate is too low.
+    """Estimate the noises along the axes, without IMU biases if the IMU rate is too low.
 
     Parameters
     ----------
@@ -126,7 +123,7 @@ def tuned(
     names : tuple of str, optional
         Axis names and "horizontal"; default: all.
     progress : callable
-        Called with the name of each step.
+        Called with the name of each estimate before it is computed.
     cache : dict, optional
         IMU signals to reuse, see :func:`px4fuse.filter.imu_motion.prepare_motion`.
     """
@@ -147,7 +144,7 @@ def estimate_noises_and_clock(
     progress: Progress = ignore_progress,
     names: tuple[str, ...] | None = (HORIZONTAL,),
 ) -> tuple[Tuning, ClockOffset | Unavailable]:
-    """Estimate the noises, and the time offset in addition to the applied one.
+    """Estimate the noises, and the remaining time offset between positions and IMU.
 
     Parameters are those of :func:`tuned`.
     """
@@ -261,7 +258,7 @@ def _horizontal_axes(
 
 
 def missing_imu_rate(flight: Flight) -> Unavailable | None:
-    """Return Unavailable if the IMU rate is too low for a time offset, else None.
+    """Return Unavailable if the IMU rate is too low to estimate a time offset, else None.
 
     A sample in a ULog is the mean over its interval. A telemetry message contains only the newest
     of several samples, minus EKF2's bias estimate (``HIGHRES_IMU.hpp``), which depends on the
@@ -276,14 +273,16 @@ def missing_imu_rate(flight: Flight) -> Unavailable | None:
     if rate_hz >= CLOCK_RATE_MARGIN * needed_hz:
         return None
     rate_text = f"{rate_hz:.{1 if rate_hz < 10 else 0}f} Hz"
-    rate_note = f"was logged at {rate_text}"
+    rate_note = f"the IMU was logged at {rate_text}"
     remedy = "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate."
     if is_telemetry:
-        rate_note = f"was received over telemetry at {rate_text}, decimated from a higher rate"
-        remedy = f"Have the IMU sent at {needed_hz:g} Hz."
+        rate_note = (
+            f"the IMU was received over telemetry at {rate_text}, decimated from a higher rate"
+        )
+        remedy = f"Request the IMU message at {needed_hz:g} Hz."
         if flight.log.has_ulog:
             remedy = "Give the ULog of the same flight as LOG, and this recording with --mavlink."
-    reason = f"the IMU {rate_note}; at least {needed_hz:g} Hz needed"
+    reason = f"{rate_note}; at least {needed_hz:g} Hz are needed"
     return Unavailable("clock offset", reason, remedy)
 
 
@@ -291,9 +290,8 @@ def widen_for_drift(clock: ClockOffset) -> ClockOffset:
     """Widen the interval of a time offset for a source that may drift.
 
     Scale errors, heading errors and drift of odometry change the estimated offset of each part of
-    the flight by more than the noise. The scatter of the parts about their mean measures these
-    errors and widens the interval. Only a significant step of at least ``MIN_CHANGE_S`` counts as a
-    change of the clock.
+    the flight by more than the noise, so their scatter widens the interval. The time offset changes
+    in flight only if it has a significant step of at least ``MIN_CHANGE_S``.
     """
     offset = np.array([part.offset_s for part in clock.parts])
     weight = np.array([part.sigma_s**-2.0 for part in clock.parts])
@@ -306,7 +304,7 @@ def widen_for_drift(clock: ClockOffset) -> ClockOffset:
     reason = clock.reason
     if not reason and (high - low) / 2.0 > MAX_HALF_INTERVAL_S:
         reason = (
-            "the offset differs between parts of the flight by more than noise, as for "
+            "the time offset differs between parts of the flight by more than noise, as for "
             f"a drifting source: possible range {low:+.2f} s to {high:+.2f} s"
         )
     return structs.replace(
@@ -322,16 +320,14 @@ def widen_for_drift(clock: ClockOffset) -> ClockOffset:
 
 
 def _weighted_square_sum(offset: Array, weight: Array) -> float:
-    """Return Σ w (x - weighted mean)²."""
     return float(np.sum(weight * (offset - np.average(offset, weights=weight)) ** 2))
 
 
 def _largest_step_p_value(offset: Array, weight: Array) -> float | None:
-    """Return the p-value of the largest step between parts, or None for too few parts.
+    """Return the p-value of the largest step of the offset in flight; None for too few parts.
 
-    Student's t-test of the weighted means before and after the step, with the scatter within both
-    sides. The p-value is multiplied by the number of tested steps (Bonferroni), and is 1 for a step
-    below ``MIN_CHANGE_S``.
+    Student's t-test of the weighted mean offsets before and after each step. The p-value is
+    multiplied by the number of tested steps (Bonferroni), and 1 for steps below ``MIN_CHANGE_S``.
     """
     count = len(offset)
     split_rows = range(MIN_PARTS, count - MIN_PARTS + 1)

@@ -1,4 +1,4 @@
-"""Events of a flight (gaps, rejections, resets, modes) for the time axes of all pages."""
+"""Events of a flight (gaps, rejections, resets, flight modes) for the time axes of all charts."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,11 +8,11 @@ import pandas as pd
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import Comparison
-from px4fuse.flight import Ekf2, FlightMode, Unavailable
+from px4fuse.flight import Ekf2, Flight, FlightMode, Unavailable
 from px4fuse.record import Span
 
-# Minimum length of a gap, in s and in intervals of the source; jitter and single lost samples are
-# shorter
+# Minimum length of a gap in the position source, in s and in intervals of the source; jitter and
+# single lost positions are shorter
 MIN_GAP_S = 1.0
 MIN_GAP_INTERVALS = 5.0
 
@@ -31,7 +31,7 @@ class Events:
         Spans on the ground, from the land detector.
     take_off_s, landing_s : tuple of float
     modes : tuple of FlightMode
-        Empty if not logged.
+        Flight modes of PX4; empty if not logged.
     resets_s : tuple of float
         Times of resets of EKF2's position or velocity.
     rejected_s : mapping from axis name to ndarray
@@ -49,7 +49,7 @@ class Events:
 
 
 def max_interval_s(interval_s: float) -> float:
-    """Return the longest interval (s) that is not a gap, for a median interval (s)."""
+    """Return the longest interval (s) between positions that is not a gap, from their median."""
     return max(MIN_GAP_S, MIN_GAP_INTERVALS * interval_s)
 
 
@@ -67,14 +67,18 @@ def source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
     return tuple(zip(time_s[:-1][is_gap].tolist(), time_s[1:][is_gap].tolist(), strict=True))
 
 
+def airborne_spans(flight: Flight) -> tuple[Span, ...]:
+    """Return the spans (s) in the air; empty without land detector."""
+    return () if isinstance(flight.airborne, Unavailable) else flight.airborne
+
+
 def collect_events(comparison: Comparison) -> Events:
     """Collect the events in the segment of a comparison."""
     flight, segment = comparison.flight, comparison.segment
     low, high = segment.start_s, segment.end_s
 
-    airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
+    airborne = airborne_spans(flight)
     edges = [low, *(time for span in airborne for time in span), high]
-    is_known = not isinstance(flight.airborne, Unavailable)
     modes = () if isinstance(flight.modes, Unavailable) else flight.modes
     resets = flight.ekf2.resets if isinstance(flight.ekf2, Ekf2) else ()
     return Events(
@@ -83,7 +87,9 @@ def collect_events(comparison: Comparison) -> Events:
             (dropout.start_s, dropout.start_s + dropout.duration_s)
             for dropout in flight.log.dropouts
         ),
-        ground=segment.cut(zip(edges[::2], edges[1::2], strict=True)) if is_known else (),
+        ground=()
+        if isinstance(flight.airborne, Unavailable)
+        else segment.cut(zip(edges[::2], edges[1::2], strict=True)),
         take_off_s=tuple(start for start, _ in airborne if low <= start <= high),
         landing_s=tuple(end for _, end in airborne if low <= end <= high),
         modes=tuple(

@@ -1,4 +1,4 @@
-"""Records of a comparison, by axis and by filter, with the tracks behind them."""
+"""Records of a comparison, by axis and by filter, with the tracks that were compared."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -30,11 +30,10 @@ FILTERS: tuple[FilterName, FilterName] = ("kf", "ekf2")
 
 
 class ErrorsAgainstTruth(Record, frozen=True, kw_only=True):
-    """Errors of one filter against ground truth, which no filter used.
+    """Errors of one filter against ground truth, at the times of EKF2's published state.
 
-    NEES is per component (expected 1), of the same samples as the errors: at the times of EKF2's
-    published state. It has no chi-square band, because errors are correlated within one flight.
-    None if the variance or the true velocity is not available.
+    The mean NEES is per axis (expected 1), and None without a variance or true velocity. It has no
+    chi-square band, because the errors of one flight are correlated.
     """
 
     count: Count
@@ -64,7 +63,7 @@ class FilterSummary(Consistency, frozen=True, kw_only=True):
 
 
 class UntestedFilter(Unavailable, frozen=True, kw_only=True):
-    """:class:`FilterSummary` with the reason instead of a consistency result."""
+    """:class:`FilterSummary` with the reason for the missing consistency test."""
 
     sigma_p_median_m: Positive | None = None
     sigma_v_median_m_s: Positive | None = None
@@ -74,7 +73,7 @@ class UntestedFilter(Unavailable, frozen=True, kw_only=True):
 
 
 class Difference(Record, frozen=True, kw_only=True):
-    """Difference KF - EKF2 at EKF2's sample times."""
+    """Difference KF - EKF2 along one axis, at EKF2's sample times."""
 
     count: Count
     position_rms_m: NotNegative
@@ -86,7 +85,7 @@ class Difference(Record, frozen=True, kw_only=True):
 
 
 class Updates(Record, frozen=True, kw_only=True):
-    """Statistics of the measurements of one axis; ``input_gap_s``: total time without IMU data."""
+    """Number and times of KF's updates along one axis; ``input_gap_s``: time without IMU data."""
 
     count: Count
     first_s: float
@@ -105,12 +104,12 @@ class AxisResult(Record, frozen=True, kw_only=True):
     direction : (float, float, float)
         Unit vector in NED.
     note : str
-        Origin of the direction.
+        Origin of the direction, for the user.
     updates : Updates
     filters : mapping from "kf" and "ekf2" to FilterSummary or UntestedFilter
     difference : Difference or Unavailable
     rejected_fraction : float or None
-        Share of the source's samples that EKF2 rejected; None if not logged.
+        Fraction of the positions that EKF2 rejected; None if not logged.
     """
 
     heading_deg: float | None = None
@@ -130,7 +129,7 @@ class AxisComparison(AxisResult, frozen=True, kw_only=True, eq=False):
     axis : Axis
     replay : Replay
     ekf2_state : DataFrame or Unavailable
-        ``position_m, velocity_m_s`` in the segment, after the treatment of resets.
+        ``position_m, velocity_m_s`` in the segment, without the removed resets.
     ekf2_variance : DataFrame or Unavailable
         ``position_variance_m2, velocity_variance_m2_s2`` in the segment.
     ekf2_innovations : DataFrame or Unavailable
@@ -203,5 +202,10 @@ class Comparison:
 
     @property
     def main(self) -> AxisComparison:
-        """Main axis: the aisle, else the first."""
+        """Result along the main axis: the aisle, else the first axis."""
         return self.axes.get(AISLE) or next(iter(self.axes.values()))
+
+
+def north_and_east(comparison: Comparison) -> list[AxisComparison]:
+    """Return the results along north and east, if these axes were analysed."""
+    return [comparison.axes[name] for name in ("north", "east") if name in comparison.axes]

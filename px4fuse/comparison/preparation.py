@@ -1,4 +1,4 @@
-"""Choice of source, segment and axes of a comparison, before any filter runs."""
+"""Choice of position source, segment and axes of a comparison, before any filter runs."""
 
 from dataclasses import replace
 from typing import TypedDict, Unpack
@@ -26,20 +26,20 @@ from px4fuse.request import HeightName
 from px4fuse.text import capitalise_first
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
-# Origins of external positions by their PX4 topic or MAVLink message
+# Origins of position sources by their PX4 topic or MAVLink message
 LOGGED_ORIGINS = TOPIC_ORIGINS | {source.name: source.origin for source in POSITION_INPUTS}
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
-    "the position source is the only reference in the log, and KF uses it as its input",
-    "Choose another --position-source; this one is then used as ground truth.",
+    "KF uses the only ground truth of the log as its position source",
+    "Choose another --position-source, then this source is the ground truth.",
 )
-# Default axes of GNSS, without down: GNSS height is much noisier than GNSS position, and SIGMA_Z is
+# Default axes with GNSS as source; without down, because GNSS height is much noisier and SIGMA_Z is
 # one number for all axes
 GNSS_AXES = (AISLE, "north", "east")
 
 
 class Choices(TypedDict, total=False):
-    """Optional choices for a comparison.
+    """Optional arguments of :func:`prepare`.
 
     Attributes
     ----------
@@ -55,11 +55,11 @@ class Choices(TypedDict, total=False):
     height : {"gnss", "barometer"}
         Height source of "down" with GNSS; default: the one that EKF2 fused, GNSS first.
     start_s, end_s : float
-        Segment, seconds from the first data.
+        Start and end of the segment, seconds from the first data.
     input_required : bool
-        Raise SettingsError instead of using ``input="zero"`` if the log has no acceleration.
+        True: raise SettingsError if the log has no acceleration, instead of ``input="zero"``.
     sigma_z_given : bool
-        Default True. If False, SIGMA_Z of GNSS is EKF2's median √R, if known.
+        Default True. If False, SIGMA_Z of GNSS is EKF2's median √R, if logged.
     """
 
     axes: tuple[str, ...] | None
@@ -78,7 +78,7 @@ def prepare(
     settings: Settings | None = None,
     **choices: Unpack[Choices],
 ) -> Comparison:
-    """Choose the source, the segment and the axes.
+    """Choose position source, segment and axes of a comparison.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def prepare(
     acceleration = lines[0].acceleration
     if settings.input == "imu" and isinstance(acceleration, Unavailable):
         if choices.get("input_required"):
-            raise SettingsError(f"{flight.log.name}: `input` imu: {acceleration}")
+            raise SettingsError(f"{flight.log.name}: `input` imu is not possible: {acceleration}")
         settings = replace(settings, input="zero")
         notes += (f"no acceleration input ({acceleration.reason}): KF assumes constant velocity",)
         missing += () if acceleration in missing else (acceleration,)
@@ -129,22 +129,21 @@ def select_innovations(flight: Flight, track: PositionTrack) -> Flight:
     """Return the flight with EKF2's GNSS innovations if GNSS is the source, else unchanged."""
     if isinstance(flight.ekf2, Unavailable) or not track.origin.fused_as_gnss:
         return flight
-    # the comparison does not need missing data of other sources, so they are not listed
-    missing_of_vision, streams = _missing_of_vision(flight.ekf2), dict(flight.streams)
+    # missing innovations of external vision and missing other sources are not relevant with GNSS
+    missing_vision, streams = _missing_innovations(flight.ekf2), dict(flight.streams)
     ekf2 = with_gnss_innovations(
         flight.ekf2, GNSS if track.barometer is None else GNSS_AND_BAROMETER
     )
     missing = tuple(
-        part for part in flight.missing if not part.source and part not in missing_of_vision
+        item for item in flight.missing if not item.source and item not in missing_vision
     )
     if "ekf2_state" in streams and ekf2.aids:
         streams["ekf2_innovations"] = replace(streams["ekf2_state"], topics=ekf2.innovation_topics)
-    return replace(flight, ekf2=ekf2, streams=streams, missing=missing + _missing_of_vision(ekf2))
+    return replace(flight, ekf2=ekf2, streams=streams, missing=missing + _missing_innovations(ekf2))
 
 
-def _missing_of_vision(ekf2: Ekf2) -> tuple[Unavailable, ...]:
-    """Return the reasons for missing EKF2 innovations."""
-    return tuple(part for part in ekf2.innovations.values() if isinstance(part, Unavailable))
+def _missing_innovations(ekf2: Ekf2) -> tuple[Unavailable, ...]:
+    return tuple(item for item in ekf2.innovations.values() if isinstance(item, Unavailable))
 
 
 def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrack, str]:
@@ -154,18 +153,18 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     ----------
     flight : Flight
     name : str, optional
-        Name of a track; default: the most direct one, and GNSS only if EKF2 fused it.
+        Name of a position track; default: the most direct one, GNSS only if EKF2 fused it.
 
     Returns
     -------
     track : PositionTrack
     reason : str
-        Reason for the choice, for the output.
+        Reason for the choice, for the user.
 
     Raises
     ------
     MissingDataError
-        The log has no track, or none of this name.
+        The log has no position track, or none of this name.
     """
     if name is None:
         for track in flight.positions:
@@ -180,12 +179,12 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     reasons = {missing.source: missing.reason for missing in flight.missing}
     raise MissingDataError(
         f"{flight.log.name}: position source {name}: {reasons.get(name, 'no such source')}",
-        f"{suggest_name(name, names)}This log has: {', '.join(names) or 'none'}.",
+        f"{suggest_name(name, names)}Sources in this log: {', '.join(names) or 'none'}.",
     )
 
 
 def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
-    """Subtract the lever arm of the sensor (EKF2 parameters) from the positions."""
+    """Subtract the lever arm of the sensor, from EKF2 parameters, from the positions."""
     attitude = flight.attitude
     if not any(track.lever_arm_m) or isinstance(attitude, Unavailable) or track.frame != "NED":
         return track
@@ -207,14 +206,14 @@ def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
 def _use_barometer_height(
     track: PositionTrack, flight: Flight, height_name: HeightName | None
 ) -> PositionTrack:
-    """Replace the track's height by that of the barometer if requested or if EKF2 fused it.
+    """Replace the height of a track by the barometer height, if requested or fused by EKF2.
 
-    A barometer has no absolute zero: its zero is set to EKF2's height by the median difference.
+    A barometer has no absolute zero, so the median difference to EKF2's height is removed.
     """
     ekf2, heights, log_name = flight.ekf2, flight.barometer, flight.log.name
     if height_name and not track.origin.fused_as_gnss:
         raise SettingsError(
-            f"{log_name}: `height` needs a GNSS position; this one is {track.name}."
+            f"{log_name}: `height` needs GNSS as position source, not {track.name}."
         )
     is_fused_by_ekf2 = fused_aid(ekf2, BAROMETER.name) and not fused_aid(ekf2, GNSS.vertical)
     uses_barometer = height_name == "barometer" or (
@@ -224,25 +223,25 @@ def _use_barometer_height(
         if height_name == "barometer":
             raise MissingDataError(f"{log_name}: no barometer height in the log.", GNSS.to_log)
         return track
-    zero_m, zero_text = heights["down_m"].iloc[0], "its first height"
+    zero_m, zero_text = heights["down_m"].iloc[0], "the first barometer height"
     if isinstance(ekf2, Ekf2):
         ekf2_down_m = np.interp(
             heights.index, ekf2.state.index, ekf2.state["down_m"], np.nan, np.nan
         )
-        offset_m = (
-            float(np.nanmedian(heights["down_m"] - ekf2_down_m))
-            if np.isfinite(ekf2_down_m).any()
-            else zero_m
-        )
-        zero_m, zero_text = offset_m, "the median of EKF2's height"
+        if np.isfinite(ekf2_down_m).any():
+            zero_m = float(np.nanmedian(heights["down_m"] - ekf2_down_m))
+        zero_text = "the median of EKF2's height"
     note = f"the down axis uses the barometer, with its zero set to {zero_text}"
-    description = f"{track.description}, barometer height"
-    notes = (*track.notes, note)
-    return replace(track, barometer=heights - zero_m, description=description, notes=notes)
+    return replace(
+        track,
+        barometer=heights - zero_m,
+        description=f"{track.description}, barometer height",
+        notes=(*track.notes, note),
+    )
 
 
 def explain_missing_source(flight: Flight) -> Unavailable:
-    """Return the reason why no track is a position source by default, and the remedy."""
+    """Return the reason why the log has no default position source, and the action."""
     damaged = "the file is damaged, and " if flight.log.damage else ""
     unused_track = next(
         (track.name for track in flight.positions if not track.origin.is_automatic), ""
@@ -274,10 +273,10 @@ def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
         return "fused by EKF2; the only position in the log"
     origin_text = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
     better_sources = [
-        part.source
-        for part in flight.missing
-        if part.source in LOGGED_ORIGINS
-        and LOGGED_ORIGINS[part.source].preference < track.origin.preference
+        missing.source
+        for missing in flight.missing
+        if missing.source in LOGGED_ORIGINS
+        and LOGGED_ORIGINS[missing.source].preference < track.origin.preference
     ]
     if not better_sources:
         return f"most direct source: as received by PX4{origin_text}"
@@ -299,14 +298,14 @@ def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
 def choose_segment(
     flight: Flight, track: PositionTrack, start_s: float | None = None, end_s: float | None = None
 ) -> Segment:
-    """Choose the part of the log to analyse: source available and vehicle airborne.
+    """Choose the segment to analyse: position source available and vehicle airborne.
 
     Parameters
     ----------
     flight : Flight
     track : PositionTrack
     start_s, end_s : float, optional
-        Chosen start and end (seconds from the first data); None: automatic.
+        Start and end that the user chose (seconds from the first data); None: automatic.
 
     Raises
     ------
@@ -327,8 +326,7 @@ def choose_segment(
     if start_s is not None or end_s is not None:
         low, high = low if start_s is None else start_s, high if end_s is None else end_s
         options = {"--start": start_s, "--end": end_s}
-        option_names = [text for text, value in options.items() if value is not None]
-        reason = f"chosen with {' and '.join(option_names)}"
+        reason = f"chosen with {' and '.join(o for o, s in options.items() if s is not None)}"
         clipped_s = max(low, 0.0), min(high, flight.log.duration_s)
         if clipped_s != (low, high) and clipped_s[0] < clipped_s[1]:
             low, high = clipped_s

@@ -1,4 +1,4 @@
-"""EKF2 and ground truth along one axis: resets, variances and innovations."""
+"""Projection of EKF2 and ground truth onto one axis, and removal of EKF2 resets."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -21,10 +21,11 @@ from px4fuse.flight import (
     Unavailable,
 )
 
-# m; lower limit of EKF2's measurement noise (ev_pos_control.cpp, EKF2.cpp)
+# Minimum measurement noise √R (m) that EKF2 uses (ev_pos_control.cpp, EKF2.cpp)
 EKF2_MIN_NOISE_M = 0.01
 # EKF2's factor from GNSS position noise to height noise, in σ (gnss_height_control.cpp)
 GNSS_HEIGHT_SCALE = 1.5
+# Minimum number of samples that two tracks have in common for statistics of their difference
 MIN_COMMON_SAMPLES = 3
 # Projected quantity: its NED columns, and the power of the direction that weights them
 PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
@@ -33,8 +34,8 @@ PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_variance_m2": (Columns.POSITION_VARIANCE, 2),
     "velocity_variance_m2_s2": (Columns.VELOCITY_VARIANCE, 2),
 }
-# Resets are removed only if the removal reduces EKF2's median squared distance to the measurements
-# to less than this share; otherwise the published output, which controlled the vehicle, is kept
+# Maximum ratio of EKF2's median squared distance to the measurements without and with its resets,
+# for their removal; otherwise the published state, which controlled the vehicle, is kept
 MAX_DISTANCE_RATIO = 0.95
 
 
@@ -44,16 +45,15 @@ def continuous_state(
     """Remove resets from EKF2's state if they change its frame.
 
     A reset that changes EKF2's frame must be removed before positions are compared. A reset that
-    moves EKF2 back to the measurements corrects an error; without this reset, the rest of the
-    flight would have that error. Resets are removed if the removal clearly reduces the median
-    distance to the measurements.
+    moves EKF2 back to the measurements corrects an error and is kept. Resets change the frame if
+    their removal clearly reduces the median distance to the measurements.
 
     Returns
     -------
     state : DataFrame
         Position and velocity as in :attr:`Ekf2.state`.
     statement : str
-        Resets removed and kept, for the notes; empty without a reset in the segment.
+        Clause on removed and kept resets; empty without a reset in the segment.
     """
     resets_inside = [r for r in ekf2.resets if segment.start_s < r.time_s <= segment.end_s]
     state = ekf2.state.copy() if resets_inside else ekf2.state
@@ -95,11 +95,11 @@ def continuous_state(
 def _continuous_candidates(
     published: pd.DataFrame, resets: list[Reset], axes: list[int]
 ) -> Iterator[pd.DataFrame]:
-    """Yield the continuous position in the frame of each stretch between resets."""
+    """Yield the position without resets, in the frame of each time span between resets."""
     deltas = np.array([reset.delta for reset in resets])[:, axes]
     is_after = np.array([published.index >= reset.time_s for reset in resets]).T
     for earlier_count in range(len(resets) + 1):
-        # in the frame of this stretch: add the resets before it, subtract those after it
+        # in the frame of this time span: add the resets before it, subtract those after it
         shift_m = (~is_after[:, :earlier_count]) @ deltas[:earlier_count] - is_after[
             :, earlier_count:
         ] @ deltas[earlier_count:]
@@ -107,7 +107,6 @@ def _continuous_candidates(
 
 
 def _median_square_distance(samples: pd.DataFrame, state: pd.DataFrame) -> float:
-    """Return the median squared distance (m²) between state and samples."""
     squared = np.zeros(len(samples))
     for column in samples:
         squared += (np.interp(samples.index, state.index, state[column]) - samples[column]) ** 2
@@ -126,7 +125,7 @@ def project(frame: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
 
 
 def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | Unavailable:
-    """Project EKF2's variances onto the axis, without cross-covariances (not logged)."""
+    """Project EKF2's variances onto the axis; EKF2 logs no cross-covariances."""
     if isinstance(ekf2.variance, Unavailable):
         return ekf2.variance
     projected = project(ekf2.variance, axis, segment)
@@ -138,13 +137,12 @@ def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame |
 
 
 def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | None:
-    """Return EKF2's position (m) at the fusion horizon with its variance (m²), or None.
+    """Return EKF2's position (m) at the fusion horizon with its variance (m²); None if not logged.
 
-    The output predictor propagates this position to the present and lags; the variance does not
-    include that lag, so the published position does not match the variance. With external vision,
-    the position before the update is observation minus innovation, and its variance P⁻ = S - R.
-    Before v1.16 the log also contains the delayed state. EKF2 logs no covariance between axes, so
-    none is added.
+    The published position does not match the variance: the output predictor propagates it from the
+    fusion horizon to the present, and lags. With external vision, the position before an update is
+    observation minus innovation, and its variance P⁻ = S - R. Before v1.16 the log also contains
+    the state at the fusion horizon. EKF2 logs no covariance between axes, so none is included.
     """
     weights = dict(zip(AXIS_NAMES, axis.direction.tolist(), strict=True))
     aid = ekf2.aids.get("ev_hgt" if axis.name == "down" else "ev_pos")
@@ -169,10 +167,10 @@ def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | 
 def project_innovations(
     flight: Flight, ekf2: Ekf2, track: PositionTrack, axis: Axis, segment: Segment
 ) -> pd.DataFrame | Unavailable:
-    """Project EKF2's innovations onto the axis, with P before and after each update.
+    """Project EKF2's innovations onto the axis, with the position variance at each update.
 
     Columns as :attr:`Ekf2.innovations` plus ``prior_variance_m2`` (P⁻ = S - R) and
-    ``posterior_variance_m2`` (P⁺ = P⁻R/S, or P⁻ where rejected), NaN where R is unknown.
+    ``posterior_variance_m2`` (P⁺ = P⁻R/S; P⁻ if rejected), NaN if R is unknown.
     """
     if track.aid(axis.name) is None:
         return Unavailable(
@@ -182,8 +180,7 @@ def project_innovations(
         )
     frames = []
     for name in ("north", "east") if axis.name == AISLE else (axis.name,):
-        frame = next(frame for key, frame in ekf2.innovations.items() if key == name)
-        if isinstance(frame, Unavailable):
+        if isinstance(frame := ekf2.innovations[name], Unavailable):
             return frame
         frames.append(frame)
     rows = cut_to_segment(frames[0], segment).copy()
@@ -202,7 +199,7 @@ def project_innovations(
     )
     rows["observation_variance_m2"] = noise_variance
     rows["prior_variance_m2"] = prior_variance
-    # a rejected sample does not change P
+    # a rejected position does not change P
     rows["posterior_variance_m2"] = (prior_variance * noise_variance / innovation_variance).where(
         ~(rows["rejected"] > 0), prior_variance
     )
@@ -214,10 +211,10 @@ def _innovations_along(north: pd.DataFrame, east: pd.DataFrame, direction: Array
     common = north.index.intersection(east.index)
     n, e = north.loc[common], east.loc[common]
     c, s = float(direction[0]), float(direction[1])
-    projected = c * c * n + s * s * e  # correct for variances only; the other columns follow
+    projected = c * c * n + s * s * e  # variances; the other columns are replaced below
     projected["innovation_m"] = c * n["innovation_m"] + s * e["innovation_m"]
     for column in ("test_ratio", "fused", "rejected"):
-        # the larger value of both axes, because PX4 rejects both together
+        # the larger value of both axes, because EKF2 fuses and rejects both together
         projected[column] = np.fmax(n[column], e[column])
     return projected
 
@@ -229,9 +226,9 @@ def observation_variance(
     segment: Segment,
     default_noise_m: float = math.nan,
 ) -> float:
-    """Return the R (m²) that EKF2 used for the source if it is not logged; NaN if unknown.
+    """Compute the R (m²) that EKF2 used for the position source; NaN if unknown.
 
-    ``default_noise_m`` replaces EKF2's noise parameter if that is not in the log.
+    ``default_noise_m`` replaces EKF2's noise parameter if the parameter is not in the log.
 
     External vision: R = EKF2_EVP_NOISE², or the sender's variance if larger and EKF2_EV_NOISE_MD
     is not 1 (EKF2.cpp, ev_pos_control.cpp). GNSS: EKF2_GPS_P_NOISE², for height 1.5 times in σ, or
@@ -246,7 +243,7 @@ def observation_variance(
         return math.nan
     scale = GNSS_HEIGHT_SCALE if aid == GNSS_POS and axis.name == "down" else 1.0
     r = max(scale * noise_m, EKF2_MIN_NOISE_M) ** 2
-    # the variance in a position file was not sent to EKF2
+    # EKF2 did not receive the variance in a position file
     ignores_reported = track.alignment is not None or aid == BAROMETER
     if ignores_reported or parameters.get(aid.noise_mode) == 1.0:
         return r

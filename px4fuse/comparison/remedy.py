@@ -1,4 +1,4 @@
-"""Maximum-likelihood parameters of EKF2, and the aid that fuses a source."""
+"""EKF2 parameters that agree with the estimated noise and delay of the position source."""
 
 import math
 from collections.abc import Mapping
@@ -15,11 +15,11 @@ from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight import Unavailable
 
-# Minimum ratio of √R to EKF2_EVP_NOISE from which R counts as reported by the sender
+# Minimum ratio of √R to EKF2_EVP_NOISE with which R is the variance that the sender reports
 MIN_REPORTED_RATIO = 1.25
-# ms; one prediction step of EKF2 (EKF2_PREDICT_US), and transmission time of a message
+# Prediction step of EKF2 (ms, EKF2_PREDICT_US), and transmission time of a position message (ms)
 PREDICTION_STEP_MS, TRANSMISSION_MS = 10.0, 30.0
-# ms; EKF2_DELAY_MAX is rounded up to a multiple
+# Multiple (ms) to which EKF2_DELAY_MAX is rounded up
 DELAY_MAX_STEP_MS = 50.0
 
 
@@ -43,17 +43,14 @@ def ml_ekf2_parameters(
     -------
     dict
         Empty without an estimate or if EKF2 did not fuse the analysed source. The delay is included
-        only if the flown value is outside its interval. For GNSS and drifting sources the noise is
-        included only if EKF2 uses less than the short-term noise: innovations do not show the slow
-        errors of these sources.
+        only if the flown value is outside its 95 % interval. For GNSS and drifting sources the
+        noise is included only if EKF2 uses a smaller one: innovations do not show slow errors.
     """
     if not is_fused_source(comparison, model.inputs):
         return {}
     changes: dict[str, float] = {}
-    axis_tuning, used_m = (
-        first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east"),
-        noise_used_m(model),
-    )
+    axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
+    used_m = noise_used_m(model)
     noise_m = None if axis_tuning is None else axis_tuning.sigma_z.value
     has_slow_errors = comparison.source.origin.may_drift or comparison.source.origin.is_gnss
     if noise_m is not None and not (has_slow_errors and noise_m <= used_m):
@@ -70,7 +67,7 @@ def is_fused_source(comparison: Comparison, inputs: Inputs) -> bool:
 def ml_delay_change(
     comparison: Comparison, inputs: Inputs, clock: ClockOffset | Unavailable
 ) -> dict[str, float]:
-    """Return EKF2's maximum-likelihood delay; empty without an estimate or change."""
+    """Return EKF2's estimated delay as a parameter change; empty if not significant."""
     if isinstance(clock, Unavailable) or not clock.is_determinable:
         return {}
     age_s, flown = comparison.source.age_s, inputs.settings[inputs.aid.delay]
@@ -81,12 +78,12 @@ def ml_delay_change(
 
 
 def aid_of(comparison: Comparison, axis: str = "") -> Aid:
-    """Return the aid as which EKF2 fuses the source along an axis."""
+    """Return the aiding source as which EKF2 fuses the positions along an axis."""
     return comparison.source.aid(axis) or EV_POS
 
 
 def delay_ms(comparison: Comparison) -> float | None:
-    """Return the age of positions (ms, relative to their timestamps) that EKF2 assumes.
+    """Return the position age (ms) that EKF2 subtracts from the timestamps.
 
     None if the parameter is not logged, EKF2 never fuses the source, or the receiver reports
     measurement times.
@@ -105,10 +102,9 @@ def delay_ms(comparison: Comparison) -> float | None:
 def noise_change(
     aid: Aid, settings: Mapping[str, float], used_m: float, noise_m: float
 ) -> dict[str, float]:
-    """Return the parameters that set EKF2's position noise to ``noise_m``.
+    """Return the EKF2 parameters for a position noise ``noise_m``, rounded to two digits.
 
-    The value has two digits and is within PX4's range. ``settings`` and ``used_m`` (median √R) are
-    the parameters and the noise as flown.
+    ``settings`` and ``used_m`` (median √R) are the parameters and the noise as flown.
     """
     changes = {aid.noise: max(float(f"{noise_m:.2g}"), PARAMETERS[aid.noise].minimum)}
     is_reported = used_m > MIN_REPORTED_RATIO * settings.get(aid.noise, math.inf)
@@ -119,10 +115,9 @@ def noise_change(
 
 
 def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
-    """Return the parameters that set the position age that EKF2 assumes to ``delay_ms``.
+    """Return the EKF2 parameters for a position delay ``delay_ms``, for early timestamps 0.
 
-    Empty if the delay exceeds PX4's range or EKF2 uses the measurement times of the source. For
-    early timestamps the delay is 0.
+    Empty if the delay exceeds PX4's range or EKF2 uses the measurement times of the source.
     """
     delay = inputs.aid.delay
     parameter = PARAMETERS[delay]
@@ -136,13 +131,13 @@ def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
 
 
 def noise_used_m(model: Model) -> float:
-    """Return the median √R (m) of EKF2 as flown."""
+    """Return the median √R (m) of the position source that EKF2 used as flown."""
     updates = model.flown.updates
     columns = ["observation_variance_north_m2", "observation_variance_east_m2"]
     return float(np.sqrt(np.median(updates[columns].to_numpy())))
 
 
 def format_settings(changes: Mapping[str, float]) -> str:
-    """Format parameters with the values to set: "EKF2_EV_DELAY to 264 ms and ..."."""
+    """Format EKF2 parameters with their new values, for example "EKF2_EV_DELAY to 264 ms"."""
     texts = (f"{name} to {value:.3g} {PARAMETERS[name].unit}" for name, value in changes.items())
     return " and ".join(map(str.rstrip, texts))

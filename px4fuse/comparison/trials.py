@@ -1,7 +1,4 @@
-"""Re-runs of a filter along the main axis, and which numbers they improve.
-
-The re-runs are made by :mod:`px4fuse.comparison.causal_replays`.
-"""
+"""Re-runs of a filter along the main axis with a change, and the statistics that they improve."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -14,14 +11,15 @@ from px4fuse.record import Count, NotNegative, Positive, Record, Share
 Statistic = Literal["nis", "nees", "difference"]
 Change = Mapping[str, float]
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
-# A re-run that changes ratios and error by less has no effect
+# Minimum factor on a σ ratio, or relative change of the position RMSE, for a re-run to have an
+# effect
 MIN_RATIO_CHANGE, MIN_RMSE_CHANGE = 1.10, 0.05
-# Reduction of the position RMSE from which a re-run improves the position
+# Minimum relative reduction of the position RMSE for a re-run to improve the position
 POSITION_IMPROVEMENT = 0.20
 
 
-class Outcome(Record, frozen=True, kw_only=True):
-    """Statistics of one filter along one axis in one run.
+class RunStatistics(Record, frozen=True, kw_only=True):
+    """Statistics of one filter along one axis in one run (flown, or re-run with a change).
 
     Attributes
     ----------
@@ -32,7 +30,7 @@ class Outcome(Record, frozen=True, kw_only=True):
     difference_rms_m : float or None
         RMS of KF - EKF2 in position.
     rejected_fraction : float or None
-        Of EKF2; None for KF, which has no gate.
+        Fraction of positions that EKF2 rejected; None for KF, which has no gate.
     """
 
     innovations: Count = 0
@@ -43,7 +41,7 @@ class Outcome(Record, frozen=True, kw_only=True):
     rejected_fraction: Share | None = None
 
     def value(self, statistic: Statistic) -> float | None:
-        """Return one of the three statistics."""
+        """Return the mean NIS, mean NEES or RMS difference KF - EKF2."""
         return {
             "nis": self.nis_mean,
             "nees": self.nees_mean,
@@ -58,40 +56,40 @@ class Trial(Record, frozen=True, kw_only=True):
     ----------
     filter : {"kf", "ekf2"}
     kinds : tuple of str
-        Kind of each change: noises, defaults, outliers, time offset, delay, rotation, bias, noise,
-        gate or process noise.
+        Kind of each change: for KF noises, defaults or bias, for EKF2 delay, noise, gate or process
+        noise, for both outliers, time offset or rotation.
     change : mapping from name to value
         See :class:`px4fuse.comparison.causal_replays.Intervention`.
-    before : Outcome
-        As flown, of the same samples: KF as run, EKF2 from the log.
-    after : Outcome
-        With the change; EKF2 by its replay.
+    before : RunStatistics
+        Statistics as flown, of the same samples; for EKF2 from the log.
+    after : RunStatistics
+        Statistics with the change; for EKF2 from its replay.
     from_s : float or None
-        Start of the replay.
+        Start of the evaluated time; None for the whole segment.
     """
 
     filter: FilterName
     kinds: tuple[str, ...]
     change: Change
-    before: Outcome
-    after: Outcome
+    before: RunStatistics
+    after: RunStatistics
     from_s: float | None = None
 
 
-def distance_from_one(outcome: Outcome) -> float:
-    """Return the sum of |ln ratio| of actual to reported σ, against source and ground truth."""
+def distance_from_one(outcome: RunStatistics) -> float:
+    """Return the sum of |ln σ ratio|, against source and ground truth."""
     means = [mean for mean in (outcome.nis_mean, outcome.nees_mean) if mean]
     return sum(0.5 * abs(math.log(mean)) for mean in means)
 
 
 def preference(trial: Trial) -> tuple[bool, int, float]:
-    """Sort key of re-runs of one kind; the best one is the smallest."""
+    """Return the sort key of re-runs of one kind; the best re-run has the smallest key."""
     enters = enters_band(trial)
     return not enters, len(trial.change) if enters else 0, distance_from_one(trial.after)
 
 
-def ratios(outcome: Outcome) -> dict[Reference, float]:
-    """Return the ratios of actual to reported σ, against source and ground truth."""
+def ratios(outcome: RunStatistics) -> dict[Reference, float]:
+    """Return the σ ratios (actual over reported) against source and ground truth."""
     means: dict[Reference, float | None] = {
         "source": outcome.nis_mean,
         "truth": outcome.nees_mean,
@@ -100,18 +98,18 @@ def ratios(outcome: Outcome) -> dict[Reference, float]:
 
 
 def reduction(trial: Trial) -> float:
-    """Return by how much a re-run reduces :func:`distance_from_one`."""
+    """Return the reduction of :func:`distance_from_one` by a re-run."""
     return distance_from_one(trial.before) - distance_from_one(trial.after)
 
 
 def ratio_pairs(trial: Trial) -> list[tuple[Reference, float, float]]:
-    """Return the ratios before and after a re-run, by reference."""
+    """Return reference (source or ground truth) and σ ratio before and after a re-run."""
     before, after = ratios(trial.before), ratios(trial.after)
     return [(name, before[name], after[name]) for name in before.keys() & after.keys()]
 
 
 def enters_band(trial: Trial) -> bool:
-    """Return True if a re-run brings a ratio into its band."""
+    """Return True if a re-run makes a σ ratio consistent."""
     return any(
         classify_ratio(before, name) != "consistent" and classify_ratio(after, name) == "consistent"
         for name, before, after in ratio_pairs(trial)
@@ -119,7 +117,7 @@ def enters_band(trial: Trial) -> bool:
 
 
 def halves(trial: Trial) -> bool:
-    """Return True if a re-run halves the logarithm of a ratio that is outside its band."""
+    """Return True if a re-run halves |ln σ ratio| of an inconsistent ratio."""
     return any(
         classify_ratio(before, name) != "consistent"
         and abs(math.log(after)) <= 0.5 * abs(math.log(before))
@@ -156,7 +154,7 @@ def find_trial(
 
 
 def has_effect(trial: Trial) -> bool:
-    """Return True if a re-run changes a ratio by 10 % or the position RMSE by 5 %."""
+    """Return True if a re-run changes a σ ratio by 10 % or the position RMSE by 5 %."""
     if any(
         not 1.0 / MIN_RATIO_CHANGE <= after / before <= MIN_RATIO_CHANGE
         for _, before, after in ratio_pairs(trial)
@@ -169,7 +167,7 @@ def has_effect(trial: Trial) -> bool:
 def can_improve(trial: Trial) -> bool:
     """Return True if a re-run could show an improvement.
 
-    The position RMSE must be known, or a ratio be outside its band before.
+    This requires a known position RMSE, or a σ ratio that is inconsistent without the change.
     """
     return trial.before.position_rmse_m is not None or any(
         classify_ratio(before, name) != "consistent" for name, before, _ in ratio_pairs(trial)
@@ -177,29 +175,18 @@ def can_improve(trial: Trial) -> bool:
 
 
 def improvement(trial: Trial) -> Improvement:
-    """Return which numbers a re-run improves.
+    """Return the quantities that a re-run improves: position, σ, both or nothing.
 
-    Position: RMSE lower by 20 %. σ: |ln ratio| halves or enters the band, against the source or
-    ground truth, and gets worse against neither.
+    Position: the RMSE is lower by 20 %. σ: a σ ratio (against source or ground truth) becomes
+    consistent or its |ln| halves, and the other one does not get worse.
     """
     before_m, after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
     is_position_better = bool(
         before_m and after_m is not None and after_m <= (1.0 - POSITION_IMPROVEMENT) * before_m
     )
-    changes = [
-        (
-            abs(math.log(was)),
-            abs(math.log(becomes)),
-            classify_ratio(was, name),
-            classify_ratio(becomes, name),
-        )
-        for name, was, becomes in ratio_pairs(trial)
-    ]
-    is_sigma_better = any(
-        word != "consistent" and (word_after == "consistent" or becomes <= 0.5 * was)
-        for was, becomes, word, word_after in changes
-    ) and all(
-        becomes <= was or word_after == "consistent" for was, becomes, _, word_after in changes
+    is_sigma_better = (enters_band(trial) or halves(trial)) and all(
+        abs(math.log(after)) <= abs(math.log(before)) or classify_ratio(after, name) == "consistent"
+        for name, before, after in ratio_pairs(trial)
     )
     if is_position_better:
         return "position and σ" if is_sigma_better else "position"

@@ -1,10 +1,9 @@
-"""Detectors of mistakes and conditions; detectors that share a condition are in one file.
+"""Findings: mistakes and conditions of a flight that the log shows.
 
-A file declares thresholds with unit and source and, in ``detect``, the condition, message, action
-and evidence of its findings. A detector does not print, and reports nothing that the log does not
-show.
+Each module declares the thresholds (with unit and source) of related findings. Its function
+``detect`` yields the findings of a flight, with message, action and evidence.
 
-To add a finding: write a file with a ``detect`` and add it to :data:`DETECTORS`; add title, group
+To add a finding: write a module with ``detect`` and add it to :data:`DETECTORS`; add title, group
 and meaning to ``catalogue.toml``, and the rates to ``tests/studies/rates.csv``.
 """
 
@@ -47,7 +46,7 @@ __all__ = [
     "group_by_root",
 ]
 
-# Detectors of a comparison; group_by_cause orders their findings
+# Functions that yield the findings of a flight; group_by_cause orders the findings
 DETECTORS: tuple[Callable[[Analysis], Findings], ...] = (
     aids.detect,
     ekf2_noise.detect,
@@ -70,22 +69,22 @@ DETECTORS: tuple[Callable[[Analysis], Findings], ...] = (
 
 
 def find(analysis: Analysis) -> tuple[Finding, ...]:
-    """Find all mistakes of a flight, most severe first, each cause followed by its consequences."""
-    return group_by_cause(found for detect in DETECTORS for found in detect(analysis))
+    """Return the findings, most severe first, each cause followed by its consequences."""
+    return group_by_cause(finding for detect in DETECTORS for finding in detect(analysis))
 
 
 def find_loop(loop: Loop) -> tuple[Finding, ...]:
-    """Find mistakes of a loop, most severe first."""
+    """Return the findings about a loop and its closures, most severe first."""
     return group_by_cause(loops.detect_in_loop(loop))
 
 
 def find_aids(results: Mapping[str, AidResult]) -> tuple[Finding, ...]:
-    """Find faults of EKF2's aids on a flight without position source, most severe first."""
+    """Return the findings about EKF2's aiding sources, for a flight without position source."""
     return group_by_cause(aids.detect_in_aids(results))
 
 
 def finding_title(finding: str) -> str:
-    """Return the title of a finding; of an unknown id, the id with blanks.
+    """Return the title of a finding id; for an unknown id, the id with blanks.
 
     >>> finding_title("source_gap"), finding_title("of_a_later_version")
     ('Gap in the position source', 'of a later version')

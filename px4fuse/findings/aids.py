@@ -1,14 +1,14 @@
-"""EKF2 aids that are not fused, overconfident, shifted or biased.
+"""Aiding sources of EKF2 that are not fused, overconfident, shifted or biased.
 
-Position and height of external vision are tested by the other detectors, which replay EKF2.
+External vision position and height are tested by other modules, which replay EKF2.
 """
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import pandas as pd
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.flight_events import airborne_spans
 from px4fuse.ekf2.aids import NOT_FUSED_LIMIT_S, WINDOW_S, AidResult
 from px4fuse.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
@@ -18,11 +18,12 @@ from px4fuse.record import Span
 from px4fuse.text import capitalise_first, format_number, format_ratio
 
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
-# s after take-off; EKF2 does not fuse the barometer while the ground disturbs the pressure
+# Time (s) after take-off in which EKF2 does not fuse the barometer: the ground changes the pressure
 TAKE_OFF_S = 10.0
-# Ratio of the largest height error in a gap to the RMSE of the rest, from which the gap matters
+# Minimum ratio of EKF2's largest height error in a gap of the barometer to the height RMSE outside
+# the gap, from which the gap is a warning instead of a note
 MIN_HEIGHT_ERROR_RATIO = 3.0
-# Possible causes by switch of the sensor
+# Check of a sensor that EKF2 does not fuse, by the PX4 parameter that enables its fusion
 CHECKS = {
     "EKF2_BARO_CTRL": "Shield the barometer from propeller wash and light.",
     "EKF2_GPS_CTRL": "Give the antenna a free view of the sky.",
@@ -35,19 +36,14 @@ OTHER_CHECK = "Check mounting and power supply of the sensor."
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect faults of the aids of a compared flight."""
+    """Detect faults of EKF2's aiding sources in a compared flight."""
     if isinstance(analysis.aids, Unavailable):
         return
     aid = analysis.source.origin.aid
-    airborne = analysis.flight.airborne
-    take_off_s = [] if isinstance(airborne, Unavailable) else [start for start, _ in airborne]
+    take_off_s = [start_s for start_s, _ in airborne_spans(analysis.flight)]
     barometer = analysis.aids.get(BAROMETER.name)
-    height_error_m = (
-        None if barometer is None else _height_error_in(analysis, barometer.longest_gap_s)
-    )
-    yield from detect_in_aids(
-        analysis.aids, "" if aid is None else aid.name, take_off_s, height_error_m
-    )
+    height_error_m = _height_error_in(analysis, barometer.longest_gap_s) if barometer else None
+    yield from detect_in_aids(analysis.aids, aid.name if aid else "", take_off_s, height_error_m)
 
 
 def detect_in_aids(
@@ -56,25 +52,25 @@ def detect_in_aids(
     take_off_s: Sequence[float] = (),
     height_error_m: float | None = None,
 ) -> Findings:
-    """Yield at most one finding per aid; aids of one sensor that are not fused share one finding.
+    """Yield at most one finding per aiding source; unfused ones of one sensor share a finding.
 
     Parameters
     ----------
     aids : mapping from aid name to AidResult
     source_aid : str
-        Aid whose positions KF also uses; the other detectors test its variance.
+        Aiding source whose positions KF also uses; other modules test its variance.
     take_off_s : sequence of float
-        Times of take-off.
     height_error_m : float or None
-        Height error that grew while the barometer was not fused; None if it did not, or is unknown.
+        EKF2's largest height error (m) in the longest gap of the barometer; None if unknown or
+        not larger than usual.
     """
     tested_aids = {name: aid for name, aid in aids.items() if name not in AIDS_OF_OTHER_DETECTORS}
     not_fused: dict[str, list[AidResult]] = {}
     for name, aid in tested_aids.items():
-        is_usual = name == BAROMETER.name and any(
+        is_take_off_gap = name == BAROMETER.name and any(
             start <= aid.longest_gap_s[0] <= start + TAKE_OFF_S for start in take_off_s
         )
-        if aid.verdict == "not_fused" and not is_usual:
+        if aid.verdict == "not_fused" and not is_take_off_gap:
             not_fused.setdefault(AIDS[name].switch or name, []).append(aid)
     for switch, aids_of_sensor in not_fused.items():
         longest_unfused = max(aids_of_sensor, key=lambda aid: aid.longest_gap_duration_s)
@@ -100,11 +96,7 @@ def detect_in_aids(
             (longest_unfused.longest_gap_s,),
         )
     for name, aid in tested_aids.items():
-        changes = {
-            axis: axis_result.change
-            for axis, axis_result in aid.axes.items()
-            if axis_result.change is not None
-        }
+        changes = {axis: result.change for axis, result in aid.axes.items() if result.change}
         label, switch = _aid_label(aid), AIDS[name].switch
         if changes and not _sensor_cause(switch, source_aid):
             axis, (time_s, shift) = max(changes.items(), key=lambda item: abs(item[1][1]))
@@ -121,10 +113,9 @@ def detect_in_aids(
             )
         elif aid.verdict == "overconfident" and name != source_aid:
             # no value is proposed: innovations alone cannot separate noise from a wrong delay
-            noise_parameter = AIDS[name].noise
-            action = "correct the accuracy that the sensor reports"
-            if noise_parameter:
-                action = f"increase {noise_parameter}"
+            action = "Then correct the accuracy that the sensor reports."
+            if noise_parameter := AIDS[name].noise:
+                action = f"Then increase {noise_parameter}."
             yield warning(
                 "aid_overconfident",
                 f"EKF2 is overconfident about {label}: σ is {format_ratio(aid.nis_mean**0.5)} "
@@ -132,7 +123,7 @@ def detect_in_aids(
                 f"{format_percent(aid.rejected_fraction)} of the samples are rejected. The "
                 f"errors of this aid are larger than R{_format_noise(aid)}, or another aid is "
                 "wrong.",
-                f"Check delay and mounting of the sensor first. Then {action}.",
+                f"Check delay and mounting of the sensor first. {action}",
                 {
                     "aid": name,
                     "nis_mean": aid.nis_mean,
@@ -161,21 +152,20 @@ def detect_in_aids(
 
 
 def _height_error_in(analysis: Analysis, span_s: Span) -> float | None:
-    """Return EKF2's largest height error (m) in a span; None if unknown, or usual in the flight."""
+    """Return EKF2's largest height error (m) in a span; None if unknown or not unusually large."""
     down = analysis.axes.get("down")
-    if down is None or isinstance(down.ekf2_state, Unavailable):
-        return None
-    if not isinstance(down.truth, pd.DataFrame):
+    if (
+        down is None
+        or isinstance(down.ekf2_state, Unavailable)
+        or isinstance(down.truth, Unavailable)
+    ):
         return None
     height_m, true = down.ekf2_state["position_m"], down.truth["position_m"]
     error_m = np.abs(height_m - np.interp(height_m.index, true.index, true, np.nan, np.nan))
-    is_inside = (error_m.index >= span_s[0]) & (error_m.index <= span_s[1])
-    inside, outside = error_m[is_inside].dropna(), error_m[~is_inside].dropna()
-    if not len(inside) or not len(outside):
-        return None
-    rmse_m = float(np.sqrt(np.mean(outside**2)))
-    largest_m = float(inside.max())
-    return largest_m if largest_m > MIN_HEIGHT_ERROR_RATIO * rmse_m else None
+    is_in_span = (error_m.index >= span_s[0]) & (error_m.index <= span_s[1])
+    rmse_outside_m = float(np.sqrt(np.mean(error_m[~is_in_span] ** 2)))
+    largest_m = float(error_m[is_in_span].max())  # NaN if no error is known
+    return largest_m if largest_m > MIN_HEIGHT_ERROR_RATIO * rmse_outside_m else None
 
 
 def _aid_label(aid: AidResult) -> str:
@@ -183,7 +173,7 @@ def _aid_label(aid: AidResult) -> str:
 
 
 def _sensor_cause(switch: str, source_aid: str) -> str:
-    """Return SENSOR if `switch` also enables the aid that KF uses, else an empty text."""
+    """Return SENSOR if one PX4 parameter enables this aid and the aid that KF uses, else ""."""
     return SENSOR if source_aid and AIDS[source_aid].switch == switch else ""
 
 

@@ -1,4 +1,4 @@
-"""Text of a change that a re-run tests: the kind of cause, the change, and the action."""
+"""Texts about re-runs with a changed setting or corrected data: kind of cause, change, action."""
 
 from collections.abc import Mapping
 
@@ -12,12 +12,13 @@ from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import UNITS
 from px4fuse.findings import cause_grouping as kinds
+from px4fuse.findings.model import format_percent
 from px4fuse.flight import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
 
 def classify_cause(analysis: Analysis, cause: Intervention | None) -> str:
-    """Return the kind of a cause; of several changes, that of the source determines the kind."""
+    """Return the kind of cause by the change that a re-run tested; a sensor fault comes first."""
     if cause is None:
         return kinds.ELSEWHERE
     aid = aid_of(analysis)
@@ -37,7 +38,7 @@ def classify_cause(analysis: Analysis, cause: Intervention | None) -> str:
 
 
 def is_refuted(analysis: Analysis, owner: FilterName, cause: Intervention) -> bool:
-    """Return True if the re-run of a cause along the main axis improves nothing."""
+    """Return True if this change, re-run along the main axis, improves neither position nor σ."""
     return any(
         (trial.filter, trial.change) == (owner, cause.change) and improvement(trial) == "nothing"
         for trial in analysis.trials
@@ -45,30 +46,27 @@ def is_refuted(analysis: Analysis, owner: FilterName, cause: Intervention) -> bo
 
 
 def format_change(analysis: Analysis, cause: Intervention) -> str:
-    """Format the changes of a re-run as a noun phrase."""
-    changes = [
+    """Format the changes of a re-run, for example "SIGMA_Z 0.1 m instead of 0.05 m"."""
+    return " and ".join(
         _format_one_change(analysis, cause, name)
         for name in cause.change
         if name not in causal_replays.ACCOMPANYING_CHANGES
-    ]
-    return " and ".join(changes)
+    )
 
 
 def format_explained_share(cause: Intervention) -> str:
-    """Format the share of a deviation that the re-run with a change explains."""
+    """Format the fraction of a deviation that disappears in a re-run with a change."""
     if cause.contradicts_truth:
         return "contradicts ground truth"
     if cause.is_sufficient:
         return "all"
     if cause.explained_fraction > 1.0 and cause.statistic != "difference":
         return "too much"
-    return (
-        f"{100.0 * cause.explained_fraction:.0f} %" if cause.explained_fraction > 0.0 else "nothing"
-    )
+    return format_percent(cause.explained_fraction) if cause.explained_fraction > 0.0 else "nothing"
 
 
 def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
-    """Format the action that a re-run with a change confirms, one sentence per change."""
+    """Format the action for a change that a re-run confirms, one sentence per changed quantity."""
     actions, change = [], dict(change)
     is_gnss = analysis.source.origin.is_gnss
     if change.pop(causal_replays.OUTLIERS, None):
@@ -78,7 +76,7 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
         actions.append("Calibrate the accelerometer and the level horizon.")
         change.pop(causal_replays.RIGHT_BIAS)
     if turn_deg := change.pop(causal_replays.ROTATION, None):
-        # GNSS positions refer to true north, so EKF2's heading is wrong
+        # GNSS positions refer to true north, so a rotation is an error of EKF2's heading
         actions.append(
             "Calibrate the magnetometer, away from metal."
             if is_gnss
@@ -96,7 +94,7 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
 
 
 def format_kf_settings(settings: Mapping[str, float]) -> str:
-    """Format settings of KF as an action, with their options."""
+    """Format KF noises as an action, for example "Set SIGMA_Z to 0.1 m (--sigma-z 0.1)"."""
     texts = (
         f"{name[:7].upper()} to {value:g} {UNITS[name]} ({COMPARISON_OPTIONS[name]} {value:g})"
         for name, value in sorted(settings.items())
@@ -127,7 +125,7 @@ def _format_one_change(analysis: Analysis, cause: Intervention, name: str) -> st
         case causal_replays.SIGMA_A | causal_replays.SIGMA_Z:
             label, unit = name[:7].upper(), UNITS[name]
             return f"{label} {value:.2g} {unit} instead of {getattr(settings, name):g} {unit}"
-    assert not isinstance(analysis.ekf2_model, Unavailable)  # it was replayed
+    assert not isinstance(analysis.ekf2_model, Unavailable)  # EKF2 was replayed with the change
     flown_value, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].unit
     unit = unit.replace("^2", "²").replace("^3", "³")
     return f"{name} {value:.3g} {unit} instead of {flown_value:.4g} {unit}".replace(

@@ -1,6 +1,7 @@
-"""Measurement noise of EKF2 for the source that is too small or too large, confirmed by a replay.
+"""EKF2 measurement noise parameter of the position source that is too small or too large.
 
-KF takes SIGMA_Z from the same parameter on GNSS, so both filters may have the fault.
+A replay of EKF2 confirms the fault. For GNSS, KF takes SIGMA_Z from the same parameter, so both
+filters may have the fault.
 """
 
 import math
@@ -16,19 +17,19 @@ from px4fuse.findings.model import Findings, finding, format_percent
 from px4fuse.flight import Unavailable, source_name
 from px4fuse.text import format_factor
 
-# Ratio of the noises from which the finding is an error; below, EKF2 works nearly as well
+# Minimum ratio of flown and estimated noise (σ) for an error; below, EKF2's error hardly changes
 MIN_RATIO_ERROR = 2.0
-# Rejected fraction from which the title names it
+# Minimum fraction of positions rejected by EKF2 for the title to contain it
 MIN_NAMED_REJECTION = 0.05
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect a measurement noise whose change brings EKF2's innovations into their band."""
+    """Detect a measurement noise whose change makes EKF2's innovations consistent in a replay."""
     aid = aid_of(analysis)
     trial = find_trial(analysis.trials, "ekf2", "noise", aid.noise)
     if trial is None or not _corrects_innovations(trial):
         return
-    assert not isinstance(analysis.ekf2_model, Unavailable)  # a trial of EKF2 needs its model
+    assert not isinstance(analysis.ekf2_model, Unavailable)  # a re-run of EKF2 needs its model
     flown_m, estimate_m = analysis.ekf2_model.inputs.settings[aid.noise], trial.change[aid.noise]
     ratio, is_small = estimate_m / flown_m, estimate_m > flown_m
     size, direction = max(ratio, 1.0 / ratio), "small" if is_small else "large"
@@ -38,17 +39,15 @@ def detect(analysis: Analysis) -> Findings:
     )
     rejected = analysis.main.rejected_fraction or 0.0
     if rejected >= MIN_NAMED_REJECTION:
-        effect = f": EKF2 rejects {format_percent(rejected)}"
+        effect = f": EKF2 rejects {format_percent(rejected)} of the positions"
         reason = f"EKF2 takes ordinary {sensor} noise for outliers, rejects it and uses the IMU."
     else:
-        effect, reason = "", f"The gain and the σ of EKF2 are too {direction}."
-        if is_small:
-            reason = "The gain of EKF2 is too large, and its σ too small."
-    of_positions = " of the positions" if effect else ""
-    title = f"{aid.noise} is {format_factor(size)} times too {direction}{effect}{of_positions}"
-    if is_small and flown_m == PARAMETERS[aid.noise].default:  # not chosen: name the sensor
-        who = "both filters assume" if is_shared else "EKF2 assumes"
-        title = f"{sensor} noise is {format_factor(size)} times what {who}{effect}"
+        effect, gain = "", "large" if is_small else "small"
+        reason = f"The gain of EKF2 is too {gain}, and the reported σ is too {direction}."
+    title = f"{aid.noise} is {format_factor(size)} times too {direction}{effect}"
+    if is_small and flown_m == PARAMETERS[aid.noise].default:  # the user did not choose it
+        assumed = "both filters assume" if is_shared else "EKF2 assumes"
+        title = f"{sensor} noise is {format_factor(size)} times what {assumed}{effect}"
     interval, tuned = "", analysis.tuning.get(HORIZONTAL)
     if isinstance(tuned, AxisTuning) and tuned.sigma_z.low and tuned.sigma_z.high:
         interval = f" (95 % {tuned.sigma_z.low:.3g} to {tuned.sigma_z.high:.3g} m)"
@@ -64,7 +63,6 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def _corrects_innovations(trial: Trial) -> bool:
-    """Return True if the change brings the ratio against the source into its band."""
     return any(
         classify_ratio(before, against) != "consistent"
         and classify_ratio(after, against) == "consistent"

@@ -1,4 +1,4 @@
-"""EKF2 does not use the source for horizontal position, or only for part of the flight."""
+"""EKF2 does not fuse the position source, or only for part of the flight."""
 
 import numpy as np
 import pandas as pd
@@ -16,17 +16,17 @@ from px4fuse.findings.model import (
 from px4fuse.flight import Ekf2, FusionRecord, Unavailable, positions_of
 from px4fuse.text import capitalise_first
 
-MIN_FUSING_SHARE_ERROR = 0.5  # of the segment; below, EKF2's track mostly uses other sensors
-MIN_FUSING_SHARE_WARNING = 0.98  # of the segment; 2 % of a minute are about 1 s
-EV_START_INTERVAL_S = 0.2  # EV_MAX_INTERVAL, PX4 v1.14 and later, ev_control.cpp
-EV_STOP_INTERVAL_S = 0.4  # two times EV_MAX_INTERVAL, ev_pos_control.cpp
+MIN_FUSING_SHARE_ERROR = 0.5  # fused fraction of the segment; below, other sensors dominate: error
+MIN_FUSING_SHARE_WARNING = 0.98  # fused fraction of the segment; 2 % of a minute are about 1 s
+EV_START_INTERVAL_S = 0.2  # s; EV_MAX_INTERVAL of PX4 v1.14 and later (ev_control.cpp)
+EV_STOP_INTERVAL_S = 0.4  # s; two times EV_MAX_INTERVAL (ev_pos_control.cpp)
 MAX_LATENESS_S = 0.1  # s after the fusion horizon; EKF2 drops older samples (RingBuffer.h)
-MIN_LIMITING_INTERVAL_S = 0.18  # s; jitter of 10 % prevents a start at EV_START_INTERVAL_S
+MIN_LIMITING_INTERVAL_S = 0.18  # s; 10 % of jitter reaches EV_START_INTERVAL_S: fusion starts late
 CHECK_SWITCH = "Check EKF2_EV_CTRL (EKF2_AID_MASK before v1.14)."
 
 
 def detect(analysis: Comparison) -> Findings:
-    """Detect a small fraction of the segment in which EKF2 fuses the source."""
+    """Detect that EKF2 fuses the position source for too small a fraction of the segment."""
     ekf2, segment, source = analysis.flight.ekf2, analysis.segment, analysis.source
     if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusing, Unavailable):
         return
@@ -46,12 +46,17 @@ def detect(analysis: Comparison) -> Findings:
             )
     elif share < MIN_FUSING_SHARE_ERROR:
         fault, reason, action = _reason_and_action(analysis, ekf2)
-        positions = positions_of(source)
-        extent = f"EKF2 fused the {positions} only {format_percent(share)} of the time"
-        if not share:
-            extent = f"EKF2 never fused the {positions}"
-        title = f"{extent}: {fault}" if fault else extent
-        yield error("ekf2_not_fusing", f"{title}. {reason}", action, evidence)
+        title = f"EKF2 never fused the {positions_of(source)}"
+        if share:
+            title = (
+                f"EKF2 fused the {positions_of(source)} only {format_percent(share)} of the time"
+            )
+        yield error(
+            "ekf2_not_fusing",
+            f"{title}{fault}. {reason}",
+            action,
+            evidence,
+        )
     elif share < MIN_FUSING_SHARE_WARNING:
         yield warning(
             "ekf2_fusion_interrupted",
@@ -65,7 +70,7 @@ def detect(analysis: Comparison) -> Findings:
 
 
 def _detect_slow_restart(analysis: Comparison, ekf2: Ekf2, fusing: pd.Series) -> Findings:
-    """Detect that EKF2 resumed fusion late after a gap, because positions come too slowly."""
+    """Detect that EKF2 resumed fusion late after a gap: positions come too slowly."""
     source = analysis.source
     is_limited = "EKF2_EV_CTRL" in analysis.flight.log.parameters  # v1.14 and later
     is_known = source.origin.is_vision and source.origin.has_all_samples and not source.alignment
@@ -95,9 +100,9 @@ def _detect_slow_restart(analysis: Comparison, ekf2: Ekf2, fusing: pd.Series) ->
 
 
 def _reason_and_action(analysis: Comparison, ekf2: Ekf2) -> tuple[str, str, str]:
-    """Return the reason why EKF2 does not fuse the source, in brief and in full, and the action.
+    """Return the end of the title, the reason why EKF2 does not fuse the source, and the action.
 
-    The brief reason is empty if the log does not contain it.
+    The end of the title is empty if the log does not show the reason.
     """
     parameters, interval_s = analysis.flight.log.parameters, 1.0 / analysis.source.rate_hz
     ev_control = parameters.get("EKF2_EV_CTRL")
@@ -107,26 +112,26 @@ def _reason_and_action(analysis: Comparison, ekf2: Ekf2) -> tuple[str, str, str]
     value = parameters.get(switch)
     if value is not None and not int(value) >> bit & 1:
         return (
-            f"{switch} is {value:.0f}",
+            f": {switch} is {value:.0f}",
             f"Bit {bit} ({quantity}) is not set.",
             f"Set {switch} to {int(value) | 1 << bit}.",
         )
     horizon_s, age_s = ekf2.horizon_s, _age_s(analysis, ekf2)
     if isinstance(horizon_s, float) and age_s > horizon_s + MAX_LATENESS_S:
         return (
-            f"they are {age_s:.2f} s old at arrival",
+            f": the positions are {age_s:.2f} s old at arrival",
             f"EKF2 buffers only {horizon_s:.2f} s. Timestamps that are too early have the same "
             "effect.",
             "Check the clock of the sender. Then increase EKF2_DELAY_MAX (v1.15 and later).",
         )
-    # the rate of a reconstructed source is that of the logger
+    # positions reconstructed from EKF2 output have the rate of the logger, not of the source
     has_source_rate = ev_control is not None and not analysis.source.origin.reconstructed
     if has_source_rate and interval_s > EV_START_INTERVAL_S:
         return (
-            f"they come at {analysis.source.rate_hz:.2g} Hz",
-            f"One position per {interval_s:.2f} s. EKF2 (v1.14 and later) starts to fuse external "
-            f"vision only when two positions come within {EV_START_INTERVAL_S:g} s. The limit is "
-            "in the code; no parameter changes it.",
+            f": the positions come at {analysis.source.rate_hz:.2g} Hz",
+            f"The interval between positions is {interval_s:.2f} s. EKF2 (v1.14 and later) starts "
+            f"to fuse external vision only when two positions come within {EV_START_INTERVAL_S:g} "
+            "s. No parameter changes this limit.",
             "Send the position at 10 Hz.",
         )
     return "", "The log does not contain the reason.", CHECK_SWITCH

@@ -12,20 +12,20 @@ from px4fuse.findings.cause_text import format_action
 from px4fuse.findings.model import Findings, finding, format_percent, zero_length_spans
 from px4fuse.flight import Ekf2, Unavailable
 
-REJECTED_SHARE_WARNING = 0.01  # of the innovations; a gate of 5 √S rejects 6e-7 if consistent
-REJECTED_SHARE_ERROR = 0.20  # of the innovations; usually R or the time offset is wrong
-MAX_REJECTED_RATIO = 0.5  # rejected share after over before a change that prevents rejections
+REJECTED_SHARE_WARNING = 0.01  # rejected fraction for a warning; 6e-7 if consistent, with 5 √S
+REJECTED_SHARE_ERROR = 0.20  # rejected fraction for an error: R or the time offset is wrong
+MAX_REJECTED_RATIO = 0.5  # rejected fraction with over without a change that prevents rejections
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect rejections and a gate that is too small."""
+    """Detect rejected positions or heights, and a gate that is too small."""
     rejections = tuple(_detect_rejections(analysis))
     yield from _detect_small_gate(analysis, rejections)
     yield from rejections
 
 
 def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> Findings:
-    """Detect a gate that rejects samples even if the noise is as EKF2 assumes."""
+    """Detect a gate that rejects 1 % of the samples even if their noise is as EKF2 assumes."""
     ekf2 = analysis.flight.ekf2
     if isinstance(ekf2, Ekf2) and rejections:
         # EKF2 accepts a sample if the normal innovations of both axes are inside: erf(gate/√2)²
@@ -45,9 +45,9 @@ def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> F
 
 
 def _detect_rejections(analysis: Analysis) -> Findings:
-    """Detect rejections; EKF2 rejects north and east together, so one axis is enough."""
     ekf2, down = analysis.flight.ekf2, analysis.axes.get("down")
-    for result in {id(each): each for each in (analysis.main, down) if each}.values():
+    # EKF2 rejects north and east together, so the main axis represents both
+    for result in (analysis.main, *([down] if down and down is not analysis.main else [])):
         frame = result.ekf2_innovations
         if isinstance(frame, Unavailable) or not isinstance(ekf2, Ekf2):
             continue
@@ -68,7 +68,7 @@ def _detect_rejections(analysis: Analysis) -> Findings:
 
 
 def _remedy(analysis: Analysis, result: AxisComparison) -> str:
-    """Format the change whose re-run prevents most rejections, or a check."""
+    """Format the change whose re-run prevents most rejections; without one, a check."""
     aid = aid_of(analysis, result.axis.name)
     trials = [trial for trial in analysis.trials if _prevents_rejections(trial)]
     if trials and result is analysis.main:
@@ -78,7 +78,6 @@ def _remedy(analysis: Analysis, result: AxisComparison) -> str:
 
 
 def _prevents_rejections(trial: Trial) -> bool:
-    """Return True if a change of EKF2 improves EKF2 and halves its rejected share."""
     before, after = trial.before.rejected_fraction, trial.after.rejected_fraction
     if before is None or after is None or improvement(trial) == "nothing":
         return False

@@ -3,14 +3,15 @@
 import numpy as np
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.flight_events import airborne_spans
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, GAP
 from px4fuse.findings.model import Findings, finding, format_count, warning, zero_length_spans
-from px4fuse.flight import Ekf2, Reset, Unavailable
+from px4fuse.flight import Ekf2, Reset
 
-# s after take-off, in which EKF2 usually resets its height
+# Time (s) after take-off in which EKF2 usually resets its height
 TAKE_OFF_S = 10.0
-# s after a gap in the source, in which EKF2 resets its position to the first positions
+# Time (s) after a gap in the source in which EKF2 resets its position to the source
 AFTER_GAP_S = 5.0
 
 
@@ -25,7 +26,7 @@ def detect(analysis: Analysis) -> Findings:
         if segment.start_s < reset.time_s <= segment.end_s
         and reset.quantity == "position"
         and any(reset.delta)
-        and not _is_usual(analysis, reset)
+        and not _is_take_off_height_reset(analysis, reset)
     ]
     if resets:
         horizontal = [reset for reset in resets if any(reset.delta[:2])]
@@ -61,12 +62,10 @@ def detect(analysis: Analysis) -> Findings:
         )
 
 
-def _is_usual(analysis: Analysis, reset: Reset) -> bool:
-    """Return True for a reset of the height alone, soon after take-off."""
-    airborne = analysis.flight.airborne
+def _is_take_off_height_reset(analysis: Analysis, reset: Reset) -> bool:
     return not any(reset.delta[:2]) and any(
-        start <= reset.time_s <= start + TAKE_OFF_S
-        for start, _ in (() if isinstance(airborne, Unavailable) else airborne)
+        start_s <= reset.time_s <= start_s + TAKE_OFF_S
+        for start_s, _ in airborne_spans(analysis.flight)
     )
 
 

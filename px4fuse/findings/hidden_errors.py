@@ -1,8 +1,8 @@
-"""Errors that innovations do not show: errors against ground truth, and drift of the source.
+"""Position errors that innovations do not show: against ground truth, and drift of the source.
 
-Innovations compare a filter with its source, so they do not show an error of the source that the
-filter follows. NEES: squared error against ground truth divided by the reported variance (expected
-1).
+Innovations compare a filter with its position source, so they do not show an error of the source
+that the filter follows. NEES is the squared error against ground truth divided by the reported
+variance (expected 1).
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,14 @@ from px4fuse.comparison.causal_replays import (
     error_above_reported_sigma,
     find_cause,
 )
-from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth, FilterName
+from px4fuse.comparison.model import (
+    FILTERS,
+    AxisComparison,
+    Comparison,
+    ErrorsAgainstTruth,
+    FilterName,
+    north_and_east,
+)
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -32,12 +39,12 @@ from px4fuse.loop.model import Loop
 from px4fuse.text import format_metres, format_ratio
 from px4fuse.trajectory.alignment import fit_alignment
 
-MIN_NEES_ERROR = 16.0  # mean NEES; errors of 4 σ
-MAX_KF_ERROR_RATIO = (
-    0.7  # RMSE of KF over EKF2; below, the source causes less than half of the squares
-)
-MAX_ALIGNED_SHARE = 0.5  # RMSE after over RMSE before alignment; below, misalignment dominates
-FILTERS: Mapping[FilterName, str] = {"kf": "KF", "ekf2": "EKF2"}
+MIN_NEES_ERROR = 16.0  # mean NEES from which the finding is an error: position errors of 4 σ
+# Maximum position RMSE of KF over that of EKF2 for a fault of EKF2 alone: the source, which both
+# filters use, then causes less than half of EKF2's mean square error
+MAX_KF_ERROR_RATIO = 0.7
+# Maximum position RMSE after alignment over RMSE before, for a misaligned frame as main cause
+MAX_ALIGNED_SHARE = 0.5
 DRIFT_REMEDY = (
     "Send an absolute position (GNSS, UWB) as well in the next flight. A loop closure (px4fuse "
     "loop) corrects the path of this flight, not the filters."
@@ -57,25 +64,27 @@ GNSS_REMEDY = (
 
 
 class AlignedError(NamedTuple):
-    """Horizontal RMSE (m) against ground truth, before and after the best shift and rotation."""
+    """Horizontal position RMSE (m) against ground truth, before and after the best alignment."""
 
     before_m: float
     after_m: float
 
     def __str__(self) -> str:
-        after = f"{format_metres(self.after_m)} m after the best shift and rotation"
-        return f"{format_metres(self.before_m)} m, {after}"
+        return (
+            f"{format_metres(self.before_m)} m, after the best shift and rotation "
+            f"{format_metres(self.after_m)} m"
+        )
 
     @property
     def is_misaligned(self) -> bool:
-        """True if a misaligned frame causes most of the error."""
+        """True if a misaligned frame causes most of the position error."""
         return self.after_m < MAX_ALIGNED_SHARE * self.before_m
 
 
 def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, ErrorAboveSigma]]:
-    """Find errors larger than the reported σ that innovations do not show.
+    """Find position errors larger than the reported σ that innovations do not show.
 
-    Returns filter, axis and numbers of each, the largest mean NEES first.
+    Returns filter, axis and size of each error, the largest mean NEES first.
     """
     errors = [
         (filter_name, name, error)
@@ -87,7 +96,7 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect errors that innovations do not show; without such errors, a source that may drift."""
+    """Detect hidden position errors; without any, a position source that may drift."""
     if hidden := find_hidden_errors(analysis):
         yield make_error_finding(analysis, hidden)
     elif analysis.source.origin.may_drift:
@@ -97,13 +106,14 @@ def detect(analysis: Analysis) -> Findings:
 def make_error_finding(
     analysis: Analysis, hidden: list[tuple[FilterName, str, ErrorAboveSigma]]
 ) -> Finding:
-    """Make the finding of large errors, with numbers of the main axis, else of the worst one."""
+    """Make the finding of hidden errors, with numbers of the main axis if it has one."""
     hidden = sorted(hidden, key=lambda entry: entry[1] != analysis.main.axis.name)
     (worst_filter, main_axis, worst), may_drift = hidden[0], analysis.source.origin.may_drift
     evidence: dict[str, float | str] = {"axis": main_axis, "filter": worst_filter}
     ratios, sentences = dict[str, float](), list[str]()
     causes = dict[FilterName, Intervention]()
-    for filter_name, label in FILTERS.items():
+    for filter_name in FILTERS:
+        label = filter_name.upper()
         for _, axis, excess in [entry for entry in hidden if entry[0] == filter_name][:1]:
             evidence |= {
                 f"{filter_name}_nis_mean": excess.nis_mean,
@@ -168,7 +178,6 @@ def _drift_finding(
     worst: ErrorAboveSigma,
     evidence: Mapping[str, float | str],
 ) -> Finding:
-    """Make the finding of a source that drifts, with its closure error if that is known."""
     sensor, loop = source_name(analysis.source), analysis.loop
     size = f"position RMSE {format_metres(worst.rmse_m)} m against ground truth"
     sentence = ""
@@ -176,7 +185,7 @@ def _drift_finding(
         size = (
             f"horizontal position RMSE {format_metres(aligned.after_m)} m after the best alignment"
         )
-        sentence = f"Before the alignment: {format_metres(aligned.before_m)} m. "
+        sentence = f"Before the alignment the RMSE is {format_metres(aligned.before_m)} m. "
     if isinstance(loop, Loop) and (gap_m := _known_closure_error_m(loop)) is not None:
         length_m = loop.path_length_m
         evidence = {**evidence, "closure_error_m": gap_m, "path_length_m": length_m}
@@ -195,15 +204,15 @@ def _drift_finding(
 
 
 def _known_closure_error_m(loop: Loop) -> float | None:
-    """Return the closure error (m) of odometry, or None if the landing place is only assumed."""
+    """Return the closure error (m) of odometry; None if the true landing place is unknown."""
     if isinstance(loop.true_end, Unavailable) or loop.is_end_assumed or loop.is_absolute_track:
         return None
     return loop.closure_error_m
 
 
 def _rmse_after_alignment(comparison: Comparison, filter_name: str) -> AlignedError | None:
-    """Return the horizontal RMSE before and after alignment in yaw, or None if unknown."""
-    axes = [comparison.axes[name] for name in ("north", "east") if name in comparison.axes]
+    """Return the horizontal RMSE before and after alignment in yaw; None without truth."""
+    axes = north_and_east(comparison)
     truths = [result.truth for result in axes if isinstance(result.truth, pd.DataFrame)]
     if len(truths) < 2:
         return None
@@ -217,11 +226,11 @@ def _rmse_after_alignment(comparison: Comparison, filter_name: str) -> AlignedEr
     zero_height = np.zeros(len(times))
     estimate = np.column_stack([*tracks, zero_height])
     true_track = np.column_stack([*(truth["position_m"] for truth in truths), zero_height])
-    is_known = np.isfinite(estimate).all(axis=1) & np.isfinite(true_track).all(axis=1)
-    estimate, true_track = estimate[is_known], true_track[is_known]
+    has_both = np.isfinite(estimate).all(axis=1) & np.isfinite(true_track).all(axis=1)
+    estimate, true_track = estimate[has_both], true_track[has_both]
     try:
         aligned = fit_alignment(estimate, true_track, "yaw").apply(estimate)
-    except TrajectoryError:  # too little motion for a rotation
+    except TrajectoryError:  # the track is too short to determine a rotation
         return None
     errors = (estimate - true_track, aligned - true_track)
     rmse_m, aligned_rmse_m = (
@@ -231,19 +240,15 @@ def _rmse_after_alignment(comparison: Comparison, filter_name: str) -> AlignedEr
 
 
 def _interpolate_ekf2_position(result: AxisComparison, times: Array) -> Array:
-    """Interpolate EKF2's position (m) along one axis; NaN outside the log."""
-    assert isinstance(result.ekf2_state, pd.DataFrame)  # an error of EKF2 was computed from it
+    assert isinstance(result.ekf2_state, pd.DataFrame)  # EKF2's error was computed from this state
     state = result.ekf2_state["position_m"]
     return np.asarray(np.interp(times, state.index, state, left=np.nan, right=np.nan))
 
 
 def make_possible_drift_finding(analysis: Analysis) -> Finding:
-    """Make the note on a source that may drift, with its short-term noise and closure error."""
-    sensor, tuned, loop = (
-        source_name(analysis.source),
-        analysis.tuning.get(HORIZONTAL),
-        analysis.loop,
-    )
+    """Make the note on odometry, with its short-term noise and loop closure error."""
+    sensor, loop = source_name(analysis.source), analysis.loop
+    tuned = analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (
         f"{sensor} may drift: it sends a heading, as odometry does. Innovations show how well a "

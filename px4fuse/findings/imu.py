@@ -1,4 +1,4 @@
-"""Faults of the IMU (bias, clipping, gaps, low rate), and roll or pitch beyond PX4's limits."""
+"""Faults of the IMU data (bias, clipping, gaps, low rate), and excessive roll or pitch."""
 
 import numpy as np
 import pandas as pd
@@ -13,19 +13,19 @@ from px4fuse.findings.model import Findings, error, finding, format_percent, war
 from px4fuse.flight import Columns, Ekf2, Flight, sample_rate
 from px4fuse.record import Span
 
-BIAS_ERROR_M_S2 = 0.3  # m/s²; causes a position error of 0.15 m after 1 s
+BIAS_ERROR_M_S2 = 0.3  # m/s²; bias from which the finding is an error: 0.15 m after 1 s
 TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))  # tilt error equivalent to a bias of 1 m/s²
-MIN_IMU_GAP_S = 0.2  # s in total; two prediction steps
-MIN_IMU_RATE_HZ = 50.0  # Hz; 5 IMU samples per DT of 0.1 s, and a margin against aliasing
-MIN_ATTITUDE_RATE_HZ = 10.0  # Hz; tilt can be interpolated over 0.1 s; PX4 logs 20 Hz by default
-MAX_CLIPPED_S = 0.1  # s; one prediction step; a touch-down clips one or two samples
-MIN_CLIPPING_PAUSE_S = 2.0  # s; clipped samples after a longer pause are a separate span
-HIGH_RATE_BIT = 16  # SDLOG_PROFILE bit 4, logged_topics.cpp
-RATE_MARGIN = 0.98  # measured stream rates are slightly below the requested rate
+MIN_IMU_GAP_S = 0.2  # s; total length of reported gaps: two prediction steps of KF
+MIN_IMU_RATE_HZ = 50.0  # Hz; 5 IMU samples per DT of 0.1 s, with a margin against aliasing
+MIN_ATTITUDE_RATE_HZ = 10.0  # Hz; tilt can be interpolated over 0.1 s
+MAX_CLIPPED_S = 0.1  # s; total clipping that is not reported: a touch-down clips one or two samples
+MIN_CLIPPING_PAUSE_S = 2.0  # s; time without clipping that separates two reported time spans
+HIGH_RATE_BIT = 16  # SDLOG_PROFILE bit 4: full IMU rate (logged_topics.cpp)
+RATE_MARGIN = 0.98  # ratio; measured message rates are up to 2 % below the requested rate
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect all faults of the IMU and of the attitude."""
+    """Detect faults of the IMU data and of the attitude."""
     yield from detect_tumbling(analysis)
     yield from detect_bias(analysis)
     yield from detect_clipping(analysis)
@@ -35,11 +35,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_bias(analysis: Analysis) -> Findings:
-    """Detect an accelerometer bias.
-
-    The horizontal estimate is from the positions. Without that, and along down, EKF2's estimate is
-    used.
-    """
+    """Detect an accelerometer bias, estimated from the positions, else by EKF2."""
     fit, ekf2_bias = analysis.bias_scale_jump_fit, _ekf2_bias(analysis)
     if isinstance(fit, BiasScaleJumpFit) and fit.has_bias:
         forward, right, size = fit.forward_bias, fit.right_bias, fit.bias.value
@@ -62,7 +58,7 @@ def detect_bias(analysis: Analysis) -> Findings:
             {"bias_m_s2": size, "sigma_m_s2": fit.bias.sigma},
         )
     elif ekf2_bias is not None:
-        # the positions, which are more accurate than EKF2's estimate, show no horizontal bias
+        # with a fit to the positions, which shows no horizontal bias, only EKF2's down bias counts
         size = float(
             np.linalg.norm(ekf2_bias[2:] if isinstance(fit, BiasScaleJumpFit) else ekf2_bias)
         )
@@ -101,7 +97,7 @@ def detect_tumbling(analysis: Analysis) -> Findings:
 
 
 def detect_clipping(analysis: Analysis) -> Findings:
-    """Detect accelerometer samples at the end of the range."""
+    """Detect accelerometer samples at the limit of the measurement range."""
     imu = analysis.flight.imu
     if not isinstance(imu, pd.DataFrame) or "clipped" not in imu:
         return
@@ -123,8 +119,8 @@ def detect_clipping(analysis: Analysis) -> Findings:
 
 
 def detect_imu_gaps(analysis: Analysis) -> Findings:
-    """Detect IMU gaps longer than two prediction steps and two IMU intervals."""
-    gap_s, imu = next(iter(analysis.axes.values())).replay.input_gap_s, analysis.flight.imu
+    """Detect gaps of the IMU longer than two prediction steps of KF and two IMU intervals."""
+    gap_s, imu = analysis.main.replay.input_gap_s, analysis.flight.imu
     interval_s = 1.0 / sample_rate(imu) if isinstance(imu, pd.DataFrame) else 0.0
     if gap_s > max(MIN_IMU_GAP_S, 2.0 * interval_s):
         is_mavlink = analysis.flight.log.format.startswith("MAVLink")
@@ -163,7 +159,7 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
 
 
 def _gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
-    """Return the spans without IMU samples in the segment, also at its ends."""
+    """Return the spans (s) without IMU samples in a segment, including its start and end."""
     time_s = imu.index.to_numpy()
     is_gap = imu_gaps(time_s)
     gaps = list(zip(time_s[:-1][is_gap].tolist(), time_s[1:][is_gap].tolist(), strict=True))
@@ -179,7 +175,7 @@ def is_rate_too_low(samples: pd.DataFrame, needed_hz: float) -> bool:
 
 
 def detect_low_rates(flight: Flight) -> Findings:
-    """Detect IMU or attitude below the rate that the acceleration in NED needs."""
+    """Detect an IMU or attitude rate too low to compute the acceleration in NED."""
     log = flight.log
     for samples, name, label, default_topic, needed_hz in (
         (flight.imu, "imu", "IMU", "sensor_combined", MIN_IMU_RATE_HZ),

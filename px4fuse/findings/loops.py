@@ -1,4 +1,4 @@
-"""False or inconsistent loop closures, drift larger than stated, and assumptions about a loop."""
+"""False or inconsistent loop closures, excessive odometry drift, and an assumed landing place."""
 
 from px4fuse.analysis import Analysis
 from px4fuse.finding import Finding
@@ -7,25 +7,25 @@ from px4fuse.loop.model import LANDING, Closure, Loop
 from px4fuse.text import capitalise_first
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
-MAX_DROPPED_SHARE = 0.5  # of the closures; most closures of a flight are true
+MAX_DROPPED_SHARE = 0.5  # of the closures; most closures of a flight are true, so more are drift
 EVIDENCE = ("time_1_s", "time_2_s", "distance_m", "d2", "degrees_of_freedom", "p")
-MIN_KEPT_WEIGHT = 0.5  # GNC weights end at 0 or 1 (Yang et al. 2020)
+MIN_KEPT_WEIGHT = 0.5  # weight of a used closure; GNC weights end at 0 or 1 (Yang et al. 2020)
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect faults of the loop of a flight, if it has one."""
+    """Detect false closures and assumptions of the flight's loop, if it has a loop."""
     if isinstance(analysis.loop, Loop):
         yield from detect_in_loop(analysis.loop)
 
 
 def detect_in_loop(loop: Loop) -> Findings:
-    """Detect faults of a loop."""
+    """Detect false closures and assumptions of a loop."""
     yield from detect_inconsistent_closures(loop)
     yield from detect_assumptions(loop)
 
 
 def detect_inconsistent_closures(loop: Loop) -> Findings:
-    """Detect closures that the drift does not explain, or that contradict the others."""
+    """Detect closures that drift does not explain, or that contradict other closures."""
     weights = [1.0 if c.weight_gnc is None else c.weight_gnc for c in loop.closures]
     dropped_count = sum(weight < MIN_KEPT_WEIGHT for weight in weights)
     drops_most = dropped_count > MAX_DROPPED_SHARE * len(weights)

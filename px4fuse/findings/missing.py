@@ -1,4 +1,4 @@
-"""Data that the log lacks: EKF2, acceleration, innovations, or the position as PX4 received it."""
+"""Data missing from the log: EKF2, acceleration, innovations, or positions that PX4 received."""
 
 import pandas as pd
 
@@ -13,18 +13,18 @@ from px4fuse.text import capitalise_first
 RECEIVED_TOPIC = "vehicle_visual_odometry"
 DEFAULT_PROFILE = 1  # SDLOG_PROFILE bit 0, logged_topics.cpp
 VISION_PROFILE_BIT = 128  # SDLOG_PROFILE bit 7, logged_topics.cpp
-LOGGER_TOLERANCE = 0.25  # of the interval; jitter of PX4's logger on flights
-# s; intervals at which PX4's default profile decimates these topics (logged_topics.cpp)
+LOGGER_TOLERANCE = 0.25  # of the logging interval; jitter of PX4's logger
+# Logging intervals (s) of topics in PX4's default profile (logged_topics.cpp)
 LOGGER_INTERVALS_S = {
     "estimator_visual_odometry_aligned": (0.2,),
     "estimator_aid_src_ev_pos": (0.5,),
-    "ekf2_state_plus_innovation": (0.5, 0.2),  # 0.2 in v1.11
+    "ekf2_state_plus_innovation": (0.5, 0.2),  # 0.2 s in v1.11
 }
-MIN_INNOVATION_SHARE = 0.75  # of the source's samples; missing a quarter does not bias the test
+MIN_INNOVATION_SHARE = 0.75  # of the positions; with fewer logged innovations, verdicts may differ
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect all data that the log lacks."""
+    """Detect data that the log lacks."""
     yield from detect_unavailable_data(analysis)
     yield from detect_source_not_logged(analysis)
     yield from detect_missing_innovations(analysis)
@@ -49,7 +49,7 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
         if isinstance(kf_summary, Unavailable):
             yield warning(
                 "too_few_innovations",
-                f"Consistency is not tested: {kf_summary.reason}.",
+                f"The consistency of KF is not tested: {kf_summary.reason}.",
                 kf_summary.remedy,
                 {"count": len(result.replay.updates)},
             )
@@ -57,7 +57,7 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
 
 
 def detect_source_not_logged(analysis: Comparison) -> Findings:
-    """Detect that the received positions are not logged, and a low logging rate of their copy."""
+    """Detect missing received positions, and a low logging rate of the topic used instead."""
     source, preference = analysis.source, RECEIVED.preference
     is_logged = any(track.origin.preference == preference for track in analysis.flight.positions)
     if source.origin.has_all_samples or is_logged:
@@ -92,29 +92,27 @@ def detect_source_not_logged(analysis: Comparison) -> Findings:
 
 
 def _weak_verdict(analysis: Comparison, owner: FilterName) -> str | None:
-    """State that more innovations could change a verdict; None if they could not.
+    """Format a clause if more innovations could change the verdict of a filter, else None.
 
-    The text completes a sentence.
-
-    They could if the 95 % interval of innovation ÷ √S contains a limit of the consistent band, or
-    if there are too few innovations for a verdict.
+    They could if there are too few for a verdict, or if the 95 % interval of the σ ratio contains a
+    limit of the consistent band.
     """
     summary, limits = analysis.main.filters[owner], CONSISTENT_RATIOS["source"]
     name = owner.upper()
     if not isinstance(summary, FilterSummary):
-        return f"too few to test {name}."
+        return f"too few to test the consistency of {name}."
     low, high = ratio_interval(summary.nis_mean, summary.nis_band)
     for limit in limits:
         if low <= limit <= high:
             return (
-                f"the verdict of {name} is near its limit. The 95 % interval of innovation ÷ "
+                f"and the verdict of {name} is near its limit. The 95 % interval of innovation ÷ "
                 f"√S ({low:.2f} to {high:.2f}) contains the limit {limit:g}."
             )
     return None
 
 
 def detect_missing_innovations(analysis: Comparison) -> Findings:
-    """Detect fewer logged EKF2 innovations than measurements."""
+    """Detect a log with fewer EKF2 innovations than measurements."""
     ekf2, axes = analysis.flight.ekf2, analysis.axes.values()
     counts = (
         (result.axis.name, len(frame))
@@ -128,7 +126,7 @@ def detect_missing_innovations(analysis: Comparison) -> Findings:
     count = len(next(iter(axes)).replay.updates)
     weak = _weak_verdict(analysis, "ekf2")
     if logged / count < MIN_INNOVATION_SHARE and weak:
-        # no profile of PX4's logger records innovations at a higher rate, so there is no action
+        # no setting of PX4's logger records innovations at a higher rate, so there is no action
         yield note(
             "ekf2_innovations_decimated",
             f"Only {logged} of {count} EKF2 innovations are logged, {weak}",

@@ -14,49 +14,38 @@ from px4fuse.record import Record, Span, table
 
 
 class CatalogueEntry(Record, frozen=True):
-    """Title, group and explanation of a finding.
-
-    Attributes
-    ----------
-    title : str
-    group : str
-        Position source, time, IMU, tuning, EKF2, loops or logging.
-    meaning : str
-        Explanation for a reader who meets the finding for the first time.
-    formerly : str
-        Id before schema 4; empty if it is the same.
-    """
+    """Title, group (one of :data:`GROUPS`) and explanation of a finding for new readers."""
 
     title: str
     group: str
     meaning: str
-    formerly: str = ""
 
 
-# By id; findings of equal rank are listed in this order
+# Catalogue of findings by id; findings of equal severity are listed in this order
 CATALOGUE: Mapping[str, CatalogueEntry] = table(
     __file__, "catalogue.toml", dict[str, CatalogueEntry]
 )
 GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "logging")
 TITLES: Mapping[str, str] = {name: entry.title for name, entry in CATALOGUE.items()}
-# Present id by the id before schema 4
-RENAMED_IDS: Mapping[str, str] = {
-    entry.formerly: name for name, entry in CATALOGUE.items() if entry.formerly
-}
+# Present finding id, by the id before schema 4 of the results
+RENAMED_IDS: Mapping[str, str] = dict(
+    line.split()
+    for line in table(__file__, "renamed_ids.toml", dict[str, str])["renamed_ids"].splitlines()
+)
 
 
 class Example(Record, frozen=True):
-    """Example of a finding, with its rates on simulated flights (tests/studies/rates.csv).
+    """Example of a finding, with detection and false alarm rates (tests/studies/rates.csv).
 
     Attributes
     ----------
     message, remedy : str
         Message and action on one flight.
     clean_flights, false_alarms : int
-        Number of flights without a mistake, and number of these with the finding.
+        Number of simulated flights without a mistake, and number of these with the finding.
     detection : dict
-        Share of the flights with a mistake that have the finding, by option of px4fuse simulate or
-        by setting.
+        Fraction of the simulated flights with a mistake that have the finding, by the mistake as
+        an option of `px4fuse simulate`, or as a setting of KF.
     """
 
     message: str
@@ -67,7 +56,7 @@ class Example(Record, frozen=True):
 
 
 def load_examples() -> Mapping[str, Example]:
-    """Load the examples by id, made by docs/findings_pages.py."""
+    """Load the example of each finding, by id; docs/findings_pages.py makes the file."""
     return msgspec.json.decode(
         Path(__file__).with_name("examples.json").read_bytes(), type=dict[str, Example]
     )
@@ -93,7 +82,7 @@ error, warning, note = (partial(finding, severity) for severity in SEVERITIES)
 
 
 def group_by_root(findings: Iterable[Finding]) -> list[list[Finding]]:
-    """Group findings: each root cause, followed by its consequences."""
+    """Group findings: each finding without a known cause, followed by its consequences."""
     groups: list[list[Finding]] = []
     for entry in findings:
         if entry.caused_by is None:
@@ -108,7 +97,7 @@ def zero_length_spans(times_s: Iterable[float]) -> tuple[Span, ...]:
 
 
 def lower_severity(severity: Severity) -> Severity:
-    """Lower a severity by one level, for default settings that the user did not choose."""
+    """Lower a severity by one level, because the user did not choose a default setting."""
     return "warning" if severity == "error" else "note"
 
 
@@ -117,13 +106,13 @@ def format_count(count: int) -> str:
     return "once" if count == 1 else f"{count} times"
 
 
-def format_percent(share: float, digits: int = 0) -> str:
-    """Format a share as "57 %"."""
-    return f"{100.0 * share:.{digits}f} %"
+def format_percent(fraction: float, digits: int = 0) -> str:
+    """Format a fraction as a percentage: "57 %"."""
+    return f"{100.0 * fraction:.{digits}f} %"
 
 
 def spans_with_value(value: float, steps: pd.Series, segment: Segment) -> tuple[Span, ...]:
-    """Return the spans of a segment in which a step function has a value.
+    """Return the spans of a segment in which a step function has a given value.
 
     Before its first time the step function has its first value.
     """

@@ -1,4 +1,4 @@
-"""SIGMA_Z or SIGMA_A that contradicts the innovations, and KF or EKF2 that is not consistent.
+"""SIGMA_Z or SIGMA_A of KF that is wrong, and KF or EKF2 that is over- or underconfident.
 
 The mean NIS alone cannot separate SIGMA_A from SIGMA_Z: both increase S. The likelihood can: a
 wrong SIGMA_A correlates successive innovations, a wrong SIGMA_Z hardly does. Both are estimated,
@@ -46,15 +46,17 @@ from px4fuse.flight import Columns, Unavailable, sample_rate
 from px4fuse.request import COMPARISON_OPTIONS
 from px4fuse.text import format_factor, format_number, format_ratio
 
-MIN_NOISE_RATIO = 1.5  # ratio of σ; below, the tracks hardly change
-MIN_NOISE_RATIO_ERROR = 4.0  # ratio of σ; above, the gain differs clearly
-MIN_RESPONSE_TIME_S = 2.5  # s; five times that of the lesson; a vehicle turns around in less
-INTERVAL_WIDENING = 1.5  # factor on the 95 % interval (log scale); 0.3 % of clean flights exceed it
-MIN_LAG1_AUTOCORRELATION = 0.3  # of white innovations below 2/√n, which is 0.2 for n = 100
+MIN_NOISE_RATIO = 1.5  # setting over estimate (σ) or its inverse; below, the track hardly changes
+MIN_NOISE_RATIO_ERROR = 4.0  # setting over estimate (σ) or its inverse, for an error
+MIN_RESPONSE_TIME_S = 2.5  # s; minimum response time of KF for Q almost zero: vehicles turn in less
+INTERVAL_WIDENING = (
+    1.5  # factor on the 95 % interval (log scale); 0.3 % of correct settings exceed it
+)
+MIN_LAG1_AUTOCORRELATION = 0.3  # of the innovations; white ones: below 2/√n, 0.2 for n = 100
 
-MIN_SIGMA_RATIO_ERROR = 2.0  # reported over actual σ, or its inverse
-NOISE_RATIO_TOLERANCE = 1.25  # 2 σ of the median for n = 100 (σ of the median: 1.17/√n)
-# Actions, if no re-run explains a deviation
+MIN_SIGMA_RATIO_ERROR = 2.0  # reported over actual σ, or its inverse, for an error
+NOISE_RATIO_TOLERANCE = 1.25  # maximum ratio of two equal noises (σ): 2 σ of a median of n = 100
+# Actions if no re-run explains an inconsistent variance
 NOT_EXPLAINED = (
     "No tested change of noise, time offset, frame or outliers explains this. Check the IMU "
     "(rate, gaps, vibration)."
@@ -72,12 +74,12 @@ KEEP_NOISES_CORRELATED = (
 KEEP_NOISES_TRUTH = (
     "Do not reduce the noises: σ would become smaller than the errors against ground truth."
 )
-# Effect and mechanism of a wrong setting, by option and direction
+# Effect and mechanism of a noise setting that is too small or too large
 SETTING_EFFECTS = {
     (SIGMA_Z, "small"): ("KF follows the measurement noise", "The gain is too large."),
     (SIGMA_Z, "large"): ("KF corrects slowly", "The gain is too small."),
     (SIGMA_A, "small"): (
-        "KF lags",
+        "KF lags the motion",
         "P grows too little between updates, so the gain is too small.",
     ),
     (SIGMA_A, "large"): (
@@ -97,7 +99,7 @@ class SettingDeviation(NamedTuple):
     value : float
         Maximum-likelihood estimate, or its upper bound.
     size : float
-        Ratio of setting and ``value``, or its inverse: at least 1.
+        Setting over ``value``, or its inverse: at least 1.
     severity : Severity
     """
 
@@ -107,16 +109,16 @@ class SettingDeviation(NamedTuple):
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect wrong settings, then the inconsistent variances that follow from them."""
+    """Detect wrong noise settings of KF, then inconsistent variances of KF and EKF2."""
     yield from detect_wrong_settings(analysis)
     yield from detect_process_noise_near_zero(analysis)
     yield from detect_inconsistent_variances(analysis)
 
 
 def detect_wrong_settings(analysis: Analysis) -> Findings:
-    """Detect settings outside their (widened) 95 % interval.
+    """Detect noise settings of KF outside the widened 95 % interval of their estimate.
 
-    The larger deviation is the cause of the other one, if its re-run improves KF.
+    If SIGMA_A and SIGMA_Z are both wrong, the larger deviation is the cause of the smaller one.
     """
     axis_tuning = first_axis_tuning(analysis.tuning, HORIZONTAL, "aisle", "down")
     if axis_tuning is None:
@@ -125,14 +127,13 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
     ml_noises = {SIGMA_Z: axis_tuning.sigma_z, SIGMA_A: axis_tuning.sigma_a_two_state}
     if hardly_moved(analysis):  # without motion SIGMA_A cannot be estimated
         del ml_noises[SIGMA_A]
-    deviations = {
-        name: setting_deviation(name, chosen[name], noise) for name, noise in ml_noises.items()
-    }
     wrong_settings = {
-        name: deviation for name, deviation in deviations.items() if deviation is not None
+        name: deviation
+        for name, noise in ml_noises.items()
+        if (deviation := setting_deviation(name, chosen[name], noise))
     }
     # if the source has drift or time-correlated errors, or ground truth shows larger errors, then
-    # innovations prove only that a noise is too small, not that it is too large
+    # innovations show only that a noise is too small, not that it is too large
     may_drift, has_slow_errors = analysis.source.origin.may_drift, analysis.source.origin.is_gnss
     if (
         may_drift
@@ -144,30 +145,27 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
             for name, deviation in wrong_settings.items()
             if chosen[name] < deviation.value and not (may_drift and deviation.severity == "note")
         }
-    found = [
+    cause = None
+    findings = [
         _setting_finding(analysis, axis_tuning, name, deviation)
-        for name, deviation in wrong_settings.items()
+        for name, deviation in sorted(wrong_settings.items(), key=lambda item: -item[1].size)
     ]
-    found.sort(key=lambda each: (SEVERITIES.index(each[1].severity), -each[0]))
-    for index, (_, setting_finding) in enumerate(found):
-        cause = found[0][1].id if index else None
+    for setting_finding in sorted(findings, key=lambda item: SEVERITIES.index(item.severity)):
         yield structs.replace(setting_finding, caused_by=cause)
+        cause = cause or setting_finding.id
 
 
 def _setting_finding(
     analysis: Analysis, axis_tuning: AxisTuning, name: str, deviation: SettingDeviation
-) -> tuple[float, Finding]:
-    """Return the ratio of a setting to its estimate, and the finding.
-
-    The finding is a note if a re-run with the estimate is no better.
-    """
+) -> Finding:
+    """Make the finding of a wrong setting; a note if a re-run with the estimate is no better."""
     value, size, severity = deviation
     chosen = getattr(analysis.settings, name)
     noise = axis_tuning.sigma_z if name == SIGMA_Z else axis_tuning.sigma_a_two_state
     direction, is_bound = "small" if chosen < value else "large", noise.value is None
     effect, mechanism = SETTING_EFFECTS[name, direction]
     action = format_setting_action(analysis, name, value)
-    return size, finding(
+    return finding(
         "note" if action == NO_IMPROVEMENT else severity,
         f"{name[:7]}_too_{direction}",
         f"{name[:7].upper()} is {'at least ' if is_bound else ''}{format_factor(size)} times "
@@ -197,7 +195,7 @@ def format_estimate(name: str, chosen: float, noise: Noise) -> str:
 def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
     """Format the action for a wrong setting of KF: the change whose re-run improves KF.
 
-    Without a re-run that could show an improvement, the estimate is proposed as the next re-run.
+    If no re-run could show an improvement, the action is a run with the estimate.
     """
     if trial := find_trial(analysis.trials, "kf", "noises", name):
         return format_kf_settings(trial.change)
@@ -211,7 +209,7 @@ def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
 
 
 def setting_deviation(name: str, chosen: float, ml_noise: Noise) -> SettingDeviation | None:
-    """Return the deviation of a setting from its estimate; None if the deviation is small."""
+    """Return the deviation of a setting from its estimate; None if it is not significant."""
     value = _value_or_bound(ml_noise)
     if value is None:
         return None
@@ -232,9 +230,9 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
     """Detect SIGMA_A so small that σ hardly grows between updates and KF ignores measurements.
 
     Without motion a slow filter is correct, so the innovations must also be correlated and too
-    large. The main axis is reported, else the first axis with a long response time.
+    large. The main axis is tested first; at most one axis is reported.
     """
-    for result in sorted(analysis.axes.values(), key=lambda each: each is not analysis.main):
+    for result in sorted(analysis.axes.values(), key=lambda result: result is not analysis.main):
         updates, summary = result.replay.updates, result.filters["kf"]
         if isinstance(summary, Unavailable) or summary.verdict != "overconfident":
             continue
@@ -276,20 +274,17 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
 
 
 def detect_inconsistent_variances(analysis: Analysis) -> Findings:
-    """Detect inconsistent variances; the vertical axis is listed below the horizontal axes."""
+    """Detect inconsistent variances; that of the down axis follows the horizontal one."""
     for filter_name in FILTERS:
         for is_underconfident in (True, False):
             first_id = None
             for group, axes in AXIS_GROUPS.items():
                 results = [analysis.axes[name] for name in axes if name in analysis.axes]
-                pairs = [(result, result.filters[filter_name]) for result in results]
-                inconsistent = [
-                    (result, summary) for result, summary in pairs if is_inconsistent(summary)
-                ]
                 members = [
-                    pair
-                    for pair in inconsistent
-                    if (pair[1].sigma_ratio < 1.0) == is_underconfident
+                    (result, summary)
+                    for result in results
+                    if is_inconsistent(summary := result.filters[filter_name])
+                    and (summary.sigma_ratio < 1.0) == is_underconfident
                 ]
                 if members:
                     variance_finding = _variance_finding(analysis, filter_name, group, members)
@@ -300,7 +295,7 @@ def detect_inconsistent_variances(analysis: Analysis) -> Findings:
 def _variance_finding(
     analysis: Analysis, filter_name: FilterName, group: str, members: list[Member]
 ) -> Finding:
-    """Make the finding of a group of axes, with numbers of the main axis, else of the worst."""
+    """Make the finding of a group of axes, with numbers of the main or the worst axis."""
     result, summary = max(
         members,
         key=lambda pair: (pair[0] is analysis.main, abs(np.log(pair[1].nis_mean))),
@@ -341,19 +336,17 @@ def _variance_finding(
         evidence["sigma_z_asked_m"] = ml_sigma_z
         evidence["sigma_z_asked_is_upper_bound"] = float(axis_tuning.sigma_z.value is None)
     low, high = summary.nis_band
-    filter_label, gate_effect = {"kf": "KF", "ekf2": "EKF2"}[filter_name], ""
+    gate_effect = ""
     if filter_name == "ekf2":
-        accepted = (
-            "accept positions with large errors" if is_underconfident else "reject good positions"
-        )
-        gate_effect = f" The gate of EKF2 may then {accepted}."
+        gate_effect = " The gate of EKF2 may then reject good positions."
+        if is_underconfident:
+            gate_effect = " The gate of EKF2 may then accept positions with large errors."
     return finding(
         severity,
         f"{filter_name}_{confidence}",
-        f"{filter_label} is {confidence} along "
-        f"{result.axis.label}: σ is {format_ratio(factor)} times too "
-        f"{'large' if is_underconfident else 'small'}. The mean NIS is "
-        f"{format_number(summary.nis_mean)}, expected {low:.2f} to {high:.2f} ({group} "
+        f"{filter_name.upper()} is {confidence} along {result.axis.label}: σ is "
+        f"{format_ratio(factor)} times too {'large' if is_underconfident else 'small'}. The mean "
+        f"NIS is {format_number(summary.nis_mean)}, expected {low:.2f} to {high:.2f} ({group} "
         f"axes).{gate_effect}",
         remedy_text,
         evidence,
@@ -361,7 +354,7 @@ def _variance_finding(
 
 
 def _format_excessive_noise(analysis: Analysis) -> str:
-    """Format the action if EKF2's noise parameter exceeds the reported accuracy, else ""."""
+    """Format the action if EKF2's GNSS noise exceeds the receiver's reported σ, else ""."""
     name = aid_of(analysis).noise
     parameter_m = analysis.flight.log.parameters.get(name, float("nan"))
     reported_variance = cut_to_segment(analysis.source.samples, analysis.segment)[
@@ -379,24 +372,20 @@ def _format_excessive_noise(analysis: Analysis) -> str:
 def _has_default_noises(
     analysis: Analysis, filter_name: FilterName, result: AxisComparison
 ) -> bool:
-    """Return True if the noises in use are defaults of px4fuse (KF) or PX4 (EKF2)."""
+    """Return True if the filter uses the default noises of px4fuse (KF) or PX4 (EKF2)."""
     if filter_name == "kf":
-        settings, defaults = analysis.settings, Settings()
-        return (settings.sigma_z_m, settings.sigma_a_m_s2) == (
-            defaults.sigma_z_m,
-            defaults.sigma_a_m_s2,
-        )
-    name = aid_of(analysis, result.axis.name).noise
-    default = PARAMETERS[name].default
-    is_parameter_default = analysis.flight.log.parameters.get(name, default) == default
-    # a variance reported by the sender is chosen by the user, too
+        kf, defaults = analysis.settings, Settings()
+        return all(getattr(kf, name) == getattr(defaults, name) for name in (SIGMA_Z, SIGMA_A))
+    parameter = aid_of(analysis, result.axis.name).noise
+    default = PARAMETERS[parameter].default
+    is_parameter_default = analysis.flight.log.parameters.get(parameter, default) == default
+    # a variance that the sender reports is a choice of the user, not a default
     return is_parameter_default and not abs(np.log(ekf2_noise_m(result) / default)) > np.log(
         NOISE_RATIO_TOLERANCE
     )
 
 
 def _value_or_bound(noise: Noise) -> float | None:
-    """Return the maximum-likelihood value of a noise, else its upper bound."""
     return noise.high if noise.value is None else noise.value
 
 
@@ -407,7 +396,6 @@ def _remedy(
     axis_tuning: AxisTuning | None,
     cause: Intervention | None,
 ) -> str:
-    """Format the action against the cause, or a check if no cause is known."""
     if cause is not None and not is_refuted(analysis, filter_name, cause):
         return format_action(analysis, cause.change)
     reruns = interventions_for(analysis.causes, filter_name, result.axis.name)
@@ -423,19 +411,15 @@ def _remedy(
 def _remedy_without_replay(
     analysis: Analysis, result: AxisComparison, axis_tuning: AxisTuning
 ) -> str:
-    """Format the action if EKF2 cannot be replayed: its R against the estimated noise."""
+    """Format the action without a replay: compare EKF2's R with the estimated noise."""
     aid, ml_noise_m = aid_of(analysis, result.axis.name), _value_or_bound(axis_tuning.sigma_z)
     summary = result.filters["ekf2"]
     assert not isinstance(summary, Unavailable)
     if ml_noise_m is None:
         return NOT_EXPLAINED
     noise_m, ekf2_m = max(ml_noise_m, EKF2_MIN_NOISE_M), ekf2_noise_m(result)
-    ratio = noise_m / ekf2_m
-    if (
-        ratio < 1.0 / NOISE_RATIO_TOLERANCE
-        if summary.sigma_ratio < 1.0
-        else ratio > NOISE_RATIO_TOLERANCE
-    ):
+    ratio = ekf2_m / noise_m if summary.sigma_ratio < 1.0 else noise_m / ekf2_m
+    if ratio > NOISE_RATIO_TOLERANCE:
         changes = noise_change(aid, analysis.flight.log.parameters, ekf2_m, noise_m)
         return (
             f"Set {format_settings(changes)} (EKF2 uses {ekf2_m:.2g} m). No replay of this log "

@@ -1,4 +1,4 @@
-"""Faults of the recording: lost data, restarts, clocks that went back, other estimators."""
+"""Faults of the recording: lost data, restarts, clocks that were set back, other estimators."""
 
 import pandas as pd
 
@@ -11,7 +11,7 @@ from px4fuse.text import capitalise_first, format_number
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect all faults of the recording, lost data first."""
+    """Detect faults of the recording, lost data first."""
     yield from detect_dropouts(analysis)
     yield from detect_lost_data(analysis.flight)
     yield from detect_clocks_set_back(analysis.flight)
@@ -42,13 +42,13 @@ def detect_dropouts(analysis: Comparison) -> Findings:
 
 
 def detect_lost_data(flight: Flight) -> Findings:
-    """Detect bytes that cannot be read, a log that ends in flight, and dropped samples."""
+    """Detect unreadable bytes, a log that ends in flight, and samples in wrong order."""
     log = flight.log
     if log.damage or log.ends_in_flight:
         fault = f"The log ends in flight after {log.duration_s:.1f} s. The landing is missing."
         if log.damage:
             lost_fraction = 1.0 - log.bytes_read / log.bytes if log.bytes else 0.0
-            size = f": {format_number(100.0 * lost_fraction, 2)} % of it cannot be read"
+            size = f": {format_number(100.0 * lost_fraction, 2)} % of its bytes cannot be read"
             damage = "the log is damaged" + (size if lost_fraction else "")
             fault = " ".join(f"{_sentence(note)}." for note in (damage, *log.damage))
         action = "Copy the log again. If this does not help, replace the SD card."
@@ -65,11 +65,7 @@ def detect_lost_data(flight: Flight) -> Findings:
         )
     for topic, count in list(log.dropped.items())[:1]:
         other_count = len(log.dropped) - 1
-        other_topics = (
-            f" (also in {other_count} other topic{'s' if other_count > 1 else ''})"
-            if other_count
-            else ""
-        )
+        other_topics = f" (other topics with such samples: {other_count})" if other_count else ""
         yield note(
             "samples_out_of_order",
             f"{count} samples of {topic} have wrong timestamps. They are zero or go "
@@ -103,7 +99,7 @@ def detect_clocks_set_back(flight: Flight) -> Findings:
 
 
 def detect_other_estimators(analysis: Analysis) -> Findings:
-    """Detect EKF2 data of a model or of another estimator, or without innovations."""
+    """Detect EKF2 data of px4fuse's model or another autopilot, or without innovations."""
     log, ekf2 = analysis.flight.log, analysis.flight.ekf2
     if MODEL_NOTE in log.notes:
         yield note(
@@ -136,5 +132,4 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
 
 
 def _sentence(note: str) -> str:
-    """Capitalise a note, unless it begins with a file name."""
     return note if "." in note.split(" ", 1)[0] else capitalise_first(note)

@@ -1,4 +1,4 @@
-"""Time offset between source and IMU, its change in flight, and a wrong EKF2_EV_DELAY."""
+"""Time offset between position source and IMU, its change in flight, and a wrong EKF2_EV_DELAY."""
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
@@ -10,15 +10,15 @@ from px4fuse.findings.model import Findings, error, finding, warning
 from px4fuse.findings.source_positions import find_low_pass
 from px4fuse.findings.source_stamps import find_synchronisation
 
-MIN_OFFSET_S = 0.03  # s; at 1 m/s a third of the noise of good UWB (0.1 m)
-MIN_OFFSET_ERROR_S = 0.10  # s; at 1 m/s the noise of good UWB (0.1 m)
-# Minimum ratio of two RMSEs of KF that is significant; its re-run is exact
+MIN_OFFSET_S = 0.03  # s; offset for a warning; at 1 m/s a third of the noise of good UWB (0.1 m)
+MIN_OFFSET_ERROR_S = 0.10  # s; offset for an error; at 1 m/s the noise of good UWB (0.1 m)
+# Ratio of KF's position RMSE with over without a change, above which the change makes KF worse
 MAX_RMSE_RATIO = 1.005
 CORRECT_AT_SENDER = "Correct the timestamps at the sender."
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect a wrong time offset or delay; positions rebuilt from EKF2 output are not tested."""
+    """Detect a wrong time offset or EKF2_EV_DELAY, unless EKF2 output is the position source."""
     clock, is_reconstructed = analysis.clock, analysis.source.origin.reconstructed
     if isinstance(clock, ClockOffset) and clock.is_determinable and not is_reconstructed:
         yield from detect_offset(analysis, clock)
@@ -26,8 +26,10 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
-    """Detect a time offset relative to the IMU, or one that changes in flight."""
-    if find_low_pass(analysis) is not None:  # a low-pass filtered source lags without a time offset
+    """Detect a time offset between positions and IMU, or one that changes in flight."""
+    if (
+        find_low_pass(analysis) is not None
+    ):  # positions that are low-pass filtered lag without a time offset
         return
     low, high = clock.interval_s
     evidence = {"offset_s": clock.offset_s, "interval_low_s": low, "interval_high_s": high}
@@ -67,14 +69,10 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
 
 
 def _find_trial(analysis: Analysis, owner: FilterName, kind: str) -> Trial | None:
-    """Return the re-run of one filter with one kind of change, if there is one."""
-    return next(
-        (one for one in analysis.trials if one.filter == owner and one.kinds == (kind,)), None
-    )
+    return next((t for t in analysis.trials if (t.filter, t.kinds) == (owner, (kind,))), None)
 
 
 def _contradicts_truth(trial: Trial | None) -> bool:
-    """Return True if a re-run increases the position RMSE against ground truth."""
     if trial is None:
         return False
     before, after = trial.before.position_rmse_m, trial.after.position_rmse_m
@@ -82,14 +80,12 @@ def _contradicts_truth(trial: Trial | None) -> bool:
 
 
 def _receiver_delay(analysis: Analysis) -> str | None:
-    """Return the parameter with the delay of a GNSS receiver, if it is logged."""
     parameters = analysis.flight.log.parameters
     names = (name for name in (*RECEIVER_DELAYS, GNSS_POS.delay) if name in parameters)
     return next(names, None) if analysis.source.origin.fused_as_gnss else None
 
 
 def _assumed_delay(analysis: Analysis, clock: ClockOffset) -> str:
-    """State the delay that the autopilot assumes of a GNSS receiver; empty for other sources."""
     name = _receiver_delay(analysis)
     if name is None:
         return ""
@@ -99,7 +95,7 @@ def _assumed_delay(analysis: Analysis, clock: ClockOffset) -> str:
 
 
 def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
-    """Return the action at the source; the card adds those of KF and EKF2 from the re-runs."""
+    """Return the action at the source; the card adds the actions for KF and EKF2."""
     if name := _receiver_delay(analysis):
         return f"Check the delay of the GNSS receiver ({name})."
     if analysis.source.alignment is not None:
@@ -113,15 +109,15 @@ def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
 def clock_offset_option_s(comparison: Comparison, clock: ClockOffset) -> float:
     """Return the value (s) for ``--clock-offset``: offset in use plus the estimated remainder.
 
-    For a position file the offset in use is part of the alignment, not of the settings.
+    For a position file, the offset in use is part of its alignment.
     """
     alignment = comparison.source.alignment
     return clock.offset_s if alignment is None else alignment.clock_offset_s + clock.remaining_s
 
 
 def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
-    """Detect EKF2_EV_DELAY outside 3 σ of the time offset plus one EKF2 step."""
-    # GNSS timestamps are corrected by EKF2_GPS_DELAY, so detect_offset already covers that delay
+    """Detect EKF2_EV_DELAY that differs from the estimate by 3 σ and one EKF2 step."""
+    # EKF2_GPS_DELAY corrects GNSS timestamps, so the time offset already includes its error
     delay_ms = remedy.delay_ms(analysis) if analysis.source.origin.is_vision else None
     ml_delay_ms = -1e3 * clock.offset_s
     tolerance_ms = max(1e3 * clock.three_sigma_s + remedy.PREDICTION_STEP_MS, 1e3 * MIN_OFFSET_S)
@@ -147,7 +143,6 @@ def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
 
 
 def _format_delay_limit(wanted_ms: float, delay_ms: float) -> str:
-    """State that EKF2_EV_DELAY cannot have the wanted value; empty if it can."""
     maximum_ms = PARAMETERS["EKF2_EV_DELAY"].maximum
     if wanted_ms > maximum_ms:
         return f" PX4 allows at most {maximum_ms:g} ms."
@@ -157,7 +152,6 @@ def _format_delay_limit(wanted_ms: float, delay_ms: float) -> str:
 
 
 def _delay_remedy(analysis: Analysis, wanted_ms: float, delay_ms: float) -> str:
-    """Return the action: EKF2_EV_DELAY if a re-run with another value is better."""
     trial = _find_trial(analysis, "ekf2", "delay")
     if _format_delay_limit(wanted_ms, delay_ms) or (trial is not None and not _improves(trial)):
         return CORRECT_AT_SENDER
@@ -167,7 +161,7 @@ def _delay_remedy(analysis: Analysis, wanted_ms: float, delay_ms: float) -> str:
 
 
 def _improves(trial: Trial) -> bool:
-    """Return True if a re-run has a smaller position RMSE, without ground truth a smaller NIS."""
+    """Return True if a re-run reduces the position RMSE, without ground truth the mean NIS."""
     before, after = trial.before, trial.after
     if before.position_rmse_m is not None and after.position_rmse_m is not None:
         return after.position_rmse_m < before.position_rmse_m

@@ -1,4 +1,4 @@
-"""Frame of the source: FRD instead of NED, misalignment, EKF2 heading errors, file alignment."""
+"""Position frame in FRD or misaligned, EKF2 heading errors, and alignment of a position file."""
 
 from px4fuse.analysis import Analysis
 from px4fuse.filter.frame_rotation import MAX_DRIFT_P_VALUE, HeadingError
@@ -8,17 +8,17 @@ from px4fuse.findings.model import Findings, finding, fraction_on, note, warning
 from px4fuse.flight import Ekf2, Unavailable, positions_of, source_name
 from px4fuse.text import capitalise_first
 
-MIN_HEADING_SIGMAS = 4.0  # standard deviations; clean flights reach 3.2
-MIN_HEADING_ERROR_DEG = 5.0  # °; EKF2's magnetic heading was wrong by 3 to 4° on real flights
-LARGE_HEADING_ERROR_DEG = 15.0  # °; a quarter of each axis appears on the other
-# Topic with the positions after EKF2 rotated them into its frame (EKF2.cpp)
+MIN_HEADING_SIGMAS = 4.0  # misalignment in σ; flights without a mistake reach 3.2
+MIN_HEADING_ERROR_DEG = 5.0  # °; real flights had errors of 3 to 4° of the magnetic heading
+LARGE_HEADING_ERROR_DEG = 15.0  # °, for an error: a quarter of the motion appears on the wrong axis
+# Topic with the positions that EKF2 has rotated into the frame of its state (EKF2.cpp)
 IN_EKF2_FRAME = "estimator_visual_odometry_aligned"
 CALIBRATE = "Calibrate the magnetometer away from metal and motors."
 CHECK_GNSS_DELAY = "Check EKF2_GPS_DELAY: a wrong delay also rotates the heading."
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect all faults of the source's frame and of EKF2's heading."""
+    """Detect faults of the position frame and of EKF2's heading."""
     if analysis.source.frame == "FRD":
         yield make_frame_finding(analysis)
     heading = analysis.heading
@@ -28,7 +28,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def make_frame_finding(analysis: Analysis) -> Finding:
-    """Make the finding of a source in FRD; its severity depends on EKF2's fusion of yaw."""
+    """Make the finding of positions in FRD: a note if EKF2 fuses the yaw of the source."""
     ekf2, log = analysis.flight.ekf2, analysis.flight.log
     fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else None
     name = source_name(analysis.source)
@@ -54,16 +54,16 @@ def make_frame_finding(analysis: Analysis) -> Finding:
 
 
 def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
-    """Detect a rotation between the motion measured by the IMU and by the positions."""
-    turn_deg, sigma_deg = heading.misalignment_deg, heading.sigma_deg
+    """Detect a rotation between the motion in the positions and the motion in the IMU."""
+    rotation_deg, sigma_deg = heading.misalignment_deg, heading.sigma_deg
     if heading.drifts:
         yield _drift_finding(analysis, heading)
         return
     limit_deg = max(MIN_HEADING_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG)
-    if abs(turn_deg) < limit_deg or _is_explained_by_bias(analysis):
+    if abs(rotation_deg) < limit_deg or _is_explained_by_bias(analysis):
         return
     positions = capitalise_first(positions_of(analysis.source))
-    title = f"{positions} are rotated by {turn_deg:+.0f}° relative to EKF2's heading"
+    title = f"{positions} are rotated by {rotation_deg:+.0f}° relative to EKF2's heading"
     interval = (
         f"The 95 % interval is ± {1.96 * sigma_deg:.0f}°; the rotation is clockwise from above and "
         "constant over the flight."
@@ -86,27 +86,27 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     else:
         finding_id = "source_frame_misaligned"
         message = (
-            f"{positions} are rotated by {turn_deg:+.0f}° relative to the IMU. {interval} Either "
-            "the positioning frame is not aligned with north, or the heading is wrong "
+            f"{positions} are rotated by {rotation_deg:+.0f}° relative to the IMU. {interval} "
+            "Either the positioning frame is not aligned with north, or the heading is wrong "
             "(magnetometer)."
         )
         action = (
-            f"Rotate the positions by {-turn_deg:+.0f}° before they are sent, or calibrate the "
+            f"Rotate the positions by {-rotation_deg:+.0f}° before they are sent, or calibrate the "
             "magnetometer."
         )
         if analysis.source.alignment is not None:
             action = "Run again with --position-yaw auto, or calibrate the magnetometer."
     yield finding(
-        "error" if abs(turn_deg) >= LARGE_HEADING_ERROR_DEG else "warning",
+        "error" if abs(rotation_deg) >= LARGE_HEADING_ERROR_DEG else "warning",
         finding_id,
         message,
         action,
-        {"misalignment_deg": turn_deg, "sigma_deg": sigma_deg},
+        {"misalignment_deg": rotation_deg, "sigma_deg": sigma_deg},
     )
 
 
 def _is_explained_by_bias(analysis: Analysis) -> bool:
-    """Return True if an accelerometer bias explains the misalignment as well as a rotation."""
+    """Return True if an accelerometer bias explains the data as well as a rotation does."""
     fit = analysis.bias_scale_jump_fit
     if isinstance(fit, Unavailable) or analysis.source.orientation is not None:
         return False
@@ -147,7 +147,7 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
 
 
 def detect_uncertain_alignment(analysis: Analysis) -> Findings:
-    """Detect an uncertain alignment (frame, yaw, time) of a position file."""
+    """Detect an uncertain frame, yaw or time of a position file."""
     alignment = analysis.source.alignment
     sentences_by_severity: dict[Severity, tuple[str, ...]] = {}
     if alignment is not None:

@@ -1,7 +1,7 @@
-"""Gaps between positions, lost samples, and a downsampled source.
+"""Gaps in the position source, lost positions, and a source that is downsampled.
 
-If exactly every second or third sample is kept, the intervals equal those of a slower source; no
-log can distinguish the two.
+If every second or third position is kept, the intervals equal those of a slower source, so the
+downsampling cannot be detected.
 """
 
 from collections.abc import Mapping
@@ -23,17 +23,18 @@ from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 from px4fuse.record import Span
 from px4fuse.text import capitalise_first, format_metres
 
-MIN_LOST_SHARE = 0.02  # of the source's samples; flights have 0 to 0.3 %, v1.13 has 8 to 9 %
-MIN_INTERVALS = 50
-MIN_DOWNSAMPLED_SHARE = 0.25  # of the source's samples; a radio link loses less
-# Downsampling to a rate alternates between two neighbouring multiples; lost messages do not
-MIN_NEIGHBOURS_SHARE = 0.85  # of the intervals
-MIN_MULTIPLE_SHARE = 0.1  # of the intervals; lost samples alone cause a smaller share
-# RMS distance from whole multiples, in intervals: 0.29 if random, 0.03 by jitter of a source
+MIN_LOST_SHARE = 0.02  # of the positions; PX4 v1.14 and later loses 0 to 0.3 %, v1.13 8 to 9 %
+MIN_INTERVALS = 50  # minimum number of intervals for the detection of downsampling
+MIN_DOWNSAMPLED_SHARE = 0.25  # of the positions that the source measured; a radio link loses less
+# Minimum fraction of intervals with both of two neighbouring multiples of the source's interval,
+# and with each of them. Downsampling to a fixed rate causes such intervals, lost messages do not
+MIN_NEIGHBOURS_SHARE, MIN_MULTIPLE_SHARE = 0.85, 0.1
+# Maximum RMS distance of the intervals from whole multiples (in source intervals): 0.29 if random,
+# 0.03 with the jitter of a source
 MAX_MULTIPLE_RMS = 0.06
-MAX_DIVISOR = 4
-SMALLEST_TIME_S = 1e-6  # s; KF at this time before a position does not contain it
-# Checks after a gap
+MAX_DIVISOR = 4  # median interval over source interval that is tested
+SMALLEST_TIME_S = 1e-6  # s; KF at this time before a position has not used the position
+# Things to check after a gap in the position source, by its kind
 CHECKS: Mapping[PositionKind, str] = {
     "uwb": "line of sight to the anchors and the link",
     "vio": "light and texture in view of the camera and the link",
@@ -44,7 +45,7 @@ CHECKS: Mapping[PositionKind, str] = {
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect gaps, lost samples and downsampling."""
+    """Detect gaps, lost positions and downsampling of the position source."""
     yield from detect_source_gaps(analysis)
     yield from detect_lost_samples(analysis)
     yield from detect_downsampling(analysis)
@@ -68,15 +69,18 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
 
 
 def _state_errors_after(analysis: Analysis, gap_s: Span) -> str:
-    """State the aids used in a gap, and error and reported σ of each filter at its end."""
+    """State the aids that each filter used in a gap, and error and reported σ at its end."""
     result, (start_s, end_s) = analysis.main, gap_s
     before_end_s = np.array([start_s, end_s - SMALLEST_TIME_S])
     axis, ekf2 = result.axis, result.ekf2_state
     reference_m = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, end_s)])
-    quantity = "Distance to the first position after it"
+    quantity = "Distance to the first position after the gap"
     if isinstance(result.truth, pd.DataFrame):
         true_m = result.truth["position_m"]
-        reference_m, quantity = float(np.interp(end_s, true_m.index, true_m)), "Error at its end"
+        reference_m, quantity = (
+            float(np.interp(end_s, true_m.index, true_m)),
+            "Position error at the end of the gap",
+        )
     texts = []
     aiding = "KF relies on the IMU alone."
     if isinstance(ekf2, pd.DataFrame) and len(before := ekf2["position_m"].loc[:end_s]):
@@ -93,11 +97,11 @@ def _state_errors_after(analysis: Analysis, gap_s: Span) -> str:
     kf_error_m = abs(float(state_at(result.replay, before_end_s)[0][1]) - reference_m)
     kf_sigma_m = float(np.sqrt(variance_at(result.replay, before_end_s)[0][1]))
     texts.append(f"KF {format_metres(kf_error_m)} m (σ {format_metres(kf_sigma_m)} m)")
-    return f"{aiding} {quantity}, along {axis.label}: {', '.join(texts)}."
+    return f"{aiding} {quantity} along {axis.label}: {', '.join(texts)}."
 
 
 def _continuously_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[str]:
-    """Return the labels of horizontal aids that EKF2 fused without a gap of half the span."""
+    """Return the labels of aids that EKF2 fused without a gap of half of the span (s)."""
     labels, (start_s, end_s) = [], span_s
     for name in (EV_POS.name, *OTHER_HORIZONTAL_AIDS):
         log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get(name)
@@ -110,7 +114,7 @@ def _continuously_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[str
 
 
 def detect_lost_samples(analysis: Analysis) -> Findings:
-    """Detect single samples of a regular source that the recording lacks."""
+    """Detect single positions of a regular source that the recording lacks."""
     source, clock = analysis.source, analysis.source.clock_map
     if clock is None or clock.method == "arrival time" or clock.distinct_stamps is not None:
         return
@@ -124,7 +128,7 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
         yield note(
             "source_samples_lost",
             f"The recording lacks {format_percent(lost_count / sent_count)} of the "
-            f"{positions_of(source)}. {lost_count} of {sent_count} samples are missing (one per "
+            f"{positions_of(source)}. {lost_count} of {sent_count} positions are missing (one per "
             f"{typical_s:.2f} s is expected). EKF2 may have received them.",
             action,
             {"lost": lost_count, "lost_fraction": lost_count / sent_count},
@@ -132,7 +136,7 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
 
 
 def detect_downsampling(analysis: Analysis) -> Findings:
-    """Detect intervals that are whole multiples of a shorter one: PX4 did not get all samples."""
+    """Detect intervals that are whole multiples of a shorter one: PX4 misses positions."""
     source = analysis.source
     # neither mapped timestamps nor the rate of the logger show the intervals at the receiver
     if source.clock_map is not None or source.origin.preference >= ALIGNED.preference:
@@ -175,25 +179,25 @@ def detect_downsampling(analysis: Analysis) -> Findings:
 
 
 def _intervals(analysis: Analysis) -> tuple[Array, float]:
-    """Return the intervals (s) between positions in the segment without gaps, and the median."""
+    """Return the intervals (s) between positions in the segment, without gaps; and their median."""
     intervals = np.diff(cut_to_segment(analysis.source.samples, analysis.segment).index.to_numpy())
     typical = float(np.median(intervals)) if len(intervals) else np.nan
     return intervals[intervals <= max_interval_s(typical)], typical
 
 
 def _base_interval(intervals: Array) -> tuple[float, Array] | None:
-    """Return the longest base interval (s) and the multiples that the intervals are of it.
+    """Return the interval (s) of the source, and the measured intervals as multiples of it.
 
-    None if the intervals are not whole multiples of one base interval.
+    None if the intervals are not whole multiples of one interval.
     """
-    # the upper median is an actual interval, not the mean of two
+    # the upper median is a measured interval, not a mean of two
     typical = float(np.sort(intervals)[len(intervals) // 2])
     for divisor in range(1, MAX_DIVISOR + 1):
         multiples = np.rint(intervals * divisor / typical)
         if np.any(multiples < 1.0):
             continue
         base = float(np.sum(intervals) / np.sum(multiples))
-        # divisors increase, so the first match is the longest interval
+        # divisors increase, so the first match gives the longest possible source interval
         if float(np.sqrt(np.mean((intervals / base - multiples) ** 2))) <= MAX_MULTIPLE_RMS:
             return base, multiples
     return None

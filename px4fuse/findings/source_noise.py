@@ -1,6 +1,6 @@
-"""Position noise that is time-correlated, repeated, unequal between axes or varying in flight.
+"""Position noise that is time-correlated, unequal between axes or varying; repeated positions.
 
-R describes white noise of constant size, so neither KF nor EKF2 can model such noise.
+R describes white noise of constant σ, so neither KF nor EKF2 can model such noise.
 """
 
 from dataclasses import asdict
@@ -10,7 +10,7 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array, BoolArray
-from px4fuse.comparison.model import ErrorsAgainstTruth
+from px4fuse.comparison.model import ErrorsAgainstTruth, north_and_east
 from px4fuse.filter.consistency import CONSISTENT_RATIOS
 from px4fuse.filter.correlated_noise import TimeCorrelatedNoise
 from px4fuse.filter.likelihood import innovations, preintegrate
@@ -23,22 +23,21 @@ from px4fuse.findings.source_positions import MIN_LAG_NATS, hardly_moved
 from px4fuse.flight import Columns, Unavailable, positions_of, source_name
 from px4fuse.text import capitalise_first, format_number
 
-MIN_CORRELATION_GAIN_NATS = 5.0  # likelihood ratio 150; 1 of 400 clean flights exceeds it
-MIN_REPEAT_SHARE = 0.05  # of the positions
-MIN_REPEAT_SHARE_ERROR = 0.3  # of the positions; the actual rate is then clearly lower
+MIN_CORRELATION_GAIN_NATS = 5.0  # log-likelihood gain; 1 of 400 flights without mistake exceeds it
+MIN_REPEAT_SHARE = 0.05  # of the positions, for a warning
+MIN_REPEAT_SHARE_ERROR = 0.3  # of the positions, for an error: the true rate is clearly lower
 MIN_REPEATS = 10
-MIN_AXIS_RATIO = 1.5  # ratio of σ between the axes
-MIN_AXIS_NIS_RATIO = (
-    1.7  # ratio of the mean NIS; below, axes are not tuned separately, to save time
-)
-MIN_PART_RATIO = 2.0  # ratio of σ between the noisier part and the rest
-MIN_PART_RATIO_WITHOUT_OUTLIERS = 1.5  # ratio of σ if outliers are not fused
-MIN_PART_RATIO_ERROR = 4.0  # ratio of σ
-MAX_PARTS, MIN_PART_COUNT = 12, 25  # parts of the flight, and measurements in each
+MIN_AXIS_RATIO = 1.5  # position noise (σ) along the noisier axis over that along the other axis
+# Minimum ratio of the mean NIS of both axes for a noise estimate of each axis, which takes time
+MIN_AXIS_NIS_RATIO = 1.7
+# Minimum ratio of σ between a noisier part of the flight and the rest: for a warning, with outliers
+# not fused, and for an error
+MIN_PART_RATIO, MIN_PART_RATIO_WITHOUT_OUTLIERS, MIN_PART_RATIO_ERROR = 2.0, 1.5, 4.0
+MAX_PARTS, MIN_PART_COUNT = 12, 25  # number of parts of the flight, and measurements in each part
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect such noise; odometry and positions rebuilt from EKF2 output cannot be tested."""
+    """Detect noise that R cannot describe; odometry and EKF2 output as source are not tested."""
     if analysis.source.orientation is not None or analysis.source.origin.reconstructed:
         return
     yield from detect_repeated_positions(analysis)
@@ -48,12 +47,12 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_time_correlated_noise(analysis: Analysis) -> Findings:
-    """Detect position errors that are correlated in time, without a lag of the positions."""
+    """Detect time-correlated position errors of a source that does not lag."""
     noise = analysis.time_correlated_noise
     if not isinstance(noise, TimeCorrelatedNoise) or noise.gain_nats < MIN_CORRELATION_GAIN_NATS:
         return
     if noise.lag_nats >= MIN_LAG_NATS:
-        return  # low-pass filtered: source_positions reports it
+        return  # the source is low-pass filtered, which source_positions reports
     low, high = (format_number(end, 1) for end in (noise.low_s, noise.high_s))
     correlation_time, interval = f"{format_number(noise.tau_s, 1)} s", f"95 % {low} to {high} s"
     if not np.isfinite(noise.high_s):
@@ -66,7 +65,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     action = "Check multipath, anchor geometry and filters in the sender."
     if is_gnss:
         action = "Use RTK, or give the antenna a free view of the sky."
-    # GNSS errors are usually time-correlated, so only an effect on σ is reported as a fault
+    # GNSS errors are usually time-correlated: a warning only if they exceed the reported σ
     make_finding = note if is_gnss and not _exceeds_sigma(analysis) else warning
     yield make_finding(
         "source_noise_time_correlated",
@@ -80,7 +79,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
 
 
 def _exceeds_sigma(analysis: Analysis) -> bool:
-    """Return True if an error against ground truth is larger than σ covers."""
+    """Return True if the mean NEES of a filter is above the consistent band."""
     truths = [summary.truth for summary in analysis.main.filters.values()]
     return any(
         isinstance(truth, ErrorsAgainstTruth)
@@ -91,7 +90,7 @@ def _exceeds_sigma(analysis: Analysis) -> bool:
 
 
 def detect_repeated_positions(analysis: Analysis) -> Findings:
-    """Detect positions that repeat the previous one while the vehicle moves."""
+    """Detect positions that are equal to the previous one while the vehicle moves."""
     if hardly_moved(analysis):
         return
     positions_m = (
@@ -115,12 +114,12 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
 
 
 def detect_unequal_noise(analysis: Analysis) -> Findings:
-    """Detect different noises along north and east."""
+    """Detect different position noise along north and east."""
     if analysis.source.origin.is_gnss:
         return  # GNSS errors are mostly time-correlated, and SIGMA_Z is their white part
-    axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
+    axes = north_and_east(analysis)
     summaries = [axis.filters["kf"] for axis in axes]
-    nis = [each_axis.nis_mean for each_axis in summaries if not isinstance(each_axis, Unavailable)]
+    nis = [summary.nis_mean for summary in summaries if not isinstance(summary, Unavailable)]
     if len(nis) < 2 or max(nis) < MIN_AXIS_NIS_RATIO * min(nis):
         return
     tunings = [
@@ -129,12 +128,10 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
         for axis_tuning in tune((axis.axis,), analysis.settings, (axis.axis.name,)).values()
         if isinstance(axis_tuning, AxisTuning)
     ]
-    intervals = [
-        (each_axis.sigma_z.value, each_axis.sigma_z.low, each_axis.sigma_z.high, each_axis.name)
-        for each_axis in tunings
-    ]
     known_intervals = sorted(
-        (s, low, high, name) for s, low, high, name in intervals if s and low and high
+        (noise.value, noise.low, noise.high, axis_tuning.name)
+        for axis_tuning in tunings
+        if (noise := axis_tuning.sigma_z).value and noise.low and noise.high
     )
     if len(known_intervals) < 2:
         return
@@ -157,14 +154,14 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     axis_tuning, settings = analysis.tuning.get(HORIZONTAL), analysis.settings
     if axis_tuning is None:
         return
-    # tuning is unavailable if a third of the measurements look like outliers
+    # noise estimates are unavailable if a third of the measurements resemble outliers
     sigma_a: float | None = settings.sigma_a_m_s2
     sigma_z: float | None = settings.sigma_z_m
     outlier_time_s = np.zeros(0)
     if isinstance(axis_tuning, AxisTuning):
         sigma_a, sigma_z = axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value
         outlier_time_s = axis_tuning.outlier_time_s
-    lines = [analysis.axes[name].axis for name in ("north", "east") if name in analysis.axes]
+    lines = [result.axis for result in north_and_east(analysis)]
     if sigma_a is None or sigma_z is None or len(lines) < 2:
         return
     increments_by_axis = [preintegrate(line, settings) for line in lines]
@@ -175,12 +172,13 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     edges = np.linspace(0, len(time), count + 1).astype(int)
 
     def relative_innovations(is_excluded: BoolArray | None) -> Array:
-        # maximum-likelihood noises, because wrong noises change the innovations along the flight
+        # wrong noises change the size of innovations along the flight, so estimated noises are used
         axis_innovations = [
-            innovations(sizes_, sigma_a, sigma_z, is_excluded) for sizes_ in increments_by_axis
+            innovations(increments, sigma_a, sigma_z, is_excluded)
+            for increments in increments_by_axis
         ]
         normalised = np.abs([nu / np.sqrt(s) for nu, s in axis_innovations])
-        # each axis relative to its median, so that unequal axes have no effect
+        # dividing by the median of each axis removes the effect of unequal axes
         return np.asarray(normalised / np.median(normalised, axis=1, keepdims=True))
 
     sizes = relative_innovations(None)
@@ -193,13 +191,13 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
         else count
     )
     if is_noisy.sum() != end_part - first_part or is_noisy.all():
-        return  # not a single contiguous part
+        return  # the noisy parts are not one contiguous time
     is_quiet = np.ones(len(time), bool)
     is_quiet[edges[first_part] : edges[end_part]] = False
-    # a fused outlier also increases the innovations after it, so both ratios must be large
+    # a fused outlier increases later innovations, so the ratio without outliers must be large, too
     ratio, ratio_without_outliers = (
-        float(np.median(sizes_[:, ~is_quiet]) / np.median(sizes_[:, is_quiet]))
-        for sizes_ in (sizes, relative_innovations(np.isin(time, outlier_time_s)))
+        float(np.median(relative[:, ~is_quiet]) / np.median(relative[:, is_quiet]))
+        for relative in (sizes, relative_innovations(np.isin(time, outlier_time_s)))
     )
     if ratio < MIN_PART_RATIO or ratio_without_outliers < MIN_PART_RATIO_WITHOUT_OUTLIERS:
         return

@@ -1,8 +1,8 @@
 """Faults of the positions: little motion, low pass, jumps, scale factor, outliers, variance.
 
-Detectability of a scale factor error: six passes at 5 Hz with noise 0.10 m determine it to 3.5 %
-(1 σ), so 5 % cannot be detected. At 10 Hz and 0.05 m 15 % can. Smaller errors need a measured
-distance or ground truth.
+Six passes at 5 Hz with a position noise of 0.10 m determine the scale factor to 3.5 % (1 σ), so an
+error of 5 % is not detected. With 10 Hz and 0.05 m, 15 % is detected. Smaller errors need a
+measured distance or ground truth.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,7 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.model import Comparison, north_and_east
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit
 from px4fuse.filter.signals import cut_to_segment
@@ -36,25 +36,25 @@ from px4fuse.flight import Columns, Unavailable, positions_of, source_name
 from px4fuse.position_source import PositionKind
 from px4fuse.text import capitalise_first, format_factor, format_metres
 
-MIN_MOTION_RANGE_M = 0.5  # m, 5 to 95 %; a hovering vehicle with UWB noise of 0.1 m stays below
-NOISE_RANGE_FACTOR = 1.25 * 3.29  # 5 to 95 % range of white noise in σ, with a margin of 25 %
+MIN_MOTION_RANGE_M = 0.5  # m; extent (5 to 95 % of the positions); below, the vehicle only hovers
+NOISE_RANGE_FACTOR = 1.25 * 3.29  # extent (5 to 95 %) of white noise in σ, with a margin of 25 %
 SECOND_DIFFERENCE_FACTOR = 6.0**0.5 / 1.4826  # median |second difference| over σ of white noise
-MIN_LOW_PASS_GAIN_NATS = 6.0  # likelihood ratio 400; clean flights have gains of 0 to 2
-MIN_LAG_NATS = 1.0  # log-likelihood of a low pass minus that of time-correlated noise
-MIN_LAG_S = 0.05  # s; at 1 m/s half of the noise of good UWB (0.1 m)
-MIN_LAG_ERROR_S = 0.10  # s; at 1 m/s the noise of good UWB (0.1 m)
-MIN_JUMP_M = 0.2  # m; twice the noise of good UWB (0.1 m)
-MIN_JUMP_SIGMAS = 5.0  # σ of the time-correlated noise; differences of this noise have up to √2 σ
-MIN_JUMP_ERROR_M = 0.5  # m; five times the noise of good UWB
-MIN_SCALE = 0.12  # relative; PX4's simulated flights without a mistake reach 0.11
-MIN_SCALE_ERROR = 0.15  # relative; 1 m in 7 m
-MIN_SCALE_SIGMAS = 3.0  # standard deviations; 0.3 % of clean flights exceed it
-MIN_OUTLIER_SHARE = 0.005  # of the measurements; normal noise has 0.02 % beyond 3.7 σ
-MIN_OUTLIER_SHARE_ERROR = 0.02  # of the measurements; one each 10 s at 5 Hz
+MIN_LOW_PASS_GAIN_NATS = 6.0  # log-likelihood gain; flights without a low pass have 0 to 2
+MIN_LAG_NATS = 1.0  # log-likelihood of a low pass minus that of time-correlated noise without lag
+MIN_LAG_S = 0.05  # s; lag for a warning; at 1 m/s half of the noise of good UWB (0.1 m)
+MIN_LAG_ERROR_S = 0.10  # s; lag for an error; at 1 m/s the noise of good UWB (0.1 m)
+MIN_JUMP_M = 0.2  # m; jump for a warning: twice the noise of good UWB (0.1 m)
+MIN_JUMP_SIGMAS = 5.0  # jump in σ of the time-correlated noise, whose changes have up to √2 σ
+MIN_JUMP_ERROR_M = 0.5  # m; jump for an error: five times the noise of good UWB (0.1 m)
+MIN_SCALE = 0.12  # relative scale error for a warning; simulated flights without one reach 0.11
+MIN_SCALE_ERROR = 0.15  # relative scale error for an error: 1 m in 7 m
+MIN_SCALE_SIGMAS = 3.0  # scale error in σ of its estimate; 0.3 % of correct sources exceed it
+MIN_OUTLIER_SHARE = 0.005  # of the positions; normal noise has 0.02 % beyond 3.7 σ
+MIN_OUTLIER_SHARE_ERROR = 0.02  # of the positions, for an error: one per 10 s at 5 Hz
 MIN_OUTLIERS = 3
-MIN_VARIANCE_RATIO = 2.0  # reported over actual variance, or its inverse
-MIN_VARIANCE_RATIO_ERROR = 3.0  # reported over actual variance, or its inverse
-# Possible causes of a jump, and action
+# Reported over estimated variance of the positions, or its inverse: for a warning, and for an error
+MIN_VARIANCE_RATIO, MIN_VARIANCE_RATIO_ERROR = 2.0, 3.0
+# Possible causes of a position jump, and action, by kind of source
 JUMP_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
     "uwb": (
         "another set of anchors, or a new origin",
@@ -71,7 +71,7 @@ JUMP_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
     ),
     "file": ("a false map match, or a new origin", "Use one origin for the whole file."),
 }
-# Possible cause of outliers, and action
+# Possible cause of outliers, and action, by kind of source
 OUTLIER_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
     "uwb": (
         "reflections without line of sight (NLOS)",
@@ -95,7 +95,7 @@ OUTLIER_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect all faults; odometry and positions rebuilt from EKF2 are tested for some only."""
+    """Detect faults of the positions; odometry and EKF2 output are tested for some only."""
     yield from detect_little_motion(analysis)
     yield from detect_jumps(analysis)
     yield from detect_outliers(analysis)
@@ -106,29 +106,27 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
-    """Return the low-pass filter of the source; None if there is none or it is not identifiable."""
+    """Return the low-pass filter of the position source; None if none is identified."""
     source, low_pass = analysis.source, analysis.source_low_pass
-    # drift of odometry also correlates successive errors, and positions rebuilt from EKF2 output
-    # contain the filter of EKF2
+    # drift of odometry also correlates successive errors, and EKF2 itself filters its positions
     if source.orientation is not None or source.origin.reconstructed:
         return None
-    if not _is_clock_known(analysis):
-        return None
     if (
-        not isinstance(low_pass, SourceLowPass)
+        not _is_clock_known(analysis)
+        or not isinstance(low_pass, SourceLowPass)
         or low_pass.gain_nats < MIN_LOW_PASS_GAIN_NATS
         or low_pass.lag_s < MIN_LAG_S
     ):
         return None
     correlation = analysis.time_correlated_noise
-    # errors that are correlated without a lag are not from a low pass
+    # a low pass delays positions: errors that are correlated without a lag have another cause
     if isinstance(correlation, TimeCorrelatedNoise) and correlation.lag_nats < MIN_LAG_NATS:
         return None
     return low_pass
 
 
 def _is_clock_known(analysis: Analysis) -> bool:
-    """Return True if the time offset is estimated; late timestamps resemble a lag."""
+    """Return True if a time offset is estimated, so that late timestamps do not look like lag."""
     return isinstance(analysis.clock, ClockOffset) and not any(detect_arrival_times(analysis))
 
 
@@ -150,13 +148,13 @@ def detect_low_pass(analysis: Analysis) -> Findings:
 
 
 def detect_jumps(analysis: Analysis) -> Findings:
-    """Detect lasting position steps that the IMU does not measure."""
+    """Detect position jumps that last and that the IMU does not measure."""
     fit = analysis.bias_scale_jump_fit
-    # a step of the time offset also shifts the positions of a moving vehicle
+    # a change of the time offset also shifts the positions of a moving vehicle
     if not isinstance(fit, BiasScaleJumpFit) or any(detect_arrival_times(analysis)):
         return
     correlated_noise = analysis.time_correlated_noise
-    # time-correlated noise changes by about its σ within seconds
+    # time-correlated noise changes by about its σ within seconds, which resembles a jump
     min_jump_m = MIN_JUMP_M
     if not isinstance(correlated_noise, Unavailable):
         min_jump_m = max(min_jump_m, MIN_JUMP_SIGMAS * correlated_noise.slow_m)
@@ -182,11 +180,11 @@ def detect_jumps(analysis: Analysis) -> Findings:
 
 
 def detect_scale_error(analysis: Analysis) -> Findings:
-    """Detect a scale factor error of the source relative to the IMU, if its rate is sufficient."""
+    """Detect a scale factor error of the source relative to the IMU."""
     imu, fit = analysis.flight.imu, analysis.bias_scale_jump_fit
     if not isinstance(imu, pd.DataFrame) or is_rate_too_low(imu, MIN_IMU_RATE_HZ):
         return
-    # GNSS has no scale factor error, so another fault would be mistaken for one
+    # GNSS has no scale factor error, so a significant estimate has another cause
     if analysis.source.origin.is_gnss:
         return
     # a low-pass filter reduces the motion, and time-correlated noise may resemble a scale error
@@ -210,7 +208,7 @@ def detect_scale_error(analysis: Analysis) -> Findings:
 
 
 def detect_outliers(analysis: Analysis) -> Findings:
-    """Detect more outliers than normal noise has, without those next to a lasting step."""
+    """Detect more outliers than normal noise has, without those next to a position jump."""
     axis_tuning = analysis.tuning.get(HORIZONTAL) or next(iter(analysis.tuning.values()), None)
     if not isinstance(axis_tuning, AxisTuning):
         return
@@ -243,12 +241,11 @@ def detect_outliers(analysis: Analysis) -> Findings:
 
 
 def outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[Array, str]:
-    """Return the horizontal distances (m) of outliers, and the name of the reference.
+    """Return the horizontal distances (m) of outliers from a reference, and its name.
 
     The reference is ground truth, else the line between the positions before and after.
     """
-    axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
-    axes = axes or [analysis.main]
+    axes = north_and_east(analysis) or [analysis.main]
     has_truth = all(isinstance(result.truth, pd.DataFrame) for result in axes)
     squares_m2 = np.zeros(len(outlier_time_s))
     for result in axes:
@@ -264,7 +261,7 @@ def outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[Array, s
 
 
 def _rejected(analysis: Analysis, times_s: Sequence[float]) -> str:
-    """State the number of outliers that EKF2 rejected; empty if the log does not show it."""
+    """State the number of outliers that EKF2 rejected; "" if the log does not show it."""
     innovations = analysis.main.ekf2_innovations
     if not isinstance(innovations, pd.DataFrame) or innovations["rejected"].isna().any():
         return ""
@@ -279,7 +276,7 @@ def _rejected(analysis: Analysis, times_s: Sequence[float]) -> str:
 def detect_wrong_variance(analysis: Analysis) -> Findings:
     """Detect a reported variance outside the 95 % interval of the position noise."""
     source, axis_tuning = analysis.source, analysis.tuning.get(HORIZONTAL)
-    # for a low-pass filtered source the noise between samples is only part of the error
+    # the noise of low-pass filtered positions is only part of their error
     may_be_low_passed = (
         isinstance(analysis.source_low_pass, Unavailable) or find_low_pass(analysis) is not None
     )
@@ -288,17 +285,14 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     reported = cut_to_segment(source.samples, analysis.segment)[
         Columns.POSITION_VARIANCE[:2]
     ].dropna()
-    noise_m, low, high = (
-        axis_tuning.sigma_z.value,
-        axis_tuning.sigma_z.low,
-        axis_tuning.sigma_z.high,
-    )
+    noise = axis_tuning.sigma_z
+    noise_m, low, high = noise.value, noise.low, noise.high
     if reported.empty or noise_m is None or low is None or high is None:
         return
     reported_m = float(np.sqrt(reported.to_numpy().mean(axis=1)).mean())
     variance_ratio = (reported_m / noise_m) ** 2
     ratio = max(variance_ratio, 1.0 / variance_ratio)
-    # R has to cover time-correlated errors too, which innovations do not show
+    # R has to cover time-correlated errors, too, which innovations do not show
     error_m = _rmse_per_axis_m(analysis) if variance_ratio > 1.0 else None
     if error_m is not None and reported_m**2 < MIN_VARIANCE_RATIO * error_m**2:
         return
@@ -323,9 +317,8 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
 
 
 def _rmse_per_axis_m(analysis: Analysis) -> float | None:
-    """Return the horizontal RMSE per axis (m) of the positions; None without ground truth."""
     squares = []
-    for result in (analysis.axes[name] for name in ("north", "east") if name in analysis.axes):
+    for result in north_and_east(analysis):
         if isinstance(result.truth, Unavailable):
             return None
         true, axis = result.truth["position_m"].dropna(), result.axis
@@ -335,7 +328,7 @@ def _rmse_per_axis_m(analysis: Analysis) -> float | None:
 
 
 def motion_range_m(comparison: Comparison) -> float:
-    """Return the larger extent (m) of north and east in the segment, 5 to 95 % of the positions."""
+    """Return the larger extent (m) of the track along north or east, 5 to 95 %."""
     samples = cut_to_segment(comparison.source.samples, comparison.segment)
     low, high = samples[Columns.POSITION[:2]].quantile([0.05, 0.95]).to_numpy()
     return float(np.max(high - low))
@@ -344,7 +337,7 @@ def motion_range_m(comparison: Comparison) -> float:
 def hardly_moved(comparison: Comparison) -> bool:
     """Return True if the extent of the positions is below 0.5 m or explained by their noise.
 
-    The noise is estimated from second differences, which constant velocity does not affect.
+    Second differences give the noise, because constant velocity does not change them.
     """
     positions = cut_to_segment(comparison.source.samples, comparison.segment)[
         Columns.POSITION[:2]

@@ -1,4 +1,4 @@
-"""Timestamps of the source that are constant, or arrival times instead of measurement times."""
+"""Position timestamps that are constant, or arrival times instead of measurement times."""
 
 import numpy as np
 import pandas as pd
@@ -11,11 +11,11 @@ from px4fuse.log import ClockMap
 from px4fuse.text import format_metres
 
 MAX_RECEIPT_JITTER_S = 0.010  # s; 1 cm at 1 m/s, a tenth of the noise of good UWB (0.1 m)
-MAX_ARRIVAL_AGE_S = 0.001  # s; from receiving a message to publishing it
-MIN_LATENCY_S = 0.02  # s; at 1 m/s a fifth of the noise of good UWB (0.1 m)
-MIN_LATENCY_ERROR_S = 0.10  # s; at 1 m/s the noise of good UWB (0.1 m)
-MIN_SAMPLES = 10
-MIN_CONSISTENT_SHARE = 0.95  # of the samples before and after the change; allows late messages
+MAX_ARRIVAL_AGE_S = 0.001  # s; PX4's time from receiving a message to publishing its position
+MIN_LATENCY_S = 0.02  # s; latency for a warning; at 1 m/s a fifth of the UWB noise (0.1 m)
+MIN_LATENCY_ERROR_S = 0.10  # s; latency for an error; at 1 m/s the UWB noise (0.1 m)
+MIN_SAMPLES = 10  # minimum number of positions with arrival times, and with measurement times
+MIN_CONSISTENT_SHARE = 0.95  # of these positions have this kind of timestamp; a few come late
 ANSWER_TIMESYNC = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "
     "every request). Send positions only after 500 answers, which take 50 s at 10 Hz."
@@ -23,27 +23,27 @@ ANSWER_TIMESYNC = (
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect wrong timestamps, by the clock map of a recording or the ages in a ULog."""
+    """Detect wrong timestamps, from the clock map of a recording or the ages in a ULog."""
     clock, positions = analysis.source.clock_map, positions_of(analysis.source)
     if clock is None:
         yield from detect_arrival_times(analysis)
     elif clock.distinct_stamps is not None:
         yield from detect_constant_timestamps(positions, clock, clock.distinct_stamps)
     elif clock.method in ARRIVAL_METHODS:
-        kf_times = f"the sender's timestamps, mapped by the {clock.method}"
+        kf_times = f"KF uses the sender's timestamps, mapped by the {clock.method}."
         if clock.method == "arrival time":
-            kf_times = "arrival times too, so the KF track is late by the age of the positions"
+            kf_times = "KF uses arrival times, too, so its track is late by the position latency."
         yield warning(
             "companion_not_synchronised",
             f"The sender of the {positions} never synchronised its clock (TIMESYNC). EKF2 used "
-            f"arrival times as times of measurement. KF uses {kf_times}.",
+            f"arrival times as times of measurement. {kf_times}",
             ANSWER_TIMESYNC,
             {"jitter_s": clock.jitter_s},
         )
 
 
 def detect_constant_timestamps(positions: str, clock: ClockMap, distinct_count: int) -> Findings:
-    """Make the findings of constant timestamps and of the jitter of the receive times."""
+    """Make the findings of constant timestamps and of jitter in receive times."""
     yield error(
         "source_timestamps_constant",
         f"The timestamps of {clock.pairs} {positions} have only {distinct_count} distinct "
@@ -67,8 +67,8 @@ def detect_constant_timestamps(positions: str, clock: ClockMap, distinct_count: 
 def detect_arrival_times(analysis: Analysis) -> Findings:
     """Detect timestamps that are arrival times, in the whole flight or until TIMESYNC converged.
 
-    Without TIMESYNC, PX4 uses the arrival time as timestamp (Timesync.cpp). The log shows this
-    directly: publication minus timestamp of the positions is zero instead of the latency.
+    Without TIMESYNC, PX4 uses the arrival time as timestamp (Timesync.cpp). Publication time minus
+    timestamp of the positions is then zero instead of the latency.
     """
     age = _age_s(analysis)
     if age is None:
@@ -100,7 +100,6 @@ def detect_arrival_times(analysis: Analysis) -> Findings:
 
 
 def _is_on_ground_until(analysis: Analysis, time_s: float) -> bool:
-    """Return True if the vehicle does not fly before a time."""
     airborne = analysis.flight.airborne
     return not isinstance(airborne, Unavailable) and all(start >= time_s for start, _ in airborne)
 
@@ -108,13 +107,13 @@ def _is_on_ground_until(analysis: Analysis, time_s: float) -> bool:
 def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
     """Return the time (s) from which timestamps are measurement times, and the latency (s).
 
-    None if there is no such change. The time is chosen so that the fewest samples are on the wrong
-    side.
+    None if timestamps do not change from arrival times to measurement times in flight.
     """
     age = _age_s(analysis)
     if age is None:
         return None
     is_arrival = (age.abs() < MAX_ARRIVAL_AGE_S).to_numpy()
+    # wrong_count: positions that contradict a change after each position
     wrong_count: Array = np.cumsum(~is_arrival) + np.sum(is_arrival) - np.cumsum(is_arrival)
     cut = int(np.argmin(wrong_count)) + 1
     if np.mean(is_arrival) >= MIN_CONSISTENT_SHARE or min(cut, len(age) - cut) < MIN_SAMPLES:
@@ -129,7 +128,7 @@ def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
 
 
 def _age_s(analysis: Analysis) -> pd.Series | None:
-    """Return the age (s) of each position at publication; None if not in the log."""
+    """Return the age (s) of each position when PX4 publishes it; None if not logged."""
     ekf2, source, segment = analysis.flight.ekf2, analysis.source, analysis.segment
     record = ekf2.record if isinstance(ekf2, Ekf2) else None
     if not isinstance(record, FusionRecord) or source.origin.reconstructed or source.clock_map:

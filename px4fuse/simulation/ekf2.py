@@ -1,14 +1,14 @@
-"""EKF2 topics of a simulated flight, computed with px4fuse's model of EKF2, as PX4 v1.16 logs them.
+"""EKF2 topics of a simulated flight as PX4 v1.16 logs them, from px4fuse's model of EKF2.
 
 The model :mod:`px4fuse.ekf2` starts with PX4's initial variances and levelling at rest, then runs
 on the simulated IMU and positions. Its error states are linearised about the true attitude. The
 difference between integrated gyro and true attitude is an input of the model, so the estimate does
 not depend on the true attitude.
 
-Outdoors, EKF2 fuses magnetometer and barometer, and vehicle_attitude is the estimate of the model.
-Indoors, heading and height of EKF2 have a simulated slow error instead. vehicle_attitude is then
-simulated without the model, so that the input of KF does not depend on EKF2 parameters; the
-estimated attitude is in estimator_states.
+Outdoors, EKF2 fuses magnetometer and barometer, and vehicle_attitude is the model's estimate.
+Indoors, heading and height of EKF2 have a simulated slow error. vehicle_attitude is then simulated
+without the model, so that KF does not depend on EKF2 parameters; the model's attitude is in
+estimator_states.
 """
 
 from collections.abc import Mapping
@@ -58,37 +58,41 @@ from px4fuse.trajectory.rotation import (
     to_vector,
 )
 
-PREDICTION_STEP_US = 10_000  # µs, EKF2_PREDICT_US
-# gauss; initial σ of each axis of earth field and magnetometer bias, after alignment on the ground
+PREDICTION_STEP_US = 10_000  # µs; EKF2's prediction step (EKF2_PREDICT_US)
+# Initial σ (gauss) per axis of earth field and magnetometer bias, after alignment on the ground
 FIELD_SIGMA_GAUSS = 0.03
-# Rules by which EKF2 starts, stops and resets fusion of external vision, v1.14 to main:
+# Rules by which EKF2 (v1.14 and later) starts, stops and resets fusion of external vision:
 # EV_MAX_INTERVAL (ev_control.cpp), reset_timeout_max (common.h)
 VISION_RULES = FusionRules(0.2, 0.4, 1.0, 5, None, horizon_by_delay=False)
-# The same rules for GNSS, v1.16: gps_control.cpp, and no_aid_timeout_max (common.h)
+# Rules by which EKF2 v1.16 starts, stops and resets fusion of GNSS: gps_control.cpp, and
+# no_aid_timeout_max (common.h)
 GNSS_RULES = FusionRules(
     np.inf, np.inf, 7.0, UNLIMITED_RESETS, None, False, reset_scale=2.0, with_velocity=True
 )
-# s, EKF2_NOAID_TOUT; after this time without an aid EKF2 holds its position (fake_pos_control.cpp)
+# Time (s) without any aiding source after which EKF2 holds its position: EKF2_NOAID_TOUT
+# (fake_pos_control.cpp)
 NO_AID_TIMEOUT_S = 5.0
-# σ from EKF2_ANGERR_INIT, _GPS_V_NOISE, _GPS_P_NOISE, _GBIAS_INIT and _ABIAS_INIT (covariance.cpp)
+# Initial σ of tilt, velocity, position, gyro bias and accelerometer bias: EKF2_ANGERR_INIT,
+# EKF2_GPS_V_NOISE, EKF2_GPS_P_NOISE, EKF2_GBIAS_INIT and EKF2_ABIAS_INIT (covariance.cpp)
 INITIAL_SIGMA = np.repeat([0.1, 0.3, 0.5, 0.1, 0.2], 3)
-# Time (s) at rest before the log, and σ of specific force, angular rate and velocity at rest. They
-# reproduce σ of v1.16 on the ground: 0.0005 rad/s, 0.06 m/s and 0.17 m/s² (horizontal)
+# Time (s) at rest before the log, and σ of specific force (m/s²), angular rate (rad/s) and velocity
+# (m/s) at rest. With them the model has the σ that EKF2 v1.16 reports on the ground: gyro bias
+# 0.0005 rad/s, velocity 0.06 m/s, horizontal accelerometer bias 0.17 m/s²
 REST_S = 10.0
 REST_SIGMA = np.repeat([0.05, 0.0005, 0.06], 3)
-# rad and m; σ of heading and height as logged by v1.16 in flight
+# σ of EKF2's heading (rad) and height (m) as PX4 v1.16 logs them in flight
 HEADING_SIGMA_RAD, HEIGHT_SIGMA_M = 0.03, 0.15
-# maximum interval (s) between times at which the model computes variances for estimator_states
+# Maximum interval (s) between times at which the model computes variances for estimator_states
 MAX_EVENT_INTERVAL_S = 0.1
 
 
 def _fused_aids(scenario: Scenario) -> tuple[Aid, ...]:
-    """Return the aids that EKF2 fuses and whose parameters the model uses."""
+    """Return the aiding sources that EKF2 fuses in this scenario."""
     return (scenario.aid, MAG, BAROMETER) if scenario.aid == GNSS_POS else (scenario.aid,)
 
 
 def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]:
-    """Return the values of all EKF2 parameters of the model in this flight, by PX4 name."""
+    """Return the values of all EKF2 parameters that the model uses, by PX4 name."""
     aid = scenario.aid
     is_gnss = aid == GNSS_POS
     defaults = effective_settings({}, *_fused_aids(scenario))
@@ -122,15 +126,15 @@ def simulate_ekf2(
     other_sensors: tuple[Topic, ...],
     log_parameters: Mapping[str, int | float],
 ) -> tuple[Topic, ...]:
-    """Return the EKF2 topics of a flight, without empty ones.
+    """Simulate EKF2 and return its topics, without empty ones.
 
     Parameters
     ----------
     imu, source, other_sensors : Topic, SimulatedPositions, tuple of Topic
-        As EKF2 received them, before logging. Outdoors ``other_sensors`` are magnetometer and
-        barometer.
+        Sensor data that EKF2 received, before logging. Outdoors ``other_sensors`` are magnetometer
+        and barometer.
     log_parameters : mapping
-        Parameters in the log, by PX4 name.
+        All parameters in the log, by PX4 name.
     """
     aid, aids = scenario.aid, _fused_aids(scenario)
     segment, time_us, true_quaternions = _make_segment(scenario, mistakes, motion, imu)
@@ -169,7 +173,7 @@ def simulate_ekf2(
 def _make_segment(
     scenario: Scenario, mistakes: Mistakes, motion: Motion, imu: Topic
 ) -> tuple[ReplaySegment, IntArray, Array]:
-    """Return the flight in prediction steps, times (µs) of the step ends, and true quaternions."""
+    """Return the input of the EKF2 model, the times (µs) of its steps, and true quaternions."""
     time_us = imu.fields["timestamp"].astype(np.int64) - sensors.START_US
     interval_s = np.diff(time_us) * 1e-6
     step_end_indices = step_ends(interval_s, np.array([], dtype=np.intp), PREDICTION_STEP_US * 1e-6)
@@ -211,7 +215,7 @@ def _make_segment(
             state=state,
             variance=variance,
             down_m=motion.at(time_s).position_m[:, 2] + sensors.height_error(scenario, time_s),
-            # infinite variance: no logged tilt is used, only positions correct the tilt
+            # infinite variance: only positions correct the tilt, as there is no logged tilt
             attitude_variance_rad2=np.tile(
                 [np.inf, np.inf, HEADING_SIGMA_RAD**2], (len(time_s), 1)
             ),
@@ -226,7 +230,7 @@ def _make_segment(
 
 
 def _with_field(segment: ReplaySegment, magnetometer: Topic) -> ReplaySegment:
-    """Add earth field and magnetometer bias, as EKF2 aligns them on the ground, to the states."""
+    """Add earth field and magnetometer bias, as aligned on the ground, to the states."""
     measured_at_s = sensors.time_s(magnetometer) - 0.5 * float(np.median(segment.step_s))
     gauss = magnetometer.fields["magnetometer_ga"].astype(np.float64)
     fields = np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)])
@@ -236,7 +240,7 @@ def _with_field(segment: ReplaySegment, magnetometer: Topic) -> ReplaySegment:
 
 
 def _barometer_heights(segment: ReplaySegment, barometer: Topic) -> HeightSamples:
-    """Return the barometer heights; the barometer is the only height sensor in these flights."""
+    """Return the barometer heights, which are the only height source of EKF2."""
     measured_at_s = sensors.time_s(barometer) - 0.5 * float(np.median(segment.step_s))
     down_m = sensors.HOME[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
     samples = barometer_samples_inside(segment, measured_at_s, down_m, np.zeros(len(down_m)))
@@ -246,10 +250,10 @@ def _barometer_heights(segment: ReplaySegment, barometer: Topic) -> HeightSample
 def _initial_state_at_rest(
     rotation: Array, force_m_s2: Array, rate_rad_s: Array, heading_error_rad: float
 ) -> tuple[Array, Array]:
-    """Return state and covariance at the start: PX4's initial state, updated at rest.
+    """Return EKF2's error state and covariance at the start of the log.
 
-    At rest the specific force is -g, and angular rate and velocity are 0, except for the biases.
-    The update correlates tilt error and accelerometer bias.
+    PX4's initial state is updated with the facts that the vehicle is at rest: specific force -g,
+    angular rate and velocity 0. The update correlates tilt error and accelerometer bias.
     """
     H = np.zeros((9, STATE_COUNT))
     H[0:3, THETA] = -skew(rotation @ force_m_s2)
@@ -268,9 +272,9 @@ def _initial_state_at_rest(
 
 
 def _received_positions(source: sensors.SimulatedPositions) -> ReceivedPositions:
-    """Return the samples in order of arrival, without samples older than a preceding one.
+    """Return the positions in order of arrival, without positions older than a preceding one.
 
-    EKF2 ignores such samples (estimator_interface.cpp).
+    EKF2 ignores late positions (estimator_interface.cpp).
     """
     fields = source.topic.fields
     timestamp_s, arrival_s = (
@@ -281,9 +285,8 @@ def _received_positions(source: sensors.SimulatedPositions) -> ReceivedPositions
     is_newer = timestamp_s > latest_timestamp_s
     velocity = source.velocity_m_s
     if velocity is not None:
-        position_variance = (
-            np.stack([fields["eph"], fields["eph"], fields["epv"]], axis=1)[is_newer] ** 2
-        )
+        sigmas_m = np.stack([fields["eph"], fields["eph"], fields["epv"]], axis=1)
+        position_variance = sigmas_m[is_newer] ** 2
         velocity_variance = np.repeat(fields["s_variance_m_s"][is_newer, None] ** 2, 3, axis=1)
     else:
         position_variance, velocity_variance = fields["position_variance"][is_newer], None
@@ -340,14 +343,14 @@ def _make_topic_track(
 def _hold_without_aiding(
     model_run: SegmentRun, state: Array
 ) -> tuple[list[tuple[int, Array]], BoolArray]:
-    """Return position resets (step, size in m) and True for steps with an aid; change ``state``.
+    """Hold the position in ``state`` (in place) while EKF2 has no aiding source.
 
-    Without an aid EKF2 fuses a fake position, which is not part of the model. Here the position in
-    ``state`` is held instead, with velocity zero.
+    EKF2 then fuses a constant position, which is not part of the model. Returns the position resets
+    (step, size in m), and True for each step with an aiding source.
     """
-    events, run, time = model_run.events[0], model_run, model_run.segment.time_s
+    events, time = model_run.events[0], model_run.segment.time_s
     horizontal = slice(NORTH, EAST + 1)
-    aid_events = np.flatnonzero(run.fused[:, 0] | run.reset[:, 0])
+    aid_events = np.flatnonzero(model_run.fused[:, 0] | model_run.reset[:, 0])
     last_aid_s = np.zeros(len(time))
     last_aid_s[events.end_step[aid_events]] = time[events.end_step[aid_events]]
     is_aided = time - np.maximum.accumulate(last_aid_s) <= NO_AID_TIMEOUT_S
@@ -359,9 +362,9 @@ def _hold_without_aiding(
         state[start:end, horizontal] = state[start - 1, horizontal]
         state[start:end, VELOCITY.start : VELOCITY.start + 2] = 0.0
     resets = []
-    for event in np.flatnonzero(run.reset[:, 0]):
+    for event in np.flatnonzero(model_run.reset[:, 0]):
         step = int(events.end_step[event])
-        reset_m = run.innovation[event, 0, POSITION_COLUMNS]
+        reset_m = model_run.innovation[event, 0, POSITION_COLUMNS]
         if not is_aided[step - 1]:
             reset_m = state[step, horizontal] - state[step - 1, horizontal]
         resets.append((step, reset_m))

@@ -1,4 +1,4 @@
-"""Topics of PX4 v1.16 with the results of the EKF2 model."""
+"""EKF2 topics of PX4 v1.16 with the results of px4fuse's EKF2 model."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,34 +16,34 @@ from px4fuse.readers.px4_positions import unproject
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ulog_writer import Topic, topic
 
-# Hz; logging rates of v1.16 (logged_topics.cpp). A vehicle logs estimator_aid_src_ev_pos at 2 Hz,
-# PX4's simulation (SITL) all messages
+# Logging rates (Hz) of PX4 v1.16 (logged_topics.cpp). A vehicle logs estimator_aid_src_ev_pos at 2
+# Hz; PX4's simulation (SITL) logs all messages
 VEHICLE_AID_SOURCE_HZ = 2.0
 STATES_HZ, LOCAL_POSITION_HZ, FLAGS_HZ = 2.0, 10.0, 1.0
 MAGNETOMETER_HZ, OTHER_AIDS_HZ = 2.0, 2.0
-PUBLICATION_DELAY_US = 100
+PUBLICATION_DELAY_US = 100  # µs from the newest IMU sample to the publication
 
 
 @dataclass(frozen=True)
 class TopicTrack:
-    """Results of the EKF2 model at start and end of each of n prediction steps, shape (n + 1, ...).
+    """Results of the EKF2 model at the ends of its n prediction steps, shape (n + 1, ...).
 
     Attributes
     ----------
     time_us : ndarray of int
-        µs from the first data.
+        Times of the steps, µs from the first data.
     lag_steps : int
-        Number of steps between fusion horizon and publication.
+        Number of prediction steps from the fusion horizon to the publication.
     delayed_attitude : ndarray
-        Quaternions at the fusion horizon, by time of validity.
+        Quaternions at the fusion horizon.
     delayed_states : ndarray
-        Velocity, position, gyro and accelerometer bias at the fusion horizon, by time of validity.
+        Velocity, position, gyro and accelerometer bias at the fusion horizon.
     velocity_m_s, position_m, attitude : ndarray
-        Published state.
+        State that the output predictor publishes.
     resets : tuple of (int, ndarray)
         Step and size (m, north and east) of each reset of the published position.
     is_aided : ndarray of bool
-        True at steps with an aid that was fused within NO_AID_TIMEOUT_S.
+        True at steps with an aiding source that was fused within NO_AID_TIMEOUT_S.
     """
 
     time_us: IntArray
@@ -57,14 +57,21 @@ class TopicTrack:
     is_aided: BoolArray
 
     def timestamps(self, rows: IntArray, measured_s: Array | None = None) -> dict[str, Any]:
-        """Return the timestamps of messages about the steps ``rows``.
+        """Return the timestamps of messages about the prediction steps ``rows``.
 
-        ``measured_s``: measurement times (s), if they are not those of the steps.
+        ``measured_s`` are the measurement times (s), if they are not those of the steps.
         """
         sample_us = self.time_us[rows]
         if measured_s is not None:
             sample_us = np.rint(measured_s * 1e6).astype(np.int64)
         return sensors.timestamps(sample_us, self.time_us[rows + self.lag_steps] - sample_us)
+
+    def logged_events(self, is_message: BoolArray, end_step: IntArray, rate_hz: float) -> IntArray:
+        """Return the indices of events with a message that the logger keeps at a rate (Hz)."""
+        is_published = end_step < len(self.time_us) - self.lag_steps
+        events = np.flatnonzero(is_message & is_published)
+        times_s = sensors.seconds(self.time_us[end_step[events]])
+        return events[sensors.keep_at_rate(times_s, rate_hz)]
 
 
 def ekf2_topics(
@@ -74,14 +81,14 @@ def ekf2_topics(
     attitude_hz: float,
     aid_source_hz: float,
 ) -> tuple[Topic, ...]:
-    """Return the topics of EKF2, without empty ones.
+    """Return the EKF2 topics of a flight, without empty ones.
 
     Parameters
     ----------
     model_run : SegmentRun
-        Run with one parameter set over one segment.
+        Run of the EKF2 model with one parameter set over the flight.
     attitude_hz : float
-        Rate of vehicle_attitude, which is a topic of EKF2 if EKF2 fuses a magnetometer.
+        Rate (Hz) of vehicle_attitude, which EKF2 publishes if it fuses a magnetometer.
     aid_source_hz : float
         Logging rate (Hz) of estimator_aid_src_ev_pos; 0 logs all messages.
     """
@@ -90,11 +97,7 @@ def ekf2_topics(
         _states_topic(model_run, track, is_gnss=inputs.aid == GNSS_POS),
         *_aid_sources(inputs, model_run, track, aid_source_hz),
         *_barometer_topics(inputs, model_run, track),
-        *(
-            []
-            if model_run.segment.field is None
-            else _magnetometer_topics(inputs, model_run, track, attitude_hz)
-        ),
+        *_magnetometer_topics(inputs, model_run, track, attitude_hz),
         _flags_topic(inputs, model_run, track),
     )
     return tuple(topic for topic in topics if len(topic.fields["timestamp"]))
@@ -116,18 +119,16 @@ def _local_position_topic(track: TopicTrack, *, is_gnss: bool) -> Topic:
 
 
 def _states_topic(model_run: SegmentRun, track: TopicTrack, *, is_gnss: bool) -> Topic:
-    """Return estimator_states of v1.16: variances, and states with horizontal positions of 0."""
+    """Return estimator_states of v1.16: states (horizontal positions are 0) and variances."""
     end = model_run.events[0].end_step
-    events = np.flatnonzero(np.diff(end, prepend=0) > 0)
-    events = events[end[events] < len(track.time_us) - track.lag_steps]
-    events = events[sensors.keep_at_rate(sensors.seconds(track.time_us[end[events]]), STATES_HZ)]
+    events = track.logged_events(np.diff(end, prepend=0) > 0, end, STATES_HZ)
     rows = end[events]
     states = np.zeros((len(rows), 25), np.float32)
     states[:, 0:4] = track.delayed_attitude[rows]
     states[:, 4 : 4 + track.delayed_states.shape[1]] = track.delayed_states[rows]
-    states[:, 7:9] = 0.0  # v1.16 stores horizontal positions as latitude and longitude
+    states[:, 7:9] = 0.0  # v1.16 logs latitude and longitude instead of horizontal positions
     if is_gnss:
-        # with a global origin, v1.16 stores the altitude instead of the vertical position
+        # with a global origin, v1.16 logs the altitude instead of the down position
         states[:, 9] -= sensors.HOME[2]
     covariances = np.zeros((len(rows), 24), np.float32)
     covariances[:, : model_run.variance.shape[2]] = model_run.variance[events + 1, 0]
@@ -138,14 +139,9 @@ def _states_topic(model_run: SegmentRun, track: TopicTrack, *, is_gnss: bool) ->
 def _aid_sources(
     inputs: Inputs, model_run: SegmentRun, track: TopicTrack, rate_hz: float
 ) -> tuple[Topic, ...]:
-    """Return estimator_aid_src_* of the position source: one message per sample in time."""
+    """Return estimator_aid_src_* of the position source: one message per usable position."""
     events, run, aid = model_run.events[0], model_run, inputs.aid
-    event_rows = np.flatnonzero(
-        events.usable & (events.end_step < len(track.time_us) - track.lag_steps)
-    )
-    event_rows = event_rows[
-        sensors.keep_at_rate(sensors.seconds(track.time_us[events.end_step[event_rows]]), rate_hz)
-    ]
+    event_rows = track.logged_events(events.usable, events.end_step, rate_hz)
     rows, sample, received = events.end_step[event_rows], events.sample[event_rows], inputs.received
     aid_stamps = track.timestamps(rows, events.time_s[event_rows])
     measured_m = received.position_m[sample, :2]
@@ -154,14 +150,13 @@ def _aid_sources(
     innovation, variance, noise = (
         values[event_rows, 0, POSITION_COLUMNS] for values in innovation_arrays
     )
-    is_not_fused = np.isnan(innovation[:, :1])
-    # EKF2 logs an innovation also for samples that it does not evaluate, but the model computes
-    # none
+    is_not_tested = np.isnan(innovation[:, :1])
+    # EKF2 also logs an innovation for positions that it does not test, but the model computes none
     innovation = np.where(
-        is_not_fused, measured_m - track.delayed_states[rows][:, POSITION][:, :2], innovation
+        is_not_tested, measured_m - track.delayed_states[rows][:, POSITION][:, :2], innovation
     )
     variance = np.where(
-        is_not_fused, run.variance[event_rows + 1, 0, NORTH : EAST + 1] + noise, variance
+        is_not_tested, run.variance[event_rows + 1, 0, NORTH : EAST + 1] + noise, variance
     )
     fused_us = np.where(
         run.fused[event_rows, 0] | run.reset[event_rows, 0], track.time_us[rows], -1
@@ -198,7 +193,7 @@ def _aid_sources(
 
 
 def _barometer_topics(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) -> list[Topic]:
-    """Return estimator_aid_src_baro_hgt; an empty list without a barometer."""
+    """Return estimator_aid_src_baro_hgt; an empty list without barometer."""
     heights, end = model_run.segment.heights, model_run.events[0].end_step
     if heights is None or model_run.heights is None:
         return []
@@ -226,19 +221,14 @@ def _barometer_topics(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) 
 def _magnetometer_topics(
     inputs: Inputs, model_run: SegmentRun, track: TopicTrack, attitude_hz: float
 ) -> list[Topic]:
-    """Return vehicle_attitude, estimator_aid_src_mag and estimator_status."""
+    """Return the topics that need a magnetometer; an empty list without magnetometer."""
     field, settings, end = model_run.segment.field, inputs.settings, model_run.events[0].end_step
-    assert field is not None
-    event_rows = np.flatnonzero(
-        np.isfinite(model_run.field[:, 2, 0, 0]) & (end < len(track.time_us) - track.lag_steps)
-    )
-    event_rows = event_rows[
-        sensors.keep_at_rate(sensors.seconds(track.time_us[end[event_rows]]), OTHER_AIDS_HZ)
-    ]
-    rows, (innovation, variance, fused) = (
-        end[event_rows],
-        np.moveaxis(model_run.field[event_rows, :, 0], 1, 0),
-    )
+    if field is None:
+        return []
+    has_sample = np.isfinite(model_run.field[:, 2, 0, 0])
+    event_rows = track.logged_events(has_sample, end, OTHER_AIDS_HZ)
+    rows = end[event_rows]
+    innovation, variance, fused = np.moveaxis(model_run.field[event_rows, :, 0], 1, 0)
     observation = field.value[np.searchsorted(field.step, rows, side="right") - 1]
     noise = np.full(innovation.shape, settings[MAG.noise] ** 2)
     is_fused = fused[:, 0] > 0.0
@@ -275,19 +265,19 @@ def _aid_source(
     settings: Mapping[str, float],
     timestamps: Mapping[str, Any],
     observation: Array,
-    innovation_parts: tuple[Array, Array, Array],
+    innovation_values: tuple[Array, Array, Array],
     decisions: tuple[BoolArray, BoolArray],
 ) -> Topic:
-    """Return estimator_aid_src_* of an aid.
+    """Return estimator_aid_src_* of an aiding source.
 
     Parameters
     ----------
-    innovation_parts : tuple of ndarray
-        Innovation, innovation variance S, and measurement noise R.
+    innovation_values : tuple of ndarray
+        Innovation, innovation variance S, and measurement variance R.
     decisions : tuple of ndarray of bool
         True for rejected samples, and True for fused samples.
     """
-    innovation, variance, noise = innovation_parts
+    innovation, variance, noise = innovation_values
     ratio = innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * variance)
     fields = {
         **timestamps,

@@ -1,4 +1,4 @@
-"""Simulated flights as topics, ULog and Flight, and the answer file for the instructor."""
+"""Simulated flights as PX4 topics, ULog or Flight, with the answers for the instructor."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -21,18 +21,18 @@ from px4fuse.simulation.ulog_writer import Topic, encode
 from px4fuse.text import to_json_types
 
 NO_MISTAKES = Mistakes()
-# Parameter values with which EKF2 fuses horizontal positions; with GNSS also velocity (bit 2)
+# Values of the PX4 parameters that let EKF2 fuse horizontal positions, with GNSS also velocity
 FUSION_ON_VALUES = {EV_POS.switch: 1, GNSS_POS.switch: 5}
-# SDLOG_PROFILE with and without the vision topics
+# SDLOG_PROFILE with and without the topics of external vision
 PROFILE_WITH_VISION, PROFILE_DEFAULT = 129, 1
-PX4_RELEASE = 1 << 24 | 16 << 16 | 255  # v1.16.0, the release of the simulated topics
+PX4_RELEASE = 1 << 24 | 16 << 16 | 255  # v1.16.0, whose topics are simulated
 HARDWARE = "px4fuse simulation"
 ANSWER_SCHEMA = {"name": "px4fuse-answer", "version": 1}
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """Simulated flight: logged topics, and true values for the instructor.
+    """Simulated flight: logged topics, and the true values that the log does not contain.
 
     Attributes
     ----------
@@ -41,10 +41,11 @@ class Simulation:
     motion : Motion
         True motion as a function of time.
     positions : SimulatedPositions
-        Position source with its outliers and errors.
+        Positions with their outliers and errors.
     topics : tuple of Topic
         All logged topics.
     parameters : mapping
+        Logged parameters, by PX4 name.
     """
 
     scenario: Scenario
@@ -56,7 +57,7 @@ class Simulation:
 
 
 def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation:
-    """Simulate a flight.
+    """Simulate a flight with mistakes.
 
     Raises
     ------
@@ -111,7 +112,7 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
 
 
 def simulate_flight(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Flight:
-    """Simulate a flight and return it as read from its ULog by :func:`px4fuse.read_log`."""
+    """Simulate a flight, and read its ULog as :func:`px4fuse.read_log` does."""
     return to_flight(simulate(scenario, mistakes))
 
 
@@ -127,7 +128,7 @@ def to_ulog(simulation: Simulation) -> bytes:
 
 
 def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
-    """Encode the flight as ULog, and read it as :func:`px4fuse.read_log` does."""
+    """Encode a simulated flight as ULog, and read it as :func:`px4fuse.read_log` does."""
     return read_ulog(name, to_ulog(simulation))
 
 
@@ -146,15 +147,15 @@ def _parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float
 
 
 def answer(simulation: Simulation) -> dict[str, Any]:
-    """Return the answers for the instructor, which the log does not contain, as JSON types.
+    """Return the true values of a simulated flight for the instructor, as JSON types.
 
     Keys
     ----
     mistakes
         Help text and expected finding of each mistake, by name.
     truth
-        Biases, noises, time offset to *add* to the timestamps of the source, outliers (index and
-        time in the logged topic), and loop closure error.
+        Biases, noises, time offset to add to the position timestamps, outliers (index and time in
+        the logged topic), and loop closure error.
     """
     scenario, mistakes = simulation.scenario, simulation.mistakes
     motion, source = simulation.motion, simulation.positions

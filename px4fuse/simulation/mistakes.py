@@ -1,11 +1,11 @@
-"""Mistakes of a simulated flight; ``mistakes.toml`` describes each.
+"""Mistakes of a simulated flight; ``mistakes.toml`` describes them.
 
-Examples of values on the command line: ``0.08``, ``80ms``, ``5%``, ``8s,40s``. Without a value, the
+Examples of sizes on the command line: ``0.08``, ``80ms``, ``5%``, ``8s,40s``. Without a size, the
 mistake has a default size that px4fuse detects easily.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from px4fuse.errors import SettingsError, suggest_name
 from px4fuse.record import table
@@ -17,13 +17,12 @@ from px4fuse.units import NAMES, convert_to_unit
 class Mistakes:
     """Sizes of all mistakes; the defaults are a flight without mistakes.
 
-    :data:`MISTAKES` explains each. Outliers occur in bursts; all outliers of a burst have the same
-    horizontal direction, and ``nlos_size_m`` is their mean size. Default times: gaps in the middle
-    of the flight, jumps at two thirds, heading errors from the start. A rate of 0 means no
-    change, an EKF2 noise of 0 the σ that the source reports, and an EKF2 delay of None the correct
-    delay. ``r_scale`` multiplies the reported variance. ``yaw_deg`` rotates the positions about the
-    start, clockwise seen from above. ``vibration_m_s2`` is the standard deviation of the mean over
-    0.1 s.
+    :data:`MISTAKES` explains each mistake. Outliers occur in bursts with one horizontal direction
+    and the mean size ``nlos_size_m``. Default times: gaps in the middle of the flight, jumps at two
+    thirds, heading errors from the start. A rate of 0 is the rate of the scenario, an EKF2 noise of
+    0 the σ that the source reports, and an EKF2 delay of None the correct delay. ``r_scale``
+    multiplies the reported variance. ``yaw_deg`` rotates the positions about the start, clockwise
+    seen from above. ``vibration_m_s2`` is the standard deviation of the mean over 0.1 s.
     """
 
     clock_offset_s: float = bounded_number(0.0, -5.0, 5.0, "s", "SECONDS")
@@ -61,19 +60,16 @@ class Mistakes:
 
 
 QUANTITIES = quantities(Mistakes)
-# ASCII spelling of units on the command line
+# ASCII spelling of units, for values of mistakes on the command line
 _ASCII = {"°": "deg", "m/s²": "m/s2"}
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """Row of ``mistakes.toml``.
+    """Mistake that a simulated flight can have (table ``mistakes.toml``).
 
     Attributes
     ----------
-    fields : tuple of str
-        Fields of :class:`Mistakes` that the mistake sets. The value of the first one is required on
-        the command line, the others are optional.
     default : float or True
         Default of the first field; True for a mistake without a size.
     help : str
@@ -84,28 +80,39 @@ class Mistake:
         Kinds of flight in which the mistake is possible.
     changes_ekf2 : bool
         True if the mistake changes EKF2 parameters.
+    fields : tuple of str
+        Fields of :class:`Mistakes` that the mistake sets: those whose name begins with the name of
+        the mistake. The command line requires the first value; the others are optional.
     """
 
-    fields: tuple[str, ...]
     default: float | bool
     help: str
     finding: str
     kinds: tuple[Kind, ...] = KINDS
     changes_ekf2: bool = False
+    fields: tuple[str, ...] = ()
 
     @property
     def sizes(self) -> tuple[str, ...]:
-        """Numeric fields; empty for a mistake without a size."""
+        """Fields that are sizes or times; empty for a mistake without a size."""
         return () if self.default is True else self.fields
 
     @property
     def usage(self) -> str:
-        """Syntax of the values after the name, such as ``=PERCENT[,SIZE]``."""
+        """Syntax of the values after the mistake's name, such as ``=PERCENT[,SIZE]``."""
         required, *optional = [f"={QUANTITIES[name].cli_name}" for name in self.sizes] or [""]
         return required + "".join(f"[,{name[1:]}]" for name in optional)
 
 
-MISTAKES: Mapping[str, Mistake] = table(__file__, "mistakes.toml", dict[str, Mistake])
+MISTAKES: Mapping[str, Mistake] = {
+    name: replace(
+        mistake,
+        fields=tuple(
+            field for field in vars(Mistakes()) if field.startswith(name.replace("-", "_"))
+        ),
+    )
+    for name, mistake in table(__file__, "mistakes.toml", dict[str, Mistake]).items()
+}
 
 
 def parse(texts: Iterable[str]) -> Mistakes:
@@ -129,26 +136,30 @@ def parse(texts: Iterable[str]) -> Mistakes:
         name, equals, values = text.strip().partition("=")
         if name not in MISTAKES:
             raise SettingsError(
-                f"--mistake {text}: not a known mistake",
+                f"--mistake {text}: {name} is not a known mistake",
                 f"{suggest_name(name, MISTAKES)}Choose from {', '.join(MISTAKES)}.",
             )
         mistake = MISTAKES[name]
         typed_values = values.split(",") if equals else []
         if len(typed_values) > len(mistake.sizes):
-            raise SettingsError(f"--mistake {text}: give {name}{mistake.usage}.")
+            raise SettingsError(
+                f"--mistake {text} has too many values: give {name}{mistake.usage}."
+            )
         value_by_field[mistake.fields[0]] = mistake.default
         for field, value in zip(mistake.sizes, typed_values, strict=False):
             bounds, size = QUANTITIES[field], convert_to_unit(value, QUANTITIES[field].unit)
             if size is None:
-                value_text = f"{NAMES[bounds.unit]}, as in {name}{mistake.usage}"
-                raise SettingsError(f"--mistake {text}: {value!r}: give {value_text}.")
+                raise SettingsError(
+                    f"--mistake {text}: {value!r}: give {NAMES[bounds.unit]}, as in "
+                    f"{name}{mistake.usage}."
+                )
             bounds.check(size, f"--mistake {text}: {bounds.cli_name}")
             value_by_field[field] = size
     return Mistakes(**value_by_field)  # type: ignore[arg-type]
 
 
 def active_mistakes(mistakes: Mistakes) -> tuple[str, ...]:
-    """Return the names of the mistakes that the flight has."""
+    """Return the names of the mistakes whose size is not the default."""
     defaults = Mistakes()
     return tuple(
         name
@@ -163,12 +174,9 @@ def format_mistake(name: str, mistakes: Mistakes) -> str:
     >>> format_mistake("nlos", parse(["nlos=5"]))
     'nlos=5%,2m'
     """
-    values_with_units = (
-        (getattr(mistakes, field), QUANTITIES[field].unit) for field in MISTAKES[name].sizes
-    )
     values = [
-        f"{value:g}{_ASCII.get(unit, unit)}"
-        for value, unit in values_with_units
-        if value is not None
+        f"{value:g}{_ASCII.get(unit := QUANTITIES[field].unit, unit)}"
+        for field in MISTAKES[name].sizes
+        if (value := getattr(mistakes, field)) is not None
     ]
     return f"{name}={','.join(values)}" if values else name

@@ -1,10 +1,10 @@
-"""True motion in closed form: a smooth path, and the attitude that a quadrotor needs for it.
+"""True motion of a simulated flight: a smooth path, and the attitude that a quadrotor needs for it.
 
-Each change Δv of the velocity is a ramp Δv · S(x), x = (t - start) / length, with the quintic
+Each velocity change Δv is a ramp Δv · S(x), x = (t - start) / length, with the quintic
 S = 6x⁵ - 15x⁴ + 10x³, so that the acceleration is continuous and the jerk bounded. In the air, a
-slow deviation (sum of a few sines) is added to the path. Thrust is along the body z axis and there
-is no drag, so the direction of the specific force a - g determines roll and pitch (Mellinger and
-Kumar 2011, eq. 6 to 8).
+slow deviation (sum of sines) is added to the path. Thrust is along the body z axis and there is no
+drag, so the direction of the specific force a - g determines roll and pitch (Mellinger and Kumar
+2011, eq. 6 to 8).
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from px4fuse.errors import SettingsError
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.scenario import CORNER_S, START_STOP_S, Scenario
 
-# s; time on the ground before take-off and after landing
+# Time (s) on the ground before take-off and after landing
 GROUND_S = 6.0
-CLIMB_M_S = 0.75
-CLIMB_RAMP_S = 1.5
-# s; the log of a flight of this length has 70 MB
+CLIMB_M_S = 0.75  # m/s; climb and descent rate
+CLIMB_RAMP_S = 1.5  # s; duration of each change of the climb rate
+# Maximum flight time (s): the log then has 70 MB
 MAX_FLIGHT_S = 3600.0
-# s; fade-in and fade-out of the slow deviation after take-off and before landing
+# Time (s) in which the slow deviation grows after take-off and decreases before landing
 FADE_S = 3.0
-# s; time of a 180° turn at the end of the aisle with --yaw follow
+# Time (s) of a 180° turn at the end of the aisle with --yaw follow
 TURN_ROUND_S = 4.0
-DEVIATION_PERIODS_S = (3.0, 20.0)
-DEVIATION_SINE_COUNT = 4
+# Range of periods (s), and number, of the sines of the slow deviation from the path
+DEVIATION_PERIODS_S, DEVIATION_SINE_COUNT = (3.0, 20.0), 4
 
 
 def _quintic(x: Array) -> tuple[Array, Array, Array, Array]:
-    """Return S(x), which rises from 0 to 1, and its three derivatives."""
+    """Return the quintic S(x), which rises from 0 to 1, and its three derivatives."""
     square, slope, complement = x * x, x * (1.0 - x), 1.0 - x
     value = square * x * (6.0 * square - 15.0 * x + 10.0)
     return (
@@ -48,12 +48,12 @@ def _quintic(x: Array) -> tuple[Array, Array, Array, Array]:
 
 @dataclass(frozen=True)
 class Ramps:
-    """Sequence of n velocity changes on k axes.
+    """Sequence of n velocity ramps on k axes.
 
     Attributes
     ----------
     start_s, length_s : ndarray, shape (n,)
-        Start and duration of each ramp.
+        Start and duration of each velocity ramp.
     velocity_change : ndarray, shape (n, k)
     """
 
@@ -63,7 +63,7 @@ class Ramps:
 
     @classmethod
     def of(cls, ramps: Sequence[tuple[float, float, Array]]) -> Ramps:
-        """Return ramps from tuples of start, length and change."""
+        """Make ramps from tuples of start (s), duration (s) and velocity change."""
         start_s, length_s, velocity_change = zip(*ramps, strict=True)
         return cls(np.array(start_s), np.array(length_s), np.array(velocity_change))
 
@@ -73,8 +73,8 @@ class Ramps:
         Position and velocity are 0 before the first ramp.
         """
         velocity_before = np.cumsum(self.velocity_change, axis=0) - self.velocity_change
-        # distance between two ramp starts: initial velocity times the interval, plus velocity
-        # change times the interval without half of the ramp
+        # distance between two ramp starts: the velocity before times the interval, plus the
+        # velocity change times the interval without half of the ramp
         position_gained = (
             velocity_before[:-1] * np.diff(self.start_s)[:, None]
             + self.velocity_change[:-1]
@@ -91,10 +91,8 @@ class Ramps:
         integral += np.maximum(time_in_ramp - length, 0.0)
         value, first, second, _ = _quintic(x)
         # take() is several times faster than indexing with an array
-        change, initial_velocity = (
-            self.velocity_change.take(ramp_index, axis=0),
-            velocity_before.take(ramp_index, axis=0),
-        )
+        change = self.velocity_change.take(ramp_index, axis=0)
+        initial_velocity = velocity_before.take(ramp_index, axis=0)
         return (
             position_before.take(ramp_index, axis=0)
             + initial_velocity * time_in_ramp[:, None]
@@ -107,7 +105,7 @@ class Ramps:
 
 @dataclass(frozen=True)
 class Sines:
-    """Sum of m sines on each of k axes; the angular frequencies are the same on all axes.
+    """Sum of m sines on each of k axes, with the same angular frequencies on all axes.
 
     Attributes
     ----------
@@ -132,7 +130,7 @@ class Sines:
         return cls(angular_frequency, amplitude * np.cos(phase), amplitude * np.sin(phase))
 
     def at(self, time_s: Array, orders: int = 1) -> list[Array]:
-        """Return the value and its first ``orders`` - 1 derivatives, each of shape (t, k)."""
+        """Return the sum and its first ``orders`` - 1 time derivatives, each of shape (t, k)."""
         angle = np.outer(time_s, self.angular_frequency_rad_s)
         basis = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
         amplitudes = [np.concatenate([self.sine, self.cosine])]
@@ -164,12 +162,12 @@ class State:
 
 @dataclass(frozen=True)
 class Motion:
-    """Planned flight.
+    """True motion of a planned flight.
 
     Attributes
     ----------
     path, yaw : Ramps
-        Position on 3 axes (NED), and yaw on one axis. The "velocity" of the yaw ramps is the yaw
+        Position on 3 axes (NED), and yaw on one axis; the "velocity" of the yaw ramps is the yaw
         angle (rad).
     deviation : Sines
         Slow deviation from the path.
@@ -188,8 +186,9 @@ class Motion:
         position, velocity, acceleration, jerk = self.path.at(time_s)
         deviation = self.deviation.at(time_s, 4)
         fade, fading_indices = self._fade_factors(time_s)
-        # derivatives of the product fade · deviation (Leibniz), where the fade factor changes
-        fading = [part[fading_indices] for part in deviation]
+        # derivatives of the product fade · deviation (Leibniz rule), at times with a changing
+        # factor
+        fading = [derivative[fading_indices] for derivative in deviation]
         velocity[fading_indices] += fade[1] * fading[0]
         acceleration[fading_indices] += 2 * fade[1] * fading[1] + fade[2] * fading[0]
         jerk[fading_indices] += (
@@ -206,10 +205,10 @@ class Motion:
         )
 
     def _fade_factors(self, time_s: Array) -> tuple[tuple[Array, Array, Array, Array], IntArray]:
-        """Return the fade factor of the deviation, its derivatives, and the indices of these.
+        """Return the factor of the slow deviation, its derivatives, and the indices of these.
 
         The factor is 1 in the air and 0 on the ground, shape (t, 1). Its first three derivatives,
-        shape (m, 1), are for the m indices at which the factor changes.
+        shape (m, 1), are for the m times at which the factor changes.
         """
         fade_in = np.clip((time_s - self.take_off_s) / FADE_S, 0.0, 1.0)
         fade_out = np.clip((time_s - self.touch_down_s) / FADE_S + 1.0, 0.0, 1.0)
@@ -231,7 +230,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Attitude:
-    """Attitude, with the angular rate and specific force that an ideal IMU measures.
+    """Attitude at n times, with angular rate and specific force that an ideal IMU measures.
 
     Attributes
     ----------
@@ -249,7 +248,7 @@ class Attitude:
 
 
 def attitude(state: State) -> Attitude:
-    """Return the attitude in which the thrust causes the acceleration, and the angular rates."""
+    """Return the attitude in which the thrust causes the true acceleration, and the rates."""
     gravity = np.array([0.0, 0.0, constants.g])
     thrust_opposite = gravity - state.acceleration_m_s2  # opposite to thrust
     thrust_m_s2 = np.sqrt(np.einsum("ij,ij->i", thrust_opposite, thrust_opposite))[:, None]
@@ -258,7 +257,7 @@ def attitude(state: State) -> Attitude:
     z_rate -= z * np.einsum("ij,ij->i", z, z_rate)[:, None]
     c, s = np.cos(state.yaw_rad), np.sin(state.yaw_rad)
     zx, zy, zz = z.T
-    # n = z × [cos ψ, sin ψ, 0], along the body's y axis
+    # n = z × [cos ψ, sin ψ, 0] is parallel to the body's y axis (ψ: yaw)
     n = np.stack([-zz * s, zz * c, zx * s - zy * c], axis=1)
     ux, uy, uz = z_rate.T
     n_rate = np.stack([-uz * s, uz * c, ux * s - uy * c], axis=1)
@@ -266,7 +265,7 @@ def attitude(state: State) -> Attitude:
     n_size = np.sqrt(np.einsum("ij,ij->i", n, n))
     y = n / n_size[:, None]
     x = np.cross(y, z)
-    # from dR/dt = R [ω]×
+    # angular rate ω in body axes, from dR/dt = R [ω]×
     rate = np.stack(
         [
             -np.einsum("ij,ij->i", z_rate, y),
@@ -286,7 +285,7 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
     Raises
     ------
     SettingsError
-        The open end of the loop is too large, or the flight would be too long.
+        The open end of the loop is longer than its last side, or the flight takes too long.
     """
     flight_plan = _Plan(GROUND_S, scenario.heading_deg)
     climb_m_s = min(CLIMB_M_S, scenario.altitude_m / 2.0)
@@ -319,12 +318,12 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
 
 
 class _Plan:
-    """Ramps of a flight; distance is velocity times the time between ramp centres."""
+    """Velocity and yaw ramps of a flight; ramps are placed by the times of their centres."""
 
     def __init__(self, start_s: float, heading_deg: float) -> None:
         self.centre_s = start_s + CLIMB_RAMP_S / 2.0
         self.path: list[tuple[float, float, Array]] = []
-        # the first yaw ramp ends before the first data, so the nose points along the heading
+        # the first yaw ramp ends before the first data, so the nose then points along the heading
         self.yaw = [(-1.0, 1.0, np.radians([heading_deg]))]
 
     def add_velocity_change(self, velocity: Array, length_s: float, until_next_s: float) -> None:
@@ -337,7 +336,7 @@ class _Plan:
 
 
 def direction(heading_deg: float) -> Array:
-    """Return the horizontal unit vector with this heading, NED, shape (3,)."""
+    """Return the horizontal unit vector (NED) of a heading in degrees."""
     heading = np.radians(heading_deg)
     return np.array([np.cos(heading), np.sin(heading), 0.0])
 

@@ -1,4 +1,4 @@
-"""Scenario of a simulated flight: path and sensors."""
+"""Path and sensors of a simulated flight without mistakes."""
 
 import math
 from collections.abc import Mapping
@@ -13,12 +13,12 @@ Yaw = Literal["fixed", "follow"]
 KINDS: tuple[Kind, ...] = ("aisle", "loop", "outdoor")
 YAWS: tuple[Yaw, Yaw] = ("fixed", "follow")
 
-# s; averaging time of the accelerometer noise SIGMA_A, as DT in px4fuse.filter.kalman
+# Averaging time (s) of the accelerometer noise SIGMA_A: DT of KF
 DT_S = 0.1
-# s; duration of the acceleration and braking along the aisle, and of a corner of the loop
+# Duration (s) of acceleration and braking along the aisle, and of a corner of the loop
 START_STOP_S = 1.5
 CORNER_S = 2.0
-# Defaults of the scenario that depend on the kind of flight
+# Values that replace defaults of the scenario, by kind of flight
 DEFAULTS_OF_KIND: Mapping[Kind, Mapping[str, float]] = {
     "aisle": {},
     "loop": {"passes": 1},
@@ -36,7 +36,7 @@ class Bounds:
     unit : str
         As in :data:`px4fuse.units.NAMES`.
     cli_name : str
-        Name of the option, or placeholder in the syntax of a mistake.
+        Name of the option, or placeholder in the syntax of a `--mistake`.
     meaning : str
         Help text of the option; empty for a field without option.
     """
@@ -48,25 +48,25 @@ class Bounds:
     meaning: str = ""
 
     def check(self, value: float, name: str) -> None:
-        """Raise SettingsError if the value is out of range; ``name`` starts the message."""
+        """Raise SettingsError if a value is out of range; ``name`` is its name in the message."""
         if not self.low <= value <= self.high:  # false for NaN too
             allowed = f"give {self.low:g} to {self.high:g} {self.unit}".rstrip()
             raise SettingsError(f"{name} {value:g} is out of range: {allowed}.")
 
 
 def bounded_number(default: Any, *bounds: Any) -> Any:
-    """Return a dataclass field with a default, and with :class:`Bounds` made of ``bounds``."""
+    """Make a dataclass field with a default, and with :class:`Bounds` from ``bounds``."""
     return field(default=default, metadata={"quantity": Bounds(*bounds)})
 
 
 def quantities(record: type) -> dict[str, Bounds]:
-    """Return the bounds of all fields of a dataclass that :func:`bounded_number` made."""
+    """Return the bounds of the fields of a dataclass that :func:`bounded_number` made."""
     return {item.name: item.metadata["quantity"] for item in fields(record) if item.metadata}
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """Flight and sensors, without mistakes.
+    """Path and sensors of a simulated flight, without mistakes.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class Scenario:
         "fixed": constant heading of the nose; "follow": nose along the direction of flight. None:
         fixed in the aisle, follow around the square.
     pause_s : float
-        Hover at each end of the aisle.
+        Time of hover at each end of the aisle.
     wander_m : float
         RMS of the slow deviation from the path, on each axis.
     uwb_rate_hz, sigma_uwb_m : float
@@ -129,7 +129,7 @@ class Scenario:
         12.0, 2.0, 1000.0, "m", "--length", "Length of the aisle, or of one side of the square."
     )
     speed_m_s: float = bounded_number(
-        1.0, 0.1, 10.0, "m/s", "--speed", "Speed on the straight parts."
+        1.0, 0.1, 10.0, "m/s", "--speed", "Speed on the straight segments of the path."
     )
     heading_deg: float = bounded_number(
         30.0,
@@ -202,7 +202,7 @@ class Scenario:
 
     @property
     def nose_follows_path(self) -> bool:
-        """Return True if the nose points along the direction of flight."""
+        """True if the nose points along the direction of flight."""
         return self.yaw == "follow" or (self.yaw is None and self.kind != "aisle")
 
     @property
@@ -219,7 +219,7 @@ class Scenario:
 
     @property
     def aid(self) -> Aid:
-        """EKF2 aid that fuses the positions."""
+        """Aiding source as which EKF2 fuses the positions."""
         return GNSS_POS if self.kind == "outdoor" else EV_POS
 
     @property
@@ -229,5 +229,5 @@ class Scenario:
 
 
 def make_scenario(kind: Kind, **field_values: Any) -> Scenario:
-    """Return a scenario with the defaults of its kind, except for the given fields."""
+    """Make a scenario with the defaults of its kind, except for ``field_values``."""
     return Scenario(kind=kind, **{**DEFAULTS_OF_KIND[kind], **field_values})

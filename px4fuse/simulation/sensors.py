@@ -1,4 +1,4 @@
-"""Sensor messages of a simulated flight as PX4 v1.16 logs them, including the mistakes."""
+"""Simulated sensor topics as PX4 v1.16 logs them, with the mistakes of the flight."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,37 +20,38 @@ from px4fuse.simulation.motion import Motion, Sines, attitude, direction
 from px4fuse.simulation.scenario import DT_S, Scenario
 from px4fuse.simulation.ulog_writer import Topic, topic
 
-# µs; boot time of the first data
+# Boot time (µs) of the first data
 START_US = 12_000_000
-# s; latency of positions from measurement to arrival in PX4: mean, standard deviation, minimum
+# Latency (s) of positions from measurement to arrival in PX4: mean, standard deviation, minimum
 LATENCY_S, LATENCY_SIGMA_S, MIN_LATENCY_S = 0.030, 0.003, 0.005
-# standard deviation of the measurement times, as a fraction of the source interval
+# Standard deviation of the position measurement times, as a fraction of the source interval
 INTERVAL_JITTER = 0.02
-# s; time of the first position
+# Time (s) of the first position
 FIRST_POSITION_S = 0.1
-# s; PX4 uses arrival times until 500 TIMESYNC replies at 10 Hz (Timesync.cpp)
+# Time (s) until PX4 stops using arrival times: 500 TIMESYNC replies at 10 Hz (Timesync.cpp)
 TIMESYNC_CONVERGED_S = 50.0
-MEAN_BURST_LENGTH = 3  # mean number of samples per outlier burst
+MEAN_BURST_LENGTH = 3  # mean number of positions per outlier burst
 # Origin of the local frame outdoors: latitude, longitude (degrees) and altitude (m)
 HOME = (47.397742, 8.545594, 488.0)
-# age (s) of a GNSS fix at its timestamp; noise north, east and down over that of the scenario
+# Age (s) of a GNSS fix at its timestamp; factors on the GNSS noise north, east and down
 FIX_AGE_S = 1e-3 * PARAMETERS[GNSS_POS.delay].default
 GNSS_SIGMA_FACTORS = np.array([1.0, 1.0, 1.5])
-# magnetic field (gauss, NED) at HOME; noise of magnetometer (gauss) and barometer (m)
+# Magnetic field (gauss, NED) at HOME; noise of magnetometer (gauss) and barometer (m)
 EARTH_FIELD_GAUSS = np.array([0.217, 0.013, 0.430])
 SIGMA_FIELD_GAUSS, SIGMA_BAROMETER_M = 0.02, 0.4
 FIELD_RATE_HZ, BAROMETER_RATE_HZ = 14.0, 10.0
-# m, RMS of the slow height error caused by weather and wind
+# RMS (m) of the slow height error that weather and wind cause
 HEIGHT_ERROR_M = 0.03
-# s; time constant with which EKF2's heading follows a compass error that starts in flight
+# Time constant (s) with which EKF2's heading follows a compass error that starts in flight
 HEADING_TIME_CONSTANT_S = 3.0
-SLOW_ERROR_PERIODS_S = (20.0, 60.0)
-SLOW_ERROR_SINE_COUNT = 4
+# Range of periods (s), and number, of the sines of slow attitude and height errors
+SLOW_ERROR_PERIODS_S, SLOW_ERROR_SINE_COUNT = (20.0, 60.0), 4
 ATTITUDE_LATENCY_US = 200
 LAND_DETECTOR_INTERVAL_US = 1_000_000
 
 
-# Streams of random numbers; separate, so that a mistake does not change the noise of other sensors
+# Separate streams of random numbers: a mistake of one sensor does not change the noise of the
+# others
 Stream = IntEnum(
     "Stream",
     "WANDER BIAS IMU ATTITUDE TIMING SOURCE DRIFT NLOS VIBRATION HEIGHT REST SLOW FIX_VELOCITY "
@@ -60,27 +61,27 @@ Stream = IntEnum(
 
 
 def random_stream(scenario: Scenario, name: Stream) -> np.random.Generator:
-    """Return the random number generator of one stream."""
+    """Return the random number generator of one stream, from the scenario's seed."""
     return np.random.default_rng([scenario.seed, name])
 
 
 @dataclass(frozen=True)
 class SimulatedPositions:
-    """Simulated position source.
+    """Simulated positions, without those that the mistakes remove.
 
     Attributes
     ----------
     topic : Topic
     is_outlier : ndarray of bool, shape (n,)
-        True for logged samples that are simulated outliers.
+        True for positions that are simulated outliers.
     error_m : ndarray, shape (n, 3)
-        Measured minus true position, NED, including the mistakes.
+        Measured minus true position, NED.
     position_m : ndarray, shape (n, 3)
         Measured position, NED.
     velocity_m_s : ndarray, shape (n, 3), or None
         Velocity measured by GNSS, NED; None for UWB and VIO.
     measured_s : ndarray, shape (n,)
-        True times of measurement, seconds from the first data.
+        True times of measurement (s from the first data).
     distance_m, drift_m : float, ndarray of shape (3,)
         Horizontal distance flown, and VIO drift at the end (NED).
     """
@@ -104,7 +105,7 @@ def biases(scenario: Scenario, mistakes: Mistakes) -> tuple[Array, Array]:
 
 
 def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
-    """Return sensor_combined with all samples of accelerometer and gyro."""
+    """Simulate sensor_combined (accelerometer and gyro) at the full rate, without gaps."""
     time_us = _grid_us(motion.duration_s, scenario.imu_rate_hz)
     truth = attitude(motion.at(seconds(time_us)))
     bias_a, bias_g = biases(scenario, mistakes)
@@ -128,10 +129,10 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
 
 
 def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
-    """Return vehicle_magnetometer with all samples."""
+    """Simulate vehicle_magnetometer at the full rate."""
     time_us = _grid_us(motion.duration_s, FIELD_RATE_HZ)
     rotation = attitude(motion.at(seconds(time_us))).body_to_ned
-    if mistakes.heading_deg:  # EKF2 uses the compass heading, so this rotation is its heading error
+    if mistakes.heading_deg:  # a rotated field causes EKF2's heading error
         rotation = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix() @ rotation
     field_gauss = np.einsum("nji,j->ni", rotation, EARTH_FIELD_GAUSS)
     field_gauss += SIGMA_FIELD_GAUSS * random_stream(scenario, Stream.FIELD).standard_normal(
@@ -143,7 +144,7 @@ def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topi
 
 
 def barometer(scenario: Scenario, motion: Motion) -> Topic:
-    """Return vehicle_air_data with all samples."""
+    """Simulate vehicle_air_data (barometer) at the full rate."""
     time_us = _grid_us(motion.duration_s, BAROMETER_RATE_HZ)
     height_m = HOME[2] - motion.at(seconds(time_us)).position_m[:, 2]
     height_m -= height_error(scenario, seconds(time_us))
@@ -153,18 +154,18 @@ def barometer(scenario: Scenario, motion: Motion) -> Topic:
 
 
 def height_error(scenario: Scenario, time_s: Array) -> Array:
-    """Return the slow height error (m, positive downward)."""
+    """Simulate the slow height error (m, positive downward)."""
     rng, rms = random_stream(scenario, Stream.HEIGHT), np.array([HEIGHT_ERROR_M])
     return Sines.draw(rng, rms, SLOW_ERROR_PERIODS_S, SLOW_ERROR_SINE_COUNT).at(time_s)[0][:, 0]
 
 
 def limit_rate(full_topic: Topic, rate_hz: float) -> Topic:
-    """Reduce a topic to a logging rate (Hz); 0 keeps all messages."""
+    """Return the messages that a logger with a rate limit (Hz) keeps; 0 keeps all."""
     return _select_messages(full_topic, keep_at_rate(time_s(full_topic), rate_hz))
 
 
 def logged_imu(full_topic: Topic, mistakes: Mistakes, motion: Motion) -> Topic:
-    """Return sensor_combined as logged, with the gap and the reduced rate of the mistakes."""
+    """Return sensor_combined as logged: with the gap and the reduced rate of the mistakes."""
     times_s = time_s(full_topic)
     is_outside_gap = _is_outside_gap(
         times_s, mistakes.imu_dropout_s, mistakes.imu_dropout_at_s, motion.duration_s
@@ -186,7 +187,7 @@ def _select_messages(topic: Topic, is_kept: BoolArray) -> Topic:
 def mean_imu_at_rest(
     scenario: Scenario, mistakes: Mistakes, motion: Motion, time_s: float
 ) -> tuple[Array, Array]:
-    """Return mean accelerometer (m/s²) and gyro (rad/s) at rest before the log."""
+    """Simulate the mean specific force (m/s²) and angular rate (rad/s) at rest before the log."""
     truth = attitude(motion.at(np.zeros(1)))
     bias_a, bias_g = biases(scenario, mistakes)
     rng = random_stream(scenario, Stream.REST)
@@ -198,7 +199,7 @@ def mean_imu_at_rest(
 
 
 def logged_attitude(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
-    """Return vehicle_attitude: the true attitude with a slow error, without the EKF2 model."""
+    """Simulate vehicle_attitude without the EKF2 model: true attitude with a slow error."""
     time_us = _grid_us(motion.duration_s, scenario.attitude_rate_hz)
     truth = attitude(motion.at(seconds(time_us))).body_to_ned
     error = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix()
@@ -207,7 +208,7 @@ def logged_attitude(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> T
 
 
 def true_attitude(scenario: Scenario, motion: Motion) -> Topic:
-    """Return vehicle_attitude_groundtruth."""
+    """Make vehicle_attitude_groundtruth from the true motion."""
     time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
     truth = attitude(motion.at(seconds(time_us))).body_to_ned
     return attitude_topic("vehicle_attitude_groundtruth", time_us, 0, quaternions(truth))
@@ -221,12 +222,12 @@ def quaternions(body_to_ned: Array) -> Array:
 def attitude_topic(
     name: str, time_us: NDArray[np.int64], delay_us: int, quaternion: Array
 ) -> Topic:
-    """Return an attitude topic, published ``delay_us`` after the measurement."""
+    """Make an attitude topic, published ``delay_us`` after the measurement."""
     return topic(name, timestamps(time_us, delay_us) | {"q": quaternion})
 
 
 def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rotation:
-    """Return the error of the logged attitude, as rotations about north, east and down."""
+    """Simulate the error of the logged attitude, a rotation in NED."""
     tilt, yaw = np.radians([scenario.tilt_error_deg, scenario.yaw_error_deg])
     rng = random_stream(scenario, Stream.ATTITUDE)
     rms = np.array([tilt, tilt, yaw])
@@ -243,7 +244,7 @@ def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rot
 
 
 def land_detector(motion: Motion) -> Topic:
-    """Return vehicle_land_detected: once a second, and at each change."""
+    """Simulate vehicle_land_detected: once a second, and at take-off and landing."""
     changes_us = np.rint(np.array([motion.take_off_s, motion.touch_down_s]) * 1e6).astype(np.int64)
     time_us = np.union1d(
         np.arange(0, int(motion.duration_s * 1e6), LAND_DETECTOR_INTERVAL_US), changes_us
@@ -254,7 +255,7 @@ def land_detector(motion: Motion) -> Topic:
 
 
 def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
-    """Return vehicle_local_position_groundtruth."""
+    """Make vehicle_local_position_groundtruth from the true motion."""
     time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
     state = motion.at(seconds(time_us))
     fields = timestamps(time_us) | vectors(
@@ -270,7 +271,7 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Simulat
     interval_s = 1.0 / scenario.source_rate_hz
     count = int((motion.duration_s - FIRST_POSITION_S) / interval_s)
     nominal_s = FIRST_POSITION_S + interval_s * np.arange(count)
-    # jitter below half an interval keeps the samples in order
+    # jitter below half an interval keeps the positions in order
     jitter = np.clip(timing_rng.normal(0.0, INTERVAL_JITTER, count), -0.4, 0.4)
     time_s = np.maximum(nominal_s + jitter * interval_s, 0.0)
     state = motion.at(time_s)
@@ -334,12 +335,12 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Simulat
 
 
 def reported_sigma_m(scenario: Scenario, mistakes: Mistakes) -> float:
-    """Return the σ (m) that the source reports; at least 0.01 m, as in EKF2 (EKF2.cpp)."""
+    """Return the σ (m) that the source reports; at least 0.01 m without ``r_scale`` (EKF2.cpp)."""
     return max(scenario.source_sigma_m, 0.01) * float(np.sqrt(mistakes.r_scale))
 
 
 def slow_error(scenario: Scenario, mistakes: Mistakes, count: int, interval_s: float) -> Array:
-    """Return time-correlated noise: a first-order Gauss-Markov process per axis, shape (n, 3)."""
+    """Simulate time-correlated noise (m), shape (n, 3): a first-order Gauss-Markov process."""
     noise = random_stream(scenario, Stream.SLOW).standard_normal((count, 3)) * mistakes.slow_error_m
     decay = np.exp(-interval_s / mistakes.slow_error_s)
     noise[1:] *= np.sqrt(1.0 - decay**2)
@@ -347,7 +348,7 @@ def slow_error(scenario: Scenario, mistakes: Mistakes, count: int, interval_s: f
 
 
 def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
-    """Return the VIO drift (m, NED), shape (n, 3): proportional to distance, plus a random walk."""
+    """Simulate the VIO drift (m, NED), shape (n, 3): proportional to distance, and random walk."""
     rng = random_stream(scenario, Stream.DRIFT)
     drift_per_metre = scenario.vio_drift * direction(rng.uniform(0.0, 360.0))
     step_sigmas = np.sqrt(np.diff(distance_m, prepend=0.0))[:, None]
@@ -358,10 +359,10 @@ def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
 def outliers(
     scenario: Scenario, mistakes: Mistakes, is_airborne: BoolArray
 ) -> tuple[Array, BoolArray]:
-    """Return the offset of each sample, shape (n, 3), 0 except for outliers; and the outlier mask.
+    """Simulate outliers: error of each position (m, NED), shape (n, 3), and mask of the outliers.
 
-    Outliers occur in bursts while airborne, as if an anchor had no line of sight. A burst has one
-    horizontal direction; the sizes are 0.5 to 1.5 times ``nlos_size_m``.
+    Outliers occur in bursts while airborne, as from an anchor without line of sight. A burst has
+    one horizontal direction; the sizes are 0.5 to 1.5 times ``nlos_size_m``.
     """
     offset_m = np.zeros((len(is_airborne), 3))
     is_outlier = np.zeros(len(is_airborne), np.bool_)
@@ -385,10 +386,8 @@ def outliers(
     outlier_indices = airborne_indices[burst_starts[burst_index] + index_in_burst]
     angle_rad = rng.uniform(0.0, 2.0 * np.pi, burst_count)[burst_index]
     size_m = mistakes.nlos_size_m * rng.uniform(0.5, 1.5, count)
-    offset_m[outlier_indices, 0], offset_m[outlier_indices, 1] = (
-        size_m * np.cos(angle_rad),
-        size_m * np.sin(angle_rad),
-    )
+    offset_m[outlier_indices, 0] = size_m * np.cos(angle_rad)
+    offset_m[outlier_indices, 1] = size_m * np.sin(angle_rad)
     is_outlier[outlier_indices] = True
     return offset_m, is_outlier
 
@@ -397,14 +396,14 @@ def keep_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
     """Return True for samples that a logger with this rate limit (Hz) keeps; 0: no limit."""
     if rate_hz <= 0.0:
         return np.ones(len(time_s), np.bool_)
-    # 1e-6: a sample at the start of an interval must not be rounded into the previous interval
+    # 1e-6: rounding must not move a sample at the start of a logging interval into the previous one
     return np.asarray(np.diff(np.floor(time_s * rate_hz + 1e-6), prepend=-1.0) > 0.0)
 
 
 def _source_times_us(
     mistakes: Mistakes, time_s: Array, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return arrival times and timestamps of measurement, µs from the first data."""
+    """Simulate arrival times and timestamps of positions, µs from the first data."""
     mean_latency_s = mistakes.clock_jump_s or LATENCY_S
     latency_s = np.maximum(rng.normal(mean_latency_s, LATENCY_SIGMA_S, len(time_s)), MIN_LATENCY_S)
     arrival_us = np.maximum.accumulate(np.rint((time_s + latency_s) * 1e6).astype(np.int64))
@@ -437,7 +436,7 @@ def _gnss_topic(
     sigma_m: float,
     scenario: Scenario,
 ) -> Topic:
-    """Return vehicle_gps_position (msg/SensorGps.msg); HOME is the origin of the positions."""
+    """Make vehicle_gps_position (msg/SensorGps.msg) from positions relative to HOME."""
     latitude, longitude = unproject(position_m[:, 0], position_m[:, 1], HOME[:2])
     accuracy_fields = {
         "eph": sigma_m,
@@ -456,7 +455,6 @@ def _gnss_topic(
 
 
 def _low_pass(position_m: Array, interval_s: float, time_constant_s: float) -> Array:
-    """Apply a first-order low-pass filter that starts at the first position."""
     decay = np.exp(-interval_s / time_constant_s)
     filtered_m, _ = lfilter(
         [1.0 - decay], [1.0, -decay], position_m, axis=0, zi=decay * position_m[:1]
@@ -467,7 +465,7 @@ def _low_pass(position_m: Array, interval_s: float, time_constant_s: float) -> A
 def _is_outside_gap(
     time_s: Array, gap_s: float, at_s: float | None, duration_s: float
 ) -> BoolArray:
-    """Return True for samples outside a gap; without ``at_s`` it is in the middle of the flight."""
+    """Return True outside a gap, which is in the middle of the flight if ``at_s`` is None."""
     start_s = (duration_s - gap_s) / 2.0 if at_s is None else at_s
     return np.asarray((time_s <= start_s) | (time_s >= start_s + gap_s))
 
@@ -483,7 +481,7 @@ def seconds(time_us: NDArray[np.int64]) -> Array:
 
 
 def timestamps(time_us: NDArray[np.int64], delay_us: int | NDArray[np.int64] = 0) -> dict[str, Any]:
-    """Return ``timestamp``, ``delay_us`` after the measurement, and ``timestamp_sample``."""
+    """Return ``timestamp_sample``, and ``timestamp`` (publication, ``delay_us`` later)."""
     return {
         "timestamp": _to_boot_time(time_us + delay_us),
         "timestamp_sample": _to_boot_time(time_us),
@@ -491,7 +489,7 @@ def timestamps(time_us: NDArray[np.int64], delay_us: int | NDArray[np.int64] = 0
 
 
 def vectors(values: Mapping[str, Array]) -> dict[str, Any]:
-    """Split vectors, shape (n, 3), into PX4 fields: ``vx``, ``vy``, ``vz`` for "v"."""
+    """Split vectors, shape (n, 3), into PX4 fields, for example "v" into vx, vy and vz."""
     return {
         f"{name}{axis}": vector[:, i]
         for name, vector in values.items()

@@ -1,4 +1,4 @@
-"""Encoding of PX4 topics as a ULog file.
+"""Writer of ULog files.
 
 Source: ULog file format, version 1, https://docs.px4.io/main/en/dev_log/ulog_file_format
 """
@@ -15,11 +15,11 @@ from px4fuse.readers import ULOG_MAGIC
 from px4fuse.record import table
 
 _ULOG_VERSION = b"\x01"
-# ULog names of numpy types; integer types only add "_t"
+# ULog names of numpy types; for integer types ULog adds "_t"
 _ULOG_TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
 _FLAG_BITS_MESSAGE = bytes(40)
-# [type, default] of each field, by topic; a field without default is optional
-FIELDS = table(__file__, "topics.toml", dict[str, dict[str, list[Any]]])
+# One line per field: numpy type, name, and default values; a field without default is optional
+FIELDS: Mapping[str, str] = table(__file__, "topics.toml", dict[str, str])
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Topic:
 
 
 def topic(name: str, field_values: Mapping[str, ArrayLike], table_row: str = "") -> Topic:
-    """Make a topic with the fields and types of PX4, and defaults for missing fields.
+    """Make a topic with PX4's fields and types, and defaults for missing fields.
 
     Parameters
     ----------
@@ -49,25 +49,19 @@ def topic(name: str, field_values: Mapping[str, ArrayLike], table_row: str = "")
     field_values : mapping
         Values by field, one per message; a scalar is used for all messages.
     table_row : str
-        Name in topics.toml, if it differs from the topic name.
+        Name in ``topics.toml``, if it differs from the topic name.
     """
-    default_by_field, count = FIELDS[table_row or name], np.size(field_values["timestamp"])
-    assert field_values.keys() <= default_by_field.keys(), (
-        f"{name} has no {field_values.keys() - default_by_field.keys()}"
-    )
-    fields = {}
-    for field, (kind, *default_values) in default_by_field.items():
-        values = (
-            field_values[field]
-            if field in field_values
-            else default_values[0]
-            if len(default_values) == 1
-            else default_values
-        )
-        if field in field_values or default_values:
-            if field not in field_values or not np.ndim(values):
-                values = np.broadcast_to(values, (count, *np.shape(values)))
-            fields[field] = np.asarray(values).astype(kind)
+    rows = [row.split() for row in FIELDS[table_row or name].splitlines()]
+    unknown_fields = field_values.keys() - {field for _, field, *_ in rows}
+    assert not unknown_fields, f"{name} has no {unknown_fields}"
+    count, fields = np.size(field_values["timestamp"]), {}
+    for kind, field, *defaults in rows:
+        if field in field_values or defaults:
+            default = float(defaults[0]) if len(defaults) == 1 else np.array(defaults, float)
+            values = np.asarray(field_values.get(field, default))
+            if field not in field_values or not values.ndim:
+                values = np.broadcast_to(values, (count, *values.shape))
+            fields[field] = values.astype(kind)
     return Topic(name, fields)
 
 
@@ -89,40 +83,40 @@ def encode(
     info : mapping
         An int is written as uint32.
     start_us : int
-        Boot time at which logging starts.
+        Boot time (µs) at which logging starts.
     dropouts_ms : sequence of int
-        Durations of the dropouts, whose messages are written after the data.
+        Durations (ms) of logger dropouts; their messages are written after the data.
     """
-    parts = [
+    content = [
         ULOG_MAGIC + _ULOG_VERSION,
         struct.pack("<Q", start_us),
         _message("B", _FLAG_BITS_MESSAGE),
     ]
     formats = dict.fromkeys(_format_text(topic) for topic in topics)
-    parts += [_message("F", format_text.encode()) for format_text in formats]
+    content += [_message("F", format_text.encode()) for format_text in formats]
     for name, info_value in info.items():
         if isinstance(info_value, str):
             text = info_value.encode()
-            parts.append(_keyed_message("I", f"char[{len(text)}] {name}", text))
+            content.append(_keyed_message("I", f"char[{len(text)}] {name}", text))
         else:
-            parts.append(_keyed_message("I", f"uint32_t {name}", struct.pack("<I", info_value)))
+            content.append(_keyed_message("I", f"uint32_t {name}", struct.pack("<I", info_value)))
     for name, value in parameters.items():
         kind, code = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
-        parts.append(_keyed_message("P", f"{kind} {name}", struct.pack(code, value)))
+        content.append(_keyed_message("P", f"{kind} {name}", struct.pack(code, value)))
     for topic_id, topic in enumerate(topics):
-        parts.append(
+        content.append(
             _message("A", struct.pack("<BH", topic.instance, topic_id) + topic.name.encode())
         )
-    messages: list[bytes] = []
+    data_messages: list[bytes] = []
     for topic_id, topic in enumerate(topics):
-        messages += _data_messages(topic, topic_id)
+        data_messages += _data_messages(topic, topic_id)
     timestamps_us = [np.maximum.accumulate(topic.fields["timestamp"]) for topic in topics]
-    parts += [
-        messages[index]
+    content += [
+        data_messages[index]
         for index in np.argsort(np.concatenate(timestamps_us), kind="stable").tolist()
     ]
-    parts += [_message("O", struct.pack("<H", length)) for length in dropouts_ms]
-    return b"".join(parts)
+    content += [_message("O", struct.pack("<H", length)) for length in dropouts_ms]
+    return b"".join(content)
 
 
 def _message(kind: str, content: bytes) -> bytes:
@@ -143,16 +137,15 @@ def _format_text(topic: Topic) -> str:
 
 
 def _data_messages(topic: Topic, topic_id: int) -> list[bytes]:
-    """Return the data messages of a topic, with headers."""
     header_fields = [("size", "<u2"), ("kind", "u1"), ("number", "<u2")]
     topic_fields = [
         (name, values.dtype.newbyteorder("<"), values.shape[1:])
         for name, values in topic.fields.items()
     ]
-    # the underscore avoids name conflicts with PX4 fields
+    # the underscore avoids conflicts of header names with PX4 fields
     dtype = np.dtype([(f"_{name}", kind) for name, kind in header_fields] + topic_fields)
     records = np.zeros(len(topic.fields["timestamp"]), dtype)
-    records["_size"] = dtype.itemsize - 3  # excludes the header bytes of size and kind
+    records["_size"] = dtype.itemsize - 3  # ULog sizes exclude the 3 bytes of size and kind
     records["_kind"] = ord("D")
     records["_number"] = topic_id
     for name, values in topic.fields.items():
