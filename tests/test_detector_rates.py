@@ -79,3 +79,8 @@ def test_detection_rate_table_counts_found_and_first_findings() -> None:
     assert made.loc[(yaw.finding, CLEAN), ["rate", "flights"]].tolist() == [0.0, 2]
     assert made.loc[(yaw.finding, yaw.typed), ["rate", "first"]].tolist() == [1.0, 0.0]
     assert set(made["scenario"]) == {DEFAULT}
+
+
+def test_find_lag_of_ekf2_output_predictor_alone_reports_nothing():
+    """At 10 Hz and 0.05 m the published position errs by 2 σ, at the fusion horizon by 1 σ."""
+    assert found(1, clean("10 Hz, 0.05 m, yaw follows")) == ()

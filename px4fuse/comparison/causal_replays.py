@@ -226,7 +226,7 @@ def error_above_reported_sigma(
     if isinstance(summary, Unavailable) or isinstance(truth, Unavailable):
         return None
     nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
-    if nees < MIN_NEES_FINDING or summary.nis_mean >= MAX_UNREMARKABLE_NIS:
+    if nees < MIN_NEES_FINDING or truth.is_lag_only or summary.nis_mean >= MAX_UNREMARKABLE_NIS:
         return None
     reported_sigma_m = summary.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
     return ErrorAboveSigma(nees, rmse_m, reported_sigma_m, summary.nis_mean)

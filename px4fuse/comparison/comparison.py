@@ -96,6 +96,10 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
         variance = projection.project_variance(ekf2, axis, segment)
         innovations = projection.project_innovations(flight, ekf2, prepared.source, axis, segment)
         axis_difference = difference(kf_run, state)
+    ekf2_errors = error_statistics(state, variance, truth)
+    if isinstance(ekf2_errors, ErrorsAgainstTruth) and isinstance(ekf2, Ekf2):
+        horizon_nees = _horizon_nees(projection.project_horizon(ekf2, axis, segment), truth)
+        ekf2_errors = structs.replace(ekf2_errors, nees_position_horizon_mean=horizon_nees)
     updates = kf_run.updates.assign(
         prior_variance_m2=kf_run.updates["prior_position_variance_m2"],
         posterior_variance_m2=kf_run.steps["position_variance_m2"].reindex(kf_run.updates.index),
@@ -116,9 +120,7 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
             "kf": _summarise_filter(
                 updates, kf_run.steps, kf_error_statistics(kf_run, truth, state), DEFAULT_GATE
             ),
-            "ekf2": _summarise_filter(
-                innovations, variance, error_statistics(state, variance, truth), gate
-            ),
+            "ekf2": _summarise_filter(innovations, variance, ekf2_errors, gate),
         },
         difference=axis_difference,
         rejected_fraction=float(rejected.mean()) if len(rejected) else None,
@@ -236,6 +238,13 @@ def error_statistics(
         nees_position_mean=nees_position,
         nees_velocity_mean=nees_velocity,
     )
+
+
+def _horizon_nees(horizon: pd.DataFrame | None, truth: Frame) -> float | None:
+    if horizon is None or isinstance(truth, Unavailable):
+        return None
+    errors = _errors(horizon, truth, "position_m")
+    return _mean_nees(errors / np.sqrt(horizon["position_variance_m2"].to_numpy()))
 
 
 def _errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Array:

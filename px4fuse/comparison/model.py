@@ -7,7 +7,7 @@ from typing import Literal
 import pandas as pd
 
 from px4fuse.errors import MissingDataError, suggest_name
-from px4fuse.filter.consistency import Consistency, HorizontalNis
+from px4fuse.filter.consistency import Consistency, HorizontalNis, classify_ratio
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis, Segment
@@ -41,6 +41,13 @@ class ErrorsAgainstTruth(Record, frozen=True, kw_only=True):
     velocity_rmse_m_s: NotNegative | None = None
     nees_position_mean: NotNegative | None = None
     nees_velocity_mean: NotNegative | None = None
+    nees_position_horizon_mean: NotNegative | None = None
+
+    @property
+    def is_lag_only(self) -> bool:
+        """True if only the lag of EKF2's output predictor makes its errors larger than σ."""
+        nees = self.nees_position_horizon_mean
+        return nees is not None and classify_ratio(nees**0.5, "truth") != "overconfident"
 
 
 class FilterSummary(Consistency, frozen=True, kw_only=True):

@@ -83,6 +83,7 @@ def _exceeds_sigma(analysis: Analysis) -> bool:
     truths = [summary.truth for summary in analysis.main.filters.values()]
     return any(
         isinstance(truth, ErrorsAgainstTruth)
+        and not truth.is_lag_only
         and truth.nees_position_mean is not None
         and truth.nees_position_mean > CONSISTENT_RATIOS["truth"][1] ** 2
         for truth in truths
