@@ -10,17 +10,14 @@ from exchange import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import (
-    CLOCK_OFFSET,
-    FORWARD_BIAS,
     MIN_EXPLAINED_SHARE,
-    OUTLIERS,
-    ROTATION,
     Intervention,
     find_cause,
     planned_configurations,
     run_interventions,
 )
-from px4fuse.comparison.causal_replays import RIGHT_BIAS as TO_RIGHT
+from px4fuse.comparison.changes import CLOCK_OFFSET, FORWARD_BIAS, OUTLIERS, ROTATION
+from px4fuse.comparison.changes import RIGHT_BIAS as TO_RIGHT
 from px4fuse.comparison.comparison import compare
 from px4fuse.diagnose import explain
 from px4fuse.ekf2.filter_recursion import FilterConfiguration

@@ -17,12 +17,8 @@ from hypothesis import strategies as st
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import (
-    POSITION_VARIANCES,
-    ROTATION,
-    find_cause,
-    interventions_for,
-)
+from px4fuse.comparison.causal_replays import POSITION_VARIANCES, find_cause, interventions_for
+from px4fuse.comparison.changes import ROTATION
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.projection import project as project_state
 from px4fuse.comparison.remedy import aid_of

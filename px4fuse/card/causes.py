@@ -12,12 +12,7 @@ from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import Action, Cause, FilterName, Rerun, Target, Verdict
-from px4fuse.comparison.causal_replays import (
-    CLOCK_OFFSET,
-    OUTLIERS,
-    SIGMA_A,
-    SIGMA_Z,
-)
+from px4fuse.comparison.changes import CLOCK_OFFSET, OUTLIERS, SIGMA_A, SIGMA_Z
 from px4fuse.comparison.trials import (
     Trial,
     enters_band,

@@ -13,15 +13,12 @@ from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import (
-    SIGMA_A,
-    SIGMA_Z,
-    SMALLEST_SIGMA_Z_M,
     Intervention,
     find_cause,
     interventions_for,
     is_inconsistent,
-    tuning_of_axis,
 )
+from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z, SMALLEST_SIGMA_Z_M, tuning_of_axis
 from px4fuse.comparison.estimates import first_axis_tuning
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
