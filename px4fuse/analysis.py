@@ -82,7 +82,7 @@ class AidsOnlyAnalysis:
     flight: Flight
     aids: Mapping[str, AidResult]
     missing_data: Unavailable
-    findings: tuple[Finding, ...]
+    findings: tuple[Finding, ...] = ()
 
     __repr__ = one_line_repr
 
