@@ -96,6 +96,11 @@ class Parameter(NamedTuple):
     minimum: float
     maximum: float
 
+    @property
+    def printed_unit(self) -> str:
+        """Unit with superscripts."""
+        return self.unit.replace("^2", "²").replace("^3", "³")
+
     def describe_range_error(self, value: float) -> str:
         """Return " 9 m is outside PX4's range 0.01 to 5" for a value outside the range, else ""."""
         low = self.minimum - FLOAT32_TOLERANCE * abs(self.minimum)

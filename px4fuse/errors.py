@@ -61,9 +61,13 @@ class Px4FuseError(Exception):
 class LogError(Px4FuseError):
     """The log cannot be read, or is not a flight log."""
 
+    id = "log_unreadable"
+
 
 class MissingDataError(Px4FuseError):
     """The log was read, but the required data are not in it."""
+
+    id = "data_missing"
 
 
 class TrajectoryError(Px4FuseError):

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record, Sha256, Share
 
@@ -132,6 +133,8 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
         Dropouts that the logger reported.
     parameters : mapping
         PX4 parameters for fusion and logging at the start of the log, by name.
+    parameter_defaults : mapping
+        Defaults of the firmware for EKF2 parameters with another value; ULog only.
     notes : tuple of str
         Sentences about dropped samples and clocks.
     damage : tuple of str
@@ -178,8 +181,13 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
     restarts: Count | None = None
     receive_time_reversals: Count | None = None
     dropped: Mapping[str, Count] = {}
+    parameter_defaults: Mapping[str, int | float] = {}
 
     __repr__ = one_line_repr
+
+    def default_of(self, parameter: str) -> float:
+        """Return the default of an EKF2 parameter: of the firmware if logged, else of v1.14."""
+        return self.parameter_defaults.get(parameter, PARAMETERS[parameter].default)
 
     @property
     def has_ulog(self) -> bool:

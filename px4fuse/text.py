@@ -57,6 +57,15 @@ def format_number(value: float, digits: int = 3) -> str:
     return f"{Decimal(f'{value:.{digits}g}'):,f}"
 
 
+def count_noun(count: int, noun: str) -> str:
+    """Format a count with its noun.
+
+    >>> count_noun(1, "innovation"), count_noun(2, "innovation")
+    ('1 innovation', '2 innovations')
+    """
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def format_factor(factor: float) -> str:
     """Format a factor with 2 significant digits, or 3 below 2.
 

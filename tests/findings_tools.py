@@ -13,6 +13,7 @@ from exchange import replace
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import Intervention
 from px4fuse.comparison.model import FILTERS, ErrorsAgainstTruth, FilterSummary, UntestedFilter
+from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.hypotheses import BiasScaleJumpFit, Estimate, Jump
 from px4fuse.filter.settings import Settings
@@ -63,6 +64,7 @@ class StandIn:
 def log(**parts: Any) -> Any:
     usual = {
         "parameters": {}, "notes": (), "format": "ULog", "has_ulog": True, "autopilot": "PX4",
+        "default_of": lambda name: PARAMETERS[name].default,
         "dropouts": (), "damage": (), "ends_in_flight": False, "duration_s": 60.0, "bytes": 0,
         "bytes_read": 0, "restarts": None, "receive_time_reversals": None, "dropped": {},
     }  # fmt: skip
@@ -123,7 +125,7 @@ def axis(name: str = "north", **parts: Any) -> Any:
         key: _with_truth(parts.pop(key, NONE), parts.pop(f"{key}_truth", NONE)) for key in FILTERS
     }
     axis = SimpleNamespace(
-        name=name, label="the aisle" if name == "aisle" else name,
+        name=name, label="the main axis" if name == "aisle" else name,
         measurement_time_s=np.arange(0.0, 120.0), measurement_m=np.zeros(120),
     )  # fmt: skip
     return SimpleNamespace(axis=axis, filters=filters, **usual | parts)

@@ -6,15 +6,20 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from cards import verdicts
 from exchange import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.build import build_card
+from px4fuse.card.build import build_card, build_refusal_card
 from px4fuse.card.causes import make_cause, rank_causes
+from px4fuse.card.model import Action
 from px4fuse.comparison.trials import RunStatistics, Trial, improvement
+from px4fuse.errors import LogError
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding
 from px4fuse.position_source import RECEIVED
+from px4fuse.readers import read_log
+from px4fuse.report.card_text import card_lines
 from px4fuse.request import ComparisonRequest
 
 REQUEST = ComparisonRequest(log="a.ulg")
@@ -22,6 +27,7 @@ CHANGES = {
     "time offset": {"clock_offset_s": -0.2},
     "noises": {"sigma_z_m": 0.3},
     "delay": {"EKF2_EV_DELAY": 200.0},
+    "process noise": {"EKF2_ACC_NOISE": 0.7},
 }
 
 
@@ -47,7 +53,10 @@ def trial(
 
 def analysis(*trials: Trial) -> Any:
     source = SimpleNamespace(origin=RECEIVED)
-    return SimpleNamespace(trials=trials, settings=Settings(), source=source, tuning={})
+    model = SimpleNamespace(inputs=SimpleNamespace(settings={"EKF2_ACC_NOISE": 0.35}))
+    return SimpleNamespace(
+        trials=trials, settings=Settings(), source=source, tuning={}, ekf2_model=model
+    )
 
 
 OFFSET = Finding("source_time_offset", "error", "Timestamps are late.", "Subtract 0.2 s.", {})
@@ -94,8 +103,62 @@ def test_diagnosis_keeps_time_offset_cause_without_ground_truth() -> None:
     (ranked,) = rank_causes(flight, [OFFSET])
     cause = make_cause(flight, ranked, (), REQUEST)
     assert cause.reruns == ()
-    assert [action.sentence for action in cause.actions] == [OFFSET.remedy]
+    assert [action.target for action in cause.actions] == ["sender", "KF"]
+    assert cause.actions[1].commands == ("px4fuse compare a.ulg --clock-offset -0.2",)
     assert rank_causes(analysis(trial("noises", outcome(0.98), outcome(1.0))), [NOISE]) == []
+
+
+def test_verdict_with_process_noise_rerun_sets_the_parameter() -> None:
+    vibration = Finding("ekf2_overconfident", "error", "EKF2 is overconfident.", "Check.", {})
+    helps = trial("process noise", CORRECTED, owner="ekf2")
+    for trials, commands in (((helps,), ("param set EKF2_ACC_NOISE 0.7",)), ((), ())):
+        flight = analysis(*trials)
+        (ranked,) = rank_causes(flight, [vibration])
+        (action,) = make_cause(flight, ranked, (), REQUEST).actions
+        assert action.commands == commands
+        assert action.sentence == ("EKF2_ACC_NOISE 0.35 → 0.7 m/s²" if trials else "Check.")
+    fails = trial("process noise", FLOWN, owner="ekf2")
+    assert rank_causes(analysis(fails), [vibration])[0].trials == ()
+
+
+def test_same_reason_of_both_filters_is_one_row() -> None:
+    ratios = [(3.0, "overconfident")] * 4
+    gap = Finding("source_gap", "warning", "No position for 8 s.", "Check the link.", {})
+    flight = analysis()
+    (ranked,) = rank_causes(flight, [gap])
+    cause = make_cause(flight, ranked, verdicts(*ratios), REQUEST)
+    assert [(action.target, action.sentence) for action in cause.actions] == [
+        ("sender", "Check the link."), ("KF, EKF2", "no setting corrects this fault"),
+    ]  # fmt: skip
+
+
+def test_consistent_filter_without_truth_is_no_reason_to_change_nothing() -> None:
+    ratios = verdicts(*[(1.0, "consistent")] * 4)
+    untested = tuple(each for each in ratios if each.against == "source")
+    (ranked,) = rank_causes(analysis(), [OFFSET])
+    for evaluated, reason in (
+        (ratios, "no change: consistent"),
+        (untested, "no change tested: only ground truth shows the effect of this fault"),
+    ):
+        cause = make_cause(analysis(), ranked, evaluated, REQUEST)
+        assert cause.actions[-1] == Action("KF, EKF2", reason)
+
+
+def test_refusal_card_shows_fault_bytes_and_action(tmp_path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(b"\xa3\x95\x80\x01" * 300)
+    with pytest.raises(LogError) as caught:
+        read_log(path)
+    lines = [text for line in card_lines(build_refusal_card(caught.value, path)) for text in
+             line.wrapped(100)]  # fmt: skip
+    assert lines == [
+        "error[log_unreadable]: a.bin: the file is an ArduPilot DataFlash log, not a PX4 ULog",
+        "  read     1,200 bytes, beginning with A3 95 80 01 (ULog: 55 4C 6F 67)",
+        "  fix      Give the .tlog that the ground station wrote.",
+        "Nothing was written. Exit code 2.",
+    ]
+    missing = build_refusal_card(LogError("b.ulg: cannot be read"), tmp_path / "b.ulg")
+    assert missing.facts == {}
 
 
 def test_diagnosis_card_of_clean_flight_advises_no_change(sample: Analysis) -> None:

@@ -58,6 +58,14 @@ def test_diagnosis_card_text_marks_alternatives_either_or() -> None:
     assert closing.endswith(f"px4fuse explain {card.id}")
 
 
+def test_causes_are_numbered_and_further_notes_are_counted() -> None:
+    notes = tuple(Note(f"note_{number}", f"Text {number}.") for number in range(5))
+    card = replace(SMALL_SIGMA_A, causes=2 * SMALL_SIGMA_A.causes, notes=notes)
+    lines = text_of(card)
+    assert [line.split()[1] for line in lines if line.startswith("  cause")] == ["1", "2"]
+    assert lines[-2:] == ["note[note_2]: Text 2.", "and 2 more notes: -v"]
+
+
 def test_diagnosis_card_text_on_ascii_terminal_is_ascii() -> None:
     four = verdicts((0.01, "underconfident"), (128.0, "overconfident"), *[(1.0, "consistent")] * 2)
     text = "\n".join(map(to_ascii, text_of(replace(SMALL_SIGMA_A, verdicts=four))))

@@ -89,7 +89,7 @@ def test_consistency_notes_list_innovations_that_are_not_white(sample: Analysis)
     (white,) = verdict_notes(sample)
     assert format_verdict(sample.axes["aisle"].filters["kf"]) == "consistent"
     assert "Ljung-Box test, p < 0.001" in white
-    assert "KF down, lag-1 autocorrelation" in white
+    assert "KF along down, lag-1 autocorrelation" in white
 
 
 def test_consistency_notes_of_white_innovations_are_empty(sample: Analysis) -> None:

@@ -51,7 +51,7 @@ def report(tmp_path_factory, sample_log) -> tuple[Path, str]:
 def test_compare_report_attaches_results_json_without_paths(report):
     folder, said = report
     assert sorted(p.name for p in folder.iterdir()) == ["notes.md", "report.json", "report.pdf"]
-    assert "warning[kf_underconfident]: KF is underconfident along the aisle" in said
+    assert "warning[kf_underconfident]: KF is underconfident along the main axis" in said
     assert f"Wrote    {folder / 'report.pdf'}" in said
     assert len(said.splitlines()) <= 42, "the summary must stay short"
     text = (folder / "report.json").read_bytes()

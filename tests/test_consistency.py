@@ -9,6 +9,7 @@ from scipy import stats
 
 from px4fuse.filter.consistency import Consistency, assess, assess_horizontal, nis_band
 from px4fuse.flight import Unavailable
+from px4fuse.text import count_noun
 
 # n, and 95 % band of the mean NIS with two degrees of freedom, as published for real flights
 BANDS_OF_TWO = [(128, 1.67, 2.36), (72, 1.56, 2.49), (179, 1.72, 2.30), (103, 1.63, 2.40)]
@@ -98,7 +99,7 @@ def test_consistency_of_few_or_equal_innovations_is_unavailable() -> None:
     for count in (0, 1, 9):
         result = assess(white(1, count), np.ones(count))
         assert isinstance(result, Unavailable)
-        assert f"only {count} innovations" in result.reason
+        assert f"only {count_noun(count, 'innovation')} (at least 10" in result.reason
     assert assessed(white(1, 14)).ljung_box_lags == 2
     for value in (0.0, -0.5):
         result = assess(np.full(50, value), np.ones(50))

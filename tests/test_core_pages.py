@@ -81,7 +81,7 @@ def test_event_marks_in_plots_have_a_label_for_each_event_type(eventful: Analysi
 
 def test_event_marks_of_long_flight_do_not_overlap() -> None:
     time_s = np.linspace(0.0, 3600.0, 20_000)
-    visible = event_marks._visible_times(time_s, 3600.0 * event_marks.MIN_MARK_DISTANCE)
+    visible = event_marks.visible_times(time_s, 3600.0 * event_marks.MIN_MARK_DISTANCE)
     assert len(visible) <= 1.0 / event_marks.MIN_MARK_DISTANCE + 1.0
     assert set(visible) <= set(time_s)
 
@@ -105,7 +105,7 @@ def test_zoomed_plot_window_avoids_position_gap() -> None:
         ({"ekf2": None}, "not evaluated: "),
         ({"truth": False}, "no ground truth"),
         ({"ekf2": Estimator(innovations_logged=False, variance_logged=False)}, "not logged"),
-        ({"ekf2": None, "truth": False}, "No error plot"),
+        ({"ekf2": None, "truth": False}, "not evaluated: "),
     ],
     ids=["no EKF2", "no truth", "no innovations", "no reference"],
 )

@@ -91,8 +91,8 @@ def test_report_cover_counts_notes_beyond_three() -> None:
     text = text_of(replace(SMALL_SIGMA_A, notes=notes, more_causes=4))
     assert "note[note_2]: Text 2." in text
     assert "note_3" not in text
-    assert "and 2 more: All findings" in text
-    assert "and 4 more: All findings" in text
+    assert "and 2 more notes: All findings" in text
+    assert "and 4 more causes: All findings" in text
 
 
 @pytest.mark.parametrize(
@@ -220,11 +220,15 @@ def test_innovations_beyond_plot_scale_are_drawn_as_triangles(eventful: Analysis
     assert {abs(value) for line in edges for value in line.get_ydata()} == {4.0}
 
 
-def test_error_plot_title_says_if_curve_is_flat_on_its_scale() -> None:
-    errors = pd.DataFrame({"error_m": [0.02, -0.05], "sigma_m": [0.05, 0.06]}, index=[0.0, 9.0])
-    titles = [cover_panels._error_title("ekf2", errors, 0.04, scale) for scale in (0.1, 5.0)]
+def test_error_plot_title_says_if_curve_is_flat_on_its_scale(eventful: Analysis) -> None:
+    error, sigma = (pd.Series(pair, [0.0, 9.0]) for pair in ([0.02, -0.05], [0.05, 0.06]))
+    label, sigmas = "EKF2 error (m)", {"EKF2": sigma}
+    titles = [
+        cover_panels._strip(eventful, label, ["RMSE 0.040"], error, sigmas, scale).title
+        for scale in (0.1, 5.0)
+    ]
     assert titles[0] == "EKF2 error (m): RMSE 0.040, σ 0.060"
-    assert titles[1] == f"{titles[0]}, flat on this scale, at most 0.050"
+    assert titles[1] == f"{titles[0]}, at most 0.050, flat on this scale"
 
 
 def test_sigma_beyond_plot_scale_is_marked_with_its_value() -> None:

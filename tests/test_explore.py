@@ -124,14 +124,15 @@ def cells(result: AxisComparison) -> dict[str, list[str]]:
             str(found.count),
         ]  # fmt: skip
 
-    names = ["● innovation ÷ √S, RMS", "◆ error ÷ σ, RMS", "Outside ±2√S (expected 5 %)",
-             "Lag-1 autocorrelation of ν", "Measurements"]  # fmt: skip
+    names = ["● innovation ÷ √S, RMS", "◆ error ÷ σ, RMS",
+             "Innovations outside ±2√S (expected 5 %)",
+             "Lag-1 autocorrelation of the innovations", "Number of measurements"]  # fmt: skip
     both = zip(*(statement(result.filters[name]) for name in FILTERS), strict=True)
     expected = {name: list(pair) for name, pair in zip(names, both, strict=True)}
     difference: Any = result.difference
     errors = [result.filters[name].truth for name in FILTERS]
-    expected["Position: KF - EKF2, RMS"] = [f"{difference.position_rms_m:.3f} m", "–"]
-    expected["Velocity: KF - EKF2, RMS"] = [f"{difference.velocity_rms_m_s:.3f} m/s", "–"]
+    expected["KF − EKF2 position difference, RMS"] = [f"{difference.position_rms_m:.3f} m", "–"]
+    expected["KF − EKF2 velocity difference, RMS"] = [f"{difference.velocity_rms_m_s:.3f} m/s", "–"]
     for name, unit in (("Position", "m"), ("Velocity", "m/s")):
         field = "position_rmse_m" if unit == "m" else "velocity_rmse_m_s"
         expected[f"{name} RMSE"] = [f"{getattr(one, field):.3f} {unit}" for one in errors]
@@ -198,14 +199,14 @@ def test_explore_page_invalid_input_shows_a_message(page: Browser) -> None:
     settle(page)
     message = "document.getElementById('message').textContent"
     assert page.ask(message) == (
-        "Invalid values in the address are ignored: sigma-a, dt, axis, input, view."
+        "Invalid values in the page address are ignored: sigma-a, dt, axis, input, view."
     )
     page.ask(
         "(() => { const n = document.getElementById('sigma-z-value'); n.value = '500';"
         "n.dispatchEvent(new Event('change')); })()"
     )
     settle(page)
-    assert "enter 0.0001 to 100 m" in page.ask(message)
+    assert "must be between 0.0001 and 100 m" in page.ask(message)
     assert page.ask(VALUES) == ["0.5", "0.2", "0", "0.1"]
 
 
@@ -321,7 +322,7 @@ def test_explore_page_without_ekf2_and_truth_shows_only_kf(
     show(browser, page_of(bare(flight), tmp_path / "bare.html"))
     table = browser.ask(TABLE)
     assert {pair[1] for pair in table.values()} == {"–"}
-    assert "Ground truth: " in browser.ask("document.getElementById('why').textContent")
+    assert "Ground truth is missing: " in browser.ask("document.getElementById('why').textContent")
     assert browser.ask("document.querySelector('[value=imu]').disabled")
     assert browser.ask("document.getElementById('likely').disabled")
     assert browser.complaints() == []

@@ -196,7 +196,7 @@ def test_explore_page_card_after_change_equals_python_ratios(
         assert rows[f"kf {verdict.against}"][:2] == [format_ratio(verdict.ratio), verdict.word]
     assert rows["kf truth"][2] == "100%"
     headline = page.ask("document.querySelector('#card h2').textContent")
-    assert f"KF overconfident with these settings: σ {format_ratio(truth.ratio)} times" in headline
+    assert f"KF is overconfident with these settings: σ is {format_ratio(truth.ratio)} " in headline
     rmse = format_metres(main.filters["kf"].truth.position_rmse_m)
     assert f"KF {rmse} m (as analysed" in page.ask("document.querySelector('#card').textContent")
     # the analysed ratio stays as a hollow mark
@@ -220,7 +220,7 @@ def test_explore_page_apply_button_sets_values_of_command(
     value = browser.ask("document.getElementById('sigma-a-value').value")
     assert f"--sigma-a {value}" in command
     assert "KF is consistent with these settings" in text(browser, "card")
-    assert "As analysed: ■ ERROR" in text(browser, "card")
+    assert "With the analysed settings: ■ ERROR" in text(browser, "card")
     assert browser.complaints() == []
 
 
@@ -348,9 +348,9 @@ def test_explore_page_tour_shows_numbers_of_the_flight(
     change = re.search(r"innovation ÷ √S changes from ([\d.]+) to ([\d.]+)\.", no_process_noise)
     with_clock = _shifted(analysis, offset)
     assert change[2] == format_ratio(nis_with(with_clock, Settings(a, z)) ** 0.5)
-    scale = re.search(r"√S from ([\d.]+) to ([\d.]+) \(one third\)", shown[3][1])
+    scale = re.search(r"√S changes from ([\d.]+) to ([\d.]+): one third", shown[3][1])
     assert float(scale[2]) == pytest.approx(float(scale[1]) / 3.0, rel=0.1)
-    assert shown[6][1].startswith("Innovation ÷ √S: EKF2 0.93, KF ")
+    assert shown[6][1].startswith("The RMS of innovation ÷ √S is 0.93 for EKF2 and ")
 
 
 def _shifted(analysis: Analysis, offset_s: float) -> Any:

@@ -520,6 +520,13 @@ def test_heading_drift_finding_states_heading_at_both_ends() -> None:
     assert (finding.evidence["from_deg"], finding.evidence["p"]) == (2.0, 1e-300)
 
 
+def test_heading_angles_are_printed_within_half_a_turn() -> None:
+    finding = only(source_frame.detect, analysis(heading=heading_error(170.0, 230.0, p=0.0)))
+    assert "It is +170° from 0 to 10 s and -130° from 10 to 20 s" in finding.message
+    finding = only(source_frame.detect, analysis(heading=heading_error(340.0)))
+    assert "rotated by -20°" in finding.title
+
+
 # ---------------------------------------------------------------- limits
 
 
@@ -733,11 +740,11 @@ SOURCE_EDGES = [
         (6.0, 0.05, "warning"), (5.9, 0.05, None), (6.0, 0.049, None),
         (6.0, 0.0999, "warning"), (6.0, 0.1, "error"))),
     # correlated errors without a lag are not from a low pass
-    *((source_positions.detect_low_pass, low_pass(99.0, 1.0,
-       time_correlated_noise=slow(99.0, lag)), expected)
+    *((source_positions.detect_low_pass,
+       low_pass(99.0, 1.0, time_correlated_noise=slow(99.0, lag)), expected)
       for lag, expected in ((0.9, None), (1.0, "error"))),
-    *((source_noise.detect_time_correlated_noise, analysis(
-       time_correlated_noise=slow(gain, lag)), expected)
+    *((source_noise.detect_time_correlated_noise,
+       analysis(time_correlated_noise=slow(gain, lag)), expected)
       for gain, lag, expected in (
           (5.0, 0.9, "warning"), (4.9, 0.0, None), (99.0, 1.0, None))),
     *((source_noise.detect_repeated_positions, repeating(again, count), expected)

@@ -327,7 +327,7 @@ def test_ekf2_noise_is_default_unless_sender_reports_another(flown, used_m, defa
         ("ekf2", {"EKF2_EV_DELAY": 90.0}, "clock", "Set EKF2_EV_DELAY to 90 ms."),
         ("ekf2", {"EKF2_EVP_NOISE": 0.3}, "measurement noise", "Set EKF2_EVP_NOISE to 0.3 m."),
         ("ekf2", {"EKF2_EVP_GATE": 5.0}, "gate", "Set EKF2_EVP_GATE to 5 SD."),
-        ("ekf2", {"EKF2_ACC_NOISE": 0.35}, "process noise", "Set EKF2_ACC_NOISE to 0.35 m/s^2."),
+        ("ekf2", {"EKF2_ACC_NOISE": 0.35}, "process noise", "Set EKF2_ACC_NOISE to 0.35 m/s²."),
     ],
 )  # fmt: skip
 def test_inconsistent_filter_action_follows_from_its_cause(owner, change, kind, action) -> None:

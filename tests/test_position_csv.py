@@ -292,7 +292,7 @@ def test_read_position_csv_unit_option_overrides_column_name(read, unit):
 
 @pytest.mark.parametrize(("x", "words"), [
     ([*X[:7], "4000.0", *X[8:]], "in m (assumed: the column names contain no unit)"),
-    (fixed(np.linspace(0.0, 5e6, ROWS), 1), "no unit gives the extent of an indoor flight"),
+    (fixed(np.linspace(0.0, 5e6, ROWS), 1), "no unit gives an indoor flight"),
 ])  # fmt: skip
 def test_read_position_csv_unit_is_not_changed_by_outlier(read, x, words):
     file = read(table({**PLAIN, "x": x}))

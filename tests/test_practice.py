@@ -254,7 +254,7 @@ def test_practice_page_scores_right_and_wrong_answers(browser: Browser, quiz: Pa
         assert page.ask("document.getElementById('quiz-solution').hidden")
         if number == 0:
             page.click("#quiz-check")
-            assert element_text(page, "quiz-message") == "Select at least one."
+            assert element_text(page, "quiz-message") == "Select at least one fault, or no mistake."
         right = number % 3 != 1
         wrong = next(name for name in CHOICES if name not in key["right"])
         page.click("#quiz-size")
@@ -276,7 +276,9 @@ def test_practice_page_scores_right_and_wrong_answers(browser: Browser, quiz: Pa
         for mistake in key["mistakes"]:
             assert (mistake["span"] is not None) == (key["right"] == ["source"])
             assert mistake["symptom"] in element_text(page, "quiz-solution")
-        assert f"{points} of {number + 1} correct" in element_text(page, "quiz-score")
+        assert f"Score: {points} of {number + 1} answered flights" in element_text(
+            page, "quiz-score"
+        )
         for mistake in key["mistakes"]:
             page.click("#quiz-solution button")
             settle(page)
@@ -289,7 +291,10 @@ def test_practice_page_scores_right_and_wrong_answers(browser: Browser, quiz: Pa
         assert page.ask("[...document.querySelectorAll('[name=choice]')].every((b) => b.disabled)")
         if number < COUNT - 1:
             renewed(page, "#quiz-next")
-    assert element_text(page, "quiz-score") == f"{points} of {COUNT} correct, set finished"
+    assert (
+        element_text(page, "quiz-score")
+        == f"Score: {points} of {COUNT} answered flights, all answered"
+    )
     assert page.ask("document.getElementById('quiz-next').hidden")
     assert page.complaints() == []
     assert page.requests() <= {"file", "data", "blob"}

@@ -132,10 +132,11 @@ def test_printed_commands_contain_typed_files_and_options() -> None:
         "LOG.ulg."
     )
     assert shlex.split(command) == [
-        "px4fuse", "compare", "my flights/a'b.ulg", "--mavlink", "-t.tlog", "--sigma-z", "0.2",
-        "--start", "12.5", "--clock-offset", "-0.125", "--position", "u w/b.csv",
+        "px4fuse", "compare", "my flights/a'b.ulg", "--mavlink", "-t.tlog", "--sigma-z", "0.3",
+        "--start", "12.5", "--position", "u w/b.csv", "--sigma-z", "0.2", "--clock-offset",
+        "-0.125",
     ]  # fmt: skip
-    assert shlex.split(loops) == ["px4fuse", "loop", "my flights/a'b.ulg", "--from", "12.5"]
+    assert shlex.split(loops) == ["px4fuse", "loop", "my flights/a'b.ulg"]
     # a file name that begins with - is not an option
     typed = command_line(ComparisonRequest(log="-a.ulg"), "tune", for_shell=True)
     assert typed == "px4fuse tune ./-a.ulg"

@@ -1,5 +1,6 @@
 """Valid timestamps of a ULog, and the ULog writer of the tests."""
 
+import struct
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -133,3 +134,14 @@ def test_read_ulog_joins_two_subscriptions_of_one_topic(order):
     np.testing.assert_array_equal(read["timestamp"], whole.fields["timestamp"])
     expected = position(seconds_of(whole.fields["timestamp"]))[:, 0]
     np.testing.assert_allclose(read["x"], expected, rtol=1e-6)
+
+
+def test_logged_default_of_firmware_precedes_the_table() -> None:
+    key = b"float EKF2_EV_DELAY"
+    body = struct.pack("<BB", 1, len(key)) + key + struct.pack("<f", 175.0)
+    message = struct.pack("<HB", len(body), ord("Q")) + body
+    content = make_log().encode()
+    end = 19 + struct.unpack("<H", content[16:18])[0]  # of the first message after the file header
+    log = read_topics("a.ulg", content[:end] + message + content[end:]).log
+    assert log.parameter_defaults == {"EKF2_EV_DELAY": 175.0}
+    assert (log.default_of("EKF2_EV_DELAY"), log.default_of("EKF2_EVP_NOISE")) == (175.0, 0.1)

@@ -96,7 +96,7 @@ def test_report_without_agreeing_replay_has_no_difference_page(sample: Analysis)
     for analysis, reason in ((parted, "they part"), (without, "no IMU")):
         assert drawn(analysis) == []
         line = unexplained_note(analysis)
-        assert line.startswith("Difference KF - EKF2 not explained: ")
+        assert line.startswith("The difference KF - EKF2 is not explained: ")
         assert line.count(reason) == 1
     assert drawn(unexplained(sample)) == []
     assert not unexplained_note(unexplained(sample))

@@ -2,16 +2,21 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from importlib import metadata
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from msgspec.structs import replace
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
+from px4fuse.arrays import Array
 from px4fuse.card.causes import (
     FILTER_NAMES,
     RankedCause,
+    can_show_effect,
     make_cause,
     make_plain_cause,
     rank_causes,
@@ -36,30 +41,40 @@ from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth
 from px4fuse.comparison.projection import project_horizon
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import improvement
+from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.errors import LogError, MissingDataError
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.settings import Settings
+from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.model import group_by_root
 from px4fuse.flight import Ekf2, Unavailable, source_name
+from px4fuse.log import LogInfo
+from px4fuse.reading import display_name, file_size, read_head
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
 from px4fuse.text import with_log_name
 
-MAX_NOTES = 3
 MAX_ACTIONS = 3
-# Rejected fraction and resets from which the effect names them
+# Minimum fraction of positions rejected by EKF2 that the effect on the card states
 MIN_NAMED_REJECTION = 0.01
 BETTER_POSITION = ("position and σ", "position")
-# Aiding sources whose √S is larger than needed with PX4's default noises, which is not a fault
+# Aiding sources whose √S is usually too large with PX4's default noises, which is no fault
 USUALLY_UNDERCONFIDENT = frozenset({"baro_hgt", "mag", "gravity"})
 DRIFT_HIDES_ERROR = (
     "σ too large against the source is not a fault here: the source may drift, and innovations do "
     "not show drift. Do not lower the noises for it."
 )
+# Number of first bytes that the card of an unreadable log shows, and those of each ULog
+SHOWN_BYTES, ULOG_HEAD = 4, "55 4C 6F 67"
+HEADING_HIDES_ERROR = (
+    "Both filters rotate the measured acceleration by the wrong heading and return to the position "
+    "at each update, so the innovations show only a part of the error."
+)
 UNEXPLAINED = "The two verdicts differ, and no tested change explains it."
 NO_FAULT = "No fault found: KF and EKF2 are consistent"
-# Findings of a source whose errors the innovations cannot show
+# Findings of errors that both filters follow, so that innovations do not show them
 SHIFTED_SOURCE = frozenset(
     {"source_time_offset", "source_scale_error", "source_frame_misaligned", "source_position_jump"}
 )
@@ -68,22 +83,22 @@ SHIFTED_SOURCE = frozenset(
 def build_card(
     analysis: Analysis, request: ComparisonRequest, student: tuple[str, str] = ("", "")
 ) -> Card:
-    """Return the diagnosis card of a comparison.
+    """Build the diagnosis card of a comparison.
 
     Parameters
     ----------
     analysis : Analysis
     request : ComparisonRequest
-        Makes the commands; without paths, they are for the folder of the log.
+        Options of the user, which the commands on the card repeat without paths.
     student : (str, str)
-        Name and id.
+        Name and id of the student.
     """
-    result = analysis.main
+    result, source, segment = analysis.main, analysis.source, analysis.segment
     roots = [group[0] for group in group_by_root(analysis.findings)]
     verdicts = make_verdicts(result)
     ranked = rank_causes(analysis, roots)
     causes = tuple(make_cause(analysis, each, verdicts, request) for each in ranked[:MAX_CAUSES])
-    may_drift = analysis.source.origin.may_drift
+    may_drift = source.origin.may_drift
     verdicts = _mark_explained(verdicts, causes, may_drift=may_drift)
     horizon_ratio = None if causes else _horizon_ratio(analysis)
     if horizon_ratio is not None:
@@ -110,19 +125,27 @@ def build_card(
         causes=causes,
         more_causes=max(len(ranked) - MAX_CAUSES, 0),
         notes=_notes(roots, request.log),
-        identity=_identity(analysis, request, student),
+        identity=_identity(
+            analysis.flight.log,
+            request,
+            student,
+            source=f"{source_name(source)} {source.rate_hz:.1f} Hz",
+            settings=_settings(analysis, request),
+            changed=_changed_settings(request),
+            parameters=_changed_parameters(analysis),
+            segment=f"{segment.start_s:.1f} to {segment.end_s:.1f} s, {segment.reason}",
+        ),
     )
 
 
 def build_aids_card(
     analysis: AidsOnlyAnalysis, request: ComparisonRequest, student: tuple[str, str] = ("", "")
 ) -> Card:
-    """Return the card of a flight without positions: EKF2's aiding sources only."""
+    """Build the card of a flight without a position source, from EKF2's aiding sources."""
     roots = [group[0] for group in group_by_root(analysis.findings)]
     faults = [one for one in roots if one.severity != "note"]
     causes = tuple(make_plain_cause(one) for one in faults[:MAX_CAUSES])
     missing = analysis.missing_data
-    log = analysis.flight.log
     return Card(
         severity=causes[0].severity if causes else "clean",
         id=causes[0].id if causes else "",
@@ -142,27 +165,33 @@ def build_aids_card(
             for name, axis in aid.axes.items()
         ),
         facts={"KF": f"not run: {missing.reason}. {with_options(missing.remedy)}"},
-        identity=Identity(
-            file=log.name,
-            firmware=log.firmware,
-            hardware=log.hardware,
-            duration_s=log.duration_s,
-            source="no position source",
-            command=command_line(request.without_paths()),
-            student=student[0],
-            student_id=student[1],
-            version=f"px4fuse {metadata.version('px4fuse')}",
-        ),
+        identity=_identity(analysis.flight.log, request, student, source="no position source"),
+    )
+
+
+def build_refusal_card(error: LogError | MissingDataError, path: Path) -> Card:
+    """Build the card of a log that cannot be analysed: fault, first bytes of the file, and fix."""
+    facts = {}
+    with suppress(LogError):  # without access to the file, the error states the reason
+        head = read_head(path, SHOWN_BYTES, LogError).hex(" ").upper()
+        size = file_size(path, LogError)
+        facts["read"] = f"{size:,} bytes, beginning with {head} (ULog: {ULOG_HEAD})"
+    if error.remedy:
+        facts["fix"] = with_options(with_log_name(error.remedy, str(path)))
+    return Card(
+        severity="refused",
+        id=error.id,
+        headline=with_options(error.reason),
+        facts=facts,
+        identity=Identity(file=display_name(path)),
     )
 
 
 def _severity_without_cause(verdicts: Sequence[Verdict]) -> CardSeverity:
-    words = {verdict.word for verdict in verdicts if not verdict.is_explained}
-    return "note" if words & {"overconfident", "underconfident"} else "clean"
+    return "note" if any(verdict.is_loud for verdict in verdicts) else "clean"
 
 
 def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
-    """Return fault and size of the first cause; a second error follows if there is room."""
     if causes:
         first, *others = causes
         for other in others:
@@ -170,12 +199,7 @@ def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
             if other.severity == "error" and len(both) <= MAX_HEADLINE_LENGTH:
                 return both
         return first.title
-    faulty = [
-        each
-        for each in verdicts
-        if each.word in ("overconfident", "underconfident") and not each.is_explained
-    ]
-    if faulty:
+    if faulty := [verdict for verdict in verdicts if verdict.is_loud]:
         worst = max(faulty, key=lambda each: abs(math.log(each.ratio or 1.0)))
         size = worst.ratio or 1.0
         direction = "small" if size > 1.0 else "large"
@@ -195,16 +219,7 @@ def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
 
 
 def _effect(analysis: Analysis) -> Effect:
-    result = analysis.main
-    ekf2, segment = analysis.flight.ekf2, analysis.segment
-    resets = None
-    if isinstance(ekf2, Ekf2):
-        resets = sum(
-            reset.quantity == "position"
-            and any(reset.delta[:2])
-            and segment.start_s < reset.time_s <= segment.end_s
-            for reset in ekf2.resets
-        )
+    result, has_ekf2 = analysis.main, isinstance(analysis.flight.ekf2, Ekf2)
     difference = result.difference
     return Effect(
         axis=describe_axis(analysis, result),
@@ -216,34 +231,42 @@ def _effect(analysis: Analysis) -> Effect:
         horizontal_rmse_m=_horizontal_rmse_m(analysis),
         difference_rms_m=None if isinstance(difference, Unavailable) else difference.position_rms_m,
         rejected_fraction=result.rejected_fraction,
-        horizontal_resets=resets,
+        horizontal_resets=len(horizontal_resets(analysis)) if has_ekf2 else None,
     )
 
 
+def horizontal_resets(analysis: Analysis) -> Array:
+    """Return the times (s) of EKF2's horizontal position resets in the segment."""
+    ekf2, segment = analysis.flight.ekf2, analysis.segment
+    times = horizontal_resets_s(ekf2) if isinstance(ekf2, Ekf2) else np.empty(0)
+    return times[(segment.start_s < times) & (times <= segment.end_s)]
+
+
 def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
-    """Format the axis with its reference: "along the aisle, 30° from north"."""
-    called, heading = result.axis.label, result.heading_deg
-    if result.axis.name != "aisle" or heading is None:
-        return f"along {called}"
+    """Describe the direction of an axis: "along the main axis, 30° from north"."""
+    direction, heading = f"along {result.axis.label}", result.heading_deg
+    if result.axis.name != AISLE or heading is None:
+        return direction
     reference = "north"
     if analysis.source.frame == "FRD":
         reference = f"the {source_name(analysis.source)} x axis"
-    return f"along {called}, {heading % 180.0:.0f}° from {reference}"
+    return f"{direction}, {heading % 180.0:.0f}° from {reference}"
 
 
 def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
-    found: dict[FilterName, float] = {}
     axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
-    for owner in FILTER_NAMES:
-        truths = [axis.filters[owner].truth for axis in axes]
-        known = [truth.position_rmse_m for truth in truths if isinstance(truth, ErrorsAgainstTruth)]
-        if len(known) == 2:
-            found[owner] = math.hypot(*known)
-    return found
+    errors_m = {
+        owner: [
+            truth.position_rmse_m
+            for axis in axes
+            if isinstance(truth := axis.filters[owner].truth, ErrorsAgainstTruth)
+        ]
+        for owner in FILTER_NAMES
+    }
+    return {owner: math.hypot(*pair) for owner, pair in errors_m.items() if len(pair) == 2}
 
 
 def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]) -> str:
-    """Make the sentences about errors, their ratios to σ, rejections and resets."""
     sentences = []
     if analysis.flight.airborne == ():
         return "The vehicle stayed on the ground, so the errors of the filters are not evaluated."
@@ -287,7 +310,7 @@ def _in_brackets(label: str, lengths_m: Mapping[FilterName, float]) -> str:
 
 
 def _do_this(causes: Sequence[Cause]) -> tuple[str, ...]:
-    """Return the first actions of the causes, at most three."""
+    """Return at most three actions of the causes; first the alternative that is listed first."""
     texts: list[str] = []
     for cause in causes:
         for alternative in cause.alternatives[:1]:
@@ -302,7 +325,9 @@ def _is_change(action: Action) -> bool:
 
 def _sentence(action: Action) -> str:
     if action.where == "console":
-        return f"EKF2: set {action.sentence}."
+        one_change = action.sentence.partition(" ")[2]  # the command states the parameter
+        change = one_change if len(action.commands) == 1 else action.sentence
+        return f"EKF2: {', '.join(action.commands)} ({change})."
     if action.where == "shell":
         options = action.commands[0].partition(" --")[2]
         return f"KF: {action.sentence or 'run again with'} --{options}."
@@ -313,15 +338,16 @@ def _sentence(action: Action) -> str:
 def _mark_explained(
     verdicts: Sequence[Verdict], causes: Sequence[Cause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
-    """Mark verdicts that are not consistent and need no change.
+    """Mark the inconsistent verdicts of filters that need no change.
 
     If the source may drift, a σ that is too large against the source is not a fault.
     """
     unchanged = {
-        action.target
+        name
         for cause in causes
         for action in cause.actions
         if action.sentence.startswith("no change")
+        for name in action.target.split(", ")
     }
     truth_is_right = {
         verdict.filter
@@ -330,7 +356,7 @@ def _mark_explained(
     }
     return tuple(
         replace(verdict, is_explained=True)
-        if verdict.word in ("overconfident", "underconfident")
+        if verdict.is_loud
         and (
             FILTER_NAMES[verdict.filter] in unchanged
             or verdict.filter in truth_is_right
@@ -342,7 +368,7 @@ def _mark_explained(
 
 
 def _horizon_ratio(analysis: Analysis) -> float | None:
-    """Return the ratio of EKF2's error to σ at the fusion horizon, if that is consistent.
+    """Return EKF2's error ÷ σ at the fusion horizon, or None unless it is consistent only there.
 
     The published position includes the lag of EKF2's output predictor, which σ does not describe.
     None if the published position is consistent, or if the horizon is not logged or not consistent.
@@ -371,7 +397,7 @@ def _horizon_sentence(ratio: float) -> str:
 def _reconcile(
     analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence[Cause], ids: Sequence[str]
 ) -> str:
-    """Explain two verdicts of one filter that differ, or ratios of which one is far larger."""
+    """Explain why verdicts against source and ground truth differ; "" if they agree."""
     corrected = {
         "ekf2" if rerun.is_prediction else "kf"
         for cause in causes[:1]
@@ -409,7 +435,7 @@ def _reconcile(
         )
     if "source_outliers" in ids and "ekf2" in differing:
         return _gate_sentence(analysis)
-    return UNEXPLAINED
+    return HEADING_HIDES_ERROR if "ekf2_heading_error" in ids else UNEXPLAINED
 
 
 def _differ(source: Verdict, truth: Verdict, *, is_corrected: bool) -> bool:
@@ -420,9 +446,9 @@ def _differ(source: Verdict, truth: Verdict, *, is_corrected: bool) -> bool:
 
 
 def _gate_sentence(analysis: Analysis) -> str:
-    """State that EKF2's gate rejected the outliers, with the ratio of the accepted positions."""
+    """State how many positions EKF2's gate rejected, and innovation ÷ √S of the accepted ones."""
     innovations = analysis.main.ekf2_innovations
-    assert not isinstance(innovations, Unavailable)  # EKF2's verdict needs them
+    assert not isinstance(innovations, Unavailable)  # else EKF2 has no verdict
     accepted = innovations[~(innovations["rejected"] > 0.0)]
     ratio = math.sqrt(
         float((accepted["innovation_m"] ** 2 / accepted["innovation_variance_m2"]).mean())
@@ -436,12 +462,15 @@ def _gate_sentence(analysis: Analysis) -> str:
 
 
 def _difference(effect: Effect, ranked: Sequence[RankedCause]) -> str:
-    """State the difference KF - EKF2 before and after the fix of the first cause."""
     if effect.difference_rms_m is None or not ranked:
         return ""
     text = f"KF − EKF2: {format_metres(effect.difference_rms_m)} m RMS"
     trials = ranked[0].trials
-    owners = {trial.filter for trial in trials if improvement(trial) in BETTER_POSITION}
+    owners = {
+        trial.filter
+        for trial in trials
+        if improvement(trial) in BETTER_POSITION or not can_show_effect(trial)
+    }
     if len(owners) == 2:
         return f"{text}. Both filters have the fault, so this difference does not show it."
     after = {trial.filter: trial.after.difference_rms_m for trial in reversed(trials)}
@@ -454,34 +483,30 @@ def _difference(effect: Effect, ranked: Sequence[RankedCause]) -> str:
 
 
 def _notes(roots: Sequence[Finding], log: str) -> tuple[Note, ...]:
-    notes = [one for one in roots if one.severity == "note"]
     return tuple(
-        Note(one.id, f"{one.title}.", with_log_name(one.remedy, log)) for one in notes[:MAX_NOTES]
+        Note(finding.id, f"{finding.title}.", with_log_name(finding.remedy, log))
+        for finding in roots
+        if finding.severity == "note"
     )
 
 
-def _identity(analysis: Analysis, request: ComparisonRequest, student: tuple[str, str]) -> Identity:
-    log, source, segment = analysis.flight.log, analysis.source, analysis.segment
-
+def _identity(
+    log: LogInfo, request: ComparisonRequest, student: tuple[str, str], **texts: Any
+) -> Identity:
     return Identity(
         file=log.name,
         firmware=log.firmware,
         hardware=log.hardware,
         duration_s=log.duration_s,
-        source=f"{source_name(source)} {source.rate_hz:.1f} Hz",
-        settings=_settings(analysis, request),
-        changed=_changed_settings(request),
-        parameters=_changed_parameters(analysis),
-        segment=f"{segment.start_s:.1f} to {segment.end_s:.1f} s, {segment.reason}",
         command=command_line(request.without_paths()),
         student=student[0],
         student_id=student[1],
         version=f"px4fuse {metadata.version('px4fuse')}",
+        **texts,
     )
 
 
 def _settings(analysis: Analysis, request: ComparisonRequest) -> str:
-    """Format the three settings of KF with their origin."""
     chosen = analysis.settings
     texts = []
     for name, label, unit in (
@@ -490,10 +515,10 @@ def _settings(analysis: Analysis, request: ComparisonRequest) -> str:
         ("dt_s", "DT", "s"),
     ):
         value, origin = getattr(chosen, name), "set by option"
-        if value == getattr(Settings(), name):
-            origin = "default"
-        elif name == "sigma_z_m" and request.sigma_z_m is None:
+        if name == "sigma_z_m" and request.sigma_z_m is None and analysis.source.origin.is_gnss:
             origin = f"from {aid_of(analysis).noise}"
+        elif value == getattr(Settings(), name):
+            origin = "default"
         texts.append(f"{label} {value:g} {unit} ({origin})")
     return ", ".join(texts)
 
@@ -508,19 +533,13 @@ def _changed_settings(request: ComparisonRequest) -> tuple[str, ...]:
 
 
 def _changed_parameters(analysis: Analysis) -> tuple[str, ...]:
-    """Format noise, delay and gate of EKF2 for the source that differ from PX4's default."""
     if analysis.source.origin.aid is None:
         return ()
-    aid, logged = analysis.source.origin.aid, analysis.flight.log.parameters
-    texts = []
-    for name in (aid.noise, aid.delay, aid.gate):
-        parameter, value = PARAMETERS.get(name), logged.get(name)
-        if (
-            parameter is None
-            or value is None
-            or math.isclose(value, parameter.default, rel_tol=1e-3)
-        ):
-            continue
-        unit = f" {parameter.unit}" if parameter.unit else ""
-        texts.append(f"{name} {value:.4g}{unit} (PX4 default {parameter.default:g})")
-    return tuple(texts)
+    aid, log = analysis.source.origin.aid, analysis.flight.log
+    return tuple(
+        f"{name} {value:.4g} {PARAMETERS[name].unit}".rstrip() + f" (PX4 default {default:g})"
+        for name in (aid.noise, aid.delay, aid.gate)
+        if name in PARAMETERS
+        and (value := log.parameters.get(name)) is not None
+        and not math.isclose(value, default := log.default_of(name), rel_tol=1e-3)
+    )

@@ -1,7 +1,7 @@
-"""Order of the causes on the card, their actions, and the re-runs that confirm them.
+"""Causes on the diagnosis card: order, actions, and the re-runs of KF and EKF2 that test them.
 
-A finding is a numbered cause only if its re-run moves a verdict or the error, or if no re-run can
-show its effect. An action on a filter is printed only if its re-run improves that filter.
+A finding is a numbered cause if a re-run with its correction changes a σ ratio or the position
+RMSE, or if no re-run can show its effect. A change of a filter is proposed only if it helps.
 """
 
 import math
@@ -31,7 +31,7 @@ from px4fuse.flight import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 from px4fuse.text import with_log_name
 
-# Kinds of change that re-run a finding, by its id
+# Kinds of change (:attr:`Trial.kinds`) whose re-runs test a finding, by the id of the finding
 RERUN_KINDS: Mapping[str, frozenset[str]] = {
     "source_time_offset": frozenset({"time offset", "delay"}),
     "ekf2_ev_delay_wrong": frozenset({"delay", "time offset"}),
@@ -48,8 +48,10 @@ RERUN_KINDS: Mapping[str, frozenset[str]] = {
     "ekf2_rejects_positions": frozenset({"noise", "gate"}),
     "ekf2_noise_too_small": frozenset({"noise", "noises"}),
     "ekf2_noise_too_large": frozenset({"noise", "noises"}),
+    "ekf2_overconfident": frozenset({"process noise"}),
+    "ekf2_underconfident": frozenset({"process noise"}),
 }
-# Findings without which the rest of the card is meaningless; they come first
+# Findings that make the verdicts meaningless; they are the first causes on the card
 MEANINGLESS = (
     "log_damaged",
     "not_px4",
@@ -57,7 +59,7 @@ MEANINGLESS = (
     "imu_samples_missing",
     "ekf2_not_fusing",
 )
-# Findings that only state a verdict; they are no cause if one is known
+# Findings that only state a verdict on σ; they are causes on the card if there is no other cause
 VERDICT_FINDINGS = frozenset(
     {
         "error_exceeds_reported_sigma",
@@ -68,11 +70,11 @@ VERDICT_FINDINGS = frozenset(
     }
 )
 SETTING_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
-# Changes that move both filters with the source: only ground truth shows their effect
+# Kinds of change that shift both filters with the source, which only ground truth shows
 UNSEEN_KINDS = frozenset({"time offset", "delay", "rotation"})
-# Endings of the parameters that PX4 reads at its start only (reboot_required in its metadata)
+# Endings of names of parameters that PX4 reads at boot only (reboot_required in its metadata)
 REBOOT_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
-# Rejected fraction from which a re-run table lists it
+# Minimum fraction of positions rejected by EKF2 for a column of the re-run table
 MIN_SHOWN_REJECTION = 0.005
 TARGETS: Mapping[str, Target] = {
     "position source": "sender",
@@ -83,13 +85,13 @@ TARGETS: Mapping[str, Target] = {
     "loops": "source",
     "logging": "logging",
 }
-# Targets of findings whose group has another one
+# Devices or persons that act against a finding, if they differ from those of its group
 TARGETS_BY_ID: Mapping[str, Target] = {"source_drift": "source", "ekf2_not_fusing": "sender"}
 FILTER_NAMES: Mapping[FilterName, Target] = {"kf": "KF", "ekf2": "EKF2"}
 
 
 class RankedCause(NamedTuple):
-    """Finding with the re-runs that confirm it, by filter."""
+    """Finding with the re-runs that test it; the card lists causes by tier, 0 first."""
 
     finding: Finding
     tier: int
@@ -100,16 +102,18 @@ class RankedCause(NamedTuple):
 def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCause]:
     """Return the causes of a flight in the order of the card.
 
-    First what makes the rest meaningless; then what brings a verdict into its band; then what moves
-    one at least half of the way; then other errors, and warnings. Within the second and third, a
-    fault of the source comes before a setting that would only hide it.
+    First come findings that make the verdicts meaningless, then those whose re-run makes a filter
+    consistent, then those whose re-run halves |ln ratio|, then other errors and warnings. A fault
+    of the source precedes a setting that would only hide it.
     """
     ranked = []
     for finding in roots:
         if finding.severity == "note":
             continue
         trials = confirming_trials(analysis.trials, finding)
-        if trials and not any(map(has_effect, trials)):
+        if finding.id in VERDICT_FINDINGS:  # a verdict remains a cause without a re-run that helps
+            trials = tuple(filter(is_useful, trials))
+        elif trials and not any(has_effect(each) or not can_show_effect(each) for each in trials):
             continue
         ranked.append(
             RankedCause(finding, _tier(finding, trials), sum(map(reduction, trials)), trials)
@@ -142,25 +146,30 @@ def _tier(finding: Finding, trials: Iterable[Trial]) -> int:
 
 
 def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
-    """Return the re-runs that correct a finding: the best one of each kind and filter.
+    """Return the re-runs that test a finding: the best one of each kind of change and filter.
 
-    Best: the smallest change that brings a verdict into its band, else the smallest ratios. For KF
-    the default settings are added. A re-run that could not show the effect is left out.
+    The best re-run has the smallest change that makes a filter consistent, else the ratios nearest
+    to 1. Of KF, the re-run with default settings is included.
     """
     kinds = RERUN_KINDS.get(finding.id, frozenset())
     kinds |= {"defaults"} if "noises" in kinds else set()
     best: dict[tuple[FilterName, str], Trial] = {}
     for trial in trials:
-        if len(trial.kinds) == 1 and trial.kinds[0] in kinds and _can_show_effect(trial):
+        if len(trial.kinds) == 1 and trial.kinds[0] in kinds:
             key = trial.filter, trial.kinds[0]
             best[key] = min(trial, best.get(key, trial), key=preference)
     return tuple(best.values())
 
 
-def _can_show_effect(trial: Trial) -> bool:
-    """Return False if innovations are alike and the change can show against ground truth only."""
+def can_show_effect(trial: Trial) -> bool:
+    """Return False if only ground truth, which is missing, could show the effect of a re-run."""
     has_truth = trial.before.position_rmse_m is not None
     return has_truth or UNSEEN_KINDS.isdisjoint(trial.kinds) or has_effect(trial)
+
+
+def is_useful(trial: Trial) -> bool:
+    """Return True unless a re-run shows that its change improves nothing."""
+    return improvement(trial) != "nothing" or not can_show_effect(trial)
 
 
 def make_cause(
@@ -168,19 +177,19 @@ def make_cause(
 ) -> Cause:
     """Make the numbered cause of a finding, with actions for sender, KF and EKF2."""
     finding, trials = ranked.finding, ranked.trials
-    useful = [trial for trial in trials if improvement(trial) != "nothing"]
-    alternatives, actions = _actions(analysis, finding, useful, verdicts, request)
+    useful = [trial for trial in trials if is_useful(trial)]
+    alternatives, actions = _actions(analysis, ranked, useful, verdicts, request)
     return structs.replace(
         make_plain_cause(finding),
         alternatives=alternatives,
         actions=actions,
-        reruns=tuple(_rerun(trial, trials) for trial in trials),
+        reruns=tuple(_rerun(trial, trials) for trial in trials if can_show_effect(trial)),
         after=_closing_sentence(analysis, useful, alternatives),
     )
 
 
 def make_plain_cause(finding: Finding) -> Cause:
-    """Make the cause of a finding without re-runs."""
+    """Make the numbered cause of a finding that no re-run tests."""
     return Cause(
         id=finding.id,
         severity="error" if finding.severity == "error" else "warning",
@@ -192,19 +201,18 @@ def make_plain_cause(finding: Finding) -> Cause:
 
 
 def _reason(finding: Finding) -> str:
-    """Return the message without its first sentence, which is the title."""
     return finding.message.removeprefix(finding.title).lstrip(". ")
 
 
 def _actions(
     analysis: Analysis,
-    finding: Finding,
+    ranked: RankedCause,
     useful: Sequence[Trial],
     verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
-    """Return alternatives that exclude each other, and the actions that are done in any case."""
-    by_kind = {(trial.filter, trial.kinds[0]): trial for trial in useful}
+    """Return the alternatives, of which one action is enough, and the other actions."""
+    finding, by_kind = ranked.finding, {(each.filter, each.kinds[0]): each for each in useful}
     alternatives: tuple[tuple[Action, ...], ...] = ()
     actions: list[Action] = []
     general = None
@@ -226,7 +234,7 @@ def _actions(
             actions.append(sender)
     elif delay is not None:
         actions.append(set_parameters(analysis, delay.change))
-    elif general is not None and not _is_setting(finding):
+    elif general is not None and not (_is_setting(finding) and ranked.trials):
         actions.append(general)
     for (owner, kind), trial in by_kind.items():
         if (
@@ -243,11 +251,18 @@ def _actions(
             and trial.change.keys() <= PARAMETERS.keys()
         ):
             actions.append(set_parameters(analysis, trial.change))
-    named = {action.target for action in actions}
-    named |= {action.target for alternative in alternatives for action in alternative}
-    for owner, name in FILTER_NAMES.items():
-        if name not in named and (text := _no_change(finding, owner, verdicts)):
-            actions.append(Action(name, text))
+    actions.sort(
+        key=lambda action: action.target == "KF"
+    )  # fix the vehicle before the analysis of this log
+    named = {action.target for group in (actions, *alternatives) for action in group}
+    reasons = {
+        name: reason
+        for owner, name in FILTER_NAMES.items()
+        if name not in named and (reason := _no_change(finding, owner, verdicts))
+    }
+    if len(reasons) == 2 and len(set(reasons.values())) == 1:
+        reasons = {"KF, EKF2": reasons["KF"]}
+    actions += [Action(target, reason) for target, reason in reasons.items()]
     return alternatives, tuple(actions)
 
 
@@ -261,19 +276,20 @@ def _no_change(finding: Finding, owner: FilterName, verdicts: Sequence[Verdict])
     if not words:
         return ""
     if set(words.values()) == {"consistent"}:
+        if "truth" not in words and RERUN_KINDS.get(finding.id, frozenset()) & UNSEEN_KINDS:
+            return "no change tested: only ground truth shows the effect of this fault"
         return "no change: consistent"
-    if finding.id == "source_drift":
-        return "no setting removes drift" if owner == "kf" else "no parameter removes drift"
     if finding.id == "source_outliers":
         if owner == "kf":
             return "no option rejects outliers; do not raise --sigma-z for them"
         if words.get("truth", "consistent") == "consistent":
             return "no change: its gate rejects outliers, and σ covers the error"
-    return f"no {'setting' if owner == 'kf' else 'parameter'} corrects this fault"
+    return (
+        f"no setting {'removes drift' if finding.id == 'source_drift' else 'corrects this fault'}"
+    )
 
 
 def _target(finding: Finding, source: PositionTrack | None = None) -> Target:
-    """Return the device or person that the remedy of a finding concerns."""
     target = TARGETS_BY_ID.get(finding.id) or TARGETS[CATALOGUE[finding.id].group]
     is_receiver = target == "sender" and source is not None and source.origin.is_gnss
     return "receiver" if is_receiver else target
@@ -282,7 +298,7 @@ def _target(finding: Finding, source: PositionTrack | None = None) -> Target:
 def run_again(
     request: ComparisonRequest, change: Mapping[str, float], defaults: Mapping[str, float]
 ) -> Action:
-    """Return the command that runs KF again with changed settings; ``defaults`` are as good."""
+    """Return the command that runs KF with changed settings; ``defaults`` would be as good."""
     command = command_line(structs.replace(request, **change))
     options = " and ".join(
         f"{COMPARISON_OPTIONS[name]} (default {defaults[name]:g})" for name in defaults
@@ -298,8 +314,8 @@ def set_parameters(analysis: Analysis, change: Mapping[str, float]) -> Action:
     texts, commands, needs_reboot = [], [], False
     for name, value in change.items():
         parameter = PARAMETERS[name]
-        unit = f" {parameter.unit}" if parameter.unit else ""
-        texts.append(f"{name} {flown.get(name, math.nan):g} → {value:g}{unit}")
+        change_text = f"{name} {flown.get(name, math.nan):g} → {value:g} {parameter.printed_unit}"
+        texts.append(change_text.rstrip())
         commands.append(f"param set {name} {value:g}")
         needs_reboot |= name.endswith(REBOOT_SUFFIXES)
     return Action(
@@ -326,7 +342,6 @@ def _rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
 
 
 def _both(before: float | None, after: float | None) -> tuple[float, float] | None:
-    """Return two numbers as a pair, or None if one is missing."""
     return None if before is None or after is None else (before, after)
 
 
@@ -352,7 +367,7 @@ def _label(trial: Trial, trials: Sequence[Trial]) -> str:
 def _closing_sentence(
     analysis: Analysis, useful: Sequence[Trial], alternatives: Sequence[object]
 ) -> str:
-    """Return the sentence below the re-runs: exclusive actions, signs, or an equal default."""
+    """Return the sentence below the re-runs: one action is enough, or the default is as good."""
     if alternatives:
         return (
             "Not both: the offset would be corrected twice. One offset, two signs: --clock-offset "
@@ -366,7 +381,7 @@ def _closing_sentence(
         name = next(iter(trial.change))
         if trial.kinds != ("noise",) or not isinstance(tuned, AxisTuning):
             continue
-        default = PARAMETERS[name].default
+        default = analysis.flight.log.default_of(name)
         if (tuned.sigma_z.low or 0.0) <= default <= (tuned.sigma_z.high or 0.0):
             return f"PX4's default, {default:g} m, is inside the 95 % interval: it is as good."
     return ""

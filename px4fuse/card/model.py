@@ -12,35 +12,39 @@ from px4fuse.record import Count, NotNegative, Positive, Record, Share, Span
 FilterName = Literal["kf", "ekf2"]
 CardSeverity = Literal["clean", "note", "warning", "error", "refused"]
 VerdictWord = Literal["consistent", "overconfident", "underconfident", "not evaluated"]
-Target = Literal["sender", "receiver", "source", "logging", "flight", "KF", "EKF2"]
+Target = Literal["sender", "receiver", "source", "logging", "flight", "KF", "EKF2", "KF, EKF2"]
 
-# Bands of a consistent ratio: against the source, and against ground truth
+# Limits of the σ ratio of a consistent filter: against the source, and against ground truth
 BANDS = CONSISTENT_RATIOS
-# Ends of the logarithmic axis of all ratios; a ratio beyond is drawn as a triangle at the end
+# Ends of the logarithmic axis of σ ratios; a ratio beyond is drawn as a triangle at the end
 AXIS_ENDS = (0.1, 10.0)
-# Ticks of that axis with their labels
+# Ticks of the logarithmic axis of σ ratios, with their labels
 AXIS_TICKS = {0.1: "1/10", 0.2: "1/5", 0.5: "1/2", 1.0: "1", 2.0: "2", 5.0: "5", 10.0: "10"}
-# Numbered causes of a card; further ones are counted
+# Maximum number of causes that a card lists; further ones are counted
 MAX_CAUSES = 3
+# Maximum number of notes that cover and terminal print; further ones are counted
+MAX_NOTES = 3
 MAX_HEADLINE_LENGTH = 84
 
 
 class Verdict(Record, frozen=True, kw_only=True):
-    """Ratio of actual to reported uncertainty of one filter.
+    """Ratio of actual to reported σ of one filter, with its verdict.
 
     Attributes
     ----------
     filter : {"kf", "ekf2"}
     against : {"source", "truth"}
-        source: innovation over √S; truth: error against ground truth over reported σ.
+        "source": RMS of innovation / √S; "truth": RMS of error / reported σ.
     ratio : float or None
         √(mean NIS) or √(mean NEES); above 1 the reported σ is too small.
     interval : (float, float) or None
-        95 %: chi-square for the source, block bootstrap for ground truth.
+        95 % interval of the ratio: chi-square for the source, block bootstrap for ground truth.
     word : str
+        Verdict on the reported σ.
     samples : int
+        Number of innovations or errors.
     reason : str
-        Missing data of a ratio that is not evaluated.
+        Missing data if the ratio is not evaluated.
     is_explained : bool
         True if the card names the cause and nothing has to be changed for this filter.
     """
@@ -54,20 +58,25 @@ class Verdict(Record, frozen=True, kw_only=True):
     reason: str = ""
     is_explained: bool = False
 
+    @property
+    def is_loud(self) -> bool:
+        """True if the σ ratio is outside its band and the card does not explain this."""
+        return self.word in ("overconfident", "underconfident") and not self.is_explained
+
 
 class Effect(Record, frozen=True, kw_only=True):
-    """Numbers of the effect along the main axis, and horizontally.
+    """Position errors of both filters, their difference, rejections and resets.
 
     Attributes
     ----------
     axis : str
-        Main axis by name, with its reference ("along the aisle, 30° from north").
+        Main axis by name, with its reference ("along the main axis, 30° from north").
     position_rmse_m, horizontal_rmse_m : mapping from "kf" and "ekf2" to float
-        Against ground truth, along the axis and horizontally; empty without ground truth.
+        Position RMSE against ground truth, along the axis and horizontally; empty without it.
     difference_rms_m : float or None
-        RMS of KF - EKF2 in position along the axis.
+        RMS position difference KF - EKF2 along the axis.
     rejected_fraction : float or None
-        Fraction of the samples that EKF2 rejected.
+        Fraction of the positions that EKF2 rejected.
     horizontal_resets : int or None
         Number of horizontal resets of EKF2.
     """
@@ -81,12 +90,12 @@ class Effect(Record, frozen=True, kw_only=True):
 
 
 class Action(Record, frozen=True):
-    """One action against a cause: commands to paste, or a sentence.
+    """Action against a fault: commands to paste, or a sentence.
 
     Attributes
     ----------
     target : str
-        Device, person or filter that changes.
+        Device, person or filters that have to change.
     sentence : str
         Action as an imperative, or "no change: <reason>"; may be empty with commands.
     commands : tuple of str
@@ -102,17 +111,18 @@ class Action(Record, frozen=True):
 
 
 class Rerun(Record, frozen=True, kw_only=True):
-    """Filter run again with one change: as flown, and after.
+    """Numbers of a filter as flown, and run again with one change.
 
     Attributes
     ----------
     label : str
         Filter and change: "KF without the 26 outliers", "EKF2 (replay)".
     is_prediction : bool
-        True for EKF2: by a replay that starts at ``from_s``.
+        True for EKF2, whose replay starts at ``from_s``.
     position_rmse_m, source_ratio, truth_ratio, rejected_fraction : (float, float) or None
-        Before and after the change.
+        Each as flown, and after the change.
     improves : str
+        Quantities that the change improves.
     """
 
     label: str
@@ -126,7 +136,7 @@ class Rerun(Record, frozen=True, kw_only=True):
 
 
 class Cause(Record, frozen=True, kw_only=True):
-    """Numbered cause: fault with its size, how it acts, actions and re-runs.
+    """Numbered cause of the card: fault with its size, effect, actions and re-runs.
 
     Attributes
     ----------
@@ -134,18 +144,18 @@ class Cause(Record, frozen=True, kw_only=True):
         Id of the finding.
     severity : {"error", "warning"}
     title : str
-        Fault and size.
+        Fault and its size.
     why : str
-        How it acts on the filters, in at most three sentences.
+        Effect of the fault on KF and EKF2.
     spans_s : tuple of (float, float)
         Times of the fault; empty for the whole flight.
     alternatives : tuple of tuple of Action
-        Two or more that exclude each other; one of them is done.
+        Groups of actions that exclude each other; one group is sufficient.
     actions : tuple of Action
-        Done in any case.
+        Actions that are necessary with each alternative.
     reruns : tuple of Rerun
     after : str
-        Sentence below the re-runs: signs and units, or another cure that is as good.
+        Sentence below the table of re-runs: signs and units, or a value that is as good.
     """
 
     id: Annotated[str, Meta(pattern="^[a-z0-9_]+$")]
@@ -160,7 +170,7 @@ class Cause(Record, frozen=True, kw_only=True):
 
 
 class Note(Record, frozen=True):
-    """Finding that is not a cause: one sentence, and an action if there is one."""
+    """Finding of severity "note" as a sentence, with its action if it has one."""
 
     id: str
     text: str
@@ -168,7 +178,7 @@ class Note(Record, frozen=True):
 
 
 class Identity(Record, frozen=True, kw_only=True):
-    """Flight and settings of a card.
+    """Flight, settings of KF and EKF2, and author of a card.
 
     Attributes
     ----------
@@ -203,7 +213,7 @@ class Identity(Record, frozen=True, kw_only=True):
 
 
 class AidRow(Record, frozen=True, kw_only=True):
-    """Ratio of one component of an aiding source on a flight without a position source."""
+    """Ratio innovation ÷ √S of one component of an aiding source, without a position source."""
 
     label: str
     component: str
@@ -212,14 +222,14 @@ class AidRow(Record, frozen=True, kw_only=True):
 
 
 class Card(Record, frozen=True, kw_only=True):
-    """Diagnosis of a flight at a glance.
+    """Diagnosis of a flight: fault, effect, actions, verdicts and causes.
 
     Attributes
     ----------
     severity : str
-        Of the first cause; clean without one.
+        Severity of the first cause; clean without a cause.
     id : str
-        Id of the first cause or of the refusal; empty without one.
+        Id of the first cause, or of the error that prevents an analysis; empty without both.
     headline : str
         Fault and size of the first cause.
     effect : Effect or None
@@ -240,7 +250,7 @@ class Card(Record, frozen=True, kw_only=True):
     aids : tuple of AidRow
         Ratios of the aiding sources, on a flight without a position source.
     facts : mapping from label to str
-        Texts of a refusal: what was read, and what was not run.
+        Texts on a log that cannot be analysed: bytes read, and fix.
     identity : Identity
     """
 

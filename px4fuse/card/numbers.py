@@ -8,7 +8,7 @@ from px4fuse.text import format_ratio as format_ratio  # noqa: PLC0414 - public 
 
 
 def axis_fraction(ratio: float) -> float:
-    """Return the position of a ratio on the logarithmic axis; 0 and 1 are its ends.
+    """Return the place of a ratio of actual to reported σ on the logarithmic axis (0 to 1).
 
     >>> axis_fraction(0.1), axis_fraction(1.0), axis_fraction(10.0)
     (0.0, 0.5, 1.0)

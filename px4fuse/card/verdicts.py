@@ -1,8 +1,7 @@
 """Ratios of actual to reported uncertainty, and the verdicts on them.
 
-Both ratios of a filter are of the same samples everywhere: √(mean NIS) over the innovations of the
-segment, and √(mean NEES) at the times of EKF2's published position. One definition, one band for
-each reference.
+Against the source the ratio is √(mean NIS) over the innovations of the segment. Against ground
+truth it is √(mean NEES) at the times of EKF2's published position.
 """
 
 import numpy as np
@@ -12,22 +11,21 @@ from px4fuse.card.model import FilterName, Verdict
 from px4fuse.comparison.comparison import normalised_position_errors
 from px4fuse.comparison.model import AxisComparison, FilterSummary
 from px4fuse.filter.consistency import (
-    MIN_INNOVATIONS,
     Reference,
     classify_ratio,
     ratio_interval,
 )
 from px4fuse.flight import Unavailable
 
-# Errors are correlated over seconds, so the bootstrap draws blocks of this length (s)
+# Length (s) of the blocks of the bootstrap: position errors are correlated over seconds
 BLOCK_S = 10.0
 DRAWS = 2000
-# Blocks needed for an interval; with fewer it is far too narrow
+# Minimum number of blocks for an interval of the RMS; with fewer it is far too narrow
 MIN_BLOCKS = 4
 
 
 def verdicts(result: AxisComparison) -> tuple[Verdict, ...]:
-    """Return the four verdicts along one axis: KF and EKF2, each against source and truth."""
+    """Return the verdicts along one axis: KF and EKF2, each against source and ground truth."""
     return tuple(
         verdict
         for owner in ("kf", "ekf2")
@@ -39,9 +37,6 @@ def _against_source(result: AxisComparison, owner: FilterName) -> Verdict:
     statement = result.filters[owner]
     if not isinstance(statement, FilterSummary):
         return _not_evaluated(owner, "source", statement)
-    if statement.count < MIN_INNOVATIONS:
-        few = f"{statement.count} innovations, at least {MIN_INNOVATIONS} are needed"
-        return Verdict(filter=owner, against="source", word="not evaluated", reason=few)
     ratio = statement.sigma_ratio
     interval = ratio_interval(statement.nis_mean, statement.nis_band)
     return Verdict(

@@ -7,6 +7,7 @@ from typing import Any, Literal, get_args
 import click
 
 from px4fuse.cli import options, outputs
+from px4fuse.errors import LogError, MissingDataError
 from px4fuse.request import settings_name
 from px4fuse.writing import STANDARD_OUTPUT
 
@@ -54,27 +55,32 @@ def compare(
     reports/LOG_sigma-z-0.05.pdf and .json.
     """
     from px4fuse.analysis import failed_checks
+    from px4fuse.card.build import build_refusal_card
     from px4fuse.diagnose import diagnose_or_check_aids
     from px4fuse.memory import release_free_memory
-    from px4fuse.report.terminal import closing, summary
+    from px4fuse.report.terminal import card_page, summary
     from px4fuse.results.build import outcome_results
 
     student = options.read_student(option_values)
     request = options.comparison_request(log, option_values)
-    outputs.report_paths(
-        output, json_path
-    )  # report an invalid output path before the long analysis
-    with outputs.progress(json_path) as show_progress:
-        outcome = diagnose_or_check_aids(request, show_progress)
-        results = outcome_results(request, outcome, student)
-        release_free_memory()  # the report modules, imported next, need memory
-        if output is None and json_path is None:
-            output = outputs.default_report(log.stem, settings_name(request), results)
-        contents = outputs.result_files(results, json_path, output, outcome, show_progress)
+    outputs.report_paths(output, json_path)  # check before the long analysis
+    try:
+        with outputs.progress(json_path) as show_progress:
+            outcome = diagnose_or_check_aids(request, show_progress)
+            results = outcome_results(request, outcome, student)
+            release_free_memory()  # the report modules, imported next, need memory
+            if output is None and json_path is None:
+                output = outputs.default_report(log.stem, settings_name(request), results)
+            contents = outputs.result_files(results, json_path, output, outcome, show_progress)
+    except (LogError, MissingDataError) as error:
+        if not sys.stderr.isatty():  # other programs read one line
+            raise
+        outputs.show_page(card_page("card", build_refusal_card(error, log)), is_error=True)
+        sys.exit(2)
     page = summary(outcome, results, verbose=verbose, quiet=quiet)
     outputs.write_and_print(contents, page, request)
     if not quiet and STANDARD_OUTPUT not in contents:
-        outputs.show_page(closing(results))
+        outputs.show_page(card_page("closing", results.card))
     failed = failed_checks(outcome) if checks else {}
     for name, verdict in failed.items():
         click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)

@@ -310,15 +310,15 @@ filter_options = _combine_options(
         "axes",
         type=Choice(get_args(AxisName)),
         multiple=True,
-        help="Axis to analyse; repeatable.  [default: all axes with a position; for GNSS the "
-        "horizontal axes]",
+        help="Axis to analyse, repeatable; aisle is the main axis of the track.  [default: all "
+        "axes with a position; for GNSS the horizontal axes]",
     ),
     click.option(
         "--heading",
         "heading_deg",
         type=TypedQuantity("°", 30.0),
-        help="Heading (°, clockwise from north) of the axis aisle.  [default: main direction of "
-        "the track]",
+        help="Heading (°, clockwise from north) of the main axis.  [default: main direction of the "
+        "track]",
     ),
     click.option(
         "--start",

@@ -335,14 +335,15 @@ def write_and_print(
         click.launch(str(openable_files[0].resolve()))
 
 
-def show_page(page: Page) -> None:
+def show_page(page: Page, *, is_error: bool = False) -> None:
+    """Print a page on the terminal, an error on standard error."""
     from px4fuse.report.screen import show
 
-    show(terminal(), page.blocks)
+    show(terminal(is_error=is_error), page.blocks)
 
 
-def terminal() -> Console:
-    """Return a console on standard output, which raises BrokenPipeError if a pipe has no reader.
+def terminal(*, is_error: bool = False) -> Console:
+    """Return a console; it raises BrokenPipeError if the reader of standard output has ended.
 
     Lines have the width of the terminal. In a pipe a paragraph is one line, unless the environment
     variable COLUMNS contains a width (characters).
@@ -353,7 +354,7 @@ def terminal() -> Console:
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError
 
-    console = PipeConsole(highlight=False)
+    console = PipeConsole(highlight=False, stderr=is_error)
     columns_text = os.environ.get("COLUMNS", "")
     if not console.is_terminal and not (columns_text.isdecimal() and int(columns_text)):
         console.width = UNWRAPPED_WIDTH

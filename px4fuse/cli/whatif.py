@@ -122,7 +122,7 @@ def _parse_number(option_text: str, name: str, value: str) -> float:
     try:
         return float(value)
     except ValueError as error:
-        unit = PARAMETERS[name].unit.replace("^2", "²") if name in PARAMETERS else ""
+        unit = PARAMETERS[name].printed_unit if name in PARAMETERS else ""
         converted = convert_to_unit(value, unit)
         unit_text = f" in {NAMES[unit]}" if unit else ""
         problem = "" if converted is None else f"{unit_text}. Give {converted:g}"

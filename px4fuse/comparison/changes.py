@@ -15,6 +15,7 @@ from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight import Unavailable
+from px4fuse.log import LogInfo
 
 CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
 FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
@@ -86,7 +87,7 @@ def candidate_changes(
         changes += [{ROTATION: -round(heading.misalignment_deg, 1)}] if is_significant else []
     if inputs is None:
         return changes + _without_bias(estimates)
-    changes += _px4_defaults(inputs)
+    changes += _px4_defaults(comparison.flight.log, inputs)
     if tuned is not None and not is_underconfident:
         changes += _vibration_noise(comparison.settings, inputs, tuned)
     return changes
@@ -199,10 +200,10 @@ def _ekf2_noise(inputs: Inputs, summary: FilterSummary, tuned: AxisTuning) -> li
     return [noise_change(aid, flown, flown_m, ml_noise_m)]
 
 
-def _px4_defaults(inputs: Inputs) -> list[Change]:
+def _px4_defaults(log: LogInfo, inputs: Inputs) -> list[Change]:
     """Return PX4's default of the gate, if it is wider, and of each other changed parameter."""
     gate, flown = inputs.aid.gate, inputs.settings
-    defaults = {name: PARAMETERS[name].default for name in (gate, *PARAMETERS_OF_EKF2)}
+    defaults = {name: log.default_of(name) for name in (gate, *PARAMETERS_OF_EKF2)}
     return [
         {name: value}
         for name, value in defaults.items()

@@ -34,8 +34,8 @@ PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_variance_m2": (Columns.POSITION_VARIANCE, 2),
     "velocity_variance_m2_s2": (Columns.VELOCITY_VARIANCE, 2),
 }
-# Maximum ratio of EKF2's median squared distance to the measurements without and with its resets,
-# for their removal; otherwise the published state, which controlled the vehicle, is kept
+# EKF2's position jumps at resets are removed only if this reduces its median squared distance to
+# the measurements to this fraction. Otherwise the published state, used in flight, is kept
 MAX_DISTANCE_RATIO = 0.95
 
 

@@ -139,5 +139,5 @@ def noise_used_m(model: Model) -> float:
 
 def format_settings(changes: Mapping[str, float]) -> str:
     """Format EKF2 parameters with their new values, for example "EKF2_EV_DELAY to 264 ms"."""
-    texts = (f"{name} to {value:.3g} {PARAMETERS[name].unit}" for name, value in changes.items())
+    texts = (f"{n} to {value:.3g} {PARAMETERS[n].printed_unit}" for n, value in changes.items())
     return " and ".join(map(str.rstrip, texts))

@@ -18,6 +18,7 @@ from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Columns, Ekf2, Flight, 
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.readers.px4_innovations import innovations_along
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
+from px4fuse.text import count_noun
 
 Spans = tuple[Span, ...]
 HORIZONTAL: tuple[AxisName, AxisName] = ("north", "east")
@@ -255,8 +256,8 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     if len(log) < MIN_SAMPLES:
         return Unavailable(
             ANALYSIS_NAME,
-            f"the log contains only {len(log)} innovations in the replayed time (at least "
-            f"{MIN_SAMPLES} are needed)",
+            f"the log contains only {count_noun(len(log), 'innovation')} in the replayed time (at "
+            f"least {MIN_SAMPLES} are needed)",
             "Fly longer with the position source, and record with SDLOG_PROFILE bit 0 (default).",
         )
     if not inside_spans(ekf2.state.index, replay.evaluated_s).any():
@@ -390,7 +391,9 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
         rows = logged_aid_innovations(name, log)
         logged, model = _matched_samples(replay, updates, rows, is_own_topic=is_own_topic)
         if len(logged) < MIN_SAMPLES:
-            doubtful[name] = f"only {len(logged)} innovations are logged in the replayed time"
+            doubtful[name] = (
+                f"the log has only {count_noun(len(logged), 'innovation')} in the replayed time"
+            )
             continue
         if _has_constant_innovations(logged, model, axes_of(updates)):
             doubtful[name] = CONSTANT_INNOVATIONS

@@ -54,7 +54,8 @@ FLOW_STEP = "optical flow"
 VISION_STEP = "external vision"
 GATE = "gate, missed samples and resets"
 OUTPUT = "output predictor"
-# EKF2 properties in every flight. Those of other aiding sources precede GATE if EKF2 fuses them
+# EKF2 properties that replace those of KF, one after the other, on every flight. If EKF2 also fuses
+# other aiding sources, a step for each is inserted before GATE
 STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 COLUMNS = (Columns.POSITION, Columns.VELOCITY)

@@ -73,9 +73,9 @@ MAX_REJECTED_SHARE = 0.35
 # Time (s) without height fusion after which EKF2 resets the height (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
-# Maximum ratio of the mean NIS of two repeated replays of a predictable result
+# A result is predictable if replays with 2 mm of added noise agree: maximum ratio of their mean NIS
 MAX_NIS_RATIO = 1.10
-# Maximum difference of the rejected fractions of two repeated replays of a predictable result
+# Maximum difference of the rejected fractions of these replays
 MAX_REJECTED_SPREAD = 0.03
 # Maximum ratio of the position RMSE of two repeated replays of a predictable result
 MAX_RMSE_RATIO = 1.15

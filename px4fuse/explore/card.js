@@ -1,85 +1,83 @@
-/* Axis of ratios and headline of the diagnosis card with the settings of the page. Numbers and words
+/* Diagnosis card for the settings of the page: axis of σ ratios, headline and effect. Numbers and words
    as in px4fuse.card. */
 const Card = (() => {
   const NAMES = { source: "the source", truth: "ground truth" };
   // format_ratio and format_metres of card/numbers.py
   const formatRatio = (x) => x.toFixed(x >= 9.95 ? 0 : x >= 1.995 ? 1 : x >= 0.00995 ? 2 : 3);
   const formatMetres = (m) => `${m.toFixed(m >= 99.95 ? 0 : m >= 9.995 ? 1 : m >= 0.0995 ? 2 : 3)} m`;
-  const size = (ratio) => Math.max(ratio, 1 / ratio);
+  const factor = (ratio) => Math.max(ratio, 1 / ratio);
 
   function start({ bands, ends, marks }, suffix) {
-    const figures = new Map([...$(`figures${suffix}`).content.children].map((one) => [one.dataset.axis, one]));
-    const part = (name) => document.querySelector(`#card [data-part=${name}]`);
-    const analysed = {};
+    const figures = new Map([...$(`figures${suffix}`).content.children].map((figure) => [figure.dataset.axis, figure]));
+    let analysed = null; // texts of the card with the settings of the analysis
 
     const fraction = (ratio) => Math.log(ratio / ends[0]) / Math.log(ends[1] / ends[0]);
-    const percent = (ratio) => `${100 * Math.min(Math.max(fraction(ratio), 0), 1)}%`;
     /* Verdict on a ratio (verdicts.py): consistent in its band, or if its 95 % interval contains 1 */
     function wordOf(ratio, against, interval) {
       const [low, high] = bands[against];
-      if ((ratio >= low && ratio <= high) || (interval && interval[0] <= 1 && interval[1] >= 1)) return "consistent";
+      if ((ratio >= low && ratio <= high) || (interval?.[0] <= 1 && interval[1] >= 1)) return "consistent";
       return ratio > 1 ? "overconfident" : "underconfident";
     }
     /* Verdicts of KF against source and truth from its numbers; null if not evaluated */
-    const verdicts = (kf) => ["source", "truth"].map((against) => {
+    const verdicts = (kf) => Object.keys(NAMES).map((against) => {
       const ratio = kf?.[against];
-      if (!ratio) return null;
-      const interval = against === "source" ? kf.interval : null;
-      return { against, ratio, interval, word: wordOf(ratio, against, interval) };
+      return ratio ? { against, ratio, word: wordOf(ratio, against, against === "source" ? kf.interval : null) } : null;
     });
 
-    /* Call after the card or the axis has changed */
+    /* Show the σ ratios of the selected axis on the card */
     function showAxis(axis, main) {
-      const shown = document.querySelector("#card figure");
-      // the figure of the card itself also states which verdicts are explained
+      const shown = query("#card figure");
+      // the figure in the card also marks explained verdicts, so it is kept for the main axis
       if (shown.hasChildNodes() && shown.dataset.axis === undefined) figures.set(main, shown);
       shown.replaceWith(figures.get(axis));
     }
-    /* Move the marks of KF; the analysed ratios stay as hollow marks */
-    function move(now, axis, isChanged) {
-      const figure = document.querySelector("#card figure");
+    /* Move the KF marks to the ratios with the changed settings; hollow marks keep the analysed ratios */
+    function moveMarks(now, axis, isChanged) {
+      const figure = query("#card figure");
       now.forEach((verdict, i) => {
-        const row = figure.querySelector(`[data-filter=kf][data-against=${["source", "truth"][i]}]`);
-        const [mark, was, ratio, word] = [".mark", ".was", ".ratio", ".word"].map((name) => row?.querySelector(name));
-        if (!mark || !verdict) return;
-        row.analysed ??= { ratio: ratio.textContent, word: word.textContent, loud: word.classList.contains("loud"),
+        const row = verdict && figure.querySelector(`[data-filter=kf][data-against=${verdict.against}]`);
+        const [mark, was, ratio, word] = ["mark", "was", "ratio", "word"].map((name) => row?.querySelector(`.${name}`));
+        if (!mark) return;
+        row.analysed ??= { ratio: ratio.textContent, word: word.textContent, isLoud: word.classList.contains("loud"),
           label: figure.ariaLabel };
-        was.setAttribute("display", isChanged ? "inline" : "none");
-        for (const line of row.querySelectorAll(".interval")) line.setAttribute("display", isChanged ? "none" : "inline");
-        const recorded = axis.verdicts[i].ratio, value = isChanged ? verdict.ratio : recorded, at = fraction(value);
-        mark.setAttribute("x", percent(value));
-        mark.firstChild.setAttribute("d", marks[at < 0 ? "below" : at > 1 ? "above" : verdict.against]);
-        ratio.textContent = isChanged ? formatRatio(value) : row.analysed.ratio;
-        word.textContent = isChanged ? verdict.word : row.analysed.word;
-        const isLoud = isChanged ? verdict.word !== "consistent" : row.analysed.loud;
-        for (const one of [ratio, word]) one.classList.toggle("loud", isLoud);
-        figure.ariaLabel = isChanged ? [...figure.querySelectorAll("[data-filter]")].map((one) =>
-          one.textContent.replace(/\s+/g, " ").trim()).join(". ") : row.analysed.label;
+        const show = (node, isShown) => node.setAttribute("display", isShown ? "inline" : "none");
+        show(was, isChanged);
+        for (const line of row.querySelectorAll(".interval")) show(line, !isChanged);
+        const value = isChanged ? verdict.ratio : axis.ratios[i], place = fraction(value);
+        mark.setAttribute("x", `${100 * clamp(place, 0, 1)}%`);
+        mark.firstChild.setAttribute("d", marks[place < 0 ? "below" : place > 1 ? "above" : verdict.against]);
+        const shown = isChanged ? { ratio: formatRatio(value), word: verdict.word, isLoud: verdict.word !== "consistent" }
+          : row.analysed;
+        ratio.textContent = shown.ratio;
+        word.textContent = shown.word;
+        for (const node of [ratio, word]) node.classList.toggle("loud", shown.isLoud);
+        figure.ariaLabel = shown.label ?? [...figure.querySelectorAll("[data-filter]")].map(({ textContent }) =>
+          textContent.replace(/\s+/g, " ").trim()).join(". ");
       });
     }
     function headline(now) {
-      const known = now.filter(Boolean), off = known.filter((one) => one.word !== "consistent");
-      if (!known.length) return "KF is not evaluated with these settings: too few measurements";
-      if (!off.length) return "KF is consistent with these settings";
-      const worst = off.reduce((a, b) => size(b.ratio) > size(a.ratio) ? b : a);
-      return `KF ${worst.word} with these settings: σ ${formatRatio(size(worst.ratio))} times too `
-        + `${worst.ratio > 1 ? "small" : "large"} against ${NAMES[worst.against]}`;
+      const evaluated = now.filter(Boolean), wrong = evaluated.filter(({ word }) => word !== "consistent");
+      if (!evaluated.length) return "KF is not evaluated with these settings: too few measurements";
+      if (!wrong.length) return "KF is consistent with these settings";
+      const { word, ratio, against } = wrong.reduce((a, b) => factor(b.ratio) > factor(a.ratio) ? b : a);
+      return `KF is ${word} with these settings: σ is ${formatRatio(factor(ratio))} times too ${ratio > 1 ? "small" : "large"} against ${NAMES[against]}`;
     }
-    /* Headline and effect of the settings; without a change those of the analysis */
-    function say(now, effect, isChanged) {
-      const texts = Object.fromEntries(["sign", "headline", "effect"].map((name) => [name, part(name)]));
-      if (texts.headline === null) return; // hidden in practice
-      const recorded = part("recorded");
-      for (const [name, node] of Object.entries(texts)) analysed[name] ??= node.textContent;
-      analysed.style ??= texts.sign.className;
-      texts.sign.textContent = isChanged ? "SETTINGS CHANGED" : analysed.sign;
-      texts.sign.className = isChanged ? "sign note" : analysed.style;
-      texts.headline.textContent = isChanged ? headline(now) : analysed.headline;
-      texts.effect.textContent = isChanged ? effect : analysed.effect;
+    /* Show headline and effect with the changed settings, or those of the analysis */
+    function showTexts(now, effect, isChanged) {
+      const [sign, headlineNode, effectNode, recorded] = ["sign", "headline", "effect", "recorded"]
+        .map((name) => query(`#card [data-part=${name}]`));
+      if (headlineNode === null) return; // practice hides them before the answer
+      analysed ??= { sign: sign.textContent, headline: headlineNode.textContent, effect: effectNode.textContent,
+        className: sign.className };
+      const shown = isChanged ? { sign: "SETTINGS CHANGED", headline: headline(now), effect, className: "sign note" } : analysed;
+      Object.assign(sign, { textContent: shown.sign, className: shown.className });
+      headlineNode.textContent = shown.headline;
+      effectNode.textContent = shown.effect;
       recorded.hidden = !isChanged;
-      recorded.textContent = `As analysed: ${analysed.sign} ${analysed.headline}`;
+      query("#card .do")?.toggleAttribute("hidden", isChanged); // its advice is for the analysed settings
+      recorded.textContent = `With the analysed settings: ${analysed.sign} ${analysed.headline}`;
     }
-    return { showAxis, move, say, verdicts };
+    return { showAxis, moveMarks, showTexts, verdicts };
   }
 
   return { start, formatRatio, formatMetres };

@@ -1,4 +1,4 @@
-"""Data of one flight for the page: input signals of KF, EKF2, ground truth, events and verdicts.
+"""Data of one flight for the explore page: KF inputs, EKF2, ground truth, events, σ ratios.
 
 Python projects and integrates the signals and evaluates EKF2. The page runs only KF.
 """
@@ -12,7 +12,7 @@ from scipy import stats
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import describe_axis
-from px4fuse.card.model import AXIS_ENDS, BANDS, Verdict
+from px4fuse.card.model import AXIS_ENDS, BANDS
 from px4fuse.card.verdicts import verdicts
 from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth
 from px4fuse.comparison.preparation import choose_source
@@ -22,7 +22,6 @@ from px4fuse.explore.packing import COARSE_SCALE, Packer
 from px4fuse.filter.consistency import CONFIDENCE_LEVEL, Consistency
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import (
-    CLOCK_OFFSET_RANGE_S,
     DT_RANGE_S,
     SIGMA_A_RANGE_M_S2,
     SIGMA_Z_RANGE_M,
@@ -35,13 +34,14 @@ from px4fuse.flight import Columns, PositionTrack, Unavailable
 from px4fuse.report.card_html import MARK_PATHS
 from px4fuse.request import ComparisonRequest, WhatIfRequest, command_line
 
-# Range of the clock offset slider on each side of the analysed value
+Data = dict[str, Any]  # data of the page, which become JSON
+# Range of the time offset slider (s) below and above the analysed time offset
 OFFSET_HALF_RANGE_S = 0.6
-RUNNING_MEAN_COUNT = 30  # innovations in the running RMS of innovation ÷ √S
-MAX_TRACK_POINTS = 2000  # drawn points of the map
+RUNNING_MEAN_COUNT = 30  # number of innovations in the running RMS of innovation ÷ √S
+MAX_TRACK_POINTS = 2000  # maximum number of drawn points of the track on the map
 
 
-def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
+def flight_data(analysis: Analysis, packer: Packer) -> Data:
     """Return all data of one flight for JSON; arrays are replaced by their index in the packer.
 
     Parameters
@@ -78,8 +78,8 @@ def flight_data(analysis: Analysis, packer: Packer) -> dict[str, Any]:
     }
 
 
-def replay_signals(comparison: Comparison, packer: Packer) -> dict[str, Any]:
-    """Return the inputs of the page's KF: measurements, IMU integrals, segment, covariance."""
+def replay_signals(comparison: Comparison, packer: Packer) -> Data:
+    """Return the KF inputs: measurements, integrals of the acceleration, segment, covariance."""
     raw = raw_source(comparison)
     return {
         "segment": [comparison.segment.start_s, comparison.segment.end_s],
@@ -89,13 +89,12 @@ def replay_signals(comparison: Comparison, packer: Packer) -> dict[str, Any]:
     }
 
 
-def ranges() -> dict[str, Any]:
-    """Return limits and lesson values of the settings, and thresholds for verdicts."""
+def ranges() -> Data:
+    """Return limits and lesson values of the KF settings, and the axis of the σ ratios."""
     return {
         "sigma-a": list(SIGMA_A_RANGE_M_S2),
         "sigma-z": list(SIGMA_Z_RANGE_M),
         "dt": list(DT_RANGE_S),
-        "clock-offset": list(CLOCK_OFFSET_RANGE_S),
         "lesson": _settings_data(Settings()),
         "running": RUNNING_MEAN_COUNT,
         "bands": BANDS,
@@ -109,7 +108,7 @@ def raw_source(comparison: Comparison) -> PositionTrack:
     return choose_source(comparison.flight, comparison.source.name)[0]
 
 
-def _settings_data(settings: Settings) -> dict[str, Any]:
+def _settings_data(settings: Settings) -> Data:
     return {
         "sigmaA": settings.sigma_a_m_s2,
         "sigmaZ": settings.sigma_z_m,
@@ -119,10 +118,10 @@ def _settings_data(settings: Settings) -> dict[str, Any]:
     }
 
 
-def _offset_data(request: ComparisonRequest, analysis: Analysis) -> dict[str, Any]:
-    """Return the range of the clock offset with its estimate, or the reason why it is fixed."""
+def _offset_data(request: ComparisonRequest, analysis: Analysis) -> Data:
+    """Return range and estimate of the time offset, or the reason why it cannot change."""
     if request.position is not None:
-        return {"why": "the clock offset of a position file is used to align the file"}
+        return {"why": "the time offset of a position file is used to align the file with the log"}
     centre, clock = analysis.settings.clock_offset_s, analysis.clock
     estimate_s = None
     if isinstance(clock, ClockOffset) and clock.is_determinable:
@@ -134,7 +133,7 @@ def _offset_data(request: ComparisonRequest, analysis: Analysis) -> dict[str, An
     }
 
 
-def _imu_data(comparison: Comparison, packer: Packer) -> dict[str, Any] | str:
+def _imu_data(comparison: Comparison, packer: Packer) -> Data | str:
     """Return times, gaps and span of the acceleration, or the reason why it is missing."""
     acceleration = comparison.lines[0].acceleration
     if isinstance(acceleration, Unavailable):
@@ -161,17 +160,15 @@ def _used_samples(comparison: Comparison, acceleration: Acceleration) -> slice:
     return slice(max(low, 0), high)
 
 
-def _axis_signals(
-    comparison: Comparison, axis: Axis, raw: PositionTrack, packer: Packer
-) -> dict[str, Any]:
-    """Return measurements (in and near the segment) and integrated acceleration of an axis."""
+def _axis_signals(comparison: Comparison, axis: Axis, raw: PositionTrack, packer: Packer) -> Data:
+    """Return measurements of an axis, in and near the segment, and its integrated acceleration."""
     segment = comparison.segment
     time = raw.samples.index.to_numpy()
     value = weighted_sum(raw.samples, Columns.POSITION, axis.direction)
     half_range_s = OFFSET_HALF_RANGE_S + abs(comparison.settings.clock_offset_s)
     is_in_reach = (time >= segment.start_s - half_range_s) & (time <= segment.end_s + half_range_s)
     is_in_reach &= np.isfinite(value)
-    signals: dict[str, Any] = {
+    signals: Data = {
         "name": axis.name,
         "time": packer.add_times(time[is_in_reach]),
         "z": packer.add(value[is_in_reach]),
@@ -187,13 +184,13 @@ def _axis_signals(
     return signals
 
 
-def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[str, Any]:
+def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Data:
     """Return the axis description, NIS bands, EKF2 and ground truth of one axis."""
     name = result.axis.name
     return {
         "called": result.axis.label,
         "along": describe_axis(analysis, result),
-        "verdicts": [_verdict_data(verdict) for verdict in verdicts(result)],
+        "ratios": [verdict.ratio for verdict in verdicts(result)],
         "note": result.axis.note,
         "bands": _nis_bands(len(result.axis.measurement_time_s), packer),
         # horizontal axes share their likelihood map if it exists
@@ -206,7 +203,7 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
 def _nis_bands(count: int, packer: Packer) -> list[int]:
     """Pack both ends of the 95 % band of the mean NIS for each number of innovations.
 
-    The number depends on the clock offset, which moves measurements into or out of the segment.
+    The time offset moves measurements into or out of the segment, so their number can change.
     """
     counts = np.arange(1, 2 * count + 1)
     probabilities = ((1.0 - CONFIDENCE_LEVEL) / 2.0, (1.0 + CONFIDENCE_LEVEL) / 2.0)
@@ -216,16 +213,16 @@ def _nis_bands(count: int, packer: Packer) -> list[int]:
     ]
 
 
-def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
+def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Data | str:
     """Return EKF2's states, σ, innovations and statistics, or the reason why they are missing."""
     if isinstance(result.ekf2_state, Unavailable):
         return result.ekf2_state.reason
     state = result.ekf2_state.dropna()
     consistency = result.filters["ekf2"]
-    ekf2: dict[str, Any] = {
+    ekf2: Data = {
         "state": _pack_frame(state, ["position_m", "velocity_m_s"], packer),
-        "variance": "",
-        "innovations": "",
+        "variance": [],
+        "innovations": [],
         "summary": _summary(consistency),
         "r": None,
     }
@@ -258,7 +255,7 @@ def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> di
     return ekf2
 
 
-def _summary(consistency: Consistency | Unavailable) -> dict[str, Any]:
+def _summary(consistency: Consistency | Unavailable) -> Data:
     """Return the statistics of EKF2, or the reason why they are missing."""
     if isinstance(consistency, Unavailable):
         return {"why": consistency.reason}
@@ -270,7 +267,7 @@ def _summary(consistency: Consistency | Unavailable) -> dict[str, Any]:
     }
 
 
-def _truth_data(result: AxisComparison, packer: Packer) -> dict[str, Any] | str:
+def _truth_data(result: AxisComparison, packer: Packer) -> Data | str:
     if isinstance(result.truth, Unavailable):
         return result.truth.reason
     position = result.truth[["position_m"]].dropna()
@@ -287,7 +284,7 @@ def _pack_frame(frame: pd.DataFrame, columns: list[str], packer: Packer) -> list
     return [packer.add_times(frame.index.to_numpy()), *values]
 
 
-def _map_data(analysis: Analysis) -> dict[str, Any]:
+def _map_data(analysis: Analysis) -> Data:
     """Return limits and estimate of each likelihood map, or the reason why it is missing."""
     return {
         name: {
@@ -312,16 +309,8 @@ def _track_data(comparison: Comparison, packer: Packer) -> list[int] | str:
     return _pack_frame(sampled, Columns.POSITION[:2], packer)
 
 
-def _verdict_data(verdict: Verdict) -> dict[str, Any]:
-    return {
-        "ratio": verdict.ratio,
-        "interval": None if verdict.interval is None else list(verdict.interval),
-        "word": verdict.word,
-    }
-
-
-def _ekf2_settings(request: ComparisonRequest, analysis: Analysis) -> dict[str, Any]:
-    """Return EKF2's parameters of the source as flown, and the command that replays EKF2."""
+def _ekf2_settings(request: ComparisonRequest, analysis: Analysis) -> Data:
+    """Return EKF2's logged parameters of the source, and a command that replays EKF2."""
     aid, logged = aid_of(analysis), analysis.flight.log.parameters
     flown = {
         name: f"{logged[name]:.4g} {PARAMETERS[name].unit}".rstrip()
@@ -330,7 +319,7 @@ def _ekf2_settings(request: ComparisonRequest, analysis: Analysis) -> dict[str, 
     }
     if isinstance(analysis.ekf2_model, Unavailable):
         return {"flown": flown, "why": analysis.ekf2_model.reason}
-    # half of the noise as flown is an example that changes S and the error visibly
+    # half of the logged noise is an example that changes S and the error visibly
     parameter = PARAMETERS[aid.noise]
     flown_m = logged.get(aid.noise, parameter.default)
     changes = {aid.noise: max(float(f"{0.5 * flown_m:.2g}"), parameter.minimum)}
@@ -340,8 +329,8 @@ def _ekf2_settings(request: ComparisonRequest, analysis: Analysis) -> dict[str, 
     return {"flown": flown, "command": command_line(example, for_shell=True)}
 
 
-def _command_data(request: ComparisonRequest, comparison: Comparison) -> dict[str, Any]:
-    """Return the command without the page's settings, and one that also fixes segment and aisle.
+def _command_data(request: ComparisonRequest, comparison: Comparison) -> Data:
+    """Return the `compare` command without KF settings, and one that fixes segment and aisle too.
 
     The automatic segment and aisle depend on the timestamps. With another clock offset the command
     must state them, so that the analysis uses the same ones.

@@ -1,6 +1,10 @@
 /* KF of px4fuse.filter.kalman in JavaScript, with the same results as px4fuse.replay: the same time
    steps, the same mean acceleration per step, the same Joseph update. */
 "use strict";
+const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
+/* Response with the decompressed bytes of a base64 text */
+const inflate = (text) => new Response(new Blob([Uint8Array.from(atob(text), (c) => c.charCodeAt(0))])
+  .stream().pipeThrough(new DecompressionStream("deflate")));
 const Engine = (() => {
   const SAME_TIME_S = 5e-7; // kalman.SAME_TIME_S
   const MIN_MEASUREMENTS = 3; // signals.MIN_MEASUREMENTS
@@ -12,11 +16,11 @@ const Engine = (() => {
     const n = xp.length, out = new Float64Array(x.length);
     let j = 0;
     for (let i = 0; i < x.length; i++) {
-      const at = x[i];
-      if (n === 0 || at < xp[0]) { out[i] = outside ?? fp[0] ?? 0; continue; }
-      if (at > xp[n - 1]) { out[i] = outside ?? fp[n - 1]; continue; }
-      while (j < n - 1 && xp[j + 1] <= at) j++;
-      out[i] = j === n - 1 ? fp[j] : (fp[j + 1] - fp[j]) / (xp[j + 1] - xp[j]) * (at - xp[j]) + fp[j];
+      const position = x[i];
+      if (n === 0 || position < xp[0]) { out[i] = outside ?? fp[0] ?? 0; continue; }
+      if (position > xp[n - 1]) { out[i] = outside ?? fp[n - 1]; continue; }
+      while (j < n - 1 && xp[j + 1] <= position) j++;
+      out[i] = j === n - 1 ? fp[j] : (fp[j + 1] - fp[j]) / (xp[j + 1] - xp[j]) * (position - xp[j]) + fp[j];
     }
     return out;
   }
@@ -26,18 +30,17 @@ const Engine = (() => {
     const velocity = interp(edges, imu.time, axis.integral);
     const gap = interp(edges, imu.gapEdges, imu.gapSum);
     const n = edges.length - 1, mean = new Float64Array(n), gapFraction = new Float64Array(n);
-    const low = imu.span[0], high = imu.span[1];
-    const clip = (t) => Math.min(Math.max(t, low), high);
+    const clip = (t) => clamp(t, ...imu.span);
     for (let i = 0; i < n; i++) {
       const length = edges[i + 1] - edges[i];
       mean[i] = (velocity[i + 1] - velocity[i]) / length;
       const outside = 1 - (clip(edges[i + 1]) - clip(edges[i])) / length;
-      gapFraction[i] = Math.min(Math.max((gap[i + 1] - gap[i]) / length + outside, 0), 1);
+      gapFraction[i] = clamp((gap[i + 1] - gap[i]) / length + outside, 0, 1);
     }
     return { mean, gapFraction };
   }
 
-  /* Measurements within the segment after the time offset correction */
+  /* Position measurements (s, m) in the analysed segment, after the correction of their time offset */
   function measured(axis, segment, offset) {
     const time = [], z = [];
     for (let i = 0; i < axis.time.length; i++) {
@@ -47,7 +50,7 @@ const Engine = (() => {
     return { time, z };
   }
 
-  /* Time steps of the filter: grid of DT and measurement times (kalman.timeline) */
+  /* Time steps of KF: grid of DT and measurement times (kalman.timeline) */
   function timeline(flight, axis, settings) {
     const { time: all, z } = measured(axis, flight.segment, settings.offset);
     if (all.length < MIN_MEASUREMENTS) return null;
@@ -61,20 +64,20 @@ const Engine = (() => {
     if (!times.length) return null;
     const m = times.length, last = times[m - 1];
     const count = Math.floor((last - first) / settings.dt + 1e-9) + 1;
-    const time = new Float64Array(count + m + 1), at = new Int32Array(count + m + 1).fill(-1);
+    const time = new Float64Array(count + m + 1), measurement = new Int32Array(count + m + 1).fill(-1);
     let n = 0, j = 0;
     for (let k = 0; k < count; k++) {
       const t = first + settings.dt * k;
-      while (j < m && times[j] < t) { at[n] = index[j]; time[n++] = times[j++]; }
+      while (j < m && times[j] < t) { measurement[n] = index[j]; time[n++] = times[j++]; }
       const near = Math.min(
         Math.abs(times[Math.min(j, m - 1)] - t), Math.abs(times[Math.max(j - 1, 0)] - t));
       if (near > SAME_TIME_S) time[n++] = t;
     }
-    while (j < m) { at[n] = index[j]; time[n++] = times[j++]; }
-    return { time: time.subarray(0, n), at: at.subarray(0, n), z, updates: m };
+    while (j < m) { measurement[n] = index[j]; time[n++] = times[j++]; }
+    return { time: time.subarray(0, n), measurement: measurement.subarray(0, n), z, updates: m };
   }
 
-  /* Mean acceleration of each step, and the additional variance in IMU gaps */
+  /* Mean acceleration (m/s²) of each KF step, and its additional variance in IMU gaps */
   function inputs(flight, axis, settings, line) {
     const n = line.time.length - 1;
     if (settings.input === "zero") {
@@ -82,9 +85,9 @@ const Engine = (() => {
     }
     const { mean, gapFraction } = stepMeans(flight.imu, axis, line.time);
     const extra = new Float64Array(n);
-    for (let from = 0; from < n;) { // from measurement to measurement: the unknown acceleration persists in a gap
+    for (let from = 0; from < n;) { // one interval between measurements: the unknown acceleration is constant in a gap
       let to = from, gap = 0;
-      do gap += gapFraction[to] * (line.time[to + 1] - line.time[to]); while (line.at[++to] < 0 && to < n);
+      do gap += gapFraction[to] * (line.time[to + 1] - line.time[to]); while (line.measurement[++to] < 0 && to < n);
       const persistence = Math.max(gap / settings.dt, 1);
       for (let i = from; i < to; i++) extra[i] = gapFraction[i] * persistence * axis.rms * axis.rms;
       from = to;
@@ -92,28 +95,20 @@ const Engine = (() => {
     return { mean, extra };
   }
 
-  /* Run the filter (px4fuse.replay); settings: sigmaA, sigmaZ, dt, input, offset */
+  /* Set row i of all columns */
+  /* Set row i of all columns */
+  const write = (columns, i, values) => { for (const name in values) columns[name][i] = values[name]; };
+  /* Run KF (px4fuse.replay); settings: sigmaA, sigmaZ, dt, input, offset */
   function replay(flight, axis, settings) {
     const line = timeline(flight, axis, settings);
     if (line === null) return null;
     const { mean, extra } = inputs(flight, axis, settings, line);
     const n = line.time.length, m = line.updates, R = settings.sigmaZ * settings.sigmaZ;
-    const column = (length) => new Float64Array(length);
-    const steps = {
-      time: line.time, at: line.at, p: column(n), v: column(n), p00: column(n), p01: column(n),
-      p11: column(n), prior00: column(n), prior11: column(n), acceleration: mean, extra,
-    };
-    const updates = {
-      step: new Int32Array(m), time: column(m), z: column(m), nu: column(m), s: column(m),
-      k0: column(m), k1: column(m), p: column(m), v: column(m), p00: column(m), p01: column(m),
-      p11: column(m),
-    };
+    const columns = (names, length) => Object.fromEntries(names.split(" ").map((name) => [name, new Float64Array(length)]));
+    const steps = { time: line.time, ...columns("p v p00 p01 p11", n), acceleration: mean, extra };
+    const updates = columns("step time z nu s k0 k1 p v p00 p01 p11", m);
     let p = line.z[0], v = 0, [p00, p01, p11] = flight.start, u = 0;
-    const keep = (i) => {
-      steps.p[i] = p; steps.v[i] = v; steps.p00[i] = p00; steps.p01[i] = p01; steps.p11[i] = p11;
-    };
-    keep(0);
-    steps.prior00[0] = p00; steps.prior11[0] = p11;
+    write(steps, 0, { p, v, p00, p01, p11 });
     for (let i = 1; i < n; i++) {
       const dt = line.time[i] - line.time[i - 1], a = mean[i - 1];
       const q = (settings.sigmaA * settings.sigmaA + extra[i - 1]) * settings.dt;
@@ -123,15 +118,10 @@ const Engine = (() => {
       p00 += 2 * dt * p01 + dt * dt * p11 + q * dt * dt * dt / 4;
       p01 += dt * p11 + q * dt * dt / 2;
       p11 += q * dt;
-      steps.prior00[i] = p00; steps.prior11[i] = p11;
-      if (line.at[i] >= 0) {
+      if (line.measurement[i] >= 0) {
         // ν = z - Hx, S = HPHᵀ + R, K = PHᵀS⁻¹
-        const z = line.z[line.at[i]], nu = z - p, s = p00 + R, k0 = p00 / s, k1 = p01 / s;
-        updates.step[u] = i; updates.time[u] = line.time[i]; updates.z[u] = z;
-        updates.nu[u] = nu; updates.s[u] = s; updates.k0[u] = k0; updates.k1[u] = k1;
-        updates.p[u] = p; updates.v[u] = v;
-        updates.p00[u] = p00; updates.p01[u] = p01; updates.p11[u] = p11;
-        u++;
+        const z = line.z[line.measurement[i]], nu = z - p, s = p00 + R, k0 = p00 / s, k1 = p01 / s;
+        write(updates, u++, { step: i, time: line.time[i], z, nu, s, k0, k1, p, v, p00, p01, p11 });
         // x = x + Kν, P = (I - KH)P(I - KH)ᵀ + KRKᵀ
         p += k0 * nu;
         v += k1 * nu;
@@ -140,12 +130,12 @@ const Engine = (() => {
         p01 = rest * a01 + k0 * k1 * R;
         p00 = rest * rest * p00 + k0 * k0 * R;
       }
-      keep(i);
+      write(steps, i, { p, v, p00, p01, p11 });
     }
     return { steps, updates, settings };
   }
 
-  /* Position, velocity and position variance at other ascending times, NaN outside the run
+  /* Position, velocity and position variance at other ascending times, NaN outside the KF run
      (kalman.state_at and variance_at) */
   function stateAt(run, times) {
     const { steps: s, settings } = run, { time, p, v, acceleration } = s, n = time.length;
@@ -166,15 +156,15 @@ const Engine = (() => {
 
   /* Statistics of innovations (consistency.assess); null for fewer than MIN_INNOVATIONS */
   function assess(nu, s) {
-    let square = 0, outside = 0, product = 0, before = 0;
+    let square = 0, outside = 0, product = 0, previous = 0;
     const n = nu.length;
     if (n < MIN_INNOVATIONS) return null;
     for (let i = 0; i < n; i++) {
-      const one = nu[i] / Math.sqrt(s[i]);
-      square += one * one;
-      if (Math.abs(one) > 2) outside++;
-      if (i) product += one * before;
-      before = one;
+      const normalised = nu[i] / Math.sqrt(s[i]);
+      square += normalised * normalised;
+      if (Math.abs(normalised) > 2) outside++;
+      product += normalised * previous;
+      previous = normalised;
     }
     return { count: n, nis: square / n, outside: outside / n, lag1: product / square };
   }
@@ -191,9 +181,7 @@ const Engine = (() => {
 
   /* Decode the arrays of px4fuse.explore.packing */
   async function unpack(text, specs) {
-    const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-    const all = new Uint8Array(await new Response(stream).arrayBuffer());
+    const all = new Uint8Array(await inflate(text).arrayBuffer());
     let from = 0;
     return specs.map(([length, planes, scale]) => {
       const out = new Float64Array(length);

@@ -1,4 +1,4 @@
-"""Empty Bokeh plots of the page, which the page's script fills with data."""
+"""Bokeh plots of the explore page without data, which the script of the page adds."""
 
 from typing import Any, Literal
 
@@ -17,37 +17,32 @@ from bokeh.plotting import figure
 from px4fuse.arrays import Array
 from px4fuse.card.model import BANDS
 from px4fuse.comparison.estimates import Tuning
+from px4fuse.explore.data import Data
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.record import Record, table
-from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MEASUREMENT_COLOUR, TRUTH_COLOUR
 
-PLOT_HEIGHT = 215
-# KF is dark, solid and round, EKF2 lighter, dashed and square, as in the report
-KF_LINE: dict[str, Any] = {"line_color": KF_COLOUR, "line_width": 1.6, "name": "kf"}
-EKF2_LINE: dict[str, Any] = {
-    "line_color": EKF2_COLOUR,
-    "line_width": 1.6,
-    "line_dash": [6, 3],
-    "name": "ekf2",
-}
-TRUTH_LINE: dict[str, Any] = {
-    "line_color": TRUTH_COLOUR,
-    "line_width": 1.2,
-    "line_dash": [1, 3],
-    "name": "truth",
-}
-# Bands in which the values of a consistent filter are
-CONSISTENT_BAND: dict[str, Any] = {"level": "underlay", "fill_alpha": 1.0, "name": "consistent"}
-# ±√S in which 95 % of the innovations are, and the range of their plot
-NORMAL_BAND, NORMAL_RANGE = 2.0, 4.6
-LEFT_BORDER, EVENT_BORDER = 50, 82  # pixels; the labels of events are longer
+Style = dict[str, Any]  # options of a drawing function of Bokeh
+# The page's script sets the colours by `name`. KF is solid and round, EKF2 dashed and square, as in
+# the report
+KF_LINE: Style = {"line_width": 1.6, "name": "kf"}
+EKF2_LINE: Style = {"line_width": 1.6, "line_dash": [6, 3], "name": "ekf2"}
+TRUTH_LINE: Style = {"line_width": 1.2, "line_dash": [1, 3], "name": "truth"}
+HOLLOW: Style = {"fill_color": None, "line_color": "black"}
+# Arrow head at the upper or lower edge, for a value outside the plot
+ARROW: Style = {"angle": "turn", "marker": "triangle"}
+# Band around the values of a consistent filter
+CONSISTENT_BAND: Style = {"level": "underlay", "fill_alpha": 1.0, "name": "consistent"}
+# Innovation ÷ √S: limit of 95 % of the values of a consistent filter, and half the plotted range
+NORMAL_LIMIT, HALF_NORMAL_RANGE = 2.0, 4.6
+# Left border of the plots and, for its longer labels, of the event plot (pixels)
+LEFT_BORDER, EVENT_BORDER = 50, 82
 STYLES = {
     "kf": KF_LINE,
     "dotted": KF_LINE | {"line_dash": [2, 2]},
     "ekf2": EKF2_LINE,
     "truth": TRUTH_LINE,
 }
-# Range of the colours of the likelihood map, in standard deviations: √(2 · (ln L_max − ln L))
+# Upper end of the colours of the likelihood map (standard deviations): √(2 · (ln L_max − ln L))
 MAP_SIGMAS = 6.0
 
 
@@ -66,7 +61,7 @@ class Plot(Record, frozen=True):
 
 
 class Figures(Record, frozen=True):
-    """Tables of ``figures.toml``."""
+    """Plots of ``figures.toml``: titles, columns of the sources, lines and colours."""
 
     event_rows: list[str]
     map_colours: list[str]
@@ -78,8 +73,8 @@ class Figures(Record, frozen=True):
 FIGURES = table(__file__, "figures.toml", Figures)
 
 
-def document_json(data: dict[str, Any], tuning: Tuning) -> tuple[Any, dict[str, str]]:
-    """Return Bokeh's document, and the element id of each root.
+def document_json(data: Data, tuning: Tuning) -> tuple[Any, dict[str, str]]:
+    """Return Bokeh's document, and the id of the page element for each plot.
 
     Parameters
     ----------
@@ -92,41 +87,38 @@ def document_json(data: dict[str, Any], tuning: Tuning) -> tuple[Any, dict[str, 
     time_range = _page_range("time")
     plots = _plots(data, time_range)
     plots |= {
-        "strip": _event_strip(data, time_range),
+        "strip": _event_plot(data, time_range),
         "map": _likelihood_map(tuning),
-        "plan": _plan_plot(),
+        "plan": _track_plot(),
         "step": _phase_plot(),
     }
-    with document.models.freeze():  # collect the models of all roots once
+    with document.models.freeze():  # faster: Bokeh collects the models of all plots once
         for plot in plots.values():
             document.add_root(plot)
     return document.to_json(deferred=False), {plot.id: name for name, plot in plots.items()}
 
 
-def has_reference(data: dict[str, Any]) -> bool:
+def has_reference(data: Data) -> bool:
     """Return True if KF can be compared with ground truth or EKF2 along some axis."""
-    return any(isinstance(axis[kind], dict) for axis in data["axes"] for kind in ("truth", "ekf2"))
+    return _has(data, "truth") or _has(data, "ekf2")
 
 
-def _plots(data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
-    """Return the plots over time by name."""
-    missing_kinds = {
-        kind
-        for kind in ("ekf2", "truth")
-        if not any(isinstance(axis[kind], dict) for axis in data["axes"])
-    }
+def _has(data: Data, kind: str) -> bool:
+    return any(isinstance(axis[kind], dict) for axis in data["axes"])
+
+
+def _plots(data: Data, time_range: Range1d) -> dict[str, Any]:
+    missing_kinds = {kind for kind in ("ekf2", "truth") if not _has(data, kind)}
     plots: dict[str, Any] = {}
     for name, plot in FIGURES.plots.items():
         if name == "error" and not has_reference(data):
             continue
         sources = _Sources(name)
-        fig = plots[name] = figure(
-            name=name,
-            height=PLOT_HEIGHT,
-            sizing_mode="stretch_width",
+        fig = plots[name] = _figure(
+            name,
+            215,
             x_range=time_range,
             y_range=_page_range(),
-            toolbar_location=None,
             y_axis_type=plot.scale,
             tools="xbox_zoom,xpan,tap",
             active_drag="xbox_zoom",
@@ -134,8 +126,8 @@ def _plots(data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
             min_border_left=LEFT_BORDER,
         )
         if name == "position":
-            _draw_dots(fig, sources["measured"], MEASUREMENT_COLOUR, 3, name="measured")
-            _draw_arrows(fig, sources["beyond"], MEASUREMENT_COLOUR, "measured")
+            _draw_dots(fig, sources["measured"], 3, name="measured")
+            _draw_dots(fig, sources["beyond"], 9, name="measured", **ARROW)
         if name == "innovation":
             _draw_innovations(fig, sources, with_ekf2="ekf2" not in missing_kinds)
         if name == "error":
@@ -151,14 +143,14 @@ def _plots(data: dict[str, Any], time_range: Range1d) -> dict[str, Any]:
             line_renderer = fig.line("t", column, source=sources[source], **STYLES[style_name])
             if hover_name:
                 _add_hover(fig, line_renderer, (hover_name, f"@{column}{{0.000}} {plot.unit}"))
-        fig.add_layout(Span(dimension="height", location=0.0, visible=False, name="cursor"))
+        _add_cursor(fig, name="cursor")
         for low, high, style in _event_bands(data):
             fig.add_layout(BoxAnnotation(left=low, right=high, level="underlay", **style))
     return plots
 
 
 class _Sources(dict[str, ColumnDataSource]):
-    """Data sources of one plot, created on first use."""
+    """Bokeh data sources of one plot, created on first use."""
 
     def __init__(self, plot: str) -> None:
         self.plot = plot
@@ -168,74 +160,62 @@ class _Sources(dict[str, ColumnDataSource]):
         return self[name]
 
 
-def _draw_arrows(fig: Any, source: ColumnDataSource, colour: str, name: str) -> None:
-    """Draw arrow heads at the upper or lower edge for values outside the plot."""
-    fig.scatter(
-        "t",
-        "y",
-        angle="turn",
-        source=source,
-        marker="triangle",
-        size=9,
-        fill_color=colour,
-        line_color=None,
-        name=name,
-    )
-
-
 def _draw_innovations(fig: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: bool) -> None:
     """Draw innovation ÷ √S of KF and EKF2 as dots, in a band that contains 95 % of them."""
-    fig.y_range = Range1d(start=-NORMAL_RANGE, end=NORMAL_RANGE)
-    fig.add_layout(BoxAnnotation(bottom=-NORMAL_BAND, top=NORMAL_BAND, **CONSISTENT_BAND))
-    kf_dots = fig.scatter(
-        "t",
-        "x",
-        source=sources["updates"],
-        size=4,
-        fill_color=KF_COLOUR,
-        line_color=None,
-        name="kf",
-    )
+    fig.y_range = Range1d(start=-HALF_NORMAL_RANGE, end=HALF_NORMAL_RANGE)
+    fig.add_layout(BoxAnnotation(bottom=-NORMAL_LIMIT, top=NORMAL_LIMIT, **CONSISTENT_BAND))
+    kf_dots = _draw_dots(fig, sources["updates"], 4, name="kf")
     _add_hover(fig, kf_dots, ("KF", "@x{0.00}"))
-    _draw_arrows(fig, sources["beyond"], KF_COLOUR, "kf")
+    _draw_dots(fig, sources["beyond"], 9, name="kf", **ARROW)
     if with_ekf2:
-        square: dict[str, Any] = {"marker": "square", "name": "ekf2"}
-        fused = _draw_dots(fig, sources["fused"], EKF2_COLOUR, 4, **square)
-        rejected = _draw_dots(fig, sources["rejected"], None, 7, line_color=EKF2_COLOUR, **square)
+        square: Style = {"marker": "square", "name": "ekf2"}
+        fused = _draw_dots(fig, sources["fused"], 4, **square)
+        rejected = _draw_dots(fig, sources["rejected"], 7, **square, **HOLLOW)
         _add_hover(fig, fused, ("EKF2", "@x{0.00}"))
         _add_hover(fig, rejected, ("EKF2 rejected", "@x{0.00}"))
-        _draw_arrows(fig, sources["beyond_ekf2"], EKF2_COLOUR, "ekf2")
+        _draw_dots(fig, sources["beyond_ekf2"], 9, name="ekf2", **ARROW)
 
 
 def _add_hover(fig: Any, renderer: Any, *rows: tuple[str, str]) -> None:
     tips = [("time", "@t{0.00} s"), *rows]
-    # The tooltips are on different sides, so that they do not overlap
+    # Tooltips of KF, EKF2 and ground truth are on different sides, so they do not overlap
     side: Any = {"EKF2": "right", "ground truth": "above"}.get(rows[0][0], "left")
     fig.add_tools(HoverTool(renderers=[renderer], tooltips=tips, mode="vline", attachment=side))
 
 
+def _figure(name: str, height: int, **options: Any) -> Any:
+    return figure(
+        name=name, height=height, sizing_mode="stretch_width", toolbar_location=None, **options
+    )
+
+
+def _add_cursor(fig: Any, **options: Any) -> None:
+    """Add the vertical line at the time of the selected measurement, or at its position."""
+    fig.add_layout(Span(dimension="height", location=0.0, visible=False, **options))
+
+
 def _page_range(name: str | None = None) -> Range1d:
-    """Return a range that the page sets."""
+    """Return a plot range that the page's script sets."""
     return Range1d(start=0.1, end=1.0, name=name)
 
 
 def _empty_source(name: str, columns: str) -> ColumnDataSource:
-    """Return an empty source that the page fills."""
-    empty: dict[str, Any] = {column: [] for column in columns.split()}
+    """Return an empty source that the page's script fills; `columns` are separated by blanks."""
+    empty: Data = {column: [] for column in columns.split()}
     return ColumnDataSource(empty, name=f"{name}-source")
 
 
-def _event_bands(data: dict[str, Any]) -> list[tuple[float, float, dict[str, Any]]]:
-    """Return the shaded spans behind the plots: modes (alternating), ground, gaps, dropouts."""
-    grey: dict[str, Any] = {"fill_color": "#888888", "line_color": None}
-    hatched: dict[str, Any] = {
+def _event_bands(data: Data) -> list[tuple[float, float, Style]]:
+    """Return start, end (s) and style of shaded flight modes, ground times, gaps and dropouts."""
+    grey: Style = {"fill_color": "#888888", "line_color": None}
+    hatched: Style = {
         "hatch_pattern": "/",
         "hatch_color": "#888888",
         "hatch_alpha": 0.6,
         "fill_alpha": 0.05,
     }
     events = data["events"]
-    sand: dict[str, Any] = {"fill_color": "#b08a3a", "fill_alpha": 0.1, "line_color": None}
+    sand: Style = {"fill_color": "#b08a3a", "fill_alpha": 0.1, "line_color": None}
     return [
         *((low, high, sand) for low, high, _ in events["modes"][1::2]),
         *((low, high, grey | {"fill_alpha": 0.18}) for low, high in events["ground"]),
@@ -244,18 +224,15 @@ def _event_bands(data: dict[str, Any]) -> list[tuple[float, float, dict[str, Any
     ]
 
 
-def _event_strip(data: dict[str, Any], time_range: Range1d) -> Any:
+def _event_plot(data: Data, time_range: Range1d) -> Any:
     """Make the event plot, with a row per kind of event."""
     source = _empty_source("strip", "row left right text")
-    has_ekf2 = any(isinstance(axis["ekf2"], dict) for axis in data["axes"])
-    rows = FIGURES.event_rows if has_ekf2 else FIGURES.event_rows[2:]
-    fig = figure(
-        name="strip",
-        height=28 * len(rows) + 24,
-        sizing_mode="stretch_width",
+    rows = FIGURES.event_rows if _has(data, "ekf2") else FIGURES.event_rows[2:]
+    fig = _figure(
+        "strip",
+        28 * len(rows) + 24,
         x_range=time_range,
         y_range=FactorRange(factors=rows),
-        toolbar_location=None,
         tools="xbox_zoom,xpan",
         active_drag="xbox_zoom",
         min_border_left=EVENT_BORDER,
@@ -280,22 +257,20 @@ def _event_strip(data: dict[str, Any], time_range: Range1d) -> Any:
         x_offset=3,
         name="ink",
     )
-    fig.add_layout(Span(dimension="height", location=0.0, visible=False, name="cursor"))
+    _add_cursor(fig, name="cursor")
     return fig
 
 
 def _likelihood_map(tuning: Tuning) -> Any:
     """Make the map of the log-likelihood over SIGMA_A and SIGMA_Z, with the current settings."""
-    fig = figure(
-        name="map",
-        height=250,
-        sizing_mode="stretch_width",
+    fig = _figure(
+        "map",
+        250,
         x_axis_type="log",
         y_axis_type="log",
         x_range=_page_range(),
         y_range=_page_range(),
         tools="tap",
-        toolbar_location=None,
         x_axis_label="SIGMA_A (m/s²)",
         y_axis_label="SIGMA_Z (m)",
     )
@@ -311,21 +286,18 @@ def _likelihood_map(tuning: Tuning) -> Any:
     trail = _empty_source("trail", "x y")
     best = _empty_source("best", "x y")
     point = _empty_source("point", "x y")
-    white: dict[str, Any] = {"line_color": "white"}
-    fig.line("x", "y", source=trail, line_color=EKF2_COLOUR, line_width=1.2, name="ekf2")
-    _draw_dots(fig, trail, EKF2_COLOUR, 3, name="ekf2")
-    fig.scatter("x", "y", source=best, size=13, marker="cross", line_width=2.5, **white)
-    _draw_dots(fig, point, EKF2_COLOUR, 12, marker="circle", line_width=2.0, **white)
+    white: Style = {"line_color": "white"}
+    fig.line("x", "y", source=trail, line_width=1.2, name="ekf2")
+    _draw_dots(fig, trail, 3, name="ekf2")
+    _draw_dots(fig, best, 13, marker="cross", line_width=2.5, **white)
+    _draw_dots(fig, point, 12, fill_color="darkorange", line_width=2.0, **white)
     return fig
 
 
-def _draw_dots(
-    fig: Any, source: ColumnDataSource, colour: str | None, size: int, **style: Any
-) -> Any:
-    """Draw dots at the last two columns of a source, without an edge line by default."""
+def _draw_dots(fig: Any, source: ColumnDataSource, size: int, **style: Any) -> Any:
+    """Draw dots without edge lines; x and y are the last two columns of the source."""
     x, y = source.column_names[-2:]
-    marker_style = {"size": size, "fill_color": colour, "line_color": None} | style
-    return fig.scatter(x, y, source=source, **marker_style)
+    return fig.scatter(x, y, source=source, size=size, **{"line_color": None} | style)
 
 
 def _pixel_extent(values: Array) -> tuple[float, float]:
@@ -335,65 +307,45 @@ def _pixel_extent(values: Array) -> tuple[float, float]:
     return start, end - start
 
 
-def _plan_plot() -> Any:
-    """Make the map of the track; a selection on it sets the time range of all plots."""
-    fig = figure(
-        name="plan",
-        height=250,
-        sizing_mode="stretch_width",
+def _track_plot() -> Any:
+    """Make the map of the position source; a box on it sets the time range of all plots."""
+    fig = _figure(
+        "plan",
+        250,
         match_aspect=True,
         tools="box_select,tap",
         active_drag="box_select",
-        toolbar_location=None,
         x_axis_label="east (m)",
         y_axis_label="north (m)",
     )
     track = _empty_source("plan", "t east north")
     shown_source = _empty_source("shown", "east north")
     cursor = _empty_source("here", "east north")
-    fig.line("east", "north", source=track, line_color=MEASUREMENT_COLOUR, line_width=1.0)
-    _draw_dots(fig, track, MEASUREMENT_COLOUR, 3, nonselection_fill_alpha=0.6)
-    _draw_dots(fig, shown_source, KF_COLOUR, 4, name="kf")
-    _draw_dots(
-        fig,
-        cursor,
-        None,
-        12,
-        marker="circle_x",
-        line_color=EKF2_COLOUR,
-        line_width=2.0,
-        name="ekf2",
-    )
+    fig.line("east", "north", source=track, name="measured")
+    _draw_dots(fig, track, 3, nonselection_fill_alpha=0.6, name="measured")
+    _draw_dots(fig, shown_source, 4, name="kf")
+    _draw_dots(fig, cursor, 12, marker="circle_x", line_width=2.0, name="ekf2", **HOLLOW)
     return fig
 
 
 def _phase_plot() -> Any:
-    """Make the phase plane: position and velocity with their 2σ ellipse, and the measurement."""
-    fig = figure(
-        name="step",
-        height=330,
-        sizing_mode="stretch_width",
+    """Make the phase plane: KF position and velocity, their 2σ ellipse, and the measurement."""
+    fig = _figure(
+        "step",
+        330,
         x_range=_page_range(),
         y_range=_page_range(),
         tools="",
-        toolbar_location=None,
         x_axis_label="position (m)",
         y_axis_label="velocity (m/s)",
     )
-    band: dict[str, Any] = {"left": 0.0, "right": 0.0, "visible": False}
-    fig.add_layout(
-        BoxAnnotation(
-            name="band", fill_color=MEASUREMENT_COLOUR, fill_alpha=0.25, line_color=None, **band
-        )
-    )
-    fig.add_layout(
-        Span(dimension="height", location=0.0, visible=False, name="measurement", line_dash=[2, 2])
-    )
+    fig.add_layout(BoxAnnotation(name="band", fill_alpha=0.25, line_color=None, visible=False))
+    _add_cursor(fig, name="measurement", line_dash=[2, 2])
     trail = _empty_source("trail-means", "p v")
     before, current = _empty_source("before", "p v"), _empty_source("now", "p v")
     mean = _empty_source("mean", "p v")
-    fig.line("p", "v", source=trail, line_color=MEASUREMENT_COLOUR, line_width=1.0, name="measured")
+    fig.line("p", "v", source=trail, name="measured")
     fig.line("p", "v", source=before, **KF_LINE | {"line_dash": [6, 3]})
-    fig.patch("p", "v", source=current, fill_color=KF_COLOUR, fill_alpha=0.25, **KF_LINE)
-    _draw_dots(fig, mean, KF_COLOUR, 7, name="kf")
+    fig.patch("p", "v", source=current, fill_alpha=0.25, **KF_LINE)
+    _draw_dots(fig, mean, 7, name="kf")
     return fig

@@ -20,9 +20,9 @@ MAX_EXACT = 2.0**52  # integers up to this are exact in JavaScript (doubles)
 
 @dataclass
 class Packer:
-    """Collection of arrays; the page's data contain indices of arrays.
+    """Encoder of arrays; the data of the page refer to an array by its index.
 
-    ``specs`` has length, number of byte planes and steps per unit of each array.
+    ``specs`` contains length, number of byte planes and steps per unit of each array.
     """
 
     specs: list[tuple[int, int, float]] = field(default_factory=list)
@@ -56,5 +56,5 @@ class Packer:
         return self.add(time_s, 1e6 if is_microseconds else FINE_SCALE)
 
     def text(self) -> str:
-        """Return all arrays in base64."""
+        """Return all arrays as one base64 text."""
         return base64.b64encode(zlib.compress(b"".join(self._bytes), 9)).decode()

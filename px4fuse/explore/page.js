@@ -1,12 +1,12 @@
 /* Main script of the page: runs KF with the settings and draws plots and numbers. */
 const Explore = (async () => {
-  const MAX_POINTS = 3000, MAX_DRAG_POINTS = 600; // most drawn points of a line, and while a slider is dragged
+  const MAX_POINTS = 3000, MAX_DRAG_POINTS = 600; // maximum number of drawn points of a line, also while a slider is dragged
   const DRAG_PAUSE_MS = 150;
   const NARROW = matchMedia("(max-width: 60rem)");
   const readJson = (id) => JSON.parse($(id).textContent);
   const content = readJson(`content${Practice.suffix}`), ranges = content.ranges;
   if (typeof DecompressionStream === "undefined") {
-    $("problem").textContent = "This browser is too old for this page. Use a browser from 2023 or later.";
+    $("problem").textContent = "This browser is too old for this page. Use a browser of 2023 or later.";
     $("problem").hidden = false;
     return null;
   }
@@ -17,82 +17,84 @@ const Explore = (async () => {
   const { imu, plan, axes } = content.flight;
   const flight = {
     ...content.flight,
-    imu: typeof imu === "string" ? imu : { ...imu, time: arrays[imu.time] },
-    plan: typeof plan === "string" ? plan : arraysAt(plan),
+    imu: isText(imu) ? imu : { ...imu, time: arrays[imu.time] },
+    plan: isText(plan) ? plan : arraysAt(plan),
     axes: axes.map((axis) => ({
       ...axis, time: arrays[axis.time], z: arrays[axis.z], bands: arraysAt(axis.bands),
-      integral: axis.integral === undefined ? null : arrays[axis.integral],
-      ekf2: typeof axis.ekf2 === "string" ? axis.ekf2 : {
-        ...axis.ekf2, state: arraysAt(axis.ekf2.state), variance: arraysAt(axis.ekf2.variance || []),
-        innovations: arraysAt(axis.ekf2.innovations || []),
+      integral: arrays[axis.integral],
+      ekf2: isText(axis.ekf2) ? axis.ekf2 : {
+        ...axis.ekf2, state: arraysAt(axis.ekf2.state), variance: arraysAt(axis.ekf2.variance),
+        innovations: arraysAt(axis.ekf2.innovations),
       },
-      truth: typeof axis.truth === "string" ? axis.truth : {
-        p: arraysAt(axis.truth.p), v: axis.truth.v === null ? null : arraysAt(axis.truth.v),
-      },
+      truth: isText(axis.truth) ? axis.truth : { p: arraysAt(axis.truth.p), v: axis.truth.v && arraysAt(axis.truth.v) },
     })),
   };
   // ------------------------------------------------------------------ settings
+  // `log`: ends of a logarithmic slider (without it: linear); `likely`: maximum-likelihood estimate
   const SETTINGS = [
     { id: "sigma-a", key: "sigmaA", title: "SIGMA_A", unit: "m/s²", log: [0.001, 100],
       hint: "process noise", likely: () => mapNow().likely?.[0] },
     { id: "sigma-z", key: "sigmaZ", title: "SIGMA_Z", unit: "m", log: [0.001, 10],
       hint: "measurement noise", likely: () => mapNow().likely?.[1] },
     { id: "clock-offset", key: "offset", title: "Time offset", unit: "s",
-      hint: "added to timestamps", likely: () => flight.offset.likely },
-    { id: "dt", key: "dt", title: "DT", unit: "s", log: [0.01, 1], hint: "prediction step" },
+      hint: "added to timestamps", isMore: true, likely: () => flight.offset.likely },
+    { id: "dt", key: "dt", title: "DT", unit: "s", log: [0.01, 1], hint: "prediction step", isMore: true },
   ];
   const TICKS = 600;
   const settings = { ...flight.settings, axis: flight.main };
-  const chosen = { step: null }; // index of the selected measurement
+  const selected = { measurement: null }; // index of the measurement selected with the keys n and p, or null
   const round = (value, digits) => Number(value.toPrecision(digits));
-  const why = flight.offset.why;
-  const reach = why ? [settings.offset, settings.offset] : [flight.offset.from, flight.offset.to];
-  const limits = (setting) => setting.key === "offset" ? reach : ranges[setting.id];
+  const fixedReason = flight.offset.why; // set if the time offset cannot change
+  const offsetLimits = fixedReason ? [settings.offset, settings.offset] : [flight.offset.from, flight.offset.to];
+  const limits = (setting) => setting.key === "offset" ? offsetLimits : ranges[setting.id];
+  const isWithinLimits = (setting, text) => {
+    const [low, high] = limits(setting);
+    return text !== "" && text >= low && text <= high;
+  };
   const fromSlider = (setting, tick) => {
-    if (!setting.log) return Math.round((reach[0] + (reach[1] - reach[0]) * tick / TICKS) * 1e4) / 1e4;
+    if (!setting.log) return Math.round((offsetLimits[0] + (offsetLimits[1] - offsetLimits[0]) * tick / TICKS) * 1e4) / 1e4;
     const [low, high] = setting.log.map(Math.log);
     return round(Math.exp(low + (high - low) * tick / TICKS), 3);
   };
   const toSlider = (setting, value) => {
-    const [low, high] = setting.log ? setting.log.map(Math.log) : reach;
-    const at = (setting.log ? Math.log(value) : value) - low;
-    return Math.round(Math.min(Math.max(at / (high - low || 1), 0), 1) * TICKS);
+    const [low, high] = setting.log ? setting.log.map(Math.log) : offsetLimits;
+    const distance = (setting.log ? Math.log(value) : value) - low;
+    return Math.round(clamp(distance / (high - low || 1), 0, 1) * TICKS);
   };
   for (const setting of SETTINGS) {
-    const isMore = ["dt", "offset"].includes(setting.key); // in the opened sheet of a phone
-    const box = make("div", undefined, { className: isMore ? "setting more" : "setting" });
+    // on a phone, DT and time offset are only in the opened settings sheet
+    const box = make("div", "", setting.isMore ? "setting more" : "setting");
     const label = make("label", `${setting.title} `, { htmlFor: `${setting.id}-value` });
     label.append(make("small", `${setting.unit}, ${setting.hint}`));
-    setting.number = make("input", undefined, { type: "number", id: `${setting.id}-value`, step: "any" });
-    setting.slider = make("input", undefined, {
+    setting.number = make("input", "", { type: "number", id: `${setting.id}-value`, step: "any" });
+    setting.slider = make("input", "", {
       type: "range", id: setting.id, min: 0, max: TICKS, step: 1, ariaLabel: setting.title });
     setting.slider.addEventListener("input", () => {
       set({ [setting.key]: fromSlider(setting, Number(setting.slider.value)) }, true);
     });
     setting.number.addEventListener("change", () => {
-      const value = setting.number.value === "" ? NaN : Number(setting.number.value);
-      const [low, high] = limits(setting);
-      if (value >= low && value <= high) return set({ [setting.key]: value });
-      showMessage(`${setting.title}: enter ${low} to ${high} ${setting.unit}.`);
+      const text = setting.number.value, [low, high] = limits(setting);
+      if (isWithinLimits(setting, text)) return set({ [setting.key]: Number(text) });
+      showMessage(`${setting.title} must be between ${low} and ${high} ${setting.unit}.`);
       show();
     });
-    setting.best = make("div", undefined, { className: "best" });
+    setting.best = make("div", "", "best");
     box.append(label, setting.number, setting.slider, setting.best);
-    if (setting.key === "offset" && why) {
+    if (setting.key === "offset" && fixedReason) {
       setting.number.disabled = setting.slider.disabled = true;
-      box.append(make("p", why, { className: "note" }));
+      box.append(make("p", fixedReason, "note"));
     }
     $("sliders").append(box);
   }
   const names = axes.map((axis) => axis.name);
-  for (const name of names) {
+  for (const value of names) {
     const label = make("label");
-    label.append(make("input", undefined, { type: "radio", name: "axis", value: name }), ` ${name}`);
+    label.append(make("input", "", { type: "radio", name: "axis", value }), ` ${value}`);
     $("axes").append(label);
   }
   $("axes").addEventListener("change", (event) => set({ axis: event.target.value }));
-  const hasImu = typeof imu !== "string";
-  for (const radio of document.querySelectorAll("[name=input]")) {
+  const hasImu = !isText(imu);
+  for (const radio of queryAll("[name=input]")) {
     radio.addEventListener("change", () => set({ input: radio.value }));
     if (radio.value === "imu" && !hasImu) {
       radio.disabled = true;
@@ -101,41 +103,41 @@ const Explore = (async () => {
   }
   /* Mark the maximum-likelihood estimate on the track of a slider */
   function markLikely(setting) {
-    const value = setting.likely?.(), text = `maximum likelihood ${value && round(value, 3)}`;
-    setting.best.hidden = value === null || value === undefined;
-    if (setting.best.hidden) return;
-    const share = toSlider(setting, value) / TICKS, line = make("i"), label = make("small", text);
-    line.style.left = `${100 * share}%`;
-    label.style.left = `${100 * share}%`;
-    label.style.transform = `translateX(${-100 * share}%)`;
+    const value = setting.likely?.() ?? null;
+    setting.best.hidden = value === null;
+    if (value === null) return;
+    const percent = 100 * toSlider(setting, value) / TICKS, line = make("i");
+    const label = make("small", `maximum-likelihood estimate ${round(value, 3)}`);
+    line.style.left = label.style.left = `${percent}%`;
+    label.style.transform = `translateX(${-percent}%)`;
     setting.best.replaceChildren(line, label);
   }
   const axisNow = () => flight.axes.find((axis) => axis.name === settings.axis);
   const showMessage = (text) => { $("message").textContent = text; };
-  const mapNow = () => flight.maps[axisNow().map] ?? "not computed";
+  const mapNow = () => flight.maps[axisNow().map] ?? "it was not computed for this axis";
 
-  $("lesson").addEventListener("click", () => {
+  onClick("lesson", () => {
     const { sigmaA, sigmaZ, dt } = ranges.lesson;
     set({ sigmaA, sigmaZ, dt });
-    showMessage("Values of the lesson.");
+    showMessage("SIGMA_A, SIGMA_Z and DT have the values of the lesson UAT 366, module 2.");
   });
-  $("likely").addEventListener("click", () => {
+  onClick("likely", () => {
     const [sigmaA, sigmaZ] = mapNow().likely;
     set({ sigmaA: round(sigmaA, 3), sigmaZ: round(sigmaZ, 3), dt: flight.settings.dt });
-    showMessage("Maximum-likelihood estimates from the innovations of this flight.");
+    showMessage("SIGMA_A and SIGMA_Z are the maximum-likelihood estimates from the innovations of this flight.");
   });
-  $("ekf2-r").addEventListener("click", () => {
+  onClick("ekf2-r", () => {
     set({ sigmaZ: round(axisNow().ekf2.r, 3) });
-    showMessage("SIGMA_Z is the median measurement standard deviation of EKF2 (√R).");
+    showMessage("SIGMA_Z is the median of √R of EKF2.");
   });
 
   /* Change settings, re-run KF and draw; during a drag at most once per frame, with fewer points */
   let isDrawing = false, isChangedSince = false, finalDraw = null;
-  function set(changes, dragged = false) {
+  function set(changes, isDragged = false) {
     Object.assign(settings, changes);
     if ($("message").textContent) showMessage("");
     clearTimeout(finalDraw);
-    if (!dragged) return show();
+    if (!isDragged) return show();
     finalDraw = setTimeout(show, DRAG_PAUSE_MS);
     if (isDrawing) { isChangedSince = true; return; }
     isDrawing = true;
@@ -148,84 +150,82 @@ const Explore = (async () => {
 
   // ------------------------------------------------------------------ the address
   function toAddress() {
-    const parts = { axis: settings.axis, input: settings.input };
-    for (const setting of SETTINGS) parts[setting.id] = String(settings[setting.key]);
-    Object.assign(parts, Practice.toAddress());
-    if (view !== "errors") parts.view = view;
-    if (chosen.step !== null) parts.measurement = String(chosen.step + 1);
-    const text = `#${new URLSearchParams(parts)}`;
+    const values = { axis: settings.axis, input: settings.input, ...Practice.toAddress() };
+    for (const { id, key } of SETTINGS) values[id] = settings[key];
+    if (view !== "errors") values.view = view;
+    if (selected.measurement !== null) values.measurement = selected.measurement + 1;
+    const text = `#${new URLSearchParams(values)}`;
     if (text !== location.hash) history.replaceState(null, "", text);
   }
   function fromAddress() {
-    const parts = new URLSearchParams(location.hash.slice(1)), ignored = [];
+    const values = new URLSearchParams(location.hash.slice(1)), ignored = [];
+    const take = (name, isValid, use) => {
+      if (!values.has(name)) return;
+      const value = values.get(name);
+      if (isValid(value)) use(value);
+      else ignored.push(name);
+    };
     for (const setting of SETTINGS) {
-      if (!parts.has(setting.id) || (setting.key === "offset" && why)) continue;
-      const text = parts.get(setting.id), value = text === "" ? NaN : Number(text);
-      const [low, high] = limits(setting);
-      if (value >= low && value <= high) settings[setting.key] = value;
-      else ignored.push(setting.id);
+      if (setting.key === "offset" && fixedReason) continue;
+      take(setting.id, (text) => isWithinLimits(setting, text), (text) => { settings[setting.key] = Number(text); });
     }
-    if (names.includes(parts.get("axis"))) settings.axis = parts.get("axis");
-    else if (parts.has("axis")) ignored.push("axis");
-    const input = parts.get("input");
-    if (input === "zero" || (input === "imu" && hasImu)) settings.input = input;
-    else if (input !== null) ignored.push("input");
-    if (parts.has("view") && !isView(parts.get("view"))) ignored.push("view");
-    else open(parts.get("view") ?? view, false);
-    const step = Number(parts.get("measurement"));
-    if (Number.isInteger(step) && step > 0) chosen.step = step - 1;
-    if (ignored.length) showMessage(`Invalid values in the address are ignored: ${ignored.join(", ")}.`);
+    take("axis", (name) => names.includes(name), (name) => { settings.axis = name; });
+    take("input", (name) => name === "zero" || (name === "imu" && hasImu), (name) => { settings.input = name; });
+    take("view", isView, (name) => open(name, false));
+    take("measurement", (text) => Number.isInteger(Number(text)) && text > 0,
+      (text) => { selected.measurement = text - 1; });
+    if (ignored.length) showMessage(`Invalid values in the page address are ignored: ${ignored.join(", ")}.`);
   }
 
   // ------------------------------------------------------------------ views
+  // Titles of the tabs: plots (each has a tab on a phone), groups of plots on a wide screen, and other views
   const PLOTS = { innovation: "Innovations", error: "Error", sigma_p: "σ position", sigma_v: "σ velocity",
     position: "Position", strip: "Events", velocity: "Velocity", gain: "Gain", running: "Running RMS" };
-  const GROUPS = { errors: ["Innovations and error", ["innovation", "error"]],
+  const GROUPS = { errors: ["Errors", ["innovation", "error"]],
     sigma: ["σ", ["sigma_p", "sigma_v"]], track: ["Position", ["position", "strip"]],
     speed: ["Velocity", ["velocity"]], gains: ["Gain", ["gain", "running"]] };
-  const CARDS = { numbers: "Numbers", step: "Step by step", map: "Likelihood" };
-  const hasPlot = (name) => document.querySelector(`[data-plot=${name}]`) !== null;
-  const isView = (name) => Object.hasOwn(GROUPS, name) || Object.hasOwn(CARDS, name)
+  const BOXES = { numbers: "Statistics", step: "Step by step", map: "Likelihood" };
+  const hasPlot = (name) => query(`[data-plot=${name}]`) !== null;
+  const isView = (name) => Object.hasOwn(GROUPS, name) || Object.hasOwn(BOXES, name)
     || (Object.hasOwn(PLOTS, name) && hasPlot(name));
   let view = "errors";
   /* Tab of a view; on a narrow screen each plot has a separate tab */
   function tabOf(name) {
-    if (Object.hasOwn(CARDS, name)) return name;
-    if (NARROW.matches) return Object.hasOwn(GROUPS, name) ? GROUPS[name][1][0] : name;
+    if (name in BOXES) return name;
+    if (NARROW.matches) return name in GROUPS ? GROUPS[name][1][0] : name;
     return Object.keys(GROUPS).find((group) => group === name || GROUPS[group][1].includes(name));
   }
-  const seenPlots = () => Object.hasOwn(CARDS, view) ? [] : Object.hasOwn(GROUPS, view) ? GROUPS[view][1] : [view];
-  const isSeen = (name) => name === "plan" || name === "step" ? view === "step" : name === view || seenPlots().includes(name);
+  const visiblePlots = () => view in BOXES ? [] : view in GROUPS ? GROUPS[view][1] : [view];
+  const isVisible = (name) => name === "plan" || name === "step" ? view === "step" : name === view || visiblePlots().includes(name);
   function drawTabs() {
-    const names = NARROW.matches ? Object.entries(PLOTS).filter(([name]) => hasPlot(name))
+    const plots = NARROW.matches ? Object.entries(PLOTS).filter(([name]) => hasPlot(name))
       : Object.entries(GROUPS).map(([name, [title]]) => [name, title]);
-    $("tabs").replaceChildren(...[...names, ...Object.entries(CARDS)].map(([name, title]) => {
-      const tab = make("button", title, { type: "button", id: `tab-${name}` });
-      tab.setAttribute("role", "tab");
-      tab.setAttribute("aria-controls", Object.hasOwn(CARDS, name) ? `view-${name}` : "view-plots");
+    $("tabs").replaceChildren(...[...plots, ...Object.entries(BOXES)].map(([name, title]) => {
+      const tab = make("button", title, { id: `tab-${name}`, role: "tab" });
+      tab.setAttribute("aria-controls", name in BOXES ? `view-${name}` : "view-plots");
       tab.addEventListener("click", () => open(name));
       return tab;
     }));
   }
-  /* Show a plot, a group of plots or a card */
+  /* Show a plot, a group of plots or another view */
   function open(name, draw = true) {
     view = tabOf(name);
     for (const tab of $("tabs").children) {
-      const own = tab.id === `tab-${view}`;
-      tab.ariaSelected = String(own);
-      tab.tabIndex = own ? 0 : -1;
-      if (own && draw) tab.scrollIntoView({ block: "nearest", inline: "nearest" });
+      const isOpen = tab.id === `tab-${view}`;
+      tab.ariaSelected = String(isOpen);
+      tab.tabIndex = isOpen ? 0 : -1;
+      if (isOpen && draw) tab.scrollIntoView({ block: "nearest", inline: "nearest" });
     }
-    const plots = seenPlots();
+    const plots = visiblePlots();
     $("view-plots").hidden = !plots.length;
     $("view-plots").setAttribute("aria-labelledby", `tab-${view}`);
-    for (const figure of document.querySelectorAll("[data-plot]")) figure.hidden = !plots.includes(figure.dataset.plot);
-    for (const card of Object.keys(CARDS)) $(`view-${card}`).hidden = card !== view;
+    for (const figure of queryAll("[data-plot]")) figure.hidden = !plots.includes(figure.dataset.plot);
+    for (const box of Object.keys(BOXES)) $(`view-${box}`).hidden = box !== view;
     if (draw) { axisShown = null; show(); }
   }
   $("tabs").addEventListener("keydown", (event) => {
-    const all = [...$("tabs").children], at = all.findIndex((tab) => tab.tabIndex === 0);
-    const to = { ArrowRight: at + 1, ArrowLeft: at - 1, Home: 0, End: all.length - 1 }[event.key];
+    const all = [...$("tabs").children], current = all.findIndex((tab) => tab.tabIndex === 0);
+    const to = { ArrowRight: current + 1, ArrowLeft: current - 1, Home: 0, End: all.length - 1 }[event.key];
     if (to === undefined) return;
     const tab = all[(to + all.length) % all.length];
     tab.click();
@@ -238,21 +238,21 @@ const Explore = (async () => {
     setHeights();
     open(view);
   });
-  new ResizeObserver(() => document.body.style.setProperty("--sheet", `${document.querySelector("aside").offsetHeight}px`))
-    .observe(document.querySelector("aside"));
+  const sheet = query("aside");
+  new ResizeObserver(() => document.body.style.setProperty("--sheet", `${sheet.offsetHeight}px`)).observe(sheet);
   /* On a phone the settings are a sheet at the bottom; a swipe or a button opens and closes it */
   function openSheet(isOpen) {
-    document.querySelector("aside").classList.toggle("open", isOpen);
+    sheet.classList.toggle("open", isOpen);
     $("handle").ariaExpanded = String(isOpen);
     $("all").textContent = isOpen ? "Less ▾" : "All ▴";
   }
   const isSheetOpen = () => $("handle").ariaExpanded === "true";
   let swipedFrom = null;
-  for (const id of ["handle", "all"]) $(id).addEventListener("click", () => openSheet(!isSheetOpen()));
-  document.querySelector("aside").addEventListener("touchstart", (event) => {
+  for (const id of ["handle", "all"]) onClick(id, () => openSheet(!isSheetOpen()));
+  sheet.addEventListener("touchstart", (event) => {
     swipedFrom = event.target.matches("input") ? null : event.touches[0].clientY;
   }, { passive: true });
-  document.querySelector("aside").addEventListener("touchend", (event) => {
+  sheet.addEventListener("touchend", (event) => {
     const by = swipedFrom === null ? 0 : event.changedTouches[0].clientY - swipedFrom;
     if (Math.abs(by) > 30) openSheet(by < 0);
   });
@@ -268,46 +268,46 @@ const Explore = (async () => {
     return models.get(name);
   };
   const setSource = (name, columns) => { model(`${name}-source`).data = columns; };
-  /* Set a source in each visible plot that has it */
-  const setVisibleSources = (name, columns) => {
-    for (const plot of seenPlots()) {
+  /* Draw columns, reduced to a few thousand points, in each visible plot with this source; add them to `drawn` */
+  function drawSource(drawn, name, columns, keys) {
+    drawn[name] = decimate(columns, keys);
+    for (const plot of visiblePlots()) {
       const source = model(`${plot}:${name}-source`);
-      if (source !== null) source.data = columns;
+      if (source !== null) source.data = drawn[name];
     }
-  };
+  }
   const timeRange = model("time");
   const figures = Object.keys(PLOTS).map(model).filter(Boolean);
   function setHeights() {
     for (const plot of figures) if (plot.name !== "strip") plot.height = NARROW.matches ? 175 : 205;
-    model("position").min_border_left = NARROW.matches ? 50 : 82; // aligned with the events below it
+    model("position").min_border_left = NARROW.matches ? 50 : 82; // same left border as the event plot below it
   }
   setHeights();
 
-  /* Rows within the visible time range; long series are reduced to the extremes of each bin */
+  /* Rows within the visible time range; of long series only minimum and maximum of `keys` in each time bin */
   let pointLimit = MAX_POINTS;
   function decimate(columns, keys) {
     const t = columns.t, n = t.length;
-    const below = (x) => { let a = 0, b = n; while (a < b) { const c = (a + b) >> 1;
-      if (t[c] < x) a = c + 1; else b = c; } return a; };
-    const from = Math.max(below(timeRange.start) - 1, 0), to = Math.min(below(timeRange.end) + 2, n);
+    const from = Math.max(t.findIndex((time) => time >= timeRange.start) - 1, 0);
+    const last = t.findIndex((time) => time >= timeRange.end), to = last < 0 ? n : Math.min(last + 2, n);
     const names = Object.keys(columns), out = {};
     if (to - from <= pointLimit) {
       for (const name of names) out[name] = columns[name].subarray(from, to);
       return out;
     }
-    const bins = Math.floor(pointLimit / 2 / keys.length), kept = [];
+    const bins = Math.floor(pointLimit / 2 / keys.length), indices = [];
     for (let b = 0; b < bins; b++) {
       const low = from + Math.floor((to - from) * b / bins);
-      const high = from + Math.floor((to - from) * (b + 1) / bins), own = new Set();
+      const high = from + Math.floor((to - from) * (b + 1) / bins), extremes = new Set();
       for (const key of keys) {
         const y = columns[key];
         let least = low, most = low;
         for (let i = low; i < high; i++) { if (y[i] < y[least]) least = i; if (y[i] > y[most]) most = i; }
-        own.add(least).add(most);
+        extremes.add(least).add(most);
       }
-      kept.push(...[...own].sort((a, b) => a - b));
+      indices.push(...[...extremes].sort((a, b) => a - b));
     }
-    for (const name of names) out[name] = Float64Array.from(kept, (i) => columns[name][i]);
+    for (const name of names) out[name] = Float64Array.from(indices, (i) => columns[name][i]);
     return out;
   }
   const EMPTY = new Float64Array(0);
@@ -317,7 +317,7 @@ const Explore = (async () => {
 
   /* Set the vertical range of a visible plot */
   function setRange(name, ends, log = false) {
-    const range = isSeen(name) ? model(name)?.y_range : undefined;
+    const range = isVisible(name) ? model(name)?.y_range : undefined;
     if (!range) return;
     let [low, high] = ends();
     if (!(high > low)) [low, high] = Number.isFinite(low) ? [0.9 * low - 0.1, 1.1 * low + 0.1] : [0.1, 1];
@@ -326,15 +326,15 @@ const Explore = (async () => {
   }
   /* Draw arrow heads at the edge for values outside the plot */
   function drawOutsideArrows(drawn) {
-    const rows = (...parts) => parts.flatMap(([part, column]) => part === undefined ? []
-      : Array.from(part.t, (t, i) => [t, part[column][i]]));
-    for (const [plot, name, points] of [["position", "beyond", rows([drawn.measured, "z"])],
-      ["innovation", "beyond", rows([drawn.updates, "x"])],
-      ["innovation", "beyond_ekf2", rows([drawn.fused, "x"], [drawn.rejected, "x"])]]) {
-      const source = isSeen(plot) ? model(`${plot}:${name}-source`) : null;
+    const points = (column, ...names) => names.flatMap((name) =>
+      Array.from(drawn[name]?.t ?? [], (t, i) => [t, drawn[name][column][i]]));
+    for (const [plot, name, all] of [["position", "beyond", points("z", "measured")],
+      ["innovation", "beyond", points("x", "updates")],
+      ["innovation", "beyond_ekf2", points("x", "fused", "rejected")]]) {
+      const source = isVisible(plot) ? model(`${plot}:${name}-source`) : null;
       if (source === null) continue;
       const { start: low, end: high } = model(plot).y_range, inside = 0.035 * (high - low);
-      const out = points.filter(([, y]) => y < low || y > high);
+      const out = all.filter(([, y]) => y < low || y > high);
       source.data = { t: out.map(([t]) => t), y: out.map(([, y]) => y > high ? high - inside : low + inside),
         turn: out.map(([, y]) => y > high ? 0 : Math.PI) };
     }
@@ -349,13 +349,13 @@ const Explore = (async () => {
   }
 
   // ------------------------------------------------------------------ KF run and its numbers
-  // run and numbers are null if the segment has too few measurements
+  // `run` and `numbers` of KF are null if the analysed segment has too few measurements
   const result = { run: null, axis: null, numbers: null };
   function replay() {
     const axis = axisNow(), run = Engine.replay(flight, axis, settings);
     Object.assign(result, { run, axis, numbers: run && numbers(axis, run) });
   }
-  /* Statistics of KF: against the source, EKF2 and ground truth, at the times of EKF2's state */
+  /* Statistics of a KF run: innovations, difference to EKF2 and error against ground truth, at the times of EKF2's state */
   function numbers(axis, run) {
     const kf = Engine.assess(run.updates.nu, run.updates.s) ?? { count: run.updates.nu.length };
     if (kf.nis !== undefined) {
@@ -363,23 +363,24 @@ const Explore = (async () => {
       const [low, high] = axis.bands.map((ends) => ends[kf.count - 1]);
       kf.interval = [Math.sqrt(kf.nis / high), Math.sqrt(kf.nis / low)];
     }
-    let times = run.steps.time;
-    if (typeof axis.ekf2 !== "string") {
-      const [time, p, v] = axis.ekf2.state, at = Engine.stateAt(run, time);
-      kf.ekf2P = Engine.rmse(at.p, p);
-      kf.ekf2V = Engine.rmse(at.v, v);
+    let times = run.steps.time, state = run.steps;
+    if (!isText(axis.ekf2)) {
+      const [time, p, v] = axis.ekf2.state;
       times = time;
+      state = Engine.stateAt(run, time);
+      kf.ekf2P = Engine.rmse(state.p, p);
+      kf.ekf2V = Engine.rmse(state.v, v);
     }
-    if (typeof axis.truth !== "string") {
-      const at = Engine.stateAt(run, times), { p, v } = axis.truth, known = Engine.interp(times, p[0], p[1], NaN);
-      kf.truthP = Engine.rmse(at.p, known);
-      kf.truthV = v === null ? null : Engine.rmse(at.v, Engine.interp(times, v[0], v[1], NaN));
-      kf.truth = Engine.rmse(at.p.map((x, i) => (x - known[i]) / Math.sqrt(at.p00[i])), new Float64Array(times.length));
+    if (!isText(axis.truth)) {
+      const { p, v } = axis.truth, expected = Engine.interp(times, ...p, NaN);
+      kf.truthP = Engine.rmse(state.p, expected);
+      kf.truthV = v && Engine.rmse(state.v, Engine.interp(times, ...v, NaN));
+      kf.truth = Engine.rmse(state.p.map((x, i) => (x - expected[i]) / Math.sqrt(state.p00[i])), new Float64Array(times.length));
     }
     return kf;
   }
-  const ekf2Of = (axis) => typeof axis.ekf2 === "string" ? { why: axis.ekf2 }
-    : { ...axis.ekf2.summary, source: axis.verdicts[2].ratio, truth: axis.verdicts[3].ratio };
+  const ekf2Of = (axis) => isText(axis.ekf2) ? { why: axis.ekf2 }
+    : { ...axis.ekf2.summary, source: axis.ratios[2], truth: axis.ratios[3] };
 
   // ------------------------------------------------------------------ card and table
   const card = Card.start(ranges, Practice.suffix);
@@ -388,10 +389,9 @@ const Explore = (async () => {
     const before = axis.name === flight.main ? analysedNumbers : null;
     if (kf?.truthP) {
       const { truthP } = ekf2Of(axis);
-      return `Position RMSE against ground truth along ${axis.called}: ${value(kf.truthP, before?.truthP)}`
-        + `${truthP ? `, EKF2 ${Card.formatMetres(truthP)}` : ""}.`;
+      return `Position RMSE against ground truth along ${axis.called}: ${value(kf.truthP, before?.truthP)}${truthP ? `, EKF2 ${Card.formatMetres(truthP)}` : ""}.`;
     }
-    return kf?.ekf2P ? `KF − EKF2 along ${axis.called}: ${Card.formatMetres(kf.ekf2P)} RMS.` : "";
+    return kf?.ekf2P ? `The position difference KF − EKF2 along ${axis.called} is ${Card.formatMetres(kf.ekf2P)} RMS.` : "";
   }
   let analysedNumbers = null;
   function drawCard(result) {
@@ -401,10 +401,10 @@ const Explore = (async () => {
       analysedNumbers = run === null ? {} : numbers(axis, run);
     }
     const now = card.verdicts(result.numbers);
-    card.move(now, result.axis, isChanged());
-    card.say(now, effect(result), isChanged());
+    card.moveMarks(now, result.axis, isChanged());
+    card.showTexts(now, effect(result), isChanged());
   }
-  $("card").addEventListener("click", ({ target }) => {
+  onClick("card", ({ target }) => {
     if (target.dataset.apply === undefined) return;
     const changes = {};
     for (const { id, key } of SETTINGS) {
@@ -414,22 +414,21 @@ const Explore = (async () => {
     set({ ...flight.settings, ...changes });
   });
   const isChanged = () => ["sigmaA", "sigmaZ", "dt", "input", "offset"].some((key) => settings[key] !== flight.settings[key]);
+  const fixed = (key, unit) => (x) => x[key]?.toFixed(3).concat(unit);
   const ROWS = [
     ["● innovation ÷ √S, RMS", (x) => x.source && Card.formatRatio(x.source)],
     ["◆ error ÷ σ, RMS", (x) => x.truth && Card.formatRatio(x.truth)],
-    ["Outside ±2√S (expected 5 %)", (x) => x.outside === undefined ? undefined
-      : `${(100 * x.outside).toFixed(1)} %`],
-    ["Lag-1 autocorrelation of ν", (x) => x.lag1?.toFixed(2)],
-    ["Measurements", (x) => x.count && String(x.count)],
-    ["Position: KF - EKF2, RMS", (x) => x.ekf2P?.toFixed(3).concat(" m")],
-    ["Velocity: KF - EKF2, RMS", (x) => x.ekf2V?.toFixed(3).concat(" m/s")],
-    ["Position RMSE", (x) => x.truthP?.toFixed(3).concat(" m")],
-    ["Velocity RMSE", (x) => x.truthV?.toFixed(3).concat(" m/s")],
+    ["Innovations outside ±2√S (expected 5 %)", (x) => x.outside === undefined ? undefined : `${(100 * x.outside).toFixed(1)} %`],
+    ["Lag-1 autocorrelation of the innovations", (x) => x.lag1?.toFixed(2)],
+    ["Number of measurements", (x) => x.count && String(x.count)],
+    ["KF − EKF2 position difference, RMS", fixed("ekf2P", " m")],
+    ["KF − EKF2 velocity difference, RMS", fixed("ekf2V", " m/s")],
+    ["Position RMSE", fixed("truthP", " m")],
+    ["Velocity RMSE", fixed("truthV", " m/s")],
   ];
   const body = $("table").tBodies[0];
   for (const [title] of ROWS) {
-    body.insertRow().append(make("th", title, { scope: "row" }), make("td", "", { className: "kf" }),
-      make("td", "", { className: "ekf2" }));
+    body.insertRow().append(make("th", title, { scope: "row" }), make("td", "", "kf"), make("td", "", "ekf2"));
   }
   function drawTable({ axis, numbers: kf }) {
     const ekf2 = ekf2Of(axis);
@@ -440,46 +439,45 @@ const Explore = (async () => {
       row.hidden = (left ?? right) === undefined && i > 4;
     });
     const missing = [];
-    if (kf === null) missing.push("KF: the segment has too few measurements.");
-    if (ekf2.why) missing.push(`EKF2: ${ekf2.why}.`);
-    if (typeof axis.truth === "string") missing.push(`Ground truth: ${axis.truth}.`);
+    if (kf === null) missing.push("KF is not evaluated: the segment has too few measurements.");
+    if (ekf2.why) missing.push(`EKF2 is not evaluated: ${ekf2.why}.`);
+    if (isText(axis.truth)) missing.push(`Ground truth is missing: ${axis.truth}.`);
     $("why").textContent = missing.join(" ");
   }
 
   // ------------------------------------------------------------------ plots over time
   function drawKf({ run, axis }) {
     const { steps, updates } = run;
-    const n = steps.time.length, m = updates.nu.length, size = n + m;
-    const sawtooth = table(["t", "p", "v", "sp", "sv"], Array.from({ length: 5 }, () => new Float64Array(size)));
-    for (let i = 0, k = 0, u = 0; i < n; i++) {
-      if (u < m && updates.step[u] === i) { // before the update, then after it
-        sawtooth.t[k] = steps.time[i]; sawtooth.p[k] = updates.p[u]; sawtooth.v[k] = updates.v[u];
-        sawtooth.sp[k] = Math.sqrt(updates.p00[u]); sawtooth.sv[k++] = Math.sqrt(updates.p11[u++]);
-      }
-      sawtooth.t[k] = steps.time[i]; sawtooth.p[k] = steps.p[i]; sawtooth.v[k] = steps.v[i];
-      sawtooth.sp[k] = Math.sqrt(steps.p00[i]); sawtooth.sv[k++] = Math.sqrt(steps.p11[i]);
+    const n = steps.time.length, m = updates.nu.length;
+    const sawtooth = table(["t", "p", "v", "sp", "sv"], Array.from({ length: 5 }, () => new Float64Array(n + m)));
+    let row = 0;
+    const add = (step, { p, v, p00, p11 }, i) => {
+      sawtooth.t[row] = steps.time[step]; sawtooth.p[row] = p[i]; sawtooth.v[row] = v[i];
+      sawtooth.sp[row] = Math.sqrt(p00[i]); sawtooth.sv[row++] = Math.sqrt(p11[i]);
+    };
+    for (let i = 0, u = 0; i < n; i++) {
+      if (u < m && updates.step[u] === i) add(i, updates, u++); // the state before the update is an additional row
+      add(i, steps, i);
     }
     const rows = { t: updates.time, x: updates.nu.map((nu, i) => nu / Math.sqrt(updates.s[i])),
       k0: updates.k0, k1: updates.k1, running: running(updates.nu, updates.s) };
-    const seen = { steps: decimate(sawtooth, ["p", "sp"]), updates: decimate(rows, ["x"]) };
-    setVisibleSources("steps", seen.steps);
-    setVisibleSources("updates", seen.updates);
-    if (isSeen("position")) {
-      seen.measured = decimate({ t: shifted(axis.time, settings.offset), z: axis.z }, ["z"]);
-      setVisibleSources("measured", seen.measured);
+    const drawn = {};
+    drawSource(drawn, "steps", sawtooth, ["p", "sp"]);
+    drawSource(drawn, "updates", rows, ["x"]);
+    if (isVisible("position")) {
+      drawSource(drawn, "measured", { t: shifted(axis.time, settings.offset), z: axis.z }, ["z"]);
     }
-    const known = reference(axis, steps.time);
-    if (isSeen("error") && known !== null) {
-      const e = steps.p.map((p, i) => p - known[i]), plus = steps.p00.map((x) => 2 * Math.sqrt(x));
-      seen.error = decimate({ t: steps.time, e, plus, minus: plus.map((x) => -x) }, ["e", "plus"]);
-      setVisibleSources("error", seen.error);
+    const expected = reference(axis, steps.time);
+    if (isVisible("error") && expected !== null) {
+      const e = steps.p.map((p, i) => p - expected[i]), plus = steps.p00.map((x) => 2 * Math.sqrt(x));
+      drawSource(drawn, "error", { t: steps.time, e, plus, minus: plus.map((x) => -x) }, ["e", "plus"]);
     }
-    return seen;
+    return drawn;
   }
-  /* Ground truth at some times, else EKF2, else null */
+  /* Position of ground truth at the given times; without ground truth of EKF2, without both null */
   function reference(axis, times) {
-    if (typeof axis.truth !== "string") return Engine.interp(times, ...axis.truth.p, NaN);
-    return typeof axis.ekf2 === "string" ? null : Engine.interp(times, axis.ekf2.state[0], axis.ekf2.state[1], NaN);
+    if (!isText(axis.truth)) return Engine.interp(times, ...axis.truth.p, NaN);
+    return isText(axis.ekf2) ? null : Engine.interp(times, ...axis.ekf2.state.slice(0, 2), NaN);
   }
   function running(nu, s) {
     const over = ranges.running, out = new Float64Array(nu.length).fill(NaN);
@@ -492,9 +490,8 @@ const Explore = (async () => {
   }
   /* Draw EKF2 and ground truth, which depend only on axis and zoom */
   function drawReferences(axis) {
-    const seen = {};
-    const take = (name, columns, keys) => { seen[name] = decimate(columns, keys); setVisibleSources(name, seen[name]); };
-    if (typeof axis.ekf2 !== "string") {
+    const drawn = {}, take = (...source) => drawSource(drawn, ...source);
+    if (!isText(axis.ekf2)) {
       const { state, variance, innovations } = axis.ekf2;
       take("state", table(["t", "p", "v"], state), ["p", "v"]);
       take("variance", table(["t", "sp", "sv"], variance), ["sp", "sv"]);
@@ -506,55 +503,54 @@ const Explore = (async () => {
       }
       take("running", { t, running: running(rows.nu, rows.sigma.map((s) => s * s)) }, ["running"]);
     }
-    if (typeof axis.truth !== "string") {
+    if (!isText(axis.truth)) {
       const { p, v } = axis.truth;
       take("truth_p", { t: p[0], p: p[1] }, ["p"]);
       if (v !== null) take("truth_v", { t: v[0], v: v[1] }, ["v"]);
-      if (typeof axis.ekf2 !== "string") {
-        const [time, own] = axis.ekf2.state;
-        const known = Engine.interp(time, ...p, NaN);
-        take("error_ekf2", { t: time, e: own.map((x, i) => x - known[i]) }, ["e"]);
+      if (!isText(axis.ekf2)) {
+        const [t, position] = axis.ekf2.state, expected = Engine.interp(t, ...p, NaN);
+        take("error_ekf2", { t, e: position.map((x, i) => x - expected[i]) }, ["e"]);
       }
     }
-    return seen;
+    return drawn;
   }
-  function setRanges(kf, others) {
-    const of = (part, column) => part?.[column] ?? EMPTY;
-    const { steps, updates } = kf;
-    setRange("position", () => extent(steps.p, of(others.state, "p"), of(others.truth_p, "p")));
-    setRange("velocity", () => extent(steps.v, of(others.state, "v"), of(others.truth_v, "v")));
-    setRange("error", () => extent(of(kf.error, "e"), of(others.error_ekf2, "e")));
-    setRange("sigma_p", () => extent(steps.sp, of(others.variance, "sp")), true);
-    setRange("sigma_v", () => extent(steps.sv, of(others.variance, "sv")), true);
-    setRange("running", () => extent(updates.running, of(others.running, "running"), ranges.bands.source), true);
+  /* Draw KF and set the vertical ranges of the plots to the drawn values */
+  function drawPlots() {
+    const drawn = { ...drawnReferences, ...drawKf(result) }, { steps, updates } = drawn;
+    const of = (source, column) => drawn[source]?.[column] ?? EMPTY;
+    setRange("position", () => extent(steps.p, of("state", "p"), of("truth_p", "p")));
+    setRange("velocity", () => extent(steps.v, of("state", "v"), of("truth_v", "v")));
+    setRange("error", () => extent(of("error", "e"), of("error_ekf2", "e")));
+    setRange("sigma_p", () => extent(steps.sp, of("variance", "sp")), true);
+    setRange("sigma_v", () => extent(steps.sv, of("variance", "sv")), true);
+    setRange("running", () => extent(updates.running, of("running", "running"), ranges.bands.source), true);
     setRange("gain", () => extent(updates.k0, updates.k1, [0]));
-    drawOutsideArrows({ ...others, ...kf });
+    drawOutsideArrows(drawn);
   }
 
-  /* Titles of the plots with RMSE and shares */
+  /* Add RMSE and the percentage of large innovations to the titles of the plots */
   function drawTitles({ axis, run, numbers: kf }) {
     const title = (name, text) => {
-      const span = document.querySelector(`[data-plot=${name}] figcaption span`);
+      const span = query(`[data-plot=${name}] figcaption span`);
       if (span !== null) span.textContent = text && `· ${text}`;
     };
-    const ekf2 = ekf2Of(axis), percent = (x) => `${(100 * x).toFixed(0)} %`;
-    const both = (format) => [["KF", kf], ["EKF2", ekf2]].flatMap(([name, one]) => {
-      const text = one && format(one);
+    const both = (format) => [["KF", kf], ["EKF2", ekf2Of(axis)]].flatMap(([name, values]) => {
+      const text = values && format(values);
       return text ? [`${name} ${text}`] : [];
     }).join(", ");
-    title("innovation", `outside ±2: ${both((one) => one.outside === undefined ? "" : percent(one.outside))}; expected 5 %`);
-    title("running", `over ${ranges.running} measurements; green: consistent`);
-    title("gain", "solid: position, dotted: velocity (1/s)");
+    title("innovation", `values outside ±2 (expected 5 %): ${both(({ outside }) => outside === undefined ? "" : `${(100 * outside).toFixed(0)} %`)}`);
+    title("running", `RMS over ${ranges.running} measurements; green: consistent`);
+    title("gain", "solid: position gain, dotted: velocity gain (1/s)");
     if (run === null) return;
     const sigmas = Array.from(run.steps.p00, Math.sqrt).sort((a, b) => a - b);
-    const at = (share) => sigmas[Math.floor(share * (sigmas.length - 1))], [low, middle, high] = [0.02, 0.5, 1].map(at);
+    const quantile = (share) => sigmas[Math.floor(share * (sigmas.length - 1))], [low, middle, high] = [0.02, 0.5, 1].map(quantile);
     const sigma = high < 1.5 * low ? Card.formatMetres(middle) : `${Card.formatMetres(low).slice(0, -2)} to ${Card.formatMetres(high)}`;
-    const gaps = flight.events.gap.length ? "; hatched: no position" : "";
-    const shaded = `shaded: ±2σ as KF reports it (σ ${sigma})${gaps}`;
-    if (typeof axis.truth !== "string") {
-      title("error", `RMSE ${both((one) => one.truthP && Card.formatMetres(one.truthP))} · ${shaded}`);
+    const gaps = flight.events.gap.length ? "; hatched: gap in the position source" : "";
+    const shaded = `shaded: ±2σ reported by KF (σ ${sigma})${gaps}`;
+    if (!isText(axis.truth)) {
+      title("error", `RMSE ${both(({ truthP }) => truthP && Card.formatMetres(truthP))} · ${shaded}`);
     } else if (kf.ekf2P) {
-      document.querySelector("[data-plot=error] b").textContent = "KF − EKF2, position (m)";
+      query("[data-plot=error] b").textContent = "KF − EKF2 position difference (m)";
       title("error", `RMS ${Card.formatMetres(kf.ekf2P)} · ${shaded}`);
     }
   }
@@ -564,9 +560,8 @@ const Explore = (async () => {
   let mapShown = null;
   function drawMap() {
     const map = mapNow(), plot = model("map");
-    const known = typeof map !== "string";
-    $("map").hidden = !known;
-    if (!known) return;
+    $("map").hidden = isText(map);
+    if (isText(map)) return;
     const last = trail.x.length - 1;
     if (trail.x[last] !== settings.sigmaA || trail.y[last] !== settings.sigmaZ) {
       trail.x.push(settings.sigmaA);
@@ -576,11 +571,11 @@ const Explore = (async () => {
     const [[a0, a1], [z0, z1]] = [map.sigmaA, map.sigmaZ], name = axisNow().map;
     if (mapShown !== name) {
       mapShown = name;
-      for (const one of plot.renderers) {
-        if (one.name?.startsWith("map:")) one.visible = one.name === `map:${name}`;
+      for (const item of plot.renderers) {
+        if (item.name?.startsWith("map:")) item.visible = item.name === `map:${name}`;
       }
-      const likely = map.likely.every((x) => x !== null);
-      setSource("best", likely ? { x: [map.likely[0]], y: [map.likely[1]] } : { x: [], y: [] });
+      const [a, z] = map.likely;
+      setSource("best", map.likely.includes(null) ? { x: [], y: [] } : { x: [a], y: [z] });
     }
     setSource("trail", { x: [...trail.x], y: [...trail.y] });
     setSource("point", { x: [settings.sigmaA], y: [settings.sigmaZ] });
@@ -589,30 +584,27 @@ const Explore = (async () => {
   }
   function mapNote() {
     const map = mapNow(), initial = flight.settings;
-    if (typeof map === "string") return `No map: ${map}.`;
+    if (isText(map)) return `The likelihood map is missing: ${map}.`;
     const axis = axisNow().map === "horizontal" ? "North and east together" : `Axis ${axisNow().map}`;
-    const differs = initial.dt !== settings.dt || initial.offset !== settings.offset || initial.input !== settings.input;
-    return `${axis}, ${map.count} measurements, DT ${initial.dt} s, input ${initial.input}, clock offset `
-      + `${round(initial.offset, 4)} s. Darker: higher likelihood. Cross: maximum. One shade: half a standard `
-      + `deviation.${differs ? " The map is not valid for the current DT, input or clock offset." : ""}`;
+    const differs = ["dt", "offset", "input"].some((key) => initial[key] !== settings[key]);
+    return `${axis}, ${map.count} measurements, DT ${initial.dt} s, input ${initial.input}, time offset ${round(initial.offset, 4)} s. Darker: higher likelihood. Cross: maximum. Dot: current settings. One shade: 0.5 σ.${differs ? " The map is not valid for the current DT, input or time offset." : ""}`;
   }
 
   // ------------------------------------------------------------------ command
-  const optionText = (x) => String(round(x, 12));
   function command() {
     const { base, fixed, input, default_input: defaultInput } = flight.command, lesson = ranges.lesson;
-    const parts = [settings.offset !== flight.settings.offset ? fixed : base];
+    const words = [settings.offset !== flight.settings.offset ? fixed : base];
     for (const setting of SETTINGS) {
       const standard = setting.key === "offset" ? 0 : lesson[setting.key];
-      if (setting.key === "offset" && why) continue;
-      if (settings[setting.key] !== standard) parts.push(`--${setting.id} ${optionText(settings[setting.key])}`);
+      if (setting.key === "offset" && fixedReason) continue;
+      if (settings[setting.key] !== standard) words.push(`--${setting.id} ${round(settings[setting.key], 12)}`);
     }
-    if (settings.input !== defaultInput || input !== null) parts.push(`--input ${settings.input}`);
-    return parts.join(" ");
+    if (settings.input !== defaultInput || input !== null) words.push(`--input ${settings.input}`);
+    return words.join(" ");
   }
-  for (const button of document.querySelectorAll("[data-copy]")) {
+  for (const button of queryAll("[data-copy]")) {
     button.addEventListener("click", async () => {
-      button.textContent = await copyText($(button.dataset.copy)) ? "copied" : "press Ctrl+C";
+      button.textContent = await copyText($(button.dataset.copy)) ? "Copied" : "Press Ctrl+C";
     });
   }
   async function copyText(node) {
@@ -626,9 +618,8 @@ const Explore = (async () => {
   }
 
   // ------------------------------------------------------------------ whole page
-  let axisShown = null;
-  let others = null;
-  /* Run KF and draw the visible views; quick (during a drag): without texts and tables */
+  let axisShown = null, drawnReferences = null; // null: to be drawn
+  /* Run KF and draw the visible views; `quick`, during a drag of a slider: without texts and tables */
   function show(quick = false) {
     pointLimit = quick ? MAX_DRAG_POINTS : MAX_POINTS;
     for (const setting of SETTINGS) {
@@ -640,56 +631,56 @@ const Explore = (async () => {
     axisShown = settings.axis;
     replay();
     if (isNewAxis) {
-      others = drawReferences(result.axis);
+      drawnReferences = drawReferences(result.axis);
       card.showAxis(settings.axis, flight.main);
       SETTINGS.forEach(markLikely);
     }
-    if (result.run) setRanges(drawKf(result), others);
+    if (result.run) drawPlots();
     drawCard(result);
     drawTitles(result);
-    if (isSeen("map")) drawMap();
+    if (isVisible("map")) drawMap();
     if (quick) return;
     clearTimeout(finalDraw);
     for (const name of ["axis", "input"]) {
-      for (const radio of document.querySelectorAll(`[name=${name}]`)) radio.checked = radio.value === settings[name];
+      for (const radio of queryAll(`[name=${name}]`)) radio.checked = radio.value === settings[name];
     }
     const { axis } = result, map = mapNow();
     $("along").textContent = `· ${axis.along}`;
     $("axis-note").textContent = axis.note;
-    $("likely").disabled = typeof map === "string" || map.likely.includes(null);
-    $("ekf2-r").disabled = typeof axis.ekf2 === "string" || axis.ekf2.r === null;
+    $("likely").disabled = isText(map) || map.likely.includes(null);
+    $("ekf2-r").disabled = isText(axis.ekf2) || axis.ekf2.r === null;
     $("map-note").textContent = mapNote();
     drawTable(result);
     $("command").textContent = command();
-    if (isNewAxis) times.strip(axis);
-    times.plan();
+    if (isNewAxis) times.drawEvents(axis);
+    times.drawTrack();
     stepper.draw();
     toAddress();
   }
   /* Draw the same KF run again after a zoom */
   function redraw() {
-    others = drawReferences(result.axis);
-    if (result.run) setRanges(drawKf(result), others);
-    times.plan();
+    drawnReferences = drawReferences(result.axis);
+    if (result.run) drawPlots();
+    times.drawTrack();
   }
 
-  const stepper = Step.start({ settings, chosen, result, model, setSource, figures, isSeen,
-    moved: (time) => { times.show(time); toAddress(); } });
-  const keys = { n: () => stepper.go((chosen.step ?? -1) + 1), p: () => stepper.go((chosen.step ?? 1) - 1),
-    " ": () => { open("step"); stepper.play(); }, s: () => stepper.faster(-1), f: () => stepper.faster(1) };
-  const times = Times.start({ flight, settings, model, setSource, timeRange, figures, redraw, shifted, isSeen, keys, open });
+  const stepper = Step.start({ settings, selected, result, model, setSource, figures, isVisible,
+    moved: (time) => { times.showTime(time); toAddress(); } });
+  const keys = { n: stepper.next, p: stepper.previous, " ": () => { open("step"); stepper.play(); },
+    s: stepper.slower, f: stepper.faster };
+  const times = Times.start({ flight, settings, model, setSource, timeRange, figures, redraw, shifted, isVisible, keys });
   const { flown, command: example, why: noReplay } = flight.ekf2;
   for (const [name, value] of Object.entries(flown)) $("flown").append(make("dt", name), make("dd", value));
-  if (!Object.keys(flown).length) $("flown").append(make("dt", "The log contains none of its parameters."));
+  if (!Object.keys(flown).length) $("flown").append(make("dt", "The log contains none of the EKF2 parameters of this source."));
   $("whatif-command").textContent = example ?? "";
-  if (noReplay) $("whatif").replaceChildren(make("p", `No replay: ${noReplay}.`, { className: "note" }));
+  if (noReplay) $("whatif").replaceChildren(make("p", `EKF2 cannot be replayed: ${noReplay}.`, "note"));
   drawTabs();
   addEventListener("hashchange", () => { fromAddress(); axisShown = null; show(); });
   open(view, false);
   fromAddress();
   show();
-  const shared = { look: times.view, settings, set, show, open, result, flight, model,
-    numbers, timeRange, chosen, stepper, axisNow, mapNow, ekf2Of, view: () => view };
+  const shared = { setSpan: times.setSpan, settings, set, open, result, flight, model,
+    numbers, timeRange, selected, stepper, axisNow, mapNow, ekf2Of, view: () => view };
   Tour.start(shared);
   Practice.start(shared);
   return shared;

@@ -1,20 +1,19 @@
-"""The page as one HTML file: Bokeh, the flight's data, the KF engine and the user interface."""
+"""Explore page as one HTML file: Bokeh, data of the flight, KF in JavaScript, user interface."""
 
 from collections.abc import Mapping
 from importlib.metadata import version
-from typing import Any
 
 from bokeh.resources import Resources
 
 from px4fuse.analysis import Analysis
-from px4fuse.explore.data import flight_data, ranges
+from px4fuse.explore.data import Data, flight_data, ranges
 from px4fuse.explore.figures import FIGURES, document_json, has_reference
 from px4fuse.explore.packing import Packer
 from px4fuse.report.card_html import axis_figures, card_html, card_of, card_style
 from px4fuse.webpage.safe import clean_values, inert_json, load_template, policy_hash, read_asset
 
-MAX_CHARACTERS = 2000  # longer texts from a log are shortened
-SCRIPTS = ("dom", "card", "step", "times", "tour")
+MAX_CHARACTERS = 2000  # maximum length of a text from a log; longer ones are shortened
+SCRIPTS = ("card", "step", "times", "tour")
 PACKAGE = "px4fuse.explore"
 
 
@@ -45,8 +44,8 @@ def html_text(analysis: Analysis) -> str:
     )
 
 
-def data_scripts(data: dict[str, Any], analysis: Analysis, packer: Packer, suffix: str = "") -> str:
-    """Return the elements with the data of one flight, which are not executed and not shown.
+def data_scripts(data: Data, analysis: Analysis, packer: Packer, suffix: str = "") -> str:
+    """Return HTML elements with the data of one flight, which browsers neither execute nor show.
 
     Parameters
     ----------
@@ -73,7 +72,7 @@ def data_scripts(data: dict[str, Any], analysis: Analysis, packer: Packer, suffi
 
 def page_text(
     data_elements: str,
-    data: dict[str, Any],
+    data: Data,
     *,
     command: str,
     title: str,
@@ -108,9 +107,8 @@ def page_text(
         # the log level
         "bokeh": Resources(mode="inline", components=["bokeh"]).js_raw[0],
         "engine": read_asset("engine.js", PACKAGE),
-        "script": "".join(
-            read_asset(f"{name}.js", PACKAGE) for name in (*SCRIPTS, practice, "page")
-        ),
+        "script": read_asset("dom.js")
+        + "".join(read_asset(f"{name}.js", PACKAGE) for name in (*SCRIPTS, practice, "page")),
     }
     return load_template("explore/page.html").render(
         {f"{name}_hash": policy_hash(text) for name, text in scripts_by_name.items()},

@@ -1,24 +1,20 @@
-/* Practice: current flight, given answers and score. The address contains them, so a reload keeps them.
+/* Practice: current flight, answers of the student and score. The page address contains them, so a reload keeps them.
    The solution of a flight is decoded only after the student's answer. */
 const Practice = (() => {
   const count = Number($("quiz").dataset.flights), address = new URLSearchParams(location.hash.slice(1));
   const savedAnswers = (address.get("answers") ?? "").split("~").slice(0, count);
-  // each answer: faults, size and time, separated by "|"
+  // answer to each flight: faults, size and time, separated by "|"
   const answers = Array.from({ length: count }, (_, i) => savedAnswers[i] ?? "");
   const requested = Math.trunc(Number(address.get("flight") ?? 1)) - 1;
   const current = requested >= 0 && requested < count ? requested : 0;
   const isOpen = answers[current] === "";
 
-  async function readSolution(number) {
-    const bytes = Uint8Array.from(atob($(`key-${number}`).textContent), (c) => c.charCodeAt(0));
-    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
-    return JSON.parse(await new Response(stream).text());
-  }
+  const readSolution = (number) => inflate($(`key-${number}`).textContent).json();
   const faultsOf = (answer) => answer.split("|")[0].split(" ");
-  /* 1 point for all mistakes and no wrong choice, 0.5 for one of two and no wrong choice */
+  /* Points of an answer: 1 for all faults of the flight, 0.5 for one of two, 0 with a wrong fault */
   function points(answer, { right }) {
     const chosen = faultsOf(answer);
-    if (chosen.some((one) => !right.includes(one))) return 0;
+    if (chosen.some((fault) => !right.includes(fault))) return 0;
     return chosen.length === right.length ? 1 : 0.5;
   }
   const toAddress = () => ({ flight: current + 1, answers: answers.join("~") });
@@ -29,14 +25,13 @@ const Practice = (() => {
 
   async function start(page) {
     $("quiz-title").textContent = `Flight ${current + 1} of ${count}: find the fault`;
-    // the flight is not a log file
+    // commands need a log file, which a simulated flight does not have
     for (const id of ["as-report", "whatif", "task"]) $(id).hidden = true;
-    for (const one of document.querySelectorAll(".tour-start")) one.hidden = true;
-    const boxes = [...document.querySelectorAll("[name=choice]")];
-    const [, size = "", time = ""] = answers[current].split("|");
-    $("quiz-size").value = size;
-    $("quiz-time").value = time;
-    for (const input of [...boxes, $("quiz-size"), $("quiz-time")]) input.disabled = !isOpen;
+    for (const button of queryAll(".tour-start")) button.hidden = true;
+    const boxes = queryAll("[name=choice]"), fields = [$("quiz-size"), $("quiz-time")];
+    const [, ...typed] = answers[current].split("|");
+    fields.forEach((field, i) => { field.value = typed[i] ?? ""; });
+    for (const input of [...boxes, ...fields]) input.disabled = !isOpen;
     for (const box of boxes) {
       box.checked = faultsOf(answers[current]).includes(box.value);
       box.addEventListener("change", () => {
@@ -47,18 +42,17 @@ const Practice = (() => {
       });
     }
     $("quiz-check").hidden = !isOpen;
-    $("quiz-check").addEventListener("click", () => {
-      const chosen = boxes.filter((box) => box.checked).map((box) => box.value);
-      if (!chosen.length) { $("quiz-message").textContent = "Select at least one."; return; }
-      const typed = ["quiz-size", "quiz-time"].map((id) => $(id).value.replace(/[|~]/g, " ").trim());
-      answers[current] = [chosen.sort().join(" "), ...typed].join("|");
+    onClick("quiz-check", () => {
+      const chosen = boxes.filter(({ checked }) => checked).map(({ value }) => value);
+      if (!chosen.length) { $("quiz-message").textContent = "Select at least one fault, or no mistake."; return; }
+      answers[current] = [chosen.sort().join(" "), ...fields.map(({ value }) => value.replace(/[|~]/g, " ").trim())].join("|");
       goTo(current);
     });
     const nextOpen = answers.findIndex((answer, i) => answer === "" && i !== current);
     $("quiz-next").hidden = isOpen || nextOpen < 0;
-    $("quiz-next").addEventListener("click", () => goTo(nextOpen));
+    onClick("quiz-next", () => goTo(nextOpen));
     $("quiz-again").hidden = answers.every((answer) => answer === "");
-    $("quiz-again").addEventListener("click", () => { answers.fill(""); goTo(0); });
+    onClick("quiz-again", () => { answers.fill(""); goTo(0); });
     await score();
     if (!isOpen) showSolution(page, await readSolution(current), boxes);
   }
@@ -69,35 +63,35 @@ const Practice = (() => {
       sum += points(answer, await readSolution(number));
       done++;
     }
-    $("quiz-score").textContent = done === 0 ? "" : `${sum} of ${done} correct${done === count
-      ? ", set finished" : " so far"}`;
+    $("quiz-score").textContent = done === 0 ? "" : `Score: ${sum} of ${done} answered flights${done === count ? ", all answered" : ""}`;
   }
   /* Show the answer beside the solution, the re-run, and the card of the flight */
   function showSolution(page, solution, boxes) {
     const score = points(answers[current], solution), box = $("quiz-solution");
-    const [faults, size, time] = answers[current].split("|"), column = (name) => solution.mistakes.map((one) => one[name]);
-    const names = faults.split(" ").map((name) => boxes.find(({ value }) => value === name)?.parentElement.textContent.trim());
+    const [, size, time] = answers[current].split("|");
+    const correct = (name) => solution.mistakes.map((mistake) => mistake[name]).join("; ");
+    const faults = boxes.filter(({ checked }) => checked).map(({ parentElement }) => parentElement.textContent.trim());
     const heading = make("h2", { 1: "✓ Correct", 0.5: "Half correct", 0: "✕ Wrong" }[score]);
     box.classList.toggle("right", score === 1);
     const table = make("table"), head = table.createTHead().insertRow();
-    for (const text of ["", "you", "correct"]) head.append(make("th", text, { scope: "col" }));
+    for (const text of ["", "your answer", "correct answer"]) head.append(make("th", text, { scope: "col" }));
     const body = table.createTBody();
-    for (const [name, yours, right] of [["fault", names.join("; "), column("fault").join("; ") || "no mistake"],
-      ["size", size, column("size").join("; ")], ["time", time, column("time").join("; ")]]) {
-      body.insertRow().append(make("th", name, { scope: "row" }), make("td", yours || "–", { dir: "auto" }), make("td", right || "–"));
+    for (const [name, yours, fallback] of [["fault", faults.join("; "), "no mistake"], ["size", size, "–"], ["time", time, "–"]]) {
+      body.insertRow().append(make("th", name, { scope: "row" }), make("td", yours || "–", { dir: "auto" }),
+        make("td", correct(name) || fallback));
     }
     box.replaceChildren(heading, table, make("p", solution.rerun));
     for (const { symptom, view, span } of solution.mistakes) {
-      const button = make("button", "show", { type: "button" });
+      const button = make("button", "Show in the plots");
       button.addEventListener("click", () => {
         page.open(view);
-        if (span !== null) page.look(span[0] - 3, span[1] + 3);
+        if (span !== null) page.setSpan(span[0] - 3, span[1] + 3);
       });
       box.append(make("p", `${symptom} `, { className: "note" }), button);
     }
     box.hidden = false;
-    $("card").innerHTML = solution.card; // escaped by px4fuse; the policy of the page allows no other script
-    for (const button of document.querySelectorAll("[data-apply]")) { // the flight is not a log file
+    $("card").innerHTML = solution.card; // px4fuse has escaped its texts
+    for (const button of queryAll("[data-apply]")) { // without the log file in the command
       button.previousElementSibling.textContent = button.dataset.apply.replace(/^.*? (?=--)/, "");
     }
     page.open(solution.mistakes[0]?.view ?? "errors");

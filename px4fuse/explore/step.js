@@ -1,8 +1,9 @@
 /* Step-by-step view: 2σ ellipse in the phase plane, which grows in each prediction and shrinks along
-   the measurement in each update, with the lesson's equations in numbers. */
+   the measurement in each update, and the equations of the lesson UAT 366, module 2, with numbers. */
 const Step = (() => {
   const CORNERS = 120;
-  const TRAIL = 60; // steps in the trail of means
+  const TRAIL = 60; // number of previous KF steps whose positions and velocities are drawn
+  // duration of a prediction or update in the animation, from slow to fast
   const STEP_TIMES_MS = [1600, 800, 400, 200, 100, 50];
 
   /* Points of the 2σ ellipse, from the Cholesky factor of P */
@@ -17,7 +18,7 @@ const Step = (() => {
     return out;
   }
 
-  /* All predictions and updates of a run in order: i is the step, u the measurement or -1 */
+  /* All predictions and updates of a KF run in order: `i` is the index of the step, `u` of the measurement or -1 */
   function moments({ steps, updates }) {
     const list = [{ i: 0, u: -1, updated: false }];
     for (let i = 1, u = 0; i < steps.time.length; i++) {
@@ -35,65 +36,64 @@ const Step = (() => {
 
   const format = (x, digits = 4) => Math.abs(x) >= 1e-4 || x === 0 ? x.toFixed(digits) : x.toExponential(2);
   const matrix = (a, b, d) => `[${format(a, 5)}  ${format(b, 5)}; ${format(b, 5)}  ${format(d, 5)}]`;
-  const grows = (before, now) => now > before ? "increases" : now < before ? "decreases" : "unchanged";
-  const sigma = (before, now) => `σ_p ${grows(before, now)}: ${format(Math.sqrt(before))} to ${format(Math.sqrt(now))} m`;
+  const trend = (before, now) => now > before ? "increases" : now < before ? "decreases" : "stays equal";
+  const sigma = (before, now) => `σ_p ${trend(before, now)}: ${format(Math.sqrt(before))} to ${format(Math.sqrt(now))} m`;
 
-  /* Equations of the lesson with the numbers of this step: [label, text, true for the update] */
+  /* Equations with numbers: rows [title, text] of prediction and update */
   function equations(run, settings, moment) {
     const { steps: s, updates: m } = run, { i, u, updated } = moment;
     const [, , b00, b01, b11] = stateAfter(run, i - 1), prior = state(run, { i, u, updated: false });
     const [p, v, p00, p01, p11] = prior, dt = s.time[i] - s.time[i - 1], a = s.acceleration[i - 1];
     const q = (settings.sigmaA ** 2 + s.extra[i - 1]) * settings.dt;
-    const rows = [
-      ["Before", `x⁺ = [${format(s.p[i - 1])} m, ${format(s.v[i - 1])} m/s]`, false],
-      ["", `P⁺ = ${matrix(b00, b01, b11)}`, false],
-      ["Predict", `F = [1  ${format(dt)}; 0  1], B = [${format(dt * dt / 2, 5)}; ${format(dt)}], a = ${format(a, 3)} m/s²`, false],
-      ["", `Q = ${matrix(q * dt ** 3 / 4, q * dt * dt / 2, q * dt)}`, false],
-      ["", `x⁻ = Fx⁺ + Ba = [${format(p)} m, ${format(v)} m/s]`, false],
-      ["", `P⁻ = FP⁺Fᵀ + Q = ${matrix(p00, p01, p11)}`, false],
-      ["", sigma(b00, p00), false],
+    const prediction = [
+      ["Previous state", `x⁺ = [${format(s.p[i - 1])} m, ${format(s.v[i - 1])} m/s]`],
+      ["", `P⁺ = ${matrix(b00, b01, b11)}`],
+      ["Prediction", `F = [1  ${format(dt)}; 0  1], B = [${format(dt * dt / 2, 5)}; ${format(dt)}], a = ${format(a, 3)} m/s²`],
+      ["", `Q = ${matrix(q * dt ** 3 / 4, q * dt * dt / 2, q * dt)}`],
+      ["", `x⁻ = Fx⁺ + Ba = [${format(p)} m, ${format(v)} m/s]`],
+      ["", `P⁻ = FP⁺Fᵀ + Q = ${matrix(p00, p01, p11)}`],
+      ["", sigma(b00, p00)],
     ];
-    if (u < 0) return rows;
-    const r = settings.sigmaZ ** 2;
-    rows.push(
-      ["Measure", `z = ${format(m.z[u])} m, R = SIGMA_Z² = ${format(r, 5)} m²`, true],
-      ["Compare", `ν = z − Hx⁻ = ${format(m.nu[u])} m`, true],
-      ["", `S = HP⁻Hᵀ + R = ${format(m.s[u], 5)} m²; ν²/S = ${format(m.nu[u] ** 2 / m.s[u], 2)}`, true]);
+    if (u < 0) return [prediction, []];
+    const update = [
+      ["Measurement", `z = ${format(m.z[u])} m, R = SIGMA_Z² = ${format(settings.sigmaZ ** 2, 5)} m²`],
+      ["Innovation", `ν = z − Hx⁻ = ${format(m.nu[u])} m`],
+      ["", `S = HP⁻Hᵀ + R = ${format(m.s[u], 5)} m²; ν²/S = ${format(m.nu[u] ** 2 / m.s[u], 2)}`]];
     if (updated) {
       const [x, w, c00, c01, c11] = stateAfter(run, i);
-      rows.push(
-        ["Gain", `K = P⁻Hᵀ/S = [${format(m.k0[u])}, ${format(m.k1[u])} 1/s]`, true],
-        ["Update", `x⁺ = x⁻ + Kν = [${format(x)} m, ${format(w)} m/s]`, true],
-        ["", `P⁺ = (I − KH)P⁻ = ${matrix(c00, c01, c11)}`, true],
-        ["", sigma(p00, c00), true]);
+      update.push(
+        ["Gain", `K = P⁻Hᵀ/S = [${format(m.k0[u])}, ${format(m.k1[u])} 1/s]`],
+        ["Update", `x⁺ = x⁻ + Kν = [${format(x)} m, ${format(w)} m/s]`],
+        ["", `P⁺ = (I − KH)P⁻ = ${matrix(c00, c01, c11)}`],
+        ["", sigma(p00, c00)]);
     }
-    return rows;
+    return [prediction, update];
   }
 
   function start(page) {
-    const { settings, chosen, result, model, setSource, figures, isSeen, moved } = page;
+    const { settings, selected, result, model, setSource, figures, isVisible, moved } = page;
     let cached = { run: null, list: [] };
     const listNow = () => {
       const { run } = result;
       if (cached.run !== run) cached = { run, list: run === null ? [] : moments(run) };
       return cached.list;
     };
-    let moment = null, playing = null, speed = 2; // indices: of moments of the run, and of STEP_TIMES_MS
+    let moment = null, playing = null, speed = 2; // indices of a prediction or update in listNow(), and of STEP_TIMES_MS
 
-    /* Go to a measurement (index), after its update */
-    function go(measurement) {
+    /* Show KF after the update with a measurement (index) */
+    function goTo(measurement) {
       const list = listNow();
       if (!list.length) return;
       const last = result.run.updates.nu.length - 1;
-      chosen.step = Math.min(Math.max(measurement, 0), last);
-      moment = list.findIndex((one) => one.u === chosen.step && one.updated);
+      selected.measurement = clamp(measurement, 0, last);
+      moment = list.findIndex(({ u, updated }) => updated && u === selected.measurement);
       draw();
-      moved(result.run.updates.time[chosen.step]);
+      moved(result.run.updates.time[selected.measurement]);
     }
     function advance() {
       const list = listNow();
       moment = Math.min((moment ?? 0) + 1, list.length - 1);
-      for (let at = moment; at >= 0; at--) if (list[at].u >= 0) { chosen.step = list[at].u; break; }
+      selected.measurement = list.slice(0, moment + 1).findLast(({ u }) => u >= 0)?.u ?? selected.measurement;
       draw();
       moved(result.run.steps.time[list[moment].i]);
       if (moment === list.length - 1) pause();
@@ -114,64 +114,65 @@ const Step = (() => {
       $("now").ariaLive = "off"; // too fast for a screen reader
     }
     function faster(by) {
-      speed = Math.min(Math.max(speed + by, 0), STEP_TIMES_MS.length - 1);
-      if (playing !== null) { clearInterval(playing); playing = setInterval(advance, STEP_TIMES_MS[speed]); }
+      speed = clamp(speed + by, 0, STEP_TIMES_MS.length - 1);
+      if (playing !== null) { pause(); play(); }
       $("slower").disabled = speed === 0;
       $("faster").disabled = speed === STEP_TIMES_MS.length - 1;
     }
 
     function draw() {
       const { run } = result;
-      if (isSeen("step")) chosen.step ??= 0; // opens at the first update
-      if (moment === null && chosen.step !== null) {
-        const requested = Math.min(chosen.step, (run?.updates.nu.length ?? 1) - 1);
-        moment = listNow().findIndex((one) => one.u === requested && one.updated);
+      if (isVisible("step")) selected.measurement ??= 0; // the view opens at the first update
+      if (moment === null && selected.measurement !== null) {
+        const requested = Math.min(selected.measurement, (run?.updates.nu.length ?? 1) - 1);
+        moment = listNow().findIndex(({ u, updated }) => updated && u === requested);
         if (moment < 0) moment = null;
       }
-      const known = run !== null && moment !== null;
-      const lines = figures.flatMap((plot) => plot.center).filter((one) => one.name === "cursor");
-      for (const line of lines) line.visible = known;
+      const hasMoment = run !== null && moment !== null;
+      const lines = figures.flatMap((plot) => plot.center).filter(({ name }) => name === "cursor");
+      for (const line of lines) line.visible = hasMoment;
       for (const id of ["first", "previous", "next", "last", "play"]) $(id).disabled = run === null;
       if (run !== null) $("cursor").max = run.updates.nu.length - 1;
-      if (!known) {
-        $("now").textContent = "Select a measurement with n or the buttons.";
+      if (!hasMoment) {
+        $("now").textContent = "Select a measurement with the buttons or the key n.";
         return;
       }
-      const list = listNow(), one = list[Math.min(moment, list.length - 1)], t = run.steps.time[one.i];
+      const list = listNow(), now = list[Math.min(moment, list.length - 1)], t = run.steps.time[now.i];
       for (const line of lines) line.location = t;
       const count = run.updates.nu.length, slider = $("cursor");
-      slider.value = chosen.step;
-      slider.ariaValueText = `Measurement ${chosen.step + 1} of ${count}`;
-      $("now").textContent = one.u >= 0 ? `Measurement ${one.u + 1} of ${count}, at ${t.toFixed(3)} s`
-        + (one.updated ? "" : ": predicted, not yet updated") : `Predicted to ${t.toFixed(3)} s`;
-      if (!isSeen("step")) return;
-      drawPlane(run, one);
-      if (one.i === 0) return $("numbers").replaceChildren(make("p", "Initial state."));
+      slider.value = selected.measurement;
+      slider.ariaValueText = `Measurement ${selected.measurement + 1} of ${count}`;
+      $("now").textContent = now.u >= 0 ? `Measurement ${now.u + 1} of ${count}, at ${t.toFixed(3)} s`
+        + (now.updated ? "" : ": KF has predicted, but not yet updated") : `KF has predicted to ${t.toFixed(3)} s`;
+      if (!isVisible("step")) return;
+      drawPlane(run, now);
+      if (now.i === 0) return $("numbers").replaceChildren(make("p", "This is the initial state of KF."));
       const table = make("table");
-      for (const [head, text, update] of equations(run, settings, one)) {
-        const row = table.insertRow();
-        row.append(make("th", head, { scope: "row" }), make("td", text));
-        row.className = update === one.updated ? "now" : "";
-      }
+      equations(run, settings, now).forEach((rows, isUpdate) => {
+        for (const [title, text] of rows) {
+          const row = table.insertRow();
+          row.append(make("th", title, { scope: "row" }), make("td", text));
+          row.className = isUpdate === Number(now.updated) ? "now" : "";
+        }
+      });
       $("numbers").replaceChildren(table);
     }
-    function drawPlane(run, one) {
-      const plot = model("step"), now = state(run, one);
-      const previous = one.updated ? state(run, { ...one, updated: false }) : stateAfter(run, Math.max(one.i - 1, 0));
+    function drawPlane(run, current) {
+      const plot = model("step"), now = state(run, current);
+      const previous = current.updated ? state(run, { ...current, updated: false }) : stateAfter(run, Math.max(current.i - 1, 0));
       setSource("now", ellipse(now));
       setSource("before", ellipse(previous));
       setSource("mean", { p: [now[0]], v: [now[1]] });
-      const from = Math.max(one.i - TRAIL, 0);
-      setSource("trail-means", { p: run.steps.p.subarray(from, one.i), v: run.steps.v.subarray(from, one.i) });
-      const measured = one.u >= 0, z = measured ? run.updates.z[one.u] : 0;
-      const band = plot.center.find((part) => part.name === "band");
-      const line = plot.center.find((part) => part.name === "measurement");
-      band.visible = line.visible = measured;
-      if (measured) {
+      const from = Math.max(current.i - TRAIL, 0);
+      setSource("trail-means", { p: run.steps.p.subarray(from, current.i), v: run.steps.v.subarray(from, current.i) });
+      const isMeasured = current.u >= 0, z = run.updates.z[current.u];
+      const [band, line] = ["band", "measurement"].map((name) => plot.center.find((item) => item.name === name));
+      band.visible = line.visible = isMeasured;
+      if (isMeasured) {
         [band.left, band.right] = [z - 2 * settings.sigmaZ, z + 2 * settings.sigmaZ];
         line.location = z;
       }
-      // constant scale over the run, so that changes of the ellipse are visible; larger at the start
+      // the same scale for the whole run shows changes of the ellipse; only the first ellipses are larger
       const reach = reachOf(run).map((typical, i) => Math.max(typical, 2.2 * Math.sqrt(now[2 + 2 * i])));
       [plot.x_range.start, plot.x_range.end] = [now[0] - reach[0], now[0] + reach[0]];
       [plot.y_range.start, plot.y_range.end] = [now[1] - reach[1], now[1] + reach[1]];
@@ -185,16 +186,16 @@ const Step = (() => {
       return cachedReach.reach;
     }
 
-    const actions = { first: () => go(0), previous: () => go((chosen.step ?? 1) - 1),
-      next: () => go((chosen.step ?? -1) + 1), last: () => go(Infinity), play,
+    const actions = { first: () => goTo(0), previous: () => goTo((selected.measurement ?? 1) - 1),
+      next: () => goTo((selected.measurement ?? -1) + 1), last: () => goTo(Infinity), play,
       slower: () => faster(-1), faster: () => faster(1) };
-    for (const [id, act] of Object.entries(actions)) $(id).addEventListener("click", act);
-    $("cursor").addEventListener("input", (event) => go(Number(event.target.value)));
-    const restart = () => { // a new run has other steps, so the selected measurement is kept
+    for (const [id, act] of Object.entries(actions)) onClick(id, act);
+    $("cursor").addEventListener("input", (event) => goTo(Number(event.target.value)));
+    const restart = () => { // a new KF run has other steps but the same measurements
       moment = null;
       draw();
     };
-    return { go, draw: restart, play, pause, faster, at: () => moment, listNow };
+    return { ...actions, goTo, draw: restart, at: () => moment };
   }
 
   return { start, ellipse, moments, state };

@@ -14,6 +14,7 @@ from scipy.special import chdtrc, gammaincinv, stdtr
 
 from px4fuse.arrays import Array, ArrayPair
 from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Unavailable
+from px4fuse.text import count_noun
 
 # "underconfident": the reported σ is too large; "overconfident": the reported σ is too small
 Verdict = Literal["consistent", "underconfident", "overconfident"]
@@ -175,7 +176,8 @@ def assess(
     if count < MIN_INNOVATIONS:
         return Unavailable(
             "consistency test",
-            f"the filter has only {count} innovations (at least {MIN_INNOVATIONS} are needed)",
+            f"the filter has only {count_noun(count, 'innovation')} (at least {MIN_INNOVATIONS} "
+            "are needed)",
             "Analyse a longer segment, or log the source at a higher rate.",
         )
     if np.ptp(nu_m) == 0.0:

@@ -193,7 +193,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
             rho[is_short_interval] = np.exp(-interval_s[is_short_interval] / tau_s)
         previous_m = np.concatenate([measured_m[:1], measured_m[:-1]])
         unfiltered_m = (measured_m - rho[:, None] * previous_m) / (1.0 - rho)[:, None]
-        # the inversion spreads an outlier to the next position: all models exclude both positions
+        # inverting the low-pass filter spreads an outlier to the next position: both are excluded
         is_used_position = ~(is_outlier | (is_short_interval & np.append(False, is_outlier[:-1])))
         prepared_motion = prepare_motion(
             flight,

@@ -22,8 +22,6 @@ from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Span
 
 AISLE = "aisle"
-# Minimum ratio of length to width of a track that counts as flown along an aisle
-MIN_AISLE_ELONGATION = 3.0
 # Maximum interval (s) between IMU samples: a longer interval is a gap
 IMU_GAP_S = 0.1
 # Maximum interval between IMU samples in median intervals: a longer interval is a gap
@@ -99,8 +97,6 @@ class Axis:
         Position measurements along the axis; n ≥ 3.
     acceleration : Acceleration or Unavailable
         Input of KF.
-    elongation : float or None
-        Ratio of the track's length to its width; None if the user chose the heading.
     """
 
     name: str
@@ -110,17 +106,13 @@ class Axis:
     measurement_time_s: Array
     measurement_m: Array
     acceleration: Acceleration | Unavailable
-    elongation: float | None = None
 
     __repr__ = one_line_repr
 
     @property
     def label(self) -> str:
-        """Name of the axis in messages; "the aisle" for an elongated track or with --heading."""
-        if self.name != AISLE:
-            return self.name
-        is_aisle = self.elongation is None or self.elongation >= MIN_AISLE_ELONGATION
-        return "the aisle" if is_aisle else "the main direction"
+        """Name of the axis in messages: "the main axis" for "aisle", else ``name``."""
+        return "the main axis" if self.name == AISLE else self.name
 
 
 def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
@@ -223,7 +215,7 @@ def make_axes(
     source_label = f"{flight.log.name}: {track.name}"
     axes = []
     for name in axis_names:
-        direction, heading, note, elongation = _axis_direction(name, track, segment, heading_deg)
+        direction, heading, note = _axis_direction(name, track, segment, heading_deg)
         samples = track.samples
         if name == "down" and track.barometer is not None:
             samples = track.barometer.reindex(columns=Columns.POSITION)
@@ -236,9 +228,7 @@ def make_axes(
             raise MissingDataError(f"{source_label} has no position along {name} in this segment.")
         projected_acceleration = project_acceleration(acceleration, direction, segment)
         measurements = samples.index.to_numpy()[is_finite], projected[is_finite]
-        axes.append(
-            Axis(name, direction, heading, note, *measurements, projected_acceleration, elongation)
-        )
+        axes.append(Axis(name, direction, heading, note, *measurements, projected_acceleration))
     if not axes:
         raise MissingDataError(f"{source_label} has no finite position in this segment.")
     return tuple(axes)
@@ -264,11 +254,10 @@ def weighted_sum(frame: pd.DataFrame, columns: list[str], weights: Array) -> Arr
 
 def _axis_direction(
     name: str, track: PositionTrack, segment: Segment, heading_deg: float | None
-) -> tuple[Array, float | None, str, float | None]:
-    elongation = None
+) -> tuple[Array, float | None, str]:
     if name != AISLE:
         axis_index = AXIS_NAMES.index(name)
-        return np.eye(3)[axis_index], (None if name == "down" else 90.0 * axis_index), "", None
+        return np.eye(3)[axis_index], (None if name == "down" else 90.0 * axis_index), ""
     if heading_deg is None:
         axis_heading_deg, elongation = aisle_heading(track, segment)
         note = f"main direction of the track, length / width {elongation:.1f}"
@@ -276,7 +265,7 @@ def _axis_direction(
         axis_heading_deg = heading_deg
         note = "heading from the option --heading"
     angle_rad = np.radians(axis_heading_deg)
-    return np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0]), axis_heading_deg, note, elongation
+    return np.array([np.cos(angle_rad), np.sin(angle_rad), 0.0]), axis_heading_deg, note
 
 
 def project_acceleration(

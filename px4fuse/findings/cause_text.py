@@ -7,7 +7,7 @@ from px4fuse.comparison import changes
 from px4fuse.comparison.causal_replays import Intervention
 from px4fuse.comparison.model import FilterName
 from px4fuse.comparison.remedy import aid_of, format_settings
-from px4fuse.comparison.trials import improvement
+from px4fuse.comparison.trials import can_improve, improvement
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import UNITS
@@ -40,7 +40,9 @@ def classify_cause(analysis: Analysis, cause: Intervention | None) -> str:
 def is_refuted(analysis: Analysis, owner: FilterName, cause: Intervention) -> bool:
     """Return True if this change, re-run along the main axis, improves neither position nor σ."""
     return any(
-        (trial.filter, trial.change) == (owner, cause.change) and improvement(trial) == "nothing"
+        (trial.filter, trial.change) == (owner, cause.change)
+        and can_improve(trial)
+        and improvement(trial) == "nothing"
         for trial in analysis.trials
     )
 
@@ -126,8 +128,7 @@ def _format_one_change(analysis: Analysis, cause: Intervention, name: str) -> st
             label, unit = name[:7].upper(), UNITS[name]
             return f"{label} {value:.2g} {unit} instead of {getattr(settings, name):g} {unit}"
     assert not isinstance(analysis.ekf2_model, Unavailable)  # EKF2 was replayed with the change
-    flown_value, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].unit
-    unit = unit.replace("^2", "²").replace("^3", "³")
+    flown_value, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].printed_unit
     return f"{name} {value:.3g} {unit} instead of {flown_value:.4g} {unit}".replace(
         "  ", " "
     ).rstrip()

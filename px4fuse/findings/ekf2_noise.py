@@ -9,7 +9,6 @@ import math
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.remedy import aid_of, format_settings
 from px4fuse.comparison.trials import Trial, find_trial, ratio_pairs
-from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Severity
@@ -45,7 +44,8 @@ def detect(analysis: Analysis) -> Findings:
         effect, gain = "", "large" if is_small else "small"
         reason = f"The gain of EKF2 is too {gain}, and the reported σ is too {direction}."
     title = f"{aid.noise} is {format_factor(size)} times too {direction}{effect}"
-    if is_small and flown_m == PARAMETERS[aid.noise].default:  # the user did not choose it
+    is_default = flown_m == analysis.flight.log.default_of(aid.noise)
+    if is_small and is_default:  # the user did not choose it
         assumed = "both filters assume" if is_shared else "EKF2 assumes"
         title = f"{sensor} noise is {format_factor(size)} times what {assumed}{effect}"
     interval, tuned = "", analysis.tuning.get(HORIZONTAL)

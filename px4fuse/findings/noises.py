@@ -24,7 +24,7 @@ from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, Filter
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of, format_settings, noise_change
 from px4fuse.comparison.trials import can_improve, find_trial
-from px4fuse.ekf2_parameters import BAROMETER, PARAMETERS
+from px4fuse.ekf2_parameters import BAROMETER
 from px4fuse.filter.settings import UNITS, Settings
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
@@ -52,7 +52,8 @@ INTERVAL_WIDENING = (
 MIN_LAG1_AUTOCORRELATION = 0.3  # of the innovations; white ones: below 2/√n, 0.2 for n = 100
 
 MIN_SIGMA_RATIO_ERROR = 2.0  # reported over actual σ, or its inverse, for an error
-NOISE_RATIO_TOLERANCE = 1.25  # maximum ratio of two equal noises (σ): 2 σ of a median of n = 100
+# Maximum ratio of two estimates of one noise: twice the standard error of a median of 100 values
+NOISE_RATIO_TOLERANCE = 1.25
 # Actions if no re-run explains an inconsistent variance
 NOT_EXPLAINED = (
     "No tested change of noise, time offset, frame or outliers explains this. Check the IMU "
@@ -374,8 +375,9 @@ def _has_default_noises(
         kf, defaults = analysis.settings, Settings()
         return all(getattr(kf, name) == getattr(defaults, name) for name in (SIGMA_Z, SIGMA_A))
     parameter = aid_of(analysis, result.axis.name).noise
-    default = PARAMETERS[parameter].default
-    is_parameter_default = analysis.flight.log.parameters.get(parameter, default) == default
+    log = analysis.flight.log
+    default = log.default_of(parameter)
+    is_parameter_default = log.parameters.get(parameter, default) == default
     # a variance that the sender reports is a choice of the user, not a default
     return is_parameter_default and not abs(np.log(ekf2_noise_m(result) / default)) > np.log(
         NOISE_RATIO_TOLERANCE

@@ -55,7 +55,7 @@ def make_frame_finding(analysis: Analysis) -> Finding:
 
 def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     """Detect a rotation between the motion in the positions and the motion in the IMU."""
-    rotation_deg, sigma_deg = heading.misalignment_deg, heading.sigma_deg
+    rotation_deg, sigma_deg = _wrap_deg(heading.misalignment_deg), heading.sigma_deg
     if heading.drifts:
         yield _drift_finding(analysis, heading)
         return
@@ -113,8 +113,14 @@ def _is_explained_by_bias(analysis: Analysis) -> bool:
     return abs(fit.rotation.value) < MIN_HEADING_SIGMAS * fit.rotation.sigma
 
 
+def _wrap_deg(angle: float) -> float:
+    """Return the same direction between -180° and +180°."""
+    return (angle + 180.0) % 360.0 - 180.0
+
+
 def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     first, last = heading.ends
+    angles = [_wrap_deg(part.heading_error_deg) for part in heading.ends]
     change = last.heading_error_deg - first.heading_error_deg
     basis = f"the orientation of {source_name(analysis.source)}"
     if heading.by != "orientation":
@@ -130,8 +136,8 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
         "error" if abs(change) >= LARGE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
         f"EKF2's heading drifts by {change:+.0f}° relative to the "
-        f"{positions_of(analysis.source)}. It is {first.heading_error_deg:+.0f}° from "
-        f"{first.start_s:.0f} to {first.end_s:.0f} s and {last.heading_error_deg:+.0f}° from "
+        f"{positions_of(analysis.source)}. It is {angles[0]:+.0f}° from "
+        f"{first.start_s:.0f} to {first.end_s:.0f} s and {angles[1]:+.0f}° from "
         f"{last.start_s:.0f} to {last.end_s:.0f} s (clockwise from above, by {basis}). A constant "
         f"rotation of the positions cannot correct this. Possible cause: {possible_cause}.",
         action,

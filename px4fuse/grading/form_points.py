@@ -224,7 +224,7 @@ def panels(kind: str) -> list[str]:
 
 
 def correction_fraction(mistake: TrueMistake, named: StudentMistake, truth: FormTruth) -> float:
-    """Return the fraction of the points for the correction of a mistake and its value."""
+    """Return the fraction of the points for a named correction and the value given with it."""
     value = named.value_in_first_unit()
     fractions = [
         fraction

@@ -188,15 +188,15 @@ def read_frames(name: str, content: bytes) -> Frames:
             f"with a valid checksum in {len(content)} bytes).",
             "Give a .ulg, a .tlog or a raw MAVLink stream.",
         )
-    source = np.frombuffer(content, dtype=np.uint8)
-    is_version_2 = source[start] == MAGIC_BYTE_2
+    content_bytes = np.frombuffer(content, dtype=np.uint8)
+    is_version_2 = content_bytes[start] == MAGIC_BYTE_2
     # Three consecutive header bytes: sequence, system, component
     sequence_offset = start + np.where(is_version_2, 4, 2)
     unknown_frame_count, bad_bytes, ends_in_frame = _count_other_bytes(
         content, start - time_bytes, end, time_bytes
     )
     received_us, damaged_receive_times = (
-        _read_receive_times(source, start, end) if time_bytes else (None, 0)
+        _read_receive_times(content_bytes, start, end) if time_bytes else (None, 0)
     )
     return Frames(
         name=name,
@@ -204,11 +204,11 @@ def read_frames(name: str, content: bytes) -> Frames:
         sha256=hashlib.sha256(content).hexdigest(),
         start=start,
         message_id=message_id.astype(np.int32),
-        system=source[sequence_offset + 1],
-        component=source[sequence_offset + 2],
-        sequence=source[sequence_offset],
+        system=content_bytes[sequence_offset + 1],
+        component=content_bytes[sequence_offset + 2],
+        sequence=content_bytes[sequence_offset],
         payload_start=start + np.where(is_version_2, HEADER_BYTES_2, HEADER_BYTES_1),
-        payload_length=source[start + 1],
+        payload_length=content_bytes[start + 1],
         received_us=received_us,
         unknown_frame_count=unknown_frame_count,
         bad_bytes=bad_bytes,
@@ -219,17 +219,17 @@ def read_frames(name: str, content: bytes) -> Frames:
 
 def _find_valid_frames(content: bytes) -> Integers:
     """Return start, end and message id, shape (n, 3), of all frames with valid checksums."""
-    source = np.frombuffer(content, dtype=np.uint8)
+    content_bytes = np.frombuffer(content, dtype=np.uint8)
     view = memoryview(content)
     valid_frames = [np.zeros((0, 3), dtype=np.int64)]
-    for block_start in range(0, len(source), BLOCK_BYTES):
-        frames, crc_end = _find_possible_frames(source, block_start)
+    for block_start in range(0, len(content_bytes), BLOCK_BYTES):
+        frames, crc_end = _find_possible_frames(content_bytes, block_start)
         checked_ranges = zip((frames[:, 0] + 1).tolist(), crc_end.tolist(), strict=True)
         crc = np.array([mcrf4xx(view[a:b]) for a, b in checked_ranges], dtype=np.uint16)
         crc = (crc >> 8) ^ _BYTE_CHECKSUMS[
             (crc ^ _CRC_EXTRA[frames[:, 2]].astype(np.uint16)) & 0xFF
         ]
-        stored_crc = source[crc_end] | source[crc_end + 1].astype(np.uint16) << 8
+        stored_crc = content_bytes[crc_end] | content_bytes[crc_end + 1].astype(np.uint16) << 8
         valid_frames.append(frames[stored_crc == crc])
     return np.concatenate(valid_frames)
 

@@ -407,7 +407,8 @@ def _time_unit(times: Array, name_unit: str, option: str | None) -> tuple[str, s
             plausible_units.append(unit)
     if not plausible_units:
         return "s", (
-            "s (assumed: no unit gives a plausible UWB rate; else give --position-time-unit)"
+            "s (assumed, because no unit gives a plausible UWB rate; "
+            "--position-time-unit sets another)"
         )
     unit = plausible_units[0]
     description = f"{unit} (from the median interval {median_step * TIME_UNITS[unit]:.3g} s)"
@@ -439,7 +440,7 @@ def _length_units(
             f"{max_spread:.0f} m is too large for an indoor flight; if cm, give --position-unit"
         )
     elif max_spread > MAX_SPREAD_M:
-        reason = "assumed: no unit gives the extent of an indoor flight; else give --position-unit"
+        reason = "assumed, because no unit gives an indoor flight; --position-unit sets another"
     units = {at: name_units.get(at, unit) for at in map(int, numbers.columns)}
     scales = {at: LENGTH_UNITS[name] for at, name in units.items()}
     span_m = max(float(spreads[at]) * scales[at] for at in axes)

@@ -41,7 +41,7 @@ MAX_ARRIVAL_DELAY_US = 100
 MIN_ARRIVAL_FRACTION = 0.9
 # Maximum time difference (s) of a height and a horizontal position that are joined: 2.5 cm error at
 # a climb rate of 0.5 m/s
-HEIGHT_TOLERANCE_S = 0.05
+MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
 # Maximum logged GNSS rate (Hz) of decimated fixes: receivers send 5 to 20 fixes per second
 MAX_DOWNSAMPLED_HZ = 4.0
 AUTOPILOT_CLOCK = "autopilot boot clock (PX4 converted the sender's timestamps)"
@@ -223,11 +223,11 @@ def _with_height(
     Height and horizontal position of a vision sample have the same timestamp, but the logger
     decimates their topics separately.
     """
-    joined = join_nearest(samples, height.assign(_found=True), HEIGHT_TOLERANCE_S)
+    joined = join_nearest(samples, height.assign(_found=True), MAX_HEIGHT_TIME_DIFFERENCE_S)
     without_height = int(joined.pop("_found").isna().sum())
     note = (
         f"{without_height} of {len(joined)} external vision positions have no height within "
-        f"{1e3 * HEIGHT_TOLERANCE_S:.0f} ms"
+        f"{1e3 * MAX_HEIGHT_TIME_DIFFERENCE_S:.0f} ms"
     )
     return joined, (note,) if without_height else ()
 

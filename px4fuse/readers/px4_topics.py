@@ -84,7 +84,10 @@ OLD_INNOVATIONS = "ekf2_innovations"
 
 
 def layouts_of_track(track: str) -> list[Layout]:
-    """Return the layouts of a track, best first; the default topic has the name of the track."""
+    """Return the possible column layouts of a track, best first.
+
+    A layout without a topic is that of the topic with the name of the track.
+    """
     rows = [LAYOUTS[name] for name in TRACKS[track].layouts]
     return [replace(row, topic=row.topic or track) for row in rows]
 

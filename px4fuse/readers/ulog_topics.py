@@ -22,7 +22,7 @@ from pyulog import ULog
 from pyulog.exceptions import ULogException
 
 from px4fuse.arrays import IntArray
-from px4fuse.ekf2_parameters import REPORTED, replace_invalid_parameters
+from px4fuse.ekf2_parameters import PARAMETERS, REPORTED, replace_invalid_parameters
 from px4fuse.errors import LogError
 from px4fuse.flight import time_index
 from px4fuse.log import Dropout, LogInfo, Stream
@@ -434,6 +434,11 @@ def read_topics(name: str, content: bytes) -> Topics:
         parameters=MappingProxyType(
             {name: parameter_values[name] for name in REPORTED if name in parameter_values}
         ),
+        parameter_defaults={
+            name: value
+            for name, value in sorted(ulog.get_default_parameters(0).items())
+            if name in PARAMETERS
+        },
         notes=(*notes, *parameter_faults),
         bytes_read=source.start - source.skipped_bytes,
         autopilot=_printable_text(ulog.msg_info_dict, "sys_name", "PX4"),

@@ -13,24 +13,22 @@ from px4fuse.report import style
 from px4fuse.report.event_marks import GROUND_BAND
 from px4fuse.report.page import Cell, Page, appendix_title
 from px4fuse.report.phrases import format_sigma_verdict, write_findings
-from px4fuse.request import with_options
 from px4fuse.text import format_number
 
-TITLE = "Aids of EKF2"
+TITLE = "Aiding sources of EKF2"
 LEAD = (
-    "Each aid is tested with its own innovations in flight (mean NIS, expected 1). A small NIS "
-    "does not prove accuracy: time-correlated errors, wrong delays and wrong headings do not show "
-    "in it."
+    "Each aiding source is tested with its innovations in flight: a mean NIS of 1 is expected. "
+    "Time-correlated errors, wrong delays and wrong headings hardly change the NIS."
 )
-AID_PANEL_HEIGHT = 21.0  # points; height of the axes of one aid
-MAX_NORMALISED = 4.0  # larger normalised innovations ν/√S are drawn at the edge
-MAX_DOTS = 400  # drawn points per axis
-# A comparison has the aids page only if EKF2 fused one of these besides external vision
+AID_PANEL_HEIGHT = 21.0  # height (points) of the axes of one aiding source
+MAX_NORMALISED = 4.0  # larger normalised innovations ν/√S are drawn at the edge of the axes
+MAX_DOTS = 400  # maximum number of drawn innovations per component of an aiding source
+# Aiding sources that add this page to a comparison, if EKF2 fused one of them
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the appendix page if EKF2 fused a horizontal aid besides external vision."""
+    """Draw the appendix on aiding sources if EKF2 fused a horizontal one besides vision."""
     page = Page(appendix_title(TITLE), LEAD)
     aid_results = write_aids_of_comparison(page, analysis)
     if aid_results:
@@ -39,7 +37,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def write_aids_of_comparison(page: Page, analysis: Analysis) -> Mapping[str, AidResult]:
-    """Write the aids of a comparison and return them; {} if EKF2 fused external vision only."""
+    """Write the table of aiding sources and return them; {} if EKF2 fused vision only."""
     aid_results = analysis.aids
     if isinstance(aid_results, Unavailable):
         return {}
@@ -52,7 +50,7 @@ def write_aids_of_comparison(page: Page, analysis: Analysis) -> Mapping[str, Aid
 
 
 def draw_aids_only(analysis: AidsOnlyAnalysis, _: object) -> Iterator[Page]:
-    """Draw the page of a flight without a position source."""
+    """Draw EKF2's aiding sources on the cover of a flight without a position source."""
     page = Page(TITLE, LEAD)
     write_aids(page, analysis.aids)
     _draw_aid_panels(page, analysis.flight, analysis.aids)
@@ -60,17 +58,14 @@ def draw_aids_only(analysis: AidsOnlyAnalysis, _: object) -> Iterator[Page]:
 
 
 def write_aids_only(page: Page, analysis: AidsOnlyAnalysis, findings: tuple[Finding, ...]) -> None:
-    """Write the reason for the missing comparison, the table of aids and the findings."""
-    missing_data = analysis.missing_data
-    page.write(f"No comparison with KF: {missing_data.reason}.", above=2.0)
-    page.write(with_options(missing_data.remedy), colour=style.MUTED_COLOUR)
+    """Write the table of EKF2's aiding sources and the findings."""
     write_aids(page, analysis.aids)
     page.heading("Findings", 10.5, above=12.0)
     write_findings(page, findings)
 
 
 def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
-    """Write a table with a row for each aid and axis, and below it the disabled aids."""
+    """Write a table row for each aiding source and axis; below it, list the disabled sources."""
     rows: list[list[Cell]] = []
     for aid in aids.values():
         if aid.verdict == "disabled":
@@ -105,7 +100,7 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
             rows.append([*aid_cells, *[""] * 5])
     page.table(
         [
-            "aid",
+            "aiding source",
             "verdict",
             "enabled",
             "rejec-\nted",
@@ -123,29 +118,28 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
     disabled_labels = [aid.label for aid in aids.values() if aid.verdict == "disabled"]
     if disabled_labels:
         page.write(
-            f"Disabled in flight (logged, never fused): {', '.join(disabled_labels)}.",
+            f"Aiding sources that are logged but never fused: {', '.join(disabled_labels)}.",
             colour=style.MUTED_COLOUR,
         )
 
 
 def format_aid_verdict(aid: AidResult) -> str:
-    """Format the verdict on an aid, with the factor between reported and actual σ."""
+    """Format the verdict on an aiding source, with the factor between reported and actual σ."""
     if aid.verdict == "not_fused":
         return f"not fused for {aid.longest_gap_duration_s:.1f} s"
     return format_sigma_verdict(aid.verdict, max(aid.nis_mean, 1.0 / aid.nis_mean) ** 0.5)
 
 
 def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) -> None:
-    """Draw the normalised innovations of each fused aid, one panel below the other."""
     span = flight_span(flight)
     if isinstance(flight.ekf2, Unavailable) or isinstance(span, Unavailable):
         return
     fused_names = [name for name, aid in aids.items() if aid.verdict != "disabled"]
-    page.heading("Normalised innovations of each aid (all axes)", above=8.0)
+    page.heading("Normalised innovations of each aiding source", above=8.0)
     page.write_small(
-        "Normalised innovations ν/√S. Expected: 95 % within ±2 (lines). Hollow: not "
-        f"fused. Grey: fusion disabled. Values beyond ±{MAX_NORMALISED:g} are drawn "
-        "at the edge."
+        "95 % of the normalised innovations ν/√S are expected within ±2 (lines). Hollow samples "
+        "were not fused; in grey times fusion was disabled. Values beyond "
+        f"±{MAX_NORMALISED:g} are drawn at the edge."
     )
     for name in fused_names:
         _draw_aid_panel(

@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card, describe_axis
-from px4fuse.card.model import AXIS_TICKS, BANDS, Action, Card, Cause, Rerun, Verdict
+from px4fuse.card.model import AXIS_TICKS, BANDS, Action, Card, Rerun, Verdict
 from px4fuse.card.numbers import axis_fraction, format_ratio
 from px4fuse.card.verdicts import verdicts
 from px4fuse.errors import SettingsError
@@ -23,6 +23,7 @@ from px4fuse.report.card_text import (
     QUANTITIES,
     format_spans,
     format_target,
+    marked_actions,
     rerun_columns,
     rerun_start,
     with_typed_path,
@@ -36,7 +37,7 @@ SIGNS = {
     "clean": "✓ NO FAULT",
     "refused": "✕ REFUSED",
 }
-# SVG paths around the position of a ratio; triangles for ratios beyond the ends of the axis
+# SVG paths of the mark of a ratio; triangles mark ratios beyond the ends of the axis
 MARK_PATHS = {
     "source": "M-5.5 0a5.5 5.5 0 1 0 11 0a5.5 5.5 0 1 0-11 0",
     "truth": "M-6.5 0L0-6.5L6.5 0L0 6.5z",
@@ -44,7 +45,7 @@ MARK_PATHS = {
     "above": "M-5-7L7 0L-5 7z",
 }
 SPOKEN_QUANTITIES = {"source": "innovation over root S", "truth": "error over sigma"}
-HALF_HEIGHT = 5  # pixels; of the end ticks of an interval
+HALF_HEIGHT = 5  # half the height (pixels) of the end ticks of an interval
 
 
 def card_of(analysis: Analysis) -> Card:
@@ -84,11 +85,13 @@ def card_html(
         more=" and ".join(
             text for text, parts in (("causes", card.causes), ("notes", card.notes)) if parts
         ).capitalize(),
-        first_actions=[row for row in _rows(card.causes[0]) if _is_prominent(row)]
+        first_actions=[row for row in marked_actions(card.causes[0]) if _is_prominent(row)]
         if card.causes
         else [],
         rows_of=lambda cause: [
-            row for row in _rows(cause) if cause is not card.causes[0] or not _is_prominent(row)
+            row
+            for row in marked_actions(cause)
+            if cause is not card.causes[0] or not _is_prominent(row)
         ],
         rerun_rows=_rerun_rows,
         signs=SIGNS,
@@ -124,12 +127,11 @@ def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str
         marks=MARKS,
         quantities=QUANTITIES,
         format_ratio=format_ratio,
-        is_loud=is_loud,
     )
 
 
 def axis_figures(analysis: Analysis) -> str:
-    """Return a figure of the verdicts for each analysed axis."""
+    """Return an HTML figure of the four verdicts for each analysed axis."""
     return "".join(
         axis_html(verdicts(result), describe_axis(analysis, result), name)
         for name, result in analysis.axes.items()
@@ -137,7 +139,7 @@ def axis_figures(analysis: Analysis) -> str:
 
 
 def band_limits() -> str:
-    """Format the limits of both bands.
+    """Format the limits of the consistent ratios against source and ground truth.
 
     >>> band_limits()
     '● 0.8 to 1.25, ◆ 0.67 to 1.5'
@@ -146,7 +148,7 @@ def band_limits() -> str:
 
 
 def card_style() -> str:
-    """Return the style of the card; its colours are in ``webpage/colours.css``."""
+    """Return the style sheet of the card; its colours are in ``webpage/colours.css``."""
     return read_asset("card.css", "px4fuse.report")
 
 
@@ -157,7 +159,7 @@ def notebook_html(card: Card) -> str:
 
 
 def alternative_text(verdicts: Sequence[Verdict]) -> str:
-    """Describe the axis for screen readers.
+    """Describe the verdicts on the axis for screen readers.
 
     >>> alternative_text([Verdict(filter="kf", against="truth", ratio=7.2, word="overconfident")])
     'KF, error over sigma: 7.2, overconfident.'
@@ -169,28 +171,12 @@ def alternative_text(verdicts: Sequence[Verdict]) -> str:
     )
 
 
-def is_loud(verdict: Verdict) -> bool:
-    """Return True if a verdict is not consistent and not explained."""
-    return verdict.word in ("overconfident", "underconfident") and not verdict.is_explained
-
-
 def _value(verdict: Verdict) -> str:
     explained = ", explained" if verdict.is_explained else ""
     return f"{format_ratio(verdict.ratio or 0.0)}, {verdict.word}{explained}"
 
 
-def _rows(cause: Cause) -> list[tuple[str, Action]]:
-    """Return the actions of a cause, with EITHER and OR before those that exclude each other."""
-    rows = [
-        ("EITHER " if not place else "OR ", action)
-        for place, alternative in enumerate(cause.alternatives)
-        for action in alternative
-    ]
-    return rows + [("", action) for action in cause.actions]
-
-
 def _is_prominent(row: tuple[str, Action]) -> bool:
-    """Return True for commands and alternatives; ``do_this`` contains the other actions."""
     return bool(row[0] or row[1].commands)
 
 
@@ -199,12 +185,11 @@ def _rerun_rows(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
 
 
 def _percent(ratio: float) -> str:
-    """Return the position of a ratio on the axis, limited to its ends."""
     return f"{100.0 * min(max(axis_fraction(ratio), 0.0), 1.0):.2f}"
 
 
 def _drawing(verdict: Verdict) -> dict[str, Any]:
-    """Return the SVG attributes of band, interval and mark."""
+    """Return the SVG attributes of the band, the 95 % interval and the mark of a ratio."""
     if verdict.ratio is None:
         return {}
     low, high = (axis_fraction(end) for end in BANDS[verdict.against])

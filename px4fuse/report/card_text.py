@@ -14,6 +14,7 @@ from msgspec.structs import replace
 from px4fuse.card.model import (
     AXIS_TICKS,
     BANDS,
+    MAX_NOTES,
     Action,
     AidRow,
     Card,
@@ -27,40 +28,22 @@ from px4fuse.request import quote_command
 
 WIDTH = 100
 AXIS_WIDTH = 37
-# Columns before the axis, and before the texts beside a label
+# Number of columns before the axis of ratios, and before the text beside a label
 AXIS_INDENT, TEXT_INDENT = 58, 11
-# A longer command is printed on a separate line
+# Maximum length of a command beside its label; a longer one is on a separate line
 MAX_COMMAND_LENGTH = 74
-# Ticks that have room for a label
+# Ticks of the axis of ratios that have room for a label
 LABELLED_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
 MARKS = {"source": "●", "truth": "◆"}
 QUANTITIES = {"source": "source: innovation ÷ √S", "truth": "ground truth: error ÷ σ"}
 FILTER_NAMES = {"kf": "KF", "ekf2": "EKF2"}
-# Labels of a headline, and styles of rich
+# Severities that a headline names differently
 SEVERITY_LABELS = {"clean": "ok", "note": "note"}
 STYLES = {"error": "bold red", "warning": "bold yellow", "note": "cyan", "clean": "bold green"}
-# Replacements for terminals whose encoding lacks a character
-ASCII = {
-    "░": ":",
-    "●": "o",
-    "◆": "x",
-    "◀": "<",
-    "▶": ">",
-    "─": "-",
-    "√": "sqrt ",
-    "σ": "sigma",
-    "→": "->",
-    "÷": "/",
-    "−": "-",
-    "–": "-",
-    "²": "2",
-    "³": "3",
-    "°": " deg",
-    "±": "+-",
-    "×": "x",
-    "ν": "nu",
-    "…": "...",
-}
+# Replacements of characters for terminals whose encoding lacks them
+ASCII = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/--23x") | str.maketrans(
+    {"√": "sqrt ", "σ": "sigma", "→": "->", "°": " deg", "±": "+-", "ν": "nu", "…": "..."}
+)
 AIDS_HEADING = (
     "Innovation ÷ √S of the aiding sources that EKF2 fused. Below 1: √S is larger than needed. For "
     "barometer, magnetometer and gravity that is usual and not a fault."
@@ -69,7 +52,7 @@ CONSOLE = "Console: MAVLink Console of QGroundControl."
 
 
 class Line(NamedTuple):
-    """Paragraph of a card.
+    """Paragraph of a card on the terminal.
 
     Attributes
     ----------
@@ -77,7 +60,7 @@ class Line(NamedTuple):
     style : str
         Style of rich.
     first, indent : str
-        Before the first line, and before the others.
+        Text before the first line, and before the other lines.
     wraps : bool
         False for the headline, commands and tables.
     """
@@ -89,7 +72,7 @@ class Line(NamedTuple):
     wraps: bool = False
 
     def wrapped(self, width: int) -> list[str]:
-        """Return the lines of the paragraph at a width in columns."""
+        """Wrap the paragraph at a width in columns."""
         if not self.wraps:
             return [f"{self.first}{self.text}"]
         return textwrap.wrap(
@@ -103,21 +86,23 @@ class Line(NamedTuple):
 
 
 def card_lines(card: Card) -> Iterator[Line]:
-    """Yield the paragraphs of a card in their order."""
+    """Yield the paragraphs of a diagnosis card from top to bottom."""
     if card.severity == "refused":
         yield Line(f"error[{card.id}]: {card.headline}", STYLES["error"])
         for label, text in card.facts.items():
             yield from _labelled(label, text)
+        yield Line("Nothing was written. Exit code 2.")
         return
     yield from _identity(card)
     yield from _headline(card)
-    for cause in card.causes:
-        if cause is not card.causes[0]:
+    for number, cause in enumerate(card.causes, start=1):
+        if number > 1:
             title = f"{cause.severity}[{cause.id}]: {cause.title}"
             yield Line(title, STYLES[cause.severity])
+        yield from _labelled(f"cause {number}" if len(card.causes) > 1 else "cause", cause.why)
         yield from _cause(cause)
     if card.more_causes:
-        yield Line(f"and {card.more_causes} more: -v")
+        yield Line(f"and {card.more_causes} more causes: -v")
     for label, text in card.facts.items():
         yield from _labelled(label, text)
     yield from _verdict_axis(card)
@@ -126,22 +111,30 @@ def card_lines(card: Card) -> Iterator[Line]:
         yield from _wrapped(text, "  ", "  ")
     if card.notes:
         yield Line("")
-    for note in card.notes:
-        text = " ".join(filter(None, (f"note[{note.id}]: {note.text}", note.action)))
+    for text in note_texts(card, "-v"):
         yield from _wrapped(text, "", "  ")
 
 
+def note_texts(card: Card, place: str) -> list[str]:
+    """Format the first notes of a card, and count the others, which stand at ``place``."""
+    texts = [
+        " ".join(filter(None, (f"note[{note.id}]: {note.text}", note.action)))
+        for note in card.notes[:MAX_NOTES]
+    ]
+    more = len(card.notes) - MAX_NOTES
+    return texts + ([f"and {more} more notes: {place}"] if more > 0 else [])
+
+
 def closing_lines(card: Card) -> Iterator[Line]:
-    """Yield the lines after the written files: where to read more, and what *console* means."""
+    """Yield the last lines of a card: where to read more, and what the console of a command is."""
     has_console = any(action.where == "console" for action in _all_actions(card))
-    sentences = ["More: -v."] if card.severity != "refused" else []
-    sentences += [CONSOLE] if has_console else []
+    sentences = ["More: -v.", *([CONSOLE] if has_console else [])]
     sentences += [f"Meaning: px4fuse explain {card.id}"] if card.id else []
     yield from _wrapped(" ".join(sentences), "", "")
 
 
 def with_typed_path(card: Card, path: str | None) -> Card:
-    """Replace the file name of the log in all commands by the path as typed.
+    """Replace the file name of the log in all commands of a card by the path as typed.
 
     >>> from px4fuse.card.model import Identity
     >>> action = Action("KF", commands=("px4fuse compare a.ulg --sigma-z 1",), where="shell")
@@ -190,7 +183,7 @@ def to_ascii(text: str) -> str:
     >>> to_ascii("error ÷ σ 7.2 → 1.2")
     'error / sigma 7.2 -> 1.2'
     """
-    return "".join(ASCII.get(character, character) for character in text)
+    return text.translate(ASCII)
 
 
 def axis_text(ratio: float | None, against: Reference) -> str:
@@ -243,7 +236,6 @@ def _headline(card: Card) -> Iterator[Line]:
 
 
 def _cause(cause: Cause) -> Iterator[Line]:
-    yield from _labelled("cause", cause.why)
     yield from _labelled("when", format_spans(cause))
     rows = marked_actions(cause)
     labels = [f"{mark}{format_target(action)}" for mark, action in rows]
@@ -255,7 +247,7 @@ def _cause(cause: Cause) -> Iterator[Line]:
 
 
 def marked_actions(cause: Cause) -> list[tuple[str, Action]]:
-    """Return the actions of a cause, alternatives first with "EITHER " and "OR "."""
+    """Return the actions of a cause, with "EITHER " and "OR " before alternatives."""
     alternatives = [
         ("OR " if place else "EITHER ", action)
         for place, alternative in enumerate(cause.alternatives)
@@ -295,7 +287,7 @@ def _rerun_table(reruns: Sequence[Rerun]) -> Iterator[Line]:
 
 
 def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
-    """Return the columns of the table of re-runs, headings first; empty columns are absent."""
+    """Return the columns of the re-run table, each with its heading; empty columns are left out."""
     columns = (
         ("re-run of this log", [rerun.label for rerun in reruns]),
         (
@@ -311,13 +303,13 @@ def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
 
 
 def rerun_start(reruns: Sequence[Rerun]) -> str:
-    """Return the sentence with the start of predicted re-runs, or ""."""
+    """Return the sentence on the time from which EKF2's replay predicts, "" without a replay."""
     starts = {rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None}
     if not starts:
         return ""
     return (
-        f"EKF2 (replay): a prediction. Both values are of the replayed flight: from "
-        f"{min(starts):.0f} s on, without gaps."
+        f"EKF2 (replay) is a prediction: both values are of the replay from {min(starts):.0f} s "
+        "on, without gaps."
     )
 
 
@@ -336,7 +328,7 @@ def _verdict_axis(card: Card) -> Iterator[Line]:
         return
     along = "" if card.effect is None else f", {card.effect.axis}"
     yield Line("")
-    heading = "Reported uncertainty: RMS of actual ÷ reported over all samples"
+    heading = "Reported uncertainty: RMS of actual ÷ reported"
     yield from _wrapped(f"{heading}{along}", "", "  ")
     limits = ", ".join(f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in BANDS.items())
     legend = f"  ░ consistent ({limits})"
@@ -344,7 +336,7 @@ def _verdict_axis(card: Card) -> Iterator[Line]:
     yield Line(f"{'':{AXIS_INDENT}}{sides}")
     yield Line(f"{legend:{AXIS_INDENT}}{_ticks()}")
     if any(verdict.is_explained for verdict in card.verdicts):
-        yield Line("  In brackets: explained below, not a fault of the filter.")
+        yield Line("  A verdict in brackets is explained below and is not a fault of the filter.")
     for verdict in card.verdicts:
         yield _verdict_line(verdict)
 
@@ -358,8 +350,7 @@ def _verdict_line(verdict: Verdict) -> Line:
         return Line(text, "", head, " " * 41, wraps=True)
     word = f"({verdict.word})" if verdict.is_explained else verdict.word
     text = f"{head}{format_ratio(verdict.ratio):>7}  {word}"
-    is_loud = verdict.word != "consistent" and not verdict.is_explained
-    style = "bold" if is_loud else ""
+    style = "bold" if verdict.is_loud else ""
     return Line(f"{text:{AXIS_INDENT}}{axis_text(verdict.ratio, verdict.against)}", style)
 
 
@@ -389,7 +380,7 @@ def _aid_axis(aids: Sequence[AidRow]) -> Iterator[Line]:
 
 
 def format_spans(cause: Cause) -> str:
-    """Format the time from the first to the last span of a cause, "" for the whole flight."""
+    """Format the times of a cause, from the first to the last; "" for the whole flight."""
     if not cause.spans_s:
         return ""
     first, last = cause.spans_s[0][0], cause.spans_s[-1][1]

@@ -14,24 +14,26 @@ from px4fuse.report.style import KF_BAND_COLOUR, KF_LINE, Axes
 from px4fuse.results.contract import ComparisonResults
 from px4fuse.text import format_p_value
 
-CURVE_HEIGHT = 170.0  # points; height of the axes
-MAX_DROP_NATS = 12.0  # lower end of the log-likelihood axis, below the maximum
-CURVE_HALF_WIDTH = 2.5  # drawn range on each side of the estimate, in half 95 % intervals
-NEGLIGIBLE_OFFSET_S = 0.010  # one EKF2 step (EKF2_PREDICT_US)
+CURVE_HEIGHT = 170.0  # height (points) of the axes
+MAX_DROP_NATS = 12.0  # lower end of the log-likelihood axis, in nats below the maximum
+# Range of drawn time offsets on each side of the estimate, in half 95 % intervals
+CURVE_HALF_WIDTH = 2.5
+# Largest time offset (s) without an action: one EKF2 step (EKF2_PREDICT_US)
+NEGLIGIBLE_OFFSET_S = 0.010
 # Ids of the findings for which the report has this page
 CLOCK_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf2_ev_delay_wrong")
 
 
 def summary_line(analysis: Analysis, findings: Iterable[Finding]) -> str:
-    """Summarise the time offset in one line."""
+    """Summarise the time offset of the position source in one line."""
     if has_page(analysis, findings):
-        return "see the appendix on the time offset"
+        return "The appendix on the time offset contains the estimate."
     advice = clock_advice(analysis, analysis.clock)
     return " ".join(advice[label] for label in ("Result", "Offset") if label in advice)
 
 
 def has_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
-    """Return True if the time offset is a finding or cannot be estimated from the data."""
+    """Return True if the report has the appendix on the time offset: a finding, or no estimate."""
     clock = analysis.clock
     if isinstance(clock, Unavailable):
         return False
@@ -39,19 +41,19 @@ def has_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
 
 
 def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> dict[str, str]:
-    """Return the estimated time offset and the actions as labelled texts."""
+    """Return the time offset of the position source, and the actions against it, by label."""
     if isinstance(clock, Unavailable):
-        return {"Offset": f"Cannot be estimated: {clock.reason}. {clock.remedy}"}
+        return {"Offset": f"The time offset cannot be estimated: {clock.reason}. {clock.remedy}"}
     if not clock.is_determinable:
         return {
-            "Offset": f"Cannot be estimated: {clock.reason}.",
+            "Offset": f"The time offset cannot be estimated: {clock.reason}.",
             "Action": "Fly passes of 5 m or more with clear starts and stops.",
         }
     offset, (low, high) = clock.offset_s, clock.interval_s
     advice = {
-        "Result": "No significant time offset.",
+        "Result": "The position source has no significant time offset.",
         "Offset": (
-            f"{offset:+.3f} s (95 % {low:+.3f} to {high:+.3f} s), to add to the timestamps of the "
+            f"Add {offset:+.3f} s (95 % {low:+.3f} to {high:+.3f} s) to the timestamps of the "
             "position source."
         ),
     }
@@ -93,13 +95,14 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
         half_width_ppm = 1.96 * clock.drift_sigma_ppm
         note = ", not significant" if abs(clock.drift_ppm) < half_width_ppm else ""
         advice["Drift"] = (
-            f"Clock drift {clock.drift_ppm:+.0f} ± {half_width_ppm:.0f} ppm (95 %){note}."
+            f"The clock of the source drifts by {clock.drift_ppm:+.0f} ± {half_width_ppm:.0f} ppm "
+            f"(95 %){note}."
         )
     return advice
 
 
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
-    """Draw the page if :func:`has_page` is true."""
+    """Draw the appendix on the time offset if it is a finding or cannot be estimated."""
     clock = analysis.clock
     if isinstance(clock, Unavailable) or not has_page(analysis, results.findings):
         return
@@ -126,7 +129,7 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
 
 
 def draw_curve(axes: Axes, clock: ClockOffset) -> None:
-    """Draw the log-likelihood over the time offset, with the 95 % interval."""
+    """Draw the log-likelihood over the time offset of the source, with the 95 % interval."""
     (low, high), estimate_s, applied = clock.interval_s, clock.offset_s, clock.applied_s
     axes.axvspan(low, high, color=KF_BAND_COLOUR, lw=0, label="95 % interval")
     axes.plot(clock.curve_s, clock.curve_drop, **KF_LINE)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,14 +16,17 @@ from px4fuse.findings.cause_text import format_change, format_explained_share
 from px4fuse.flight import Unavailable
 from px4fuse.report import event_marks
 from px4fuse.report.page import Cell, Page, draw_legend_above, halves
-from px4fuse.report.phrases import VERDICT_HEAD, filters_by_name, format_verdict, verdict_rows
+from px4fuse.report.panels import normalised_innovations
+from px4fuse.report.phrases import VERDICT_HEAD, filters_by_name, verdict_rows
 from px4fuse.report.style import (
     DOTS,
     KF_BAND_COLOUR,
+    KF_COLOUR,
     LINES,
     MUTED_COLOUR,
     Axes,
     draw_curve,
+    line_style,
     set_plain_ticks,
 )
 from px4fuse.text import format_number, format_p_value
@@ -31,13 +34,13 @@ from px4fuse.text import format_number, format_p_value
 MAX_LAG = 20
 MAX_NORMALISED = 4.0
 BINS = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 33)
-# Upper limit of the density axis; the normal curve (maximum 0.4) stays visible
+# Maximum of the density axis, at which the normal curve (maximum 0.4) is visible
 MAX_DENSITY = 1.6
-# p value of the Ljung-Box test below which the caption calls the innovations not white
+# Maximum p value of the Ljung-Box test for innovations that the caption calls not white
 MAX_NON_WHITE_P = 0.01
-RUNNING_HEIGHT, LOWER_HEIGHT, LEGEND_HEIGHT = 140.0, 150.0, 14.0  # points; heights of the axes
+RUNNING_HEIGHT, LOWER_HEIGHT, LEGEND_HEIGHT = 140.0, 150.0, 14.0  # heights (points)
 BAND_GREY = "#dcdcdc"
-# Label of each statistic that a cause explains, and the power with which its value is printed
+# Label of each statistic that a re-run changes, and the power of the statistic that is printed
 CAUSE_STATISTICS: Mapping[Statistic, tuple[str, float]] = {
     "nis": ("mean NIS", 1.0),
     "nees": ("√NEES", 0.5),
@@ -45,16 +48,11 @@ CAUSE_STATISTICS: Mapping[Statistic, tuple[str, float]] = {
 }
 
 
-class FilterSeries(NamedTuple):
-    """Normalised innovations ν/√S of one filter, with their statistics."""
-
-    name: str
-    values: pd.Series[float]
-    consistency: Consistency
+Series = Mapping[str, "pd.Series[float]"]
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw one page: three panels of the main axis, and a table of all axes."""
+    """Draw the consistency tests of the main axis, and a table of all axes."""
     result = analysis.main
     axis_text = result.axis.label
     page = Page(
@@ -72,7 +70,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
             page,
             analysis,
             "Running mean NIS (log scale)",
-            _nis_sentence(series),
+            "",
             RUNNING_HEIGHT,
             above=LEGEND_HEIGHT,
         )
@@ -80,14 +78,13 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         draw_legend_above(axes)
         left_page, right_page = halves()
         left = left_page.panel(
-            "Distribution of ν/√S",
-            _shape_sentence(series),
-            LOWER_HEIGHT,
-            above=LEGEND_HEIGHT,
-            left=4.0,
+            "Distribution of ν/√S", "", LOWER_HEIGHT, above=LEGEND_HEIGHT, left=4.0
         )
         right = right_page.panel(
-            "Autocorrelation", _whiteness_sentence(series), LOWER_HEIGHT, above=LEGEND_HEIGHT
+            "Autocorrelation",
+            _whiteness_sentence(result, series),
+            LOWER_HEIGHT,
+            above=LEGEND_HEIGHT,
         )
         _draw_histogram(left, series)
         _draw_autocorrelation(right, series)
@@ -97,7 +94,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     else:
         kf_summary = result.filters["kf"]
         reason = kf_summary.reason if isinstance(kf_summary, Unavailable) else "too few innovations"
-        page.write(f"Along {axis_text}: {reason}.")
+        page.write(f"The consistency along {axis_text} is not tested: {reason}.")
     page.heading("All axes", above=12.0)
     head = [*VERDICT_HEAD, "n", "beyond\n2√S", "t of\nmean", "lag 1", "Ljung-\nBox"]
     page.table(head, verdict_rows(analysis.axes.values(), _statistic_cells), right=(2, 5, 6, 7, 8))
@@ -106,7 +103,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _write_causes(page: Page, analysis: Analysis) -> None:
-    """Write the table of re-runs along the main axis, each with one change."""
+    """Write the table of re-runs of KF and EKF2 with one change along the main axis."""
     axis = analysis.main.axis
     rows: list[list[Cell]] = []
     for cause in analysis.causes:
@@ -138,38 +135,33 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     )
 
 
-def _series(result: AxisComparison) -> list[FilterSeries]:
-    """Return the normalised innovations of each filter with at least MIN_INNOVATIONS."""
-    innovation_tables = {"KF": result.replay.updates, "EKF2": result.ekf2_innovations}
-    series = []
-    for name, consistency in filters_by_name(result).items():
-        table = innovation_tables[name]
-        if isinstance(table, pd.DataFrame) and isinstance(consistency, Consistency):
-            values = table["innovation_m"] / np.sqrt(table["innovation_variance_m2"])
-            finite_values = values[np.isfinite(values)]
-            if len(finite_values) >= MIN_INNOVATIONS:
-                series.append(FilterSeries(name, finite_values, consistency))
-    return series
+def _series(result: AxisComparison) -> Series:
+    verdicts = filters_by_name(result)
+    return {
+        name: values
+        for name, values in normalised_innovations(result).items()
+        if isinstance(verdicts.get(name), Consistency) and len(values) >= MIN_INNOVATIONS
+    }
 
 
-def _thin_line_style(filter_series: FilterSeries) -> dict[str, Any]:
-    return {"color": LINES[filter_series.name]["color"], "lw": 0.6, "ls": (0, (1, 1.5))}
+def _thin_line_style(name: str) -> dict[str, Any]:
+    return line_style(LINES[name]["color"], 0.6, (0, (1, 1.5)))
 
 
-def _draw_running_nis(axes: Axes, series: list[FilterSeries]) -> None:
+def _draw_running_nis(axes: Axes, series: Series) -> None:
     lowest, highest = 0.5, 2.0
-    for filter_series in series:
-        number = np.arange(1, len(filter_series.values) + 1)
-        running = (filter_series.values**2).cumsum() / number
-        draw_curve(axes, running.iloc[2:], **LINES[filter_series.name], label=filter_series.name)
+    for name, values in series.items():
+        number = np.arange(1, len(values) + 1)
+        running = (values**2).cumsum() / number
+        draw_curve(axes, running.iloc[2:], **LINES[name], label=name)
         drawn_counts = np.unique(np.geomspace(3, len(number), 60).astype(int))
         low, high = np.array([nis_band(int(count)) for count in drawn_counts]).T
-        time = filter_series.values.index[drawn_counts - 1]
-        if filter_series.name == "KF":
+        time = values.index[drawn_counts - 1]
+        if name == "KF":
             axes.fill_between(time, low, high, color=BAND_GREY, lw=0, label="95 % band KF")
         else:
-            axes.plot(time, low, **_thin_line_style(filter_series))
-            axes.plot(time, high, **_thin_line_style(filter_series), label="95 % band EKF2")
+            axes.plot(time, low, **_thin_line_style(name))
+            axes.plot(time, high, **_thin_line_style(name), label="95 % band EKF2")
         settled_nis = running.iloc[len(running) // 4 :]
         lowest, highest = (
             min(lowest, 0.7 * settled_nis.min()),
@@ -180,16 +172,16 @@ def _draw_running_nis(axes: Axes, series: list[FilterSeries]) -> None:
     set_plain_ticks(axes.yaxis)
 
 
-def _draw_histogram(axes: Axes, series: list[FilterSeries]) -> None:
+def _draw_histogram(axes: Axes, series: Series) -> None:
     x = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 81)
     normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
     axes.fill_between(x, normal, color=BAND_GREY, lw=0, label="normal")
     highest = 0.4
-    for filter_series in series:
+    for name, values in series.items():
         density, _ = np.histogram(
-            filter_series.values.clip(-MAX_NORMALISED, MAX_NORMALISED), bins=BINS, density=True
+            values.clip(-MAX_NORMALISED, MAX_NORMALISED), bins=BINS, density=True
         )
-        axes.stairs(density, BINS, **LINES[filter_series.name], label=filter_series.name)
+        axes.stairs(density, BINS, **LINES[name], label=name)
         highest = max(highest, float(density.max()))
     axes.set_xlim(-MAX_NORMALISED, MAX_NORMALISED)
     axes.set_ylim(0.0, min(1.15 * highest, MAX_DENSITY))
@@ -197,23 +189,16 @@ def _draw_histogram(axes: Axes, series: list[FilterSeries]) -> None:
     axes.set_xlabel("ν / √S")
 
 
-def _draw_autocorrelation(axes: Axes, series: list[FilterSeries]) -> None:
-    for shift, filter_series in zip((-0.18, 0.18), series, strict=False):
-        lags = min(MAX_LAG, len(filter_series.values) // 3)
-        r = autocorrelation(np.asarray(filter_series.values, np.float64), lags)
+def _draw_autocorrelation(axes: Axes, series: Series) -> None:
+    for shift, (name, values) in zip((-0.18, 0.18), series.items(), strict=False):
+        lags = min(MAX_LAG, len(values) // 3)
+        r = autocorrelation(np.asarray(values, np.float64), lags)
         positions = np.arange(1, lags + 1) + shift
-        axes.vlines(positions, 0.0, r, color=LINES[filter_series.name]["color"], lw=1.2)
-        fill_style = {
-            "mfc": LINES[filter_series.name]["color"] if filter_series.name == "KF" else "white"
-        }
-        axes.plot(
-            positions,
-            r,
-            **DOTS[filter_series.name] | fill_style | {"ms": 3.0, "mew": 0.6},
-            label=filter_series.name,
-        )
-        bound = _whiteness_bound(filter_series)
-        if filter_series.name == "KF":
+        axes.vlines(positions, 0.0, r, color=LINES[name]["color"], lw=1.2)
+        dots = DOTS[name] | {"ms": 3.0, "mew": 0.6, "mfc": KF_COLOUR if name == "KF" else "white"}
+        axes.plot(positions, r, **dots, label=name)
+        bound = _whiteness_bound(values)
+        if name == "KF":
             axes.axhspan(
                 -bound,
                 bound,
@@ -224,7 +209,7 @@ def _draw_autocorrelation(axes: Axes, series: list[FilterSeries]) -> None:
             )
         else:
             for level in (-bound, bound):
-                axes.axhline(level, **_thin_line_style(filter_series))
+                axes.axhline(level, **_thin_line_style(name))
     axes.axhline(0.0, color="black", lw=0.5)
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, -0.3), -1.05), min(max(high, 0.3), 1.05))
@@ -232,39 +217,23 @@ def _draw_autocorrelation(axes: Axes, series: list[FilterSeries]) -> None:
     axes.set_xlabel("lag (measurements)")
 
 
-def _whiteness_bound(filter_series: FilterSeries) -> float:
+def _whiteness_bound(values: pd.Series[float]) -> float:
     """Return the half width of the 95 % band for the autocorrelation of white innovations."""
-    return float(1.96 / np.sqrt(len(filter_series.values)))
+    return float(1.96 / np.sqrt(len(values)))
 
 
-def _nis_sentence(series: list[FilterSeries]) -> str:
-    return " ".join(
-        f"{name}: final mean NIS {format_number(consistency.nis_mean)} "
-        "(expected {:.2f} to {:.2f}): ".format(*consistency.nis_band)
-        + f"{format_verdict(consistency)}."
-        for name, _, consistency in series
-    )
-
-
-def _shape_sentence(series: list[FilterSeries]) -> str:
-    return "\n".join(
-        f"{name}: {consistency.fraction_outside_two_sigma:.1%} beyond 2√S (expected 4.5 %), "
-        f"mean {consistency.innovation_mean_m:+z.3f} m ({format_p_value(consistency.bias_p)})."
-        for name, _, consistency in series
-    )
-
-
-def _whiteness_sentence(series: list[FilterSeries]) -> str:
+def _whiteness_sentence(result: AxisComparison, series: Series) -> str:
     sentences = []
-    for filter_series in series:
-        r, p = filter_series.consistency.lag1_autocorrelation, filter_series.consistency.ljung_box_p
+    for name, values in series.items():
+        consistency = filters_by_name(result)[name]
+        assert isinstance(consistency, Consistency)  # else the filter has no innovations
+        r, p = consistency.lag1_autocorrelation, consistency.ljung_box_p
         interpretation = "white" if p >= MAX_NON_WHITE_P else "not white"
-        if p < MAX_NON_WHITE_P and abs(r) > _whiteness_bound(filter_series):
-            interpretation = (
-                "the filter lags" if r > 0.0 else "the filter follows measurement noise"
-            )
+        if p < MAX_NON_WHITE_P and abs(r) > _whiteness_bound(values):
+            cause = "lags" if r > 0.0 else "follows measurement noise"
+            interpretation = f"the filter {cause}"
         sentences.append(
-            f"{filter_series.name}: lag 1 {r:+.2f}, Ljung-Box {format_p_value(p)}: "
+            f"{name}: lag-1 autocorrelation {r:+.2f}, Ljung-Box test {format_p_value(p)}: "
             f"{interpretation}."
         )
     return "\n".join(sentences)

@@ -28,6 +28,7 @@ from px4fuse.report.card_text import (
     QUANTITIES,
     format_spans,
     marked_actions,
+    note_texts,
     rerun_columns,
     rerun_start,
 )
@@ -37,18 +38,17 @@ from px4fuse.report.style import SEVERITY_COLOURS
 from px4fuse.report.typesetting import measure_free_height
 from px4fuse.results.contract import AidsResults, ComparisonResults
 
-MAX_NOTES = 3
-# More changed settings are counted in the head; the foot has the command with all of them
+# Maximum number of changed settings in the head; with more, their number is printed
 MAX_CHANGED = 3
-MAX_FILE_LENGTH = 56  # characters
+MAX_FILE_LENGTH = 56  # maximum number of characters of the file name in the head
 SIGNS = {"error": "■", "warning": "▲", "note": "●", "clean": "✓"}
 SEVERITY_WORDS = {"error": "ERROR", "warning": "WARNING", "note": "NOTE", "clean": "NO FAULT"}
 AXIS_TITLE = "Is the reported uncertainty right?"
 AXIS_TEXT = "RMS of actual ÷ reported"
 TERMS = (
-    "Source: positions that both filters fuse. σ: reported standard deviation of the position. "
-    "√S: of the innovation. KF: position and velocity along one axis, IMU acceleration as input, "
-    "no gate. Replay: px4fuse's model of EKF2, run on this log."
+    "Source: positions that both filters fuse. σ, √S: standard deviation that a filter reports for "
+    "its position and for an innovation. KF: filter with position and velocity along one axis, IMU "
+    "acceleration as input, no gate. Replay: px4fuse's model of EKF2, run on this log."
 )
 AIDS_TERMS = "√S: standard deviation of an innovation as EKF2 reports it. Source: an aiding sensor."
 PLACES = {"shell": "your computer", "console": "MAVLink Console of QGroundControl"}
@@ -71,10 +71,10 @@ def draw_aids_only(_: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
 
 
 def add_card(page: Page, card: Card) -> Block:
-    """Add the texts of a card to a page; its panels belong into ``blocks`` of the result."""
+    """Add the texts of a card to a page; the panels go into ``blocks`` of the returned block."""
     identity = card.identity
     flight = identity.firmware, identity.hardware, f"{identity.duration_s:.1f} s", identity.source
-    more = [f"and {card.more_causes} more: {ALL_FINDINGS}"] if card.more_causes else []
+    more = [f"and {card.more_causes} more causes: {ALL_FINDINGS}"] if card.more_causes else []
     return page.add(
         "cover",
         sign=SIGNS[card.severity],
@@ -97,7 +97,7 @@ def add_card(page: Page, card: Card) -> Block:
         causes=[_cause(number, cause) for number, cause in enumerate(card.causes, start=1)],
         more_causes="".join(more),
         difference=card.difference,
-        notes=_notes(card),
+        notes=note_texts(card, ALL_FINDINGS),
         terms=AIDS_TERMS if card.aids else TERMS,
         command=identity.command,
         segment=f"analysed {identity.segment}" if identity.segment else "",
@@ -129,7 +129,7 @@ def _format_changed(changed: Sequence[str]) -> str:
 
 
 def _axis(card: Card) -> dict[str, Any]:
-    """Return the rows of the logarithmic axis with their heading."""
+    """Return the heading and the rows of the logarithmic axis of σ ratios."""
     limits = [
         f"{MARKS[name]} {low:g} to {high:g}"
         for name, (low, high) in BANDS.items()
@@ -161,7 +161,7 @@ def _verdict_row(verdict: Verdict) -> dict[str, Any]:
         "quantity": quantity,
         "word": word,
         "quiet": verdict.is_explained,
-        "loud": verdict.word in ("overconfident", "underconfident") and not verdict.is_explained,
+        "loud": verdict.is_loud,
         **_mark(verdict.ratio, verdict.against, verdict.interval),
     }
 
@@ -181,7 +181,7 @@ def _aid_row(row: AidRow) -> dict[str, Any]:
 def _mark(
     ratio: float | None, against: Reference, interval: tuple[float, float] | None
 ) -> dict[str, Any]:
-    """Return the places of a ratio, its interval and its band as fractions of the axis."""
+    """Return the places (0 to 1) of a ratio, its interval and its band on the axis."""
     fraction = 0.5 if ratio is None else axis_fraction(ratio)
     beyond = 1 if fraction > 1.0 else -1 if fraction < 0.0 else 0
     return {
@@ -195,7 +195,6 @@ def _mark(
 
 
 def _clipped(ratio: float) -> float:
-    """Return the place of a ratio on the axis, at most its end."""
     return min(max(axis_fraction(max(ratio, AXIS_ENDS[0])), 0.0), 1.0)
 
 
@@ -228,12 +227,3 @@ def _action(mark: str, action: Action) -> dict[str, Any]:
         "commands": action.commands,
         "long": any(len(command) > MAX_COMMAND_LENGTH for command in action.commands),
     }
-
-
-def _notes(card: Card) -> list[str]:
-    texts = [
-        " ".join(filter(None, (f"note[{note.id}]: {note.text}", note.action)))
-        for note in card.notes[:MAX_NOTES]
-    ]
-    more = len(card.notes) - MAX_NOTES
-    return texts + ([f"and {more} more: {ALL_FINDINGS}"] if more > 0 else [])

@@ -1,4 +1,7 @@
-"""Panels of the cover: map, errors of KF and EKF2, innovations; no value leaves one unmarked."""
+"""Panels of the cover: map, position errors of KF and EKF2, innovations.
+
+Values outside of a panel are marked by triangles at its edge.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,8 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.card.model import Card, FilterName
+from px4fuse.card.build import horizontal_resets
+from px4fuse.card.model import Card
 from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.comparison.comparison import kf_state_and_variance, position_errors, reported_sigma
 from px4fuse.comparison.model import FILTERS, AxisComparison
@@ -25,6 +29,7 @@ from px4fuse.report.event_marks import (
     OUTLIER_MARK,
     TAKE_OFF_MARK,
     outlier_times,
+    visible_times,
 )
 from px4fuse.report.page import (
     AXES_RIGHT,
@@ -39,69 +44,70 @@ from px4fuse.report.page import (
     line_count,
     text_width,
 )
+from px4fuse.report.panels import normalised_innovations
 from px4fuse.report.style import LINES, Artist, Axes, draw_curve
 
 MM = 72.0 / 25.4
-# Length / width of the track from which the panels stand one below the other
+# Minimum length / width of the track for panels that fill the page width
 MIN_LONG_RATIO = 2.2
-# pt; heights of panels with their titles and labels
+# Least and largest height (pt) of the map, with title and labels
 MAP_HEIGHTS = 40.0 * MM, 53.0 * MM
-# pt; least heights of all panels in two columns and in three
+# Least total heights (pt) of the panels in two columns and in three columns
 MIN_HALVES_HEIGHT, MIN_THIRDS_HEIGHT = 50.0 * MM, 38.0 * MM
 INNOVATION_HEIGHTS = 27.0 * MM, 38.0 * MM
 MIN_ERROR_HEIGHT = 17.0 * MM
-# pt; height of all panels if the card fills its page
+# Total height (pt) of the panels on the next page, if the card fills the first one
 NEXT_PAGE_HEIGHT = 160.0 * MM
-# pt; title with its gaps, each further line of it, gap above the legend, and what is left free
+# Heights (pt): title with gaps, each further line of it, gap above the legend, unused rest
 TITLE_HEIGHT, TITLE_LINE, LEGEND_GAP, SPARE = 16.5, 10.5, 11.0, 4.0
-MIN_TICKS_HEIGHT = 48.0  # pt; lower axes of the innovations have ticks at -4, 0 and 4 only
-MIN_WIDE = 200.0  # pt; narrower panels have fewer ticks
-LEFT = 38.0  # pt; tick and axis labels left of the axes
-# Share of the free height for the innovations and for the map
+# Minimum height (pt) of the innovations for ticks at ±2 besides -4, 0 and 4
+MIN_TICKS_HEIGHT = 48.0
+MIN_WIDE = 200.0  # minimum width (pt) of a panel for six ticks of the time axis
+LEFT = 38.0  # width (pt) for tick and axis labels left of the axes
+# Fraction of the height of all panels for the innovations, and for the map
 INNOVATION_SHARE, MAP_SHARE = 0.22, 0.25
-MAX_DRAWN = 400  # innovations per filter; more are decimated evenly, those beyond the scale never
+# Maximum number of drawn innovations per filter; those beyond the scale are always drawn
+MAX_DRAWN = 400
 MAX_NORMALISED = 4.0
-# pt; height below the axes, without and with labels of the x axis
+# Height (pt) below the axes, without and with labels of the time axis
 BELOW = UNLABELLED_HEIGHT, TICKS_HEIGHT + AXIS_LABEL_HEIGHT
 MAP_MARGIN, MAP_REACH, MIN_MAP_LENGTH_M = 1.08, 0.25, 0.5
-# Fraction of the map's length between two triangles of a track
+# Minimum distance between two triangles of a track, as a fraction of the map's length
 MIN_EXIT_DISTANCE = 0.02
-# A curve that fills less of its scale than this is called flat
+# Maximum part of the scale that a curve fills if the title calls it flat
 FLAT_SHARE = 0.1
 FLAT_INNOVATIONS = 1.0
-# σ is printed as one value if its largest is below this multiple of its smallest
+# Maximum ratio of the largest to the smallest σ for a title with one value of σ
 MAX_SIGMA_SPREAD = 1.5
-SETTLING_S = 2.0  # at the start, σ settles; its values do not count in the titles
-# Markers of the innovations, as in the title
+# Time (s) in which σ settles at the start; titles do not include its values
+SETTLING_S = 2.0
+# Markers of the innovations; the title of their panel shows the same symbols
 INNOVATION_DOTS: Mapping[str, dict[str, Any]] = {
     "KF": style.KF_DOTS,
     "EKF2": style.EKF2_DOTS | {"ms": 2.8, "mew": 0.6, "mfc": "none"},
 }
-# Fraction of the axes: of marks closer than this, one is drawn
+# Minimum distance of two marks as a fraction of the axes; of closer marks one is drawn
 MIN_MARK_DISTANCE = 1.0 / 150.0
-GAP_HATCH: dict[str, Any] = {**GAP_BAND, "facecolor": "none"}  # σ in the gap stays visible
-RESET_LINE: dict[str, Any] = {"color": style.EKF2_COLOUR, "lw": 1.0, "ls": (0, (1, 1))}
-REJECTED_MARK: dict[str, Any] = {
-    "color": "black",
-    "marker": "|",
-    "ms": 5.0,
-    "mew": 0.7,
-    "ls": "none",
-}
+GAP_HATCH: dict[str, Any] = {
+    **GAP_BAND,
+    "facecolor": "none",
+}  # no fill, so that σ in the gap is visible
+RESET_LINE = style.line_style(style.EKF2_COLOUR, 1.0, (0, (1, 1)))
+REJECTED_MARK = style.dot_style("black", "|", 5.0, 0.7)
 Coordinates = tuple[Array, Array]
 MapLimits = tuple[tuple[float, float], tuple[float, float]]
 DrawStrip = Callable[[Axes], None]
 
 
 class Strip(NamedTuple):
-    """Panel over time: title, and the function that draws it."""
+    """Small plot over time: title, and the function that draws it."""
 
     title: str
     draw: DrawStrip
 
 
 class FlightMap(NamedTuple):
-    """Flight from above: tracks (m, right and up), and the labels of both axes.
+    """Flight from above: tracks in metres to the right and upwards, and the axis labels.
 
     Of ``right_labels`` the first that fits is used.
     """
@@ -113,13 +119,13 @@ class FlightMap(NamedTuple):
 
     @property
     def is_long(self) -> bool:
-        """True if the track is at least :data:`MIN_LONG_RATIO` times longer than wide."""
+        """True if the track is so long and narrow that the panels fill the page width."""
         length_m, width_m = (float(np.ptp(values)) for values in self.tracks["positions"])
         return length_m >= MIN_LONG_RATIO * max(width_m, 1e-6)
 
 
 def write_panels(block: Block, analysis: Analysis, card: Card, free: float) -> None:
-    """Draw legend, map and strips into the block of the cover.
+    """Draw legend, map and plots over time into the block of the cover.
 
     Parameters
     ----------
@@ -166,7 +172,7 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free: float) -> N
 def _draw_strips(
     page: Page, analysis: Analysis, strips: Sequence[Strip], heights: Sequence[float]
 ) -> None:
-    """Draw strips on one time axis; heights include titles and labels."""
+    """Draw plots on one time axis; their heights (pt) include titles and labels."""
     for strip, height in zip(strips, heights, strict=True):
         is_last = strip is strips[-1]
         axes_height = height - _head_height(page, strip.title) - BELOW[is_last]
@@ -180,7 +186,7 @@ def _draw_strips(
 def _equal_heights(
     page: Page, strips: Sequence[Strip], total: float, *, is_labelled: bool
 ) -> list[float]:
-    """Return heights of strips that add up to a total (pt), with axes of equal height.
+    """Return heights (pt) of plots with equal axes that add up to a total.
 
     If ``is_labelled``, the last strip has the labels of the time axis.
     """
@@ -196,86 +202,32 @@ def _tick_count(page: Page) -> int:
 
 
 def _head_height(page: Page, title: str) -> float:
-    """Return the height (pt) of a title with its gaps."""
     return TITLE_HEIGHT + TITLE_LINE * (line_count(title, page.width) - 1)
 
 
-# ------------------------------------------------------------------------------------------ errors
-
-
 def _error_strips(analysis: Analysis, card: Card) -> list[Strip]:
-    """Return a strip of the errors of each filter, or of KF - EKF2 without ground truth."""
-    result = analysis.main
-    found = {
+    """Return a plot of the position error of each filter, or of KF - EKF2 without ground truth."""
+    result, effect = analysis.main, card.effect
+    errors_by_filter = {
         owner: errors
         for owner in FILTERS
         if isinstance(errors := position_errors(result, owner), pd.DataFrame)
         and errors["error_m"].notna().any()
     }
-    if not found:
-        return _difference_strip(analysis, card)
-    half_height = 1.1 * max(_shown_height(errors) for errors in found.values())
-    rmse_m = card.effect.position_rmse_m if card.effect else {}
-    return [
-        Strip(
-            _error_title(owner, errors, rmse_m.get(owner), half_height),
-            _error_drawing(analysis, owner, errors, half_height),
-        )
-        for owner, errors in found.items()
-    ]
-
-
-def _shown_height(errors: pd.DataFrame) -> float:
-    """Return the largest error (m), or 2.2 σ if that is not much larger."""
-    largest, sigma = float(errors["error_m"].abs().max()), errors["sigma_m"].median()
-    return max(largest, 1e-3, min(2.2 * sigma, 3.0 * largest) if np.isfinite(sigma) else 0.0)
-
-
-def _error_title(
-    owner: FilterName, errors: pd.DataFrame, rmse_m: float | None, half_height: float
-) -> str:
-    parts = [] if rmse_m is None else [f"RMSE {format_metres(rmse_m)}"]
-    if sigma := _format_sigma(errors["sigma_m"]):
-        parts.append(f"σ {sigma}")
-    largest = float(errors["error_m"].abs().max())
-    if largest < FLAT_SHARE * half_height:
-        parts.append(f"flat on this scale, at most {format_metres(largest)}")
-    return f"{FILTER_NAMES[owner]} error (m): {', '.join(parts)}"
-
-
-def _format_sigma(sigma: pd.Series[float]) -> str:
-    known = sigma.dropna()
-    known = known[known.index >= known.index.min() + SETTLING_S]
-    if known.empty:
-        return ""
-    low, high = float(known.min()), float(known.max())
-    if high < MAX_SIGMA_SPREAD * low:
-        return format_metres(float(known.median()))
-    return f"{format_metres(low)} to {format_metres(high)}"
-
-
-def _error_drawing(
-    analysis: Analysis, owner: FilterName, errors: pd.DataFrame, half_height: float
-) -> DrawStrip:
-    name = FILTER_NAMES[owner]
-
-    def draw(axes: Axes) -> None:
-        axes.set_ylim(-half_height, half_height)
-        _draw_sigma(axes, errors["sigma_m"], name)
-        axes.axhline(0.0, color="black", lw=0.5)
-        draw_curve(axes, errors["error_m"], **LINES[name])
-        _draw_spans(axes, analysis)
-        if owner == "kf":
-            _draw_at_edge(axes, outlier_times(analysis), 0.94, OUTLIER_MARK)
-        else:
-            _draw_ekf2_events(axes, analysis)
-
-    return draw
-
-
-def _difference_strip(analysis: Analysis, card: Card) -> list[Strip]:
-    """Return the strip of KF - EKF2 with ±2σ of both; none without EKF2."""
-    result = analysis.main
+    if errors_by_filter:
+        half_height = 1.1 * max(map(_shown_height, errors_by_filter.values()))
+        rmse_m = effect.position_rmse_m if effect else {}
+        return [
+            _strip(
+                analysis,
+                f"{(name := FILTER_NAMES[owner])} error (m)",
+                _format_size("RMSE", rmse_m.get(owner)),
+                errors["error_m"],
+                {name: errors["sigma_m"]},
+                half_height,
+            )
+            for owner, errors in errors_by_filter.items()
+        ]
     if not isinstance(result.ekf2_state, pd.DataFrame):
         return []
     time_s = result.ekf2_state.index.to_numpy()
@@ -289,25 +241,69 @@ def _difference_strip(analysis: Analysis, card: Card) -> list[Strip]:
     }
     widest = [2.2 * sigma.median() for sigma in sigmas.values() if sigma.notna().any()]
     half_height = 1.1 * max(float(difference.abs().max()), *widest)
+    size = _format_size("RMS", effect.difference_rms_m if effect else None)
+    return [_strip(analysis, "KF − EKF2 (m)", size, difference, sigmas, half_height)]
+
+
+def _format_size(label: str, length_m: float | None) -> list[str]:
+    return [] if length_m is None else [f"{label} {format_metres(length_m)}"]
+
+
+def _strip(
+    analysis: Analysis,
+    label: str,
+    sizes: list[str],
+    curve: pd.Series[float],
+    sigmas: Mapping[str, pd.Series[float]],
+    half_height: float,
+) -> Strip:
+    """Return the plot of a position error or of KF - EKF2 (m), with ±2σ of each filter."""
     texts = [f"{name} {text}" for name, sigma in sigmas.items() if (text := _format_sigma(sigma))]
-    rms_m = card.effect.difference_rms_m if card.effect else None
-    size = [] if rms_m is None else [f"RMS {format_metres(rms_m)}"]
+    if len(sigmas) == 1:
+        texts = [text.partition(" ")[2] for text in texts]
+    if texts:
+        sizes = [*sizes, f"σ {', '.join(texts)}"]
+    largest = float(curve.abs().max())
+    if largest < FLAT_SHARE * half_height:
+        sizes = [*sizes, f"at most {format_metres(largest)}, flat on this scale"]
+    line = LINES[next(iter(sigmas))] if len(sigmas) == 1 else style.line_style("black", 1.0)
 
     def draw(axes: Axes) -> None:
         axes.set_ylim(-half_height, half_height)
         for name, sigma in sigmas.items():
             _draw_sigma(axes, sigma, name)
         axes.axhline(0.0, color="black", lw=0.5)
-        draw_curve(axes, difference, color="black", lw=1.0)
+        draw_curve(axes, curve, **line)
         _draw_spans(axes, analysis)
-        _draw_ekf2_events(axes, analysis)
+        if "EKF2" in sigmas:
+            for time_s in horizontal_resets(analysis):
+                axes.axvline(time_s, **RESET_LINE)
+            _draw_at_edge(axes, _rejected(analysis), 0.06, REJECTED_MARK)
+        else:
+            _draw_at_edge(axes, outlier_times(analysis), 0.94, OUTLIER_MARK)
 
-    title = ", ".join([*size, *([f"σ {', '.join(texts)}"] if texts else [])])
-    return [Strip(f"KF − EKF2 (m): {title}", draw)]
+    return Strip(f"{label}: {', '.join(sizes)}", draw)
+
+
+def _shown_height(errors: pd.DataFrame) -> float:
+    """Return the largest position error (m) of a filter, or 2.2 σ if that is not much larger."""
+    largest, sigma = float(errors["error_m"].abs().max()), errors["sigma_m"].median()
+    return max(largest, 1e-3, min(2.2 * sigma, 3.0 * largest) if np.isfinite(sigma) else 0.0)
+
+
+def _format_sigma(sigma: pd.Series[float]) -> str:
+    known = sigma.dropna()
+    known = known[known.index >= known.index.min() + SETTLING_S]
+    if known.empty:
+        return ""
+    low, high = float(known.min()), float(known.max())
+    if high < MAX_SIGMA_SPREAD * low:
+        return format_metres(float(known.median()))
+    return f"{format_metres(low)} to {format_metres(high)}"
 
 
 def _draw_sigma(axes: Axes, sigma: pd.Series[float], name: str) -> None:
-    """Draw ±2σ of a filter; where it leaves the scale, a triangle and the largest value."""
+    """Draw ±2σ of a filter; beyond the plot, draw triangles and write the largest value."""
     known = sigma.dropna()
     if known.empty:
         return
@@ -342,69 +338,32 @@ def _draw_spans(axes: Axes, analysis: Analysis) -> None:
             axes.axvspan(start, end, **band, zorder=1.5)
 
 
-def _draw_ekf2_events(axes: Axes, analysis: Analysis) -> None:
-    """Draw EKF2's rejections and horizontal resets."""
-    for time_s in horizontal_resets(analysis):
-        axes.axvline(time_s, **RESET_LINE)
-    _draw_at_edge(axes, _rejected(analysis), 0.06, REJECTED_MARK)
-
-
 def _rejected(analysis: Analysis) -> Array:
     return np.asarray(analysis.events.rejected_s.get(analysis.main.axis.name, ()), np.float64)
 
 
-def horizontal_resets(analysis: Analysis) -> list[float]:
-    """Return the times (s) of EKF2's horizontal position resets in the segment."""
-    ekf2, segment = analysis.flight.ekf2, analysis.segment
-    resets = ekf2.resets if isinstance(ekf2, Ekf2) else ()
-    return [
-        reset.time_s
-        for reset in resets
-        if reset.quantity == "position"
-        and any(reset.delta[:2])
-        and segment.start_s < reset.time_s <= segment.end_s
-    ]
-
-
 def _draw_at_edge(axes: Axes, times: Array, height: float, mark: Mapping[str, Any]) -> None:
-    """Draw marks at a height of the axes (0 to 1)."""
     if len(times):
-        visible = _distant(np.asarray(times), axes.get_xlim())
+        visible = _distant(axes, times)
         axes.plot(
             visible, np.full(len(visible), height), transform=axes.get_xaxis_transform(), **mark
         )
 
 
-def _distant(values: Array, limits: tuple[float, float]) -> Array:
-    """Return the first value of each interval, so that marks do not overlap."""
-    bins = np.floor(values / (MIN_MARK_DISTANCE * (limits[1] - limits[0])))
-    return np.asarray(values[np.sort(np.unique(bins, return_index=True)[1])])
-
-
-# ------------------------------------------------------------------------------------- innovations
+def _distant(axes: Axes, times: Array) -> Array:
+    low, high = axes.get_xlim()
+    return visible_times(times, MIN_MARK_DISTANCE * (high - low))
 
 
 def _innovation_strip(result: AxisComparison) -> Strip:
-    """Return the strip of the innovations over √S, with triangles beyond its scale."""
-    series = {
-        name: (frame["innovation_m"] / np.sqrt(frame["innovation_variance_m2"])).dropna()
-        for name, frame in (("KF", result.replay.updates), ("EKF2", result.ekf2_innovations))
-        if isinstance(frame, pd.DataFrame)
-    }
-    signs = {"KF": "●", "EKF2": "□"}
-    beyond = [
-        f"{name} {format_ratio(size)}"
-        for name, values in series.items()
-        if len(values) and (size := float(values.abs().max())) > MAX_NORMALISED
-    ]
-    strides = {name: -(-len(values) // MAX_DRAWN) for name, values in series.items()}
-    marks = ", ".join(f"{signs[name]} {name}" for name in series)
+    """Return the plot of innovation ÷ √S, with triangles for values beyond its scale."""
+    series = normalised_innovations(result)
+    sizes = {name: float(values.abs().max()) for name, values in series.items() if len(values)}
+    marks = ", ".join(f"{sign} {name}" for name, sign in zip(series, "●□", strict=False))
     title = f"Innovations ÷ √S ({marks}): 95 % belong inside ±2"
-    largest = max(
-        (float(values.abs().max()) for values in series.values() if len(values)), default=0
-    )
-    if largest < FLAT_INNOVATIONS:
+    if (largest := max(sizes.values(), default=0.0)) < FLAT_INNOVATIONS:
         title += f"; all are inside ±{format_ratio(largest)}"
+    beyond = [f"{name} {format_ratio(n)}" for name, n in sizes.items() if n > MAX_NORMALISED]
     if beyond:
         title += f"; ▲▼ beyond ±{MAX_NORMALISED:g}, up to {', '.join(beyond)}"
 
@@ -417,21 +376,18 @@ def _innovation_strip(result: AxisComparison) -> Strip:
         for name in reversed(series):
             values, dots = series[name], INNOVATION_DOTS[name]
             inside = values[values.abs() <= MAX_NORMALISED]
-            axes.plot(inside.iloc[:: strides[name]], **dots)
+            axes.plot(inside.iloc[:: -(-len(values) // MAX_DRAWN)], **dots)
             for sign, marker in ((1.0, "^"), (-1.0, "v")):
                 times = values.index[sign * values > MAX_NORMALISED].to_numpy()
                 edge = {**dots, "marker": marker, "ms": 3.4, "mew": 0, "mfc": dots["color"]}
-                visible = _distant(times, axes.get_xlim()) if len(times) else times
+                visible = _distant(axes, times)
                 axes.plot(visible, np.full(len(visible), sign * MAX_NORMALISED), **edge)
 
     return Strip(title, draw)
 
 
-# ------------------------------------------------------------------------------------------ map
-
-
 def _tracks(analysis: Analysis) -> dict[str, Coordinates]:
-    """Return north and east (m) of each track within the segment."""
+    """Return north and east (m) of positions, KF, EKF2 and ground truth within the segment."""
     segment, flight = analysis.segment, analysis.flight
 
     def cut(frame: pd.DataFrame) -> Coordinates:
@@ -452,7 +408,7 @@ def _tracks(analysis: Analysis) -> dict[str, Coordinates]:
 
 
 def _flight_map(analysis: Analysis, card: Card) -> FlightMap:
-    """Return the map along the aisle, at a heading below 180°; else north up."""
+    """Return the map along the main axis, at a heading below 180°; without it, north is up."""
     aisle = next((line for line in analysis.lines if line.name == AISLE), None)
     heading, right_labels, up_label = np.pi / 2.0, ["east (m)"], "north (m)"
     if aisle is not None and aisle.heading_deg is not None:
@@ -472,12 +428,12 @@ def _flight_map(analysis: Analysis, card: Card) -> FlightMap:
 
 
 def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: float) -> None:
-    """Draw the tracks at equal scales; a triangle marks each place where one leaves the map."""
+    """Draw the tracks at equal scales, with triangles where a track leaves the map."""
     tracks, width = flight_map.tracks, page.width - LEFT - AXES_RIGHT
     title, axes_height = "Map", height - TITLE_HEIGHT - BELOW[True]
     limits = _map_limits(tracks, width / axes_height)
     if leaving := _leaving(tracks, limits):
-        title = f"Map; triangles: {leaving} outside"
+        title = f"Map; triangles: tracks leave it ({leaving})"
         axes_height = height - _head_height(page, title) - BELOW[True]
         limits = _map_limits(tracks, width / axes_height)
     axes = page.panel(title, "", axes_height, above=4.0, left=LEFT, is_compact=True)
@@ -508,7 +464,6 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
 
 
 def _leaving(tracks: Mapping[str, Coordinates], limits: MapLimits) -> str:
-    """Format the tracks that leave the map, each with its largest distance outside."""
     sizes = {name: _distance_outside(track, limits) for name, track in tracks.items()}
     return ", ".join(
         f"{name} {format_metres(size)} m" for name, size in sizes.items() if size > 0.0
@@ -549,7 +504,7 @@ def _ends(values: Array) -> Array:
 
 
 def _overshoot(values: Array, limits: tuple[float, float]) -> Array:
-    """Return the signed distance beyond limits; 0 inside."""
+    """Return the signed distance of values beyond two limits; 0 between them."""
     return np.asarray(values - np.clip(values, *limits))
 
 
@@ -568,7 +523,7 @@ def _exits(track: Coordinates, limits: MapLimits) -> Iterator[tuple[str, tuple[f
     spacing = MIN_EXIT_DISTANCE * (limits[0][1] - limits[0][0])
     last = np.full(2, np.inf)
     for change in changes:
-        # the outside sample next to the change
+        # use the sample outside of the map next to the crossing of its frame
         index = change if change < len(is_outside) and is_outside[change] else change - 1
         x, y = over[0][index], over[1][index]
         marker = ("^" if y > 0.0 else "v") if abs(y) >= abs(x) else (">" if x > 0.0 else "<")
@@ -578,11 +533,7 @@ def _exits(track: Coordinates, limits: MapLimits) -> Iterator[tuple[str, tuple[f
             last = place
 
 
-# -------------------------------------------------------------------------------------- legend
-
-
 def _legend_entries(analysis: Analysis) -> list[Artist]:
-    """Return entries for all lines and marks that occur."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 

@@ -28,14 +28,14 @@ from px4fuse.report.style import (
 from px4fuse.text import capitalise_first
 
 TITLE = "Difference between KF and EKF2, step by step"
-ROW_HEIGHT, LABEL_WIDTH = 12.0, 140.0  # points; height of a bar, width of the step names
-LEFT_COLUMN_FRACTION = 0.62  # of the page width; this column has the step names
-TIME_HEIGHT = 105.0  # points; height of the axes
-INCREASE_STYLE = {"color": "white", "hatch": "////"}  # bars of steps that increase the difference
+ROW_HEIGHT, LABEL_WIDTH = 12.0, 140.0  # height of a bar and width of its label (points)
+LEFT_COLUMN_FRACTION = 0.62  # fraction of the page width for the column with the labels of bars
+TIME_HEIGHT = 105.0  # height (points) of the axes of the difference over time
+INCREASE_STYLE = {"color": "white", "hatch": "////"}  # bars of steps that increase KF - EKF2
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the steps for each axis with an explanation; no page if no axis has one."""
+    """Draw the steps that turn KF into EKF2; no page without an explanation of the difference."""
     explanations = _explanations(analysis)
     if not any(
         isinstance(explanation, DifferenceExplanation) for explanation in explanations.values()
@@ -56,28 +56,32 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         else:
             _draw_axis(page, name, explanation, analysis)
     replay = analysis.ekf2_replay
-    assert isinstance(replay, Ekf2Replay)  # explanations exist only with a replay
+    assert isinstance(
+        replay, Ekf2Replay
+    )  # without a replay of EKF2 the difference is not explained
     assert replay.agreement is not None
     page.write_small(f"EKF2 replay: {format_agreement(replay.agreement)}.")
     yield page
 
 
 def _explanations(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Unavailable]:
-    """Return the explanation of the aisle axis if it exists, else those of all axes."""
+    """Return the explanation of KF - EKF2 along the main axis, else those of all axes."""
     explanations = analysis.difference_steps
     return {AISLE: explanations[AISLE]} if AISLE in explanations else explanations
 
 
 def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailable) -> None:
-    """Write the largest step of the difference KF - EKF2, or the reason why it is unknown."""
+    """Write the largest contribution to KF - EKF2, or the reason why it is unknown."""
     if isinstance(explanation, Unavailable):
-        page.write_labelled("KF-EKF2", f"Difference not explained: {explanation.reason}.")
+        page.write_labelled(
+            "KF-EKF2", f"The difference KF - EKF2 is not explained: {explanation.reason}."
+        )
     else:
         page.write_labelled("KF-EKF2", explanation.sentences[0])
 
 
 def unexplained_note(analysis: Analysis) -> str:
-    """Return the reason why the report has no such page; "" if it has or the log has no EKF2."""
+    """Return why the report does not explain KF - EKF2; "" if it does or the log has no EKF2."""
     explanations = list(_explanations(analysis).values())
     if isinstance(analysis.flight.ekf2, Unavailable) or any(
         isinstance(explanation, DifferenceExplanation) for explanation in explanations
@@ -88,7 +92,7 @@ def unexplained_note(analysis: Analysis) -> str:
         for explanation in explanations
         if isinstance(explanation, Unavailable)
     }
-    return f"Difference KF - EKF2 not explained: {' '.join(reasons)}" if reasons else ""
+    return f"The difference KF - EKF2 is not explained: {' '.join(reasons)}" if reasons else ""
 
 
 def format_agreement(agreement: Agreement) -> str:
@@ -159,7 +163,7 @@ def _draw_axis(
 
 
 def _draw_waterfall(axes: Axes, names: list[str], shares: Array, unexplained_share: float) -> None:
-    """Draw bars from the total mean square down to the unexplained rest (% of the total)."""
+    """Draw bars from the mean square of KF - EKF2 down to its unexplained rest (% of the total)."""
     bar_ends = 100.0 - np.concatenate([[0.0], np.cumsum(shares)])
     rows, right_end = len(names) + 2, max(100.0, float(bar_ends.max()))
     style: dict[str, Any] = {"height": 0.7, "edgecolor": KF_COLOUR, "lw": 0.6, "color": KF_COLOUR}
@@ -181,7 +185,6 @@ def _draw_waterfall(axes: Axes, names: list[str], shares: Array, unexplained_sha
 
 
 def _time_sentence(explanation: DifferenceExplanation) -> str:
-    """Caption of the time panel: largest difference and unexplained RMS."""
     largest = int(np.argmax(np.abs(explanation.kf_minus_ekf2_m)))
     return (
         f"Largest difference {abs(explanation.kf_minus_ekf2_m[largest]):.2g} m at "

@@ -16,7 +16,7 @@ from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
 from px4fuse.trajectory.scores import Interval, PairwiseError, Statistics
 
-# Indices of the axes drawn to the right, drawn upwards, and vertical; True if that one is down
+# Indices of the coordinates drawn to the right, drawn upwards, and vertical; True if that is down
 PAGE_AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
     "NED": (1, 0, 2, True),
     "FRD": (1, 0, 2, True),
@@ -24,23 +24,23 @@ PAGE_AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
     "camera": (0, 2, 1, True),
     "unknown": (0, 1, 2, False),
 }
-# Height / length of a path below which the page has no side view
+# Maximum height / length of a path whose page has no side view
 MAX_FLAT_RATIO = 0.1
-# Time step, as a multiple of the median step, above which a line is interrupted
+# Minimum time between two poses, in median times, at which the drawn path is interrupted
 MIN_GAP_STEPS = 10.0
 MAX_PATH_POINTS = 1200
 MIN_ERROR_RANGE_M = 1e-3  # minimum range of an error axis, so that rounding errors look small
-PANEL_HEIGHT, MAP_HEIGHT, MAP_GAP = 76.0, 128.0, 16.0  # points
+PANEL_HEIGHT, MAP_HEIGHT, MAP_GAP = 76.0, 128.0, 16.0  # heights and gap (points)
 MAX_DELTA_LABELS = 12
-REFERENCE_LINE: dict[str, Any] = {"color": TRUTH_COLOUR, "lw": 0.8, "ls": (0, (4, 2))}
-STATISTIC_LINES: tuple[tuple[str, str, dict[str, Any]], ...] = (
-    ("max", "max", {"color": MUTED_COLOUR, "lw": 0.8, "ls": (0, (1, 1.5))}),
-    ("rmse", "RMSE", {"color": EKF2_COLOUR, "lw": 1.4, "ls": "-"}),
-    ("mean", "mean", {"color": "black", "lw": 0.9, "ls": (0, (5, 2))}),
-    ("median", "median", {"color": "black", "lw": 0.9, "ls": (0, (5, 1.5, 1, 1.5))}),
+REFERENCE_LINE = style.line_style(TRUTH_COLOUR, 0.8, (0, (4, 2)))
+STATISTIC_LINES = (
+    ("max", "max", style.line_style(MUTED_COLOUR, 0.8, (0, (1, 1.5)))),
+    ("rmse", "RMSE", style.line_style(EKF2_COLOUR, 1.4)),
+    ("mean", "mean", style.line_style("black", 0.9, (0, (5, 2)))),
+    ("median", "median", style.line_style("black", 0.9, (0, (5, 1.5, 1, 1.5)))),
 )
 NEGLIGIBLE_ERROR_M = 1e-6  # smaller errors are rounding errors
-SHADES_CAPTION = "Darker: larger error. ×: largest error."
+SHADES_CAPTION = "Darker poses have a larger error; × marks the largest one."
 ERROR_TABLE_HEAD = (
     "error",
     "RMSE",
@@ -66,7 +66,7 @@ def error_colours() -> Colormap:
 
 
 class View(NamedTuple):
-    """View of a path: indices and names of the axes drawn to the right and upwards."""
+    """View of a path: indices and names of the coordinates drawn to the right and upwards."""
 
     across: int
     up: int
@@ -94,7 +94,7 @@ def path_views(evaluation: Evaluation) -> list[View]:
 
 
 def draw(evaluation: Evaluation, _: object) -> Iterator[Page]:
-    """Draw the evaluation: scores, maps and error panels."""
+    """Draw the evaluation of a trajectory: ATE and RPE, maps and error plots."""
     page = Page(
         "Trajectory error",
         (
@@ -110,7 +110,7 @@ def draw(evaluation: Evaluation, _: object) -> Iterator[Page]:
 
 
 def _draw_maps(page: Page, evaluation: Evaluation) -> None:
-    """Draw the paths before alignment, and the aligned path coloured by error in each view."""
+    """Draw both paths before alignment, and in each view the aligned path coloured by error."""
     map_views, is_aligned = path_views(evaluation), evaluation.alignment != "none"
     count = len(map_views) + is_aligned
     width = (PAGE_WIDTH - MAP_GAP * (count - 1)) / count
@@ -130,7 +130,7 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
         columns[-1].write_small(unaligned_sentence(evaluation))
     for view in map_views:
         columns.append(Page(width=width))
-        title = f"{'After alignment, coloured' if is_aligned else 'Coloured'} by error"
+        title = f"{'Aligned path' if is_aligned else 'Path'} coloured by error"
         axes = columns[-1].panel(title, "", MAP_HEIGHT, left=34.0, right=40.0)
         draw_path(axes, evaluation, view)
         columns[-1].write_small(
@@ -179,7 +179,6 @@ def _set_map_frame(axes: Axes, view: View) -> None:
 
 
 def _draw_panels(page: Page, evaluation: Evaluation) -> None:
-    """Draw the panels: APE over time and distance, RPE per delta."""
     left, right = halves()
     axes = left.panel("APE over time (m)", "", PANEL_HEIGHT)
     draw_ape(axes, evaluation, *time_from_start(evaluation))
@@ -197,7 +196,7 @@ def _draw_panels(page: Page, evaluation: Evaluation) -> None:
 
 
 def draw_ape(axes: Axes, evaluation: Evaluation, along: Array, label: str) -> None:
-    """Draw the APE with its statistics as horizontal lines, interrupted at gaps in time."""
+    """Draw the APE with its RMSE, mean, median and maximum as horizontal lines."""
     error, low, high = evaluation.position_error_m, float(along[0]), float(along[-1])
     shown_along, values = style.decimate_series(along, error, style.MAX_POINTS_NARROW)
     gap_indices = np.searchsorted(shown_along, along[_gap_indices(evaluation.time_s)])
@@ -217,7 +216,6 @@ def draw_ape(axes: Axes, evaluation: Evaluation, along: Array, label: str) -> No
 
 
 def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
-    """Draw the RPE (RMSE) of each delta with its 95 % interval."""
     for index, (error, statistics) in enumerate(rpe_statistics := _rpe_statistics(evaluation)):
         if isinstance(error.interval_m, Interval):
             interval = error.interval_m.low, error.interval_m.high
@@ -241,7 +239,6 @@ def time_from_start(evaluation: Evaluation) -> tuple[Array, str]:
 
 
 def _gap_indices(time_s: Array) -> IntArray:
-    """Return the indices of the poses after a gap in time."""
     steps = np.diff(time_s)
     return np.asarray(np.flatnonzero(steps > MIN_GAP_STEPS * np.median(steps)) + 1)
 
@@ -256,9 +253,6 @@ def plot_path(axes: Axes, positions: Array, time_s: Array, **style: Any) -> None
     axes.plot(
         *np.insert(positions[selected], np.searchsorted(selected, gaps), np.nan, axis=0).T, **style
     )
-
-
-# ---------------------------------------------------------------------------------------- text
 
 
 def format_metres(value: float) -> str:
@@ -301,7 +295,7 @@ def write_evaluation(page: Page, evaluation: Evaluation) -> None:
 
 
 def error_rows(evaluation: Evaluation) -> list[list[str]]:
-    """Return the table rows of the ATE and each RPE, with the columns of SCORE_HEAD."""
+    """Return the table rows of the ATE and of each RPE, with the columns of ERROR_TABLE_HEAD."""
     errors: dict[str, AbsoluteError | PairwiseError] = {"ATE (m)": evaluation.ate}
     errors |= {f"RPE {error.delta_text} (m)": error for error in evaluation.rpe}
     rows = []

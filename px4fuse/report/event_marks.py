@@ -9,39 +9,35 @@ from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.page import Page
-from px4fuse.report.style import EKF2_REJECTED, MUTED_COLOUR, Artist, Axes, label_time_axis
+from px4fuse.report.style import (
+    EKF2_REJECTED,
+    MUTED_COLOUR,
+    Artist,
+    Axes,
+    dot_style,
+    label_time_axis,
+)
 
 # Bands differ in shade and hatching, so they remain distinct in grey. Markers are at the bottom of
 # the axes, those of resets at the top
-GROUND_BAND: dict[str, Any] = {"facecolor": "#e4e4e4", "edgecolor": "none", "lw": 0.0}
-GAP_BAND: dict[str, Any] = {
-    "facecolor": "#fbfbfb",
-    "edgecolor": "#9a9a9a",
-    "lw": 0.0,
-    "hatch": "/////",
-}
-DROPOUT_BAND: dict[str, Any] = {"facecolor": "#a8a8a8", "edgecolor": "none", "lw": 0.0}
-MODE_BAND: dict[str, Any] = {"facecolor": "#f6f0e2", "edgecolor": "none", "lw": 0.0}
-RESET_MARK: dict[str, Any] = {"color": "#8a4508", "marker": 2, "ms": 6.0, "mew": 1.2, "ls": "none"}
-OUTLIER_MARK: dict[str, Any] = {
-    "color": "black",
-    "marker": "x",
-    "ms": 3.0,
-    "mew": 0.7,
-    "ls": "none",
-}
-# No triangles: they mark values beyond the scale
-TAKE_OFF_MARK: dict[str, Any] = {"color": "black", "marker": "*", "ms": 6.0, "mew": 0, "ls": "none"}
-LANDING_MARK: dict[str, Any] = {"color": "black", "marker": "P", "ms": 5.0, "mew": 0, "ls": "none"}
+_FILLED: dict[str, Any] = {"edgecolor": "none", "lw": 0.0}
+GROUND_BAND, DROPOUT_BAND, MODE_BAND = (
+    {"facecolor": colour, **_FILLED} for colour in ("#e4e4e4", "#a8a8a8", "#f6f0e2")
+)
+GAP_BAND = _FILLED | {"facecolor": "#fbfbfb", "edgecolor": "#9a9a9a", "hatch": "/////"}
+RESET_MARK = dot_style("#8a4508", 2, 6.0, 1.2)
+OUTLIER_MARK = dot_style("black", "x", 3.0, 0.7)
+# Take-off and landing are no triangles, which mark values beyond the scale
+TAKE_OFF_MARK, LANDING_MARK = dot_style("black", "*", 6.0), dot_style("black", "P", 5.0)
 REJECTED_HEIGHT, OUTLIER_HEIGHT, RESET_HEIGHT = 0.025, 0.075, 0.92
-MODE_NAMES_HEIGHT = 12.0  # points; height above the axes for the names of flight modes
-# Fraction of the segment; of markers closer than this, only the first is drawn
+MODE_NAMES_HEIGHT = 12.0  # height (points) above the axes for the names of flight modes
+# Minimum time between two markers as a fraction of the segment; of closer ones one is drawn
 MIN_MARK_DISTANCE = 1.0 / 300.0
-MODE_NAME_SIZE, MODE_LETTER_WIDTH = 8.0, 5.0  # points
+MODE_NAME_SIZE, MODE_LETTER_WIDTH = 8.0, 5.0  # type size and mean width of a letter (points)
 
 
 class Mark(NamedTuple):
-    """Kind of event: bands (height None), or markers at a height of the axes (0 to 1)."""
+    """Kind of event on a time axis: bands (height None), or markers at a height of 0 to 1."""
 
     label: str
     spans_or_times: Sequence[Any] | Array
@@ -50,7 +46,6 @@ class Mark(NamedTuple):
 
 
 def _marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[Mark, ...]:
-    """Return all kinds of marks in drawing order."""
     events = analysis.events
     modes = [(mode.start_s, mode.end_s) for mode in events.modes]
     return (
@@ -69,7 +64,7 @@ def _marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[Mar
 def draw_marks(
     axes: Axes, analysis: Analysis, *, axis: str | None = None, with_mode_names: bool = False
 ) -> None:
-    """Draw the events behind the curves, and set the limits of the time axis to the segment.
+    """Draw gaps, flight modes, resets, rejections and outliers, and limit the time axis.
 
     Parameters
     ----------
@@ -78,7 +73,7 @@ def draw_marks(
     analysis : Analysis
     axis : str, optional
         Axis of the rejections to mark, by default the main axis; "" for none.
-    strip : bool
+    with_mode_names : bool
         Write the names of the flight modes above the axes.
     """
     from matplotlib.collections import PolyCollection  # noqa: PLC0415
@@ -96,12 +91,12 @@ def draw_marks(
             bands = PolyCollection(corners, transform=x_transform, zorder=0.1 * order, **style)
             axes.add_collection(bands, autolim=False)
         else:
-            visible_times = _visible_times(
+            times = visible_times(
                 spans_or_times, MIN_MARK_DISTANCE * (segment.end_s - segment.start_s)
             )
             mark_style = {**style, "transform": x_transform, "zorder": 2.6, "clip_on": height > 0.0}
-            markers = Line2D(visible_times, np.full(len(visible_times), height), **mark_style)
-            axes.add_artist(markers)  # unlike add_line this does not change the limits
+            markers = Line2D(times, np.full(len(times), height), **mark_style)
+            axes.add_artist(markers)  # unlike add_line, add_artist does not change the axis limits
     if with_mode_names:
         _draw_mode_names(axes, analysis)
 
@@ -118,12 +113,12 @@ def panel(
     with_mode_names: bool = False,
     with_time_label: bool = True,
 ) -> Axes:
-    """Add a panel over time with the marks of :func:`draw_marks`.
+    """Add a plot over time with the events of :func:`draw_marks`.
 
     Parameters
     ----------
-    last : bool
-        False if a panel below this one has the label of the time axis.
+    with_time_label : bool
+        False if a plot below this one has the label of the time axis.
     """
     with_mode_names = with_mode_names and bool(analysis.events.modes)
     axes = page.panel(
@@ -147,7 +142,7 @@ def outlier_times(analysis: Analysis) -> Array:
 
 
 def legend_entries(analysis: Analysis) -> list[Artist]:
-    """Return legend entries for the kinds of marks in this flight."""
+    """Return legend entries for the kinds of events in this flight."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
@@ -159,8 +154,8 @@ def legend_entries(analysis: Analysis) -> list[Artist]:
     ]
 
 
-def _visible_times(times: Any, min_interval_s: float) -> Array:
-    """Return the first time in each interval, so that markers do not overlap."""
+def visible_times(times: Any, min_interval_s: float) -> Array:
+    """Return the first time (s) in each interval, so that markers do not overlap."""
     values = np.asarray(times, dtype=np.float64)
     visible: Array = values[np.unique(np.floor(values / min_interval_s), return_index=True)[1]]
     return visible

@@ -10,46 +10,34 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import AxisComparison, Difference
+from px4fuse.comparison.model import AxisComparison
 from px4fuse.filter.signals import Segment
-from px4fuse.flight import Unavailable
 from px4fuse.record import Span
 from px4fuse.report import event_marks, panels, style
 from px4fuse.report.difference_page import unexplained_note
 from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page
-from px4fuse.report.phrases import filters_by_name, format_verdict, verdict_notes
+from px4fuse.report.phrases import filters_by_name, verdict_notes
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, Artist, Axes
 
 ZOOM_UPDATES = 15
 MIN_ZOOM_S = 1.0
-ZOOM_HEIGHT = 125.0  # points; height of the axes
+ZOOM_HEIGHT = 125.0  # height (points) of the axes of the zoom
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the page on position and velocity along the main axis."""
+    """Draw position and velocity along the main axis over time."""
     result = analysis.main
     page = Page(f"Position and velocity along {result.axis.label}")
     _write_legend(page, analysis)
-    reference = panels.error_reference(result)
-    shown_panels = [panels.POSITION, panels.VELOCITY]
-    if isinstance(reference, pd.DataFrame):
-        shown_panels.append(panels.ERROR)
-    for panel in shown_panels:
-        panel.draw_on_page(
-            page,
-            analysis,
-            result,
-            with_time_label=panel is shown_panels[-1],
-            with_mode_names=panel is shown_panels[0],
-        )
+    panels.POSITION.draw_on_page(
+        page, analysis, result, with_time_label=False, with_mode_names=True
+    )
+    panels.VELOCITY.draw_on_page(page, analysis, result, with_time_label=True)
     page.write(unexplained_note(analysis), above=6.0)
-    if isinstance(reference, Unavailable):
-        page.write(f"No error plot: {reference.reason}. {reference.remedy}", above=6.0)
     yield page
 
 
 def _write_legend(page: Page, analysis: Analysis) -> None:
-    """Write the legend of lines and marks, valid for all pages."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
@@ -66,7 +54,7 @@ def _write_legend(page: Page, analysis: Analysis) -> None:
 
 
 def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the page on innovations, σ_p and σ_v along the main axis, with a zoom."""
+    """Draw innovations, σ_p and σ_v along the main axis over time, with a zoom."""
     result = analysis.main
     page = Page(f"Innovations and variances along {result.axis.label}")
     for panel in (panels.INNOVATIONS, panels.SIGMA_P, panels.SIGMA_V):
@@ -81,7 +69,7 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _draw_zoom(page: Page, analysis: Analysis) -> None:
-    """Draw σ_p in each prediction and update of a short part of the flight."""
+    """Draw σ_p in each prediction and update during a short part of the flight."""
     result = analysis.main
     start_s, end_s = window = zoom_window(result, analysis.segment)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
@@ -99,15 +87,15 @@ def _draw_zoom(page: Page, analysis: Analysis) -> None:
     axes.set_xlabel(style.TIME_LABEL)
     symbols = []
     if isinstance(result.ekf2_innovations, pd.DataFrame):
-        symbols += ["triangle up before the update", "triangle down after"]
+        symbols += ["triangle up before an update", "triangle down after it"]
     if isinstance(result.ekf2_variance, pd.DataFrame):
-        symbols.append("square as logged")
-    ekf2_legend = f" EKF2: {', '.join(symbols)}." if symbols else ""
-    page.write_small(f"Line: KF. Grey ticks: measurements.{ekf2_legend}")
+        symbols.append("square for the logged σ")
+    ekf2_legend = f" Symbols of EKF2: {', '.join(symbols)}." if symbols else ""
+    page.write_small(f"The line is σ of KF; grey ticks mark measurements.{ekf2_legend}")
 
 
 def zoom_window(result: AxisComparison, segment: Segment) -> Span:
-    """Return start and end (s) of the zoom, with about ZOOM_UPDATES updates.
+    """Return start and end (s) of the zoom, which contains about ZOOM_UPDATES updates.
 
     The zoom is centred on the middle measurement (of EKF2, if logged), so it avoids gaps.
     """
@@ -125,33 +113,26 @@ def zoom_window(result: AxisComparison, segment: Segment) -> Span:
 
 
 def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
-    """Draw σ_p before and after each update."""
     updates, steps = result.replay.updates, result.replay.steps
     prior, posterior = updates["prior_position_variance_m2"], steps["position_variance_m2"]
-    # a stable sort keeps the prior before the posterior at equal times
+    # sort stably, so that the prior variance precedes the posterior at the time of an update
     variances = pd.concat([prior, posterior]).sort_index(kind="stable").loc[slice(*window)]
-    axes.plot(
-        variances.index, np.sqrt(variances), color=KF_COLOUR, lw=1.1, marker=".", ms=2.4, mew=0
-    )
+    dots = style.dot_style(KF_COLOUR, ".", 2.4) | {"ls": "-", "lw": 1.1}
+    axes.plot(variances.index, np.sqrt(variances), **dots)
     if isinstance(result.ekf2_innovations, pd.DataFrame):
         ekf2 = result.ekf2_innovations.loc[slice(*window)].dropna(subset=["prior_variance_m2"])
-        prior_sigma, posterior_sigma = (
-            np.sqrt(ekf2["prior_variance_m2"]),
-            np.sqrt(ekf2["posterior_variance_m2"]),
-        )
-        axes.vlines(ekf2.index, posterior_sigma, prior_sigma, color=EKF2_COLOUR, lw=1.0)
-        axes.plot(
-            prior_sigma, ls="none", marker="^", ms=3.6, mew=0.7, mfc="none", color=EKF2_COLOUR
-        )
-        axes.plot(posterior_sigma, ls="none", marker="v", ms=3.6, mew=0, color=EKF2_COLOUR)
+        before, after = (np.sqrt(ekf2[f"{side}_variance_m2"]) for side in ("prior", "posterior"))
+        axes.vlines(ekf2.index, after, before, color=EKF2_COLOUR, lw=1.0)
+        axes.plot(before, **style.dot_style(EKF2_COLOUR, "^", 3.6, 0.7), mfc="none")
+        axes.plot(after, **style.dot_style(EKF2_COLOUR, "v", 3.6))
     if isinstance(result.ekf2_variance, pd.DataFrame):
         logged = np.sqrt(result.ekf2_variance["position_variance_m2"].loc[slice(*window)])
-        axes.plot(logged, ls="none", marker="s", ms=3.0, mew=0.7, mfc="white", color=EKF2_COLOUR)
+        axes.plot(logged, **style.dot_style(EKF2_COLOUR, "s", 3.0, 0.7), mfc="white")
     axes.set_xlim(*window)
 
 
 def zoom_sentence(result: AxisComparison) -> str:
-    """Caption of the zoom: σ_p before and after an update, for KF and EKF2."""
+    """Return the caption of the zoom: σ_p before and after an update of KF and of EKF2."""
     texts = []
     for name, filter_summary in filters_by_name(result).items():
         prior_m, posterior_m = (
@@ -175,37 +156,22 @@ def zoom_sentence(result: AxisComparison) -> str:
 
 
 def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the other axes, one column each; no page if the comparison has one axis only."""
+    """Draw the axes except the main axis, one column each; no page without such axes."""
     others = analysis.secondary_axes
     if not others:
         return
     page = Page(
         "Appendix: other axes",
-        "The same panels for the other axes, with the same lines, bands and marks.",
+        "Position, velocity, innovations and σ of the other axes, drawn as for the main axis.",
     )
     width = (PAGE_WIDTH - COLUMN_GAP * (len(others) - 1)) / max(len(others), 2)
-    columns = [Page(width=width) for _ in others]
-    for column, result in zip(columns, others, strict=True):
-        verdicts = "; ".join(
-            f"{name} {format_verdict(consistency)}"
-            for name, consistency in filters_by_name(result).items()
-        )
-        if isinstance(result.difference, Difference):
-            verdicts += f"; KF - EKF2 {result.difference.position_rms_m:.3f} m RMS"
-        column.heading(result.axis.name)
-        column.write(f"{verdicts}.")
-    first_row = Page()  # one column is not divided, so the headings stay with the first panels
-    first_row.add_columns(*columns)
-    shown_panels = [panels.POSITION, panels.VELOCITY, panels.INNOVATIONS, panels.SIGMA_P]
-    if any(isinstance(panels.error_reference(axis), pd.DataFrame) for axis in others):
-        shown_panels.insert(2, panels.ERROR)
-    for panel in shown_panels:
+    for panel in (panels.POSITION, panels.VELOCITY, panels.INNOVATIONS, panels.SIGMA_P):
         columns = [Page(width=width) for _ in others]
         for column, result in zip(columns, others, strict=True):
+            if panel is panels.POSITION:
+                column.heading(result.axis.name)
             panel.draw_on_page(
-                column, analysis, result, with_time_label=panel is shown_panels[-1], is_narrow=True
+                column, analysis, result, with_time_label=panel is panels.SIGMA_P, is_narrow=True
             )
-        (first_row if panel is panels.POSITION else page).add_columns(*columns)
-        if panel is panels.POSITION:
-            page.add_columns(first_row)
+        page.add_columns(*columns)
     yield page

@@ -1,7 +1,6 @@
 """Page on a loop: closure error, corrected paths, and their errors against references."""
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from px4fuse.report.page import Cell, Page, appendix_title
 from px4fuse.report.phrases import student_line, write_finding
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, MUTED_COLOUR, Axes, set_map_axes
 from px4fuse.results.contract import LoopResults
-from px4fuse.text import capitalise_first, format_p_value
+from px4fuse.text import capitalise_first, format_p_value, join_first
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import MAX_ROBUST_CLOSURES, SOLUTIONS, SolvedGraph
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
@@ -27,18 +26,18 @@ from px4fuse.trajectory.scores import Interval, Statistics
 
 LEAD = (
     "The closure error is the distance between the end of the odometry and the true end. Each "
-    "correction distributes it along the path: by distance (positions only as in Example 2 of the "
-    "lesson, or headings too), or by pose graph optimisation. Each closure is tested first: a "
-    "false one would deform the whole path."
+    "correction distributes it along the path: by distance (positions only as in Example 2 of "
+    "lesson UAT 366, module 2, or headings too), or by pose graph optimisation. Each closure is "
+    "tested first, because a false closure would deform the whole path."
 )
-MAX_LISTED_CLOSURES = 10  # on the terminal
-GREEN, RED = "#3a7d5c", style.SEVERITY_COLOURS["error"]
-PATH_STYLES: Mapping[str, dict[str, Any]] = {
-    corrections.UNCORRECTED: {"color": EKF2_COLOUR, "lw": 1.1, "ls": (0, (4, 1.6))},
-    corrections.POSITIONS_ONLY: {"color": "#79b294", "lw": 1.3, "ls": (0, (1.2, 1.2))},
-    corrections.BY_DISTANCE: {"color": GREEN, "lw": 1.0, "ls": (0, (6, 1.2, 1, 1.2))},
-    SOLUTIONS["gated"]: {"color": KF_COLOUR, "lw": 1.2, "ls": "-"},
-    SOLUTIONS["all"]: {"color": "#8d6a9f", "lw": 0.9, "ls": (0, (2, 1))},
+MAX_LISTED_CLOSURES = 10  # maximum number of rejected closures that the terminal lists
+RED = style.SEVERITY_COLOURS["error"]
+PATH_STYLES = {
+    corrections.UNCORRECTED: style.EKF2_LINE,
+    corrections.POSITIONS_ONLY: style.line_style("#79b294", 1.3, (0, (1.2, 1.2))),
+    corrections.BY_DISTANCE: style.line_style("#3a7d5c", 1.0, (0, (6, 1.2, 1, 1.2))),
+    SOLUTIONS["gated"]: style.line_style(KF_COLOUR, 1.2),
+    SOLUTIONS["all"]: style.line_style("#8d6a9f", 0.9, (0, (2, 1))),
 }
 TRACK_KINDS = {
     "vio": "odometry (external vision)",
@@ -59,12 +58,12 @@ CLOSURE_HEAD = (
     "GNC\nweight",
 )
 TITLE = "Loop closure"
-MAX_MAP_POINTS = 2000  # drawn points per path
-MAP_HEIGHT = 290.0  # points; height of the axes
+MAX_MAP_POINTS = 2000  # maximum number of drawn points per path
+MAP_HEIGHT = 290.0  # height (points) of the axes of the map
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the appendix page if the flight contains a loop."""
+    """Draw the appendix on loop closure if the flight contains a loop."""
     if isinstance(analysis.loop, Loop):
         page = Page(appendix_title(TITLE), LEAD)
         _write_page(page, analysis.loop)
@@ -82,7 +81,6 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 
 
 def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
-    """Write the results, the map, the closures, and the RPE of each path."""
     write_loop(page, loop, findings)
     _draw_map(page, loop)
     page.heading("Closures and scores", 10.5, above=14.0)
@@ -98,7 +96,7 @@ def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> N
 
 
 def shown_paths(loop: Loop) -> list[CorrectedPath]:
-    """Return the corrected paths that the map shows, one per kind of correction."""
+    """Return the corrected paths for the map, one per kind of correction."""
     return [path for path in loop.reported_paths if path.name in PATH_STYLES]
 
 
@@ -109,7 +107,7 @@ def _draw_map(page: Page, loop: Loop) -> None:
 
 
 def draw_map(axes: Axes, loop: Loop) -> None:
-    """Draw each path from above, with the end of the odometry and the true end."""
+    """Draw each corrected path from above, with the end of the odometry and the true end."""
     path = loop.odometry.trajectory
     names = AXES_OF_FRAME[path.frame]
     _draw_reference(axes, loop)
@@ -154,11 +152,8 @@ def _draw_reference(axes: Axes, loop: Loop) -> None:
             )
 
 
-# ---------------------------------------------------------------------------------------- text
-
-
 def summary(loop: Loop, findings: tuple[Finding, ...]) -> Page:
-    """Make the terminal page of a loop: results, scores and findings."""
+    """Make the terminal page of a loop: closure error, corrected paths and findings."""
     page = Page()
     write_loop(page, loop)
     write_scores(page, loop)
@@ -214,7 +209,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
 
 
 def write_scores(page: Page, loop: Loop) -> None:
-    """Write the tables of closures (gate and weights) and RPE, and the method of the scores."""
+    """Write the tables of closures (gate, weights) and RPE, and the method of the evaluation."""
     rows: list[list[Cell]] = []
     for closure in loop.closures:
         cells = [
@@ -275,7 +270,7 @@ def _format_span(loop: Loop) -> str:
 
 
 def describe_closure_error(loop: Loop) -> str:
-    """Format the closure error in m, in percent of the path, per axis and in heading."""
+    """Format the loop closure error in m, in percent of the path, per axis and in heading."""
     error, misclosure = loop.closure_error_m, loop.closure_error_axes_m
     if error is None or misclosure is None:
         return f"path {loop.path_length_m:.1f} m; the loop is open (--open): no closure error"
@@ -290,7 +285,7 @@ def describe_closure_error(loop: Loop) -> str:
 
 
 def describe_gate(closure: Closure) -> str:
-    """Format the chi-square test of one closure."""
+    """Format the chi-square test of one loop closure."""
     verdict = "accepted (consistent with the stated drift)"
     if not closure.accepted:
         verdict = "REJECTED (not explained by the stated drift)"
@@ -301,7 +296,7 @@ def describe_gate(closure: Closure) -> str:
 
 
 def closure_name(closure: Closure, loop: Loop) -> str:
-    """Format the two times of a closure; UNIX timestamps are counted from the first pose."""
+    """Format the two times of a loop closure (s); UNIX timestamps count from the first pose."""
     if closure.source == LANDING:
         return "take-off and landing"
     origin_s = loop.start_s if loop.start_s > MIN_UNIX_TIME_S else 0.0
@@ -309,21 +304,21 @@ def closure_name(closure: Closure, loop: Loop) -> str:
 
 
 def by_distance_sentence(loop: Loop) -> str:
-    """Explain the corrections by distance; "" if the loop has none."""
+    """Explain the correction of the path by distance; "" if the loop has none."""
     if "by_distance_plain" not in loop.paths:
         return ""
     heading_deg = loop.heading_error_deg
-    headings = "Headings too: each step is also rotated by its share of the heading error."
+    headings = "With headings, each step is also rotated by its share of the heading error."
     if isinstance(heading_deg, Unavailable):
         headings = f"The correction of headings is missing: {heading_deg.reason}."
     return (
-        "By distance, positions only (Example 2 of the lesson): each position moves "
-        f"by its share of the closure error; headings are not corrected. {headings}"
+        "The correction by distance, positions only, moves each position by its share of the "
+        f"closure error (Example 2 of lesson UAT 366, module 2). {headings}"
     )
 
 
 def missing_corrections(loop: Loop) -> list[str]:
-    """Return the corrections that were not computed with the reasons, without repetitions."""
+    """Return why corrections of the path were not computed, each reason once."""
     unavailable = [
         correction
         for correction in loop.corrections.values()
@@ -340,7 +335,6 @@ def _format_ate(score: Evaluation | Unavailable) -> str:
 
 
 def _format_error(translation: Statistics | Unavailable, interval: Interval | Unavailable) -> str:
-    """Format an RMSE, with its 95 % interval in brackets if available."""
     interval_text = format_interval(interval)
     return _format_rmse(translation) + (f" ({interval_text})" if interval_text else "")
 
@@ -350,7 +344,7 @@ def _format_rmse(statistics: Statistics | Unavailable, digits: int = 3) -> str:
 
 
 def format_correction(correction: CorrectedPath) -> str:
-    """Format RMS and maximum (m) of a correction."""
+    """Format RMS and maximum (m) by which a correction moves the path."""
     if not correction.correction_max_m:
         return "–"
     return f"{correction.correction_rms_m:.2f} / {correction.correction_max_m:.2f}"
@@ -373,16 +367,9 @@ def graph_summary(solved: SolvedGraph) -> Page:
         page.write_labelled("Gate", "no closures to test: every edge is odometry")
     else:
         rejected = [gate for gate in gates if not gate.accepted]
-        lines = [
-            f"{gate.first} – {gate.second}: d² {gate.d2:.1f}, p {gate.p:.2g}"
-            for gate in rejected[:MAX_LISTED_CLOSURES]
-        ]
-        lines += (
-            [f"and {len(rejected) - MAX_LISTED_CLOSURES} more"]
-            if len(rejected) > MAX_LISTED_CLOSURES
-            else []
-        )
-        page.write_labelled("Gate", f"{len(rejected)} of {len(gates)} closures rejected", *lines)
+        lines = [f"{g.first} – {g.second}: d² {g.d2:.1f}, p {g.p:.2g}" for g in rejected]
+        listed = join_first(lines, MAX_LISTED_CLOSURES, "\n").split("\n")
+        page.write_labelled("Gate", f"{len(rejected)} of {len(gates)} closures rejected", *listed)
     if len(solved.solutions) == 1 and (~solved.graph.is_successive).sum() > MAX_ROBUST_CLOSURES:
         page.write_labelled(
             "Robust", "not solved for this many closures; add --robust (takes some minutes)"

@@ -45,24 +45,17 @@ SYMBOLS = {
     "infty": "∞",
     "circ": "°",
     "sim": "~",
-    "hat": "",
-    "bar": "",
-    "mathrm": "",
-    "mathbf": "",
-    "text": "",
-    "left": "",
-    "right": "",
     "quad": " ",
     "ldots": "…",
     "degree": "°",
     ",": " ",
     ";": " ",
-    "!": "",
+    **dict.fromkeys(("hat", "bar", "mathrm", "mathbf", "text", "left", "right", "!"), ""),
 }
 
 
 def draw(subject: object, results: ComparisonResults | AidsResults | LoopResults) -> Iterator[Page]:
-    """Draw the answer form and the notes; no page if the report has neither."""
+    """Draw the answer form and the notes of the student; no page if both are missing."""
     title, answers = "Student notes", results.student.answers
     page = Page(appendix_title(title) if isinstance(subject, Analysis) else title)
     if isinstance(answers, Answers):
@@ -121,7 +114,7 @@ def parse(notes: str, name: str = "the notes") -> list[Token]:
 
 
 def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, mark: str = "") -> None:
-    """Write the children of a node, with the list mark before the first line."""
+    """Write the blocks below a Markdown node, with the list mark before the first line."""
     indent = INDENT * min(indent_level, MAX_INDENTS)
     children = node.children
     if mark and (not children or children[0].type.endswith("_list")):
@@ -161,7 +154,6 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, mark: str
 
 
 def _inline_text(node: SyntaxTreeNode) -> str:
-    """Return the text of a block without Markdown marks."""
     return "".join(map(_node_text, node.children))
 
 
@@ -183,7 +175,7 @@ def _node_text(node: SyntaxTreeNode) -> str:
 
 
 def _parse_maths(state: StateInline, silent: bool) -> bool:
-    """Parser rule for mathematics in dollar signs; code and escapes take precedence."""
+    """Parse mathematics in dollar signs (rule of markdown-it); code and escapes take precedence."""
     maths_match = MATHS_PATTERN.match(state.src, state.pos)
     if maths_match is None:
         return False
@@ -194,12 +186,11 @@ def _parse_maths(state: StateInline, silent: bool) -> bool:
 
 
 def _tex_to_text(maths: str) -> str:
-    """Convert TeX to Unicode text as far as possible."""
     text = COMMAND_PATTERN.sub(_symbol, FRACTION_PATTERN.sub(r"(\1)/(\2)", maths))
     return text.translate(str.maketrans("{}~", "() "))
 
 
 def _symbol(command_match: re.Match[str]) -> str:
-    """Return the character of a TeX command; most names equal those of HTML entities."""
+    """Return the Unicode character of a TeX command; most names equal those of HTML entities."""
     name = command_match[1]
     return SYMBOLS[name] if name in SYMBOLS else html5.get(f"{name};", name)

@@ -30,7 +30,7 @@ Cell = str | tuple[str, str]
 
 
 class Page:
-    """A part of a report that begins on a new page, or a column of a page.
+    """Section of a report, or a column of a section.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class Page:
         colour: str = "black",
         bold: bool = True,
     ) -> None:
-        """Write a label with texts beside it; :func:`styled_text` sets the style of a text."""
+        """Write a label with paragraphs beside it, styled by :func:`styled_text`."""
         styled_texts = [
             styled_text(text, size) if isinstance(text, str) else text for text in texts
         ]
@@ -91,7 +91,7 @@ class Page:
         self.add("labelled", label=styled_label, texts=styled_texts, width=width, above=above)
 
     def write_labelled_texts(self, texts: Mapping[str, str], size: float = 8.0) -> None:
-        """Write a text for each label."""
+        """Write each text of a mapping beside its label."""
         for label, text in texts.items():
             self.write_labelled(label, text, size=size)
 
@@ -104,13 +104,13 @@ class Page:
         right: Sequence[int] = (),
         size: float = 8.0,
     ) -> None:
-        """Write a table.
+        """Add a table with a heading row.
 
         Parameters
         ----------
         head : sequence of str
         rows : sequence of sequence of str, or of (str, colour)
-        shares : sequence of float, optional
+        column_widths : sequence of float, optional
             Relative widths of the columns; by default they follow the content.
         right : sequence of int
             Right-aligned columns (numbers).
@@ -133,8 +133,6 @@ class Page:
 
         Parameters
         ----------
-        say : str
-            Caption.
         height : float
             Height of the axes alone (points).
         above, left, right, below : float
@@ -302,7 +300,7 @@ def _figure_svg(block: Mapping[str, Any]) -> str:
 
 
 def _place_axes(block: Mapping[str, Any]) -> None:
-    """Set figure height and axes position, with room for existing tick labels and axis label."""
+    """Set the height of the figure and the place of its axes, with room for the labels it has."""
     axes, width, height = block["axes"], block["width"], block["height"]
     left, right, below, above = block["margins"]
     has_tick_labels = axes.axison and axes.xaxis.get_tick_params()["labelbottom"]

@@ -43,18 +43,13 @@ VELOCITIES = Quantity(
 
 
 class Panel(NamedTuple):
-    """Panel over time: title, height (points), drawing function, caption and numbers."""
+    """Plot over time along one axis: title, height (points), drawing, caption and numbers."""
 
     title: str
     height: float
     draw: Callable[[Axes, AxisComparison], None]
     caption: Callable[[Analysis, AxisComparison], str]
     numbers: Callable[[AxisComparison], str]
-
-    def full_title(self, result: AxisComparison) -> str:
-        """Title with the reference of the errors, ground truth or EKF2."""
-        has_truth = isinstance(result.truth, pd.DataFrame)
-        return self.title.format("ground truth" if has_truth else "EKF2")
 
     def draw_on_page(
         self,
@@ -66,25 +61,23 @@ class Panel(NamedTuple):
         with_mode_names: bool = False,
         is_narrow: bool = False,
     ) -> None:
-        """Draw the panel on a page.
+        """Draw the plot of one axis on a page.
 
         Parameters
         ----------
-        last : bool
+        with_time_label : bool
             Label the time axis, which all panels above share.
-        strip : bool
+        with_mode_names : bool
             Write the names of the flight modes above it.
-        narrow : bool
-            Draw it for a narrow column, without caption.
+        is_narrow : bool
+            Draw it in a narrow column: without caption, and with the numbers below it.
         """
-        caption, height = (
-            ("", NARROW_HEIGHT) if is_narrow else (self.caption(analysis, result), self.height)
-        )
-        # this panel already shows the rejected innovations as hollow dots
-        rejected = "" if self is INNOVATIONS else result.axis.name
-        title, numbers = self.full_title(result), self.numbers(result)
+        title, caption, height, numbers = self.title, "", NARROW_HEIGHT, self.numbers(result)
         if not is_narrow:
+            caption, height = self.caption(analysis, result), self.height
             title, numbers = ": ".join(filter(None, (title, numbers))), ""
+        # the panel of innovations shows the rejected ones as hollow dots
+        rejected = "" if self is INNOVATIONS else result.axis.name
         axes = event_marks.panel(
             page,
             analysis,
@@ -101,11 +94,8 @@ class Panel(NamedTuple):
         page.write_small(numbers)
 
 
-# ------------------------------------------------------------------------------ position, velocity
-
-
 def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
-    """Draw measurements, KF with its ±2σ band, EKF2 and ground truth."""
+    """Draw position or velocity: measurements, KF with ±2σ, EKF2 and ground truth."""
     if quantity is POSITIONS:
         measurements = pd.Series(result.axis.measurement_m, result.axis.measurement_time_s)
         draw_curve(axes, measurements, **style.MEASUREMENT_DOTS)
@@ -123,119 +113,39 @@ def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
     axes.set_ylim(all_values.min() - pad, all_values.max() + pad)
 
 
-def error_reference(result: AxisComparison) -> pd.DataFrame | Unavailable:
-    """Return the reference for errors: ground truth if available, else EKF2."""
-    return result.truth if isinstance(result.truth, pd.DataFrame) else result.ekf2_state
-
-
-def position_difference(frame: pd.DataFrame, reference: pd.DataFrame) -> pd.Series[float]:
-    """Return frame minus reference position (m) at the times of the frame."""
-    times, reference_position = frame.index, reference["position_m"]
-    reference_m = np.interp(
-        times, reference_position.index, reference_position, left=np.nan, right=np.nan
-    )
-    difference_m: pd.Series[float] = (frame["position_m"] - reference_m).dropna()
-    return difference_m
-
-
-def draw_error(axes: Axes, result: AxisComparison) -> None:
-    """Draw position errors against ground truth, or without it the difference KF - EKF2."""
-    reference, steps = error_reference(result), result.replay.steps
-    assert isinstance(reference, pd.DataFrame)
-    sigma = np.sqrt(steps["position_variance_m2"])
-    draw_sigma_band(axes, 0.0 * sigma, sigma)
-    axes.axhline(0.0, color="black", lw=0.5)
-    error = position_difference(steps, reference)
-    largest_values = [error.abs().max(), 2.2 * sigma.median()]
-    if reference is result.truth and isinstance(result.ekf2_state, pd.DataFrame):
-        ekf2_error = position_difference(result.ekf2_state, reference)
-        draw_curve(axes, ekf2_error, **LINES["EKF2"], zorder=2.5)
-        largest_values.append(ekf2_error.abs().max())
-    draw_curve(axes, error, **LINES["KF"])
-    axes.set_ylim(-1.1 * max(largest_values), 1.1 * max(largest_values))
-
-
 def _position_sentence(_: Analysis, result: AxisComparison) -> str:
     extent_m = float(np.ptp(result.axis.measurement_m))
-    text = f"{len(result.replay.updates)} measurements over {extent_m:.3g} m"
-    if isinstance(result.ekf2_state, Unavailable) or isinstance(result.difference, Unavailable):
-        return f"{text}."
-    difference_m = position_difference(result.ekf2_state, result.replay.steps).abs()
-    return (
-        f"{text}; the largest difference between KF and EKF2 is {difference_m.max():.2g} m at "
-        f"{difference_m.idxmax():.1f} s."
-    )
+    return f"{len(result.replay.updates)} measurements over {extent_m:.3g} m."
 
 
-def _velocity_sentence(_: Analysis, result: AxisComparison) -> str:
-    text = "Velocity is not measured: each filter estimates it from positions and IMU."
-    return f"{text} {compare_rmse(result, VELOCITIES)}".rstrip()
-
-
-def _error_sentence(_: Analysis, result: AxisComparison) -> str:
-    fraction = fraction_inside_two_sigma(result)
-    if isinstance(result.truth, pd.DataFrame):
-        coverage_text = f"{fraction:.0%} of the KF errors are within ±2σ (blue; expected 95 %)."
-        return f"{compare_rmse(result, POSITIONS)} {coverage_text}".lstrip()
-    return (
-        "No ground truth in the log: this is the difference KF - EKF2, not an "
-        f"error. {fraction:.0%} of it is within ±2σ of KF (blue)."
-    )
-
-
-def compare_rmse(result: AxisComparison, quantity: Quantity) -> str:
-    """Compare the RMSE of KF and EKF2 in a sentence; "" if one of them is unknown."""
-    errors = _rmse_by_filter(result, quantity)
-    if len(errors) < 2:
-        return ""
-    (smaller_m, better), (larger_m, worse) = sorted((error, name) for name, error in errors.items())
-    if larger_m < 1.1 * smaller_m:
-        return "KF and EKF2 have the same RMSE (within 10 %)."
-    return f"{better} has a {larger_m / smaller_m:.2g} times smaller RMSE than {worse}."
-
-
-def fraction_inside_two_sigma(result: AxisComparison) -> float:
-    """Return the fraction of KF errors (without ground truth: differences to EKF2) within ±2σ."""
-    reference, steps = error_reference(result), result.replay.steps
-    assert isinstance(reference, pd.DataFrame)
-    error = position_difference(steps, reference)
-    return float((error.abs() <= 2.0 * np.sqrt(steps["position_variance_m2"])[error.index]).mean())
-
-
-def _rmse_by_filter(result: AxisComparison, quantity: Quantity) -> dict[str, float]:
+def _error_numbers(result: AxisComparison, quantity: Quantity) -> list[str]:
     """Return the RMSE against ground truth of each filter for which it is known."""
     values = {
         name: getattr(filter_summary.truth, quantity.rmse, None)
         for name, filter_summary in filters_by_name(result).items()
     }
-    return {name: error for name, error in values.items() if error is not None}
-
-
-def _error_numbers(result: AxisComparison, quantity: Quantity = POSITIONS) -> str:
-    errors = ", ".join(
-        f"{name} {error:.3f}" for name, error in _rmse_by_filter(result, quantity).items()
-    )
-    return f"RMSE to ground truth {errors}" if errors else ""
+    errors = [
+        f"{name} {error:.3f} {quantity.unit}" for name, error in values.items() if error is not None
+    ]
+    return [f"RMSE against ground truth {', '.join(errors)}"] if errors else []
 
 
 def _position_numbers(result: AxisComparison) -> str:
     difference = result.difference
-    if isinstance(difference, Unavailable):
-        return f"{difference.what}: {difference.reason}"
-    return (
-        f"KF - EKF2: RMS {difference.position_rms_m:.3f} m, mean "
+    text = (
+        f"{difference.what}: {difference.reason}"
+        if isinstance(difference, Unavailable)
+        else f"KF - EKF2 RMS {difference.position_rms_m:.3f} m, mean "
         f"{difference.position_mean_m:+.3f} m, maximum {difference.position_maximum_m:.2f} m"
     )
+    return "; ".join([*_error_numbers(result, POSITIONS), text])
 
 
 def _velocity_numbers(result: AxisComparison) -> str:
-    texts = [_error_numbers(result, VELOCITIES)]
+    texts = _error_numbers(result, VELOCITIES)
     if isinstance(result.difference, Difference):
-        texts.append(f"KF - EKF2 RMS {result.difference.velocity_rms_m_s:.3f}")
-    return "; ".join(filter(None, texts))
-
-
-# ---------------------------------------------------------------------------------- innovations, σ
+        texts.append(f"KF - EKF2 RMS {result.difference.velocity_rms_m_s:.3f} m/s")
+    return "; ".join(texts)
 
 
 def _axis_half_height(result: AxisComparison) -> float:
@@ -249,6 +159,15 @@ def _axis_half_height(result: AxisComparison) -> float:
                 max(2.0 * median_sigma, min(usual_innovation, MAX_EDGE_SIGMAS * median_sigma))
             )
     return EDGE_FACTOR * max(limits)
+
+
+def normalised_innovations(result: AxisComparison) -> dict[str, pd.Series[float]]:
+    """Return the finite ν/√S of KF and of EKF2, if logged, by filter name."""
+    return {
+        name: (frame["innovation_m"] / np.sqrt(frame["innovation_variance_m2"])).dropna()
+        for name, frame in (("KF", result.replay.updates), ("EKF2", result.ekf2_innovations))
+        if isinstance(frame, pd.DataFrame)
+    }
 
 
 def draw_innovations(axes: Axes, result: AxisComparison) -> None:
@@ -293,7 +212,7 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
 
 
 def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
-    """Caption of the innovations: verdict, statistics and rejections."""
+    """Return the caption of the innovations: verdict, mean, standard deviation, rejections."""
     half_height, sentences = _axis_half_height(result), []
     innovation_tables = {"KF": result.replay.updates, "EKF2": result.ekf2_innovations}
     for name, consistency in filters_by_name(result).items():
@@ -335,7 +254,7 @@ def _draw_sigma(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
 
 
 def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
-    """Caption of σ: its growth in the longest gap of the source; "" without a gap."""
+    """Return the caption of σ: its growth in the longest gap of the source; "" without a gap."""
     if not analysis.events.gaps:
         return ""
     start, end = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])
@@ -373,15 +292,8 @@ VELOCITY = Panel(
     "Velocity (m/s)",
     150.0,
     partial(draw_tracks, quantity=VELOCITIES),
-    _velocity_sentence,
+    lambda *_: "Velocity is not measured: each filter estimates it from positions and IMU.",
     _velocity_numbers,
-)
-ERROR = Panel(
-    "Position - {} (m)",
-    150.0,
-    draw_error,
-    _error_sentence,
-    lambda result: _error_numbers(result) or _position_numbers(result),
 )
 INNOVATIONS = Panel(
     "Innovations (m)",

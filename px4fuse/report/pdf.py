@@ -114,6 +114,5 @@ def render(content: Any, results: Any, results_json: str) -> bytes:
 
 
 def _shorten(text: str, max_length: int) -> str:
-    """Return the text on one line of at most `max_length` characters."""
     line = " ".join(replace_unprintable(text).split())
     return line if len(line) <= max_length else f"{line[: max_length - 1]}…"

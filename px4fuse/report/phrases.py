@@ -27,17 +27,17 @@ if TYPE_CHECKING:
     from px4fuse.analysis import Analysis
     from px4fuse.report.page import Cell, Page
 
-# p value of the Ljung-Box test below which innovations are reported as not white; so a flight with
-# eight tests has a false alarm in less than 1 % of cases
+# Maximum p value of the Ljung-Box test for a note that innovations are not white: with eight tests
+# per flight, less than 1 % of flights have a false alarm
 MIN_WHITE_P = 0.001
-# Error of the reported σ, by verdict
+# Error of the reported σ that a verdict states
 SIGMA_VERDICTS = {"underconfident": "too large", "overconfident": "too small"}
 RMS_FIELDS = ("position_rms_m", "velocity_rms_m_s")
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
 
 
 def format_settings(settings: Settings) -> str:
-    """Format the KF settings on one line."""
+    """Format SIGMA_A, SIGMA_Z, DT, input and time offset of KF on one line."""
     offset = f", clock offset {settings.clock_offset_s:+g} s" if settings.clock_offset_s else ""
     return (
         f"SIGMA_A {settings.sigma_a_m_s2:g} m/s², SIGMA_Z {settings.sigma_z_m:g} m, "
@@ -46,14 +46,14 @@ def format_settings(settings: Settings) -> str:
 
 
 def format_verdict(consistency: Consistency | Unavailable) -> str:
-    """Format the verdict on a filter; "not logged" if the log has no innovations of it."""
+    """Format the verdict on the σ of a filter; "not logged" without its innovations."""
     if isinstance(consistency, Unavailable):
         return "not logged"
     return format_sigma_verdict(consistency.verdict, consistency.sigma_error_factor)
 
 
 def format_sigma_verdict(verdict: str, factor: float) -> str:
-    """Format a verdict of the results with the factor between reported and actual σ.
+    """Format a verdict with the factor between reported and actual σ.
 
     >>> format_sigma_verdict("overconfident", 2.41)
     'overconfident, σ 2.4× too small'
@@ -64,7 +64,7 @@ def format_sigma_verdict(verdict: str, factor: float) -> str:
 
 
 def filters_by_name(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
-    """Return KF and EKF2 of an axis by their display names; KF only if EKF2 is not logged."""
+    """Return the statistics of KF, and of EKF2 if logged, by filter name."""
     filters = {"KF": result.filters["kf"]}
     if not isinstance(result.ekf2_state, Unavailable):
         filters["EKF2"] = result.filters["ekf2"]
@@ -78,11 +78,11 @@ def verdict_rows(
     axes: Iterable[AxisComparison],
     extra_cells: Callable[[AxisComparison, str, FilterSummary | UntestedFilter], Sequence[str]],
 ) -> list[list[Cell]]:
-    """Return a table row per axis and filter: the cells of VERDICT_HEAD, then the extra cells."""
+    """Return a table row per axis and filter: mean NIS, its band, verdict, then the extra cells."""
     rows: list[list[Cell]] = []
     for result in axes:
         for name, consistency in filters_by_name(result).items():
-            label = result.axis.name if name == "KF" else ""
+            label = result.axis.label.removeprefix("the ") if name == "KF" else ""
             nis, colour = ("", ""), MUTED_COLOUR
             if isinstance(consistency, Consistency):
                 nis = (
@@ -107,7 +107,7 @@ def verdict_rows(
 
 
 def write_errors(page: Page, analysis: Analysis) -> None:
-    """Write the table of verdicts and errors, main axis first.
+    """Write the table of verdicts and position errors of all axes, main axis first.
 
     RMS differences KF - EKF2 and RMSE against ground truth are columns if the log contains them.
     """
@@ -128,19 +128,18 @@ def write_errors(page: Page, analysis: Analysis) -> None:
 
 
 def _format_rms(statistic: object, field: str) -> str:
-    """Format a field of a record with three decimals; "" if the record does not have it."""
     value = getattr(statistic, field, None)
     return "" if value is None else f"{value:.3f}"
 
 
 def verdict_notes(comparison: Comparison) -> list[str]:
-    """Return notes on verdicts that could be misread.
+    """Return notes on verdicts about σ that could be misread.
 
     They concern a source that may drift, deviations too small for a finding, and innovations that
     are consistent but not white.
     """
     consistencies = [
-        (result.axis.name, filter_name, consistency)
+        (result.axis.label, filter_name, consistency)
         for result in comparison.axes.values()
         for filter_name, consistency in filters_by_name(result).items()
         if isinstance(consistency, Consistency)
@@ -152,13 +151,13 @@ def verdict_notes(comparison: Comparison) -> list[str]:
             "not with the true position. Check the error with ground truth or a loop."
         )
     correlated = [
-        f"{filter_name} {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"
+        f"{filter_name} along {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"
         for axis, filter_name, consistency in consistencies
         if consistency.verdict == "consistent" and consistency.ljung_box_p < MIN_WHITE_P
     ]
     if correlated:
         notes.append(
-            "Innovations not white, although their size is consistent (Ljung-Box test, p < "
+            "Innovations are not white, although their size is consistent (Ljung-Box test, p < "
             f"{MIN_WHITE_P:g}): {'; '.join(correlated)}. Positive: the filter lags, SIGMA_A may "
             "be too small. Negative: the filter follows the measurement noise, SIGMA_A may be too "
             "large."
@@ -208,7 +207,7 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
 def tuning_advice(
     comparison: Comparison, tuned: Mapping[str, AxisTuning | Unavailable]
 ) -> dict[str, str]:
-    """Return the actions after tuning as labelled texts: command, PX4 parameter and cautions.
+    """Return the actions after noise estimation by label: command, PX4 parameter, cautions.
 
     Commands are written as ``px4fuse compare LOG``; the terminal replaces LOG.
     """
@@ -235,12 +234,12 @@ def tuning_advice(
         advice["Action"] = f"Re-run with the estimates of {name}: {command}"
     if sigma_z.value is None and sigma_z.low is not None:
         advice["SIGMA_Z"] = (
-            f"at least {sigma_z.low:.2g} m. Check that the source measures positions."
+            f"SIGMA_Z is at least {sigma_z.low:.2g} m. Check that the source measures positions."
         )
     elif sigma_z.value is None:
         bound = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
         advice["SIGMA_Z"] = (
-            f"cannot be estimated at this logging rate{bound}: the process noise between "
+            f"SIGMA_Z cannot be estimated at this logging rate{bound}: the process noise between "
             "samples masks it. Log the source at a higher rate."
         )
     elif log.autopilot == "PX4" and not drifts and comparison.source.origin.is_vision:
@@ -249,9 +248,10 @@ def tuning_advice(
         advice["PX4"] = f"Set EKF2_EVP_NOISE to {sigma_z.value:.3g} m{current_value}."
     if sigma_a.value is None:
         advice["SIGMA_A"] = (
-            "cannot be estimated: too little motion, or the flight is too short."
+            "SIGMA_A cannot be estimated: the flight has too little motion, or is too short."
             if sigma_a.low is None
-            else f"at least {sigma_a.low:.2g} m/s²: logged acceleration and positions disagree."
+            else f"SIGMA_A is at least {sigma_a.low:.2g} m/s²: logged acceleration and positions "
+            "disagree."
         )
     elif (
         tuning.biases_fitted
@@ -265,8 +265,8 @@ def tuning_advice(
         )
     if len(tuning.outlier_time_s):
         advice["Outliers"] = (
-            f"{len(tuning.outlier_time_s)} of {tuning.count} measurements ({name}), first "
-            f"at {tuning.outlier_time_s[0]:.1f} s; excluded from the noise estimates"
+            f"{len(tuning.outlier_time_s)} of {tuning.count} measurements ({name}) are outliers, "
+            f"the first at {tuning.outlier_time_s[0]:.1f} s. The noise estimates exclude them."
         )
     return advice
 

@@ -15,7 +15,7 @@ from px4fuse.report.style import MUTED_COLOUR
 from px4fuse.request import with_options
 from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults
 
-LABEL_WIDTH = 168.0  # points
+LABEL_WIDTH = 168.0  # width (points) of the labels
 
 
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
@@ -59,7 +59,7 @@ def _findings_page(results: ComparisonResults | AidsResults) -> Page:
 
 
 def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) -> None:
-    """Write log, position source and parameters, without those of unused position aids.
+    """Write log, position source and parameters, without those of unused position sources.
 
     Names and SHA-256 of the files are last, so that they stand on the last page.
     """
@@ -96,7 +96,7 @@ def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) 
     }
     section = Page()
     _write_section(section, "Log", facts.items())
-    page.add_columns(section)  # one column is not divided
+    page.add_columns(section)  # Typst does not divide one column
 
 
 def _write_missing(page: Page, unavailable_parts: Iterable[Unavailable]) -> None:
@@ -131,7 +131,6 @@ def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
 
 
 def _write_versions(page: Page, results: ComparisonResults | AidsResults | LoopResults) -> None:
-    """Write command, versions and attached results."""
     student, versions = results.student, results.provenance
     facts = {
         "command": versions.command,

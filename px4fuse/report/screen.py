@@ -7,11 +7,10 @@ prints the command with the path and the options that the user typed.
 """
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import zip_longest
 from typing import Literal
 
-from msgspec.structs import replace
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -28,21 +27,14 @@ from px4fuse.report.card_text import (
 )
 from px4fuse.report.page import Block, Cell
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
-from px4fuse.request import (
-    COMPARISON_OPTIONS,
-    ComparisonRequest,
-    LoopRequest,
-    Request,
-    WhatIfRequest,
-    command_line,
-)
+from px4fuse.request import ComparisonRequest, Request, command_line
 
 # Encodings of terminals that can print all characters of a card
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
-# Lines of a card, by kind of block
+# Functions that yield the lines of a card, by kind of block
 CARD_LINES = {"card": card_lines, "closing": closing_lines, "headline": headline}
-INDENT = 9  # columns; width of the labels
-COLUMN_POINTS = 6.0  # points of an indent on paper per terminal column
+INDENT = 9  # number of columns of a label
+COLUMN_POINTS = 6.0  # indent on paper (points) that corresponds to one column of the terminal
 # Terminal styles of text colours; the other colours belong to plots
 STYLES = {
     MUTED_COLOUR: "dim",
@@ -51,13 +43,12 @@ STYLES = {
     SEVERITY_COLOURS["note"]: "cyan",
     GOOD_COLOUR: "green",
 }
-# A value does not end in a full stop: that ends the sentence
+# Commands in a text; a full stop after a value ends the sentence and is not part of the command
 _COMMAND = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(?:\.\d+)?)*)")
-_FIELD_OF_OPTION = {option: field for field, option in COMPARISON_OPTIONS.items()}
 
 
 def show(console: Console, blocks: Iterable[Block], request: Request | None = None) -> None:
-    """Print text and tables of a page.
+    """Print texts, tables and cards of a page on the terminal.
 
     Parameters
     ----------
@@ -95,7 +86,6 @@ def _show_card(
     card: Card,
     request: Request | None,
 ) -> None:
-    """Print lines of a card; commands contain the path as typed instead of the file name."""
     is_limited = console.encoding.lower() not in UNICODE_ENCODINGS
     typed = None if request is None else getattr(request, "log", None)
     for line in lines_of(with_typed_path(card, typed)):
@@ -126,7 +116,7 @@ def expand_commands(text: str, request: Request) -> tuple[str, list[str]]:
     ----------
     text : str
     request : Request
-        Request of the user; its files and options complete the commands.
+        Request of the user; its files and options precede those of the command.
 
     Examples
     --------
@@ -134,32 +124,13 @@ def expand_commands(text: str, request: Request) -> tuple[str, list[str]]:
     >>> expand_commands("px4fuse compare LOG --sigma-z 0.2: better.", request)
     ('--sigma-z 0.2: better.', ["px4fuse compare 'a b.ulg' --sigma-z 0.2"])
     """
-    commands = []
-    for name, options in _COMMAND.findall(text):
-        parts_of_options = options.split()
-        values = zip(parts_of_options[::2], parts_of_options[1::2], strict=True)
-        changes = {_FIELD_OF_OPTION[option]: float(value) for option, value in values}
-        commands.append(rerun_command(request, name, changes))
-    short_text = _COMMAND.sub(lambda match: match[2].strip() or f"px4fuse {match[1]}", text)
-    return short_text, list(dict.fromkeys(commands))
-
-
-def rerun_command(request: Request, command: str, changes: Mapping[str, float]) -> str:
-    """Return the command line of a command on the files of a request, with changed options."""
-    new_request = request
-    if isinstance(request, ComparisonRequest):
-        if command == "loop":
-            new_request = LoopRequest(
-                source=request.log,
-                system=request.system,
-                start_s=request.start_s,
-                end_s=request.end_s,
-            )
-        elif command == "whatif":
-            new_request = WhatIfRequest(
-                log=request.log, mavlink=request.mavlink, system=request.system
-            )
-    return command_line(replace(new_request, **changes), command, for_shell=True)
+    log = str(getattr(request, "log", "") or getattr(request, "source", ""))
+    plain = ComparisonRequest(log=log)
+    commands = {
+        command_line(request if name == "compare" else plain, name, for_shell=True) + options: None
+        for name, options in _COMMAND.findall(text)
+    }
+    return _COMMAND.sub(lambda match: match[2].strip() or f"px4fuse {match[1]}", text), [*commands]
 
 
 def _styled_text(block: Block) -> Text:
@@ -170,7 +141,7 @@ def _styled_text(block: Block) -> Text:
 def print_paragraph(
     console: Console, text: str | Text, head: str | Text = "", indent: int = 0
 ) -> None:
-    """Print a paragraph.
+    """Print a paragraph that wraps with a hanging indent.
 
     Parameters
     ----------

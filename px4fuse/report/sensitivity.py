@@ -17,7 +17,7 @@ from px4fuse.report.style import KF_COLOUR, set_plain_ticks
 from px4fuse.text import format_factor, format_number
 
 NOISE_FACTOR = 4.0
-# Label and factors on SIGMA_A and SIGMA_Z
+# Label of each compared pair of noises, and its factors on SIGMA_A and SIGMA_Z
 SETTINGS = (
     ("as chosen", 1.0, 1.0),
     ("SIGMA_A × 4", NOISE_FACTOR, 1.0),
@@ -25,22 +25,20 @@ SETTINGS = (
     ("SIGMA_A / 4", 1.0 / NOISE_FACTOR, 1.0),
     ("SIGMA_Z × 4", 1.0, NOISE_FACTOR),
 )
-# Label, and indices of the two SETTINGS with the same gain
-GAIN_GROUPS = (("larger gain", (1, 2)), ("smaller gain", (3, 4)))
-# Contours below the maximum: joint 95 % region of both noises, then decades
+# Log-likelihood below its maximum (nats) of the contours: joint 95 % region, then decades
 REGION_95_NATS = float(-np.log(0.05))
 LEVELS_NATS = (0.0, REGION_95_NATS, 10.0, 100.0, 1000.0, 10_000.0)
 SHADES = ("#0b2a55", "#3f6aa8", "#86a7d3", "#c3d4ea", "#e6edf6")
 SHADE_LABELS = ("95 %", "10 below", "100", "1,000", "10,000")
 COARSE_POINTS, FINE_POINTS = 14, 11
-# Margin of the map (factor), and reach of the fine grid in half 95 % intervals (log scale)
+# Factor of the map's margin, and reach of the fine grid in half 95 % intervals (log scale)
 MAP_MARGIN_FACTOR, FINE_GRID_REACH = 1.3, 2.3
-MAP_HEIGHT, MAP_LEFT, LEGEND_HEIGHT = 150.0, 40.0, 42.0  # points; margin left of the axes
-MAP_COLUMN_FRACTION = 0.42  # of the page width
+MAP_HEIGHT, MAP_LEFT, LEGEND_HEIGHT = 150.0, 40.0, 42.0  # points
+MAP_COLUMN_FRACTION = 0.42  # fraction of the page width for the map
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the page if the noises were estimated and the flight has enough measurements."""
+    """Draw the appendix on SIGMA_A and SIGMA_Z if they were estimated."""
     result, settings = analysis.main, analysis.settings
     if not analysis.tuning or len(result.replay.updates) < MIN_MEASUREMENTS:
         return
@@ -73,7 +71,7 @@ def _draw_map(page: Page, analysis: Analysis) -> None:
     tuned_noises = tuning[name]
     title = f"Log-likelihood over SIGMA_A and SIGMA_Z ({name})"
     if isinstance(tuned_noises, Unavailable):
-        page.write(f"{title}: no map ({tuned_noises.reason}).")
+        page.write(f"{title} is not available: {tuned_noises.reason}.")
         return
     axes = page.panel(
         title, _map_sentence(tuned_noises), MAP_HEIGHT, left=MAP_LEFT, above=LEGEND_HEIGHT
@@ -87,13 +85,10 @@ def _draw_map(page: Page, analysis: Analysis) -> None:
     for factor in (1.0 / NOISE_FACTOR, 1.0, NOISE_FACTOR):
         sigma_a_of_gain = factor * chosen[0] / chosen[1] * z[[0, -1]]
         axes.plot(z[[0, -1]], sigma_a_of_gain, color="black", lw=0.7, ls=(0, (1, 1.5)))
-    scaled = {
-        label: (chosen[1] * z_factor, chosen[0] * a_factor)
-        for label, a_factor, z_factor in SETTINGS
-    }
-    for (label, pair), marker in zip(GAIN_GROUPS, "^v", strict=True):
-        pairs = [scaled[SETTINGS[column][0]] for column in pair]
-        axes.plot(*zip(*pairs, strict=True), marker, color=KF_COLOUR, ms=4.0, label=label)
+    others = [
+        (chosen[1] * z_factor, chosen[0] * a_factor) for _, a_factor, z_factor in SETTINGS[1:]
+    ]
+    axes.plot(*zip(*others, strict=True), "D", color=KF_COLOUR, ms=4.0, label="pairs in the table")
     best = [_best_value(noise) for noise in noises]
     axes.plot(best[1], best[0], "o", color="white", mec="black", ms=6.0, label="maximum")
     axes.plot(chosen[1], chosen[0], "X", color="black", mec="white", ms=8.0, label="chosen")
@@ -121,7 +116,7 @@ def _draw_map(page: Page, analysis: Analysis) -> None:
 
 
 def _noise_grid(chosen: float, noise: Noise) -> tuple[Array, tuple[float, float]]:
-    """Return grid values of a noise, fine near its estimate, and the limits of its map axis."""
+    """Return grid values of a noise, fine near its estimate, and the limits of the axis."""
     best = _best_value(noise)
     least, most = noise.low or best, noise.high or best
     shown_values = (chosen / NOISE_FACTOR, chosen * NOISE_FACTOR, best, least, most)
@@ -147,7 +142,7 @@ def _map_sentence(tuned_noises: AxisTuning) -> str:
 
 
 def format_noise(noise: Noise, unit: str) -> str:
-    """Format a noise with its 95 % interval, or the bounds if it has no estimate."""
+    """Format an estimated noise with its 95 % interval, or its bounds without an estimate."""
     if noise.value is None:
         ends = (("at least", noise.low), ("at most", noise.high))
         bounds = [f"{word} {format_number(end)} {unit}" for word, end in ends if end is not None]
@@ -179,12 +174,12 @@ def _log_likelihood_drop(
 
 
 def _second_half_median(values: Array) -> Array:
-    """Return the median over the second half, which has no initial transient."""
+    """Return the median over the second half of the flight, which has no initial transient."""
     return np.asarray(np.median(values[len(values) // 2 :], axis=0))
 
 
 def _write_table(page: Page, result: AxisComparison, states: FilterStates, chosen: Array) -> None:
-    """Write the table of gain, reported σ, mean NIS and velocity RMSE per setting."""
+    """Write gain, reported σ, mean NIS and velocity RMSE of KF for each pair of noises."""
     second_half = slice(len(states.gain) // 2, None)
     gains, sigmas, nis = (
         _second_half_median(states.gain),
@@ -209,7 +204,7 @@ def _write_table(page: Page, result: AxisComparison, states: FilterStates, chose
             for row, rmse in zip(rows, np.sqrt((error**2).mean(axis=0)), strict=True):
                 row.append(f"{rmse:.3f}")
     nis_text = ""
-    if nis[1] > 0.0:  # zero if the positions never change
+    if nis[1] > 0.0:  # NIS is zero if the positions never change
         nis_text = f", and the NIS {format_factor(nis[2] / nis[1])} times smaller"
     page.heading("Same track, different σ", 9.5, above=9.0)
     page.write(

@@ -45,33 +45,31 @@ SEVERITY_COLOURS = {
 }
 CONSISTENT_BAND_COLOUR = "#d5dfd8"
 
-KF_LINE: dict[str, Any] = {"color": KF_COLOUR, "lw": 1.0, "ls": "-"}
-EKF2_LINE: dict[str, Any] = {"color": EKF2_COLOUR, "lw": 1.1, "ls": (0, (4, 1.6))}
-TRUTH_LINE: dict[str, Any] = {"color": TRUTH_COLOUR, "lw": 0.7, "ls": (0, (1, 1.5))}
-KF_DOTS: dict[str, Any] = {"color": KF_COLOUR, "marker": "o", "ms": 2.0, "mew": 0, "ls": "none"}
-EKF2_DOTS: dict[str, Any] = {"color": EKF2_COLOUR, "marker": "s", "ms": 2.2, "mew": 0, "ls": "none"}
+
+def line_style(colour: str, width: float, dashes: object = "-") -> dict[str, Any]:
+    """Return matplotlib's options of a line; ``dashes`` is a line style of matplotlib."""
+    return {"color": colour, "lw": width, "ls": dashes}
+
+
+def dot_style(colour: str, marker: str | int, size: float, edge: float = 0.0) -> dict[str, Any]:
+    """Return matplotlib's options of markers without a line; size and edge width in points."""
+    return {"color": colour, "marker": marker, "ms": size, "mew": edge, "ls": "none"}
+
+
+KF_LINE = line_style(KF_COLOUR, 1.0)
+EKF2_LINE = line_style(EKF2_COLOUR, 1.1, (0, (4, 1.6)))
+TRUTH_LINE = line_style(TRUTH_COLOUR, 0.7, (0, (1, 1.5)))
+KF_DOTS = dot_style(KF_COLOUR, "o", 2.0)
+EKF2_DOTS = dot_style(EKF2_COLOUR, "s", 2.2)
 # Samples that EKF2 did not fuse are hollow in all panels
-EKF2_REJECTED: dict[str, Any] = {
-    "color": EKF2_COLOUR,
-    "marker": "s",
-    "ms": 2.8,
-    "mew": 0.6,
-    "mfc": "white",
-    "ls": "none",
-}
-MEASUREMENT_DOTS: dict[str, Any] = {
-    "color": MEASUREMENT_COLOUR,
-    "marker": ".",
-    "ms": 1.8,
-    "mew": 0,
-    "ls": "none",
-}
-# Styles by display name
+EKF2_REJECTED = dot_style(EKF2_COLOUR, "s", 2.8, 0.6) | {"mfc": "white"}
+MEASUREMENT_DOTS = dot_style(MEASUREMENT_COLOUR, ".", 1.8)
+# Styles of lines, dots and bands by the name of the track in legends
 LINES = {"KF": KF_LINE, "EKF2": EKF2_LINE, "ground truth": TRUTH_LINE}
 DOTS = {"KF": KF_DOTS, "EKF2": EKF2_DOTS}
 BANDS = {"KF": KF_BAND_COLOUR, "EKF2": EKF2_BAND_COLOUR}
 
-# Most drawn points of a series in wide and in narrow axes, and the smallest width of wide axes
+# Maximum number of drawn points in wide and in narrow axes; minimum width (inches) of wide axes
 MAX_POINTS, MAX_POINTS_NARROW, MIN_WIDE_INCHES = 1500, 500, 3.0
 
 

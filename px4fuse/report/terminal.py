@@ -3,6 +3,7 @@
 from typing import Any
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
+from px4fuse.card.model import Card
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.findings import group_by_root
@@ -10,16 +11,18 @@ from px4fuse.report.aids import write_aids_of_comparison, write_aids_only
 from px4fuse.report.difference_page import write_explanation
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import (
+    describe_alignment,
     format_settings,
     verdict_notes,
     write_errors,
     write_finding,
 )
 from px4fuse.report.style import MUTED_COLOUR
+from px4fuse.text import capitalise_first
 
 ERROR_LEGEND = (
-    "KF-EKF2: RMS difference of position and velocity. RMSE: against ground truth. Consistent: "
-    "σ ratio 0.8 to 1.25, or its 95 % interval contains 1."
+    "KF-EKF2 is the RMS difference of position and velocity; RMSE is against ground truth. A "
+    "filter is consistent if its σ ratio is 0.8 to 1.25, or if its 95 % interval contains 1."
 )
 
 
@@ -41,8 +44,7 @@ def summary(
     quiet : bool
         Print the headline only.
     """
-    page = Page()
-    page.add("headline" if quiet else "card", card=results.card)
+    page = card_page("headline" if quiet else "card", results.card)
     if not verbose:
         return page
     if isinstance(analysis, AidsOnlyAnalysis):
@@ -53,7 +55,6 @@ def summary(
 
 
 def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
-    """Write what the card leaves out."""
     page.add("blank")
     page.write_labelled_texts(facts(analysis))
     write_errors(page, analysis)
@@ -67,32 +68,24 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
         write_finding(page, group)
 
 
-def closing(results: Any) -> Page:
-    """Make the lines below the written files: where to read more."""
+def card_page(part: str, card: Card) -> Page:
+    """Make a page with a part of a card: "card", "headline", or "closing" (where to read more)."""
     page = Page()
-    page.add("closing", card=results.card)
+    page.add(part, card=card)
     return page
 
 
 def facts(comparison: Comparison) -> dict[str, str]:
-    """Return filter settings, position source and segment as texts by label."""
+    """Return filter settings, position source, alignment and segment as texts by label."""
     source, segment = comparison.source, comparison.segment
     position = (
         f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, "
         f"{source.frame}; {comparison.source_reason}"
     )
-    alignment_text = ""
-    if source.alignment is not None:
-        alignment = source.alignment
-        sigma = alignment.clock_offset_sigma_s
-        alignment_text = (
-            f"{alignment.frame}, yaw {alignment.yaw_deg:.1f}°, clock "
-            f"{alignment.clock_offset_s:+.3f}{'' if sigma is None else f' ± {sigma:.3f}'} s"
-        )
-    texts = {
+    alignment = {} if source.alignment is None else describe_alignment(source.alignment)
+    return {
         "Filter": format_settings(comparison.settings),
         "Position": position,
-        "Aligned": alignment_text,
+        **{capitalise_first(label): text for label, text in alignment.items()},
         "Segment": f"{segment.start_s:.2f} s to {segment.end_s:.2f} s, {segment.reason}",
     }
-    return {label: text for label, text in texts.items() if text}

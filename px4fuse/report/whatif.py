@@ -16,7 +16,7 @@ from px4fuse.text import format_number
 
 NOT_PREDICTABLE = "not predictable"
 Rows = tuple[tuple[str, Callable[[Any], str]], ...]
-# Label and cell text of each row: statistics of an axis or of an aid
+# Label of each table row, and the function that formats its statistic of an axis or aiding source
 NIS_ROWS: Rows = (
     ("{}: mean NIS", lambda summary: format_number(summary.nis_mean)),
     ("    expected", lambda summary: "{:.2f} to {:.2f}".format(*summary.nis_band)),
@@ -28,20 +28,20 @@ AXIS_ROWS: Rows = (
     ("    position RMSE (m)", lambda axis: _format_number(axis.position_rmse_to_truth_m)),
 )
 HEIGHT_ROWS: Rows = (*NIS_ROWS, ("    rejected", lambda height: f"{height.rejected_fraction:.1%}"))
-# Statistics of the whole replay
+# Table rows with statistics of the whole replay of EKF2
 OVERALL_ROWS: Rows = (
     ("samples", lambda s: f"{s.samples}"),
     ("rejected", lambda s: f"{s.rejected_fraction:.1%}"),
     ("longest time without fusion (s)", lambda s: _format_number(s.longest_without_fusion_s, 2)),
     ("position resets", lambda s: f"{s.resets}"),
 )
-# Only if the replay estimates heading and height instead of taking them from the log
+# Table rows of replays that estimate heading and height instead of taking them from the log
 HEADING_ROW = ("mean heading error (°)", lambda s: _format_number(s.heading_error_mean_deg, 1))
 HEIGHT_ROW = ("height RMSE (m)", lambda s: _format_number(s.height_rmse_to_truth_m))
 
 
 def column_heads(analysis: WhatIfAnalysis) -> list[str]:
-    """Return the column heads of :func:`rows`."""
+    """Return the heads of the columns of EKF2: logged, replayed, replayed with changes."""
     change_texts = [
         f"{name} {format_number(value)} {PARAMETERS[name].unit}".rstrip()
         for name, value in analysis.changes.items()
@@ -59,7 +59,7 @@ def column_heads(analysis: WhatIfAnalysis) -> list[str]:
 
 
 def rows(analysis: WhatIfAnalysis) -> list[list[str]]:
-    """Return table rows: a label, then the cells of the logged, replayed and changed EKF2."""
+    """Return the table rows: label, then the statistic of the logged, replayed and changed EKF2."""
     whatif_result = analysis.whatif
     overall_rows, heights = list(OVERALL_ROWS), whatif_result.replayed.heights
     if isinstance(whatif_result.replayed.heading_error_mean_deg, float):
@@ -84,7 +84,7 @@ def rows(analysis: WhatIfAnalysis) -> list[list[str]]:
 
 
 def _format_cell(summary: Summary, name: str, cell: Callable[[Any], str]) -> str:
-    """Format a statistic of an axis or aid; the name "" stands for the whole replay."""
+    """Format a statistic of an axis or aiding source; the name "" stands for the whole replay."""
     if not summary.is_predictable:
         return NOT_PREDICTABLE
     statistics = {"": summary, **summary.axes, **summary.heights, **summary.others}.get(name)
@@ -92,7 +92,7 @@ def _format_cell(summary: Summary, name: str, cell: Callable[[Any], str]) -> str
 
 
 def sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
-    """Return column heads and a row per value of the sweep."""
+    """Return the column heads, and a row of EKF2 statistics per value of the swept parameter."""
     name, rows = swept_parameter(analysis), []
     unit = PARAMETERS[name].unit
     (_, nis), _, _, (_, sigma), (_, rmse) = AXIS_ROWS
@@ -121,7 +121,7 @@ def sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
 
 
 def sweep_summaries(analysis: WhatIfAnalysis) -> tuple[Summary, ...]:
-    """Return the summary of the replay with each value of the sweep."""
+    """Return the statistics of EKF2 replayed with each value of the swept parameter."""
     return analysis.whatif.whatif[analysis.sweep_start :]
 
 
@@ -132,7 +132,7 @@ def swept_parameter(analysis: WhatIfAnalysis) -> str:
 
 
 def sweep_notes(analysis: WhatIfAnalysis) -> list[str]:
-    """Return sentences on the best values of the sweep and on the limits of the replay."""
+    """Return sentences on the best value of the swept parameter and on the limits of the replay."""
     sentences = []
     if summaries := [summary for summary in sweep_summaries(analysis) if summary.is_predictable]:
         name = swept_parameter(analysis)
@@ -174,7 +174,7 @@ def summary(analysis: WhatIfAnalysis) -> Page:
     log, whatif_result = analysis.flight.log, analysis.whatif
     page.write_labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
     spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.evaluated_s)
-    page.write_labelled("Used", f"{spans} of the flight, in all columns")
+    page.write_labelled("Used", f"All columns contain {spans} of the flight.")
     page.write_labelled("Replay", format_agreement(whatif_result.agreement))
     head = ["", *column_heads(analysis)]
     page.table(head, rows(analysis), right=range(1, len(head)))

@@ -49,7 +49,7 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     if not re.fullmatch(rf"{major}\.[0-9]{{1,4}}", version):
         provenance = value.get("provenance")
         writer = provenance.get("px4fuse") if isinstance(provenance, dict) else None
-        reader = f"px4fuse {one_line(str(writer), 60)}" if writer else "the px4fuse that reader it"
+        reader = f"px4fuse {one_line(str(writer), 60)}" if writer else "the px4fuse that wrote it"
         raise ResultsError(
             f"{name} uses schema version {one_line(version, 20)}; this px4fuse reads version "
             f"{major}.",

@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 from px4fuse.webpage.safe import clean_values, inert_json, load_template, policy_hash, read_asset
 
-MAX_PAGE_ROWS = 100  # rows on one page of the table
-MAX_PLAIN_ROWS = 300  # rows shown if scripts are disabled
+MAX_PAGE_ROWS = 100  # maximum number of rows on one page of the table
+MAX_PLAIN_ROWS = 300  # maximum number of rows of the plain table, for browsers without scripts
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def boxes_section(
     rows: Sequence[tuple[str, float, float | None, str]],
     other_rows: Sequence[tuple[str, float | None, str]] = (),
 ) -> Section:
-    """Return a section with input boxes for points and comments, which the page exports as CSV.
+    """Return a section with input boxes for points and comments; the page exports them as CSV.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def page(
         HTML, identical for the same input; write it as UTF-8.
     """
     style = "".join(map(read_asset, ("colours.css", "base.css", "frame.css")))
-    script = read_asset("frame.js")
+    script = "".join(map(read_asset, ("dom.js", "frame.js")))
     content = {
         "columns": [(c.title, c.kind, c.group, c.visible_from) for c in columns],
         "rows": [
@@ -230,7 +230,7 @@ def page(
 
 
 def _compact(cell: Cell) -> list[Any]:
-    """Return the fields of a cell without empty ones at the end; True: the value is the text."""
+    """Return the fields of a cell as a list without empty ends; value True: equal to the text."""
     value = True if cell.value == cell.text else "" if cell.value is None else cell.value
     bar = "" if cell.bar is None else round(cell.bar, 3)
     fields = [cell.text, value, cell.below, cell.style_class, bar]
