@@ -191,7 +191,7 @@ GATE_UPDATES = 20
 
 
 def draw_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
-    """Draw three questions at random, with the SHA-256 of the log as seed: each log has others."""
+    """Draw three questions at random, with the SHA-256 of the log as seed."""
     random_bytes = iter(hashlib.sha256(f"px4fuse answers {log_sha256}".encode()).digest())
 
     def draw_between(low: float, high: float, decimals: int) -> float:

@@ -73,7 +73,7 @@ class Aid:
         return frozenset((self.noise, self.gate, self.delay, self.noise_mode))
 
     def logged_parameters(self, logged: Mapping[str, float]) -> dict[str, float]:
-        """Return the logged parameters of this aiding source, with the one that enables fusion."""
+        """Return the logged parameters of this aiding source, including the ``switch``."""
         names = (self.noise, self.delay, self.gate, self.noise_mode, self.switch, AID_MASK)
         return {name: float(logged[name]) for name in names if name in logged}
 
@@ -84,7 +84,7 @@ GNSS_MODE = "EKF2_GPS_MODE"
 # Relative tolerance of PX4's parameter ranges, because logged values are float32 (rounding 6e-8)
 FLOAT32_TOLERANCE = 1e-6
 # Parameters from PX4 v1.17 on for the age (ms) of a fix of the first GNSS receiver, which EKF2
-# subtracts from its timestamp
+# subtracts from the timestamp of the fix
 RECEIVER_DELAYS = ("SENS_GNSS0_DELAY", "SENS_GPS0_DELAY")
 
 
@@ -98,7 +98,7 @@ class Parameter(NamedTuple):
 
     @property
     def printed_unit(self) -> str:
-        """Unit with superscripts."""
+        """Unit with superscripts: "m/s²" for "m/s^2"."""
         return self.unit.replace("^2", "²").replace("^3", "³")
 
     def describe_range_error(self, value: float) -> str:
@@ -131,7 +131,7 @@ PARAMETERS = msgspec.convert(TABLES["parameters"], dict[str, Parameter])
 # Parameters of the EKF2 model, and other logged parameters with which px4fuse computes
 RANGES = PARAMETERS | msgspec.convert(TABLES["logged"], dict[str, Parameter])
 FIELD_NOISES = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
-# Defaults of PX4 up to v1.13 that differ from later ones (ekf2_params.c)
+# Defaults of PX4 up to v1.13 that differ from the defaults of later releases (ekf2_params.c)
 OLD_DEFAULTS: Mapping[str, float] = {EV_POS.delay: 175.0}
 # Names of the logged parameters that the results contain
 REPORTED: tuple[str, ...] = tuple(TABLES["reported"].split())

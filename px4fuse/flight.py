@@ -98,7 +98,8 @@ class FlightMode:
 class Alignment(Record, frozen=True, kw_only=True):
     """Alignment of an external position file with the flight in time and space.
 
-    A position p of the file becomes origin + Rz(yaw) · C · p, where C converts its frame to NED.
+    A position p of the file becomes origin + Rz(yaw) · C · p, where C converts the frame of the
+    file to NED.
 
     Attributes
     ----------
@@ -153,7 +154,7 @@ class PositionTrack:
     name : str
         Name for ``--position-source``; the PX4 topic if there is one.
     origin : Origin
-        Kind of the source and path to the log.
+        Kind of the position source, and data path of the positions from sender to log.
     description : str
         Description for the user.
     samples : DataFrame, shape (n, 6)
@@ -331,7 +332,7 @@ class FusionRecord:
         Height of the aid minus height of the reference: ``bias_m``, with variance ``bias_m2``.
     states : mapping from :data:`GROUND_EFFECT` and :data:`BAD_ACCELERATION` to Series
         Step functions: 1 while EKF2 detects ground effect on the barometer, or wrong vertical
-        acceleration; otherwise 0. Only those that are logged.
+        acceleration; otherwise 0. Contains logged states only.
     """
 
     parameters: Mapping[str, float]
@@ -415,8 +416,8 @@ class Ekf2:
         ``test_ratio``, ``fused``, ``rejected`` (1, 0, or NaN if not logged).
     innovation_topics : tuple of str
     fusing : DataFrame or Unavailable
-        Step functions ``horizontal``, ``vertical``, ``yaw``: 1 while EKF2 reports fusion of
-        external vision for them.
+        Step functions ``horizontal``, ``vertical``, ``yaw``: 1 while EKF2 reports fusion of this
+        component of external vision.
     resets : tuple of Reset
     instances : tuple of (float, int)
         (Start time, primary instance from then on).

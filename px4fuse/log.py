@@ -134,7 +134,7 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
     parameters : mapping
         PX4 parameters for fusion and logging at the start of the log, by name.
     parameter_defaults : mapping
-        Defaults of the firmware for EKF2 parameters with another value; ULog only.
+        Logged firmware defaults of the EKF2 parameters that differ from their default; ULog only.
     notes : tuple of str
         Sentences about dropped samples and clocks.
     damage : tuple of str
@@ -186,7 +186,7 @@ class LogInfo(Record, frozen=True, omit_defaults=False):
     __repr__ = one_line_repr
 
     def default_of(self, parameter: str) -> float:
-        """Return the default of an EKF2 parameter: of the firmware if logged, else of v1.14."""
+        """Return the default of an EKF2 parameter: the logged default, else PX4's since v1.14."""
         return self.parameter_defaults.get(parameter, PARAMETERS[parameter].default)
 
     @property

@@ -55,7 +55,7 @@ FINDING_WITH_TIME = {
     "dropout": "source_gap",
 }
 NO_MISTAKE = "No mistake: about 5 % of the innovations are outside ±2√S, and they are white."
-# Name of the mistake "SIGMA_Z of KF is too small", which is not in the log
+# Name of the mistake "SIGMA_Z of KF is too small", which is a wrong setting and no fault in the log
 NOISY_UWB = "noisy-uwb"
 
 
@@ -112,7 +112,7 @@ class PracticeFlight:
     scenario : Scenario
         Settings of the simulation.
     mistakes : tuple of HiddenMistake
-        None, one or two mistakes with different right answers.
+        No, one or two mistakes with different right answers.
     sizes : tuple of str
         Sizes of the mistakes, as after ``px4fuse simulate --mistake NAME=``.
     """
@@ -266,7 +266,7 @@ def _rerun_sentence(card: Card) -> str:
 
 
 def _name_mistakes(card: Card, described: Sequence[Mapping[str, Any]]) -> Card:
-    """Replace the headline of the report card if the analysis did not detect the mistake."""
+    """Replace the headline of the diagnosis if the analysis did not detect the mistake."""
     if card.causes or not described:
         return card
     fault = "; ".join(f"{mistake['fault']}: {mistake['size']}" for mistake in described)

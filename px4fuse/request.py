@@ -192,7 +192,7 @@ class LoopRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command", 
 
 
 class Sweep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Values of an EKF2 parameter for replays: equal ratios if ``low`` is above 0, else steps."""
+    """Values of an EKF2 parameter for replays: equal ratios if ``low`` > 0, else equal steps."""
 
     parameter: str
     low: float

@@ -79,6 +79,11 @@ def capitalise_first(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
+def lower_first(text: str) -> str:
+    """Return a sentence as the continuation of another one; acronyms such as UWB stay."""
+    return text if text[1:2].isupper() else text[:1].lower() + text[1:]
+
+
 def join_first(names: Sequence[str], max_count: int, separator: str = ", ") -> str:
     """Join the first ``max_count`` names, and append the number of further names.
 

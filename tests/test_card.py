@@ -9,18 +9,22 @@ import pytest
 from cards import verdicts
 from exchange import replace
 
-from px4fuse.analysis import Analysis
+from px4fuse.analysis import Analysis, explain
 from px4fuse.card.build import build_card, build_refusal_card
 from px4fuse.card.causes import make_cause, rank_causes
 from px4fuse.card.model import Action
+from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.trials import RunStatistics, Trial, improvement
 from px4fuse.errors import LogError
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import Finding
+from px4fuse.findings import Finding, find
 from px4fuse.position_source import RECEIVED
 from px4fuse.readers import read_log
 from px4fuse.report.card_text import card_lines
 from px4fuse.request import ComparisonRequest
+from px4fuse.simulation.flights import simulate_flight
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import Scenario
 
 REQUEST = ComparisonRequest(log="a.ulg")
 CHANGES = {
@@ -166,3 +170,17 @@ def test_diagnosis_card_of_clean_flight_advises_no_change(sample: Analysis) -> N
     assert (card.severity, card.id, card.causes) == ("clean", "", ())
     assert card.headline == "No fault found: KF and EKF2 are consistent"
     assert card.do_this == ("Change nothing.",)
+
+
+def test_verdicts_that_differ_by_ekf2_delay_refer_to_the_rerun() -> None:
+    flight = simulate_flight(Scenario(seed=8), parse(("ekf2-delay=0.25",)))
+    explained = explain(compare(flight, Settings()))
+    card = build_card(explained, find(explained), REQUEST)
+    assert (card.id, card.causes[0].reruns[0].improves) == (
+        "ekf2_ev_delay_wrong",
+        "position and σ",
+    )
+    assert card.reconcile == (
+        "The two verdicts of EKF2 differ: innovations hardly show this fault, ground truth does. "
+        "The re-run above removes most of the error."
+    )

@@ -22,7 +22,7 @@ YAW_FREE_FRAMES = ("ned", "enu")
 # Maximum time span (s) of a position file: matching a day of positions takes five seconds
 MAX_SPAN_S = 86400.0
 # Minimum value of Lin's concordance correlation coefficient (1989) for a good match, by reference:
-# a match below gets a warning and does not overrule options
+# a worse match gets a warning and does not overrule options
 GOOD_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
 # Maximum standard deviation (s) of an accepted time offset
 MAX_CLOCK_SIGMA_S = 0.5

@@ -33,7 +33,7 @@ from px4fuse.readers.position_csv import PositionRecording
 # Maximum ratio of the residual at another time offset to the residual at the best time offset for a
 # warning that the offset is ambiguous, by reference: IMU noise gives ratios of 1.4 to 1.7
 MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}
-# Minimum negative correlation between the heights of file and EKF2 for opposite z axes
+# Minimum of the negated correlation between the heights of file and EKF2 that shows opposite z axes
 MIN_MIRRORED_CORRELATION = 0.8
 # Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
 # indicates another flight

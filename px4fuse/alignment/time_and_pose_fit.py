@@ -16,7 +16,8 @@ MAX_LAG_SHIFT_S = 1.0
 # Minimum value of Lin's concordance correlation coefficient (1989) for an accepted match, by
 # reference
 MIN_CONCORDANCE = {EKF2_POSITION: 0.7, IMU: 0.5}
-# Lower limit of 1 - concordance in the likelihood: of nearly perfect matches the longest is chosen
+# Lower limit of 1 - concordance in the likelihood: with it, the longest of several nearly perfect
+# matches has the greatest likelihood
 MIN_DISCORDANCE = 1e-4
 # Minimum distance (s) between the lags of two separate correlation peaks
 MIN_PEAK_DISTANCE_S = 3.0
@@ -86,9 +87,10 @@ def find_correlation_peak(
     """Find the lag with the greatest likelihood gain on the grid; yaw is estimated if None.
 
     With a free origin the residual sum of squares of file f and reference g over an overlap of N
-    grid points is Σ|f - f̄|² + Σ|g - ḡ|² - 2·Re(e^{-iψ}cov). The log-likelihood minus that of two
-    independent tracks is -N·ln(1 - concordance). This gain is maximised. It prefers a long overlap
-    with an excellent match to a short overlap in which two straight lines match equally well.
+    grid points is Σ|f - f̄|² + Σ|g - ḡ|² - 2·Re(e^{-iψ}cov). The log-likelihood minus the
+    log-likelihood of two independent tracks is -N·ln(1 - concordance). This gain is maximised. It
+    prefers a long overlap with an excellent match to a short overlap in which two straight lines
+    match equally well.
 
     Raises
     ------

@@ -25,7 +25,7 @@ FRAMES = {
 }
 EKF2_POSITION, IMU = "EKF2 position", "IMU"
 
-# Minimum length (s) of a gap, which is also longer than three median intervals
+# Minimum length (s) of a gap; a gap is also longer than three median intervals
 MIN_GAP_LIMIT_S = 0.5
 # Minimum horizontal motion (m), number of positions and overlap (s) for a match; of short tracks,
 # half of the shorter track must overlap
@@ -34,7 +34,8 @@ MIN_SAMPLES = 10
 MIN_OVERLAP_S = 10.0
 # σ (s) of the Gaussian filter without delay that smooths EKF2's steps at updates
 SMOOTHING_S = 0.2
-# Frequency band in which acceleration integrated twice equals position; below, the integral drifts
+# Frequency band in which acceleration integrated twice equals position; at lower frequencies the
+# integral drifts
 BAND_HZ = (0.1, 1.0)
 # Length (s) of the transients of the band-pass filter, and of the padding at both ends of a track
 TRANSIENT_S, BAND_PADDING_S = 2.0, 10.0

@@ -72,7 +72,7 @@ class AnswerKey(msgspec.Struct, frozen=True):
     answers : tuple of Answer
         Assigned flight and right answers of each student.
     secret : str
-        Random secret that determined the flights; "" if the instructor has the secret.
+        Random secret that determined the flights; "" if the instructor chose and keeps the secret.
     """
 
     kind: _Text

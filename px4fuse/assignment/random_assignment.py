@@ -1,7 +1,7 @@
 """Random assignment of a flight with mistakes to each student.
 
-Random numbers are the HMAC (RFC 2104) of the student id with the instructor's secret as key. They
-cannot be predicted without the secret, and a second run gives the same flights.
+Random numbers are the HMAC (RFC 2104) of the student id with the instructor's secret as key. The
+numbers cannot be predicted without the secret, and a second run gives the same flights.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ MIN_SECRET_LENGTH = 8
 # not be added to existing answer keys
 DRAW_LABEL = "px4fuse assignment 2"
 # Fractions of flights with 0, 1 and 2 mistakes, unless --mistakes sets the number. The only
-# possible mistake of a loop is "open-end". Many loops have none, so that students cannot guess it
+# possible mistake of a loop is "open-end". Many loops have no mistake, so that students cannot
+# guess "open-end"
 COUNT_FRACTIONS: dict[Kind, tuple[float, ...]] = {"aisle": (0.1, 0.5, 0.4), "loop": (0.4, 0.6)}
 # Fraction of the students of a "mixed" class who get a loop; the others get an aisle flight
 LOOP_FRACTION = 1 / 3
-# Limits of the difficulty of a mistake: its smallest detectable size divided by its size in the
-# flight
+# Limits of the difficulty of a mistake: smallest detectable size divided by the size in the flight
 EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
 
 

@@ -56,7 +56,10 @@ class TrueMistake(Record, frozen=True):
 
 
 class VerdictTruth(Record, frozen=True):
-    """Right verdict on the reported σ of a filter, or "", and the factor by which σ is wrong."""
+    """Right verdict on the reported σ of a filter, and the factor by which σ is wrong.
+
+    ``verdict`` is "" if the flight has too few data for a verdict.
+    """
 
     verdict: str
     factor: float | None = None

@@ -54,7 +54,7 @@ from px4fuse.flight import Ekf2, Unavailable, source_name
 from px4fuse.log import LogInfo
 from px4fuse.reading import display_name, file_size, read_head
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
-from px4fuse.text import with_log_name
+from px4fuse.text import lower_first, with_log_name
 
 MAX_ACTIONS = 3
 # Minimum fraction of positions rejected by EKF2 that the effect on the card states
@@ -195,7 +195,7 @@ def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
     if causes:
         first, *others = causes
         for other in others:
-            both = f"{first.title}; {other.title[0].lower()}{other.title[1:]}"
+            both = f"{first.title}; {lower_first(other.title)}"
             if other.severity == "error" and len(both) <= MAX_HEADLINE_LENGTH:
                 return both
         return first.title
@@ -310,12 +310,15 @@ def _in_brackets(label: str, lengths_m: Mapping[FilterName, float]) -> str:
 
 
 def _do_this(causes: Sequence[Cause]) -> tuple[str, ...]:
-    """Return at most three actions of the causes; first the alternative that is listed first."""
+    """Return at most three actions, with the number of the cause if there are several causes."""
     texts: list[str] = []
-    for cause in causes:
-        for alternative in cause.alternatives[:1]:
-            texts += [_sentence(action) for action in alternative]
-        texts += [_sentence(action) for action in cause.actions if _is_change(action)]
+    for number, cause in enumerate(causes, 1):
+        sentences = [_sentence(action) for action in cause.actions if _is_change(action)]
+        if cause.alternatives:
+            either = [_sentence(action) for group in cause.alternatives for action in group]
+            sentences.insert(0, ", or ".join([*(text[:-1] for text in either[:-1]), either[-1]]))
+        label = f"({number}) " if len(causes) > 1 else ""
+        texts += [f"{label}{sentence}" for sentence in sentences]
     return tuple(dict.fromkeys(texts))[:MAX_ACTIONS] if causes else ("Change nothing.",)
 
 
@@ -416,8 +419,14 @@ def _reconcile(
         return ""
     if not SHIFTED_SOURCE.isdisjoint(ids):
         return (
-            "The two verdicts of each filter differ: both filters follow the wrong positions, so "
-            "the innovations stay small and cannot show it. Ground truth does."
+            "Both filters follow the faulty positions, so their innovations show little of the "
+            "error. Ground truth shows it."
+        )
+    if corrected.issuperset(differing):
+        filters = " and ".join(FILTER_NAMES[owner] for owner in differing)
+        return (
+            f"The two verdicts of {filters} differ: innovations hardly show this fault, ground "
+            "truth does. The re-run above removes most of the error."
         )
     tuned = analysis.tuning.get(HORIZONTAL)
     if analysis.source.origin.may_drift:
@@ -433,9 +442,9 @@ def _reconcile(
             "Innovations show only the error that changes from sample to sample. Both filters "
             "follow the slow part, so it shows against ground truth alone."
         )
-    if "source_outliers" in ids and "ekf2" in differing:
-        return _gate_sentence(analysis)
-    return HEADING_HIDES_ERROR if "ekf2_heading_error" in ids else UNEXPLAINED
+    unexplained = HEADING_HIDES_ERROR if "ekf2_heading_error" in ids else UNEXPLAINED
+    is_gated = "source_outliers" in ids and "ekf2" in differing
+    return _gate_sentence(analysis) if is_gated else unexplained
 
 
 def _differ(source: Verdict, truth: Verdict, *, is_corrected: bool) -> bool:

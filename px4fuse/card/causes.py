@@ -19,11 +19,13 @@ from px4fuse.comparison.trials import (
     halves,
     has_effect,
     improvement,
+    leaves_error,
     preference,
     ratios,
     reduction,
 )
 from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.model import CATALOGUE
@@ -104,7 +106,8 @@ def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCaus
 
     First come findings that make the verdicts meaningless, then those whose re-run makes a filter
     consistent, then those whose re-run halves |ln ratio|, then other errors and warnings. A fault
-    of the source precedes a setting that would only hide it.
+    of the source precedes a setting that would only hide it, or that leaves the error against
+    ground truth as it is.
     """
     ranked = []
     for finding in roots:
@@ -124,7 +127,7 @@ def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCaus
         ranked,
         key=lambda each: (
             each.tier,
-            each.tier in (1, 2) and _is_setting(each.finding),
+            each.tier in (1, 2, 3) and _is_setting(each.finding),
             -each.reduction,
         ),
     )
@@ -138,6 +141,8 @@ def _is_setting(finding: Finding) -> bool:
 def _tier(finding: Finding, trials: Iterable[Trial]) -> int:
     if finding.id in MEANINGLESS:
         return 0
+    if _is_setting(finding) and any(map(leaves_error, trials)):
+        return 3
     if any(enters_band(trial) for trial in trials):
         return 1
     if any(halves(trial) for trial in trials):
@@ -384,4 +389,7 @@ def _closing_sentence(
         default = analysis.flight.log.default_of(name)
         if (tuned.sigma_z.low or 0.0) <= default <= (tuned.sigma_z.high or 0.0):
             return f"PX4's default, {default:g} m, is inside the 95 % interval: it is as good."
+    after = [math.sqrt(trial.after.nees_mean) for trial in useful if trial.after.nees_mean]
+    if after and classify_ratio(min(after), "truth") == "overconfident":
+        return "Against ground truth, σ stays too small after this fix: another error remains."
     return ""

@@ -55,7 +55,7 @@ IGNORED_VARIABLES = ("MPLBACKEND", "SOURCE_DATE_EPOCH")
 # Minimum address space (bytes) for a run: the report of the sample log needs 0.7 GB
 MIN_ADDRESS_SPACE_BYTES = 800_000_000
 
-# Commands that need pyarrow; in all other runs pandas must not import it, which takes 70 MB
+# Commands that need pyarrow; in all other runs pandas must not import pyarrow, which takes 70 MB
 PARQUET_COMMANDS = ("batch", "extract")
 
 

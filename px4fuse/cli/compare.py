@@ -63,7 +63,7 @@ def compare(
 
     student = options.read_student(option_values)
     request = options.comparison_request(log, option_values)
-    outputs.report_paths(output, json_path)  # check before the long analysis
+    outputs.report_paths(output, json_path)  # report an invalid path before the long analysis
     try:
         with outputs.progress(json_path) as show_progress:
             outcome = diagnose_or_check_aids(request, show_progress)
@@ -73,7 +73,7 @@ def compare(
                 output = outputs.default_report(log.stem, settings_name(request), results)
             contents = outputs.result_files(results, json_path, output, outcome, show_progress)
     except (LogError, MissingDataError) as error:
-        if not sys.stderr.isatty():  # other programs read one line
+        if not sys.stderr.isatty():  # programs that read standard error expect one line
             raise
         outputs.show_page(card_page("card", build_refusal_card(error, log)), is_error=True)
         sys.exit(2)

@@ -169,7 +169,7 @@ def _source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
         data_type = source.part if source.part != previous else ""
         previous = source.part
         if source.unavailable:
-            # the table of analyses contains the reason
+            # the table of analyses contains the reason for the missing data
             yield (data_type, ("none", MUTED_COLOUR), *("" for _ in SOURCES_HEAD[2:]))
             continue
         yield (

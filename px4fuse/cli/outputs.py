@@ -82,7 +82,7 @@ def progress(output: Path | None = None) -> Iterator[ShowProgress]:
     from rich.console import Console
 
     console = Console(stderr=True)
-    # no disabled progress bar: older versions of rich print an empty line after it
+    # no progress bar, not even a disabled one: older versions of rich print an empty line after it
     if not console.is_terminal or output == STANDARD_OUTPUT:
         yield show_nothing
         return
@@ -336,7 +336,7 @@ def write_and_print(
 
 
 def show_page(page: Page, *, is_error: bool = False) -> None:
-    """Print a page on the terminal, an error on standard error."""
+    """Print a page on standard output or, if it reports an error, on standard error."""
     from px4fuse.report.screen import show
 
     show(terminal(is_error=is_error), page.blocks)

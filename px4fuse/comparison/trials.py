@@ -16,6 +16,8 @@ Improvement = Literal["position and σ", "position", "σ only", "nothing"]
 MIN_RATIO_CHANGE, MIN_RMSE_CHANGE = 1.10, 0.05
 # Minimum relative reduction of the position RMSE for a re-run to improve the position
 POSITION_IMPROVEMENT = 0.20
+# A re-run leaves an error if ln(error ÷ σ) stays above this fraction of its value before
+MAX_ERROR_LEFT = 0.75
 
 
 class RunStatistics(Record, frozen=True, kw_only=True):
@@ -121,6 +123,16 @@ def halves(trial: Trial) -> bool:
     return any(
         classify_ratio(before, name) != "consistent"
         and abs(math.log(after)) <= 0.5 * abs(math.log(before))
+        for name, before, after in ratio_pairs(trial)
+    )
+
+
+def leaves_error(trial: Trial) -> bool:
+    """Return True if a filter stays overconfident against ground truth by nearly as much."""
+    return any(
+        name == "truth"
+        and classify_ratio(before, name) == classify_ratio(after, name) == "overconfident"
+        and math.log(after) > MAX_ERROR_LEFT * math.log(before)
         for name, before, after in ratio_pairs(trial)
     )
 

@@ -26,9 +26,9 @@ AidVerdict = Literal[
     "disabled",
     "too few samples",
 ]
-# Minimum |mean innovation| / RMS innovation of a biased aiding source: EKF2 then follows the bias
+# Minimum |mean innovation| / RMS innovation of an aiding source that counts as biased
 MIN_BIAS_SHARE = 0.5
-# Minimum |mean innovation| / √S of a biased aiding source
+# Minimum |mean innovation| / √S of an aiding source that counts as biased
 MIN_BIAS_IN_SIGMA = 0.2
 # Length (s) of the windows in which the normalised innovations ν/√S are averaged, to detect a
 # change of their mean in flight
@@ -39,7 +39,8 @@ MIN_WINDOW_SAMPLES = 5
 MIN_WINDOWS_BEFORE = 2
 # Minimum change (√S) of the mean normalised innovation
 MIN_CHANGE_IN_SIGMA = 0.5
-# Minimum ratio of a change of the mean to the scatter of the means of the earlier windows
+# Minimum ratio of a change of the mean normalised innovation to the standard deviation of the means
+# of the earlier windows
 MIN_CHANGE_SCATTER_RATIO = 6.0
 # Maximum time (s) without a fused sample of an enabled aiding source. EKF2 resets its state to the
 # source after 7 s (reset_timeout_max)
@@ -225,7 +226,7 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
     if fused_logged:
         fused, rejected = (samples[flag].to_numpy() > 0.0 for flag in ("fused", "rejected"))
         noise = samples[[f"noise_{axis}" for axis in log.axes]].to_numpy()
-        # EKF2 logs innovation 0 and S = R for a sample to which it resets its state
+        # If EKF2 resets its state to a sample, it logs innovation 0 and S = R for this sample
         is_reset = ((innovation == 0.0) & np.isclose(variance, noise)).all(axis=1)
         noise_median = float(np.median(np.sqrt(noise[fused, 0]))) if fused.any() else None
     else:

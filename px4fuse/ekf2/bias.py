@@ -18,8 +18,8 @@ MIN_VARIANCE_M2 = 1e-8
 MIN_NOISE_M2 = 1e-4
 # Innovation gate (√S) in updates of the bias
 BIAS_GATE = 3.0
-# Maximum mean of test ratio times sign of the innovation; above, EKF2 multiplies the variance of
-# the random walk by NOISE_FACTOR (isOffsetDetected)
+# Maximum |mean| of test ratio times sign of the innovation: if it is larger, EKF2 multiplies the
+# variance of the random walk by NOISE_FACTOR (isOffsetDetected)
 MAX_MEAN_SIGNED_RATIO = 0.2
 NOISE_FACTOR = 1e3
 # Time constant (s) of the low-pass filter that averages the signed test ratio

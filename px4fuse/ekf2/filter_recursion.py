@@ -70,7 +70,7 @@ LOGGED_STATES = slice(HEADING, DOWN + 1, DOWN - HEADING)
 HORIZONTAL = slice(NORTH, EAST + 1)
 # State indices of velocity and position, both of which a GNSS sample measures
 MEASURED_STATES = slice(3, 9)
-# Columns of velocity and of horizontal position in arrays of these six measured states
+# Columns of velocity and of horizontal position in arrays of the six MEASURED_STATES
 VELOCITY_COLUMNS = slice(0, 3)
 POSITION_COLUMNS = slice(3, 5)
 
@@ -306,7 +306,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         :, :, None, None
     ]
     if (share := segment.bad_acceleration_share) is not None:
-        # mean over each interval of the share of accelerometer axes with a larger noise
+        # fraction of accelerometer axes with BAD_ACCELERATION_NOISE, averaged over each interval
         share_sums = np.diff(np.cumsum(share)[event_steps], axis=0, prepend=share[0])
         mean_share = (share_sums[:, :, None] / np.maximum(steps, 1))[..., None]
         acceleration_variance += mean_share * (BAD_ACCELERATION_NOISE**2 - acceleration_variance)
@@ -439,7 +439,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         if vision is not None:
             vision.bias.value_m = vision.bias.value_m + position_reset_m[e]
             x, P = vision.fuse(e, x, P, True, fusion.last_position_s)
-            # EKF2 resets after a time without any fused position, from GNSS or from vision
+            # EKF2 resets the position after a time without a fused position, from GNSS or vision
             if inputs.rules.with_velocity:
                 fusion.last_position_s = np.maximum(fusion.last_position_s, vision.fused_s)
         states[e + 1] = x
@@ -523,9 +523,9 @@ def _rejection_by_output(
     """Infer EKF2's rejection of a position sample from the published position.
 
     Return two masks of filter configurations: True if the sample is near the gate limit, and True
-    if EKF2 rejected the sample. It counts as rejected if the correction of the published position
-    (``observed_correction_m``, north and east) is less than half of the expected correction,
-    (1 - R/S)ν. The other arrays have shape (S, 2).
+    if EKF2 rejected the sample. A sample counts as rejected if the correction of the published
+    position (``observed_correction_m``, north and east) is less than half of the expected
+    correction, (1 - R/S)ν. The other arrays have shape (S, 2).
     """
     ratio = (nu * nu / (gate_squared * S)).max(axis=1)
     is_near_gate = (
@@ -629,9 +629,9 @@ def _variance_growth(
     biases: BoolArray,
     attitude: BoolArray,
 ) -> ArrayPair:
-    """Return the variance that sensor biases and magnetic fields gain in one prediction step.
+    """Return the process noise of sensor biases and magnetic fields in one prediction step.
 
-    Return also the variance above which they gain none.
+    Return also the state variances above which EKF2 adds no process noise.
     """
     field_parameters = ("MAG_E", "MAG_B") if segment.field is not None else ()
     noise_density = np.stack(

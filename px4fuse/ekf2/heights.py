@@ -44,7 +44,7 @@ OLD_BAROMETER_HZ = 15.0
 MIN_BAROMETER_LOG_HZ = 4.0
 # Minimum innovation gate (√S) in EKF2
 MIN_GATE = 1.0
-# Minimum measurement noise in EKF2, of positions (m) and of velocities (m/s)
+# Minimum measurement noise (σ) in EKF2, of positions (m) and of velocities (m/s)
 MIN_SIGMA = 0.01
 
 
@@ -111,8 +111,8 @@ def barometer_samples_inside(
 ) -> tuple[IntArray, Array, Array, Array]:
     """Select the barometer samples inside a segment.
 
-    Return the prediction step after which each is fused, its time (s), height (m, down) and dead
-    zone (m).
+    Return for each sample the prediction step after which it is fused, time (s), height (m, down)
+    and dead zone (m).
     """
     step, is_inside = sample_steps(segment, measured_at_s)
     return step, measured_at_s[is_inside], down_m[is_inside], dead_zone_m[is_inside]
@@ -121,10 +121,9 @@ def barometer_samples_inside(
 def barometer_samples(segment: ReplaySegment, ends: Sequence[IntArray]) -> list[Array]:
     """Return the barometer samples that are fused at each event, one array per set of events.
 
-    Each element of ``ends`` contains the prediction steps of E events. Each array has shape
-    (5, k, E). Its rows are height (m, down), see
-    :func:`~px4fuse.ekf2.replay_segments.samples_by_event`; sample age (s); sample time (s); dead
-    zone (m); and 1. All are 0 without a sample.
+    Each element of ``ends`` contains the prediction steps of E events. Each array has shape (5, k,
+    E). Its rows are height (m, down), see :func:`~px4fuse.ekf2.replay_segments.samples_by_event`;
+    sample age (s); sample time (s); dead zone (m); and 1 for a sample. All are 0 without a sample.
     """
     heights = segment.heights
     assert heights is not None

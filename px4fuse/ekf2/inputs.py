@@ -54,7 +54,7 @@ from px4fuse.readers.px4_topics import DEFAULT_PROFILE
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, rotate, to_matrix
 
 ANALYSIS_NAME = "EKF2 replay"
-# Note in simulated logs: their EKF2 data are from px4fuse's EKF2 model
+# Note that px4fuse writes into simulated logs
 MODEL_NOTE = (
     "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
 )
@@ -433,7 +433,7 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
         is_enabled = step_values_at(enabled, samples.index) > 0.0
         samples = samples[is_enabled]
         velocities = velocities[is_enabled]
-    # the track has measurement times: add the delay, because the replay subtracts it again
+    # the track has measurement times: add the delay, because the replay subtracts the delay again
     flown = effective_settings(parameters, GNSS_POS)
     flown_s = flown[GNSS_POS.delay] * 1e-3
     timestamp_s = samples.index.to_numpy() + flown_s

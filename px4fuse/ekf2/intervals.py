@@ -43,8 +43,9 @@ MAX_LATENESS_S = 0.1
 MIN_LATENESS_S = 0.03
 # Action on a position sample: none, update of the state, or start of fusion with a reset
 IDLE, FUSE, START = 0, 1, 2
-# Number of columns of the sensitivity of an interval's final state: initial attitude error, gyro
-# bias and accelerometer bias (3 columns each), correction of the nominal attitude, acceleration
+# Number of columns of the sensitivities of the state at the end of an interval: to initial attitude
+# error, gyro bias and accelerometer bias (3 columns each), to the correction of the nominal
+# attitude, and to the acceleration
 EFFECT_COLUMNS = 11
 CORRECTION_COLUMN, INPUT_COLUMN = 9, 10
 
@@ -135,7 +136,7 @@ def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
     end = np.maximum.accumulate(np.minimum(end, last))
     is_in_time = time_s[end] < measured_s + MAX_LATENESS_S
     is_usable = is_inside & is_in_time
-    is_usable[:-1] &= end[1:] > end[:-1]  # of two samples in one step EKF2 fuses only the newer
+    is_usable[:-1] &= end[1:] > end[:-1]  # EKF2 fuses only the newer of two samples in one step
     action, can_start = _actions(inputs, segment, measured_s, end, is_usable)
     # additional events in gaps of the position source; their number does not depend on the delay
     gap_s = np.diff(np.r_[time_s[0], stamp, time_s[-1]])

@@ -140,7 +140,8 @@ def _open_without_aids(
 ) -> Model | Unavailable:
     """Prepare the EKF2 replay without the aiding sources in ``failed_agreements``.
 
-    Keys are PX4's names of the sources; values, the agreement that shows the wrong replay.
+    Keys are PX4's names of the sources; values are the agreements of the replay that contained the
+    source and was wrong.
     """
     doubtful = {name: agreement.doubtful[name] for name, agreement in failed_agreements.items()}
     inputs = prepare_inputs(flight, doubtful)
@@ -174,7 +175,7 @@ def _open_without_aids(
             agreement = with_logged_rejections(
                 agreement, logged_agreement, has_all_decisions=has_all_decisions
             )
-    # the numbers of an omitted aiding source are from the replay that contained it
+    # the agreement of an omitted aiding source is from the replay that contained this source
     failed_fields = {
         (field_name := AGREEMENT_FIELDS.get(name, name)): getattr(failed_agreement, field_name)
         for name, failed_agreement in failed_agreements.items()
@@ -413,7 +414,7 @@ def _make_replay(
 
 
 def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[Span]:
-    """Return the times between fused positions that are longer than RESTART_GAP_S."""
+    """Return the spans (s) without a fused position that are longer than RESTART_GAP_S."""
     is_used = (updates["fused"] > 0.0) | (updates["reset"] > 0.0)
     ends = [*updates.loc[is_used, "fused_at_s"], float(segment.time_s[-1])]
     return [(a, b) for a, b in pairwise(ends) if b - a > RESTART_GAP_S]

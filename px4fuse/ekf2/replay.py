@@ -159,7 +159,7 @@ class Agreement(Record, frozen=True, kw_only=True):
         return {"north": self.north, "east": self.east}
 
     def as_unavailable(self, what: str) -> Unavailable:
-        """Return Unavailable for the result ``what``, because the replay does not agree."""
+        """Return Unavailable for a result ``what`` of a replay that does not agree with the log."""
         profile = "3 (default and full rates)" if self.gnss_pos else "129 (default and vision)"
         return Unavailable(
             what,

@@ -263,7 +263,7 @@ def samples_by_event(
     -------
     ndarray, shape (a + 2 + len(more), k, E)
         Position plus the displacement up to the event due to the IMU acceleration; sample age (s)
-        at the event; ``more``; and 1. All are 0 in empty slots.
+        at the event; ``more``; and 1 for a sample. All are 0 in empty slots.
     """
     event = np.searchsorted(event_steps, measurement_step)
     event = event[event < len(event_steps)]
@@ -329,7 +329,8 @@ def find_replay_segments(
         fused_inside = fused[(fused >= low) & (fused <= high)]
         if not len(fused_inside):
             continue
-        # the first take-off before the end of the segment
+        # the replay starts MIN_AIRBORNE_S after the first take-off, if this is before the end of
+        # the segment
         starts = [start_s + MIN_AIRBORNE_S for start_s, _ in airborne[:1] if start_s < high]
         if field_span and low <= field_span[0] < high:
             starts.append(field_span[0])
@@ -447,7 +448,7 @@ def _make_segment(
         rotation = conjugate(interpolate(at_s, times, end_attitude))
         return at_s, multiply(frame[Columns.QUATERNION].to_numpy(), rotation)
 
-    # rotation (NED) from the attitude integrated from the gyro to the published attitude
+    # rotation (NED) between the attitude integrated from the gyro and the published attitude
     extra_rotation = interpolate(times, *relative_attitude(attitude, 0.0, gyro))
     nominal = multiply(extra_rotation, gyro)
     states, state_rotation = relative_attitude(record.delayed, 1e-4, nominal)

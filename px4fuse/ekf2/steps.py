@@ -39,8 +39,8 @@ OTHER_TIME = Unavailable(
     "ground truth and replay do not overlap in time",
     "Record both at the same time.",
 )
-# EKF2 properties that replace those of KF, one after the other. Increase of the velocity variance
-# per second by the process noise: SIGMA_A² · DT in KF, EKF2_ACC_NOISE² · Δt in EKF2 with the
+# Names of the properties that differ between KF and EKF2. "process noise" is the increase of the
+# velocity variance per second: SIGMA_A² · DT in KF, and EKF2_ACC_NOISE² · Δt in EKF2 with the
 # prediction step Δt
 SAMPLES = "samples and time steps"
 STAMPS = "timestamps and delay"
@@ -54,15 +54,15 @@ FLOW_STEP = "optical flow"
 VISION_STEP = "external vision"
 GATE = "gate, missed samples and resets"
 OUTPUT = "output predictor"
-# EKF2 properties that replace those of KF, one after the other, on every flight. If EKF2 also fuses
-# other aiding sources, a step for each is inserted before GATE
+# Order in which EKF2 properties replace KF properties. A flight in which EKF2 fuses further aiding
+# sources has one more step for each of them, before GATE
 STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
 class Step(Record, frozen=True, kw_only=True):
-    """Replacement of one property of KF by that of EKF2, and its effect on KF - EKF2.
+    """Change of the difference KF - EKF2 by replacing one KF property by the EKF2 property.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class DifferenceSteps(Record, frozen=True, kw_only=True):
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
         Mean square difference between KF and the logged EKF2.
     steps : tuple of Step
-        Replacements of one property of KF after the other by that of EKF2.
+        Replacements of KF properties by EKF2 properties, one after the other.
     unexplained_mean_square_m2, unexplained_velocity_mean_square_m2_s2 : float
         Remainder: mean square difference between the complete replay and the logged EKF2.
     position_rmse_to_truth_m : mapping from "kf" and "ekf2" to float or Unavailable
@@ -194,7 +194,7 @@ class DifferenceExplanation(DifferenceSteps, frozen=True, kw_only=True, eq=False
 def explain_by_steps(
     model: Model, settings: Settings | None = None, runs: Mapping[str, Replay] | None = None
 ) -> dict[str, DifferenceExplanation] | Unavailable:
-    """Replace the properties of KF by those of EKF2, one after the other, and compare with EKF2.
+    """Replace KF properties by EKF2 properties, one after the other, and compare with EKF2.
 
     The result is without explanatory sentences.
 
@@ -252,7 +252,7 @@ def explain_by_steps(
             VELOCITY_STEP,
             FLOW_STEP,
             VISION_STEP,
-        ):  # the last of these replays has all properties except gate and output predictor
+        ):  # the replay before GATE has all EKF2 properties except gate and output predictor
             without_gate = track
     spans = Segment(*span, "").cut(evaluated_spans)
     longest_rejection = _longest_rejection(flown, without_gate, span, evaluated_spans)
@@ -304,7 +304,7 @@ def explain_by_steps(
 def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, FilterConfiguration]:
     """Return the filter configurations from KF to EKF2 without output predictor.
 
-    Keys are the names of the EKF2 properties that replace those of KF, one after the other.
+    Keys are the names of the EKF2 properties that replace KF properties, one after the other.
     """
     flown = inputs.settings
     aid = inputs.aid

@@ -44,7 +44,7 @@ def vision_samples(
 
     The rows are position north and east (m), see
     :func:`~px4fuse.ekf2.replay_segments.samples_by_event`; age, measurement time and fusion time
-    (s); reported variances north and east (m²); and 1.
+    (s); reported variances north and east (m²); and 1 for a sample. All are 0 without a sample.
     """
     vision = inputs.vision
     time_s = segment.time_s
@@ -54,7 +54,7 @@ def vision_samples(
     step = np.maximum.accumulate(np.searchsorted(time_s, due_s - 1e-9))
     is_usable = (step > 0) & (step < len(time_s)) & (due_s < measured_at_s + MAX_LATENESS_S)
     is_usable &= np.isfinite(vision.position_m[:, 0])
-    is_usable[:-1] &= step[1:] > step[:-1]  # of two samples in one step EKF2 fuses only the newer
+    is_usable[:-1] &= step[1:] > step[:-1]  # EKF2 fuses only the newer of two samples in one step
     step = step[is_usable]
     lever_arm_m = np.array([settings[name] for name in EV_POS.lever_arm]) - inputs.imu_offset_m
     position_m = (vision.position_m[is_usable] - segment.rotation[step] @ lever_arm_m)[:, :2]
@@ -176,7 +176,7 @@ class VisionFilter:
         is_fused = has_sample & ~is_outside_gate & ~has_restarted
         reset = restarts & (without_gnss | (is_failing & (now_s - gnss_fused_s > MAX_REJECTED_S)))
         is_evaluated = has_sample & ~has_restarted | reset
-        # EKF2 logs innovation 0 for a sample to which it resets its position
+        # if EKF2 resets its position to a sample, it logs innovation 0 for this sample
         update_log = (
             *np.where(reset, 0.0, nu.T),
             *diagonal.T,

@@ -35,7 +35,8 @@ from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record, Share
 
 ANALYSIS_NAME = "EKF2 what-if"
-# Minimum ratio of logged to replayed innovations: with fewer, the time between fusions is unknown
+# Minimum ratio of the number of logged innovations to the number of replayed innovations: with
+# fewer logged innovations, the time between fusions is unknown
 MIN_COMPLETE_SHARE = 0.9
 NO_TRUTH = Unavailable(
     "RMSE against ground truth",
@@ -73,11 +74,13 @@ MAX_REJECTED_SHARE = 0.35
 # Time (s) without height fusion after which EKF2 resets the height (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
-# A result is predictable if replays with 2 mm of added noise agree: maximum ratio of their mean NIS
+# Maximum ratio of the mean NIS of two replays with added position noise, for a predictable result
 MAX_NIS_RATIO = 1.10
-# Maximum difference of the rejected fractions of these replays
+# Maximum difference of the rejected fractions of two replays with added position noise, for a
+# predictable result
 MAX_REJECTED_SPREAD = 0.03
-# Maximum ratio of the position RMSE of two repeated replays of a predictable result
+# Maximum ratio of the position RMSE of two replays with added position noise, for a predictable
+# result
 MAX_RMSE_RATIO = 1.15
 
 
@@ -115,7 +118,7 @@ class HeightSummary(Record, frozen=True):
 
     @property
     def is_predictable(self) -> bool:
-        """True with few rejections and without a height reset, which the replay does not model."""
+        """True with few rejections and no height reset: the replay does not model height resets."""
         has_reset = self.longest_without_fusion_s > HEIGHT_TIMEOUT_S
         return not has_reset and self.rejected_fraction <= MAX_REJECTED_SHARE
 
@@ -247,7 +250,7 @@ def what_if(
     evaluated_s = model.flown.evaluated_s
     if without:
         disabled_s = min(without.values())
-        # later segments are not used: they start from a logged state with the disabled source
+        # later segments are not used: the disabled source affected the logged states at their start
         remaining_spans = [
             (max(start, disabled_s), end)
             for start, end in evaluated_s
@@ -378,7 +381,8 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
             f"{replay.lost} samples arrive after the fusion horizon",
             "Choose another parameter value.",
         )
-    # the variance grows between updates and drops at an update: use the values before and after
+    # the position variance grows between updates and drops at an update: use the values before and
+    # after each update
     variance = pd.DataFrame(index=np.column_stack([fused_at_s - 1e-6, fused_at_s]).ravel())
     for axis in HORIZONTAL:
         s, r = (

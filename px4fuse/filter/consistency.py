@@ -30,7 +30,8 @@ LJUNG_BOX_LAGS = 10  # number of lags of the Ljung-Box whiteness test
 # predictor
 Reference = Literal["source", "truth"]
 CONSISTENT_RATIOS: Mapping[Reference, Interval] = {"source": (0.8, 1.25), "truth": (0.67, 1.5)}
-DEFAULT_GATE = 5.0  # √S; default of EKF2_EVP_GATE, for KF and for logs without a gate
+# Innovation gate (√S) for KF and for logs without a gate parameter: default of EKF2_EVP_GATE
+DEFAULT_GATE = 5.0
 
 
 class NisVerdict(Record, frozen=True, kw_only=True):

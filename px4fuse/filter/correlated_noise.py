@@ -6,13 +6,13 @@ positions given the motion from the IMU. Biases, tilt and scale factor error are
 SIGMA_A of KF is not used: it includes the effect of biases and would hide slow errors.
 
 A low pass of first order, z_k = (1 - ρ) u_k + ρ z_(k-1), ρ = exp(-Δt/τ), correlates the noise of
-successive positions and makes the positions lag. The inverse, u_k = (z_k - ρ z_(k-1)) / (1 - ρ),
-gives positions with white noise and without lag. So the likelihood of the logged positions z is the
-likelihood of u times the Jacobian Π 1/(1 - ρ) of the inversion.
+successive positions and makes the positions lag. The inverse of the low pass, u_k = (z_k - ρ
+z_(k-1)) / (1 - ρ), gives positions with white noise and without lag. So the likelihood of the
+logged positions z is the likelihood of u times the Jacobian Π 1/(1 - ρ) of this inverse.
 
 Time-correlated noise of first order, c_k = ρ c_(k-1) + √(1 - ρ²) σ_c w, is a third state in the
-measurement: z = p + c + v. It also correlates the noise, but without a lag. Both models use the
-logged timestamps. Time-correlated noise is also fitted with timestamps shifted by the estimated
+measurement: z = p + c + v. Time-correlated noise does not make the positions lag. Both models use
+the logged timestamps. Time-correlated noise is also fitted with timestamps shifted by the estimated
 time offset, because a time offset is another explanation of a lag.
 
 Noise with a time constant much above a second cannot be distinguished from an IMU error, so a long
@@ -187,7 +187,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     signals = SignalCache()
 
     def undo_low_pass(tau_s: float) -> tuple[PreparedMotion | Unavailable, float]:
-        """Return the positions before a low pass, and the contribution of its Jacobian to -ln p."""
+        """Return the positions before a low pass, and -ln of the Jacobian of its inverse."""
         rho = np.zeros(len(time_s))
         if tau_s:
             rho[is_short_interval] = np.exp(-interval_s[is_short_interval] / tau_s)
@@ -367,7 +367,7 @@ def _score_of_fit(fit: NoiseFit) -> float:
 def _best_of_grid(
     prepared_motion: PreparedMotion, offsets_s: Sequence[float], candidate_noises: Sequence[Noises]
 ) -> tuple[float, Noises]:
-    """Return the lowest -ln p over all time offsets and scaled candidate noises, and its noises.
+    """Return the lowest -ln p over all time offsets and scaled candidate noises, and the noises.
 
     First SIGMA_A and then all noises together are multiplied by the factors of the coarse search.
     """

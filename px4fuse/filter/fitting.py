@@ -45,7 +45,7 @@ MAX_OUTLIER_SHARE = 0.4  # maximum fraction of outliers
 MAX_SIGMA_Z_RATIO = 1.2
 # Maximum change of an outlier probability in the last iteration
 MAX_PROBABILITY_CHANGE = 0.01
-# Value that replaces -ln p per measurement if it cannot be computed: larger than any computed value
+# Value used as -ln p per measurement if -ln p cannot be computed: larger than any computed value
 UNCOMPUTABLE_SCORE = 1e6
 # Step of ln σ for numerical derivatives of the likelihood
 DERIVATIVE_LOG_STEP = 1e-4
@@ -91,9 +91,9 @@ class Likelihood:
     """Negative log-likelihood of the measurements (without a constant) as a function of the noises.
 
     With acceleration and measurement noise only, it is a smooth function of ln(SIGMA_A/SIGMA_Z) and
-    ln SIGMA_Z. The function is computed on demand at nodes and interpolated with polynomials. Its
-    singularities are π/2 from the real axis, so the interpolation error is at the level of
-    rounding.
+    ln SIGMA_Z. The function is computed on demand at nodes and interpolated with polynomials. The
+    singularities of the function are π/2 from the real axis, so the interpolation error is at the
+    level of rounding.
 
     Parameters
     ----------
@@ -241,7 +241,7 @@ class NoiseFit:
     outlier_probability : ndarray, shape (m,)
         Probability that the measurement is an outlier.
     score : Likelihood
-        -ln p as a function of the noises, with these weights.
+        -ln p as a function of the noises, with the weights ``weight``.
     sigma_z_variance_factor : float
         Factor, at least 1, on the variance of ln SIGMA_Z from the curvature of the likelihood. The
         outliers are also estimated, which adds uncertainty.

@@ -40,9 +40,10 @@ MIN_PART_SAMPLES = 3  # minimum number of samples in a part of the flight
 # Maximum number of measurements; longer tracks are downsampled: more measurements take time and
 # hardly improve the heading
 MAX_MEASUREMENTS = 1000
-# Maximum p-value of a constant heading error for a heading error that changes in flight
+# Maximum p-value of the hypothesis "constant heading error", for a heading error that counts as
+# changing in flight
 MAX_DRIFT_P_VALUE = 0.002
-# Minimum change over the flight of a heading error that changes in flight
+# Minimum change (°) over the flight of a heading error that counts as changing in flight
 MIN_DRIFT_DEG = 5.5
 # Maximum yaw rate at which the headings of source and EKF2 are compared: at a higher rate, a delay
 # of 0.2 s would look like a heading error of more than 2°
@@ -57,7 +58,7 @@ MAX_LINEARISATIONS = 3
 MAX_FINAL_STEP_RAD = 0.01
 STATE_COUNT = 7
 ROTATION_INDEX = 6  # index of the rotation in the state
-ADJUGATE_SIGNS = np.array([[1.0, -1.0], [-1.0, 1.0]])  # of a symmetric 2 × 2 matrix
+ADJUGATE_SIGNS = np.array([[1.0, -1.0], [-1.0, 1.0]])  # signs in the adjugate of a 2 × 2 matrix
 # Initial σ of position (m), velocity (m/s), acceleration error (m/s²) and rotation (rad)
 INITIAL_SIGMAS = np.repeat([INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, 0.3, 0.6], [2, 2, 2, 1])
 GAP_SIGMA = 5.0  # process noise of position (m) and velocity (m/s) in a gap of the IMU
@@ -86,8 +87,8 @@ class HeadingError(Record, frozen=True):
     misalignment_deg : float
         Mean over the flight.
     sigma_deg : float
-        Standard deviation of ``misalignment_deg``. Averaging over the parts does not reduce it,
-        because they share their errors.
+        Standard deviation of ``misalignment_deg``. Not reduced by averaging over the parts, because
+        the errors of all parts are correlated.
     drifts : bool
         True if the angle changes significantly and by at least ``MIN_DRIFT_DEG``.
     parts : tuple of HeadingPart
@@ -312,7 +313,7 @@ def _interval_inputs(acceleration: pd.DataFrame, time: Array) -> tuple[Array, Ar
 def _transitions(increments: Array, dt_s: Array, rotation_rad: float) -> ArrayPair:
     """Return transition matrix F and input vector of each interval between positions.
 
-    They are linearised about the frame rotation ``rotation_rad``.
+    Both are linearised about the frame rotation ``rotation_rad``.
     """
     count = len(dt_s)
     dt = dt_s[:, None, None]

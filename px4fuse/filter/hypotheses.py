@@ -61,7 +61,8 @@ STEP_BATCH_SIZE = 200
 # Time (s) after a jump in which measurements are ignored, so that a burst of outliers is not
 # detected as a jump
 OUTLIER_BURST_S = 1.0
-# Time (s) after a jump in which outliers are tested again: they may be good measurements after it
+# Time (s) after a jump in which outliers are tested again: they may be good measurements of the
+# shifted positions
 OUTLIERS_AFTER_STEP_S = 6.0
 # Maximum probability of a false detection of a jump, per flight
 MAX_STEP_FALSE_ALARM_P = 1e-3
@@ -196,7 +197,7 @@ def fit_bias_scale_jumps(
 def _fit_sigma_a(
     design: DesignMatrix, sigma_a_grid: Array, is_skipped: BoolArray
 ) -> tuple[float, DesignFit]:
-    """Return the maximum-likelihood SIGMA_A of a grid, and the fit of the design matrix with it."""
+    """Return the maximum-likelihood SIGMA_A of a grid, and the fit with this SIGMA_A."""
     fit_at = cache(lambda index: design.fit(float(sigma_a_grid[index]), is_skipped))
     best_index = _index_of_minimum(lambda index: fit_at(index).score, len(sigma_a_grid))
     return float(sigma_a_grid[best_index]), fit_at(best_index)
@@ -417,7 +418,7 @@ class DesignMatrix:
         Position and velocity increments by a slow acceleration error, interpolated between knots
         (hat functions of time); each axis has separate coefficients.
     prior_sigma : ndarray, shape (k,)
-        Prior standard deviations of the coefficients, without those of the jumps.
+        Prior standard deviations of the coefficients, except the coefficients of jumps.
     sigma_z_m : float
     step_columns : ndarray, shape (m, j)
         Unit jumps of the measurements: j more columns per axis.
@@ -506,7 +507,8 @@ class DesignMatrix:
         column_count = len(self.prior_sigma)
         data = np.empty((axes, len(is_skipped)))
         columns = np.zeros((axes, len(is_skipped), column_count + axes * step_count))
-        # the scale multiplies the measured acceleration and its rotation, but not the biases
+        # the scale multiplies the measured acceleration and the signal of a frame rotation, not the
+        # biases
         scale_factors = np.ones(1 + CONSTANT_COUNT)
         scale_factors[[0, 1 + ROTATION]] = scale
         zero_signal = np.zeros_like(self.hat_signals[0])

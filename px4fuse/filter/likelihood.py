@@ -336,8 +336,9 @@ def profile_ends(
     def find_end(direction: float, bound: float) -> float | None:
         other_log = best_logs[1]
 
-        # zero at the end of the interval: the root of the likelihood drop is nearly linear. The
-        # search for the other parameter starts at the previous result
+        # square root of the drop of the log-likelihood, which is nearly linear in the distance from
+        # the maximum, minus its value at the end of the interval. The search for the other
+        # parameter starts at the previous result
         @cache
         def excess(distance: float) -> float:
             nonlocal other_log

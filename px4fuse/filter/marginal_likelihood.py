@@ -42,7 +42,8 @@ MIN_KNOWN_START_PRECISION = 1e-3
 MIN_NOISE_SHARE = 1e-5
 # Number of signals that are computed together: more need more memory and are not faster
 SIGNAL_BATCH_SIZE = 8
-# Minimum determinant of Q, relative to its two terms: smaller values are rounding errors
+# Minimum determinant of Q, relative to the product of the diagonal of Q: smaller values are
+# rounding errors
 MIN_DETERMINANT_SHARE = 1e-12
 
 
@@ -57,7 +58,7 @@ class Positions:
     segment_starts : ndarray of int, shape (s,)
         Index of the first measurement of each segment.
     length_s : ndarray, shape (m - 1,)
-        Intervals between successive measurements, including those between segments.
+        Intervals between successive measurements, including intervals between segments.
     noise_unit, noise_fixed : ndarray, shape (3, m - 1)
         Elements 00, 01, 11 of the process noise Q of each interval: for SIGMA_A = 1 m/s², and the
         component of Q that does not depend on SIGMA_A.
@@ -257,8 +258,8 @@ def fit_positions(
 def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
     """Subtract a smooth path through the positions from positions and IMU increments.
 
-    The likelihood is unchanged in theory. Its rounding errors are smaller, because it is no longer
-    the small difference of large squares. The path starts at zero in each segment.
+    The likelihood is unchanged in theory. The rounding errors are smaller, because the likelihood
+    is no longer a small difference of large squares. The path starts at zero in each segment.
 
     Parameters
     ----------
@@ -312,7 +313,7 @@ def expected_squares(
         Number of axes with a measurement.
     """
     coefficients = np.concatenate([np.ones((len(constants), 1)), constants], axis=1)
-    # the constants of an interval are those of the segment in which the interval ends
+    # an interval has the constants of the segment in which the interval ends
     interval_coefficients = np.repeat(
         coefficients, np.diff([*positions.segment_starts, len(variance_m2)]), axis=0
     )[1:]

@@ -40,7 +40,7 @@ from px4fuse.record import Count, NotNegative, Record, Share, Span
 
 # Number of time offsets at which the likelihood is computed near its maximum
 FINE_OFFSETS = 11
-# Number of points of the likelihood curve, interpolated between these offsets
+# Number of time offsets of the reported likelihood curve, interpolated between the FINE_OFFSETS
 CURVE_OFFSETS = 121
 # Prior σ (rad) of EKF2's heading, by default and with GNSS. With a GNSS delay that is wrong by
 # 0.2 s, EKF2 rotates its heading by 5° to fit the positions: a narrow prior would hide the offset
@@ -50,7 +50,8 @@ MAX_HALF_INTERVAL_S = 0.15
 # Maximum σ (s) of the time offset in a part of the flight: parts with a larger σ are ignored in the
 # test for a change of the offset
 MAX_PART_SIGMA_S = 0.15
-# Maximum p-value of a constant time offset for an offset that changes in flight
+# Maximum p-value of the hypothesis "constant time offset", for an offset that counts as changing in
+# flight
 MAX_CHANGE_P = 0.005
 # Minimum significant time offset, in σ: false alarm probability 0.3 %
 OFFSET_SIGMAS = 3.0

@@ -53,8 +53,8 @@ MAX_OUTLIER_SHARE = 0.3
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value of the random walk (m/√s) of a source that may drift
 START_RANDOM_WALK_M = 0.02
-# Minimum ratio between an estimate and the ends of the search range: with a smaller ratio the
-# likelihood has its maximum at the end
+# Maximum ratio between an estimate and an end of the search range at which the maximum of the
+# likelihood counts as being at this end
 MAX_SEARCH_END_RATIO = 1.001
 
 
@@ -220,13 +220,13 @@ def tune(
     ----------
     axes : tuple of Axis
     settings : Settings
-        ``dt_s`` and ``input`` are used. The estimates are compared with its SIGMA_A and SIGMA_Z.
+        ``dt_s`` and ``input`` are used; SIGMA_A and SIGMA_Z are compared with the estimates.
     names : tuple of str, optional
         Axis names and "horizontal"; default: all.
     progress : callable
         Called with the name of each axis.
     flight : Flight, optional
-        Its IMU data separate biases and tilt from noise.
+        Flight whose IMU data separate biases and tilt from noise.
     drifts : bool
         True if the source may drift, as odometry does.
     signals : dict, optional
@@ -268,9 +268,9 @@ def tune_axes(
     axes : tuple of Axis
         Axes with the same measurement times.
     settings : Settings
-        ``dt_s`` and ``input`` are used. The estimates are compared with its SIGMA_A and SIGMA_Z.
+        ``dt_s`` and ``input`` are used; SIGMA_A and SIGMA_Z are compared with the estimates.
     flight : Flight, optional
-        Its IMU data separate biases and tilt from noise.
+        Flight whose IMU data separate biases and tilt from noise.
     drifts : bool
         True if the source may drift, as odometry does.
     signals : dict, optional

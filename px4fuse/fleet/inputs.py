@@ -21,8 +21,8 @@ from px4fuse.verification.pdf_input import attached_results
 Kind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]
 Results = ComparisonResults | AidsResults
-# Settings with which px4fuse diff analyses a log: those in the results of the other input. Settings
-# in _SEGMENT_FIELDS are used only if both inputs are of the same log
+# Fields of the settings that px4fuse diff takes from the results of one input to analyse the log of
+# the other input. Settings in _SEGMENT_FIELDS are used only if both inputs are of the same log
 _FILTER_FIELDS = ("sigma_a_m_s2", "sigma_z_m", "dt_s", "input", "axes", "clock_offset_s")
 _SEGMENT_FIELDS = ("heading_deg", "start_s", "end_s", "position_source", "source_kind", "height")
 

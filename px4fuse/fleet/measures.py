@@ -40,7 +40,7 @@ class ComparedNumber:
 def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, ComparedNumber]:
     """Return the numbers of MEASURES by path, except estimates that are not determinable."""
     axes = {} if isinstance(results, AidsResults) else results.axes
-    # EKF2 rejects north and east together, so px4fuse diff lists the rejections of one of them
+    # EKF2 rejects north and east together, so px4fuse diff lists the rejections of one axis only
     horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")
     # the axes contain the same numbers of the aiding source that is the position source
     source_aids: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()

@@ -20,7 +20,7 @@ from px4fuse.webpage.frame import Cell, Column, Row, Section
 from px4fuse.webpage.safe import clean, load_template, local_link
 
 # Columns of the four σ ratios (KF and EKF2, against source and ground truth), in the order of the
-# verdicts of a diagnosis card
+# verdicts of the diagnosis (Card)
 RATIOS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
 SEVERITIES = ("error", "warning", "note", "clean", "refused")
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))

@@ -20,7 +20,7 @@ from px4fuse.text import utc_time
 
 DONE, NOT_COMPARED, FAILED = "done", "not compared", "failed"
 FINDING_SEPARATOR = ";"
-# Name of the noise estimate of an axis, if it is not the name of the axis
+# Name of the noise estimate by axis: north and east share the estimate "horizontal"
 _TUNING_OF_AXIS = {"north": "horizontal", "east": "horizontal"}
 
 
@@ -88,7 +88,7 @@ def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) 
 
 
 def card_columns(card: Card) -> Row:
-    """Return the table columns of a diagnosis card, which are equal for all axes of a log."""
+    """Return the table columns with the diagnosis, which is the same for all axes of a log."""
     rmse_m = card.effect.position_rmse_m.values() if card.effect else ()
     return {
         "severity": card.severity,
@@ -106,7 +106,7 @@ def card_columns(card: Card) -> Row:
 
 
 def first_action(card: Card) -> str:
-    """Return the commands, else the sentence, of the first action on a diagnosis card."""
+    """Return the first action of a diagnosis: the commands or, without commands, the sentence."""
     if not card.causes:
         return ""
     first = card.causes[0]

@@ -128,7 +128,7 @@ def batch(
     progress : callable
         Function of the activity, the number of finished logs, and the number of all logs.
     **settings
-        The arguments above, and those of :func:`px4fuse.compare`, such as ``sigma_z_m``.
+        The arguments above, and the arguments of :func:`px4fuse.compare`, such as ``sigma_z_m``.
 
     Returns
     -------
@@ -196,7 +196,7 @@ def run(
             "`mavlink` and `position` are files of one flight and not available for many logs."
         )
     sigma_z_m = Settings().sigma_z_m if request.sigma_z_m is None else request.sigma_z_m
-    # raises an error if a setting is out of range
+    # not used; raises SettingsError if a setting is out of range
     Settings(request.sigma_a_m_s2, sigma_z_m, request.dt_s)
     state = _RunState(output, metadata.version("px4fuse"), command_line(request))
     hashes_by_size = _cached_hashes(state, reports)

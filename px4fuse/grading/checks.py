@@ -210,7 +210,7 @@ def format_reason(reason: str) -> str:
     return f" ({text})" if text else ""
 
 
-# ------------------------------------------------------------------ the report
+# ------------------------------------------------------------------ checks of any report
 
 
 NO_COMPARISON: FractionAndReason = (0.0, "Your report is not a compare report.")
@@ -230,7 +230,7 @@ class NumberItem(RubricItem, frozen=True, tag="number"):
     """Check that a number of the report is within bounds.
 
     If ``path`` matches several numbers, the worst counts. Outside the bounds the points decrease
-    linearly to zero at ``zero_at``; without ``zero_at`` they are zero.
+    linearly to zero at ``zero_at``; without ``zero_at`` the points are zero.
     """
 
     path: Text
@@ -311,7 +311,7 @@ class TextItem(RubricItem, frozen=True, tag="text"):
         return 0.0, "Your instructor reads your text and gives points for it."
 
 
-# ------------------------------------------------------------------ the filter
+# ------------------------------------------------------------------ checks of the settings of KF
 
 
 # Ids of the findings that report a time offset which changes during the flight
@@ -352,7 +352,8 @@ def _score_tuning(
         "source_drift"
     )
     if name == "sigma_z_m" and may_drift:
-        # innovations do not show the drift of a source, so a SIGMA_Z up to the known error is right
+        # innovations do not show the drift of a source, so each SIGMA_Z up to the error of KF is
+        # right
         high = max(high, _largest_source_error_m(comparison))
     deviation_factor = max(chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0)
     interval_text = (
@@ -386,7 +387,7 @@ class ConsistencyItem(RubricItem, frozen=True, tag="consistent"):
     factor: Factor = 2.0
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
-        """Score the verdict on the joint NIS of the axes north and east."""
+        """Score the verdict on the joint NIS of KF along north and east."""
         comparison = check_input.comparison
         if comparison is None:
             return NO_COMPARISON
@@ -444,12 +445,13 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
         return 0.0, f"{statement}. Use --clock-offset auto."
 
 
-# ------------------------------------------------------------------ a loop
+# ------------------------------------------------------------------ check of a loop
 
 
 # Maximum distance (m) between take-off and landing place of a closed loop
 MAX_CLOSED_LOOP_M = 0.5
-# Fraction of the points for a smaller ATE, if the report has no reference trajectory to compute it
+# Fraction of the points for a smaller ATE, if the report has no reference trajectory to compute the
+# ATE
 NO_REFERENCE_FRACTION = 0.5
 
 

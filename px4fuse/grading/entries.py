@@ -91,13 +91,13 @@ class Course:
     logs : sequence of Path
         Flight logs, and folders of logs. The SHA-256 identifies the log of a report.
     title : str
-        Title of the class page; by default that of the rubric.
+        Title of the class page; by default the title of the rubric.
     roster : tuple of Person or None
         Class list; by default the students of the answer key, else of the worksheets.
     worksheets : tuple of Sheet
         Tables of learning platforms, into which the grades are entered.
     column : str
-        Title of the grade column in the worksheets; "" if they have only one.
+        Title of the grade column in the worksheets; "" if each has only one grade column.
     attempt : {"latest", "best", "first"}
         Report of a student that counts.
     due : datetime or None

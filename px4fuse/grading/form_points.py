@@ -21,8 +21,8 @@ FALSE_MISTAKE_POINTS, MAX_FALSE_MISTAKES = 10.0, 3
 # Fractions of the points if the answer form names another mistake instead: a related mistake, a
 # wrong EKF2 noise instead of a wrong reported variance, and a consequence of the mistake
 NEIGHBOUR_FRACTION, SAME_NUMBER_FRACTION, EFFECT_FRACTION = 0.4, 2.0 / 3.0, 0.15
-# Mistakes that can be guessed without a measurement: only the correct size has points. A close size
-# has none, because the assigned sizes are close to each other
+# Mistakes that can be guessed without a measurement: only the correct size has points. A nearly
+# correct size has no points, because the assigned sizes are close to each other
 GUESSABLE_KINDS = frozenset(("open-end",))
 ANY_BOUNDS = (-math.inf, math.inf)
 # Tolerance of start and end of a mistake: the larger of a duration (s) and a fraction of the time
@@ -95,7 +95,8 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     if truth.mistakes and len(false_mistakes) < MAX_FALSE_MISTAKES:
         fractions |= _mistake_fractions(matches, truth)
     fractions["numbers"] = quantities_fraction = _quantities_fraction(answers, truth)
-    # half of the points if no computed number is right, because most verdicts can be guessed
+    # half of the points for the verdicts if no computed number is right, because most verdicts can
+    # be guessed
     fractions["verdicts"] = _verdicts_fraction(answers, truth) * (
         1.0 if quantities_fraction else 0.5
     )
@@ -138,7 +139,7 @@ def _mistake_feedback(
 
 
 def _match_mistakes(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[StudentMistake]]:
-    """Match each mistake of the flight with one in the answer form; also return the others.
+    """Match each mistake of the flight with one in the form; also return unmatched form mistakes.
 
     Equal mistakes are matched first, then related mistakes, then consequences.
     """
@@ -237,7 +238,7 @@ def correction_fraction(mistake: TrueMistake, named: StudentMistake, truth: Form
 
 
 def _value_fraction(value: float, low: float, high: float, fallback: float) -> float:
-    """Return 1 for a value within bounds, 1/3 with the wrong sign, else ``fallback``."""
+    """Return 1 for a value within bounds, 1/3 for a wrong sign, ``fallback`` for other values."""
     if low <= value <= high:
         return 1.0
     return 1.0 / 3.0 if low <= -value <= high else fallback

@@ -102,7 +102,7 @@ class GradedReport:
     flags : tuple of str
         Sentences about suspicious contents, for the instructor.
     instructor_action : str
-        Action of the instructor before the points count; "" if they count.
+        Action of the instructor before the points count; "" if the points count.
     form : Answers or None
         Completed answer form of the student.
     numbers : mapping
@@ -161,7 +161,7 @@ class GradedReport:
 
 @dataclass(frozen=True)
 class Override:
-    """Points or comment of the instructor, which replace those of px4fuse."""
+    """Points or comment of the instructor, which replace the points and comment of px4fuse."""
 
     points: float | None = None
     comment: str = ""

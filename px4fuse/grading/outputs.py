@@ -167,7 +167,8 @@ def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
 def _anonymise(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
     """Replace names by pseudonyms and sort by pseudonym; also return the table of names as CSV.
 
-    Pseudonyms are assigned in random order. A later run reads them from the table at ``path``.
+    Pseudonyms are assigned in random order. A later run reads the pseudonyms from the table at
+    ``path``.
     """
     names_by_identity: dict[str, tuple[str, str]] = {}
     if path.exists():
@@ -367,7 +368,7 @@ def fill_grades(
     Raises
     ------
     SettingsError
-        The table does not have exactly one such column.
+        The table does not have exactly one grade column with this title.
     """
     grade_index, feedback_index = find_grade_column(sheet, column), sheet.column(COMMENT_TITLES)
     format_feedback = (

@@ -1,8 +1,8 @@
-"""Stored verifications: a report is verified again only if it, a log or a version has changed.
+"""Stored verifications, which are valid until the report, a log or a version changes.
 
 The SHA-256 of the PDF identifies the record of its verification, which is valid while library
-versions and available input files are unchanged. It contains no points, so that a new rubric needs
-no new verification.
+versions and available input files are unchanged. The record contains no points, so that a new
+rubric needs no new verification.
 """
 
 import hashlib

@@ -57,7 +57,7 @@ TimeSpans = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class AnalysisOption:
-    """Analysis of px4fuse; ``reason``: data that it uses, or why the analysis is not possible."""
+    """Analysis of px4fuse; ``reason``: data used, or why the analysis is not possible."""
 
     name: str
     possible: bool
@@ -220,7 +220,7 @@ def _data_by_part(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unavai
     """Return all data of a flight except positions, by their names in Flight.streams.
 
     Without EKF2 data, the result contains the EKF2 state as unavailable, and no other EKF2 data.
-    EKF2 innovations are those of the axis with the most samples.
+    EKF2 innovations are along the axis with the most samples.
     """
     ekf2, truth = flight.ekf2, flight.truth
     data_by_part = {"imu": flight.imu, "attitude": flight.attitude}

@@ -35,8 +35,8 @@ _TO_Z_DOWN: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
         "the frame is unknown, so z is assumed to be up",
     ),
 }
-# Default key frame spacing as fraction of the extent of the path: the radius of curves grows with
-# the extent, so the spacing may grow, too. Then minimum and maximum spacing (m)
+# Default key frame spacing as fraction of the extent of the path, because the radius of curves
+# grows with the extent; then minimum and maximum of the default spacing (m)
 SPACING_FRACTION = 0.02
 MIN_SPACING_M, MAX_SPACING_M = 0.02, 0.5
 

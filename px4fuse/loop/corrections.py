@@ -73,7 +73,7 @@ def _unavailable_by_gate(correction_name: str, closure: Closure) -> Unavailable:
 def gate_closures(
     graph: PoseGraph | Unavailable, closures_with_end: Sequence[ClosureWithEnd]
 ) -> tuple[Closure, ...]:
-    """Test each closure, the last edges of the graph, against odometry; empty without a graph."""
+    """Test the closures (last edges of the graph) against odometry; return () without a graph."""
     if isinstance(graph, Unavailable):
         return ()
     edges = np.arange(len(graph.first) - len(closures_with_end), len(graph.first))

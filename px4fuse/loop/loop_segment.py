@@ -116,7 +116,7 @@ def assume_end_at_takeoff(path: Trajectory) -> TrueEnd:
     """Return the take-off place as landing place.
 
     If the heading change from odometry is small, the final heading is assumed equal to the initial
-    heading; else it is unknown.
+    heading; after a larger change the final heading is unknown.
     """
     change_deg = heading_change_deg(path)
     is_same_heading = change_deg is not None and abs(change_deg) <= MAX_SAME_HEADING_DEG

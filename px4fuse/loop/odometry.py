@@ -14,8 +14,8 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
-# Minimum ratio of the reported variances at the end of the path to those at the start, for
-# variances that are used as drift
+# Minimum ratio of the reported variances, end to start of the path, for variances that are used as
+# drift
 MIN_VARIANCE_GROWTH = 2.0
 # Minimum variance of an odometry edge as fraction of the default drift: a reported growth may be
 # zero

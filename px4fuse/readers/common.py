@@ -50,7 +50,7 @@ def ends_in_flight(airborne: Spans | Unavailable, duration_s: float) -> bool:
 
 
 def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
-    """Format the sentence on a file that ends within a ``unit``: "frame" or "message"."""
+    """Return the sentence that a file ends within a ``unit`` ("frame" or "message")."""
     flying = ", in flight" if in_flight else ""
     return f"the file ends within a {unit} after {duration_s:.1f} s{flying}; later data are missing"
 

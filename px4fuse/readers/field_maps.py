@@ -1,4 +1,4 @@
-"""Mapping of message fields to DataFrame columns: row format of two tables.
+"""Message fields with their DataFrame columns: format of the rows of two tables.
 
 The tables are ``px4_topics.toml`` (PX4 topics) and ``mavlink_messages.toml`` (MAVLink messages).
 """
@@ -40,7 +40,7 @@ class Layout:
 
 
 def expand_layouts(rows: Mapping[str, Any]) -> dict[str, Layout]:
-    """Convert the rows of a table to layouts, with abbreviated column names written in full."""
+    """Return a :class:`Layout` for each table row; abbreviated column names are expanded."""
     return {
         name: replace(
             row,

@@ -121,7 +121,8 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
 
 def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
     candidates = [(layout, recording.rows(layout.topic)) for layout in messages.IMU_LAYOUTS]
-    # HIGHRES_IMU is preferred (SI units, µs timestamps), otherwise the message with most samples
+    # HIGHRES_IMU is preferred, because it has SI units and µs timestamps; without HIGHRES_IMU, the
+    # message with most samples is used
     layout, rows = (
         candidates[0]
         if len(candidates[0][1]) > 1
@@ -172,7 +173,8 @@ def _read_ekf2(
 ) -> Ekf2 | Unavailable:
     remedies, replay_unavailable = messages.remedies_of_autopilot(autopilot)
     counts = {layout.topic: len(recording.rows(layout.topic)) for layout in messages.STATE_LAYOUTS}
-    # ODOMETRY has variances, so it is preferred unless its rate is below half of the highest rate
+    # ODOMETRY has variances, so it is preferred unless its message rate is below half of the
+    # highest message rate
     frequent_layouts = (
         candidate
         for candidate in messages.STATE_LAYOUTS

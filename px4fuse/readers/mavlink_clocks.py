@@ -24,14 +24,15 @@ MAX_BOOT_CLOCK_DISTANCE_S = 10.0
 MIN_TIMESYNC_IMPROVEMENT_S = 0.1
 # Minimum time (s) that counts as UNIX time, 2001-09-09: smaller times count from boot
 MIN_UNIX_TIME_S = 1e9
-# Length (s) of the intervals of which the lower envelope uses the message with the least delay
+# Interval length (s) of the lower envelope, which uses the message with the least delay in each
+# interval
 ENVELOPE_INTERVAL_S = 2.0
 MAX_ENVELOPE_INTERVALS = 200
 # Minimum time span (s) to estimate a clock drift: in a shorter span both clocks are assumed to have
 # the same rate
 MIN_DRIFT_SPAN_S = 30.0
 # Maximum relative difference of the rates of two real clocks: a larger difference is from a
-# replayed link, and is estimated for any time span
+# replayed link, and is estimated even in a time span below MIN_DRIFT_SPAN_S
 MAX_RATE_DIFFERENCE = 0.01
 # Maximum ratio of the rates of two clocks: above any replay speed or wrong unit of time (s for ns
 # is 1e9)
@@ -67,7 +68,7 @@ class Line:
 
 
 def fit_least_delay(x: Array, y: Array) -> Line:
-    """Fit the lower envelope of pairs of clock readings; y is read a varying delay after x.
+    """Fit the lower envelope of pairs of clock readings: y is read after x with a varying delay.
 
     Parameters
     ----------
@@ -99,7 +100,7 @@ def fit_least_delay(x: Array, y: Array) -> Line:
     residual = y - slope * (x - x0)
     envelope_rows = [rows[np.argmin(residual[rows])] for rows in interval_rows]
     if span_s >= MIN_DRIFT_SPAN_S and len(envelope_rows) > 1:
-        # Repeated, because other messages have the smallest delay with a better slope
+        # Two iterations, because with a better slope other messages have the smallest delay
         for _ in range(2):
             corrected_slope = slope + _median_slope(x[envelope_rows], residual[envelope_rows])
             slope = corrected_slope if _is_rate_ratio(corrected_slope) else 1.0
@@ -234,7 +235,8 @@ def _fit_timesync(replies: tuple[Array, Array], answers: tuple[Array, Array]) ->
     """
     lines = []
     if len(replies[0]) >= MIN_TIMESYNC_PAIRS:
-        # The sender reads its clock later than the autopilot: the map is fitted in this order
+        # In a reply the autopilot's clock is read first, so the map from that clock is fitted and
+        # then inverted
         lines.append(fit_least_delay(*replies).inverse())
     if len(answers[0]) >= MIN_TIMESYNC_PAIRS:
         lines.append(fit_least_delay(*answers))

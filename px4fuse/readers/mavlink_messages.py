@@ -15,7 +15,7 @@ from px4fuse.readers.field_maps import Layout, expand_layouts
 from px4fuse.record import table
 
 AUTOPILOT_COMPONENT_ID = 1  # MAV_COMP_ID_AUTOPILOT1
-INVALID_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a ground station, a camera, a companion computer
+INVALID_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: sent by ground stations, cameras, companions
 GROUND_STATION_TYPE = 6  # MAV_TYPE_GCS
 ON_GROUND_STATE = 1  # MAV_LANDED_STATE_ON_GROUND
 AUTO_MAIN_MODE = 4  # PX4_CUSTOM_MAIN_MODE_AUTO
@@ -52,8 +52,8 @@ class PositionInput:
 
     ``name`` is the track name for ``--position-source``, ``row`` the key in LAYOUTS, ``stamp`` the
     field with the sender's time (µs), ``estimator`` the required MAV_ESTIMATOR_TYPE, if any.
-    ``drops_covariance`` is True for a naive estimator, because PX4 ignores its covariance
-    (``mavlink_receiver.cpp``).
+    ``drops_covariance`` is True for a naive estimator, because PX4 ignores the covariance in its
+    message (``mavlink_receiver.cpp``).
     """
 
     row: str
@@ -71,7 +71,7 @@ class PositionInput:
 
     @property
     def origin(self) -> Origin:
-        """Kind of the position source, and path of the positions to the log."""
+        """Kind of the position source, and data path of the positions from sender to log."""
         return find_origin(self.kind, "as received")
 
     @property
@@ -82,7 +82,7 @@ class PositionInput:
 
 @dataclass(frozen=True)
 class FrameOfReference:
-    """MAV_FRAME: order and signs of its components along the axes of ``name`` ("NED", "FRD")."""
+    """Order and signs of the components of a MAV_FRAME along the axes of ``name``: NED or FRD."""
 
     name: str
     order: tuple[int, int, int] = (0, 1, 2)

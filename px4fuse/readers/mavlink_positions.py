@@ -91,7 +91,7 @@ def _read_track(
     samples = recording.read(source.layout, rows, boot_s, name)
     frame = "NED"
     if "frame_id" in samples and len(samples):
-        # A track has one coordinate frame: the frame of the last sample, as PX4 uses
+        # A track has one coordinate frame: the frame of the last sample, as in PX4
         reference = messages.FRAMES_OF_REFERENCE.get(int(samples["frame_id"].iloc[-1]))
         frame = "unknown" if reference is None else reference.name
     if source.drops_covariance:

@@ -31,7 +31,8 @@ MIN_RESTART_STEP_S = 5.0
 # Distance (messages) before and after a suspected restart at which boot times are compared to
 # confirm the restart
 RESTART_CHECK_MESSAGES = 20
-# Minimum number of timestamps in a valid group between gaps, relative to the largest group
+# Minimum size of a group of timestamps between two gaps, as fraction of the largest group: smaller
+# groups are damaged timestamps
 MIN_GROUP_FRACTION = 0.01
 # Maximum gap (s) between valid timestamps, and maximum distance (s) of valid timestamps from the
 # analysed session

@@ -169,7 +169,7 @@ def _map_sender_clock(
 
 
 def _requests_of_other_senders(recording: Recording, sender: Address) -> NDArray[np.int64]:
-    """Return ``ts1`` of the TIMESYNC requests of all other senders."""
+    """Return the field ``ts1`` of the TIMESYNC requests of all other senders."""
     frames = recording.frames
     rows = frames.rows("TIMESYNC")
     timesync = frames.table("TIMESYNC", rows[~frames.sent_by(sender, rows)])

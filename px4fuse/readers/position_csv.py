@@ -29,13 +29,13 @@ from px4fuse.reading import display_name, read_bytes_limited
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
 
-# Maximum file size: several days of UWB positions
+# Maximum file size (bytes): several days of UWB positions
 MAX_FILE_BYTES = 500_000_000
 MIN_ROWS = 3
 # Limits (s) of plausible intervals: UWB systems have rates of 0.2 Hz to 200 Hz, with 10 % variation
 MIN_INTERVAL_S, MAX_INTERVAL_S = 0.9 / 200, 1.1 / 0.2
-# Maximum interval (s) between positions with UNIX time in s: boot time in µs has equally large
-# values half an hour after boot, but larger intervals
+# Maximum interval (s) between timestamps that count as UNIX time in s: boot time in µs reaches
+# equally large numbers half an hour after boot, but with larger intervals
 MAX_UNIX_TIME_INTERVAL_S = 60.0
 # Maximum extent (m) of an indoor flight: a larger extent shows that the unit of length is mm
 MAX_SPREAD_M = 200.0
@@ -314,7 +314,10 @@ def _find_table(
 
 
 def _is_header(fields: list[str], wanted_names: set[str]) -> bool:
-    """Return True if the fields contain ``wanted_names``; if empty, names of time and position."""
+    """Return True if the fields of a line are a header: they contain all wanted names.
+
+    Without wanted names, a header contains names of time and position.
+    """
     if wanted_names:
         return wanted_names <= {name.casefold() for name in fields}
     meanings = [read_column_name(name) for name in fields]
@@ -350,8 +353,8 @@ def _choose_columns(
 ) -> tuple[int, _Columns, _Columns, str | None, str]:
     """Choose the columns of time, position and sigma; also return frame and time description.
 
-    The columns of the option are used, otherwise columns with known names. The time of measurement,
-    if that column is not empty, is preferred to the time of recording.
+    Without the option ``columns``, the columns with known names are used. A non-empty column with
+    the time of measurement is preferred to a column with the time of recording.
     """
     if chosen_columns:
         time = chosen_columns[0]

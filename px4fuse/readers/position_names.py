@@ -27,8 +27,8 @@ _TIME_ROLES = _ROLES["time"] | _ROLES["measured"] | _ROLES["recorded"] | _ROLES[
 TIME_KINDS = ["time of measurement", "time", "time of recording"]
 # Names without separator, such as "px" (position, x) and "xstd" (x, sigma)
 _GLUED_NAMES = re.compile(r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)")
-# Coordinate frame and names of its axes; the first row is used of which both horizontal axes are
-# in the file
+# Coordinate frames with the names of their axes. The first frame with both horizontal axes in the
+# file is used
 _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
     ("ned", ("north", "east", "down")),
     ("enu", ("east", "north", "up")),

@@ -38,8 +38,8 @@ STATE_COUNT = 22
 MAG_3D_BIT = 5
 # Minimum rate (Hz) of a magnetometer topic that contains all samples: EKF2 uses 14 per second
 MIN_COMPLETE_FIELD_HZ = 10.0
-# Maximum distance (IMU samples) of the prediction interval from n + 0.5 samples, for which EKF2 may
-# round up or down
+# Maximum distance (IMU samples) of the prediction interval from n + 0.5 samples at which EKF2 may
+# round to n or to n + 1 samples
 MAX_HALF_DISTANCE = 0.05
 # Maximum interval (s) between two optical flow velocities whose difference is used
 MAX_FLOW_INTERVAL_S = 0.5
@@ -144,7 +144,7 @@ def _state_vector(topics: Topics) -> tuple[str, int]:
 
 
 def _read_delayed_state(topics: Topics, step_s: float) -> TableOrUnavailable:
-    """Read EKF2's state and variances at the fusion horizon, in one layout for all releases.
+    """Read EKF2's state and variances at the fusion horizon, with equal columns for all releases.
 
     ``step_s`` is the prediction interval (s). It is needed for releases that log biases as
     increments per prediction.

@@ -107,7 +107,8 @@ def reconstruct_fixes(
     innovation_s = innovation_s[is_between_fixes]
     previous_fix = previous_fix[is_between_fixes]
     intervals_passed = (innovation_s - delay_beyond_horizon_s - fix_s[previous_fix]) / interval_s
-    # Skip innovations logged within one EKF2 step of a fix, because they may belong to either fix
+    # Skip innovations logged within one EKF2 step of a fix: they may belong to this fix or to the
+    # previous fix
     is_unambiguous = intervals_passed % 1.0 > ekf2.step_s / interval_s
     innovation_s = innovation_s[is_unambiguous]
     previous_fix = previous_fix[is_unambiguous]

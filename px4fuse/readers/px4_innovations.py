@@ -43,7 +43,7 @@ def fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
 
 
 def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
-    """Replace the innovations of external vision by those of GNSS."""
+    """Replace the innovations of external vision by the GNSS innovations."""
     enabled = {
         group: log.enabled
         for group, name in (("horizontal", source.horizontal), ("vertical", source.vertical))

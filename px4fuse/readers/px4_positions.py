@@ -34,7 +34,7 @@ from px4fuse.readers.ulog_topics import Topics
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 GPS_3D_FIX = 3
-# Maximum publication delay (µs) of a sample with the arrival time instead of the measurement time
+# Maximum delay (µs) from timestamp to publication of a sample whose timestamp is the arrival time
 MAX_ARRIVAL_DELAY_US = 100
 # Minimum fraction of samples with arrival time, for a topic that counts as having arrival times
 # only
@@ -42,7 +42,8 @@ MIN_ARRIVAL_FRACTION = 0.9
 # Maximum time difference (s) of a height and a horizontal position that are joined: 2.5 cm error at
 # a climb rate of 0.5 m/s
 MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
-# Maximum logged GNSS rate (Hz) of decimated fixes: receivers send 5 to 20 fixes per second
+# Maximum rate (Hz) of logged GNSS fixes that count as downsampled: receivers send 5 to 20 fixes per
+# second
 MAX_DOWNSAMPLED_HZ = 4.0
 AUTOPILOT_CLOCK = "autopilot boot clock (PX4 converted the sender's timestamps)"
 # Latitude and longitude in degrees, optionally altitude in m

@@ -22,8 +22,8 @@ from px4fuse.record import table
 class TrackSource:
     """Position track that a ULog may contain. The key in TRACKS is the ``--position-source`` name.
 
-    ``kind`` and ``path`` define the origin of the track, ``remedy`` is the action to log the
-    track, and ``layouts`` are the layouts of its topic, if any.
+    ``kind`` and ``path`` define the origin of the track, ``remedy`` is the action to log the track,
+    and ``layouts`` are the possible fields of the topic of the track; empty without a topic.
     """
 
     kind: str
@@ -34,7 +34,7 @@ class TrackSource:
 
     @property
     def origin(self) -> Origin:
-        """Kind of the position source, and path of the positions to the log."""
+        """Kind of the position source, and data path of the positions from sender to log."""
         return find_origin(self.kind, self.path)
 
 
@@ -56,7 +56,7 @@ MAGNETOMETER = (
     ("estimator_aid_src_mag", "observation"),
 )
 # Number of attitude variances by the array lengths of states and variances in the log. 4: filter
-# with quaternion states, its biases are increments per prediction. 3: error-state filter
+# with quaternion states, with biases as increments per prediction. 3: error-state filter
 # (EKF/python/ekf_derivation/generated/state.h at v1.15.4 and v1.16)
 ATTITUDE_VARIANCES: Mapping[tuple[int, int], int] = {
     (24, 24): 4,
@@ -78,15 +78,16 @@ FLAG_ALWAYS_SET = ("gravity", "drag")
 # Aids that log a local position as observation (the GNSS observation is latitude and longitude)
 WITH_OBSERVATION = ("ev_pos", "ev_hgt")
 STATUS_FLAGS, STATUS = "estimator_status_flags", "estimator_status"
-# Topics of innovations and of variances of all aids; before v1.12 one topic for both
+# Topics with the innovations, and with the innovation variances, of all aids; before v1.12 one
+# topic contains both
 INNOVATIONS = "estimator_innovations", "estimator_innovation_variances"
 OLD_INNOVATIONS = "ekf2_innovations"
 
 
 def layouts_of_track(track: str) -> list[Layout]:
-    """Return the possible column layouts of a track, best first.
+    """Return the possible topics and fields of a position track, best first.
 
-    A layout without a topic is that of the topic with the name of the track.
+    If a layout has no topic, the name of the track is the topic.
     """
     rows = [LAYOUTS[name] for name in TRACKS[track].layouts]
     return [replace(row, topic=row.topic or track) for row in rows]

@@ -14,8 +14,8 @@ from px4fuse.errors import TrajectoryError
 
 # Minimum and maximum valid UNIX time (s): the years 2000 and 2100
 UNIX_START_S, UNIX_END_S = 946_684_800.0, 4_102_444_800.0
-# Number of characters at the beginning in which a control character shows that a file is binary; a
-# NUL anywhere shows the same
+# Number of characters at the beginning of a file that are searched for control characters: a file
+# with a control character there, or with a NUL anywhere, is binary
 _CHECKED_CHARS = 100_000
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # byte order marks, written by Windows shells
 _CONTROL = re.compile("[\x00-\x08\x0e-\x1b]")
@@ -27,7 +27,7 @@ _NUMBER = re.compile(
 def decode_text(content: bytes) -> str | None:
     """Decode text and convert its line ends to line feeds; None if the content is binary.
 
-    The encoding is UTF-8, UTF-16 with byte order mark, or otherwise Latin-1.
+    The encoding is UTF-8, UTF-16 with byte order mark, or Latin-1 for all other bytes.
     """
     if content.startswith(_UTF_16):
         text = content[: len(content) // 2 * 2].decode("utf-16", errors="replace")
@@ -108,7 +108,8 @@ class Rows:
         Raises
         ------
         TrajectoryError
-            A row does not have these columns. The message contains the first such line.
+            A row has another number of columns, or no number in a number column. The message
+            contains the first such line.
         """
         texts = [text for _, text in self.lines]
         columns = [("words", "U80", (words,)), ("values", "f8", (values,))]

@@ -326,7 +326,7 @@ def _detect_frame(kind: Kind, position: Array) -> tuple[Frame, str]:
     if kind != "slam":
         return "unknown", ""
     centred = position - position.mean(axis=0)
-    eigenvalues, axes = np.linalg.eigh(centred.T @ centred)  # ascending
+    eigenvalues, axes = np.linalg.eigh(centred.T @ centred)  # eigenvalues in ascending order
     height, width, length = np.sqrt(np.maximum(eigenvalues, 0.0) / len(position))
     tilt = math.acos(min(1.0, abs(float(axes[1, 0]))))
     is_level = width > MIN_WIDTH_RATIO * length and height < MAX_THICKNESS_RATIO * width

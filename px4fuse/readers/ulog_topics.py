@@ -46,7 +46,7 @@ NOTE_KEY = "px4fuse_note"
 MAX_DATA_GAP_S = 600.0
 # Maximum number of fields of all subscriptions (300 bytes of memory each); real logs have 3,300
 MAX_FIELDS = 200_000
-# Length of a ULog message header
+# Length (bytes) of a ULog message header
 HEADER_BYTES = 3
 # Exceptions that pyulog may raise when it parses damaged bytes as messages
 _PARSE_ERRORS = (
@@ -218,14 +218,14 @@ class Topics:
         return tuple((float(at), int(number)) for at, number in zip(times, changes, strict=True))
 
     def find(self, *layouts: Layout) -> Layout | None:
-        """Return the first layout with all required fields in the log; None if none has them."""
+        """Return the first layout whose required fields are all in the log; None without one."""
         for layout in layouts:
             if any({*layout.columns.values()} <= table.keys() for table in self.of(layout.topic)):
                 return layout
         return None
 
     def frame(self, layout: Layout, instance: int = 0, *, step: bool = False) -> pd.DataFrame:
-        """Read one layout as a DataFrame of float64, indexed by measurement time in s.
+        """Read the fields of a layout as a DataFrame of float64, indexed by measurement time (s).
 
         Parameters
         ----------
@@ -267,7 +267,7 @@ class Topics:
         return frame if step else frame[(frame.index >= -MAX_OUTSIDE_S) & (frame.index <= end_s)]
 
     def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
-        """Read the first layout that is in the log, see :meth:`frame`; empty if none is."""
+        """Read the first layout whose fields are in the log, see :meth:`frame`; else empty."""
         layout = self.find(*layouts)
         return _empty_frame(layouts[0]) if layout is None else self.frame(layout, step=step)
 

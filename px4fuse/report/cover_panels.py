@@ -292,8 +292,7 @@ def _shown_height(errors: pd.DataFrame) -> float:
 
 
 def _format_sigma(sigma: pd.Series[float]) -> str:
-    known = sigma.dropna()
-    known = known[known.index >= known.index.min() + SETTLING_S]
+    known = _settled(sigma)
     if known.empty:
         return ""
     low, high = float(known.min()), float(known.max())
@@ -302,15 +301,22 @@ def _format_sigma(sigma: pd.Series[float]) -> str:
     return f"{format_metres(low)} to {format_metres(high)}"
 
 
+def _settled(sigma: pd.Series[float]) -> pd.Series[float]:
+    """Return the known σ of a filter from :data:`SETTLING_S` after its start on."""
+    known = sigma.dropna()
+    settled: pd.Series[float] = known[known.index >= known.index.min() + SETTLING_S]
+    return settled
+
+
 def _draw_sigma(axes: Axes, sigma: pd.Series[float], name: str) -> None:
     """Draw ±2σ of a filter; beyond the plot, draw triangles and write the largest value."""
     known = sigma.dropna()
     if known.empty:
         return
     style.draw_sigma_band(axes, 0.0 * known, known, style.BANDS[name])
+    known = _settled(sigma)
     top = axes.get_ylim()[1]
-    largest = 2.0 * float(known.max())
-    if largest <= top:
+    if known.empty or (largest := 2.0 * float(known.max())) <= top:
         return
     at = float(known.index[int(np.argmax(known))])
     for sign, marker in ((1.0, "^"), (-1.0, "v")):

@@ -188,11 +188,13 @@ class ComparisonResults(_FlightResults, frozen=True):
     ekf2_replay : Replayed
         Replay of EKF2 from the log, and its agreement with the logged EKF2.
     difference_steps : mapping of axis name to DifferenceSteps
-        Differences KF - EKF2 after each replacement of one EKF2 property by that of KF.
+        Changes of the difference KF - EKF2 by each replacement of one KF property by the EKF2
+        property.
     trials : tuple of Trial
-        Re-runs along the main axis, with all statistics before and after the change.
+        Re-runs along the aisle, else along the first axis, with all statistics before and after the
+        change.
     causes : tuple of Intervention
-        Re-runs with one change each, and the fraction of an inconsistency that it explains.
+        Re-runs with one change each, and the fraction of an inconsistency that the change explains.
     aids : mapping of PX4's name to AidResult
         Aiding sources of EKF2 with statistics of their innovations; empty without innovations.
     loop : LoopResult

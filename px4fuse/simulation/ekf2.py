@@ -76,8 +76,8 @@ NO_AID_TIMEOUT_S = 5.0
 # EKF2_GPS_V_NOISE, EKF2_GPS_P_NOISE, EKF2_GBIAS_INIT and EKF2_ABIAS_INIT (covariance.cpp)
 INITIAL_SIGMA = np.repeat([0.1, 0.3, 0.5, 0.1, 0.2], 3)
 # Time (s) at rest before the log, and σ of specific force (m/s²), angular rate (rad/s) and velocity
-# (m/s) at rest. With them the model has the σ that EKF2 v1.16 reports on the ground: gyro bias
-# 0.0005 rad/s, velocity 0.06 m/s, horizontal accelerometer bias 0.17 m/s²
+# (m/s) at rest. With REST_S and REST_SIGMA the model has the σ that EKF2 v1.16 reports on the
+# ground: gyro bias 0.0005 rad/s, velocity 0.06 m/s, horizontal accelerometer bias 0.17 m/s²
 REST_S = 10.0
 REST_SIGMA = np.repeat([0.05, 0.0005, 0.06], 3)
 # σ of EKF2's heading (rad) and height (m) as PX4 v1.16 logs them in flight
@@ -240,7 +240,7 @@ def _with_field(segment: ReplaySegment, magnetometer: Topic) -> ReplaySegment:
 
 
 def _barometer_heights(segment: ReplaySegment, barometer: Topic) -> HeightSamples:
-    """Return the barometer heights, which are the only height source of EKF2."""
+    """Return the barometer heights, the only height source of EKF2 in outdoor flights."""
     measured_at_s = sensors.time_s(barometer) - 0.5 * float(np.median(segment.step_s))
     down_m = sensors.HOME[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
     samples = barometer_samples_inside(segment, measured_at_s, down_m, np.zeros(len(down_m)))

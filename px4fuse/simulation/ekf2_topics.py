@@ -59,7 +59,7 @@ class TopicTrack:
     def timestamps(self, rows: IntArray, measured_s: Array | None = None) -> dict[str, Any]:
         """Return the timestamps of messages about the prediction steps ``rows``.
 
-        ``measured_s`` are the measurement times (s), if they are not those of the steps.
+        ``measured_s`` are the measurement times (s), by default the times of the steps.
         """
         sample_us = self.time_us[rows]
         if measured_s is not None:

@@ -22,7 +22,8 @@ class Mistakes:
     thirds, heading errors from the start. A rate of 0 is the rate of the scenario, an EKF2 noise of
     0 the σ that the source reports, and an EKF2 delay of None the correct delay. ``r_scale``
     multiplies the reported variance. ``yaw_deg`` rotates the positions about the start, clockwise
-    seen from above. ``vibration_m_s2`` is the standard deviation of the mean over 0.1 s.
+    seen from above. ``vibration_m_s2`` is the standard deviation of the mean vibration acceleration
+    over 0.1 s.
     """
 
     clock_offset_s: float = bounded_number(0.0, -5.0, 5.0, "s", "SECONDS")

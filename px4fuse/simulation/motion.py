@@ -73,8 +73,8 @@ class Ramps:
         Position and velocity are 0 before the first ramp.
         """
         velocity_before = np.cumsum(self.velocity_change, axis=0) - self.velocity_change
-        # distance between two ramp starts: the velocity before times the interval, plus the
-        # velocity change times the interval without half of the ramp
+        # distance from the start of one ramp to the start of the next: velocity before the ramp ·
+        # interval, plus velocity change · (interval - half of the ramp duration)
         position_gained = (
             velocity_before[:-1] * np.diff(self.start_s)[:, None]
             + self.velocity_change[:-1]
@@ -205,7 +205,7 @@ class Motion:
         )
 
     def _fade_factors(self, time_s: Array) -> tuple[tuple[Array, Array, Array, Array], IntArray]:
-        """Return the factor of the slow deviation, its derivatives, and the indices of these.
+        """Return the factor of the slow deviation, its derivatives, and their time indices.
 
         The factor is 1 in the air and 0 on the ground, shape (t, 1). Its first three derivatives,
         shape (m, 1), are for the m times at which the factor changes.

@@ -115,7 +115,7 @@ class Scenario:
         True if the log contains the output of px4fuse's EKF2 model.
     seed : int
         Seed of all random numbers. Each sensor has a separate stream of random numbers, so a
-        mistake in one sensor does not change the noise of the others.
+        mistake in one sensor does not change the noise of other sensors.
 
     Raises
     ------

@@ -18,7 +18,8 @@ _ULOG_VERSION = b"\x01"
 # ULog names of numpy types; for integer types ULog adds "_t"
 _ULOG_TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
 _FLAG_BITS_MESSAGE = bytes(40)
-# One line per field: numpy type, name, and default values; a field without default is optional
+# Fields of each topic, one line per field: numpy type, name, and default values. A field without
+# default is optional
 FIELDS: Mapping[str, str] = table(__file__, "topics.toml", dict[str, str])
 
 

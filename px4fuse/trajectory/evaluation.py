@@ -33,8 +33,8 @@ MAX_SCALE_ERROR = 0.1
 MIN_COVERAGE = 0.5
 # Minimum estimated time offset (s) for a warning: the lag of a filter is smaller
 MIN_DOUBTFUL_OFFSET_S = 0.1
-# Maximum ratio of the pose interval of the reference to that of the estimate: with a larger ratio,
-# the two are probably interchanged
+# Maximum ratio of the pose intervals, reference to estimate: with a larger ratio, reference and
+# estimate are probably interchanged
 MAX_INTERVAL_RATIO = 5.0
 
 # Frames with vertical z axis

@@ -43,9 +43,9 @@ SEARCH_WINDOW_S, FINE_SEARCH_WINDOW_S = 0.5, 0.1
 MIN_PEAK_DISTANCE_S = 1.0
 # Minimum correlation of the speeds at a peak
 MIN_CORRELATION = 0.3
-# Minimum ratio of another offset's residual (RMS) to the best offset's residual. Below, both fit
-# equally well: 95 % limit for two sets of 80 independent residuals, half a minute of flight
-# (F-test, F = 1.2², 80 and 80 degrees of freedom)
+# Minimum ratio of another offset's residual (RMS) to the best offset's residual. With a smaller
+# ratio both offsets fit equally well: 95 % limit for two sets of 80 independent residuals, half a
+# minute of flight (F-test, F = 1.2², 80 and 80 degrees of freedom)
 MIN_SECOND_PEAK_RATIO = 1.2
 # Maximum number of poses in the least-squares fit
 MAX_FITTED_POSES = 2000

@@ -67,8 +67,8 @@ class Verdict:
     Attributes
     ----------
     status : Status
-        Result of comparing the numbers. If they agree, it is still "cannot verify" in two cases:
-        another program wrote the PDF, or pages differ and the library versions too.
+        Result of comparing the numbers. If the numbers agree, the status is still "cannot verify"
+        in two cases: another program wrote the PDF, or pages differ and the library versions too.
     reasons : tuple of str
         Sentences with the differences, the reason for "cannot verify", or the successful checks.
     with_log : bool

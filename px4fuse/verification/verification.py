@@ -1,8 +1,9 @@
 """Verification: repeat the analysis of a report on its log, and compare numbers and pages.
 
 The recorded command is run again on the log, which is found by its SHA-256, and the results are
-compared with those attached to the PDF. This confirms that the numbers follow from the log. It does
-not confirm the author: each person with the log can make the same report under another name.
+compared with the results attached to the PDF. This confirms that the numbers follow from the log.
+It does not confirm the author: each person with the log can make the same report under another
+name.
 
 The report is drawn again from the new results, and the submitted PDF is compared with it
 (:mod:`px4fuse.verification.pages`). No number is read from the submitted pages.
@@ -66,7 +67,8 @@ ESTIMATE_PATHS = (
     "source.alignment",
     "settings.clock_offset_s",
 )
-# Results field with the number of solver iterations, and maximum difference of equal numbers
+# Results field with the number of solver iterations, and maximum difference of two numbers of
+# iterations that count as equal
 ITERATIONS_FIELD, MAX_MORE_ITERATIONS = "iterations", 2
 # Results fields that are not compared, because they describe the computer that made the report
 MACHINE_PATHS = ("provenance.python", "provenance.libraries")
@@ -340,7 +342,8 @@ def compare_results(
         Number of compared values.
     """
     command = str(recomputed["provenance"]["command"])
-    # with these options, all numbers depend on an estimated time offset or frame alignment
+    # with the value "auto" or the option --position, all numbers depend on an estimated time offset
+    # or frame alignment
     is_estimate_everywhere = not {"auto", "--position"}.isdisjoint(command.split())
     recorded_values, new_values = dict(flatten(recorded)), dict(flatten(recomputed))
     pairs = {

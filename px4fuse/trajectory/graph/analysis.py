@@ -12,7 +12,8 @@ from px4fuse.trajectory.graph.covariance import GateResult, gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import GraphSolution, Solution, solve
 
-# Maximum number of closures for robust optimisation by default: with more it takes minutes
+# Maximum number of closures for robust optimisation by default: with more closures the optimisation
+# takes minutes
 MAX_ROBUST_CLOSURES = 1000
 # Key of the solution by robust optimisation (graduated non-convexity)
 ROBUST = "gnc"

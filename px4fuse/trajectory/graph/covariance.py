@@ -89,7 +89,7 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
     step_adjoints = lie.adjoint(poses[1:])
     step_covariances = (
         step_adjoints @ _covariances(graph, chain_edges) @ step_adjoints.transpose(0, 2, 1)
-    )  # in the axes of the first pose of the odometry chain
+    )  # covariances in the axes of the first pose of the odometry chain
     cumulative_covariance = np.concatenate(
         [np.zeros((1, *step_covariances.shape[1:])), np.cumsum(step_covariances, axis=0)]
     )

@@ -25,7 +25,7 @@ _STAGE_TOLERANCE, _STAGE_ITERATIONS = 1e-6, 20
 
 # Probability that the squared residual of a true closure is not truncated
 GNC_PROBABILITY = 0.99
-# Probability that the cost of a true closure is below the cost of dropping it
+# Probability that the cost of a true closure is below the cost of dropping the closure
 DROP_PROBABILITY = 0.999
 # Factor on the control parameter of graduated non-convexity per stage (Yang 2020, section V)
 _GNC_FACTOR = 1.4
