@@ -10,11 +10,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+
+from msgspec import structs
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis, WhatIfAnalysis
 from px4fuse.comparison.causal_replays import Reruns, planned_configurations, run_interventions
-from px4fuse.comparison.comparison import compare, compare_prepared
+from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.difference_steps import (
     corrected_settings,
     explain_ekf2_difference,
@@ -39,7 +40,6 @@ from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2.whatif import sweep_values, what_if
 from px4fuse.ekf2_parameters import check_parameters
 from px4fuse.errors import LogError, MissingDataError, SettingsError
-from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.findings import find, find_aids
 from px4fuse.flight import Flight, Unavailable
@@ -68,8 +68,7 @@ def diagnose(
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
     prepared = prepare_comparison(request, progress, flight)
-    compared = compare_prepared(prepared, lambda name: progress(f"running KF along {name}"))
-    return replace(explain(compared, progress), request=request)
+    return replace(explain(compare(prepared, progress), progress), request=request)
 
 
 def explain(compared: Comparison, progress: Progress = ignore_progress) -> Analysis:
@@ -186,28 +185,9 @@ def prepare_comparison(
 
     Arguments and errors are those of :func:`diagnose`.
     """
-    clock_offset = request.clock_offset_s
-    _check_finite(start_s=request.start_s, end_s=request.end_s, clock_offset_s=clock_offset)
     flight = flight or read_flight(request, progress)
-    settings = Settings(
-        sigma_a_m_s2=request.sigma_a_m_s2,
-        sigma_z_m=Settings().sigma_z_m if request.sigma_z_m is None else request.sigma_z_m,
-        dt_s=request.dt_s,
-        input=request.input or "imu",
-        # for a position file, align_position_file has already applied the time offset
-        clock_offset_s=clock_offset
-        if isinstance(clock_offset, float) and request.position is None
-        else 0.0,
-    )
-    field_names = ("heading_deg", "position_source", "source_kind", "height", "start_s", "end_s")
-    choices: dict[str, Any] = {name: getattr(request, name) for name in field_names}
-    choices |= {
-        "input_required": request.input == "imu",
-        "sigma_z_given": request.sigma_z_m is not None,
-        "axes": request.axes or None,
-    }
-    prepared = prepare(flight, settings, **choices)
-    if clock_offset != AUTO or request.position is not None:
+    prepared = prepare(flight, request)
+    if request.clock_offset_s != AUTO or request.position is not None:
         return prepared
     _, clock = estimate_noises_and_clock(prepared, progress)
     if isinstance(clock, Unavailable) or not clock.is_determinable:
@@ -223,14 +203,7 @@ def prepare_comparison(
             f"{high:+.3f} s) is not significant and was not applied"
         )
         return replace(prepared, notes=(*prepared.notes, note))
-    settings = replace(settings, clock_offset_s=clock.offset_s)
-    return prepare(flight, settings, **choices)
-
-
-def _check_finite(**values: float | str | None) -> None:
-    for name, value in values.items():
-        if isinstance(value, float) and not math.isfinite(value):
-            raise SettingsError(f"`{name}` {value:g} is not a finite number.")
+    return prepare(flight, structs.replace(request, clock_offset_s=clock.offset_s))
 
 
 def run_loop(request: LoopRequest, progress: Progress = ignore_progress) -> Loop:
@@ -244,7 +217,9 @@ def run_loop(request: LoopRequest, progress: Progress = ignore_progress) -> Loop
     from px4fuse.loop.analysis import analyse  # noqa: PLC0415 - not for tune and sync
     from px4fuse.loop.tracks import read_source  # noqa: PLC0415
 
-    _check_finite(start_s=request.start_s, end_s=request.end_s)
+    for name in ("start_s", "end_s"):
+        if not math.isfinite(getattr(request, name) or 0.0):
+            raise SettingsError(f"`{name}` {getattr(request, name):g} is not a finite number.")
     progress(f"reading {display_name(Path(request.source))}")
     system, reference = request.system, None
     source = read_source(request.source, frame=request.frame, system=system)
@@ -283,7 +258,8 @@ def run_what_if(
     comparison = None
     try:
         if model.agreement.good:
-            comparison = compare(flight, axes=("north", "east", AISLE), sigma_z_given=False)
+            recordings = structs.replace(recordings, axes=("north", "east", AISLE))
+            comparison = compare(prepare(flight, recordings))
     except MissingDataError:  # a replay of EKF2 is possible without a comparison with KF
         if is_default_change:
             raise

@@ -11,6 +11,7 @@ from collections import Counter
 import numpy as np
 import pytest
 from cli_tools import run_checked
+from comparisons import compare
 from detector_rates import rates
 
 import px4fuse
@@ -27,7 +28,6 @@ from px4fuse.assignment.random_assignment import (
     draw,
 )
 from px4fuse.assignment.roster import Person
-from px4fuse.comparison.comparison import compare
 from px4fuse.diagnose import explain
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.findings import find_loop

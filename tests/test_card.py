@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 from cards import verdicts
+from comparisons import compare
 from exchange import replace
 
 from px4fuse.analysis import Analysis, explain
 from px4fuse.card.build import build_card, build_refusal_card
 from px4fuse.card.causes import make_cause, rank_causes
 from px4fuse.card.model import Action
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.trials import RunStatistics, Trial, improvement
 from px4fuse.errors import LogError
 from px4fuse.filter.settings import Settings

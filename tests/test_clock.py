@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from comparisons import compare
 from exchange import replace
 from filter_tools import (
     GRAVITY,
@@ -28,7 +29,6 @@ from scipy.stats import binom, chi2, ttest_ind
 
 from px4fuse.arrays import Array
 from px4fuse.comparison import estimates
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import MIN_PARTS, estimate_noises_and_clock, widen_for_drift
 from px4fuse.filter import time_offset
 from px4fuse.filter.fitting import Noises

@@ -5,10 +5,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from comparisons import compare
 from flights import with_noises
 
 from px4fuse.card.build import build_card
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import FILTERS
 from px4fuse.diagnose import explain
 from px4fuse.filter.time_offset import MAX_CHANGE_P

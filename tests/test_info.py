@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from cli_tools import run_main
 from click.testing import CliRunner
+from comparisons import compare
 from exchange import replace
 from flights import Estimator, Uwb, aisle_flight
 from mavlink_tools import Aisle
 from ulog_tools import Log, load, make_log, odometry, stamps, take, topic
 
 from px4fuse.cli import cli
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.diagnose import explain
 from px4fuse.errors import Px4FuseError

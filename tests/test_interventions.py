@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from comparisons import compare
 from exchange import replace
 
 from px4fuse.analysis import Analysis
@@ -18,7 +19,6 @@ from px4fuse.comparison.causal_replays import (
 )
 from px4fuse.comparison.changes import CLOCK_OFFSET, FORWARD_BIAS, OUTLIERS, ROTATION
 from px4fuse.comparison.changes import RIGHT_BIAS as TO_RIGHT
-from px4fuse.comparison.comparison import compare
 from px4fuse.diagnose import explain
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.model import replay_settings, with_misaligned_positions, with_position_noise

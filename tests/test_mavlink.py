@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from comparisons import compare
 from mavlink_tools import (
     AUTOPILOT,
     BOOT_S,
@@ -46,7 +47,6 @@ from pandas.testing import assert_frame_equal
 from scipy.spatial.transform import Rotation
 from time_limit import time_limit
 
-from px4fuse.comparison.comparison import compare
 from px4fuse.diagnose import explain
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.flight import Columns, Ekf2, Flight, Truth, Unavailable
@@ -515,7 +515,7 @@ def test_mavlink_gnss_position_is_relative_to_autopilot_origin(read, origin, clo
     assert track.samples[Columns.POSITION].to_numpy() == pytest.approx(true, abs=exact_m)
     variance = track.samples[Columns.POSITION_VARIANCE].iloc[0]
     assert variance.to_numpy() == pytest.approx([0.09, 0.09, 0.25])
-    result = compare(flight, sigma_z_given=False)
+    result = compare(flight, sigma_z_m=None)
     assert result.source.name == "GPS_RAW_INT"
     assert result.settings.sigma_z_m == 0.5  # EKF2_GPS_P_NOISE is the lower limit
 

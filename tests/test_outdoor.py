@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from cli_tools import error_line, run_checked
+from comparisons import compare
 from ekf2_tools import opened
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,7 +20,6 @@ from msgspec import structs
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import POSITION_VARIANCES, find_cause, interventions_for
 from px4fuse.comparison.changes import ROTATION
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.projection import project as project_state
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.diagnose import explain

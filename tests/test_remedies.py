@@ -4,11 +4,11 @@ import re
 from functools import cache
 
 import pytest
+from comparisons import compare
 from exchange import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy as remedies
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import ml_ekf2_parameters, noise_used_m
 from px4fuse.comparison.trials import RunStatistics, Trial, find_trial, has_effect, improvement

@@ -3,11 +3,11 @@
 import numpy as np
 import pandas as pd
 import pytest
+from comparisons import compare
 from exchange import replace
 from flights import unexplained
 from scipy.spatial.transform import Rotation
 
-from px4fuse.comparison.comparison import compare
 from px4fuse.diagnose import explain
 from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.ekf2.model import open_model

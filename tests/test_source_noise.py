@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 import source_errors as errors
+from comparisons import compare
 from exchange import replace
 from scipy.interpolate import CubicSpline
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import compare
 from px4fuse.diagnose import explain
 from px4fuse.filter import correlated_noise
 from px4fuse.filter.correlated_noise import fit_time_correlation

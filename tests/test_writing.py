@@ -22,7 +22,7 @@ from exchange import replace
 from ulog_tools import make_log
 
 from px4fuse import writing
-from px4fuse.comparison.comparison import compare_prepared
+from px4fuse.comparison.comparison import compare as compare_prepared
 from px4fuse.diagnose import prepare_comparison
 from px4fuse.errors import OutputError
 from px4fuse.report import fonts, pdf
