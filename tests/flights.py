@@ -20,6 +20,7 @@ from px4fuse.comparison.causal_replays import run_interventions
 from px4fuse.comparison.estimates import Estimates, Tuning
 from px4fuse.comparison.flight_events import collect_events
 from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.noise_differences import find_noisy_part, tune_by_axis
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.filter.signals import Axis, Segment, project_acceleration
 from px4fuse.filter.tuning import HORIZONTAL, tune
@@ -344,6 +345,8 @@ def unexplained(comparison: Comparison, tuning: Tuning | None = None) -> Analysi
     estimates = Estimates(
         tuning=tuning or {}, clock=missing, heading=missing, bias_scale_jump_fit=missing,
         source_low_pass=missing, time_correlated_noise=missing,
+        tuning_by_axis=tune_by_axis(comparison),
+        noisy_part=find_noisy_part(comparison, (tuning or {}).get(HORIZONTAL)),
     )  # fmt: skip
     causes, trials = run_interventions(comparison, estimates, missing)
     return Analysis(

@@ -15,6 +15,7 @@ from scipy.special import stdtr
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.noise_differences import NoisyPart, find_noisy_part, tune_by_axis
 from px4fuse.filter.correlated_noise import (
     SourceLowPass,
     TimeCorrelatedNoise,
@@ -69,6 +70,10 @@ class Estimates:
         Low-pass filter of the position source.
     time_correlated_noise : TimeCorrelatedNoise or Unavailable
         Time-correlated noise of the position source, without jumps.
+    tuning_by_axis : tuple of AxisTuning
+        Noises along north and east, if their mean NIS differs; not for GNSS and odometry.
+    noisy_part : NoisyPart or None
+        Part of the flight with larger innovations; not for odometry.
     """
 
     tuning: Tuning
@@ -77,6 +82,8 @@ class Estimates:
     bias_scale_jump_fit: BiasScaleJumpFit | Unavailable
     source_low_pass: SourceLowPass | Unavailable
     time_correlated_noise: TimeCorrelatedNoise | Unavailable
+    tuning_by_axis: tuple[AxisTuning, ...] = ()
+    noisy_part: NoisyPart | None = None
 
 
 def ignore_progress(_: str) -> None:
@@ -99,6 +106,7 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
     names = REPORTED_AXES if {"north", "east"} <= {line.name for line in comparison.lines} else None
     tuning, clock = estimate_noises_and_clock(comparison, progress, names)
     fit, low_pass, correlated_noise = _fit_source_errors(comparison, tuning, clock)
+    source, is_odometry = comparison.source, comparison.source.orientation is not None
     return Estimates(
         tuning=tuning,
         clock=clock,
@@ -106,6 +114,8 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
         bias_scale_jump_fit=fit,
         source_low_pass=low_pass,
         time_correlated_noise=correlated_noise,
+        tuning_by_axis=() if is_odometry or source.origin.is_gnss else tune_by_axis(comparison),
+        noisy_part=None if is_odometry else find_noisy_part(comparison, tuning.get(HORIZONTAL)),
     )
 
 
