@@ -42,7 +42,7 @@ from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
 from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
 from px4fuse.findings import TITLES, Finding, find, find_aids, find_loop, source_frame  # noqa: E402
-from px4fuse.findings.cause_grouping import CONSEQUENCES, RECORDING, SETTINGS, effect_ids  # noqa: E402
+from px4fuse.findings.cause_grouping import CONSEQUENCES, RECORDING, effect_ids  # noqa: E402
 from px4fuse.findings.model import CATALOGUE, GROUPS  # noqa: E402
 from px4fuse.flight import Columns, Unavailable  # noqa: E402
 from px4fuse.report.panels import (  # noqa: E402
@@ -151,7 +151,7 @@ def examples() -> dict[str, Example]:
         if fault.id in made:
             continue
         comparison = compare(fault.fly(), Settings(**fault.settings))
-        tuned = fault.id in SETTINGS or "sigma_z_asked_m" in fault.evidence
+        tuned = fault.id.startswith("sigma_") or "sigma_z_asked_m" in fault.evidence
         analysis = with_noises(comparison) if tuned else unexplained(comparison)
         keep(
             [one for one in find(analysis) if one.id == fault.id], "a flight of the tests", analysis

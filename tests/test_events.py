@@ -76,6 +76,28 @@ def test_flight_events_outside_evaluated_segment_are_excluded() -> None:
     assert found.resets_s == (30.0,)
 
 
+def test_time_without_source_is_shown_but_not_in_statistics() -> None:
+    resets = (Reset(100.0, "position", (1.0, 0.0, 0.0)),)
+    flight = aisle_flight(uwb=Uwb(gap_s=(80.0, 130.0)), ekf2=Estimator(resets=resets))
+    whole, covered = compare(flight), compare(flight, end_s=80.0)
+    assert (whole.segment.end_s, whole.segment.flight.end_s) == (80.0, 120.0)
+    chosen = compare(flight, end_s=100.0).segment
+    assert (chosen.end_s, chosen.flight.end_s) == (80.0, 100.0)
+    events = collect_events(whole)
+    assert (events.gaps, events.resets_s, events.landing_s) == (
+        ((80.0, 120.0),),
+        (100.0,),
+        (120.0,),
+    )
+    assert collect_events(covered).gaps == ()
+    for result, other in zip(whole.axes.values(), covered.axes.values(), strict=True):
+        assert (result.filters, result.difference) == (other.filters, other.difference)
+        shown = result.in_flight
+        for name in ("ekf2_state", "ekf2_variance", "truth"):
+            assert getattr(result, name).index[-1] <= 80.0
+            assert getattr(shown, name).index[-1] > 119.0
+
+
 def test_flight_events_list_rejections_per_axis() -> None:
     comparison = compare(aisle_flight(ekf2=Estimator(rejected_fraction=0.2)))
     found = collect_events(comparison)

@@ -34,6 +34,7 @@ from findings_tools import (
     with_bias,
 )
 
+from px4fuse.comparison.flight_events import source_gaps
 from px4fuse.comparison.trials import RunStatistics, Trial
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.frame_rotation import HeadingError, HeadingPart
@@ -444,8 +445,10 @@ def test_position_gap_above_1_s_and_five_intervals_is_reported(
     for gap_s, there in ((least_s, False), (least_s + 0.25, True)):
         monkeypatch.setattr(source_intervals, "_state_errors_after", lambda *_: "Errors.")
         time = np.concatenate([np.arange(10.0, 20.5, 0.5), [20.0 + gap_s, 20.5 + gap_s]])
-        one = analysis(axes=(axis(),), source=source(rate_hz=rate_hz))
-        one.lines[0].measurement_time_s = time
+        gaps = source_gaps(time, rate_hz)
+        one = analysis(
+            axes=(axis(),), source=source(rate_hz=rate_hz), events=SimpleNamespace(gaps=gaps)
+        )
         found = list(source_intervals.detect_source_gaps(one))
         assert [each.evidence for each in found] == [
             {"count": 1, "longest_s": gap_s, "at_s": 20.0}

@@ -16,16 +16,19 @@ from exchange import replace
 from flights import Estimator, Imu, Uwb, aisle_flight, given_placement, unexplained, with_noises
 from golden_tools import assert_matches_golden, rounded, value
 
+from px4fuse.comparison.comparison import compare as compare_prepared
 from px4fuse.comparison.model import Comparison
+from px4fuse.diagnose import prepare_comparison
 from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import TITLES, Finding, find, group_by_root
 from px4fuse.findings.model import CATALOGUE, GROUPS, load_examples
-from px4fuse.flight import AXIS_NAMES, Columns, Flight, Reset, Unavailable
+from px4fuse.flight import AXIS_NAMES, AidLog, Columns, Flight, Reset, Unavailable
 from px4fuse.log import ClockMap, Dropout
 from px4fuse.position_source import ALIGNED, LOGGED_BY_EKF2
 from px4fuse.readers import read_log
+from px4fuse.request import ComparisonRequest, PositionFile
 
 ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
 NO_VISION = {"EKF2_EVP_NOISE": 0.1, "SDLOG_PROFILE": 1.0}
@@ -92,6 +95,16 @@ def as_recording(flight: Flight) -> Flight:
     none = Unavailable("EKF2 innovations", "MAVLink does not carry them", "")
     recorded = with_ekf2(innovations=dict.fromkeys(AXIS_NAMES, none))(flight)
     return with_log(format="MAVLink tlog")(recorded)
+
+
+def with_fused(flight: Flight, end_s: float) -> Flight:
+    """Log that EKF2 fused a position each 0.5 s until some time."""
+    values = {
+        "fused": 1.0, "rejected": 0.0, "innovation_north": 0.1, "variance_north": 0.02,
+        "noise_north": 0.01, "ratio_north": 0.02,
+    }  # fmt: skip
+    samples = pd.DataFrame(values, index=np.arange(0.0, end_s, 0.5))
+    return with_ekf2(aids={"ev_pos": AidLog(("a_topic",), ("north",), samples, None)})(flight)
 
 
 def with_ekf2_bias(flight: Flight) -> Flight:
@@ -193,6 +206,15 @@ FAULTS = [
     Fault("source_frame_frd", "note", flight={"uwb": Uwb(frame="FRD")}),
     Fault("source_gap", "warning", {"longest_s": about(8.0, 1e-9), "at_s": about(40.0, 1e-9)},
           {"uwb": Uwb(gap_s=(40.0, 48.0))}),
+    Fault("source_stops", "warning",
+          {"at_s": about(80.0, 1e-9), "duration_s": about(40.0, 1e-9)},
+          {"uwb": Uwb(gap_s=(80.0, 130.0))}),
+    Fault("source_stops", "error", {"at_s": about(80.0, 1e-9), "sigma_m": about(0.07, 0.1)},
+          {"uwb": Uwb(gap_s=(80.0, 130.0)), "truth": False}, change=lambda f: with_fused(f, 80.0)),
+    Fault("source_begins", "warning", {"at_s": about(40.0, 1e-9), "duration_s": about(40.0, 1e-9)},
+          {"uwb": Uwb(gap_s=(-1.0, 40.0))}),
+    Fault("source_gap_in_log", "warning", {"count": 1, "longest_s": about(8.0, 1e-9)},
+          {"uwb": Uwb(gap_s=(40.0, 48.0))}, change=lambda f: with_fused(f, 120.0)),
     Fault("source_drift", "error",
           {"filter": "ekf2", "ekf2_nees_position_mean": about(300, 0.2)},
           change=lambda f: as_odometry(with_offset_truth(f, grows=True))),
@@ -305,6 +327,48 @@ def test_crash_flight_lists_tumbling_as_first_finding(shared_logs: Path) -> None
     assert "--end 67.0" in first.remedy
     assert second.evidence["count"] == 202
     assert second.spans_s[0][0] == pytest.approx(24.9, abs=0.1)
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize(("log", "file", "finding", "at_s", "error_m"), [
+    ("conventions/stops_in_flight", None, "source_stops", 33.4, 12.2),
+    ("simulated/v1.16.1_aisle_nominal", "case17.csv", "source_stops", 50.9, 0.12),
+    ("simulated/v1.16.1_aisle_10hz", "case18.csv", "source_begins", 63.3, 0.05),
+])  # fmt: skip
+def test_source_of_part_of_flight_is_first_finding(
+    log: str, file: str | None, finding: str, at_s: float, error_m: float, shared_logs: Path
+) -> None:
+    cases = shared_logs.parent / "cases"
+    position = file and PositionFile(path=str(cases / file), frame="enu")
+    request = ComparisonRequest(log=str(shared_logs / f"{log}.ulg"), position=position or None)
+    first, *_ = found(compare_prepared(prepare_comparison(request)))
+    # EKF2 fused its own source besides the file
+    assert (first.id, first.severity) == (finding, "warning" if file else "error")
+    assert f"in flight at {at_s} s: EKF2's error is " in first.title
+    assert first.evidence["error_m"] == pytest.approx(error_m, rel=0.05)
+    assert ("dead reckoning" in first.message) == (file is None)
+
+
+@pytest.mark.parametrize(("gap_s", "reset_s", "cause"), [
+    ((-1.0, 40.0), 40.4, "source_begins"), ((80.0, 130.0), 90.0, "source_stops"),
+])  # fmt: skip
+def test_reset_in_time_without_source_has_it_as_cause(
+    gap_s: tuple[float, float], reset_s: float, cause: str
+) -> None:
+    resets = (Reset(reset_s, "position", (16.0, 0.0, 0.0)),)
+    flight = aisle_flight(uwb=Uwb(gap_s=gap_s), ekf2=Estimator(resets=resets))
+    first, reset = found(compare(flight))[:2]
+    assert (first.id, reset.id, reset.caused_by) == (cause, "ekf2_resets", cause)
+    assert "by up to 16.00 m" in reset.message
+
+
+def test_positions_lost_by_logger_are_no_gap_of_the_source(sample_flight: Flight) -> None:
+    samples = sample_flight.positions[0].samples
+    lost = with_source(samples=samples.drop(samples.loc[40.0:60.0].index))(sample_flight)
+    lost = replace(lost, positions=(*lost.positions, *sample_flight.positions[1:]))
+    (finding,) = (one for one in found(compare(lost)) if "source" in one.id)
+    assert (finding.id, finding.evidence["count"]) == ("source_gap_in_log", 1)
+    assert finding.spans_s == (pytest.approx((40.0, 60.0), abs=0.2),)
 
 
 def test_each_finding_has_a_test_with_a_simulated_fault() -> None:

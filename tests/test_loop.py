@@ -317,6 +317,18 @@ def test_loop_with_assumed_landing_point_is_reported(sample: LoopSource, sample_
     assert find_loop(analyse_loop(sample, landed_at=Landing(0.0, 0.0))) == ()
 
 
+def test_loop_of_odometry_that_stops_in_flight_has_no_end(sample: LoopSource) -> None:
+    """Without ground truth; the place at which the odometry stops is not the landing place."""
+    flight = replace(sample.flight, truth=Unavailable("ground truth", "not logged", "Log it."))
+    (start_s, landing_s), trajectory = flight.airborne[0], sample.trajectory
+    early = trajectory[trajectory.time_s < landing_s - 10.0]
+    loop = analyse(replace(sample, flight=flight, trajectory=early))
+    assert isinstance(loop.true_end, Unavailable)
+    assert (loop.closure_error_m, loop.closures) == (None, ())
+    chosen = LoopRequest(source="", start_s=start_s, end_s=landing_s - 11.0)
+    assert analyse(replace(sample, flight=flight, trajectory=early), chosen).is_end_assumed
+
+
 def test_odometry_variance_uses_growth_of_reported_variance() -> None:
     _, odometry = laps(1, 6, OdometryNoise())
     nodes = np.arange(0, len(odometry), 10)

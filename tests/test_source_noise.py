@@ -17,7 +17,6 @@ from px4fuse.filter.correlated_noise import fit_time_correlation
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, find
-from px4fuse.findings.cause_grouping import SETTINGS
 from px4fuse.findings.source_noise import detect, detect_noise_variation
 from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
@@ -63,7 +62,9 @@ def analysed(
 
 def root_findings(analysis: Analysis) -> dict[str, Finding]:
     """Findings by id without infos, KF settings and consequences."""
-    left_out = {*SETTINGS, "ekf2_not_logged"}
+    left_out = {f"sigma_{one}_too_{size}" for one in "az" for size in ("large", "small")} | {
+        "ekf2_not_logged"
+    }
     return {
         one.id: one for one in find(analysis)
         if one.severity != "note" and one.caused_by is None and one.id not in left_out

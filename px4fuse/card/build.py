@@ -37,6 +37,7 @@ from px4fuse.card.model import (
 )
 from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.card.verdicts import verdicts as make_verdicts
+from px4fuse.comparison.flight_events import MIN_GAP_S
 from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth
 from px4fuse.comparison.projection import project_horizon
 from px4fuse.comparison.remedy import aid_of
@@ -237,7 +238,7 @@ def _effect(analysis: Analysis) -> Effect:
 
 def horizontal_resets(analysis: Analysis) -> Array:
     """Return the times (s) of EKF2's horizontal position resets in the segment."""
-    ekf2, segment = analysis.flight.ekf2, analysis.segment
+    ekf2, segment = analysis.flight.ekf2, analysis.segment.flight
     times = horizontal_resets_s(ekf2) if isinstance(ekf2, Ekf2) else np.empty(0)
     return times[(segment.start_s < times) & (times <= segment.end_s)]
 
@@ -267,12 +268,14 @@ def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
 
 
 def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]) -> str:
-    sentences = []
+    sentences, segment, flight = [], analysis.segment, analysis.segment.flight
+    is_part = max(segment.start_s - flight.start_s, flight.end_s - segment.end_s) > MIN_GAP_S
+    when = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s" if is_part else ""
     if analysis.flight.airborne == ():
         return "The vehicle stayed on the ground, so the errors of the filters are not evaluated."
     if effect.position_rmse_m:
         sentences.append(
-            f"Position RMSE against ground truth along {analysis.main.axis.label}: "
+            f"Position RMSE against ground truth along {analysis.main.axis.label}{when}: "
             f"{_by_filter(effect.position_rmse_m)}"
             f"{_in_brackets('horizontal', effect.horizontal_rmse_m)}."
         )

@@ -22,7 +22,8 @@ from px4fuse.comparison.model import (
 )
 from px4fuse.filter.consistency import DEFAULT_GATE, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
-from px4fuse.flight import RECORD_NOT_LOGGED, Ekf2, Unavailable, sample_rate
+from px4fuse.filter.signals import Axis, Segment
+from px4fuse.flight import RECORD_NOT_LOGGED, Ekf2, Truth, Unavailable, sample_rate
 
 STATE_COLUMNS = ("position_m", "velocity_m_s")
 VARIANCE_COLUMNS = ("position_variance_m2", "velocity_variance_m2_s2")
@@ -57,19 +58,14 @@ def compare(prepared: Comparison, progress: Callable[[str], None] = lambda _: No
 def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay) -> AxisComparison:
     """Compare KF and EKF2 along one axis; ``ekf2`` is without the removed resets."""
     axis, segment, flight = kf_run.axis, prepared.segment, prepared.flight
-    truth = projection.project_truth(flight.truth, axis, segment)
-    state: Frame
-    variance: Frame
+    tracks = _project_tracks(ekf2, flight.truth, axis, segment)
+    state, variance, truth = tracks.values()
     innovations: Frame
-    axis_difference: Difference | Unavailable
-    gate = DEFAULT_GATE if isinstance(ekf2, Unavailable) else ekf2.gate
     if isinstance(ekf2, Unavailable):
-        state = variance = innovations = axis_difference = ekf2
+        innovations, gate = ekf2, DEFAULT_GATE
     else:
-        state = projection.project(ekf2.state, axis, segment)
-        variance = projection.project_variance(ekf2, axis, segment)
         innovations = projection.project_innovations(flight, ekf2, prepared.source, axis, segment)
-        axis_difference = difference(kf_run, state)
+        gate = ekf2.gate
     ekf2_errors = error_statistics(state, variance, truth)
     if isinstance(ekf2_errors, ErrorsAgainstTruth) and isinstance(ekf2, Ekf2):
         horizon_nees = _horizon_nees(projection.project_horizon(ekf2, axis, segment), truth)
@@ -96,15 +92,29 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
             ),
             "ekf2": _summarise_filter(innovations, variance, ekf2_errors, gate),
         },
-        difference=axis_difference,
+        difference=difference(kf_run, state),
         rejected_fraction=float(rejected.mean()) if len(rejected) else None,
         axis=axis,
         replay=kf_run,
-        ekf2_state=state,
-        ekf2_variance=variance,
         ekf2_innovations=innovations,
-        truth=truth,
+        **tracks,
+        flight_tracks=_project_tracks(ekf2, flight.truth, axis, segment.flight),
     )
+
+
+def _project_tracks(
+    ekf2: Ekf2 | Unavailable, truth: Truth | Unavailable, axis: Axis, segment: Segment
+) -> dict[str, Frame]:
+    """Project EKF2's state and variances and the ground truth onto an axis, in a segment."""
+    state: Frame
+    variance: Frame
+    if isinstance(ekf2, Unavailable):
+        state = variance = ekf2
+    else:
+        state = projection.project(ekf2.state, axis, segment)
+        variance = projection.project_variance(ekf2, axis, segment)
+    true = projection.project_truth(truth, axis, segment)
+    return {"ekf2_state": state, "ekf2_variance": variance, "truth": true}
 
 
 def _summarise_filter(
@@ -132,8 +142,10 @@ def _known_values(frame: Frame, column: str) -> pd.Series:
     return pd.Series(dtype=float) if isinstance(frame, Unavailable) else frame[column].dropna()
 
 
-def difference(kf_run: Replay, ekf2_state: pd.DataFrame) -> Difference | Unavailable:
+def difference(kf_run: Replay, ekf2_state: Frame) -> Difference | Unavailable:
     """Compute the difference KF - EKF2 along one axis at EKF2's sample times."""
+    if isinstance(ekf2_state, Unavailable):
+        return ekf2_state
     kf_minus_ekf2 = (
         np.array(state_at(kf_run, ekf2_state.index.to_numpy()))
         - ekf2_state[[*STATE_COLUMNS]].to_numpy().T

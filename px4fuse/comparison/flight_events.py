@@ -19,7 +19,7 @@ MIN_GAP_INTERVALS = 5.0
 
 @dataclass(frozen=True)
 class Events:
-    """Events in the segment of a comparison; times in s from the first data.
+    """Events of a flight, also before and after the segment; times in s from the first data.
 
     Attributes
     ----------
@@ -73,16 +73,17 @@ def airborne_spans(flight: Flight) -> tuple[Span, ...]:
 
 
 def collect_events(comparison: Comparison) -> Events:
-    """Collect the events in the segment of a comparison."""
-    flight, segment = comparison.flight, comparison.segment
+    """Collect the events in the segment of a comparison, and in flight before and after it."""
+    flight, segment = comparison.flight, comparison.segment.flight
     low, high = segment.start_s, segment.end_s
+    time_s = np.concatenate([[low], comparison.lines[0].measurement_time_s, [high]])
 
     airborne = airborne_spans(flight)
     edges = [low, *(time for span in airborne for time in span), high]
     modes = () if isinstance(flight.modes, Unavailable) else flight.modes
     resets = flight.ekf2.resets if isinstance(flight.ekf2, Ekf2) else ()
     return Events(
-        gaps=source_gaps(comparison.lines[0].measurement_time_s, comparison.source.rate_hz),
+        gaps=source_gaps(time_s, comparison.source.rate_hz),
         dropouts=segment.cut(
             (dropout.start_s, dropout.start_s + dropout.duration_s)
             for dropout in flight.log.dropouts

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import pandas as pd
+from msgspec import structs
 
 from px4fuse.errors import MissingDataError, suggest_name
 from px4fuse.filter.consistency import Consistency, HorizontalNis, classify_ratio
@@ -144,6 +145,8 @@ class AxisComparison(AxisResult, frozen=True, kw_only=True, eq=False):
         ``posterior_variance_m2`` (P⁻ = S - R and P⁺ = P⁻R/S, NaN where R is unknown).
     truth : DataFrame or Unavailable
         ``position_m, velocity_m_s`` in the segment.
+    flight_tracks : mapping from "ekf2_state", "ekf2_variance" and "truth" to their values
+        As above, but also in flight before and after the segment.
     """
 
     schema_type = AxisResult
@@ -153,8 +156,14 @@ class AxisComparison(AxisResult, frozen=True, kw_only=True, eq=False):
     ekf2_variance: pd.DataFrame | Unavailable
     ekf2_innovations: pd.DataFrame | Unavailable
     truth: pd.DataFrame | Unavailable
+    flight_tracks: Mapping[str, pd.DataFrame | Unavailable]
 
     __repr__ = one_line_repr
+
+    @property
+    def in_flight(self) -> "AxisComparison":
+        """Comparison with tracks also before and after the segment, for plots."""
+        return structs.replace(self, **self.flight_tracks)
 
 
 @dataclass(frozen=True)

@@ -281,16 +281,18 @@ def choose_segment(
         The segment is empty or contains fewer than three measurements.
     """
     source_span_s = track.samples.index[[0, -1]].tolist()
-    low, high = max(source_span_s[0], 0.0), min(source_span_s[1], flight.log.duration_s)
+    first_s, last_s = max(source_span_s[0], 0.0), min(source_span_s[1], flight.log.duration_s)
+    low, high = first_s, last_s
     if isinstance(flight.airborne, Unavailable):
         reason = "whole duration of the source (no land detector in the log)"
     elif not flight.airborne:
         reason = "whole duration of the source (the vehicle never took off)"
     else:
-        reason = "whole duration of the source (no positions in flight)"
-        flight_span_s = max(low, flight.airborne[0][0]), min(high, flight.airborne[-1][1])
-        if flight_span_s[0] < flight_span_s[1]:
-            (low, high), reason = flight_span_s, "source available and vehicle airborne"
+        low, high = flight.airborne[0][0], flight.airborne[-1][1]
+        reason = "source available and vehicle airborne"
+        if not max(low, first_s) < min(high, last_s):
+            low, high = min(low, first_s), max(high, last_s)
+            reason = "whole duration of the source (no positions in flight)"
     if start_s is not None or end_s is not None:
         low, high = low if start_s is None else start_s, high if end_s is None else end_s
         options = {"--start": start_s, "--end": end_s}
@@ -305,7 +307,10 @@ def choose_segment(
             f"source runs from {source_span_s[0]:.2f} s to {source_span_s[1]:.2f} s. Change "
             "--start or --end."
         )
-    segment = Segment(low, high, reason)
+    start, end = max(low, first_s), min(high, last_s)
+    if start >= end:
+        start, end = low, high
+    segment = Segment(start, end, reason, (low, high))
     count = len(cut_to_segment(track.samples, segment))
     if count < MIN_MEASUREMENTS:
         raise SettingsError(

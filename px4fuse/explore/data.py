@@ -58,6 +58,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> Data:
         "log": analysis.flight.log.name,
         "settings": _settings_data(analysis.settings),
         "main": analysis.main.axis.name,
+        "shown": [analysis.segment.flight.start_s, analysis.segment.flight.end_s],
         **signals,
         "axes": [
             axis_signals | _axis_data(analysis, result, packer)
@@ -195,8 +196,8 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Da
         "bands": _nis_bands(len(result.axis.measurement_time_s), packer),
         # horizontal axes share their likelihood map if it exists
         "map": HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name,
-        "ekf2": _ekf2_data(analysis, result, packer),
-        "truth": _truth_data(result, packer),
+        "ekf2": _ekf2_data(analysis, result.in_flight, packer),
+        "truth": _truth_data(result.in_flight, packer),
     }
 
 

@@ -5,7 +5,7 @@ const Times = (() => {
 
   function start(page) {
     const { flight, settings, model, setSource, timeRange, figures, redraw, shifted, isVisible, keys: otherKeys } = page;
-    const ends = flight.segment;
+    const ends = flight.shown;
 
     // ------------------------------------------------------------------ visible time range
     let waiting = false;

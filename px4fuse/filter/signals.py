@@ -5,6 +5,8 @@ The aisle is the main horizontal direction of the flight.
 NED acceleration = R(q) · specific force + [0, 0, g] (Groves 2013, eq. 5.52 without earth rate).
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -30,11 +32,21 @@ MIN_MEASUREMENTS = 3  # minimum number of position measurements along an axis
 
 @dataclass(frozen=True)
 class Segment:
-    """Analysed part of a flight: start and end (s), and the reason for choosing it."""
+    """Analysed part of a flight: start and end (s), and the reason for choosing it.
+
+    ``flight_s`` also contains the times in flight (or chosen) before and after it, which have no
+    positions; None if there are none.
+    """
 
     start_s: float
     end_s: float
     reason: str
+    flight_s: Span | None = None
+
+    @property
+    def flight(self) -> Segment:
+        """Segment with the times without positions before and after it."""
+        return Segment(*(self.flight_s or (self.start_s, self.end_s)), self.reason)
 
     def cut(self, spans: Iterable[Span]) -> tuple[Span, ...]:
         """Return the parts of time spans (s) that are inside the segment."""

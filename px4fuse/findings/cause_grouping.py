@@ -56,9 +56,12 @@ RECORDING = frozenset(
         "logger_dropouts",
         "imu_rate_too_low",
         "source_rate_limited_by_logger",
+        "source_begins",
         "source_gap",
+        "source_gap_in_log",
         "source_not_logged",
         "source_samples_lost",
+        "source_stops",
         "too_few_innovations",
     }
 )

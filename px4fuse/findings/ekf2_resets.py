@@ -17,7 +17,7 @@ AFTER_GAP_S = 5.0
 
 def detect(analysis: Analysis) -> Findings:
     """Detect position resets and instance changes in the segment."""
-    ekf2, segment = analysis.flight.ekf2, analysis.segment
+    ekf2, segment = analysis.flight.ekf2, analysis.segment.flight
     if not isinstance(ekf2, Ekf2):
         return
     resets = [
@@ -34,13 +34,15 @@ def detect(analysis: Analysis) -> Findings:
         sizes_m = [float(np.linalg.norm(reset.delta)) for reset in counted]
         follows_gap = all(_follows_gap(analysis, reset) for reset in counted)
         at_s = counted[int(np.argmax(sizes_m))].time_s
-        _, treatment = continuous_state(ekf2, analysis.source, segment)
+        _, treatment = continuous_state(ekf2, analysis.source, analysis.segment)
+        if treatment:
+            treatment = f" In the comparison: {treatment}."
         yield finding(
             "warning" if horizontal else "note",
             "ekf2_resets",
             f"EKF2 reset its {'horizontal position' if horizontal else 'height'} "
             f"{format_count(len(counted))}, by up to {max(sizes_m):.2f} m. The largest reset is at "
-            f"{at_s:.1f} s. In the comparison: {treatment}.",
+            f"{at_s:.1f} s.{treatment}",
             f"Run px4fuse explore LOG and compare position and innovation at {at_s:.1f} s.",
             {
                 "count": len(counted),

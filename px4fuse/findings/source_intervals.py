@@ -11,13 +11,16 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.comparison.flight_events import max_interval_s, source_gaps
-from px4fuse.ekf2_parameters import AIDS, EV_POS
+from px4fuse.comparison.comparison import reported_sigma
+from px4fuse.comparison.flight_events import max_interval_s
+from px4fuse.ekf2.aids import NOT_FUSED_LIMIT_S
+from px4fuse.ekf2_parameters import AIDS, EV_POS, Aid
 from px4fuse.filter.kalman import state_at, variance_at
 from px4fuse.filter.signals import cut_to_segment
+from px4fuse.finding import Finding
 from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL_S
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
-from px4fuse.flight import Ekf2, Unavailable, positions_of
+from px4fuse.flight import Ekf2, Unavailable, positions_of, step_values_at
 from px4fuse.position_source import ALIGNED, PositionKind
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 from px4fuse.record import Span
@@ -33,6 +36,9 @@ MIN_NEIGHBOURS_SHARE, MIN_MULTIPLE_SHARE = 0.85, 0.1
 # 0.03 with the jitter of a source
 MAX_MULTIPLE_RMS = 0.06
 MAX_DIVISOR = 4  # median interval over source interval that is tested
+# Minimum flight time without a source that begins or stops in flight: the land detector is seconds
+# late
+MIN_PARTIAL_S = 3.0
 SMALLEST_TIME_S = 1e-6  # s; KF at this time before a position has not used the position
 # Things to check after a gap in the position source, by its kind
 CHECKS: Mapping[PositionKind, str] = {
@@ -52,20 +58,104 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_source_gaps(analysis: Analysis) -> Findings:
-    """Detect gaps in the position source."""
-    spans = source_gaps(analysis.lines[0].measurement_time_s, analysis.source.rate_hz)
+    """Detect gaps in the position source, or in its log, and a source that does not last."""
+    flight, source, ekf2 = analysis.segment.flight, analysis.source, analysis.flight.ekf2
+    spans, logged_spans = list[Span](), list[Span]()
+    for span in analysis.events.gaps:
+        aids = _continuously_fused_aids(ekf2, span)
+        if source.origin.aid in aids and source.alignment is None:
+            logged_spans.append(span)
+        elif span[0] == flight.start_s or span[1] == flight.end_s:
+            if span[1] - span[0] > MIN_PARTIAL_S:
+                yield _partial_source(analysis, span, aids)
+        else:
+            spans.append(span)
+    positions = capitalise_first(positions_of(source))
+    if logged_spans:
+        start_s, end_s, longest = _longest(logged_spans)
+        yield warning(
+            "source_gap_in_log",
+            f"{positions} are missing in the log for {end_s - start_s:.1f} s{longest}, but EKF2 "
+            "fused them. The source did not stop; KF has no measurement in this time.",
+            _logged_elsewhere(analysis, start_s, end_s),
+            {"count": len(logged_spans), "longest_s": end_s - start_s, "at_s": start_s},
+            tuple(logged_spans),
+        )
     if spans:
-        start_s, end_s = longest_s = max(spans, key=lambda gap: gap[1] - gap[0])
-        count = len(spans)
-        longest = "" if count == 1 else f", the longest of {count} gaps"
+        start_s, end_s, longest = _longest(spans)
         yield warning(
             "source_gap",
             f"No position for {end_s - start_s:.1f} s{longest}. "
-            f"{_state_errors_after(analysis, longest_s)}",
-            f"Check {CHECKS[analysis.source.origin.kind]} at {start_s:.1f} s.",
-            {"count": count, "longest_s": end_s - start_s, "at_s": start_s},
-            spans,
+            f"{_state_errors_after(analysis, (start_s, end_s))}",
+            f"Check {CHECKS[source.origin.kind]} at {start_s:.1f} s.",
+            {"count": len(spans), "longest_s": end_s - start_s, "at_s": start_s},
+            tuple(spans),
         )
+
+
+def _longest(gaps: list[Span]) -> tuple[float, float, str]:
+    """Return start and end (s) of the longest gap, and the text for more than one gap."""
+    start_s, end_s = max(gaps, key=lambda gap: gap[1] - gap[0])
+    return start_s, end_s, "" if len(gaps) == 1 else f", the longest of {len(gaps)} gaps"
+
+
+def _logged_elsewhere(analysis: Analysis, start_s: float, end_s: float) -> str:
+    """Return the option for a track that contains the gap, or else what to check."""
+    for track in analysis.flight.positions:
+        if track.origin.aid == analysis.source.origin.aid and len(track.samples[start_s:end_s]) > 2:
+            return f"Add --position-source {track.name}, which contains these positions."
+    return "Use a faster SD card, or log fewer topics (SDLOG_PROFILE)."
+
+
+def _partial_source(analysis: Analysis, span_s: Span, aids: list[Aid]) -> Finding:
+    """Make the finding of a source that begins or stops in flight, with EKF2's error then."""
+    (start_s, end_s), source = span_s, analysis.source
+    stops = end_s == analysis.segment.flight.end_s
+    event, at_s, when = ("stop", start_s, "after") if stops else ("begin", end_s, "before")
+    action = "" if stops or source.alignment else " Take off only when positions arrive."
+    at_end, duration_s = _ekf2_at_end(analysis, span_s), end_s - start_s
+    later = f"after {duration_s:.1f} s" if stops else "just before"
+    effect = f", {duration_s:.1f} s {'before the end' if stops else 'after the start'}"
+    if "error_m" in at_end:
+        effect = f": EKF2's error is {format_metres(at_end['error_m'])} m {later}"
+    elif "sigma_m" in at_end:
+        effect = f": EKF2's reported σ is {format_metres(at_end['sigma_m'])} m {later}"
+    has_aids, aiding = _has_aids(analysis.flight.ekf2), ""
+    if has_aids:
+        labels = " and ".join(aid.label for aid in aids) or "the IMU alone (dead reckoning)"
+        aiding = f"For {duration_s:.1f} s EKF2 relied on {labels}. "
+    return finding(
+        "error" if has_aids and not aids and duration_s > NOT_FUSED_LIMIT_S else "warning",
+        "source_stops" if stops else "source_begins",
+        f"{capitalise_first(positions_of(source))} {event} in flight at {at_s:.1f} s{effect}. "
+        f"{aiding}KF, RMSE and verdicts do not include this time.",
+        f"Check {CHECKS[source.origin.kind]} {when} {at_s:.1f} s.{action}",
+        {"at_s": at_s, "duration_s": duration_s, **at_end},
+        (span_s,),
+    )
+
+
+def _ekf2_at_end(analysis: Analysis, span_s: Span) -> dict[str, float]:
+    """Return EKF2's last horizontal error and reported σ (m) in a span, if they are known."""
+    axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
+    squares_m2 = []
+    for result in axes if len(axes) == 2 else [analysis.main]:
+        tracks = result.in_flight
+        if isinstance(tracks.ekf2_state, Unavailable):
+            return {}
+        position_m = tracks.ekf2_state["position_m"].loc[slice(*span_s)]
+        time_s, true_m = position_m.index.to_numpy(), np.full(len(position_m), np.nan)
+        if isinstance(tracks.truth, pd.DataFrame):
+            true = tracks.truth["position_m"]
+            true_m = np.interp(time_s, true.index, true, np.nan, np.nan)
+        sigma_m = reported_sigma(time_s, tracks.ekf2_variance, "position_variance_m2")
+        squares_m2.append([(position_m - true_m) ** 2, sigma_m**2])
+    sums_m2 = zip(("error_m", "sigma_m"), np.sum(squares_m2, axis=0), strict=True)
+    return {
+        name: float(np.sqrt(values[np.isfinite(values)][-1]))
+        for name, values in sums_m2
+        if np.isfinite(values).any()
+    }
 
 
 def _state_errors_after(analysis: Analysis, gap_s: Span) -> str:
@@ -84,9 +174,11 @@ def _state_errors_after(analysis: Analysis, gap_s: Span) -> str:
     texts = []
     aiding = "KF relies on the IMU alone."
     if isinstance(ekf2, pd.DataFrame) and len(before := ekf2["position_m"].loc[:end_s]):
-        aiding = "KF and EKF2 rely on the IMU alone."
+        if _has_aids(analysis.flight.ekf2):
+            aiding = "KF and EKF2 rely on the IMU alone."
         if other_aids := _continuously_fused_aids(analysis.flight.ekf2, gap_s):
-            aiding = f"KF relies on the IMU alone, EKF2 also on {' and '.join(other_aids)}."
+            labels = " and ".join(aid.label for aid in other_aids)
+            aiding = f"KF relies on the IMU alone, EKF2 also on {labels}."
         variance, at_s = result.ekf2_variance, float(before.index[-1])
         sigma = ""
         if isinstance(variance, pd.DataFrame) and len(variance):
@@ -100,17 +192,28 @@ def _state_errors_after(analysis: Analysis, gap_s: Span) -> str:
     return f"{aiding} {quantity} along {axis.label}: {', '.join(texts)}."
 
 
-def _continuously_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[str]:
-    """Return the labels of aids that EKF2 fused without a gap of half of the span (s)."""
-    labels, (start_s, end_s) = [], span_s
+def _has_aids(ekf2: Ekf2 | Unavailable) -> bool:
+    """Return True if the log shows which aids EKF2 fused."""
+    return isinstance(ekf2, Ekf2) and bool(ekf2.aids)
+
+
+def _continuously_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[Aid]:
+    """Return the horizontal aids that EKF2 fused without a gap of half of the span (s)."""
+    aids, (start_s, end_s) = list[Aid](), span_s
     for name in (EV_POS.name, *OTHER_HORIZONTAL_AIDS):
         log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get(name)
-        if log is not None and "fused" in log.samples:
-            fused = log.samples["fused"].loc[start_s:end_s]
-            times_s = [start_s, *fused.index[fused > 0.0], end_s]
-            if np.diff(times_s).max() < 0.5 * (end_s - start_s):
-                labels.append(AIDS[name].label)
-    return labels
+        if log is None:
+            continue
+        samples = log.samples.loc[start_s:end_s]
+        is_fused = np.zeros(len(samples), bool)
+        if "fused" in samples:
+            is_fused = samples["fused"].to_numpy() > 0.0
+        elif log.enabled is not None:
+            is_fused = step_values_at(log.enabled, samples.index) > 0.0
+        times_s = [start_s, *samples.index[is_fused], end_s]
+        if np.diff(times_s).max() < 0.5 * (end_s - start_s):
+            aids.append(AIDS[name])
+    return aids
 
 
 def detect_lost_samples(analysis: Analysis) -> Findings:

@@ -6,6 +6,7 @@ import numpy as np
 
 from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
+from px4fuse.filter.signals import Segment
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop import loop_segment
 from px4fuse.loop.closure import choose_key_frames, default_key_frame_spacing_m, to_z_down
@@ -82,7 +83,7 @@ def analyse(
         if end_truth is None
         else loop_segment.read_end_from_truth(path, end_truth, segment, rests_at_ends)
     )
-    true_end = _find_true_end(path, request, truth_end)
+    true_end = _find_true_end(path, request, truth_end, segment)
     given_closures = [
         GivenClosure(to_track_time(c.time_1_s), to_track_time(c.time_2_s), c.sigma_m)
         for c in request.closures
@@ -150,7 +151,7 @@ def analyse(
 
 
 def _find_true_end(
-    path: Trajectory, request: LoopRequest, truth_end: TrueEnd | str | None
+    path: Trajectory, request: LoopRequest, truth_end: TrueEnd | str | None, segment: Segment
 ) -> TrueEnd | Unavailable:
     """Return the landing place: as measured, or from ground truth, or else the take-off place."""
     if request.landed_at is not None:
@@ -161,7 +162,20 @@ def _find_true_end(
         return loop_segment.convert_measured_end(path, request.landed_at)
     if not request.closed_loop:
         return Unavailable("loop closure error", "--open declares the loop open", "Omit --open.")
-    return truth_end if isinstance(truth_end, TrueEnd) else loop_segment.assume_end_at_takeoff(path)
+    if isinstance(truth_end, TrueEnd):
+        return truth_end
+    flight = segment.flight
+    if (
+        max(segment.start_s - flight.start_s, flight.end_s - segment.end_s)
+        > loop_segment.REST_TIME_S
+    ):
+        return Unavailable(
+            "loop closure error",
+            f"{path.name} has poses only from {segment.start_s:.1f} s to {segment.end_s:.1f} s, a "
+            "part of the flight",
+            "Choose a part that is a loop with --from and --to.",
+        )
+    return loop_segment.assume_end_at_takeoff(path)
 
 
 def _is_absolute(trajectory: Trajectory, flight: Flight) -> bool:

@@ -77,18 +77,19 @@ def choose_loop_segment(
         The segment is empty.
     """
     low_s, high_s = span_s = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
-    rests_at_ends = False
+    rests_at_ends, flight_s = False, None
     if flight is None:
         reason = "the whole trajectory"
     elif isinstance(flight.airborne, Unavailable) or not flight.airborne:
         reason = "the whole track, because the log has no land detector"
     else:
-        low_s = max(low_s, flight.airborne[0][0])
-        high_s = min(high_s, flight.airborne[-1][1])
+        take_off_s, landing_s = flight.airborne[0][0], flight.airborne[-1][1]
+        low_s, high_s = max(low_s, take_off_s), min(high_s, landing_s)
         reason = "from take-off to landing, by the land detector"
         if len(flight.airborne) > 1:
             reason = f"from the first take-off to the last of {len(flight.airborne)} landings"
-        rests_at_ends = start_s is None and end_s is None
+        if start_s is None and end_s is None:
+            rests_at_ends, flight_s = True, (take_off_s, landing_s)
     if start_s is not None or end_s is not None:
         low_s = low_s if start_s is None else start_s
         high_s = high_s if end_s is None else end_s
@@ -102,7 +103,7 @@ def choose_loop_segment(
     inside_s = max(low_s, span_s[0]), min(high_s, span_s[1])
     if inside_s != (low_s, high_s) and inside_s[0] < inside_s[1]:
         reason, (low_s, high_s) = f"{reason}, cut at the ends of the data", inside_s
-    return Segment(low_s, high_s, reason), rests_at_ends
+    return Segment(low_s, high_s, reason, flight_s), rests_at_ends
 
 
 def heading_change_deg(path: Trajectory) -> float | None:

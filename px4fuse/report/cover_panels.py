@@ -177,7 +177,8 @@ def _draw_strips(
         is_last = strip is strips[-1]
         axes_height = height - _head_height(page, strip.title) - BELOW[is_last]
         axes = page.panel(strip.title, "", axes_height, above=4.0, left=LEFT, is_compact=True)
-        axes.set_xlim(analysis.segment.start_s, analysis.segment.end_s)
+        shown = analysis.segment.flight
+        axes.set_xlim(shown.start_s, shown.end_s)
         axes.locator_params(axis="x", nbins=_tick_count(page))
         strip.draw(axes)
         style.label_time_axis(axes, is_last)
@@ -207,7 +208,7 @@ def _head_height(page: Page, title: str) -> float:
 
 def _error_strips(analysis: Analysis, card: Card) -> list[Strip]:
     """Return a plot of the position error of each filter, or of KF - EKF2 without ground truth."""
-    result, effect = analysis.main, card.effect
+    result, effect = analysis.main.in_flight, card.effect
     errors_by_filter = {
         owner: errors
         for owner in FILTERS
@@ -394,7 +395,7 @@ def _innovation_strip(result: AxisComparison) -> Strip:
 
 def _tracks(analysis: Analysis) -> dict[str, Coordinates]:
     """Return north and east (m) of positions, KF, EKF2 and ground truth within the segment."""
-    segment, flight = analysis.segment, analysis.flight
+    segment, flight = analysis.segment.flight, analysis.flight
 
     def cut(frame: pd.DataFrame) -> Coordinates:
         inside = cut_to_segment(frame, segment)

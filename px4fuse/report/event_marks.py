@@ -79,7 +79,7 @@ def draw_marks(
     from matplotlib.collections import PolyCollection  # noqa: PLC0415
     from matplotlib.lines import Line2D  # noqa: PLC0415
 
-    segment, x_transform = analysis.segment, axes.get_xaxis_transform()
+    segment, x_transform = analysis.segment.flight, axes.get_xaxis_transform()
     axes.set_xlim(segment.start_s, segment.end_s)
     name = analysis.main.axis.name if axis is None else axis
     marks = _marks(analysis, analysis.events.rejected_s.get(name, ()))

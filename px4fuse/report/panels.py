@@ -90,7 +90,7 @@ class Panel(NamedTuple):
         )
         if is_narrow:
             axes.locator_params(axis="x", nbins=4)
-        self.draw(axes, result)
+        self.draw(axes, result.in_flight)
         page.write_small(numbers)
 
 
@@ -260,13 +260,13 @@ def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
     start, end = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])
     largest = {
         name: float(np.sqrt(frame.loc[start:end, "position_variance_m2"].max()))
-        for name, frame in (("KF", result.replay.steps), ("EKF2", result.ekf2_variance))
-        if isinstance(frame, pd.DataFrame)
+        for name, frame in (("KF", result.replay.steps), ("EKF2", result.in_flight.ekf2_variance))
+        if isinstance(frame, pd.DataFrame) and len(frame.loc[start:end]) > 1
     }
     growth = " and ".join(
         f"{sigma:.2g} m ({name})" for name, sigma in largest.items() if np.isfinite(sigma)
     )
-    return f"In the {end - start:.1f} s gap from {start:.0f} s, σ grew to {growth}."
+    return growth and f"In the {end - start:.1f} s gap from {start:.0f} s, σ grew to {growth}."
 
 
 def _medians(result: AxisComparison, quantity: Quantity) -> str:
