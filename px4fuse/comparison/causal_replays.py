@@ -110,7 +110,7 @@ class Intervention(Record, frozen=True, kw_only=True):
         from above), ``outliers_left_out`` (number), and the removed accelerometer biases
         ``bias_forward_m_s2`` and ``bias_right_m_s2``.
     before, after : float
-        Statistic without the change (EKF2: from the log) and with it (from a re-run).
+        Statistic of a re-run without the change and with it, of the same samples.
     explained_fraction : float
         Fraction of ln(statistic) that the change removes; above 1 the change overshoots. For the
         RMS difference, the fraction of the mean square.
@@ -322,14 +322,11 @@ def _try_for_discrepancy(
     each: _Filter, result: AxisComparison, statistic: Statistic, changes: Sequence[Change]
 ) -> list[Intervention]:
     """Re-run each change that may explain a discrepancy; if none suffices, also pairs."""
-    summary = result.filters[each.name]
-    assert isinstance(summary, FilterSummary)  # else it has no discrepancy
-    truth = summary.truth
-    nees = None if isinstance(truth, Unavailable) else truth.nees_position_mean
-    before = summary.nis_mean if nees is None or statistic == "nis" else nees
-    is_checked_by_truth = (
-        statistic == "nis" and before < 1.0 and not isinstance(result.truth, Unavailable)
-    )
+    flown = each.rerun(result, {})
+    before, nees = flown.value(statistic), flown.nees_mean
+    if not before:
+        return []
+    is_checked_by_truth = statistic == "nis" and before < 1.0
     max_nees = MAX_NEES_AFTER_CHANGE if nees is not None and nees > 1.0 else MIN_NEES_FINDING
 
     def explain(change: Change) -> list[Intervention]:
