@@ -32,8 +32,10 @@ from exchange import replace  # noqa: E402
 from flights import aisle_flight, unexplained, with_noises  # noqa: E402
 from source_errors import coloured, held, laid_over, two_levels, white  # noqa: E402
 from test_aids import aid_log, outage_free, steps  # noqa: E402
+from test_convention import examples as convention_examples  # noqa: E402
 from test_findings import FAULTS  # noqa: E402
 from test_loop import LAP_S, TRUE, GivenClosure, OdometryNoise, laps  # noqa: E402
+from test_source_values import examples as value_examples  # noqa: E402
 
 import px4fuse  # noqa: E402
 from px4fuse.analysis import Analysis  # noqa: E402
@@ -44,13 +46,11 @@ from px4fuse.filter.settings import Settings  # noqa: E402
 from px4fuse.findings import TITLES, Finding, find, find_aids, find_loop, source_frame  # noqa: E402
 from px4fuse.findings.cause_grouping import CONSEQUENCES, RECORDING, effect_ids  # noqa: E402
 from px4fuse.findings.model import CATALOGUE, GROUPS  # noqa: E402
-from px4fuse.flight import Columns, Unavailable  # noqa: E402
+from px4fuse.flight import Columns  # noqa: E402
 from px4fuse.report.panels import (  # noqa: E402
-    ERROR,
     INNOVATIONS,
     POSITION,
     SIGMA_P,
-    error_reference,
 )
 from px4fuse.simulation.flights import simulate_flight  # noqa: E402
 from px4fuse.simulation.mistakes import parse  # noqa: E402
@@ -125,6 +125,8 @@ def examples() -> dict[str, Example]:
         made_of = {**options, "source": f"{ROOT}/{options['source']}"}
         typed = f"px4fuse loop {options['source']} {drift_option}".strip()
         keep(find_loop(px4fuse.close_loop(**made_of)), f"`{typed}`")
+    keep(convention_examples(), "a simulated loop with changed positions")
+    keep(value_examples(), "a flight of the tests")
     _, odometry = laps(3, 5, OdometryNoise())
     wrong = GivenClosure(20.0, 21.5 + LAP_S, 0.05)
     keep(
@@ -280,9 +282,8 @@ def picture(name: str, example: Example, folder: Path) -> str:
     axis = example.finding.evidence.get("axis")
     assert example.analysis is not None
     shown = example.analysis.axes.get(str(axis)) or example.analysis.main
-    error = POSITION if isinstance(error_reference(shown), Unavailable) else ERROR
     figure, panels = pyplot.subplots(3, sharex=True, figsize=(8, 7), layout="constrained")
-    for axes, panel in zip(panels, (error, INNOVATIONS, SIGMA_P), strict=True):
+    for axes, panel in zip(panels, (POSITION, INNOVATIONS, SIGMA_P), strict=True):
         panel.draw(axes, shown)
         axes.set_ylabel(fill(panel.full_title(shown), LABEL_WIDTH))
     panels[0].set_title(shown.axis.name)

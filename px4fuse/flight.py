@@ -49,6 +49,9 @@ SOURCE_NAMES: Mapping[PositionKind, str] = {
 }
 
 
+NO_INVALID_ROWS: pd.Series[str] = pd.Series(dtype=str, index=pd.Index([], dtype=np.float64))
+
+
 class Columns:
     """Column names of all tables of a flight, with units."""
 
@@ -188,6 +191,14 @@ class PositionTrack:
         the position of the sensor.
     notes : tuple of str
         Sentences on joined and dropped samples.
+    invalid : Series
+        Rows of the source that are no measurement and not in ``samples``, by time, with the reason:
+        "NaN", "zero" (0, 0, 0 without a position) or "held" (the last position sent again).
+    status : DataFrame
+        ``reset_counter``, ``quality`` and ``age_s`` (arrival - timestamp) at the times of the
+        source; only those that are logged.
+    step_m : float
+        Rounding step of the coarsest horizontal coordinate as sent; 0 if there is none.
     """
 
     name: str
@@ -206,6 +217,9 @@ class PositionTrack:
     barometer: pd.DataFrame | None = None
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     notes: tuple[str, ...] = ()
+    invalid: pd.Series[str] = field(default_factory=lambda: NO_INVALID_ROWS)
+    status: pd.DataFrame = field(default_factory=pd.DataFrame)
+    step_m: float = 0.0
 
     __repr__ = one_line_repr
 
@@ -436,6 +450,12 @@ class Ekf2:
         Data at the fusion horizon.
     aids : mapping from PX4 name to AidLog
         Logged data of all aids that EKF2 can fuse.
+    states : mapping from name to Series
+        Step functions, only those that are logged: 1 while an aid is enabled, by its PX4 name;
+        ``tilt_align``, ``yaw_align``, ``gnss_fault``, and the keys of :attr:`FusionRecord.states`;
+        ``xy_valid``, ``xy_global``; ``failed_checks``: ``estimator_status.gps_check_fail_flags``.
+    parameters : mapping
+        All EKF2_ parameters at the start of the log, by PX4 name, in PX4 units.
     """
 
     state: pd.DataFrame
@@ -452,6 +472,8 @@ class Ekf2:
     horizon_s: float | Unavailable = HORIZON_NOT_LOGGED
     record: FusionRecord | Unavailable = RECORD_NOT_LOGGED
     aids: Mapping[str, AidLog] = field(default_factory=dict)
+    states: StepFunctions = field(default_factory=dict)
+    parameters: Mapping[str, float] = field(default_factory=dict)
 
     __repr__ = one_line_repr
 

@@ -8,6 +8,10 @@ from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import Count, NotNegative, Record, Sha256, Share
 
+SHARED_STAMPS = "most samples share a timestamp"
+# Clock of timestamps that PX4 converted or replaced
+SENDER_CLOCK = "sender timestamps"
+
 
 class Dropout(Record, frozen=True):
     """Time span (s) in which the logger of the autopilot lost data."""

@@ -21,7 +21,7 @@ from px4fuse.filter.signals import Segment
 from px4fuse.filter.time_offset import ClockOffset, PartOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings import Finding
-from px4fuse.flight import Columns, Ekf2, FusionRecord, Unavailable
+from px4fuse.flight import NO_INVALID_ROWS, Columns, Ekf2, FusionRecord, Unavailable
 from px4fuse.position_source import RECEIVED
 
 T = TypeVar("T")
@@ -71,11 +71,20 @@ def log(**parts: Any) -> Any:
     return SimpleNamespace(**{**usual, **parts})
 
 
+def moving(rate_hz: float) -> pd.DataFrame:
+    """Make positions that move north at 1 m/s, regular to 0.1 ms."""
+    time_s = np.arange(0.0, 120.0, 1.0 / rate_hz)
+    time_s[1::2] += 1e-4
+    return positions(time_s, time_s)
+
+
 def source(**parts: Any) -> Any:
     usual = {
         "name": "uwb", "description": "UWB", "origin": RECEIVED, "orientation": None,
         "frame": "NED",
         "clock_map": None, "alignment": None, "rate_hz": 5.0, "age_s": 0.0,
+        "samples": moving(parts.get("rate_hz", 5.0)), "status": pd.DataFrame(), "velocity": None,
+        "invalid": NO_INVALID_ROWS,
     }  # fmt: skip
     made = {**usual, **parts}
     return SimpleNamespace(aid=lambda axis: made["origin"].aid, **made)
@@ -94,7 +103,8 @@ def analysis(
 ) -> Analysis:  # fmt: skip
     """Make an analysis; fields that are not given are Unavailable."""
     if isinstance(ekf2, dict):
-        ekf2 = made(Ekf2, **ekf2)
+        usual_ekf2 = {"states": {}, "parameters": {}, "aids": {}, "record": NONE}
+        ekf2 = made(Ekf2, **{**usual_ekf2, **ekf2})
     usual_flight = {"imu": NONE, "attitude": NONE, "positions": (), "streams": {}, "airborne": NONE}
     flown = {**usual_flight, **(flight or {})}
     usual = dict.fromkeys(

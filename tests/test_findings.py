@@ -113,6 +113,14 @@ def with_ekf2_bias(flight: Flight) -> Flight:
     return with_ekf2(accelerometer_bias=zero + np.array([0.2, -0.1, 0.2]))(flight)
 
 
+def with_invalid_position(flight: Flight) -> Flight:
+    """Let EKF2 drift to the north by 1 m/s, with xy_valid 0, from 80 s on."""
+    state = flight.ekf2.state.copy()
+    state["north_m"] += np.clip(state.index - 80.0, 0.0, None)
+    valid = pd.Series([1.0, 0.0], index=[0.0, 80.0])
+    return with_ekf2(state=state, states={"xy_valid": valid})(flight)
+
+
 def as_odometry(flight: Flight) -> Flight:
     """Give the source an orientation that rotates, as VIO does."""
     (track,) = flight.positions
@@ -174,6 +182,8 @@ FAULTS = [
           ekf2(fusing=((0.0, 0.0), (90.0, 1.0)))),
     Fault("ekf2_fusion_interrupted", "warning", {"fused_fraction": about(0.90, 0.01)},
           ekf2(fusing=((0.0, 1.0), (60.0, 0.0), (72.0, 1.0)))),
+    Fault("ekf2_position_invalid", "error", {"invalid_fraction": about(0.333, 0.01)},
+          change=with_invalid_position),
     Fault("ekf2_rejects_positions", "error",
           {"rejected_fraction": about(0.5, 0.2), "axis": "aisle"},
           ekf2(rejected_fraction=0.5)),
@@ -247,15 +257,19 @@ FAULTS = [
 TESTED_ELSEWHERE = {
     "accelerometer_bias", "aid_innovation_bias", "aid_innovation_shift", "aid_not_fused",
     "aid_overconfident", "ekf2_ev_delay_wrong", "ekf2_gate_too_small", "ekf2_heading_error",
-    "ekf2_noise_too_large", "ekf2_noise_too_small",
-    "false_loop_closure", "loop_closure_inconsistent", "loop_drift_too_small",
-    "loop_landing_assumed", "loop_on_absolute_positions", "sigma_a_too_large",
-    "sigma_a_too_small", "sigma_z_too_large", "sigma_z_too_small", "source_downsampled",
+    "ekf2_noise_too_large", "ekf2_noise_too_small", "false_loop_closure",
+    "loop_closure_inconsistent", "loop_drift_too_small", "loop_landing_assumed",
+    "loop_on_absolute_positions", "sigma_a_too_large", "sigma_a_too_small", "sigma_z_too_large",
+    "sigma_z_too_small", "source_axes_wrong", "source_convention_ambiguous", "source_downsampled",
     "source_frame_misaligned", "source_low_pass_filtered", "source_noise_time_correlated",
-    "source_noise_unequal_axes", "source_noise_varies", "source_outliers",
-    "source_position_jump", "source_reported_variance_wrong", "source_samples_repeated",
-    "source_scale_error", "source_time_offset", "source_time_offset_changes",
-    "source_timestamps_are_arrival_times",
+    "source_noise_unequal_axes", "source_noise_varies", "source_orientation_copied",
+    "source_orientation_wrong", "source_outliers", "source_position_jump",
+    "source_reported_variance_wrong", "source_samples_repeated", "source_scale_error",
+    "source_time_offset", "source_time_offset_changes", "source_timestamps_are_arrival_times",
+    "source_unit_wrong", "source_is_ekf2_estimate", "source_two_senders",
+    "source_positions_rounded", "source_lever_arm", "source_timestamp_unit",
+    "source_timestamps_shared", "source_position_held", "source_zero_positions",
+    "source_without_position",
 }  # fmt: skip
 # Second finding of severity error that the mistake causes
 ALSO_ERROR = {

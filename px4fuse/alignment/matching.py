@@ -70,8 +70,6 @@ class Match:
         Fit with estimated yaw.
     is_rotated : bool
         True if the frame of the file is misaligned; the time offset is then from ``free_yaw_fit``.
-    better_frame : str
-        Other frame in which the file fits without rotation; "" if there is none.
     """
 
     reference: SampledTrack
@@ -80,7 +78,6 @@ class Match:
     fit: Fit
     free_yaw_fit: Fit
     is_rotated: bool
-    better_frame: str = ""
 
     @property
     def time_offset_fit(self) -> Fit:
@@ -158,23 +155,7 @@ def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
             fit.concordance < MIN_CONCORDANCE[name]
             or needs_rotation(fit.horizontal_rms_m, free_yaw_fit, name)
         )
-        better_frame = ""
-        if is_rotated and frame and yaw_rad is not None:
-            other_fits = {
-                tried_frame: fit_frame(tried_frame, yaw_rad)
-                for tried_frame in tracks.FRAMES
-                if tried_frame != frame
-            }
-            other_frame, other_fit = min(other_fits.items(), key=lambda item: item[1].rms_m)
-            is_other_fit_good = other_fit.concordance >= GOOD_CONCORDANCE[name]
-            better_frame = (
-                other_frame
-                if is_other_fit_good and MIN_ROTATION_RATIO * other_fit.rms_m < fit.rms_m
-                else ""
-            )
-        matches.append(
-            Match(reference, best_frame, residuals_m, fit, free_yaw_fit, is_rotated, better_frame)
-        )
+        matches.append(Match(reference, best_frame, residuals_m, fit, free_yaw_fit, is_rotated))
     return min(matches, key=lambda match: match.time_offset_fit.rms_m)
 
 

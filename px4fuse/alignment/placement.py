@@ -19,13 +19,14 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.alignment import matching, tracks
+from px4fuse.alignment.file_convention import explain_mismatch
 from px4fuse.alignment.matching import AlignmentProblem, Match
 from px4fuse.alignment.time_and_pose_fit import MIN_CONCORDANCE, truncated_rms
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
 from px4fuse.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight import Alignment, Flight, PositionTrack, Unavailable
-from px4fuse.log import InputFile
+from px4fuse.log import SHARED_STAMPS, ClockMap, InputFile
 from px4fuse.position_source import POSITION_FILE
 from px4fuse.readers.common import finite_rows
 from px4fuse.readers.position_csv import PositionRecording
@@ -33,10 +34,9 @@ from px4fuse.readers.position_csv import PositionRecording
 # Maximum ratio of the residual at another time offset to the residual at the best time offset for a
 # warning that the offset is ambiguous, by reference: IMU noise gives ratios of 1.4 to 1.7
 MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}
-# Minimum of the negated correlation between the heights of file and EKF2 that shows opposite z axes
-MIN_MIRRORED_CORRELATION = 0.8
 # Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
 # indicates another flight
+MAX_DISTINCT_FRACTION = 0.5  # of the rows, if their timestamps are too coarse
 MAX_UNIX_DIFFERENCE_S = 60.0
 
 
@@ -100,10 +100,12 @@ def align_position_file(
             "Correct or omit --clock-offset.",
         )
     yaw_rad = None if yaw_deg == "auto" else float(np.radians(yaw_deg or 0.0))
+    problem = AlignmentProblem(samples, frame or recording.frame, yaw_rad, lag_s)
     try:
-        problem = AlignmentProblem(samples, frame or recording.frame, yaw_rad, lag_s)
         match = matching.find_match(flight, problem)
     except NoMatchError as error:
+        if fault := explain_mismatch(flight, problem, recording.metres_per_unit):
+            raise MissingDataError(f"{recording.name}: {fault[0]}.", fault[1]) from None
         raise MissingDataError(
             f"{recording.name}: {error}; {spans_text}", f"{error.remedy}."
         ) from None
@@ -112,6 +114,7 @@ def align_position_file(
     )
     clock_source = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
+    clock_map = _shared_timestamps(recording)
     track = PositionTrack(
         name=recording.name,
         origin=POSITION_FILE,
@@ -124,11 +127,16 @@ def align_position_file(
         topics=(recording.name,),
         log=recording.name,
         alignment=alignment,
+        clock_map=clock_map,
+        invalid=recording.invalid.set_axis(
+            recording.invalid.index + (aligned_samples.index[0] - start_s)
+        ),
+        step_m=recording.step_m,
     )
     reader_notes = tuple(
         f"{recording.name}: {text}" for text in (*recording.detected, *recording.notes)
     )
-    dropped = {recording.name: recording.dropped} if recording.dropped else {}
+    dropped = {recording.name: recording.dropped} if recording.dropped and not clock_map else {}
     notes = (*flight.log.notes, *reader_notes)
     dropped = {**flight.log.dropped, **dropped}
     log = structs.replace(flight.log, notes=notes, dropped=dropped)
@@ -137,6 +145,14 @@ def align_position_file(
         InputFile(recording.name, recording.sha256, recording.size_bytes, "position"),
     )
     return replace(flight, log=log, positions=(track, *flight.positions), inputs=inputs)
+
+
+def _shared_timestamps(recording: PositionRecording) -> ClockMap | None:
+    """Describe a clock whose timestamps are shared by most rows; None for another clock."""
+    distinct, count = len(recording.samples), len(recording.samples) + recording.dropped
+    if distinct > MAX_DISTINCT_FRACTION * count:
+        return None
+    return ClockMap(recording.clock, "as sent", count, 0.0, 0.0, 0.0, SHARED_STAMPS, distinct)
 
 
 def _check_options(
@@ -214,8 +230,6 @@ def _describe_alignment(
         correlation=unexplained_correlation,
         clock_offset_s=clock_offset_s,
     )
-    if not (match and match.better_frame):
-        frame_conflicts += _find_height_conflicts(flight, aligned_samples)
     alignment = Alignment(
         frame=frame,
         frame_reason=frame_reason,
@@ -269,25 +283,6 @@ def _compare_with_ekf2(
     ) / power if has_motion and power > 0.0 else None
 
 
-def _find_height_conflicts(flight: Flight, aligned_samples: pd.DataFrame) -> Iterator[str]:
-    if isinstance(flight.ekf2, Unavailable):
-        return
-    down = flight.ekf2.state["down_m"]
-    file_down_m = aligned_samples["down_m"].loc[down.index[0] : down.index[-1]].dropna()
-    if len(file_down_m) < tracks.MIN_SAMPLES:
-        return
-    ekf2_down_m = np.interp(file_down_m.index, down.index, down)
-    range_m = min(np.ptp(np.percentile(file_down_m, [2, 98])), np.ptp(ekf2_down_m))
-    if (
-        range_m >= tracks.MIN_MOTION_M
-        and np.corrcoef(file_down_m, ekf2_down_m)[0, 1] <= -MIN_MIRRORED_CORRELATION
-    ):
-        yield (
-            "The z axis of the position file is inverted: the heights of file and EKF2 change in "
-            "opposite directions. Give another --position-frame."
-        )
-
-
 def _find_frame_conflicts(
     match: Match | None, comparison: tuple[Array, float | None] | None, yaw_rad: float
 ) -> Iterator[str]:
@@ -300,12 +295,7 @@ def _find_frame_conflicts(
         is_rotated = matching.is_good_fit(match.free_yaw_fit, name) and matching.needs_rotation(
             rms_m, match.free_yaw_fit, name
         )
-    if is_rotated and match.better_frame:
-        yield (
-            f"The positions of the file fit the {name} in the frame {match.better_frame}, but not "
-            f"in {match.frame}. Give --position-frame {match.better_frame}."
-        )
-    elif is_rotated:
+    if is_rotated:
         yaw_deg = np.degrees(np.angle(np.exp(1j * (match.free_yaw_fit.yaw_rad - yaw_rad))))
         shift_m = np.hypot(*match.free_yaw_fit.origin_m[:2])
         shift_text = f" and shifted by {shift_m:.1f} m" if comparison else ""

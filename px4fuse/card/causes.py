@@ -28,6 +28,7 @@ from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
+from px4fuse.findings.cause_grouping import CONVENTION
 from px4fuse.findings.model import CATALOGUE
 from px4fuse.flight import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
@@ -139,7 +140,7 @@ def _is_setting(finding: Finding) -> bool:
 
 
 def _tier(finding: Finding, trials: Iterable[Trial]) -> int:
-    if finding.id in MEANINGLESS:
+    if finding.id in MEANINGLESS or CONVENTION in finding.evidence:
         return 0
     if _is_setting(finding) and any(map(leaves_error, trials)):
         return 3

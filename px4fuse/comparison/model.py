@@ -7,6 +7,7 @@ from typing import Literal
 import pandas as pd
 from msgspec import structs
 
+from px4fuse.convention.model import Convention
 from px4fuse.errors import MissingDataError, suggest_name
 from px4fuse.filter.consistency import Consistency, HorizontalNis, classify_ratio
 from px4fuse.filter.kalman import Replay
@@ -186,6 +187,8 @@ class Comparison:
         Empty before the filters run.
     horizontal : mapping from "kf" and "ekf2" to HorizontalNis
         North and east together; empty if one of them was not analysed.
+    convention : Convention or None
+        Axes, unit, clock and orientation of the source as sent; ``source`` is without their faults.
     """
 
     flight: Flight
@@ -198,6 +201,7 @@ class Comparison:
     missing: tuple[Unavailable, ...]
     axes: Mapping[str, AxisComparison] = field(default_factory=dict)
     horizontal: Mapping[FilterName, HorizontalNis] = field(default_factory=dict)
+    convention: Convention | None = None
 
     __repr__ = one_line_repr
 

@@ -8,6 +8,8 @@ from msgspec import structs
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.projection import observation_variance
+from px4fuse.convention.check import check_convention
+from px4fuse.convention.correction import correct, find_faults
 from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.errors import MissingDataError, SettingsError, suggest_name
 from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
@@ -66,7 +68,12 @@ def prepare(flight: Flight, request: ComparisonRequest) -> Comparison:
     track, reason = choose_source(flight, request.position_source)
     if kind := request.source_kind:
         track = replace(track, origin=structs.replace(track.origin, kind=kind))
-    track = _move_to_vehicle(shift_clock(track, settings.clock_offset_s), flight)
+    track = shift_clock(track, settings.clock_offset_s)
+    convention = None if track.origin.is_gnss else check_convention(flight, track)
+    late_s = find_faults(convention, flight, track.frame).late_s
+    settings = replace(settings, clock_offset_s=settings.clock_offset_s - late_s)
+    flight, track = correct(flight, track, convention)
+    track = _move_to_vehicle(track, flight)
     track = _use_barometer_height(track, flight, request.height)
     flight = select_innovations(flight, track)
     missing = flight.missing
@@ -90,7 +97,9 @@ def prepare(flight: Flight, request: ComparisonRequest) -> Comparison:
         settings = replace(settings, input="zero")
         notes += (f"no acceleration input ({acceleration.reason}): KF assumes constant velocity",)
         missing += () if acceleration in missing else (acceleration,)
-    return Comparison(flight, track, reason, segment, settings, lines, notes, missing)
+    return Comparison(
+        flight, track, reason, segment, settings, lines, notes, missing, convention=convention
+    )
 
 
 def select_innovations(flight: Flight, track: PositionTrack) -> Flight:
@@ -257,7 +266,7 @@ def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
         return track
     shifted_frames = {
         name: frame.set_axis(frame.index + clock_offset_s)
-        for name in ("samples", "orientation", "velocity")
+        for name in ("samples", "orientation", "velocity", "invalid", "status")
         if (frame := getattr(track, name)) is not None
     }
     return replace(track, **shifted_frames)

@@ -25,11 +25,13 @@ from px4fuse.findings import (
     noises,
     recording,
     source_clock,
+    source_convention,
     source_frame,
     source_intervals,
     source_noise,
     source_positions,
     source_stamps,
+    source_values,
 )
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.model import TITLES, Findings, group_by_root
@@ -60,17 +62,20 @@ DETECTORS: tuple[Callable[[Analysis], Findings], ...] = (
     noises.detect,
     recording.detect,
     source_clock.detect,
+    source_convention.detect,
     source_frame.detect,
     source_intervals.detect,
     source_noise.detect,
     source_positions.detect,
     source_stamps.detect,
+    source_values.detect,
 )
 
 
 def find(analysis: Analysis) -> tuple[Finding, ...]:
     """Return the findings, most severe first, each cause followed by its consequences."""
-    return group_by_cause(finding for detect in DETECTORS for finding in detect(analysis))
+    findings = [found for detect in DETECTORS for found in detect(analysis)]
+    return group_by_cause(source_convention.apply_convention(analysis, findings))
 
 
 def find_loop(loop: Loop) -> tuple[Finding, ...]:

@@ -28,6 +28,21 @@ WHITE_RATIO = "white_over_assumed"
 SENSOR, CHANGE = "the source's sensor", "change"
 # Kind of cause of ekf2_resets: all position resets follow a gap in the position source
 GAP = "gap"
+# Evidence key of faults of the source's convention, which precede all others
+CONVENTION = "convention"
+# Faults of the source that leave no usable position, and others that make findings about EKF2's
+# parameters false; they precede all others
+UNUSABLE = (
+    "source_is_ekf2_estimate",
+    "source_two_senders",
+    "source_positions_rounded",
+    "source_lever_arm",
+    "source_timestamps_shared",
+)
+# Evidence key of a jump that the source announced: it set a new origin
+ANNOUNCED = "reset_at_s"
+WITHOUT = "source_without_position"
+MISLEADING = ("source_timestamp_unit", "source_position_held", "source_zero_positions")
 # Kind of cause of no_motion: the vehicle stayed on the ground
 GROUND = "never took off"
 
@@ -108,5 +123,8 @@ def effect_ids(cause: str) -> tuple[str, ...]:
 def _report_rank(group: list[Finding]) -> int:
     # noises depend on the recording, so its warnings precede errors of noises
     cause = group[0]
+    is_first = CONVENTION in cause.evidence or cause.id in (*UNUSABLE, *MISLEADING, WITHOUT)
+    if is_first and cause.severity != "note":
+        return -1
     ranks = {"error": 2 * (cause.id in NOISES), "warning": 3 - 2 * (cause.id in RECORDING)}
     return ranks.get(cause.severity, 4)

@@ -1,72 +1,157 @@
-"""EKF2 does not fuse the position source, or only for part of the flight."""
+"""EKF2 does not use the source for horizontal position, or only for part of the flight."""
 
 import numpy as np
 import pandas as pd
 
 from px4fuse.comparison.model import Comparison
+from px4fuse.ekf2.fusion_conditions import (
+    EV_START_INTERVAL_S,
+    EV_STOP_INTERVAL_S,
+    Attempt,
+    Unmet,
+    find_unmet,
+)
 from px4fuse.findings.model import (
     Findings,
-    error,
+    finding,
     format_percent,
     fraction_on,
     note,
     spans_with_value,
     warning,
 )
-from px4fuse.flight import Ekf2, FusionRecord, Unavailable, positions_of
-from px4fuse.text import capitalise_first
+from px4fuse.flight import Ekf2, PositionTrack, Truth, Unavailable, positions_of
+from px4fuse.position_source import POSITION_FILE
+from px4fuse.record import Span
+from px4fuse.text import capitalise_first, format_metres
 
 MIN_FUSING_SHARE_ERROR = 0.5  # fused fraction of the segment; below, other sensors dominate: error
 MIN_FUSING_SHARE_WARNING = 0.98  # fused fraction of the segment; 2 % of a minute are about 1 s
-EV_START_INTERVAL_S = 0.2  # s; EV_MAX_INTERVAL of PX4 v1.14 and later (ev_control.cpp)
-EV_STOP_INTERVAL_S = 0.4  # s; two times EV_MAX_INTERVAL (ev_pos_control.cpp)
-MAX_LATENESS_S = 0.1  # s after the fusion horizon; EKF2 drops older samples (RingBuffer.h)
 MIN_LIMITING_INTERVAL_S = 0.18  # s; 10 % of jitter reaches EV_START_INTERVAL_S: fusion starts late
-CHECK_SWITCH = "Check EKF2_EV_CTRL (EKF2_AID_MASK before v1.14)."
+MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
+MIN_INVALID_DISTANCE_M = 1.0  # m; less before take-off, where EKF2 needs no position
+UNKNOWN = Unmet(
+    "",
+    "The log does not contain the reason: the logged conditions of EKF2 are met.",
+    "Check `ekf2 status` in the console of PX4.",
+)
 
 
 def detect(analysis: Comparison) -> Findings:
-    """Detect that EKF2 fuses the position source for too small a fraction of the segment."""
-    ekf2, segment, source = analysis.flight.ekf2, analysis.segment, analysis.source
+    """Detect an invalid position of EKF2, and a source that EKF2 does not fuse."""
+    if isinstance(analysis.flight.ekf2, Ekf2):
+        yield from _detect_invalid_position(analysis, analysis.flight.ekf2)
+    yield from detect_missing_fusion(analysis)
+
+
+def detect_missing_fusion(analysis: Comparison) -> Findings:
+    """Detect that EKF2 fused the source only in a small part of the segment."""
+    ekf2, source = analysis.flight.ekf2, _received_source(analysis)
     if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusing, Unavailable):
         return
     fusing = ekf2.fusing["horizontal"]
-    share = fraction_on(fusing, segment)
+    share = fraction_on(fusing, analysis.segment)
     if share >= MIN_FUSING_SHARE_ERROR:
         yield from _detect_slow_restart(analysis, ekf2, fusing)
-    evidence = {"fused_fraction": share, "source_interval_s": 1.0 / source.rate_hz}
-    if not source.origin.is_vision:
-        if source.name == "vehicle_mocap_odometry" and share == 0.0:
+    if source is None or share >= MIN_FUSING_SHARE_WARNING:
+        return
+    positions, aid = positions_of(source), source.origin.aid
+    evidence: dict[str, float | str] = {
+        "fused_fraction": share,
+        "source_interval_s": 1.0 / source.rate_hz,
+    }
+    if aid is None:
+        if source.name == MOTION_CAPTURE_TOPIC and not share:
             yield warning(
                 "ekf2_not_fusing",
-                "EKF2 never fused the MOCAP positions (ATT_POS_MOCAP). It received no other "
-                "external vision, so its track does not come from this source.",
-                "Send the position as VISION_POSITION_ESTIMATE.",
-                {"fused_fraction": share},
+                f"EKF2 never fused the {positions}: it does not read {source.name}. PX4 writes "
+                "ATT_POS_MOCAP, and ODOMETRY of estimator type MOCAP, to this topic, as ground "
+                "truth. EKF2's track does not come from this source.",
+                "To fuse it, send VISION_POSITION_ESTIMATE, or ODOMETRY of estimator type VISION.",
+                evidence,
             )
-    elif share < MIN_FUSING_SHARE_ERROR:
-        fault, reason, action = _reason_and_action(analysis, ekf2)
-        title = f"EKF2 never fused the {positions_of(source)}"
-        if share:
-            title = (
-                f"EKF2 fused the {positions_of(source)} only {format_percent(share)} of the time"
-            )
-        yield error(
+        return
+    spans = spans_with_value(0.0, fusing, analysis.segment)
+    longest_s = max(spans, key=lambda span: span[1] - span[0])
+    parameters = {**analysis.flight.log.parameters, **ekf2.parameters}
+    found = find_unmet(Attempt(ekf2, source, aid, parameters, longest_s))
+    name, unmet = found or ("", UNKNOWN)
+    action = unmet.action
+    if not found and not source.origin.has_all_samples:
+        action = f"Record with SDLOG_PROFILE 129 (default and vision). {action}"
+    extent = f"EKF2 fused the {positions} only {format_percent(share)} of the time"
+    if not share:
+        extent = f"EKF2 never fused the {positions}"
+    title = f"{extent}: {unmet.fault}" if unmet.fault else extent
+    if share < MIN_FUSING_SHARE_ERROR:
+        is_reference = source.origin.fused_as_gnss and name == "switch"
+        yield finding(
+            "note" if unmet.is_intended or is_reference else "error",
             "ekf2_not_fusing",
-            f"{title}{fault}. {reason}",
+            f"{title}. {unmet.reason}",
             action,
-            evidence,
+            {**evidence, "condition": name},
+            spans if share else (),
         )
-    elif share < MIN_FUSING_SHARE_WARNING:
+    else:
         yield warning(
             "ekf2_fusion_interrupted",
-            f"EKF2 fused the {positions_of(source)} only {format_percent(share)} of the time. In "
-            "the rest EKF2 relied on its other sensors, and its position error grew. EKF2 (v1.14 "
-            f"and later) stops fusion {EV_STOP_INTERVAL_S:g} s after the last position.",
-            "Check the gaps and rejections at these times.",
-            evidence,
-            spans_with_value(0.0, fusing, segment),
+            f"{title}. {unmet.reason} EKF2 relied on its other sensors for up to "
+            f"{longest_s[1] - longest_s[0]:.1f} s.",
+            action,
+            {**evidence, "condition": name},
+            spans,
         )
+
+
+def _received_source(analysis: Comparison) -> PositionTrack | None:
+    """Return the source that EKF2 received; a position file is not one. None without a source."""
+    if analysis.source.origin != POSITION_FILE:
+        return analysis.source
+    tracks = (track for track in analysis.flight.positions if track.origin != POSITION_FILE)
+    return next((track for track in tracks if track.origin.is_vision), None)
+
+
+def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
+    """Detect that EKF2 declares its position invalid; it is then not the result of fusion."""
+    is_valid = ekf2.states.get("xy_valid")
+    if is_valid is None or is_valid.empty:
+        return
+    share = 1.0 - fraction_on(is_valid, analysis.segment)
+    if share <= 1.0 - MIN_FUSING_SHARE_WARNING:
+        return
+    spans = spans_with_value(0.0, is_valid, analysis.segment)
+    distance_m = _largest_distance_m(analysis, ekf2, spans)
+    if distance_m < MIN_INVALID_DISTANCE_M:
+        return
+    reference = "ground truth" if isinstance(analysis.flight.truth, Truth) else "source"
+    distance = f" Its distance to the {reference} is up to {format_metres(distance_m)} m."
+    if not np.isfinite(distance_m):
+        distance = ""
+    yield finding(
+        "error" if share > MIN_FUSING_SHARE_ERROR else "warning",
+        "ekf2_position_invalid",
+        f"EKF2's horizontal position is invalid {format_percent(share)} of the time. EKF2 sets "
+        f"xy_valid to 0, and PX4 does not use the position.{distance}",
+        "Correct the fusion first. Errors of EKF2 in this time do not depend on its noises.",
+        {"invalid_fraction": share, "distance_m": distance_m},
+        spans,
+    )
+
+
+def _largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...]) -> float:
+    """Return the largest horizontal distance (m) of EKF2 to the ground truth, or to the source.
+
+    NaN if neither covers the spans.
+    """
+    truth, axes = analysis.flight.truth, ["north_m", "east_m"]
+    reference = truth.samples if isinstance(truth, Truth) else analysis.source.samples
+    state = pd.concat([ekf2.state[axes].loc[start:end] for start, end in spans])
+    errors = [
+        state[axis] - np.interp(state.index, reference.index, reference[axis], np.nan, np.nan)
+        for axis in axes
+    ]
+    return float(np.hypot(*errors).max())
 
 
 def _detect_slow_restart(analysis: Comparison, ekf2: Ekf2, fusing: pd.Series) -> Findings:
@@ -97,50 +182,3 @@ def _detect_slow_restart(analysis: Comparison, ekf2: Ekf2, fusing: pd.Series) ->
             {"rate_hz": source.rate_hz, "longest_s": longest_s, "count": len(late_spans)},
             tuple(late_spans),
         )
-
-
-def _reason_and_action(analysis: Comparison, ekf2: Ekf2) -> tuple[str, str, str]:
-    """Return the end of the title, the reason why EKF2 does not fuse the source, and the action.
-
-    The end of the title is empty if the log does not show the reason.
-    """
-    parameters, interval_s = analysis.flight.log.parameters, 1.0 / analysis.source.rate_hz
-    ev_control = parameters.get("EKF2_EV_CTRL")
-    switch, bit, quantity = "EKF2_EV_CTRL", 0, "horizontal position"
-    if ev_control is None:  # before v1.14
-        switch, bit, quantity = "EKF2_AID_MASK", 3, "vision position"
-    value = parameters.get(switch)
-    if value is not None and not int(value) >> bit & 1:
-        return (
-            f": {switch} is {value:.0f}",
-            f"Bit {bit} ({quantity}) is not set.",
-            f"Set {switch} to {int(value) | 1 << bit}.",
-        )
-    horizon_s, age_s = ekf2.horizon_s, _age_s(analysis, ekf2)
-    if isinstance(horizon_s, float) and age_s > horizon_s + MAX_LATENESS_S:
-        return (
-            f": the positions are {age_s:.2f} s old at arrival",
-            f"EKF2 buffers only {horizon_s:.2f} s. Timestamps that are too early have the same "
-            "effect.",
-            "Check the clock of the sender. Then increase EKF2_DELAY_MAX (v1.15 and later).",
-        )
-    # positions reconstructed from EKF2 output have the rate of the logger, not of the source
-    has_source_rate = ev_control is not None and not analysis.source.origin.reconstructed
-    if has_source_rate and interval_s > EV_START_INTERVAL_S:
-        return (
-            f": the positions come at {analysis.source.rate_hz:.2g} Hz",
-            f"The interval between positions is {interval_s:.2f} s. EKF2 (v1.14 and later) starts "
-            f"to fuse external vision only when two positions come within {EV_START_INTERVAL_S:g} "
-            "s. No parameter changes this limit.",
-            "Send the position at 10 Hz.",
-        )
-    return "", "The log does not contain the reason.", CHECK_SWITCH
-
-
-def _age_s(analysis: Comparison, ekf2: Ekf2) -> float:
-    """Return the median age (s) at arrival: arrival - timestamp + EKF2_EV_DELAY; NaN if unknown."""
-    if not isinstance(ekf2.record, FusionRecord):
-        return float("nan")
-    age_s = ekf2.record.vision_age_s.loc[analysis.segment.start_s : analysis.segment.end_s]
-    delay_ms = analysis.flight.log.parameters.get("EKF2_EV_DELAY", 0.0)
-    return float(age_s.median() + delay_ms * 1e-3)

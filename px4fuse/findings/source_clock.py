@@ -112,13 +112,15 @@ def clock_offset_option_s(comparison: Comparison, clock: ClockOffset) -> float:
     For a position file, the offset in use is part of its alignment.
     """
     alignment = comparison.source.alignment
-    return clock.offset_s if alignment is None else alignment.clock_offset_s + clock.remaining_s
+    return clock.offset_s + (0.0 if alignment is None else alignment.clock_offset_s)
 
 
 def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
     """Detect EKF2_EV_DELAY that differs from the estimate by 3 σ and one EKF2 step."""
     # EKF2_GPS_DELAY corrects GNSS timestamps, so the time offset already includes its error
-    delay_ms = remedy.delay_ms(analysis) if analysis.source.origin.is_vision else None
+    # a position file is not what EKF2 fused, and its clock is aligned with EKF2's position
+    is_fused = analysis.source.origin.is_vision and analysis.source.alignment is None
+    delay_ms = remedy.delay_ms(analysis) if is_fused else None
     ml_delay_ms = -1e3 * clock.offset_s
     tolerance_ms = max(1e3 * clock.three_sigma_s + remedy.PREDICTION_STEP_MS, 1e3 * MIN_OFFSET_S)
     if delay_ms is None or abs(delay_ms - ml_delay_ms) < tolerance_ms:

@@ -14,11 +14,11 @@ from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import reported_sigma
 from px4fuse.comparison.flight_events import max_interval_s
 from px4fuse.ekf2.aids import NOT_FUSED_LIMIT_S
+from px4fuse.ekf2.fusion_conditions import EV_START_INTERVAL_S
 from px4fuse.ekf2_parameters import AIDS, EV_POS, Aid
 from px4fuse.filter.kalman import state_at, variance_at
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.finding import Finding
-from px4fuse.findings.ekf2_not_fusing import EV_START_INTERVAL_S
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
 from px4fuse.flight import Ekf2, Unavailable, positions_of, step_values_at
 from px4fuse.position_source import ALIGNED, PositionKind
@@ -61,7 +61,10 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
     """Detect gaps in the position source, or in its log, and a source that does not last."""
     flight, source, ekf2 = analysis.segment.flight, analysis.source, analysis.flight.ekf2
     spans, logged_spans = list[Span](), list[Span]()
+    invalid_s = analysis.source.invalid.index
     for span in analysis.events.gaps:
+        if np.any((invalid_s > span[0]) & (invalid_s < span[1])):
+            continue  # reported by source_values
         aids = _continuously_fused_aids(ekf2, span)
         if source.origin.aid in aids and source.alignment is None:
             logged_spans.append(span)
@@ -86,7 +89,7 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
         yield warning(
             "source_gap",
             f"No position for {end_s - start_s:.1f} s{longest}. "
-            f"{_state_errors_after(analysis, (start_s, end_s))}",
+            f"{state_errors_after(analysis, (start_s, end_s))}",
             f"Check {CHECKS[source.origin.kind]} at {start_s:.1f} s.",
             {"count": len(spans), "longest_s": end_s - start_s, "at_s": start_s},
             tuple(spans),
@@ -158,7 +161,7 @@ def _ekf2_at_end(analysis: Analysis, span_s: Span) -> dict[str, float]:
     }
 
 
-def _state_errors_after(analysis: Analysis, gap_s: Span) -> str:
+def state_errors_after(analysis: Analysis, gap_s: Span) -> str:
     """State the aids that each filter used in a gap, and error and reported σ at its end."""
     result, (start_s, end_s) = analysis.main, gap_s
     before_end_s = np.array([start_s, end_s - SMALLEST_TIME_S])

@@ -19,7 +19,8 @@ from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, Bi
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings.cause_grouping import CAUSE, GROUND
+from px4fuse.finding import Severity
+from px4fuse.findings.cause_grouping import ANNOUNCED, CAUSE, GROUND
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
 from px4fuse.findings.missing import MIN_INNOVATION_SHARE
 from px4fuse.findings.model import (
@@ -45,6 +46,7 @@ MIN_LAG_S = 0.05  # s; lag for a warning; at 1 m/s half of the noise of good UWB
 MIN_LAG_ERROR_S = 0.10  # s; lag for an error; at 1 m/s the noise of good UWB (0.1 m)
 MIN_JUMP_M = 0.2  # m; jump for a warning: twice the noise of good UWB (0.1 m)
 MIN_JUMP_SIGMAS = 5.0  # jump in σ of the time-correlated noise, whose changes have up to √2 σ
+MAX_RESET_DISTANCE_S = 1.0  # s from a jump to its reset_counter; two intervals at 2 Hz
 MIN_JUMP_ERROR_M = 0.5  # m; jump for an error: five times the noise of good UWB (0.1 m)
 MIN_SCALE = 0.12  # relative scale error for a warning; simulated flights without one reach 0.11
 MIN_SCALE_ERROR = 0.15  # relative scale error for an error: 1 m in 7 m
@@ -159,11 +161,17 @@ def detect_jumps(analysis: Analysis) -> Findings:
     if not isinstance(correlated_noise, Unavailable):
         min_jump_m = max(min_jump_m, MIN_JUMP_SIGMAS * correlated_noise.slow_m)
     large = [jump for jump in fit.jumps if jump.size_m >= min_jump_m]
+    reset_s = _reset_times(analysis)
     if large:
         largest = max(large, key=lambda jump: jump.size_m)
         size_m, at_s, sigma = largest.size_m, largest.time_s, max(s.sigma for s in largest.step_m)
         positions = capitalise_first(positions_of(analysis.source))
         causes, action = JUMP_CAUSES[analysis.source.origin.kind]
+        cause = f"Possible causes: {causes}."
+        evidence = {"count": len(large), "size_m": size_m, "at_s": at_s, "sigma_m": sigma}
+        if np.any(np.abs(reset_s - at_s) < MAX_RESET_DISTANCE_S):
+            evidence[ANNOUNCED] = float(reset_s[np.argmin(np.abs(reset_s - at_s))])
+            cause = "The source announced it (reset_counter): it relocalised or set a new origin."
         extent = f"by {size_m:.2f} m"
         if len(large) > 1:
             extent = f"{format_count(len(large))}, by up to {size_m:.2f} m"
@@ -171,12 +179,18 @@ def detect_jumps(analysis: Analysis) -> Findings:
             "error" if size_m >= MIN_JUMP_ERROR_M else "warning",
             "source_position_jump",
             f"{positions} jump {extent} at {at_s:.1f} s and stay there. The IMU measures no such "
-            f"motion (± {1.96 * sigma:.2f} m, 95 %). Possible causes: {causes}. After the jump KF "
-            "and EKF2 are wrong by its size, with consistent innovations.",
+            f"motion (± {1.96 * sigma:.2f} m, 95 %). {cause} The frames before and after it differ "
+            "by its size: after the jump KF and EKF2 are wrong by it, with consistent innovations.",
             f"{action} Analyse one side of the jump (--start, --end).",
-            {"count": len(large), "size_m": size_m, "at_s": at_s, "sigma_m": sigma},
+            evidence,
             zero_length_spans(jump.time_s for jump in large),
         )
+
+
+def _reset_times(analysis: Analysis) -> Array:
+    """Return the times (s) at which ``reset_counter`` changes."""
+    counter = analysis.source.status.get("reset_counter", pd.Series(dtype=float))
+    return np.asarray(counter.index[1:][np.diff(counter) != 0.0], dtype=np.float64)
 
 
 def detect_scale_error(analysis: Analysis) -> Findings:
@@ -300,13 +314,16 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
         direction, doubt = "small" if variance_ratio < 1.0 else "large", ""
         if direction == "large" and error_m is None:
             doubt = " It may cover time-correlated errors."
+        severity: Severity = "error" if ratio >= MIN_VARIANCE_RATIO_ERROR else "warning"
+        use = "EKF2 takes R from the report (EKF2_EV_NOISE_MD 0), but not less than EKF2_EVP_NOISE."
+        if analysis.flight.log.parameters.get("EKF2_EV_NOISE_MD") == 1:
+            severity, use = "note", "EKF2 does not use the report (EKF2_EV_NOISE_MD 1)."
         yield finding(
-            "error" if ratio >= MIN_VARIANCE_RATIO_ERROR else "warning",
+            severity,
             "source_reported_variance_wrong",
             f"The variance that {source_name(source)} reports is {format_factor(ratio)} times too "
             f"{direction}. Reported σ {reported_m:.3g} m; noise {noise_m:.3g} m (95 % {low:.3g} to "
-            f"{high:.3g} m). EKF2 takes R from the report (EKF2_EV_NOISE_MD 0), but not less than "
-            f"EKF2_EVP_NOISE.{doubt}",
+            f"{high:.3g} m). {use}{doubt}",
             f"Report a variance of {noise_m**2:.2g} m² with each position.",
             {
                 "reported_sigma_m": reported_m,

@@ -5,9 +5,10 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
-from px4fuse.findings.model import Findings, error, note, warning
+from px4fuse.ekf2.fusion_conditions import SET_TIMESTAMP, STAMP_FAULTS, SYNCHRONISE
+from px4fuse.findings.model import Findings, error, fraction_on, note, warning
 from px4fuse.flight import ARRIVAL_METHODS, Ekf2, FusionRecord, Unavailable, positions_of
-from px4fuse.log import ClockMap
+from px4fuse.log import SHARED_STAMPS, ClockMap
 from px4fuse.text import format_metres
 
 MAX_RECEIPT_JITTER_S = 0.010  # s; 1 cm at 1 m/s, a tenth of the noise of good UWB (0.1 m)
@@ -27,6 +28,10 @@ def detect(analysis: Analysis) -> Findings:
     clock, positions = analysis.source.clock_map, positions_of(analysis.source)
     if clock is None:
         yield from detect_arrival_times(analysis)
+    elif clock.note == SHARED_STAMPS and clock.distinct_stamps:
+        yield from detect_shared_timestamps(analysis, clock.pairs, clock.distinct_stamps)
+    elif clock.clock in STAMP_FAULTS:
+        yield from detect_timestamp_unit(analysis, clock.clock)
     elif clock.distinct_stamps is not None:
         yield from detect_constant_timestamps(positions, clock, clock.distinct_stamps)
     elif clock.method in ARRIVAL_METHODS:
@@ -40,6 +45,40 @@ def detect(analysis: Analysis) -> Findings:
             ANSWER_TIMESYNC,
             {"jitter_s": clock.jitter_s},
         )
+
+
+def detect_shared_timestamps(analysis: Analysis, count: int, distinct_count: int) -> Findings:
+    """Make the finding of timestamps with a resolution coarser than the sample interval."""
+    resolution_s = float(np.median(np.diff(analysis.source.samples.index)))
+    rate_hz = count / (distinct_count * resolution_s)
+    yield error(
+        "source_timestamps_shared",
+        f"The timestamps of the {positions_of(analysis.source)} have a resolution of "
+        f"{resolution_s:.3g} s. {count} samples ({rate_hz:.2g} Hz) share {distinct_count} "
+        f"timestamps. px4fuse uses the first sample of each; at 1 m/s a rounded timestamp is an "
+        f"error of up to {format_metres(resolution_s)} m.",
+        "Write the time of measurement with microseconds.",
+        {"resolution_s": resolution_s, "samples": count, "distinct": distinct_count},
+    )
+
+
+def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
+    """Make the finding of timestamps that are not the autopilot's boot time in microseconds."""
+    ekf2, segment = analysis.flight.ekf2, analysis.segment
+    fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
+    effect = ""
+    if isinstance(fusing, pd.DataFrame) and not fraction_on(fusing["horizontal"], segment):
+        effect = f"EKF2 never fused the positions: for it they are {STAMP_FAULTS[clock]}. "
+    is_unix = clock.startswith("UNIX") or clock == "another clock"
+    stated = "0 in every message" if clock == "0" else f"in {clock}"
+    yield error(
+        "source_timestamp_unit",
+        f"The timestamps of the {positions_of(analysis.source)} are {stated}. PX4 expects "
+        "timestamp_sample in microseconds of the autopilot's boot time. "
+        f"{effect}px4fuse uses the arrival times, which are late by the latency.",
+        SYNCHRONISE if is_unix else SET_TIMESTAMP,
+        {"clock": clock},
+    )
 
 
 def detect_constant_timestamps(positions: str, clock: ClockMap, distinct_count: int) -> Findings:

@@ -386,7 +386,7 @@ def _logging_advice(
     if comparison is not None:
         findings += [
             *missing.detect_source_not_logged(comparison),
-            *ekf2_not_fusing.detect(comparison),
+            *ekf2_not_fusing.detect_missing_fusion(comparison),
         ]
         findings += [
             *missing.detect_missing_innovations(comparison),

@@ -14,6 +14,13 @@ MAX_VALID_VALUE = 1e9
 # Maximum absolute value (m/s², rad/s) of valid IMU data: above the range of accelerometers (400 g)
 # and gyros (4000 °/s)
 MAX_IMU_VALUE = 1e4
+# Minimum distance (m) of rows 0, 0, 0 from the positions beside them: 3 σ of good UWB (0.1 m)
+MIN_ZERO_DISTANCE_M = 0.3
+# Minimum duration (s) and number of equal positions that are one position held: a source that sends
+# each position several times repeats it for less
+MIN_HELD_S, MIN_HELD_COUNT = 1.0, 5
+MAX_HELD_FRACTION = 0.5  # of the rows; a source that is at rest for longer may repeat its position
+MAX_MULTIPLE_ERROR = 0.01  # distance from whole multiples of a rounding step
 # Minimum norm of a valid quaternion: senders without attitude send zeros
 MIN_QUATERNION_NORM = 0.5
 
@@ -66,6 +73,45 @@ def finite_rows(
     """Return the rows with all absolute values in ``columns`` below ``limit``, without NaN."""
     is_valid: BoolArray = (np.abs(samples[columns].to_numpy()) < limit).all(axis=1)
     return samples[is_valid]
+
+
+def find_invalid(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
+    """Return the reason why each row is no measurement (NaN, zero, held), "" for measurements.
+
+    ``columns`` are the coordinates that a measurement needs.
+    """
+    values, time_s = samples[columns].to_numpy(), samples.index.to_numpy()
+    reason = pd.Series("", index=samples.index)
+    is_number: BoolArray = (np.abs(values) < MAX_VALID_VALUE).all(axis=1)
+    reason[~is_number] = "NaN"
+    is_zero: BoolArray = (values == 0.0).all(axis=1)
+    others, zeros = np.flatnonzero(is_number & ~is_zero), np.flatnonzero(is_zero)
+    if len(others):
+        after = np.searchsorted(others, zeros)
+        beside = others[np.clip([after - 1, after], 0, len(others) - 1)]
+        distance_m = np.linalg.norm(values[beside], axis=2).min(axis=0)
+        reason.iloc[zeros[distance_m > MIN_ZERO_DISTANCE_M]] = "zero"
+    valid = np.flatnonzero(reason == "")
+    is_same = np.all(np.diff(values[valid], axis=0) == 0.0, axis=1)
+    starts = np.flatnonzero(np.append(True, ~is_same))
+    held = [
+        valid[start + 1 : end]
+        for start, end in zip(starts, [*starts[1:], len(valid)], strict=True)
+        if end - start >= MIN_HELD_COUNT and np.ptp(time_s[valid[start:end]]) >= MIN_HELD_S
+    ]
+    if held and len(rows := np.concatenate(held)) < MAX_HELD_FRACTION * len(valid):
+        reason.iloc[rows] = "held"
+    return reason
+
+
+def rounding_step(values: Array) -> float:
+    """Return the step of which all differences of the values are multiples; 0 without one."""
+    steps = np.diff(np.unique(values[np.isfinite(values)]))
+    if not len(steps):
+        return 0.0
+    multiples = steps / steps.min()
+    is_multiple = np.abs(multiples - np.rint(multiples)) < MAX_MULTIPLE_ERROR
+    return float(steps.min()) if is_multiple.all() else 0.0
 
 
 def join_nearest(samples: pd.DataFrame, others: pd.DataFrame, tolerance_s: float) -> pd.DataFrame:

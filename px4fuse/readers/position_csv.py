@@ -10,7 +10,7 @@ import hashlib
 import io
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -19,8 +19,9 @@ import pandas as pd
 
 from px4fuse.arrays import Array, median_interval
 from px4fuse.errors import LogError, SettingsError
-from px4fuse.flight import time_index
+from px4fuse.flight import NO_INVALID_ROWS, time_index
 from px4fuse.readers import position_names
+from px4fuse.readers.common import find_invalid, rounding_step
 from px4fuse.readers.position_names import LENGTH_UNITS, TIME_UNITS, ColumnMeaning, read_column_name
 from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, decode_text, quote
 from px4fuse.readers.ulog_topics import longest_increasing_run
@@ -74,6 +75,12 @@ class PositionRecording:
         Number of dropped rows with the reason, and warnings.
     dropped : int
         Number of rows with an invalid timestamp.
+    metres_per_unit : float
+        Factor that was applied to the first position column.
+    invalid : Series
+        Rows that are no measurement, as in :class:`~px4fuse.flight.PositionTrack`.
+    step_m : float
+        Rounding step of the coarsest horizontal coordinate; 0 if there is none.
     """
 
     name: str
@@ -85,6 +92,9 @@ class PositionRecording:
     detected: tuple[str, ...]
     notes: tuple[str, ...]
     dropped: int = 0
+    metres_per_unit: float = 1.0
+    invalid: "pd.Series[str]" = field(default_factory=lambda: NO_INVALID_ROWS)
+    step_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -175,10 +185,11 @@ def read_position_csv(
     )
     axes = [at for at in position if at is not None]
     # Numbers such as 1e999 are read as infinite
-    is_usable = np.isfinite(numbers[time])
-    is_usable &= (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
+    has_time = np.isfinite(numbers[time])
+    is_usable = has_time & (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
     if unusable_count := int(np.count_nonzero(~is_usable)):
         notes.insert(0, f"dropped rows without valid time or position: {unusable_count}")
+    empty_times = numbers.loc[has_time & ~is_usable, time].to_numpy()
     for tag in (at for at, m in enumerate(meanings) if m.kind == "tag"):
         tags = sorted({*texts[tag].dropna()})
         if tags[1:]:
@@ -216,8 +227,10 @@ def read_position_csv(
     columns_m = {
         name: np.nan if at is None else numbers[at] * scales[at] for name, at in column_of_name
     }
-    samples = pd.DataFrame(columns_m, index=numbers.index)
-    samples = samples.where(np.isfinite(samples))
+    samples = pd.DataFrame(columns_m, index=numbers.index).replace([np.inf, -np.inf], np.nan)
+    reason = find_invalid(samples, SAMPLE_COLUMNS[: len(axes)])
+    invalid = reason[reason != ""], pd.Series("NaN", empty_times / round(1.0 / TIME_UNITS[unit]))
+    samples = samples[reason == ""]
     is_not_positive = samples[SIGMA_COLUMNS] <= 0.0
     if bad_row_count := int(is_not_positive.any(axis=1).sum()):
         notes.append(f"ignored sigmas that are zero or negative: {bad_row_count}")
@@ -243,6 +256,9 @@ def read_position_csv(
             f"sigma: columns {table.label(*sigma) or 'none'}",
         ),
         notes=tuple(notes),
+        metres_per_unit=scales[axes[0]],
+        invalid=pd.concat(invalid).sort_index(),
+        step_m=max(rounding_step(samples[name].to_numpy()) for name in ("x_m", "y_m")),
     )
 
 

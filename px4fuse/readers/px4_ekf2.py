@@ -108,6 +108,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     ]
     step_s = _step_s(topics)
     delayed = _read_delayed_state(topics, step_s)
+    states = _read_states(topics, local_position, enabled)
     variance = _variance(delayed)
     if not isinstance(variance, Unavailable):
         topics.record_stream("ekf2_variance", _state_vector(topics)[0])
@@ -126,6 +127,8 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         horizon_s=_horizon_s(topics, step_s),
         record=_read_record(topics, delayed, local_position, enabled, step_s),
         aids=aids,
+        states=states,
+        parameters=topics.ekf2_parameters,
     )
 
 
@@ -265,6 +268,13 @@ def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
             age_us = table["timestamp"].astype(np.int64) - measured_us
             return pd.Series(age_us * 1e-6, index=times)
     return pd.Series(dtype=np.float64)
+
+
+def _read_states(topics: Topics, local: pd.DataFrame, enabled: StepFunctions) -> StepFunctions:
+    """Read the step functions of :attr:`Ekf2.states`."""
+    checks = topics.primary_samples(px4.LAYOUTS["gnss_checks"], step=True)["failed"].dropna()
+    validity = {name: local[name] for name in ("xy_valid", "xy_global") if name in local}
+    return {**enabled, **validity, **({"failed_checks": checks} if len(checks) else {})}
 
 
 def _read_fusing(topics: Topics, enabled: StepFunctions) -> TableOrUnavailable:

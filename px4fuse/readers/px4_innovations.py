@@ -36,18 +36,27 @@ VISION, GNSS, GNSS_AND_BAROMETER = (
 
 def fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
     """Return True if EKF2 fused the aid at any time, or enabled it if fusion is not logged."""
-    log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get(aid)
-    if log is None:
+    if isinstance(ekf2, Unavailable):
         return False
-    return bool(log.samples["fused"].any() if "fused" in log.samples else log.enabled is not None)
+    log = ekf2.aids.get(aid)
+    if log is not None and "fused" in log.samples:
+        return bool(log.samples["fused"].any())
+    if log is not None and log.enabled is not None:
+        return True
+    # without fusion flags, a valid global position shows that EKF2 fused GNSS
+    has_flags = "tilt_align" in ekf2.states
+    is_global = ekf2.states.get("xy_global")
+    return (
+        aid == GNSS_POS.name and not has_flags and is_global is not None and bool(is_global.any())
+    )
 
 
 def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
     """Replace the innovations of external vision by the GNSS innovations."""
     enabled = {
-        group: log.enabled
+        group: ekf2.states[name]
         for group, name in (("horizontal", source.horizontal), ("vertical", source.vertical))
-        if (log := ekf2.aids.get(name)) is not None and log.enabled is not None
+        if name in ekf2.states
     }
     fusing: TableOrUnavailable = Unavailable(
         "EKF2 fusion flags", "the log does not contain the fusion flags of GNSS", GNSS.to_log

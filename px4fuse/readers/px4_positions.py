@@ -9,9 +9,10 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.arrays import Array
+from px4fuse.arrays import Array, IntArray
 from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, effective_settings
 from px4fuse.flight import (
+    NO_INVALID_ROWS,
     Columns,
     Ekf2,
     PositionTrack,
@@ -21,15 +22,23 @@ from px4fuse.flight import (
     sort_by_preference,
     time_index,
 )
-from px4fuse.log import ClockMap
+from px4fuse.log import SENDER_CLOCK, SHARED_STAMPS, ClockMap
 from px4fuse.position_source import Origin, with_orientation
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.common import finite_rows, join_nearest, read_attitude, read_orientation
+from px4fuse.readers.common import (
+    find_invalid,
+    finite_rows,
+    join_nearest,
+    read_attitude,
+    read_orientation,
+    rounding_step,
+)
 from px4fuse.readers.field_maps import GLOBAL_COLUMNS
 from px4fuse.readers.px4_ekf2 import target_step_s
 from px4fuse.readers.px4_fixes import read_unlogged_fixes, reconstruct_fixes
 from px4fuse.readers.px4_innovations import fused_aid
-from px4fuse.readers.ulog_topics import Topics
+from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S
+from px4fuse.readers.ulog_topics import MAX_PUBLICATION_LAG_S, Topics
 
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
@@ -45,6 +54,10 @@ MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
 # Maximum rate (Hz) of logged GNSS fixes that count as downsampled: receivers send 5 to 20 fixes per
 # second
 MAX_DOWNSAMPLED_HZ = 4.0
+STATUS_COLUMNS = ["reset_counter", "quality", "age_s"]
+# Units of timestamps by name, in µs
+STAMP_UNITS = {"microseconds": 1.0, "milliseconds": 1e3, "seconds": 1e6, "nanoseconds": 1e-3}
+MAX_RATE_ERROR = 0.05  # of a clock, to recognise the unit of its timestamps
 AUTOPILOT_CLOCK = "autopilot boot clock (PX4 converted the sender's timestamps)"
 # Latitude and longitude in degrees, optionally altitude in m
 GeodeticPosition = tuple[float, ...]
@@ -97,8 +110,14 @@ def make_track(
     track_fields
         Other fields of :class:`~px4fuse.flight.PositionTrack`.
     """
+    status = samples[[name for name in STATUS_COLUMNS if name in samples]]
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
-    samples = finite_rows(samples, needed_columns)
+    step_m = max(rounding_step(samples[name].to_numpy()) for name in needed_columns[:2])
+    if origin.is_gnss:  # a receiver at rest may repeat its position
+        samples, invalid = finite_rows(samples, needed_columns), NO_INVALID_ROWS
+    else:
+        reason = find_invalid(samples, needed_columns)
+        samples, invalid = samples[reason == ""], reason[reason != ""]
     if len(samples) < MIN_TRACK_SAMPLES:
         return unavailable(
             name,
@@ -107,7 +126,15 @@ def make_track(
         )
     variance = samples[Columns.POSITION_VARIANCE]
     samples = samples.assign(**variance.where(variance > 0))
-    return PositionTrack(name=name, samples=samples, origin=origin, **track_fields)
+    return PositionTrack(
+        name=name,
+        samples=samples,
+        origin=origin,
+        invalid=invalid,
+        status=status,
+        step_m=step_m,
+        **track_fields,
+    )
 
 
 def _make_ulog_track(
@@ -149,6 +176,9 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
             frame = names.get(int(samples[field].iloc[-1]), "unknown")
     if name == "estimator_visual_odometry_aligned":
         frame = "NED"  # the field contains the frame before EKF2 rotated the positions to NED
+    if "published_us" in samples:
+        published_s = 1e-6 * (samples["published_us"] - topics.zero_us)
+        samples["age_s"] = published_s - samples.index
     orientation = read_orientation(samples)
     return _make_ulog_track(
         topics,
@@ -165,26 +195,42 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
 def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
     """Describe the clock of a topic with arrival times instead of measurement times; else None.
 
-    PX4 uses the arrival time until it has received 500 TIMESYNC replies (``Timesync.cpp``).
+    PX4 uses the arrival time until it has received 500 TIMESYNC replies (``Timesync.cpp``). px4fuse
+    uses it if ``timestamp_sample`` is not the boot clock in microseconds.
     """
     table = topics.of(topic)[0]
-    if "timestamp_sample" not in table:
+    if "timestamp_sample" not in table or len(table["timestamp"]) < MIN_TRACK_SAMPLES:
         return None
-    age_us = table["timestamp"].astype(np.int64) - table["timestamp_sample"].astype(np.int64)
-    if (
-        len(age_us) < MIN_TRACK_SAMPLES
-        or np.mean(np.abs(age_us) <= MAX_ARRIVAL_DELAY_US) < MIN_ARRIVAL_FRACTION
-    ):
+    published_us = table["timestamp"].astype(np.int64)
+    sampled_us = table["timestamp_sample"].astype(np.int64)
+    age_us = published_us - sampled_us
+    if np.mean(np.abs(age_us) <= MAX_ARRIVAL_DELAY_US) >= MIN_ARRIVAL_FRACTION:
+        clock = SENDER_CLOCK
+        note = "PX4 replaced the timestamps by arrival times: the clocks were not synchronised"
+    elif abs(np.median(age_us)) > MAX_PUBLICATION_LAG_S * 1e6:
+        clock = _stamp_clock(published_us, sampled_us)
+        note = "timestamp_sample is not the autopilot's clock in microseconds"
+    elif (distinct := len(np.unique(sampled_us))) < 0.5 * len(sampled_us):
+        return ClockMap(
+            SENDER_CLOCK, "as sent", len(age_us), 0.0, 0.0, 0.0, SHARED_STAMPS, distinct
+        )
+    else:
         return None
-    return ClockMap(
-        "sender timestamps",
-        "arrival time",
-        len(age_us),
-        0.0,
-        0.0,
-        0.0,
-        "PX4 replaced the timestamps by arrival times: the clocks were not synchronised",
-    )
+    return ClockMap(clock, "arrival time", len(age_us), 0.0, 0.0, 0.0, note)
+
+
+def _stamp_clock(published_us: IntArray, sampled_us: IntArray) -> str:
+    """Return the clock of timestamps that are not boot time in microseconds."""
+    if not sampled_us.any():
+        return "0"
+    rate = float(np.ptp(published_us)) / max(float(np.ptp(sampled_us)), 1.0)
+    units = [name for name, us in STAMP_UNITS.items() if abs(rate / us - 1.0) < MAX_RATE_ERROR]
+    if not units:
+        return "an unknown clock"
+    stamp_s = float(np.median(sampled_us)) * STAMP_UNITS[units[0]] * 1e-6
+    if UNIX_START_S <= stamp_s < UNIX_END_S:
+        return f"UNIX time in {units[0]}"
+    return units[0] if units[0] != "microseconds" else "another clock"
 
 
 def _read_ev_pos_aid(topics: Topics, turns: bool) -> PositionTrack | Unavailable:

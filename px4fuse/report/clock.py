@@ -5,6 +5,8 @@ from collections.abc import Iterable, Iterator
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import aid_of, delay_ms
+from px4fuse.convention.correction import find_faults
+from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
 from px4fuse.findings import Finding
 from px4fuse.findings.source_clock import clock_offset_option_s
@@ -72,6 +74,13 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
         <= max_delay_s + NEGLIGIBLE_OFFSET_S
     ):
         advice["PX4"] = f"{delay_name} {configured_delay_ms:g} ms is within the 95 % interval."
+    elif (
+        configured_delay_ms is not None and 1e3 * (age_s - offset) > PARAMETERS[delay_name].maximum
+    ):
+        advice["PX4"] = (
+            f"{delay_name} cannot exceed {PARAMETERS[delay_name].maximum:g} ms. Correct the "
+            "sender's clock."
+        )
     elif configured_delay_ms is not None and offset > age_s and configured_delay_ms <= 0.0:
         advice["PX4"] = (
             f"The maximum-likelihood {delay_name} is {1e3 * (age_s - offset):.0f} ms, but "
@@ -91,7 +100,13 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
             f"The offset changes during the flight ({format_p_value(clock.change_p_value)}): "
             f"{offset_texts}."
         )
-    if clock.drift_ppm is not None and clock.drift_sigma_ppm is not None:
+    source = comparison.source
+    if drift := find_faults(comparison.convention, comparison.flight, source.frame).clock_drift:
+        advice["Drift"] = (
+            f"The clock of the timestamps is {abs(100.0 * drift):.1f} % "
+            f"{'fast' if drift > 0.0 else 'slow'}. The offset is that of the middle of the data."
+        )
+    elif clock.drift_ppm is not None and clock.drift_sigma_ppm is not None:
         half_width_ppm = 1.96 * clock.drift_sigma_ppm
         note = ", not significant" if abs(clock.drift_ppm) < half_width_ppm else ""
         advice["Drift"] = (

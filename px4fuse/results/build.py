@@ -44,6 +44,7 @@ _COPIED_FIELDS = (
     "findings",
     "notes",
     "missing",
+    "convention",
 )
 
 

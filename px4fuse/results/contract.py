@@ -16,6 +16,7 @@ from px4fuse.card.model import Card
 from px4fuse.comparison.causal_replays import Intervention
 from px4fuse.comparison.model import AxisResult, FilterName
 from px4fuse.comparison.trials import Trial
+from px4fuse.convention.model import Convention
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Agreement, Replayed
 from px4fuse.ekf2.steps import DifferenceSteps
@@ -208,6 +209,9 @@ class ComparisonResults(_FlightResults, frozen=True):
         Missing data, with reasons and actions.
     student : Student
     provenance : Provenance
+    convention : Convention
+        Axes, unit, clock and orientation of the source as sent. Absent for GNSS, and without IMU or
+        attitude.
     """
 
     axes: Annotated[dict[AxisName, AxisResult], Meta(min_length=1)]
@@ -227,6 +231,7 @@ class ComparisonResults(_FlightResults, frozen=True):
     missing: tuple[Unavailable, ...]
     student: Student
     provenance: Provenance
+    convention: Convention | None = None
 
 
 class AidsResults(Record, frozen=True):

@@ -1,0 +1,55 @@
+"""Convention of a position file that matches neither EKF2 nor the IMU as stated."""
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.alignment.matching import AlignmentProblem
+from px4fuse.convention.axes import UNITS
+from px4fuse.convention.check import check_convention
+from px4fuse.convention.correction import MIN_ROTATION_DEG
+from px4fuse.convention.texts import FRAME_AXES, UNIT_NAMES, describe_axes, describe_unit
+from px4fuse.flight import Columns, Flight, PositionTrack
+from px4fuse.position_source import POSITION_FILE
+
+MAX_SPAN_S = 7200.0  # of file and log; the search takes 1 s per hour
+
+
+def explain_mismatch(
+    flight: Flight, problem: AlignmentProblem, metres_per_unit: float = 1.0
+) -> tuple[str, str] | None:
+    """Return the fault of a file's axes or unit, and the action; None if the motion shows none.
+
+    Parameters
+    ----------
+    flight : Flight
+    problem : AlignmentProblem
+    metres_per_unit : float
+        Factor that was applied to the positions of the file.
+    """
+    samples = problem.samples
+    span_s = max(float(samples.index[-1] - samples.index[0]), flight.log.duration_s)
+    if span_s > MAX_SPAN_S:
+        return None
+    time_s = samples.index - samples.index[0] + (problem.lag_s or 0.0)
+    positions = samples[["x_m", "y_m", "z_m"]] / metres_per_unit
+    values = np.hstack([positions, np.full((len(samples), 3), np.nan)])
+    table = pd.DataFrame(
+        values, pd.Index(time_s, name="time_s"), Columns.POSITION + Columns.POSITION_VARIANCE
+    )
+    track = PositionTrack("", POSITION_FILE, "", table, "unknown", "", ())
+    reach = {} if problem.lag_s is not None else {"max_offset_s": span_s}
+    convention = check_convention(flight, track, **reach)
+    if convention is None or convention.verdict != "determined":
+        return None
+    axes, faults = (convention.x, convention.y, convention.z), []
+    if UNITS[convention.unit] != metres_per_unit:
+        stated = next(name for unit, name in UNIT_NAMES.items() if UNITS[unit] == metres_per_unit)
+        faults.append(describe_unit(convention.unit, "the positions", stated, is_file=True))
+    stated = (problem.frame or "").upper()
+    is_rotated = abs(convention.rotation_deg) > MIN_ROTATION_DEG
+    if stated and axes != FRAME_AXES[stated] and not is_rotated:
+        faults.append(describe_axes(axes, stated, is_mirrored=convention.is_mirrored, is_file=True))
+    if not faults:
+        return None
+    texts, actions = zip(*faults, strict=True)
+    return "; ".join(texts), " ".join(actions)

@@ -1,0 +1,1 @@
+"""Check of a position source's convention: axes, unit, clock and orientation."""

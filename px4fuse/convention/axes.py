@@ -1,0 +1,332 @@
+"""Maximum-likelihood search of the map from the positions of a source to north, east and down.
+
+A hypothesis consists of axes (48 signed permutations, mirrored ones included), a rotation about the
+vertical, a unit and a time offset, usually up to 10 s. For one time offset, all hypotheses
+follow from one 3×3 matrix of moments: with w = D_a ± i D_b of the source and n = A_north + i A_east
+of the IMU, the best rotation is the angle of Σ conj(w) n. The best hypotheses are refined together
+with an accelerometer bias (body) and, with the heading of the gyro, its linear drift.
+
+Residuals (m) have a Student distribution with ``FREEDOM`` degrees of freedom, with one scale for
+north and east and one for down. The log likelihood is relative to positions without relation to the
+motion, and contains the Jacobian of the unit: small units make residuals small.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from px4fuse.arrays import Array, IntArray
+from px4fuse.convention.motion import GRID_S, WINDOW_S, ImuMotion, SourceMotion
+
+MAX_OFFSET_S = 10.0
+MIN_OVERLAP_S = 10.0
+# Minimum scale (m) of the residuals: IMU noise, tilt and interpolation over T
+MIN_SIGMA_M, MIN_SIGMA_DOWN_M = 0.05, 0.08
+FREEDOM = 4.0
+UNITS: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}  # m
+SMALL_ROTATION = np.radians(8.0)  # a smaller rotation is not another convention
+SMALL_OFFSET_S = 0.3
+# Log prior odds of a rotation, a time offset and a unit other than metres
+ROTATION_ODDS, OFFSET_ODDS, UNIT_ODDS = -1.0, -2.0, -2.0
+BAROMETER_SIGMA_M, BAROMETER_WEIGHT = 0.5, 6.0
+MAX_REFINED, MAX_DEFICIT = 8, 60.0  # hypotheses of the coarse search that are refined
+MAX_ROWS = 1200  # of the refinement
+ITERATIONS = 7
+MAX_STEP_S = 0.15  # of the time offset per iteration
+# Prior precision of time offset (s), rotation (rad), drift of the gyro's heading (σ 0.05 °/s),
+# clock drift, accelerometer bias (σ 0.3 m/s²)
+PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
+CLOCKWISE = ("north", "east", "south", "west")
+Axes = tuple[str, str, str]
+# Log prior odds of axes. Left-handed frames: one wrong sign, or x and y exchanged
+AXES_ODDS: Final[dict[Axes, float]] = {
+    ("north", "east", "down"): 1.0,  # as stated
+    ("east", "north", "up"): -0.5,
+    ("north", "west", "up"): -1.0,
+    ("north", "east", "up"): -2.5,
+    ("east", "north", "down"): -2.5,
+    ("north", "west", "down"): -2.5,
+}
+
+
+class Family(NamedTuple):
+    """Vertical axis and its sign (1: down), other axes a and b, handedness seen from above."""
+
+    vertical: int
+    sign: int
+    a: int
+    b: int
+    hand: int
+
+    @property
+    def is_mirrored(self) -> bool:
+        """True for a left-handed frame."""
+        return (self.sign * self.hand < 0) != (self.vertical == 1)
+
+    def axes(self, quarter: int) -> Axes:
+        """Return the directions of x, y, z if axis a points to ``CLOCKWISE[quarter]``."""
+        names = ["down" if self.sign > 0 else "up"] * 3
+        names[self.a] = CLOCKWISE[quarter % 4]
+        names[self.b] = CLOCKWISE[(quarter + self.hand) % 4]
+        return names[0], names[1], names[2]
+
+    def log_odds(self, quarter: int) -> float:
+        """Return the log prior odds of the axes."""
+        axes = self.axes(quarter)
+        other = -2.0 if self.vertical == 2 or axes[1] == "up" else -4.0
+        return AXES_ODDS.get(axes, -5.0 if self.is_mirrored else other)
+
+
+FAMILIES = tuple(
+    Family(vertical, sign, 0 if vertical else 1, 1 if vertical == 2 else 2, hand)
+    for vertical, sign, hand in product(range(3), (1, -1), (1, -1))
+)
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Positions of a source as sent, and barometer heights (time in s, height in m, up)."""
+
+    time_s: Array
+    position_m: Array
+    max_offset_s: float
+    barometer: tuple[Array, Array] | None = None
+
+    def with_clock_drift(self, drift: float) -> "Positions":
+        """Return the positions with the drift removed from the timestamps."""
+        middle = float(np.mean(self.time_s))
+        return replace(self, time_s=middle + (self.time_s - middle) / (1.0 + drift))
+
+    def motion(self, imu: ImuMotion) -> SourceMotion:
+        """Return the motion on the grid of the IMU, extended by the largest time offset."""
+        edge = round(self.max_offset_s / GRID_S)
+        grid = imu.time_s[0] + GRID_S * np.arange(-edge, len(imu.time_s) + edge)
+        return SourceMotion.of(self.time_s, self.position_m, grid)
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """Map from the positions of a source to NED, with its likelihood.
+
+    Attributes
+    ----------
+    family : Family
+    unit : str
+    parameters : ndarray, shape (7,)
+        Delay of the timestamps (s); rotation of axis a from north, clockwise (rad); drift of the
+        gyro's heading (rad/s); clock drift; accelerometer bias (m/s²; forward, right, down).
+    score : float
+        Log likelihood relative to no relation, with log prior odds.
+    has_rotation : bool
+        False for a multiple of 90°.
+    has_clock_drift : bool
+    scale, max_scale : float
+        Ratio of the distances in the source to those of the IMU, in addition to the unit: lower
+        limit, with IMU noise only, and upper limit, with noise of the source only.
+    sigma_m : float
+        Scale of the horizontal residuals.
+    windows : float
+        Number of independent residuals.
+    heading_from : {"EKF2", "gyroscopes"}
+    """
+
+    family: Family
+    unit: str
+    parameters: Array
+    score: float
+    has_rotation: bool = True
+    has_clock_drift: bool = False
+    scale: float = 1.0
+    max_scale: float = 1.0
+    sigma_m: float = 0.0
+    windows: float = 0.0
+    heading_from: str = "EKF2"
+
+    @property
+    def offset_s(self) -> float:
+        """Delay of the timestamps."""
+        return float(self.parameters[0])
+
+    @property
+    def quarter(self) -> int:
+        """Number of quarter turns nearest to the rotation."""
+        return round(float(self.parameters[1]) / (np.pi / 2.0))
+
+    @property
+    def axes(self) -> Axes:
+        """Directions of x, y and z, to the nearest quarter turn."""
+        return self.family.axes(self.quarter)
+
+    @property
+    def remainder_rad(self) -> float:
+        """Rotation beyond the quarter turns."""
+        return float(self.parameters[1] - self.quarter * np.pi / 2.0)
+
+    def has_meaning_of(self, other: "Hypothesis") -> bool:
+        """Return True if axes and unit are equal and the time offset is similar."""
+        is_close = abs(self.offset_s - other.offset_s) < 0.5
+        return is_close and (self.axes, self.unit) == (other.axes, other.unit)
+
+
+def search(positions: Positions, imu: ImuMotion, heading_from: str) -> list[Hypothesis]:
+    """Return the refined hypotheses, best first; empty without enough overlap."""
+    source, refined = positions.motion(imu), []
+    for candidate in find_candidates(source, imu):
+        start = replace(candidate, heading_from=heading_from)
+        refined.append(refine(start, positions, source, imu))
+        if abs(candidate.remainder_rad) < 3.0 * SMALL_ROTATION:
+            nearest = [0.0, candidate.remainder_rad, *[0.0] * 5]
+            start = replace(start, parameters=start.parameters - nearest, has_rotation=False)
+            refined.append(refine(start, positions, source, imu))
+    return sorted(refined, key=lambda one: -one.score)
+
+
+def find_candidates(source: SourceMotion, imu: ImuMotion) -> list[Hypothesis]:
+    """Return the best hypotheses on a grid of time offsets, from Gaussian likelihoods.
+
+    Each has the best time offset for its axes (to a quarter turn) and unit.
+    """
+    left = np.column_stack([source.table, source.table**2, source.is_valid])
+    right = np.column_stack([imu.table[..., 0], imu.table[..., 0] ** 2, imu.is_valid])
+    steps = np.arange(len(left) - len(right) + 1)
+    means = np.stack([left[k : k + len(right)].T @ right for k in steps])
+    has_overlap = means[:, 6, 6] * GRID_S >= MIN_OVERLAP_S
+    if not has_overlap.any():
+        return []
+    offset_s, means = (steps[has_overlap] - steps[-1] / 2.0) * GRID_S, means[has_overlap]
+    windows = means[:, 6, 6, None, None] * (GRID_S / WINDOW_S)
+    means /= means[:, 6:, 6:]
+    vertical, sign, a, b, hand = np.array(FAMILIES).T
+    correlation = means[:, a, 0] + hand * means[:, b, 1] + 1j * means[:, a, 1]
+    correlation -= 1j * hand * means[:, b, 0]
+    square, unit = np.maximum(means[:, 3:6, 6, None], 1e-12), np.array([*UNITS.values()])
+    north2, east2, down2 = np.moveaxis(means[:, 6, 3:6, None, None], 1, 0)
+    horizontal = unit**2 * (square[:, a] + square[:, b]) + north2 + east2
+    horizontal = (horizontal - 2.0 * unit * np.abs(correlation)[..., None]) / 2.0
+    down = unit**2 * square[:, vertical] + down2
+    down -= 2.0 * unit * (sign * means[:, vertical, 2])[..., None]
+    score = np.sum(np.log(square), axis=1)[:, None] + 6.0 * np.log(unit)
+    score = score - 2.0 * np.log(np.maximum(horizontal, MIN_SIGMA_M**2))
+    score = 0.5 * windows * (score - np.log(np.maximum(down, MIN_SIGMA_DOWN_M**2)))
+    angle = np.angle(correlation)
+    quarter = np.round(angle / (np.pi / 2.0)).astype(int) % 4
+    found = []
+    for k in range(4):
+        score_of_quarter = np.where((quarter == k)[..., None], score, -np.inf)
+        for (f, u), row in np.ndenumerate(np.argmax(score_of_quarter, axis=0)):
+            name, family = [*UNITS][u], FAMILIES[f]
+            total = score_of_quarter[row, f, u] + family.log_odds(k) + UNIT_ODDS * (name != "m")
+            parameters = np.array([offset_s[row], angle[row, f], *[0.0] * 5])
+            found.append(Hypothesis(family, name, parameters, float(total)))
+    found.sort(key=lambda one: -one.score)
+    return [one for one in found[:MAX_REFINED] if one.score > found[0].score - MAX_DEFICIT]
+
+
+def refine(
+    start: Hypothesis, positions: Positions, source: SourceMotion, imu: ImuMotion
+) -> Hypothesis:
+    """Refine a hypothesis by robust least squares (Gauss-Newton)."""
+    rows = np.flatnonzero(source.is_valid)
+    rows = rows[:: max(1, len(rows) // MAX_ROWS)]
+    best, parameters = replace(start, score=-np.inf), start.parameters
+    for _ in range(ITERATIONS):
+        one, step = _evaluate(replace(start, parameters=parameters), rows, source, imu)
+        if one.score > best.score:
+            best = one
+        parameters = parameters + step
+    return replace(best, score=best.score + _log_odds(best, positions))
+
+
+def _evaluate(
+    one: Hypothesis, rows: IntArray, source: SourceMotion, imu: ImuMotion
+) -> tuple[Hypothesis, Array]:
+    """Return a hypothesis with its score, and the Gauss-Newton step of the parameters."""
+    offset_s, angle, heading_drift, clock_drift = one.parameters[:4]
+    bias, time_s = one.parameters[4:], source.time_s[rows]
+    row_s, middle_s = GRID_S * float(np.median(np.diff(rows))), float(np.mean(time_s))
+    at = time_s - offset_s - clock_drift * (time_s - middle_s)
+    at = (at - imu.time_s[0]) / GRID_S
+    index = np.clip(np.floor(at).astype(int), 0, len(imu.time_s) - 2)
+    used = (at >= 0) & (at < len(imu.time_s) - 1) & imu.is_valid[index]
+    windows = float(np.count_nonzero(used)) * row_s / WINDOW_S
+    if windows * WINDOW_S < MIN_OVERLAP_S:
+        return replace(one, score=-np.inf), np.zeros(len(one.parameters))
+    index, time_s = index[used], time_s[used]
+    flown_s = time_s - time_s[0]
+    fraction = (at[used] - index)[:, None, None]
+    table = (1.0 - fraction) * imu.table[index] + fraction * imu.table[index + 1]
+    sent, family, unit = source.table[rows[used]], one.family, UNITS[one.unit]
+    horizontal = sent[:, family.a] + 1j * family.hand * sent[:, family.b]
+    horizontal = unit * np.exp(1j * (angle + heading_drift * flown_s)) * horizontal
+    down = unit * family.sign * sent[:, family.vertical]
+    ned = np.column_stack([horizontal.real, horizontal.imag, down])
+    measured = table[..., 0] - table[..., 1:] @ bias
+    residual = ned - measured
+    squares = np.stack([np.abs(horizontal - measured[:, 0] - 1j * measured[:, 1]), residual[:, 2]])
+    squares = squares**2
+    gain, sigma_m = student_score(squares[0], 2, MIN_SIGMA_M)
+    gain_down, sigma_down_m = student_score(squares[1], 1, MIN_SIGMA_DOWN_M)
+    is_known = sent.any(axis=0)  # False for a missing height
+    gain += gain_down * is_known[family.vertical] + np.log(unit) * np.count_nonzero(is_known)
+    gain -= sum(student_score(column**2, 1, 1e-6)[0] for column in sent.T[is_known])
+    weight = 1.0 / (np.array([[sigma_m**2], [sigma_down_m**2]]) + squares / FREEDOM)
+    weight *= row_s / WINDOW_S
+    products = [
+        float(np.sum(weight[0] @ (first[:, :2] * second[:, :2])))
+        for first, second in ((ned, ned), (ned, measured), (measured, measured))
+    ]
+    jacobian = np.zeros((len(index), 3, len(PRECISION)))
+    jacobian[..., 0] = imu.rate_m_s[index]
+    jacobian[:, 0, 1], jacobian[:, 1, 1] = -horizontal.imag, horizontal.real
+    jacobian[..., 2] = jacobian[..., 1] * flown_s[:, None]
+    jacobian[..., 3] = jacobian[..., 0] * (time_s - middle_s)[:, None]
+    jacobian[..., 4:] = table[..., 1:]
+    free = np.array([True, one.has_rotation, one.heading_from != "EKF2", one.has_clock_drift])
+    free = np.append(free, np.ones(3, dtype=bool))
+    weights, columns = weight[[0, 0, 1]].T.ravel(), jacobian[..., free].reshape(-1, free.sum())
+    weighted = columns.T * weights
+    normal = weighted @ columns + np.diag(PRECISION[free] + 1e-9)
+    gradient = weighted @ residual.ravel() + (PRECISION * one.parameters)[free]
+    step = np.zeros(len(PRECISION))
+    step[free] = -np.linalg.solve(normal, gradient)
+    step[0] = np.clip(step[0], -MAX_STEP_S, MAX_STEP_S)
+    scored = replace(
+        one,
+        score=float(windows * gain - 0.5 * PRECISION @ one.parameters**2),
+        scale=products[1] / products[2],
+        max_scale=products[0] / products[1],
+        sigma_m=sigma_m,
+        windows=windows,
+    )
+    return scored, step
+
+
+def student_score(squares: Array, dimensions: int, min_sigma: float) -> tuple[float, float]:
+    """Return the mean Student log likelihood of squared residuals, and its scale (maximised)."""
+    variance = max(float(np.median(squares)) / (0.455, 1.386)[dimensions - 1], min_sigma**2)
+    for _ in range(5):
+        weight = (FREEDOM + dimensions) / (FREEDOM + squares / variance)
+        variance = max(float(np.mean(weight * squares)) / dimensions, min_sigma**2)
+    tails = np.mean(np.log1p(squares / variance / FREEDOM))
+    score = -0.5 * (dimensions * np.log(variance) + (FREEDOM + dimensions) * tails)
+    return float(score), float(np.sqrt(variance))
+
+
+def _log_odds(one: Hypothesis, positions: Positions) -> float:
+    """Return the log prior odds of a hypothesis, and the log likelihood of its height."""
+    odds = one.family.log_odds(one.quarter) + UNIT_ODDS * (one.unit != "m")
+    odds += OFFSET_ODDS * (abs(one.offset_s) > SMALL_OFFSET_S)
+    if one.has_rotation:
+        odds -= 0.5 * float(np.log(max(one.windows, 2.0)))
+        odds += ROTATION_ODDS if abs(one.remainder_rad) > SMALL_ROTATION else -0.5
+    if positions.barometer is None:
+        return odds
+    barometer = np.interp(positions.time_s - one.offset_s, *positions.barometer)
+    down = UNITS[one.unit] * one.family.sign * positions.position_m[:, one.family.vertical]
+    error = down - np.median(down) + barometer - np.median(barometer)
+    square = float(np.mean(np.minimum(error**2, (20.0 * BAROMETER_SIGMA_M) ** 2)))
+    floor = BAROMETER_SIGMA_M**2
+    ratio = max(float(np.var(barometer)), floor) / max(square, floor)
+    return odds + 0.5 * BAROMETER_WEIGHT * float(np.log(ratio))

@@ -1,0 +1,229 @@
+"""Decision on the convention of a position source, before anything is estimated from it."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from msgspec import structs
+
+from px4fuse.convention.axes import (
+    MAX_OFFSET_S,
+    SMALL_ROTATION,
+    UNITS,
+    Hypothesis,
+    Positions,
+    find_candidates,
+    refine,
+    search,
+)
+from px4fuse.convention.model import Convention, OrientationConvention, Verdict
+from px4fuse.convention.motion import (
+    WINDOW_S,
+    ImuMotion,
+    Inertial,
+    heading,
+    motion_from_imu,
+    read_inertial,
+    replace_heading,
+)
+from px4fuse.convention.orientation import check_orientation
+from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
+
+MIN_LOG_ODDS = 4.0  # to the best other convention
+MIN_GAIN = 8.0  # log likelihood over no relation
+MIN_GAIN_PER_WINDOW = (0.15, 0.4)  # of a determined and of an ambiguous convention
+MIN_SCALE, MAX_SCALE = 0.88, 1.12
+# Residuals over those that explain the noise of the source and the minimum error (m) of the IMU
+MAX_RESIDUAL_RATIO, IMU_ERROR_M = 2.4, 0.05
+MAX_LOGGED_DEFICIT = 20.0  # by which the logged heading may fit worse than the gyro's
+MIN_DRIFT_GAIN = 15.0
+DRIFTS = np.linspace(-0.05, 0.05, 21)
+MAX_REPEATED_SHARE = 0.5
+# Sums of the squares of the coefficients of third and second differences
+THIRD_DIFFERENCE, SECOND_DIFFERENCE = 20.0, 6.0
+
+
+def check_convention(
+    flight: Flight, track: PositionTrack, max_offset_s: float = MAX_OFFSET_S
+) -> Convention | None:
+    """Determine axes, unit, clock and orientation of a position source.
+
+    Parameters
+    ----------
+    flight : Flight
+    track : PositionTrack
+        Positions as read: north, east, down by their definition.
+    max_offset_s : float
+        Largest time offset that is tried.
+
+    Returns
+    -------
+    Convention, or None without IMU or attitude.
+    """
+    inertial = read_inertial(flight)
+    if isinstance(inertial, Unavailable):
+        return None
+    positions = _read_positions(flight, track, max_offset_s)
+    motions = {
+        "EKF2": motion_from_imu(inertial, inertial.with_logged_heading),
+        "gyroscopes": motion_from_imu(inertial, inertial.gyro),
+    }
+    found = _search(positions, motions)
+    if not found:
+        return Convention(verdict="not determinable")
+    drift = _clock_drift(positions, motions[found[0].heading_from], found[0])
+    corrected = positions.with_clock_drift(drift)
+    with_drift = _search(corrected, motions) if drift else []
+    if with_drift and with_drift[0].score > found[0].score + MIN_DRIFT_GAIN:
+        found, positions = with_drift, corrected
+    else:
+        drift = 0.0
+    convention = _decide(found, positions, drift)
+    if track.orientation is None:
+        return convention
+    orientation = _check_orientation(inertial, track, positions, found[0], convention.verdict)
+    return structs.replace(convention, orientation=orientation)
+
+
+def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -> Positions:
+    """Return the positions without repeated ones; a missing height is 0."""
+    samples, barometer = track.samples[Columns.POSITION], flight.barometer
+    if samples["down_m"].notna().mean() < MAX_REPEATED_SHARE:
+        samples = samples.assign(down_m=0.0)
+    samples = samples.dropna()
+    is_repeated = (samples.diff() == 0.0).all(axis=1)
+    if is_repeated.mean() < MAX_REPEATED_SHARE:
+        samples = samples[~is_repeated]
+    heights = None
+    if barometer is not None:
+        heights = barometer.index.to_numpy(), -barometer["down_m"].to_numpy()
+    return Positions(samples.index.to_numpy(), samples.to_numpy(), max_offset_s, heights)
+
+
+def _search(positions: Positions, motions: dict[str, ImuMotion]) -> list[Hypothesis]:
+    """Return the hypotheses with both headings, best first.
+
+    If the logged heading fits about as well as the gyro's, it is preferred: it refers to north, the
+    gyro's only to the heading at the start.
+    """
+    found = [one for name in motions for one in search(positions, motions[name], name)]
+    found.sort(key=lambda one: -one.score)
+    for one in found:
+        if (
+            one.heading_from == "EKF2"
+            and one.score > found[0].score - MAX_LOGGED_DEFICIT
+            and one.has_meaning_of(found[0])
+            and abs(one.remainder_rad - found[0].remainder_rad) < SMALL_ROTATION
+        ):
+            return [
+                replace(one, score=found[0].score),
+                *(other for other in found if other is not one),
+            ]
+    return found
+
+
+def _decide(found: list[Hypothesis], positions: Positions, drift: float) -> Convention:
+    """Compare the best hypothesis with the others and with the noise of the source."""
+    best = found[0]
+    rivals = [one for one in found if not one.has_meaning_of(best)]
+    if not positions.position_m[:, 2].any():  # without height, up and down are equivalent
+        rivals = [one for one in rivals if one.axes[:2] != best.axes[:2]]
+    log_odds = best.score - rivals[0].score if rivals else None
+    is_ambiguous = log_odds is not None and log_odds < MIN_LOG_ODDS
+    verdict: Verdict = "ambiguous" if is_ambiguous else "determined"
+    if best.score < MIN_GAIN:
+        verdict = "not determinable"
+    elif (
+        best.score < MIN_GAIN_PER_WINDOW[is_ambiguous] * best.windows
+        or best.scale > MAX_SCALE
+        or best.max_scale < MIN_SCALE
+        or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO
+    ):
+        verdict = "doubtful"
+    names: dict[str, Any] = dict(zip("xyz", best.axes, strict=True))
+    names |= {"unit": best.unit, "heading_from": best.heading_from}
+    return Convention(
+        verdict=verdict,
+        **names,
+        is_mirrored=best.family.is_mirrored,
+        rotation_deg=-float(np.degrees(best.remainder_rad)) * best.has_rotation,
+        late_s=best.offset_s,
+        clock_drift=drift,
+        scale=best.scale,
+        log_odds=log_odds,
+        log_likelihood_gain=best.score,
+        alternatives=tuple(
+            dict.fromkeys(_describe(one) for one in rivals if one.score > best.score - MIN_LOG_ODDS)
+        ),
+    )
+
+
+def _describe(one: Hypothesis) -> str:
+    """Describe a hypothesis in words."""
+    x, y, z = one.axes
+    rotation = f", rotated by {-np.degrees(one.remainder_rad):+.0f}°" if one.has_rotation else ""
+    return f"x {x}, y {y}, z {z}, {one.unit}{rotation}, timestamps {one.offset_s:+.1f} s late"
+
+
+def residual_ratio(one: Hypothesis, positions: Positions) -> float:
+    """Return the residuals over those that noise of the source and error of the IMU explain.
+
+    The noise is that of third differences, which contain hardly any motion.
+    """
+    third = np.diff(positions.position_m, 3, axis=0)
+    deviation = 1.4826 * float(np.median(np.abs(third - np.median(third, axis=0))))
+    noise_m = UNITS[one.unit] * deviation * np.sqrt(SECOND_DIFFERENCE / THIRD_DIFFERENCE)
+    return float(one.sigma_m / np.hypot(noise_m, IMU_ERROR_M))
+
+
+def _clock_drift(positions: Positions, imu: ImuMotion, best: Hypothesis) -> float:
+    """Return the most likely drift of the clock; if nothing fits, drifts of 5 % are tried."""
+    start = 0.0
+    if best.score < MIN_GAIN or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO:
+        gains = []
+        for drift in DRIFTS:
+            source = positions.with_clock_drift(drift).motion(imu)
+            gains.append(max((one.score for one in find_candidates(source, imu)), default=-np.inf))
+        start = float(DRIFTS[int(np.argmax(gains))])
+        positions = positions.with_clock_drift(start)
+        candidates = find_candidates(positions.motion(imu), imu)
+        best = replace(candidates[0], heading_from=best.heading_from) if candidates else best
+    one = refine(replace(best, has_clock_drift=True), positions, positions.motion(imu), imu)
+    drift = (1.0 + start) / (1.0 - float(one.parameters[3])) - 1.0
+    return drift if start or one.score > best.score + MIN_DRIFT_GAIN else 0.0
+
+
+def _check_orientation(
+    inertial: Inertial,
+    track: PositionTrack,
+    positions: Positions,
+    best: Hypothesis,
+    verdict: Verdict,
+) -> OrientationConvention | None:
+    """Check the orientation, and its heading against the positions.
+
+    For the second, the source's heading replaces the logged one: this needs no reference to north.
+    """
+    assert track.orientation is not None
+    quaternions = track.orientation[Columns.QUATERNION].to_numpy()
+    checked = check_orientation(inertial, track.orientation.index.to_numpy(), quaternions)
+    if checked is None:
+        return None
+    convention, time_s, attitude = checked
+    is_known = convention.verdict in ("determined", "ambiguous") and verdict == "determined"
+    if not is_known or best.family.vertical != 2 or best.family.is_mirrored:
+        return convention
+    own_heading = np.interp(inertial.time_s, time_s, heading(attitude))
+    motion = motion_from_imu(inertial, replace_heading(inertial.gyro, own_heading))
+    is_covered = (motion.time_s > time_s[0] + WINDOW_S) & (motion.time_s < time_s[-1] - WINDOW_S)
+    motion = replace(motion, is_valid=motion.is_valid & is_covered)
+    # direction of the x axis of a consistent frame, clockwise from north
+    directions_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(convention.frames, [0.0, 90.0])
+    if best.family.sign > 0:
+        directions_deg = [0.0]
+    for one in search(positions, motion, "EKF2"):
+        if (one.family, one.unit, one.has_rotation) == (best.family, best.unit, True):
+            x_deg = float(np.degrees(one.parameters[1]))
+            errors = [(x_deg - at_deg + 180.0) % 360.0 - 180.0 for at_deg in directions_deg]
+            return structs.replace(convention, heading_error_deg=min(errors, key=abs))
+    return convention

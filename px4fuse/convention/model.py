@@ -1,0 +1,83 @@
+"""Records of the convention of a position source."""
+
+from typing import Literal
+
+from px4fuse.record import NotNegative, Positive, Record
+
+Verdict = Literal["determined", "ambiguous", "doubtful", "not determinable"]
+Direction = Literal["north", "east", "south", "west", "up", "down"]
+Frames = Literal["FRD to NED", "FLU to ENU", "FLU to NWU", "FLU to NED", "FRD to ENU"]
+
+
+class OrientationConvention(Record, frozen=True, kw_only=True):
+    """Convention of the orientation of a position source.
+
+    Attributes
+    ----------
+    verdict : str
+        "determined" or "ambiguous"; "copied": equal to the autopilot's attitude; "unrelated": no
+        convention makes the orientation follow the vehicle.
+    order : {"w x y z", "x y z w"}
+        Order of the components as sent.
+    frames : str
+        Body frame and world frame of the orientation.
+    heading_error_deg : float or None
+        Heading of the orientation relative to the positions, clockwise from above; None if it
+        cannot be determined.
+    tilt_difference_deg : float
+        Median difference from the attitude of the gyroscopes, after the conversion.
+    """
+
+    verdict: Literal["determined", "ambiguous", "copied", "unrelated"]
+    order: Literal["w x y z", "x y z w"] = "w x y z"
+    frames: Frames = "FRD to NED"
+    heading_error_deg: float | None = None
+    tilt_difference_deg: NotNegative = 0.0
+
+
+class Convention(Record, frozen=True, kw_only=True):
+    """Convention of the positions of a source, relative to IMU and attitude.
+
+    Attributes
+    ----------
+    verdict : str
+        "doubtful": the best hypothesis leaves errors that no noise of the source explains.
+    x, y, z : str
+        Directions of the axes as sent, to the nearest quarter turn about the vertical.
+    unit : {"m", "cm", "mm", "feet"}
+    is_mirrored : bool
+        True for a left-handed frame.
+    rotation_deg : float
+        Rotation of the positions beyond these axes: clockwise from above, 0 if not significant.
+    heading_from : {"EKF2", "gyroscopes"}
+        Heading that fits the positions: as logged, or integrated from the start of the log.
+    late_s : float
+        Delay of the timestamps; negative if they are early.
+    clock_drift : float
+        Rate of the sender's clock minus 1.
+    scale : float
+        Distances of the source relative to those of the IMU, with the unit applied.
+    log_odds : float or None
+        Log likelihood ratio to the best other convention (with priors); None without another.
+    log_likelihood_gain : float
+        Log likelihood ratio to positions without relation to the motion.
+    alternatives : tuple of str
+        Other conventions that fit about as well.
+    orientation : OrientationConvention or None
+    """
+
+    verdict: Verdict
+    x: Direction = "north"
+    y: Direction = "east"
+    z: Direction = "down"
+    unit: Literal["m", "cm", "mm", "feet"] = "m"
+    is_mirrored: bool = False
+    rotation_deg: float = 0.0
+    heading_from: Literal["EKF2", "gyroscopes"] = "EKF2"
+    late_s: float = 0.0
+    clock_drift: float = 0.0
+    scale: Positive = 1.0
+    log_odds: float | None = None
+    log_likelihood_gain: float = 0.0
+    alternatives: tuple[str, ...] = ()
+    orientation: OrientationConvention | None = None

@@ -1,0 +1,228 @@
+"""Second differences of the position, from the IMU and from a position source.
+
+The second difference of a position is a double integral of the acceleration a(t), without unknown
+initial position and velocity:
+
+p(t + T) - 2 p(t) + p(t - T) = ∫ (T - |s|) a(t + s) ds, s from -T to T
+
+The running mean over ``HIGH_PASS_S`` is subtracted, which removes constant errors of the
+acceleration (tilt, bias).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from px4fuse.arrays import Array, BoolArray, cumulative_integral
+from px4fuse.filter.signals import imu_gaps
+from px4fuse.flight import Columns, Flight, Unavailable
+from px4fuse.trajectory.association import gap_limit, is_bracketed
+from px4fuse.trajectory.rotation import (
+    conjugate,
+    cumulative_product,
+    from_vector,
+    interpolate,
+    multiply,
+    to_matrix,
+    to_vector,
+)
+
+GRAVITY_M_S2 = 9.80665
+WINDOW_S = 2.0  # T
+GRID_S = 0.1  # interval of the second differences
+STEP_S = 0.02  # integration step of the IMU
+HIGH_PASS_S = 12.0
+# Length (s) of the running mean of the specific force that defines the vertical, applied twice. A
+# symmetric mean causes no delay; a causal correction towards gravity delays the result by 0.02 s
+LEVELLING_S = 40.0
+GYRO_BIAS_WINDOW_S = 1.0
+MIN_GAP_S = 0.35  # gap of a source
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """IMU and attitude on a regular grid with interval ``STEP_S``.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (n + 1,)
+    force_m_s2 : ndarray, shape (n, 3)
+        Mean specific force (body FRD) between the times.
+    logged, gyro : ndarray, shape (n + 1, 4)
+        Attitude (w, x, y, z; FRD to NED). ``gyro`` is integrated from the gyroscopes, starting with
+        the first logged attitude; gravity corrects the tilt, nothing corrects the heading.
+    valid_spans_s : tuple of (float, float)
+        Spans in flight without a gap of the IMU.
+    """
+
+    time_s: Array
+    force_m_s2: Array
+    logged: Array
+    gyro: Array
+    valid_spans_s: tuple[tuple[float, float], ...]
+
+    @property
+    def with_logged_heading(self) -> Array:
+        """Attitude with the tilt of ``gyro`` and the heading of ``logged``."""
+        return replace_heading(self.gyro, heading(self.logged))
+
+
+@dataclass(frozen=True)
+class SourceMotion:
+    """Second differences of the positions of a source, as sent, on a grid of ``GRID_S``."""
+
+    time_s: Array
+    table: Array
+    is_valid: BoolArray
+
+    @classmethod
+    def of(cls, time_s: Array, position: Array, grid_s: Array) -> "SourceMotion":
+        """Interpolate positions; a grid point is valid if samples are near all three times."""
+        window = round(WINDOW_S / GRID_S)
+        at_s = grid_s[0] + GRID_S * np.arange(-window, len(grid_s) + window)
+        is_near = is_bracketed(at_s, time_s, gap_limit(time_s, MIN_GAP_S))
+        columns = np.column_stack([np.interp(at_s, time_s, column) for column in position.T])
+        is_valid = is_near[2 * window :] & is_near[window:-window] & is_near[: -2 * window]
+        return cls(grid_s, high_pass(second_difference(columns, window), is_valid), is_valid)
+
+
+@dataclass(frozen=True)
+class ImuMotion:
+    """Second differences (m, NED) of the position, from the IMU.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (n,)
+    is_valid : ndarray of bool, shape (n,)
+    table : ndarray, shape (n, 3, 4)
+        Second difference without accelerometer bias; then its change per 1 m/s² of bias forward,
+        right, down.
+    rate_m_s : ndarray, shape (n, 3)
+        Time derivative of ``table[..., 0]``.
+    """
+
+    time_s: Array
+    is_valid: BoolArray
+    table: Array
+    rate_m_s: Array
+
+
+def read_inertial(flight: Flight) -> Inertial | Unavailable:
+    """Integrate the gyroscopes of a flight to an attitude that no position affects."""
+    imu, attitude = flight.imu, flight.attitude
+    if isinstance(imu, Unavailable):
+        return imu
+    if isinstance(attitude, Unavailable):
+        return attitude
+    imu_s, attitude_s = imu.index.to_numpy(), attitude.index.to_numpy()
+    time_s = np.arange(max(imu_s[0], attitude_s[0]), min(imu_s[-1], attitude_s[-1]), STEP_S)
+    if len(time_s) < 4 * WINDOW_S / STEP_S:
+        return Unavailable(
+            "convention of the positions",
+            "IMU and attitude cover less than 8 s together",
+            "Log both during the flight.",
+        )
+    columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
+    integral = cumulative_integral(imu[columns].to_numpy(), imu_s)
+    steps = np.diff([np.interp(time_s, imu_s, column) for column in integral.T]).T
+    force = steps[:, :3] / STEP_S
+    logged = interpolate(time_s, attitude_s, attitude[Columns.QUATERNION].to_numpy())
+    gyro = _integrate_gyros(steps[:, 3:], logged)
+    gyro = _level(gyro, force)
+    airborne = flight.airborne
+    if isinstance(airborne, Unavailable):
+        airborne = ((float(time_s[0]), float(time_s[-1])),)
+    gaps = np.flatnonzero(imu_gaps(imu_s))
+    edges = zip([-np.inf, *imu_s[gaps + 1]], [*imu_s[gaps], np.inf], strict=True)
+    spans = (
+        (max(start, begin), min(stop, end)) for begin, end in edges for start, stop in airborne
+    )
+    return Inertial(time_s, force, logged, gyro, tuple(s for s in spans if s[0] < s[1]))
+
+
+def _integrate_gyros(angle_rad: Array, logged: Array) -> Array:
+    """Integrate rotations per step, without the gyro bias.
+
+    The bias is the median over windows of 1 s of the difference to the logged rotation: resets of
+    the logged heading are outliers.
+    """
+    excess = angle_rad - to_vector(multiply(conjugate(logged[:-1]), logged[1:]))
+    total = np.cumsum(excess, axis=0)
+    window = round(GYRO_BIAS_WINDOW_S / STEP_S)
+    bias = np.median(total[window:] - total[:-window], axis=0) / window
+    return cumulative_product(np.concatenate([logged[:1], from_vector(angle_rad - bias)]))
+
+
+def _level(attitude: Array, force_m_s2: Array) -> Array:
+    """Correct the tilt: the mean specific force is vertical."""
+    mean = np.einsum("nij,nj->ni", to_matrix(attitude[:-1]), force_m_s2)
+    is_all = np.ones(len(mean), dtype=bool)
+    for _ in range(2):
+        mean = running_mean(mean, is_all, round(LEVELLING_S / STEP_S))
+    up = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1.0)
+    correction = from_vector(np.cross(up, [0.0, 0.0, -1.0]))
+    return multiply(np.concatenate([correction, correction[-1:]]), attitude)
+
+
+def running_mean(values: Array, is_valid: BoolArray, width: int) -> Array:
+    """Return the centred running mean of the valid rows; shorter at the ends."""
+    rows = np.arange(len(values))
+    low, high = np.clip(rows - width // 2, 0, None), np.clip(rows + width // 2 + 1, None, len(rows))
+    flat = np.where(is_valid[:, None], values.reshape(len(rows), -1), 0.0)
+    total = np.cumsum(np.column_stack([flat, is_valid]), axis=0)
+    total = np.concatenate([np.zeros_like(total[:1]), total])
+    sums = total[high] - total[low]
+    means: Array = sums[:, :-1] / np.maximum(sums[:, -1:], 1.0)
+    return means.reshape(values.shape)
+
+
+def high_pass(values: Array, is_valid: BoolArray) -> Array:
+    """Subtract the running mean; invalid rows are 0."""
+    shape = (-1, *[1] * (values.ndim - 1))
+    return np.where(
+        is_valid.reshape(shape),
+        values - running_mean(values, is_valid, round(HIGH_PASS_S / GRID_S)),
+        0.0,
+    )
+
+
+def second_difference(position: Array, window: int) -> Array:
+    """Return p(t + T) - 2 p(t) + p(t - T), with T in samples."""
+    return position[2 * window :] - 2.0 * position[window:-window] + position[: -2 * window]
+
+
+def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
+    """Integrate the acceleration with an attitude (w, x, y, z), shape (n + 1, 4)."""
+    middle = attitude[1:] + attitude[:-1]
+    body_to_ned = to_matrix(middle / np.linalg.norm(middle, axis=1, keepdims=True))
+    acceleration = body_to_ned @ inertial.force_m_s2[..., None] + [[0.0], [0.0], [GRAVITY_M_S2]]
+    table = np.concatenate([acceleration, body_to_ned], axis=2)
+    position = np.zeros((len(attitude), 3, 4))
+    velocity = np.cumsum(table, axis=0) * STEP_S
+    np.cumsum((velocity - table * (STEP_S / 2.0)) * STEP_S, axis=0, out=position[1:])
+    window, every = round(WINDOW_S / STEP_S), round(GRID_S / STEP_S)
+    second = second_difference(position, window)[::every]
+    time_s = inertial.time_s[window:-window][::every]
+    is_valid = np.zeros(len(time_s), dtype=bool)
+    for start, end in inertial.valid_spans_s:
+        # the land detector already excludes the ground; a gap excludes T on both sides
+        is_valid |= (time_s >= start) & (time_s <= end)
+    for (_, end), (start, _) in zip(
+        inertial.valid_spans_s, inertial.valid_spans_s[1:], strict=False
+    ):
+        is_valid &= (time_s < end - WINDOW_S) | (time_s > start + WINDOW_S)
+    filtered = high_pass(second, is_valid)
+    return ImuMotion(time_s, is_valid, filtered, np.gradient(filtered[..., 0], GRID_S, axis=0))
+
+
+def heading(attitude: Array) -> Array:
+    """Return the heading (rad, clockwise from north, continuous) of quaternions (n, 4)."""
+    w, x, y, z = np.moveaxis(attitude, -1, 0)
+    return np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+
+
+def replace_heading(attitude: Array, heading_rad: Array) -> Array:
+    """Rotate quaternions about the vertical to a given heading."""
+    half = np.unwrap(heading_rad - heading(attitude)) / 2.0
+    zeros = np.zeros_like(half)
+    return multiply(np.stack([np.cos(half), zeros, zeros, np.sin(half)], axis=-1), attitude)

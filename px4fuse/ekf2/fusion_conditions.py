@@ -1,0 +1,362 @@
+"""Conditions under which EKF2 fuses positions of external vision or GNSS, in EKF2's order.
+
+Source: PX4-Autopilot ``src/modules/ekf2``, v1.13.3 to main: ``RingBuffer.h``, ``ev_control.cpp``,
+``ev_pos_control.cpp``, ``gnss_checks.cpp`` (``control.cpp``, ``gps_checks.cpp`` before v1.15).
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.ekf2.intervals import MAX_LATENESS_S
+from px4fuse.ekf2_parameters import AID_MASK, Aid
+from px4fuse.flight import Columns, Ekf2, PositionTrack, step_values_at
+from px4fuse.record import Span
+
+T = TypeVar("T", pd.DataFrame, "pd.Series[float]")
+
+EV_START_INTERVAL_S = 0.2  # s; EV_MAX_INTERVAL of PX4 v1.14 and later (ev_control.cpp)
+EV_STOP_INTERVAL_S = 0.4  # s; two times EV_MAX_INTERVAL (ev_pos_control.cpp)
+STOP_S = 7.0  # s without GNSS, or without vision up to v1.13; reset_timeout_max
+MAX_HORIZON_S = 1.0  # s; maximum of the delay parameters of EKF2
+BUFFER_COUNT = 20  # samples; longer waits for a timestamp in the future overwrite the sample
+TIME_STEP_S = 5e-7  # s; half of the resolution of timestamps
+GATE_TIME_S = 1.0  # s; EKF2 stops fusion after rejections for this time (no_aid_timeout_max)
+MAX_CONSTANT_M = 1e-3  # range of positions that contain no measurement
+MIN_FAILED_FRACTION = 0.1  # of the time; EKF2 waits 10 s after each failure of a check
+SET_TIMESTAMP = (
+    "Set timestamp_sample to the time of measurement in microseconds since the autopilot's boot."
+)
+SYNCHRONISE = (
+    "Synchronise the clocks: UXRCE_DDS_SYNCT 1 with the uXRCE-DDS agent, or answer TIMESYNC of "
+    "MAVLink. Send microseconds."
+)
+# Clocks of timestamp_sample that EKF2 cannot use, and the effect on EKF2
+STAMP_FAULTS = {
+    **dict.fromkeys(("0", "milliseconds", "seconds"), "too old"),
+    **dict.fromkeys(
+        ("another clock", "an unknown clock", "UNIX time in seconds"), "too old or in the future"
+    ),
+    **{f"UNIX time in {unit}seconds": "in the future" for unit in ("nano", "micro", "milli")},
+    "nanoseconds": "in the future",
+}
+# Checks of GNSS by bit of gps_check_fail_flags, with parameter and unit of the limit. The bit of
+# EKF2_GPS_CHECK is lower by one; the fix is always checked
+GNSS_CHECKS = (
+    ("3D fix", "", ""),
+    ("number of satellites", "EKF2_REQ_NSATS", ""),
+    ("PDOP", "EKF2_REQ_PDOP", ""),
+    ("horizontal accuracy", "EKF2_REQ_EPH", " m"),
+    ("vertical accuracy", "EKF2_REQ_EPV", " m"),
+    ("speed accuracy", "EKF2_REQ_SACC", " m/s"),
+    ("horizontal drift at rest", "EKF2_REQ_HDRIFT", " m/s"),
+    ("vertical drift at rest", "EKF2_REQ_VDRIFT", " m/s"),
+    ("horizontal speed at rest", "EKF2_REQ_HDRIFT", " m/s"),
+    ("vertical speed", "EKF2_REQ_VDRIFT", " m/s"),
+    ("spoofing", "", ""),
+    ("jamming", "", ""),
+)
+
+
+class Unmet(NamedTuple):
+    """Condition of EKF2 that is not met.
+
+    Attributes
+    ----------
+    fault : str
+        Fault for a title.
+    reason : str
+        Sentences with the values of the log and the limits.
+    action : str
+    is_intended : bool
+        True if EKF2 is rightly set not to fuse these positions.
+    """
+
+    fault: str
+    reason: str
+    action: str
+    is_intended: bool = False
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """Positions that EKF2 did not fuse in the time span ``span_s``; ``parameters`` by PX4 name."""
+
+    ekf2: Ekf2
+    source: PositionTrack
+    aid: Aid
+    parameters: Mapping[str, float]
+    span_s: Span
+
+    @property
+    def is_vision(self) -> bool:
+        return self.source.origin.is_vision
+
+    @property
+    def has_switch(self) -> bool:
+        """True for PX4 v1.14 and later."""
+        return self.aid.switch in self.parameters
+
+    @property
+    def horizon_s(self) -> float:
+        """Age that EKF2 buffers; if it is not logged, EKF2_DELAY_MAX or else an upper limit."""
+        horizon_s = self.ekf2.horizon_s
+        limit_s = 1e-3 * self.parameters.get("EKF2_DELAY_MAX", 1e3 * MAX_HORIZON_S)
+        return horizon_s if isinstance(horizon_s, float) else limit_s
+
+    @property
+    def interval_s(self) -> float:
+        return 1.0 / self.source.rate_hz
+
+    def within(self, samples: T, before_s: float = 0.0) -> T:
+        """Return the samples in the span, and those up to ``before_s`` before it."""
+        return samples.loc[self.span_s[0] - before_s : self.span_s[1]]
+
+    def fraction(self, state: str, bit: int = 0) -> float:
+        """Return the fraction of the span in which a bit of a state is set; NaN if not logged."""
+        steps = self.ekf2.states.get(state)
+        if steps is None:
+            return float("nan")
+        values = step_values_at(steps, np.linspace(*self.span_s, 200))
+        return float(np.mean(values.astype(np.int64) >> bit & 1))
+
+
+def find_unmet(attempt: Attempt) -> tuple[str, Unmet] | None:
+    """Return name and description of the first condition that is not met; None if it is unknown."""
+    conditions = VISION_CONDITIONS if attempt.is_vision else GNSS_CONDITIONS
+    found = ((name, check(attempt)) for name, check in conditions.items())
+    return next(((name, unmet) for name, unmet in found if unmet), None)
+
+
+def _check_switch(attempt: Attempt) -> Unmet | None:
+    name, bit = attempt.aid.switch, 0
+    if not attempt.has_switch:
+        name, bit = AID_MASK, 3 if attempt.is_vision else 0
+    value = int(attempt.parameters.get(name, 1 << bit))
+    if value >> bit & 1:
+        return None
+    quantity = "horizontal position" if attempt.has_switch else attempt.aid.label.replace(",", "")
+    fault, reason = f"{name} is {value}", f"Bit {bit} ({quantity}) is not set."
+    if np.ptp(attempt.source.samples[Columns.POSITION[:2]], axis=0).max() < MAX_CONSTANT_M:
+        reason = f"x and y are constant: the source contains no horizontal position. {reason}"
+        return Unmet(fault, reason, f"Leave bit {bit} of {name} unset.", is_intended=True)
+    return Unmet(fault, reason, f"Set {name} to {value | 1 << bit}.")
+
+
+def _check_frame(attempt: Attempt) -> Unmet | None:
+    is_unknown = attempt.source.frame == "unknown" and attempt.has_switch
+    if not is_unknown or attempt.source.name != "vehicle_visual_odometry":
+        return None
+    return Unmet(
+        "the pose_frame is unknown",
+        "EKF2 (v1.14 and later) reads positions only in the frames NED (1) and FRD (2).",
+        "Send pose_frame 1 (x north, y east) or 2 (x forward at start); in MAVLink ODOMETRY the "
+        "frame_id MAV_FRAME_LOCAL_NED or MAV_FRAME_LOCAL_FRD.",
+    )
+
+
+def _check_gap(attempt: Attempt) -> Unmet | None:
+    is_short = attempt.is_vision and attempt.has_switch
+    limit_s = EV_STOP_INTERVAL_S if is_short else STOP_S
+    times_s = attempt.source.samples.index.to_numpy()
+    start_s, end_s = attempt.span_s
+    # fusion stops when the gap has lasted for the limit
+    before = times_s[times_s < start_s]
+    after = times_s[times_s >= start_s]
+    last_s = before[-1] if len(before) else start_s
+    next_s = min(after[0], end_s) if len(after) else end_s
+    if next_s - last_s <= limit_s + attempt.interval_s:
+        return None
+    return Unmet(
+        f"no position for {next_s - last_s:.1f} s from {last_s:.1f} s",
+        f"EKF2 stops fusion {limit_s:g} s after the last position.",
+        "Restore the line of sight and the link of the position source.",
+    )
+
+
+def _check_clock(attempt: Attempt) -> Unmet | None:
+    clock_map = attempt.source.clock_map
+    if clock_map is None or clock_map.clock not in STAMP_FAULTS:
+        return None
+    clock = clock_map.clock
+    return Unmet(
+        f"the timestamps are {clock if clock == '0' else f'in {clock}'}",
+        "EKF2 reads timestamp_sample in microseconds since the autopilot's boot: for it the "
+        f"positions are {STAMP_FAULTS[clock]}.",
+        SYNCHRONISE if "UNIX" in clock or "clock" in clock else SET_TIMESTAMP,
+    )
+
+
+def _check_age(attempt: Attempt) -> Unmet | None:
+    if "age_s" not in attempt.source.status:
+        return None
+    delay_s = attempt.parameters.get(attempt.aid.delay, 0.0) * 1e-3
+    age_s = float(attempt.within(attempt.source.status["age_s"]).median()) + delay_s
+    if -age_s > BUFFER_COUNT * attempt.interval_s:
+        return Unmet(
+            f"the timestamps are {-age_s:.2f} s in the future",
+            f"EKF2 waits for this time, but buffers only {BUFFER_COUNT} positions.",
+            SYNCHRONISE,
+        )
+    if not age_s > attempt.horizon_s + MAX_LATENESS_S:
+        return None
+    action = SYNCHRONISE
+    if age_s < MAX_HORIZON_S:
+        delay_ms = 50.0 * np.ceil(20.0 * age_s)
+        action = (
+            f"Check the clock of the sender. Then set EKF2_DELAY_MAX to {delay_ms:.0f} ms (v1.15 "
+            "and later)."
+        )
+    return Unmet(
+        f"the positions are {age_s:.2f} s old at arrival",
+        f"EKF2 buffers only {attempt.horizon_s:.2f} s. Timestamps that are too early have the same "
+        "effect.",
+        action,
+    )
+
+
+def _check_quality(attempt: Attempt) -> Unmet | None:
+    minimum, status = attempt.parameters.get("EKF2_EV_QMIN", 0.0), attempt.source.status
+    if minimum <= 0.0 or "quality" not in status:
+        return None
+    quality = attempt.within(status["quality"])
+    # the sample, the one before it, and the newest in the buffer must be good
+    count = int(np.ceil(attempt.horizon_s / attempt.interval_s)) + 2
+    is_good = (quality >= minimum).astype(float)
+    if is_good.rolling(min(count, max(len(quality), 1))).min().max() == 1.0:
+        return None
+    median = float(quality.median())
+    action = (
+        "Improve light and texture in view, or fly slower. Set EKF2_EV_QMIN to "
+        f"{max(median, 0.0):.0f} only if the positions are correct."
+    )
+    note = ""
+    if not quality.any():
+        note = " VISION_POSITION_ESTIMATE has no quality, which EKF2 reads as 0."
+        action = "Send the quality (MAVLink ODOMETRY), or set EKF2_EV_QMIN to 0."
+    return Unmet(
+        f"the quality is {median:.0f}, below EKF2_EV_QMIN {minimum:.0f}",
+        f"{100.0 * (1.0 - is_good.mean()):.0f} % of {len(quality)} positions are below this limit."
+        f"{note}",
+        action,
+    )
+
+
+def _check_interval(attempt: Attempt) -> Unmet | None:
+    intervals_s = np.diff(attempt.within(attempt.source.samples).index)
+    # the rate of a reconstructed source is that of the logger
+    is_unknown = attempt.source.origin.reconstructed or not attempt.has_switch
+    if is_unknown or not len(intervals_s) or intervals_s.min() < EV_START_INTERVAL_S - TIME_STEP_S:
+        return None
+    return Unmet(
+        f"the positions come at {attempt.source.rate_hz:.2g} Hz",
+        f"The interval between positions is {attempt.interval_s:.2f} s. EKF2 (v1.14 and later) "
+        f"starts to fuse external vision only when two positions come within "
+        f"{EV_START_INTERVAL_S:g} s. No parameter changes this limit.",
+        "Send the position at 10 Hz.",
+    )
+
+
+def _check_alignment(attempt: Attempt) -> Unmet | None:
+    if attempt.fraction("tilt_align") < 0.5:
+        return Unmet(
+            "EKF2 has not aligned its tilt",
+            "cs_tilt_align is 0. EKF2 fuses no position before.",
+            "Keep the vehicle at rest after boot until EKF2 is ready.",
+        )
+    is_free = attempt.is_vision and attempt.has_switch and attempt.source.frame == "FRD"
+    if is_free or not attempt.fraction("yaw_align") < 0.5:
+        return None
+    action = "Calibrate and enable the magnetometer (EKF2_MAG_TYPE 0)"
+    if attempt.is_vision:
+        action += ", or send a valid orientation and set bit 3 (yaw) of EKF2_EV_CTRL"
+    return Unmet(
+        "EKF2 has not aligned its heading",
+        "cs_yaw_align is 0. EKF2 needs a heading before it fuses positions relative to north.",
+        f"{action}.",
+    )
+
+
+def _check_gnss_fault(attempt: Attempt) -> Unmet | None:
+    if not attempt.fraction("gnss_fault") > MIN_FAILED_FRACTION:
+        return None
+    return Unmet(
+        "EKF2 declared GNSS faulty",
+        "cs_gnss_fault is set: GNSS and another position source contradicted each other for 7 s.",
+        "Compare both sources. EKF2_GPS_MODE 1 permits a reset to GNSS.",
+    )
+
+
+def _check_gnss_quality(attempt: Attempt) -> Unmet | None:
+    mask = int(attempt.parameters.get("EKF2_GPS_CHECK", -1)) << 1 | 1
+    fractions = {
+        bit: attempt.fraction("failed_checks", bit)
+        for bit in range(len(GNSS_CHECKS))
+        if mask >> bit & 1
+    }
+    failed = [bit for bit, fraction in fractions.items() if fraction > MIN_FAILED_FRACTION]
+    failed.sort(key=lambda bit: -fractions[bit])
+    if not failed:
+        return None
+    samples, velocity = attempt.within(attempt.source.samples), attempt.source.velocity
+    squares = {3: samples["north_m2"], 4: samples["down_m2"]}
+    if velocity is not None:
+        squares[5] = attempt.within(velocity)["north_m2_s2"]
+    texts = []
+    for bit in failed[:3]:
+        name, parameter, unit = GNSS_CHECKS[bit]
+        text = f"{name} ({100.0 * fractions[bit]:.0f} % of the time"
+        limit = attempt.parameters.get(parameter, np.nan)
+        value = float(np.sqrt(squares[bit].median())) if bit in squares else np.nan
+        # positions without a fix are not in the samples
+        text += f", median {value:.2f}{unit}" if value > limit else ""
+        text += f", limit {parameter} {limit:g}{unit}" if np.isfinite(limit) else ""
+        texts.append(f"{text})")
+    return Unmet(
+        f"GNSS fails EKF2's check of the {GNSS_CHECKS[failed[0]][0]}",
+        f"Failed checks: {'; '.join(texts)}. EKF2 starts to fuse GNSS after "
+        f"{attempt.parameters.get('EKF2_REQ_GPS_H', 10.0):g} s without a failure.",
+        "Give the antenna a free view of the sky and wait for the checks before take-off.",
+    )
+
+
+def _check_gate(attempt: Attempt) -> Unmet | None:
+    log, aid = attempt.ekf2.aids.get(attempt.aid.name), attempt.aid
+    if log is None or "rejected" not in log.samples:
+        return None
+    rejected = attempt.within(log.samples, GATE_TIME_S)["rejected"]
+    if not rejected.mean() > 0.5:
+        return None
+    gate = attempt.parameters.get(aid.gate, aid.default_gate)
+    return Unmet(
+        f"EKF2 rejects {100.0 * rejected.mean():.0f} % of the positions",
+        f"The innovations are beyond its gate of {gate:g} √S.",
+        f"Check the frame of the positions, {aid.delay} and {aid.noise}. Increase {aid.gate} last.",
+    )
+
+
+Conditions = Mapping[str, Callable[[Attempt], Unmet | None]]
+# Conditions by name, in EKF2's order; the switch first, because it is the intention of the user
+VISION_CONDITIONS: Conditions = {
+    "switch": _check_switch,
+    "frame": _check_frame,
+    "gap": _check_gap,
+    "clock": _check_clock,
+    "age": _check_age,
+    "quality": _check_quality,
+    "interval": _check_interval,
+    "alignment": _check_alignment,
+    "gate": _check_gate,
+}
+GNSS_CONDITIONS: Conditions = {
+    "switch": _check_switch,
+    "fault": _check_gnss_fault,
+    # without a fix the reader has no samples; while none arrive, the flags of the checks stay
+    "checks": _check_gnss_quality,
+    "gap": _check_gap,
+    "alignment": _check_alignment,
+    "gate": _check_gate,
+}

@@ -1,0 +1,231 @@
+"""Values of the source that are no measurement: zeros, repeated, rounded, mixed or copied ones."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+from scipy.interpolate import CubicHermiteSpline
+
+from px4fuse.analysis import Analysis
+from px4fuse.arrays import Array
+from px4fuse.comparison.flight_events import max_interval_s
+from px4fuse.convention.lever_arm import estimate_lever_arm
+from px4fuse.filter.signals import cut_to_segment
+from px4fuse.findings.model import Findings, error, note, warning
+from px4fuse.findings.source_intervals import CHECKS, state_errors_after
+from px4fuse.flight import Columns, Ekf2, Unavailable, positions_of, source_name
+from px4fuse.record import Span
+from px4fuse.text import capitalise_first
+
+MIN_STEP_M = 0.05  # m; its error (1 σ) is 0.29 of it, so smaller steps are below the noise of UWB
+MIN_OFFSET_M = 0.1  # m between two senders; the noise of good UWB
+MIN_OFFSET_SIGMAS = 4.0  # of the offset in one window; white noise of one sender has 1 to 2
+WINDOW, MIN_WINDOWS = 16, 5  # samples, of which a lost one reverses the order of two senders
+# Median difference (m) from EKF2's own position: of a source that EKF2 does not fuse, and of one
+# that it follows
+MAX_COPY_M, MAX_FOLLOWED_COPY_M = 0.01, 0.001
+MIN_COPY_SPEED_M_S = 0.2  # m/s; at rest any source may equal EKF2's position
+DELAYS_S = np.arange(0.0, 0.305, 0.005)  # s, from EKF2's position to the timestamp of its copy
+# Id of the finding, fault and action, by the reason why rows are no measurement
+INVALID: Mapping[str, tuple[str, str, str]] = {
+    "zero": (
+        "source_zero_positions",
+        "are exactly 0, 0, 0: the sender writes zeros when it has no position",
+        "Send no position (or NaN) while there is none.",
+    ),
+    "held": (
+        "source_position_held",
+        "repeat the last position: the sender lost tracking and holds it",
+        "Stop sending while tracking is lost, or send NaN (check the state of the tracking).",
+    ),
+    "NaN": (
+        "source_without_position",
+        "have no position (NaN): the source had no fix",
+        "",
+    ),
+}
+
+
+def detect(analysis: Analysis) -> Findings:
+    """Detect values that are no measurement of the vehicle's position."""
+    yield from detect_invalid_rows(analysis)
+    yield from detect_rounding(analysis)
+    yield from detect_lever_arm(analysis)
+    yield from detect_two_senders(analysis)
+    yield from detect_copied_estimate(analysis)
+
+
+def invalid_spans(analysis: Analysis, reason: str = "") -> tuple[Span, ...]:
+    """Return the spans of consecutive rows without a measurement, by default for all reasons."""
+    source, segment = analysis.source, analysis.segment
+    invalid = source.invalid[segment.start_s : segment.end_s]
+    time_s = invalid[invalid == reason].index if reason else invalid.index
+    valid_s = source.samples.index.to_numpy()
+    if time_s.empty:
+        return ()
+    # rows of one span have the same valid sample before them
+    before = np.searchsorted(valid_s, time_s)
+    starts = np.flatnonzero(np.diff(before, prepend=-1))
+    ends = np.append(starts[1:], len(time_s)) - 1
+    return tuple(zip(time_s[starts].tolist(), time_s[ends].tolist(), strict=True))
+
+
+def detect_invalid_rows(analysis: Analysis) -> Findings:
+    """Detect rows of zeros, of a position that is held, and without a position."""
+    source, segment = analysis.source, analysis.segment
+    invalid = source.invalid[segment.start_s : segment.end_s]
+    for reason, (name, fault, action) in INVALID.items():
+        spans, count = invalid_spans(analysis, reason), int((invalid == reason).sum())
+        if not count:
+            continue
+        longest_s = max(spans, key=lambda span: span[1] - span[0])
+        duration_s, total_s = longest_s[1] - longest_s[0], sum(end - start for start, end in spans)
+        times = f"{len(spans)} times between {spans[0][0]:.1f} s and {spans[-1][1]:.1f} s"
+        if len(spans) <= 3:
+            times = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
+        effect, make_finding = "", note if reason == "NaN" else warning
+        if duration_s > max_interval_s(1.0 / source.rate_hz):
+            make_finding = warning
+            effect = f" {state_errors_after(analysis, _valid_around(analysis, longest_s))}"
+        yield make_finding(
+            name,
+            f"{count} {positions_of(source)} {fault}. They are sent {times}, {total_s:.1f} s in "
+            f"total. KF does not use them.{effect}",
+            action or f"Check {CHECKS[source.origin.kind]} at {longest_s[0]:.1f} s.",
+            {"count": count, "longest_s": duration_s, "total_s": total_s, "at_s": longest_s[0]},
+            spans,
+        )
+
+
+def _valid_around(analysis: Analysis, span_s: Span) -> Span:
+    """Return the times of the last measurement before a span and of the first one after it."""
+    time_s = analysis.lines[0].measurement_time_s
+    at = np.clip(np.searchsorted(time_s, span_s), 1, len(time_s) - 1)
+    return float(time_s[at[0] - 1]), float(time_s[at[1]])
+
+
+def detect_rounding(analysis: Analysis) -> Findings:
+    """Detect positions that are rounded to steps above their noise."""
+    source, step_m = analysis.source, analysis.source.step_m
+    if step_m < MIN_STEP_M:
+        return
+    cause, action = "They are rounded.", "Send the positions with more digits."
+    if np.log2(step_m) % 1.0 == 0.0:
+        cause = "A 32-bit float has this resolution at large coordinates, such as UTM."
+        action = (
+            "Subtract a local origin in double precision (64 bit) before the position becomes a "
+            "32-bit float."
+        )
+    yield warning(
+        "source_positions_rounded",
+        f"{capitalise_first(positions_of(source))} move in steps of {step_m:.3g} m. {cause} The "
+        f"rounding error is {step_m / 12.0**0.5:.2g} m (1 σ), equal for successive positions. "
+        "Estimates from the positions are left out.",
+        action,
+        {"step_m": step_m},
+    )
+
+
+def detect_lever_arm(analysis: Analysis) -> Findings:
+    """Detect a sensor that is mounted away from the IMU without a lever arm in EKF2."""
+    source, convention = analysis.source, analysis.convention
+    is_received = source.origin.has_all_samples and not source.origin.is_gnss
+    if not is_received or convention is None or convention.verdict != "determined":
+        return
+    arm = estimate_lever_arm(analysis.flight, source)
+    if arm is None:
+        return
+    forward_m, right_m, _ = source.lever_arm_m
+    size_m = float(np.hypot(arm.forward_m, arm.right_m))
+    sensor = "sensor" if source.origin.kind == "file" else f"{source_name(source)} sensor"
+    yield warning(
+        "source_lever_arm",
+        f"The {sensor} is mounted {size_m:.2f} m from the position that EKF2 assumes: "
+        f"{arm.forward_m:+.2f} m forward, {arm.right_m:+.2f} m right (± {1.96 * arm.sigma_m:.2f} "
+        "m, 95 %). In each turn the positions move relative to the vehicle by up to twice this "
+        "lever arm. Estimates from the positions are left out.",
+        "Measure the position of the sensor relative to the IMU. Set EKF2_EV_POS_X to "
+        f"{forward_m + arm.forward_m:.2f} m and EKF2_EV_POS_Y to {right_m + arm.right_m:.2f} m.",
+        {"forward_m": arm.forward_m, "right_m": arm.right_m, "sigma_m": arm.sigma_m},
+    )
+
+
+def detect_two_senders(analysis: Analysis) -> Findings:
+    """Detect positions of two systems in turn: every other position is off by a constant."""
+    samples = cut_to_segment(analysis.source.samples, analysis.segment)[Columns.POSITION]
+    samples = samples.dropna(axis=1, how="all").dropna()
+    count = (len(samples) - 2) // WINDOW
+    if count < MIN_WINDOWS:
+        return
+    time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
+    weight = ((time_s[1:-1] - time_s[:-2]) / (time_s[2:] - time_s[:-2]))[:, None]
+    offset_m = position_m[1:-1] - (1.0 - weight) * position_m[:-2] - weight * position_m[2:]
+    offset_m[::2] *= -1.0
+    windows_m = offset_m[: count * WINDOW].reshape(count, WINDOW, -1).mean(axis=1)
+    direction = windows_m[np.argmax(np.linalg.norm(windows_m, axis=1))]
+    windows_m[windows_m @ direction < 0.0] *= -1.0
+    offset = np.median(windows_m, axis=0)
+    scatter_m = 1.4826 * float(np.median(np.abs(windows_m - offset)))
+    size_m = float(np.linalg.norm(offset))
+    if size_m < max(MIN_OFFSET_M, MIN_OFFSET_SIGMAS * scatter_m):
+        return
+    rate_hz = analysis.source.rate_hz
+    axes = ", ".join(
+        f"{abs(part):.2f} m {name.partition('_')[0]}"
+        for part, name in zip(offset, samples.columns, strict=True)
+    )
+    yield error(
+        "source_two_senders",
+        f"Two systems send positions in turn, {size_m:.2f} m apart. Every other one of the "
+        f"{positions_of(analysis.source)} ({rate_hz:.3g} Hz in total) differs by {axes}. Estimates "
+        "from the positions are left out.",
+        "Send the positions of one system only, for example stop the second node, bridge or "
+        "MAVROS plugin.",
+        {"distance_m": size_m, "rate_hz": rate_hz},
+    )
+
+
+def detect_copied_estimate(analysis: Analysis) -> Findings:
+    """Detect a source that is EKF2's own position, sent back to the autopilot."""
+    source, ekf2, segment = analysis.source, analysis.flight.ekf2, analysis.segment
+    if not isinstance(ekf2, Ekf2) or source.alignment is not None or source.origin.reconstructed:
+        return
+    samples = cut_to_segment(source.samples, segment)[Columns.POSITION].dropna()
+    state = ekf2.state.dropna()
+    if len(samples) < WINDOW or len(state) < WINDOW:
+        return
+    time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
+    differences = [_difference_m(position_m, time_s - d, state) for d in DELAYS_S]
+    best = int(np.nanargmin(differences)) if np.isfinite(differences).any() else 0
+    fusing = ekf2.fusing
+    is_fused = isinstance(fusing, Unavailable) or bool(
+        (fusing["horizontal"][segment.start_s : segment.end_s] > 0.0).any()
+    )
+    if not differences[best] < (MAX_FOLLOWED_COPY_M if is_fused else MAX_COPY_M):
+        return
+    convention = analysis.convention
+    orientation = convention.orientation if convention is not None else None
+    is_copied = orientation is not None and orientation.verdict == "copied"
+    quantity = "position and attitude" if is_copied else "position"
+    yield error(
+        "source_is_ekf2_estimate",
+        f"{source_name(source)} sends EKF2's own {quantity} back. The positions equal EKF2's of "
+        f"{1e3 * DELAYS_S[best]:.0f} ms earlier (median difference "
+        f"{1e3 * differences[best]:.1f} mm). They contain no measurement: EKF2 becomes certain of "
+        "its own error.",
+        "Send the position of the positioning system. Do not connect the autopilot's local "
+        "position (MAVROS local_position) to its vision input.",
+        {"delay_s": float(DELAYS_S[best]), "difference_m": differences[best]},
+    )
+
+
+def _difference_m(position_m: Array, time_s: Array, state: pd.DataFrame) -> float:
+    """Return the median distance of positions from EKF2's state in flight at other times."""
+    at = state.index.to_numpy()
+    curve = CubicHermiteSpline(at, state[Columns.POSITION], state[Columns.VELOCITY])
+    is_moving = np.linalg.norm(curve(time_s, 1), axis=1) > MIN_COPY_SPEED_M_S
+    is_inside = (time_s > at[0]) & (time_s < at[-1]) & is_moving
+    if np.count_nonzero(is_inside) < WINDOW:
+        return float("nan")
+    distance_m = np.linalg.norm(position_m - curve(time_s), axis=1)
+    return float(np.median(distance_m[is_inside]))

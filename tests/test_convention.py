@@ -1,0 +1,365 @@
+"""Convention of the positions against ground truth: axes, unit, clock and orientation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+
+import numpy as np
+import pandas as pd
+import pytest
+from conftest import shared
+from exchange import replace
+from flights import given_placement
+
+from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.preparation import prepare
+from px4fuse.convention.axes import CLOCKWISE, FAMILIES, UNITS, Axes
+from px4fuse.convention.check import check_convention
+from px4fuse.convention.correction import Faults, find_faults
+from px4fuse.convention.model import Convention, OrientationConvention
+from px4fuse.finding import Finding
+from px4fuse.findings import source_convention
+from px4fuse.findings.cause_grouping import CONVENTION
+from px4fuse.findings.model import finding
+from px4fuse.flight import Columns, Flight, PositionTrack
+from px4fuse.position_source import RECEIVED
+from px4fuse.readers import read_log
+from px4fuse.simulation.flights import simulate_flight
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import Scenario
+from px4fuse.trajectory.rotation import from_vector, interpolate, multiply
+
+UNIT_VECTORS = {
+    "north": (1, 0, 0), "south": (-1, 0, 0), "east": (0, 1, 0), "west": (0, -1, 0),
+    "down": (0, 0, 1), "up": (0, 0, -1),
+}  # fmt: skip
+ALL_AXES = [family.axes(quarter) for family in FAMILIES for quarter in range(4)]
+ENU, NWU = ("east", "north", "up"), ("north", "west", "up")
+# Rotations of NED to ENU and NWU, and of FRD to FLU
+NED_TO = {"ENU": (0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0), "NWU": (0.0, 1.0, 0.0, 0.0)}
+CASES = {
+    "frame_turned": ("case03.ulg", {"rotation_deg": 30.0}),
+    "yaw_90_off": ("case04.ulg", {"heading_error_deg": 90.0}),
+    "quaternion_order": ("case05.ulg", {"order": "x y z w"}),
+    "orientation_copied": ("case06.ulg", {"verdict": "copied"}),
+}
+FLOWN = {
+    "clean_uwb": {},
+    "clean_mocap": {},
+    "enu_uwb": {"x": "east", "y": "north", "z": "up"},
+    "enu_beside_gnss": {"x": "east", "y": "north", "z": "up"},
+    "nwu_vio": {"y": "west", "z": "up"},
+    "z_up": {"z": "up", "is_mirrored": True},
+    "centimetres": {"unit": "cm"},
+    "late_400": {"late_s": 0.4},
+    "yaw_90_off": {"heading_error_deg": 90.0},
+    "quaternion_xyzw": {"order": "x y z w"},
+    "orientation_copied": {"verdict": "copied"},
+    "frozen_10s": {},
+    "relocalised": {},
+    "stops_in_flight": {},
+}
+TOLERANCES = {"rotation_deg": 4.0, "heading_error_deg": 4.0, "late_s": 0.06, "clock_drift": 0.002}
+
+
+@cache
+def flown(seed: int = 3, *mistakes: str) -> Flight:
+    return simulate_flight(Scenario(seed=seed, kind="loop", passes=2), parse(mistakes))
+
+
+def sent(
+    flight: Flight,
+    axes: Axes = ("north", "east", "down"),
+    unit: str = "m",
+    rotation_deg: float = 0.0,
+    late_s: float = 0.0,
+    clock_drift: float = 0.0,
+    sigma_m: float = 0.05,
+    seed: int = 1,
+) -> PositionTrack:
+    """Return positions made of ground truth: other axes, rotated, scaled, with wrong timestamps."""
+    truth = flight.truth.samples[Columns.POSITION]
+    time = np.arange(truth.index[0] + 0.3, truth.index[-1] - 0.3, 0.1)
+    true = np.column_stack([np.interp(time, truth.index, column) for column in truth.to_numpy().T])
+    true += np.random.default_rng(seed).normal(0.0, sigma_m, true.shape)
+    cosine, sine = np.cos(np.radians(rotation_deg)), np.sin(np.radians(rotation_deg))
+    true = true @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    position = true @ np.array([UNIT_VECTORS[name] for name in axes]).T / UNITS[unit]
+    stamps = time + late_s + clock_drift * (time - time.mean())
+    samples = pd.DataFrame(position, pd.Index(stamps, name="time_s"), Columns.POSITION)
+    samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
+    return PositionTrack("made", RECEIVED, "", samples, "NED", "", ())
+
+
+def with_orientation(track: PositionTrack, quaternion: np.ndarray, time: np.ndarray):
+    table = pd.DataFrame(quaternion, pd.Index(time, name="time_s"), Columns.QUATERNION)
+    return replace(track, orientation=table)
+
+
+def oriented(flight: Flight, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and attitudes, FRD to NED, with noise of 0.3°."""
+    attitude = flight.attitude[Columns.QUATERNION].iloc[::5]
+    rng = np.random.default_rng(seed)
+    noise = from_vector(np.radians(rng.normal(0.0, 0.3, (len(attitude), 3))))
+    return attitude.index.to_numpy(), multiply(attitude.to_numpy(), noise)
+
+
+def yaw(degrees: float) -> np.ndarray:
+    return from_vector(np.array([0.0, 0.0, np.radians(degrees)]))
+
+
+def assert_found(convention: Convention, **expected: object) -> None:
+    """Compare fields of a convention and of its orientation; other fields are as PX4 expects."""
+    assert convention.verdict == "determined", convention
+    usual = {"x": "north", "y": "east", "z": "down", "unit": "m", "clock_drift": 0.0}
+    orientation = convention.orientation or OrientationConvention(verdict="determined")
+    for name, value in {**usual, **expected}.items():
+        owner = convention if hasattr(convention, name) and name != "verdict" else orientation
+        found = getattr(owner, name)
+        is_number = isinstance(value, float)
+        assert found == (pytest.approx(value, abs=TOLERANCES[name]) if is_number else value), name
+
+
+@pytest.mark.parametrize("index", range(0, len(ALL_AXES), 5))
+def test_check_random_axes_unit_and_offset_are_found(index):
+    rng = np.random.default_rng(index)
+    axes, unit = ALL_AXES[index], [*UNITS][index % 4]
+    late_s = float(rng.uniform(-8.0, 8.0))
+    found = check_convention(flown(), sent(flown(), axes, unit, late_s=late_s, seed=index))
+    assert_found(found, **dict(zip("xyz", axes, strict=True)), unit=unit, late_s=late_s)
+
+
+@pytest.mark.parametrize("rotation_deg", [-170.0, -60.0, 25.0, 100.0])
+def test_check_rotated_positions_have_their_rotation(rotation_deg):
+    found = check_convention(flown(), sent(flown(), rotation_deg=rotation_deg))
+    quarter = CLOCKWISE.index(found.x)
+    assert not found.is_mirrored
+    total = found.rotation_deg - 90.0 * quarter
+    assert (total - rotation_deg + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=4.0)
+
+
+@pytest.mark.parametrize("clock_drift", [-0.04, -0.01, 0.02])
+def test_check_clock_drift_is_found(clock_drift):
+    found = check_convention(flown(), sent(flown(), clock_drift=clock_drift, late_s=1.0))
+    assert_found(found, clock_drift=clock_drift)
+
+
+def test_check_clean_source_is_ned_in_metres():
+    track = flown().positions[0]
+    found = check_convention(flown(), track)
+    assert_found(found)
+    assert abs(found.late_s) < 0.05
+    assert found.rotation_deg == 0.0
+    assert found.scale == pytest.approx(1.0, abs=0.1)  # odometry drifts
+
+
+def test_check_noise_without_motion_is_not_determinable():
+    track = sent(flown())
+    noise = np.random.default_rng(2).normal(0.0, 0.3, (len(track.samples), 3))
+    samples = track.samples.assign(**dict(zip(Columns.POSITION, noise.T, strict=True)))
+    assert check_convention(flown(), replace(track, samples=samples)).verdict == "not determinable"
+
+
+def test_check_repeated_positions_are_left_out():
+    track = sent(flown())
+    samples = track.samples.copy()
+    samples.iloc[200:260] = samples.iloc[199].to_numpy()
+    assert_found(check_convention(flown(), replace(track, samples=samples)))
+
+
+def test_check_without_height_axes_are_found():
+    track = sent(flown())
+    samples = track.samples.assign(down_m=np.nan)
+    assert_found(check_convention(flown(), replace(track, samples=samples)))
+
+
+@pytest.mark.parametrize("frames", ["ENU", "NWU"])
+def test_check_orientation_of_ros_frames_is_found(frames):
+    time, attitude = oriented(flown())
+    quaternion = multiply(multiply(np.array(NED_TO[frames]), attitude), np.array(NED_TO["NWU"]))
+    track = with_orientation(sent(flown(), ENU if frames == "ENU" else NWU), quaternion, time)
+    found = check_convention(flown(), track).orientation
+    assert found.frames == f"FLU to {frames}"
+    assert abs(found.heading_error_deg) < 3.0
+
+
+@pytest.mark.parametrize("error_deg", [-90.0, 45.0, 180.0])
+def test_check_heading_error_of_the_orientation_is_found(error_deg):
+    time, attitude = oriented(flown())
+    track = with_orientation(sent(flown()), multiply(yaw(error_deg), attitude), time)
+    found = check_convention(flown(), track).orientation
+    assert found.frames == "FRD to NED"
+    difference = (found.heading_error_deg - error_deg + 180.0) % 360.0 - 180.0
+    assert difference == pytest.approx(0.0, abs=3.0)
+
+
+def test_check_orientation_with_w_last_has_its_order():
+    found = check_convention(flown(), w_last(flown())).orientation
+    assert (found.verdict, found.order) == ("determined", "x y z w")
+
+
+def test_check_attitude_sent_back_is_copied():
+    assert check_convention(flown(), copied(flown())).orientation.verdict == "copied"
+
+
+def copied(flight: Flight) -> PositionTrack:
+    """Return positions with the attitude of the autopilot, 0.03 s later."""
+    attitude = flight.attitude
+    time = np.arange(attitude.index[0] + 1.0, attitude.index[-1], 0.1)
+    quaternions = attitude[Columns.QUATERNION].to_numpy()
+    sent_back = interpolate(time - 0.03, attitude.index.to_numpy(), quaternions)
+    return with_orientation(sent(flight), sent_back, time)
+
+
+def w_last(flight: Flight) -> PositionTrack:
+    time, attitude = oriented(flight)
+    return with_orientation(sent(flight), np.roll(attitude, -1, axis=1), time)
+
+
+def turned(flight: Flight) -> PositionTrack:
+    time, attitude = oriented(flight)
+    return with_orientation(sent(flight), multiply(yaw(90.0), attitude), time)
+
+
+# By id of the finding, and kind of the fault
+FAULTS = {
+    ("source_axes_wrong", "axes"): lambda flight: sent(flight, ENU),
+    ("source_unit_wrong", "unit"): lambda flight: sent(flight, unit="cm"),
+    ("source_frame_misaligned", "rotation"): lambda flight: sent(flight, rotation_deg=60.0),
+    ("source_time_offset", "time offset"): lambda flight: sent(flight, late_s=1.5),
+    ("source_time_offset_changes", "clock drift"): lambda flight: sent(flight, clock_drift=0.02),
+    ("source_orientation_wrong", "order"): w_last,
+    ("source_orientation_wrong", "heading"): turned,
+    ("source_orientation_copied", "copied"): copied,
+}
+
+
+def compared(track: PositionTrack) -> Comparison:
+    """Return the prepared comparison of a flight that EKF2 flew with other positions."""
+    usual = [one for one in flown().positions if not one.origin.is_automatic]
+    return prepare(replace(flown(), positions=(track, *usual)))
+
+
+def examples() -> Iterator[Finding]:
+    """Return examples of the findings about the convention, for their pages."""
+    for change in FAULTS.values():
+        yield from source_convention.detect(compared(change(flown())))
+    unclear = replace(compared(sent(flown())), convention=AMBIGUOUS)
+    yield from source_convention.detect(unclear)
+
+
+AMBIGUOUS = Convention(
+    verdict="ambiguous", x="east", y="north", z="up", log_odds=1.2, log_likelihood_gain=30.0,
+    alternatives=("x south, y west, z up, m, rotated by +12°, timestamps +0.0 s late",),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "kind"), FAULTS)
+def test_detect_faulty_convention_is_the_only_finding(name, kind):
+    found = list(source_convention.detect(compared(FAULTS[name, kind](flown()))))
+    assert [(one.id, one.evidence[CONVENTION]) for one in found] == [(name, kind)]
+
+
+@pytest.mark.parametrize("name", [name for name, _ in FAULTS if "orientation" not in name])
+def test_prepare_faulty_positions_are_corrected(name):
+    track = next(FAULTS[one](flown()) for one in FAULTS if one[0] == name)
+    samples, truth = compared(track).source.samples, flown().truth.samples
+    error = [
+        samples[column] - np.interp(samples.index, truth.index, truth[column])
+        for column in Columns.POSITION
+    ]
+    assert np.std(error, axis=1).max() < 0.25
+
+
+def test_prepare_copied_orientation_is_left_out():
+    source = compared(copied(flown())).source
+    assert source.orientation is None
+    assert source.origin.kind == "uwb"
+
+
+def test_detect_clean_source_has_no_finding():
+    assert not list(source_convention.detect(prepare(flown())))
+    assert not list(source_convention.detect(compared(sent(flown()))))
+
+
+def test_detect_orientation_in_enu_of_ned_positions_names_the_conversion():
+    time, attitude = oriented(flown())
+    quaternion = multiply(multiply(np.array(NED_TO["ENU"]), attitude), np.array(NED_TO["NWU"]))
+    (found,) = source_convention.detect(compared(with_orientation(sent(flown()), quaternion, time)))
+    assert found.evidence[CONVENTION] == "frames"
+    assert "q_NED = (0, √½, √½, 0) ⊗ q ⊗ (0, 1, 0, 0)" in found.remedy
+
+
+def fused(flight: Flight) -> Flight:
+    """Return a flight in which EKF2 fused the position and the yaw of the source."""
+    fusing = pd.DataFrame({"horizontal": [1.0], "vertical": [0.0], "yaw": [1.0]}, index=[0.0])
+    return replace(flight, ekf2=replace(flight.ekf2, fusing=fusing))
+
+
+@pytest.mark.parametrize(("axes", "rotation_deg", "expected"), [
+    (("west", "south", "up"), 20.0, Faults(axes=True, affects_ekf2=True, is_north_unknown=True)),
+    (("west", "north", "down"), -32.0, Faults()),
+])  # fmt: skip
+def test_find_faults_heading_from_source_has_no_rotation(axes, rotation_deg, expected):
+    convention = Convention(
+        verdict="determined", **dict(zip("xyz", axes, strict=True)), rotation_deg=rotation_deg,
+        heading_from="gyroscopes", orientation=OrientationConvention(verdict="determined",
+        frames="FLU to ENU" if axes[2] == "up" else "FRD to NED"),
+    )  # fmt: skip
+    assert find_faults(convention, fused(flown()), "NED") == expected
+
+
+def test_find_faults_of_frd_has_no_rotation():
+    convention = Convention(verdict="determined", x="west", y="north", rotation_deg=-32.0)
+    assert not find_faults(convention, flown(), "FRD")
+    assert find_faults(convention, flown(), "NED").rotation_deg == pytest.approx(58.0)
+
+
+def test_detect_ambiguous_axes_are_listed():
+    (found,) = source_convention.detect(replace(compared(sent(flown())), convention=AMBIGUOUS))
+    assert found.id == "source_convention_ambiguous"
+    assert "rotated by +12°" in found.message
+
+
+@pytest.mark.parametrize(("axes", "message", "remedy"), [
+    (("north", "east", "up"), "x and y are exchanged: x is east, y north, z down", "(y, x, z)"),
+    (("west", "north", "down"), "NWU read as ENU: x is north, y west, z up", "frame nwu."),
+])  # fmt: skip
+def test_detect_file_read_in_another_frame_names_it(axes, message, remedy):
+    """The axes are those of positions that were converted from ENU."""
+    alignment = replace(given_placement(), frame="enu")
+    (found,) = source_convention.detect(compared(replace(sent(flown(), axes), alignment=alignment)))
+    assert found.message.startswith(message)
+    assert remedy in found.remedy
+
+
+def test_apply_convention_effects_follow_with_another_action():
+    comparison = compared(sent(flown(), ENU))
+    roots = list(source_convention.detect(comparison))
+    other = finding("error", "ekf2_rejects_positions", "EKF2 rejects 9 %. Why.", "Set a gate.")
+    false = finding("error", "ekf2_noise_too_small", "Too small.", "Set EKF2_EVP_NOISE to 1.")
+    root, effect = source_convention.apply_convention(comparison, [false, other, *roots])
+    assert root.id == "source_axes_wrong"
+    assert (effect.caused_by, effect.message) == ("source_axes_wrong", "EKF2 rejects 9 %.")
+    assert effect.remedy == source_convention.CORRECT_FIRST
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("name", FLOWN)
+def test_check_flown_convention_is_determined(name):
+    flight = read_log(shared("logs/conventions") / f"{name}.ulg")
+    found = check_convention(flight, flight.positions[0])
+    expected = dict(FLOWN[name])
+    if name in ("yaw_90_off", "quaternion_xyzw"):  # the frame refers to EKF2's wrong heading
+        expected |= {"x": found.x, "y": found.y}
+    assert_found(found, **expected)
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("name", CASES)
+def test_check_shared_case_is_determined(name):
+    file, expected = CASES[name]
+    flight = read_log(shared("cases") / file)
+    track = next(one for one in flight.positions if one.name == "vehicle_visual_odometry")
+    assert_found(check_convention(flight, track), **expected)

@@ -1,0 +1,312 @@
+"""Values and timestamps of a source that are no measurement: reading, findings, shared cases."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+
+import numpy as np
+import pandas as pd
+import pytest
+from comparisons import compare
+from conftest import shared
+from exchange import replace
+from flights import Estimator, Uwb, aisle_flight, unexplained
+from studies.expected_cases import judge, run
+from ulog_tools import make_log, odometry
+
+from px4fuse.analysis import Analysis
+from px4fuse.convention.model import Convention
+from px4fuse.finding import Finding
+from px4fuse.findings import (
+    ekf2_not_fusing,
+    source_convention,
+    source_intervals,
+    source_stamps,
+    source_values,
+)
+from px4fuse.findings.cause_grouping import group_by_cause
+from px4fuse.findings.model import finding
+from px4fuse.flight import Columns, Flight
+from px4fuse.log import SHARED_STAMPS, ClockMap
+from px4fuse.readers import read_log
+from px4fuse.readers.common import find_invalid, rounding_step
+from px4fuse.readers.position_csv import read_position_csv
+from px4fuse.simulation.flights import simulate_flight
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import Scenario
+from px4fuse.trajectory.rotation import interpolate, to_matrix
+
+pytestmark = pytest.mark.usefixtures("quick_filter")
+LAST = {"tracking_lost", "exact_zeros", "nan_rows", "quality_low", "ekf2_own_back", "two_senders"}
+CASES = sorted(
+    LAST
+    | {"utm_float32", "lever_arm", "reset_counter", "timestamps_ms", "unix_time", "resolution_1s"}
+    | {"clean_mocap_100hz"}
+)
+
+
+def track(count: int = 60) -> pd.DataFrame:
+    """Return positions at 10 Hz that move by 0.1 m each, far from the origin."""
+    time = pd.Index(0.1 * np.arange(count), name="time_s")
+    moved = 5.0 + 0.1 * np.arange(count)
+    return pd.DataFrame({"x": moved, "y": moved, "z": moved}, time)
+
+
+def invalid(samples: pd.DataFrame) -> dict[str, list[int]]:
+    """Return the rows of each reason."""
+    reason = find_invalid(samples, ["x", "y", "z"]).to_numpy()
+    return {name: np.flatnonzero(reason == name).tolist() for name in sorted({*reason} - {""})}
+
+
+def test_find_invalid_rows_states_each_reason():
+    samples = track()
+    samples.iloc[5:7] = np.nan
+    samples.iloc[[10, 20]] = 0.0
+    samples.iloc[30:45] = samples.iloc[29].to_numpy()
+    assert invalid(samples) == {"NaN": [5, 6], "held": [*range(30, 45)], "zero": [10, 20]}
+
+
+def test_find_invalid_keeps_zeros_at_the_origin():
+    samples = track() - 8.0
+    assert samples.iloc[30].abs().max() < 1e-9
+    samples.iloc[30] = 0.0
+    assert invalid(samples) == {}
+
+
+def test_find_invalid_keeps_positions_sent_twice():
+    samples = track()
+    assert invalid(samples.set_axis(samples.index, axis=0).iloc[np.arange(60) // 2 * 2]) == {}
+
+
+def test_find_invalid_keeps_a_source_at_rest():
+    samples = track()
+    samples.iloc[10:] = samples.iloc[10].to_numpy()
+    assert invalid(samples) == {}
+
+
+@pytest.mark.parametrize(("origin", "step"), [(5_334_567.0, 0.5), (691_234.0, 0.0625)])
+def test_rounding_step_of_32_bit_floats_is_their_resolution(origin, step):
+    values = origin + np.random.default_rng(1).normal(0.0, 5.0, 400)
+    assert rounding_step(values.astype(np.float32).astype(float)) == step
+    assert rounding_step(values) < 0.01
+
+
+@pytest.mark.parametrize(("stamp", "clock"), [
+    (lambda us: us // 1000, "milliseconds"),
+    (lambda us: us // 1_000_000, "seconds"),
+    (lambda us: us * 0, "0"),
+    (lambda us: us + 1_795_251_250_000_000, "UNIX time in microseconds"),
+    (lambda us: us + 3_600_000_000, "another clock"),
+])  # fmt: skip
+def test_read_log_names_the_clock_of_timestamps(tmp_path, stamp, clock):
+    log = make_log("v1.16", 40.0).drop("vehicle_visual_odometry")
+    source = odometry("vehicle_visual_odometry", 40.0, 16)
+    source.fields["timestamp_sample"] = stamp(source.fields["timestamp_sample"])
+    position, *_ = read_log(log.add(source).write(tmp_path / "log.ulg")).positions
+    assert position.clock_map.clock == clock
+    assert clock in source_stamps.STAMP_FAULTS
+
+
+def test_read_log_reads_reset_counter_and_quality(tmp_path):
+    log = make_log("v1.16").drop("vehicle_visual_odometry")
+    source = odometry("vehicle_visual_odometry", 10.0, 16)
+    count = len(source.fields["timestamp"])
+    counter = (np.arange(count) > 20).astype(np.uint8)
+    source.fields.update(reset_counter=counter, quality=np.full(count, -1, np.int8))
+    status = read_log(log.add(source).write(tmp_path / "log.ulg")).positions[0].status
+    assert status["reset_counter"].tolist() == [0.0] * 21 + [1.0] * (count - 21)
+    assert set(status["quality"]) == {-1.0}
+
+
+def test_read_position_csv_keeps_the_times_without_position(tmp_path):
+    rows = [f"{0.1 * at:.1f},{at + 5},{at},{at}" for at in range(40)]
+    rows[10:12] = ["1.0,nan,nan,nan", "1.1,,,"]
+    rows[20] = "2.0,0,0,0"
+    path = tmp_path / "uwb.csv"
+    path.write_text("\n".join(["time,x,y,z", *rows, ""]))
+    recording = read_position_csv(path)
+    assert recording.invalid.to_dict() == {1.0: "NaN", 1.1: "NaN", 2.0: "zero"}
+    assert len(recording.samples) == 37
+
+
+def with_track(flight: Flight, **changes: object) -> Flight:
+    return replace(flight, positions=(replace(flight.positions[0], **changes),))
+
+
+def test_detect_invalid_rows_states_times_and_effect():
+    flight = aisle_flight(uwb=Uwb(gap_s=(40.0, 46.0)))
+    at = pd.Index([*np.arange(40.2, 46.0, 0.2), 80.1, 80.2])
+    reasons = pd.Series(["held"] * (len(at) - 2) + ["zero"] * 2, at)
+    findings = {one.id: one for one in detected(with_track(flight, invalid=reasons))}
+    assert set(findings) == {"source_zero_positions", "source_position_held"}
+    assert findings["source_zero_positions"].evidence["count"] == 2
+    held = findings["source_position_held"]
+    assert held.spans_s[0] == pytest.approx((40.2, 45.8))
+    assert "40.2 s to 45.8 s" in held.message
+    assert "rely on the IMU alone" in held.message
+    assert [one.id for one in detected(flight)] == ["source_gap"]
+
+
+def test_detect_single_row_without_position_is_a_note():
+    invalid_rows = pd.Series(["NaN"], pd.Index([60.05]))
+    (one,) = detected(with_track(aisle_flight(), invalid=invalid_rows))
+    assert (one.id, one.severity) == ("source_without_position", "note")
+
+
+@pytest.mark.parametrize(("step_m", "words"), [(0.5, "double precision"), (0.1, "more digits")])
+def test_detect_rounding_names_the_remedy(step_m, words):
+    (one,) = detected(with_track(aisle_flight(), step_m=step_m))
+    assert words in one.remedy
+
+
+def alternating(flight: Flight, lost: int = 0) -> Flight:
+    """Move every other position by 1 m; one sample may be lost."""
+    samples = flight.positions[0].samples.copy()
+    samples.iloc[1::2, :2] += [0.6, -0.8]
+    return with_track(flight, samples=samples.drop(samples.index[[200] * lost]))
+
+
+def copied(flight: Flight, sigma_m: float = 0.0) -> Flight:
+    """Send EKF2's position back 0.03 s later, with noise."""
+    truth = flight.truth.samples
+    time = np.arange(1.0, flight.log.duration_s - 1.0, 0.2)
+    samples = flight.positions[0].samples.iloc[: len(time)].set_axis(time + 0.03)
+    for name in Columns.POSITION:
+        samples[name] = np.interp(time, truth.index, truth[name])
+    samples += np.random.default_rng(1).normal(0.0, sigma_m, samples.shape)
+    return with_track(replace(flight, ekf2=replace(flight.ekf2, state=truth)), samples=samples)
+
+
+def without_rows(flight: Flight, reason: str) -> Flight:
+    """Leave out the rows of 6 s."""
+    samples = flight.positions[0].samples
+    is_invalid = (samples.index > 40.0) & (samples.index < 46.0)
+    return with_track(
+        flight,
+        samples=samples[~is_invalid],
+        invalid=pd.Series(reason, samples.index[is_invalid]),
+    )
+
+
+def with_clock(flight: Flight, name: str, note: str = "", distinct: int | None = None) -> Flight:
+    clock = ClockMap(name, "arrival time", 600, 0.0, 0.0, 0.0, note, distinct)
+    return with_track(flight, clock_map=clock)
+
+
+FAULTS = {
+    "source_is_ekf2_estimate": copied,
+    "source_two_senders": alternating,
+    "source_positions_rounded": lambda flight: with_track(flight, step_m=0.5),
+    "source_timestamp_unit": lambda flight: with_clock(flight, "milliseconds"),
+    "source_timestamps_shared": lambda flight: with_clock(flight, "local", SHARED_STAMPS, 120),
+    "source_position_held": lambda flight: without_rows(flight, "held"),
+    "source_zero_positions": lambda flight: without_rows(flight, "zero"),
+    "source_without_position": lambda flight: without_rows(flight, "NaN"),
+}
+
+
+def detected(flight: Flight) -> tuple[Finding, ...]:
+    analysis = unexplained(compare(flight))
+    detectors = (source_values, source_stamps, source_intervals, ekf2_not_fusing)
+    findings = [one for detector in detectors for one in detector.detect(analysis)]
+    return group_by_cause(source_convention.apply_convention(analysis, findings))
+
+
+def examples() -> Iterator[Finding]:
+    """Return examples of the findings about values and timestamps, for their pages."""
+    for name, change in FAULTS.items():
+        yield from (one for one in detected(change(aisle_flight())) if one.id == name)
+    yield from source_values.detect_lever_arm(mounted((0.4, -0.3)))
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_detect_fault_is_the_only_finding(name):
+    assert [one.id for one in detected(FAULTS[name](aisle_flight()))] == [name]
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+def test_detect_two_senders_states_the_distance(lost):
+    (one,) = detected(alternating(aisle_flight(uwb=Uwb(rate_hz=10.0)), lost))
+    assert one.evidence["distance_m"] == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("is_fused", [0.0, 1.0])
+def test_detect_copied_estimate_states_the_delay(is_fused):
+    flight = aisle_flight(ekf2=Estimator(fusing=((0.0, is_fused),)))
+    first, *_ = detected(copied(flight))
+    assert first.evidence["delay_s"] == pytest.approx(0.03, abs=0.01)
+    assert "source_is_ekf2_estimate" not in {one.id for one in detected(copied(flight, 0.02))}
+
+
+def test_detect_clean_flight_has_no_finding():
+    assert detected(aisle_flight()) == ()
+
+
+def test_detect_timestamp_unit_states_that_ekf2_never_fused():
+    flight = aisle_flight(ekf2=Estimator(fusing=((0.0, 0.0),)))
+    flight = replace(flight, log=replace(flight.log, parameters={"EKF2_EV_CTRL": 15}))
+    first, second = detected(with_clock(flight, "milliseconds"))
+    assert "in milliseconds" in first.message
+    assert "EKF2 never fused the positions" in first.message
+    assert "their timestamps are too old" in second.title
+
+
+def test_detect_shared_timestamps_states_the_resolution():
+    (one,) = detected(with_clock(aisle_flight(uwb=Uwb(rate_hz=1.0)), "local", SHARED_STAMPS, 120))
+    assert one.evidence["resolution_s"] == pytest.approx(1.0)
+    assert "(5 Hz)" in one.message
+
+
+@pytest.mark.parametrize(("quality", "words"), [(20.0, "light"), (0.0, "ODOMETRY")])
+def test_detect_low_quality_is_the_reason(quality, words):
+    flight = aisle_flight(ekf2=Estimator(fusing=((0.0, 0.0),)))
+    parameters = {"EKF2_EV_CTRL": 15, "EKF2_EV_QMIN": 50}
+    flight = replace(flight, log=replace(flight.log, parameters=parameters))
+    status = pd.DataFrame({"quality": quality}, flight.positions[0].samples.index)
+    (one,) = detected(with_track(flight, status=status))
+    assert f"quality is {quality:.0f}, EKF2_EV_QMIN is 50" in one.title
+    assert words in one.remedy
+
+
+def test_find_unusable_source_leaves_no_other_estimate():
+    analysis = unexplained(compare(aisle_flight()))
+    findings = [
+        finding("error", name, "m.", "r.")
+        for name in ("ekf2_not_fusing", "source_outliers", "source_two_senders", "imu_gap")
+    ]
+    left = source_convention.apply_convention(analysis, findings)
+    assert [one.id for one in left] == ["source_two_senders", "ekf2_not_fusing", "imu_gap"]
+    assert left[1].remedy == source_convention.CORRECT_FIRST
+
+
+def mounted(arm_m: tuple[float, float]) -> Analysis:
+    """Return a flight whose sensor is mounted away from the IMU."""
+    flight = simulate_flight(Scenario(seed=3, kind="loop", passes=2), parse(()))
+    source, attitude = flight.positions[0], flight.truth.attitude
+    time = source.samples.index.to_numpy()
+    rotation = to_matrix(interpolate(time, attitude.index.to_numpy(), attitude.to_numpy()))
+    samples = source.samples.copy()
+    samples[Columns.POSITION] += rotation @ [*arm_m, 0.0]
+    analysis = unexplained(compare(with_track(flight, samples=samples)))
+    return replace(analysis, convention=Convention(verdict="determined"))
+
+
+def test_detect_lever_arm_equals_truth():
+    (one,) = source_values.detect_lever_arm(mounted((0.4, -0.3)))
+    found_m = one.evidence["forward_m"], one.evidence["right_m"]
+    assert found_m == pytest.approx((0.4, -0.3), abs=0.1)
+    assert "Set EKF2_EV_POS_X to 0." in one.remedy
+
+
+def test_detect_no_lever_arm_has_no_finding():
+    assert not [*source_values.detect_lever_arm(mounted((0.0, 0.0)))]
+
+
+@pytest.mark.reallogs
+@pytest.mark.parametrize("name", CASES)
+def test_findings_of_shared_case_are_as_expected(name):
+    folder = shared("cases")
+    case = json.loads((folder / "EXPECTED.json").read_text())["cases"][name]
+    result, first, harmful = judge(case, run(case["command"], folder))
+    assert (result, harmful) == ("correct", []), first
