@@ -112,8 +112,10 @@ def compare(
     arguments = locals()  # names of the arguments are fields of the request
     known = get_args(request.AxisName)
     axis_names = (axes,) if isinstance(axes, str) else tuple(axes)
-    if unknown := set(axis_names).difference(known):
-        raise SettingsError(f"`axes` {unknown.pop()!r} is unknown. Choose from {', '.join(known)}.")
+    if unknown_axes := set(axis_names).difference(known):
+        raise SettingsError(
+            f"`axes` {unknown_axes.pop()!r} is unknown. Choose from {', '.join(known)}."
+        )
     if isinstance(log, Flight) and (position, mavlink, system) != (None, None, None):
         raise SettingsError(
             "the arguments position, mavlink and system are not possible with a Flight, because "

@@ -206,7 +206,7 @@ def prepare_comparison(
     return prepare(flight, structs.replace(request, clock_offset_s=clock.offset_s))
 
 
-def run_loop(request: LoopRequest, progress: Progress = ignore_progress) -> Loop:
+def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progress) -> Loop:
     """Read a flight or a trajectory, measure its loop closure error and correct the path.
 
     Raises

@@ -149,7 +149,7 @@ def test_consistent_filter_without_truth_is_no_reason_to_change_nothing() -> Non
         assert cause.actions[-1] == Action("KF, EKF2", reason)
 
 
-def test_refusal_card_shows_fault_bytes_and_action(tmp_path) -> None:
+def test_card_of_unreadable_log_shows_fault_bytes_and_action(tmp_path) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(b"\xa3\x95\x80\x01" * 300)
     with pytest.raises(LogError) as caught:

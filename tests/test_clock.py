@@ -422,7 +422,7 @@ def test_time_offset_estimate_excludes_position_outliers() -> None:
     _, found = estimate_noises_and_clock(compared)
     assert covers(found, -0.2)
     assert (found.applied_s, found.remaining_s) == (-0.2, pytest.approx(0.0, abs=0.03))
-    assert clock_advice(compared, found)["Offset"].startswith("-0.")
+    assert clock_advice(compared, found)["Offset"].startswith("Add -0.")
 
 
 def test_time_offset_step_p_value_equals_bonferroni_t_test() -> None:

@@ -130,7 +130,7 @@ def test_check_random_axes_unit_and_offset_are_found(index):
     assert_found(found, **dict(zip("xyz", axes, strict=True)), unit=unit, late_s=late_s)
 
 
-@pytest.mark.parametrize("rotation_deg", [-170.0, -60.0, 25.0, 100.0])
+@pytest.mark.parametrize("rotation_deg", [-170.0, -60.0, 25.0, 45.0, 100.0])
 def test_check_rotated_positions_have_their_rotation(rotation_deg):
     found = check_convention(flown(), sent(flown(), rotation_deg=rotation_deg))
     quarter = CLOCKWISE.index(found.x)

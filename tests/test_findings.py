@@ -518,5 +518,6 @@ def test_explain_command_with_unknown_finding_exits_with_2(
     code, out, err = run_main(monkeypatch, capsys, "explain", typed)
     assert (code, out) == (2, "")
     assert err == (
-        f"px4fuse: '{typed}' is not a finding. {suggestion}For a list, run px4fuse explain.\n"
+        f"px4fuse: '{typed}' is not a finding. {suggestion}"
+        "For a list of findings, run px4fuse explain.\n"
     )

@@ -21,7 +21,7 @@ import px4fuse
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.diagnose import prepare_comparison
 from px4fuse.ekf2.aids import AidResult
-from px4fuse.ekf2.inputs import _rules, read_gnss
+from px4fuse.ekf2.inputs import _fusion_rules, read_gnss
 from px4fuse.ekf2.inputs import prepare_inputs as prepare_replay
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.replay import inside_spans, rms
@@ -624,8 +624,8 @@ def test_gnss_driver_timestamp_replaces_delay_parameter(tmp_path):
 def test_gnss_reset_rule_depends_on_px4_release(north_m, parameters, scale, with_velocity):
     delayed = pd.DataFrame({"north_m": [north_m]})
     record = made(FusionRecord, parameters=parameters, per_step_biases=False, delayed=delayed)
-    rules = _rules(record, 0.01, is_gnss=True)
-    assert (rules.reset_scale, rules.with_velocity) == (scale, with_velocity)
+    rules = _fusion_rules(record, 0.01, is_gnss=True)
+    assert (rules.reset_variance_factor, rules.resets_velocity) == (scale, with_velocity)
     assert (rules.reset_s, rules.stop_s) == (7.0, np.inf)
 
 
@@ -636,9 +636,12 @@ def test_gnss_reset_rule_depends_on_px4_release(north_m, parameters, scale, with
     (110.0, 0.0, -0.15, None),  # EKF2 uses the driver's times
 ])  # fmt: skip
 def test_gnss_time_offset_advice_names_delay_parameter(delay_ms, age_s, remaining_s, expected):
-    source = SimpleNamespace(origin=GNSS, age_s=age_s, alignment=None, aid=lambda _: GNSS.aid)
+    source = SimpleNamespace(
+        origin=GNSS, age_s=age_s, alignment=None, aid=lambda _: GNSS.aid, frame="NED"
+    )
     log = SimpleNamespace(name="x.ulg", parameters={"EKF2_GPS_DELAY": delay_ms})
-    comparison = SimpleNamespace(source=source, flight=SimpleNamespace(log=log))
+    flight = SimpleNamespace(log=log)
+    comparison = SimpleNamespace(source=source, flight=flight, convention=None)
     clock = late(remaining_s, drift_ppm=None, drift_sigma_ppm=None)
     advice = clock_advice(comparison, clock).get("PX4")  # type: ignore[arg-type]
     assert all(text in (advice or "") for text in expected or ())

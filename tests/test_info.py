@@ -192,7 +192,7 @@ def test_info_on_log_without_take_off_states_never_airborne(tmp_path):
     inventory = inventory_of(log, tmp_path)
     assert inventory.flight.airborne == ()
     assert ability(inventory, "compare").possible
-    assert "never, according to the land detector" in info(tmp_path / "made.ulg")
+    assert "the land detector never reported a flight" in info(tmp_path / "made.ulg")
 
 
 def test_info_does_not_use_position_source_as_ground_truth(tmp_path):

@@ -161,7 +161,7 @@ def test_loop_correction_without_heading_has_only_one_path(sample, sample_loop) 
     np.testing.assert_allclose(plain.position_m, turned.position_m, atol=1e-9)
 
 
-def test_loop_with_given_landing_point_equals_ground_truth(
+def test_given_landing_point_gives_closure_error_of_ground_truth(
     sample: LoopSource, sample_loop: Loop
 ) -> None:
     forward, right, _ = sample_loop.true_end.displacement  # the vehicle heads along x

@@ -95,7 +95,7 @@ def test_simulated_magnetometer_and_height_have_stated_noise(tmp_path: Path) -> 
     log.write_bytes(to_ulog(simulate(OUTDOOR, parse(["mag=0.3,60"]))))
     flight = read_log(log)
     truth, record = flight.truth.samples, flight.ekf2.record
-    down = flight.barometer["down_m"] + sensors.HOME[2]
+    down = flight.barometer["down_m"] + sensors.HOME_POSITION[2]
     error = down.to_numpy() - np.interp(down.index, truth.index, truth["down_m"])
     assert error.std() == pytest.approx(0.4, rel=0.1)
     assert abs(error.mean()) < 4 * 0.4 / len(error) ** 0.5

@@ -67,7 +67,7 @@ def root_findings(analysis: Analysis) -> dict[str, Finding]:
     }
     return {
         one.id: one for one in find(analysis)
-        if one.severity != "note" and one.caused_by is None and one.id not in left_out
+        if one.severity != "note" and one.caused_by is None and not one.id.startswith(left_out)
     }  # fmt: skip
 
 

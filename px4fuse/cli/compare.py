@@ -81,10 +81,10 @@ def compare(
     outputs.write_and_print(contents, page, request)
     if not quiet and STANDARD_OUTPUT not in contents:
         outputs.show_page(card_page("closing", results.card))
-    failed = failed_checks(outcome) if checks else {}
-    for name, verdict in failed.items():
+    failed_findings = failed_checks(outcome) if checks else {}
+    for name, verdict in failed_findings.items():
         click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)
-    if failed:
+    if failed_findings:
         sys.exit(1)
     if fail_on is not None:
         failing_severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1]

@@ -70,6 +70,8 @@ def prepare(flight: Flight, request: ComparisonRequest) -> Comparison:
         track = replace(track, origin=structs.replace(track.origin, kind=kind))
     track = shift_clock(track, settings.clock_offset_s)
     convention = None if track.origin.is_gnss else check_convention(flight, track)
+    if convention is not None and settings.clock_offset_s:  # a chosen time offset is not changed
+        convention = structs.replace(convention, late_s=0.0)
     late_s = find_faults(convention, flight, track.frame).late_s
     settings = replace(settings, clock_offset_s=settings.clock_offset_s - late_s)
     flight, track = correct(flight, track, convention)

@@ -164,10 +164,11 @@ class Hypothesis:
         """Rotation beyond the quarter turns."""
         return float(self.parameters[1] - self.quarter * np.pi / 2.0)
 
-    def has_meaning_of(self, other: "Hypothesis") -> bool:
-        """Return True if axes and unit are equal and the time offset is similar."""
-        is_close = abs(self.offset_s - other.offset_s) < 0.5
-        return is_close and (self.axes, self.unit) == (other.axes, other.unit)
+    def has_meaning_of(self, other: "Hypothesis", max_turn_rad: float = np.pi / 4.0) -> bool:
+        """Return True if axes, unit, rotation and time offset are similar."""
+        turn_rad = np.angle(np.exp(1j * (self.parameters[1] - other.parameters[1])))
+        is_similar = abs(self.offset_s - other.offset_s) < 0.5 and abs(turn_rad) < max_turn_rad
+        return bool(is_similar and (self.family, self.unit) == (other.family, other.unit))
 
 
 def search(positions: Positions, imu: ImuMotion, heading_from: str) -> list[Hypothesis]:
@@ -277,6 +278,8 @@ def _evaluate(
         float(np.sum(weight[0] @ (first[:, :2] * second[:, :2])))
         for first, second in ((ned, ned), (ned, measured), (measured, measured))
     ]
+    if 0.0 in products:  # at rest, no hypothesis can be scored
+        return replace(one, score=-np.inf), np.zeros(len(one.parameters))
     jacobian = np.zeros((len(index), 3, len(PRECISION)))
     jacobian[..., 0] = imu.rate_m_s[index]
     jacobian[:, 0, 1], jacobian[:, 1, 1] = -horizontal.imag, horizontal.real

@@ -21,13 +21,13 @@ from px4fuse.convention.motion import (
     WINDOW_S,
     ImuMotion,
     Inertial,
-    heading,
     motion_from_imu,
     read_inertial,
     replace_heading,
 )
 from px4fuse.convention.orientation import check_orientation
 from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
+from px4fuse.trajectory.rotation import heading
 
 MIN_LOG_ODDS = 4.0  # to the best other convention
 MIN_GAIN = 8.0  # log likelihood over no relation
@@ -112,8 +112,7 @@ def _search(positions: Positions, motions: dict[str, ImuMotion]) -> list[Hypothe
         if (
             one.heading_from == "EKF2"
             and one.score > found[0].score - MAX_LOGGED_DEFICIT
-            and one.has_meaning_of(found[0])
-            and abs(one.remainder_rad - found[0].remainder_rad) < SMALL_ROTATION
+            and one.has_meaning_of(found[0], SMALL_ROTATION)
         ):
             return [
                 replace(one, score=found[0].score),

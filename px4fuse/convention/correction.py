@@ -10,9 +10,10 @@ from msgspec import structs
 from px4fuse.arrays import Array
 from px4fuse.convention.axes import CLOCKWISE, UNITS
 from px4fuse.convention.model import Convention
-from px4fuse.convention.motion import heading, read_inertial, replace_heading
+from px4fuse.convention.motion import read_inertial, replace_heading
 from px4fuse.convention.orientation import to_attitude
 from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Unavailable
+from px4fuse.trajectory.rotation import heading
 
 # Minimum rotation (°) of a frame with other axes, and of a frame that is only rotated: smaller
 # ones are in the reach of the estimate of the heading error

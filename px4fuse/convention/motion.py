@@ -21,6 +21,7 @@ from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
     from_vector,
+    heading,
     interpolate,
     multiply,
     to_matrix,
@@ -213,12 +214,6 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
         is_valid &= (time_s < end - WINDOW_S) | (time_s > start + WINDOW_S)
     filtered = high_pass(second, is_valid)
     return ImuMotion(time_s, is_valid, filtered, np.gradient(filtered[..., 0], GRID_S, axis=0))
-
-
-def heading(attitude: Array) -> Array:
-    """Return the heading (rad, clockwise from north, continuous) of quaternions (n, 4)."""
-    w, x, y, z = np.moveaxis(attitude, -1, 0)
-    return np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
 
 
 def replace_heading(attitude: Array, heading_rad: Array) -> Array:

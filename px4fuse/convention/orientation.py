@@ -11,8 +11,8 @@ import numpy as np
 
 from px4fuse.arrays import Array
 from px4fuse.convention.model import Frames, OrientationConvention
-from px4fuse.convention.motion import Inertial, heading
-from px4fuse.trajectory.rotation import interpolate, multiply
+from px4fuse.convention.motion import Inertial
+from px4fuse.trajectory.rotation import heading, interpolate, multiply
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 FRD_FLU = np.array([0.0, 1.0, 0.0, 0.0])  # half a turn about x

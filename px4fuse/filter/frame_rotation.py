@@ -14,7 +14,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 import pandas as pd
 from msgspec import structs
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from px4fuse.arrays import Array, ArrayPair, cumulative_integral
@@ -31,6 +30,7 @@ from px4fuse.filter.signals import (
 from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.notebook_display import one_line_repr
 from px4fuse.record import NotNegative, Record, Share
+from px4fuse.trajectory.rotation import heading
 
 # Length (s) of the parts of the flight over which the heading error is averaged
 PART_LENGTH_S = 2.0
@@ -118,7 +118,7 @@ class HeadingError(Record, frozen=True):
 
 
 def combine_heading_parts(
-    parts: tuple[HeadingPart, ...], drift_p: float, by: Literal["orientation", "positions"]
+    parts: tuple[HeadingPart, ...], drift_p: float, method: Literal["orientation", "positions"]
 ) -> HeadingError:
     """Combine the heading errors of the parts of a flight into one result."""
     angles_deg = [heading_part.heading_error_deg for heading_part in parts]
@@ -128,7 +128,7 @@ def combine_heading_parts(
         drifts=drift_p < MAX_DRIFT_P_VALUE and max(angles_deg) - min(angles_deg) >= MIN_DRIFT_DEG,
         parts=parts,
         drift_p=drift_p,
-        by=by,
+        by=method,
     )
 
 
@@ -217,9 +217,7 @@ def _mean_per_part(time_s: Array, rotation_rad: Array, sigma_rad: Array) -> tupl
 
 def heading_rad(quaternions: pd.DataFrame) -> Array:
     """Return the headings of attitude quaternions (rad, clockwise from above), unwrapped."""
-    values = quaternions[Columns.QUATERNION].to_numpy(copy=True)
-    angles: Array = Rotation.from_quat(values, scalar_first=True).as_euler("ZYX")[:, 0]
-    return np.unwrap(angles)
+    return heading(quaternions[Columns.QUATERNION].to_numpy())
 
 
 def _compare_orientations(
@@ -246,13 +244,13 @@ def _compare_orientations(
     # correlated
     noise_rad = 1.4826 * np.median(np.abs(np.diff(rotation_rad))) / np.sqrt(2.0)
     sigma_rad = np.full(len(time_s), max(float(noise_rad), np.radians(MIN_SIGMA_DEG)))
-    heading_parts = _mean_per_part(time_s, rotation_rad, sigma_rad)
-    if len(heading_parts) < MIN_PARTS:
+    part_headings = _mean_per_part(time_s, rotation_rad, sigma_rad)
+    if len(part_headings) < MIN_PARTS:
         return None
-    angles_deg = np.array([heading_part.heading_error_deg for heading_part in heading_parts])
+    angles_deg = np.array([heading_part.heading_error_deg for heading_part in part_headings])
     chi_square = np.sum((angles_deg - angles_deg.mean()) ** 2) / np.degrees(sigma_rad[0]) ** 2
     return combine_heading_parts(
-        heading_parts, float(chdtrc(len(heading_parts) - 1, chi_square)), "orientation"
+        part_headings, float(chdtrc(len(part_headings) - 1, chi_square)), "orientation"
     )
 
 

@@ -188,9 +188,9 @@ def fit_bias_scale_jumps(
             design, step_columns=unit_steps(design.time_s, [jump.time_s for jump in jumps])
         )
         sigma_a, fit = _fit_sigma_a(design, sigma_a_grid, is_skipped)
-    forward, right, rotation = map(fit.estimate, (FORWARD, RIGHT, ROTATION))
+    forward_bias, right_bias, rotation = map(fit.estimate, (FORWARD, RIGHT, ROTATION))
     return BiasScaleJumpFit(
-        forward, right, rotation, _fit_scale(design, sigma_a, is_skipped), jumps, sigma_a
+        forward_bias, right_bias, rotation, _fit_scale(design, sigma_a, is_skipped), jumps, sigma_a
     )
 
 
@@ -391,7 +391,7 @@ class DesignFit:
 
     @property
     def axis_rms(self) -> Array:
-        """Root mean square of the residual along each axis, at least 1."""
+        """RMS residual along each axis in units of √S; 1 is the minimum, as for correct noises."""
         mean_square = np.bincount(self.axis, self.residual**2) / np.bincount(self.axis)
         return np.sqrt(np.maximum(mean_square, 1.0))
 
@@ -500,7 +500,10 @@ class DesignMatrix:
     def whitened_design(
         self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0
     ) -> tuple[Array, Array, float]:
-        """Return whitened innovations, shape (a, m), and columns, shape (a, m, k), and Σ ln S."""
+        """Return whitened innovations, their design matrix, and Σ ln S.
+
+        With a axes, m measurements and k unknowns, the shapes are (a, m) and (a, m, k).
+        """
         hat_count = self.hat_signals[0].shape[1]
         step_count = self.step_columns.shape[1]
         axes = len(self.intervals)
@@ -590,9 +593,9 @@ def make_design_matrix(
         measured_m = np.zeros_like(dp)
         # positions relative to the first measurement, which is KF's initial position
         measured_m[:, 0] = interval_input.measurement_m - interval_input.initial.position_m
-        initial = replace(interval_input.initial, position_m=0.0)
+        initial_state = replace(interval_input.initial, position_m=0.0)
         intervals.append(
-            replace(_replace_signals(interval_input, dp, dv, measured_m), initial=initial)
+            replace(_replace_signals(interval_input, dp, dv, measured_m), initial=initial_state)
         )
     time_s = axes[0].measurement_time_s[-len(measured_m) :]
     hat_time_s, hat_functions = _hat_functions(

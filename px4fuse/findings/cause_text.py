@@ -10,7 +10,7 @@ from px4fuse.comparison.remedy import aid_of, format_settings
 from px4fuse.comparison.trials import can_improve, improvement
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.frame_rotation import HeadingError
-from px4fuse.filter.settings import UNITS
+from px4fuse.filter.settings import SETTING_UNITS
 from px4fuse.findings import cause_grouping as kinds
 from px4fuse.findings.model import format_percent
 from px4fuse.flight import Unavailable
@@ -98,7 +98,8 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
 def format_kf_settings(settings: Mapping[str, float]) -> str:
     """Format KF noises as an action, for example "Set SIGMA_Z to 0.1 m (--sigma-z 0.1)"."""
     texts = (
-        f"{name[:7].upper()} to {value:g} {UNITS[name]} ({COMPARISON_OPTIONS[name]} {value:g})"
+        f"{name[:7].upper()} to {value:g} {SETTING_UNITS[name]} "
+        f"({COMPARISON_OPTIONS[name]} {value:g})"
         for name, value in sorted(settings.items())
     )
     return f"Set {' and '.join(texts)}."
@@ -125,7 +126,7 @@ def _format_one_change(analysis: Analysis, cause: Intervention, name: str) -> st
                 else f"positions rotated by {value:+.0f}°{mean}"
             )
         case changes.SIGMA_A | changes.SIGMA_Z:
-            label, unit = name[:7].upper(), UNITS[name]
+            label, unit = name[:7].upper(), SETTING_UNITS[name]
             return f"{label} {value:.2g} {unit} instead of {getattr(settings, name):g} {unit}"
     assert not isinstance(analysis.ekf2_model, Unavailable)  # EKF2 was replayed with the change
     flown_value, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].printed_unit

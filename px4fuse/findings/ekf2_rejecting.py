@@ -48,10 +48,10 @@ def _detect_rejections(analysis: Analysis) -> Findings:
     ekf2, down = analysis.flight.ekf2, analysis.axes.get("down")
     # EKF2 rejects north and east together, so the main axis represents both
     for result in (analysis.main, *([down] if down and down is not analysis.main else [])):
-        frame = result.ekf2_innovations
-        if isinstance(frame, Unavailable) or not isinstance(ekf2, Ekf2):
+        innovations = result.ekf2_innovations
+        if isinstance(innovations, Unavailable) or not isinstance(ekf2, Ekf2):
             continue
-        rejected_flags = frame["rejected"].dropna()
+        rejected_flags = innovations["rejected"].dropna()
         share = float(rejected_flags.mean())  # NaN if the log has no rejections
         if share >= REJECTED_SHARE_WARNING:
             quantity = "heights" if result is down else "positions"
@@ -62,7 +62,7 @@ def _detect_rejections(analysis: Analysis) -> Findings:
                 f"beyond its gate of {ekf2.gate:g} √S. Possible causes: outliers, measurement "
                 "noise set too small, or late timestamps.",
                 _remedy(analysis, result),
-                {"rejected_fraction": share, "count": len(frame), "axis": result.axis.name},
+                {"rejected_fraction": share, "count": len(innovations), "axis": result.axis.name},
                 zero_length_spans(rejected_flags.index[rejected_flags > 0.0]),
             )
 

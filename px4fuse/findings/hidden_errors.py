@@ -87,7 +87,7 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
     Returns filter, axis and size of each error, the largest mean NEES first.
     """
     alignment, frame_error_m = comparison.source.alignment, 0.0
-    # a frame that was fitted to EKF2's track may be off by EKF2's error
+    # a frame that was fitted to EKF2's track may contain EKF2's error
     if alignment is not None and alignment.yaw_sigma_deg is not None:
         frame_error_m = alignment.residual_rms_m or 0.0
     errors = [

@@ -58,7 +58,7 @@ def detect_bias(analysis: Analysis) -> Findings:
             {"bias_m_s2": size, "sigma_m_s2": fit.bias.sigma},
         )
     elif ekf2_bias is not None:
-        # with a fit to the positions, which shows no horizontal bias, only EKF2's down bias counts
+        # a fit to the positions, if any, shows no horizontal bias: then use EKF2's bias along down
         size = float(
             np.linalg.norm(ekf2_bias[2:] if isinstance(fit, BiasScaleJumpFit) else ekf2_bias)
         )

@@ -25,7 +25,7 @@ from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of, format_settings, noise_change
 from px4fuse.comparison.trials import can_improve, find_trial
 from px4fuse.ekf2_parameters import BAROMETER
-from px4fuse.filter.settings import UNITS, Settings
+from px4fuse.filter.settings import SETTING_UNITS, Settings
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.finding import SEVERITIES, Finding, Severity
@@ -44,14 +44,14 @@ from px4fuse.request import COMPARISON_OPTIONS
 from px4fuse.text import format_factor, format_number, format_ratio
 
 MIN_NOISE_RATIO = 1.5  # setting over estimate (σ) or its inverse; below, the track hardly changes
-MIN_NOISE_RATIO_ERROR = 4.0  # setting over estimate (σ) or its inverse, for an error
+MIN_NOISE_RATIO_ERROR = 4.0  # setting over estimate (σ) or its inverse, for severity "error"
 MIN_RESPONSE_TIME_S = 2.5  # s; minimum response time of KF for Q almost zero: vehicles turn in less
 INTERVAL_WIDENING = (
     1.5  # factor on the 95 % interval (log scale); 0.3 % of correct settings exceed it
 )
 MIN_LAG1_AUTOCORRELATION = 0.3  # of the innovations; white ones: below 2/√n, 0.2 for n = 100
 
-MIN_SIGMA_RATIO_ERROR = 2.0  # reported over actual σ, or its inverse, for an error
+MIN_SIGMA_RATIO_ERROR = 2.0  # reported over actual σ, or its inverse, for severity "error"
 # Maximum ratio of two estimates of one noise: twice the standard error of a median of 100 values
 NOISE_RATIO_TOLERANCE = 1.25
 # Actions if no re-run explains an inconsistent variance
@@ -182,7 +182,7 @@ def _setting_finding(
 
 def format_estimate(name: str, chosen: float, noise: Noise) -> str:
     """Format a setting with its maximum-likelihood estimate and 95 % interval."""
-    label, unit = name[:7].upper(), UNITS[name]
+    label, unit = name[:7].upper(), SETTING_UNITS[name]
     estimate = f"{label} {chosen:g} {unit}; maximum-likelihood estimate"
     if noise.value is None:
         return f"{estimate} at most {noise.high:.3g} {unit}"

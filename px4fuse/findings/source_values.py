@@ -151,7 +151,7 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
 
 
 def detect_two_senders(analysis: Analysis) -> Findings:
-    """Detect positions of two systems in turn: every other position is off by a constant."""
+    """Detect positions of two systems in turn: every other position has a constant offset."""
     samples = cut_to_segment(analysis.source.samples, analysis.segment)[Columns.POSITION]
     samples = samples.dropna(axis=1, how="all").dropna()
     count = (len(samples) - 2) // WINDOW
@@ -176,7 +176,7 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     )
     yield error(
         "source_two_senders",
-        f"Two systems send positions in turn, {size_m:.2f} m apart. Every other one of the "
+        f"Two systems send positions in turn that differ by {size_m:.2f} m. Every other one of the "
         f"{positions_of(analysis.source)} ({rate_hz:.3g} Hz in total) differs by {axes}. Estimates "
         "from the positions are left out.",
         "Send the positions of one system only, for example stop the second node, bridge or "
@@ -211,8 +211,8 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
         "source_is_ekf2_estimate",
         f"{source_name(source)} sends EKF2's own {quantity} back. The positions equal EKF2's of "
         f"{1e3 * DELAYS_S[best]:.0f} ms earlier (median difference "
-        f"{1e3 * differences[best]:.1f} mm). They contain no measurement: EKF2 becomes certain of "
-        "its own error.",
+        f"{1e3 * differences[best]:.1f} mm). They contain no measurement: EKF2's σ decreases, "
+        "its error does not.",
         "Send the position of the positioning system. Do not connect the autopilot's local "
         "position (MAVROS local_position) to its vision input.",
         {"delay_s": float(DELAYS_S[best]), "difference_m": differences[best]},

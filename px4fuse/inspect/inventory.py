@@ -319,9 +319,9 @@ def _analysis_options(
     data_by_part = _data_by_part(flight)
     for name, key in PARTS_OF_COMPARE.items():
         result, description = rows_by_name.get(name, (NO_COMPARISON, ""))
-        logged = data_by_part.get(key, flight.ekf2)
-        if isinstance(logged, Unavailable):
-            result = logged
+        logged_data = data_by_part.get(key, flight.ekf2)
+        if isinstance(logged_data, Unavailable):
+            result = logged_data
         yield _analysis_option(name, result, description)
     aids, ekf2 = evaluate_aids(flight), flight.ekf2
     if isinstance(aids, dict) and isinstance(ekf2, Ekf2):
@@ -348,7 +348,11 @@ def _analysis_option(name: str, part: object, description: str) -> AnalysisOptio
 def _ekf2_and_truth_rows(comparison: Comparison) -> dict[str, tuple[object, str]]:
     first_axis, truth = next(iter(comparison.axes.values())), comparison.flight.truth
     innovations = {name: axis.ekf2_innovations for name, axis in comparison.axes.items()}
-    counts = [f"{n} {len(f)}" for n, f in innovations.items() if isinstance(f, pd.DataFrame)]
+    counts = [
+        f"{axis_name} {len(innovation_table)}"
+        for axis_name, innovation_table in innovations.items()
+        if isinstance(innovation_table, pd.DataFrame)
+    ]
     summaries = [axis.filters["ekf2"] for axis in comparison.axes.values()]
     quantities_text = "position only"
     if isinstance(truth, Truth) and truth.samples[Columns.VELOCITY].notna().any(axis=None):

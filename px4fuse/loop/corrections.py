@@ -11,7 +11,7 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import Px4FuseError
 from px4fuse.flight import Unavailable
 from px4fuse.loop.closure import correct_by_distance, distribute_by_distance
-from px4fuse.loop.model import LANDING, Closure, CorrectedPath, CorrectionName
+from px4fuse.loop.model import LANDING_SOURCE, Closure, CorrectedPath, CorrectionName
 from px4fuse.loop.odometry import ClosureWithEnd
 from px4fuse.record import to_serializable
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
@@ -82,7 +82,7 @@ def gate_closures(
         odometry_m = graph.poses[result.second, :3] - graph.poses[result.first, :3]
         closure_fields = structs.asdict(closure) | structs.asdict(result)
         del closure_fields["first"], closure_fields["second"]
-        closure_fields["source"] = "given" if end is None else LANDING
+        closure_fields["source"] = "given" if end is None else LANDING_SOURCE
         true_m = np.zeros(3) if end is None else end.displacement
         closures.append(
             Closure(distance_m=float(np.linalg.norm(odometry_m - true_m)), **closure_fields)
@@ -127,7 +127,9 @@ def solve_pose_graphs(
         else:
             is_used = ~is_rejected if is_gated else np.ones_like(is_rejected)
             solution = solve(
-                graph.select_edges(is_used), robust=robust, is_closure=is_closure[is_used]
+                graph.select_edges(is_used),
+                robust=robust,
+                is_closure=is_closure[is_used],
             )
             corrected_path = _interpolate_corrections(path, nodes, graph.poses, solution.poses)
             corrections[name] = corrected_path, solution
@@ -153,12 +155,12 @@ def _interpolate_corrections(
     fraction = (time - time[nodes[previous_node]]) / (
         time[nodes[previous_node + 1]] - time[nodes[previous_node]]
     )
-    corrected = [
+    corrected_poses = [
         solved_poses[node, :3] + rotation[node].apply(path.position_m - graph_poses[node, :3])
         for node in (previous_node, previous_node + 1)
     ]
     weight = np.clip(fraction, 0.0, 1.0)[:, None]
-    position = (1.0 - weight) * corrected[0] + weight * corrected[1]
+    position = (1.0 - weight) * corrected_poses[0] + weight * corrected_poses[1]
     return path.with_positions(position, Slerp(time[nodes], rotation)(time))
 
 
@@ -204,15 +206,15 @@ def score_paths(
         if isinstance(evaluation, Evaluation) and evaluation.time_offset.offset_s is not None:
             offsets[name] = evaluation.time_offset.offset_s
     scored_paths: dict[CorrectionName, CorrectedPath | Unavailable] = {"uncorrected": uncorrected}
-    for name, corrected in corrected_paths.items():
+    for name, corrected_path in corrected_paths.items():
         all_closures_path = scored_paths.get("pose_graph_all")
-        if isinstance(corrected, Unavailable):
-            scored_paths[name] = corrected
+        if isinstance(corrected_path, Unavailable):
+            scored_paths[name] = corrected_path
         elif (
             isinstance(all_closures_path, CorrectedPath)
-            and corrected[1] is all_closures_path.solution
+            and corrected_path[1] is all_closures_path.solution
         ):
             scored_paths[name] = structs.replace(all_closures_path, name=CORRECTION_LABELS[name])
         else:
-            scored_paths[name] = score_path(name, *corrected)
+            scored_paths[name] = score_path(name, *corrected_path)
     return scored_paths

@@ -25,7 +25,7 @@ CorrectionName = Literal[
     "pose_graph_gnc",
 ]
 # Source of the loop closure between take-off and landing
-LANDING = "landing"
+LANDING_SOURCE = "landing"
 
 
 class TrueEnd(Record, frozen=True, kw_only=True):
@@ -117,9 +117,9 @@ class Closure(Record, frozen=True, kw_only=True):
     weight_gnc: float | None = None
 
     def __str__(self) -> str:
-        if self.source == LANDING:
+        if self.source == LANDING_SOURCE:
             return "the closure of take-off and landing"
-        return f"the closure of {self.time_1_s:.12g} s and {self.time_2_s:.12g} s"
+        return f"the closure between {self.time_1_s:.12g} s and {self.time_2_s:.12g} s"
 
 
 class Correction(Record, frozen=True, kw_only=True):
@@ -263,6 +263,6 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
         """
         if isinstance(self.graph, Unavailable):
             raise MissingDataError(f"{self.graph.what}: {self.graph.reason}.")
-        solved = self.paths.get("pose_graph_gated") or self.paths.get("pose_graph_all")
-        solution = None if solved is None else solved.solution
+        graph_path = self.paths.get("pose_graph_gated") or self.paths.get("pose_graph_all")
+        solution = None if graph_path is None else graph_path.solution
         return self.graph if solution is None else replace(self.graph, poses=solution.poses)

@@ -258,12 +258,12 @@ def read_source(
             "Omit --frame.",
         )
     flight = read_log(path, system=system)
-    chosen = track_name or default
-    if chosen is None:
+    chosen_track = track_name or default
+    if chosen_track is None:
         odometry = find_odometry(flight)
-        chosen = "vio"
+        chosen_track = "vio"
         if isinstance(odometry, Unavailable):
-            chosen = "ekf2"
+            chosen_track = "ekf2"
             if isinstance(flight.ekf2, Unavailable):
                 raise MissingDataError(f"{flight.log.name}: {odometry.reason}", odometry.remedy)
-    return LoopSource(trajectory_of(flight, chosen), flight)
+    return LoopSource(trajectory_of(flight, chosen_track), flight)

@@ -54,7 +54,7 @@ def results(
     """Return the results of ``px4fuse compare`` on a flight with positions for KF."""
     return within_bounds(
         contract.ComparisonResults(
-            **_flight_fields(contract.COMPARISON, request, analysis),
+            **_flight_fields(contract.COMPARISON_SCHEMA, request, analysis),
             **{name: to_serializable(getattr(analysis, name)) for name in _COPIED_FIELDS},
             aids={} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
             card=build_card(analysis, request.without_paths(), (student.name, student.id)),
@@ -71,7 +71,7 @@ def outcome_results(
         return results(request, outcome, student)
     return within_bounds(
         contract.AidsResults(
-            **_common_fields(contract.AIDS, request, outcome.flight),
+            **_common_fields(contract.AIDS_SCHEMA, request, outcome.flight),
             aids=dict(outcome.aids),
             card=build_aids_card(outcome, request.without_paths(), (student.name, student.id)),
             findings=outcome.findings,
@@ -84,17 +84,19 @@ def outcome_results(
 def tuning_results(
     request: ComparisonRequest,
     comparison: Comparison,
-    tuned: Mapping[str, AxisTuning | Unavailable],
+    tuning_by_axis: Mapping[str, AxisTuning | Unavailable],
 ) -> contract.TuningResults:
-    common = _flight_fields("px4fuse-tuning", request, comparison, "tune")
-    return within_bounds(contract.TuningResults(**common, tuning=to_serializable(tuned)))
+    common_fields = _flight_fields("px4fuse-tuning", request, comparison, "tune")
+    return within_bounds(
+        contract.TuningResults(**common_fields, tuning=to_serializable(tuning_by_axis))
+    )
 
 
 def sync_results(
     request: ComparisonRequest, comparison: Comparison, clock: ClockOffset | Unavailable
 ) -> contract.SyncResults:
-    common = _flight_fields("px4fuse-sync", request, comparison, "sync")
-    return within_bounds(contract.SyncResults(**common, clock=to_serializable(clock)))
+    common_fields = _flight_fields("px4fuse-sync", request, comparison, "sync")
+    return within_bounds(contract.SyncResults(**common_fields, clock=to_serializable(clock)))
 
 
 def whatif_results(
@@ -103,7 +105,7 @@ def whatif_results(
     whatif_result, sweep_start = counterfactual.whatif, counterfactual.sweep_start
     return within_bounds(
         contract.WhatIfResults(
-            **_common_fields(contract.WHATIF, request, counterfactual.flight),
+            **_common_fields(contract.WHATIF_SCHEMA, request, counterfactual.flight),
             agreement=whatif_result.agreement,
             evaluated_s=whatif_result.evaluated_s,
             asked=counterfactual.uses_estimates,
@@ -121,7 +123,7 @@ def loop_results(
 ) -> contract.LoopResults:
     return within_bounds(
         contract.LoopResults(
-            schema=schema_of(contract.LOOP),
+            schema=schema_of(contract.LOOP_SCHEMA),
             request=request.without_paths(),
             track=loop.odometry.trajectory.track(),
             references=tuple(reference.track() for reference in loop.references),
@@ -145,11 +147,11 @@ def evaluation_results(request: EvaluationRequest, score: Evaluation) -> contrac
     )
 
 
-def graph_results(solved: SolvedGraph, command: str) -> contract.GraphResults:
+def graph_results(solved_graph: SolvedGraph, command: str) -> contract.GraphResults:
     """Return the results of ``px4fuse loop`` for a pose graph file."""
     return within_bounds(
         contract.GraphResults(
-            schema_of("px4fuse-graph"), to_serializable(solved), provenance(command)
+            schema_of("px4fuse-graph"), to_serializable(solved_graph), provenance(command)
         )
     )
 

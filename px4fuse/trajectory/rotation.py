@@ -99,3 +99,9 @@ def interpolate(times: Array, known_times: Array, quaternions: Array) -> Array:
     continuous = quaternions * signs[:, None]
     q = np.stack([np.interp(times, known_times, component) for component in continuous.T], axis=-1)
     return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
+
+
+def heading(q: Array) -> Array:
+    """Return the headings (rad, clockwise from above, unwrapped) of quaternions, shape (n, 4)."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    return np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))

@@ -201,8 +201,10 @@ def _solve_gnc(
     graph: PoseGraph, start: Residuals, plain_minimum: _Minimum, is_doubtful: BoolArray
 ) -> tuple[_Minimum, Array]:
     """Solve least squares, truncated for the edges that may be false, from two starts."""
-    _, scaled = model.scale_to_unit_diagonal(graph.information)
-    degrees_of_freedom = np.sum(np.linalg.eigvalsh(scaled) > model.MIN_OBSERVED_EIGENVALUE, axis=1)
+    _, scaled_information = model.scale_to_unit_diagonal(graph.information)
+    degrees_of_freedom = np.sum(
+        np.linalg.eigvalsh(scaled_information) > model.MIN_OBSERVED_EIGENVALUE, axis=1
+    )
     bound = np.full(len(is_doubtful), np.inf)
     drop_cost = np.zeros(len(is_doubtful))
     is_testable = is_doubtful & (degrees_of_freedom > 0)
@@ -240,9 +242,9 @@ def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tupl
     state = start
     iteration_count = 0
     # Edges that cannot be false have an infinite bound, so their excess is -1
-    excess = 2.0 * state.chi2 / bound - 1.0
-    if np.max(excess) > 0.0:
-        control = 1.0 / float(np.max(excess))
+    chi2_excess = 2.0 * state.chi2 / bound - 1.0
+    if np.max(chi2_excess) > 0.0:
+        control = 1.0 / float(np.max(chi2_excess))
         for _ in range(_MAX_GNC_STAGES):
             ratio = np.maximum(state.chi2 / bound, 1e-200)  # not 0; the weight is 1 anyway
             weights = np.clip(np.sqrt(control * (control + 1.0) / ratio) - control, 0.0, 1.0)
@@ -254,12 +256,12 @@ def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tupl
             control *= _GNC_FACTOR
     weights = (state.chi2 <= bound).astype(float)
     for _ in range(_MAX_TRUNCATION_ROUNDS):
-        minimum = _minimise(graph, state, weights)
-        state = minimum.state
-        iteration_count = iteration_count + minimum.iterations
+        minimum_state = _minimise(graph, state, weights)
+        state = minimum_state.state
+        iteration_count = iteration_count + minimum_state.iterations
         # Each round decreases the truncated cost, so the iteration ends
         new_weights = (state.chi2 <= bound).astype(float)
         if np.array_equal(new_weights, weights):
             break
         weights = new_weights
-    return _Minimum(state, minimum.cost, iteration_count, minimum.converged), weights
+    return _Minimum(state, minimum_state.cost, iteration_count, minimum_state.converged), weights
