@@ -3,7 +3,7 @@
 Positions with timestamps that are wrong by a time offset τ lag or lead the measured acceleration.
 KF follows the positions, so innovations hardly grow with τ. Only the comparison of positions and
 acceleration shows the offset. So the likelihood of the positions given the acceleration is
-maximised over τ, with the noises of the best τ. Constant errors that could be confused with τ
+maximised over τ, and at every τ over the noises. Constant errors that could be confused with τ
 (biases, tilt, scale; see :mod:`px4fuse.filter.imu_motion`) are marginalised.
 
 The noise of the IMU looks like motion that the positions do not contain, and τ shifts this noise,
@@ -13,6 +13,7 @@ curvature of the likelihood. The ratio of both variances is simulated and widens
 """
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 from msgspec import structs
@@ -20,7 +21,7 @@ from scipy.interpolate import CubicSpline
 from scipy.special import chdtrc
 
 from px4fuse.arrays import Array
-from px4fuse.filter.fitting import Noises, fit_noises, maximise_likelihood
+from px4fuse.filter.fitting import Noises, fit_noises, fit_ratios, maximise_likelihood
 from px4fuse.filter.imu_motion import (
     COARSE_MEASUREMENTS,
     COARSE_OFFSETS,
@@ -31,7 +32,7 @@ from px4fuse.filter.imu_motion import (
     prepare_motion,
 )
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
-from px4fuse.filter.marginal_likelihood import products_by_segment
+from px4fuse.filter.marginal_likelihood import FittedPositions, products_by_segment
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, cut_to_segment
 from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
@@ -57,6 +58,8 @@ MAX_CHANGE_P = 0.005
 MIN_OFFSET_SIGMAS = 3.0
 # Number of simulations of the IMU noise, to estimate the variance of the time offset
 SIMULATION_COUNT = 96
+# Step of ln σ for numerical derivatives of the likelihood with respect to the noises
+LOG_SIGMA_STEP = 0.1
 
 
 class PartOffset(Record, frozen=True):
@@ -207,10 +210,9 @@ def estimate_time_offset(
         nodes_s, curve_s = (
             _offset_grid(offset_s, half_width_s, count) for count in (FINE_OFFSETS, CURVE_OFFSETS)
         )
-        totals = fit_noises(
-            prepared_motion.position_batches(nodes_s), noises, prepared_motion.weight
-        ).scores()[0]
-        scores = CubicSpline(nodes_s, totals)(curve_s)
+        scores = CubicSpline(
+            nodes_s, _profile_over_noises(prepared_motion, nodes_s, noises, offset_s)
+        )(curve_s)
         low_s, high_s = profile_interval(curve_s, scores, PROFILE_DROP * variance_factor)
         is_closed = low_s is not None and high_s is not None
         if is_closed or half_width_s >= 2.0 * MAX_OFFSET_S:
@@ -259,6 +261,47 @@ def _offset_grid(centre_s: float, half_width_s: float, count: int) -> Array:
     """Return equally spaced time offsets around ``centre_s``, within the search range."""
     low_s = max(centre_s - half_width_s, -MAX_OFFSET_S)
     return np.linspace(low_s, min(centre_s + half_width_s, MAX_OFFSET_S), count)
+
+
+def _profile_over_noises(
+    prepared_motion: PreparedMotion, offsets_s: Array, noises: Noises, best_offset_s: float
+) -> Array:
+    """Compute -ln p at time offsets, minimised over the noises at each offset by a Newton step.
+
+    The gradient is evaluated at each offset; the Hessian hardly changes and is evaluated at
+    ``best_offset_s`` only.
+    """
+    sigma_z = noises.sigma_z_m
+    sigma_a = noises.sigma_a_m_s2
+    all_offsets_s = np.append(offsets_s, best_offset_s)
+    ratios = sigma_a / sigma_z * np.exp(LOG_SIGMA_STEP * np.array([-1.0, 0.0, 1.0]))
+
+    @cache
+    def fits_at_random_walk(random_walk: float) -> list[FittedPositions]:
+        return fit_ratios(
+            prepared_motion.position_batches(all_offsets_s),
+            ratios.tolist(),
+            random_walk,
+            prepared_motion.weight,
+            sigma_z,
+        )
+
+    def scores_at(shift_a: int, shift_z: int) -> Array:
+        scale = sigma_z * float(np.exp(LOG_SIGMA_STEP * shift_z))
+        fit = fits_at_random_walk(noises.random_walk_m / scale)[1 + shift_a - shift_z]
+        return np.asarray(fit.scores(np.array([scale]))[0])
+
+    centre = scores_at(0, 0)
+    forward, backward = (np.array([scores_at(sign, 0), scores_at(0, sign)]) for sign in (1, -1))
+    gradient = (forward - backward)[:, :-1] / (2.0 * LOG_SIGMA_STEP)
+    hessian = np.diag((forward + backward)[:, -1] - 2.0 * centre[-1])
+    mixed = scores_at(1, 1)[-1] + scores_at(-1, -1)[-1] - 2.0 * centre[-1]
+    hessian[0, 1] = hessian[1, 0] = 0.5 * (mixed - hessian[0, 0] - hessian[1, 1])
+    hessian /= LOG_SIGMA_STEP**2
+    if np.any(np.linalg.eigvalsh(hessian) <= 0.0):  # SIGMA_A is at the end of its search range
+        return centre[:-1]
+    gain = 0.5 * np.einsum("it,ij,jt->t", gradient, np.linalg.inv(hessian), gradient)
+    return np.asarray(centre[:-1] - gain)
 
 
 def _simulate_variance_factor(
