@@ -10,6 +10,7 @@ import findings_tools
 import numpy as np
 import pandas as pd
 import pytest
+from comparisons import compare, prepare
 from exchange import replace
 from findings_tools import analysis as stand_in
 from findings_tools import late, made
@@ -17,9 +18,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from ulog_tools import Log, gnss_log, position, seconds_of, stamps, take, topic
 
 import px4fuse
-from px4fuse.analysis import prepare_comparison
-from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.preparation import choose_source, prepare
+from px4fuse.comparison.preparation import choose_source
+from px4fuse.diagnose import prepare_comparison
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.inputs import _fusion_rules, read_gnss
 from px4fuse.ekf2.inputs import prepare_inputs as prepare_replay
