@@ -27,6 +27,7 @@ from scipy.interpolate import CubicSpline
 ROOT = Path(__file__).resolve().parents[1]
 sys.path += [str(ROOT / "tests"), str(ROOT / "tests" / "studies")]
 
+from comparisons import compare  # noqa: E402
 from exchange import replace  # noqa: E402
 from flights import aisle_flight, unexplained, with_noises  # noqa: E402
 from source_errors import coloured, held, laid_over, two_levels, white  # noqa: E402
@@ -37,8 +38,8 @@ from test_loop import LAP_S, TRUE, GivenClosure, OdometryNoise, laps  # noqa: E4
 from test_source_values import examples as value_examples  # noqa: E402
 
 import px4fuse  # noqa: E402
-from px4fuse.analysis import Analysis, explain  # noqa: E402
-from px4fuse.comparison.comparison import compare  # noqa: E402
+from px4fuse.analysis import Analysis  # noqa: E402
+from px4fuse.diagnose import explain  # noqa: E402
 from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
 from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
@@ -46,11 +47,7 @@ from px4fuse.findings import TITLES, Finding, find, find_aids, find_loop, source
 from px4fuse.findings.cause_grouping import CONSEQUENCES, RECORDING, effect_ids  # noqa: E402
 from px4fuse.findings.model import CATALOGUE, GROUPS  # noqa: E402
 from px4fuse.flight import Columns  # noqa: E402
-from px4fuse.report.panels import (  # noqa: E402
-    INNOVATIONS,
-    POSITION,
-    SIGMA_P,
-)
+from px4fuse.report.panels import INNOVATIONS, POSITION, SIGMA_P  # noqa: E402
 from px4fuse.simulation.flights import simulate_flight  # noqa: E402
 from px4fuse.simulation.mistakes import parse  # noqa: E402
 from px4fuse.simulation.scenario import Scenario  # noqa: E402
@@ -152,8 +149,8 @@ def examples() -> dict[str, Example]:
         if fault.id in made:
             continue
         comparison = compare(fault.fly(), Settings(**fault.settings))
-        tuned = fault.id.startswith("sigma_") or "sigma_z_asked_m" in fault.evidence
-        analysis = with_noises(comparison) if tuned else unexplained(comparison)
+        is_tuned = fault.id == "process_noise_near_zero" or "sigma_z_asked_m" in fault.evidence
+        analysis = with_noises(comparison) if is_tuned else unexplained(comparison)
         keep(
             [one for one in find(analysis) if one.id == fault.id], "a flight of the tests", analysis
         )
@@ -230,7 +227,7 @@ def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
         yield f"## How it looks\n\nSeverity *{finding.severity}*, on {example.flight}:\n"
         yield f"> {finding.message}\n"
         if example.analysis is not None:
-            yield f"![Error, innovations and σ of that flight]({picture(name, example, folder)})\n"
+            yield f"![Position, innovations, σ of that flight]({picture(name, example, folder)})\n"
         yield f"## What to do\n\n> {finding.remedy}\n"
     found = list(rate_rows(name))
     if found:
@@ -277,14 +274,14 @@ def write_examples() -> None:
 
 
 def picture(name: str, example: Example, folder: Path) -> str:
-    """Draw error, innovations and σ of the example's axis; return the file name."""
+    """Draw position, innovations and σ of the example's axis; return the file name."""
     axis = example.finding.evidence.get("axis")
     assert example.analysis is not None
     shown = example.analysis.axes.get(str(axis)) or example.analysis.main
     figure, panels = pyplot.subplots(3, sharex=True, figsize=(8, 7), layout="constrained")
     for axes, panel in zip(panels, (POSITION, INNOVATIONS, SIGMA_P), strict=True):
-        panel.draw(axes, shown)
-        axes.set_ylabel(fill(panel.full_title(shown), LABEL_WIDTH))
+        panel.draw(axes, shown.in_flight)
+        axes.set_ylabel(fill(panel.title, LABEL_WIDTH))
     panels[0].set_title(shown.axis.name)
     panels[-1].set_xlabel("time (s)")
     figure.savefig(folder / f"{name}.png", dpi=70)

@@ -20,9 +20,9 @@ from px4fuse.record import Record, Sha256, table
 
 # Maximum size (bytes) of an answer form and maximum length (characters) of its lines: tomllib needs
 # seconds and gigabytes for a dotted key of 64 kB
-MAX_BYTES, MAX_LINE_LENGTH = 20_000, 500
+MAX_FORM_BYTES, MAX_LINE_LENGTH = 20_000, 500
 MAX_MISTAKES = 20
-NONE = "none"
+NO_MISTAKE_KIND = "none"
 EMPTY_CELL = "\u2013"
 
 
@@ -137,7 +137,7 @@ class Answers(Record, frozen=True, kw_only=True):
     @property
     def names_no_mistake(self) -> bool:
         """True if the form states that the flight has no mistake."""
-        return [mistake.kind for mistake in self.mistakes] == [NONE]
+        return [mistake.kind for mistake in self.mistakes] == [NO_MISTAKE_KIND]
 
 
 QuestionKind = Literal["gain", "variance", "innovation", "nis", "prediction", "gate"]
@@ -216,7 +216,7 @@ def read_answers(path: Path) -> Answers:
     SettingsError
         The file is not an answer form, or an answer is not allowed.
     """
-    text = read_text(path, SettingsError, MAX_BYTES, name=str(path))
+    text = read_text(path, SettingsError, MAX_FORM_BYTES, name=str(path))
     if any(len(line) > MAX_LINE_LENGTH for line in text.splitlines()):
         raise SettingsError(f"{path}: a line has more than {MAX_LINE_LENGTH} characters.")
     try:
@@ -232,8 +232,8 @@ def _as_record(form: dict[str, Any]) -> dict[str, Any]:
     mistakes = filled_form.pop("mistake", ())
     quantities = msgspec.convert(filled_form.pop("quantities", {}), dict[str, Any])
     names = [f"q{number}" for number in range(1, len(draw_questions("")) + 1)]
-    if unknown := sorted({*quantities, *({"mistakes"} & filled_form.keys())} - set(names)):
-        raise ValueError(f"the field {unknown[0]} is not one of mistake, {', '.join(names)}")
+    if unknown_fields := sorted({*quantities, *({"mistakes"} & filled_form.keys())} - set(names)):
+        raise ValueError(f"the field {unknown_fields[0]} is not one of mistake, {', '.join(names)}")
     return {
         **filled_form,
         "mistakes": mistakes,
@@ -262,31 +262,33 @@ def _without_blanks(value: Any) -> Any:
 
 def check_answers(answers: Answers) -> None:
     """Raise ValueError if an answer is not allowed, out of range, or names a mistake twice."""
-    kinds = [named.kind for named in answers.mistakes]
+    kinds = [student_mistake.kind for student_mistake in answers.mistakes]
     for kind in kinds:
         _require_choice("kind", kind, MISTAKES)
         if kinds.count(kind) > 1:
             raise ValueError(f"kind {kind!r} is given twice; give each kind of mistake once")
-    if NONE in kinds and len(kinds) > 1:
+    if NO_MISTAKE_KIND in kinds and len(kinds) > 1:
         raise ValueError('kind "none" is given together with a mistake; give only one of them')
     for behaviour in answers.ekf2_did:
         _require_choice("ekf2_did", behaviour, EKF2_BEHAVIOURS)
-    for named in answers.mistakes:
-        mistake = MISTAKES[named.kind]
+    for student_mistake in answers.mistakes:
+        mistake = MISTAKES[student_mistake.kind]
         for field, choices in (
             ("parameter", CORRECTIONS),
             ("panel", PANELS),
             ("unit", mistake.units),
-            ("value_unit", CORRECTIONS.get(named.parameter)),
+            ("value_unit", CORRECTIONS.get(student_mistake.parameter)),
         ):
-            value = getattr(named, field)
+            value = getattr(student_mistake, field)
             if value and choices is not None:
-                _require_choice(f"{named.kind}: {field}", value, choices)
+                _require_choice(f"{student_mistake.kind}: {field}", value, choices)
         low, high = mistake.range
-        size = named.size_in_first_unit()
+        size = student_mistake.size_in_first_unit()
         if size is not None and not low <= size <= high:
             unit, limits = next(iter(mistake.units)), f"{low:g} to {high:g}"
-            raise ValueError(f"{named.kind}: size {size:g} is out of range ({limits} {unit})")
+            raise ValueError(
+                f"{student_mistake.kind}: size {size:g} is out of range ({limits} {unit})"
+            )
 
 
 def _require_choice(field: str, value: str, choices: Any) -> None:
@@ -359,8 +361,8 @@ def _format_number_with_unit(number: float | None, unit: str, units: Mapping[str
 
 
 def _format_units(units: Mapping[str, float]) -> str:
-    named = ", ".join(filter(None, units))
-    return f" [{named}]" if named else ""
+    unit_text = ", ".join(filter(None, units))
+    return f" [{unit_text}]" if unit_text else ""
 
 
 def _format_block(lines: Iterable[str]) -> str:

@@ -8,8 +8,9 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse import request
-from px4fuse.analysis import Analysis, run, run_what_if
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FilterSummary, UntestedFilter
+from px4fuse.diagnose import diagnose, run_what_if
 from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.whatif import WhatIf
@@ -111,8 +112,10 @@ def compare(
     arguments = locals()  # names of the arguments are fields of the request
     known = get_args(request.AxisName)
     axis_names = (axes,) if isinstance(axes, str) else tuple(axes)
-    if unknown := set(axis_names).difference(known):
-        raise SettingsError(f"`axes` {unknown.pop()!r} is unknown. Choose from {', '.join(known)}.")
+    if unknown_axes := set(axis_names).difference(known):
+        raise SettingsError(
+            f"`axes` {unknown_axes.pop()!r} is unknown. Choose from {', '.join(known)}."
+        )
     if isinstance(log, Flight) and (position, mavlink, system) != (None, None, None):
         raise SettingsError(
             "the arguments position, mavlink and system are not possible with a Flight, because "
@@ -132,7 +135,7 @@ def compare(
     if isinstance(clock_offset_s, int):
         fields["clock_offset_s"] = float(clock_offset_s)
     flight = log if isinstance(log, Flight) else None
-    return run(request.ComparisonRequest(**fields), progress, flight)
+    return diagnose(request.ComparisonRequest(**fields), progress, flight)
 
 
 def table(analysis: Analysis) -> pd.DataFrame:

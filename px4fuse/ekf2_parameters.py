@@ -72,10 +72,10 @@ class Aid:
         """Names of the parameters that affect only the measurements of this aiding source."""
         return frozenset((self.noise, self.gate, self.delay, self.noise_mode))
 
-    def logged_parameters(self, logged: Mapping[str, float]) -> dict[str, float]:
+    def logged_parameters(self, logged_values: Mapping[str, float]) -> dict[str, float]:
         """Return the logged parameters of this aiding source, including the ``switch``."""
         names = (self.noise, self.delay, self.gate, self.noise_mode, self.switch, AID_MASK)
-        return {name: float(logged[name]) for name in names if name in logged}
+        return {name: float(logged_values[name]) for name in names if name in logged_values}
 
 
 AID_MASK = "EKF2_AID_MASK"
@@ -129,22 +129,22 @@ EV_POS, GNSS_POS, GNSS_VEL, GNSS_HGT, BAROMETER, FLOW, MAG = map(
 )
 PARAMETERS = msgspec.convert(TABLES["parameters"], dict[str, Parameter])
 # Parameters of the EKF2 model, and other logged parameters with which px4fuse computes
-RANGES = PARAMETERS | msgspec.convert(TABLES["logged"], dict[str, Parameter])
+PARAMETER_RANGES = PARAMETERS | msgspec.convert(TABLES["logged"], dict[str, Parameter])
 FIELD_NOISES = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
 # Defaults of PX4 up to v1.13 that differ from the defaults of later releases (ekf2_params.c)
 OLD_DEFAULTS: Mapping[str, float] = {EV_POS.delay: 175.0}
 # Names of the logged parameters that the results contain
-REPORTED: tuple[str, ...] = tuple(TABLES["reported"].split())
+REPORTED_PARAMETERS: tuple[str, ...] = tuple(TABLES["reported"].split())
 
 
 def effective_settings(
-    logged: Mapping[str, float], aid: Aid = EV_POS, *other_aids: Aid
+    logged_values: Mapping[str, float], aid: Aid = EV_POS, *other_aids: Aid
 ) -> dict[str, float]:
     """Return the parameter values of the EKF2 model: the logged value, else PX4's default.
 
     Parameters
     ----------
-    logged : mapping
+    logged_values : mapping
         Parameter values in the log, by PX4 name.
     aid, *other_aids : Aid
         Aiding sources that EKF2 fuses; parameters of other aiding sources are omitted.
@@ -152,12 +152,12 @@ def effective_settings(
     used_switches = {fused_aid.switch for fused_aid in (aid, *other_aids)}
     excluded_names = {
         name
-        for other in (EV_POS, GNSS_POS, GNSS_VEL, MAG, BAROMETER)
-        if other.switch not in used_switches
+        for other_aid in (EV_POS, GNSS_POS, GNSS_VEL, MAG, BAROMETER)
+        if other_aid.switch not in used_switches
         for name in (
-            *other.own_parameters,
-            *other.lever_arm,
-            *(FIELD_NOISES if other == MAG else ()),
+            *other_aid.own_parameters,
+            *other_aid.lever_arm,
+            *(FIELD_NOISES if other_aid == MAG else ()),
         )
     }
     defaults = {
@@ -165,25 +165,25 @@ def effective_settings(
         for name, parameter in PARAMETERS.items()
         if name not in excluded_names
     }
-    if fuses_by_mask(logged) and aid == EV_POS:
+    if fuses_by_mask(logged_values) and aid == EV_POS:
         defaults |= OLD_DEFAULTS
-    return {name: float(logged.get(name, default)) for name, default in defaults.items()}
+    return {name: float(logged_values.get(name, default)) for name, default in defaults.items()}
 
 
-def fuses_by_mask(logged: Mapping[str, float]) -> bool:
+def fuses_by_mask(logged_values: Mapping[str, float]) -> bool:
     """Return True if EKF2_AID_MASK selects the aiding sources in this log (PX4 up to v1.13)."""
-    return AID_MASK in logged and EV_POS.switch not in logged
+    return AID_MASK in logged_values and EV_POS.switch not in logged_values
 
 
 def replace_invalid_parameters(
-    logged: Mapping[str, float],
+    logged_values: Mapping[str, float],
 ) -> tuple[dict[str, float], tuple[str, ...]]:
     """Replace logged parameters that are not finite or outside PX4's range by their defaults.
 
     Returns
     -------
     valid : dict
-        All parameters, except non-finite ones whose default is not in ``RANGES``.
+        All parameters, except non-finite ones whose default is not in ``PARAMETER_RANGES``.
     notes : tuple of str
         One sentence per parameter that was replaced or omitted.
 
@@ -193,11 +193,11 @@ def replace_invalid_parameters(
     {'EKF2_EVP_GATE': 5.0, 'SYS_AUTOSTART': 4001.0}
     """
     valid, notes = {}, []
-    defaults = {name: parameter.default for name, parameter in RANGES.items()}
-    if fuses_by_mask(logged):
+    defaults = {name: parameter.default for name, parameter in PARAMETER_RANGES.items()}
+    if fuses_by_mask(logged_values):
         defaults |= OLD_DEFAULTS
-    for name, value in logged.items():
-        parameter = RANGES.get(name)
+    for name, value in logged_values.items():
+        parameter = PARAMETER_RANGES.get(name)
         fault = "" if parameter is None else parameter.describe_range_error(value)
         if not math.isfinite(value):
             fault = " is not a finite number"

@@ -192,7 +192,7 @@ class PositionTrack:
     notes : tuple of str
         Sentences on joined and dropped samples.
     invalid : Series
-        Rows of the source that are no measurement and not in ``samples``, by time, with the reason:
+        Rows without a measurement, not in ``samples``, by time, with the reason:
         "NaN", "zero" (0, 0, 0 without a position) or "held" (the last position sent again).
     status : DataFrame
         ``reset_counter``, ``quality`` and ``age_s`` (arrival - timestamp) at the times of the

@@ -15,7 +15,7 @@ from px4fuse.loop.closure import distribute_by_distance
 from px4fuse.trajectory.model import cumulative_distance
 
 TRUE_VELOCITY_M_S = 1.0
-PREDICTIONS = 30
+PREDICTION_COUNT = 30
 PREDICTIONS_PER_UPDATE = 5
 # Errors (m) of the six UWB positions in Example 1: fixed numbers instead of random noise
 UWB_NOISE_M = (0.08, -0.12, 0.05, 0.10, -0.06, -0.09)
@@ -27,7 +27,7 @@ def example_1() -> Replay:
     """Run Example 1: UWB every 0.5 s along an aisle at 1 m/s, initial velocity unknown."""
     settings = Settings(sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input="zero")
     time = settings.dt_s * np.arange(
-        PREDICTIONS_PER_UPDATE, PREDICTIONS + 1, PREDICTIONS_PER_UPDATE, dtype=np.float64
+        PREDICTIONS_PER_UPDATE, PREDICTION_COUNT + 1, PREDICTIONS_PER_UPDATE, dtype=np.float64
     )
     axis = Axis(
         name="aisle",
@@ -37,20 +37,20 @@ def example_1() -> Replay:
         measurement_time_s=time,
         measurement_m=TRUE_VELOCITY_M_S * time + np.array(UWB_NOISE_M),
         acceleration=Unavailable(
-            "acceleration", "Example 1 has no acceleration", "No action needed."
+            "acceleration", "Example 1 has no acceleration", "No action is needed."
         ),
     )
     return replay(axis, settings, InitialState(time_s=0.0, position_m=0.0))
 
 
 def kalman_lines() -> Iterator[str]:
-    """Yield the lines of Example 1: the state after each of the six UWB updates."""
+    """Yield the lines of Example 1 as the lesson prints them: the state after each UWB update."""
     kf_run = example_1()
     for time, row in kf_run.steps.loc[kf_run.updates.index].iterrows():
         seconds = float(str(time))
         yield (
-            f"time {seconds:.1f} s: position {row['position_m']:.2f} m (true "
-            f"{TRUE_VELOCITY_M_S * seconds:.2f} m), velocity {row['velocity_m_s']:.2f} m/s, "
+            f"t {seconds:.1f} s: p {row['position_m']:.2f} (true "
+            f"{TRUE_VELOCITY_M_S * seconds:.2f}), v {row['velocity_m_s']:.2f}, "
             f"sigma_p {np.sqrt(row['position_variance_m2']):.3f} m, "
             f"sigma_v {np.sqrt(row['velocity_variance_m2_s2']):.3f} m/s"
         )
@@ -65,6 +65,6 @@ def loop_lines() -> Iterator[str]:
         f"loop closure error ({misclosure[0]:.1f}, {misclosure[1]:.1f}) m over {total:.1f} m = "
         f"{np.hypot(*misclosure) / total:.1%}"
     )
-    corrected = distribute_by_distance(odometry, misclosure)
-    for (x, y), (x_corrected, y_corrected) in zip(odometry, corrected, strict=True):
+    corrected_path = distribute_by_distance(odometry, misclosure)
+    for (x, y), (x_corrected, y_corrected) in zip(odometry, corrected_path, strict=True):
         yield f"({x:5.1f}, {y:5.1f}) -> ({x_corrected:5.2f}, {y_corrected:5.2f})"

@@ -5,7 +5,7 @@ from functools import singledispatch
 from typing import Any
 
 # Maximum length (characters) of a text field in the representation of a record
-MAX_TEXT = 60
+MAX_TEXT_LENGTH = 60
 
 
 @singledispatch
@@ -38,7 +38,9 @@ def _format_value(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, str):
-        return repr(value if len(value) <= MAX_TEXT else f"{value[: MAX_TEXT - 3]}...")
+        return repr(
+            value if len(value) <= MAX_TEXT_LENGTH else f"{value[: MAX_TEXT_LENGTH - 3]}..."
+        )
     if shape := getattr(value, "shape", ()):
         return f"<{' × '.join(f'{length:,}' for length in shape)}>"
     if isinstance(value, int):

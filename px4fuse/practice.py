@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from msgspec import structs
 
-from px4fuse.analysis import run
 from px4fuse.card.build import build_card
 from px4fuse.card.model import Card
 from px4fuse.card.numbers import format_metres, format_ratio
+from px4fuse.diagnose import diagnose
 from px4fuse.explore.data import flight_data
 from px4fuse.explore.packing import Packer
 from px4fuse.explore.page import data_scripts, page_text
-from px4fuse.findings import Finding, find
+from px4fuse.findings import Finding
 from px4fuse.record import Record, table
 from px4fuse.report.card_html import card_html
 from px4fuse.request import ComparisonRequest
@@ -47,7 +47,7 @@ SCENARIO_VALUES: dict[str, Any] = {
     "yaw_error_deg": 0.2,
 }
 # Smallest and largest length (m) of a pass along the aisle, which is drawn for each flight
-LENGTH_M = (8.0, 12.0)
+AISLE_LENGTH_RANGE_M = (8.0, 12.0)
 # Finding of the analysis that contains the time span of each mistake
 FINDING_WITH_TIME = {
     "nlos": "source_outliers",
@@ -65,7 +65,7 @@ class HiddenMistake(Record, frozen=True):
     Attributes
     ----------
     choice : str
-        Right answer, a key of :data:`CHOICES`.
+        Right answer, a key of :data:`FAULT_CHOICES`.
     mistake : str
         Name in :data:`px4fuse.simulation.mistakes.MISTAKES`, or :data:`NOISY_UWB`.
     sizes : tuple of str
@@ -100,7 +100,7 @@ class MistakeTable(Record, frozen=True):
 
 
 _TABLES = table(__file__, "practice.toml", MistakeTable)
-CHOICES, HIDDEN_MISTAKES = _TABLES.choices, _TABLES.mistakes
+FAULT_CHOICES, HIDDEN_MISTAKES = _TABLES.choices, _TABLES.mistakes
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def draw(seed: int, level: int = 1, count: int = 10) -> tuple[PracticeFlight, ..
     rng = np.random.default_rng([seed, level, count])
     names: list[str] = []
     while len(names) < count:
-        names += [str(name) for name in rng.permutation(list(CHOICES))]
+        names += [str(name) for name in rng.permutation(list(FAULT_CHOICES))]
     return tuple(_draw_flight(rng, name, level) for name in names[:count])
 
 
@@ -162,7 +162,7 @@ def _draw_flight(rng: np.random.Generator, choice: str, level: int) -> PracticeF
             noise_m = float(sizes[-1])
     scenario = Scenario(
         **SCENARIO_VALUES,
-        length_m=round(float(rng.uniform(*LENGTH_M)), 1),
+        length_m=round(float(rng.uniform(*AISLE_LENGTH_RANGE_M)), 1),
         heading_deg=round(float(rng.uniform(0.0, 359.0)), 0),
         sigma_uwb_m=noise_m,
         seed=int(rng.integers(MAX_SEED)),
@@ -193,7 +193,7 @@ def practice_text(
         title="simulated flights with known faults",
         about=f"seed {seed}, level {level}",
         flight_count=count,
-        choices=CHOICES,
+        choices=FAULT_CHOICES,
     )
 
 
@@ -208,15 +208,14 @@ def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str
     simulation = flights.simulate(practice_flight.scenario, parse(options))
     flight = flights.to_flight(simulation, f"flight {number + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
-    analysis = run(request, flight=flight)
-    findings, packer = find(analysis), Packer()
-    data, card = flight_data(analysis, packer), build_card(analysis, findings, request)
-    described = [_describe_mistake(*pair, findings) for pair in mistakes_and_sizes]
+    analysis, packer = diagnose(request, flight=flight), Packer()
+    data, card = flight_data(analysis, packer), build_card(analysis, request)
+    descriptions = [_describe_mistake(*pair, analysis.findings) for pair in mistakes_and_sizes]
     key = {
         "right": practice_flight.correct_answers,
-        "mistakes": described,
-        "rerun": _rerun_sentence(card) if described else NO_MISTAKE,
-        "card": card_html(_name_mistakes(card, described), has_apply=True),
+        "mistakes": descriptions,
+        "rerun": _rerun_sentence(card) if descriptions else NO_MISTAKE,
+        "card": card_html(_name_mistakes(card, descriptions), has_apply=True),
     }
     compressed_key = base64.b64encode(zlib.compress(json.dumps(key).encode())).decode()
     scripts = data_scripts(data, analysis, packer, f"-{number}")
@@ -252,25 +251,25 @@ def size_in_words(size: str) -> list[str]:
 def _rerun_sentence(card: Card) -> str:
     """Describe the most effective re-run with one change: RMSE and innovation before and after."""
     reruns = (rerun for cause in card.causes for rerun in cause.reruns)
-    best = next((rerun for rerun in reruns if rerun.improves != "nothing"), None)
-    if best is None:
+    best_rerun = next((rerun for rerun in reruns if rerun.improves != "nothing"), None)
+    if best_rerun is None:
         return "No re-run with one change corrects this flight."
     changes = [
-        f"{name} {format_value(pair[0])} → {format_value(pair[1])}{unit}"
-        for name, pair, format_value, unit in (
-            ("position RMSE", best.position_rmse_m, format_metres, " m"),
-            ("innovation ÷ √S", best.source_ratio, format_ratio, ""),
+        f"{name} {format_value(values[0])} → {format_value(values[1])}{unit}"
+        for name, values, format_value, unit in (
+            ("position RMSE", best_rerun.position_rmse_m, format_metres, " m"),
+            ("innovation ÷ √S", best_rerun.source_ratio, format_ratio, ""),
         )
-        if pair is not None
+        if values is not None
     ]
-    return f"Re-run of {best.label}: {', '.join(changes)}."
+    return f"Re-run of {best_rerun.label}: {', '.join(changes)}."
 
 
-def _name_mistakes(card: Card, described: Sequence[Mapping[str, Any]]) -> Card:
+def _name_mistakes(card: Card, descriptions: Sequence[Mapping[str, Any]]) -> Card:
     """Replace the headline of the diagnosis if the analysis did not detect the mistake."""
-    if card.causes or not described:
+    if card.causes or not descriptions:
         return card
-    fault = "; ".join(f"{mistake['fault']}: {mistake['size']}" for mistake in described)
+    fault = "; ".join(f"{mistake['fault']}: {mistake['size']}" for mistake in descriptions)
     return structs.replace(
         card,
         severity="warning",

@@ -64,7 +64,7 @@ class _RequestBase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Return the request with file names instead of paths, as the results contain it."""
         paths = {name: getattr(self, name, None) for name in _PATHS}
         changes: dict[str, Any] = {
-            n: _file_name(path) for n, path in paths.items() if path is not None
+            field_name: _file_name(path) for field_name, path in paths.items() if path is not None
         }
         position = getattr(self, "position", None)
         if position is not None:

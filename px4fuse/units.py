@@ -8,7 +8,7 @@ from px4fuse.record import table
 
 _UNITS = table(__file__, "units.toml", dict[str, dict[str, Any]])
 # Full names of the units by symbol, and factors that convert typed units to the units of px4fuse
-NAMES: Mapping[str, str] = _UNITS["names"]
+UNIT_NAMES: Mapping[str, str] = _UNITS["names"]
 _SCALES: Mapping[str, Mapping[str, float]] = _UNITS["typed"]
 _NUMBER_WITH_UNIT = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNORECASE)
 

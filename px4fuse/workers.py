@@ -28,7 +28,7 @@ Result = TypeVar("Result")
 # cost time, because the imports of a new process take 2 s
 JOBS_PER_WORKER = 80
 # Default maximum time (s) and memory (bytes) of a job; a report of a 10-minute flight takes 60 s
-TIMEOUT_S, MEMORY_BYTES = 120.0, 4_000_000_000
+TIMEOUT_S, MAX_MEMORY_BYTES = 120.0, 4_000_000_000
 # Maximum time (s) for the imports of a new process on a slow and busy computer
 START_TIMEOUT_S = 180.0
 # Environment variables of worker processes. PYTHONSAFEPATH prevents imports from the current
@@ -79,7 +79,7 @@ def run_bounded(
     *,
     processes: int | None = None,
     timeout_s: float = TIMEOUT_S,
-    memory_bytes: int | None = MEMORY_BYTES,
+    memory_bytes: int | None = MAX_MEMORY_BYTES,
 ) -> Generator[tuple[int, Result | JobFailure]]:
     """Call a function on every job in worker processes, with limits of time and memory for a job.
 
@@ -140,7 +140,10 @@ def run_bounded(
 
 
 def run_one_bounded(
-    function: Callable[[Job], Result], job: Job, timeout_s: float, memory_bytes: int = MEMORY_BYTES
+    function: Callable[[Job], Result],
+    job: Job,
+    timeout_s: float,
+    memory_bytes: int = MAX_MEMORY_BYTES,
 ) -> Result | JobFailure:
     """Call a function on one job in a worker process, with limits as in :func:`run_bounded`."""
     results = run_bounded(function, [job], timeout_s=timeout_s, memory_bytes=memory_bytes)

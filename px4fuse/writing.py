@@ -47,7 +47,7 @@ def write_all(
         The reader of a pipe has ended. All other outputs are written.
     """
     check_outputs(path for path in contents if path != STANDARD_OUTPUT)
-    written: list[Path] = []
+    written_files: list[Path] = []
     pipe_error = None
     for path, content in contents.items():
         try:
@@ -56,8 +56,8 @@ def write_all(
             pipe_error = error
             continue
         except OSError as error:
-            raise _make_output_error(path, error, written) from error
-        written.append(path)
+            raise _make_output_error(path, error, written_files) from error
+        written_files.append(path)
         on_written(path)
     if pipe_error is not None:
         raise pipe_error
@@ -78,7 +78,7 @@ def _write(path: Path, content: bytes) -> None:
         sys.stdout.flush()
         sys.stdout.buffer.write(content)
         sys.stdout.flush()
-    elif stat.S_ISREG(mode := _mode(path)):
+    elif stat.S_ISREG(mode := _file_mode(path)):
         _replace(path.resolve(), content)
     else:
         with _open_pipe(path) if stat.S_ISFIFO(mode) else path.open("wb") as file:
@@ -93,7 +93,7 @@ def _is_standard_output(path: Path) -> bool:
         return False
 
 
-def _mode(path: Path) -> int:
+def _file_mode(path: Path) -> int:
     """Return type and permissions of a file; for a new file, the type of a regular file."""
     try:
         return path.stat().st_mode
@@ -128,10 +128,10 @@ def _open_pipe(path: Path) -> IO[bytes]:
             return os.fdopen(descriptor, "wb")
 
 
-def _make_output_error(path: Path, error: OSError, written: Sequence[Path]) -> OutputError:
+def _make_output_error(path: Path, error: OSError, written_files: Sequence[Path]) -> OutputError:
     name = "standard output" if path == STANDARD_OUTPUT else path
     reason = "the pipe has no reader" if error.errno == errno.ENXIO else error.strerror
-    already_written = f"; {written_before(written)}" if written else ""
+    already_written = f"; {written_before(written_files)}" if written_files else ""
     remedy = "Choose another name."
     if LOCKS_OPEN_FILES and isinstance(error, PermissionError):
         remedy = "Close the program that has the file open, or choose another name."

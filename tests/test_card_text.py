@@ -54,7 +54,7 @@ def test_diagnosis_card_text_marks_alternatives_either_or() -> None:
     assert lines[first + 2].split() == ["param", "set", "EKF2_EV_DELAY", "264"]
     assert lines[first + 3].startswith("  KF (shell)  ")
     closing = " ".join(line.text for line in card_text.closing_lines(card))
-    assert "Console: MAVLink Console" in closing
+    assert "Console means the MAVLink Console" in closing
     assert closing.endswith(f"px4fuse explain {card.id}")
 
 
@@ -63,7 +63,7 @@ def test_causes_are_numbered_and_further_notes_are_counted() -> None:
     card = replace(SMALL_SIGMA_A, causes=2 * SMALL_SIGMA_A.causes, notes=notes)
     lines = text_of(card)
     assert [line.split()[1] for line in lines if line.startswith("  cause")] == ["1", "2"]
-    assert lines[-2:] == ["note[note_2]: Text 2.", "and 2 more notes: -v"]
+    assert lines[-2:] == ["note[note_2]: Text 2.", "2 more notes are listed with -v"]
 
 
 def test_diagnosis_card_text_on_ascii_terminal_is_ascii() -> None:

@@ -23,7 +23,7 @@ from px4fuse.grading.class_page import count_tenths, html_text
 from px4fuse.grading.model import Entry, GradedReport, Item, Override
 from px4fuse.grading.outputs import anonymise_entry
 from px4fuse.verification.model import Mismatch, PageDifference, Verdict
-from px4fuse.webpage.safe import MAX_CHARACTERS
+from px4fuse.webpage.safe import MAX_TEXT_LENGTH
 
 MARKUP = '<img src=x onerror="window.alive=1"><b>bold</b>'
 BREAKOUT = "</script ></script\n<script>window.alive=2</script><!-- \u2028 ]]> & &lt;"
@@ -162,7 +162,7 @@ def test_class_page_shortens_long_text_and_omits_nan() -> None:
     odd = row("x" * 10**6, 3.0, notes="y" * 10**6, numbers={"NIS": float("nan")})
     text = html_text([odd], "Class", "px4fuse 1")
     assert "nan" not in text.lower().split("<script>")[0]
-    assert len(text) < 16 * MAX_CHARACTERS
+    assert len(text) < 16 * MAX_TEXT_LENGTH
     apart = (Mismatch("axes.49", "1.0", "2.0"),)
     one = GradedReport("a.pdf", "Ada", "1", Verdict("numbers differ", ("60.",), True, apart))
     text = html_text([Entry("Ada", "1", one)], "Class", "px4fuse 1")

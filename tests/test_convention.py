@@ -8,19 +8,20 @@ from functools import cache
 import numpy as np
 import pandas as pd
 import pytest
+from comparisons import prepare
 from conftest import shared
 from exchange import replace
 from flights import given_placement
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.preparation import prepare
 from px4fuse.convention.axes import CLOCKWISE, FAMILIES, UNITS
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import Faults, find_faults
 from px4fuse.convention.model import Axes, Convention, OrientationConvention
+from px4fuse.finding import Finding
 from px4fuse.findings import source_convention
 from px4fuse.findings.cause_grouping import CONVENTION
-from px4fuse.findings.model import Finding, finding
+from px4fuse.findings.model import finding
 from px4fuse.flight import Columns, Flight, PositionTrack
 from px4fuse.position_source import RECEIVED
 from px4fuse.readers import read_log

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from cards import SMALL_SIGMA_A, verdicts
+from comparisons import compare
 from flights import Estimator, Uwb, aisle_flight, unexplained, with_noises
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -17,7 +18,6 @@ from page_tools import axes_of, every, pdf_of, set_by_typst, smallest_type
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import Action, AidRow, Card, Cause, Note
-from px4fuse.comparison.comparison import compare
 from px4fuse.flight import Reset
 from px4fuse.report import cover, cover_panels
 from px4fuse.report.page import Page
@@ -91,8 +91,8 @@ def test_report_cover_counts_notes_beyond_three() -> None:
     text = text_of(replace(SMALL_SIGMA_A, notes=notes, more_causes=4))
     assert "note[note_2]: Text 2." in text
     assert "note_3" not in text
-    assert "and 2 more notes: All findings" in text
-    assert "and 4 more causes: All findings" in text
+    assert "2 more notes are listed in All findings" in text
+    assert "4 more causes are listed in All findings" in text
 
 
 @pytest.mark.parametrize(
@@ -199,11 +199,11 @@ def test_report_cover_omits_plots_of_missing_data(changes, titles) -> None:
 def test_track_outside_map_is_marked_with_exit_distance() -> None:
     x = np.array([1.0, 5.0, 12.0, 13.0, 5.0, 5.0, 5.0])
     y = np.array([1.0, 1.0, 1.0, 1.0, 1.0, -3.0, 1.0])
-    found = list(cover_panels._exits((x, y), LIMITS))
+    found = list(cover_panels._map_exits((x, y), LIMITS))
     assert [marker for marker, _ in found] == [">", "v"]
     assert [place for _, place in found] == [(10.0, 1.0), (5.0, 0.0)]
     inside = np.full(7, 2.0)
-    text = cover_panels._leaving({"KF": (x, y), "EKF2": (inside, inside)}, LIMITS)
+    text = cover_panels._leaving_tracks({"KF": (x, y), "EKF2": (inside, inside)}, LIMITS)
     assert text == "KF 3.00 m"
 
 
@@ -224,7 +224,7 @@ def test_error_plot_title_says_if_curve_is_flat_on_its_scale(eventful: Analysis)
     error, sigma = (pd.Series(pair, [0.0, 9.0]) for pair in ([0.02, -0.05], [0.05, 0.06]))
     label, sigmas = "EKF2 error (m)", {"EKF2": sigma}
     titles = [
-        cover_panels._strip(eventful, label, ["RMSE 0.040"], error, sigmas, scale).title
+        cover_panels._error_strip(eventful, label, ["RMSE 0.040"], error, sigmas, scale).title
         for scale in (0.1, 5.0)
     ]
     assert titles[0] == "EKF2 error (m): RMSE 0.040, σ 0.060"

@@ -78,16 +78,16 @@ def agreeing(
 
 
 @pytest.mark.parametrize(("axis", "logged", "replayed_share", "good", "expected"), [
-    (agreeing(s=1.049), 0.0, 0.0, True, "innovations 1.0000 or better"),
+    (agreeing(s=1.049), 0.0, 0.0, True, "the correlation 1.0000 of"),
     (agreeing(s=1.051), 0.0, 0.0, False, "replay / log is 1.05"),
     (agreeing(s=0.949), 0.0, 0.0, False, "replay / log is 0.95"),
-    (agreeing(0.95), 0.0, 0.0, True, "innovations 0.9500"),
-    (agreeing(published_m=0.09), 0.0, 0.0, True, "innovations 1.0000 or better"),
-    (agreeing(published_m=0.11), 0.0, 0.0, False, "published position differs by 0.11 m"),
+    (agreeing(0.95), 0.0, 0.0, True, "the correlation 0.9500"),
+    (agreeing(published_m=0.09), 0.0, 0.0, True, "the correlation 1.0000 of"),
+    (agreeing(published_m=0.11), 0.0, 0.0, False, "published positions differ by 0.11 m"),
     # enough digits to show the excess
-    (agreeing(published_m=0.1028), 0.0, 0.0, False, "differs by 0.103 m RMS (limit 0.1"),
-    (agreeing(published_m=0.10004), 0.0, 0.0, False, "differs by 0.10004 m"),
-    (agreeing(0.949), 0.0, 0.09, False, "innovations 0.9490 only"),
+    (agreeing(published_m=0.1028), 0.0, 0.0, False, "differ by 0.103 m RMS (limit 0.1"),
+    (agreeing(published_m=0.10004), 0.0, 0.0, False, "differ by 0.10004 m"),
+    (agreeing(0.949), 0.0, 0.09, False, "the correlation 0.9490"),
     # with many rejections, shares and NIS decide
     (agreeing(0.5), 0.1, 0.06, True, "rejected 6.0% of the samples (log 10.0%)"),
     (agreeing(0.5), 0.06, 0.1, True, "single innovations differ"),

@@ -66,7 +66,7 @@ def test_ekf2_model_interval_transition_equals_product_of_steps(model: Model) ->
 @pytest.mark.parametrize("attitude", [True, False])
 def test_ekf2_model_states_follow_from_start_of_interval(model: Model, attitude: bool) -> None:
     """Without attitude as a state, the nominal attitude is not corrected."""
-    configuration = FilterConfiguration(model.inputs.settings, attitude=attitude)
+    configuration = FilterConfiguration(model.inputs.settings, estimates_attitude=attitude)
     (part,) = run_configurations(model.inputs, [configuration], model.intervals)
     kept = np.random.default_rng(4).normal(0.0, 0.05, part.state.shape)
     state, _ = delayed_states(replace(part, state=kept), 0)

@@ -142,7 +142,7 @@ def test_replayed_fusion_decision_follows_ekf2_rules(case, expected):
 ])  # fmt: skip
 def test_fusion_horizon_equals_length_of_ekf2_buffer(settings, by_delay, timing):
     usual = {"EKF2_EV_DELAY": 0.0, "EKF2_DELAY_MAX": 200.0}
-    rules = replace(RULES, horizon_by_delay=by_delay)
+    rules = replace(RULES, uses_delay_as_horizon=by_delay)
     inputs = made(Inputs, rules=rules, settings=usual, horizon_s=0.12, step_s=0.01, predict_s=0.01)
     found = FilterConfiguration({**usual, **settings}).timing(inputs)
     assert (found.delay_s, found.horizon_s) == pytest.approx((timing.delay_s, timing.horizon_s))
@@ -151,7 +151,7 @@ def test_fusion_horizon_equals_length_of_ekf2_buffer(settings, by_delay, timing)
 
 
 def test_ekf2_replay_of_delay_max_for_px4_v1_14_raises_error():
-    rules = replace(RULES, horizon_by_delay=True)
+    rules = replace(RULES, uses_delay_as_horizon=True)
     received = made(ReceivedPositions, uses_sender_times=False)
     inputs = made(Inputs, rules=rules, settings={}, aid=EV_POS, received=received)
     flight = SimpleNamespace(log=log(firmware="PX4 v1.14"))
@@ -163,16 +163,18 @@ def test_ekf2_replay_of_delay_max_for_px4_v1_14_raises_error():
     assert replay_settings(model, []) == ()
 
 
-GNSS_RULES = replace(RULES, stop_s=math.inf, reset_s=7.0, resets=1_000_000, with_velocity=True)
+GNSS_RULES = replace(
+    RULES, stop_s=math.inf, reset_s=7.0, max_resets=1_000_000, resets_velocity=True
+)
 
 
-@pytest.mark.parametrize(("gap_s", "velocity_gap_s", "with_velocity", "resets"), [
+@pytest.mark.parametrize(("gap_s", "velocity_gap_s", "resets_velocity", "resets"), [
     (7.1, 7.1, True, True), (6.9, 7.1, True, False), (7.1, 6.9, True, False),
     (13.9, 0.0, True, False), (14.1, 0.0, True, True), (7.1, 0.0, False, True),
 ])  # fmt: skip
-def test_gnss_position_is_reset_after_7_or_14_s(gap_s, velocity_gap_s, with_velocity, resets):
+def test_gnss_position_is_reset_after_7_or_14_s(gap_s, velocity_gap_s, resets_velocity, resets):
     """shouldResetGpsFusion of gps_control.cpp; from main of 2026 on aids are independent."""
-    rules = replace(GNSS_RULES, with_velocity=with_velocity)
+    rules = replace(GNSS_RULES, resets_velocity=resets_velocity)
     _, taken, reset, *_ = deciding(gap_s=gap_s, velocity_gap_s=velocity_gap_s, rules=rules, left=9)
     assert (taken, reset) == (False, resets)
 

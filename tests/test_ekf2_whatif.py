@@ -104,7 +104,7 @@ def test_kf_ekf2_difference_without_common_time_is_unavailable(model):
 # ----------------------------------------------------------- cases with a known answer
 
 
-def test_kf_ekf2_difference_steps_change_one_property_each():
+def test_each_kf_ekf2_difference_step_changes_one_property():
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(ReceivedPositions)
     plain = (made(ReplaySegment, flow=None, heights=None),)
@@ -114,10 +114,12 @@ def test_kf_ekf2_difference_steps_change_one_property_each():
     settings = [configuration.settings for configuration in found]
     assert [s["EKF2_ACC_NOISE"] for s in settings] == pytest.approx([2.0] * 4 + [0.35] * 3)
     assert [s["EKF2_EVP_NOISE"] for s in settings] == [0.2] * 2 + [0.3] * 5
-    assert [configuration.reported for configuration in found] == [False] * 2 + [True] * 5
+    assert [configuration.uses_reported_noise for configuration in found] == [False] * 2 + [
+        True
+    ] * 5
     assert settings[0]["EKF2_EV_POS_X"] == 0.0
-    assert [configuration.biases for configuration in found] == [False] * 3 + [True] * 4
-    assert [configuration.attitude for configuration in found] == [False] * 5 + [True] * 2
+    assert [configuration.estimates_biases for configuration in found] == [False] * 3 + [True] * 4
+    assert [configuration.estimates_attitude for configuration in found] == [False] * 5 + [True] * 2
     assert [configuration.has_gate for configuration in found] == [False] * 6 + [True]
     assert [configuration.uses_logged_decisions for configuration in found] == [False] * 6 + [True]
     assert [configuration.timestamp_offset_s for configuration in found] == [-0.05] + [None] * 6
@@ -130,7 +132,7 @@ def test_kf_ekf2_difference_steps_change_one_property_each():
         segments=plain,
     )
     found = list(step_configurations(gnss, kf_settings).values())
-    assert [configuration.velocity for configuration in found] == [False] * 6 + [True] * 2
+    assert [configuration.fuses_velocity for configuration in found] == [False] * 6 + [True] * 2
     assert [configuration.has_gate for configuration in found] == [False] * 7 + [True]
     # the GNSS positions of KF already include the delay
     assert found[0].timestamp_offset_s == pytest.approx(-0.16)
@@ -145,7 +147,7 @@ def test_kf_ekf2_difference_steps_change_one_property_each():
     assert ["optical_flow" in each.without for each in configurations.values()] == [True] * 8 + [
         False
     ] * 2
-    assert [each.velocity for each in configurations.values()] == [False] * 7 + [True] * 3
+    assert [each.fuses_velocity for each in configurations.values()] == [False] * 7 + [True] * 3
 
 
 def test_longest_run_of_ekf2_rejections_has_start_and_duration():
@@ -201,7 +203,7 @@ def test_what_if_summary_combines_north_and_east() -> None:
 
 def test_what_if_with_late_samples_adds_a_note():
     for by_delay, remedy in ((False, ": raise EKF2_DELAY_MAX"), (True, "")):
-        rules = replace(RULES, horizon_by_delay=by_delay)
+        rules = replace(RULES, uses_delay_as_horizon=by_delay)
         model: Any = SimpleNamespace(inputs=SimpleNamespace(rules=rules))
         one: Any = SimpleNamespace(
             late=3, lost=2, updates=range(8), changed={"EKF2_EV_DELAY": 90}, settings={}

@@ -22,7 +22,7 @@ from px4fuse.trajectory.association import Method, associate
 from px4fuse.trajectory.evaluation import choose_alignment, evaluate
 from px4fuse.trajectory.model import Trajectory
 from px4fuse.trajectory.scores import (
-    MIN_BLOCKS,
+    MIN_BOOTSTRAP_BLOCKS,
     Delta,
     Interval,
     autocorrelation_time,
@@ -521,7 +521,7 @@ def test_rmse_interval_from_too_few_blocks_is_unavailable() -> None:
     drift = np.linspace(0.0, 1.0, 500)
     got = rmse_interval(drift, "ATE")
     assert isinstance(got, Unavailable)
-    assert f"fewer than {MIN_BLOCKS:.0f} independent blocks" in str(got)
+    assert f"fewer than {MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks" in str(got)
     assert isinstance(rmse_interval(np.ones(100), "ATE", min_block=30), Unavailable)
     same = rmse_interval(np.full(100, 0.5), "ATE")
     assert (same.low, same.high) == (pytest.approx(0.5), pytest.approx(0.5))

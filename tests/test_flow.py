@@ -199,7 +199,7 @@ def test_read_gnss_omits_fixes_while_fusion_is_disabled():
     np.testing.assert_array_equal(found.stamp_s, every.stamp_s[remaining])  # type: ignore[union-attr]
 
 
-def test_ekf2_replay_start_correlation_uses_earlier_flight():
+def test_ekf2_replay_start_covariance_uses_data_before_start():
     """Six seconds at rest and the climb correlate tilt and accelerometer bias."""
     (segment,) = model().inputs.segments
     assert segment.history is not None

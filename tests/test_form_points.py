@@ -25,7 +25,13 @@ from px4fuse.answer_form import (
 from px4fuse.assignment.random_assignment import draw
 from px4fuse.assignment.truth import FormTruth, TrueMistake, VerdictTruth, form_truth
 from px4fuse.cli.simulate import simulate
-from px4fuse.grading.form_points import PART_NAMES, TABLE, form_points, panels, right_corrections
+from px4fuse.grading.form_points import (
+    PART_NAMES,
+    POINTS_TABLE,
+    form_points,
+    panels,
+    right_corrections,
+)
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
 from px4fuse.simulation.mistakes import parse
@@ -86,7 +92,7 @@ def parts(answers: Answers, truth: FormTruth = TRUTH) -> list[float]:
 
 def test_answer_form_offers_correct_answers_for_each_mistake() -> None:
     assert set(SIMULATED) == set(MISTAKES) - {"none", "vio-drift"}
-    assert set(TABLE["shows"]) | {"cover"} == set(PANELS)
+    assert set(POINTS_TABLE["shows"]) | {"cover"} == set(PANELS)
     for name in SIMULATED:
         offered = right_corrections(TrueMistake(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
         assert {cure for cure, _, _ in offered} <= set(CORRECTIONS)
@@ -157,7 +163,7 @@ def test_loop_open_end_answer_needs_its_size_for_all_points() -> None:
     assert parts(measured, truth)[:4] == [30.0, 15.0, 10.0, 15.0]
 
 
-def test_same_answer_form_for_all_loops_earns_few_points() -> None:
+def test_same_answers_for_all_loop_flights_earn_few_points() -> None:
     """300 drawn loops with their closure errors and verdicts.
 
     Most have no update outside the gate, so an empty list is not counted as an answer.

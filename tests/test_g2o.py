@@ -134,7 +134,7 @@ def test_parse_g2o_with_invalid_text_names_the_line(case: str) -> None:
 def test_read_g2o_from_binary_or_missing_file_is_rejected(tmp_path: Path) -> None:
     binary = tmp_path / "log.g2o"
     binary.write_bytes(b"ULog\x01\x12\x35\xff\xfe\x00")
-    with pytest.raises(TrajectoryError, match=r"^log\.g2o: the file is not a text file"):
+    with pytest.raises(TrajectoryError, match=r"^log\.g2o is not a text file"):
         read_g2o(binary)
     with pytest.raises(TrajectoryError, match=r"^none\.g2o: cannot be read \(No such file"):
         read_g2o(tmp_path / "none.g2o")

@@ -246,7 +246,7 @@ def test_what_if_excludes_height_sensor_that_disagrees_with_log() -> None:
     agreement = model.agreement
     assert agreement.good
     assert set(agreement.doubtful) == {"baro_hgt"}
-    assert "correlation of" in agreement.doubtful["baro_hgt"]
+    assert "the correlation" in agreement.doubtful["baro_hgt"]
     assert agreement.baro_hgt["down"].innovation_correlation < 0.95
     assert "barometer" in format_agreement(agreement)
     assert model.flown.other_aid_updates == {}

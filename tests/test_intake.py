@@ -123,7 +123,7 @@ def test_read_resaved_report_pdf_returns_same_results():
     (REAL[: len(REAL) // 2], "the end of the PDF is missing"),
     (REAL[:300_000] + b"\n%%EOF\n", DAMAGED),
     (b"%PDF-1.4\nstartxref\n5\n%%EOF", DAMAGED),
-    (b"%PDF-1.4\n" + bytes(pdf_input.MAX_BYTES), "larger than 25 MB"),
+    (b"%PDF-1.4\n" + bytes(pdf_input.MAX_PDF_BYTES), "larger than 25 MB"),
     (small_report(None), "printed to PDF, which removes attachments. Hand in the original"),
     (
         small_report(name="../../results.json"),

@@ -158,7 +158,7 @@ def test_join_of_recordings_without_overlap_states_both_spans(record):
         join(first, second)
 
 
-def test_join_of_flights_with_other_positions_is_rejected(sample_flight, tlog_flight):
+def test_join_of_flights_with_different_positions_is_rejected(sample_flight, tlog_flight):
     moved = replace(tlog_flight.ekf2, state=tlog_flight.ekf2.state + 3.0)
     with pytest.raises(
         MissingDataError, match="are different flights: their EKF2 positions differ"

@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 from px4fuse.errors import SettingsError
 from px4fuse.filter import model
 from px4fuse.filter.kalman import UPDATE_COLUMNS, replay, state_at, variance_at
-from px4fuse.filter.model import COVARIANCES, STATES
+from px4fuse.filter.model import COVARIANCE_COLUMNS, STATE_COLUMNS
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
 
 SAME_TIME_S = 5e-7
-STATE = STATES + COVARIANCES
+STATE = STATE_COLUMNS + COVARIANCE_COLUMNS
 
 
 def steps_of(measured: Sequence[float], dt: float) -> list[float]:
@@ -156,7 +156,7 @@ def test_kf_variance_between_steps_is_predicted_from_previous(dt: float, gap: bo
         for k, at in enumerate(times):
             step = run.steps.iloc[k]
             ahead = at - edges[k]
-            P = model.symmetric_matrix(step[COVARIANCES])
+            P = model.symmetric_matrix(step[COVARIANCE_COLUMNS])
             F = np.array([[1.0, ahead], [0.0, 1.0]])
             q = (0.7**2 + step["input_variance_m2_s4"]) * dt
             Q = q * np.array([[ahead**3 / 4.0, ahead**2 / 2.0], [ahead**2 / 2.0, ahead]])

@@ -309,11 +309,13 @@ def test_centring_positions_on_imu_path_keeps_likelihood() -> None:
     np.testing.assert_allclose(found_values, plain, rtol=1e-7)
     # the signal of the scale is the path of each offset
     scaled = fit_positions(
-        *arguments(centre_on_path(part, scaled=True), SOME_NOISES[0], WEIGHT)
+        *arguments(centre_on_path(part, has_scale=True), SOME_NOISES[0], WEIGHT)
     ).gram
     way, speed = part.delta_position_m[:, 1:2], part.delta_velocity_m_s[:, 1:2]
     alone = replace(part, delta_position_m=way, delta_velocity_m_s=speed)
-    one = fit_positions(*arguments(centre_on_path(alone, scaled=True), SOME_NOISES[0], WEIGHT)).gram
+    one = fit_positions(
+        *arguments(centre_on_path(alone, has_scale=True), SOME_NOISES[0], WEIGHT)
+    ).gram
     assert np.ptp(scaled[..., -1, -1]) > 1.0
     np.testing.assert_allclose(scaled[:, [1]], one, rtol=1e-7, atol=1e-7)
 

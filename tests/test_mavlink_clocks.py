@@ -166,7 +166,7 @@ def test_constant_mavlink_timestamp_is_replaced_by_receive_time(read, asks):
     rng = np.random.default_rng(1)
     for i, boot in enumerate(aisle.times(5.0)):
         made = message(
-            "VISION_POSITION_ESTIMATE", usec=us(UNIX_S) + (i >= 100), x=float(i),
+            "VISION_POSITION_ESTIMATE", usec=us(UNIX_S) + (i >= 100), x=1.0 + i,
             covariance=[0] * 21,
         )  # fmt: skip
         recorder.hear(unix(boot + aisle.delay(rng)), COMPANION, made)

@@ -11,21 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 from cli_tools import error_line, run_checked
+from comparisons import compare
 from ekf2_tools import opened
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
-from px4fuse.analysis import Analysis, explain
-from px4fuse.comparison.causal_replays import (
-    POSITION_VARIANCES,
-    ROTATION,
-    find_cause,
-    interventions_for,
-)
-from px4fuse.comparison.comparison import compare
+from px4fuse.analysis import Analysis
+from px4fuse.comparison.causal_replays import POSITION_VARIANCES, find_cause, interventions_for
+from px4fuse.comparison.changes import ROTATION
 from px4fuse.comparison.projection import project as project_state
 from px4fuse.comparison.remedy import aid_of
+from px4fuse.diagnose import explain
 from px4fuse.ekf2.model import replay_settings
 from px4fuse.ekf2.whatif import HEADING_LOGGED_NOTE, what_if
 from px4fuse.errors import SettingsError
@@ -98,7 +95,7 @@ def test_simulated_magnetometer_and_height_have_stated_noise(tmp_path: Path) -> 
     log.write_bytes(to_ulog(simulate(OUTDOOR, parse(["mag=0.3,60"]))))
     flight = read_log(log)
     truth, record = flight.truth.samples, flight.ekf2.record
-    down = flight.barometer["down_m"] + sensors.HOME[2]
+    down = flight.barometer["down_m"] + sensors.HOME_POSITION[2]
     error = down.to_numpy() - np.interp(down.index, truth.index, truth["down_m"])
     assert error.std() == pytest.approx(0.4, rel=0.1)
     assert abs(error.mean()) < 4 * 0.4 / len(error) ** 0.5

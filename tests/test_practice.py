@@ -18,17 +18,17 @@ import pytest
 from browser import Browser
 from cards import SMALL_SIGMA_A
 from cli_tools import run_checked
+from comparisons import compare
 from explore_tools import ask, axe, serious, settle, show
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
 from px4fuse import practice
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Flight
-from px4fuse.practice import CHOICES, NOISY_UWB, HiddenMistake, draw
+from px4fuse.practice import FAULT_CHOICES, NOISY_UWB, HiddenMistake, draw
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -48,9 +48,9 @@ def test_practice_flights_contain_each_mistake_equally_often(
     assert draw(seed, level, count) == rounds
     assert len(rounds) == count
     first = Counter(one.mistakes[0].choice if one.mistakes else "nothing" for one in rounds)
-    assert max(first.values()) - min(first[name] for name in CHOICES) <= 1
+    assert max(first.values()) - min(first[name] for name in FAULT_CHOICES) <= 1
     for one in rounds:
-        assert set(one.correct_answers) <= set(CHOICES)
+        assert set(one.correct_answers) <= set(FAULT_CHOICES)
         assert len(one.correct_answers) == max(len(one.mistakes), 1)
         assert len(one.mistakes) <= (2 if level == 3 else 1)
         for mistake, size in zip(one.mistakes, one.sizes, strict=True):
@@ -254,9 +254,12 @@ def test_practice_page_scores_right_and_wrong_answers(browser: Browser, quiz: Pa
         assert page.ask("document.getElementById('quiz-solution').hidden")
         if number == 0:
             page.click("#quiz-check")
-            assert element_text(page, "quiz-message") == "Select at least one fault, or no mistake."
+            assert (
+                element_text(page, "quiz-message")
+                == "Select at least one mistake, or “no mistake”."
+            )
         right = number % 3 != 1
-        wrong = next(name for name in CHOICES if name not in key["right"])
+        wrong = next(name for name in FAULT_CHOICES if name not in key["right"])
         page.click("#quiz-size")
         page.write("1 | 2 m")
         choose(page, *(key["right"] if right else [wrong]))
@@ -268,7 +271,7 @@ def test_practice_page_scores_right_and_wrong_answers(browser: Browser, quiz: Pa
             "[...row.cells].map((cell) => cell.textContent))"
         )
         faults = "; ".join(one["fault"] for one in key["mistakes"])
-        yours = CHOICES[key["right"][0] if right else wrong]
+        yours = FAULT_CHOICES[key["right"][0] if right else wrong]
         assert rows[0] == ["fault", yours, faults or "no mistake"]
         assert rows[1][:2] == ["size", "1   2 m"]
         assert rows[1][2] == ("; ".join(one["size"] for one in key["mistakes"]) or "–")

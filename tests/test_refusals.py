@@ -224,7 +224,7 @@ REFUSED = {
     "from after to": ("loop s.tum --from 50 --to 40", "Change --from or --to"),
     "no such part": ("loop l.ulg:slam", "'slam' is not a track of a flight"),
     "part of a trajectory": ("loop s.tum:vio", "s.tum is a trajectory file and has no track 'vio'"),
-    "frame of a flight": ("loop l.ulg --frame enu", "--frame enu is only for trajectory files"),
+    "frame of a flight": ("loop l.ulg --frame enu", "--frame is only for trajectory files"),
     "no PDF": ("loop s.tum -o r.txt", "r.txt: the output is a PDF"),
     "path and graph": ("loop s.tum --tum x --g2o x", "two outputs have the same file name"),
     "path to standard output": ("loop s.tum --tum -", "only --json can write to standard output"),

@@ -5,21 +5,21 @@ import math
 
 import jsonschema
 import pytest
+from comparisons import compare
 from exchange import replace
 from flights import unexplained
 from results_tools import EXAMPLE, LOOP, changed_results, decode_results
 
 import px4fuse
-from px4fuse.analysis import explain
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import UntestedFilter
+from px4fuse.diagnose import explain
 from px4fuse.errors import ResultsError
 from px4fuse.flight import Flight
 from px4fuse.report.pdf import render
 from px4fuse.request import ComparisonRequest
 from px4fuse.results import build
 from px4fuse.results.bounds import within_bounds
-from px4fuse.results.contract import KINDS, schema, to_json
+from px4fuse.results.contract import RESULTS_BY_SCHEMA, schema, to_json
 from px4fuse.results.reading import read_results
 
 
@@ -40,7 +40,7 @@ def assert_valid(text: str) -> None:
 
 def test_results_schema_is_valid_and_contains_each_result_type():
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
-    kinds = [f"#/$defs/{kind.__name__}" for kind in KINDS.values()]
+    kinds = [f"#/$defs/{kind.__name__}" for kind in RESULTS_BY_SCHEMA.values()]
     assert [one["$ref"] for one in SCHEMA["oneOf"]] == kinds
 
 

@@ -21,7 +21,7 @@ from px4fuse.grading import submissions
 from px4fuse.grading.model import Submission
 from px4fuse.grading.submissions import add_origins, find_submissions, parse_origin, read
 from px4fuse.reading import files_by_sha256
-from px4fuse.verification.pdf_input import MAX_BYTES, read_report
+from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_report
 
 PDF = b"%PDF-1.4 a small one\n%%EOF\n"
 
@@ -120,7 +120,7 @@ submission_31:
 """
 
 
-def test_forged_submission_name_does_not_change_platform():
+def test_forged_file_name_does_not_change_learning_platform():
     """The student's part of the name contains a second time, or a name as from Moodle."""
     usual = [f"Lab_user{n}_attempt_2026-11-20-11-00-0{n}_r.pdf" for n in range(3)]
     forged = [
@@ -290,19 +290,19 @@ def test_submission_above_size_limit_is_rejected_without_reading(tmp_path):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert said == "large.pdf: the file is larger than 25 MB; reports are below 2 MB."
-    assert peak < 3 * MAX_BYTES
+    assert peak < 3 * MAX_PDF_BYTES
 
 
 def test_submission_with_zip_bomb_is_rejected(tmp_path, monkeypatch):
     packed = zipped({"bomb.pdf": bytes(20_000_000)})
     path = write(tmp_path / "x.zip", packed)
     assert "compressed more than 100 times" in reason(single_submission(path))
-    path.write_bytes(zipped({"large.pdf": bytes(MAX_BYTES + 1)}))
+    path.write_bytes(zipped({"large.pdf": bytes(MAX_PDF_BYTES + 1)}))
     assert "larger than 25 MB" in reason(single_submission(path))
     # declared size below the actual one: zipfile stops there, and the checksum is wrong
     path.write_bytes(packed.replace(struct.pack("<I", 20_000_000), struct.pack("<I", 1000)))
     assert "cannot be read" in reason(single_submission(path))
-    monkeypatch.setattr(submissions, "MAX_BYTES", len(PDF))
+    monkeypatch.setattr(submissions, "MAX_PDF_BYTES", len(PDF))
     path.write_bytes(zipped({"just.pdf": PDF}))
     assert read(single_submission(path)) == PDF
 
@@ -311,7 +311,7 @@ def test_submission_with_zip_bomb_is_rejected(tmp_path, monkeypatch):
     ("limit", "value", "said"),
     [
         ("MAX_TOTAL_BYTES", 200, "the zip file unpacks to more than"),
-        ("MAX_ENTRIES", 3, "more than 3 entries"),
+        ("MAX_ZIP_ENTRIES", 3, "more than 3 entries"),
         ("MAX_DIRECTORY_BYTES", 100, "damaged"),
     ],
 )

@@ -18,8 +18,8 @@ from exchange import replace
 from rich.console import Console
 
 from px4fuse.analysis import Analysis
-from px4fuse.analysis import run as analyse
 from px4fuse.cli.outputs import default_report, progress, terminal
+from px4fuse.diagnose import diagnose as analyse
 from px4fuse.errors import OutputError
 from px4fuse.report import card_text, screen
 from px4fuse.report.card_text import card_lines, with_typed_path
@@ -95,9 +95,9 @@ def test_terminal_summary_wraps_without_cutting_text(document, monkeypatch) -> N
     assert sorted(summaries[WIDTH].split()) == sorted(whole.split())
     assert "\x1b" not in whole
     # the card comes first, also in a pipe; below it a paragraph is one line there
-    first = [text for line in card_lines(card) for text in line.wrapped(card_text.WIDTH)]
+    first = [text for line in card_lines(card) for text in line.wrapped(card_text.CARD_WIDTH)]
     assert whole.splitlines()[: len(first) + 1] == [*first, ""]
-    assert max(map(len, whole.splitlines()[len(first) :])) > card_text.WIDTH
+    assert max(map(len, whole.splitlines()[len(first) :])) > card_text.CARD_WIDTH
 
 
 def test_terminal_paragraph_has_hanging_indent(capsys) -> None:
@@ -264,7 +264,7 @@ def test_explore_page_of_another_log_is_not_overwritten(desk, sample_log) -> Non
     page = Path("reports/l.html")
     run_checked("explore", "l.ulg")
     before = page.read_bytes()
-    assert "l.html exists and is not a page" in error_line("explore", "b/l.ulg")
+    assert "l.html exists and is not a web page" in error_line("explore", "b/l.ulg")
     assert page.read_bytes() == before
     run_checked("explore", "l.ulg")
 
@@ -281,7 +281,7 @@ def test_html_file_of_user_is_not_overwritten_by_default(desk, command, mine) ->
     page = Path("reports", "practice_3.html" if "practice" in command else "l.html")
     page.parent.mkdir()
     page.write_bytes(mine)
-    assert f"{page} exists and is not a page of" in error_line(*command.split())
+    assert f"{page} exists and is not a web page of" in error_line(*command.split())
     assert page.read_bytes() == mine
     run_checked(*command.split(), "-o", page)
     assert page.read_bytes() != mine

@@ -13,11 +13,11 @@ import jsonschema
 import numpy as np
 import pandas as pd
 import pytest
+from comparisons import compare
 from ekf2_tools import opened, step_matrix, step_noise, step_state
 from exchange import replace
 
-from px4fuse.analysis import explain, run_what_if
-from px4fuse.comparison.comparison import compare
+from px4fuse.diagnose import explain, run_what_if
 from px4fuse.ekf2 import steps
 from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun, run_segment
 from px4fuse.ekf2.inputs import Inputs, ReceivedPositions
@@ -336,12 +336,14 @@ def test_loss_of_gnss_resets_position_to_vision() -> None:
 def test_vision_position_bias_follows_gnss_reset() -> None:
     """Position and bias move together (resetHorizontalPositionTo): vision is fused as before."""
     inputs = flying(sent(sigma_m=0.05))
-    for with_velocity in (False, True):
-        rules = replace(inputs.rules, with_velocity=with_velocity)
+    for resets_velocity in (False, True):
+        rules = replace(inputs.rules, resets_velocity=resets_velocity)
         done = ran(replace(inputs, rules=rules, received=off_by(inputs.received, 30.0)))
         # up to v1.16 any fused position, also from vision, prevents a reset to GNSS
-        assert int(done.reset.sum()) == (not with_velocity)
-        assert done.position_reset_m.sum() == pytest.approx(0.0 if with_velocity else 30.0, abs=3.0)
+        assert int(done.reset.sum()) == (not resets_velocity)
+        assert done.position_reset_m.sum() == pytest.approx(
+            0.0 if resets_velocity else 30.0, abs=3.0
+        )
         assert update_log(done)["fused"].mean() > 0.999
 
 

@@ -4,17 +4,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from comparisons import compare
 from exchange import replace
 from flights import unexplained
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.difference_steps import (
     add_sentences,
     corrected_settings,
     explain_ekf2_difference,
 )
-from px4fuse.ekf2.steps import NOISE, SAMPLES, STAMPS, STEPS, DifferenceExplanation
+from px4fuse.ekf2.steps import NOISE, SAMPLES, STEPS, TIMESTAMPS, DifferenceExplanation
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Unavailable
@@ -57,7 +57,7 @@ def test_kf_setting_changes_only_its_step_of_kf_ekf2_difference(sample: Analysis
     assert next(step for step in small.steps if step.name == NOISE).position_moved_m > 0.05
     assert NOISE not in {step.name for step in plain.steps}  # equal settings
     late = explain_again(sample, Settings(clock_offset_s=-0.3))
-    assert STAMPS in late.sentences[0]
+    assert TIMESTAMPS in late.sentences[0]
     assert "KF 300 ms" in late.sentences[0]
     left = pytest.approx(plain.unexplained_mean_square_m2, rel=0.02)
     assert [o.unexplained_mean_square_m2 for o in (zero, small, late)] == [left] * 3

@@ -14,7 +14,7 @@ from px4fuse.reading import read_text
 
 # Maximum size (bytes) of an answer key: the key of 1000 students has two million bytes
 MAX_KEY_BYTES = 20_000_000
-NOTE = (
+KEY_NOTE = (
     "For the instructor only: this file lists the mistakes of every student's flight. Do not hand "
     "it out, and do not put it into the students' folder."
 )
@@ -81,7 +81,7 @@ class AnswerKey(msgspec.Struct, frozen=True):
     )
     secret: _Text = ""
     schema: _Schema = _Schema()
-    note: str = NOTE
+    note: str = KEY_NOTE
 
     def __repr__(self) -> str:  # without the secret, which an error message must not show
         return f"AnswerKey({self.kind!r}, {len(self.answers)} students)"

@@ -71,10 +71,10 @@ class AssignableMistake(Record, frozen=True):
     start_range_s: tuple[float, float] | None = None
     hidden_groups: tuple[str, ...] = ()
 
-    def is_detectable_with(self, other: AssignableMistake) -> bool:
+    def is_detectable_with(self, other_mistake: AssignableMistake) -> bool:
         """Return True if both mistakes can be detected in the same flight."""
-        is_hidden = other.group in (self.group, *self.hidden_groups)
-        return not is_hidden and self.group not in other.hidden_groups
+        is_hidden = other_mistake.group in (self.group, *self.hidden_groups)
+        return not is_hidden and self.group not in other_mistake.hidden_groups
 
     def format_option(
         self, difficulty: float, sign: float = 1.0, start_fraction: float = 0.5

@@ -23,7 +23,7 @@ MAX_STEM_LENGTH = 48
 RESERVED_NAMES = {"con", "prn", "aux", "nul"} | {
     f"{n}{i}" for n in ("com", "lpt") for i in range(10)
 }
-COLUMNS = table(__file__, "columns.toml", dict[str, tuple[str, ...]])
+ROSTER_COLUMNS = table(__file__, "columns.toml", dict[str, tuple[str, ...]])
 # Fields of a student that another list adds if the class list does not contain them
 ADDED_FIELDS = ("name", "email", "login", "submitted")
 # Names of rows in Canvas gradebooks that are not students, without blanks and punctuation
@@ -70,7 +70,7 @@ def read_people(sheet: Sheet) -> tuple[Person, ...]:
     SettingsError
         No column identifies the students, or two rows have the same id.
     """
-    if all(sheet.column(titles) is None for titles in COLUMNS.values()):
+    if all(sheet.column(titles) is None for titles in ROSTER_COLUMNS.values()):
         raise SettingsError(
             f"{sheet.path}: no column identifies the student.",
             "Give one column the title id, email or name.",
@@ -123,7 +123,7 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
     """Return the student in a row of a class list; None if the row contains no student."""
     cells = {
         field_name: one_line(sheet.cell(row, titles), MAX_NAME_LENGTH)
-        for field_name, titles in COLUMNS.items()
+        for field_name, titles in ROSTER_COLUMNS.items()
     }
     name = cells["name"] or f"{cells['first']} {cells['last']}".strip()
     if re.sub(r"\W", "", name.casefold()) in NOT_STUDENT_NAMES:
@@ -135,8 +135,8 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
         numbers |= {"canvas": number} if (number := sheet.cell(row, ("id",))) else {}
         cells["student_id"] = one_line(sheet.cell(row, ("sisuserid",)), MAX_NAME_LENGTH)
     student_id = cells["student_id"] or cells["login"] or cells["email"]
-    submitted = sheet.cell(row, ("lastmodifiedsubmission",))
-    person = Person(student_id, name, cells["email"], cells["login"], numbers, submitted)
+    submission_time = sheet.cell(row, ("lastmodifiedsubmission",))
+    person = Person(student_id, name, cells["email"], cells["login"], numbers, submission_time)
     return person if student_id or name or numbers else None
 
 
@@ -187,20 +187,20 @@ def normalise_text(text: str) -> str:
     return unicodedata.normalize("NFKC", text).strip().casefold()
 
 
-def _is_same_text(known: str, other: str) -> bool:
-    return normalise_text(known) == normalise_text(other) != ""
+def _is_same_text(stated_text: str, other_text: str) -> bool:
+    return normalise_text(stated_text) == normalise_text(other_text) != ""
 
 
-def is_same_id(student_id: str, other: str) -> bool:
+def is_same_id(student_id: str, other_id: str) -> bool:
     """Return True if two ids are equal except for case and leading zeros.
 
     >>> is_same_id("0042", "42"), is_same_id("S1", "s1 "), is_same_id("00", "0")
     (True, True, False)
     """
-    return normalise_text(student_id).lstrip("0") == normalise_text(other).lstrip("0") != ""
+    return normalise_text(student_id).lstrip("0") == normalise_text(other_id).lstrip("0") != ""
 
 
-def is_same_name(name: str, other: str) -> bool:
+def is_same_name(name: str, other_name: str) -> bool:
     """Return True if two names have the same words in any order, or joined as Canvas joins them.
 
     >>> is_same_name("Ada Lovelace", "Lovelace, Ada"), is_same_name("Ada Lovelace", "lovelaceada")
@@ -208,7 +208,9 @@ def is_same_name(name: str, other: str) -> bool:
     >>> is_same_name("Ada", "ada lovelace"), is_same_name("", "")
     (False, False)
     """
-    words, other_words = (re.findall(r"[^\W_]+", normalise_text(text)) for text in (name, other))
+    words, other_words = (
+        re.findall(r"[^\W_]+", normalise_text(text)) for text in (name, other_name)
+    )
     short, long = sorted((words, other_words), key=len)
     rotated_words = ("".join(long[start:] + long[:start]) for start in range(len(long)))
     is_joined = len(short) == 1 < len(long) and short[0] in rotated_words

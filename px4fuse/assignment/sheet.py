@@ -16,8 +16,8 @@ from pathlib import Path
 from px4fuse.errors import SettingsError
 from px4fuse.reading import read_bytes_limited
 
-MAX_BYTES = 20_000_000
-SEPARATORS = ",;\t|"
+MAX_TABLE_BYTES = 20_000_000
+COLUMN_SEPARATORS = ",;\t|"
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class Sheet:
     @property
     def text(self) -> str:
         """Table as CSV (RFC 4180), with the original separator."""
-        out = io.StringIO()
-        csv.writer(out, delimiter=self.separator).writerows((self.head, *self.rows))
-        return out.getvalue()
+        csv_file = io.StringIO()
+        csv.writer(csv_file, delimiter=self.separator).writerows((self.head, *self.rows))
+        return csv_file.getvalue()
 
     def content(self) -> bytes:
         """Encode the table in its original encoding."""
@@ -81,7 +81,11 @@ def read_sheet(path: Path) -> Sheet:
         The file cannot be read, is not text, or has no header.
     """
     content = read_bytes_limited(
-        path, SettingsError, MAX_BYTES, name=str(path), size_remedy="Give a CSV table of one class"
+        path,
+        SettingsError,
+        MAX_TABLE_BYTES,
+        name=str(path),
+        size_remedy="Give a CSV table of one class",
     )
     if content.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
         raise SettingsError(f"{path} is a spreadsheet, not a CSV file.", "Save it as CSV.")
@@ -97,7 +101,7 @@ def read_sheet(path: Path) -> Sheet:
         raise SettingsError(f"{path} is not a text file.", "Give a CSV file with a header.")
     header = next((line for line in text.splitlines() if line.strip()), "")
     # separators in quoted titles are not counted
-    separator = max(SEPARATORS, key=re.sub(r'"[^"]*"', "", header).count)
+    separator = max(COLUMN_SEPARATORS, key=re.sub(r'"[^"]*"', "", header).count)
     try:
         lines = [*csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)]
     except csv.Error as error:

@@ -10,14 +10,21 @@ from px4fuse.answer_form import GATE_UPDATES, FormQuestion, draw_questions
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
+from px4fuse.comparison.preparation import prepare
 from px4fuse.filter.kalman import replay
-from px4fuse.filter.model import COVARIANCES, process_noise_unit, symmetric_matrix, transition
+from px4fuse.filter.model import (
+    COVARIANCE_COLUMNS,
+    process_noise_unit,
+    symmetric_matrix,
+    transition,
+)
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.record import Record, table
+from px4fuse.request import SIGMA_Z_M, ComparisonRequest
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED_MISTAKES
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
@@ -31,7 +38,8 @@ MIN_REJECTED_FRACTION = 0.005
 # Minimum position reset of EKF2 (m) that a complete answer must name, and time (s) after the start
 # in which resets are ignored, because EKF2 resets to its first position
 MIN_RESET_M, EKF2_START_S = 0.2, 5.0
-EKF2_BEHAVIOUR = table(__file__, "did.toml", dict[str, dict[str, set[str]]])
+# Answers on EKF2's behaviour, and the kinds of mistakes for which each is required or allowed
+BEHAVIOUR_RULES = table(__file__, "did.toml", dict[str, dict[str, set[str]]])
 
 
 class TrueMistake(Record, frozen=True):
@@ -94,7 +102,9 @@ class FormTruth(Record, frozen=True):
 def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
     """Compute the right answers from a simulation and its analysis with default settings."""
     answer = flights.answer(simulation)
-    comparison = compare(flights.to_flight(simulation), Settings())
+    flight = flights.to_flight(simulation)
+    request = ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M)
+    comparison = compare(prepare(flight, request))
     mistakes = tuple(
         _true_mistake(name, values, answer["truth"], comparison)
         for name, values in answer["mistakes"].items()
@@ -156,7 +166,7 @@ def _ekf2_behaviour(
     """Return behaviour of EKF2 that a complete answer names, and further behaviour not wrong."""
     size_of = {mistake.kind: mistake.size or 0.0 for mistake in mistakes}
     required, allowed = (
-        [behaviour for behaviour, kinds in EKF2_BEHAVIOUR[rule].items() if kinds & size_of.keys()]
+        [behaviour for behaviour, kinds in BEHAVIOUR_RULES[rule].items() if kinds & size_of.keys()]
         for rule in ("required", "allowed")
     )
     if size_of.get("ekf2-noise", 0.0) > sigma_z_m:
@@ -191,7 +201,7 @@ def quantity_truth(
     updates = kf_replay.updates.iloc[question.update - 1 :]
     if updates.empty:
         return None
-    row, covariance = updates.iloc[0], kf_replay.steps.loc[updates.index[0], COVARIANCES]
+    row, covariance = updates.iloc[0], kf_replay.steps.loc[updates.index[0], COVARIANCE_COLUMNS]
     nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
     match question.kind:
         case "gate":

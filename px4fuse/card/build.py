@@ -49,7 +49,8 @@ from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings.model import Finding, group_by_root
+from px4fuse.finding import Finding
+from px4fuse.findings.model import group_by_root
 from px4fuse.flight import Ekf2, Unavailable, source_name
 from px4fuse.log import LogInfo
 from px4fuse.reading import display_name, file_size, read_head
@@ -67,14 +68,13 @@ DRIFT_HIDES_ERROR = (
     "not show drift. Do not lower the noises for it."
 )
 # Number of first bytes that the card of an unreadable log shows, and those of each ULog
-SHOWN_BYTES, ULOG_HEAD = 4, "55 4C 6F 67"
+SHOWN_BYTE_COUNT, ULOG_HEAD = 4, "55 4C 6F 67"
 HEADING_HIDES_ERROR = (
     "Both filters rotate the measured acceleration by the wrong heading and return to the position "
     "at each update, so the innovations show only a part of the error."
 )
-UNEXPLAINED = "The two verdicts differ, and no tested change explains it."
-NO_FAULT = "No fault found: KF and EKF2 are consistent"
-# Findings of errors that both filters follow, so that innovations do not show them
+UNEXPLAINED_DIFFERENCE = "The two verdicts differ, and no tested change explains it."
+NO_FAULT_HEADLINE = "No fault found: KF and EKF2 are consistent"
 # Findings about the source with the sentence on verdicts that differ
 SENTENCES_BY_SOURCE_FAULT = (
     (
@@ -95,41 +95,41 @@ SENTENCES_BY_SOURCE_FAULT = (
 
 
 def build_card(
-    analysis: Analysis,
-    findings: Sequence[Finding],
-    request: ComparisonRequest,
-    student: tuple[str, str] = ("", ""),
+    analysis: Analysis, request: ComparisonRequest, student: tuple[str, str] = ("", "")
 ) -> Card:
     """Build the diagnosis card of a comparison.
 
     Parameters
     ----------
     analysis : Analysis
-    findings : sequence of Finding
-        Most severe first; a finding that is a consequence follows its cause.
     request : ComparisonRequest
         Options of the user, which the commands on the card repeat without paths.
     student : (str, str)
         Name and id of the student.
     """
     result, source, segment = analysis.main, analysis.source, analysis.segment
-    roots = [group[0] for group in group_by_root(findings)]
+    roots = [group[0] for group in group_by_root(analysis.findings)]
     verdicts = make_verdicts(result)
-    ranked = rank_causes(analysis, roots)
-    causes = tuple(make_cause(analysis, each, verdicts, request) for each in ranked[:MAX_CAUSES])
+    ranked_causes = rank_causes(analysis, roots)
+    causes = tuple(
+        make_cause(analysis, ranked_finding, verdicts, request)
+        for ranked_finding in ranked_causes[:MAX_CAUSES]
+    )
     may_drift = source.origin.may_drift
     verdicts = _mark_explained(verdicts, causes, may_drift=may_drift)
     horizon_ratio = None if causes else _horizon_ratio(analysis)
     if horizon_ratio is not None:
         verdicts = (*verdicts[:-1], replace(verdicts[-1], is_explained=True))
-    reconcile = _reconcile(analysis, verdicts, causes, [one.id for one in findings])
+    reconcile = _reconcile(
+        analysis, verdicts, causes, [finding.id for finding in analysis.findings]
+    )
     if not reconcile and any(verdict.is_explained for verdict in verdicts) and may_drift:
         reconcile = DRIFT_HIDES_ERROR
     if horizon_ratio is not None:
         reconcile = _horizon_sentence(horizon_ratio)
-    elif reconcile == UNEXPLAINED:
+    elif reconcile == UNEXPLAINED_DIFFERENCE:
         verdicts = tuple(replace(verdict, is_explained=False) for verdict in verdicts)
-    effect = _effect(analysis)
+    effect = _make_effect(analysis)
     severity: CardSeverity = causes[0].severity if causes else _severity_without_cause(verdicts)
     return Card(
         severity=severity,
@@ -137,13 +137,13 @@ def build_card(
         headline=_headline(causes, verdicts),
         effect=effect,
         effect_text=_effect_text(analysis, effect, verdicts),
-        do_this=_do_this(causes),
+        do_this=_action_sentences(causes),
         verdicts=verdicts,
         reconcile=reconcile,
-        difference=_difference(effect, ranked),
+        difference=_difference_text(effect, ranked_causes),
         causes=causes,
-        more_causes=max(len(ranked) - MAX_CAUSES, 0),
-        notes=_notes(roots, request.log),
+        more_causes=max(len(ranked_causes) - MAX_CAUSES, 0),
+        notes=_make_notes(roots, request.log),
         identity=_identity(
             analysis.flight.log,
             request,
@@ -158,24 +158,21 @@ def build_card(
 
 
 def build_aids_card(
-    analysis: AidsOnlyAnalysis,
-    findings: Sequence[Finding],
-    request: ComparisonRequest,
-    student: tuple[str, str] = ("", ""),
+    analysis: AidsOnlyAnalysis, request: ComparisonRequest, student: tuple[str, str] = ("", "")
 ) -> Card:
     """Build the card of a flight without a position source, from EKF2's aiding sources."""
-    roots = [group[0] for group in group_by_root(findings)]
-    faults = [one for one in roots if one.severity != "note"]
-    causes = tuple(make_plain_cause(one) for one in faults[:MAX_CAUSES])
-    missing = analysis.missing_data
+    roots = [group[0] for group in group_by_root(analysis.findings)]
+    faults = [finding for finding in roots if finding.severity != "note"]
+    causes = tuple(make_plain_cause(finding) for finding in faults[:MAX_CAUSES])
+    missing_data = analysis.missing_data
     return Card(
         severity=causes[0].severity if causes else "clean",
         id=causes[0].id if causes else "",
         headline=causes[0].title if causes else "No fault found in EKF2's aiding sources",
-        do_this=_do_this(causes),
+        do_this=_action_sentences(causes),
         causes=causes,
         more_causes=max(len(faults) - MAX_CAUSES, 0),
-        notes=_notes(roots, request.log),
+        notes=_make_notes(roots, request.log),
         aids=tuple(
             AidRow(
                 label=aid.label,
@@ -186,7 +183,7 @@ def build_aids_card(
             for key, aid in analysis.aids.items()
             for name, axis in aid.axes.items()
         ),
-        facts={"KF": f"not run: {missing.reason}. {with_options(missing.remedy)}"},
+        facts={"KF": f"not run: {missing_data.reason}. {with_options(missing_data.remedy)}"},
         identity=_identity(analysis.flight.log, request, student, source="no position source"),
     )
 
@@ -195,7 +192,7 @@ def build_refusal_card(error: LogError | MissingDataError, path: Path) -> Card:
     """Build the card of a log that cannot be analysed: fault, first bytes of the file, and fix."""
     facts = {}
     with suppress(LogError):  # without access to the file, the error states the reason
-        head = read_head(path, SHOWN_BYTES, LogError).hex(" ").upper()
+        head = read_head(path, SHOWN_BYTE_COUNT, LogError).hex(" ").upper()
         size = file_size(path, LogError)
         facts["read"] = f"{size:,} bytes, beginning with {head} (ULog: {ULOG_HEAD})"
     if error.remedy:
@@ -215,12 +212,12 @@ def _severity_without_cause(verdicts: Sequence[Verdict]) -> CardSeverity:
 
 def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
     if causes:
-        first, *others = causes
-        for other in others:
-            both = f"{first.title}; {lower_first(other.title)}"
-            if other.severity == "error" and len(both) <= MAX_HEADLINE_LENGTH:
-                return both
-        return first.title
+        main_cause, *further_causes = causes
+        for further_cause in further_causes:
+            joined_titles = f"{main_cause.title}; {lower_first(further_cause.title)}"
+            if further_cause.severity == "error" and len(joined_titles) <= MAX_HEADLINE_LENGTH:
+                return joined_titles
+        return main_cause.title
     if faulty := [verdict for verdict in verdicts if verdict.is_loud]:
         worst = max(faulty, key=lambda each: abs(math.log(each.ratio or 1.0)))
         size = worst.ratio or 1.0
@@ -234,20 +231,20 @@ def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
         return "No fault found; KF and EKF2 could not be evaluated"
     tested = {each.filter for each in verdicts if each.word == "consistent"}
     return (
-        NO_FAULT
+        NO_FAULT_HEADLINE
         if len(tested) == 2
         else f"No fault found: {FILTER_NAMES[tested.pop()]} is consistent"
     )
 
 
-def _effect(analysis: Analysis) -> Effect:
+def _make_effect(analysis: Analysis) -> Effect:
     result, has_ekf2 = analysis.main, isinstance(analysis.flight.ekf2, Ekf2)
     difference = result.difference
     return Effect(
         axis=describe_axis(analysis, result),
         position_rmse_m={
-            owner: truth.position_rmse_m
-            for owner, statement in result.filters.items()
+            filter_name: truth.position_rmse_m
+            for filter_name, statement in result.filters.items()
             if isinstance(truth := statement.truth, ErrorsAgainstTruth)
         },
         horizontal_rmse_m=_horizontal_rmse_m(analysis),
@@ -278,14 +275,16 @@ def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
 def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
     axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
     errors_m = {
-        owner: [
+        filter_name: [
             truth.position_rmse_m
             for axis in axes
-            if isinstance(truth := axis.filters[owner].truth, ErrorsAgainstTruth)
+            if isinstance(truth := axis.filters[filter_name].truth, ErrorsAgainstTruth)
         ]
-        for owner in FILTER_NAMES
+        for filter_name in FILTER_NAMES
     }
-    return {owner: math.hypot(*pair) for owner, pair in errors_m.items() if len(pair) == 2}
+    return {
+        filter_name: math.hypot(*pair) for filter_name, pair in errors_m.items() if len(pair) == 2
+    }
 
 
 def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]) -> str:
@@ -297,8 +296,8 @@ def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]
     if effect.position_rmse_m:
         sentences.append(
             f"Position RMSE against ground truth along {analysis.main.axis.label}{when}: "
-            f"{_by_filter(effect.position_rmse_m)}"
-            f"{_in_brackets('horizontal', effect.horizontal_rmse_m)}."
+            f"{_lengths_by_filter(effect.position_rmse_m)}"
+            f"{_bracketed_lengths('horizontal', effect.horizontal_rmse_m)}."
         )
         for verdict in verdicts:
             if verdict.against == "truth" and verdict.ratio and verdict.word != "consistent":
@@ -314,32 +313,34 @@ def _effect_text(analysis: Analysis, effect: Effect, verdicts: Sequence[Verdict]
         sentences.append(
             "The log has no ground truth, so it does not show which filter is more accurate."
         )
-    if (rejected := effect.rejected_fraction) is not None and rejected >= MIN_NAMED_REJECTION:
-        sentences.append(f"EKF2 rejected {100.0 * rejected:.0f} % of the positions.")
+    if (
+        rejected_fraction := effect.rejected_fraction
+    ) is not None and rejected_fraction >= MIN_NAMED_REJECTION:
+        sentences.append(f"EKF2 rejected {100.0 * rejected_fraction:.0f} % of the positions.")
     if effect.horizontal_resets:
         times = "once" if effect.horizontal_resets == 1 else f"{effect.horizontal_resets} times"
         sentences.append(f"EKF2 reset its horizontal position {times}.")
     return " ".join(sentences)
 
 
-def _by_filter(lengths_m: Mapping[FilterName, float]) -> str:
+def _lengths_by_filter(lengths_m: Mapping[FilterName, float]) -> str:
     return ", ".join(
-        f"{FILTER_NAMES[owner]} {format_metres(length_m)} m"
-        for owner, length_m in lengths_m.items()
+        f"{FILTER_NAMES[filter_name]} {format_metres(length_m)} m"
+        for filter_name, length_m in lengths_m.items()
     )
 
 
-def _in_brackets(label: str, lengths_m: Mapping[FilterName, float]) -> str:
-    return f" ({label}: {_by_filter(lengths_m)})" if lengths_m else ""
+def _bracketed_lengths(label: str, lengths_m: Mapping[FilterName, float]) -> str:
+    return f" ({label}: {_lengths_by_filter(lengths_m)})" if lengths_m else ""
 
 
-def _do_this(causes: Sequence[Cause]) -> tuple[str, ...]:
+def _action_sentences(causes: Sequence[Cause]) -> tuple[str, ...]:
     """Return at most three actions, with the number of the cause if there are several causes."""
     texts: list[str] = []
     for number, cause in enumerate(causes, 1):
-        sentences = [_sentence(action) for action in cause.actions if _is_change(action)]
+        sentences = [_action_sentence(action) for action in cause.actions if _is_change(action)]
         if cause.alternatives:
-            either = [_sentence(action) for group in cause.alternatives for action in group]
+            either = [_action_sentence(action) for group in cause.alternatives for action in group]
             sentences.insert(0, ", or ".join([*(text[:-1] for text in either[:-1]), either[-1]]))
         label = f"({number}) " if len(causes) > 1 else ""
         texts += [f"{label}{sentence}" for sentence in sentences]
@@ -350,7 +351,7 @@ def _is_change(action: Action) -> bool:
     return bool(action.commands) or not action.sentence.startswith("no ")
 
 
-def _sentence(action: Action) -> str:
+def _action_sentence(action: Action) -> str:
     if action.where == "console":
         one_change = action.sentence.partition(" ")[2]  # the command states the parameter
         change = one_change if len(action.commands) == 1 else action.sentence
@@ -401,8 +402,8 @@ def _horizon_ratio(analysis: Analysis) -> float | None:
     None if the published position is consistent, or if the horizon is not logged or not consistent.
     """
     result, ekf2 = analysis.main, analysis.flight.ekf2
-    published = make_verdicts(result)[-1]
-    if published.word != "overconfident" or not isinstance(ekf2, Ekf2):
+    published_verdict = make_verdicts(result)[-1]
+    if published_verdict.word != "overconfident" or not isinstance(ekf2, Ekf2):
         return None
     horizon = project_horizon(ekf2, result.axis, analysis.segment)
     if horizon is None or not isinstance(result.truth, pd.DataFrame):
@@ -432,11 +433,11 @@ def _reconcile(
         if rerun.improves == "position and σ"
     }
     differing = [
-        owner
-        for owner in FILTER_NAMES
-        if _differ(
-            *(verdict for verdict in verdicts if verdict.filter == owner),
-            is_corrected=owner in corrected,
+        filter_name
+        for filter_name in FILTER_NAMES
+        if _verdicts_differ(
+            *(verdict for verdict in verdicts if verdict.filter == filter_name),
+            is_corrected=filter_name in corrected,
         )
     ]
     if not differing:
@@ -445,15 +446,17 @@ def _reconcile(
         if not ids_of_source.isdisjoint(ids):
             return sentence
     if corrected.issuperset(differing):
-        filters = " and ".join(FILTER_NAMES[owner] for owner in differing)
+        filters = " and ".join(FILTER_NAMES[filter_name] for filter_name in differing)
         return (
             f"The two verdicts of {filters} differ: innovations hardly show this fault, ground "
             "truth does. The re-run above removes most of the error."
         )
-    tuned = analysis.tuning.get(HORIZONTAL)
+    horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     if analysis.source.origin.may_drift:
         noise = ""
-        if isinstance(tuned, AxisTuning) and (sigma := tuned.sigma_z.value or tuned.sigma_z.high):
+        if isinstance(horizontal_tuning, AxisTuning) and (
+            sigma := horizontal_tuning.sigma_z.value or horizontal_tuning.sigma_z.high
+        ):
             noise = f" of {format_metres(sigma)} m"
         return (
             f"Source: the noise{noise} from sample to sample is less than both filters assume. "
@@ -464,12 +467,14 @@ def _reconcile(
             "Innovations show only the error that changes from sample to sample. Both filters "
             "follow the slow part, so it shows against ground truth alone."
         )
-    unexplained = HEADING_HIDES_ERROR if "ekf2_heading_error" in ids else UNEXPLAINED
+    unexplained_text = (
+        HEADING_HIDES_ERROR if "ekf2_heading_error" in ids else UNEXPLAINED_DIFFERENCE
+    )
     is_gated = "source_outliers" in ids and "ekf2" in differing
-    return _gate_sentence(analysis) if is_gated else unexplained
+    return _gate_sentence(analysis) if is_gated else unexplained_text
 
 
-def _differ(source: Verdict, truth: Verdict, *, is_corrected: bool) -> bool:
+def _verdicts_differ(source: Verdict, truth: Verdict, *, is_corrected: bool) -> bool:
     if source.ratio is None or truth.ratio is None:
         return False
     is_far_larger = truth.ratio > 2.0 * source.ratio and not is_corrected
@@ -484,36 +489,38 @@ def _gate_sentence(analysis: Analysis) -> str:
     ratio = math.sqrt(
         float((accepted["innovation_m"] ** 2 / accepted["innovation_variance_m2"]).mean())
     )
-    rejected = int((innovations["rejected"] > 0.0).sum())
+    rejected_count = int((innovations["rejected"] > 0.0).sum())
     return (
-        f"EKF2's gate rejected {rejected} of {len(innovations)} positions. They count among the "
-        f"innovations, but did not move its state. Over the accepted positions its innovation ÷ √S "
-        f"is {format_ratio(ratio)}."
+        f"EKF2's gate rejected {rejected_count} of {len(innovations)} positions. They count among "
+        f"the innovations, but did not move its state. Over the accepted positions its innovation "
+        f"÷ √S is {format_ratio(ratio)}."
     )
 
 
-def _difference(effect: Effect, ranked: Sequence[RankedCause]) -> str:
-    if effect.difference_rms_m is None or not ranked:
+def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> str:
+    if effect.difference_rms_m is None or not ranked_causes:
         return ""
     text = f"KF − EKF2: {format_metres(effect.difference_rms_m)} m RMS"
-    trials = ranked[0].trials
-    owners = {
+    trials = ranked_causes[0].trials
+    filter_names = {
         trial.filter
         for trial in trials
         if improvement(trial) in BETTER_POSITION or not can_show_effect(trial)
     }
-    if len(owners) == 2:
+    if len(filter_names) == 2:
         return f"{text}. Both filters have the fault, so this difference does not show it."
     after = {trial.filter: trial.after.difference_rms_m for trial in reversed(trials)}
-    owner: FilterName = "ekf2" if owners == {"ekf2"} or set(after) == {"ekf2"} else "kf"
-    after_m = after.get(owner)
+    filter_name: FilterName = "ekf2" if filter_names == {"ekf2"} or set(after) == {"ekf2"} else "kf"
+    after_m = after.get(filter_name)
     if after_m is None:
         return f"{text}."
-    predicted = "predicted " if owner == "ekf2" else ""
-    return f"{text}; {format_metres(after_m)} m {predicted}with {FILTER_NAMES[owner]} corrected."
+    predicted = "predicted " if filter_name == "ekf2" else ""
+    return (
+        f"{text}; {format_metres(after_m)} m {predicted}with {FILTER_NAMES[filter_name]} corrected."
+    )
 
 
-def _notes(roots: Sequence[Finding], log: str) -> tuple[Note, ...]:
+def _make_notes(roots: Sequence[Finding], log: str) -> tuple[Note, ...]:
     return tuple(
         Note(finding.id, f"{finding.title}.", with_log_name(finding.remedy, log))
         for finding in roots
@@ -538,14 +545,14 @@ def _identity(
 
 
 def _settings(analysis: Analysis, request: ComparisonRequest) -> str:
-    chosen = analysis.settings
+    settings = analysis.settings
     texts = []
     for name, label, unit in (
         ("sigma_a_m_s2", "SIGMA_A", "m/s²"),
         ("sigma_z_m", "SIGMA_Z", "m"),
         ("dt_s", "DT", "s"),
     ):
-        value, origin = getattr(chosen, name), "set by option"
+        value, origin = getattr(settings, name), "set by option"
         if name == "sigma_z_m" and request.sigma_z_m is None and analysis.source.origin.is_gnss:
             origin = f"from {aid_of(analysis).noise}"
         elif value == getattr(Settings(), name):

@@ -12,12 +12,7 @@ from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import Action, Cause, FilterName, Rerun, Target, Verdict
-from px4fuse.comparison.causal_replays import (
-    CLOCK_OFFSET,
-    OUTLIERS,
-    SIGMA_A,
-    SIGMA_Z,
-)
+from px4fuse.comparison.changes import CLOCK_OFFSET, OUTLIERS, SIGMA_A, SIGMA_Z
 from px4fuse.comparison.trials import (
     Trial,
     enters_band,
@@ -32,8 +27,9 @@ from px4fuse.comparison.trials import (
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CONVENTION
-from px4fuse.findings.model import CATALOGUE, Finding
+from px4fuse.findings.model import CATALOGUE
 from px4fuse.flight import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 from px4fuse.text import with_log_name
@@ -59,7 +55,7 @@ RERUN_KINDS: Mapping[str, frozenset[str]] = {
     "ekf2_underconfident": frozenset({"process noise"}),
 }
 # Findings that make the verdicts meaningless; they are the first causes on the card
-MEANINGLESS = (
+MEANINGLESS_VERDICT_FINDINGS = (
     "log_damaged",
     "not_px4",
     "autopilot_restarted",
@@ -76,9 +72,9 @@ VERDICT_FINDINGS = frozenset(
         "ekf2_underconfident",
     }
 )
-SETTING_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
+SETTING_CHANGE_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
 # Kinds of change that shift both filters with the source, which only ground truth shows
-UNSEEN_KINDS = frozenset({"time offset", "delay", "rotation"})
+UNSEEN_CHANGE_KINDS = frozenset({"time offset", "delay", "rotation"})
 # Endings of names of parameters that PX4 reads at boot only (reboot_required in its metadata)
 REBOOT_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
 # Minimum fraction of positions rejected by EKF2 for a column of the re-run table
@@ -114,37 +110,41 @@ def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCaus
     of the source precedes a setting that would only hide it, or that leaves the error against
     ground truth as it is.
     """
-    ranked = []
+    ranked_causes = []
     for finding in roots:
         if finding.severity == "note":
             continue
         trials = confirming_trials(analysis.trials, finding)
         if finding.id in VERDICT_FINDINGS:  # a verdict remains a cause without a re-run that helps
             trials = tuple(filter(is_useful, trials))
-        elif trials and not any(has_effect(each) or not can_show_effect(each) for each in trials):
+        elif trials and not any(
+            has_effect(trial) or not can_show_effect(trial) for trial in trials
+        ):
             continue
-        ranked.append(
-            RankedCause(finding, _tier(finding, trials), sum(map(reduction, trials)), trials)
+        ranked_causes.append(
+            RankedCause(finding, _cause_rank(finding, trials), sum(map(reduction, trials)), trials)
         )
-    has_cause = any(each.finding.id not in VERDICT_FINDINGS for each in ranked)
-    ranked = [each for each in ranked if not (has_cause and each.finding.id in VERDICT_FINDINGS)]
+    has_cause = any(trial.finding.id not in VERDICT_FINDINGS for trial in ranked_causes)
+    ranked_causes = [
+        trial for trial in ranked_causes if not (has_cause and trial.finding.id in VERDICT_FINDINGS)
+    ]
     return sorted(
-        ranked,
-        key=lambda each: (
-            each.tier,
-            each.tier in (1, 2, 3) and _is_setting(each.finding),
-            -each.reduction,
+        ranked_causes,
+        key=lambda trial: (
+            trial.tier,
+            trial.tier in (1, 2, 3) and _is_setting(trial.finding),
+            -trial.reduction,
         ),
     )
 
 
 def _is_setting(finding: Finding) -> bool:
     kinds = RERUN_KINDS.get(finding.id, frozenset())
-    return bool(kinds) and kinds <= SETTING_KINDS
+    return bool(kinds) and kinds <= SETTING_CHANGE_KINDS
 
 
-def _tier(finding: Finding, trials: Iterable[Trial]) -> int:
-    if finding.id in MEANINGLESS or CONVENTION in finding.evidence:
+def _cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
+    if finding.id in MEANINGLESS_VERDICT_FINDINGS or CONVENTION in finding.evidence:
         return 0
     if _is_setting(finding) and any(map(leaves_error, trials)):
         return 3
@@ -163,18 +163,18 @@ def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial,
     """
     kinds = RERUN_KINDS.get(finding.id, frozenset())
     kinds |= {"defaults"} if "noises" in kinds else set()
-    best: dict[tuple[FilterName, str], Trial] = {}
+    best_trials: dict[tuple[FilterName, str], Trial] = {}
     for trial in trials:
         if len(trial.kinds) == 1 and trial.kinds[0] in kinds:
             key = trial.filter, trial.kinds[0]
-            best[key] = min(trial, best.get(key, trial), key=preference)
-    return tuple(best.values())
+            best_trials[key] = min(trial, best_trials.get(key, trial), key=preference)
+    return tuple(best_trials.values())
 
 
 def can_show_effect(trial: Trial) -> bool:
     """Return False if only ground truth, which is missing, could show the effect of a re-run."""
     has_truth = trial.before.position_rmse_m is not None
-    return has_truth or UNSEEN_KINDS.isdisjoint(trial.kinds) or has_effect(trial)
+    return has_truth or UNSEEN_CHANGE_KINDS.isdisjoint(trial.kinds) or has_effect(trial)
 
 
 def is_useful(trial: Trial) -> bool:
@@ -183,18 +183,21 @@ def is_useful(trial: Trial) -> bool:
 
 
 def make_cause(
-    analysis: Analysis, ranked: RankedCause, verdicts: Sequence[Verdict], request: ComparisonRequest
+    analysis: Analysis,
+    ranked_cause: RankedCause,
+    verdicts: Sequence[Verdict],
+    request: ComparisonRequest,
 ) -> Cause:
     """Make the numbered cause of a finding, with actions for sender, KF and EKF2."""
-    finding, trials = ranked.finding, ranked.trials
-    useful = [trial for trial in trials if is_useful(trial)]
-    alternatives, actions = _actions(analysis, ranked, useful, verdicts, request)
+    finding, trials = ranked_cause.finding, ranked_cause.trials
+    useful_trials = [trial for trial in trials if is_useful(trial)]
+    alternatives, actions = _make_actions(analysis, ranked_cause, useful_trials, verdicts, request)
     return structs.replace(
         make_plain_cause(finding),
         alternatives=alternatives,
         actions=actions,
         reruns=tuple(_rerun(trial, trials) for trial in trials if can_show_effect(trial)),
-        after=_closing_sentence(analysis, useful, alternatives),
+        after=_closing_sentence(analysis, useful_trials, alternatives),
     )
 
 
@@ -204,31 +207,37 @@ def make_plain_cause(finding: Finding) -> Cause:
         id=finding.id,
         severity="error" if finding.severity == "error" else "warning",
         title=finding.title,
-        why=_reason(finding),
+        why=_cause_reason(finding),
         spans_s=finding.spans_s,
-        actions=(Action(_target(finding), finding.remedy),) if finding.remedy else (),
+        actions=(Action(_target_of(finding), finding.remedy),) if finding.remedy else (),
     )
 
 
-def _reason(finding: Finding) -> str:
+def _cause_reason(finding: Finding) -> str:
     return finding.message.removeprefix(finding.title).lstrip(". ")
 
 
-def _actions(
+def _make_actions(
     analysis: Analysis,
-    ranked: RankedCause,
-    useful: Sequence[Trial],
+    ranked_cause: RankedCause,
+    useful_trials: Sequence[Trial],
     verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
     """Return the alternatives, of which one action is enough, and the other actions."""
-    finding, by_kind = ranked.finding, {(each.filter, each.kinds[0]): each for each in useful}
+    finding, by_kind = (
+        ranked_cause.finding,
+        {
+            (useful_trial.filter, useful_trial.kinds[0]): useful_trial
+            for useful_trial in useful_trials
+        },
+    )
     alternatives: tuple[tuple[Action, ...], ...] = ()
     actions: list[Action] = []
-    general = None
+    general_action = None
     if finding.remedy:
         remedy = with_log_name(finding.remedy, request.log)
-        general = Action(_target(finding, analysis.source), remedy)
+        general_action = Action(_target_of(finding, analysis.source), remedy)
     delay = by_kind.get(("ekf2", "delay"))
     if offset := by_kind.get(("ekf2", "time offset")) or by_kind.get(("kf", "time offset")):
         shift = offset.change[CLOCK_OFFSET] - analysis.settings.clock_offset_s * (
@@ -236,19 +245,19 @@ def _actions(
         )
         verb = f"subtract {-shift:.3f} s from" if shift < 0 else f"add {shift:.3f} s to"
         sender = Action("sender", f"{verb} the timestamp (usec) of each position")
-        if analysis.source.origin.is_gnss and general is not None:
-            sender = general  # a GNSS receiver does not let the user shift its timestamps
+        if analysis.source.origin.is_gnss and general_action is not None:
+            sender = general_action  # a GNSS receiver does not let the user shift its timestamps
         if delay is not None:
             alternatives = ((sender,), (set_parameters(analysis, delay.change),))
         else:
             actions.append(sender)
     elif delay is not None:
         actions.append(set_parameters(analysis, delay.change))
-    elif general is not None and not (_is_setting(finding) and ranked.trials):
-        actions.append(general)
-    for (owner, kind), trial in by_kind.items():
+    elif general_action is not None and not (_is_setting(finding) and ranked_cause.trials):
+        actions.append(general_action)
+    for (filter_name, kind), trial in by_kind.items():
         if (
-            owner == "kf"
+            filter_name == "kf"
             and kind != "defaults"
             and trial.change.keys() <= COMPARISON_OPTIONS.keys()
         ):
@@ -256,7 +265,7 @@ def _actions(
             defaults = by_kind["kf", "defaults"].change if is_default else {}
             actions.append(run_again(request, trial.change, defaults))
         elif (
-            owner == "ekf2"
+            filter_name == "ekf2"
             and kind not in ("delay", "time offset")
             and trial.change.keys() <= PARAMETERS.keys()
         ):
@@ -264,11 +273,11 @@ def _actions(
     actions.sort(
         key=lambda action: action.target == "KF"
     )  # fix the vehicle before the analysis of this log
-    named = {action.target for group in (actions, *alternatives) for action in group}
+    targets = {action.target for group in (actions, *alternatives) for action in group}
     reasons = {
         name: reason
-        for owner, name in FILTER_NAMES.items()
-        if name not in named and (reason := _no_change(finding, owner, verdicts))
+        for filter_name, name in FILTER_NAMES.items()
+        if name not in targets and (reason := _no_change_reason(finding, filter_name, verdicts))
     }
     if len(reasons) == 2 and len(set(reasons.values())) == 1:
         reasons = {"KF, EKF2": reasons["KF"]}
@@ -276,21 +285,23 @@ def _actions(
     return alternatives, tuple(actions)
 
 
-def _no_change(finding: Finding, owner: FilterName, verdicts: Sequence[Verdict]) -> str:
+def _no_change_reason(
+    finding: Finding, filter_name: FilterName, verdicts: Sequence[Verdict]
+) -> str:
     """Return the reason why a filter needs no change, or "" if it is not evaluated."""
     words = {
         verdict.against: verdict.word
         for verdict in verdicts
-        if verdict.filter == owner and verdict.ratio is not None
+        if verdict.filter == filter_name and verdict.ratio is not None
     }
     if not words:
         return ""
     if set(words.values()) == {"consistent"}:
-        if "truth" not in words and RERUN_KINDS.get(finding.id, frozenset()) & UNSEEN_KINDS:
+        if "truth" not in words and RERUN_KINDS.get(finding.id, frozenset()) & UNSEEN_CHANGE_KINDS:
             return "no change tested: only ground truth shows the effect of this fault"
         return "no change: consistent"
     if finding.id == "source_outliers":
-        if owner == "kf":
+        if filter_name == "kf":
             return "no option rejects outliers; do not raise --sigma-z for them"
         if words.get("truth", "consistent") == "consistent":
             return "no change: its gate rejects outliers, and σ covers the error"
@@ -299,7 +310,7 @@ def _no_change(finding: Finding, owner: FilterName, verdicts: Sequence[Verdict])
     )
 
 
-def _target(finding: Finding, source: PositionTrack | None = None) -> Target:
+def _target_of(finding: Finding, source: PositionTrack | None = None) -> Target:
     target = TARGETS_BY_ID.get(finding.id) or TARGETS[CATALOGUE[finding.id].group]
     is_receiver = target == "sender" and source is not None and source.origin.is_gnss
     return "receiver" if is_receiver else target
@@ -320,11 +331,13 @@ def run_again(
 def set_parameters(analysis: Analysis, change: Mapping[str, float]) -> Action:
     """Return the console lines that set parameters of EKF2, with old and new values."""
     model = analysis.ekf2_model
-    flown = {} if isinstance(model, Unavailable) else model.inputs.settings
+    flown_settings = {} if isinstance(model, Unavailable) else model.inputs.settings
     texts, commands, needs_reboot = [], [], False
     for name, value in change.items():
         parameter = PARAMETERS[name]
-        change_text = f"{name} {flown.get(name, math.nan):g} → {value:g} {parameter.printed_unit}"
+        change_text = (
+            f"{name} {flown_settings.get(name, math.nan):g} → {value:g} {parameter.printed_unit}"
+        )
         texts.append(change_text.rstrip())
         commands.append(f"param set {name} {value:g}")
         needs_reboot |= name.endswith(REBOOT_SUFFIXES)
@@ -337,25 +350,27 @@ def set_parameters(analysis: Analysis, change: Mapping[str, float]) -> Action:
 
 
 def _rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
-    before, after = ratios(trial.before), ratios(trial.after)
-    rejected = _both(trial.before.rejected_fraction, trial.after.rejected_fraction)
+    ratios_before, ratios_after = ratios(trial.before), ratios(trial.after)
+    rejected_fractions = _change_pair(trial.before.rejected_fraction, trial.after.rejected_fraction)
     return Rerun(
-        label=_label(trial, trials),
+        label=_trial_label(trial, trials),
         is_prediction=trial.filter == "ekf2",
         from_s=trial.from_s,
-        position_rmse_m=_both(trial.before.position_rmse_m, trial.after.position_rmse_m),
-        source_ratio=_both(before.get("source"), after.get("source")),
-        truth_ratio=_both(before.get("truth"), after.get("truth")),
-        rejected_fraction=rejected if rejected and max(rejected) >= MIN_SHOWN_REJECTION else None,
+        position_rmse_m=_change_pair(trial.before.position_rmse_m, trial.after.position_rmse_m),
+        source_ratio=_change_pair(ratios_before.get("source"), ratios_after.get("source")),
+        truth_ratio=_change_pair(ratios_before.get("truth"), ratios_after.get("truth")),
+        rejected_fraction=rejected_fractions
+        if rejected_fractions and max(rejected_fractions) >= MIN_SHOWN_REJECTION
+        else None,
         improves=improvement(trial),
     )
 
 
-def _both(before: float | None, after: float | None) -> tuple[float, float] | None:
+def _change_pair(before: float | None, after: float | None) -> tuple[float, float] | None:
     return None if before is None or after is None else (before, after)
 
 
-def _label(trial: Trial, trials: Sequence[Trial]) -> str:
+def _trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
     kind = trial.kinds[0]
     if OUTLIERS in trial.change:
         name = "KF" if trial.filter == "kf" else "EKF2 (replay)"
@@ -375,7 +390,7 @@ def _label(trial: Trial, trials: Sequence[Trial]) -> str:
 
 
 def _closing_sentence(
-    analysis: Analysis, useful: Sequence[Trial], alternatives: Sequence[object]
+    analysis: Analysis, useful_trials: Sequence[Trial], alternatives: Sequence[object]
 ) -> str:
     """Return the sentence below the re-runs: one action is enough, or the default is as good."""
     if alternatives:
@@ -384,17 +399,23 @@ def _closing_sentence(
             "(this log only) is added to the timestamps (s), the delay parameter is the age of a "
             "position (ms)."
         )
-    if any(trial.kinds == ("defaults",) for trial in useful):
+    if any(trial.kinds == ("defaults",) for trial in useful_trials):
         return "Both values are consistent; the default needs no option."
-    tuned = analysis.tuning.get(HORIZONTAL)
-    for trial in useful:
+    horizontal_tuning = analysis.tuning.get(HORIZONTAL)
+    for trial in useful_trials:
         name = next(iter(trial.change))
-        if trial.kinds != ("noise",) or not isinstance(tuned, AxisTuning):
+        if trial.kinds != ("noise",) or not isinstance(horizontal_tuning, AxisTuning):
             continue
         default = analysis.flight.log.default_of(name)
-        if (tuned.sigma_z.low or 0.0) <= default <= (tuned.sigma_z.high or 0.0):
+        if (
+            (horizontal_tuning.sigma_z.low or 0.0)
+            <= default
+            <= (horizontal_tuning.sigma_z.high or 0.0)
+        ):
             return f"PX4's default, {default:g} m, is inside the 95 % interval: it is as good."
-    after = [math.sqrt(trial.after.nees_mean) for trial in useful if trial.after.nees_mean]
-    if after and classify_ratio(min(after), "truth") == "overconfident":
+    ratios_after = [
+        math.sqrt(trial.after.nees_mean) for trial in useful_trials if trial.after.nees_mean
+    ]
+    if ratios_after and classify_ratio(min(ratios_after), "truth") == "overconfident":
         return "Against ground truth, σ stays too small after this fix: another error remains."
     return ""

@@ -15,7 +15,7 @@ VerdictWord = Literal["consistent", "overconfident", "underconfident", "not eval
 Target = Literal["sender", "receiver", "source", "logging", "flight", "KF", "EKF2", "KF, EKF2"]
 
 # Limits of the σ ratio of a consistent filter: against the source, and against ground truth
-BANDS = CONSISTENT_RATIOS
+SIGMA_RATIO_BANDS = CONSISTENT_RATIOS
 # Ends of the logarithmic axis of σ ratios; a ratio beyond is drawn as a triangle at the end
 AXIS_ENDS = (0.1, 10.0)
 # Ticks of the logarithmic axis of σ ratios, with their labels

@@ -18,29 +18,29 @@ from px4fuse.filter.consistency import (
 from px4fuse.flight import Unavailable
 
 # Length (s) of the blocks of the bootstrap: position errors are correlated over seconds
-BLOCK_S = 10.0
-DRAWS = 2000
+BOOTSTRAP_BLOCK_S = 10.0
+BOOTSTRAP_RESAMPLES = 2000
 # Minimum number of blocks for an interval of the RMS; with fewer it is far too narrow
-MIN_BLOCKS = 4
+MIN_BOOTSTRAP_BLOCKS = 4
 
 
 def verdicts(result: AxisComparison) -> tuple[Verdict, ...]:
     """Return the verdicts along one axis: KF and EKF2, each against source and ground truth."""
     return tuple(
         verdict
-        for owner in ("kf", "ekf2")
-        for verdict in (_against_source(result, owner), _against_truth(result, owner))
+        for filter_name in ("kf", "ekf2")
+        for verdict in (_against_source(result, filter_name), _against_truth(result, filter_name))
     )
 
 
-def _against_source(result: AxisComparison, owner: FilterName) -> Verdict:
-    statement = result.filters[owner]
+def _against_source(result: AxisComparison, filter_name: FilterName) -> Verdict:
+    statement = result.filters[filter_name]
     if not isinstance(statement, FilterSummary):
-        return _not_evaluated(owner, "source", statement)
+        return _not_evaluated(filter_name, "source", statement)
     ratio = statement.sigma_ratio
     interval = ratio_interval(statement.nis_mean, statement.nis_band)
     return Verdict(
-        filter=owner,
+        filter=filter_name,
         against="source",
         ratio=ratio,
         interval=interval,
@@ -49,18 +49,18 @@ def _against_source(result: AxisComparison, owner: FilterName) -> Verdict:
     )
 
 
-def _against_truth(result: AxisComparison, owner: FilterName) -> Verdict:
-    truth = result.filters[owner].truth
+def _against_truth(result: AxisComparison, filter_name: FilterName) -> Verdict:
+    truth = result.filters[filter_name].truth
     if isinstance(truth, Unavailable):
-        return _not_evaluated(owner, "truth", truth)
-    errors = normalised_position_errors(result, owner)
+        return _not_evaluated(filter_name, "truth", truth)
+    errors = normalised_position_errors(result, filter_name)
     if isinstance(errors, Unavailable):
-        return _not_evaluated(owner, "truth", errors)
+        return _not_evaluated(filter_name, "truth", errors)
     time_s, normalised = errors
     ratio = float(np.sqrt(np.mean(np.square(normalised))))
     interval = block_bootstrap_rms(time_s, normalised)
     return Verdict(
-        filter=owner,
+        filter=filter_name,
         against="truth",
         ratio=ratio,
         interval=interval,
@@ -69,15 +69,18 @@ def _against_truth(result: AxisComparison, owner: FilterName) -> Verdict:
     )
 
 
-def _not_evaluated(owner: FilterName, against: Reference, missing: Unavailable) -> Verdict:
-    return Verdict(filter=owner, against=against, word="not evaluated", reason=missing.reason)
+def _not_evaluated(
+    filter_name: FilterName, reference: Reference, unavailable: Unavailable
+) -> Verdict:
+    return Verdict(
+        filter=filter_name, against=reference, word="not evaluated", reason=unavailable.reason
+    )
 
 
 def block_bootstrap_rms(time_s: Array, values: Array) -> tuple[float, float] | None:
     """Return the 95 % interval of an RMS by the moving-block bootstrap, or None if too short.
 
-    Künsch (1989), Annals of Statistics 17(3). Blocks have :data:`BLOCK_S` seconds; the seed is
-    fixed, so that a report can be made again.
+    Künsch (1989), Annals of Statistics 17(3). The seed is fixed, so that the result is repeatable.
 
     Parameters
     ----------
@@ -85,14 +88,16 @@ def block_bootstrap_rms(time_s: Array, values: Array) -> tuple[float, float] | N
         Increasing.
     values : ndarray, shape (n,)
     """
-    blocks = int((time_s[-1] - time_s[0]) / BLOCK_S) if len(time_s) > 1 else 0
-    if blocks < MIN_BLOCKS:
+    block_count = int((time_s[-1] - time_s[0]) / BOOTSTRAP_BLOCK_S) if len(time_s) > 1 else 0
+    if block_count < MIN_BOOTSTRAP_BLOCKS:
         return None
-    starts = np.arange(np.searchsorted(time_s, time_s[-1] - BLOCK_S, side="right"))
-    ends = np.searchsorted(time_s, time_s[starts] + BLOCK_S)
+    starts = np.arange(np.searchsorted(time_s, time_s[-1] - BOOTSTRAP_BLOCK_S, side="right"))
+    ends = np.searchsorted(time_s, time_s[starts] + BOOTSTRAP_BLOCK_S)
     sums = np.concatenate(([0.0], np.cumsum(np.square(values))))
-    drawn = np.random.default_rng(0).integers(len(starts), size=(DRAWS, blocks))
-    total = (sums[ends] - sums[starts])[drawn].sum(axis=1)
-    count = (ends - starts)[drawn].sum(axis=1)
-    low, high = np.percentile(np.sqrt(total / count), (2.5, 97.5))
+    drawn_starts = np.random.default_rng(0).integers(
+        len(starts), size=(BOOTSTRAP_RESAMPLES, block_count)
+    )
+    square_sum = (sums[ends] - sums[starts])[drawn_starts].sum(axis=1)
+    count = (ends - starts)[drawn_starts].sum(axis=1)
+    low, high = np.percentile(np.sqrt(square_sum / count), (2.5, 97.5))
     return float(low), float(high)

@@ -15,7 +15,7 @@ from px4fuse.cli.compare import SEVERITIES, Severity
 from px4fuse.errors import SettingsError
 from px4fuse.fleet import TIMEOUT_S
 
-FAILED = "failed"
+FAILED_STATUS = "failed"
 # Types of clusters for which --scheduler NAME prints instructions, from NAME.txt in this folder
 CLUSTERS = ("slurm", "kubernetes")
 
@@ -54,7 +54,7 @@ CLUSTERS = ("slurm", "kubernetes")
 )
 @options.settings_options
 @options.fail_option(
-    (FAILED, *SEVERITIES),
+    (FAILED_STATUS, *SEVERITIES),
     "Exit with code 1 if a log failed or has a finding of at least this severity.",
 )
 @options.open_option
@@ -95,10 +95,10 @@ def batch(
     except KeyboardInterrupt as interrupt:
         message = f"finished results are in {output}. Run the same command to continue."
         raise outputs.Interrupted(interrupt, message) from None
-    outputs.write_and_print({}, format_summary(fleet), written=fleet.written)
+    outputs.write_and_print({}, format_summary(fleet), written_files=fleet.written)
     severities = SEVERITIES[: SEVERITIES.index(fail_on) + 1] if fail_on in SEVERITIES else ()
-    failed = fail_on is not None and bool((fleet.table["status"] == FAILED).any())
-    if failed or fleet.severities & set(severities):
+    has_failed = fail_on is not None and bool((fleet.table["status"] == FAILED_STATUS).any())
+    if has_failed or fleet.severities & set(severities):
         sys.exit(1)
 
 

@@ -56,7 +56,7 @@ def extract(
             '--format parquet requires pyarrow. Run pip install "px4fuse[parquet]", or '
             "use --format csv."
         )
-    from px4fuse.analysis import read_flight
+    from px4fuse.diagnose import read_flight
     from px4fuse.inspect import tables as extraction
     from px4fuse.results.contract import to_json
 
@@ -72,8 +72,8 @@ def extract(
     for name, table in tables.items():
         click.echo(f"  {f'{name}.{format}':44} {len(table):8} rows")
     click.echo("  data_dictionary.csv, flight.json")
-    for missing in extraction.unavailable_parts(flight):
-        click.echo(f"Not exported: {missing.what} ({missing.reason})")
+    for missing_part in extraction.unavailable_parts(flight):
+        click.echo(f"Not exported: {missing_part.what} ({missing_part.reason})")
 
 
 def _require_same_flight(folder: Path, sha256: str) -> None:

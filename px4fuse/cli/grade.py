@@ -176,12 +176,12 @@ def grade(
     except KeyboardInterrupt as interrupt:
         message = f"finished results are in {output}. Run the same command to continue."
         raise Interrupted(interrupt, message) from None
-    write_and_print({}, _page(outcome), written=outcome.written_paths)
+    write_and_print({}, _page(outcome), written_files=outcome.written_paths)
 
 
 def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None:
-    resolved = output.resolve()
-    parents = [folder for folder in (resolved, *resolved.parents) if folder.is_dir()]
+    resolved_path = output.resolve()
+    parents = [folder for folder in (resolved_path, *resolved_path.parents) if folder.is_dir()]
     for path in input_paths:
         if path.is_dir() and any(map(path.samefile, parents)):
             raise OutputError(
@@ -210,14 +210,16 @@ def _page(outcome: GradeOutcome) -> Page:
         name = one_line(entry.student or entry.student_id, 60)
         file, flags = attempt.submission if attempt else "", f"{len(entry.flags) or ''}"
         rows.append((name, file, (status, status_colour), f"{total} / {entry.max_points:g}", flags))
-    page.table(("student", "submission", "status", "points", "flags"), rows, right=(3, 4))
+    page.table(
+        ("student", "submission", "status", "points", "flags"), rows, right_aligned_columns=(3, 4)
+    )
     counts = Counter(attempt.status for attempt in outcome.reports)
     status_counts = ", ".join(f"{count} {status}" for status, count in counts.most_common())
-    missing = sum(entry.counted_report is None for entry in outcome.entries)
+    missing_count = sum(entry.counted_report is None for entry in outcome.entries)
     page.write(
         f"{len(outcome.reports)} submissions: {status_counts or 'none'}; no submission from "
-        f"{missing} of {len(outcome.entries)} students; {outcome.reused_count} submissions were "
-        "verified in an earlier run"
+        f"{missing_count} of {len(outcome.entries)} students; {outcome.reused_count} submissions "
+        "were verified in an earlier run"
     )
     for note in outcome.notes:
         page.write(note, colour=MUTED_COLOUR)

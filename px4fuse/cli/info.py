@@ -53,7 +53,7 @@ def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
     Lists topics, rates (Hz) and gaps, the possible analyses, the reasons why other analyses are
     not possible, and settings to log the missing data on the next flight.
     """
-    from px4fuse.analysis import read_flight
+    from px4fuse.diagnose import read_flight
     from px4fuse.inspect.inventory import take_inventory, to_plain
 
     request = comparison_request(log, option_values)
@@ -76,8 +76,12 @@ def _page(inventory: Inventory, request: ComparisonRequest) -> Page:
     for label, text in _describe_log(inventory):
         page.write_labelled(label, text)
     if inventory.flight.log.senders:
-        page.table(("sender", "type", "messages", "lost"), _sender_rows(inventory), right=(2, 3))
-    page.table(SOURCES_HEAD, list(_source_rows(inventory)), right=(2, 3, 4, 5))
+        page.table(
+            ("sender", "type", "messages", "lost"),
+            _sender_rows(inventory),
+            right_aligned_columns=(2, 3),
+        )
+    page.table(SOURCES_HEAD, list(_source_rows(inventory)), right_aligned_columns=(2, 3, 4, 5))
     answer_styles = {True: ("yes", GOOD_COLOUR), False: ("no", SEVERITY_COLOURS["warning"])}
     rows = [
         (answer_styles[option.possible], option.name, option.reason)
@@ -130,7 +134,7 @@ def _describe_log(inventory: Inventory) -> list[tuple[str, str]]:
 
 
 def _duration_text(seconds: float) -> str:
-    return f"{seconds:.{1 if seconds >= 1 else 3}f} s" if seconds else "data of one time only"
+    return f"{seconds:.{1 if seconds >= 1 else 3}f} s" if seconds else "all data have the same time"
 
 
 def _start_text(inventory: Inventory) -> str:
@@ -144,7 +148,7 @@ def _airborne_text(inventory: Inventory) -> str:
     if isinstance(airborne, Unavailable):
         return "unknown (the log contains no land detector)"
     if not airborne:
-        return "never, according to the land detector"
+        return "the land detector never reported a flight"
     spans = [f"{start:.1f} s to {end:.1f} s" for start, end in airborne]
     return join_first(spans, 3)
 

@@ -162,7 +162,7 @@ def loop(
     trajectory (TUM, EuRoC, ORB-SLAM3), or a pose graph (g2o), which is optimised. Writes a PDF
     report and the results as JSON, except for a pose graph.
     """
-    from px4fuse.analysis import run_loop
+    from px4fuse.diagnose import analyse_loop_closure
     from px4fuse.loop.tracks import file_name, is_g2o, split_part
     from px4fuse.report.loop import summary
     from px4fuse.results.build import loop_results
@@ -179,7 +179,7 @@ def loop(
     request = loop_request(source, option_values)
     outputs.check_targets([tum, g2o, *outputs.report_paths(output, json_path)])
     with outputs.progress(json_path) as show_progress:
-        loop_result = run_loop(request, show_progress)
+        loop_result = analyse_loop_closure(request, show_progress)
         results = loop_results(request, loop_result, student)
         if output is None and json_path is None:
             output = outputs.default_report(
@@ -207,13 +207,15 @@ def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict
 
     contents = {}
     if tum is not None:
-        best = loop_result.best
-        if best is loop_result.odometry:
+        best_path = loop_result.best
+        if best_path is loop_result.odometry:
             raise MissingDataError(
                 f"--tum {display_name(tum)}: no corrected path exists, as no loop closure was "
                 "accepted. Give a loop closure (--closure) or the landing place (--landed-at)."
             )
-        contents[tum] = tum_text(from_z_down(best.trajectory, loop_result.original_frame)).encode()
+        contents[tum] = tum_text(
+            from_z_down(best_path.trajectory, loop_result.original_frame)
+        ).encode()
     if g2o is not None:
         contents[g2o] = g2o_text(loop_result.solved_graph()).encode()
     return contents
@@ -242,10 +244,10 @@ def _solve_graph(
     outputs.check_targets([json_path, g2o])
     with outputs.progress(json_path) as show_progress:
         show_progress(f"reading {display_name(source)}")
-        solved = analyse_graph(
+        solved_graph = analyse_graph(
             display_name(source), read_g2o(path), show_progress, run_robust=robust
         )
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
-    contents = {} if g2o is None else {g2o: g2o_text(solved.graph).encode()}
-    contents |= outputs.result_files(graph_results(solved, command), json_path)
-    outputs.write_and_print(contents, graph_summary(solved))
+    contents = {} if g2o is None else {g2o: g2o_text(solved_graph.graph).encode()}
+    contents |= outputs.result_files(graph_results(solved_graph, command), json_path)
+    outputs.write_and_print(contents, graph_summary(solved_graph))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 from click.core import ParameterSource
 
-from px4fuse.cli.outputs import OPEN_KEY
+from px4fuse.cli.outputs import OPENS_OUTPUT_KEY
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import DT_RANGE_S, SIGMA_A_RANGE_M_S2, SIGMA_Z_RANGE_M
 from px4fuse.input_files import add_input
@@ -29,7 +29,7 @@ from px4fuse.request import (
     PositionFile,
     SourceKind,
 )
-from px4fuse.units import NAMES, convert_to_unit
+from px4fuse.units import UNIT_NAMES, convert_to_unit
 
 if TYPE_CHECKING:
     from px4fuse.results.model import Student
@@ -86,7 +86,7 @@ class TypedQuantity(click.ParamType["float | str"]):
     Parameters
     ----------
     unit : str
-        One of :data:`px4fuse.units.NAMES`.
+        One of :data:`px4fuse.units.UNIT_NAMES`.
     example : float
         Number that the error message suggests if the typed text is not a number.
     auto : bool
@@ -108,7 +108,7 @@ class TypedQuantity(click.ParamType["float | str"]):
     ) -> float | str:
         if self.auto and value == AUTO:
             return str(value)
-        unit = f" in {NAMES[self.unit]}" if self.unit else ""
+        unit = f" in {UNIT_NAMES[self.unit]}" if self.unit else ""
         try:
             number = float(value)
         except ValueError:
@@ -188,7 +188,7 @@ def _open_flag(*names: str) -> Option:
         *names,
         is_flag=True,
         expose_value=False,
-        callback=lambda ctx, _, value: ctx.meta.update({OPEN_KEY: value}),
+        callback=lambda ctx, _, value: ctx.meta.update({OPENS_OUTPUT_KEY: value}),
         help="Open the written report or page in its default program.",
     )
 

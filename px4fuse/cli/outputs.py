@@ -38,7 +38,7 @@ UNWRAPPED_WIDTH = 10_000
 # Key in the context of click for the list of files that this run has written
 WRITTEN_KEY = "px4fuse.written"
 # Key in the context of click: True if px4fuse opens the output in its default program
-OPEN_KEY = "px4fuse.opened"
+OPENS_OUTPUT_KEY = "px4fuse.opens_output"
 # Suffixes of files that --open can open, the preferred suffix first
 OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
 # Element in the head of a web page with the command and the SHA-256 of its log
@@ -251,14 +251,14 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
         A path is not possible, or an output cannot be written.
     """
     check_targets(contents)
-    written: list[Path] = click.get_current_context().meta.setdefault(WRITTEN_KEY, [])
-    write_all(contents, written.append)
+    written_files: list[Path] = click.get_current_context().meta.setdefault(WRITTEN_KEY, [])
+    write_all(contents, written_files.append)
 
 
 def written_so_far(context: click.Context) -> str:
     """Format a sentence with the files that this run has written, for a run that ends early."""
-    written: list[Path] = context.meta.get(WRITTEN_KEY, [])
-    return f"{written_before(written)}." if written else "nothing was written."
+    written_files: list[Path] = context.meta.get(WRITTEN_KEY, [])
+    return f"{written_before(written_files)}." if written_files else "nothing was written."
 
 
 def write_new(path: Path, content: bytes) -> None:
@@ -303,7 +303,7 @@ def write_and_print(
     contents: Mapping[Path, bytes],
     page: Page | None = None,
     request: Request | None = None,
-    written: Iterable[Path] = (),
+    written_files: Iterable[Path] = (),
 ) -> None:
     """Write all outputs, print the results and the file names, and open one file for --open.
 
@@ -315,13 +315,13 @@ def write_and_print(
         Results to print.
     request : Request, optional
         Request of the analysis, whose files and options complete the printed commands.
-    written : iterable of Path
+    written_files : iterable of Path
         Files that the command has already written; their names are printed too.
     """
     from px4fuse.report.screen import print_line, show
 
     write_outputs(contents)
-    files = [*contents, *written]
+    files = [*contents, *written_files]
     if STANDARD_OUTPUT not in contents:
         console = terminal()
         if page is not None:
@@ -331,7 +331,7 @@ def write_and_print(
     openable_files = [
         path for suffix in OPENABLE_SUFFIXES for path in files if path.suffix.lower() == suffix
     ]
-    if click.get_current_context().meta.get(OPEN_KEY) and openable_files:
+    if click.get_current_context().meta.get(OPENS_OUTPUT_KEY) and openable_files:
         click.launch(str(openable_files[0].resolve()))
 
 

@@ -7,7 +7,13 @@ from pathlib import Path
 import click
 
 from px4fuse.cli.options import output_option
-from px4fuse.cli.outputs import OPEN_KEY, check_default_page, progress, web_page, write_and_print
+from px4fuse.cli.outputs import (
+    OPENS_OUTPUT_KEY,
+    check_default_page,
+    progress,
+    web_page,
+    write_and_print,
+)
 
 
 @click.command()
@@ -55,7 +61,7 @@ def practice(
     """
     seed = secrets.randbelow(10**6) if seed is None else seed
     target = web_page(output, Path("reports", f"practice_{seed}.html"))
-    ctx.meta[OPEN_KEY] = sys.stdout.isatty() if opened is None else opened
+    ctx.meta[OPENS_OUTPUT_KEY] = sys.stdout.isatty() if opened is None else opened
     with progress(target) as show_progress:
         from px4fuse.practice import practice_text
 

@@ -7,9 +7,9 @@ import click
 from px4fuse.cli.options import output_option
 from px4fuse.cli.outputs import write_and_print
 
-FOLDER = Path("sample_logs")
-SAMPLE = "aisle_uwb.ulg"
-INSTALL = 'pip install "px4fuse[samples]"'
+SAMPLES_FOLDER = Path("sample_logs")
+SAMPLE_LOG = "aisle_uwb.ulg"
+INSTALL_COMMAND = 'pip install "px4fuse[samples]"'
 
 
 def sample_log() -> Path:
@@ -24,24 +24,24 @@ def sample_log() -> Path:
 
     from px4fuse.errors import MissingDataError
 
-    local_path = FOLDER / SAMPLE
+    local_path = SAMPLES_FOLDER / SAMPLE_LOG
     if local_path.is_file():
         sample_path = local_path
     else:
         try:
-            with as_file(files("px4fuse_samples") / SAMPLE) as installed:
+            with as_file(files("px4fuse_samples") / SAMPLE_LOG) as installed:
                 sample_path = installed
         except ModuleNotFoundError:
             raise MissingDataError(
                 "No log was given, and the sample logs are not installed.",
-                f"Give the path of a log, or run {INSTALL}.",
+                f"Give the path of a log, or run {INSTALL_COMMAND}.",
             ) from None
-    click.echo(f"No log was given: the sample log {SAMPLE} is used.", err=True)
+    click.echo(f"No log was given: the sample log {SAMPLE_LOG} is used.", err=True)
     return sample_path
 
 
 @click.command()
-@output_option("DIR", "Folder to write the sample logs to.", default=FOLDER)
+@output_option("DIR", "Folder to write the sample logs to.", default=SAMPLES_FOLDER)
 def sample(output: Path) -> None:
     """Write the sample logs (aisle with UWB, loop with VIO) to a folder."""
     from importlib.resources import files
@@ -53,7 +53,9 @@ def sample(output: Path) -> None:
     try:
         logs = [file for file in files("px4fuse_samples").iterdir() if file.is_file()]
     except ModuleNotFoundError:
-        raise MissingDataError("The sample logs are not installed", f"Run {INSTALL}.") from None
+        raise MissingDataError(
+            "The sample logs are not installed", f"Run {INSTALL_COMMAND}."
+        ) from None
     contents = {output / file.name: file.read_bytes() for file in sorted(logs, key=str)}
     for path, content in contents.items():
         if path.is_file() and path.read_bytes() != content:

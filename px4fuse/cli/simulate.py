@@ -37,10 +37,10 @@ if TYPE_CHECKING:
     from px4fuse.report.page import Page
     from px4fuse.simulation.flights import Simulation
 
-_DEFAULT = Scenario()
-MIXED = "mixed"
-OUTDOOR: Kind = "outdoor"
-SOURCES = {"aisle": "UWB", "loop": "VIO", OUTDOOR: "GNSS"}
+_DEFAULT_SCENARIO = Scenario()
+MIXED_KIND = "mixed"
+OUTDOOR_KIND: Kind = "outdoor"
+SOURCE_BY_KIND = {"aisle": "UWB", "loop": "VIO", OUTDOOR_KIND: "GNSS"}
 # Options that require --assignment, and all options that are allowed together with it
 ASSIGNMENT_ONLY_OPTIONS = ("secret_file", "mistakes", "preview")
 ASSIGNMENT_OPTIONS = (
@@ -60,7 +60,10 @@ def _scenario_options(command: Command) -> Command:
     for field, quantity in reversed(quantities(Scenario).items()):
         if not quantity.meaning:
             continue
-        default, outdoors = getattr(_DEFAULT, field), DEFAULTS_OF_KIND[OUTDOOR].get(field)
+        default, outdoors = (
+            getattr(_DEFAULT_SCENARIO, field),
+            DEFAULTS_OF_KIND[OUTDOOR_KIND].get(field),
+        )
         default_text = f"{default:g}" + (f"; outdoors {outdoors:g}" if outdoors else "")
         help_text = f"{quantity.meaning}  [default: {default_text}]"
         kind = TypedQuantity(quantity.unit, default)
@@ -115,8 +118,8 @@ class WithMistakes(click.Command):
 )
 @click.option(
     "--kind",
-    type=Choice((*get_args(Kind), MIXED)),
-    default=_DEFAULT.kind,
+    type=Choice((*get_args(Kind), MIXED_KIND)),
+    default=_DEFAULT_SCENARIO.kind,
     help="Kind of flight. aisle: passes along an aisle with UWB; loop: laps of a square with "
     "drifting VIO; outdoor: laps of a square with GNSS; mixed: with --assignment, loop for one "
     "third of the students and aisle for the others.",
@@ -125,7 +128,7 @@ class WithMistakes(click.Command):
     "--seed",
     type=int,
     metavar="N",
-    default=_DEFAULT.seed,
+    default=_DEFAULT_SCENARIO.seed,
     help="Seed of the random numbers: the same N gives the same flight.",
 )
 @click.option(
@@ -191,8 +194,8 @@ def simulate(
             assignment, output, answer, *random_choices, truth=not no_truth, preview=preview
         )
         return
-    if kind == MIXED:
-        raise SettingsError(f"--kind {MIXED} requires --assignment ROSTER.csv.")
+    if kind == MIXED_KIND:
+        raise SettingsError(f"--kind {MIXED_KIND} requires --assignment ROSTER.csv.")
     if output.suffix.lower() != ".ulg":
         raise OutputError(f"{output}: the output is a ULog. Give a name ending in .ulg (-o).")
     check_targets([output, answer])
@@ -218,11 +221,11 @@ def simulate(
 
 
 def _check_options(assignment: Path | None) -> None:
-    """Reject options that are not possible with --assignment, or require it."""
-    if assignment is not None and click.get_current_context().params["kind"] == OUTDOOR:
+    """Reject options that do not fit: some exclude --assignment, others require it."""
+    if assignment is not None and click.get_current_context().params["kind"] == OUTDOOR_KIND:
         raise SettingsError(
-            f"--kind {OUTDOOR} is not available with --assignment.",
-            f"Use --kind aisle, loop or {MIXED}.",
+            f"--kind {OUTDOOR_KIND} is not available with --assignment.",
+            f"Use --kind aisle, loop or {MIXED_KIND}.",
         )
     for parameter in typed_parameters():
         if assignment is not None and parameter.name not in ASSIGNMENT_OPTIONS:
@@ -275,32 +278,36 @@ def _write_assignment(
     drawn_flights: list[tuple[tuple[str, ...], float | None]]
     if preview:
         previews = assignment.preview(students, key_file, secret, kind, count)
-        drawn_flights = [(assigned.mistake_options, assigned.difficulty) for assigned in previews]
+        drawn_flights = [(flight.mistake_options, flight.difficulty) for flight in previews]
         rows = [
             (
                 student.student_id,
                 student.name,
-                assigned.scenario.kind,
-                " ".join(assigned.mistake_options) or "none",
-                f"{assigned.difficulty:.2f}",
+                flight.scenario.kind,
+                " ".join(flight.mistake_options) or "none",
+                f"{flight.difficulty:.2f}",
             )
-            for student, assigned in zip(students, previews, strict=True)
+            for student, flight in zip(students, previews, strict=True)
         ]
-        page.table(("student", "name", "flight", "mistakes", "difficulty"), rows, right=(4,))
+        page.table(
+            ("student", "name", "flight", "mistakes", "difficulty"),
+            rows,
+            right_aligned_columns=(4,),
+        )
         closing_texts["Preview"] = (
             "no file was written. Not for students: the table lists the mistakes of each flight."
         )
     else:
         with progress() as show_progress:
             show_flight = partial(show_progress, "simulating")
-            key, written = assignment.assign(
+            key, written_files = assignment.assign(
                 students, folder, key_file, secret, kind, count, truth, show_flight
             )
         drawn_flights = [(answer.mistakes, answer.difficulty) for answer in key.answers]
         folder_text, key_text = (to_one_line(str(path)) for path in (folder, key_file))
-        existing_count = len(drawn_flights) - written
+        existing_count = len(drawn_flights) - written_files
         closing_texts["Flights"] = (
-            f"{folder_text} ({written} logs written, {existing_count} existed already)"
+            f"{folder_text} ({written_files} logs written, {existing_count} existed already)"
         )
         closing_texts["Answers"] = (
             f"{key_text} (not for students: it lists the mistakes of each flight)"
@@ -311,7 +318,9 @@ def _write_assignment(
                 "be written again and students can be added later."
             )
     counts = Counter(
-        mistake.partition("=")[0] for typed, _ in drawn_flights for mistake in typed or ("none",)
+        mistake.partition("=")[0]
+        for mistake_options, _ in drawn_flights
+        for mistake in mistake_options or ("none",)
     )
     difficulties = [difficulty for _, difficulty in drawn_flights if difficulty is not None]
     page.write_labelled_texts(
@@ -340,7 +349,7 @@ def _page(simulation: Simulation, answer: Path | None) -> Page:
         {
             "Flight": f"{scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
             f"{simulation.motion.duration_s:g} s, seed {scenario.seed}",
-            "Position": f"{SOURCES[scenario.kind]}, {scenario.source_sigma_m:g} m at "
+            "Position": f"{SOURCE_BY_KIND[scenario.kind]}, {scenario.source_sigma_m:g} m at "
             f"{scenario.source_rate_hz:g} Hz"
             + (f", drift {scenario.vio_drift:.1%} of the path" if loop else ""),
             "IMU": f"{scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²",

@@ -42,8 +42,8 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
     Prints the estimates for each axis with 95 % intervals, and compares them with --sigma-a and
     --sigma-z. LOG is a PX4 ULog or a MAVLink recording.
     """
-    from px4fuse.analysis import prepare_comparison
     from px4fuse.comparison.estimates import tuned as tuned_noises
+    from px4fuse.diagnose import prepare_comparison
     from px4fuse.errors import MissingDataError
     from px4fuse.results.build import tuning_results
 
@@ -52,13 +52,13 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
     with progress(json_path) as show_progress:
         comparison = prepare_comparison(request, show_progress)
         tunings = tuned_noises(comparison, progress=show_progress)
-    missing = [
+    missing_axes = [
         noise_result for noise_result in tunings.values() if isinstance(noise_result, Unavailable)
     ]
-    if len(missing) == len(tunings):
-        name, reason = comparison.flight.log.name, missing[0].reason
+    if len(missing_axes) == len(tunings):
+        name, reason = comparison.flight.log.name, missing_axes[0].reason
         raise MissingDataError(
-            f"{name}: SIGMA_A and SIGMA_Z cannot be estimated: {reason}", missing[0].remedy
+            f"{name}: SIGMA_A and SIGMA_Z cannot be estimated: {reason}", missing_axes[0].remedy
         )
     results = tuning_results(request, comparison, tunings)
     write_and_print(result_files(results, json_path), _page(comparison, tunings), request)
@@ -111,7 +111,7 @@ def _page(comparison: Comparison, tunings: dict[str, AxisTuning | Unavailable]) 
         )
     page.write_labelled("Chosen", format_settings(comparison.settings))
     if rows:
-        page.table(TUNING_HEAD, rows, right=(1, 2, 3, 4, 5))
+        page.table(TUNING_HEAD, rows, right_aligned_columns=(1, 2, 3, 4, 5))
         sentences.append(TUNING_NOTE)
     for text in sentences:
         page.write(text, colour=MUTED_COLOUR)

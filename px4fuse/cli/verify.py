@@ -44,14 +44,14 @@ def verify(
 
     Exit code 0: verified; 1: differences, another log, or not verifiable; 2: invalid input.
     """
-    from px4fuse.verification.pdf_input import MAX_BYTES, read_report
+    from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_report
     from px4fuse.verification.verification import verify as verify_report
     from px4fuse.workers import JobFailure, run_one_bounded
 
     content = read_bytes_limited(
-        report, LogError, MAX_BYTES, size_remedy="Give a report, which has less than 2 MB"
+        report, LogError, MAX_PDF_BYTES, size_remedy="Give a report, which has less than 2 MB"
     )
-    recorded = read_report(content, display_name(report))
+    recorded_results = read_report(content, display_name(report))
     with progress(json_path) as show_progress:
         show_progress("computing the SHA-256 of the logs")
         files = files_by_sha256(logs)
@@ -60,7 +60,7 @@ def verify(
             raise LogError("The folders LOG contain no files. Give the flight log or its folder.")
         show_progress("repeating the analysis")
         verdict = run_one_bounded(
-            partial(verify_report, pdf=content, logs=files), recorded, TIMEOUT_S
+            partial(verify_report, pdf=content, logs=files), recorded_results, TIMEOUT_S
         )
     if isinstance(verdict, JobFailure):
         raise LogError(f"{display_name(report)}: cannot be verified: {verdict.reason}")

@@ -9,7 +9,7 @@ import click
 
 from px4fuse.cli import options, outputs
 from px4fuse.errors import SettingsError
-from px4fuse.units import NAMES, convert_to_unit
+from px4fuse.units import UNIT_NAMES, convert_to_unit
 
 if TYPE_CHECKING:
     from px4fuse.request import Sweep
@@ -67,7 +67,7 @@ def whatif(
     px4fuse tune and px4fuse sync). --without gnss_pos --from 60 omits the GNSS positions from 60 s
     on.
     """
-    from px4fuse.analysis import run_what_if
+    from px4fuse.diagnose import run_what_if
     from px4fuse.report.whatif import summary
     from px4fuse.request import WhatIfRequest
     from px4fuse.results.build import whatif_results
@@ -123,7 +123,7 @@ def _parse_number(option_text: str, name: str, value: str) -> float:
         return float(value)
     except ValueError as error:
         unit = PARAMETERS[name].printed_unit if name in PARAMETERS else ""
-        converted = convert_to_unit(value, unit)
-        unit_text = f" in {NAMES[unit]}" if unit else ""
-        problem = "" if converted is None else f"{unit_text}. Give {converted:g}"
+        number = convert_to_unit(value, unit)
+        unit_text = f" in {UNIT_NAMES[unit]}" if unit else ""
+        problem = "" if number is None else f"{unit_text}. Give {number:g}"
         raise SettingsError(f"{option_text}: {value!r} is not a number{problem}.") from error

@@ -37,7 +37,7 @@ EQUAL_RMSE_TOLERANCE = 0.05
 MIN_NOTABLE_SHARE = 0.05
 # Minimum ratio of a KF noise setting and its estimate for the setting to be corrected first
 MIN_SETTING_RATIO = 4.0
-# Minimum change of the KF position (m) by a listed step: KF and EKF2 differ in this property
+# Minimum change of the KF position (m) by an EKF2 property for which KF and EKF2 count as different
 MIN_STEP_EFFECT_M = 1e-6
 # Minimum difference KF - EKF2 outside the replayed times that is reported: in m, and as a factor on
 # the largest difference in the replayed times
@@ -265,7 +265,7 @@ def _step_reasons(
     )
     return {
         steps.SAMPLES: samples_text,
-        steps.STAMPS: delay_text,
+        steps.TIMESTAMPS: delay_text,
         steps.NOISE: (
             f"EKF2 uses a measurement noise of {noise_used_m(model):.2g} m ({aid.noise}), "
             f"KF {settings.sigma_z_m:.2g} m"
@@ -301,7 +301,7 @@ def _velocity_sentence(explanation: DifferenceExplanation) -> str:
     first = max(explanation.steps, key=lambda step: step.velocity_mean_square_m2_s2)
     share = first.velocity_mean_square_m2_s2 / velocity
     # a step with a fraction above 1 compensates an earlier step: it is not the largest contribution
-    largest = f" Largest contribution to the velocity: {first.name} ({100 * share:.0f} %)."
+    largest = f" Largest cause of the velocity difference: {first.name} ({100 * share:.0f} %)."
     velocity_left_share = explanation.unexplained_velocity_mean_square_m2_s2 / velocity
     return (
         f"RMS difference KF - EKF2 over the replayed times: {np.sqrt(position):.3f} m and "

@@ -125,7 +125,7 @@ def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
         return {}
     changes = {delay: max(float(round(delay_ms)), parameter.minimum)}
     needed_ms, flown = changes[delay] + TRANSMISSION_MS, inputs.settings
-    if not inputs.rules.horizon_by_delay and needed_ms > flown["EKF2_DELAY_MAX"]:
+    if not inputs.rules.uses_delay_as_horizon and needed_ms > flown["EKF2_DELAY_MAX"]:
         changes["EKF2_DELAY_MAX"] = DELAY_MAX_STEP_MS * math.ceil(needed_ms / DELAY_MAX_STEP_MS)
     return {name: value for name, value in changes.items() if value != flown[name]}
 

@@ -164,7 +164,7 @@ class Hypothesis:
         """Rotation beyond the quarter turns."""
         return float(self.parameters[1] - self.quarter * np.pi / 2.0)
 
-    def has_meaning_of(self, other: "Hypothesis", max_turn_rad: float = np.pi / 4.0) -> bool:
+    def is_similar_to(self, other: "Hypothesis", max_turn_rad: float = np.pi / 4.0) -> bool:
         """Return True if axes, unit, rotation and time offset are similar."""
         turn_rad = np.angle(np.exp(1j * (self.parameters[1] - other.parameters[1])))
         is_similar = abs(self.offset_s - other.offset_s) < 0.5 and abs(turn_rad) < max_turn_rad
@@ -178,7 +178,7 @@ def without_drift(time_s: Array, drift: float) -> Array:
 
 
 def search(positions: Positions, motions: Mapping[HeadingSource, ImuMotion]) -> list[Hypothesis]:
-    """Return the refined hypotheses, best first; empty without enough overlap."""
+    """Return the refined hypotheses, best first; empty without enough overlap or motion."""
     refined = []
     for heading_from, imu in motions.items():
         source = positions.motion(imu)
@@ -190,7 +190,7 @@ def search(positions: Positions, motions: Mapping[HeadingSource, ImuMotion]) -> 
                 parameters[1] -= candidate.remainder_rad
                 start = replace(start, parameters=parameters, has_rotation=False)
                 refined.append(refine(start, positions, source, imu))
-    return sorted(refined, key=lambda one: -one.score)
+    return sorted((one for one in refined if one.score > -np.inf), key=lambda one: -one.score)
 
 
 def find_candidates(source: SourceMotion, imu: ImuMotion) -> list[Hypothesis]:
@@ -286,6 +286,8 @@ def _evaluate(
         float(np.sum(weight[0] @ (first * second)[:, :2]))
         for first, second in ((ned, ned), (ned, measured), (measured, measured))
     )
+    if 0.0 in (ned_square, product, square):  # at rest, no hypothesis can be scored
+        return replace(one, score=-np.inf), np.zeros(len(one.parameters))
     jacobian = np.zeros((len(index), 3, len(PRECISION)))
     jacobian[..., 0] = imu.rate_m_s[index]
     jacobian[:, 0, 1], jacobian[:, 1, 1] = -horizontal.imag, horizontal.real

@@ -37,13 +37,13 @@ from px4fuse.trajectory.rotation import heading
 MIN_LOG_ODDS = 4.0  # to the best other convention
 MIN_GAIN = 8.0  # log likelihood over no relation
 MIN_GAIN_PER_WINDOW = (0.15, 0.4)  # of a determined and of an ambiguous convention
-MIN_SCALE, MAX_SCALE = 0.88, 1.12
+MIN_SCALE, MAX_SCALE = 0.88, 1.12  # distances of the source over those of the IMU
 # Residuals over those that explain the noise of the source and the minimum error (m) of the IMU
 MAX_RESIDUAL_RATIO, IMU_ERROR_M = 2.4, 0.05
 MAX_LOGGED_DEFICIT = 20.0  # by which the logged heading may fit worse than the gyro's
-MIN_DRIFT_GAIN = 15.0
+MIN_DRIFT_GAIN = 15.0  # log likelihood gained by a clock drift
 DRIFTS = np.linspace(-0.05, 0.05, 21)
-MAX_REPEATED_SHARE = 0.5
+MAX_REPEATED_SHARE = 0.5  # of repeated positions that are left out; also minimum share with height
 # Sums of the squares of the coefficients of third and second differences
 THIRD_DIFFERENCE, SECOND_DIFFERENCE = 20.0, 6.0
 
@@ -115,7 +115,7 @@ def _search(positions: Positions, motions: dict[HeadingSource, ImuMotion]) -> li
         if (
             one.heading_from == "EKF2"
             and one.score > found[0].score - MAX_LOGGED_DEFICIT
-            and one.has_meaning_of(found[0], SMALL_ROTATION)
+            and one.is_similar_to(found[0], SMALL_ROTATION)
         ):
             others = [other for other in found if other is not one]
             return [replace(one, score=found[0].score), *others]
@@ -125,7 +125,7 @@ def _search(positions: Positions, motions: dict[HeadingSource, ImuMotion]) -> li
 def _decide(found: list[Hypothesis], positions: Positions, drift: float) -> Convention:
     """Compare the best hypothesis with the others and with the noise of the source."""
     best = found[0]
-    rivals = [one for one in found if not one.has_meaning_of(best)]
+    rivals = [one for one in found if not one.is_similar_to(best)]
     if not positions.position_m[:, 2].any():  # without height, up and down are equivalent
         rivals = [one for one in rivals if one.axes[:2] != best.axes[:2]]
     log_odds = best.score - rivals[0].score if rivals else None

@@ -31,9 +31,9 @@ ORDERS: tuple[Order, Order] = ("w x y z", "x y z w")
 MAX_COPY_DEG = 0.15  # copies differ by up to 0.03°, fused motion capture by more than 0.2°
 COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
 MAX_TILT_DEG, MAX_HEADING_DEG = 6.0, 12.0  # median differences of a correct convention
-MIN_DIFFERENCE_DEG = 0.7
-SCORE_PER_S = 0.5
-MIN_LOG_ODDS = 4.0
+MIN_DIFFERENCE_DEG = 0.7  # noise of tilt and heading; smaller differences score equally
+SCORE_PER_S = 0.5  # log likelihood per second and factor e of the differences
+MIN_LOG_ODDS = 4.0  # to the best other convention
 MAX_SAMPLES, MIN_SAMPLES = 600, 20
 
 
@@ -45,8 +45,8 @@ class Candidate(NamedTuple):
     score: float
 
     @property
-    def meaning(self) -> tuple[str, str]:
-        """Convention without headings: ENU and NWU differ by a rotation about the vertical."""
+    def order_and_frames(self) -> tuple[str, str]:
+        """Order and frames; ENU and NWU differ only by a rotation about the vertical."""
         return self.convention.order, self.convention.frames.replace("ENU", "NWU")
 
 
@@ -89,7 +89,7 @@ def check_orientation(
     ]
     candidates.sort(key=lambda candidate: -candidate.score)
     best = candidates[0]
-    rival = next(one for one in candidates if one.meaning != best.meaning)
+    rival = next(one for one in candidates if one.order_and_frames != best.order_and_frames)
     convention = best.convention
     tilt_deg = convention.tilt_difference_deg
     if tilt_deg > MAX_TILT_DEG or best.heading_difference_deg > MAX_HEADING_DEG:

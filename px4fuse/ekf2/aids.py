@@ -221,21 +221,21 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
         is_enabled = np.asarray(step_values_at(log.enabled, grid) > 0.0)
         enabled_fraction = _fraction(is_enabled, np.ones(len(grid), bool))
     fused_logged = "fused" in samples
-    fused: BoolArray
-    rejected: BoolArray
+    is_fused: BoolArray
+    is_rejected: BoolArray
     if fused_logged:
-        fused, rejected = (samples[flag].to_numpy() > 0.0 for flag in ("fused", "rejected"))
+        is_fused, is_rejected = (samples[flag].to_numpy() > 0.0 for flag in ("fused", "rejected"))
         noise = samples[[f"noise_{axis}" for axis in log.axes]].to_numpy()
         # If EKF2 resets its state to a sample, it logs innovation 0 and S = R for this sample
         is_reset = ((innovation == 0.0) & np.isclose(variance, noise)).all(axis=1)
-        noise_median = float(np.median(np.sqrt(noise[fused, 0]))) if fused.any() else None
+        noise_median = float(np.median(np.sqrt(noise[is_fused, 0]))) if is_fused.any() else None
     else:
-        rejected = np.max(innovation**2 / variance, axis=1, initial=0.0) > gate**2
-        fused = ~rejected
+        is_rejected = np.max(innovation**2 / variance, axis=1, initial=0.0) > gate**2
+        is_fused = ~is_rejected
         is_reset = np.zeros(len(samples), bool)
         noise_median = None
-    is_evaluated = (fused | rejected) & enabled & ~is_reset
-    longest_gap_s = _longest_gap(times, fused & enabled, log, start_s, end_s)
+    is_evaluated = (is_fused | is_rejected) & enabled & ~is_reset
+    longest_gap_s = _longest_gap(times, is_fused & enabled, log, start_s, end_s)
     axes = {}
     for number, axis in enumerate(log.axes):
         assessment = assess(innovation[is_evaluated, number], variance[is_evaluated, number], gate)
@@ -262,16 +262,16 @@ def _evaluate_aid(aid: Aid, log: AidLog, start_s: float, end_s: float) -> AidRes
         unit=aid.unit,
         topic=log.topics[0],
         enabled_fraction=enabled_fraction,
-        fused_fraction=_fraction(fused & enabled, enabled),
+        fused_fraction=_fraction(is_fused & enabled, enabled),
         fused_logged=fused_logged,
-        rejected_fraction=_fraction(rejected & enabled, enabled),
+        rejected_fraction=_fraction(is_rejected & enabled, enabled),
         longest_gap_s=longest_gap_s,
         resets=int(is_reset.sum()),
         gate=gate,
         noise=noise_median,
         noise_from=_noise_origin(aid, log, noise_median),
         axes=axes,
-        verdict=_verdict(axes, longest_gap_s, times[fused & (not fused_logged)])
+        verdict=_verdict(axes, longest_gap_s, times[is_fused & (not fused_logged)])
         if is_evaluated.any()
         else "disabled",
     )
@@ -325,23 +325,25 @@ def _noise_origin(aid: Aid, log: AidLog, noise: float | None) -> str:
     if noise is None or value is None:
         return "" if noise is None else aid.noise_origin
     # EKF2 multiplies EKF2_GPS_P_NOISE by 1.5 for GNSS heights
-    for expected in (value, 1.5 * value, np.sqrt(value)):
-        if abs(noise - expected) <= NOISE_TOLERANCE * expected:
+    for expected_noise in (value, 1.5 * value, np.sqrt(value)):
+        if abs(noise - expected_noise) <= NOISE_TOLERANCE * expected_noise:
             return aid.noise
     return aid.noise_origin or aid.noise
 
 
-def _longest_gap(times: Array, fused: BoolArray, log: AidLog, start_s: float, end_s: float) -> Span:
-    ends = np.r_[start_s, times[fused], end_s]
+def _longest_gap(
+    times: Array, is_fused: BoolArray, log: AidLog, start_s: float, end_s: float
+) -> Span:
+    ends = np.r_[start_s, times[is_fused], end_s]
     starts = ends[:-1]
-    enabled = np.ones(len(starts), bool)
+    is_enabled = np.ones(len(starts), bool)
     if log.enabled is not None:
         # EKF2 disables an aiding source up to 1 s after the last fused sample
-        enabled = step_values_at(log.enabled, pd.Index(starts + 1.0)) > 0.0
-    longest = int(np.argmax(np.diff(ends) * enabled))
-    if not enabled[longest]:
+        is_enabled = step_values_at(log.enabled, pd.Index(starts + 1.0)) > 0.0
+    longest_index = int(np.argmax(np.diff(ends) * is_enabled))
+    if not is_enabled[longest_index]:
         return start_s, start_s
-    return float(ends[longest]), float(ends[longest + 1])
+    return float(ends[longest_index]), float(ends[longest_index + 1])
 
 
 def _verdict(axes: dict[str, AidAxis], longest_gap_s: Span, fused_s: Array) -> AidVerdict:

@@ -19,11 +19,11 @@ MIN_NOISE_M2 = 1e-4
 # Innovation gate (√S) in updates of the bias
 BIAS_GATE = 3.0
 # Maximum |mean| of test ratio times sign of the innovation: if it is larger, EKF2 multiplies the
-# variance of the random walk by NOISE_FACTOR (isOffsetDetected)
+# variance of the random walk by RANDOM_WALK_FACTOR (isOffsetDetected)
 MAX_MEAN_SIGNED_RATIO = 0.2
-NOISE_FACTOR = 1e3
+RANDOM_WALK_FACTOR = 1e3
 # Time constant (s) of the low-pass filter that averages the signed test ratio
-FILTER_S = 10.0
+TEST_RATIO_FILTER_S = 10.0
 
 
 class BiasEstimator:
@@ -44,7 +44,7 @@ class BiasEstimator:
         self.variance_m2 = variance_m2
         self.mean_signed_ratio = np.zeros_like(value_m)
         self.last_s = np.full_like(value_m, start_s)
-        self.filter_weight = step_s / (FILTER_S + step_s)
+        self.filter_weight = step_s / (TEST_RATIO_FILTER_S + step_s)
 
     def remove_bias(
         self,
@@ -69,7 +69,7 @@ class BiasEstimator:
         """
         updates_now = has_sample & updates_bias
         density_factor = np.where(
-            np.abs(self.mean_signed_ratio) > MAX_MEAN_SIGNED_RATIO, NOISE_FACTOR, 1.0
+            np.abs(self.mean_signed_ratio) > MAX_MEAN_SIGNED_RATIO, RANDOM_WALK_FACTOR, 1.0
         )
         variance_growth = BIAS_DENSITY**2 * (time_s - self.last_s) * density_factor * updates_now
         max_variance = np.maximum(noise_m2, MIN_NOISE_M2)

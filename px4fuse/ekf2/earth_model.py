@@ -28,10 +28,11 @@ def ekf2_metres_per_metre(record: FusionRecord) -> tuple[float, float, float]:
     """Return the ratio of EKF2's internal metres to published metres along north, east and down."""
     if np.isnan(record.latitude_deg) or not record.stores_latitude:
         return 1.0, 1.0, 1.0
-    squared = ECCENTRICITY**2
-    q = 1.0 - squared * np.sin(np.radians(record.latitude_deg)) ** 2
+    eccentricity_squared = ECCENTRICITY**2
+    q = 1.0 - eccentricity_squared * np.sin(np.radians(record.latitude_deg)) ** 2
     radii_m = (
-        EQUATORIAL_RADIUS_M * np.array([(1.0 - squared) / q**2.5, q**-0.5]) + record.altitude_m
+        EQUATORIAL_RADIUS_M * np.array([(1.0 - eccentricity_squared) / q**2.5, q**-0.5])
+        + record.altitude_m
     )
     north, east = (radii_m / EARTH_RADIUS_M).tolist()
     return north, east, 1.0

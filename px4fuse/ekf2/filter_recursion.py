@@ -40,7 +40,7 @@ from px4fuse.notebook_display import one_line_repr
 
 # Flight time (s) of a preliminary filter run that estimates the correlations of the initial state
 CORRELATION_PASS_S = 8.0
-MIN_VARIANCE = 1e-30  # minimum state variance, to avoid a division by zero
+MIN_STATE_VARIANCE = 1e-30  # minimum state variance, to avoid a division by zero
 # A position sample with NIS / gate² from 1/2 to 2 is near the gate limit. If EKF2's rejection of
 # this sample is not logged, the rejection is inferred from the published position
 GATE_EDGE_RATIO = 2.0
@@ -53,8 +53,8 @@ IGNORED_VARIANCE = 1e9
 BAD_ACCELERATION_NOISE = 4.9
 # Factors on the GNSS velocity variance, NED: EKF2 multiplies the vertical σ by 1.5
 # (gps_control.cpp)
-VERTICAL_SCALE = np.array([1.0, 1.0, 2.25])
-HEIGHT_SCALE = 1.5  # factor on EKF2_GPS_P_NOISE for GNSS height (gnss_height_control.cpp)
+VELOCITY_VARIANCE_FACTORS = np.array([1.0, 1.0, 2.25])
+HEIGHT_NOISE_FACTOR = 1.5  # factor on EKF2_GPS_P_NOISE for GNSS height (gnss_height_control.cpp)
 # Maximum σ (m/s²) of EKF2's accelerometer bias: 0.1 g (covariance.cpp)
 MAX_BIAS_SIGMA_M_S2 = 0.1 * 9.80665
 # Minimum accelerometer bias variance of an axis, relative to the largest of the three axes
@@ -83,13 +83,13 @@ class FilterConfiguration:
     ----------
     settings : dict
         Values of all EKF2 parameters in the model, by PX4 name.
-    biases : bool
+    estimates_biases : bool
         True if the accelerometer bias is a state; else the bias is 0.
-    attitude : bool
+    estimates_attitude : bool
         True if attitude and gyro bias are states; else the published attitude is used.
-    velocity : bool
+    fuses_velocity : bool
         True to fuse velocity in flights in which EKF2 fuses velocity.
-    reported : bool
+    uses_reported_noise : bool
         True to use the variance reported by the position source if EKF2 uses the reported variance.
     has_gate : bool
         True if an innovation gate rejects samples and the position is reset after rejections.
@@ -102,10 +102,10 @@ class FilterConfiguration:
     """
 
     settings: dict[str, float]
-    biases: bool = True
-    attitude: bool = True
-    velocity: bool = True
-    reported: bool = True
+    estimates_biases: bool = True
+    estimates_attitude: bool = True
+    fuses_velocity: bool = True
+    uses_reported_noise: bool = True
     has_gate: bool = True
     uses_logged_decisions: bool = False
     without: Mapping[str, float] = field(default_factory=dict)
@@ -118,7 +118,7 @@ class FilterConfiguration:
         delay_s = self.settings[inputs.aid.delay] * 1e-3
         delay_names = self.settings.keys() & {GNSS_POS.delay, EV_POS.delay}
         max_delay_ms = max(self.settings[name] for name in delay_names)
-        if inputs.rules.horizon_by_delay:  # the length of the IMU buffer is the largest delay
+        if inputs.rules.uses_delay_as_horizon:  # the length of the IMU buffer is the largest delay
             length = math.ceil(max_delay_ms * 1e-3 / inputs.predict_s)
             return Timing(delay_s, max(inputs.horizon_s, (length - 1) * inputs.step_s))
         # at its start EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
@@ -201,15 +201,15 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         name: np.array([configuration.settings[name] for configuration in configurations])
         for name in configurations[0].settings
     }
-    biases, attitude, has_gate, uses_logged_decisions, reported, fuses_velocity = (
+    biases, attitude, has_gate, uses_logged_decisions, uses_reported_noise, fuses_velocity = (
         np.array([getattr(configuration, name) for configuration in configurations])
         for name in (
-            "biases",
-            "attitude",
+            "estimates_biases",
+            "estimates_attitude",
             "has_gate",
             "uses_logged_decisions",
-            "reported",
-            "velocity",
+            "uses_reported_noise",
+            "fuses_velocity",
         )
     )
     distinct_intervals = list(dict.fromkeys(intervals))
@@ -238,7 +238,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     }
     can_fuse_velocity = (action == FUSE) & enabled[GNSS_VEL.name] & fuses_velocity
     sample = np.maximum(intervals[0].events.sample, 0)
-    measured, noise = _measurements(inputs, segment, sample, event_steps, parameters, reported)
+    measured_values, noise = _measurements(
+        inputs, segment, sample, event_steps, parameters, uses_reported_noise
+    )
     is_sequential = inputs.aid == GNSS_POS
     has_speed = inputs.received.velocity_m_s is not None
     gates = [
@@ -295,7 +297,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             for interval_arrays, configuration in zip(intervals, configurations, strict=True)
         ]
         vision = VisionFilter(
-            segment, vision_by_configuration, enabled, parameters, has_gate, reported
+            segment, vision_by_configuration, enabled, parameters, has_gate, uses_reported_noise
         )
     gyro_variance = np.where(attitude, parameters["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
     variance_increment, variance_limit = _variance_growth(
@@ -326,7 +328,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     field_record = np.full(
         (0 if field_samples is None else events, 3, configuration_count, 3), np.nan
     )
-    rejected, fused, reset = np.zeros((3, events, configuration_count), bool)
+    is_rejected, is_fused, reset = np.zeros((3, events, configuration_count), bool)
     position_reset_m = np.zeros((events, configuration_count, 2))
     states, state_variances = np.empty((2, events + 1, configuration_count, x.shape[1]))
     states[0] = x
@@ -355,8 +357,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += added_noise[batch_index]
         bias_variance = _diagonal(P)[:, BIASES.start :]
         bias_variance += (bias_variance < variance_limit) * variance_growth[batch_index]
-        if inputs.rules.bias_floor is not None:
-            _limit_bias(P, inputs.rules.bias_floor, biases)
+        if inputs.rules.min_bias_variance is not None:
+            _limit_bias(P, inputs.rules.min_bias_variance, biases)
         innovation[:, 2:] = 0.0
         R[:, 2:] = IGNORED_VARIANCE
         if field_samples is not None and has_field[e]:
@@ -371,7 +373,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         if vision is not None:
             x, P = vision.fuse(e, x, P, False, fusion.last_position_s)
         if has_sample[e]:
-            nu = measured[e] - x[:, MEASURED_STATES]
+            nu = measured_values[e] - x[:, MEASURED_STATES]
             S = _diagonal(P)[:, MEASURED_STATES] + noise[e]
             innovations[e] = nu
             variances[e] = S
@@ -388,7 +390,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 is_outside_gate = np.where(
                     uses_logged_decisions & is_on_edge, was_rejected, is_outside_gate
                 )
-            rejected[e], fused[e], reset[e], is_velocity_fused = fusion.decide(
+            is_rejected[e], is_fused[e], reset[e], is_velocity_fused = fusion.decide(
                 e, is_outside_gate, is_velocity_fused
             )
             if is_sequential:
@@ -398,15 +400,15 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                     for row in range(HEADING):
                         _, P = _reduce_variance_to(P, row, attitude_variance[e, :, row])
                 is_component_fused[:, VELOCITY_COLUMNS] = is_velocity_fused[:, None]
-                is_component_fused[:, POSITION_COLUMNS] = fused[e, :, None]
+                is_component_fused[:, POSITION_COLUMNS] = is_fused[e, :, None]
                 x, P = _sequential_update(
                     x, P, nu, S, noise[e], measured_slice, is_component_fused[:, measured_slice]
                 )
             else:
                 innovation[:, 2:] = nu[:, POSITION_COLUMNS]
-                R[fused[e], 2:] = noise[e, fused[e], POSITION_COLUMNS]
+                R[is_fused[e], 2:] = noise[e, is_fused[e], POSITION_COLUMNS]
         if heights is not None:
-            x, P = heights.fuse(e, x, P, measured[e, :, 5], noise[e, :, 5])
+            x, P = heights.fuse(e, x, P, measured_values[e, :, 5], noise[e, :, 5])
         # the magnetometer corrects the heading, so only the height is set to EKF2's logged value
         elif field_samples is not None:
             K, P = _reduce_variance_to(P, DOWN, logged_variance[e, :, 1])
@@ -424,15 +426,17 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             x, P = _joint_update(x, P, innovation, R)
             x[:, HEADING] = heading
         if has_sample[e] and reset[e].any():
-            reset_variance = inputs.rules.reset_scale * noise[e, :, POSITION_COLUMNS]
-            set_states(x, P, reset[e], HORIZONTAL, measured[e, :, POSITION_COLUMNS], reset_variance)
-            if has_speed and inputs.rules.with_velocity:
+            reset_variance = inputs.rules.reset_variance_factor * noise[e, :, POSITION_COLUMNS]
+            set_states(
+                x, P, reset[e], HORIZONTAL, measured_values[e, :, POSITION_COLUMNS], reset_variance
+            )
+            if has_speed and inputs.rules.resets_velocity:
                 set_states(
                     x,
                     P,
                     reset[e],
                     VELOCITY,
-                    measured[e, :, VELOCITY_COLUMNS],
+                    measured_values[e, :, VELOCITY_COLUMNS],
                     noise[e, :, VELOCITY_COLUMNS],
                 )
             position_reset_m[e, reset[e]] = nu[reset[e], POSITION_COLUMNS]
@@ -440,7 +444,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             vision.bias.value_m = vision.bias.value_m + position_reset_m[e]
             x, P = vision.fuse(e, x, P, True, fusion.last_position_s)
             # EKF2 resets the position after a time without a fused position, from GNSS or vision
-            if inputs.rules.with_velocity:
+            if inputs.rules.resets_velocity:
                 fusion.last_position_s = np.maximum(fusion.last_position_s, vision.fused_s)
         states[e + 1] = x
         state_variances[e + 1] = _diagonal(P)
@@ -453,8 +457,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         innovations,
         variances,
         noise,
-        rejected,
-        fused,
+        is_rejected,
+        is_fused,
         reset,
         position_reset_m if vision is None else position_reset_m + vision.position_reset_m,
         states,
@@ -500,14 +504,14 @@ def _sequential_update(
     """
     nu, S, R = (array[:, components] for array in (nu, S, R))
     weight = is_fused / S
-    square = weight * weight
-    b = 2.0 * weight - square * R
+    weight_squared = weight * weight
+    b = 2.0 * weight - weight_squared * R
     rows = slice(MEASURED_STATES.start + components.start, MEASURED_STATES.start + components.stop)
     columns = P[:, rows].copy()
     for j in range(nu.shape[1]):
         column = columns[:, j]
         cross_covariance = column[:, rows]
-        b[:, j] -= square[:, j] * cross_covariance[:, j]
+        b[:, j] -= weight_squared[:, j] * cross_covariance[:, j]
         if j < nu.shape[1] - 1:
             columns[:, j + 1 :] -= (b[:, j, None] * cross_covariance[:, j + 1 :])[
                 :, :, None
@@ -564,7 +568,7 @@ class _Fusion:
 
         self.last_position_s, self.last_velocity_s = np.full((2, configuration_count), self.start_s)
         self.is_stopped = np.zeros(configuration_count, bool)
-        self.remaining_resets = np.full(configuration_count, self.rules.resets)
+        self.remaining_resets = np.full(configuration_count, self.rules.max_resets)
         # True for events at which all configurations fuse or reject by the gate, without a reset
         self.only_gate_decides = (
             (self.action == FUSE).all(axis=1) & ~self.reset & ~(self.rejected > 0.0)
@@ -604,7 +608,7 @@ class _Fusion:
         is_starting = has_gate & ((action == START) | (self.is_stopped & self.can_start[e]))
         gap_s = now_s - self.last_position_s
         is_failing = is_rejected & ~self.is_stopped & (gap_s > rules.reset_s)
-        if rules.with_velocity:
+        if rules.resets_velocity:
             are_both_late = now_s - self.last_velocity_s > rules.reset_s
             is_failing &= are_both_late | (gap_s > 2.0 * rules.reset_s)
         is_restarted = is_starting | (is_failing & (self.remaining_resets > 0))
@@ -618,7 +622,7 @@ class _Fusion:
             is_failing & (self.remaining_resets == 0)
         )
         remaining_resets = self.remaining_resets - (is_failing & (self.remaining_resets > 0))
-        self.remaining_resets = np.where(is_starting, rules.resets, remaining_resets)
+        self.remaining_resets = np.where(is_starting, rules.max_resets, remaining_resets)
         return is_rejected, is_fused, is_restarted, is_velocity_fused & ~is_restarted
 
 
@@ -688,7 +692,7 @@ def with_correlation(inputs: Inputs, segment: ReplaySegment, intervals: Interval
 
 def _correlation(P: Array) -> Array:
     # the lower limit avoids a division by zero: a bias that is not estimated has variance 0
-    deviation = np.sqrt(np.maximum(np.diagonal(P), MIN_VARIANCE))
+    deviation = np.sqrt(np.maximum(np.diagonal(P), MIN_STATE_VARIANCE))
     return np.asarray(P / deviation[:, None] / deviation)
 
 
@@ -762,9 +766,9 @@ def _measurements(
     offset_m = (np.stack([parameters[name] for name in aid.lever_arm], -1) - inputs.imu_offset_m)[
         :, :, None
     ]
-    measured, noise = np.full((2, len(event_steps), len(offset_m), 6), np.nan)
+    measured_values, noise = np.full((2, len(event_steps), len(offset_m), 6), np.nan)
     lever_arm_ned = (segment.rotation[event_steps] @ offset_m)[..., 0]
-    measured[..., 3:] = received.position_m[sample][:, None] - lever_arm_ned
+    measured_values[..., 3:] = received.position_m[sample][:, None] - lever_arm_ned
     if aid.noise_mode:
         uses_reported_noise = uses_reported_noise & (parameters[aid.noise_mode] != 1.0)
     reported_variance = np.where(
@@ -780,10 +784,12 @@ def _measurements(
             / segment.step_s[event_steps - 1, None, None]
         )
         lever_arm_ned = (rotation_rate @ offset_m)[..., 0]
-        measured[..., :3] = received.velocity_m_s[sample][:, None] - lever_arm_ned
+        measured_values[..., :3] = received.velocity_m_s[sample][:, None] - lever_arm_ned
         reported_variance = received.velocity_variance_m2_s2[sample][:, None]
         min_variance = np.maximum(parameters[GNSS_VEL.noise], MIN_SIGMA)[:, None] ** 2
-        noise[..., :3] = np.maximum(reported_variance, min_variance) * VERTICAL_SCALE
+        noise[..., :3] = np.maximum(reported_variance, min_variance) * VELOCITY_VARIANCE_FACTORS
     if aid == GNSS_POS:
-        noise[..., 5] = np.maximum(noise[..., 5], (HEIGHT_SCALE * parameters[aid.noise]) ** 2)
-    return measured, noise
+        noise[..., 5] = np.maximum(
+            noise[..., 5], (HEIGHT_NOISE_FACTOR * parameters[aid.noise]) ** 2
+        )
+    return measured_values, noise

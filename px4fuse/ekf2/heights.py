@@ -30,7 +30,7 @@ from px4fuse.flight import GROUND_EFFECT, Ekf2, Flight, FusionRecord, step_value
 
 VELOCITY_DOWN, DOWN = 5, 8  # indices in the state
 SENSORS = (BAROMETER, GNSS_HGT)
-HEIGHTS = (*SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
+HEIGHT_AIDS = (*SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
 DEFAULT_DEAD_ZONE_M = 4.0  # default of EKF2_GND_EFF_DZ, the barometer's dead zone near the ground
 HEIGHT_REFERENCES = {0: BAROMETER.name, 1: GNSS_HGT.name}  # by value of EKF2_HGT_REF
 # Maximum time (s) from the start of the replay to the first logged height bias: the bias is logged
@@ -61,28 +61,28 @@ def add_heights(
         for name, log in ekf2.aids.items()
         if log.enabled is not None
     }
-    fused = [aid.name for aid in SENSORS if enabled_fractions.get(aid.name) == 1.0]
-    for aid in HEIGHTS:
-        if enabled_fractions.get(aid.name) and aid.name not in fused:
+    fused_aids = [aid.name for aid in SENSORS if enabled_fractions.get(aid.name) == 1.0]
+    for aid in HEIGHT_AIDS:
+        if enabled_fractions.get(aid.name) and aid.name not in fused_aids:
             return f"EKF2 also fused {aid.label} in part of the flight"
     reference = HEIGHT_REFERENCES.get(int(parameters.get("EKF2_HGT_REF", 1.0)))
-    if len(fused) == 1:  # a single sensor is the reference
-        (reference,) = fused
-    if reference not in fused:
+    if len(fused_aids) == 1:  # a single sensor is the reference
+        (reference,) = fused_aids
+    if reference not in fused_aids:
         return "EKF2's height reference is neither GNSS nor barometer, or not logged"
     measured_at_s, down_m = np.zeros((2, 0))
-    if BAROMETER.name in fused and flight.barometer is not None:
+    if BAROMETER.name in fused_aids and flight.barometer is not None:
         measured_at_s = flight.barometer.index.to_numpy() - 0.5 * ekf2.step_s
         down_m = flight.barometer["down_m"].to_numpy() + record.altitude_m
     effect_height_m = parameters.get("EKF2_GND_EFF_DZ", DEFAULT_DEAD_ZONE_M)
     dead_zone_m = np.where(record.was_in_state(GROUND_EFFECT, measured_at_s), effect_height_m, 0.0)
     ekf2_rate_hz = OLD_BAROMETER_HZ if record.per_step_biases else BAROMETER_HZ
     new_segments = []
-    delayed = record.delayed["down_m"]
+    delayed_down_m = record.delayed["down_m"]
     for segment in segments:
         start_s = float(segment.time_s[0])
         bias = (0.0, 0.0)
-        for aid_name in {*fused} - {reference}:
+        for aid_name in {*fused_aids} - {reference}:
             logged_bias = record.height_bias.get(aid_name)
             if (
                 logged_bias is None
@@ -96,12 +96,12 @@ def add_heights(
             bias = value, variance
         samples = barometer_samples_inside(segment, measured_at_s, down_m, dead_zone_m)
         rate_hz = len(samples[0]) / float(segment.time_s[-1] - start_s)
-        if BAROMETER.name in fused and rate_hz < MIN_BAROMETER_LOG_HZ:
+        if BAROMETER.name in fused_aids and rate_hz < MIN_BAROMETER_LOG_HZ:
             return f"the barometer is logged at {rate_hz:.1f} Hz"
         weight = max(ekf2_rate_hz / rate_hz, 1.0) if rate_hz else 1.0
         state = segment.state.copy()
-        state[DOWN] = np.interp(start_s, delayed.index, delayed)
-        heights = HeightSamples(tuple(fused), reference, bias, *samples, weight)
+        state[DOWN] = np.interp(start_s, delayed_down_m.index, delayed_down_m)
+        heights = HeightSamples(tuple(fused_aids), reference, bias, *samples, weight)
         new_segments.append(replace(segment, state=state, heights=heights))
     return tuple(new_segments)
 
@@ -201,9 +201,9 @@ class HeightFilter:
             measured_s = times[has_sample, min(configuration, times.shape[1] - 1)]
             updates = self.update_log[has_sample, slot, :, configuration].T
             rows.append(np.vstack([measured_s, updates, end_s[has_sample]]))
-        measured_s, nu, S, fused, end_s = np.hstack(rows)
+        measured_s, nu, S, is_fused, end_s = np.hstack(rows)
         columns = {"innovation_down_m": nu, "innovation_variance_down_m2": S}
-        columns |= {"rejected": 1.0 - fused, "fused": fused, "fused_at_s": end_s}
+        columns |= {"rejected": 1.0 - is_fused, "fused": is_fused, "fused_at_s": end_s}
         return pd.DataFrame(columns, pd.Index(measured_s, name="time_s")).sort_index()
 
     def fuse(self, e: int, x: Array, P: Array, gnss_m: Array, gnss_m2: Array) -> ArrayPair:

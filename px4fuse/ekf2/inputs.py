@@ -138,17 +138,17 @@ class FusionRules:
         Time without a sample after which fusion stops.
     reset_s : float
         Time of rejections after which the position is reset to the sample.
-    resets : int
+    max_resets : int
         Number of resets in a row after which fusion stops, until a sample with which fusion may
         start.
-    reset_scale : float
+    reset_variance_factor : float
         Ratio of the position variance after a reset to the measurement variance of the sample.
-    with_velocity : bool
+    resets_velocity : bool
         True if velocity is reset together with position. Both are then reset after both were
         rejected for ``reset_s``, or after position was rejected for twice that time.
-    bias_floor : float or None
+    min_bias_variance : float or None
         Minimum of the accelerometer bias variance (m²/s⁴); None if the release has no minimum.
-    horizon_by_delay : bool
+    uses_delay_as_horizon : bool
         True if the largest delay parameter sets the fusion horizon; False for EKF2_DELAY_MAX (from
         v1.15).
     """
@@ -156,11 +156,11 @@ class FusionRules:
     start_interval_s: float
     stop_s: float
     reset_s: float
-    resets: int
-    bias_floor: float | None
-    horizon_by_delay: bool
-    reset_scale: float = 1.0
-    with_velocity: bool = False
+    max_resets: int
+    min_bias_variance: float | None
+    uses_delay_as_horizon: bool
+    reset_variance_factor: float = 1.0
+    resets_velocity: bool = False
 
 
 @dataclass(frozen=True)
@@ -214,14 +214,14 @@ class Inputs:
 
 
 def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
-    flight: Flight, doubtful: Mapping[str, str] = MappingProxyType({})
+    flight: Flight, doubtful_aids: Mapping[str, str] = MappingProxyType({})
 ) -> Inputs | Unavailable:
     """Return the inputs of the EKF2 replay, or the reason why the log is insufficient.
 
     Parameters
     ----------
     flight : Flight
-    doubtful : mapping from PX4's name of an aiding source to str
+    doubtful_aids : mapping from PX4's name of an aiding source to str
         Aiding sources with a replay that disagrees with the log, and the reasons. They are omitted:
         height sensors are replaced by the logged EKF2 height; without optical flow the replay is
         interrupted in gaps of the position source.
@@ -257,8 +257,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
             f"the model does not contain ({', '.join(unmodelled_aids)})",
             f"Fly with EKF2_OF_CTRL 0{disable_gnss} and without bit 2 of {EV_POS.switch}.",
         )
-    if missing := _missing_imu(imu.index.to_numpy()):
-        return missing
+    if missing_imu := _missing_imu(imu.index.to_numpy()):
+        return missing_imu
     position_samples = (
         read_gnss(flight, ekf2, record) if is_gnss else read_vision(flight, ekf2, record, attitude)
     )
@@ -272,7 +272,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         )
     vision = (
         _read_vision_besides_gnss(flight, logged_ekf2, record, attitude)
-        if is_gnss and EV_POS.name not in doubtful
+        if is_gnss and EV_POS.name not in doubtful_aids
         else None
     )
     if isinstance(vision, Unavailable):
@@ -287,7 +287,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         horizon_s = 0.0
     aiding_s = position_samples.stamp_s
     flow = record.flow if is_gnss else record.flow.iloc[:0]
-    if len(flow) and FLOW.name not in doubtful:
+    if len(flow) and FLOW.name not in doubtful_aids:
         aiding_s = np.union1d(aiding_s, flow.index)
     segments = find_replay_segments(flight, imu, attitude, ekf2, record, aiding_s, is_gnss=is_gnss)
     if not segments:
@@ -303,7 +303,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         segments = tuple(add_flow_samples(segment, flow, gate) for segment in segments)
     height_reason = "; ".join(
         f"{AIDS[name].label}: {reason}"
-        for name, reason in doubtful.items()
+        for name, reason in doubtful_aids.items()
         if name not in (FLOW.name, EV_POS.name)
     )
     if is_gnss and not height_reason:
@@ -319,7 +319,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         settings=effective_settings(record.parameters, aid, *other_aids) | lever_arm,
         segments=segments,
         received=position_samples,
-        rules=_rules(record, ekf2.step_s, is_gnss=is_gnss),
+        rules=_fusion_rules(record, ekf2.step_s, is_gnss=is_gnss),
         step_s=ekf2.step_s,
         horizon_s=horizon_s,
         predict_s=predict_s(record),
@@ -362,13 +362,13 @@ def _missing_imu(time_s: Array) -> Unavailable | None:
     return None
 
 
-def _rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules:
-    bias_floor = 5e-8 / step_s**2 if record.per_step_biases else None
+def _fusion_rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules:
+    min_bias_variance = 5e-8 / step_s**2 if record.per_step_biases else None
     is_horizon_from_delay = "EKF2_DELAY_MAX" not in record.parameters
     if is_gnss:
         # a reset doubles the variance of the sample from v1.16 on (resetHorizontalPositionTo,
         # gps_control.cpp)
-        reset_scale = 2.0 if record.stores_latitude else 1.0
+        reset_variance_factor = 2.0 if record.stores_latitude else 1.0
         # in PX4 main since 2026, position and velocity have separate timeouts and resets
         resets_together = GNSS_MODE not in record.parameters
         return FusionRules(
@@ -376,16 +376,16 @@ def _rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules
             np.inf,
             7.0,
             UNLIMITED_RESETS,
-            bias_floor,
+            min_bias_variance,
             is_horizon_from_delay,
-            reset_scale,
+            reset_variance_factor,
             resets_together,
         )
     # times: EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
     limits = (np.inf, 7.0, 7.0, UNLIMITED_RESETS)
     if not fuses_by_mask(record.parameters):
         limits = (0.2, 0.4, 1.0, 5)
-    return FusionRules(*limits, bias_floor, is_horizon_from_delay)
+    return FusionRules(*limits, min_bias_variance, is_horizon_from_delay)
 
 
 def replayed_aid(ekf2: Ekf2) -> Aid:
@@ -429,13 +429,13 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
     samples = track.samples
     velocities = track.velocity
     # EKF2 ignores GNSS fixes while GNSS is disabled
-    if (enabled := ekf2.aids[GNSS_POS.name].enabled) is not None:
-        is_enabled = step_values_at(enabled, samples.index) > 0.0
+    if (enabled_log := ekf2.aids[GNSS_POS.name].enabled) is not None:
+        is_enabled = step_values_at(enabled_log, samples.index) > 0.0
         samples = samples[is_enabled]
         velocities = velocities[is_enabled]
     # the track has measurement times: add the delay, because the replay subtracts the delay again
-    flown = effective_settings(parameters, GNSS_POS)
-    flown_s = flown[GNSS_POS.delay] * 1e-3
+    flown_settings = effective_settings(parameters, GNSS_POS)
+    flown_s = flown_settings[GNSS_POS.delay] * 1e-3
     timestamp_s = samples.index.to_numpy() + flown_s
     # EKF2's upper limit of the reported position noise (m; gps_control.cpp)
     max_noise_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
@@ -456,19 +456,19 @@ def read_gnss(flight: Flight, ekf2: Ekf2, record: FusionRecord) -> ReceivedPosit
         velocity_variance if has_velocity else None,
         uses_sender_times=track.age_s == 0.0 != flown_s,
         correction_m=_position_corrections(
-            ekf2, samples.index.to_numpy(), decisions[0], flown["EKF2_TAU_POS"]
+            ekf2, samples.index.to_numpy(), decisions[0], flown_settings["EKF2_TAU_POS"]
         ),
     )
 
 
 def _position_corrections(
-    ekf2: Ekf2, measured_s: Array, rejected: Array, tau_s: float
+    ekf2: Ekf2, measured_s: Array, is_rejected: Array, tau_s: float
 ) -> Array | None:
     """Estimate EKF2's position correction (m) by each GNSS fix from the published position.
 
     Return None if all rejections are logged, or none occurred.
     """
-    if not (rejected > 0.0).any() or np.isfinite(rejected).all():
+    if not (is_rejected > 0.0).any() or np.isfinite(is_rejected).all():
         return None
     if isinstance(ekf2.horizon_s, Unavailable):
         return None
@@ -510,8 +510,12 @@ def read_vision(
                 "Send the position in NED, or with an orientation.",
             )
         ekf2_attitude, source_attitude = (
-            interpolate(timestamp_s, frame.index.to_numpy(), frame[Columns.QUATERNION].to_numpy())
-            for frame in (attitude, track.orientation)
+            interpolate(
+                timestamp_s,
+                orientations.index.to_numpy(),
+                orientations[Columns.QUATERNION].to_numpy(),
+            )
+            for orientations in (attitude, track.orientation)
         )
         rotation = to_matrix(multiply(ekf2_attitude, conjugate(source_attitude)))
         position = rotate(rotation, position)
@@ -529,7 +533,7 @@ def _read_vision_besides_gnss(
     flight: Flight, ekf2: Ekf2, record: FusionRecord, attitude: pd.DataFrame
 ) -> ReceivedPositions | Unavailable | None:
     """Return the vision positions of a flight with GNSS; None if EKF2 did not fuse vision."""
-    if (enabled := _enabled_log(ekf2, EV_POS)) is None:
+    if (enabled_log := _enabled_log(ekf2, EV_POS)) is None:
         return None
     if fuses_by_mask(record.parameters):
         return Unavailable(
@@ -541,7 +545,7 @@ def _read_vision_besides_gnss(
     received = read_vision(flight, ekf2, record, attitude)
     if isinstance(received, Unavailable):
         return received
-    is_disabled = step_values_at(enabled, received.stamp_s) == 0.0
+    is_disabled = step_values_at(enabled_log, received.stamp_s) == 0.0
     position_m = received.position_m * ekf2_metres_per_metre(record)
     return replace(received, position_m=np.where(is_disabled[:, None], np.nan, position_m))
 
@@ -550,7 +554,7 @@ def _logged_decisions(
     ekf2: Ekf2, record: FusionRecord, timestamp_s: Array, aid: Aid = EV_POS
 ) -> tuple[Array, BoolArray]:
     """Return EKF2's logged rejection and reset at each position sample."""
-    rejected = np.full(len(timestamp_s), np.nan)
+    rejected_flags = np.full(len(timestamp_s), np.nan)
     reset = np.zeros(len(timestamp_s), dtype=bool)
     innovations = ekf2.innovations["north"]
     horizon_s = ekf2.horizon_s
@@ -559,21 +563,23 @@ def _logged_decisions(
         or isinstance(horizon_s, Unavailable)
         or aid_source(aid) not in ekf2.innovation_topics
     ):
-        return rejected, reset
+        return rejected_flags, reset
     delay_s = effective_settings(record.parameters, aid)[aid.delay] * 1e-3
     measured_s = timestamp_s - delay_s - 0.5 * ekf2.step_s
     sample_row = same_sample(innovations.index.to_numpy(), measured_s)
-    rejected[sample_row >= 0] = innovations["rejected"].to_numpy()[sample_row[sample_row >= 0]]
+    rejected_flags[sample_row >= 0] = innovations["rejected"].to_numpy()[
+        sample_row[sample_row >= 0]
+    ]
     # a reset is visible in the next published state, one fusion horizon later than the measurement
     publication_s = measured_s + horizon_s
     for reset_s in horizontal_resets_s(ekf2):
-        earlier_rows = np.flatnonzero((publication_s <= reset_s) & (rejected != 0.0))
+        earlier_rows = np.flatnonzero((publication_s <= reset_s) & (rejected_flags != 0.0))
         if (
             len(earlier_rows)
             and reset_s - publication_s[earlier_rows[-1]] < MAX_RESET_PUBLICATION_S
         ):
             reset[earlier_rows[-1]] = True
-    return rejected, reset
+    return rejected_flags, reset
 
 
 def aid_source(aid: Aid) -> str:

@@ -46,7 +46,7 @@ IDLE, FUSE, START = 0, 1, 2
 # Number of columns of the sensitivities of the state at the end of an interval: to initial attitude
 # error, gyro bias and accelerometer bias (3 columns each), to the correction of the nominal
 # attitude, and to the acceleration
-EFFECT_COLUMNS = 11
+EFFECT_COLUMN_COUNT = 11
 CORRECTION_COLUMN, INPUT_COLUMN = 9, 10
 
 # Array with one row per event (end of an interval), in time order
@@ -124,16 +124,16 @@ def make_intervals(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> In
 def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
     received = inputs.received
     time_s = segment.time_s
-    first, last_row = np.searchsorted(received.stamp_s, time_s[[0, -1]])
-    stamp = received.stamp_s[first:last_row]
-    last = len(time_s) - 1
+    first_row, last_row = np.searchsorted(received.stamp_s, time_s[[0, -1]])
+    stamp = received.stamp_s[first_row:last_row]
+    last_step = len(time_s) - 1
     measured_s = stamp - timing.delay_s - 0.5 * inputs.step_s
     # a sample that arrives after the fusion horizon has passed its measurement time is fused late
     # or never
-    due_s = np.maximum(measured_s, received.arrival_s[first:last_row] - timing.horizon_s)
+    due_s = np.maximum(measured_s, received.arrival_s[first_row:last_row] - timing.horizon_s)
     end = np.searchsorted(time_s, due_s - 1e-9)
-    is_inside = (end > 0) & (end <= last)
-    end = np.maximum.accumulate(np.minimum(end, last))
+    is_inside = (end > 0) & (end <= last_step)
+    end = np.maximum.accumulate(np.minimum(end, last_step))
     is_in_time = time_s[end] < measured_s + MAX_LATENESS_S
     is_usable = is_inside & is_in_time
     is_usable[:-1] &= end[1:] > end[:-1]  # EKF2 fuses only the newer of two samples in one step
@@ -145,11 +145,11 @@ def _events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
     total = len(stamp) + int(extra_events.sum())
     events = np.zeros(total, EVENT)
     events["end_step"] = np.rint(
-        np.interp(np.arange(total), np.r_[-1, sample_places, total], np.r_[0, end, last])
+        np.interp(np.arange(total), np.r_[-1, sample_places, total], np.r_[0, end, last_step])
     )
     events["sample"], events["time_s"] = -1, time_s[events["end_step"]]
     late = is_inside & is_in_time & (due_s - measured_s > MIN_LATENESS_S)
-    samples = np.arange(first, last_row)
+    samples = np.arange(first_row, last_row)
     lost = is_inside & ~is_in_time
     events[sample_places] = np.rec.fromarrays(
         [end, samples, action, is_usable, can_start, late, lost, measured_s], dtype=EVENT
@@ -192,21 +192,21 @@ def _actions(
 def _effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
     """Return the sensitivities of attitude, velocity and position at the end of each interval.
 
-    Shape (E, 9, EFFECT_COLUMNS).
+    Shape (E, 9, EFFECT_COLUMN_COUNT).
     """
     length = end - start
     # integrate the first prediction step of all intervals, then the second step, and so on. Longer
     # intervals are sorted first, so the intervals with a next step are the first rows
     longest_first = np.argsort(-length, kind="stable")
-    first = start[longest_first]
-    attitude, velocity, position = effects = np.zeros((3, len(end), 3, EFFECT_COLUMNS))
+    first_start = start[longest_first]
+    attitude, velocity, position = effects = np.zeros((3, len(end), 3, EFFECT_COLUMN_COUNT))
     attitude[:, :, 0:3] = np.eye(3)
     force_m_s2 = rotate(segment.rotation[1:], segment.force_m_s2)
     steps = np.arange(int(length.max(initial=0)))
     for step_number, count in zip(
         steps, np.searchsorted(-length[longest_first], -steps), strict=True
     ):
-        step = first[:count] + step_number
+        step = first_start[:count] + step_number
         rows = slice(count)
         dt = segment.step_s[step][:, None, None]
         force = force_m_s2[step]

@@ -11,7 +11,7 @@ filter configurations run together, to save time.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -92,17 +92,17 @@ class Model:
         Replay with the logged parameters.
     agreement : Agreement
         Agreement of ``flown`` with the log.
-    runs : list of SegmentRun
+    runs : tuple of SegmentRun
         One run per segment, with the filter configurations already computed: logged parameters,
         logged parameters with logged rejections, and the result of ``request_configurations``.
     """
 
     flight: Flight
     inputs: Inputs
-    intervals: dict[Timing, tuple[Intervals, ...]]
+    intervals: Mapping[Timing, tuple[Intervals, ...]]
     flown: Ekf2Replay
     agreement: Agreement
-    runs: list[SegmentRun] = field(default_factory=list, init=False)
+    runs: tuple[SegmentRun, ...] = ()
 
     __repr__ = one_line_repr
 
@@ -127,9 +127,11 @@ def open_model(
     while not isinstance(
         model := _open_without_aids(flight, request_configurations, failed_agreements), Unavailable
     ):
-        if not (more := model.agreement.doubtful.keys() - failed_agreements.keys()):
+        if not (
+            further_doubtful_aids := model.agreement.doubtful.keys() - failed_agreements.keys()
+        ):
             break
-        failed_agreements |= dict.fromkeys(more, model.agreement)
+        failed_agreements |= dict.fromkeys(further_doubtful_aids, model.agreement)
     return model
 
 
@@ -143,8 +145,10 @@ def _open_without_aids(
     Keys are PX4's names of the sources; values are the agreements of the replay that contained the
     source and was wrong.
     """
-    doubtful = {name: agreement.doubtful[name] for name, agreement in failed_agreements.items()}
-    inputs = prepare_inputs(flight, doubtful)
+    doubtful_aids = {
+        name: agreement.doubtful[name] for name, agreement in failed_agreements.items()
+    }
+    inputs = prepare_inputs(flight, doubtful_aids)
     if isinstance(inputs, Unavailable):
         return structs.replace(inputs, what=ANALYSIS_NAME)
     if inputs.aid == GNSS_POS and isinstance(flight.ekf2, Ekf2):
@@ -181,12 +185,10 @@ def _open_without_aids(
         for name, failed_agreement in failed_agreements.items()
     }
     agreement = structs.replace(
-        agreement, doubtful={**doubtful, **agreement.doubtful}, **failed_fields
+        agreement, doubtful={**doubtful_aids, **agreement.doubtful}, **failed_fields
     )
     replay = structs.replace(replay, agreement=agreement)
-    model = Model(flight, inputs, intervals_by_timing, replay, agreement)
-    model.runs.extend(runs)
-    return model
+    return Model(flight, inputs, intervals_by_timing, replay, agreement, tuple(runs))
 
 
 def replay_with_logged_rejections(model: Model) -> Ekf2Replay:
@@ -232,7 +234,7 @@ def replay_settings(
             unmodelled & BAROMETER.own_parameters,
             height_text if inputs.height_reason else "EKF2 fused no barometer height",
         )
-    if inputs.rules.horizon_by_delay:
+    if inputs.rules.uses_delay_as_horizon:
         firmware = model.flight.log.firmware
         unused_parameters["EKF2_DELAY_MAX"] = (
             f"in {firmware} the fusion horizon follows from the largest delay parameter"
@@ -254,14 +256,16 @@ def replay_settings(
     uses_logged_decisions = excluded_s is not None
     if excluded_s is not None:
         rows = same_sample(inputs.received.stamp_s, excluded_s)
-        rejected = np.full(len(inputs.received.stamp_s), np.nan)
-        rejected[rows[rows >= 0]] = 1.0
-        no_reset = np.zeros(len(rejected), dtype=bool)
+        rejected_flags = np.full(len(inputs.received.stamp_s), np.nan)
+        rejected_flags[rows[rows >= 0]] = 1.0
+        no_reset = np.zeros(len(rejected_flags), dtype=bool)
         inputs = replace(
             inputs,
-            received=replace(inputs.received, rejected=rejected, reset=no_reset, correction_m=None),
+            received=replace(
+                inputs.received, rejected=rejected_flags, reset=no_reset, correction_m=None
+            ),
         )
-        model = replace(model, inputs=inputs)
+        model = replace(model, inputs=inputs, runs=())
     configurations = [
         FilterConfiguration(
             {**inputs.settings, **change},
@@ -310,7 +314,7 @@ def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
             noise = rng.normal(scale=sigma_m, size=samples.position_m.shape)
             new_inputs[name] = replace(samples, position_m=samples.position_m + noise)
     # the noise changes positions only, not their times, so the intervals remain valid
-    return replace(model, inputs=replace(inputs, **new_inputs))
+    return replace(model, inputs=replace(inputs, **new_inputs), runs=())
 
 
 def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float) -> Model:
@@ -330,7 +334,8 @@ def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float)
         velocity_m_s=None if velocity is None else velocity @ rotation,
     )
     intervals = {} if delay_s else model.intervals
-    return replace(model, inputs=replace(model.inputs, received=received), intervals=intervals)
+    inputs = replace(model.inputs, received=received)
+    return replace(model, inputs=inputs, intervals=intervals, runs=())
 
 
 def delayed_tracks(
@@ -343,11 +348,13 @@ def delayed_tracks(
     """
     runs = _run_model(model, configurations)
     for configuration_index in map(runs[0].configurations.index, configurations):
-        yield pd.concat([_track(run, delayed_states(run, configuration_index)[0]) for run in runs])
+        yield pd.concat(
+            [_published_columns(run, delayed_states(run, configuration_index)[0]) for run in runs]
+        )
 
 
-def _run_model(model: Model, configurations: Sequence[FilterConfiguration]) -> list[SegmentRun]:
-    """Run filter configurations, or return the stored runs of the model if they contain all."""
+def _run_model(model: Model, configurations: Sequence[FilterConfiguration]) -> Sequence[SegmentRun]:
+    """Run filter configurations, or return the stored runs of the model if these contain all."""
     if model.runs and all(
         configuration in model.runs[0].configurations for configuration in configurations
     ):
@@ -378,7 +385,7 @@ def run_configurations(
     return runs
 
 
-def _track(run: SegmentRun, state: Array) -> pd.DataFrame:
+def _published_columns(run: SegmentRun, state: Array) -> pd.DataFrame:
     """Return position and velocity of a state as a table with one row per prediction step."""
     index = pd.Index(run.segment.time_s, name="time_s")
     position = state[:, POSITION] / run.segment.metres
@@ -389,14 +396,14 @@ def _make_replay(
     inputs: Inputs,
     runs: Sequence[SegmentRun],
     configuration: FilterConfiguration,
-    changed: Mapping[str, float],
+    changed_parameters: Mapping[str, float],
 ) -> Ekf2Replay:
     configuration_index = runs[0].configurations.index(configuration)
     tracks = [_delayed_and_published(inputs, run, configuration_index) for run in runs]
     updates = [_position_updates(run, configuration_index) for run in runs]
     return Ekf2Replay(
         settings=configuration.settings,
-        changed=dict(changed),
+        changed=dict(changed_parameters),
         updates=pd.concat(updates),
         flow_only_spans_s=tuple(
             span
@@ -404,8 +411,8 @@ def _make_replay(
             if run.segment.flow is not None
             for span in _flow_only_spans_s(run_updates, run.segment)
         ),
-        delayed=pd.concat([delayed for delayed, _ in tracks]),
-        published=pd.concat([published for _, published in tracks]),
+        delayed=pd.concat([delayed_track for delayed_track, _ in tracks]),
+        published=pd.concat([published_track for _, published_track in tracks]),
         other_aid_updates=_other_aid_updates(runs, configuration_index),
         stretches_s=tuple(tuple(run.segment.time_s[[0, -1]].tolist()) for run in runs),
         source=inputs.received.source,
@@ -473,13 +480,15 @@ def _delayed_and_published(
     lag = max(round(horizon_s / inputs.step_s), 1)
     published_rotation = np.zeros((len(state), 3))
     # without attitude states, the nominal (published) attitude already is EKF2's logged attitude
-    if configuration.attitude:
+    if configuration.estimates_attitude:
         attitude_difference = state[:, THETA] - segment.attitude_error_rad
         published_rotation = follow_attitude(attitude_difference, lag, inputs.step_s, horizon_s)
-    published = publish(segment, state, reset, published_rotation, lag, configuration.settings)
+    published_track = publish(
+        segment, state, reset, published_rotation, lag, configuration.settings
+    )
     heading = np.arctan2(segment.rotation[:, 1, 0], segment.rotation[:, 0, 0]) + state[:, HEADING]
-    delayed = _track(run, state).assign(heading_rad=heading)
-    return delayed, _track(run, np.hstack([state[:, THETA], *published]))
+    delayed_track = _published_columns(run, state).assign(heading_rad=heading)
+    return delayed_track, _published_columns(run, np.hstack([state[:, THETA], *published_track]))
 
 
 def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Array]:
@@ -514,7 +523,7 @@ def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Ar
 
     # state equations of px4fuse.ekf2.intervals, evaluated for this state only
     rotation_steps = -rotate(rotation, state[1:, GYRO_BIAS]) * dt
-    if configuration.attitude:
+    if configuration.estimates_attitude:
         rotation_steps -= segment.correction_rad
     state[1:, THETA] += sum_since_event(rotation_steps)
     force = rotate(rotation, segment.force_m_s2)
@@ -528,6 +537,6 @@ def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Ar
     state[event_steps] = event_states[1:]
     reset = np.zeros((count + 1, 3))
     position_reset_m = run.position_reset_m[:, configuration_index]
-    for e in np.flatnonzero(position_reset_m.any(axis=1)):
-        reset[event_steps[e] :, :2] += position_reset_m[e]
+    for event_index in np.flatnonzero(position_reset_m.any(axis=1)):
+        reset[event_steps[event_index] :, :2] += position_reset_m[event_index]
     return state, reset

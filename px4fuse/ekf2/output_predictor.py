@@ -161,9 +161,10 @@ def corrections(
         (decay_start - decay_end, (row, sample_index)),
         shape=(len(correction_increments), len(sample_s)),
     )
-    normal = visible_shares.T @ visible_shares + PRIOR_WEIGHT * eye_array(len(sample_s))
+    normal_matrix = visible_shares.T @ visible_shares + PRIOR_WEIGHT * eye_array(len(sample_s))
     result = np.reshape(
-        spsolve(normal.tocsc(), visible_shares.T @ correction_increments), (len(sample_s), -1)
+        spsolve(normal_matrix.tocsc(), visible_shares.T @ correction_increments),
+        (len(sample_s), -1),
     )
     return np.where(visible_shares.sum(axis=0)[:, None] > MIN_VISIBLE_SHARE, result, np.nan)
 

@@ -46,7 +46,7 @@ MIN_SAMPLES = 20  # minimum number of logged innovations for a comparison with t
 CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
 # Maximum time (s) from an update to its logged innovation: estimator_innovations repeats a sample
 # with later timestamps until the next fusion
-MAX_REPEAT_S = 0.5
+MAX_INNOVATION_AGE_S = 0.5
 # Minimum correlation of replayed and logged innovations: above 0.997 in simulated flights with
 # complete logs, below 0.9 with a downsampled source or IMU dropouts (see
 # tests/benchmarks/bench_ekf2.py)
@@ -158,11 +158,11 @@ class Agreement(Record, frozen=True, kw_only=True):
         """Agreement of the position innovations by horizontal axis."""
         return {"north": self.north, "east": self.east}
 
-    def as_unavailable(self, what: str) -> Unavailable:
-        """Return Unavailable for a result ``what`` of a replay that does not agree with the log."""
+    def as_unavailable(self, result_name: str) -> Unavailable:
+        """Return Unavailable for a result of a replay that does not agree with the log."""
         profile = "3 (default and full rates)" if self.gnss_pos else "129 (default and vision)"
         return Unavailable(
-            what,
+            result_name,
             f"the EKF2 replay does not agree with the log: {self.reason}",
             f"Record without dropouts and with SDLOG_PROFILE {profile}.",
         )
@@ -277,21 +277,21 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     north = axes["north"]
     east = axes["east"]
     rejected_in_log, rejected_in_model = (
-        frame["rejected"].to_numpy() > 0 for frame in (log, model)
+        innovations["rejected"].to_numpy() > 0 for innovations in (log, model)
     )
     rejected_fractions = float(rejected_in_log.mean()), float(rejected_in_model.mean())
-    good, reason = _agreement_verdict(axes, *rejected_fractions)
-    other_agreements, doubtful = _other_agreements(ekf2, replay)
+    is_good, reason = _agreement_verdict(axes, *rejected_fractions)
+    other_agreements, doubtful_aids = _other_agreements(ekf2, replay)
     velocity, constant = _velocity_agreement(ekf2, replay, is_own_topic=is_own_topic)
     if constant:
-        doubtful[GNSS_VEL.name] = CONSTANT_INNOVATIONS
+        doubtful_aids[GNSS_VEL.name] = CONSTANT_INNOVATIONS
     position = {replayed_aid(ekf2).name: axes}
     distance_m = np.hypot(north.position_rms_difference_m, east.position_rms_difference_m)
     flow_only_m = _flow_only_error_m(ekf2, replay)
     if flow_only_m is not None and flow_only_m > MAX_FLOW_ONLY_DIFFERENCE_M:
-        doubtful[FLOW.name] = (
-            f"while {FLOW.label} was the only horizontal aid, the published position differs by "
-            f"{_format_beyond(flow_only_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m (limit "
+        doubtful_aids[FLOW.name] = (
+            f"while {FLOW.label} was the only horizontal aid, replayed and logged positions differ "
+            f"by {_format_beyond(flow_only_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m (limit "
             f"{MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
         )
     return Agreement(
@@ -299,13 +299,13 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
         east=east,
         gnss_vel=velocity,
         **(position | other_agreements),
-        doubtful=doubtful,
+        doubtful=doubtful_aids,
         samples=len(log),
         rejected_fraction_logged=rejected_fractions[0],
         rejected_fraction_replayed=rejected_fractions[1],
         decisions_same=float(np.mean(rejected_in_log == rejected_in_model)),
         published_rms_difference_m=float(distance_m),
-        good=good,
+        good=is_good,
         reason=reason,
         heading_rms_difference_deg=_heading_error_deg(ekf2, replay),
         carried_difference_m=flow_only_m,
@@ -332,22 +332,25 @@ def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     """Return the RMS heading difference (°) between replay and log; None without magnetometer."""
     if MAG.noise not in replay.settings or isinstance(ekf2.record, Unavailable):
         return None
-    logged = ekf2.record.delayed
-    logged = logged[inside_spans(logged.index, replay.evaluated_s)]
-    if logged.empty:
+    logged_state = ekf2.record.delayed
+    logged_state = logged_state[inside_spans(logged_state.index, replay.evaluated_s)]
+    if logged_state.empty:
         return None
     heading = replay.delayed["heading_rad"]
-    replayed_rad = np.interp(logged.index, heading.index, np.unwrap(heading))
-    difference_rad = np.angle(np.exp(1j * (replayed_rad - heading_rad(logged))))
+    replayed_rad = np.interp(logged_state.index, heading.index, np.unwrap(heading))
+    difference_rad = np.angle(np.exp(1j * (replayed_rad - heading_rad(logged_state))))
     return float(np.degrees(rms(difference_rad)))
 
 
 def _has_constant_innovations(
-    logged: pd.DataFrame, model: pd.DataFrame, axes: Iterable[AxisName]
+    logged_samples: pd.DataFrame, model_samples: pd.DataFrame, axes: Iterable[AxisName]
 ) -> bool:
     """Return True if logged or replayed innovations are constant: they have no correlation."""
     columns = [f"innovation_{axis}_m" for axis in axes]
-    return not all(np.ptp(frame[columns], axis=0).all() for frame in (logged, model))
+    return not all(
+        np.ptp(innovations[columns], axis=0).all()
+        for innovations in (logged_samples, model_samples)
+    )
 
 
 def _velocity_agreement(
@@ -360,8 +363,10 @@ def _velocity_agreement(
     log = ekf2.aids.get("gnss_vel")
     if log is None or VELOCITY_UPDATE_COLUMNS[0] not in replay.updates:
         return {}, False
-    logged, model = _matched_samples(replay, replay.updates, log.samples, is_own_topic=is_own_topic)
-    if len(logged) < MIN_SAMPLES:
+    logged_samples, model_samples = _matched_samples(
+        replay, replay.updates, log.samples, is_own_topic=is_own_topic
+    )
+    if len(logged_samples) < MIN_SAMPLES:
         return {}, False
     # give the velocity columns the names of position columns, which _axis_agreement reads
     names: dict[str, str] = {}
@@ -369,13 +374,15 @@ def _velocity_agreement(
         nu = f"innovation_{axis}_m"
         S = f"innovation_variance_{axis}_m2"
         names |= {f"{nu}_s": nu, f"{S}_s2": S, f"innovation_{axis}": nu, f"variance_{axis}": S}
-    logged = logged.rename(columns=names)
-    model = model[VELOCITY_UPDATE_COLUMNS].rename(columns=names)
+    logged_samples = logged_samples.rename(columns=names)
+    model_samples = model_samples[VELOCITY_UPDATE_COLUMNS].rename(columns=names)
     # compare the axis down only if the replay fuses heights: else it uses the logged EKF2 height
     axes = AXIS_NAMES if GNSS_HGT.name in replay.other_aid_updates else HORIZONTAL
-    if _has_constant_innovations(logged, model, axes):
+    if _has_constant_innovations(logged_samples, model_samples, axes):
         return {}, True
-    return {axis: _axis_agreement(axis, logged, model, ekf2, replay) for axis in axes}, False
+    return {
+        axis: _axis_agreement(axis, logged_samples, model_samples, ekf2, replay) for axis in axes
+    }, False
 
 
 def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
@@ -384,28 +391,35 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
     Return also the reason of each disagreement, by PX4 name.
     """
     agreements: dict[str, dict[str, AxisAgreement]] = {}
-    doubtful = {}
+    doubtful_aids = {}
     for name, updates in replay.other_aid_updates.items():
         log = ekf2.aids[name]
         is_own_topic = aid_source(AIDS[name]) in log.topics
         rows = logged_aid_innovations(name, log)
-        logged, model = _matched_samples(replay, updates, rows, is_own_topic=is_own_topic)
-        if len(logged) < MIN_SAMPLES:
-            doubtful[name] = (
-                f"the log has only {count_noun(len(logged), 'innovation')} in the replayed time"
+        logged_samples, model_samples = _matched_samples(
+            replay, updates, rows, is_own_topic=is_own_topic
+        )
+        if len(logged_samples) < MIN_SAMPLES:
+            doubtful_aids[name] = (
+                f"the log has only {count_noun(len(logged_samples), 'innovation')} in the replayed "
+                "time"
             )
             continue
-        if _has_constant_innovations(logged, model, axes_of(updates)):
-            doubtful[name] = CONSTANT_INNOVATIONS
+        if _has_constant_innovations(logged_samples, model_samples, axes_of(updates)):
+            doubtful_aids[name] = CONSTANT_INNOVATIONS
             continue
         agreements[name] = {
-            axis: _axis_agreement(axis, logged, model, ekf2, replay) for axis in axes_of(updates)
+            axis: _axis_agreement(axis, logged_samples, model_samples, ekf2, replay)
+            for axis in axes_of(updates)
         }
-        rejected_fractions = (float(np.mean(frame["rejected"] > 0.0)) for frame in (logged, model))
-        good, reason = _agreement_verdict(agreements[name], *rejected_fractions)
-        if not good:
-            doubtful[name] = reason
-    return agreements, doubtful
+        rejected_fractions = (
+            float(np.mean(innovations["rejected"] > 0.0))
+            for innovations in (logged_samples, model_samples)
+        )
+        is_good, reason = _agreement_verdict(agreements[name], *rejected_fractions)
+        if not is_good:
+            doubtful_aids[name] = reason
+    return agreements, doubtful_aids
 
 
 def logged_aid_innovations(name: str, log: AidLog) -> pd.DataFrame:
@@ -424,9 +438,9 @@ def _matched_samples(
     replay: Ekf2Replay, updates: pd.DataFrame, logged: pd.DataFrame, *, is_own_topic: bool
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return the logged innovations in the evaluated times, and the updates of the same samples."""
-    matched = match_updates(updates, logged.index.to_numpy(), is_own_topic=is_own_topic)
-    is_used = (matched >= 0) & inside_spans(logged.index, replay.evaluated_s)
-    return logged[is_used], updates.iloc[matched[is_used]]
+    matched_updates = match_updates(updates, logged.index.to_numpy(), is_own_topic=is_own_topic)
+    is_used = (matched_updates >= 0) & inside_spans(logged.index, replay.evaluated_s)
+    return logged[is_used], updates.iloc[matched_updates[is_used]]
 
 
 def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
@@ -436,12 +450,12 @@ def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
 
 def _columns_by_axis(innovations: Mapping[AxisName, pd.DataFrame | Unavailable]) -> pd.DataFrame:
     columns = {}
-    for axis, frame in innovations.items():
-        if isinstance(frame, Unavailable):
+    for axis, axis_innovations in innovations.items():
+        if isinstance(axis_innovations, Unavailable):
             return pd.DataFrame()
-        columns[f"innovation_{axis}_m"] = frame["innovation_m"]
-        columns[f"innovation_variance_{axis}_m2"] = frame["innovation_variance_m2"]
-        columns["rejected"] = frame["rejected"]
+        columns[f"innovation_{axis}_m"] = axis_innovations["innovation_m"]
+        columns[f"innovation_variance_{axis}_m2"] = axis_innovations["innovation_variance_m2"]
+        columns["rejected"] = axis_innovations["rejected"]
     return pd.DataFrame(columns).dropna()
 
 
@@ -465,14 +479,16 @@ def match_updates(updates: pd.DataFrame, times: Array, *, is_own_topic: bool) ->
     fused_at = updates["fused_at_s"].to_numpy()
     row = np.searchsorted(fused_at, times + 1e-4, side="right") - 1
     age = times - fused_at[np.maximum(row, 0)]
-    return np.where((row >= 0) & (age <= MAX_REPEAT_S), row, -1)
+    return np.where((row >= 0) & (age <= MAX_INNOVATION_AGE_S), row, -1)
 
 
 def _axis_agreement(
     axis: AxisName, log: pd.DataFrame, model: pd.DataFrame, ekf2: Ekf2, replay: Ekf2Replay
 ) -> AxisAgreement:
-    nu, nu_log = (frame[f"innovation_{axis}_m"].to_numpy() for frame in (model, log))
-    S, S_log = (frame[f"innovation_variance_{axis}_m2"].to_numpy() for frame in (model, log))
+    nu, nu_log = (innovations[f"innovation_{axis}_m"].to_numpy() for innovations in (model, log))
+    S, S_log = (
+        innovations[f"innovation_variance_{axis}_m2"].to_numpy() for innovations in (model, log)
+    )
     s_ratio_p5, s_ratio_median, s_ratio_p95 = np.percentile(S / S_log, [5, 50, 95]).tolist()
     times = ekf2.state.index[inside_spans(ekf2.state.index, replay.evaluated_s)].to_numpy()
     direction = np.eye(3)[AXIS_NAMES.index(axis)]
@@ -494,10 +510,10 @@ def _axis_agreement(
     )
 
 
-def along(frame: pd.DataFrame, columns: list[str], direction: Array, times: Array) -> Array:
-    """Interpolate the component of a vector (NED columns of ``frame``) along a direction."""
-    component = signals.weighted_sum(frame, columns, direction[: len(columns)])
-    return np.asarray(np.interp(times, frame.index, component))
+def along(vectors: pd.DataFrame, columns: list[str], direction: Array, times: Array) -> Array:
+    """Interpolate the component of a vector (NED columns of ``vectors``) along a direction."""
+    component = signals.weighted_sum(vectors, columns, direction[: len(columns)])
+    return np.asarray(np.interp(times, vectors.index, component))
 
 
 def rms_to_truth(flight: Flight, position: Array, direction: Array, times: Array) -> float | None:
@@ -537,19 +553,19 @@ def _agreement_verdict(
             "samples that are not in the log"
         )
     min_correlation = min(axis.innovation_correlation for axis in axes.values())
-    correlation_text = f"correlation of replayed and logged innovations {min_correlation:.4f}"
+    correlation_text = f"the correlation {min_correlation:.4f} of replayed and logged innovations"
     if min_correlation >= MIN_CORRELATION:
         difference_m = max(axis.position_rms_difference_m for axis in axes.values())
         limit_m = published_factor * MAX_PUBLISHED_DIFFERENCE_M
         if difference_m > limit_m:
             return False, (
-                "the innovations agree, but the published position differs by "
+                "the innovations agree, but replayed and published positions differ by "
                 f"{_format_beyond(difference_m, limit_m)} m RMS (limit {limit_m:g} m): the log "
                 "lacks an input of EKF2's output predictor"
             )
-        return True, f"{correlation_text} or better"
+        return True, f"{correlation_text} is sufficient"
     if max(rejected_in_log, rejected_in_replay) < MANY_REJECTIONS_SHARE:
-        return False, f"{correlation_text} only (at least {MIN_CORRELATION:g})"
+        return False, f"{correlation_text} is below the minimum of {MIN_CORRELATION:g}"
     rejected_difference = abs(rejected_in_replay - rejected_in_log)
     nis = max(abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) for axis in axes.values())
     text = (
@@ -584,13 +600,13 @@ def with_logged_rejections(
         True if every decision of EKF2 is logged. Then all numbers are from
         ``logged_rejections_agreement``.
     """
-    good, reason = _agreement_verdict(
+    is_good, reason = _agreement_verdict(
         logged_rejections_agreement.axes, 0.0, 0.0, REJECTING_TOLERANCE_FACTOR
     )
     return replace(
         logged_rejections_agreement if has_all_decisions else agreement,
         rejected_fraction_replayed=agreement.rejected_fraction_replayed,
         decisions_same=agreement.decisions_same,
-        good=good,
+        good=is_good,
         reason=f"with EKF2's logged rejections: {reason}",
     )

@@ -52,7 +52,7 @@ MAG_FUSION_HZ = 14.0
 # Minimum rate (Hz) of the logged magnetometer for a replay of its fusion
 MIN_MAG_LOG_HZ = 1.5
 # Time constant (s) of EKF2's low-pass filter of innovations (updateAidSourceStatus, ekf_helper.cpp)
-FILTER_S = 0.5
+INNOVATION_FILTER_S = 0.5
 MIN_SEGMENT_S = 10.0  # minimum length of a replayed segment
 # Maximum delay (s) from a reset to its publication: largest delay of the fusion horizon plus one
 # logging interval
@@ -309,7 +309,7 @@ def find_replay_segments(
     """
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
-    fused = innovations.index.to_numpy()
+    fused_s = innovations.index.to_numpy()
     states = record.delayed.index.to_numpy()
     time = imu.index.to_numpy()
     cuts = [time[0], time[-1]]
@@ -317,16 +317,16 @@ def find_replay_segments(
         gap = np.flatnonzero(np.diff(stamps) > limit)
         cuts += [*stamps[gap], *stamps[gap + 1]]
     cuts += _break_times_s(imu, ekf2) if is_gnss else ()
-    first = max(attitude.index[0], source_s[0])
-    last = min(attitude.index[-1], source_s[-1] + 1.0)
+    first_s = max(attitude.index[0], source_s[0])
+    end_s = min(attitude.index[-1], source_s[-1] + 1.0)
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     field_span = _field_span(record) if is_gnss else None
     cuts += field_span[1:] if field_span else ()
     # end a segment when the primary EKF2 instance changes, because instances have different states
     cuts += [time_s for time_s, _ in ekf2.instances[1:]]
     segments = []
-    for low, high in pairwise(np.unique(np.clip(cuts, first, last))):
-        fused_inside = fused[(fused >= low) & (fused <= high)]
+    for low, high in pairwise(np.unique(np.clip(cuts, first_s, end_s))):
+        fused_inside = fused_s[(fused_s >= low) & (fused_s <= high)]
         if not len(fused_inside):
             continue
         # the replay starts MIN_AIRBORNE_S after the first take-off, if this is before the end of
@@ -346,7 +346,7 @@ def find_replay_segments(
             continue
         segment = _make_gnss_segment(*segment_inputs, start_row, high)
         history_row = int(
-            np.searchsorted(states, max(first, states[start_row] - CORRELATION_HISTORY_S))
+            np.searchsorted(states, max(first_s, states[start_row] - CORRELATION_HISTORY_S))
         )
         if history_row < start_row:
             history = _make_gnss_segment(*segment_inputs, history_row, states[start_row])
@@ -442,22 +442,24 @@ def _make_segment(
         np.concatenate([[[1.0, 0.0, 0.0, 0.0]], from_vector(rotation_vectors)])
     )
 
-    def relative_attitude(frame: pd.DataFrame, early_s: float, end_attitude: Array) -> ArrayPair:
-        frame = frame.loc[times[0] - early_s : times[-1]]
-        at_s = frame.index.to_numpy()
+    def relative_attitude(
+        attitude_samples: pd.DataFrame, early_s: float, end_attitude: Array
+    ) -> ArrayPair:
+        attitude_samples = attitude_samples.loc[times[0] - early_s : times[-1]]
+        at_s = attitude_samples.index.to_numpy()
         rotation = conjugate(interpolate(at_s, times, end_attitude))
-        return at_s, multiply(frame[Columns.QUATERNION].to_numpy(), rotation)
+        return at_s, multiply(attitude_samples[Columns.QUATERNION].to_numpy(), rotation)
 
     # rotation (NED) between the attitude integrated from the gyro and the published attitude
     extra_rotation = interpolate(times, *relative_attitude(attitude, 0.0, gyro))
     nominal = multiply(extra_rotation, gyro)
     states, state_rotation = relative_attitude(record.delayed, 1e-4, nominal)
     error = to_vector(state_rotation)
-    published = [np.interp(times[0], ekf2.state.index, ekf2.state[c]) for c in Columns.POSITION]
+    published_m = [np.interp(times[0], ekf2.state.index, ekf2.state[c]) for c in Columns.POSITION]
     position = start[Columns.POSITION].to_numpy()
-    position = np.where(np.isfinite(position), position, published)
+    position = np.where(np.isfinite(position), position, published_m)
     # from PX4 v1.16 on, state and published height have different origins
-    position[2] = published[2]
+    position[2] = published_m[2]
     return ReplaySegment(
         time_s=times,
         step_s=step,
@@ -481,15 +483,17 @@ def _make_segment(
 
 def _field_span(record: FusionRecord) -> Span | None:
     """Return start and end (s) of EKF2's fusion of all magnetometer axes; None if interrupted."""
-    fused = record.field_gauss["fused_3d"] if len(record.field_gauss) else pd.Series(dtype=float)
-    times = fused.index.to_numpy()
-    is_fused = fused.to_numpy() > 0.0
+    is_fused_3d = (
+        record.field_gauss["fused_3d"] if len(record.field_gauss) else pd.Series(dtype=float)
+    )
+    times = is_fused_3d.index.to_numpy()
+    is_fused = is_fused_3d.to_numpy() > 0.0
     if not is_fused.any() or 1.0 / np.median(np.diff(times)) < MIN_MAG_LOG_HZ:
         return None
-    first, last = np.flatnonzero(is_fused)[[0, -1]]
-    if not is_fused[first:last].all():
+    first_row, last_row = np.flatnonzero(is_fused)[[0, -1]]
+    if not is_fused[first_row:last_row].all():
         return None
-    return float(times[first]) + FIELD_RESET_S, float(times[last])
+    return float(times[first_row]) + FIELD_RESET_S, float(times[last_row])
 
 
 def _add_field(
@@ -497,24 +501,24 @@ def _add_field(
 ) -> ReplaySegment:
     """Add the logged magnetic fields to the states of a segment."""
     start = record.delayed.iloc[start_row]
-    frame = record.field_gauss
-    stamps = frame.index.to_numpy()
+    field_gauss = record.field_gauss
+    stamps = field_gauss.index.to_numpy()
     age_s = record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     weight = max(MAG_FUSION_HZ * float(np.median(np.diff(stamps))), 1.0)
-    gauss = frame.iloc[:, :3].to_numpy()
+    gauss = field_gauss.iloc[:, :3].to_numpy()
     fields = np.asarray(start[[*Columns.EARTH_FIELD, *Columns.BODY_FIELD]])
     variance = np.asarray(start[Columns.DELAYED_VARIANCE[-6:]])
     extended = add_field_states(segment, stamps - age_s, gauss, weight, fields, variance)
-    if Columns.FIELD_INNOVATION[0] not in frame:
+    if Columns.FIELD_INNOVATION[0] not in field_gauss:
         return extended
-    filtered_gauss = frame[Columns.FIELD_INNOVATION].to_numpy()
+    filtered_gauss = field_gauss[Columns.FIELD_INNOVATION].to_numpy()
     return replace(
         extended, field=_mean_field(segment, record.delayed, stamps - age_s, filtered_gauss)
     )
 
 
 def _mean_field(
-    segment: ReplaySegment, delayed: pd.DataFrame, measured_at_s: Array, filtered_gauss: Array
+    segment: ReplaySegment, delayed_state: pd.DataFrame, measured_at_s: Array, filtered_gauss: Array
 ) -> SensorSamples:
     """Reconstruct the mean magnetic field between two logged rows from filtered innovations.
 
@@ -527,21 +531,25 @@ def _mean_field(
     measured_at_s = measured_at_s[rows]
     between_s = between_s[rows - 1]
     count = np.maximum(np.rint(MAG_FUSION_HZ * between_s), 1.0)
-    share = between_s / (between_s + count * FILTER_S)
+    share = between_s / (between_s + count * INNOVATION_FILTER_S)
     decay = ((1.0 - share) ** count)[:, None]
     innovation = (filtered_gauss[rows] - decay * filtered_gauss[rows - 1]) / (1.0 - decay)
     step, weight = low_pass_weights(segment, measured_at_s, count, between_s / count, share)
     rotation_to_body = segment.rotation[step].swapaxes(2, 3)
     earth, body = (
-        np.column_stack([np.interp(measured_at_s, delayed.index, delayed[name]) for name in names])
+        np.column_stack(
+            [np.interp(measured_at_s, delayed_state.index, delayed_state[name]) for name in names]
+        )
         for names in (Columns.EARTH_FIELD, Columns.BODY_FIELD)
     )
     rotated_earth_field = earth[:, None] - np.cross(
         segment.attitude_error_rad[step], earth[:, None]
     )
-    expected = np.einsum("ki,kiab,kib->ka", weight, rotation_to_body, rotated_earth_field) + body
+    expected_field = (
+        np.einsum("ki,kiab,kib->ka", weight, rotation_to_body, rotated_earth_field) + body
+    )
     mean = np.einsum("ki,kiab->kab", weight, rotation_to_body)
-    return SensorSamples(step[:, 0], expected - innovation, mean, count, np.zeros(len(rows)))
+    return SensorSamples(step[:, 0], expected_field - innovation, mean, count, np.zeros(len(rows)))
 
 
 def low_pass_weights(

@@ -43,7 +43,7 @@ OTHER_TIME = Unavailable(
 # velocity variance per second: SIGMA_A² · DT in KF, and EKF2_ACC_NOISE² · Δt in EKF2 with the
 # prediction step Δt
 SAMPLES = "samples and time steps"
-STAMPS = "timestamps and delay"
+TIMESTAMPS = "timestamps and delay"
 NOISE = "measurement noise"
 BIASES = "accelerometer bias as a state"
 PROCESS = "process noise"
@@ -56,9 +56,9 @@ GATE = "gate, missed samples and resets"
 OUTPUT = "output predictor"
 # Order in which EKF2 properties replace KF properties. A flight in which EKF2 fuses further aiding
 # sources has one more step for each of them, before GATE
-STEPS = (SAMPLES, STAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
+STEPS = (SAMPLES, TIMESTAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
-COLUMNS = (Columns.POSITION, Columns.VELOCITY)
+TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
 class Step(Record, frozen=True, kw_only=True):
@@ -218,12 +218,12 @@ def explain_by_steps(
     assert isinstance(ekf2, Ekf2)
     configurations = step_configurations(model.inputs, settings or Settings())
     delayed = delayed_tracks(model, list(configurations.values()))
-    flown = replay_with_logged_rejections(model)
+    flown_replay = replay_with_logged_rejections(model)
     evaluated_spans = model.flown.evaluated_s
     times = ekf2.state.index.to_numpy()
     is_inside = inside_spans(times, evaluated_spans)
     # compare only at times that the replay and all KF runs cover
-    for index in (flown.delayed.index, *(run.steps.index for run in (runs or {}).values())):
+    for index in (flown_replay.delayed.index, *(run.steps.index for run in (runs or {}).values())):
         is_inside &= (times >= index[0]) & (times <= index[-1])
     times = times[is_inside]
     if not len(times):
@@ -235,14 +235,14 @@ def explain_by_steps(
     span = float(times[0]), float(times[-1])
     directions = {name: run.axis.direction for name, run in (runs or {}).items()}
     directions = directions or {"north": np.eye(3)[0], "east": np.eye(3)[1]}
-    without_gate = flown.delayed
+    without_gate = flown_replay.delayed
     stages = []
     # one track at a time, to limit memory
-    tracks = chain(delayed, (flown.published, ekf2.state))
+    tracks = chain(delayed, (flown_replay.published, ekf2.state))
     for stage, track in zip((*configurations, OUTPUT, "EKF2 as logged"), tracks, strict=True):
         stages.append(
             [
-                [along(track, columns, direction, times) for columns in COLUMNS]
+                [along(track, columns, direction, times) for columns in TRACK_COLUMNS]
                 for direction in directions.values()
             ]
         )
@@ -255,7 +255,7 @@ def explain_by_steps(
         ):  # the replay before GATE has all EKF2 properties except gate and output predictor
             without_gate = track
     spans = Segment(*span, "").cut(evaluated_spans)
-    longest_rejection = _longest_rejection(flown, without_gate, span, evaluated_spans)
+    longest_rejection = _longest_rejection(flown_replay, without_gate, span, evaluated_spans)
     truth = model.flight.truth
     steps_by_axis = {}
     no_truth = OTHER_TIME if isinstance(truth, Truth) else truth
@@ -306,72 +306,78 @@ def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, Filt
 
     Keys are the names of the EKF2 properties that replace KF properties, one after the other.
     """
-    flown = inputs.settings
+    flown_settings = inputs.settings
     aid = inputs.aid
     acceleration_noise = kf_settings.sigma_a_m_s2 * math.sqrt(kf_settings.dt_s / inputs.step_s)
-    kf_process_noise = {**flown, "EKF2_ACC_NOISE": acceleration_noise}
+    kf_process_noise = {**flown_settings, "EKF2_ACC_NOISE": acceleration_noise}
     kf_parameters = {**kf_process_noise, aid.noise: kf_settings.sigma_z_m}
     # KF's GNSS positions have measurement times as timestamps: the delay is already subtracted
-    applied_delay_s = flown[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
+    applied_delay_s = flown_settings[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     offset_s = kf_settings.clock_offset_s - applied_delay_s
     without_lever_arm = {**kf_parameters, **dict.fromkeys(aid.lever_arm, 0.0)}
     aids = modelled_aids(inputs)
     other_aids = [name for name in (FLOW.name, EV_POS.name) if name in aids[1:]]
     kf_configuration = FilterConfiguration(
         kf_parameters,
-        biases=False,
-        attitude=False,
-        velocity=False,
-        reported=False,
+        estimates_biases=False,
+        estimates_attitude=False,
+        fuses_velocity=False,
+        uses_reported_noise=False,
         has_gate=False,
         without=dict.fromkeys((MAG.name, *other_aids), 0.0),
     )
     configurations = {
         SAMPLES: replace(kf_configuration, settings=without_lever_arm, timestamp_offset_s=offset_s),
-        STAMPS: kf_configuration,
-        NOISE: (noise := replace(kf_configuration, settings=kf_process_noise, reported=True)),
-        BIASES: replace(noise, biases=True),
-        PROCESS: replace(noise, settings=flown, biases=True),
-        ATTITUDE: (configuration := replace(noise, settings=flown, biases=True, attitude=True)),
+        TIMESTAMPS: kf_configuration,
+        NOISE: (
+            noise := replace(kf_configuration, settings=kf_process_noise, uses_reported_noise=True)
+        ),
+        BIASES: replace(noise, estimates_biases=True),
+        PROCESS: replace(noise, settings=flown_settings, estimates_biases=True),
+        ATTITUDE: (
+            configuration := replace(
+                noise, settings=flown_settings, estimates_biases=True, estimates_attitude=True
+            )
+        ),
     }
     if MAG.name in aids:
         configurations[FIELD_STEP] = configuration = replace(
             configuration, without=dict.fromkeys(other_aids, 0.0)
         )
     if inputs.received.velocity_m_s is not None:
-        configurations[VELOCITY_STEP] = configuration = replace(configuration, velocity=True)
+        configurations[VELOCITY_STEP] = configuration = replace(configuration, fuses_velocity=True)
     for position, name in enumerate(other_aids, start=1):
         step = FLOW_STEP if name == FLOW.name else VISION_STEP
         configurations[step] = configuration = replace(
             configuration, without=dict.fromkeys(other_aids[position:], 0.0)
         )
-    return configurations | {GATE: FilterConfiguration(flown, uses_logged_decisions=True)}
+    return configurations | {GATE: FilterConfiguration(flown_settings, uses_logged_decisions=True)}
 
 
 def _longest_rejection(
-    flown: Ekf2Replay, without_gate: pd.DataFrame, span: Span, spans: Spans
+    flown_replay: Ekf2Replay, without_gate: pd.DataFrame, span: Span, spans: Spans
 ) -> RejectionRun | None:
-    updates = flown.updates[inside_spans(flown.updates.index, spans)]
+    updates = flown_replay.updates[inside_spans(flown_replay.updates.index, spans)]
     updates = updates[updates["fused_at_s"].between(*span)]
-    rejected = updates["rejected"].to_numpy() > 0
+    is_rejected = updates["rejected"].to_numpy() > 0
     time = updates["fused_at_s"].to_numpy()
-    if not rejected.any():
+    if not is_rejected.any():
         return None
     # a run of rejections lasts from the first rejected sample to the next fused sample
-    change = np.diff(rejected.astype(int), prepend=0, append=0)
+    change = np.diff(is_rejected.astype(int), prepend=0, append=0)
     starts = np.flatnonzero(change == 1)
     ends = np.flatnonzero(change == -1)
-    longest = int(np.argmax(ends - starts))
-    begin = time[starts[longest]]
-    end = time[min(ends[longest], len(time) - 1)]
-    with_gate = flown.delayed.loc[begin:end]
+    longest_index = int(np.argmax(ends - starts))
+    begin = time[starts[longest_index]]
+    end = time[min(ends[longest_index], len(time) - 1)]
+    with_gate = flown_replay.delayed.loc[begin:end]
     position_difference = [
         with_gate[column] - np.interp(with_gate.index, without_gate.index, without_gate[column])
         for column in Columns.POSITION[:2]
     ]
     return RejectionRun(
         start_s=float(begin),
-        samples=int(ends[longest] - starts[longest]),
+        samples=int(ends[longest_index] - starts[longest_index]),
         duration_s=float(end - begin),
         distance_m=float(np.max(np.hypot(*position_difference))),
     )

@@ -25,7 +25,7 @@ from px4fuse.ekf2.replay_segments import ReplaySegment, pad_samples, samples_by_
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 
 # State indices of horizontal velocity and horizontal position
-SPEED, HORIZONTAL = slice(3, 5), slice(6, 8)
+HORIZONTAL_VELOCITY, HORIZONTAL_POSITION = slice(3, 5), slice(6, 8)
 # Maximum time (s) without a vision sample before fusion stops (2 EV_MAX_INTERVAL, ev_control.cpp)
 MAX_SAMPLE_GAP_S = 0.4
 # Maximum time (s) of vision samples outside the gate before EKF2 resets the vision bias or the
@@ -95,7 +95,7 @@ class VisionFilter:
         enabled: Mapping[str, BoolArray],
         parameters: Mapping[str, Array],
         has_gate: BoolArray,
-        reported: BoolArray,
+        uses_reported_noise: BoolArray,
     ) -> None:
         samples = np.stack(pad_samples(sample_arrays), axis=-1)
         self.position_m = np.moveaxis(samples[:2], 0, -1)
@@ -110,7 +110,9 @@ class VisionFilter:
         self.has_gate = has_gate
         self.without_gnss = ~enabled[GNSS_POS.name]
         self.gate2 = np.maximum(parameters[EV_POS.gate], MIN_GATE)[:, None] ** 2
-        reported_variance = samples[5:7] * (reported & (parameters[EV_POS.noise_mode] != 1.0))
+        reported_variance = samples[5:7] * (
+            uses_reported_noise & (parameters[EV_POS.noise_mode] != 1.0)
+        )
         min_variance = np.maximum(parameters[EV_POS.noise], MIN_SIGMA) ** 2
         gnss_variance = np.where(self.without_gnss, 0.0, parameters[GNSS_POS.noise] ** 2)
         self.noise_m2 = np.moveaxis(
@@ -158,10 +160,12 @@ class VisionFilter:
         now_s = self.now_s[slot, e]
         without_gnss = self.without_gnss[e]
         noise_m2 = self.noise_m2[slot, e]
-        HP = P[:, HORIZONTAL] - age_s[:, None] * P[:, SPEED]
-        S = HP[:, :, HORIZONTAL] - age_s[:, None] * HP[:, :, SPEED]
+        HP = P[:, HORIZONTAL_POSITION] - age_s[:, None] * P[:, HORIZONTAL_VELOCITY]
+        S = HP[:, :, HORIZONTAL_POSITION] - age_s[:, None] * HP[:, :, HORIZONTAL_VELOCITY]
         diagonal = S.reshape(len(S), -1)[:, ::3]  # view, to add R to S in slot
-        distance_m = self.position_m[slot, e] - x[:, HORIZONTAL] + age_s * x[:, SPEED]
+        distance_m = (
+            self.position_m[slot, e] - x[:, HORIZONTAL_POSITION] + age_s * x[:, HORIZONTAL_VELOCITY]
+        )
         sample_state = now_s[:, None], has_sample[:, None], ~without_gnss[:, None]
         nu, R = self.bias.remove_bias(distance_m, diagonal.copy(), noise_m2, *sample_state)
         diagonal += R
@@ -191,7 +195,14 @@ class VisionFilter:
         if reset.any():
             position_reset_m = np.where(without_gnss[:, None], distance_m, nu) * reset[:, None]
             variance = np.where(without_gnss[:, None], noise_m2, R)
-            set_states(x, P, reset, HORIZONTAL, x[:, HORIZONTAL] + position_reset_m, variance)
+            set_states(
+                x,
+                P,
+                reset,
+                HORIZONTAL_POSITION,
+                x[:, HORIZONTAL_POSITION] + position_reset_m,
+                variance,
+            )
             self.position_reset_m[e] += position_reset_m
         if restarts.any():
             new_bias = (restarts & ~reset)[:, None]

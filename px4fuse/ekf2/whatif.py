@@ -60,13 +60,13 @@ HEIGHT_NOT_REPLAYED = Unavailable(
 # Minimum evaluated time (s) after an aiding source is disabled
 MIN_EVALUATED_S = 5.0
 # Number of parameter values of a sweep, by default and at most
-SWEEP_VALUES = 9
+SWEEP_VALUE_COUNT = 9
 MAX_SWEEP_VALUES = 200
 # Position noise (m) that is added in repeated replays: the result of a replay is predictable if
 # this noise hardly changes the result
-DISTURBANCE_M = 0.002
+ADDED_NOISE_M = 0.002
 # Number of repeated replays with added position noise
-DISTURBANCE_RUNS = 4
+ADDED_NOISE_RUNS = 4
 # Minimum rejected fraction for which replays are repeated to test if the result is predictable
 MIN_REJECTED_SHARE = 0.02
 # Maximum rejected fraction of a predictable result
@@ -298,7 +298,7 @@ def _heading_and_height_notes(model: Model) -> tuple[str, str]:
     return heading, HEIGHT_LOGGED_NOTE if model.inputs.height_reason else HEIGHT_REPLAYED_NOTE
 
 
-def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUES) -> list[float]:
+def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUE_COUNT) -> list[float]:
     """Return values of a parameter from ``low`` to ``high``, both included.
 
     The values have equal ratios if ``low`` is above zero, else equal differences.
@@ -338,26 +338,28 @@ def _mark_unpredictable(
         and MIN_REJECTED_SHARE < repeated_runs[0].rejected_fraction <= MAX_REJECTED_SHARE
     ]
     changes = [repeated_runs[0].changed for repeated_runs in uncertain_runs]
-    for seed in range(DISTURBANCE_RUNS if changes else 0):
-        noisy_model = with_position_noise(model, DISTURBANCE_M, seed)
+    for seed in range(ADDED_NOISE_RUNS if changes else 0):
+        noisy_model = with_position_noise(model, ADDED_NOISE_M, seed)
         replays = replay_settings(noisy_model, changes, without=without)
         for repeated_runs, replay in zip(uncertain_runs, replays, strict=True):
             repeated_runs.append(_summarise_replay(model.flight, replay, evaluated_s))
     marked_summaries = []
     for summary, *noisy_summaries in runs:
-        rejected_fractions = [other.rejected_fraction for other in summary.others.values()]
+        rejected_fractions = [
+            axis_summary.rejected_fraction for axis_summary in summary.others.values()
+        ]
         if summary.changed:
             rejected_fractions.append(summary.rejected_fraction)
         is_predictable = (
             all(height.is_predictable for height in summary.heights.values())
             and max(rejected_fractions, default=0.0) <= MAX_REJECTED_SHARE
-            and _agree([summary, *noisy_summaries])
+            and _results_agree([summary, *noisy_summaries])
         )
         marked_summaries.append(replace(summary, is_predictable=is_predictable, without=without))
     return tuple(marked_summaries)
 
 
-def _agree(runs: Sequence[Summary]) -> bool:
+def _results_agree(runs: Sequence[Summary]) -> bool:
     """Return True if NIS, rejected fraction and RMSE of all runs agree within the limits."""
     rmse = [
         error for summary in runs if isinstance(error := summary.position_rmse_to_truth_m, float)
@@ -390,7 +392,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
         )
         variance_after = updates[f"position_variance_{axis}_m2"]
         variance[f"{axis}_m2"] = np.column_stack([s - r, variance_after]).ravel()
-    fused = evaluated_updates["fused_at_s"][
+    fused_s = evaluated_updates["fused_at_s"][
         (evaluated_updates["fused"] > 0) | (evaluated_updates["reset"] > 0)
     ]
     resets = evaluated_updates["reset"].sum()
@@ -406,7 +408,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
         replay.other_aid_updates,
         replay.delayed["heading_rad"],
         changed=replay.changed,
-        longest_without_fusion_s=_longest_between_fusions(fused.to_numpy(), evaluated_s),
+        longest_without_fusion_s=_longest_between_fusions(fused_s.to_numpy(), evaluated_s),
         resets=int(resets),
         late=replay.late,
         lost=replay.lost,
@@ -416,20 +418,20 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
 def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Summary:
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    logged = logged_innovations(ekf2)
-    evaluated_updates = logged[inside_spans(logged.index, evaluated_s)]
+    logged_updates = logged_innovations(ekf2)
+    evaluated_updates = logged_updates[inside_spans(logged_updates.index, evaluated_s)]
     horizon_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
     resets = horizontal_resets_s(ekf2) - horizon_s
     resets = resets[inside_spans(resets, evaluated_s)]
     replayed = int(inside_spans(replay.updates.index, evaluated_s).sum())
-    longest: float | Unavailable = Unavailable(
+    longest_gap_s: float | Unavailable = Unavailable(
         "longest time without fusion",
         f"the log contains only {len(evaluated_updates)} of about {replayed} innovations",
         "Log estimator_aid_src_ev_pos at full rate.",
     )
     if len(evaluated_updates) > MIN_COMPLETE_SHARE * replayed:
-        fused = evaluated_updates.index[evaluated_updates["rejected"] == 0].to_numpy()
-        longest = _longest_between_fusions(np.concatenate([fused, resets]), evaluated_s)
+        fused_s = evaluated_updates.index[evaluated_updates["rejected"] == 0].to_numpy()
+        longest_gap_s = _longest_between_fusions(np.concatenate([fused_s, resets]), evaluated_s)
     assert isinstance(flight.attitude, pd.DataFrame)  # a replay requires the attitude
     heading = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
     other_aid_updates = {
@@ -445,7 +447,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
         other_aid_updates,
         heading,
         changed={},
-        longest_without_fusion_s=longest,
+        longest_without_fusion_s=longest_gap_s,
         resets=len(resets),
     )
 
@@ -455,7 +457,7 @@ def _make_summary(
     replay: Ekf2Replay,
     evaluated_s: Spans,
     evaluated_updates: pd.DataFrame,
-    published: pd.DataFrame,
+    published_track: pd.DataFrame,
     variance: pd.DataFrame | None,
     other_aid_updates: Mapping[str, pd.DataFrame],
     heading: pd.Series,
@@ -468,21 +470,23 @@ def _make_summary(
     """
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    logged = ekf2.variance
+    logged_variance = ekf2.variance
     times = ekf2.state.index[inside_spans(ekf2.state.index, evaluated_s)].to_numpy()
 
     def error_m(direction: Array) -> float | Unavailable:
-        position = along(published, Columns.POSITION, direction, times)
+        position = along(published_track, Columns.POSITION, direction, times)
         error = rms_to_truth(flight, position, direction, times)
         return NO_TRUTH if error is None else error
 
     for axis, direction in zip(HORIZONTAL, np.eye(3), strict=False):
         sigma: float | Unavailable
-        if isinstance(logged, Unavailable):
-            sigma = logged
+        if isinstance(logged_variance, Unavailable):
+            sigma = logged_variance
         else:
-            variance_s = logged.index[inside_spans(logged.index, evaluated_s)].to_numpy()
-            series = (logged if variance is None else variance)[f"{axis}_m2"]
+            variance_s = logged_variance.index[
+                inside_spans(logged_variance.index, evaluated_s)
+            ].to_numpy()
+            series = (logged_variance if variance is None else variance)[f"{axis}_m2"]
             sigma = float(np.sqrt(np.median(np.interp(variance_s, series.index, series))))
         more[axis] = AxisSummary(
             *_innovation_statistics(evaluated_updates, axis), sigma, error_m(direction)
@@ -515,15 +519,15 @@ def _innovation_statistics(
 
 
 def _summarise_aid(evaluated_updates: pd.DataFrame, evaluated_s: Spans) -> HeightSummary:
-    rejected = evaluated_updates["rejected"].to_numpy()
-    fused_s = evaluated_updates.index.to_numpy()[rejected == 0.0]
+    rejected_flags = evaluated_updates["rejected"].to_numpy()
+    fused_s = evaluated_updates.index.to_numpy()[rejected_flags == 0.0]
     longest_s = max(
         _longest_between_fusions(fused_s[inside_spans(fused_s, (span,))], (span,))
         for span in evaluated_s
     )
     return HeightSummary(
         *_innovation_statistics(evaluated_updates, *axes_of(evaluated_updates)),
-        float(rejected.mean()),
+        float(rejected_flags.mean()),
         longest_s,
     )
 
@@ -552,17 +556,17 @@ def _longest_between_fusions(fused_s: Array, evaluated_s: Spans) -> float:
 
 
 def _deviation_note(
-    model: Model, replay: Ekf2Replay, without: Mapping[str, float], evaluated_s: Spans
+    model: Model, replay: Ekf2Replay, replays_without: Mapping[str, float], evaluated_s: Spans
 ) -> str:
     """Describe the position difference between replays with and without an aiding source."""
     difference = replay.published[Columns.POSITION] - model.flown.published[Columns.POSITION]
     difference = difference[inside_spans(difference.index, evaluated_s)]
-    *horizontal, down = np.abs(difference.to_numpy()).T
-    distance = np.hypot(*horizontal)
-    aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in without.items())
+    *horizontal_m, down = np.abs(difference.to_numpy()).T
+    distance = np.hypot(*horizontal_m)
+    aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in replays_without.items())
     heights = {*model.flown.other_aid_updates} - {EV_POS.name}
     horizontal_aids = {*modelled_aids(model.inputs)} - {MAG.name} - heights
-    height = f"; the height by at most {down.max():.3g} m" if heights & {*without} else ""
+    height = f"; the height by at most {down.max():.3g} m" if heights & {*replays_without} else ""
     give_up_note = (
         "; without a horizontal aid EKF2 stops providing a position after EKF2_NOAID_TOUT (5 s), "
         "while the replay dead-reckons"
@@ -571,7 +575,7 @@ def _deviation_note(
     return (
         f"Without {aids_text} the published position differs from the replay as flown by at most "
         f"{distance.max():.3g} m (at {at_s:.1f} s), {distance[-1]:.3g} m at the end{height}"
-        + (give_up_note if horizontal_aids <= without.keys() else "")
+        + (give_up_note if horizontal_aids <= replays_without.keys() else "")
     )
 
 
@@ -583,7 +587,7 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
             f"({min_noise:g} m)"
         )
     if replay.late or replay.lost:
-        remedy = "" if model.inputs.rules.horizon_by_delay else ": raise EKF2_DELAY_MAX"
+        remedy = "" if model.inputs.rules.uses_delay_as_horizon else ": raise EKF2_DELAY_MAX"
         # EKF2 fuses only the newer of two samples in a prediction step: updates may be fewer
         samples = max(len(replay.updates), replay.late) + replay.lost
         yield (

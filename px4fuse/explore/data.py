@@ -12,7 +12,7 @@ from scipy import stats
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import describe_axis
-from px4fuse.card.model import AXIS_ENDS, BANDS
+from px4fuse.card.model import AXIS_ENDS, SIGMA_RATIO_BANDS
 from px4fuse.card.verdicts import verdicts
 from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth
 from px4fuse.comparison.preparation import shift_clock
@@ -98,7 +98,7 @@ def ranges() -> Data:
         "dt": list(DT_RANGE_S),
         "lesson": _settings_data(Settings()),
         "running": RUNNING_MEAN_COUNT,
-        "bands": BANDS,
+        "bands": SIGMA_RATIO_BANDS,
         "ends": list(AXIS_ENDS),
         "marks": MARK_PATHS,
     }
@@ -161,11 +161,13 @@ def _used_samples(comparison: Comparison, acceleration: Acceleration) -> slice:
     return slice(max(low, 0), high)
 
 
-def _axis_signals(comparison: Comparison, axis: Axis, raw: PositionTrack, packer: Packer) -> Data:
+def _axis_signals(
+    comparison: Comparison, axis: Axis, raw_source: PositionTrack, packer: Packer
+) -> Data:
     """Return measurements of an axis, in and near the segment, and its integrated acceleration."""
     segment = comparison.segment
-    time = raw.samples.index.to_numpy()
-    value = weighted_sum(raw.samples, Columns.POSITION, axis.direction)
+    time = raw_source.samples.index.to_numpy()
+    value = weighted_sum(raw_source.samples, Columns.POSITION, axis.direction)
     half_range_s = OFFSET_HALF_RANGE_S + abs(comparison.settings.clock_offset_s)
     is_in_reach = (time >= segment.start_s - half_range_s) & (time <= segment.end_s + half_range_s)
     is_in_reach &= np.isfinite(value)
@@ -238,9 +240,9 @@ def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Da
             sigma, ["position_variance_m2", "velocity_variance_m2_s2"], packer
         )
     if isinstance(result.ekf2_innovations, pd.DataFrame):
-        frame = result.ekf2_innovations
-        valid_rows = frame[
-            np.isfinite(frame["innovation_m"]) & (frame["innovation_variance_m2"] > 0)
+        innovations = result.ekf2_innovations
+        valid_rows = innovations[
+            np.isfinite(innovations["innovation_m"]) & (innovations["innovation_variance_m2"] > 0)
         ]
         packed_rows = valid_rows.assign(
             rejected=(valid_rows["rejected"] > 0).astype(float),
@@ -249,7 +251,7 @@ def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Da
         ekf2["innovations"] = _pack_frame(
             packed_rows, ["innovation_m", "sigma", "rejected"], packer
         )
-        variance_m2 = frame["observation_variance_m2"].dropna()
+        variance_m2 = innovations["observation_variance_m2"].dropna()
         ekf2["r"] = float(np.sqrt(variance_m2.median())) if len(variance_m2) else None
     else:
         ekf2["why"] = result.ekf2_innovations.reason
@@ -279,24 +281,24 @@ def _truth_data(result: AxisComparison, packer: Packer) -> Data | str:
     }
 
 
-def _pack_frame(frame: pd.DataFrame, columns: list[str], packer: Packer) -> list[int]:
+def _pack_frame(table: pd.DataFrame, columns: list[str], packer: Packer) -> list[int]:
     """Pack the times and some columns of a frame; return their indices."""
-    values = [packer.add(frame[column].to_numpy(), COARSE_SCALE) for column in columns]
-    return [packer.add_times(frame.index.to_numpy()), *values]
+    values = [packer.add(table[column].to_numpy(), COARSE_SCALE) for column in columns]
+    return [packer.add_times(table.index.to_numpy()), *values]
 
 
 def _map_data(analysis: Analysis) -> Data:
     """Return limits and estimate of each likelihood map, or the reason why it is missing."""
     return {
         name: {
-            "sigmaA": tuned.map.sigma_a_m_s2[[0, -1]].tolist(),
-            "sigmaZ": tuned.map.sigma_z_m[[0, -1]].tolist(),
-            "likely": [tuned.sigma_a_two_state.value, tuned.sigma_z.value],
-            "count": tuned.count,
+            "sigmaA": axis_tuning.map.sigma_a_m_s2[[0, -1]].tolist(),
+            "sigmaZ": axis_tuning.map.sigma_z_m[[0, -1]].tolist(),
+            "likely": [axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value],
+            "count": axis_tuning.count,
         }
-        if isinstance(tuned, AxisTuning)
-        else tuned.reason
-        for name, tuned in analysis.tuning.items()
+        if isinstance(axis_tuning, AxisTuning)
+        else axis_tuning.reason
+        for name, axis_tuning in analysis.tuning.items()
     }
 
 
@@ -312,22 +314,22 @@ def _track_data(comparison: Comparison, packer: Packer) -> list[int] | str:
 
 def _ekf2_settings(request: ComparisonRequest, analysis: Analysis) -> Data:
     """Return EKF2's logged parameters of the source, and a command that replays EKF2."""
-    aid, logged = aid_of(analysis), analysis.flight.log.parameters
-    flown = {
-        name: f"{logged[name]:.4g} {PARAMETERS[name].unit}".rstrip()
+    aid, logged_parameters = aid_of(analysis), analysis.flight.log.parameters
+    flown_settings = {
+        name: f"{logged_parameters[name]:.4g} {PARAMETERS[name].unit}".rstrip()
         for name in (aid.noise, aid.delay, aid.gate)
-        if name in logged and name in PARAMETERS
+        if name in logged_parameters and name in PARAMETERS
     }
     if isinstance(analysis.ekf2_model, Unavailable):
-        return {"flown": flown, "why": analysis.ekf2_model.reason}
+        return {"flown": flown_settings, "why": analysis.ekf2_model.reason}
     # half of the logged noise is an example that changes S and the error visibly
     parameter = PARAMETERS[aid.noise]
-    flown_m = logged.get(aid.noise, parameter.default)
+    flown_m = logged_parameters.get(aid.noise, parameter.default)
     changes = {aid.noise: max(float(f"{0.5 * flown_m:.2g}"), parameter.minimum)}
     example = WhatIfRequest(
         log=request.log, mavlink=request.mavlink, system=request.system, changes=changes
     )
-    return {"flown": flown, "command": command_line(example, for_shell=True)}
+    return {"flown": flown_settings, "command": command_line(example, for_shell=True)}
 
 
 def _command_data(request: ComparisonRequest, comparison: Comparison) -> Data:

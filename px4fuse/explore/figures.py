@@ -15,7 +15,7 @@ from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
 from px4fuse.arrays import Array
-from px4fuse.card.model import BANDS
+from px4fuse.card.model import SIGMA_RATIO_BANDS
 from px4fuse.comparison.estimates import Tuning
 from px4fuse.explore.data import Data
 from px4fuse.filter.tuning import AxisTuning
@@ -27,9 +27,9 @@ Style = dict[str, Any]  # options of a drawing function of Bokeh
 KF_LINE: Style = {"line_width": 1.6, "name": "kf"}
 EKF2_LINE: Style = {"line_width": 1.6, "line_dash": [6, 3], "name": "ekf2"}
 TRUTH_LINE: Style = {"line_width": 1.2, "line_dash": [1, 3], "name": "truth"}
-HOLLOW: Style = {"fill_color": None, "line_color": "black"}
+HOLLOW_MARKER: Style = {"fill_color": None, "line_color": "black"}
 # Arrow head at the upper or lower edge, for a value outside the plot
-ARROW: Style = {"angle": "turn", "marker": "triangle"}
+ARROW_MARKER: Style = {"angle": "turn", "marker": "triangle"}
 # Band around the values of a consistent filter
 CONSISTENT_BAND: Style = {"level": "underlay", "fill_alpha": 1.0, "name": "consistent"}
 # Innovation ÷ √S: limit of 95 % of the values of a consistent filter, and half the plotted range
@@ -85,7 +85,7 @@ def document_json(data: Data, tuning: Tuning) -> tuple[Any, dict[str, str]]:
     """
     document = Document()
     time_range = _page_range("time")
-    plots = _plots(data, time_range)
+    plots = _make_plots(data, time_range)
     plots |= {
         "strip": _event_plot(data, time_range),
         "map": _likelihood_map(tuning),
@@ -100,15 +100,15 @@ def document_json(data: Data, tuning: Tuning) -> tuple[Any, dict[str, str]]:
 
 def has_reference(data: Data) -> bool:
     """Return True if KF can be compared with ground truth or EKF2 along some axis."""
-    return _has(data, "truth") or _has(data, "ekf2")
+    return _has_kind(data, "truth") or _has_kind(data, "ekf2")
 
 
-def _has(data: Data, kind: str) -> bool:
+def _has_kind(data: Data, kind: str) -> bool:
     return any(isinstance(axis[kind], dict) for axis in data["axes"])
 
 
-def _plots(data: Data, time_range: Range1d) -> dict[str, Any]:
-    missing_kinds = {kind for kind in ("ekf2", "truth") if not _has(data, kind)}
+def _make_plots(data: Data, time_range: Range1d) -> dict[str, Any]:
+    missing_kinds = {kind for kind in ("ekf2", "truth") if not _has_kind(data, kind)}
     plots: dict[str, Any] = {}
     for name, plot in FIGURES.plots.items():
         if name == "error" and not has_reference(data):
@@ -127,7 +127,7 @@ def _plots(data: Data, time_range: Range1d) -> dict[str, Any]:
         )
         if name == "position":
             _draw_dots(fig, sources["measured"], 3, name="measured")
-            _draw_dots(fig, sources["beyond"], 9, name="measured", **ARROW)
+            _draw_dots(fig, sources["beyond"], 9, name="measured", **ARROW_MARKER)
         if name == "innovation":
             _draw_innovations(fig, sources, with_ekf2="ekf2" not in missing_kinds)
         if name == "error":
@@ -135,7 +135,7 @@ def _plots(data: Data, time_range: Range1d) -> dict[str, Any]:
                 "t", "minus", "plus", source=sources["error"], fill_alpha=0.25, name="kf_band"
             )
         if name == "running":
-            low, high = BANDS["source"]
+            low, high = SIGMA_RATIO_BANDS["source"]
             fig.add_layout(BoxAnnotation(bottom=low, top=high, **CONSISTENT_BAND))
         for source, column, style_name, hover_name in plot.lines:
             if style_name in missing_kinds:
@@ -166,14 +166,14 @@ def _draw_innovations(fig: Any, sources: dict[str, ColumnDataSource], *, with_ek
     fig.add_layout(BoxAnnotation(bottom=-NORMAL_LIMIT, top=NORMAL_LIMIT, **CONSISTENT_BAND))
     kf_dots = _draw_dots(fig, sources["updates"], 4, name="kf")
     _add_hover(fig, kf_dots, ("KF", "@x{0.00}"))
-    _draw_dots(fig, sources["beyond"], 9, name="kf", **ARROW)
+    _draw_dots(fig, sources["beyond"], 9, name="kf", **ARROW_MARKER)
     if with_ekf2:
         square: Style = {"marker": "square", "name": "ekf2"}
-        fused = _draw_dots(fig, sources["fused"], 4, **square)
-        rejected = _draw_dots(fig, sources["rejected"], 7, **square, **HOLLOW)
-        _add_hover(fig, fused, ("EKF2", "@x{0.00}"))
-        _add_hover(fig, rejected, ("EKF2 rejected", "@x{0.00}"))
-        _draw_dots(fig, sources["beyond_ekf2"], 9, name="ekf2", **ARROW)
+        fused_dots = _draw_dots(fig, sources["fused"], 4, **square)
+        rejected_dots = _draw_dots(fig, sources["rejected"], 7, **square, **HOLLOW_MARKER)
+        _add_hover(fig, fused_dots, ("EKF2", "@x{0.00}"))
+        _add_hover(fig, rejected_dots, ("EKF2 rejected", "@x{0.00}"))
+        _draw_dots(fig, sources["beyond_ekf2"], 9, name="ekf2", **ARROW_MARKER)
 
 
 def _add_hover(fig: Any, renderer: Any, *rows: tuple[str, str]) -> None:
@@ -226,8 +226,8 @@ def _event_bands(data: Data) -> list[tuple[float, float, Style]]:
 
 def _event_plot(data: Data, time_range: Range1d) -> Any:
     """Make the event plot, with a row per kind of event."""
-    source = _empty_source("strip", "row left right text")
-    rows = FIGURES.event_rows if _has(data, "ekf2") else FIGURES.event_rows[2:]
+    source = _empty_source("strip", FIGURES.sources["events"])
+    rows = FIGURES.event_rows if _has_kind(data, "ekf2") else FIGURES.event_rows[2:]
     fig = _figure(
         "strip",
         28 * len(rows) + 24,
@@ -275,21 +275,21 @@ def _likelihood_map(tuning: Tuning) -> Any:
         y_axis_label="SIGMA_Z (m)",
     )
     mapper = LinearColorMapper(palette=FIGURES.map_colours, low=0.0, high=MAP_SIGMAS)
-    for name, tuned in tuning.items():
-        if isinstance(tuned, AxisTuning):
-            x, dw = _pixel_extent(tuned.map.sigma_a_m_s2)
-            y, dh = _pixel_extent(tuned.map.sigma_z_m)
+    for name, axis_tuning in tuning.items():
+        if isinstance(axis_tuning, AxisTuning):
+            x, dw = _pixel_extent(axis_tuning.map.sigma_a_m_s2)
+            y, dh = _pixel_extent(axis_tuning.map.sigma_z_m)
             # rows: SIGMA_Z, columns: SIGMA_A
-            image = np.sqrt(2.0 * np.maximum(tuned.map.drop.T, 0.0)).astype(np.float32)
+            image = np.sqrt(2.0 * np.maximum(axis_tuning.map.drop.T, 0.0)).astype(np.float32)
             draw: Any = fig.image  # color_mapper is missing in its type signature
             draw([image], x, y, dw, dh, color_mapper=mapper, name=f"map:{name}", visible=False)
     trail = _empty_source("trail", "x y")
-    best = _empty_source("best", "x y")
+    best_point = _empty_source("best", "x y")
     point = _empty_source("point", "x y")
     white: Style = {"line_color": "white"}
     fig.line("x", "y", source=trail, line_width=1.2, name="ekf2")
     _draw_dots(fig, trail, 3, name="ekf2")
-    _draw_dots(fig, best, 13, marker="cross", line_width=2.5, **white)
+    _draw_dots(fig, best_point, 13, marker="cross", line_width=2.5, **white)
     _draw_dots(fig, point, 12, fill_color="darkorange", line_width=2.0, **white)
     return fig
 
@@ -324,7 +324,7 @@ def _track_plot() -> Any:
     fig.line("east", "north", source=track, name="measured")
     _draw_dots(fig, track, 3, nonselection_fill_alpha=0.6, name="measured")
     _draw_dots(fig, shown_source, 4, name="kf")
-    _draw_dots(fig, cursor, 12, marker="circle_x", line_width=2.0, name="ekf2", **HOLLOW)
+    _draw_dots(fig, cursor, 12, marker="circle_x", line_width=2.0, name="ekf2", **HOLLOW_MARKER)
     return fig
 
 
@@ -342,10 +342,10 @@ def _phase_plot() -> Any:
     fig.add_layout(BoxAnnotation(name="band", fill_alpha=0.25, line_color=None, visible=False))
     _add_cursor(fig, name="measurement", line_dash=[2, 2])
     trail = _empty_source("trail-means", "p v")
-    before, current = _empty_source("before", "p v"), _empty_source("now", "p v")
+    point_before, current_point = _empty_source("before", "p v"), _empty_source("now", "p v")
     mean = _empty_source("mean", "p v")
     fig.line("p", "v", source=trail, name="measured")
-    fig.line("p", "v", source=before, **KF_LINE | {"line_dash": [6, 3]})
-    fig.patch("p", "v", source=current, fill_alpha=0.25, **KF_LINE)
+    fig.line("p", "v", source=point_before, **KF_LINE | {"line_dash": [6, 3]})
+    fig.patch("p", "v", source=current_point, fill_alpha=0.25, **KF_LINE)
     _draw_dots(fig, mean, 7, name="kf")
     return fig

@@ -15,7 +15,7 @@ from px4fuse.arrays import Array
 # Steps per unit: 1.5e-11 m, m/s or s, 1 % of the tolerance between the page's KF and Python's
 FINE_SCALE = 2.0**36
 COARSE_SCALE = 1e6  # steps per unit for values that are only drawn or averaged
-MAX_EXACT = 2.0**52  # integers up to this are exact in JavaScript (doubles)
+MAX_EXACT_INTEGER = 2.0**52  # integers up to this are exact in JavaScript (doubles)
 
 
 @dataclass
@@ -35,11 +35,11 @@ class Packer:
         ----------
         values : ndarray, shape (n,)
         scale : float
-            Steps per unit; reduced for numbers beyond :data:`MAX_EXACT`.
+            Steps per unit; reduced for numbers beyond :data:`MAX_EXACT_INTEGER`.
         """
         values = np.asarray(values, dtype=np.float64)
-        largest = float(np.max(np.abs(values), initial=1.0))
-        while largest * scale > MAX_EXACT:
+        largest_value = float(np.max(np.abs(values), initial=1.0))
+        while largest_value * scale > MAX_EXACT_INTEGER:
             scale /= 2.0
         integers = np.rint(values * scale).astype(np.int64)
         differences = np.diff(integers, prepend=0)

@@ -12,8 +12,8 @@ from px4fuse.explore.packing import Packer
 from px4fuse.report.card_html import axis_figures, card_html, card_of, card_style
 from px4fuse.webpage.safe import clean_values, inert_json, load_template, policy_hash, read_asset
 
-MAX_CHARACTERS = 2000  # maximum length of a text from a log; longer ones are shortened
-SCRIPTS = ("card", "step", "times", "tour")
+MAX_LOG_TEXT_LENGTH = 2000  # maximum length of a text from a log; longer ones are shortened
+SCRIPT_NAMES = ("card", "step", "times", "tour")
 PACKAGE = "px4fuse.explore"
 
 
@@ -63,7 +63,7 @@ def data_scripts(data: Data, analysis: Analysis, packer: Packer, suffix: str = "
     return figures + "\n".join(
         f'<script type="{kind}" id="{name}{suffix}">{text}</script>'
         for name, kind, text in (
-            ("content", "application/json", inert_json(clean_values(content, MAX_CHARACTERS))),
+            ("content", "application/json", inert_json(clean_values(content, MAX_LOG_TEXT_LENGTH))),
             ("document", "application/json", inert_json(document)),
             ("arrays", "text/plain", packer.text()),
         )
@@ -108,7 +108,7 @@ def page_text(
         "bokeh": Resources(mode="inline", components=["bokeh"]).js_raw[0],
         "engine": read_asset("engine.js", PACKAGE),
         "script": read_asset("dom.js")
-        + "".join(read_asset(f"{name}.js", PACKAGE) for name in (*SCRIPTS, practice, "page")),
+        + "".join(read_asset(f"{name}.js", PACKAGE) for name in (*SCRIPT_NAMES, practice, "page")),
     }
     return load_template("explore/page.html").render(
         {f"{name}_hash": policy_hash(text) for name, text in scripts_by_name.items()},

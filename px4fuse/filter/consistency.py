@@ -118,13 +118,13 @@ def nis_band(count: int, dimensions: int = 1) -> Interval:
     return low, high
 
 
-def classify_ratio(ratio: float, against: Reference, interval: Interval | None = None) -> Verdict:
+def classify_ratio(ratio: float, reference: Reference, interval: Interval | None = None) -> Verdict:
     """Return the verdict on a ratio of actual to reported σ.
 
     The filter is consistent inside :data:`CONSISTENT_RATIOS`, or if the 95 % ``interval`` of the
     ratio contains 1.
     """
-    low, high = CONSISTENT_RATIOS[against]
+    low, high = CONSISTENT_RATIOS[reference]
     if low <= ratio <= high or (interval is not None and interval[0] <= 1.0 <= interval[1]):
         return "consistent"
     return "overconfident" if ratio > 1.0 else "underconfident"

@@ -53,7 +53,7 @@ COARSE_VARIANCE_SHARES = (0.12, 0.35, 0.8)
 # Factors on SIGMA_A in the coarse search
 COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
 # Factors on all noises together in the coarse search
-COARSE_SCALES = np.geomspace(0.7, 1.6, 12)
+COARSE_NOISE_FACTORS = np.geomspace(0.7, 1.6, 12)
 # Approximate number of measurements in the coarse search
 COARSE_MEASUREMENTS = 1000
 # Minimum gain of log-likelihood over white noise in the coarse search: below, there is no full fit
@@ -75,11 +75,11 @@ MIN_TRUTH_GAIN_NATS = 5.0
 # is then 1 cm
 MAX_TRUTH_DISTANCE_S = 0.1
 # Number of parts of the flight with separate time offsets in the fit to ground truth
-OFFSET_PARTS = 12
+OFFSET_PART_COUNT = 12
 # Time constants (s) of the fit to ground truth
 TRUTH_TAUS_S = np.geomspace(0.3, 80.0, 17)
 # Time-correlated fractions of the error variance in the fit to ground truth
-TRUTH_SHARES = np.linspace(0.05, 0.999, 20)
+CORRELATED_FRACTIONS = np.linspace(0.05, 0.999, 20)
 
 
 @dataclass(frozen=True)
@@ -314,10 +314,14 @@ def fit_time_correlation_to_truth(
     time = time[:: max(1, -(-len(time) // MAX_TRUTH_MEASUREMENTS))]
     if len(time) < MIN_MEASUREMENTS:
         return imu_fit
-    measured_m = np.transpose([a.measurement_m[np.isin(a.measurement_time_s, time)] for a in axes])
+    measured_m = np.transpose(
+        [axis.measurement_m[np.isin(axis.measurement_time_s, time)] for axis in axes]
+    )
     track = CubicSpline(true_track.index, true_track)
     true_m, velocity = (track(time + clock_offset_s, order) for order in (0, 1))
-    part_indicators = np.eye(OFFSET_PARTS)[OFFSET_PARTS * np.arange(len(time)) // len(time)]
+    part_indicators = np.eye(OFFSET_PART_COUNT)[
+        OFFSET_PART_COUNT * np.arange(len(time)) // len(time)
+    ]
     offset_columns = np.einsum("tp,ta->tpa", part_indicators, velocity).reshape(len(time), -1)
     jump_columns = unit_steps(time, [jump.time_s for jump in jumps])
     nuisance_columns = np.column_stack([np.ones_like(time), true_m, offset_columns, jump_columns])
@@ -325,7 +329,7 @@ def fit_time_correlation_to_truth(
         :, nuisance_columns.shape[1] :
     ]
     residuals = residual_basis.T @ (measured_m - true_m)
-    shares = TRUTH_SHARES
+    shares = CORRELATED_FRACTIONS
     grid_scores = []
     half_counts = 0.5 * np.array([len(axes), len(residuals)])
     for tau in TRUTH_TAUS_S:
@@ -375,10 +379,12 @@ def _best_of_grid(
     for positions in map(prepared_motion.at, offsets_s):
         for candidate, factor in product(candidate_noises, COARSE_SIGMA_A_FACTORS):
             noises = replace(candidate, sigma_a_m_s2=factor * candidate.sigma_a_m_s2)
-            totals = fit_noises([positions], noises, prepared_motion.weight).scores(COARSE_SCALES)[
-                :, 0
-            ]
-            results.append((float(totals.min()), float(COARSE_SCALES[np.argmin(totals)]), noises))
+            totals = fit_noises([positions], noises, prepared_motion.weight).scores(
+                COARSE_NOISE_FACTORS
+            )[:, 0]
+            results.append(
+                (float(totals.min()), float(COARSE_NOISE_FACTORS[np.argmin(totals)]), noises)
+            )
     lowest_score, scale, noises = min(results, key=lambda result: result[0])
     scaled_values = {name: value * scale for name, value in vars(noises).items() if name != "tau_s"}
     return lowest_score, replace(noises, **scaled_values)

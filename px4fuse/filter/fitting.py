@@ -35,7 +35,7 @@ SIGMA_Z_SEARCH_M = (1e-3, 10.0)
 MAX_OUTLIER_ITERATIONS = 12
 # Maximum number of iterations of L-BFGS-B: with final outlier probabilities, and while these
 # probabilities still change
-MAX_STEPS, COARSE_MAX_STEPS = 50, 3
+MAX_ITERATIONS, COARSE_MAX_ITERATIONS = 50, 3
 # Minimum ratio of the outliers' σ to SIGMA_Z: outliers with a smaller σ cannot be distinguished
 MIN_OUTLIER_WIDTH = 3.0
 # Initial values of the fraction of outliers, and of the ratio of their σ to SIGMA_Z
@@ -51,7 +51,7 @@ UNCOMPUTABLE_SCORE = 1e6
 DERIVATIVE_LOG_STEP = 1e-4
 # Number and distance (in ln σ) of the nodes between which the likelihood is interpolated: with
 # final outlier probabilities, and while these probabilities still change
-NODES, COARSE_NODES = (10, 0.25), (6, 0.2)
+LIKELIHOOD_NODES, COARSE_LIKELIHOOD_NODES = (10, 0.25), (6, 0.2)
 # Precision of a known initial position (1/m²) and velocity (s²/m²): σ of 1 µm and 1 µm/s
 KNOWN_START_PRECISION = 1e12
 
@@ -118,7 +118,9 @@ class Likelihood:
         self.weight = weight
         self.sigma_z_m = sigma_z_m
         self.is_tabulated = not any(positions.noise_fixed.any() for positions in axis_positions)
-        self.nodes, self.step = nodes, step = COARSE_NODES if is_coarse else NODES
+        self.nodes, self.step = nodes, step = (
+            COARSE_LIKELIHOOD_NODES if is_coarse else LIKELIHOOD_NODES
+        )
 
         @cache
         def fits_at_ratio(ratio_index: int) -> list[FittedPositions]:
@@ -304,22 +306,22 @@ def maximise_likelihood(
     for iteration in range(MAX_OUTLIER_ITERATIONS if outliers else 0):
         likelihood = Likelihood(axis_positions, weight, start.sigma_z_m, is_coarse=True)
         noises = _maximise_by_gradient(
-            likelihood, noises, COARSE_MAX_STEPS if iteration else MAX_STEPS
+            likelihood, noises, COARSE_MAX_ITERATIONS if iteration else MAX_ITERATIONS
         )
-        square, count = _expected_squares_of_axes(axis_positions, noises, weight)
+        squares, count = _expected_squares_of_axes(axis_positions, noises, weight)
         # outliers increase the estimated SIGMA_Z, which would hide them; the median is robust
-        median_square = float(np.median(square / count) / (chdtri(count[0], 0.5) / count[0]))
+        median_square = float(np.median(squares / count) / (chdtri(count[0], 0.5) / count[0]))
         # noise above the search range is not due to outliers
         if median_square > SIGMA_Z_SEARCH_M[1] ** 2:
             break
         variance = min(noises.sigma_z_m**2, MAX_SIGMA_Z_RATIO**2 * median_square)
-        probability = _outlier_probability(square / variance, count, outlier_share, width)
+        probability = _outlier_probability(squares / variance, count, outlier_share, width)
         if probability.sum() < 1.0 and probability.max() < 0.5 and not outlier_probability.any():
             break
         outlier_share = float(
             np.clip(probability.mean(), 0.5 / len(probability), MAX_OUTLIER_SHARE)
         )
-        outlier_square = np.sum(probability * square) / max(np.sum(probability * count), 1e-9)
+        outlier_square = np.sum(probability * squares) / max(np.sum(probability * count), 1e-9)
         width = max(MIN_OUTLIER_WIDTH, float(np.sqrt(outlier_square / variance)))
         weight = 1.0 - probability * (1.0 - width**-2.0)
         change = np.abs(probability - outlier_probability)
@@ -331,9 +333,9 @@ def maximise_likelihood(
     noises = _maximise_by_gradient(likelihood, noises)
     sigma_z_variance_factor = 1.0
     if outlier_probability.any():
-        square, count = _expected_squares_of_axes(axis_positions, noises, weight)
+        squares, count = _expected_squares_of_axes(axis_positions, noises, weight)
         sigma_z_variance_factor = outlier_variance_factor(
-            square / noises.sigma_z_m**2, count, outlier_probability, width
+            squares / noises.sigma_z_m**2, count, outlier_probability, width
         )
     return NoiseFit(noises, weight, outlier_probability, likelihood, sigma_z_variance_factor)
 
@@ -341,9 +343,10 @@ def maximise_likelihood(
 def _expected_squares_of_axes(
     axis_positions: Sequence[Positions], noises: Noises, weight: Array
 ) -> tuple[Array, Array]:
-    """Return the expected squared error (m²) and number of axes of each measurement.
+    """Return the sum of the expected squared errors (m²) over the axes, and the number of axes.
 
-    The unknown constants have their maximum-likelihood values, see :func:`expected_squares`.
+    Both are arrays over the measurements. Biases and initial states have their maximum-likelihood
+    values.
     """
     results = []
     for positions in axis_positions:
@@ -352,13 +355,15 @@ def _expected_squares_of_axes(
             1.0, noises.random_walk_m, weight / noises.sigma_z_m**2
         )
         results.append(expected_squares(scaled_positions, noises.sigma_a_m_s2, variance, constants))
-    square, count = np.sum(results, axis=0)[:, -len(weight) :]
-    return square, count
+    squares, axis_counts = np.sum(results, axis=0)[:, -len(weight) :]
+    return squares, axis_counts
 
 
-def _outlier_probability(square: Array, count: Array, outlier_share: float, width: float) -> Array:
+def _outlier_probability(
+    expected_squares: Array, count: Array, outlier_share: float, width: float
+) -> Array:
     log_odds = np.log(outlier_share / (1.0 - outlier_share)) - count * np.log(width)
-    return np.asarray(expit(log_odds + 0.5 * square * (1.0 - width**-2.0)))
+    return np.asarray(expit(log_odds + 0.5 * expected_squares * (1.0 - width**-2.0)))
 
 
 def outlier_variance_factor(
@@ -403,7 +408,7 @@ def outlier_variance_factor(
 
 
 def _maximise_by_gradient(
-    likelihood: Likelihood, start: Noises, max_steps: int = MAX_STEPS
+    likelihood: Likelihood, start: Noises, max_steps: int = MAX_ITERATIONS
 ) -> Noises:
     values = {name: value for name, value in vars(start).items() if value}
     bounds = np.log([SEARCH_RANGES[name] for name in values])

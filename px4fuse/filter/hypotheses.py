@@ -36,7 +36,7 @@ from px4fuse.filter.likelihood import (
     preintegrate,
 )
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis, ned_acceleration, too_few_measurements
+from px4fuse.filter.signals import Acceleration, Axis, too_few_measurements
 from px4fuse.filter.steps import Timeline, make_timeline
 from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.notebook_display import one_line_repr
@@ -188,9 +188,9 @@ def fit_bias_scale_jumps(
             design, step_columns=unit_steps(design.time_s, [jump.time_s for jump in jumps])
         )
         sigma_a, fit = _fit_sigma_a(design, sigma_a_grid, is_skipped)
-    forward, right, rotation = map(fit.estimate, (FORWARD, RIGHT, ROTATION))
+    forward_bias, right_bias, rotation = map(fit.estimate, (FORWARD, RIGHT, ROTATION))
     return BiasScaleJumpFit(
-        forward, right, rotation, _fit_scale(design, sigma_a, is_skipped), jumps, sigma_a
+        forward_bias, right_bias, rotation, _fit_scale(design, sigma_a, is_skipped), jumps, sigma_a
     )
 
 
@@ -391,7 +391,7 @@ class DesignFit:
 
     @property
     def axis_rms(self) -> Array:
-        """Root mean square of the residual along each axis, at least 1."""
+        """RMS residual along each axis in units of √S; 1 is the minimum, as for correct noises."""
         mean_square = np.bincount(self.axis, self.residual**2) / np.bincount(self.axis)
         return np.sqrt(np.maximum(mean_square, 1.0))
 
@@ -500,7 +500,10 @@ class DesignMatrix:
     def whitened_design(
         self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0
     ) -> tuple[Array, Array, float]:
-        """Return whitened innovations, shape (a, m), and columns, shape (a, m, k), and Σ ln S."""
+        """Return whitened innovations, their design matrix, and Σ ln S.
+
+        With a axes, m measurements and k unknowns, the shapes are (a, m) and (a, m, k).
+        """
         hat_count = self.hat_signals[0].shape[1]
         step_count = self.step_columns.shape[1]
         axes = len(self.intervals)
@@ -564,13 +567,11 @@ def make_design_matrix(
 
     The axes have the same measurement times; ``clock_offset_s`` is added to the timestamps.
     """
-    acceleration = ned_acceleration(flight)
-    attitude = flight.attitude
-    for input_data in (acceleration, axes[0].acceleration, attitude):
-        if isinstance(input_data, Unavailable):
-            return input_data
-    assert isinstance(acceleration, pd.DataFrame)
-    assert isinstance(attitude, pd.DataFrame)
+    acceleration, attitude = axes[0].acceleration, flight.attitude
+    if isinstance(acceleration, Unavailable):
+        return acceleration
+    if isinstance(attitude, Unavailable):
+        return attitude
     if len(axes[0].measurement_time_s) <= MIN_MEASUREMENTS:
         return too_few_measurements(
             ANALYSIS_NAME, len(axes[0].measurement_time_s), MIN_MEASUREMENTS
@@ -592,9 +593,9 @@ def make_design_matrix(
         measured_m = np.zeros_like(dp)
         # positions relative to the first measurement, which is KF's initial position
         measured_m[:, 0] = interval_input.measurement_m - interval_input.initial.position_m
-        initial = replace(interval_input.initial, position_m=0.0)
+        initial_state = replace(interval_input.initial, position_m=0.0)
         intervals.append(
-            replace(_replace_signals(interval_input, dp, dv, measured_m), initial=initial)
+            replace(_replace_signals(interval_input, dp, dv, measured_m), initial=initial_state)
         )
     time_s = axes[0].measurement_time_s[-len(measured_m) :]
     hat_time_s, hat_functions = _hat_functions(
@@ -617,14 +618,15 @@ def _integrate_signal(acceleration_m_s2: Array, time_s: ArrayLike, timeline: Tim
 
 
 def _common_accelerations(
-    attitude: pd.DataFrame, acceleration: pd.DataFrame
-) -> list[tuple[pd.Index, Array]]:
+    attitude: pd.DataFrame, acceleration: Acceleration
+) -> list[tuple[Array, Array]]:
     """Return times and NED accelerations of unit biases forward and right, and a unit rotation."""
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
-    biases = [(attitude.index, body_to_ned.apply(np.eye(3)[axis])) for axis in (FORWARD, RIGHT)]
-    north, east, _ = acceleration.to_numpy().T
-    return [*biases, (acceleration.index, np.column_stack([-east, north, 0.0 * north]))]
+    attitude_s = attitude.index.to_numpy()
+    biases = [(attitude_s, body_to_ned.apply(np.eye(3)[axis])) for axis in (FORWARD, RIGHT)]
+    north, east, _ = acceleration.ned_m_s2.T
+    return [*biases, (acceleration.time_s, np.column_stack([-east, north, 0.0 * north]))]
 
 
 def _hat_functions(start_s: float, end_s: float) -> ArrayPair:

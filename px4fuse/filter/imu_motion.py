@@ -173,16 +173,16 @@ class PreparedMotion:
         """Return the positions minus a smooth path for one time offset, with unknown scale."""
         return next(self.position_batches(np.array([offset_s])))
 
-    def position_batches(self, offset_s: Array, *, scaled: bool = True) -> Iterator[Positions]:
-        """Yield positions for batches of time offsets; ``scaled`` adds an unknown scale."""
+    def position_batches(self, offset_s: Array, *, has_scale: bool = True) -> Iterator[Positions]:
+        """Yield positions for batches of time offsets, with an unknown scale if ``has_scale``."""
         signal_count = len(self.time_s) * len(self.directions) * (1 + len(CONSTANT_SIGMAS))
         batch_size = max(MIN_BATCH_OFFSETS, SIGNALS_PER_BATCH // signal_count)
         for batch in np.split(offset_s, range(batch_size, len(offset_s), batch_size)):
             positions = self.positions(batch)
-            yield centre_on_path(positions, scaled=True) if scaled else positions
+            yield centre_on_path(positions, has_scale=True) if has_scale else positions
 
     def search_offset(
-        self, noises: Noises, factors: Sequence[float] = (1.0,), *, scaled: bool = True
+        self, noises: Noises, factors: Sequence[float] = (1.0,), *, has_scale: bool = True
     ) -> tuple[float, Noises]:
         """Return the time offset and the noises with the maximum likelihood on a coarse grid.
 
@@ -191,14 +191,14 @@ class PreparedMotion:
         noises : Noises
         factors : sequence of float
             Factors on SIGMA_A of the grid.
-        scaled : bool
+        has_scale : bool
             True if the scale of the positions is unknown.
         """
         offsets = np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSETS)
         sigma = noises.sigma_z_m
         ratios = [factor * noises.sigma_a_m_s2 / sigma for factor in factors]
         coarse_motion = self.downsample(COARSE_MEASUREMENTS)
-        position_batches = coarse_motion.position_batches(offsets, scaled=scaled)
+        position_batches = coarse_motion.position_batches(offsets, has_scale=has_scale)
         ratio_fits = fit_ratios(
             position_batches, ratios, noises.random_walk_m / sigma, coarse_motion.weight, sigma
         )

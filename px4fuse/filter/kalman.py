@@ -137,7 +137,7 @@ def make_replay(
     """Build a run of KF from the rows (state, covariance) of ``steps`` and those of ``updates``."""
     time_arrays = timeline.time_s, timeline.time_s[timeline.measurement_index >= 0]
     time, update_index = (pd.Index(times_s, name="time_s") for times_s in time_arrays)
-    steps = pd.DataFrame(states, index=time, columns=model.STATES + model.COVARIANCES)
+    steps = pd.DataFrame(states, index=time, columns=model.STATE_COLUMNS + model.COVARIANCE_COLUMNS)
     steps["acceleration_m_s2"] = np.append(timeline.acceleration_m_s2, 0.0)
     steps["input_variance_m2_s4"] = np.append(timeline.input_variance_m2_s4, 0.0)
     return Replay(
@@ -177,7 +177,8 @@ def state_at(run: Replay, times_s: Array) -> ArrayPair:
     """
     index, elapsed_s, is_outside = _step_before(run, times_s)
     position, velocity, acceleration = (
-        run.steps[column].to_numpy()[index] for column in (*model.STATES, "acceleration_m_s2")
+        run.steps[column].to_numpy()[index]
+        for column in (*model.STATE_COLUMNS, "acceleration_m_s2")
     )
     position, velocity = model.propagate_state(position, velocity, acceleration, elapsed_s)
     return np.where(is_outside, np.nan, position), np.where(is_outside, np.nan, velocity)
@@ -186,7 +187,7 @@ def state_at(run: Replay, times_s: Array) -> ArrayPair:
 def variance_at(run: Replay, times_s: Array) -> ArrayPair:
     """Return the variances (m², m²/s²) of the results of :func:`state_at`: FPFᵀ + Q."""
     index, elapsed_s, is_outside = _step_before(run, times_s)
-    p00, p01, p11 = run.steps[model.COVARIANCES].to_numpy()[index].T
+    p00, p01, p11 = run.steps[model.COVARIANCE_COLUMNS].to_numpy()[index].T
     gap_variance = run.steps["input_variance_m2_s4"].to_numpy()[index]
     noise_density = (run.settings.sigma_a_m_s2**2 + gap_variance) * run.settings.dt_s
     p00, _, p11 = model.propagate_covariance((p00, p01, p11), elapsed_s)

@@ -281,9 +281,9 @@ def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
     curvature : float
         Second difference of the profile at the middle point.
     """
-    left, middle, right = profile[index - 1 : index + 2]
-    curvature = left - 2.0 * middle + right
-    return (0.5 * (left - right) / curvature if curvature > 0.0 else 0.0), curvature
+    left_value, middle_value, right_value = profile[index - 1 : index + 2]
+    curvature = left_value - 2.0 * middle_value + right_value
+    return (0.5 * (left_value - right_value) / curvature if curvature > 0.0 else 0.0), curvature
 
 
 def profile_interval(
@@ -299,15 +299,17 @@ def profile_interval(
         Increase of the negative log-likelihood from the minimum to the ends of the interval.
     """
     drop = profile - profile.min()
-    first, last = np.flatnonzero(drop <= max_drop)[[0, -1]]
+    first_index, last_index = np.flatnonzero(drop <= max_drop)[[0, -1]]
 
-    def interpolate_end(inside: int, outside: int) -> float | None:
+    def interpolate_end(inside_index: int, outside: int) -> float | None:
         if not 0 <= outside < len(grid):
             return None
-        fraction = (max_drop - drop[inside]) / (drop[outside] - drop[inside])
-        return float(grid[inside] + fraction * (grid[outside] - grid[inside]))
+        fraction = (max_drop - drop[inside_index]) / (drop[outside] - drop[inside_index])
+        return float(grid[inside_index] + fraction * (grid[outside] - grid[inside_index]))
 
-    return interpolate_end(first, first - 1), interpolate_end(last, last + 1)
+    return interpolate_end(first_index, first_index - 1), interpolate_end(
+        last_index, last_index + 1
+    )
 
 
 def profile_ends(

@@ -199,11 +199,11 @@ class FittedPositions:
         gram = self.gram / scales[:, None, None, None, None] ** 2
         sigma = self.constant_sigma
         information = gram[..., 1:, 1:] * np.outer(sigma, sigma) + np.eye(len(sigma))
-        cross = gram[..., 1:, 0] * sigma
+        cross_products = gram[..., 1:, 0] * sigma
         cholesky = np.linalg.cholesky(information)
-        solution = np.linalg.solve(information, cross[..., None])[..., 0]
+        solution = np.linalg.solve(information, cross_products[..., None])[..., 0]
         log_diagonal = np.log(np.diagonal(cholesky, axis1=-2, axis2=-1)).sum(axis=-1)
-        square_sum = gram[..., 0, 0] - np.sum(cross * solution, axis=-1)
+        square_sum = gram[..., 0, 0] - np.sum(cross_products * solution, axis=-1)
         return np.asarray(0.5 * square_sum + log_diagonal)
 
     def scores(self, scales: Array = UNIT_SCALE) -> Array:
@@ -255,7 +255,7 @@ def fit_positions(
     return FittedPositions(gram, log_determinant, degrees_of_freedom, positions.constant_sigma)
 
 
-def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
+def centre_on_path(positions: Positions, *, has_scale: bool = False) -> Positions:
     """Subtract a smooth path through the positions from positions and IMU increments.
 
     The likelihood is unchanged in theory. The rounding errors are smaller, because the likelihood
@@ -264,31 +264,31 @@ def centre_on_path(positions: Positions, *, scaled: bool = False) -> Positions:
     Parameters
     ----------
     positions : Positions
-    scaled : bool
+    has_scale : bool
         True if the last unknown constant is the scale of the positions. The path becomes the
         sensitivity to this constant.
     """
-    measured = positions.measurement_m.copy()
+    measured_m = positions.measurement_m.copy()
     dp = positions.delta_position_m.copy()
     dv = positions.delta_velocity_m_s.copy()
     sigma_a, sigma_z = PATH_NOISES
     for axes, system, _ in positions.factorised_systems(
-        sigma_a, np.full(len(measured), sigma_z**2)
+        sigma_a, np.full(len(measured_m), sigma_z**2)
     ):
-        data = np.nan_to_num(measured[:, axes].T)[:, None]
+        data = np.nan_to_num(measured_m[:, axes].T)[:, None]
         state = system.solve(data, dp[axes, :, 0], dv[axes, :, 0])
         state[:, :, positions.segment_starts] = 0.0
         path = state[..., 0]
         speed = state[..., 1]
-        measured[:, axes] -= path[:, 0].T
+        measured_m[:, axes] -= path[:, 0].T
         path_increment = np.diff(path) - positions.length_s * speed[..., :-1]
         # the path of the first time offset is subtracted at all offsets; the sensitivity to the
         # scale is the path of each offset
         for array, increment in ((dp, path_increment), (dv, np.diff(speed))):
             array[axes, :, 0] -= increment[:, :1]
-            if scaled:
+            if has_scale:
                 array[axes, :, -1] = increment
-    return replace(positions, measurement_m=measured, delta_position_m=dp, delta_velocity_m_s=dv)
+    return replace(positions, measurement_m=measured_m, delta_position_m=dp, delta_velocity_m_s=dv)
 
 
 def expected_squares(
@@ -321,8 +321,8 @@ def expected_squares(
     dp, dv = (np.einsum("akn,nk->an", array[:, 0], interval_coefficients) for array in increments)
     square_m2 = np.zeros(len(variance_m2))
     for axes, system, _ in positions.factorised_systems(sigma_a_m_s2, variance_m2):
-        measured = positions.measurement_m[:, axes].T
-        error_m = measured - system.solve(np.nan_to_num(measured), dp[axes], dv[axes])[..., 0]
+        measured_m = positions.measurement_m[:, axes].T
+        error_m = measured_m - system.solve(np.nan_to_num(measured_m), dp[axes], dv[axes])[..., 0]
         position_variance = np.where(np.isnan(error_m), np.nan, system.position_variance())
         square_m2 += np.nansum(error_m**2 + position_variance, axis=0)
     return square_m2, np.isfinite(positions.measurement_m).sum(axis=1)
@@ -490,10 +490,10 @@ class BandedSystem:
         for below in range(4):
             reversed_bands[below, : size - below] = self.bands[below, : size - below][::-1]
         reversed_lower, _ = lapack.dpbtrf(reversed_bands, lower=1, overwrite_ab=1)
-        (a, c) = (self.lower[0, at::2] for at in (0, 1))
+        (a, c) = (self.lower[0, first_row::2] for first_row in (0, 1))
         b = self.lower[1, 0::2]
         # in the blocks of the reversed matrix, velocity precedes position
-        (d, f) = (reversed_lower[0, at::2][::-1] for at in (0, 1))
+        (d, f) = (reversed_lower[0, first_row::2][::-1] for first_row in (0, 1))
         e = reversed_lower[1, 0::2][::-1]
         p00 = a**2 + e**2 + f**2 - self.bands[0, 0::2]
         p01 = a * b + d * e - self.bands[1, 0::2]

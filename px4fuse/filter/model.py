@@ -19,8 +19,8 @@ import numpy as np
 
 from px4fuse.arrays import Array
 
-STATES = ["position_m", "velocity_m_s"]
-COVARIANCES = ["position_variance_m2", "covariance_m2_s", "velocity_variance_m2_s2"]
+STATE_COLUMNS = ["position_m", "velocity_m_s"]
+COVARIANCE_COLUMNS = ["position_variance_m2", "covariance_m2_s", "velocity_variance_m2_s2"]
 # Initial standard deviations in the lesson UAT 366, module 2: P₀ = diag(0.5², 1.0²)
 INITIAL_SIGMA_P_M = 0.5
 INITIAL_SIGMA_V_M_S = 1.0

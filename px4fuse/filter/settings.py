@@ -15,7 +15,7 @@ DT_RANGE_S = (1e-3, 1.0)
 CLOCK_OFFSET_RANGE_S = (-10.0, 10.0)
 _RANGES = (SIGMA_A_RANGE_M_S2, SIGMA_Z_RANGE_M, DT_RANGE_S, CLOCK_OFFSET_RANGE_S)
 # Unit of each numeric setting
-UNITS = {"sigma_a_m_s2": "m/s²", "sigma_z_m": "m", "dt_s": "s", "clock_offset_s": "s"}
+SETTING_UNITS = {"sigma_a_m_s2": "m/s²", "sigma_z_m": "m", "dt_s": "s", "clock_offset_s": "s"}
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Settings:
     clock_offset_s: float = 0.0
 
     def __post_init__(self) -> None:
-        for (name, unit), (low, high) in zip(UNITS.items(), _RANGES, strict=True):
+        for (name, unit), (low, high) in zip(SETTING_UNITS.items(), _RANGES, strict=True):
             value = getattr(self, name)
             if not low <= value <= high:  # also rejects NaN
                 raise SettingsError(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import pandas as pd
@@ -131,22 +130,12 @@ def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     """Return the acceleration in NED without gravity, at the IMU's timestamps.
 
     Logs with PX4's default profile contain the attitude at a tenth of the IMU's rate, so the
-    attitude is interpolated (slerp, Shoemake 1985). The result is cached as long as the flight
-    exists.
+    attitude is interpolated (slerp, Shoemake 1985).
 
     Returns
     -------
     DataFrame, shape (n, 3), m/s², or Unavailable
     """
-    if flight not in _NED_ACCELERATIONS:
-        _NED_ACCELERATIONS[flight] = _ned_acceleration(flight)
-    return _NED_ACCELERATIONS[flight]
-
-
-_NED_ACCELERATIONS: WeakKeyDictionary[Flight, pd.DataFrame | Unavailable] = WeakKeyDictionary()
-
-
-def _ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     if isinstance(flight.imu, Unavailable):
         return flight.imu
     if isinstance(flight.attitude, Unavailable):
@@ -178,9 +167,9 @@ def aisle_heading(track: PositionTrack, segment: Segment) -> tuple[float, float]
         Ratio of the standard deviations along and across this direction; 1 without a main
         direction.
     """
-    horizontal = cut_to_segment(track.samples, segment)[Columns.POSITION[:2]].dropna().to_numpy()
-    centred = horizontal - horizontal.mean(axis=0)
-    _, singular_values, directions = np.linalg.svd(centred, full_matrices=False)
+    position_m = cut_to_segment(track.samples, segment)[Columns.POSITION[:2]].dropna().to_numpy()
+    centred_m = position_m - position_m.mean(axis=0)
+    _, singular_values, directions = np.linalg.svd(centred_m, full_matrices=False)
     heading_deg = float(np.degrees(np.arctan2(directions[0, 1], directions[0, 0]))) % 180.0
     elongation = (
         float(singular_values[0] / singular_values[1]) if singular_values[1] > 0 else float("inf")
@@ -220,9 +209,10 @@ def make_axes(
     axis_names = tuple(dict.fromkeys(valid_names if names is None else names))
     if heading_deg is not None and not 0.0 <= heading_deg <= 360.0:
         raise SettingsError(f"`heading_deg` {heading_deg:g} is not between 0 and 360 degrees.")
-    if unknown := [name for name in axis_names if name not in valid_names]:
+    if unknown_names := [name for name in axis_names if name not in valid_names]:
         raise SettingsError(
-            f"Axis {unknown[0]} is not known.", f"Choose from the axes {', '.join(valid_names)}."
+            f"Axis {unknown_names[0]} is not known.",
+            f"Choose from the axes {', '.join(valid_names)}.",
         )
     source_label = f"{flight.log.name}: {track.name}"
     axes = []
@@ -255,12 +245,12 @@ def too_few_measurements(name: str, count: int, min_count: int) -> Unavailable:
     )
 
 
-def weighted_sum(frame: pd.DataFrame, columns: list[str], weights: Array) -> Array:
+def weighted_sum(samples: pd.DataFrame, columns: list[str], weights: Array) -> Array:
     """Return the weighted sum of columns of a table; columns with weight zero may be NaN."""
-    total = np.zeros(len(frame))
+    total = np.zeros(len(samples))
     for column, weight in zip(columns, weights, strict=True):
         if weight != 0.0:
-            total += weight * frame[column].to_numpy()
+            total += weight * samples[column].to_numpy()
     return total
 
 
@@ -346,6 +336,6 @@ def step_means(acceleration: Acceleration, edges: ArrayLike) -> tuple[Array, Arr
     )
 
 
-def cut_to_segment(frame: pd.DataFrame, segment: Segment) -> pd.DataFrame:
+def cut_to_segment(samples: pd.DataFrame, segment: Segment) -> pd.DataFrame:
     """Return the rows of a time-indexed table inside a segment, both ends included."""
-    return frame[(frame.index >= segment.start_s) & (frame.index <= segment.end_s)]
+    return samples[(samples.index >= segment.start_s) & (samples.index <= segment.end_s)]

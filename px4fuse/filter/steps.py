@@ -39,7 +39,9 @@ class Timeline:
     input_gap_s: float
 
 
-def make_timeline(axis: Axis, settings: Settings, initial: InitialState | None = None) -> Timeline:
+def make_timeline(
+    axis: Axis, settings: Settings, initial_state: InitialState | None = None
+) -> Timeline:
     """Return the prediction steps of KF along an axis.
 
     Raises
@@ -48,7 +50,7 @@ def make_timeline(axis: Axis, settings: Settings, initial: InitialState | None =
         ``settings.input`` is "imu" and the axis has no acceleration, or no measurement is later
         than the initial state.
     """
-    start_s = axis.measurement_time_s[0] if initial is None else initial.time_s
+    start_s = axis.measurement_time_s[0] if initial_state is None else initial_state.time_s
     is_usable = axis.measurement_time_s > start_s + MAX_SAME_TIME_S
     measured_s = axis.measurement_time_s[is_usable]
     if not len(measured_s):

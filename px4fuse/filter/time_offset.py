@@ -55,7 +55,7 @@ MAX_PART_SIGMA_S = 0.15
 # flight
 MAX_CHANGE_P = 0.005
 # Minimum significant time offset, in σ: false alarm probability 0.3 %
-OFFSET_SIGMAS = 3.0
+MIN_OFFSET_SIGMAS = 3.0
 # Number of simulations of the IMU noise, to estimate the variance of the time offset
 SIMULATION_COUNT = 96
 # Step of ln σ for numerical derivatives of the likelihood with respect to the noises
@@ -118,8 +118,8 @@ class Clock(Record, frozen=True, kw_only=True):
 
     @property
     def three_sigma_s(self) -> float:
-        """Minimum significant offset: ``OFFSET_SIGMAS`` standard deviations (s)."""
-        return OFFSET_SIGMAS * self.sigma_s
+        """Minimum significant offset: ``MIN_OFFSET_SIGMAS`` standard deviations (s)."""
+        return MIN_OFFSET_SIGMAS * self.sigma_s
 
 
 class ClockOffset(Clock, frozen=True, kw_only=True, eq=False):

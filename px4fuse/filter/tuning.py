@@ -45,7 +45,7 @@ NoiseInterval = tuple[NotNegative, NotNegative | None]
 # Number of grid points along each side of the likelihood map
 GRID_SIZE = 40
 # Half-width of the likelihood map along each side, in σ of the estimate
-MAP_SIGMAS = 4.5
+MAP_HALF_WIDTH_SIGMAS = 4.5
 MIN_MEASUREMENTS = 30  # minimum number of positions for an estimate of the noises
 # Maximum fraction of outliers for an estimate of the noises
 MAX_OUTLIER_SHARE = 0.3
@@ -306,7 +306,7 @@ def tune_axes(
             )
             # a coarse time offset is enough: a finer value hardly changes the noises
             offset_s, start_noises = prepared_motion.search_offset(
-                start_noises, START_SIGMA_A_FACTORS, scaled=False
+                start_noises, START_SIGMA_A_FACTORS, has_scale=False
             )
             motion_fit = maximise_likelihood(
                 [prepared_motion.at(offset_s)], start_noises, prepared_motion.weight
@@ -407,9 +407,9 @@ def _make_map(
         (sigma_z, best_noises.sigma_z_m, SIGMA_Z_SEARCH_M),
     ):
         interval = np.array([noise.low or low, noise.high or high])
-        ends = best_value * (interval / best_value) ** (MAP_SIGMAS / 1.96)
-        first, last = np.clip(ends, low, high)
-        grids.append(np.geomspace(first, last, GRID_SIZE))
+        ends = best_value * (interval / best_value) ** (MAP_HALF_WIDTH_SIGMAS / 1.96)
+        lowest, highest = np.clip(ends, low, high)
+        grids.append(np.geomspace(lowest, highest, GRID_SIZE))
     sigma_a_grid, sigma_z_grid = grids
     scores = score_grid(intervals, sigma_a_grid[:, None], sigma_z_grid[None, :], weight)
     return LikelihoodMap(sigma_a_grid, sigma_z_grid, scores - scores.min())

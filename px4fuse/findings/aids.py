@@ -173,7 +173,7 @@ def _aid_label(aid: AidResult) -> str:
 
 
 def _sensor_cause(switch: str, source_aid: str) -> str:
-    """Return SENSOR if one PX4 parameter enables this aid and the aid that KF uses, else ""."""
+    """Return SENSOR if an aid and KF's position source use one sensor (one parameter), else ""."""
     return SENSOR if source_aid and AIDS[source_aid].switch == switch else ""
 
 

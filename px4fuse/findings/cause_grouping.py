@@ -4,10 +4,11 @@ from collections.abc import Iterable, Mapping
 
 from msgspec.structs import replace
 
-from px4fuse.findings.model import SEVERITIES, TITLES, Finding, group_by_root
+from px4fuse.finding import SEVERITIES, Finding
+from px4fuse.findings.model import TITLES, group_by_root
 from px4fuse.record import table
 
-# Evidence key of a finding: kind of its cause, as shown by re-runs with changed settings or data
+# Key in Finding.evidence for the kind of cause, which re-runs with changed settings or data show
 CAUSE = "cause"
 NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "measurement noise",
@@ -22,8 +23,8 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
 # Evidence key of time-correlated noise: ratio of its white part to the measurement σ that a filter
 # assumes. Present only if the ratio is large: the assumed σ is then a separate fault
 WHITE_RATIO = "white_over_assumed"
-# Kinds of cause of findings about an aiding source: it uses the same sensor as the position source,
-# or its innovations shift in flight
+# Values of CAUSE in a finding about an aiding source: its sensor is that of the position source, or
+# its mean innovation changes in flight
 SENSOR, CHANGE = "the source's sensor", "change"
 # Kind of cause of ekf2_resets: all position resets follow a gap in the position source
 GAP = "gap"
@@ -120,7 +121,7 @@ def effect_ids(cause: str) -> tuple[str, ...]:
 
 
 def _report_rank(group: list[Finding]) -> int:
-    # noises depend on the recording, so its warnings precede errors of noises
+    # gaps of the recording falsify estimated noises: RECORDING warnings precede NOISES errors
     cause = group[0]
     is_first = CONVENTION in cause.evidence or cause.id in (*UNUSABLE, *MISLEADING, WITHOUT)
     if is_first and cause.severity != "note":

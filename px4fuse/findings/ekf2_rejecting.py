@@ -7,8 +7,9 @@ from px4fuse.comparison.model import AxisComparison
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import Trial, improvement, preference
 from px4fuse.ekf2_parameters import GNSS_POS
+from px4fuse.finding import Finding
 from px4fuse.findings.cause_text import format_action
-from px4fuse.findings.model import Finding, Findings, finding, format_percent, zero_length_spans
+from px4fuse.findings.model import Findings, finding, format_percent, zero_length_spans
 from px4fuse.flight import Ekf2, Unavailable
 
 REJECTED_SHARE_WARNING = 0.01  # rejected fraction for a warning; 6e-7 if consistent, with 5 √S
@@ -47,10 +48,10 @@ def _detect_rejections(analysis: Analysis) -> Findings:
     ekf2, down = analysis.flight.ekf2, analysis.axes.get("down")
     # EKF2 rejects north and east together, so the main axis represents both
     for result in (analysis.main, *([down] if down and down is not analysis.main else [])):
-        frame = result.ekf2_innovations
-        if isinstance(frame, Unavailable) or not isinstance(ekf2, Ekf2):
+        innovations = result.ekf2_innovations
+        if isinstance(innovations, Unavailable) or not isinstance(ekf2, Ekf2):
             continue
-        rejected_flags = frame["rejected"].dropna()
+        rejected_flags = innovations["rejected"].dropna()
         share = float(rejected_flags.mean())  # NaN if the log has no rejections
         if share >= REJECTED_SHARE_WARNING:
             quantity = "heights" if result is down else "positions"
@@ -61,7 +62,7 @@ def _detect_rejections(analysis: Analysis) -> Findings:
                 f"beyond its gate of {ekf2.gate:g} √S. Possible causes: outliers, measurement "
                 "noise set too small, or late timestamps.",
                 _remedy(analysis, result),
-                {"rejected_fraction": share, "count": len(frame), "axis": result.axis.name},
+                {"rejected_fraction": share, "count": len(innovations), "axis": result.axis.name},
                 zero_length_spans(rejected_flags.index[rejected_flags > 0.0]),
             )
 

@@ -7,15 +7,9 @@ from px4fuse.analysis import Analysis
 from px4fuse.ekf2.inputs import MAX_LOST_SHARE, lost_imu_fraction
 from px4fuse.filter.hypotheses import MIN_BIAS_M_S2, BiasScaleJumpFit
 from px4fuse.filter.signals import Segment, cut_to_segment, imu_gaps
+from px4fuse.finding import MIN_SPAN_S
 from px4fuse.findings.missing import DEFAULT_PROFILE, VISION_PROFILE_BIT
-from px4fuse.findings.model import (
-    MIN_SPAN_S,
-    Findings,
-    error,
-    finding,
-    format_percent,
-    warning,
-)
+from px4fuse.findings.model import Findings, error, finding, format_percent, warning
 from px4fuse.flight import Columns, Ekf2, Flight, sample_rate
 from px4fuse.record import Span
 
@@ -64,7 +58,7 @@ def detect_bias(analysis: Analysis) -> Findings:
             {"bias_m_s2": size, "sigma_m_s2": fit.bias.sigma},
         )
     elif ekf2_bias is not None:
-        # with a fit to the positions, which shows no horizontal bias, only EKF2's down bias counts
+        # a fit to the positions, if any, shows no horizontal bias: then use EKF2's bias along down
         size = float(
             np.linalg.norm(ekf2_bias[2:] if isinstance(fit, BiasScaleJumpFit) else ekf2_bias)
         )

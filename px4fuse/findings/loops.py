@@ -1,8 +1,9 @@
 """False or inconsistent loop closures, excessive odometry drift, and an assumed landing place."""
 
 from px4fuse.analysis import Analysis
-from px4fuse.findings.model import Finding, Findings, error, note, warning
-from px4fuse.loop.model import LANDING, Closure, Loop
+from px4fuse.finding import Finding
+from px4fuse.findings.model import Findings, error, note, warning
+from px4fuse.loop.model import LANDING_SOURCE, Closure, Loop
 from px4fuse.text import capitalise_first
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
@@ -74,7 +75,7 @@ def detect_assumptions(loop: Loop) -> Findings:
 
 
 def _false_closure(closure: Closure, is_end_assumed: bool) -> Finding:
-    is_landing = closure.source == LANDING
+    is_landing = closure.source == LANDING_SOURCE
     fault = f"False loop closure of {closure.distance_m:.2f} m: {closure}"
     if is_landing and is_end_assumed:
         fault = (

@@ -80,7 +80,9 @@ def detect_source_not_logged(analysis: Comparison) -> Findings:
     )
     for interval in LOGGER_INTERVALS_S.get(source.name, ()):
         is_limited = abs(1.0 / rate_hz / interval - 1.0) < LOGGER_TOLERANCE
-        weak = next(filter(None, (_weak_verdict(analysis, owner) for owner in FILTERS)), None)
+        weak = next(
+            filter(None, (_weak_verdict(analysis, filter_name) for filter_name in FILTERS)), None
+        )
         if is_limited and weak:
             yield note(
                 "source_rate_limited_by_logger",
@@ -91,22 +93,22 @@ def detect_source_not_logged(analysis: Comparison) -> Findings:
             )
 
 
-def _weak_verdict(analysis: Comparison, owner: FilterName) -> str | None:
+def _weak_verdict(analysis: Comparison, filter_name: FilterName) -> str | None:
     """Format a clause if more innovations could change the verdict of a filter, else None.
 
     They could if there are too few for a verdict, or if the 95 % interval of the σ ratio contains a
     limit of the consistent band.
     """
-    summary, limits = analysis.main.filters[owner], CONSISTENT_RATIOS["source"]
-    name = owner.upper()
+    summary, limits = analysis.main.filters[filter_name], CONSISTENT_RATIOS["source"]
+    filter_label = filter_name.upper()
     if not isinstance(summary, FilterSummary):
-        return f"too few to test the consistency of {name}."
+        return f"too few to test the consistency of {filter_label}."
     low, high = ratio_interval(summary.nis_mean, summary.nis_band)
     for limit in limits:
         if low <= limit <= high:
             return (
-                f"and the verdict of {name} is near its limit. The 95 % interval of innovation ÷ "
-                f"√S ({low:.2f} to {high:.2f}) contains the limit {limit:g}."
+                f"and the verdict of {filter_label} is near its limit. The 95 % interval of "
+                f"innovation ÷ √S ({low:.2f} to {high:.2f}) contains the limit {limit:g}."
             )
     return None
 

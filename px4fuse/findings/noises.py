@@ -13,24 +13,22 @@ from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import (
-    SIGMA_A,
-    SIGMA_Z,
-    SMALLEST_SIGMA_Z_M,
     Intervention,
     find_cause,
     interventions_for,
     is_inconsistent,
-    tuning_of_axis,
 )
+from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z, SMALLEST_SIGMA_Z_M, tuning_of_axis
 from px4fuse.comparison.estimates import first_axis_tuning
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of, format_settings, noise_change
 from px4fuse.comparison.trials import can_improve, find_trial
 from px4fuse.ekf2_parameters import BAROMETER
-from px4fuse.filter.settings import UNITS, Settings
+from px4fuse.filter.settings import SETTING_UNITS, Settings
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
+from px4fuse.finding import SEVERITIES, Finding, Severity
 from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, NOISE
 from px4fuse.findings.cause_text import (
     classify_cause,
@@ -39,30 +37,21 @@ from px4fuse.findings.cause_text import (
     is_refuted,
 )
 from px4fuse.findings.hidden_errors import find_hidden_errors
-from px4fuse.findings.model import (
-    SEVERITIES,
-    Finding,
-    Findings,
-    Severity,
-    error,
-    finding,
-    format_percent,
-    lower_severity,
-)
+from px4fuse.findings.model import Findings, error, finding, format_percent, lower_severity
 from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight import Columns, Unavailable, sample_rate
 from px4fuse.request import COMPARISON_OPTIONS
 from px4fuse.text import format_factor, format_number, format_ratio
 
 MIN_NOISE_RATIO = 1.5  # setting over estimate (σ) or its inverse; below, the track hardly changes
-MIN_NOISE_RATIO_ERROR = 4.0  # setting over estimate (σ) or its inverse, for an error
+MIN_NOISE_RATIO_ERROR = 4.0  # setting over estimate (σ) or its inverse, for severity "error"
 MIN_RESPONSE_TIME_S = 2.5  # s; minimum response time of KF for Q almost zero: vehicles turn in less
 INTERVAL_WIDENING = (
     1.5  # factor on the 95 % interval (log scale); 0.3 % of correct settings exceed it
 )
 MIN_LAG1_AUTOCORRELATION = 0.3  # of the innovations; white ones: below 2/√n, 0.2 for n = 100
 
-MIN_SIGMA_RATIO_ERROR = 2.0  # reported over actual σ, or its inverse, for an error
+MIN_SIGMA_RATIO_ERROR = 2.0  # reported over actual σ, or its inverse, for severity "error"
 # Maximum ratio of two estimates of one noise: twice the standard error of a median of 100 values
 NOISE_RATIO_TOLERANCE = 1.25
 # Actions if no re-run explains an inconsistent variance
@@ -193,7 +182,7 @@ def _setting_finding(
 
 def format_estimate(name: str, chosen: float, noise: Noise) -> str:
     """Format a setting with its maximum-likelihood estimate and 95 % interval."""
-    label, unit = name[:7].upper(), UNITS[name]
+    label, unit = name[:7].upper(), SETTING_UNITS[name]
     estimate = f"{label} {chosen:g} {unit}; maximum-likelihood estimate"
     if noise.value is None:
         return f"{estimate} at most {noise.high:.3g} {unit}"

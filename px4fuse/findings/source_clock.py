@@ -34,11 +34,11 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
     low, high = clock.interval_s
     evidence = {"offset_s": clock.offset_s, "interval_low_s": low, "interval_high_s": high}
     if clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P:
-        first_s, last_s = clock.parts[0].offset_s, clock.parts[-1].offset_s
+        start_offset_s, end_offset_s = clock.parts[0].offset_s, clock.parts[-1].offset_s
         yield error(
             "source_time_offset_changes",
-            f"The time offset of the positions changes in flight from {first_s:+.2f} s to "
-            f"{last_s:+.2f} s. These are the estimates of the first and the last part "
+            f"The time offset of the positions changes in flight from {start_offset_s:+.2f} s to "
+            f"{end_offset_s:+.2f} s. These are the estimates of the first and the last part "
             f"(p {clock.change_p_value:.1g}). No single --clock-offset corrects both. Until 500 "
             "TIMESYNC answers have come, PX4 uses arrival times.",
             "Let the clocks synchronise for one minute before take-off. Analyse one side of the "
@@ -55,12 +55,12 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
     ):
         return
     interval_s, is_late = (low - clock.applied_s, high - clock.applied_s), clock.remaining_s < 0
-    first_s, last_s = (-interval_s[1], -interval_s[0]) if is_late else interval_s
+    lower_s, upper_s = (-interval_s[1], -interval_s[0]) if is_late else interval_s
     yield finding(
         "error" if size_s > MIN_OFFSET_ERROR_S else "warning",
         "source_time_offset",
         f"Position timestamps are {size_s:.2f} s {'late' if is_late else 'early'}. The estimate "
-        f"from IMU and positions is {size_s:.3f} s (95 % {first_s:.3f} to {last_s:.3f} s). At "
+        f"from IMU and positions is {size_s:.3f} s (95 % {lower_s:.3f} to {upper_s:.3f} s). At "
         f"1 m/s this is a position error of {size_s:.2f} m in KF and EKF2, which innovations "
         f"hardly show.{_assumed_delay(analysis, clock)}",
         _offset_remedy(analysis, clock),

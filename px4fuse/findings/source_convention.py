@@ -19,8 +19,9 @@ from px4fuse.convention.texts import (
     describe_unit,
     format_axes,
 )
+from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION, MISLEADING, UNUSABLE
-from px4fuse.findings.model import CATALOGUE, Finding, Findings, error, warning
+from px4fuse.findings.model import CATALOGUE, Findings, error, warning
 from px4fuse.flight import PositionTrack, positions_of, source_name
 from px4fuse.text import capitalise_first
 

@@ -24,7 +24,7 @@ from px4fuse.text import format_factor, format_number
 # because errors in a flight are correlated and EKF2's output predictor delays its position
 MAX_NEES_SIGMA_RATIO = 2.0
 # Label of each setting or property of a flight that px4fuse diff compares, and path in the results
-SETTINGS = {
+SETTING_LABELS = {
     "SIGMA_A (m/s²)": "settings.sigma_a_m_s2",
     "SIGMA_Z (m)": "settings.sigma_z_m",
     "DT (s)": "settings.dt_s",
@@ -65,7 +65,7 @@ def list_changes(a: DiffInput, b: DiffInput) -> contract.ChangeResults:
     """List the settings, numbers and findings that differ between two results of comparisons."""
     findings = tuple(_finding_changes(a.results, b.results))
     return contract.ChangeResults(
-        schema=schema_of(contract.CHANGES),
+        schema=schema_of(contract.CHANGES_SCHEMA),
         a=_describe_input(a),
         b=_describe_input(b),
         settings=tuple(_setting_changes(a.results, b.results)),
@@ -89,7 +89,8 @@ def _describe_input(diff_input: DiffInput) -> contract.DiffInput:
 
 def _setting_changes(a: Results, b: Results) -> Iterator[contract.SettingChange]:
     values_a, values_b = (
-        {name: value_at(results, path) for name, path in SETTINGS.items()} | _parameters(results)
+        {name: value_at(results, path) for name, path in SETTING_LABELS.items()}
+        | _parameters(results)
         for results in (a, b)
     )
     for name in {**values_a, **values_b}:
@@ -139,8 +140,8 @@ def compare_numbers(
 def _finding_changes(a: Results, b: Results) -> Iterator[contract.FindingChange]:
     """Yield the findings that only A or only B contains with the same id and severity."""
     sides: tuple[tuple[Results, Results, contract.DiffSide], ...] = ((b, a, "B"), (a, b, "A"))
-    for results, other, only_in in sides:
-        ids = {(finding.id, finding.severity) for finding in other.findings}
+    for results, other_results, only_in in sides:
+        ids = {(finding.id, finding.severity) for finding in other_results.findings}
         for finding in results.findings:
             if (finding.id, finding.severity) not in ids:
                 yield contract.FindingChange(finding.id, finding.severity, finding.message, only_in)
@@ -150,7 +151,7 @@ def _worse_verdicts(
     a: Results, b: Results, findings: Iterable[contract.FindingChange]
 ) -> Iterator[str]:
     """Yield a sentence for each verdict that is worse in B, and for each new error finding."""
-    verdicts_a, verdicts_b = _verdicts(a), _verdicts(b)
+    verdicts_a, verdicts_b = _verdicts_by_axis(a), _verdicts_by_axis(b)
     for name, (value_a, was_consistent) in verdicts_a.items():
         value_b, is_consistent = verdicts_b.get(name, (value_a, True))
         if was_consistent and not is_consistent:
@@ -170,7 +171,7 @@ def _worse_verdicts(
         yield f"New finding of severity error: {finding_id}."
 
 
-def _verdicts(results: Results) -> dict[str, tuple[float, bool]]:
+def _verdicts_by_axis(results: Results) -> dict[str, tuple[float, bool]]:
     """Return mean NIS and mean NEES by label ("Mean NIS of KF, north"), with True if consistent."""
     verdicts: dict[str, tuple[float, bool]] = {}
     for axis, result in (value_at(results, "axes") or {}).items():

@@ -7,16 +7,14 @@ from typing import Literal
 
 from msgspec.structs import replace
 
-from px4fuse.analysis import run_or_evaluate_aids
+from px4fuse.diagnose import diagnose_or_check_aids
 from px4fuse.errors import LogError, ResultsError
 from px4fuse.reading import display_name, files_by_sha256, read_bytes_limited, read_head
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import outcome_results
 from px4fuse.results.contract import AidsResults, ComparisonResults, to_json
-from px4fuse.results.reading import MAX_BYTES as MAX_RESULTS_BYTES
-from px4fuse.results.reading import read_results
-from px4fuse.verification.pdf_input import MAX_BYTES as MAX_REPORT_BYTES
-from px4fuse.verification.pdf_input import attached_results
+from px4fuse.results.reading import MAX_RESULTS_BYTES, read_results
+from px4fuse.verification.pdf_input import MAX_PDF_BYTES, attached_results
 
 Kind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]
@@ -48,12 +46,12 @@ def read_inputs(
     ResultsError
         An input cannot be read or is not from ``px4fuse compare``, or A and B are the same file.
     """
-    first, second = (_read_attached(path) for path in (a, b))
+    first_input, second_input = (_read_attached(path) for path in (a, b))
     if a.samefile(b):
         raise ResultsError(f"{display_name(a)}: A and B are the same file. Give two files.")
     return (
-        first or _analyse_log(a, second, progress),
-        second or _analyse_log(b, first, progress),
+        first_input or _analyse_log(a, second_input, progress),
+        second_input or _analyse_log(b, first_input, progress),
     )
 
 
@@ -63,7 +61,7 @@ def _read_attached(path: Path) -> DiffInput | None:
     is_report = head.startswith(b"%PDF-")
     if not is_report and not head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
         return None
-    limit = MAX_REPORT_BYTES if is_report else MAX_RESULTS_BYTES
+    limit = MAX_PDF_BYTES if is_report else MAX_RESULTS_BYTES
     advice = (
         "Give a report, which has less than 2 MB"
         if is_report
@@ -79,15 +77,15 @@ def _read_attached(path: Path) -> DiffInput | None:
     return DiffInput(name, "report" if is_report else "results", results)
 
 
-def _analyse_log(path: Path, other: DiffInput | None, progress: Progress) -> DiffInput:
+def _analyse_log(path: Path, other_input: DiffInput | None, progress: Progress) -> DiffInput:
     request = ComparisonRequest(log=str(path))
-    if other is not None:
-        is_same = other.results.log.sha256 in files_by_sha256([path])
+    if other_input is not None:
+        is_same = other_input.results.log.sha256 in files_by_sha256([path])
         fields = (*_FILTER_FIELDS, *_SEGMENT_FIELDS) if is_same else _FILTER_FIELDS
         request = replace(
-            request, **{name: getattr(other.results.request, name) for name in fields}
+            request, **{name: getattr(other_input.results.request, name) for name in fields}
         )
-    result = run_or_evaluate_aids(request, progress)
+    result = diagnose_or_check_aids(request, progress)
     text = to_json(outcome_results(request, result))  # to_json rounds the numbers as in a report
     results = read_results(text.encode())
     assert isinstance(results, Results)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
 
 #: Suffixes of the files in a folder that are logs; a file that the user names may have any suffix
-SUFFIXES = (".ulg", ".tlog", ".bin")
+LOG_SUFFIXES = (".ulg", ".tlog", ".bin")
 
 
 @dataclass(frozen=True, order=True)
@@ -50,7 +50,7 @@ def find_logs(patterns: Iterable[str]) -> list[LogAddress]:
     Parameters
     ----------
     patterns : iterable of str
-        Files, folders (in which files with SUFFIXES are logs), globs and URLs.
+        Files, folders (in which files with LOG_SUFFIXES are logs), globs and URLs.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def _logs_in(pattern: str) -> list[LogAddress]:
             info_by_path = {
                 path: info
                 for path, info in all_files.items()
-                if PurePosixPath(path).suffix.lower() in SUFFIXES
+                if PurePosixPath(path).suffix.lower() in LOG_SUFFIXES
             }
         elif file_system.exists(root):  # a worker process rejects devices and pipes
             info_by_path = {root: file_system.info(root) if file_system.isfile(root) else {}}
@@ -94,7 +94,7 @@ def _logs_in(pattern: str) -> list[LogAddress]:
     if not info_by_path:
         raise SettingsError(
             f"{pattern}: no logs found",
-            f"Give existing logs, or folders with logs ({', '.join(SUFFIXES)}).",
+            f"Give existing logs, or folders with logs ({', '.join(LOG_SUFFIXES)}).",
         )
     found_logs = []
     for path, info in info_by_path.items():
@@ -129,9 +129,9 @@ def local_file(address: str) -> Iterator[Path]:
             "Increase the limit with --max-size MB.",
         )
     with TemporaryDirectory(prefix="px4fuse-") as folder:
-        local = Path(folder, _file_name(path))
-        file_system.get_file(path, str(local))
-        yield local
+        local_path = Path(folder, _file_name(path))
+        file_system.get_file(path, str(local_path))
+        yield local_path
 
 
 def _file_system(address: str) -> tuple[AbstractFileSystem, str]:

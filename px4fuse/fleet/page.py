@@ -8,11 +8,11 @@ from typing import Any
 
 import pandas as pd
 
-from px4fuse.card.model import AXIS_ENDS, BANDS
+from px4fuse.card.model import AXIS_ENDS, SIGMA_RATIO_BANDS
 from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.findings import finding_title
 from px4fuse.fleet.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, RESULT_PATHS
-from px4fuse.report.card_html import MARK_PATHS, SIGNS, band_limits
+from px4fuse.report.card_html import MARK_PATHS, SEVERITY_SIGNS, band_limits
 from px4fuse.report.card_text import FILTER_NAMES, MARKS
 from px4fuse.text import format_number, join_first
 from px4fuse.webpage import frame
@@ -21,7 +21,7 @@ from px4fuse.webpage.safe import clean, load_template, local_link
 
 # Columns of the four σ ratios (KF and EKF2, against source and ground truth), in the order of the
 # verdicts of the diagnosis (Card)
-RATIOS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
+SIGMA_RATIO_COLUMNS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
 SEVERITIES = ("error", "warning", "note", "clean", "refused")
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
 # Columns that the page shows after a click on a row: one value per axis (AXIS_COLUMNS) or per log
@@ -47,9 +47,9 @@ LOG_COLUMNS = [
     )
 ]
 # Name of the group of columns that the page shows on request
-EXTRA_COLUMNS = "numbers"
+EXTRA_COLUMN_GROUP = "numbers"
 # Label of each page filter, by the first word of its tags
-FILTERS = {
+PAGE_FILTERS = {
     "severity": "Diagnosis",
     "status": "Status",
     "vehicle": "Vehicle",
@@ -83,7 +83,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     logs = sort_logs(logs_of(table))
     names = short_names(logs)
     rows = [
-        Row(_cells(log, names), tuple(log["tags"]), _details(log), _side_sections(log))
+        Row(_log_cells(log, names), tuple(log["tags"]), _log_details(log), _side_sections(log))
         for log in logs
     ]
     counts = Counter(log["severity"] for log in logs)
@@ -105,39 +105,43 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             Column("Log", "name"),
             Column("Diagnosis and first action", "full"),
             *(
-                Column(f"{FILTER_NAMES[owner]} {MARKS[against]}", "ratio", visible_from="tablet")
-                for owner, against in (name.split("_") for name in RATIOS)
+                Column(
+                    f"{FILTER_NAMES[filter_name]} {MARKS[reference_name]}",
+                    "ratio",
+                    visible_from="tablet",
+                )
+                for filter_name, reference_name in (name.split("_") for name in SIGMA_RATIO_COLUMNS)
             ),
             Column("KF − EKF2 (m)", "number", visible_from="tablet"),
             *(
-                Column(label, "line", EXTRA_COLUMNS)
+                Column(label, "line", EXTRA_COLUMN_GROUP)
                 for label in ("Date (UTC)", "Vehicle", "Firmware")
             ),
-            Column("SIGMA_Z estimate (m)", "number", EXTRA_COLUMNS),
-            Column("Time offset (s)", "number", EXTRA_COLUMNS),
-            Column("Findings", "rank", EXTRA_COLUMNS),
+            Column("SIGMA_Z estimate (m)", "number", EXTRA_COLUMN_GROUP),
+            Column("Time offset (s)", "number", EXTRA_COLUMN_GROUP),
+            Column("Findings", "rank", EXTRA_COLUMN_GROUP),
         ),
         rows=rows,
-        filters=_filters(logs),
-        groups=[(EXTRA_COLUMNS, "more columns")],
+        filters=_page_filters(logs),
+        groups=[(EXTRA_COLUMN_GROUP, "more columns")],
         placeholder="search by name, vehicle, firmware or finding",
         full_table_note="All rows are in fleet.csv.",
-        ratio_axis={"bands": BANDS, "ends": AXIS_ENDS, "marks": MARK_PATHS},
+        ratio_axis={"bands": SIGMA_RATIO_BANDS, "ends": AXIS_ENDS, "marks": MARK_PATHS},
     )
 
 
-def _cells(log: Log, names: Mapping[str, str]) -> tuple[Cell, ...]:
+def _log_cells(log: Log, names: Mapping[str, str]) -> tuple[Cell, ...]:
     finding_titles = [finding_title(finding) for finding in log["findings"]]
     vehicle = log.get("vehicle", "")
     severity, action = log["severity"], log.get("action", "")
     style = "command" if action.startswith(("px4fuse ", "param ")) else ""
     return (
-        Cell(SIGNS[severity], SEVERITIES.index(severity), style_class=f"sign {severity}"),
+        Cell(SEVERITY_SIGNS[severity], SEVERITIES.index(severity), style_class=f"sign {severity}"),
         Cell(log["name"], log["name"], log.get("changed", "")),
         Cell(log["headline"], log["headline"], action, style_class=style),
         *(
             _ratio_cell(log.get(f"{name}_ratio"), name, word)
-            for name, word in zip(RATIOS, log["verdict_texts"], strict=True)
+            for name, word in zip(SIGMA_RATIO_COLUMNS, log["verdict_texts"], strict=True)
         ),
         _value_cell(log.get("difference_rms_m"), format_metres),
         frame.text_cell(log.get("date", "")[:10]),
@@ -147,25 +151,31 @@ def _cells(log: Log, names: Mapping[str, str]) -> tuple[Cell, ...]:
         _value_cell(log.get("clock_offset_s"), format_number),
         Cell()
         if log["status"] == FAILED
-        else frame.number_cell(float(len(finding_titles)), below=join_first(finding_titles, 2)),
+        else frame.number_cell(
+            float(len(finding_titles)), text_below=join_first(finding_titles, 2)
+        ),
     )
 
 
 def _ratio_cell(ratio: float | None, name: str, word: str) -> Cell:
-    owner, _, against = name.partition("_")
+    filter_name, _, reference_name = name.partition("_")
     emphasis = " loud" if word in ("overconfident", "underconfident") else ""
     if ratio is None:
         return Cell()
-    return Cell(format_ratio(ratio), ratio, style_class=f"{owner} {against}{emphasis}")
+    return Cell(format_ratio(ratio), ratio, style_class=f"{filter_name} {reference_name}{emphasis}")
 
 
 def sort_logs(logs: Iterable[Log]) -> list[Log]:
     """Sort logs by severity, then by the largest |ln(σ ratio)|, then by position RMSE."""
 
     def rank(log: Log) -> tuple[float, ...]:
-        ratios = [log[key] for name in RATIOS if log.get(key := f"{name}_ratio")]
-        largest = max((abs(math.log(ratio)) for ratio in ratios), default=0.0)
-        return SEVERITIES.index(log["severity"]), -largest, -log.get("position_rmse_m", 0.0)
+        ratios = [log[key] for name in SIGMA_RATIO_COLUMNS if log.get(key := f"{name}_ratio")]
+        largest_log_ratio = max((abs(math.log(ratio)) for ratio in ratios), default=0.0)
+        return (
+            SEVERITIES.index(log["severity"]),
+            -largest_log_ratio,
+            -log.get("position_rmse_m", 0.0),
+        )
 
     return sorted(logs, key=rank)
 
@@ -174,7 +184,7 @@ def _value_cell(value: float | None, format_value: Callable[[float], str]) -> Ce
     return Cell() if value is None else frame.number_cell(value, format_value(value))
 
 
-def _details(log: Log) -> tuple[Section, ...]:
+def _log_details(log: Log) -> tuple[Section, ...]:
     axes = [
         [name, *(_format_value(axis.get(name, "")) for axis in log["axes"])]
         for name in AXIS_COLUMNS
@@ -212,14 +222,14 @@ def _format_value(value: str | float) -> str:
     return value if isinstance(value, str) else format_number(float(value))
 
 
-def _filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
+def _page_filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
     """Return the page filters with their options and log counts, most frequent option first."""
     counts = Counter(tag for log in logs for tag in log["tags"])
     label_by_tag: Mapping[str, str] = {
         tag: label for log in logs for tag, label in log["tags"].items()
     }
     filters = []
-    for kind, label in FILTERS.items():
+    for kind, label in PAGE_FILTERS.items():
         options = [
             (tag, f"{clean(label_by_tag[tag], 60)} ({count})")
             for tag, count in counts.most_common()
@@ -239,8 +249,8 @@ def logs_of(table: pd.DataFrame) -> list[Log]:
     present = (table.notna() & (table != "")).to_numpy()
     for row, is_present in zip(table.to_dict("records"), present, strict=True):
         row_values = {
-            str(n): value
-            for (n, value), is_value_present in zip(row.items(), is_present, strict=True)
+            str(column): value
+            for (column, value), is_value_present in zip(row.items(), is_present, strict=True)
             if is_value_present
         }
         rows[str(row["log"])].append(row_values)
@@ -270,10 +280,10 @@ def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
         "action": log.get("action") or log.get("remedy", "") * ("headline" not in log),
         "verdict_texts": (log.get("verdicts", "").split(FINDING_SEPARATOR) + [""] * 4)[:4],
     }
-    return log | {"tags": _tags(log)}
+    return log | {"tags": _log_tags(log)}
 
 
-def _tags(log: Log) -> dict[str, str]:
+def _log_tags(log: Log) -> dict[str, str]:
     tags = {
         f"severity:{log['severity']}": log["severity"],
         f"status:{log['status']}": log["status"],

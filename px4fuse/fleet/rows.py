@@ -56,13 +56,15 @@ def axis_rows(results: ComparisonResults) -> list[Row]:
     SIGMA_Z and SIGMA_A are maximum-likelihood estimates; north and east have a common estimate. A
     time offset that is not determinable from the flight is absent.
     """
-    common = log_columns(results.log) | finding_columns(results.findings, results.aids)
-    common |= card_columns(results.card)
+    common_columns = log_columns(results.log) | finding_columns(results.findings, results.aids)
+    common_columns |= card_columns(results.card)
     has_time_offset = bool(value_at(results, "clock.is_determinable"))
     rows = []
     for name, axis in results.axes.items():
-        unavailable = next((f for f in axis.filters.values() if isinstance(f, Unavailable)), None)
-        row = common | {
+        unavailable = next(
+            (summary for summary in axis.filters.values() if isinstance(summary, Unavailable)), None
+        )
+        row = common_columns | {
             "axis": name,
             "status": NOT_COMPARED if isinstance(axis.filters["kf"], Unavailable) else DONE,
             "reason": f"{unavailable.what}: {unavailable.reason}" if unavailable else "",
@@ -70,8 +72,8 @@ def axis_rows(results: ComparisonResults) -> list[Row]:
         }
         for column, path in RESULT_PATHS.items():
             if column not in row and path and (has_time_offset or not path.startswith("clock.")):
-                tuned = _TUNING_OF_AXIS.get(name, name)
-                row[column] = value_at(results, path.format(axis=name, tuned=tuned))
+                tuned_axis = _TUNING_OF_AXIS.get(name, name)
+                row[column] = value_at(results, path.format(axis=name, tuned=tuned_axis))
         rows.append(row)
     return rows
 
@@ -79,9 +81,11 @@ def axis_rows(results: ComparisonResults) -> list[Row]:
 def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) -> Row:
     """Return findings that no other finding causes, and verdicts on EKF2's aiding sources."""
     causes = [finding for finding in findings if finding.caused_by is None]
-    fused = [f"{name} {aid.verdict}" for name, aid in aids.items() if aid.verdict != "disabled"]
+    aid_verdicts = [
+        f"{name} {aid.verdict}" for name, aid in aids.items() if aid.verdict != "disabled"
+    ]
     return {
-        "aids": FINDING_SEPARATOR.join(fused),
+        "aids": FINDING_SEPARATOR.join(aid_verdicts),
         "findings": FINDING_SEPARATOR.join(finding.id for finding in causes),
         "severities": sorted({finding.severity for finding in causes}),
     }
@@ -109,8 +113,11 @@ def first_action(card: Card) -> str:
     """Return the first action of a diagnosis: the commands or, without commands, the sentence."""
     if not card.causes:
         return ""
-    first = card.causes[0]
-    for action in (*(first.alternatives[0] if first.alternatives else ()), *first.actions):
+    first_cause = card.causes[0]
+    for action in (
+        *(first_cause.alternatives[0] if first_cause.alternatives else ()),
+        *first_cause.actions,
+    ):
         if action.commands:
             return "\n".join(action.commands)
         if not action.sentence.startswith("no "):

@@ -34,7 +34,7 @@ from px4fuse.fleet.rows import (
 from px4fuse.input_files import check_output_folder
 from px4fuse.reading import max_log_bytes
 from px4fuse.request import ComparisonRequest, command_line
-from px4fuse.workers import MEMORY_BYTES, JobFailure, run_bounded
+from px4fuse.workers import MAX_MEMORY_BYTES, JobFailure, run_bounded
 from px4fuse.writing import write_all
 
 # Table columns with the paths of a log's outputs, relative to the output folder
@@ -163,7 +163,7 @@ def run(
     timeout_s: float = TIMEOUT_S,
     scheduler: str | None = None,
     workers: int | None = None,
-    memory_gb: float = MEMORY_BYTES / 1e9,
+    memory_gb: float = MAX_MEMORY_BYTES / 1e9,
     progress: Progress = lambda *_: None,
     **settings: Any,
 ) -> BatchResult:
@@ -234,11 +234,11 @@ def run(
 def _cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]]:
     """Return the SHA-256 of the logs with finished outputs in the folder, by size of the log."""
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
-    for cached in load_cached_rows(state.output, state.px4fuse, state.settings):
-        first_row = cached.rows[0]
+    for cached_rows in load_cached_rows(state.output, state.px4fuse, state.settings):
+        first_row = cached_rows.rows[0]
         files = [state.output / first_row.get(kind, "") for kind in FILE_COLUMNS[: 1 + reports]]
         if "axis" not in first_row or all(file.is_file() for file in files):
-            hashes_by_size[cached.size_bytes].add(cached.sha256)
+            hashes_by_size[cached_rows.size_bytes].add(cached_rows.sha256)
     return hashes_by_size
 
 
@@ -246,11 +246,11 @@ def load_cached_rows(folder: Path, px4fuse: str, settings: str) -> Iterator[Cach
     """Yield the cached table rows in a folder for this px4fuse version and these settings."""
     for file in sorted((folder / "rows").glob("*.json")):
         try:
-            cached = msgspec.json.decode(file.read_bytes(), type=CachedRows)
+            cached_rows = msgspec.json.decode(file.read_bytes(), type=CachedRows)
         except (OSError, msgspec.MsgspecError):
             continue  # no cache file of this px4fuse version, so the log is compared again
-        if (cached.px4fuse, cached.settings) == (px4fuse, settings):
-            yield cached
+        if (cached_rows.px4fuse, cached_rows.settings) == (px4fuse, settings):
+            yield cached_rows
 
 
 def _cache_outcome(state: _RunState, log: LogAddress, outcome: Outcome | JobFailure) -> None:
@@ -278,8 +278,8 @@ def _write_log(state: _RunState, log: LogAddress, outcome: Outcome) -> None:
         for kind, name in zip(FILE_COLUMNS, named_contents, strict=True)
     }
     rows = [clean_row(row) | files for row in outcome.rows]
-    cached = CachedRows(outcome.sha256, state.px4fuse, state.settings, log.size_bytes, rows)
-    contents = named_contents | {cached.file: msgspec.json.encode(cached)}
+    cached_rows = CachedRows(outcome.sha256, state.px4fuse, state.settings, log.size_bytes, rows)
+    contents = named_contents | {cached_rows.file: msgspec.json.encode(cached_rows)}
     write_all({state.output / name: content for name, content in contents.items() if content})
 
 
@@ -287,8 +287,8 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
     """Write the table of the logs that are finished so far, as CSV, Parquet and web page."""
     severities: set[str] = set()
     rows_by_hash = {
-        cached.sha256: cached.rows
-        for cached in load_cached_rows(state.output, state.px4fuse, state.settings)
+        cached_rows.sha256: cached_rows.rows
+        for cached_rows in load_cached_rows(state.output, state.px4fuse, state.settings)
     }
 
     def rows_of_log(log: LogAddress) -> Iterable[Row]:
@@ -306,11 +306,11 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
 
     def rows() -> Iterator[Row]:
         for log in logs:
-            common = {"log": log.log, "name": log.name}
-            common |= {"px4fuse": state.px4fuse, "settings": state.settings}
+            common_columns = {"log": log.log, "name": log.name}
+            common_columns |= {"px4fuse": state.px4fuse, "settings": state.settings}
             for row in rows_of_log(log):
                 severities.update(row.get("severities", ()))
-                yield with_log_path(row, log.log) | common
+                yield with_log_path(row, log.log) | common_columns
 
     table = make_table(rows())
     page = html_text(table, state.output.resolve().name, f"px4fuse {state.px4fuse}")

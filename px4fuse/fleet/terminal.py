@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 from px4fuse.card.numbers import format_ratio
 from px4fuse.fleet.measures import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
-from px4fuse.fleet.page import RATIOS, Log, logs_of, sort_logs
+from px4fuse.fleet.page import SIGMA_RATIO_COLUMNS, Log, logs_of, sort_logs
 from px4fuse.fleet.rows import FAILED
-from px4fuse.report.card_html import SIGNS
+from px4fuse.report.card_html import SEVERITY_SIGNS
 from px4fuse.report.page import Cell, Page, styled_text
 from px4fuse.report.style import MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.contract import ChangeResults, Interval
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from px4fuse.fleet.run import BatchResult
 
 # Maximum numbers of reasons for missing results, and of logs, that the summary lists
-MAX_LISTED, MAX_DIAGNOSES = 8, 40
+MAX_LISTED_REASONS, MAX_LISTED_LOGS = 8, 40
 RATIO_NOTE = "Ratio of actual to reported σ: ● innovation ÷ √S, ◆ error ÷ σ (ground truth)"
 RED, YELLOW = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warning"]
 NUMBER_HEADS = ("number", "A", "95 %", "B", "95 %", "unit")
@@ -30,23 +30,27 @@ def format_summary(batch_result: BatchResult) -> Page:
     uncompared = logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)["log"]
     causes = uncompared.agg(["count", "first"]).reset_index()
     sorted_causes = causes.sort_values("count", ascending=False, kind="stable")
-    for cause in sorted_causes.head(MAX_LISTED).to_dict("records"):
+    for cause in sorted_causes.head(MAX_LISTED_REASONS).to_dict("records"):
         template = "{first}: {status}: {reason}. {remedy}"
         if cause["count"] > 1:
             template = "{count} logs, for example {first}: {status}: {reason}. {remedy}"
         page.write(
             template.format_map(cause).rstrip(), colour=RED if cause["status"] == FAILED else YELLOW
         )
-    if len(sorted_causes) > MAX_LISTED:
-        remaining_count = len(sorted_causes) - MAX_LISTED
+    if len(sorted_causes) > MAX_LISTED_REASONS:
+        remaining_count = len(sorted_causes) - MAX_LISTED_REASONS
         page.write(f"fleet.html lists {remaining_count} more reasons for logs without a result.")
     entries = sort_logs(logs_of(batch_result.table))
     if entries:
-        rows = [_diagnosis(log) for log in entries[:MAX_DIAGNOSES]]
-        page.table(("", "log", "diagnosis", "KF ●", "◆", "EKF2 ●", "◆"), rows, right=(3, 4, 5, 6))
+        rows = [_diagnosis(log) for log in entries[:MAX_LISTED_LOGS]]
+        page.table(
+            ("", "log", "diagnosis", "KF ●", "◆", "EKF2 ●", "◆"),
+            rows,
+            right_aligned_columns=(3, 4, 5, 6),
+        )
         page.write(RATIO_NOTE, colour=MUTED_COLOUR)
-    if len(entries) > MAX_DIAGNOSES:
-        page.write(f"fleet.html lists {len(entries) - MAX_DIAGNOSES} more logs.")
+    if len(entries) > MAX_LISTED_LOGS:
+        page.write(f"fleet.html lists {len(entries) - MAX_LISTED_LOGS} more logs.")
     counts = logs["status"].value_counts()
     status_counts = ", ".join(f"{count} {status}" for status, count in counts.items())
     retry_note = " Run the same command to repeat failed logs." if FAILED in counts else ""
@@ -57,9 +61,9 @@ def format_summary(batch_result: BatchResult) -> Page:
 
 def _diagnosis(log: Log) -> tuple[Cell, ...]:
     colour = SEVERITY_COLOURS.get(log["severity"], MUTED_COLOUR)
-    ratios = (log.get(f"{name}_ratio") for name in RATIOS)
+    ratios = (log.get(f"{name}_ratio") for name in SIGMA_RATIO_COLUMNS)
     return (
-        (SIGNS[log["severity"]][0], colour),
+        (SEVERITY_SIGNS[log["severity"]][0], colour),
         log["name"],
         log["headline"],
         *("–" if ratio is None else format_ratio(ratio) for ratio in ratios),
@@ -93,7 +97,7 @@ def format_differences(results: ChangeResults) -> Page:
         ]
         rows.append((number.label, *cells, unit))
     if rows:
-        page.table(NUMBER_HEADS, rows, right=(1, 2, 3, 4))
+        page.table(NUMBER_HEADS, rows, right_aligned_columns=(1, 2, 3, 4))
     tolerance_text = f"{100.0 * RELATIVE_TOLERANCE:g} % or {ABSOLUTE_TOLERANCE:g}"
     page.write(
         f"Numbers that differ by less than {tolerance_text} are not listed.", colour=MUTED_COLOUR

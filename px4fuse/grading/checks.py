@@ -41,9 +41,12 @@ from px4fuse.verification.verification import flatten, is_number, log_sha256
 MAX_QUOTE_LENGTH = 160
 BOTH_AXES_ADVICE = " (the axes north and east are required: omit --axis)"
 # Regular expression of one character that is not a control character
-_PLAIN = r"[^\x00-\x1f\x7f]"
-Text = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN}*$")]
-Title = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN}*[^\s\x00-\x1f\x7f]{_PLAIN}*$")]
+_PLAIN_CHARACTER = r"[^\x00-\x1f\x7f]"
+Text = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN_CHARACTER}*$")]
+Title = Annotated[
+    str,
+    Meta(max_length=200, pattern=rf"^{_PLAIN_CHARACTER}*[^\s\x00-\x1f\x7f]{_PLAIN_CHARACTER}*$"),
+]
 Bound = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Factor = Annotated[float, Meta(ge=1.0, le=1000.0)]
 # Fraction of the maximum points (0 to 1), and sentences for the student with the reason
@@ -155,9 +158,9 @@ class CheckInput:
     @cached_property
     def form_points(self) -> FormPoints | str:
         """Points of the answer form, or the reason why the form has no points."""
-        assigned = self.assigned_answer
-        if self.answer is None or (assigned and not self.is_own_log):
-            file_text = format_reason(assigned.file if assigned else "")
+        assigned_answer = self.assigned_answer
+        if self.answer is None or (assigned_answer and not self.is_own_log):
+            file_text = format_reason(assigned_answer.file if assigned_answer else "")
             return (
                 f"this report is not about the log that you were given{file_text}. Make a "
                 "report of that log, with your --id"
@@ -342,8 +345,8 @@ def _score_tuning(
 ) -> FractionAndReason:
     label, unit, option = NOISE_SETTINGS[name]
     chosen_value: float = getattr(comparison.settings, name)
-    tuned = comparison.tuning.get(HORIZONTAL)
-    interval = getattr(tuned, f"{TUNED_FIELDS[name]}_interval", None)
+    horizontal_tuning = comparison.tuning.get(HORIZONTAL)
+    interval = getattr(horizontal_tuning, f"{TUNED_FIELDS[name]}_interval", None)
     if interval is None or interval[1] is None:
         reason_text = check_input.missing_reason(f"tuning.{HORIZONTAL}")
         return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
@@ -432,9 +435,9 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
             reason_text = format_reason(clock.reason or "")
             statement = f"The time offset cannot be estimated from your flight{reason_text}."
             return 1.0 if check_input.answer is not None else fraction, statement
-        (low, high), applied = clock.interval_s, clock.applied_s
-        statement = f"You applied a time offset of {applied:.3f} s"
-        if low - self.margin_s <= applied <= high + self.margin_s:
+        (low, high), applied_s = clock.interval_s, clock.applied_s
+        statement = f"You applied a time offset of {applied_s:.3f} s"
+        if low - self.margin_s <= applied_s <= high + self.margin_s:
             return 1.0, f"{statement}; the estimate is {low:.3f} to {high:.3f} s (95 %)."
         if any(map(check_input.has_finding, CHANGING_CLOCK_FINDINGS)):
             if check_input.names_mistake("clock-jump", "clock-drift"):
@@ -494,8 +497,12 @@ def _score_corrections(
     corrections: Mapping[CorrectionName, OrUnavailable[Correction]],
 ) -> FractionAndReason:
     """Return the quarters of the points: 1 for a corrected path, 1 more for a smaller ATE."""
-    ways: tuple[CorrectionName, ...] = ("by_distance_plain", "by_distance", "pose_graph_gated")
-    paths = map(corrections.get, ways)
+    correction_names: tuple[CorrectionName, ...] = (
+        "by_distance_plain",
+        "by_distance",
+        "pose_graph_gated",
+    )
+    paths = map(corrections.get, correction_names)
     corrected_paths = [path for path in paths if isinstance(path, Correction)]
     if not corrected_paths:
         return 0.0, "The path was not corrected."

@@ -21,7 +21,7 @@ from px4fuse.webpage.frame import Cell, Column, Row, Section
 from px4fuse.webpage.safe import load_template, local_link
 
 BIN_COUNT = 10
-MISSING = "no submission"
+MISSING_REPORT = "no submission"
 # CSS style and symbol of each verification status, in the order in which the class table sorts them
 STATUS_STYLES: dict[str, tuple[str, str]] = {
     "verified": ("good", "✓"),
@@ -29,7 +29,7 @@ STATUS_STYLES: dict[str, tuple[str, str]] = {
     "other log": ("odd", "⇄"),
     "cannot verify": ("open", "?"),
     "page differs": ("odd", "≠"),
-    MISSING: ("open", "–"),
+    MISSING_REPORT: ("open", "–"),
 }
 STATUSES = tuple(STATUS_STYLES)
 FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "set by instructor")
@@ -48,7 +48,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
         Name and version of the program.
     """
     items, numbers = list_titles(entries)
-    counts = Counter(tag for entry in entries for tag in _tags(entry))
+    counts = Counter(tag for entry in entries for tag in _entry_tags(entry))
     tags = (*FILTER_TAGS, *sorted(tag for tag in counts if tag not in FILTER_TAGS))
     options = [(tag, f"{tag} ({counts[tag]})") for tag in tags if counts[tag]]
     return frame.page(
@@ -67,7 +67,7 @@ def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
             *(Column(name, "number", "items") for name in items),
             *(Column(name, "number", "numbers") for name in numbers),
         ),
-        rows=[_row(entry, items, numbers) for entry in entries],
+        rows=[_class_row(entry, items, numbers) for entry in entries],
         filters=[("Status", [("", f"Everyone ({len(entries)})"), *options])],
         groups=(("items", "Points of each item"), ("numbers", "Numbers")),
         placeholder="search for name, id, file or flag",
@@ -119,9 +119,9 @@ def count_tenths(values: Sequence[float], maximum: float) -> list[tuple[int, str
     return list(zip(counts.tolist(), lower_edges, strict=False))
 
 
-def _tags(entry: Entry) -> list[str]:
+def _entry_tags(entry: Entry) -> list[str]:
     report = entry.counted_report
-    tags = [report.status if report else MISSING]
+    tags = [report.status if report else MISSING_REPORT]
     tags += ["flagged"] * bool(entry.flags) + ["late"] * bool(entry.late_s)
     if report:
         tags += ["pending"] * bool(report.instructor_action) + ["to read"] * report.awaits_points
@@ -131,9 +131,9 @@ def _tags(entry: Entry) -> list[str]:
     return tags + ["set by instructor"] * bool(entry.overrides or entry.comment)
 
 
-def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
+def _class_row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
     report = entry.counted_report
-    status = report.status if report else MISSING
+    status = report.status if report else MISSING_REPORT
     style, symbol = STATUS_STYLES[status]
     count = len(entry.flags)
     flag_count_text = f"{count} flag{'s' if count > 1 else ''}" if count else ""
@@ -158,10 +158,10 @@ def _row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
     # a row with pseudonym has no link, because the file name may contain the student's name
     links = [("Redrawn from the log (PDF)", local_link(report.redrawn_path))] if report else []
     link_sections = (frame.links_section("Report", links),)
-    return Row(cells, tuple(_tags(entry)), (*_details(entry), *boxes), link_sections)
+    return Row(cells, tuple(_entry_tags(entry)), (*_entry_details(entry), *boxes), link_sections)
 
 
-def _details(entry: Entry) -> Iterator[Section]:
+def _entry_details(entry: Entry) -> Iterator[Section]:
     """Yield the sections that the class page shows if a row is opened."""
     report, comment = entry.counted_report, frame.prose_section("Your comment", entry.comment)
     if report is None:
@@ -169,7 +169,10 @@ def _details(entry: Entry) -> Iterator[Section]:
         yield comment
         return
     verdict = report.verdict
-    differences = [(each.path, each.recorded, each.recomputed) for each in verdict.differences]
+    differences = [
+        (difference.path, difference.recorded, difference.recomputed)
+        for difference in verdict.differences
+    ]
     items = [
         (
             item.title,
@@ -183,7 +186,9 @@ def _details(entry: Entry) -> Iterator[Section]:
         f"{name}: {'named' if is_named else 'not named'} in the answer form"
         for name, is_named in report.mistakes.items()
     ]
-    attempts = [f"{other.submission}: {other.status}" for other in entry.other_reports]
+    attempts = [
+        f"{other_report.submission}: {other_report.status}" for other_report in entry.other_reports
+    ]
     yield frame.list_section("Flags", entry.flags, is_warning=True)
     actions = list(filter(None, [report.instructor_action]))
     yield frame.list_section("Pending: action required", actions, is_warning=True)

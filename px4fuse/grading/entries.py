@@ -222,20 +222,22 @@ def _make_attempt(
     register: Register,
 ) -> Attempt:
     """Make the row of the class table for a student with this report only, and its sort key."""
-    origin, due = submission.origin, course.due
+    origin, due_time = submission.origin, course.due
     platform = origin.platform.capitalize()
     person = Person(report.student_id) if student_index is None else register.people[student_index]
     stated_time = origin.time or parse_moodle_time(person.submitted)
-    time, zip_time = (time and add_time_zone(time, due) for time in (stated_time, submission.time))
+    time, zip_time = (
+        time and add_time_zone(time, due_time) for time in (stated_time, submission.time)
+    )
     late_s, flags = None, []
-    if due is not None and time is not None:
+    if due_time is not None and time is not None:
         # UNIX times are subtracted, because datetime ignores daylight saving in one time zone
-        late_s = max(time.timestamp() - due.timestamp(), 0.0)
+        late_s = max(time.timestamp() - due_time.timestamp(), 0.0)
     elif origin.is_late:
         flags.append(
             f"{platform} marks the file as late without a time, so no points were deducted."
         )
-    elif course.late_rule and due and zip_time and zip_time.timestamp() > due.timestamp():
+    elif course.late_rule and due_time and zip_time and zip_time.timestamp() > due_time.timestamp():
         flags.append(
             f"The time in the zip file ({zip_time:{TIME_FORMAT}}) is after the due time. It may be "
             "the time of the download, so no points were deducted."
@@ -247,10 +249,10 @@ def _make_attempt(
         )
     stated_index = register.student_index(Person(report.student_id)) if platform else None
     if stated_index is not None and student_index not in (None, stated_index):
-        other = register.people[stated_index]
+        stated_person = register.people[stated_index]
         flags.append(
-            f"The id in the report is that of {other.student_id} ({other.name or 'no name'}), but "
-            f"{platform} names another student."
+            f"The id in the report is that of {stated_person.student_id} "
+            f"({stated_person.name or 'no name'}), but {platform} names another student."
         )
     rule = course.late_rule
     entry = Entry(
@@ -365,26 +367,28 @@ def read_overrides(path: Path) -> Overrides:
     if not path.exists():
         return {}
     sheet = read_sheet(path)
-    missing = [title for title in OVERRIDE_TITLES if sheet.column((title,)) is None]
-    if missing:
+    missing_titles = [title for title in OVERRIDE_TITLES if sheet.column((title,)) is None]
+    if missing_titles:
         remedy = f"Required columns: {', '.join(OVERRIDE_TITLES)}."
-        raise SettingsError(f"{path}: no column {', '.join(missing)}.", remedy)
+        raise SettingsError(f"{path}: no column {', '.join(missing_titles)}.", remedy)
     overrides: dict[str, dict[str, Override]] = defaultdict(dict)
     for row_number, row in enumerate(sheet.rows, start=2):
-        student, item, points, comment = (
+        student, item_title, points, comment = (
             sheet.cell(row, (title,)).removeprefix("'") for title in OVERRIDE_TITLES
         )
         value = parse_decimal(points)
         problem = ""
-        if item in overrides[student]:
-            item_text = one_line(item, 40) or "(whole report)"
+        if item_title in overrides[student]:
+            item_text = one_line(item_title, 40) or "(whole report)"
             problem = f"a second row for student {one_line(student, 40)}, item {item_text}"
-        elif points and (value is None or not 0.0 <= value <= MAX_OVERRIDE_POINTS or not item):
+        elif points and (
+            value is None or not 0.0 <= value <= MAX_OVERRIDE_POINTS or not item_title
+        ):
             points_text = one_line(points, 20)
             problem = f"points {points_text!r}: give a number of 0 or more, and an item or total"
         if problem:
             raise SettingsError(f"{path}: row {row_number}: {problem}.")
-        overrides[student][item] = Override(value, clean_text(comment[:MAX_COMMENT_LENGTH]))
+        overrides[student][item_title] = Override(value, clean_text(comment[:MAX_COMMENT_LENGTH]))
     return overrides
 
 
@@ -412,9 +416,9 @@ def match_overrides(
     for student, override_by_item in overrides.items():
         # the instructor may type an id, with or without leading zeros, or a file name
         student_index = people.student_index(Person(student, login=student))
-        who = one_line(student, 40) or "(empty)"
+        student_text = one_line(student, 40) or "(empty)"
         if student_index is None:
-            notes.append(f"{OVERRIDES_NAME}: no student has the id {who}.")
+            notes.append(f"{OVERRIDES_NAME}: no student has the id {student_text}.")
             continue
         max_by_title = {TOTAL_TITLE: max_total, "": MAX_OVERRIDE_POINTS}
         if report := entries[student_index].counted_report:
@@ -424,12 +428,12 @@ def match_overrides(
         for item, override in override_by_item.items():
             title, problem = titles.get(normalise_text(item)), ""
             if title is None:
-                problem = f"student {who} has no item {one_line(item, 60)!r}"
+                problem = f"student {student_text} has no item {one_line(item, 60)!r}"
             elif title in matched_overrides[student_index]:
-                problem = f"student {who} has two rows for {title or 'the whole report'!r}"
+                problem = f"student {student_text} has two rows for {title or 'the whole report'!r}"
             elif (override.points or 0.0) > max_by_title[title]:
                 limit = f"{max_by_title[title]:g} points of {one_line(title, 60)!r}"
-                problem = f"student {who} cannot have more than {limit}"
+                problem = f"student {student_text} cannot have more than {limit}"
             else:
                 matched_overrides[student_index][title] = override
             notes += [f"{OVERRIDES_NAME}: {problem}."] if problem else []

@@ -39,11 +39,11 @@ Pairs = Iterator[tuple[GradedReport, GradedReport]]
 def flag_pages(verdict: Verdict) -> Iterator[str]:
     """Yield a flag with the first difference if a PDF differs from the redrawn report."""
     if verdict.pages:
-        first, *others = verdict.pages
-        more_text = f" The PDF has {len(others)} more differences." if others else ""
+        first_page, *further_pages = verdict.pages
+        more_text = f" The PDF has {len(further_pages)} more differences." if further_pages else ""
         yield (
             "The PDF differs from the report that px4fuse draws from the log. "
-            f"{capitalise_first(first.sentence)}.{more_text} Read the redrawn report."
+            f"{capitalise_first(first_page.sentence)}.{more_text} Read the redrawn report."
         )
 
 
@@ -75,10 +75,12 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
             f"The position source is {source.name} ({source.path}), not "
             f"{tracks_as_received[0]}, the positions as received by PX4."
         )
-    estimates = [each for each in results.tuning.values() if isinstance(each, NoiseEstimate)]
+    estimates = [
+        estimate for estimate in results.tuning.values() if isinstance(estimate, NoiseEstimate)
+    ]
     for name, label in (("sigma_z_m", "SIGMA_Z"), ("sigma_a_m_s2", "SIGMA_A")):
         value = getattr(settings, name)
-        ml_values = [ml_value for each in estimates if (ml_value := getattr(each, name))]
+        ml_values = [ml_value for estimate in estimates if (ml_value := getattr(estimate, name))]
         if ml_values and not (
             min(ml_values) / MAX_SETTING_FACTOR < value < MAX_SETTING_FACTOR * max(ml_values)
         ):
@@ -174,10 +176,15 @@ def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequenc
         ("The answer form has the same numbers as that of {}.", _copied_forms(reports)),
     ):
         texts_by_submission: dict[str, list[str]] = defaultdict(list)
-        for first, second in pairs:
-            for report, other in ((first, second), (second, first)):
-                file = one_line(other.submission, 80)
-                texts_by_submission[report.submission].append(f"{_student_text(other)} ({file})")
+        for first_report, second_report in pairs:
+            for report, other_report in (
+                (first_report, second_report),
+                (second_report, first_report),
+            ):
+                file = one_line(other_report.submission, 80)
+                texts_by_submission[report.submission].append(
+                    f"{_student_text(other_report)} ({file})"
+                )
         for name, texts in texts_by_submission.items():
             flags_by_submission[name].append(
                 sentence.format(join_first(texts, MAX_LISTED_REPORTS, "; "))
@@ -194,18 +201,18 @@ def _same_pairs(
     for report in reports:
         groups[key_of(report)].append(report)
     for key, group in groups.items():
-        for report, other in combinations(group if key else (), 2):
-            if owner_of(report) != owner_of(other):
-                yield report, other
+        for report, other_report in combinations(group if key else (), 2):
+            if owner_of(report) != owner_of(other_report):
+                yield report, other_report
 
 
 def _copied_forms(reports: Sequence[GradedReport]) -> Pairs:
     """Yield pairs of reports of different students whose answer forms have the same numbers."""
     numbers_by_report = [(report, _form_numbers(report)) for report in reports]
-    for (report, numbers), (other, other_numbers) in combinations(numbers_by_report, 2):
+    for (report, numbers), (other_report, other_numbers) in combinations(numbers_by_report, 2):
         is_copied = _count_same_numbers(numbers, other_numbers) >= MIN_SAME_NUMBERS
-        if is_copied and _student_key(report) != _student_key(other):
-            yield report, other
+        if is_copied and _student_key(report) != _student_key(other_report):
+            yield report, other_report
 
 
 def _student_text(report: GradedReport) -> str:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from px4fuse.answer_form import MISTAKES, NONE, Answers, QuantityAnswer, StudentMistake
+from px4fuse.answer_form import MISTAKES, NO_MISTAKE_KIND, Answers, QuantityAnswer, StudentMistake
 from px4fuse.assignment.truth import FormTruth, TrueMistake
 from px4fuse.record import table
 
@@ -53,10 +53,10 @@ class _CorrectionRule:
     only_if_late: bool = False
 
 
-TABLE = table(__file__, "form_points.toml", dict)
-CORRECTIONS = msgspec.convert(TABLE["corrections"], tuple[_CorrectionRule, ...])
-NEIGHBOURS = msgspec.convert([*TABLE["neighbours"].values()], tuple[frozenset[str], ...])
-PART_NAMES = tuple(TABLE["weights"])
+POINTS_TABLE = table(__file__, "form_points.toml", dict)
+CORRECTIONS = msgspec.convert(POINTS_TABLE["corrections"], tuple[_CorrectionRule, ...])
+NEIGHBOURS = msgspec.convert([*POINTS_TABLE["neighbours"].values()], tuple[frozenset[str], ...])
+PART_NAMES = tuple(POINTS_TABLE["weights"])
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class FormPoints:
 def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
     """Compute the points of an answer form by comparison with the right answers."""
     is_clean_named = not truth.mistakes and answers.names_no_mistake
-    weights = TABLE["weights_clean" if is_clean_named else "weights"]
+    weights = POINTS_TABLE["weights_clean" if is_clean_named else "weights"]
     fractions = dict.fromkeys(PART_NAMES, 0.0)
     matches, false_mistakes = _match_mistakes(answers, truth)
     if truth.mistakes and len(false_mistakes) < MAX_FALSE_MISTAKES:
@@ -109,7 +109,7 @@ def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
         points_by_part["mistakes"] += weights["sizes"] * fractions["mistakes"]
     points_by_part["mistakes"] -= FALSE_MISTAKE_POINTS * len(false_mistakes)
     points_by_part["mistakes"] = max(points_by_part["mistakes"], 0.0)
-    named_kinds = [named.kind for named in answers.mistakes]
+    named_kinds = [student_mistake.kind for student_mistake in answers.mistakes]
     is_named_by_mistake = {mistake.kind: mistake.kind in named_kinds for mistake in truth.mistakes}
     feedback = tuple(_mistake_feedback(matches, false_mistakes, is_clean_named))
     return FormPoints(points_by_part, weights, feedback, is_named_by_mistake)
@@ -125,16 +125,16 @@ def _mistake_feedback(
     """Yield a clause for each right or missed mistake, and one for all false mistakes."""
     if not matches:
         yield f"your flight has no mistake{', as your form states' * is_clean_named}"
-    for mistake, named, _ in matches:
+    for mistake, student_mistake, _ in matches:
         mistake_text = f"{mistake.kind} ({MISTAKES[mistake.kind].description})"
-        if named is None:
+        if student_mistake is None:
             yield f"you did not name {mistake_text}"
-        elif named.kind != mistake.kind:
-            yield f"you named {named.kind} instead of {mistake_text}"
+        elif student_mistake.kind != mistake.kind:
+            yield f"you named {student_mistake.kind} instead of {mistake_text}"
         else:
             yield f"you named {mistake.kind}, which is right"
     if false_mistakes:
-        kinds = ", ".join(named.kind for named in false_mistakes)
+        kinds = ", ".join(student_mistake.kind for student_mistake in false_mistakes)
         yield f"your flight does not have {kinds}"
 
 
@@ -143,19 +143,26 @@ def _match_mistakes(answers: Answers, truth: FormTruth) -> tuple[list[Match], li
 
     Equal mistakes are matched first, then related mistakes, then consequences.
     """
-    unmatched = [named for named in answers.mistakes if named.kind != NONE]
+    unmatched = [
+        student_mistake
+        for student_mistake in answers.mistakes
+        if student_mistake.kind != NO_MISTAKE_KIND
+    ]
     match_by_kind: dict[str, tuple[StudentMistake, float]] = {}
     pairs = [
-        (kind_fraction(mistake.kind, named.kind), mistake.kind, named)
+        (kind_fraction(mistake.kind, student_mistake.kind), mistake.kind, student_mistake)
         for mistake in truth.mistakes
-        for named in unmatched
+        for student_mistake in unmatched
     ]
-    for fraction, kind, named in sorted(pairs, key=lambda pair: -pair[0]):
-        if fraction and kind not in match_by_kind and named in unmatched:
-            match_by_kind[kind] = named, fraction
-            unmatched.remove(named)
+    for fraction, kind, student_mistake in sorted(pairs, key=lambda pair: -pair[0]):
+        if fraction and kind not in match_by_kind and student_mistake in unmatched:
+            match_by_kind[kind] = student_mistake, fraction
+            unmatched.remove(student_mistake)
     no_match = (None, 0.0)
-    matches = [(each, *match_by_kind.get(each.kind, no_match)) for each in truth.mistakes]
+    matches = [
+        (true_mistake, *match_by_kind.get(true_mistake.kind, no_match))
+        for true_mistake in truth.mistakes
+    ]
     return matches, unmatched
 
 
@@ -167,36 +174,38 @@ def kind_fraction(kind: str, named_kind: str) -> float:
         return SAME_NUMBER_FRACTION
     if any({kind, named_kind} <= group for group in NEIGHBOURS):
         return NEIGHBOUR_FRACTION
-    return EFFECT_FRACTION if named_kind in TABLE["effects"].get(kind, ()) else 0.0
+    return EFFECT_FRACTION if named_kind in POINTS_TABLE["effects"].get(kind, ()) else 0.0
 
 
 def _mistake_fractions(matches: list[Match], truth: FormTruth) -> dict[str, float]:
     """Return the fraction of the points for four parts of the form, as mean over all mistakes."""
     sized_count = sum(mistake.size is not None for mistake, _, _ in matches)
     fractions = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
-    for mistake, named, fraction in matches:
-        if named is None:
+    for mistake, student_mistake, fraction in matches:
+        if student_mistake is None:
             continue
-        size_points = size_fraction(mistake, named)
+        size_points = size_fraction(mistake, student_mistake)
         weight = (size_points if mistake.kind in GUESSABLE_KINDS else 1.0) / len(matches)
-        time_weight = weight if named.kind == mistake.kind else 0.5 * weight
+        time_weight = weight if student_mistake.kind == mistake.kind else 0.5 * weight
         fractions["mistakes"] += fraction / len(matches)
-        fractions["time and panel"] += time_and_panel_fraction(mistake, named) * time_weight
-        fractions["correction"] += correction_fraction(mistake, named, truth) * weight
+        fractions["time and panel"] += (
+            time_and_panel_fraction(mistake, student_mistake) * time_weight
+        )
+        fractions["correction"] += correction_fraction(mistake, student_mistake, truth) * weight
         fractions["sizes"] += size_points / max(sized_count, 1)
     return fractions
 
 
-def size_fraction(mistake: TrueMistake, named: StudentMistake) -> float:
+def size_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> float:
     """Return the fraction of the points for the size of a mistake: 1, 1/2 (close), 1/3, or 0.
 
     1/3 is for the wrong sign, and for the size of a related mistake.
     """
-    size = named.size_in_first_unit()
+    size = student_mistake.size_in_first_unit()
     if mistake.size is None or mistake.low is None or mistake.high is None or size is None:
         return 0.0
-    if named.kind != mistake.kind:
-        first_units = [[*MISTAKES[kind].units][:1] for kind in (named.kind, mistake.kind)]
+    if student_mistake.kind != mistake.kind:
+        first_units = [[*MISTAKES[kind].units][:1] for kind in (student_mistake.kind, mistake.kind)]
         is_right = mistake.low <= size <= mistake.high and first_units[0] == first_units[1]
         return is_right / 3.0
     is_close = abs(size - mistake.size) <= HALF_SIZE_TOLERANCE * abs(mistake.size)
@@ -204,35 +213,37 @@ def size_fraction(mistake: TrueMistake, named: StudentMistake) -> float:
     return _value_fraction(size, mistake.low, mistake.high, close_fraction)
 
 
-def time_and_panel_fraction(mistake: TrueMistake, named: StudentMistake) -> float:
+def time_and_panel_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> float:
     """Return the fraction of the points for time and report panel of a mistake: half for each."""
     if mistake.from_s is None and mistake.until_s is None:
-        is_time_right = named.when == "whole flight"
+        is_time_right = student_mistake.when == "whole flight"
     else:
-        times = (mistake.from_s, named.from_s), (mistake.until_s, named.until_s)
-        is_time_right = not named.when and all(
+        times = (mistake.from_s, student_mistake.from_s), (mistake.until_s, student_mistake.until_s)
+        is_time_right = not student_mistake.when and all(
             named_s is not None
             and abs(named_s - true_s) <= max(TIME_TOLERANCE_S, TIME_TOLERANCE_FRACTION * true_s)
             for true_s, named_s in times
             if true_s is not None
         )
-    return 0.5 * is_time_right + 0.5 * (named.panel in panels(mistake.kind))
+    return 0.5 * is_time_right + 0.5 * (student_mistake.panel in panels(mistake.kind))
 
 
 def panels(kind: str) -> list[str]:
     """Return the panels of the report that show a kind of mistake."""
-    return [*(panel for panel, kinds in TABLE["shows"].items() if kind in kinds), "cover"]
+    return [*(panel for panel, kinds in POINTS_TABLE["shows"].items() if kind in kinds), "cover"]
 
 
-def correction_fraction(mistake: TrueMistake, named: StudentMistake, truth: FormTruth) -> float:
+def correction_fraction(
+    mistake: TrueMistake, student_mistake: StudentMistake, truth: FormTruth
+) -> float:
     """Return the fraction of the points for a named correction and the value given with it."""
-    value = named.value_in_first_unit()
+    value = student_mistake.value_in_first_unit()
     fractions = [
         fraction
         if (low, high) == ANY_BOUNDS
         else fraction * (0.5 if value is None else _value_fraction(value, low, high, 0.5))
         for parameter, (low, high), fraction in right_corrections(mistake, truth)
-        if parameter == named.parameter
+        if parameter == student_mistake.parameter
     ]
     return max(fractions, default=0.0)
 
@@ -286,12 +297,14 @@ def _ekf2_behaviour_fraction(answers: Answers, truth: FormTruth) -> float:
 
     An error is a missing or a false statement.
     """
-    named, required = set(answers.ekf2_did), set(truth.ekf2_did)
+    stated_behaviours, required_behaviours = set(answers.ekf2_did), set(truth.ekf2_did)
     also_allowed = set(truth.ekf2_did_also)
-    false_count = len(named - required - also_allowed)
-    if len(named) == false_count or false_count > 1:
+    false_count = len(stated_behaviours - required_behaviours - also_allowed)
+    if len(stated_behaviours) == false_count or false_count > 1:
         return 0.0
-    is_complete = required <= named or (len(required) == 1 and named & also_allowed)
+    is_complete = required_behaviours <= stated_behaviours or (
+        len(required_behaviours) == 1 and stated_behaviours & also_allowed
+    )
     return 1.0 if is_complete and not false_count else 0.5
 
 

@@ -113,7 +113,7 @@ def write_class(
         The folder cannot be written.
     """
     title = course.title or course.rubric.title or "Class"
-    stems = file_names([_identity(entry, stem=True) for entry in entries])
+    stems = file_names([_entry_identity(entry, stem=True) for entry in entries])
     page_entries = [
         _copy_redrawn(entry, stem, output) for entry, stem in zip(entries, stems, strict=True)
     ]
@@ -123,7 +123,7 @@ def write_class(
     feedback_texts = [feedback_text(entry, title) for entry in entries]
     contents = {"class.csv": csv_text(entries).encode()}
     if course.anonymous:
-        page_entries, names_table = _anonymise(page_entries, output / NAMES_FILE)
+        page_entries, names_table = _anonymise_entries(page_entries, output / NAMES_FILE)
         contents[NAMES_FILE] = names_table.encode()
     made_with = f"px4fuse {metadata.version('px4fuse')}"
     contents["class.html"] = html_text(page_entries, title, made_with).encode()
@@ -145,7 +145,7 @@ def write_class(
     return tuple(output / name for name in outputs), tuple(notes)
 
 
-def _identity(entry: Entry, stem: bool = False) -> str:
+def _entry_identity(entry: Entry, stem: bool = False) -> str:
     """Return id, else name, else file name: the identity of a row in all runs of grading."""
     file = entry.counted_report.submission if entry.counted_report else ""
     return entry.student_id or (Path(file).stem if stem else entry.student or file)
@@ -156,15 +156,15 @@ def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
     report = entry.counted_report
     if report is None or not report.sha256:
         return entry
-    redrawn = output / RECORDS_FOLDER / f"{report.sha256}{REDRAWN_SUFFIX}"
-    if not redrawn.exists():
+    redrawn_file = output / RECORDS_FOLDER / f"{report.sha256}{REDRAWN_SUFFIX}"
+    if not redrawn_file.exists():
         return entry
     name = f"{REPORTS_FOLDER}/{stem}.pdf"
-    write_all({output / name: redrawn.read_bytes()})
+    write_all({output / name: redrawn_file.read_bytes()})
     return replace(entry, counted_report=replace(report, redrawn_path=name))
 
 
-def _anonymise(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
+def _anonymise_entries(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
     """Replace names by pseudonyms and sort by pseudonym; also return the table of names as CSV.
 
     Pseudonyms are assigned in random order. A later run reads the pseudonyms from the table at
@@ -182,7 +182,7 @@ def _anonymise(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
     used_names = {name for name, _ in names_by_identity.values()}
     numbered_names = (f"Student {number:03}" for number in itertools.count(1))
     free_names = (name for name in numbered_names if name not in used_names)
-    students = {_identity(entry): entry.student for entry in entries}
+    students = {_entry_identity(entry): entry.student for entry in entries}
     new_identities = [identity for identity in students if identity not in names_by_identity]
     random.SystemRandom().shuffle(new_identities)
     for identity in new_identities:
@@ -192,7 +192,7 @@ def _anonymise(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
         for identity, (name, student) in sorted(names_by_identity.items(), key=itemgetter(1))
     )
     anonymous_entries = [
-        anonymise_entry(entry, names_by_identity[_identity(entry)][0]) for entry in entries
+        anonymise_entry(entry, names_by_identity[_entry_identity(entry)][0]) for entry in entries
     ]
     names_table = "\ufeff" + Sheet(path, NAMES_TITLES, tuple(rows)).text
     return sorted(anonymous_entries, key=lambda entry: entry.student), names_table
@@ -282,7 +282,7 @@ def feedback_text(entry: Entry, class_name: str = "") -> str:
         entry=entry,
         graded=graded,
         class_name=class_name,
-        reasons="; ".join(filter(None, (shorten_text(each).rstrip(".") for each in reasons))),
+        reasons="; ".join(filter(None, (shorten_text(reason).rstrip(".") for reason in reasons))),
         is_total_set=TOTAL_TITLE in entry.overrides,
         line=shorten_text,
         number=format_cell_number,
@@ -325,12 +325,14 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
         if not any(READ_ONLY_MARK in row[index] for row in sheet.rows[:3])
     }
     grade_index = sheet.column(GRADE_TITLES)
-    plain_titles = {at: _ASSIGNMENT_NUMBER.sub("", title) for at, title in title_by_index.items()}
-    assignments = [at for at, title in title_by_index.items() if plain_titles[at] != title]
+    plain_titles = {
+        index: _ASSIGNMENT_NUMBER.sub("", title) for index, title in title_by_index.items()
+    }
+    assignments = [index for index, title in title_by_index.items() if plain_titles[index] != title]
     matches = [
-        at
-        for at, title in title_by_index.items()
-        if normalise_text(column_title) in map(normalise_text, (title, plain_titles[at]))
+        index
+        for index, title in title_by_index.items()
+        if normalise_text(column_title) in map(normalise_text, (title, plain_titles[index]))
     ]
     columns = assignments if grade_index is None else [grade_index]
     # Moodle's worksheets have only one grade column: another title is for another table
@@ -339,7 +341,7 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
     if len(columns) == 1:
         return columns[0]
     problem = "the table has several grade columns" if columns else "no grade column matches"
-    titles = ", ".join(one_line(plain_titles[at], 40) for at in assignments or title_by_index)
+    titles = ", ".join(one_line(plain_titles[index], 40) for index in assignments or title_by_index)
     remedy = f"Name one of them with --column: {one_line(titles, 300)}."
     raise SettingsError(f"{sheet.path}: {problem}.", remedy)
 

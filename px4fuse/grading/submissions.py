@@ -39,11 +39,11 @@ from px4fuse.input_files import add_input
 from px4fuse.reading import files_below
 from px4fuse.record import table
 from px4fuse.results.reading import clean_text, one_line
-from px4fuse.verification.model import BAD_VALUES
-from px4fuse.verification.pdf_input import MAX_BYTES
+from px4fuse.verification.model import BAD_VALUE_ERRORS
+from px4fuse.verification.pdf_input import MAX_PDF_BYTES
 
 # Maximum number of entries of a submitted zip file
-MAX_ENTRIES = 10_000
+MAX_ZIP_ENTRIES = 10_000
 # Maximum size (bytes) of the table of contents of a zip file, which zipfile reads completely
 MAX_DIRECTORY_BYTES = 4_000_000
 # Maximum sum (bytes) of the unpacked sizes of the entries of a zip file: they may share their data
@@ -56,7 +56,9 @@ MAX_NAME_LENGTH = 200
 # Year that zip programs write if an entry has no time
 ZIP_EPOCH_YEAR = 1980
 
-_TOO_LARGE_REASON = f"the file is larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB."
+_TOO_LARGE_REASON = (
+    f"the file is larger than {MAX_PDF_BYTES // 1_000_000} MB; reports are below 2 MB."
+)
 # General purpose bit flags of a zip entry (APPNOTE.TXT of PKWARE, 4.4.4)
 _ENCRYPTED_FLAG = 1
 _UTF8_FLAG = 0x800
@@ -80,8 +82,8 @@ class _EntryError(Exception):
 
 
 _BROKEN_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryError)
-# BAD_VALUES contains RuntimeError, and so the NotImplementedError that zipfile raises
-_UNREADABLE_ERRORS = (_EntryError, *_BROKEN_ZIP_ERRORS, *BAD_VALUES)
+# BAD_VALUE_ERRORS contains RuntimeError, and so the NotImplementedError that zipfile raises
+_UNREADABLE_ERRORS = (_EntryError, *_BROKEN_ZIP_ERRORS, *BAD_VALUE_ERRORS)
 
 
 def _unread_reason(error: Exception) -> str:
@@ -164,7 +166,7 @@ def add_origins(
     origin_by_number : mapping
         Students and times of Gradescope, by submission number.
     """
-    exports = [each.file if each.zip_entry else each.name.partition("/")[0] for each in submissions]
+    exports = [item.file if item.zip_entry else item.name.partition("/")[0] for item in submissions]
     platform_counts: dict[object, Counter[str]] = defaultdict(Counter)
     for export, submission in zip(exports, submissions, strict=True):
         platform_counts[export].update(filter(None, [parse_origin(submission.name).platform]))
@@ -179,7 +181,7 @@ def add_origins(
 
 
 def read(submission: Submission) -> bytes:
-    """Read a submission of at most :data:`~px4fuse.verification.pdf_input.MAX_BYTES` bytes.
+    """Read a submission of at most :data:`~px4fuse.verification.pdf_input.MAX_PDF_BYTES` bytes.
 
     Raises
     ------
@@ -192,8 +194,8 @@ def read(submission: Submission) -> bytes:
                 with _open_zip(file) as archive:
                     content = _read_entry(archive, submission.zip_entry)
             else:
-                content = file.read(MAX_BYTES + 1)
-        if len(content) > MAX_BYTES:
+                content = file.read(MAX_PDF_BYTES + 1)
+        if len(content) > MAX_PDF_BYTES:
             raise _EntryError(_TOO_LARGE_REASON)
     except _UNREADABLE_ERRORS as error:
         name = one_line(submission.name, MAX_NAME_LENGTH)
@@ -225,8 +227,8 @@ class _LimitedFile:
 @contextmanager
 def _open_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
     with zipfile.ZipFile(_LimitedFile(file)) as archive:
-        if len(archive.infolist()) > MAX_ENTRIES:
-            raise _EntryError(f"the zip file has more than {MAX_ENTRIES} entries.")
+        if len(archive.infolist()) > MAX_ZIP_ENTRIES:
+            raise _EntryError(f"the zip file has more than {MAX_ZIP_ENTRIES} entries.")
         yield archive
 
 
@@ -251,7 +253,11 @@ def _zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
         Submission(path.resolve(), name, _entry_label(entry), _entry_time(entry))
         for name, entry in last_by_name.items()
     )
-    return [each for each in submissions if not any(map(_is_hidden, each.name.split("/")))]
+    return [
+        submission
+        for submission in submissions
+        if not any(map(_is_hidden, submission.name.split("/")))
+    ]
 
 
 def _folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
@@ -268,13 +274,13 @@ def _folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
         if any(map(_is_hidden, name.parts)):
             continue
         try:
-            resolved = file.resolve(strict=True)
+            resolved_path = file.resolve(strict=True)
             # only regular files: reading a named pipe would wait forever
-            is_inside = resolved.is_relative_to(root) and resolved.is_file()
+            is_inside = resolved_path.is_relative_to(root) and resolved_path.is_file()
         except (OSError, RuntimeError):  # symbolic link without target, or circular
             is_inside = False
         if is_inside:
-            yield Submission(resolved, "", name.as_posix())
+            yield Submission(resolved_path, "", name.as_posix())
         outside_count += not is_inside
     if outside_count:
         notes.append(
@@ -318,7 +324,7 @@ def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
         reason = "the zip entry is a symbolic link."
     elif entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         reason = "the compression method of the zip entry is not supported."
-    elif entry.file_size > MAX_BYTES:
+    elif entry.file_size > MAX_PDF_BYTES:
         reason = _TOO_LARGE_REASON
     elif entry.file_size > max_bytes:
         reason = f"the zip entry is compressed more than {MAX_COMPRESSION_RATIO} times."
@@ -332,8 +338,8 @@ def _short_name(name: str) -> str:
     """Format a file name on one line; shorten a long name in the middle."""
     line = " ".join(clean_text(name[-10 * MAX_NAME_LENGTH :]).split())
     if len(line) > MAX_NAME_LENGTH:
-        half = MAX_NAME_LENGTH // 2
-        line = f"{line[:half]}…{line[1 - half :]}"
+        half_length = MAX_NAME_LENGTH // 2
+        line = f"{line[:half_length]}…{line[1 - half_length :]}"
     return line or "no name"
 
 

@@ -10,7 +10,7 @@ import pandas as pd
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.flight_events import max_interval_s
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.preparation import select_innovations
+from px4fuse.comparison.preparation import prepare, select_innovations
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.inputs import prepare_inputs
 from px4fuse.errors import MissingDataError, Px4FuseError
@@ -25,7 +25,7 @@ from px4fuse.findings import ekf2_not_fusing, finding_title, imu, missing, recor
 from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable, sample_rate
 from px4fuse.inspect.tables import NO_POSITION, unavailable_parts
 from px4fuse.log import Stream
-from px4fuse.request import with_options
+from px4fuse.request import ComparisonRequest, with_options
 from px4fuse.text import capitalise_first, to_json_types, utc_time
 
 SCHEMA_NAME = "px4fuse-info"
@@ -172,7 +172,7 @@ def take_inventory(flight: Flight) -> Inventory:
     """List the contents of a flight, the possible analyses and the advice on logging."""
     comparison, reason, remedy = None, "", ""
     try:
-        comparison = compare(flight)
+        comparison = compare(prepare(flight, ComparisonRequest(log=flight.log.name)))
         reason = comparison.source_reason
     except Px4FuseError as error:
         reason = with_options(error.reason).removeprefix(f"{flight.log.name}: ")
@@ -319,9 +319,9 @@ def _analysis_options(
     data_by_part = _data_by_part(flight)
     for name, key in PARTS_OF_COMPARE.items():
         result, description = rows_by_name.get(name, (NO_COMPARISON, ""))
-        logged = data_by_part.get(key, flight.ekf2)
-        if isinstance(logged, Unavailable):
-            result = logged
+        logged_data = data_by_part.get(key, flight.ekf2)
+        if isinstance(logged_data, Unavailable):
+            result = logged_data
         yield _analysis_option(name, result, description)
     aids, ekf2 = evaluate_aids(flight), flight.ekf2
     if isinstance(aids, dict) and isinstance(ekf2, Ekf2):
@@ -348,7 +348,11 @@ def _analysis_option(name: str, part: object, description: str) -> AnalysisOptio
 def _ekf2_and_truth_rows(comparison: Comparison) -> dict[str, tuple[object, str]]:
     first_axis, truth = next(iter(comparison.axes.values())), comparison.flight.truth
     innovations = {name: axis.ekf2_innovations for name, axis in comparison.axes.items()}
-    counts = [f"{n} {len(f)}" for n, f in innovations.items() if isinstance(f, pd.DataFrame)]
+    counts = [
+        f"{axis_name} {len(innovation_table)}"
+        for axis_name, innovation_table in innovations.items()
+        if isinstance(innovation_table, pd.DataFrame)
+    ]
     summaries = [axis.filters["ekf2"] for axis in comparison.axes.values()]
     quantities_text = "position only"
     if isinstance(truth, Truth) and truth.samples[Columns.VELOCITY].notna().any(axis=None):

@@ -136,12 +136,14 @@ def _table(
     described_name: str = "",
     **values: str,
 ) -> DescribedTable:
-    """Make a table with the columns in columns.csv for ``described_name``, by default ``name``.
+    """Make a table with the columns that columns.csv lists for it.
 
     Parameters
     ----------
     origin : (tuple of str, str)
         Topics and clock of the data.
+    described_name : str
+        Name of the table in columns.csv; by default ``name``.
     **values
         Values for the names in braces in columns.csv.
     """

@@ -16,7 +16,7 @@ from px4fuse.loop.corrections import (
     score_paths,
     solve_pose_graphs,
 )
-from px4fuse.loop.model import LANDING, Loop, OdometryNoise, TrueEnd
+from px4fuse.loop.model import LANDING_SOURCE, Loop, OdometryNoise, TrueEnd
 from px4fuse.loop.odometry import ClosureWithEnd, build_pose_graph
 from px4fuse.loop.tracks import LoopSource, find_odometry, trajectory_of
 from px4fuse.request import GivenClosure, LoopRequest
@@ -110,9 +110,11 @@ def analyse(
     heading_deg = loop_segment.heading_change_deg(path)
     misclosure_m = true_end if isinstance(true_end, Unavailable) else end_m - true_end.displacement
     heading_error_deg = _compute_heading_error(true_end, heading_deg)
-    landing = gated_closures[0] if gated_closures and gated_closures[0].source == LANDING else None
+    landing_closure = (
+        gated_closures[0] if gated_closures and gated_closures[0].source == LANDING_SOURCE else None
+    )
     distance_corrections = correct_paths_by_distance(
-        path, distance_m, misclosure_m, heading_error_deg, landing
+        path, distance_m, misclosure_m, heading_error_deg, landing_closure
     )
     references = tuple(track for track in (truth, reference) if track is not None)
     error_m = error_axes_m = None
@@ -157,7 +159,8 @@ def _find_true_end(
     if request.landed_at is not None:
         if not request.closed_loop:
             raise SettingsError(
-                "`landed_at` and `closed_loop` exclude each other.", "Omit one of both."
+                "`landed_at` and `closed_loop` exclude each other.",
+                "Omit `landed_at` or `closed_loop`.",
             )
         return loop_segment.convert_measured_end(path, request.landed_at)
     if not request.closed_loop:
@@ -227,7 +230,7 @@ def _compute_heading_error(
     if isinstance(end, Unavailable):
         return end
     if heading_deg is None:
-        return Unavailable(name, "the trajectory has no orientations", "No action needed.")
+        return Unavailable(name, "the trajectory has no orientations", "No action is needed.")
     if end.heading_change_deg is None:
         return Unavailable(
             name,

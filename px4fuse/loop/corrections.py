@@ -11,11 +11,11 @@ from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import Px4FuseError
 from px4fuse.flight import Unavailable
 from px4fuse.loop.closure import correct_by_distance, distribute_by_distance
-from px4fuse.loop.model import LANDING, Closure, CorrectedPath, CorrectionName
+from px4fuse.loop.model import LANDING_SOURCE, Closure, CorrectedPath, CorrectionName
 from px4fuse.loop.odometry import ClosureWithEnd
 from px4fuse.record import to_serializable
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
-from px4fuse.trajectory.graph.analysis import ROBUST_METHODS, SOLUTIONS
+from px4fuse.trajectory.graph.analysis import ROBUST, SOLUTIONS
 from px4fuse.trajectory.graph.covariance import gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution, solve
@@ -82,7 +82,7 @@ def gate_closures(
         odometry_m = graph.poses[result.second, :3] - graph.poses[result.first, :3]
         closure_fields = structs.asdict(closure) | structs.asdict(result)
         del closure_fields["first"], closure_fields["second"]
-        closure_fields["source"] = "given" if end is None else LANDING
+        closure_fields["source"] = "given" if end is None else LANDING_SOURCE
         true_m = np.zeros(3) if end is None else end.displacement
         closures.append(
             Closure(distance_m=float(np.linalg.norm(odometry_m - true_m)), **closure_fields)
@@ -97,7 +97,7 @@ def solve_pose_graphs(
     closures: tuple[Closure, ...],
     progress: Callable[[str], None],
 ) -> tuple[dict[CorrectionName, Corrected], tuple[Closure, ...]]:
-    """Optimise the graph with all closures, with accepted closures only, and by robust methods.
+    """Optimise the graph with all closures, with accepted closures only, and robustly.
 
     Return the corrected paths, and the closures with their weights from robust optimisation.
     """
@@ -113,10 +113,10 @@ def solve_pose_graphs(
     is_rejected[is_closure] = [not closure.accepted for closure in closures]
     for solution_name, label in SOLUTIONS.items():
         name = f"pose_graph_{solution_name}"
-        robust = ROBUST_METHODS.get(solution_name, "none")
+        robust = solution_name == ROBUST
         is_gated = solution_name == "gated"
         progress(f"optimising: {label}")
-        if robust != "none" and len(closures) < 2:
+        if robust and len(closures) < 2:
             corrections[name] = Unavailable(
                 label, SINGLE_LOOP_REASON, "Give further closures with --closure."
             )
@@ -127,14 +127,16 @@ def solve_pose_graphs(
         else:
             is_used = ~is_rejected if is_gated else np.ones_like(is_rejected)
             solution = solve(
-                graph.select_edges(is_used), robust=robust, is_closure=is_closure[is_used]
+                graph.select_edges(is_used),
+                robust=robust,
+                is_closure=is_closure[is_used],
             )
             corrected_path = _interpolate_corrections(path, nodes, graph.poses, solution.poses)
             corrections[name] = corrected_path, solution
-            if robust != "none":
+            if robust:
                 weights = solution.weights[is_closure].tolist()
                 closures = tuple(
-                    structs.replace(closure, **{f"weight_{solution_name}": weight})
+                    structs.replace(closure, weight_gnc=weight)
                     for closure, weight in zip(closures, weights, strict=True)
                 )
     return corrections, closures
@@ -153,12 +155,12 @@ def _interpolate_corrections(
     fraction = (time - time[nodes[previous_node]]) / (
         time[nodes[previous_node + 1]] - time[nodes[previous_node]]
     )
-    corrected = [
+    corrected_poses = [
         solved_poses[node, :3] + rotation[node].apply(path.position_m - graph_poses[node, :3])
         for node in (previous_node, previous_node + 1)
     ]
     weight = np.clip(fraction, 0.0, 1.0)[:, None]
-    position = (1.0 - weight) * corrected[0] + weight * corrected[1]
+    position = (1.0 - weight) * corrected_poses[0] + weight * corrected_poses[1]
     return path.with_positions(position, Slerp(time[nodes], rotation)(time))
 
 
@@ -204,15 +206,15 @@ def score_paths(
         if isinstance(evaluation, Evaluation) and evaluation.time_offset.offset_s is not None:
             offsets[name] = evaluation.time_offset.offset_s
     scored_paths: dict[CorrectionName, CorrectedPath | Unavailable] = {"uncorrected": uncorrected}
-    for name, corrected in corrected_paths.items():
+    for name, corrected_path in corrected_paths.items():
         all_closures_path = scored_paths.get("pose_graph_all")
-        if isinstance(corrected, Unavailable):
-            scored_paths[name] = corrected
+        if isinstance(corrected_path, Unavailable):
+            scored_paths[name] = corrected_path
         elif (
             isinstance(all_closures_path, CorrectedPath)
-            and corrected[1] is all_closures_path.solution
+            and corrected_path[1] is all_closures_path.solution
         ):
             scored_paths[name] = structs.replace(all_closures_path, name=CORRECTION_LABELS[name])
         else:
-            scored_paths[name] = score_path(name, *corrected)
+            scored_paths[name] = score_path(name, *corrected_path)
     return scored_paths

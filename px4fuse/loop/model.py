@@ -22,11 +22,10 @@ CorrectionName = Literal[
     "by_distance",
     "pose_graph_all",
     "pose_graph_gated",
-    "pose_graph_dcs",
     "pose_graph_gnc",
 ]
 # Source of the loop closure between take-off and landing
-LANDING = "landing"
+LANDING_SOURCE = "landing"
 
 
 class TrueEnd(Record, frozen=True, kw_only=True):
@@ -88,7 +87,7 @@ class OdometryNoise(Record, frozen=True, omit_defaults=False):
 
 
 class Closure(Record, frozen=True, kw_only=True):
-    """Loop closure (two times at the same place), with gate result and weights of robust methods.
+    """Loop closure (two times at the same place), with gate result and robust weight.
 
     Attributes
     ----------
@@ -102,8 +101,8 @@ class Closure(Record, frozen=True, kw_only=True):
         Closure error of the odometry: odometry minus true displacement.
     d2, degrees_of_freedom, p, accepted
         See :class:`~px4fuse.trajectory.graph.covariance.GateResult`.
-    weight_dcs, weight_gnc : float or None
-        Weights of robust optimisation, 0 to 1; None with a single closure (no redundancy).
+    weight_gnc : float or None
+        Weight of robust optimisation, 0 to 1; None with a single closure (no redundancy).
     """
 
     time_1_s: float
@@ -115,13 +114,12 @@ class Closure(Record, frozen=True, kw_only=True):
     degrees_of_freedom: Count
     p: Share
     accepted: bool
-    weight_dcs: float | None = None
     weight_gnc: float | None = None
 
     def __str__(self) -> str:
-        if self.source == LANDING:
+        if self.source == LANDING_SOURCE:
             return "the closure of take-off and landing"
-        return f"the closure of {self.time_1_s:.12g} s and {self.time_2_s:.12g} s"
+        return f"the closure between {self.time_1_s:.12g} s and {self.time_2_s:.12g} s"
 
 
 class Correction(Record, frozen=True, kw_only=True):
@@ -265,6 +263,6 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
         """
         if isinstance(self.graph, Unavailable):
             raise MissingDataError(f"{self.graph.what}: {self.graph.reason}.")
-        solved = self.paths.get("pose_graph_gated") or self.paths.get("pose_graph_all")
-        solution = None if solved is None else solved.solution
+        graph_path = self.paths.get("pose_graph_gated") or self.paths.get("pose_graph_all")
+        solution = None if graph_path is None else graph_path.solution
         return self.graph if solution is None else replace(self.graph, poses=solution.poses)

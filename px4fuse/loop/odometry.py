@@ -14,8 +14,8 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
-# Minimum ratio of the reported variances, end to start of the path, for variances that are used as
-# drift
+# Minimum ratio of the reported position variance at the end of the path to that at its start: with
+# less growth, the default drift is used
 MIN_VARIANCE_GROWTH = 2.0
 # Minimum variance of an odometry edge as fraction of the default drift: a reported growth may be
 # zero
@@ -134,16 +134,16 @@ def build_pose_graph(
     rotation = path.rotation[nodes]
     translation_m2, rotation_rad2, statement = odometry_variances(path, nodes, noise)
     steps = np.arange(len(nodes) - 1)
-    first = np.append(steps, end_nodes[:, 0])
+    first_nodes = np.append(steps, end_nodes[:, 0])
     second = np.append(steps + 1, end_nodes[:, 1])
-    information = np.zeros((len(first), 6, 6))
+    information = np.zeros((len(first_nodes), 6, 6))
     diagonal = np.column_stack(
         [np.repeat(1.0 / translation_m2[:, None], 3, axis=1), 1.0 / rotation_rad2]
     )
     information[steps[:, None], range(6), range(6)] = diagonal
-    first_inverse = rotation[first].inv()
+    first_inverse = rotation[first_nodes].inv()
     second_rotation = rotation[second]
-    translation_measured = first_inverse.apply(position[second] - position[first])
+    translation_measured = first_inverse.apply(position[second] - position[first_nodes])
     for row, (closure, end) in enumerate(closures_with_end, start=len(steps)):
         translation_measured[row] = (
             0.0 if end is None else first_inverse[row].apply(end.displacement)
@@ -151,18 +151,18 @@ def build_pose_graph(
         information[row, range(3), range(3)] = closure.sigma_m**-2
         if end is not None and end.heading_change_deg is not None:
             odometry_change_rad = heading_change_rad(
-                second_rotation[row] * rotation[first[row]].inv()
+                second_rotation[row] * rotation[first_nodes[row]].inv()
             )
             error_rad = float(lie.wrap(np.radians(end.heading_change_deg) - odometry_change_rad))
             second_rotation[row] = Rotation.from_rotvec(error_rad * DOWN) * second_rotation[row]
-            vertical = second_rotation[row].inv().apply(DOWN)
+            vertical_direction = second_rotation[row].inv().apply(DOWN)
             sigma = np.radians(end.sigma_heading_deg or 0.0)
-            information[row, 3:, 3:] = np.outer(vertical, vertical) / sigma**2
+            information[row, 3:, 3:] = np.outer(vertical_direction, vertical_direction) / sigma**2
     graph = PoseGraph(
         dimension=3,
         ids=np.arange(len(nodes)),
         poses=np.column_stack([position, rotation.as_quat()]),
-        first=first,
+        first=first_nodes,
         second=second,
         measurements=np.column_stack(
             [translation_measured, (first_inverse * second_rotation).as_quat()]

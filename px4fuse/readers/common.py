@@ -114,11 +114,13 @@ def rounding_step(values: Array) -> float:
     return float(steps.min()) if is_multiple.all() else 0.0
 
 
-def join_nearest(samples: pd.DataFrame, others: pd.DataFrame, tolerance_s: float) -> pd.DataFrame:
-    """Join each row with the row of ``others`` nearest in time; NaN if none is in the tolerance."""
+def join_nearest(
+    samples: pd.DataFrame, other_samples: pd.DataFrame, tolerance_s: float
+) -> pd.DataFrame:
+    """Join each row with the other sample nearest in time; NaN if none is within the tolerance."""
     return pd.merge_asof(
         samples,
-        others,
+        other_samples,
         left_index=True,
         right_index=True,
         direction="nearest",

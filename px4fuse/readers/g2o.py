@@ -111,7 +111,9 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         first=vertex_index[:, 0],
         second=vertex_index[:, 1],
         measurements=_normalise_quaternions(edges, edge_values[:, :pose_width]),
-        information=_information(edges, edge_values[:, pose_width:], 3 if dimension == 2 else 6),
+        information=_information_matrices(
+            edges, edge_values[:, pose_width:], 3 if dimension == 2 else 6
+        ),
         initialised=FROM_FILE,
     )
     try:
@@ -206,7 +208,7 @@ def _normalise_quaternions(rows: Rows, poses: Array) -> Array:
     return np.hstack([poses[:, :3], poses[:, 3:] / norm[:, None]])
 
 
-def _information(rows: Rows, numbers: Array, size: int) -> Array:
+def _information_matrices(rows: Rows, numbers: Array, size: int) -> Array:
     """Return the information matrices, (n, size, size), from upper triangles in row order."""
     row, column = np.triu_indices(size)
     matrices = np.empty((len(numbers), size, size))

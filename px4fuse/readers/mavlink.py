@@ -13,7 +13,7 @@ import pandas as pd
 from px4fuse.ekf2_parameters import (
     EV_POS,
     GNSS_POS,
-    REPORTED,
+    REPORTED_PARAMETERS,
     effective_settings,
     replace_invalid_parameters,
 )
@@ -113,7 +113,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
         clocks=senders.clock_maps(recording, clock_mappings),
         unused=tuple(
             UnusedData(name, count, reason)
-            for name, reason in messages.UNUSED.items()
+            for name, reason in messages.UNUSED_MESSAGES.items()
             if (count := int(np.count_nonzero(frames.message_id == MESSAGE_IDS[name])))
         ),
     )
@@ -298,7 +298,7 @@ def _read_parameters(recording: Recording, autopilot: str) -> dict[str, float]:
     value_by_name: dict[str, float] = {}
     for raw_name, value in zip(table["param_id"].tolist(), values.tolist(), strict=True):
         name = raw_name.decode(errors="replace")
-        if name in REPORTED:
+        if name in REPORTED_PARAMETERS:
             value_by_name.setdefault(name, float(value))
     return value_by_name
 

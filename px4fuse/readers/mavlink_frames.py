@@ -257,27 +257,35 @@ def _remove_nested_frames(frames: Integers) -> Integers:
     return frames[kept_rows]
 
 
-def _find_possible_frames(source: NDArray[np.uint8], block_start: int) -> tuple[Integers, Integers]:
+def _find_possible_frames(
+    content_bytes: NDArray[np.uint8], block_start: int
+) -> tuple[Integers, Integers]:
     """Return start, end and message id of possible frames, and the offset of their checksums."""
-    block = source[block_start : block_start + BLOCK_BYTES]
+    block = content_bytes[block_start : block_start + BLOCK_BYTES]
     start = (
         np.flatnonzero((block == MAGIC_BYTE_1) | (block == MAGIC_BYTE_2)).astype(np.int64)
         + block_start
     )
-    header_bytes = np.where(source[start] == MAGIC_BYTE_2, HEADER_BYTES_2, HEADER_BYTES_1)
-    has_whole_header = start + header_bytes + CHECKSUM_BYTES <= len(source)
+    header_bytes = np.where(content_bytes[start] == MAGIC_BYTE_2, HEADER_BYTES_2, HEADER_BYTES_1)
+    has_whole_header = start + header_bytes + CHECKSUM_BYTES <= len(content_bytes)
     start = start[has_whole_header]
     header_bytes = header_bytes[has_whole_header]
     is_version_2 = header_bytes == HEADER_BYTES_2
     start_2 = start[is_version_2]
-    message_id = source[start + 5].astype(np.int64)
-    message_id[is_version_2] = source[start_2 + 7] | source[start_2 + 8].astype(np.int64) << 8
+    message_id = content_bytes[start + 5].astype(np.int64)
+    message_id[is_version_2] = (
+        content_bytes[start_2 + 7] | content_bytes[start_2 + 8].astype(np.int64) << 8
+    )
     is_candidate = _CRC_EXTRA[message_id] >= 0
-    is_candidate[is_version_2] &= (source[start_2 + 9] == 0) & (source[start_2 + 2] <= SIGNED_FLAG)
-    crc_end = start + source[start + 1] + header_bytes
+    is_candidate[is_version_2] &= (content_bytes[start_2 + 9] == 0) & (
+        content_bytes[start_2 + 2] <= SIGNED_FLAG
+    )
+    crc_end = start + content_bytes[start + 1] + header_bytes
     end = crc_end + CHECKSUM_BYTES
-    end[is_version_2] += SIGNATURE_BYTES * (source[start_2 + 2] & SIGNED_FLAG).astype(np.int64)
-    is_candidate &= end <= len(source)
+    end[is_version_2] += SIGNATURE_BYTES * (content_bytes[start_2 + 2] & SIGNED_FLAG).astype(
+        np.int64
+    )
+    is_candidate &= end <= len(content_bytes)
     return np.stack([start, end, message_id], axis=1)[is_candidate], crc_end[is_candidate]
 
 

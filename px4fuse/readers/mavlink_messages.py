@@ -98,7 +98,7 @@ AUTOPILOTS, VEHICLE_TYPES, MAIN_MODES, AUTO_MODES = (
     msgspec.convert(_TABLE[name], dict[int, str], strict=False)
     for name in ("autopilots", "vehicle_types", "main_modes", "auto_modes")
 )
-UNUSED: Mapping[str, str] = _TABLE["unused"]
+UNUSED_MESSAGES: Mapping[str, str] = _TABLE["unused"]
 POSITION_INPUTS = tuple(replace(row, name=name) for name, row in _INPUTS.items())
 _SCALED_IMU = (replace(LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{n}") for n in ("", "2", "3"))
 IMU_LAYOUTS = (LAYOUTS["highres_imu"], *_SCALED_IMU)

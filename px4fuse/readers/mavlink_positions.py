@@ -60,10 +60,10 @@ def read_positions(
         ]
     fixes = (_read_gnss(recording, layout, delay_s) for layout in messages.GNSS_LAYOUTS)
     tracks_and_missing += [track for track in fixes if track]
-    missing = tuple(item for item in tracks_and_missing if isinstance(item, Unavailable))
+    missing_tracks = tuple(item for item in tracks_and_missing if isinstance(item, Unavailable))
     return sort_by_preference(
         item for item in tracks_and_missing if isinstance(item, PositionTrack)
-    ), missing
+    ), missing_tracks
 
 
 def _read_track(

@@ -39,7 +39,7 @@ MIN_INTERVAL_S, MAX_INTERVAL_S = 0.9 / 200, 1.1 / 0.2
 # equally large numbers half an hour after boot, but with larger intervals
 MAX_UNIX_TIME_INTERVAL_S = 60.0
 # Maximum extent (m) of an indoor flight: a larger extent shows that the unit of length is mm
-MAX_SPREAD_M = 200.0
+MAX_INDOOR_EXTENT_M = 200.0
 # Maximum absolute coordinate in any unit of length: larger values are timestamps or damaged text
 MAX_COORDINATE = 1e9
 # Number of lines and characters at the beginning of the file in which the header is searched
@@ -110,9 +110,9 @@ class _Table:
     def label(self, *columns: int | None) -> str:
         """Format the names of columns for messages, without repetition; skip None."""
         labels = dict.fromkeys(
-            quote(self.names[at]) if self.names[at] else f"column {at + 1}"
-            for at in columns
-            if at is not None
+            quote(self.names[index]) if self.names[index] else f"column {index + 1}"
+            for index in columns
+            if index is not None
         )
         return ", ".join([*labels][:12]) + (", ..." if len(labels) > 12 else "")
 
@@ -178,19 +178,21 @@ def read_position_csv(
     table, notes = _find_table(display_name(path), content, columns)
     meanings = [read_column_name(name) for name in table.names]
     chosen_columns = _column_indices(table, columns or ())
-    texts = table.texts([*chosen_columns, *(at for at, m in enumerate(meanings) if m.kind)])
+    texts = table.texts(
+        [*chosen_columns, *(index for index, meaning in enumerate(meanings) if meaning.kind)]
+    )
     numbers = texts.apply(pd.to_numeric, errors="coerce").astype(np.float64)
     time, position, sigma, frame, time_text = _choose_columns(
         table, meanings, chosen_columns, numbers
     )
-    axes = [at for at in position if at is not None]
+    axes = [index for index in position if index is not None]
     # Numbers such as 1e999 are read as infinite
     has_time = np.isfinite(numbers[time])
     is_usable = has_time & (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
     if unusable_count := int(np.count_nonzero(~is_usable)):
         notes.insert(0, f"dropped rows without valid time or position: {unusable_count}")
     empty_times = numbers.loc[has_time & ~is_usable, time].to_numpy()
-    for tag in (at for at, m in enumerate(meanings) if m.kind == "tag"):
+    for tag in (index for index, meaning in enumerate(meanings) if meaning.kind == "tag"):
         tags = sorted({*texts[tag].dropna()})
         if tags[1:]:
             notes.append(
@@ -222,10 +224,11 @@ def read_position_csv(
             f"a median interval of {median_interval_s:.3g} s is not plausible for UWB: check "
             "--position-time-unit"
         )
-    scales, length_text = _length_units(numbers, axes, meanings, length_unit)
+    scale_by_column, length_unit_text = _length_units(numbers, axes, meanings, length_unit)
     column_of_name = zip(SAMPLE_COLUMNS, (*position, *sigma), strict=True)
     columns_m = {
-        name: np.nan if at is None else numbers[at] * scales[at] for name, at in column_of_name
+        name: np.nan if index is None else numbers[index] * scale_by_column[index]
+        for name, index in column_of_name
     }
     samples = pd.DataFrame(columns_m, index=numbers.index).replace([np.inf, -np.inf], np.nan)
     reason = find_invalid(samples, SAMPLE_COLUMNS[: len(axes)])
@@ -252,11 +255,11 @@ def read_position_csv(
             f"{table.header_line}",
             f"time: column {time_text}, {clock} clock, in {unit_text}",
             f"position: columns {table.label(*position)} as {axis_names}{height_text}, in "
-            f"{length_text}",
+            f"{length_unit_text}",
             f"sigma: columns {table.label(*sigma) or 'none'}",
         ),
         notes=tuple(notes),
-        metres_per_unit=scales[axes[0]],
+        metres_per_unit=scale_by_column[axes[0]],
         invalid=pd.concat(invalid).sort_index(),
         step_m=max(rounding_step(samples[name].to_numpy()) for name in ("x_m", "y_m")),
     )
@@ -304,8 +307,8 @@ def _find_table(
     lines = text[: text.rfind("\n", 0, MAX_HEADER_CHARS) + 1].split("\n")[:MAX_HEADER_LINES]
     wanted_names = {column.strip().casefold() for column in columns or () if not column.isdecimal()}
     headers = (
-        (at + 1, separator, names)
-        for at, header_line in enumerate(lines)
+        (index + 1, separator, names)
+        for index, header_line in enumerate(lines)
         for separator in _SEPARATORS
         for names in [_split_line(header_line.strip("#% "), separator)]
         if len(names) <= MAX_COLUMNS and _is_header(names, wanted_names)
@@ -343,7 +346,7 @@ def _is_header(fields: list[str], wanted_names: set[str]) -> bool:
 
 def _column_indices(table: _Table, columns: tuple[str, ...]) -> list[int]:
     names = [name.casefold() for name in table.names]
-    numbers = [str(at + 1) for at in range(len(names))]
+    numbers = [str(index + 1) for index in range(len(names))]
     indices = []
     for column in columns:
         wanted_name = column.strip().casefold()
@@ -377,7 +380,8 @@ def _choose_columns(
         time_text = table.label(chosen_columns[0])
         # The column names may contain the frame, which determines the order of the axes
         chosen_meanings = [
-            m if at in chosen_columns[1:4] else ColumnMeaning() for at, m in enumerate(meanings)
+            meaning if index in chosen_columns[1:4] else ColumnMeaning()
+            for index, meaning in enumerate(meanings)
         ]
         frame_and_position = position_names.find_position(chosen_meanings)
         position: _Columns = (*chosen_columns[1:4], None)[:3]
@@ -387,11 +391,15 @@ def _choose_columns(
             else (None, position)
         )
     else:
-        time_columns = [at for at, column in enumerate(meanings) if column.kind == "time"]
+        time_columns = [index for index, column in enumerate(meanings) if column.kind == "time"]
         is_mostly_empty = numbers[time_columns].fillna(0.0).eq(0.0).mean() >= 0.5
         rank = position_names.TIME_KINDS.index
         time, *other_times = sorted(
-            time_columns, key=lambda at: (bool(is_mostly_empty[at]), rank(meanings[at].key))
+            time_columns,
+            key=lambda index: (
+                bool(is_mostly_empty[index]),
+                rank(meanings[index].key),
+            ),
         )
         time_text = table.label(time)
         if other_times:
@@ -440,28 +448,35 @@ def _length_units(
     numbers: pd.DataFrame, axes: list[int], meanings: Sequence[ColumnMeaning], option: str | None
 ) -> tuple[dict[int, float], str]:
     """Return metres per unit of each column, and the description of the unit of the positions."""
-    name_units = {at: m.unit for at, m in enumerate(meanings) if m.unit in LENGTH_UNITS}
+    name_units = {
+        index: meaning.unit
+        for index, meaning in enumerate(meanings)
+        if meaning.unit in LENGTH_UNITS
+    }
     # Extent from 5 % to 95 % of the coordinates, because outliers must not determine the unit
-    spreads = numbers[axes].quantile(0.95) - numbers[axes].quantile(0.05)
-    max_spread = float(spreads.max())
+    extents = numbers[axes].quantile(0.95) - numbers[axes].quantile(0.05)
+    max_extent = float(extents.max())
     unit = "m"
     reason = "assumed: the column names contain no unit"
     if option is not None:
         unit = option
         name_units = {}
         reason = "given with --position-unit"
-    elif axis_units := [name_units[at] for at in axes if at in name_units]:
+    elif axis_units := [name_units[index] for index in axes if index in name_units]:
         unit = axis_units[0]
         reason = "from the column names"
-    elif MAX_SPREAD_M < max_spread <= MAX_SPREAD_M / LENGTH_UNITS["mm"]:
+    elif MAX_INDOOR_EXTENT_M < max_extent <= MAX_INDOOR_EXTENT_M / LENGTH_UNITS["mm"]:
         unit = "mm"
         reason = (
-            f"{max_spread:.0f} m is too large for an indoor flight; if cm, give --position-unit"
+            f"{max_extent:.0f} m is too large for an indoor flight; if cm, give --position-unit"
         )
-    elif max_spread > MAX_SPREAD_M:
+    elif max_extent > MAX_INDOOR_EXTENT_M:
         reason = "assumed, because no unit gives an indoor flight; --position-unit sets another"
-    units = {at: name_units.get(at, unit) for at in map(int, numbers.columns)}
-    scales = {at: LENGTH_UNITS[name] for at, name in units.items()}
-    span_m = max(float(spreads[at]) * scales[at] for at in axes)
-    used_units = ", ".join(dict.fromkeys(units[at] for at in axes))
-    return scales, f"{used_units} ({reason}); 90 % of the positions are within {span_m:.3g} m"
+    unit_by_column = {index: name_units.get(index, unit) for index in map(int, numbers.columns)}
+    scale_by_column = {index: LENGTH_UNITS[name] for index, name in unit_by_column.items()}
+    span_m = max(float(extents[index]) * scale_by_column[index] for index in axes)
+    used_units = ", ".join(dict.fromkeys(unit_by_column[index] for index in axes))
+    return (
+        scale_by_column,
+        f"{used_units} ({reason}); 90 % of the positions are within {span_m:.3g} m",
+    )

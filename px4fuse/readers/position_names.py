@@ -101,7 +101,11 @@ def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, Positi
 def find_sigma(meanings: Sequence[ColumnMeaning], frame: str | None) -> tuple[int | None, ...]:
     """Return the index of the sigma column of each axis; a sigma column without axis is for all."""
     # Reversed, so that the first of several columns with the same meaning is used
-    sigmas = {m.key: at for at, m in [*enumerate(meanings)][::-1] if m.kind == "sigma"}
+    sigmas = {
+        meaning.key: index
+        for index, meaning in [*enumerate(meanings)][::-1]
+        if meaning.kind == "sigma"
+    }
     axes = next(axes for name, axes in _FRAMES if name == frame)
     axes_and_letters = zip(axes, "xyz", strict=True)
     return tuple(

@@ -24,16 +24,16 @@ from px4fuse.readers.ulog_topics import Topics
 JOIN_TOLERANCE_S = 0.6
 
 
-def read_aids(topics: Topics, enabled: StepFunctions) -> dict[str, AidLog]:
+def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
     """Read all aiding sources with innovations in the log, by PX4 name.
 
-    ``enabled`` is the result of :func:`read_enabled_aids`. An aid's topic ``estimator_aid_src_...``
+    ``enabled_aids`` is the result of :func:`read_enabled_aids`. A topic ``estimator_aid_src_...``
     is preferred: it contains each fusion attempt with time and result. The older topics that are
     common to all aids repeat each value until the next fusion; repeated values are removed.
     """
     logs = {}
     for name, aid in AIDS.items():
-        aid_enabled = enabled.get(name)
+        aid_enabled = enabled_aids.get(name)
         log = _read_aid_topic(topics, aid, aid_enabled)
         # Without fusion of an aid, the common topics contain outdated values or values of other
         # aids
@@ -50,7 +50,7 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     The source is ``estimator_status_flags``, or the control bits of ``estimator_status`` in older
     logs.
     """
-    enabled = {}
+    enabled_aids = {}
     tables = topics.of(px4.STATUS_FLAGS)
     all_aids = (*AIDS.values(), *DISTURBANCES.values())
     flag_names = {flag for aid in all_aids for group in aid.flags for flag in group}
@@ -62,14 +62,14 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
         for aid in all_aids if len(flags) else ():
             group = next((group for group in aid.flags if {*group} <= {*logged_flags}), None)
             if group is not None:
-                enabled[aid.name] = flags[list(group)].max(axis=1)
+                enabled_aids[aid.name] = flags[list(group)].max(axis=1)
     if not logged_flags and topics.find(px4.LAYOUTS["control_bits"]) is not None:
         bits = topics.primary_samples(px4.LAYOUTS["control_bits"], step=True)["bits"].dropna()
         for aid in all_aids if len(bits) else ():
             if aid.status_bit is not None:
                 is_enabled = bits.to_numpy().astype(np.int64) >> aid.status_bit & 1
-                enabled[aid.name] = pd.Series(is_enabled.astype(float), index=bits.index)
-    return enabled
+                enabled_aids[aid.name] = pd.Series(is_enabled.astype(float), index=bits.index)
+    return enabled_aids
 
 
 def _read_aid_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) -> AidLog | None:
@@ -132,11 +132,11 @@ def _read_common_topics(
     return None
 
 
-def _drop_repeats(frame: pd.DataFrame) -> pd.DataFrame:
+def _drop_repeats(samples: pd.DataFrame) -> pd.DataFrame:
     """Remove repeated rows, and rows of zeros, which mean "not fused yet"."""
-    finite_frame = frame.dropna()
-    first_column = finite_frame.iloc[:, 0]
-    return finite_frame[first_column.ne(first_column.shift()) & (first_column != 0.0)]
+    finite_samples = samples.dropna()
+    first_column = finite_samples.iloc[:, 0]
+    return finite_samples[first_column.ne(first_column.shift()) & (first_column != 0.0)]
 
 
 def _columns_by_axis(name: str, aid: Aid, fields: Iterable[str]) -> dict[str, str]:

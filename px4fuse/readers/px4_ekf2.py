@@ -87,11 +87,11 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
             "Wait until EKF2 has started before recording.",
         )
     topics.record_stream("ekf2_state", px4.LOCAL_POSITION.topic)
-    enabled = read_enabled_aids(topics)
-    fusing = _read_fusing(topics, enabled)
+    enabled_aids = read_enabled_aids(topics)
+    fusion_flags = _read_fusing(topics, enabled_aids)
     gate = effective_settings(parameters)[EV_POS.gate]
-    aids = read_aids(topics, enabled)
-    innovations, innovation_topics = innovations_by_axis(aids, fusing, gate)
+    aids = read_aids(topics, enabled_aids)
+    innovations, innovation_topics = innovations_by_axis(aids, fusion_flags, gate)
     if innovation_topics:
         topics.record_stream("ekf2_innovations", *innovation_topics)
     notes = [
@@ -107,9 +107,9 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         if log.excluded_count
     ]
     step_s = _step_s(topics)
-    delayed = _read_delayed_state(topics, step_s)
-    states = _read_states(topics, local_position, enabled)
-    variance = _variance(delayed)
+    delayed_state = _read_delayed_state(topics, step_s)
+    states = _read_states(topics, local_position, enabled_aids)
+    variance = _delayed_variance(delayed_state)
     if not isinstance(variance, Unavailable):
         topics.record_stream("ekf2_variance", _state_vector(topics)[0])
     return Ekf2(
@@ -117,15 +117,15 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         variance=variance,
         innovations=innovations,
         innovation_topics=innovation_topics,
-        fusing=fusing,
+        fusing=fusion_flags,
         resets=read_resets(local_position),
         instances=topics.primary,
         gate=gate,
         notes=tuple(notes),
-        accelerometer_bias=_accelerometer_bias(topics, delayed),
+        accelerometer_bias=_accelerometer_bias(topics, delayed_state),
         step_s=step_s,
         horizon_s=_horizon_s(topics, step_s),
-        record=_read_record(topics, delayed, local_position, enabled, step_s),
+        record=_read_record(topics, delayed_state, local_position, enabled_aids, step_s),
         aids=aids,
         states=states,
         parameters=topics.ekf2_parameters,
@@ -163,24 +163,24 @@ def _read_delayed_state(topics: Topics, step_s: float) -> TableOrUnavailable:
         )
     states = [f"states[{i}]" for i in range(STATE_COUNT)]
     variances = [f"covariances[{i}]" for i in range(STATE_COUNT - 4 + attitude)]
-    raw = topics.primary_samples(
+    samples = topics.primary_samples(
         Layout(topic, {name: name for name in states + variances})
     ).dropna()
-    raw = raw[(raw[variances] >= 0.0).all(axis=1)]
-    state = raw[states].to_numpy(copy=True)
-    variance = raw[variances].to_numpy(copy=True)
+    samples = samples[(samples[variances] >= 0.0).all(axis=1)]
+    state = samples[states].to_numpy(copy=True)
+    variance = samples[variances].to_numpy(copy=True)
     if attitude == px4.QUATERNION_FILTER:
         state[:, 10:16] /= step_s
         variance = np.hstack([_attitude_variance(state[:, :4], variance[:, :4]), variance[:, 4:]])
         variance[:, 9:15] /= step_s**2
     columns = Columns.DELAYED_STATE + Columns.DELAYED_VARIANCE
-    return pd.DataFrame(np.hstack([state, variance]), index=raw.index, columns=columns)
+    return pd.DataFrame(np.hstack([state, variance]), index=samples.index, columns=columns)
 
 
-def _variance(delayed: TableOrUnavailable) -> TableOrUnavailable:
-    if isinstance(delayed, Unavailable):
-        return delayed
-    variance = delayed[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
+def _delayed_variance(delayed_state: TableOrUnavailable) -> TableOrUnavailable:
+    if isinstance(delayed_state, Unavailable):
+        return delayed_state
+    variance = delayed_state[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
     variance = variance[(variance > 0.0).all(axis=1)]
     return variance if len(variance) else VARIANCES_NOT_LOGGED
 
@@ -239,12 +239,12 @@ def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -
     return samples
 
 
-def _accelerometer_bias(topics: Topics, delayed: TableOrUnavailable) -> TableOrUnavailable:
+def _accelerometer_bias(topics: Topics, delayed_state: TableOrUnavailable) -> TableOrUnavailable:
     if len(bias := topics.primary_samples(px4.LAYOUTS["sensor_bias"]).dropna()):
         return bias
-    if isinstance(delayed, Unavailable) or delayed.empty:
+    if isinstance(delayed_state, Unavailable) or delayed_state.empty:
         return flight.BIAS_NOT_LOGGED
-    return delayed[Columns.ACCELEROMETER_BIAS].set_axis(Columns.SPECIFIC_FORCE, axis=1)
+    return delayed_state[Columns.ACCELEROMETER_BIAS].set_axis(Columns.SPECIFIC_FORCE, axis=1)
 
 
 def _horizon_s(topics: Topics, step_s: float) -> float | Unavailable:
@@ -270,67 +270,72 @@ def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
     return pd.Series(dtype=np.float64)
 
 
-def _read_states(topics: Topics, local: pd.DataFrame, enabled: StepFunctions) -> StepFunctions:
+def _read_states(
+    topics: Topics, local_samples: pd.DataFrame, enabled_aids: StepFunctions
+) -> StepFunctions:
     """Read the step functions of :attr:`Ekf2.states`."""
     checks = topics.primary_samples(px4.LAYOUTS["gnss_checks"], step=True)["failed"].dropna()
-    validity = {name: local[name] for name in ("xy_valid", "xy_global") if name in local}
-    return {**enabled, **validity, **({"failed_checks": checks} if len(checks) else {})}
+    validity = {
+        name: local_samples[name] for name in ("xy_valid", "xy_global") if name in local_samples
+    }
+    return {**enabled_aids, **validity, **({"failed_checks": checks} if len(checks) else {})}
 
 
-def _read_fusing(topics: Topics, enabled: StepFunctions) -> TableOrUnavailable:
+def _read_fusing(topics: Topics, enabled_aids: StepFunctions) -> TableOrUnavailable:
     """Read the fusion flags of external vision: horizontal and vertical position, and yaw."""
     vision = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
-    if not {*vision.values()} <= enabled.keys():
+    if not {*vision.values()} <= enabled_aids.keys():
         return Unavailable(
             "EKF2 fusion flags",
             "estimator_status_flags and estimator_status are not logged",
             px4.DEFAULT_PROFILE,
         )
-    flags = pd.DataFrame({group: enabled[aid] for group, aid in vision.items()}).dropna()
-    topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS
+    flags = pd.DataFrame({group: enabled_aids[aid] for group, aid in vision.items()}).dropna()
+    topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS_TOPIC
     if flags.empty:
         return Unavailable("EKF2 fusion flags", f"{topic} has no usable sample", "Record again.")
     topics.record_stream("ekf2_fusing", topic)
     return flags
 
 
-def read_resets(local: pd.DataFrame) -> tuple[Reset, ...]:
+def read_resets(local_samples: pd.DataFrame) -> tuple[Reset, ...]:
     """Read the resets of the published state from its counters (uint8, wrapping) and deltas."""
     resets = []
     for quantity, counter, deltas in _RESET_FIELDS:
-        if counter not in local:
+        if counter not in local_samples:
             continue
-        for row in (np.flatnonzero(np.diff(local[counter].to_numpy()) != 0) + 1).tolist():
+        for row in (np.flatnonzero(np.diff(local_samples[counter].to_numpy()) != 0) + 1).tolist():
             north, east, down = (
-                float(local[name].iloc[row]) if name in local else 0.0 for name in deltas
+                float(local_samples[name].iloc[row]) if name in local_samples else 0.0
+                for name in deltas
             )
             if all(np.isfinite([north, east, down])):
-                resets.append(Reset(float(local.index[row]), quantity, (north, east, down)))
+                resets.append(Reset(float(local_samples.index[row]), quantity, (north, east, down)))
     return tuple(sorted(resets, key=lambda reset: reset.time_s))
 
 
 def _read_record(
     topics: Topics,
-    delayed: TableOrUnavailable,
-    local: pd.DataFrame,
-    enabled: StepFunctions,
+    delayed_state: TableOrUnavailable,
+    local_samples: pd.DataFrame,
+    enabled_aids: StepFunctions,
     step_s: float,
 ) -> FusionRecord | Unavailable:
-    """Read the data for a replay of EKF2; ``local`` is the published local position."""
+    """Read the data for a replay of EKF2; ``local_samples``: published local position."""
     topic, attitude = _state_vector(topics)
-    if topic != px4.ESTIMATOR_STATES[0] or isinstance(delayed, Unavailable):
+    if topic != px4.ESTIMATOR_STATES[0] or isinstance(delayed_state, Unavailable):
         return flight.RECORD_NOT_LOGGED
-    norm = np.linalg.norm(delayed[Columns.QUATERNION], axis=1)
-    usable_state = delayed[np.abs(norm - 1.0) < 0.01].copy()
+    norm = np.linalg.norm(delayed_state[Columns.QUATERNION], axis=1)
+    usable_state = delayed_state[np.abs(norm - 1.0) < 0.01].copy()
     if usable_state.empty:
         return flight.RECORD_NOT_LOGGED
-    horizontal = Columns.POSITION[:2]
+    horizontal_columns = Columns.POSITION[:2]
     altitude_m = 0.0
     # Since v1.16 EKF2 stores latitude and longitude, which are logged as zero. Once EKF2 has an
     # origin, the height is altitude above sea level (ekf_helper.cpp)
-    if not usable_state[horizontal].to_numpy().any():
-        usable_state[horizontal] = np.nan
-        altitude_m = _last_finite(local, "ref_alt", 0.0)
+    if not usable_state[horizontal_columns].to_numpy().any():
+        usable_state[horizontal_columns] = np.nan
+        altitude_m = _last_finite_value(local_samples, "ref_alt", 0.0)
         usable_state["down_m"] += altitude_m
     age_s = _publication_age_s(topics, VISION_TOPIC).sort_index()
     return FusionRecord(
@@ -340,14 +345,14 @@ def _read_record(
         other_aiding=tuple(
             AIDS[name].label.replace("external vision,", "vision")
             for name in OTHER_HORIZONTAL_AIDS
-            if name in enabled and enabled[name].any()
+            if name in enabled_aids and enabled_aids[name].any()
         ),
         vision_age_s=age_s[~age_s.index.duplicated()],
         field_gauss=_read_field(topics, step_s),
-        flow=_read_flow(topics, enabled),
-        latitude_deg=_last_finite(local, "ref_lat", np.nan),
+        flow=_read_flow(topics, enabled_aids),
+        latitude_deg=_last_finite_value(local_samples, "ref_lat", np.nan),
         altitude_m=altitude_m,
-        states={name: enabled[name] for name in DISTURBANCES if name in enabled},
+        states={name: enabled_aids[name] for name in DISTURBANCES if name in enabled_aids},
         height_bias={
             name: topics.primary_samples(layout).dropna()
             for name, layout in px4.HEIGHT_BIAS.items()
@@ -356,8 +361,8 @@ def _read_record(
     )
 
 
-def _last_finite(frame: pd.DataFrame, column: str, default: float) -> float:
-    finite_values = frame[column].dropna().to_numpy() if column in frame else np.zeros(0)
+def _last_finite_value(samples: pd.DataFrame, column: str, default: float) -> float:
+    finite_values = samples[column].dropna().to_numpy() if column in samples else np.zeros(0)
     return float(finite_values[-1]) if len(finite_values) else default
 
 
@@ -370,7 +375,7 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
     candidates = []
     for topic, name in px4.MAGNETOMETER:
         measured_columns = expand_columns({"forward_gauss right_gauss down_gauss": f"{name}[]"})
-        frame = topics.primary_samples(
+        field_samples = topics.primary_samples(
             Layout(
                 topic,
                 measured_columns,
@@ -379,8 +384,8 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
         ).dropna()
         if name == "observation":  # EKF2 subtracts delay and half a step from measurement times
             delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3
-            frame = frame.set_axis(frame.index + delay_s + 0.5 * step_s)
-        candidates.append(frame)
+            field_samples = field_samples.set_axis(field_samples.index + delay_s + 0.5 * step_s)
+        candidates.append(field_samples)
     complete = [
         field for field in candidates if len(field) > MIN_COMPLETE_FIELD_HZ * topics.log.duration_s
     ]
@@ -393,7 +398,7 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
     return field.assign(fused_3d=(flags >> MAG_3D_BIT & 1).astype(float))
 
 
-def _read_flow(topics: Topics, enabled: StepFunctions) -> pd.DataFrame:
+def _read_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
     """Compute the mean flow velocity between consecutive rows of EKF2's low-pass filtered flow."""
     velocity, interval, noise = (
         topics.primary_samples(px4.LAYOUTS[f"flow_{quantity}"]).dropna()
@@ -410,8 +415,8 @@ def _read_flow(topics: Topics, enabled: StepFunctions) -> pd.DataFrame:
         )
         + 1
     )
-    if FLOW.name in enabled:
-        rows = rows[step_values_at(enabled[FLOW.name], times[rows]) > 0.0]
+    if FLOW.name in enabled_aids:
+        rows = rows[step_values_at(enabled_aids[FLOW.name], times[rows]) > 0.0]
     sample_count = np.rint((times[rows] - times[rows - 1]) / interval_s)
     filter_memory = ((1.0 - flight.FLOW_FILTER_WEIGHT) ** sample_count)[:, None]
     low_passed = velocity[["forward_m_s", "right_m_s"]].to_numpy()

@@ -16,7 +16,7 @@ MAX_SAME_FIX_S = 0.01
 # difference shows that the observation is in m
 MAX_LATITUDE_DISTANCE_DEG = 1.0
 # Possible intervals (s) of a GNSS receiver: receivers send 4 to 20 fixes per second
-PERIODS_S = np.arange(0.05, 0.26, 0.0005)
+FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
 # Maximum deviation (s) of a logged interval from a multiple of the receiver's interval: half of an
 # EKF2 prediction interval, plus clock jitter
 MAX_GRID_ERROR_S = 0.006
@@ -155,15 +155,19 @@ def _interval_s(times: Array) -> float | None:
     multiple is then unknown.
     """
     gaps = np.diff(times)[:, None]
-    grid_error_s = np.abs(gaps / PERIODS_S - np.round(gaps / PERIODS_S)) * PERIODS_S
+    grid_error_s = (
+        np.abs(gaps / FIX_INTERVALS_S - np.round(gaps / FIX_INTERVALS_S)) * FIX_INTERVALS_S
+    )
     worst_error_s = np.percentile(grid_error_s, 98, axis=0)
     fitting_periods = np.flatnonzero(worst_error_s <= MAX_GRID_ERROR_S)
     if not len(fitting_periods):
         return None
-    longest_period_s = PERIODS_S[fitting_periods[-1]]
+    longest_period_s = FIX_INTERVALS_S[fitting_periods[-1]]
     # Use the interval with the smallest error within 10 % of the longest possible interval
-    near_periods = np.flatnonzero(np.abs(PERIODS_S - longest_period_s) < 0.1 * longest_period_s)
-    best_period_s = PERIODS_S[near_periods[np.argmin(worst_error_s[near_periods])]]
+    near_periods = np.flatnonzero(
+        np.abs(FIX_INTERVALS_S - longest_period_s) < 0.1 * longest_period_s
+    )
+    best_period_s = FIX_INTERVALS_S[near_periods[np.argmin(worst_error_s[near_periods])]]
     interval_multiples = np.round(gaps[:, 0] / best_period_s)
     is_frequent = np.bincount(interval_multiples.astype(int)) >= MIN_REPEATED_INTERVALS
     if not np.any(is_frequent[1:] & is_frequent[:-1]):

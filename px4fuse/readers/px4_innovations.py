@@ -58,24 +58,26 @@ def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
         for group, name in (("horizontal", source.horizontal), ("vertical", source.vertical))
         if name in ekf2.states
     }
-    fusing: TableOrUnavailable = Unavailable(
+    fusion_flags: TableOrUnavailable = Unavailable(
         "EKF2 fusion flags", "the log does not contain the fusion flags of GNSS", GNSS.to_log
     )
     if enabled:
         columns = ["horizontal", "vertical", "yaw"]
-        fusing = pd.DataFrame(enabled).ffill().bfill().reindex(columns=columns, fill_value=0.0)
+        fusion_flags = (
+            pd.DataFrame(enabled).ffill().bfill().reindex(columns=columns, fill_value=0.0)
+        )
     log = ekf2.aids.get("gnss_pos")
     parameters = {} if log is None else log.parameters
     gate = parameters.get(GNSS_POS.gate, GNSS_POS.default_gate)
-    innovations, topics = innovations_by_axis(ekf2.aids, fusing, gate, source)
+    innovations, topics = innovations_by_axis(ekf2.aids, fusion_flags, gate, source)
     return replace(
-        ekf2, innovations=innovations, innovation_topics=topics, fusing=fusing, gate=gate
+        ekf2, innovations=innovations, innovation_topics=topics, fusing=fusion_flags, gate=gate
     )
 
 
 def innovations_by_axis(
     aids: Mapping[str, AidLog],
-    fusing: TableOrUnavailable,
+    fusion_flags: TableOrUnavailable,
     gate: float,
     source: Ekf2Source = VISION,
 ) -> tuple[Innovations, tuple[str, ...]]:
@@ -84,7 +86,7 @@ def innovations_by_axis(
     Parameters
     ----------
     aids : mapping from PX4 name to AidLog
-    fusing : DataFrame or Unavailable
+    fusion_flags : DataFrame or Unavailable
         Fusion flags, see :class:`~px4fuse.flight.Ekf2`.
     gate : float
         Innovation gate (√S), used to compute rejections if they are not logged.
@@ -97,7 +99,7 @@ def innovations_by_axis(
         sensor = (axis == "down" and source.height) or source.name
         log = aids.get(source.vertical if axis == "down" else source.horizontal)
         axis_innovations = None if log is None else innovations_along(log, axis, gate)
-        if isinstance(fusing, pd.DataFrame) and not fusing[group].any():
+        if isinstance(fusion_flags, pd.DataFrame) and not fusion_flags[group].any():
             quantity = "height" if axis == "down" else "horizontal position"
             reason = f"EKF2 never fused {sensor} for {quantity} in this log"
             remedy = source.remedies[group]
@@ -126,7 +128,7 @@ def innovations_along(log: AidLog, axis: AxisName, gate: float) -> pd.DataFrame:
         name: samples[f"innovation_{name}"] ** 2 / samples[f"variance_{name}"] for name in log.axes
     }
     is_beyond_gate = pd.DataFrame(nis).max(axis=1) > gate**2
-    frame = pd.DataFrame(
+    innovations = pd.DataFrame(
         {
             "innovation_m": samples[f"innovation_{axis}"],
             "innovation_variance_m2": samples[f"variance_{axis}"],
@@ -136,4 +138,6 @@ def innovations_along(log: AidLog, axis: AxisName, gate: float) -> pd.DataFrame:
             "rejected": samples.get("rejected", is_beyond_gate.astype(float)),
         }
     )
-    return frame[(frame["fused"] > 0.0) | (frame["rejected"] > 0.0) | frame["fused"].isna()]
+    return innovations[
+        (innovations["fused"] > 0.0) | (innovations["rejected"] > 0.0) | innovations["fused"].isna()
+    ]

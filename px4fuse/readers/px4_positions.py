@@ -67,20 +67,20 @@ def read_positions(
     topics: Topics, ekf2: Ekf2 | Unavailable
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Read all external position tracks, best first, and the reasons for missing tracks."""
-    fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
+    fusion_flags = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
     # EKF2's position observations contain no orientation; if EKF2 also fused the source's yaw, the
     # source is odometry
-    turns = isinstance(fusing, pd.DataFrame) and bool((fusing["yaw"] > 0).any())
+    turns = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
     tracks_and_missing = [
-        *(_read_logged(topics, name) for name in px4.LOGGED),
+        *(_read_logged(topics, name) for name in px4.SOURCE_TRACKS),
         _read_ev_pos_aid(topics, turns),
         _reconstruct(topics, ekf2, turns),
         _read_gps(topics, ekf2),
     ]
-    missing = tuple(track for track in tracks_and_missing if isinstance(track, Unavailable))
+    missing_tracks = tuple(track for track in tracks_and_missing if isinstance(track, Unavailable))
     return sort_by_preference(
         track for track in tracks_and_missing if isinstance(track, PositionTrack)
-    ), missing
+    ), missing_tracks
 
 
 def unavailable(name: str, reason: str, remedy: str = "") -> Unavailable:
@@ -169,7 +169,7 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
         return unavailable(name, f"{name} is not logged")
     # Topics of EKF2 have one topic instance per EKF2 instance
     is_ekf2 = layout.topic.startswith("estimator_")
-    samples = topics.primary_samples(layout) if is_ekf2 else topics.frame(layout)
+    samples = topics.primary_samples(layout) if is_ekf2 else topics.read_instance(layout)
     frame = "unknown"
     for field, names in px4.FRAMES.items():
         if field in samples and len(samples):
@@ -364,11 +364,11 @@ def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[
 
 def _local_origin(topics: Topics) -> GeodeticPosition | None:
     """Return EKF2's origin: latitude, longitude (degrees), altitude (m); None without an origin."""
-    local = topics.read(px4.LOCAL_POSITION)
+    local_samples = topics.read(px4.LOCAL_POSITION)
     columns = ["ref_lat", "ref_lon", "ref_alt"]
-    if not {*columns} <= {*local}:
+    if not {*columns} <= {*local_samples}:
         return None
-    origin = finite_rows(local[columns], columns)
+    origin = finite_rows(local_samples[columns], columns)
     origin = origin[origin["ref_lat"] != 0]
     if origin.empty:
         return None
@@ -397,7 +397,7 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
     layout = topics.find(*px4.layouts_of_track(px4.GPS_POSITION))
     if layout is None:
         return unavailable(px4.GPS_POSITION, f"{px4.GPS_POSITION} is not logged")
-    gps = topics.frame(layout)
+    gps = topics.read_instance(layout)
     if "fix_type" in gps:
         gps = gps[gps["fix_type"] >= GPS_3D_FIX]
     if gps.empty:
@@ -490,12 +490,14 @@ def read_truth(
     """
     attitude = read_attitude(topics.read(px4.LAYOUTS["truth_attitude"]))
     logged_local = topics.read(px4.LAYOUTS["truth_local"])
-    local = finite_rows(logged_local, logged_local.columns.tolist())
+    local_samples = finite_rows(logged_local, logged_local.columns.tolist())
     global_positions = finite_rows(topics.read(px4.LAYOUTS["truth_global"]), GLOBAL_COLUMNS[:2])
-    if len(local):
+    if len(local_samples):
         if len(global_positions) and fused_aid(ekf2):
-            local = _move_to_origin(local, project_to_ned(global_positions, _local_origin(topics)))
-        return Truth(px4.LAYOUTS["truth_local"].topic, local, attitude)
+            local_samples = _move_to_origin(
+                local_samples, project_to_ned(global_positions, _local_origin(topics))
+            )
+        return Truth(px4.LAYOUTS["truth_local"].topic, local_samples, attitude)
     if len(global_positions):
         samples = project_to_ned(global_positions, _local_origin(topics)).join(
             global_positions.reindex(columns=Columns.VELOCITY)
@@ -515,12 +517,16 @@ def read_truth(
     )
 
 
-def _move_to_origin(local: pd.DataFrame, global_samples: pd.DataFrame) -> pd.DataFrame:
+def _move_to_origin(local_samples: pd.DataFrame, global_samples: pd.DataFrame) -> pd.DataFrame:
     """Shift local positions to the origin of ``global_samples`` by the median difference."""
-    moved_samples = local.copy()
+    moved_samples = local_samples.copy()
     for column in Columns.POSITION:
         local_at_global = np.interp(
-            global_samples.index, local.index, local[column], left=np.nan, right=np.nan
+            global_samples.index,
+            local_samples.index,
+            local_samples[column],
+            left=np.nan,
+            right=np.nan,
         )
         shift = (global_samples[column] - local_at_global).median()
         moved_samples[column] += shift if np.isfinite(shift) else 0.0

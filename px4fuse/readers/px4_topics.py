@@ -43,7 +43,7 @@ LAYOUTS = expand_layouts(_TABLE["layouts"])
 TRACKS = msgspec.convert(_TABLE["tracks"], dict[str, TrackSource])
 FRAMES = msgspec.convert(_TABLE["frames"], dict[str, dict[int, str]], strict=False)
 NAV_STATES = msgspec.convert(_TABLE["nav_states"], dict[int, str], strict=False)
-UNUSED: Mapping[str, str] = _TABLE["unused"]
+UNUSED_TOPICS: Mapping[str, str] = _TABLE["unused"]
 IMU, LOCAL_POSITION = LAYOUTS["imu"], LAYOUTS["local_position"]
 HEIGHT_BIAS = {name: LAYOUTS[f"bias_of_{name}"] for name in ("baro_hgt", "gnss_hgt")}
 # Action for topics that the default logging profile contains
@@ -71,13 +71,13 @@ FUSED_OBSERVATION = "estimator_aid_src_ev_pos"
 RECONSTRUCTION = "ekf2_state_plus_innovation"
 GPS_POSITION = "vehicle_gps_position"
 # Tracks of external vision and motion capture that have a separate topic
-LOGGED = [name for name, track in TRACKS.items() if track.layouts and name != GPS_POSITION]
+SOURCE_TRACKS = [name for name, track in TRACKS.items() if track.layouts and name != GPS_POSITION]
 TOPIC_ORIGINS = {name: track.origin for name, track in TRACKS.items()}
 # Aids with a flag "fused" that is always set in v1.15 and v1.16; the control bit is used instead
 FLAG_ALWAYS_SET = ("gravity", "drag")
 # Aids that log a local position as observation (the GNSS observation is latitude and longitude)
 WITH_OBSERVATION = ("ev_pos", "ev_hgt")
-STATUS_FLAGS, STATUS = "estimator_status_flags", "estimator_status"
+STATUS_FLAGS, STATUS_TOPIC = "estimator_status_flags", "estimator_status"
 # Topics with the innovations, and with the innovation variances, of all aids; before v1.12 one
 # topic contains both
 INNOVATIONS = "estimator_innovations", "estimator_innovation_variances"
@@ -100,5 +100,5 @@ def topics() -> list[str]:
     named_topics |= {f"estimator_aid_src_{name}" for name in AIDS}
     aid_topics = {STATUS_FLAGS, *INNOVATIONS, OLD_INNOVATIONS}
     return sorted(
-        named_topics | UNUSED.keys() | aid_topics | {*ESTIMATOR_STATES, MAGNETOMETER[0][0]}
+        named_topics | UNUSED_TOPICS.keys() | aid_topics | {*ESTIMATOR_STATES, MAGNETOMETER[0][0]}
     )

@@ -17,8 +17,8 @@ UNIX_START_S, UNIX_END_S = 946_684_800.0, 4_102_444_800.0
 # Number of characters at the beginning of a file that are searched for control characters: a file
 # with a control character there, or with a NUL anywhere, is binary
 _CHECKED_CHARS = 100_000
-_UTF_16 = (b"\xff\xfe", b"\xfe\xff")  # byte order marks, written by Windows shells
-_CONTROL = re.compile("[\x00-\x08\x0e-\x1b]")
+_UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")  # byte order marks, written by Windows shells
+_CONTROL_CHARACTER = re.compile("[\x00-\x08\x0e-\x1b]")
 _NUMBER = re.compile(
     r"[+-]?(?:(?:[0-9]+\.?|[0-9]*\.[0-9]+)(?:e[+-]?[0-9]+)?|nan|inf)", re.IGNORECASE
 )
@@ -29,7 +29,7 @@ def decode_text(content: bytes) -> str | None:
 
     The encoding is UTF-8, UTF-16 with byte order mark, or Latin-1 for all other bytes.
     """
-    if content.startswith(_UTF_16):
+    if content.startswith(_UTF_16_MARKS):
         text = content[: len(content) // 2 * 2].decode("utf-16", errors="replace")
     else:
         content = content.rstrip(b"\0\x1a")  # NUL at the end after a power loss, 0x1a from DOS
@@ -37,7 +37,7 @@ def decode_text(content: bytes) -> str | None:
             text = content.decode("utf-8-sig")
         except UnicodeDecodeError:
             text = content.decode("latin-1")
-    if "\0" in text or _CONTROL.search(text, 0, _CHECKED_CHARS):
+    if "\0" in text or _CONTROL_CHARACTER.search(text, 0, _CHECKED_CHARS):
         return None
     return text.replace("\r\n", "\n").replace("\r", "\n")
 

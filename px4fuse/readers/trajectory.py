@@ -250,12 +250,12 @@ def _convert_timestamps(rows: Rows, timestamps: list[str]) -> tuple[Array, str]:
         )
         return values, interval_note if median_interval >= MAX_USUAL_INTERVAL_S else ""
     for unit, units_per_second in UNITS_PER_SECOND.items():
-        first = float(values[0]) / units_per_second
-        last = float(np.abs(values).max()) / units_per_second
+        first_s = float(values[0]) / units_per_second
+        latest_s = float(np.abs(values).max()) / units_per_second
         # Times that are not UNIX time must be in nanoseconds, as ORB-SLAM3 writes them
         if (
-            (first >= UNIX_START_S or unit == "nanoseconds")
-            and last < UNIX_END_S
+            (first_s >= UNIX_START_S or unit == "nanoseconds")
+            and latest_s < UNIX_END_S
             and MIN_INTERVAL_S <= median_interval / units_per_second <= MAX_INTERVAL_S
         ):
             counts = np.array([int(Decimal(timestamp)) for timestamp in timestamps], dtype=np.int64)
@@ -325,8 +325,8 @@ def _detect_kind(
 def _detect_frame(kind: Kind, position: Array) -> tuple[Frame, str]:
     if kind != "slam":
         return "unknown", ""
-    centred = position - position.mean(axis=0)
-    eigenvalues, axes = np.linalg.eigh(centred.T @ centred)  # eigenvalues in ascending order
+    centred_m = position - position.mean(axis=0)
+    eigenvalues, axes = np.linalg.eigh(centred_m.T @ centred_m)  # eigenvalues in ascending order
     height, width, length = np.sqrt(np.maximum(eigenvalues, 0.0) / len(position))
     tilt = math.acos(min(1.0, abs(float(axes[1, 0]))))
     is_level = width > MIN_WIDTH_RATIO * length and height < MAX_THICKNESS_RATIO * width

@@ -80,7 +80,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
         streams=topics.streams,
         unused=tuple(
             UnusedData(name, len(table["timestamp"]), reason)
-            for name, reason in px4.UNUSED.items()
+            for name, reason in px4.UNUSED_TOPICS.items()
             for table in topics.of(name)[:1]
         ),
     )

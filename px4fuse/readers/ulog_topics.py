@@ -22,7 +22,7 @@ from pyulog import ULog
 from pyulog.exceptions import ULogException
 
 from px4fuse.arrays import IntArray
-from px4fuse.ekf2_parameters import PARAMETERS, REPORTED, replace_invalid_parameters
+from px4fuse.ekf2_parameters import PARAMETERS, REPORTED_PARAMETERS, replace_invalid_parameters
 from px4fuse.errors import LogError
 from px4fuse.flight import time_index
 from px4fuse.log import Dropout, LogInfo, Stream
@@ -92,12 +92,12 @@ class _Content(io.BytesIO):
     skipped_bytes = start = end = position = 0
 
     def read(self, size: int, /) -> bytes:  # type: ignore[override]  # pyulog gives a size
-        at = self.position
+        start = self.position
         if size == HEADER_BYTES:
-            if at != self.end:
-                self.skipped_bytes += at - self.start
-            self.start = at
-        self.end = self.position = at + size
+            if start != self.end:
+                self.skipped_bytes += start - self.start
+            self.start = start
+        self.end = self.position = start + size
         return io.BytesIO.read(self, size)
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
@@ -215,7 +215,9 @@ class Topics:
             return NO_SELECTOR
         changes = instances[instances.ne(instances.shift())]
         times = [-np.inf, *changes.index[1:]]
-        return tuple((float(at), int(number)) for at, number in zip(times, changes, strict=True))
+        return tuple(
+            (float(switch_s), int(number)) for switch_s, number in zip(times, changes, strict=True)
+        )
 
     def find(self, *layouts: Layout) -> Layout | None:
         """Return the first layout whose required fields are all in the log; None without one."""
@@ -224,8 +226,10 @@ class Topics:
                 return layout
         return None
 
-    def frame(self, layout: Layout, instance: int = 0, *, step: bool = False) -> pd.DataFrame:
-        """Read the fields of a layout as a DataFrame of float64, indexed by measurement time (s).
+    def read_instance(
+        self, layout: Layout, instance: int = 0, *, step: bool = False
+    ) -> pd.DataFrame:
+        """Read the fields of a topic instance as float64, indexed by measurement time (s).
 
         Parameters
         ----------
@@ -254,7 +258,7 @@ class Topics:
         if len(kept_rows) < len(time_us):
             self.dropped[layout.topic, instance] = len(time_us) - len(kept_rows)
         with np.errstate(invalid="ignore"):  # damaged bytes can be signalling NaNs
-            frame = pd.DataFrame(
+            samples = pd.DataFrame(
                 {
                     column: table[field_name][kept_rows].astype(np.float64)
                     * layout.scale.get(column, 1.0)
@@ -262,14 +266,18 @@ class Topics:
                 },
                 index=time_index((time_us[kept_rows] - self.zero_us) * _MICROSECOND),
             )
-        frame = frame.where(np.abs(frame) < MAX_FIELD_VALUE)  # damaged values become NaN
+        samples = samples.where(np.abs(samples) < MAX_FIELD_VALUE)  # damaged values become NaN
         end_s = self.log.duration_s + MAX_OUTSIDE_S
-        return frame if step else frame[(frame.index >= -MAX_OUTSIDE_S) & (frame.index <= end_s)]
+        return (
+            samples
+            if step
+            else samples[(samples.index >= -MAX_OUTSIDE_S) & (samples.index <= end_s)]
+        )
 
     def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
         """Read the first layout whose fields are in the log, see :meth:`frame`; else empty."""
         layout = self.find(*layouts)
-        return _empty_frame(layouts[0]) if layout is None else self.frame(layout, step=step)
+        return _empty_frame(layouts[0]) if layout is None else self.read_instance(layout, step=step)
 
     def primary_samples(
         self,
@@ -296,10 +304,12 @@ class Topics:
         switch_s, numbers = (np.array(values) for values in zip(*self.primary, strict=True))
         primary_frames: list[pd.DataFrame] = []
         for number in available[:1] if is_single else available:
-            frame = self.frame(layout, number, step=step)
-            frame = frame if select is None else select(frame)
-            at = np.searchsorted(switch_s, frame.index.to_numpy(), side="right") - 1
-            primary_frames.append(frame if is_single else frame[numbers[at] == number])
+            samples = self.read_instance(layout, number, step=step)
+            samples = samples if select is None else select(samples)
+            switch_index = np.searchsorted(switch_s, samples.index.to_numpy(), side="right") - 1
+            primary_frames.append(
+                samples if is_single else samples[numbers[switch_index] == number]
+            )
         joined_frames = pd.concat(primary_frames).sort_index()
         return joined_frames[~joined_frames.index.duplicated()]
 
@@ -422,17 +432,21 @@ def read_topics(name: str, content: bytes) -> Topics:
         sha256=hashlib.sha256(content).hexdigest(),
         bytes=size,
         format="ULog",
-        firmware=_firmware(ulog.msg_info_dict),
+        firmware=_firmware_text(ulog.msg_info_dict),
         firmware_hash=_printable_text(ulog.msg_info_dict, "ver_sw", "unknown"),
         hardware=_printable_text(ulog.msg_info_dict, "ver_hw", "unknown"),
         boot_time_s=zero_us * _MICROSECOND,
         duration_s=(end_us - zero_us) * _MICROSECOND,
         dropouts=tuple(
-            Dropout((d.timestamp - zero_us) * _MICROSECOND, d.duration * 1e-3)
-            for d in ulog.dropouts
+            Dropout((dropout.timestamp - zero_us) * _MICROSECOND, dropout.duration * 1e-3)
+            for dropout in ulog.dropouts
         ),
         parameters=MappingProxyType(
-            {name: parameter_values[name] for name in REPORTED if name in parameter_values}
+            {
+                name: parameter_values[name]
+                for name in REPORTED_PARAMETERS
+                if name in parameter_values
+            }
         ),
         parameter_defaults={
             name: value
@@ -496,7 +510,7 @@ def _printable_text(info: dict[str, Any], key: str, default: str) -> str:
     return "".join(c for c in str(info.get(key, default)) if c.isprintable()) or default
 
 
-def _firmware(info: dict[str, Any]) -> str:
+def _firmware_text(info: dict[str, Any]) -> str:
     release = info.get("ver_sw_release")
     if not isinstance(release, int):
         return "unknown"

@@ -16,20 +16,20 @@ from px4fuse.report.phrases import format_sigma_verdict, write_findings
 from px4fuse.text import format_number
 
 TITLE = "Aiding sources of EKF2"
-LEAD = (
+LEAD_TEXT = (
     "Each aiding source is tested with its innovations in flight: a mean NIS of 1 is expected. "
     "Time-correlated errors, wrong delays and wrong headings hardly change the NIS."
 )
 AID_PANEL_HEIGHT = 21.0  # height (points) of the axes of one aiding source
 MAX_NORMALISED = 4.0  # larger normalised innovations ν/√S are drawn at the edge of the axes
-MAX_DOTS = 400  # maximum number of drawn innovations per component of an aiding source
+MAX_DRAWN_INNOVATIONS = 400  # maximum number of drawn innovations per component of an aiding source
 # Aiding sources that add this page to a comparison, if EKF2 fused one of them
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the appendix on aiding sources if EKF2 fused a horizontal one besides vision."""
-    page = Page(appendix_title(TITLE), LEAD)
+    page = Page(appendix_title(TITLE), LEAD_TEXT)
     aid_results = write_aids_of_comparison(page, analysis)
     if aid_results:
         _draw_aid_panels(page, analysis.flight, aid_results)
@@ -51,7 +51,7 @@ def write_aids_of_comparison(page: Page, analysis: Analysis) -> Mapping[str, Aid
 
 def draw_aids_only(analysis: AidsOnlyAnalysis, _: object) -> Iterator[Page]:
     """Draw EKF2's aiding sources on the cover of a flight without a position source."""
-    page = Page(TITLE, LEAD)
+    page = Page(TITLE, LEAD_TEXT)
     write_aids(page, analysis.aids)
     _draw_aid_panels(page, analysis.flight, analysis.aids)
     yield page
@@ -70,7 +70,7 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
     for aid in aids.values():
         if aid.verdict == "disabled":
             continue
-        enabled = "" if aid.enabled_fraction is None else f"{aid.enabled_fraction:.0%}"
+        enabled_percent = "" if aid.enabled_fraction is None else f"{aid.enabled_fraction:.0%}"
         noise = "" if aid.noise is None else f"{format_number(aid.noise)} {aid.unit}"
         colour = style.GOOD_COLOUR if aid.verdict == "consistent" else style.MUTED_COLOUR
         if aid.is_faulty:
@@ -78,7 +78,7 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
         aid_cells: list[Cell] = [
             aid.label,
             (format_aid_verdict(aid), colour),
-            enabled,
+            enabled_percent,
             f"{aid.rejected_fraction:.1%}",
             f"{aid.longest_gap_duration_s:.1f}",
             noise,
@@ -113,7 +113,7 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
             "mean\nν/√S",
         ],
         rows,
-        right=(2, 3, 4, 5, 7, 8, 10),
+        right_aligned_columns=(2, 3, 4, 5, 7, 8, 10),
     )
     disabled_labels = [aid.label for aid in aids.values() if aid.verdict == "disabled"]
     if disabled_labels:
@@ -161,7 +161,7 @@ def _draw_aid_panel(
         for mask, dot_style in ((is_fused, style.EKF2_DOTS), (~is_fused, style.EKF2_REJECTED)):
             if mask.any():
                 dots = style.decimate_series(
-                    samples.index.to_numpy()[mask], clipped[mask], MAX_DOTS
+                    samples.index.to_numpy()[mask], clipped[mask], MAX_DRAWN_INNOVATIONS
                 )
                 axes.plot(*dots, **dot_style | {"ms": 1.4})
     for limit in (-2.0, 2.0):

@@ -11,12 +11,11 @@ from markupsafe import Markup
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card, describe_axis
-from px4fuse.card.model import AXIS_TICKS, BANDS, Action, Card, Rerun, Verdict
+from px4fuse.card.model import AXIS_TICKS, SIGMA_RATIO_BANDS, Action, Card, Rerun, Verdict
 from px4fuse.card.numbers import axis_fraction, format_ratio
 from px4fuse.card.verdicts import verdicts
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import Reference
-from px4fuse.findings import find
 from px4fuse.report.card_text import (
     FILTER_NAMES,
     LABELLED_TICKS,
@@ -31,7 +30,7 @@ from px4fuse.report.card_text import (
 )
 from px4fuse.webpage.safe import load_template, read_asset
 
-SIGNS = {
+SEVERITY_SIGNS = {
     "error": "■ ERROR",
     "warning": "▲ WARNING",
     "note": "● NOTE",
@@ -56,7 +55,7 @@ def card_of(analysis: Analysis) -> Card:
             "This analysis contains no request, so its command is unknown.",
             "Create it with px4fuse.compare.",
         )
-    card = build_card(analysis, find(analysis), analysis.request)
+    card = build_card(analysis, analysis.request)
     return with_typed_path(card, analysis.request.log)
 
 
@@ -95,7 +94,7 @@ def card_html(
             if cause is not card.causes[0] or not _is_prominent(row)
         ],
         rerun_rows=_rerun_rows,
-        signs=SIGNS,
+        signs=SEVERITY_SIGNS,
         target=format_target,
         format_spans=format_spans,
         rerun_start=rerun_start,
@@ -145,7 +144,9 @@ def band_limits() -> str:
     >>> band_limits()
     '● 0.8 to 1.25, ◆ 0.67 to 1.5'
     """
-    return ", ".join(f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in BANDS.items())
+    return ", ".join(
+        f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in SIGMA_RATIO_BANDS.items()
+    )
 
 
 def card_style() -> str:
@@ -193,13 +194,15 @@ def _drawing(verdict: Verdict) -> dict[str, Any]:
     """Return the SVG attributes of the band, the 95 % interval and the mark of a ratio."""
     if verdict.ratio is None:
         return {}
-    low, high = (axis_fraction(end) for end in BANDS[verdict.against])
+    low, high = (axis_fraction(end) for end in SIGMA_RATIO_BANDS[verdict.against])
     marks = []
     if verdict.interval is not None:
-        first, last = (_percent(max(end, 1e-9)) for end in verdict.interval)
-        marks.append(f'x1="{first}%" x2="{last}%" y1="10" y2="10"')
+        left_percent, right_percent = (_percent(max(end, 1e-9)) for end in verdict.interval)
+        marks.append(f'x1="{left_percent}%" x2="{right_percent}%" y1="10" y2="10"')
         top, bottom = 10 - HALF_HEIGHT, 10 + HALF_HEIGHT
-        marks += [f'x1="{x}%" x2="{x}%" y1="{top}" y2="{bottom}"' for x in (first, last)]
+        marks += [
+            f'x1="{x}%" x2="{x}%" y1="{top}" y2="{bottom}"' for x in (left_percent, right_percent)
+        ]
     return {
         "band": Markup(
             f'x="{100.0 * low:.2f}%" width="{100.0 * (high - low):.2f}%" y="1" height="18"'
@@ -210,6 +213,6 @@ def _drawing(verdict: Verdict) -> dict[str, Any]:
     }
 
 
-def _shape(ratio: float, against: Reference) -> str:
+def _shape(ratio: float, reference: Reference) -> str:
     fraction = axis_fraction(ratio)
-    return against if 0.0 <= fraction <= 1.0 else "above" if fraction > 1.0 else "below"
+    return reference if 0.0 <= fraction <= 1.0 else "above" if fraction > 1.0 else "below"

@@ -13,8 +13,8 @@ from msgspec.structs import replace
 
 from px4fuse.card.model import (
     AXIS_TICKS,
-    BANDS,
     MAX_NOTES,
+    SIGMA_RATIO_BANDS,
     Action,
     AidRow,
     Card,
@@ -26,7 +26,7 @@ from px4fuse.card.numbers import axis_fraction, format_metres, format_ratio
 from px4fuse.filter.consistency import Reference
 from px4fuse.request import quote_command
 
-WIDTH = 100
+CARD_WIDTH = 100
 AXIS_WIDTH = 37
 # Number of columns before the axis of ratios, and before the text beside a label
 AXIS_INDENT, TEXT_INDENT = 58, 11
@@ -41,14 +41,14 @@ FILTER_NAMES = {"kf": "KF", "ekf2": "EKF2"}
 SEVERITY_LABELS = {"clean": "ok", "note": "note"}
 STYLES = {"error": "bold red", "warning": "bold yellow", "note": "cyan", "clean": "bold green"}
 # Replacements of characters for terminals whose encoding lacks them
-ASCII = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/--23x") | str.maketrans(
+ASCII_REPLACEMENTS = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/--23x") | str.maketrans(
     {"√": "sqrt ", "σ": "sigma", "→": "->", "°": " deg", "±": "+-", "ν": "nu", "…": "..."}
 )
 AIDS_HEADING = (
     "Innovation ÷ √S of the aiding sources that EKF2 fused. Below 1: √S is larger than needed. For "
     "barometer, magnetometer and gravity that is usual and not a fault."
 )
-CONSOLE = "Console: MAVLink Console of QGroundControl."
+CONSOLE_NOTE = "Console means the MAVLink Console of QGroundControl."
 
 
 class Line(NamedTuple):
@@ -90,29 +90,31 @@ def card_lines(card: Card) -> Iterator[Line]:
     if card.severity == "refused":
         yield Line(f"error[{card.id}]: {card.headline}", STYLES["error"])
         for label, text in card.facts.items():
-            yield from _labelled(label, text)
+            yield from _labelled_lines(label, text)
         yield Line("Nothing was written. Exit code 2.")
         return
-    yield from _identity(card)
-    yield from _headline(card)
+    yield from _identity_line(card)
+    yield from _headline_lines(card)
     for number, cause in enumerate(card.causes, start=1):
         if number > 1:
             title = f"{cause.severity}[{cause.id}]: {cause.title}"
             yield Line(title, STYLES[cause.severity])
-        yield from _labelled(f"cause {number}" if len(card.causes) > 1 else "cause", cause.why)
-        yield from _cause(cause)
+        yield from _labelled_lines(
+            f"cause {number}" if len(card.causes) > 1 else "cause", cause.why
+        )
+        yield from _cause_lines(cause)
     if card.more_causes:
-        yield Line(f"and {card.more_causes} more causes: -v")
+        yield Line(f"{card.more_causes} more causes are listed with -v")
     for label, text in card.facts.items():
-        yield from _labelled(label, text)
+        yield from _labelled_lines(label, text)
     yield from _verdict_axis(card)
     yield from _aid_axis(card.aids)
     for text in (card.reconcile, card.difference):
-        yield from _wrapped(text, "  ", "  ")
+        yield from _wrapped_lines(text, "  ", "  ")
     if card.notes:
         yield Line("")
-    for text in note_texts(card, "-v"):
-        yield from _wrapped(text, "", "  ")
+    for text in note_texts(card, "with -v"):
+        yield from _wrapped_lines(text, "", "  ")
 
 
 def note_texts(card: Card, place: str) -> list[str]:
@@ -121,16 +123,16 @@ def note_texts(card: Card, place: str) -> list[str]:
         " ".join(filter(None, (f"note[{note.id}]: {note.text}", note.action)))
         for note in card.notes[:MAX_NOTES]
     ]
-    more = len(card.notes) - MAX_NOTES
-    return texts + ([f"and {more} more notes: {place}"] if more > 0 else [])
+    omitted_count = len(card.notes) - MAX_NOTES
+    return texts + ([f"{omitted_count} more notes are listed {place}"] if omitted_count > 0 else [])
 
 
 def closing_lines(card: Card) -> Iterator[Line]:
     """Yield the last lines of a card: where to read more, and what the console of a command is."""
     has_console = any(action.where == "console" for action in _all_actions(card))
-    sentences = ["More: -v.", *([CONSOLE] if has_console else [])]
+    sentences = ["More: -v.", *([CONSOLE_NOTE] if has_console else [])]
     sentences += [f"Meaning: px4fuse explain {card.id}"] if card.id else []
-    yield from _wrapped(" ".join(sentences), "", "")
+    yield from _wrapped_lines(" ".join(sentences), "", "")
 
 
 def with_typed_path(card: Card, path: str | None) -> Card:
@@ -165,7 +167,7 @@ def with_typed_path(card: Card, path: str | None) -> Card:
         replace(
             cause,
             actions=tuple(map(typed, cause.actions)),
-            alternatives=tuple(tuple(map(typed, each)) for each in cause.alternatives),
+            alternatives=tuple(tuple(map(typed, group)) for group in cause.alternatives),
         )
         for cause in card.causes
     )
@@ -178,15 +180,15 @@ def with_typed_path(card: Card, path: str | None) -> Card:
 
 
 def to_ascii(text: str) -> str:
-    """Replace the characters of :data:`ASCII`, for terminals that cannot print them.
+    """Replace the characters of :data:`ASCII_REPLACEMENTS`, for terminals that cannot print them.
 
     >>> to_ascii("error ÷ σ 7.2 → 1.2")
     'error / sigma 7.2 -> 1.2'
     """
-    return text.translate(ASCII)
+    return text.translate(ASCII_REPLACEMENTS)
 
 
-def axis_text(ratio: float | None, against: Reference) -> str:
+def axis_text(ratio: float | None, reference: Reference) -> str:
     """Draw one ratio on the logarithmic axis with the band of consistent ratios.
 
     >>> axis_text(0.93, "source")
@@ -194,12 +196,12 @@ def axis_text(ratio: float | None, against: Reference) -> str:
     >>> axis_text(128.0, "truth")
     '───────────────░░░░░░░──────────────▶'
     """
-    low, high = (_column(end) for end in BANDS[against])
+    low, high = (_column(end) for end in SIGMA_RATIO_BANDS[reference])
     characters = ["░" if low <= column <= high else "─" for column in range(AXIS_WIDTH)]
     if ratio is not None:
         column = _column(ratio)
-        inside = 0 <= column < AXIS_WIDTH
-        mark = MARKS[against] if inside else "▶" if column > 0 else "◀"
+        is_inside = 0 <= column < AXIS_WIDTH
+        mark = MARKS[reference] if is_inside else "▶" if column > 0 else "◀"
         characters[min(max(column, 0), AXIS_WIDTH - 1)] = mark
     return "".join(characters)
 
@@ -208,16 +210,16 @@ def _column(ratio: float) -> int:
     return round(axis_fraction(ratio) * (AXIS_WIDTH - 1))
 
 
-def _identity(card: Card) -> Iterator[Line]:
+def _identity_line(card: Card) -> Iterator[Line]:
     identity = card.identity
     flight = f"{identity.firmware}, {identity.duration_s:.1f} s, {identity.source}"
     student = ", ".join(filter(None, (identity.student, identity.student_id)))
     yield Line(f"{identity.file}  {flight}{f'  {student}' if student else ''}")
     if identity.settings:
-        yield from _wrapped(f"KF: {identity.settings}", "  ", "      ")
-    changed = (*identity.changed, *identity.parameters)
-    if changed:
-        yield from _wrapped(f"changed: {'; '.join(changed)}", "  ", "           ")
+        yield from _wrapped_lines(f"KF: {identity.settings}", "  ", "      ")
+    changed_options = (*identity.changed, *identity.parameters)
+    if changed_options:
+        yield from _wrapped_lines(f"changed: {'; '.join(changed_options)}", "  ", "           ")
     yield Line("")
 
 
@@ -228,22 +230,22 @@ def headline(card: Card) -> Iterator[Line]:
     yield Line(f"{name}: {card.headline}", STYLES[card.severity])
 
 
-def _headline(card: Card) -> Iterator[Line]:
+def _headline_lines(card: Card) -> Iterator[Line]:
     yield from headline(card)
-    yield from _labelled("effect", card.effect_text)
+    yield from _labelled_lines("effect", card.effect_text)
     for place, text in enumerate(card.do_this):
-        yield from _labelled("" if place else "do this", text)
+        yield from _labelled_lines("" if place else "do this", text)
 
 
-def _cause(cause: Cause) -> Iterator[Line]:
-    yield from _labelled("when", format_spans(cause))
+def _cause_lines(cause: Cause) -> Iterator[Line]:
+    yield from _labelled_lines("when", format_spans(cause))
     rows = marked_actions(cause)
     labels = [f"{mark}{format_target(action)}" for mark, action in rows]
     width = max(map(len, labels), default=0) + 2
     for label, (_, action) in zip(labels, rows, strict=True):
-        yield from _action(label, width, action)
+        yield from _action_lines(label, width, action)
     yield from _rerun_table(cause.reruns)
-    yield from _wrapped(cause.after, "  ", "  ")
+    yield from _wrapped_lines(cause.after, "  ", "  ")
 
 
 def marked_actions(cause: Cause) -> list[tuple[str, Action]]:
@@ -261,19 +263,19 @@ def format_target(action: Action) -> str:
     return f"{action.target} ({action.where})" if action.where else action.target
 
 
-def _action(label: str, width: int, action: Action) -> Iterator[Line]:
+def _action_lines(label: str, width: int, action: Action) -> Iterator[Line]:
     indent = " " * (2 + width)
-    first = f"  {label:{width}}"
+    label_text = f"  {label:{width}}"
     if action.sentence:
-        yield from _wrapped(action.sentence, first, indent)
-        first = indent
+        yield from _wrapped_lines(action.sentence, label_text, indent)
+        label_text = indent
     if any(len(command) > MAX_COMMAND_LENGTH for command in action.commands):
-        if first.strip():
-            yield Line(first.rstrip())
-        first = indent = "    "
+        if label_text.strip():
+            yield Line(label_text.rstrip())
+        label_text = indent = "    "
     for command in action.commands:
-        yield Line(f"{first}{command}", "bold")
-        first = indent
+        yield Line(f"{label_text}{command}", "bold")
+        label_text = indent
 
 
 def _rerun_table(reruns: Sequence[Rerun]) -> Iterator[Line]:
@@ -292,11 +294,11 @@ def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
         ("re-run of this log", [rerun.label for rerun in reruns]),
         (
             "position RMSE",
-            [_change(rerun.position_rmse_m, format_metres, " m") for rerun in reruns],
+            [_change_text(rerun.position_rmse_m, format_metres, " m") for rerun in reruns],
         ),
-        ("● innovation ÷ √S", [_change(rerun.source_ratio, format_ratio) for rerun in reruns]),
-        ("◆ error ÷ σ", [_change(rerun.truth_ratio, format_ratio) for rerun in reruns]),
-        ("rejected", [_change(rerun.rejected_fraction, _percent, " %") for rerun in reruns]),
+        ("● innovation ÷ √S", [_change_text(rerun.source_ratio, format_ratio) for rerun in reruns]),
+        ("◆ error ÷ σ", [_change_text(rerun.truth_ratio, format_ratio) for rerun in reruns]),
+        ("rejected", [_change_text(rerun.rejected_fraction, _percent, " %") for rerun in reruns]),
         ("improves", [rerun.improves for rerun in reruns]),
     )
     return [(head, *cells) for head, cells in columns if any(cells)]
@@ -313,10 +315,16 @@ def rerun_start(reruns: Sequence[Rerun]) -> str:
     )
 
 
-def _change(
-    pair: tuple[float, float] | None, format_value: Callable[[float], str], unit: str = ""
+def _change_text(
+    before_and_after: tuple[float, float] | None,
+    format_value: Callable[[float], str],
+    unit: str = "",
 ) -> str:
-    return "" if pair is None else f"{format_value(pair[0])} → {format_value(pair[1])}{unit}"
+    return (
+        ""
+        if before_and_after is None
+        else f"{format_value(before_and_after[0])} → {format_value(before_and_after[1])}{unit}"
+    )
 
 
 def _percent(fraction: float) -> str:
@@ -326,15 +334,17 @@ def _percent(fraction: float) -> str:
 def _verdict_axis(card: Card) -> Iterator[Line]:
     if not card.verdicts:
         return
-    along = "" if card.effect is None else f", {card.effect.axis}"
+    axis_text = "" if card.effect is None else f", {card.effect.axis}"
     yield Line("")
     heading = "Reported uncertainty: RMS of actual ÷ reported"
-    yield from _wrapped(f"{heading}{along}", "", "  ")
-    limits = ", ".join(f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in BANDS.items())
+    yield from _wrapped_lines(f"{heading}{axis_text}", "", "  ")
+    limits = ", ".join(
+        f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in SIGMA_RATIO_BANDS.items()
+    )
     legend = f"  ░ consistent ({limits})"
     sides = f"{'σ too large':<{AXIS_WIDTH // 2}}{'σ too small':>{AXIS_WIDTH - AXIS_WIDTH // 2}}"
     yield Line(f"{'':{AXIS_INDENT}}{sides}")
-    yield Line(f"{legend:{AXIS_INDENT}}{_ticks()}")
+    yield Line(f"{legend:{AXIS_INDENT}}{_ticks_line()}")
     if any(verdict.is_explained for verdict in card.verdicts):
         yield Line("  A verdict in brackets is explained below and is not a fault of the filter.")
     for verdict in card.verdicts:
@@ -342,9 +352,9 @@ def _verdict_axis(card: Card) -> Iterator[Line]:
 
 
 def _verdict_line(verdict: Verdict) -> Line:
-    owner = FILTER_NAMES[verdict.filter] if verdict.against == "source" else ""
+    filter_label = FILTER_NAMES[verdict.filter] if verdict.against == "source" else ""
     quantity = f"{MARKS[verdict.against]} {QUANTITIES[verdict.against]}"
-    head = f"  {owner:4} {quantity:25}"
+    head = f"  {filter_label:4} {quantity:25}"
     if verdict.ratio is None:
         text = f"{'–':>7}  not evaluated: {verdict.reason}"
         return Line(text, "", head, " " * 41, wraps=True)
@@ -354,7 +364,7 @@ def _verdict_line(verdict: Verdict) -> Line:
     return Line(f"{text:{AXIS_INDENT}}{axis_text(verdict.ratio, verdict.against)}", style)
 
 
-def _ticks() -> str:
+def _ticks_line() -> str:
     characters = [" "] * AXIS_WIDTH
     for tick in LABELLED_TICKS:
         label = AXIS_TICKS[tick]
@@ -367,9 +377,9 @@ def _aid_axis(aids: Sequence[AidRow]) -> Iterator[Line]:
     if not aids:
         return
     yield Line("")
-    yield from _wrapped(AIDS_HEADING, "", "  ")
+    yield from _wrapped_lines(AIDS_HEADING, "", "  ")
     indent = 31
-    yield Line(f"{'':{indent}}{_ticks()}")
+    yield Line(f"{'':{indent}}{_ticks_line()}")
     previous = ""
     for row in aids:
         label = row.label if row.label != previous else ""
@@ -383,18 +393,18 @@ def format_spans(cause: Cause) -> str:
     """Format the times of a cause, from the first to the last; "" for the whole flight."""
     if not cause.spans_s:
         return ""
-    first, last = cause.spans_s[0][0], cause.spans_s[-1][1]
-    return f"{first:.1f} s" if last - first < 0.05 else f"{first:.1f} to {last:.1f} s"
+    first_s, last_s = cause.spans_s[0][0], cause.spans_s[-1][1]
+    return f"{first_s:.1f} s" if last_s - first_s < 0.05 else f"{first_s:.1f} to {last_s:.1f} s"
 
 
-def _labelled(label: str, text: str) -> Iterator[Line]:
+def _labelled_lines(label: str, text: str) -> Iterator[Line]:
     indent = " " * TEXT_INDENT
-    yield from _wrapped(text, f"  {label:{TEXT_INDENT - 2}}", indent)
+    yield from _wrapped_lines(text, f"  {label:{TEXT_INDENT - 2}}", indent)
 
 
-def _wrapped(text: str, first: str, indent: str) -> Iterator[Line]:
+def _wrapped_lines(text: str, first_indent: str, indent: str) -> Iterator[Line]:
     if text:
-        yield Line(text, "", first, indent, wraps=True)
+        yield Line(text, "", first_indent, indent, wraps=True)
 
 
 def _all_actions(card: Card) -> Iterator[Action]:

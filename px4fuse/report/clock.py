@@ -145,16 +145,16 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
 
 def draw_curve(axes: Axes, clock: ClockOffset) -> None:
     """Draw the log-likelihood over the time offset of the source, with the 95 % interval."""
-    (low, high), estimate_s, applied = clock.interval_s, clock.offset_s, clock.applied_s
+    (low, high), estimate_s, applied_s = clock.interval_s, clock.offset_s, clock.applied_s
     axes.axvspan(low, high, color=KF_BAND_COLOUR, lw=0, label="95 % interval")
     axes.plot(clock.curve_s, clock.curve_drop, **KF_LINE)
-    axes.axvline(applied, color="black", lw=0.8, ls="--", label="as analysed")
+    axes.axvline(applied_s, color="black", lw=0.8, ls="--", label="as analysed")
     axes.set_ylim(min(MAX_DROP_NATS, float(clock.curve_drop.max()) * 1.05), 0.0)
     half_width = CURVE_HALF_WIDTH * max(high - estimate_s, estimate_s - low)
     ends = clock.curve_s[0], clock.curve_s[-1]
     axes.set_xlim(
-        min(max(estimate_s - half_width, ends[0]), applied - 0.1 * half_width),
-        max(min(estimate_s + half_width, ends[1]), applied + 0.1 * half_width),
+        min(max(estimate_s - half_width, ends[0]), applied_s - 0.1 * half_width),
+        max(min(estimate_s + half_width, ends[1]), applied_s + 0.1 * half_width),
     )
     axes.set_xlabel("offset added to the source's timestamps (s)")
     draw_legend_above(axes)

@@ -33,7 +33,7 @@ from px4fuse.text import format_number, format_p_value
 
 MAX_LAG = 20
 MAX_NORMALISED = 4.0
-BINS = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 33)
+HISTOGRAM_EDGES = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 33)
 # Maximum of the density axis, at which the normal curve (maximum 0.4) is visible
 MAX_DENSITY = 1.6
 # Maximum p value of the Ljung-Box test for innovations that the caption calls not white
@@ -97,7 +97,11 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         page.write(f"The consistency along {axis_text} is not tested: {reason}.")
     page.heading("All axes", above=12.0)
     head = [*VERDICT_HEAD, "n", "beyond\n2√S", "t of\nmean", "lag 1", "Ljung-\nBox"]
-    page.table(head, verdict_rows(analysis.axes.values(), _statistic_cells), right=(2, 5, 6, 7, 8))
+    page.table(
+        head,
+        verdict_rows(analysis.axes.values(), _statistic_cells),
+        right_aligned_columns=(2, 5, 6, 7, 8),
+    )
     _write_causes(page, analysis)
     yield page
 
@@ -108,12 +112,12 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     rows: list[list[Cell]] = []
     for cause in analysis.causes:
         if cause.axis == axis.name:
-            owner = "KF" if cause.filter == "kf" else "EKF2"
+            filter_label = "KF" if cause.filter == "kf" else "EKF2"
             statistic, power = CAUSE_STATISTICS[cause.statistic]
             values = (format_number(value**power, 2) for value in (cause.before, cause.after))
             rows.append(
                 [
-                    owner,
+                    filter_label,
                     format_change(analysis, cause),
                     statistic,
                     *values,
@@ -124,7 +128,7 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
         return
     page.heading(f"Tested causes along {axis.label}", above=12.0)
     head = ["filter", "change", "quantity", "as flown", "with change", "explains"]
-    page.table(head, rows, right=(3, 4))
+    page.table(head, rows, right_aligned_columns=(3, 4))
     page.write(
         (
             "Each row is a re-run with one change. 'all': the change brings the quantity "
@@ -149,7 +153,7 @@ def _thin_line_style(name: str) -> dict[str, Any]:
 
 
 def _draw_running_nis(axes: Axes, series: Series) -> None:
-    lowest, highest = 0.5, 2.0
+    lowest_nis, highest_nis = 0.5, 2.0
     for name, values in series.items():
         number = np.arange(1, len(values) + 1)
         running = (values**2).cumsum() / number
@@ -163,28 +167,28 @@ def _draw_running_nis(axes: Axes, series: Series) -> None:
             axes.plot(time, low, **_thin_line_style(name))
             axes.plot(time, high, **_thin_line_style(name), label="95 % band EKF2")
         settled_nis = running.iloc[len(running) // 4 :]
-        lowest, highest = (
-            min(lowest, 0.7 * settled_nis.min()),
-            max(highest, 1.4 * settled_nis.max()),
+        lowest_nis, highest_nis = (
+            min(lowest_nis, 0.7 * settled_nis.min()),
+            max(highest_nis, 1.4 * settled_nis.max()),
         )
     axes.axhline(1.0, color="black", lw=0.5)
-    axes.set(yscale="log", ylim=(lowest, highest))
+    axes.set(yscale="log", ylim=(lowest_nis, highest_nis))
     set_plain_ticks(axes.yaxis)
 
 
 def _draw_histogram(axes: Axes, series: Series) -> None:
     x = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 81)
-    normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
-    axes.fill_between(x, normal, color=BAND_GREY, lw=0, label="normal")
-    highest = 0.4
+    normal_density = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
+    axes.fill_between(x, normal_density, color=BAND_GREY, lw=0, label="normal")
+    density_limit = 0.4
     for name, values in series.items():
         density, _ = np.histogram(
-            values.clip(-MAX_NORMALISED, MAX_NORMALISED), bins=BINS, density=True
+            values.clip(-MAX_NORMALISED, MAX_NORMALISED), bins=HISTOGRAM_EDGES, density=True
         )
-        axes.stairs(density, BINS, **LINES[name], label=name)
-        highest = max(highest, float(density.max()))
+        axes.stairs(density, HISTOGRAM_EDGES, **LINES[name], label=name)
+        density_limit = max(density_limit, float(density.max()))
     axes.set_xlim(-MAX_NORMALISED, MAX_NORMALISED)
-    axes.set_ylim(0.0, min(1.15 * highest, MAX_DENSITY))
+    axes.set_ylim(0.0, min(1.15 * density_limit, MAX_DENSITY))
     axes.set_yticks([])
     axes.set_xlabel("ν / √S")
 

@@ -10,7 +10,7 @@ from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.card.model import (
     AXIS_ENDS,
     AXIS_TICKS,
-    BANDS,
+    SIGMA_RATIO_BANDS,
     Action,
     AidRow,
     Card,
@@ -39,19 +39,19 @@ from px4fuse.report.typesetting import measure_free_height
 from px4fuse.results.contract import AidsResults, ComparisonResults
 
 # Maximum number of changed settings in the head; with more, their number is printed
-MAX_CHANGED = 3
+MAX_CHANGED_SETTINGS = 3
 MAX_FILE_LENGTH = 56  # maximum number of characters of the file name in the head
-SIGNS = {"error": "■", "warning": "▲", "note": "●", "clean": "✓"}
+SEVERITY_SIGNS = {"error": "■", "warning": "▲", "note": "●", "clean": "✓"}
 SEVERITY_WORDS = {"error": "ERROR", "warning": "WARNING", "note": "NOTE", "clean": "NO FAULT"}
 AXIS_TITLE = "Is the reported uncertainty right?"
 AXIS_TEXT = "RMS of actual ÷ reported"
-TERMS = (
+TERMS_NOTE = (
     "Source: positions that both filters fuse. σ, √S: standard deviation that a filter reports for "
     "its position and for an innovation. KF: filter with position and velocity along one axis, IMU "
     "acceleration as input, no gate. Replay: px4fuse's model of EKF2, run on this log."
 )
 AIDS_TERMS = "√S: standard deviation of an innovation as EKF2 reports it. Source: an aiding sensor."
-PLACES = {"shell": "your computer", "console": "MAVLink Console of QGroundControl"}
+PLACE_NAMES = {"shell": "your computer", "console": "MAVLink Console of QGroundControl"}
 ALL_FINDINGS = "All findings"
 
 
@@ -74,10 +74,12 @@ def add_card(page: Page, card: Card) -> Block:
     """Add the texts of a card to a page; the panels go into ``blocks`` of the returned block."""
     identity = card.identity
     flight = identity.firmware, identity.hardware, f"{identity.duration_s:.1f} s", identity.source
-    more = [f"and {card.more_causes} more causes: {ALL_FINDINGS}"] if card.more_causes else []
+    further_causes_text = (
+        [f"{card.more_causes} more causes are listed in {ALL_FINDINGS}"] if card.more_causes else []
+    )
     return page.add(
         "cover",
-        sign=SIGNS[card.severity],
+        sign=SEVERITY_SIGNS[card.severity],
         word=SEVERITY_WORDS[card.severity],
         colour=SEVERITY_COLOURS[card.severity],
         file=_shorten_middle(identity.file),
@@ -89,16 +91,16 @@ def add_card(page: Page, card: Card) -> Block:
         headline=card.headline,
         effect=card.effect_text,
         do_this=card.do_this,
-        **_axis(card),
+        **_axis_data(card),
         facts=list(card.facts.items()),
         reconcile=card.reconcile,
         causes_title="Cause and fix" if len(card.causes) == 1 else "Causes and fixes",
         causes_legend=_causes_legend(card.causes),
-        causes=[_cause(number, cause) for number, cause in enumerate(card.causes, start=1)],
-        more_causes="".join(more),
+        causes=[_cause_data(number, cause) for number, cause in enumerate(card.causes, start=1)],
+        more_causes="".join(further_causes_text),
         difference=card.difference,
-        notes=note_texts(card, ALL_FINDINGS),
-        terms=AIDS_TERMS if card.aids else TERMS,
+        notes=note_texts(card, f"in {ALL_FINDINGS}"),
+        terms=AIDS_TERMS if card.aids else TERMS_NOTE,
         command=identity.command,
         segment=f"analysed {identity.segment}" if identity.segment else "",
         version=identity.version,
@@ -117,30 +119,36 @@ def _shorten_middle(name: str) -> str:
     >>> _shorten_middle("2026-04-02_14-13-00_" + "x" * 60 + "_issue.ulg")
     '2026-04-02_14-13-00_xxxxxxx…xxxxxxxxxxxxxxxxxx_issue.ulg'
     """
-    half = MAX_FILE_LENGTH // 2
-    return name if len(name) <= MAX_FILE_LENGTH else f"{name[: half - 1]}…{name[-half:]}"
+    half_length = MAX_FILE_LENGTH // 2
+    return (
+        name if len(name) <= MAX_FILE_LENGTH else f"{name[: half_length - 1]}…{name[-half_length:]}"
+    )
 
 
-def _format_changed(changed: Sequence[str]) -> str:
-    if not changed:
+def _format_changed(changed_options: Sequence[str]) -> str:
+    if not changed_options:
         return ""
-    text = ", ".join(changed) if len(changed) <= MAX_CHANGED else f"{len(changed)} settings"
+    text = (
+        ", ".join(changed_options)
+        if len(changed_options) <= MAX_CHANGED_SETTINGS
+        else f"{len(changed_options)} settings"
+    )
     return f"KF changed: {text}"
 
 
-def _axis(card: Card) -> dict[str, Any]:
+def _axis_data(card: Card) -> dict[str, Any]:
     """Return the heading and the rows of the logarithmic axis of σ ratios."""
     limits = [
         f"{MARKS[name]} {low:g} to {high:g}"
-        for name, (low, high) in BANDS.items()
+        for name, (low, high) in SIGMA_RATIO_BANDS.items()
         if name == "source" or not card.aids
     ]
     intervals = "" if card.aids else " · ├─┤ 95 % interval"
     ends = " and ".join(AXIS_TICKS[end] for end in AXIS_ENDS)
-    along = f", {card.effect.axis}" if card.effect else ""
+    axis_text = f", {card.effect.axis}" if card.effect else ""
     return {
         "axis_title": AXIS_TITLE,
-        "axis_text": AIDS_HEADING if card.aids else f"{AXIS_TEXT}{along}",
+        "axis_text": AIDS_HEADING if card.aids else f"{AXIS_TEXT}{axis_text}",
         "axis_legend": f"grey: consistent ({', '.join(limits)}){intervals} · ◀ ▶ beyond {ends}",
         "ticks": [
             {"fraction": axis_fraction(tick), "label": label} for tick, label in AXIS_TICKS.items()
@@ -162,7 +170,7 @@ def _verdict_row(verdict: Verdict) -> dict[str, Any]:
         "word": word,
         "quiet": verdict.is_explained,
         "loud": verdict.is_loud,
-        **_mark(verdict.ratio, verdict.against, verdict.interval),
+        **_ratio_marks(verdict.ratio, verdict.against, verdict.interval),
     }
 
 
@@ -174,37 +182,37 @@ def _aid_row(row: AidRow) -> dict[str, Any]:
         "word": "not evaluated" if row.ratio is None else "",
         "quiet": row.is_usual,
         "loud": False,
-        **_mark(row.ratio, "source", None),
+        **_ratio_marks(row.ratio, "source", None),
     }
 
 
-def _mark(
-    ratio: float | None, against: Reference, interval: tuple[float, float] | None
+def _ratio_marks(
+    ratio: float | None, reference: Reference, interval: tuple[float, float] | None
 ) -> dict[str, Any]:
     """Return the places (0 to 1) of a ratio, its interval and its band on the axis."""
     fraction = 0.5 if ratio is None else axis_fraction(ratio)
     beyond = 1 if fraction > 1.0 else -1 if fraction < 0.0 else 0
     return {
         "ratio": "" if ratio is None else format_ratio(ratio),
-        "shape": "circle" if against == "source" else "diamond",
+        "shape": "circle" if reference == "source" else "diamond",
         "fraction": fraction,
         "beyond": beyond,
-        "band": [axis_fraction(end) for end in BANDS[against]],
-        "interval": None if interval is None or beyond else list(map(_clipped, interval)),
+        "band": [axis_fraction(end) for end in SIGMA_RATIO_BANDS[reference]],
+        "interval": None if interval is None or beyond else list(map(_clipped_place, interval)),
     }
 
 
-def _clipped(ratio: float) -> float:
+def _clipped_place(ratio: float) -> float:
     return min(max(axis_fraction(max(ratio, AXIS_ENDS[0])), 0.0), 1.0)
 
 
 def _causes_legend(causes: Sequence[Cause]) -> str:
     places = {action.where for cause in causes for _, action in marked_actions(cause)}
-    texts = [f"{place}: {text}" for place, text in PLACES.items() if place in places]
-    return " · ".join([*texts, "[id]: px4fuse explain ID"])
+    texts = [f"{place}: {text}" for place, text in PLACE_NAMES.items() if place in places]
+    return " · ".join([*texts, "[id]: `px4fuse explain ID` explains the finding"])
 
 
-def _cause(number: int, cause: Cause) -> dict[str, Any]:
+def _cause_data(number: int, cause: Cause) -> dict[str, Any]:
     columns = rerun_columns(cause.reruns)
     head, *rows = zip(*columns, strict=True) if columns else ((),)
     return {
@@ -212,14 +220,14 @@ def _cause(number: int, cause: Cause) -> dict[str, Any]:
         "title": cause.title,
         "when": f"{cause.severity} · {format_spans(cause) or 'whole flight'}",
         "why": cause.why,
-        "actions": [_action(mark, action) for mark, action in marked_actions(cause)],
+        "actions": [_action_data(mark, action) for mark, action in marked_actions(cause)],
         "reruns": {"head": head, "rows": rows},
         "after": " ".join(filter(None, (rerun_start(cause.reruns), cause.after))),
         "id": cause.id,
     }
 
 
-def _action(mark: str, action: Action) -> dict[str, Any]:
+def _action_data(mark: str, action: Action) -> dict[str, Any]:
     return {
         "label": f"{mark}{action.target}",
         "where": action.where,

@@ -47,30 +47,30 @@ from px4fuse.report.page import (
 from px4fuse.report.panels import normalised_innovations
 from px4fuse.report.style import LINES, Artist, Axes, draw_curve
 
-MM = 72.0 / 25.4
+POINTS_PER_MM = 72.0 / 25.4
 # Minimum length / width of the track for panels that fill the page width
 MIN_LONG_RATIO = 2.2
 # Least and largest height (pt) of the map, with title and labels
-MAP_HEIGHTS = 40.0 * MM, 53.0 * MM
+MAP_HEIGHTS = 40.0 * POINTS_PER_MM, 53.0 * POINTS_PER_MM
 # Least total heights (pt) of the panels in two columns and in three columns
-MIN_HALVES_HEIGHT, MIN_THIRDS_HEIGHT = 50.0 * MM, 38.0 * MM
-INNOVATION_HEIGHTS = 27.0 * MM, 38.0 * MM
-MIN_ERROR_HEIGHT = 17.0 * MM
+MIN_HALVES_HEIGHT, MIN_THIRDS_HEIGHT = 50.0 * POINTS_PER_MM, 38.0 * POINTS_PER_MM
+INNOVATION_HEIGHTS = 27.0 * POINTS_PER_MM, 38.0 * POINTS_PER_MM
+MIN_ERROR_HEIGHT = 17.0 * POINTS_PER_MM
 # Total height (pt) of the panels on the next page, if the card fills the first one
-NEXT_PAGE_HEIGHT = 160.0 * MM
+NEXT_PAGE_HEIGHT = 160.0 * POINTS_PER_MM
 # Heights (pt): title with gaps, each further line of it, gap above the legend, unused rest
-TITLE_HEIGHT, TITLE_LINE, LEGEND_GAP, SPARE = 16.5, 10.5, 11.0, 4.0
+TITLE_HEIGHT, TITLE_LINE, LEGEND_GAP, SPARE_HEIGHT = 16.5, 10.5, 11.0, 4.0
 # Minimum height (pt) of the innovations for ticks at ±2 besides -4, 0 and 4
 MIN_TICKS_HEIGHT = 48.0
-MIN_WIDE = 200.0  # minimum width (pt) of a panel for six ticks of the time axis
-LEFT = 38.0  # width (pt) for tick and axis labels left of the axes
+MIN_WIDE_PANEL = 200.0  # minimum width (pt) of a panel for six ticks of the time axis
+LEFT_MARGIN = 38.0  # width (pt) for tick and axis labels left of the axes
 # Fraction of the height of all panels for the innovations, and for the map
 INNOVATION_SHARE, MAP_SHARE = 0.22, 0.25
 # Maximum number of drawn innovations per filter; those beyond the scale are always drawn
-MAX_DRAWN = 400
+MAX_DRAWN_INNOVATIONS = 400
 MAX_NORMALISED = 4.0
 # Height (pt) below the axes, without and with labels of the time axis
-BELOW = UNLABELLED_HEIGHT, TICKS_HEIGHT + AXIS_LABEL_HEIGHT
+HEIGHT_BELOW_AXES = UNLABELLED_HEIGHT, TICKS_HEIGHT + AXIS_LABEL_HEIGHT
 MAP_MARGIN, MAP_REACH, MIN_MAP_LENGTH_M = 1.08, 0.25, 0.5
 # Minimum distance between two triangles of a track, as a fraction of the map's length
 MIN_EXIT_DISTANCE = 0.02
@@ -124,7 +124,7 @@ class FlightMap(NamedTuple):
         return length_m >= MIN_LONG_RATIO * max(width_m, 1e-6)
 
 
-def write_panels(block: Block, analysis: Analysis, card: Card, free: float) -> None:
+def write_panels(block: Block, analysis: Analysis, card: Card, free_height: float) -> None:
     """Draw legend, map and plots over time into the block of the cover.
 
     Parameters
@@ -132,7 +132,7 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free: float) -> N
     block : Block
     analysis : Analysis
     card : Card
-    free : float
+    free_height : float
         Height (pt) that is left on the page.
     """
     page = Page()
@@ -140,7 +140,7 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free: float) -> N
     legend = page.legend(_legend_entries(analysis))
     errors, innovations = _error_strips(analysis, card), _innovation_strip(analysis.main)
     flight_map = _flight_map(analysis, card)
-    rest = free - legend["height"] - LEGEND_GAP - SPARE
+    rest = free_height - legend["height"] - LEGEND_GAP - SPARE_HEIGHT
     if rest < MIN_THIRDS_HEIGHT:
         rest = NEXT_PAGE_HEIGHT
         page.blocks.insert(0, {"kind": "break"})
@@ -175,8 +175,10 @@ def _draw_strips(
     """Draw plots on one time axis; their heights (pt) include titles and labels."""
     for strip, height in zip(strips, heights, strict=True):
         is_last = strip is strips[-1]
-        axes_height = height - _head_height(page, strip.title) - BELOW[is_last]
-        axes = page.panel(strip.title, "", axes_height, above=4.0, left=LEFT, is_compact=True)
+        axes_height = height - _head_height(page, strip.title) - HEIGHT_BELOW_AXES[is_last]
+        axes = page.panel(
+            strip.title, "", axes_height, above=4.0, left=LEFT_MARGIN, is_compact=True
+        )
         shown = analysis.segment.flight
         axes.set_xlim(shown.start_s, shown.end_s)
         axes.locator_params(axis="x", nbins=_tick_count(page))
@@ -191,15 +193,15 @@ def _equal_heights(
 
     If ``is_labelled``, the last strip has the labels of the time axis.
     """
-    extras = [_head_height(page, strip.title) + BELOW[False] for strip in strips]
+    extras = [_head_height(page, strip.title) + HEIGHT_BELOW_AXES[False] for strip in strips]
     if is_labelled:
-        extras[-1] += BELOW[True] - BELOW[False]
+        extras[-1] += HEIGHT_BELOW_AXES[True] - HEIGHT_BELOW_AXES[False]
     axes_height = (total - sum(extras)) / max(len(strips), 1)
-    return [axes_height + extra for extra in extras]
+    return [axes_height + extra_height for extra_height in extras]
 
 
 def _tick_count(page: Page) -> int:
-    return 6 if page.width > MIN_WIDE else 4
+    return 6 if page.width > MIN_WIDE_PANEL else 4
 
 
 def _head_height(page: Page, title: str) -> float:
@@ -210,24 +212,24 @@ def _error_strips(analysis: Analysis, card: Card) -> list[Strip]:
     """Return a plot of the position error of each filter, or of KF - EKF2 without ground truth."""
     result, effect = analysis.main.in_flight, card.effect
     errors_by_filter = {
-        owner: errors
-        for owner in FILTERS
-        if isinstance(errors := position_errors(result, owner), pd.DataFrame)
+        filter_name: errors
+        for filter_name in FILTERS
+        if isinstance(errors := position_errors(result, filter_name), pd.DataFrame)
         and errors["error_m"].notna().any()
     }
     if errors_by_filter:
         half_height = 1.1 * max(map(_shown_height, errors_by_filter.values()))
         rmse_m = effect.position_rmse_m if effect else {}
         return [
-            _strip(
+            _error_strip(
                 analysis,
-                f"{(name := FILTER_NAMES[owner])} error (m)",
-                _format_size("RMSE", rmse_m.get(owner)),
+                f"{(name := FILTER_NAMES[filter_name])} error (m)",
+                _format_size("RMSE", rmse_m.get(filter_name)),
                 errors["error_m"],
                 {name: errors["sigma_m"]},
                 half_height,
             )
-            for owner, errors in errors_by_filter.items()
+            for filter_name, errors in errors_by_filter.items()
         ]
     if not isinstance(result.ekf2_state, pd.DataFrame):
         return []
@@ -243,14 +245,14 @@ def _error_strips(analysis: Analysis, card: Card) -> list[Strip]:
     widest = [2.2 * sigma.median() for sigma in sigmas.values() if sigma.notna().any()]
     half_height = 1.1 * max(float(difference.abs().max()), *widest)
     size = _format_size("RMS", effect.difference_rms_m if effect else None)
-    return [_strip(analysis, "KF − EKF2 (m)", size, difference, sigmas, half_height)]
+    return [_error_strip(analysis, "KF − EKF2 (m)", size, difference, sigmas, half_height)]
 
 
 def _format_size(label: str, length_m: float | None) -> list[str]:
     return [] if length_m is None else [f"{label} {format_metres(length_m)}"]
 
 
-def _strip(
+def _error_strip(
     analysis: Analysis,
     label: str,
     sizes: list[str],
@@ -264,9 +266,9 @@ def _strip(
         texts = [text.partition(" ")[2] for text in texts]
     if texts:
         sizes = [*sizes, f"σ {', '.join(texts)}"]
-    largest = float(curve.abs().max())
-    if largest < FLAT_SHARE * half_height:
-        sizes = [*sizes, f"at most {format_metres(largest)}, flat on this scale"]
+    largest_value = float(curve.abs().max())
+    if largest_value < FLAT_SHARE * half_height:
+        sizes = [*sizes, f"at most {format_metres(largest_value)}, flat on this scale"]
     line = LINES[next(iter(sigmas))] if len(sigmas) == 1 else style.line_style("black", 1.0)
 
     def draw(axes: Axes) -> None:
@@ -279,7 +281,7 @@ def _strip(
         if "EKF2" in sigmas:
             for time_s in horizontal_resets(analysis):
                 axes.axvline(time_s, **RESET_LINE)
-            _draw_at_edge(axes, _rejected(analysis), 0.06, REJECTED_MARK)
+            _draw_at_edge(axes, _rejection_times(analysis), 0.06, REJECTED_MARK)
         else:
             _draw_at_edge(axes, outlier_times(analysis), 0.94, OUTLIER_MARK)
 
@@ -288,45 +290,49 @@ def _strip(
 
 def _shown_height(errors: pd.DataFrame) -> float:
     """Return the largest position error (m) of a filter, or 2.2 σ if that is not much larger."""
-    largest, sigma = float(errors["error_m"].abs().max()), errors["sigma_m"].median()
-    return max(largest, 1e-3, min(2.2 * sigma, 3.0 * largest) if np.isfinite(sigma) else 0.0)
+    largest_error, sigma = float(errors["error_m"].abs().max()), errors["sigma_m"].median()
+    return max(
+        largest_error, 1e-3, min(2.2 * sigma, 3.0 * largest_error) if np.isfinite(sigma) else 0.0
+    )
 
 
 def _format_sigma(sigma: pd.Series[float]) -> str:
-    known = _settled(sigma)
-    if known.empty:
+    valid_sigma = _settled_sigma(sigma)
+    if valid_sigma.empty:
         return ""
-    low, high = float(known.min()), float(known.max())
+    low, high = float(valid_sigma.min()), float(valid_sigma.max())
     if high < MAX_SIGMA_SPREAD * low:
-        return format_metres(float(known.median()))
+        return format_metres(float(valid_sigma.median()))
     return f"{format_metres(low)} to {format_metres(high)}"
 
 
-def _settled(sigma: pd.Series[float]) -> pd.Series[float]:
+def _settled_sigma(sigma: pd.Series[float]) -> pd.Series[float]:
     """Return the known σ of a filter from :data:`SETTLING_S` after its start on."""
-    known = sigma.dropna()
-    settled: pd.Series[float] = known[known.index >= known.index.min() + SETTLING_S]
+    valid_sigma = sigma.dropna()
+    settled: pd.Series[float] = valid_sigma[
+        valid_sigma.index >= valid_sigma.index.min() + SETTLING_S
+    ]
     return settled
 
 
 def _draw_sigma(axes: Axes, sigma: pd.Series[float], name: str) -> None:
     """Draw ±2σ of a filter; beyond the plot, draw triangles and write the largest value."""
-    known = sigma.dropna()
-    if known.empty:
+    valid_sigma = sigma.dropna()
+    if valid_sigma.empty:
         return
-    style.draw_sigma_band(axes, 0.0 * known, known, style.BANDS[name])
-    known = _settled(sigma)
+    style.draw_sigma_band(axes, 0.0 * valid_sigma, valid_sigma, style.BANDS[name])
+    valid_sigma = _settled_sigma(sigma)
     top = axes.get_ylim()[1]
-    if known.empty or (largest := 2.0 * float(known.max())) <= top:
+    if valid_sigma.empty or (largest_2_sigma := 2.0 * float(valid_sigma.max())) <= top:
         return
-    at = float(known.index[int(np.argmax(known))])
+    largest_sigma_s = float(valid_sigma.index[int(np.argmax(valid_sigma))])
     for sign, marker in ((1.0, "^"), (-1.0, "v")):
-        axes.plot(at, sign * top, marker, color="black", ms=4.5, mew=0, clip_on=False)
+        axes.plot(largest_sigma_s, sign * top, marker, color="black", ms=4.5, mew=0, clip_on=False)
     low, high = axes.get_xlim()
-    is_right = at > 0.5 * (low + high)
+    is_right = largest_sigma_s > 0.5 * (low + high)
     axes.annotate(
-        f"±2σ of {name} up to ±{format_metres(largest)} m",
-        (at, -top),
+        f"±2σ of {name} up to ±{format_metres(largest_2_sigma)} m",
+        (largest_sigma_s, -top),
         xytext=(-6.0 if is_right else 6.0, 3.0),
         textcoords="offset points",
         ha="right" if is_right else "left",
@@ -345,19 +351,22 @@ def _draw_spans(axes: Axes, analysis: Analysis) -> None:
             axes.axvspan(start, end, **band, zorder=1.5)
 
 
-def _rejected(analysis: Analysis) -> Array:
+def _rejection_times(analysis: Analysis) -> Array:
     return np.asarray(analysis.events.rejected_s.get(analysis.main.axis.name, ()), np.float64)
 
 
 def _draw_at_edge(axes: Axes, times: Array, height: float, mark: Mapping[str, Any]) -> None:
     if len(times):
-        visible = _distant(axes, times)
+        visible_times_s = _thinned_times(axes, times)
         axes.plot(
-            visible, np.full(len(visible), height), transform=axes.get_xaxis_transform(), **mark
+            visible_times_s,
+            np.full(len(visible_times_s), height),
+            transform=axes.get_xaxis_transform(),
+            **mark,
         )
 
 
-def _distant(axes: Axes, times: Array) -> Array:
+def _thinned_times(axes: Axes, times: Array) -> Array:
     low, high = axes.get_xlim()
     return visible_times(times, MIN_MARK_DISTANCE * (high - low))
 
@@ -368,9 +377,11 @@ def _innovation_strip(result: AxisComparison) -> Strip:
     sizes = {name: float(values.abs().max()) for name, values in series.items() if len(values)}
     marks = ", ".join(f"{sign} {name}" for name, sign in zip(series, "●□", strict=False))
     title = f"Innovations ÷ √S ({marks}): 95 % belong inside ±2"
-    if (largest := max(sizes.values(), default=0.0)) < FLAT_INNOVATIONS:
-        title += f"; all are inside ±{format_ratio(largest)}"
-    beyond = [f"{name} {format_ratio(n)}" for name, n in sizes.items() if n > MAX_NORMALISED]
+    if (largest_size := max(sizes.values(), default=0.0)) < FLAT_INNOVATIONS:
+        title += f"; all are inside ±{format_ratio(largest_size)}"
+    beyond = [
+        f"{name} {format_ratio(size)}" for name, size in sizes.items() if size > MAX_NORMALISED
+    ]
     if beyond:
         title += f"; ▲▼ beyond ±{MAX_NORMALISED:g}, up to {', '.join(beyond)}"
 
@@ -382,24 +393,26 @@ def _innovation_strip(result: AxisComparison) -> Strip:
         axes.axhline(0.0, color="black", lw=0.5)
         for name in reversed(series):
             values, dots = series[name], INNOVATION_DOTS[name]
-            inside = values[values.abs() <= MAX_NORMALISED]
-            axes.plot(inside.iloc[:: -(-len(values) // MAX_DRAWN)], **dots)
+            values_in_scale = values[values.abs() <= MAX_NORMALISED]
+            axes.plot(values_in_scale.iloc[:: -(-len(values) // MAX_DRAWN_INNOVATIONS)], **dots)
             for sign, marker in ((1.0, "^"), (-1.0, "v")):
                 times = values.index[sign * values > MAX_NORMALISED].to_numpy()
                 edge = {**dots, "marker": marker, "ms": 3.4, "mew": 0, "mfc": dots["color"]}
-                visible = _distant(axes, times)
-                axes.plot(visible, np.full(len(visible), sign * MAX_NORMALISED), **edge)
+                visible_times_s = _thinned_times(axes, times)
+                axes.plot(
+                    visible_times_s, np.full(len(visible_times_s), sign * MAX_NORMALISED), **edge
+                )
 
     return Strip(title, draw)
 
 
-def _tracks(analysis: Analysis) -> dict[str, Coordinates]:
+def _map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
     """Return north and east (m) of positions, KF, EKF2 and ground truth within the segment."""
     segment, flight = analysis.segment.flight, analysis.flight
 
-    def cut(frame: pd.DataFrame) -> Coordinates:
-        inside = cut_to_segment(frame, segment)
-        return inside["north_m"].to_numpy(), inside["east_m"].to_numpy()
+    def cut(track: pd.DataFrame) -> Coordinates:
+        segment_track = cut_to_segment(track, segment)
+        return segment_track["north_m"].to_numpy(), segment_track["east_m"].to_numpy()
 
     tracks = {"positions": cut(analysis.source.samples)}
     if {"north", "east"} <= analysis.axes.keys():
@@ -430,22 +443,22 @@ def _flight_map(analysis: Analysis, card: Card) -> FlightMap:
     def to_map(north: Any, east: Any) -> Coordinates:
         return c * north + s * east, s * north - c * east
 
-    tracks = {name: to_map(*track) for name, track in _tracks(analysis).items()}
+    tracks = {name: to_map(*track) for name, track in _map_tracks(analysis).items()}
     return FlightMap(tracks, right_labels, up_label, to_map)
 
 
 def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: float) -> None:
     """Draw the tracks at equal scales, with triangles where a track leaves the map."""
-    tracks, width = flight_map.tracks, page.width - LEFT - AXES_RIGHT
-    title, axes_height = "Map", height - TITLE_HEIGHT - BELOW[True]
+    tracks, width = flight_map.tracks, page.width - LEFT_MARGIN - AXES_RIGHT
+    title, axes_height = "Map", height - TITLE_HEIGHT - HEIGHT_BELOW_AXES[True]
     limits = _map_limits(tracks, width / axes_height)
-    if leaving := _leaving(tracks, limits):
-        title = f"Map; triangles: tracks leave it ({leaving})"
-        axes_height = height - _head_height(page, title) - BELOW[True]
+    if leaving := _leaving_tracks(tracks, limits):
+        title = f"Map; tracks leave it at the triangles ({leaving})"
+        axes_height = height - _head_height(page, title) - HEIGHT_BELOW_AXES[True]
         limits = _map_limits(tracks, width / axes_height)
-    axes = page.panel(title, "", axes_height, above=4.0, left=LEFT, is_compact=True)
+    axes = page.panel(title, "", axes_height, above=4.0, left=LEFT_MARGIN, is_compact=True)
     right_label = next(
-        text for text in flight_map.right_labels if text_width(text) < page.width - LEFT
+        text for text in flight_map.right_labels if text_width(text) < page.width - LEFT_MARGIN
     )
     axes.set(xlim=limits[0], ylim=limits[1], xlabel=right_label, ylabel=flight_map.up_label)
     axes.set_aspect("equal", adjustable="datalim")
@@ -457,7 +470,7 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
         else:
             stride = max(1, len(right) // style.MAX_POINTS)
             axes.plot(right[::stride], up[::stride], **LINES[name])
-        for marker, (x, y) in _exits((right, up), limits):
+        for marker, (x, y) in _map_exits((right, up), limits):
             axes.plot(x, y, marker, color=_track_colour(name), ms=5.0, mew=0, clip_on=False)
     samples = analysis.source.samples
     for times, mark in (
@@ -465,12 +478,14 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
         (analysis.events.landing_s, LANDING_MARK),
     ):
         if times:
-            nearest = samples.iloc[samples.index.get_indexer(pd.Index(times), method="nearest")]
-            place = flight_map.to_map(nearest["north_m"], nearest["east_m"])
+            nearest_samples = samples.iloc[
+                samples.index.get_indexer(pd.Index(times), method="nearest")
+            ]
+            place = flight_map.to_map(nearest_samples["north_m"], nearest_samples["east_m"])
             axes.plot(*place, **{**mark, "ms": 9.0, "mec": "white", "mew": 0.8, "zorder": 3.0})
 
 
-def _leaving(tracks: Mapping[str, Coordinates], limits: MapLimits) -> str:
+def _leaving_tracks(tracks: Mapping[str, Coordinates], limits: MapLimits) -> str:
     sizes = {name: _distance_outside(track, limits) for name, track in tracks.items()}
     return ", ".join(
         f"{name} {format_metres(size)} m" for name, size in sizes.items() if size > 0.0
@@ -491,10 +506,10 @@ def _map_limits(tracks: Mapping[str, Coordinates], ratio: float) -> MapLimits:
     for side in (0, 1):
         ends = [np.percentile(tracks["positions"][side], (1.0, 99.0))]
         if "ground truth" in tracks:
-            ends.append(_ends(tracks["ground truth"][side]))
+            ends.append(_range_of(tracks["ground truth"][side]))
         reach = MAP_REACH * (np.max(ends) - np.min(ends))
-        shown = np.min(ends) - reach, np.max(ends) + reach
-        ends += [np.clip(_ends(track[side]), *shown) for track in tracks.values()]
+        limits = np.min(ends) - reach, np.max(ends) + reach
+        ends += [np.clip(_range_of(track[side]), *limits) for track in tracks.values()]
         low, high = np.min(ends), np.max(ends)
         spans.append((0.5 * (low + high), max(MAP_MARGIN * (high - low), MIN_MAP_LENGTH_M)))
     (x, length), (y, breadth) = spans
@@ -506,7 +521,7 @@ def _map_limits(tracks: Mapping[str, Coordinates], ratio: float) -> MapLimits:
     )
 
 
-def _ends(values: Array) -> Array:
+def _range_of(values: Array) -> Array:
     return np.array([np.nanmin(values), np.nanmax(values)])
 
 
@@ -522,7 +537,7 @@ def _distance_outside(track: Coordinates, limits: MapLimits) -> float:
     )
 
 
-def _exits(track: Coordinates, limits: MapLimits) -> Iterator[tuple[str, tuple[float, float]]]:
+def _map_exits(track: Coordinates, limits: MapLimits) -> Iterator[tuple[str, tuple[float, float]]]:
     """Yield a triangle and its place on the frame where a track leaves or enters the map."""
     over = [_overshoot(values, ends) for values, ends in zip(track, limits, strict=True)]
     is_outside = (over[0] != 0.0) | (over[1] != 0.0)
@@ -544,7 +559,7 @@ def _legend_entries(analysis: Analysis) -> list[Artist]:
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
-    names = _tracks(analysis).keys()
+    names = _map_tracks(analysis).keys()
     entries: list[Artist] = [
         Line2D([], [], **line, label=name) for name, line in LINES.items() if name in names
     ]
@@ -554,14 +569,20 @@ def _legend_entries(analysis: Analysis) -> list[Artist]:
         ("take-off", events.take_off_s, TAKE_OFF_MARK),
         ("landing", events.landing_s, LANDING_MARK),
         ("outlier", outlier_times(analysis), OUTLIER_MARK),
-        ("EKF2 rejected", _rejected(analysis), REJECTED_MARK),
+        ("EKF2 rejected", _rejection_times(analysis), REJECTED_MARK),
         ("EKF2 reset", horizontal_resets(analysis), RESET_LINE),
     )
-    entries += [Line2D([], [], **mark, label=label) for label, found, mark in marks if len(found)]
+    entries += [
+        Line2D([], [], **mark, label=label)
+        for label, marked_values, mark in marks
+        if len(marked_values)
+    ]
     bands: Sequence[tuple[str, Any, dict[str, Any]]] = (
         ("±2σ reported", names, {"facecolor": "#c9c9c9", "lw": 0.0}),
         ("gap", events.gaps, GAP_HATCH),
         ("log dropout", events.dropouts, DROPOUT_BAND),
     )
-    entries += [Patch(**band, label=label) for label, found, band in bands if len(found)]
+    entries += [
+        Patch(**band, label=label) for label, marked_values, band in bands if len(marked_values)
+    ]
     return entries

@@ -36,7 +36,7 @@ INCREASE_STYLE = {"color": "white", "hatch": "////"}  # bars of steps that incre
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the steps that turn KF into EKF2; no page without an explanation of the difference."""
-    explanations = _explanations(analysis)
+    explanations = _axis_explanations(analysis)
     if not any(
         isinstance(explanation, DifferenceExplanation) for explanation in explanations.values()
     ):
@@ -64,7 +64,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     yield page
 
 
-def _explanations(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Unavailable]:
+def _axis_explanations(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Unavailable]:
     """Return the explanation of KF - EKF2 along the main axis, else those of all axes."""
     explanations = analysis.difference_steps
     return {AISLE: explanations[AISLE]} if AISLE in explanations else explanations
@@ -82,7 +82,7 @@ def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailab
 
 def unexplained_note(analysis: Analysis) -> str:
     """Return why the report does not explain KF - EKF2; "" if it does or the log has no EKF2."""
-    explanations = list(_explanations(analysis).values())
+    explanations = list(_axis_explanations(analysis).values())
     if isinstance(analysis.flight.ekf2, Unavailable) or any(
         isinstance(explanation, DifferenceExplanation) for explanation in explanations
     ):
@@ -128,7 +128,7 @@ def _draw_axis(
         ("position", "m", "m2", explanation.unexplained_mean_square_m2),
         ("velocity", "m/s", "m2_s2", explanation.unexplained_velocity_mean_square_m2_s2),
     )
-    for column, left, (quantity, unit, power, unexplained) in zip(
+    for column, left_edge, (quantity, unit, power, unexplained_mean_square) in zip(
         columns, (LABEL_WIDTH, 4.0), quantities, strict=True
     ):
         total = getattr(explanation, f"{quantity}_mean_square_{power}")
@@ -139,8 +139,8 @@ def _draw_axis(
             f"{quantity} difference, {np.sqrt(total):.3f} {unit} RMS",
             ROW_HEIGHT * (len(names) + 2),
         )
-        axes = column.panel(title, "", height, left=left)
-        _draw_waterfall(axes, names, 100.0 * steps / total, 100.0 * unexplained / total)
+        axes = column.panel(title, "", height, left=left_edge)
+        _draw_waterfall(axes, names, 100.0 * steps / total, 100.0 * unexplained_mean_square / total)
     axes.set_yticklabels([])
     page.add_columns(*columns)
     title = "Position difference KF - EKF2 (m, dark) and unexplained part (light)"
@@ -185,9 +185,9 @@ def _draw_waterfall(axes: Axes, names: list[str], shares: Array, unexplained_sha
 
 
 def _time_sentence(explanation: DifferenceExplanation) -> str:
-    largest = int(np.argmax(np.abs(explanation.kf_minus_ekf2_m)))
+    largest_row = int(np.argmax(np.abs(explanation.kf_minus_ekf2_m)))
     return (
-        f"Largest difference {abs(explanation.kf_minus_ekf2_m[largest]):.2g} m at "
-        f"{explanation.times_s[largest]:.1f} s; unexplained RMS "
+        f"Largest difference {abs(explanation.kf_minus_ekf2_m[largest_row]):.2g} m at "
+        f"{explanation.times_s[largest_row]:.1f} s; unexplained RMS "
         f"{np.sqrt(np.mean(explanation.unexplained_m**2)):.2g} m."
     )

@@ -80,17 +80,23 @@ class View(NamedTuple):
 
 def path_views(evaluation: Evaluation) -> list[View]:
     """Return the view from above, and the side view if the path is not flat."""
-    across, up, vertical, is_down = PAGE_AXES[evaluation.reference.frame]
+    across, up, vertical_axis, is_down = PAGE_AXES[evaluation.reference.frame]
     names = AXES_OF_FRAME[evaluation.reference.frame]
     extent = np.maximum(
         np.ptp(evaluation.reference_m, axis=0), np.ptp(evaluation.estimate_m, axis=0)
     )
-    horizontal = across if extent[across] >= extent[up] else up
+    horizontal_axis = across if extent[across] >= extent[up] else up
     all_views = [
         View(across, up, False, (names[across], names[up])),
-        View(horizontal, vertical, is_down, (names[horizontal], names[vertical])),
+        View(
+            horizontal_axis, vertical_axis, is_down, (names[horizontal_axis], names[vertical_axis])
+        ),
     ]
-    return all_views if extent[vertical] > MAX_FLAT_RATIO * extent[horizontal] else all_views[:1]
+    return (
+        all_views
+        if extent[vertical_axis] > MAX_FLAT_RATIO * extent[horizontal_axis]
+        else all_views[:1]
+    )
 
 
 def draw(evaluation: Evaluation, _: object) -> Iterator[Page]:
@@ -195,11 +201,11 @@ def _draw_panels(page: Page, evaluation: Evaluation) -> None:
         page.add_columns(left, right)
 
 
-def draw_ape(axes: Axes, evaluation: Evaluation, along: Array, label: str) -> None:
+def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) -> None:
     """Draw the APE with its RMSE, mean, median and maximum as horizontal lines."""
-    error, low, high = evaluation.position_error_m, float(along[0]), float(along[-1])
-    shown_along, values = style.decimate_series(along, error, style.MAX_POINTS_NARROW)
-    gap_indices = np.searchsorted(shown_along, along[_gap_indices(evaluation.time_s)])
+    error, low, high = evaluation.position_error_m, float(x_values[0]), float(x_values[-1])
+    shown_along, values = style.decimate_series(x_values, error, style.MAX_POINTS_NARROW)
+    gap_indices = np.searchsorted(shown_along, x_values[_gap_indices(evaluation.time_s)])
     axes.plot(
         np.insert(shown_along, gap_indices, np.nan),
         np.insert(values, gap_indices, np.nan),
@@ -290,7 +296,11 @@ def write_evaluation(page: Page, evaluation: Evaluation) -> None:
     page.write_labelled("Method", describe_method(evaluation))
     for text in evaluation.warnings:
         page.write(text, bold=True, colour=style.SEVERITY_COLOURS["warning"])
-    page.table(ERROR_TABLE_HEAD, error_rows(evaluation), right=range(1, len(ERROR_TABLE_HEAD)))
+    page.table(
+        ERROR_TABLE_HEAD,
+        error_rows(evaluation),
+        right_aligned_columns=range(1, len(ERROR_TABLE_HEAD)),
+    )
     page.write_small(" ".join([*missing_reasons(evaluation), *evaluation.notes]))
 
 
@@ -317,7 +327,7 @@ def missing_reasons(evaluation: Evaluation) -> list[str]:
     quantities = [
         evaluation.ate.interval_m,
         evaluation.ate.rotation_deg,
-        *(e.translation_m for e in evaluation.rpe),
+        *(error.translation_m for error in evaluation.rpe),
     ]
     unavailable = [quantity for quantity in quantities if isinstance(quantity, Unavailable)]
     return list(
@@ -342,7 +352,7 @@ def unaligned_sentence(evaluation: Evaluation) -> str:
 
 
 def vertical_error_sentence(evaluation: Evaluation, axis: int) -> str:
-    """Caption of the side view: RMSE along the vertical axis and its share."""
+    """State the RMSE along the vertical axis and its fraction of the mean squared error."""
     squares = ((evaluation.estimate_m - evaluation.reference_m) ** 2).mean(axis=0)
     name = AXES_OF_FRAME[evaluation.reference.frame][axis]
     if not squares.any():
@@ -354,7 +364,7 @@ def vertical_error_sentence(evaluation: Evaluation, axis: int) -> str:
 
 
 def worst_poses_sentence(evaluation: Evaluation) -> str:
-    """Caption of the APE panel: share of the squared error in the worst 10 % of the poses."""
+    """State the fraction of the squared error that the worst 10 % of the poses contribute."""
     squared_errors = np.sort(evaluation.position_error_m**2)
     worst_share = squared_errors[-max(1, len(squared_errors) // 10) :].sum() / max(
         squared_errors.sum(), NEGLIGIBLE_ERROR_M**2
@@ -367,9 +377,9 @@ def worst_poses_sentence(evaluation: Evaluation) -> str:
 
 def quarter_rmse(evaluation: Evaluation) -> list[float]:
     """Return the RMSE (m) of each quarter of the reference path that contains poses."""
-    along = evaluation.distance_m
-    edges = np.linspace(0.0, along[-1], 5)
-    quarter_index = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, 3)
+    distance_m = evaluation.distance_m
+    edges = np.linspace(0.0, distance_m[-1], 5)
+    quarter_index = np.clip(np.searchsorted(edges, distance_m, side="right") - 1, 0, 3)
     errors = [evaluation.position_error_m[quarter_index == index] for index in range(4)]
     return [float(np.sqrt(np.mean(e**2))) for e in errors if len(e)]
 

@@ -133,9 +133,9 @@ def outlier_times(analysis: Analysis) -> Array:
     """Return the times (s) of the outliers that tuning found, horizontally or on the main axis."""
     names = HORIZONTAL, analysis.main.axis.name
     times_by_axis = [
-        tuned.outlier_time_s
-        for name, tuned in analysis.tuning.items()
-        if isinstance(tuned, AxisTuning) and name in names
+        axis_tuning.outlier_time_s
+        for name, axis_tuning in analysis.tuning.items()
+        if isinstance(axis_tuning, AxisTuning) and name in names
     ]
     times: Array = np.unique(np.concatenate(times_by_axis)) if times_by_axis else np.empty(0)
     return times
@@ -146,10 +146,10 @@ def legend_entries(analysis: Analysis) -> list[Artist]:
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
-    rejected = [time for times in analysis.events.rejected_s.values() for time in times]
+    rejected_s = [time for times in analysis.events.rejected_s.values() for time in times]
     return [
         Patch(**style, label=label) if height is None else Line2D([], [], **style, label=label)
-        for label, spans_or_times, style, height in _marks(analysis, rejected)
+        for label, spans_or_times, style, height in _marks(analysis, rejected_s)
         if len(spans_or_times)
     ]
 
@@ -157,8 +157,8 @@ def legend_entries(analysis: Analysis) -> list[Artist]:
 def visible_times(times: Any, min_interval_s: float) -> Array:
     """Return the first time (s) in each interval, so that markers do not overlap."""
     values = np.asarray(times, dtype=np.float64)
-    visible: Array = values[np.unique(np.floor(values / min_interval_s), return_index=True)[1]]
-    return visible
+    visible_s: Array = values[np.unique(np.floor(values / min_interval_s), return_index=True)[1]]
+    return visible_s
 
 
 def _draw_mode_names(axes: Axes, analysis: Analysis) -> None:

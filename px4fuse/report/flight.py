@@ -47,8 +47,8 @@ def _write_legend(page: Page, analysis: Analysis) -> None:
         Line2D([], [], **LINES["KF"], label="KF"),
         Patch(facecolor=style.KF_BAND_COLOUR, lw=0, label="KF ±2σ"),
     ]
-    for name, frame in (("EKF2", result.ekf2_state), ("ground truth", result.truth)):
-        if isinstance(frame, pd.DataFrame):
+    for name, track in (("EKF2", result.ekf2_state), ("ground truth", result.truth)):
+        if isinstance(track, pd.DataFrame):
             lines.append(Line2D([], [], **LINES[name], label=name))
     page.legend([*lines, *event_marks.legend_entries(analysis)])
 
@@ -108,8 +108,8 @@ def zoom_window(result: AxisComparison, segment: Segment) -> Span:
     middle_s = float(times[len(times) // 2])
     if isinstance(result.ekf2_innovations, pd.DataFrame) and len(result.ekf2_innovations):
         middle_s = float(result.ekf2_innovations.index[len(result.ekf2_innovations) // 2])
-    nearest = np.argmin(np.abs(times[:-count] + spans / 2.0 - middle_s))
-    return float(times[nearest]), float(times[nearest + count])
+    nearest_row = np.argmin(np.abs(times[:-count] + spans / 2.0 - middle_s))
+    return float(times[nearest_row]), float(times[nearest_row + count])
 
 
 def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
@@ -121,13 +121,15 @@ def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
     axes.plot(variances.index, np.sqrt(variances), **dots)
     if isinstance(result.ekf2_innovations, pd.DataFrame):
         ekf2 = result.ekf2_innovations.loc[slice(*window)].dropna(subset=["prior_variance_m2"])
-        before, after = (np.sqrt(ekf2[f"{side}_variance_m2"]) for side in ("prior", "posterior"))
-        axes.vlines(ekf2.index, after, before, color=EKF2_COLOUR, lw=1.0)
-        axes.plot(before, **style.dot_style(EKF2_COLOUR, "^", 3.6, 0.7), mfc="none")
-        axes.plot(after, **style.dot_style(EKF2_COLOUR, "v", 3.6))
+        sigma_before, sigma_after = (
+            np.sqrt(ekf2[f"{side}_variance_m2"]) for side in ("prior", "posterior")
+        )
+        axes.vlines(ekf2.index, sigma_after, sigma_before, color=EKF2_COLOUR, lw=1.0)
+        axes.plot(sigma_before, **style.dot_style(EKF2_COLOUR, "^", 3.6, 0.7), mfc="none")
+        axes.plot(sigma_after, **style.dot_style(EKF2_COLOUR, "v", 3.6))
     if isinstance(result.ekf2_variance, pd.DataFrame):
-        logged = np.sqrt(result.ekf2_variance["position_variance_m2"].loc[slice(*window)])
-        axes.plot(logged, **style.dot_style(EKF2_COLOUR, "s", 3.0, 0.7), mfc="white")
+        logged_sigma = np.sqrt(result.ekf2_variance["position_variance_m2"].loc[slice(*window)])
+        axes.plot(logged_sigma, **style.dot_style(EKF2_COLOUR, "s", 3.0, 0.7), mfc="white")
     axes.set_xlim(*window)
 
 
@@ -157,17 +159,17 @@ def zoom_sentence(result: AxisComparison) -> str:
 
 def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the axes except the main axis, one column each; no page without such axes."""
-    others = analysis.secondary_axes
-    if not others:
+    secondary_axes = analysis.secondary_axes
+    if not secondary_axes:
         return
     page = Page(
         "Appendix: other axes",
         "Position, velocity, innovations and σ of the other axes, drawn as for the main axis.",
     )
-    width = (PAGE_WIDTH - COLUMN_GAP * (len(others) - 1)) / max(len(others), 2)
+    width = (PAGE_WIDTH - COLUMN_GAP * (len(secondary_axes) - 1)) / max(len(secondary_axes), 2)
     for panel in (panels.POSITION, panels.VELOCITY, panels.INNOVATIONS, panels.SIGMA_P):
-        columns = [Page(width=width) for _ in others]
-        for column, result in zip(columns, others, strict=True):
+        columns = [Page(width=width) for _ in secondary_axes]
+        for column, result in zip(columns, secondary_axes, strict=True):
             if panel is panels.POSITION:
                 column.heading(result.axis.name)
             panel.draw_on_page(

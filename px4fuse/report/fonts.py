@@ -47,11 +47,11 @@ def missing_characters(text: str) -> str:
 
 def font_advice(characters: str) -> str:
     """Format the advice to install a font for missing characters."""
-    listed = characters[:MAX_LISTED_CHARACTERS] + (
+    listed_characters = characters[:MAX_LISTED_CHARACTERS] + (
         "…" if len(characters) > MAX_LISTED_CHARACTERS else ""
     )
     return (
-        f"No installed font has the characters {listed}; the report shows {NO_GLYPH} "
+        f"No installed font has the characters {listed_characters}; the report shows {NO_GLYPH} "
         "instead. Install a font with them, for example Noto Sans of their script "
         "(fonts.google.com/noto)."
     )

@@ -10,7 +10,7 @@ from px4fuse.flight import Unavailable
 from px4fuse.loop import corrections
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.loop.corrections import SINGLE_LOOP_REASON
-from px4fuse.loop.model import LANDING, Closure, CorrectedPath, Loop
+from px4fuse.loop.model import LANDING_SOURCE, Closure, CorrectedPath, Loop
 from px4fuse.report import style
 from px4fuse.report.evaluation import describe_method, format_interval, plot_path
 from px4fuse.report.page import Cell, Page, appendix_title
@@ -54,7 +54,6 @@ CLOSURE_HEAD = (
     "degrees of\nfreedom",
     "p",
     "gate",
-    "DCS\nweight",
     "GNC\nweight",
 )
 TITLE = "Loop closure"
@@ -87,8 +86,8 @@ def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> N
     page.write(
         (
             "d²: squared Mahalanobis distance of the closure given drift and closure "
-            "noise. p: probability of a larger d² for a true closure. DCS and GNC "
-            "weights: 1 keeps the closure, 0 drops it."
+            "noise. p: probability of a larger d² for a true closure. GNC weight: "
+            "1 keeps the closure, 0 drops it."
         ),
         colour=MUTED_COLOUR,
     )
@@ -220,12 +219,11 @@ def write_scores(page: Page, loop: Loop) -> None:
             format_p_value(closure.p).removeprefix("p "),
             "accepted" if closure.accepted else "REJECTED",
         ]
-        weights = closure.weight_dcs, closure.weight_gnc
-        cells += ["–" if weight is None else f"{weight:.2f}" for weight in weights]
+        cells.append("–" if closure.weight_gnc is None else f"{closure.weight_gnc:.2f}")
         colour = "black" if closure.accepted else style.SEVERITY_COLOURS["error"]
         rows.append([(cell, colour) for cell in cells])
     if rows:
-        page.table(CLOSURE_HEAD, rows, right=(1, 2, 3, 4, 6, 7))
+        page.table(CLOSURE_HEAD, rows, right_aligned_columns=(1, 2, 3, 4, 6))
     for reference in loop.references:
         scores = {
             corrected_path.name: corrected_path.scores[reference.name]
@@ -243,13 +241,17 @@ def write_scores(page: Page, loop: Loop) -> None:
         if not evaluations:
             continue
         first_evaluation = next(iter(evaluations.values()))
-        head = ["path", *(f"{e.delta_text} (m)" for e in first_evaluation.rpe), "rotation (°)"]
+        head = [
+            "path",
+            *(f"{error.delta_text} (m)" for error in first_evaluation.rpe),
+            "rotation (°)",
+        ]
         page.table(
             head,
             [
                 [
                     name,
-                    *(_format_error(e.translation_m, e.interval_m) for e in score.rpe),
+                    *(_format_error(error.translation_m, error.interval_m) for error in score.rpe),
                     _format_rmse(score.ate.rotation_deg, 2),
                 ]
                 for name, score in evaluations.items()
@@ -297,7 +299,7 @@ def describe_gate(closure: Closure) -> str:
 
 def closure_name(closure: Closure, loop: Loop) -> str:
     """Format the two times of a loop closure (s); UNIX timestamps count from the first pose."""
-    if closure.source == LANDING:
+    if closure.source == LANDING_SOURCE:
         return "take-off and landing"
     origin_s = loop.start_s if loop.start_s > MIN_UNIX_TIME_S else 0.0
     return f"{closure.time_1_s - origin_s:.2f} s and {closure.time_2_s - origin_s:.2f} s"
@@ -350,32 +352,37 @@ def format_correction(correction: CorrectedPath) -> str:
     return f"{correction.correction_rms_m:.2f} / {correction.correction_max_m:.2f}"
 
 
-def graph_summary(solved: SolvedGraph) -> Page:
+def graph_summary(solved_graph: SolvedGraph) -> Page:
     """Make the terminal page of a pose graph: gate, solver and costs."""
     page = Page()
     page.write_labelled(
         "Graph",
         (
-            f"{solved.name}: {solved.dimension}-D, {solved.poses} poses, {solved.edges} "
-            f"edges; initial poses: {solved.initialised}"
+            f"{solved_graph.name}: {solved_graph.dimension}-D, {solved_graph.poses} poses, "
+            f"{solved_graph.edges} edges; initial poses: {solved_graph.initialised}"
         ),
     )
-    gates = solved.gates
+    gates = solved_graph.gates
     if isinstance(gates, Unavailable):
         page.write_labelled("Gate", f"not applied: {gates.reason}")
     elif not gates:
         page.write_labelled("Gate", "no closures to test: every edge is odometry")
     else:
-        rejected = [gate for gate in gates if not gate.accepted]
-        lines = [f"{g.first} – {g.second}: d² {g.d2:.1f}, p {g.p:.2g}" for g in rejected]
-        listed = join_first(lines, MAX_LISTED_CLOSURES, "\n").split("\n")
-        page.write_labelled("Gate", f"{len(rejected)} of {len(gates)} closures rejected", *listed)
-    if len(solved.solutions) == 1 and (~solved.graph.is_successive).sum() > MAX_ROBUST_CLOSURES:
+        rejected_gates = [gate for gate in gates if not gate.accepted]
+        lines = [f"{g.first} – {g.second}: d² {g.d2:.1f}, p {g.p:.2g}" for g in rejected_gates]
+        listed_closures = join_first(lines, MAX_LISTED_CLOSURES, "\n").split("\n")
+        page.write_labelled(
+            "Gate", f"{len(rejected_gates)} of {len(gates)} closures rejected", *listed_closures
+        )
+    if (
+        len(solved_graph.solutions) == 1
+        and (~solved_graph.graph.is_successive).sum() > MAX_ROBUST_CLOSURES
+    ):
         page.write_labelled(
             "Robust", "not solved for this many closures; add --robust (takes some minutes)"
         )
     unconverged = [
-        SOLUTIONS[key] for key, solution in solved.solutions.items() if not solution.converged
+        SOLUTIONS[key] for key, solution in solved_graph.solutions.items() if not solution.converged
     ]
     if unconverged:
         page.write_labelled(
@@ -389,8 +396,8 @@ def graph_summary(solved: SolvedGraph) -> Page:
             f"{solution.iterations}" + ("" if solution.converged else " (not converged)"),
             "" if key == "all" else f"{solution.dropped}",
         ]
-        for key, solution in solved.solutions.items()
+        for key, solution in solved_graph.solutions.items()
     ]
     head = ("path", "initial cost", "final cost", "iterations", "dropped closures")
-    page.table(head, rows, right=(1, 2, 3, 4))
+    page.table(head, rows, right_aligned_columns=(1, 2, 3, 4))
     return page

@@ -186,11 +186,11 @@ def _parse_maths(state: StateInline, silent: bool) -> bool:
 
 
 def _tex_to_text(maths: str) -> str:
-    text = COMMAND_PATTERN.sub(_symbol, FRACTION_PATTERN.sub(r"(\1)/(\2)", maths))
+    text = COMMAND_PATTERN.sub(_maths_symbol, FRACTION_PATTERN.sub(r"(\1)/(\2)", maths))
     return text.translate(str.maketrans("{}~", "() "))
 
 
-def _symbol(command_match: re.Match[str]) -> str:
+def _maths_symbol(command_match: re.Match[str]) -> str:
     """Return the Unicode character of a TeX command; most names equal those of HTML entities."""
     name = command_match[1]
     return SYMBOLS[name] if name in SYMBOLS else html5.get(f"{name};", name)

@@ -101,7 +101,7 @@ class Page:
         rows: Sequence[Sequence[Cell]],
         *,
         column_widths: Sequence[float] | None = None,
-        right: Sequence[int] = (),
+        right_aligned_columns: Sequence[int] = (),
         size: float = 8.0,
     ) -> None:
         """Add a table with a heading row.
@@ -112,10 +112,17 @@ class Page:
         rows : sequence of sequence of str, or of (str, colour)
         column_widths : sequence of float, optional
             Relative widths of the columns; by default they follow the content.
-        right : sequence of int
+        right_aligned_columns : sequence of int
             Right-aligned columns (numbers).
         """
-        self.add("table", head=head, rows=rows, column_widths=column_widths, right=right, size=size)
+        self.add(
+            "table",
+            head=head,
+            rows=rows,
+            column_widths=column_widths,
+            right=right_aligned_columns,
+            size=size,
+        )
 
     def panel(
         self,
@@ -126,7 +133,7 @@ class Page:
         above: float = 4.0,
         left: float = AXIS_LEFT,
         right: float = AXES_RIGHT,
-        below: float = 0.0,
+        space_below: float = 0.0,
         is_compact: bool = False,
     ) -> Axes:
         """Add axes as wide as the column, below a title and a caption; return them.
@@ -135,7 +142,7 @@ class Page:
         ----------
         height : float
             Height of the axes alone (points).
-        above, left, right, below : float
+        above, left, right, space_below : float
             Margins of the axes (points); the height of tick and axis labels is added below.
         is_compact : bool
             Small title and gaps, for the cover.
@@ -146,7 +153,7 @@ class Page:
         axes = Figure().add_axes((0.0, 0.0, 1.0, 1.0))
         axes.locator_params(axis="x", nbins=8)
         axes.locator_params(axis="y", nbins=4)
-        margins = left, right, below, above
+        margins = left, right, space_below, above
         alt = ": ".join(filter(None, (title, caption)))
         block = self.add(
             "panel",
@@ -168,14 +175,14 @@ class Page:
         from matplotlib.figure import Figure  # noqa: PLC0415
 
         rows: list[list[Artist]] = [[]]
-        free = self.width
+        free_width = self.width
         for entry in entries:
             width = text_width(str(entry.get_label())) + LEGEND_HANDLE
-            if rows[-1] and width > free:
+            if rows[-1] and width > free_width:
                 rows.append([])
-                free = self.width
+                free_width = self.width
             rows[-1].append(entry)
-            free -= width
+            free_width -= width
         height = LEGEND_LINE * len(rows)
         figure = Figure(figsize=(self.width / 72.0, height / 72.0))
         for row_index, row in enumerate(rows):
@@ -205,7 +212,7 @@ class Page:
 
     def add_columns(self, *columns: Page, gap: float = COLUMN_GAP, above: float = 6.0) -> None:
         """Add columns side by side; `gap` between and space `above` them in points."""
-        blocks, widths = [c.blocks for c in columns], [c.width for c in columns]
+        blocks, widths = [column.blocks for column in columns], [column.width for column in columns]
         self.add("columns", columns=blocks, widths=widths, gap=gap, above=above)
 
 
@@ -233,12 +240,12 @@ def text_width(text: str, size: float = 8.0) -> float:
 
 def line_count(text: str, width: float, size: float = 8.0) -> int:
     """Return the number of lines of a text that wraps at a width (points)."""
-    lines, used = 1, 0.0
+    lines, used_width = 1, 0.0
     for word in text.split(" "):
         word_width = text_width(f"{word} ", size)
-        if used and used + text_width(word, size) > width:
-            lines, used = lines + 1, 0.0
-        used += word_width
+        if used_width and used_width + text_width(word, size) > width:
+            lines, used_width = lines + 1, 0.0
+        used_width += word_width
     return lines
 
 

@@ -77,14 +77,14 @@ class Panel(NamedTuple):
             caption, height = self.caption(analysis, result), self.height
             title, numbers = ": ".join(filter(None, (title, numbers))), ""
         # the panel of innovations shows the rejected ones as hollow dots
-        rejected = "" if self is INNOVATIONS else result.axis.name
+        rejection_axis = "" if self is INNOVATIONS else result.axis.name
         axes = event_marks.panel(
             page,
             analysis,
             title,
             caption,
             height,
-            axis=rejected,
+            axis=rejection_axis,
             with_mode_names=with_mode_names,
             with_time_label=with_time_label,
         )
@@ -102,10 +102,10 @@ def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
     kf_values = result.replay.steps[quantity.column]
     draw_sigma_band(axes, kf_values, np.sqrt(result.replay.steps[quantity.variance]))
     drawn_series = [kf_values]
-    for frame, name in ((result.ekf2_state, "EKF2"), (result.truth, "ground truth")):
-        if isinstance(frame, pd.DataFrame) and frame[quantity.column].notna().any():
-            draw_curve(axes, frame[quantity.column], **LINES[name], zorder=2.5)
-            drawn_series.append(frame[quantity.column])
+    for track, name in ((result.ekf2_state, "EKF2"), (result.truth, "ground truth")):
+        if isinstance(track, pd.DataFrame) and track[quantity.column].notna().any():
+            draw_curve(axes, track[quantity.column], **LINES[name], zorder=2.5)
+            drawn_series.append(track[quantity.column])
     draw_curve(axes, kf_values, **LINES["KF"])
     # The axis is scaled to the tracks, because the ±2σ band is very wide in the first second
     all_values = pd.concat(drawn_series)
@@ -151,10 +151,10 @@ def _velocity_numbers(result: AxisComparison) -> str:
 def _axis_half_height(result: AxisComparison) -> float:
     """Return the half height (m) of the innovation axes; outliers and gaps do not enlarge it."""
     limits = []
-    for frame in (result.replay.updates, result.ekf2_innovations):
-        if isinstance(frame, pd.DataFrame):
-            median_sigma = float(np.sqrt(frame["innovation_variance_m2"].median()))
-            usual_innovation = float(np.quantile(frame["innovation_m"].abs(), 0.99))
+    for innovations in (result.replay.updates, result.ekf2_innovations):
+        if isinstance(innovations, pd.DataFrame):
+            median_sigma = float(np.sqrt(innovations["innovation_variance_m2"].median()))
+            usual_innovation = float(np.quantile(innovations["innovation_m"].abs(), 0.99))
             limits.append(
                 max(2.0 * median_sigma, min(usual_innovation, MAX_EDGE_SIGMAS * median_sigma))
             )
@@ -164,15 +164,17 @@ def _axis_half_height(result: AxisComparison) -> float:
 def normalised_innovations(result: AxisComparison) -> dict[str, pd.Series[float]]:
     """Return the finite ν/√S of KF and of EKF2, if logged, by filter name."""
     return {
-        name: (frame["innovation_m"] / np.sqrt(frame["innovation_variance_m2"])).dropna()
-        for name, frame in (("KF", result.replay.updates), ("EKF2", result.ekf2_innovations))
-        if isinstance(frame, pd.DataFrame)
+        name: (
+            innovations["innovation_m"] / np.sqrt(innovations["innovation_variance_m2"])
+        ).dropna()
+        for name, innovations in (("KF", result.replay.updates), ("EKF2", result.ekf2_innovations))
+        if isinstance(innovations, pd.DataFrame)
     }
 
 
 def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     """Draw the innovations of KF and EKF2 with ±2√S; rejected ones are hollow."""
-    half_height, updates, frame = (
+    half_height, updates, ekf2_innovations = (
         _axis_half_height(result),
         result.replay.updates,
         result.ekf2_innovations,
@@ -181,15 +183,15 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     draw_sigma_band(axes, 0.0 * kf_innovations, np.sqrt(updates["innovation_variance_m2"]))
     axes.axhline(0.0, color="black", lw=0.5)
     dots = [(kf_innovations, DOTS["KF"])]
-    if isinstance(frame, pd.DataFrame):
-        two_sigma = 2.0 * np.sqrt(frame["innovation_variance_m2"])
+    if isinstance(ekf2_innovations, pd.DataFrame):
+        two_sigma = 2.0 * np.sqrt(ekf2_innovations["innovation_variance_m2"])
         for side in (two_sigma, -two_sigma):
             draw_curve(axes, side, **LINES["EKF2"])
-        rejected = frame["rejected"] > 0
-        innovations = frame["innovation_m"]
+        is_rejected = ekf2_innovations["rejected"] > 0
+        innovations = ekf2_innovations["innovation_m"]
         dots = [
-            (innovations[~rejected], DOTS["EKF2"]),
-            (innovations[rejected], style.EKF2_REJECTED),
+            (innovations[~is_rejected], DOTS["EKF2"]),
+            (innovations[is_rejected], style.EKF2_REJECTED),
             *dots,
         ]
     for values, marker_style in dots:
@@ -247,9 +249,9 @@ def _innovation_numbers(result: AxisComparison) -> str:
 
 
 def _draw_sigma(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
-    for frame, name in ((result.replay.steps, "KF"), (result.ekf2_variance, "EKF2")):
-        if isinstance(frame, pd.DataFrame):
-            draw_curve(axes, np.sqrt(frame[quantity.variance]), **LINES[name])
+    for variance, name in ((result.replay.steps, "KF"), (result.ekf2_variance, "EKF2")):
+        if isinstance(variance, pd.DataFrame):
+            draw_curve(axes, np.sqrt(variance[quantity.variance]), **LINES[name])
     set_log_scale(axes)
 
 
@@ -258,18 +260,21 @@ def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
     if not analysis.events.gaps:
         return ""
     start, end = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])
-    largest = {
-        name: float(np.sqrt(frame.loc[start:end, "position_variance_m2"].max()))
-        for name, frame in (("KF", result.replay.steps), ("EKF2", result.in_flight.ekf2_variance))
-        if isinstance(frame, pd.DataFrame) and len(frame.loc[start:end]) > 1
+    largest_sigmas = {
+        name: float(np.sqrt(variance.loc[start:end, "position_variance_m2"].max()))
+        for name, variance in (
+            ("KF", result.replay.steps),
+            ("EKF2", result.in_flight.ekf2_variance),
+        )
+        if isinstance(variance, pd.DataFrame) and len(variance.loc[start:end]) > 1
     }
     growth = " and ".join(
-        f"{sigma:.2g} m ({name})" for name, sigma in largest.items() if np.isfinite(sigma)
+        f"{sigma:.2g} m ({name})" for name, sigma in largest_sigmas.items() if np.isfinite(sigma)
     )
     return growth and f"In the {end - start:.1f} s gap from {start:.0f} s, σ grew to {growth}."
 
 
-def _medians(result: AxisComparison, quantity: Quantity) -> str:
+def _median_text(result: AxisComparison, quantity: Quantity) -> str:
     medians = {
         name: getattr(filter_summary, quantity.sigma)
         for name, filter_summary in filters_by_name(result).items()
@@ -307,12 +312,12 @@ SIGMA_P = Panel(
     80.0,
     partial(_draw_sigma, quantity=POSITIONS),
     sigma_sentence,
-    partial(_medians, quantity=POSITIONS),
+    partial(_median_text, quantity=POSITIONS),
 )
 SIGMA_V = Panel(
     "σ of velocity (m/s), log scale",
     60.0,
     partial(_draw_sigma, quantity=VELOCITIES),
     lambda *_: "",
-    partial(_medians, quantity=VELOCITIES),
+    partial(_median_text, quantity=VELOCITIES),
 )

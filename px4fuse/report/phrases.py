@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 # Maximum p value of the Ljung-Box test for a note that innovations are not white: with eight tests
 # per flight, less than 1 % of flights have a false alarm
 MIN_WHITE_P = 0.001
-# Error of the reported σ that a verdict states
+# Words for each verdict: "the reported σ is ..."
 SIGMA_VERDICTS = {"underconfident": "too large", "overconfident": "too small"}
 RMS_FIELDS = ("position_rms_m", "velocity_rms_m_s")
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
@@ -124,7 +124,7 @@ def write_errors(page: Page, analysis: Analysis) -> None:
 
     head = [*VERDICT_HEAD, *(["KF-EKF2\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
     head += ["RMSE\n(m)", "\n(m/s)"] if has_truth else []
-    page.table(head, verdict_rows(axes, rms_cells), right=(2, 3, 5, 6, 7, 8))
+    page.table(head, verdict_rows(axes, rms_cells), right_aligned_columns=(2, 3, 5, 6, 7, 8))
 
 
 def _format_rms(statistic: object, field: str) -> str:
@@ -205,15 +205,15 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
 
 
 def tuning_advice(
-    comparison: Comparison, tuned: Mapping[str, AxisTuning | Unavailable]
+    comparison: Comparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
 ) -> dict[str, str]:
     """Return the actions after noise estimation by label: command, PX4 parameter, cautions.
 
     Commands are written as ``px4fuse compare LOG``; the terminal replaces LOG.
     """
-    names = (HORIZONTAL, "aisle", *tuned)
-    name = next((name for name in names if isinstance(tuned.get(name), AxisTuning)), "")
-    tuning = tuned.get(name)
+    names = (HORIZONTAL, "aisle", *tuning_by_axis)
+    name = next((name for name in names if isinstance(tuning_by_axis.get(name), AxisTuning)), "")
+    tuning = tuning_by_axis.get(name)
     if not isinstance(tuning, AxisTuning):
         return {}
     advice, sigma_a, sigma_z = {}, tuning.sigma_a_two_state, tuning.sigma_z

@@ -82,7 +82,9 @@ def _write_log(page: Page, flight: Flight, source: PositionTrack | None = None) 
             f"{', '.join(source.topics)}; clock: {source.clock}"
         )
     parameters = (
-        f"{n} {value:g}" for n, value in log.parameters.items() if n not in unused_parameters
+        f"{name} {value:g}"
+        for name, value in log.parameters.items()
+        if name not in unused_parameters
     )
     facts = {
         "firmware": f"{log.firmware}, git {log.firmware_hash}",

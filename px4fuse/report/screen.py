@@ -17,7 +17,7 @@ from rich.text import Text
 
 from px4fuse.card.model import Card
 from px4fuse.report.card_text import (
-    WIDTH,
+    CARD_WIDTH,
     Line,
     card_lines,
     closing_lines,
@@ -87,9 +87,9 @@ def _show_card(
     request: Request | None,
 ) -> None:
     is_limited = console.encoding.lower() not in UNICODE_ENCODINGS
-    typed = None if request is None else getattr(request, "log", None)
-    for line in lines_of(with_typed_path(card, typed)):
-        for text in line.wrapped(min(console.width, WIDTH)):
+    log_argument = None if request is None else getattr(request, "log", None)
+    for line in lines_of(with_typed_path(card, log_argument)):
+        for text in line.wrapped(min(console.width, CARD_WIDTH)):
             console.print(Text(to_ascii(text) if is_limited else text, line.style), soft_wrap=True)
 
 
@@ -125,9 +125,10 @@ def expand_commands(text: str, request: Request) -> tuple[str, list[str]]:
     ('--sigma-z 0.2: better.', ["px4fuse compare 'a b.ulg' --sigma-z 0.2"])
     """
     log = str(getattr(request, "log", "") or getattr(request, "source", ""))
-    plain = ComparisonRequest(log=log)
+    default_request = ComparisonRequest(log=log)
     commands = {
-        command_line(request if name == "compare" else plain, name, for_shell=True) + options: None
+        command_line(request if name == "compare" else default_request, name, for_shell=True)
+        + options: None
         for name, options in _COMMAND.findall(text)
     }
     return _COMMAND.sub(lambda match: match[2].strip() or f"px4fuse {match[1]}", text), [*commands]
@@ -168,14 +169,19 @@ def print_line(console: Console, label: str, text: str, style: str = "bold cyan 
 
 
 def _rich_table(
-    head: Sequence[str], rows: Iterable[Iterable[Cell]], right: Sequence[int], **_: object
+    head: Sequence[str],
+    rows: Iterable[Iterable[Cell]],
+    right: Sequence[int],
+    **_: object,
 ) -> Table:
     """Return a table without rules; a head may have several lines."""
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    vertical: Literal["bottom", "top"] = "bottom" if any("\n" in title for title in head) else "top"
+    vertical_alignment: Literal["bottom", "top"] = (
+        "bottom" if any("\n" in title for title in head) else "top"
+    )
     for index, title in enumerate(head):
         side: Literal["right", "left"] = "right" if index in right else "left"
-        table.add_column(Text(title), justify=side, overflow="fold", vertical=vertical)
+        table.add_column(Text(title), justify=side, overflow="fold", vertical=vertical_alignment)
     for row in rows:
         texts = [(cell, "") if isinstance(cell, str) else cell for cell in row]
         table.add_row(*(Text(text, STYLES.get(colour, "")) for text, colour in texts))

@@ -51,12 +51,12 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
             "both."
         ),
     )
-    chosen = np.array([settings.sigma_a_m_s2, settings.sigma_z_m])
+    used_noises = np.array([settings.sigma_a_m_s2, settings.sigma_z_m])
     factors = np.array([(a, z) for _, a, z in SETTINGS]).T
-    states = filter_states(preintegrate(result.axis, settings), *(chosen[:, None] * factors))
+    states = filter_states(preintegrate(result.axis, settings), *(used_noises[:, None] * factors))
     map_column, table_column = halves(MAP_COLUMN_FRACTION)
     _draw_map(map_column, analysis)
-    _write_table(table_column, result, states, chosen)
+    _write_table(table_column, result, states, used_noises)
     page.add_columns(map_column, table_column)
     yield page
 
@@ -76,22 +76,33 @@ def _draw_map(page: Page, analysis: Analysis) -> None:
     axes = page.panel(
         title, _map_sentence(tuned_noises), MAP_HEIGHT, left=MAP_LEFT, above=LEGEND_HEIGHT
     )
-    chosen = settings.sigma_a_m_s2, settings.sigma_z_m
+    used_noises = settings.sigma_a_m_s2, settings.sigma_z_m
     noises = tuned_noises.sigma_a_two_state, tuned_noises.sigma_z
-    (a, a_limits), (z, z_limits) = map(_noise_grid, chosen, noises)
+    (a, a_limits), (z, z_limits) = map(_noise_grid, used_noises, noises)
     axes.contourf(
         z, a, _log_likelihood_drop(analysis, name, tuned_noises, a, z), LEVELS_NATS, colors=SHADES
     )
     for factor in (1.0 / NOISE_FACTOR, 1.0, NOISE_FACTOR):
-        sigma_a_of_gain = factor * chosen[0] / chosen[1] * z[[0, -1]]
+        sigma_a_of_gain = factor * used_noises[0] / used_noises[1] * z[[0, -1]]
         axes.plot(z[[0, -1]], sigma_a_of_gain, color="black", lw=0.7, ls=(0, (1, 1.5)))
-    others = [
-        (chosen[1] * z_factor, chosen[0] * a_factor) for _, a_factor, z_factor in SETTINGS[1:]
+    compared_points = [
+        (used_noises[1] * z_factor, used_noises[0] * a_factor)
+        for _, a_factor, z_factor in SETTINGS[1:]
     ]
-    axes.plot(*zip(*others, strict=True), "D", color=KF_COLOUR, ms=4.0, label="pairs in the table")
-    best = [_best_value(noise) for noise in noises]
-    axes.plot(best[1], best[0], "o", color="white", mec="black", ms=6.0, label="maximum")
-    axes.plot(chosen[1], chosen[0], "X", color="black", mec="white", ms=8.0, label="chosen")
+    axes.plot(
+        *zip(*compared_points, strict=True),
+        "D",
+        color=KF_COLOUR,
+        ms=4.0,
+        label="pairs in the table",
+    )
+    best_noises = [_best_value(noise) for noise in noises]
+    axes.plot(
+        best_noises[1], best_noises[0], "o", color="white", mec="black", ms=6.0, label="maximum"
+    )
+    axes.plot(
+        used_noises[1], used_noises[0], "X", color="black", mec="white", ms=8.0, label="chosen"
+    )
     axes.set(
         xscale="log",
         yscale="log",
@@ -115,15 +126,21 @@ def _draw_map(page: Page, analysis: Analysis) -> None:
     )
 
 
-def _noise_grid(chosen: float, noise: Noise) -> tuple[Array, tuple[float, float]]:
+def _noise_grid(used_noise: float, noise: Noise) -> tuple[Array, tuple[float, float]]:
     """Return grid values of a noise, fine near its estimate, and the limits of the axis."""
-    best = _best_value(noise)
-    least, most = noise.low or best, noise.high or best
-    shown_values = (chosen / NOISE_FACTOR, chosen * NOISE_FACTOR, best, least, most)
+    best_noise = _best_value(noise)
+    lowest_noise, highest_noise = noise.low or best_noise, noise.high or best_noise
+    shown_values = (
+        used_noise / NOISE_FACTOR,
+        used_noise * NOISE_FACTOR,
+        best_noise,
+        lowest_noise,
+        highest_noise,
+    )
     low, high = min(shown_values) / MAP_MARGIN_FACTOR, max(shown_values) * MAP_MARGIN_FACTOR
-    spread = max(most / best, best / least, 1.02)
-    fine = best * spread ** np.linspace(-FINE_GRID_REACH, FINE_GRID_REACH, FINE_POINTS)
-    grid = np.concatenate([np.geomspace(low, high, COARSE_POINTS), fine])
+    spread = max(highest_noise / best_noise, best_noise / lowest_noise, 1.02)
+    fine_grid = best_noise * spread ** np.linspace(-FINE_GRID_REACH, FINE_GRID_REACH, FINE_POINTS)
+    grid = np.concatenate([np.geomspace(low, high, COARSE_POINTS), fine_grid])
     return np.unique(grid[(low <= grid) & (grid <= high)]), (low, high)
 
 
@@ -178,7 +195,9 @@ def _second_half_median(values: Array) -> Array:
     return np.asarray(np.median(values[len(values) // 2 :], axis=0))
 
 
-def _write_table(page: Page, result: AxisComparison, states: FilterStates, chosen: Array) -> None:
+def _write_table(
+    page: Page, result: AxisComparison, states: FilterStates, used_noises: Array
+) -> None:
     """Write gain, reported σ, mean NIS and velocity RMSE of KF for each pair of noises."""
     second_half = slice(len(states.gain) // 2, None)
     gains, sigmas, nis = (
@@ -189,9 +208,9 @@ def _write_table(page: Page, result: AxisComparison, states: FilterStates, chose
     head = ["", "SIGMA_A\n(m/s²)", "SIGMA_Z\n(m)", "gain", "σ_p\n(m)", "mean\nNIS"]
     rows = []
     for index, (label, *scale) in enumerate(SETTINGS):
-        noises = [format_number(value) for value in chosen * scale]
-        reported = [format_number(value) for value in (sigmas[index], nis[index])]
-        rows.append([label, *noises, f"{gains[index]:.2f}", *reported])
+        noises = [format_number(value) for value in used_noises * scale]
+        reported_sigmas = [format_number(value) for value in (sigmas[index], nis[index])]
+        rows.append([label, *noises, f"{gains[index]:.2f}", *reported_sigmas])
     if isinstance(result.truth, pd.DataFrame):
         true_velocity = result.truth["velocity_m_s"].dropna()
         if len(true_velocity):
@@ -206,10 +225,10 @@ def _write_table(page: Page, result: AxisComparison, states: FilterStates, chose
     nis_text = ""
     if nis[1] > 0.0:  # NIS is zero if the positions never change
         nis_text = f", and the NIS {format_factor(nis[2] / nis[1])} times smaller"
-    page.heading("Same track, different σ", 9.5, above=9.0)
+    page.heading("Settings with the same track and different σ", 9.5, above=9.0)
     page.write(
         f"With SIGMA_A × 4, σ_p is {format_factor(sigmas[1] / sigmas[2])} times larger than with "
         f"SIGMA_Z / 4{nis_text}; the track is nearly the same. All numbers are of the second half "
         "of the flight."
     )
-    page.table(head, rows, right=range(1, len(head)))
+    page.table(head, rows, right_aligned_columns=range(1, len(head)))

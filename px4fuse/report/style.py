@@ -151,8 +151,14 @@ def decimate_series(time: Array, value: Array, limit: int = MAX_POINTS) -> tuple
         return time, value
     bucket_size, larger_bucket_count = divmod(len(time), limit // 2)
     split, index_groups = larger_bucket_count * (bucket_size + 1), []
-    for first, last, width in ((0, split, bucket_size + 1), (split, len(time), bucket_size)):
-        buckets, starts = value[first:last].reshape(-1, width), np.arange(first, last, width)
+    for first_row, last_row, width in (
+        (0, split, bucket_size + 1),
+        (split, len(time), bucket_size),
+    ):
+        buckets, starts = (
+            value[first_row:last_row].reshape(-1, width),
+            np.arange(first_row, last_row, width),
+        )
         index_groups += [starts + buckets.argmin(axis=1), starts + buckets.argmax(axis=1)]
     selected = np.unique(np.concatenate(index_groups))
     return time[selected], value[selected]

@@ -6,7 +6,7 @@ from typing import Any
 
 from px4fuse.analysis import WhatIfAnalysis
 from px4fuse.ekf2.replay import HORIZONTAL
-from px4fuse.ekf2.whatif import DISTURBANCE_M, HEIGHT_TIMEOUT_S, MAX_REJECTED_SHARE, Summary
+from px4fuse.ekf2.whatif import ADDED_NOISE_M, HEIGHT_TIMEOUT_S, MAX_REJECTED_SHARE, Summary
 from px4fuse.ekf2_parameters import AIDS, PARAMETERS
 from px4fuse.filter.signals import AISLE
 from px4fuse.flight import Unavailable
@@ -136,10 +136,10 @@ def sweep_notes(analysis: WhatIfAnalysis) -> list[str]:
     sentences = []
     if summaries := [summary for summary in sweep_summaries(analysis) if summary.is_predictable]:
         name = swept_parameter(analysis)
-        best = min(summaries, key=lambda s: abs(math.log(s.nis_mean)))
+        best_summary = min(summaries, key=lambda s: abs(math.log(s.nis_mean)))
         sentences.append(
-            f"The mean NIS is closest to 1 at {name} {format_number(best.changed[name])} "
-            f"({format_number(best.nis_mean)})."
+            f"The mean NIS is closest to 1 at {name} {format_number(best_summary.changed[name])} "
+            f"({format_number(best_summary.nis_mean)})."
         )
         errors = {
             error: summary.changed[name]
@@ -155,7 +155,7 @@ def sweep_notes(analysis: WhatIfAnalysis) -> list[str]:
     if not all(summary.is_predictable for summary in analysis.whatif.whatif):
         sentences.append(
             f"Not predictable: more than {MAX_REJECTED_SHARE:.0%} of the samples would "
-            f"be rejected, {1000.0 * DISTURBANCE_M:.0f} mm of position noise would change "
+            f"be rejected, {1000.0 * ADDED_NOISE_M:.0f} mm of position noise would change "
             f"the result, or heights would be rejected for {HEIGHT_TIMEOUT_S:g} s. The "
             "result then depends on single rejections."
         )
@@ -177,9 +177,9 @@ def summary(analysis: WhatIfAnalysis) -> Page:
     page.write_labelled("Used", f"All columns contain {spans} of the flight.")
     page.write_labelled("Replay", format_agreement(whatif_result.agreement))
     head = ["", *column_heads(analysis)]
-    page.table(head, rows(analysis), right=range(1, len(head)))
+    page.table(head, rows(analysis), right_aligned_columns=range(1, len(head)))
     if sweep_summaries(analysis):
-        page.table(*sweep_table(analysis), right=range(1, 7))
+        page.table(*sweep_table(analysis), right_aligned_columns=range(1, 7))
     for line in sweep_notes(analysis):
         page.write(line)
     page.write("Replays use px4fuse's model of EKF2, not PX4's code.")

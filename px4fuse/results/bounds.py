@@ -63,8 +63,10 @@ def within_bounds(results: T) -> T:
     if not reasons:
         return results
     if hasattr(checked, "missing"):
-        missing = (Unavailable(reason.split(" ", 1)[0], reason, REMEDY) for reason in reasons)
-        return replace(checked, missing=(*checked.missing, *missing))
+        exceeded_bounds = (
+            Unavailable(reason.split(" ", 1)[0], reason, REMEDY) for reason in reasons
+        )
+        return replace(checked, missing=(*checked.missing, *exceeded_bounds))
     return (
         replace(checked, notes=(*checked.notes, *reasons)) if hasattr(checked, "notes") else checked
     )
@@ -116,13 +118,13 @@ def _check_mapping(value: Mapping[str, Any], kind: Any, path: str, reasons: list
         (get_args(member)[1] for member in types_of(kind) if len(get_args(member)) == 2), Any
     )
     checked: dict[str, Any] = {}
-    for key, item in value.items():
+    for key, element in value.items():
         name = f"{path}.{key}"
         try:
-            checked[key] = _check_value(item, value_type, name, reasons)
+            checked[key] = _check_value(element, value_type, name, reasons)
         except _OutsideError as error:
             try:
-                checked[key] = _make_unavailable(item, value_type, name, error, reasons)
+                checked[key] = _make_unavailable(element, value_type, name, error, reasons)
             except _OutsideError:
                 reasons.append(str(error))
     if not checked and any(getattr(meta, "min_length", 0) for meta in get_args(kind)[1:]):
@@ -134,11 +136,11 @@ def _check_mapping(value: Mapping[str, Any], kind: Any, path: str, reasons: list
 def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple[Any, ...]:
     # an error in a tuple of numbers (a vector) is raised, so that the whole vector is omitted
     checked = []
-    for item in value:
+    for element in value:
         try:
-            checked.append(_check_value(item, Any, path, reasons))
+            checked.append(_check_value(element, Any, path, reasons))
         except _OutsideError as error:
-            if not isinstance(item, msgspec.Struct):
+            if not isinstance(element, msgspec.Struct):
                 raise
             reasons.append(str(error))
     is_unchanged = len(checked) == len(value) and all(map(is_, value, checked))
@@ -146,15 +148,15 @@ def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple
 
 
 def _make_unavailable(
-    item: Any, kind: Any, path: str, error: _OutsideError, reasons: list[str]
+    record: Any, kind: Any, path: str, error: _OutsideError, reasons: list[str]
 ) -> Unavailable:
     for member in types_of(kind):
         if isinstance(member, type) and issubclass(member, Unavailable):
             texts = {"what": path, "reason": str(error), "remedy": REMEDY}
             other_fields = {
-                field.name: _check_value(getattr(item, field.name), field.type, path, reasons)
+                field.name: _check_value(getattr(record, field.name), field.type, path, reasons)
                 for field in fields(member)
-                if field.name not in texts and hasattr(item, field.name)
+                if field.name not in texts and hasattr(record, field.name)
             }
             return member(**texts, **other_fields)
     raise error

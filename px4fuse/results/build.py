@@ -11,7 +11,7 @@ from px4fuse.card.build import build_aids_card, build_card
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
-from px4fuse.findings import find, find_aids, find_loop
+from px4fuse.findings import find_loop
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.record import to_serializable
@@ -41,6 +41,7 @@ _COPIED_FIELDS = (
     "trials",
     "causes",
     "loop",
+    "findings",
     "notes",
     "missing",
     "convention",
@@ -51,16 +52,12 @@ def results(
     request: ComparisonRequest, analysis: Analysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults:
     """Return the results of ``px4fuse compare`` on a flight with positions for KF."""
-    findings = find(analysis)
     return within_bounds(
         contract.ComparisonResults(
-            **_flight_fields(contract.COMPARISON, request, analysis),
+            **_flight_fields(contract.COMPARISON_SCHEMA, request, analysis),
             **{name: to_serializable(getattr(analysis, name)) for name in _COPIED_FIELDS},
             aids={} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
-            card=build_card(
-                analysis, findings, request.without_paths(), (student.name, student.id)
-            ),
-            findings=findings,
+            card=build_card(analysis, request.without_paths(), (student.name, student.id)),
             student=student,
         )
     )
@@ -72,15 +69,12 @@ def outcome_results(
     """Return the results of ``px4fuse compare``, also for a flight without positions for KF."""
     if isinstance(outcome, Analysis):
         return results(request, outcome, student)
-    findings = find_aids(outcome.aids)
     return within_bounds(
         contract.AidsResults(
-            **_common_fields(contract.AIDS, request, outcome.flight),
+            **_common_fields(contract.AIDS_SCHEMA, request, outcome.flight),
             aids=dict(outcome.aids),
-            card=build_aids_card(
-                outcome, findings, request.without_paths(), (student.name, student.id)
-            ),
-            findings=findings,
+            card=build_aids_card(outcome, request.without_paths(), (student.name, student.id)),
+            findings=outcome.findings,
             missing=(outcome.missing_data, *outcome.flight.missing),
             student=student,
         )
@@ -90,17 +84,19 @@ def outcome_results(
 def tuning_results(
     request: ComparisonRequest,
     comparison: Comparison,
-    tuned: Mapping[str, AxisTuning | Unavailable],
+    tuning_by_axis: Mapping[str, AxisTuning | Unavailable],
 ) -> contract.TuningResults:
-    common = _flight_fields("px4fuse-tuning", request, comparison, "tune")
-    return within_bounds(contract.TuningResults(**common, tuning=to_serializable(tuned)))
+    common_fields = _flight_fields("px4fuse-tuning", request, comparison, "tune")
+    return within_bounds(
+        contract.TuningResults(**common_fields, tuning=to_serializable(tuning_by_axis))
+    )
 
 
 def sync_results(
     request: ComparisonRequest, comparison: Comparison, clock: ClockOffset | Unavailable
 ) -> contract.SyncResults:
-    common = _flight_fields("px4fuse-sync", request, comparison, "sync")
-    return within_bounds(contract.SyncResults(**common, clock=to_serializable(clock)))
+    common_fields = _flight_fields("px4fuse-sync", request, comparison, "sync")
+    return within_bounds(contract.SyncResults(**common_fields, clock=to_serializable(clock)))
 
 
 def whatif_results(
@@ -109,7 +105,7 @@ def whatif_results(
     whatif_result, sweep_start = counterfactual.whatif, counterfactual.sweep_start
     return within_bounds(
         contract.WhatIfResults(
-            **_common_fields(contract.WHATIF, request, counterfactual.flight),
+            **_common_fields(contract.WHATIF_SCHEMA, request, counterfactual.flight),
             agreement=whatif_result.agreement,
             evaluated_s=whatif_result.evaluated_s,
             asked=counterfactual.uses_estimates,
@@ -127,7 +123,7 @@ def loop_results(
 ) -> contract.LoopResults:
     return within_bounds(
         contract.LoopResults(
-            schema=schema_of(contract.LOOP),
+            schema=schema_of(contract.LOOP_SCHEMA),
             request=request.without_paths(),
             track=loop.odometry.trajectory.track(),
             references=tuple(reference.track() for reference in loop.references),
@@ -151,11 +147,11 @@ def evaluation_results(request: EvaluationRequest, score: Evaluation) -> contrac
     )
 
 
-def graph_results(solved: SolvedGraph, command: str) -> contract.GraphResults:
+def graph_results(solved_graph: SolvedGraph, command: str) -> contract.GraphResults:
     """Return the results of ``px4fuse loop`` for a pose graph file."""
     return within_bounds(
         contract.GraphResults(
-            schema_of("px4fuse-graph"), to_serializable(solved), provenance(command)
+            schema_of("px4fuse-graph"), to_serializable(solved_graph), provenance(command)
         )
     )
 

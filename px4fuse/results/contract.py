@@ -32,16 +32,16 @@ from px4fuse.loop.model import LoopResult
 from px4fuse.position_source import DataPath, PositionKind
 from px4fuse.record import Count, OrUnavailable, Positive, Record, Sha256, Span, Unavailable
 from px4fuse.request import AxisName, ComparisonRequest, InputName, LoopRequest, WhatIfRequest
-from px4fuse.results.model import VERSION, Provenance, Schema, Student, Version
+from px4fuse.results.model import SCHEMA_VERSION, Provenance, Schema, Student, Version
 from px4fuse.trajectory.evaluation import Score
 from px4fuse.trajectory.graph.analysis import Graph
 from px4fuse.trajectory.model import Track
 
-COMPARISON = "px4fuse-results"
-LOOP = "px4fuse-loop"
-WHATIF = "px4fuse-whatif"
-AIDS = "px4fuse-aids"
-CHANGES = "px4fuse-changes"
+COMPARISON_SCHEMA = "px4fuse-results"
+LOOP_SCHEMA = "px4fuse-loop"
+WHATIF_SCHEMA = "px4fuse-whatif"
+AIDS_SCHEMA = "px4fuse-aids"
+CHANGES_SCHEMA = "px4fuse-changes"
 # Maximum number of significant digits of a number in the results
 SIGNIFICANT_DIGITS = 10
 
@@ -351,22 +351,22 @@ Results = (
     | ChangeResults
 )
 # Type of the results by the name of their schema
-KINDS: dict[str, type[Results]] = {
-    COMPARISON: ComparisonResults,
-    LOOP: LoopResults,
-    AIDS: AidsResults,
+RESULTS_BY_SCHEMA: dict[str, type[Results]] = {
+    COMPARISON_SCHEMA: ComparisonResults,
+    LOOP_SCHEMA: LoopResults,
+    AIDS_SCHEMA: AidsResults,
     "px4fuse-tuning": TuningResults,
     "px4fuse-sync": SyncResults,
     "px4fuse-graph": GraphResults,
     "px4fuse-evaluation": EvaluationResults,
-    WHATIF: WhatIfResults,
-    CHANGES: ChangeResults,
+    WHATIF_SCHEMA: WhatIfResults,
+    CHANGES_SCHEMA: ChangeResults,
 }
 
 
 def schema() -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of the results of all commands."""
-    kinds: dict[type, None] = dict.fromkeys(KINDS.values())
+    kinds: dict[type, None] = dict.fromkeys(RESULTS_BY_SCHEMA.values())
     components: dict[str, Any] = {}
 
     def describe_union(kind: Any) -> dict[str, Any]:
@@ -382,7 +382,7 @@ def schema() -> dict[str, Any]:
         )
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "$id": f"px4fuse-results-{VERSION}",
+        "$id": f"px4fuse-results-{SCHEMA_VERSION}",
         "title": "Results of px4fuse",
         "description": f"Numbers have at most {SIGNIFICANT_DIGITS} significant digits, or six "
         "decimals if that is more precise.",
@@ -391,7 +391,7 @@ def schema() -> dict[str, Any]:
                 "$ref": f"#/$defs/{kind.__name__}",
                 "properties": {"schema": {"properties": {"name": {"const": name}}}},
             }
-            for name, kind in KINDS.items()
+            for name, kind in RESULTS_BY_SCHEMA.items()
         ],
         "$defs": components,
     }
@@ -440,8 +440,8 @@ def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
         The results contain a number that is not finite.
     """
     plain_results = to_plain(results) if isinstance(results, msgspec.Struct) else results
-    plain = _round_numbers(plain_results)
-    return json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    rounded_results = _round_numbers(plain_results)
+    return json.dumps(rounded_results, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def file_hashes_in(text: str) -> list[str]:

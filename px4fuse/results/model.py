@@ -11,7 +11,7 @@ from px4fuse.answer_form import Answers
 from px4fuse.record import Record
 
 # Version of the results schema: a new field increases the minor version, another change the major
-VERSION = "4.0"
+SCHEMA_VERSION = "4.0"
 # Libraries that affect the numbers in the results
 LIBRARIES = ("numpy", "scipy", "pandas", "pyulog", "pymavlink", "filterpy", "matplotlib", "pypdf")
 MAX_NOTES_BYTES = 200_000
@@ -58,7 +58,7 @@ class Provenance(Record, frozen=True):
 
 
 def schema_of(name: str) -> Schema:
-    return Schema(name, VERSION)
+    return Schema(name, SCHEMA_VERSION)
 
 
 def provenance(command: str) -> Provenance:

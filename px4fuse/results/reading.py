@@ -12,11 +12,11 @@ from msgspec.structs import fields
 from px4fuse.errors import ResultsError
 from px4fuse.record import decode_record_or_unavailable
 from px4fuse.results.bounds import types_of
-from px4fuse.results.contract import KINDS, Results
-from px4fuse.results.model import VERSION
+from px4fuse.results.contract import RESULTS_BY_SCHEMA, Results
+from px4fuse.results.model import SCHEMA_VERSION
 
 # Maximum size of results (bytes), and of an integer in them (bits)
-MAX_BYTES, INTEGER_BITS = 5_000_000, 64
+MAX_RESULTS_BYTES, INTEGER_BITS = 5_000_000, 64
 
 
 def read_results(data: bytes, name: str = "results.json") -> Results:
@@ -32,8 +32,8 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     ResultsError
         The data are too large, not JSON, nested too deeply, or not results of this major version.
     """
-    if len(data) > MAX_BYTES:
-        raise ResultsError(f"{name} is larger than {MAX_BYTES // 1_000_000} MB.")
+    if len(data) > MAX_RESULTS_BYTES:
+        raise ResultsError(f"{name} is larger than {MAX_RESULTS_BYTES // 1_000_000} MB.")
     try:
         value = _clean_values(msgspec.json.decode(data))
         json.loads(data, object_pairs_hook=_require_unique_keys)
@@ -42,10 +42,10 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     except (msgspec.DecodeError, ValueError) as error:
         raise ResultsError(f"{name} is not JSON ({one_line(str(error), 100)}).") from error
     schema = value.get("schema") if isinstance(value, dict) else None
-    kind = KINDS.get(str(schema.get("name"))) if isinstance(schema, dict) else None
+    kind = RESULTS_BY_SCHEMA.get(str(schema.get("name"))) if isinstance(schema, dict) else None
     if schema is None or kind is None:
         raise ResultsError(f"{name} contains no results of px4fuse.")
-    version, (major, minor) = str(schema.get("version")), VERSION.split(".")
+    version, (major, minor) = str(schema.get("version")), SCHEMA_VERSION.split(".")
     if not re.fullmatch(rf"{major}\.[0-9]{{1,4}}", version):
         provenance = value.get("provenance")
         writer = provenance.get("px4fuse") if isinstance(provenance, dict) else None
@@ -80,7 +80,7 @@ def _known_fields(value: Any, kind: Any) -> Any:
         }
     if isinstance(value, list):
         item_type = next((args[0] for args in map(get_args, types) if args), Any)
-        return [_known_fields(item, item_type) for item in value]
+        return [_known_fields(element, item_type) for element in value]
     return value
 
 

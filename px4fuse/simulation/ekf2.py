@@ -63,11 +63,18 @@ PREDICTION_STEP_US = 10_000  # µs; EKF2's prediction step (EKF2_PREDICT_US)
 FIELD_SIGMA_GAUSS = 0.03
 # Rules by which EKF2 (v1.14 and later) starts, stops and resets fusion of external vision:
 # EV_MAX_INTERVAL (ev_control.cpp), reset_timeout_max (common.h)
-VISION_RULES = FusionRules(0.2, 0.4, 1.0, 5, None, horizon_by_delay=False)
+VISION_RULES = FusionRules(0.2, 0.4, 1.0, 5, None, uses_delay_as_horizon=False)
 # Rules by which EKF2 v1.16 starts, stops and resets fusion of GNSS: gps_control.cpp, and
 # no_aid_timeout_max (common.h)
 GNSS_RULES = FusionRules(
-    np.inf, np.inf, 7.0, UNLIMITED_RESETS, None, False, reset_scale=2.0, with_velocity=True
+    np.inf,
+    np.inf,
+    7.0,
+    UNLIMITED_RESETS,
+    None,
+    False,
+    reset_variance_factor=2.0,
+    resets_velocity=True,
 )
 # Time (s) without any aiding source after which EKF2 holds its position: EKF2_NOAID_TOUT
 # (fake_pos_control.cpp)
@@ -76,9 +83,9 @@ NO_AID_TIMEOUT_S = 5.0
 # EKF2_GPS_V_NOISE, EKF2_GPS_P_NOISE, EKF2_GBIAS_INIT and EKF2_ABIAS_INIT (covariance.cpp)
 INITIAL_SIGMA = np.repeat([0.1, 0.3, 0.5, 0.1, 0.2], 3)
 # Time (s) at rest before the log, and σ of specific force (m/s²), angular rate (rad/s) and velocity
-# (m/s) at rest. With REST_S and REST_SIGMA the model has the σ that EKF2 v1.16 reports on the
-# ground: gyro bias 0.0005 rad/s, velocity 0.06 m/s, horizontal accelerometer bias 0.17 m/s²
-REST_S = 10.0
+# (m/s) at rest. With them the model has the σ that EKF2 v1.16 reports on the ground: gyro bias
+# 0.0005 rad/s, velocity 0.06 m/s, horizontal accelerometer bias 0.17 m/s²
+REST_BEFORE_LOG_S = 10.0
 REST_SIGMA = np.repeat([0.05, 0.0005, 0.06], 3)
 # σ of EKF2's heading (rad) and height (m) as PX4 v1.16 logs them in flight
 HEADING_SIGMA_RAD, HEIGHT_SIGMA_M = 0.03, 0.15
@@ -196,7 +203,7 @@ def _make_segment(
     attitude_error_rad[:, HEADING] = sensors.attitude_error(scenario, mistakes, time_s).as_rotvec()[
         :, HEADING
     ]
-    mean_at_rest = sensors.mean_imu_at_rest(scenario, mistakes, motion, REST_S)
+    mean_at_rest = sensors.mean_imu_at_rest(scenario, mistakes, motion, REST_BEFORE_LOG_S)
     state, covariance = _initial_state_at_rest(
         rotation[0], *mean_at_rest, float(attitude_error_rad[0, HEADING])
     )
@@ -242,7 +249,7 @@ def _with_field(segment: ReplaySegment, magnetometer: Topic) -> ReplaySegment:
 def _barometer_heights(segment: ReplaySegment, barometer: Topic) -> HeightSamples:
     """Return the barometer heights, the only height source of EKF2 in outdoor flights."""
     measured_at_s = sensors.time_s(barometer) - 0.5 * float(np.median(segment.step_s))
-    down_m = sensors.HOME[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
+    down_m = sensors.HOME_POSITION[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
     samples = barometer_samples_inside(segment, measured_at_s, down_m, np.zeros(len(down_m)))
     return HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *samples, 1.0)
 

@@ -114,7 +114,7 @@ def _local_position_topic(track: TopicTrack, *, is_gnss: bool) -> Topic:
     fields |= {"delta_xy": resets_m[reset_count], "xy_reset_counter": reset_count % 256}
     fields |= dict.fromkeys(("xy_valid", "v_xy_valid"), is_aided)
     if is_gnss:
-        fields |= dict(zip(("ref_lat", "ref_lon", "ref_alt"), sensors.HOME, strict=True))
+        fields |= dict(zip(("ref_lat", "ref_lon", "ref_alt"), sensors.HOME_POSITION, strict=True))
     return topic("vehicle_local_position", fields)
 
 
@@ -129,7 +129,7 @@ def _states_topic(model_run: SegmentRun, track: TopicTrack, *, is_gnss: bool) ->
     states[:, 7:9] = 0.0  # v1.16 logs latitude and longitude instead of horizontal positions
     if is_gnss:
         # with a global origin, v1.16 logs the altitude instead of the down position
-        states[:, 9] -= sensors.HOME[2]
+        states[:, 9] -= sensors.HOME_POSITION[2]
     covariances = np.zeros((len(rows), 24), np.float32)
     covariances[:, : model_run.variance.shape[2]] = model_run.variance[events + 1, 0]
     fields = track.timestamps(rows) | {"states": states, "covariances": covariances}
@@ -164,7 +164,7 @@ def _aid_sources(
     newest_fused_us = np.maximum.accumulate(fused_us)
     last_fused_us = np.where(newest_fused_us >= 0, sensors.START_US + newest_fused_us, 0)
     is_gnss = received.velocity_m_s is not None
-    observed = unproject(north, east, sensors.HOME[:2]) if is_gnss else (north, east)
+    observed = unproject(north, east, sensors.HOME_POSITION[:2]) if is_gnss else (north, east)
     position_topic = _aid_source(
         aid,
         inputs.settings,
@@ -202,18 +202,21 @@ def _barometer_topics(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) 
         update_rows["fused_at_s"] < len(track.time_us) - track.lag_steps
     ].iloc[1:]
     update_rows = update_rows[sensors.keep_at_rate(update_rows.index.to_numpy(), OTHER_AIDS_HZ)]
-    innovation, variance, rejected, fused, rows = update_rows.to_numpy().T
+    innovation, variance, is_rejected, is_fused, rows = update_rows.to_numpy().T
     measured_s, step = update_rows.index.to_numpy(), rows.astype(np.intp)
-    measured = heights.down_m[np.searchsorted(heights.measured_at_s, measured_s)] - sensors.HOME[2]
+    measured_m = (
+        heights.down_m[np.searchsorted(heights.measured_at_s, measured_s)]
+        - sensors.HOME_POSITION[2]
+    )
     noise = np.full(len(step), inputs.settings[BAROMETER.noise] ** 2)
     return [
         _aid_source(
             BAROMETER,
             inputs.settings,
             track.timestamps(step, measured_s),
-            measured,
+            measured_m,
             (innovation, variance, noise),
-            (rejected > 0, fused > 0),
+            (is_rejected > 0, is_fused > 0),
         )
     ]
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from px4fuse.errors import SettingsError, suggest_name
 from px4fuse.record import table
 from px4fuse.simulation.scenario import KINDS, Kind, bounded_number, quantities
-from px4fuse.units import NAMES, convert_to_unit
+from px4fuse.units import UNIT_NAMES, convert_to_unit
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Mistakes:
 
 QUANTITIES = quantities(Mistakes)
 # ASCII spelling of units, for values of mistakes on the command line
-_ASCII = {"°": "deg", "m/s²": "m/s2"}
+_ASCII_UNITS = {"°": "deg", "m/s²": "m/s2"}
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def parse(texts: Iterable[str]) -> Mistakes:
             bounds, size = QUANTITIES[field], convert_to_unit(value, QUANTITIES[field].unit)
             if size is None:
                 raise SettingsError(
-                    f"--mistake {text}: {value!r}: give {NAMES[bounds.unit]}, as in "
+                    f"--mistake {text}: {value!r}: give {UNIT_NAMES[bounds.unit]}, as in "
                     f"{name}{mistake.usage}."
                 )
             bounds.check(size, f"--mistake {text}: {bounds.cli_name}")
@@ -170,13 +170,13 @@ def active_mistakes(mistakes: Mistakes) -> tuple[str, ...]:
 
 
 def format_mistake(name: str, mistakes: Mistakes) -> str:
-    """Format one mistake with its values, as :func:`parse` reads it.
+    """Format one mistake with its values, in the notation of the option --mistake.
 
     >>> format_mistake("nlos", parse(["nlos=5"]))
     'nlos=5%,2m'
     """
     values = [
-        f"{value:g}{_ASCII.get(unit := QUANTITIES[field].unit, unit)}"
+        f"{value:g}{_ASCII_UNITS.get(unit := QUANTITIES[field].unit, unit)}"
         for field in MISTAKES[name].sizes
         if (value := getattr(mistakes, field)) is not None
     ]

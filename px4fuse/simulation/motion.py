@@ -18,10 +18,10 @@ from scipy import constants
 from px4fuse.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.simulation.mistakes import Mistakes
-from px4fuse.simulation.scenario import CORNER_S, START_STOP_S, Scenario
+from px4fuse.simulation.scenario import CORNER_DURATION_S, START_STOP_S, Scenario
 
 # Time (s) on the ground before take-off and after landing
-GROUND_S = 6.0
+TIME_ON_GROUND_S = 6.0
 CLIMB_M_S = 0.75  # m/s; climb and descent rate
 CLIMB_RAMP_S = 1.5  # s; duration of each change of the climb rate
 # Maximum flight time (s): the log then has 70 MB
@@ -36,8 +36,8 @@ DEVIATION_PERIODS_S, DEVIATION_SINE_COUNT = (3.0, 20.0), 4
 
 def _quintic(x: Array) -> tuple[Array, Array, Array, Array]:
     """Return the quintic S(x), which rises from 0 to 1, and its three derivatives."""
-    square, slope, complement = x * x, x * (1.0 - x), 1.0 - x
-    value = square * x * (6.0 * square - 15.0 * x + 10.0)
+    x_squared, slope, complement = x * x, x * (1.0 - x), 1.0 - x
+    value = x_squared * x * (6.0 * x_squared - 15.0 * x + 10.0)
     return (
         value,
         30.0 * slope**2,
@@ -287,7 +287,7 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
     SettingsError
         The open end of the loop is longer than its last side, or the flight takes too long.
     """
-    flight_plan = _Plan(GROUND_S, scenario.heading_deg)
+    flight_plan = _Plan(TIME_ON_GROUND_S, scenario.heading_deg)
     climb_m_s = min(CLIMB_M_S, scenario.altitude_m / 2.0)
     rise_s = scenario.altitude_m / climb_m_s
     up = np.array([0.0, 0.0, -climb_m_s])
@@ -311,9 +311,9 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
         deviation=Sines.draw(
             rng, np.full(3, scenario.wander_m), DEVIATION_PERIODS_S, DEVIATION_SINE_COUNT
         ),
-        take_off_s=GROUND_S,
+        take_off_s=TIME_ON_GROUND_S,
         touch_down_s=touch_down_s,
-        duration_s=float(np.ceil(touch_down_s + GROUND_S)),
+        duration_s=float(np.ceil(touch_down_s + TIME_ON_GROUND_S)),
     )
 
 
@@ -360,19 +360,21 @@ def _fly_aisle(flight_plan: _Plan, scenario: Scenario, speed_m_s: float) -> None
 def _fly_loop(flight_plan: _Plan, scenario: Scenario, mistakes: Mistakes) -> None:
     speed = 0.0 if mistakes.no_motion else scenario.speed_m_s
     last_side_m = scenario.length_m - mistakes.open_end_m
-    if last_side_m < scenario.speed_m_s * CORNER_S:
+    if last_side_m < scenario.speed_m_s * CORNER_DURATION_S:
         raise SettingsError(
             f"--mistake open-end={mistakes.open_end_m:g}: the last side is {last_side_m:g} m long. "
-            f"Use at most {scenario.length_m - scenario.speed_m_s * CORNER_S:g} m."
+            f"Use at most {scenario.length_m - scenario.speed_m_s * CORNER_DURATION_S:g} m."
         )
     side_count = 4 * scenario.passes
     previous_velocity = np.zeros(3)
     flight_plan.centre_s += START_STOP_S / 2.0
     for side in range(side_count):
         velocity = speed * direction(scenario.heading_deg + 90.0 * side)
-        length_s = CORNER_S if side else START_STOP_S
+        length_s = CORNER_DURATION_S if side else START_STOP_S
         if side and scenario.nose_follows_path and speed > 0.0:
-            flight_plan.add_turn(np.pi / 2.0, flight_plan.centre_s - CORNER_S / 2.0, CORNER_S)
+            flight_plan.add_turn(
+                np.pi / 2.0, flight_plan.centre_s - CORNER_DURATION_S / 2.0, CORNER_DURATION_S
+            )
         side_m = last_side_m if side == side_count - 1 else scenario.length_m
         flight_plan.add_velocity_change(
             velocity - previous_velocity, length_s, side_m / scenario.speed_m_s

@@ -17,7 +17,7 @@ YAWS: tuple[Yaw, Yaw] = ("fixed", "follow")
 DT_S = 0.1
 # Duration (s) of acceleration and braking along the aisle, and of a corner of the loop
 START_STOP_S = 1.5
-CORNER_S = 2.0
+CORNER_DURATION_S = 2.0
 # Values that replace defaults of the scenario, by kind of flight
 DEFAULTS_OF_KIND: Mapping[Kind, Mapping[str, float]] = {
     "aisle": {},
@@ -34,7 +34,7 @@ class Bounds:
     ----------
     low, high : float
     unit : str
-        As in :data:`px4fuse.units.NAMES`.
+        As in :data:`px4fuse.units.UNIT_NAMES`.
     cli_name : str
         Name of the option, or placeholder in the syntax of a `--mistake`.
     meaning : str
@@ -192,7 +192,9 @@ class Scenario:
             raise SettingsError(f"--yaw {self.yaw}: give {' or '.join(YAWS)}.")
         for name, bounds in quantities(Scenario).items():
             bounds.check(getattr(self, name), bounds.cli_name or name)
-        min_length_m = self.speed_m_s * (START_STOP_S if self.kind == "aisle" else CORNER_S)
+        min_length_m = self.speed_m_s * (
+            START_STOP_S if self.kind == "aisle" else CORNER_DURATION_S
+        )
         if self.length_m < min_length_m:
             raise SettingsError(
                 f"--length {self.length_m:g} m is too short for --speed {self.speed_m_s:g} "

@@ -32,11 +32,11 @@ FIRST_POSITION_S = 0.1
 TIMESYNC_CONVERGED_S = 50.0
 MEAN_BURST_LENGTH = 3  # mean number of positions per outlier burst
 # Origin of the local frame outdoors: latitude, longitude (degrees) and altitude (m)
-HOME = (47.397742, 8.545594, 488.0)
+HOME_POSITION = (47.397742, 8.545594, 488.0)
 # Age (s) of a GNSS fix at its timestamp; factors on the GNSS noise north, east and down
 FIX_AGE_S = 1e-3 * PARAMETERS[GNSS_POS.delay].default
 GNSS_SIGMA_FACTORS = np.array([1.0, 1.0, 1.5])
-# Magnetic field (gauss, NED) at HOME; noise of magnetometer (gauss) and barometer (m)
+# Magnetic field (gauss, NED) at HOME_POSITION; noise of magnetometer (gauss) and barometer (m)
 EARTH_FIELD_GAUSS = np.array([0.217, 0.013, 0.430])
 SIGMA_FIELD_GAUSS, SIGMA_BAROMETER_M = 0.02, 0.4
 FIELD_RATE_HZ, BAROMETER_RATE_HZ = 14.0, 10.0
@@ -146,7 +146,7 @@ def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topi
 def barometer(scenario: Scenario, motion: Motion) -> Topic:
     """Simulate vehicle_air_data (barometer) at the full rate."""
     time_us = _grid_us(motion.duration_s, BAROMETER_RATE_HZ)
-    height_m = HOME[2] - motion.at(seconds(time_us)).position_m[:, 2]
+    height_m = HOME_POSITION[2] - motion.at(seconds(time_us)).position_m[:, 2]
     height_m -= height_error(scenario, seconds(time_us))
     noise = random_stream(scenario, Stream.BAROMETER).standard_normal(len(time_us))
     height_m += SIGMA_BAROMETER_M * noise
@@ -436,8 +436,8 @@ def _gnss_topic(
     sigma_m: float,
     scenario: Scenario,
 ) -> Topic:
-    """Make vehicle_gps_position (msg/SensorGps.msg) from positions relative to HOME."""
-    latitude, longitude = unproject(position_m[:, 0], position_m[:, 1], HOME[:2])
+    """Make vehicle_gps_position (msg/SensorGps.msg) from positions relative to HOME_POSITION."""
+    latitude, longitude = unproject(position_m[:, 0], position_m[:, 1], HOME_POSITION[:2])
     accuracy_fields = {
         "eph": sigma_m,
         "epv": sigma_m * GNSS_SIGMA_FACTORS[2],
@@ -446,7 +446,7 @@ def _gnss_topic(
     position_fields = {
         "latitude_deg": latitude,
         "longitude_deg": longitude,
-        "altitude_msl_m": HOME[2] - position_m[:, 2],
+        "altitude_msl_m": HOME_POSITION[2] - position_m[:, 2],
     }
     velocity_fields = {f"vel_{axis}_m_s": velocity_m_s[:, i] for i, axis in enumerate("ned")}
     return topic(

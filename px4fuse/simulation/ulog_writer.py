@@ -20,7 +20,7 @@ _ULOG_TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
 _FLAG_BITS_MESSAGE = bytes(40)
 # Fields of each topic, one line per field: numpy type, name, and default values. A field without
 # default is optional
-FIELDS: Mapping[str, str] = table(__file__, "topics.toml", dict[str, str])
+TOPIC_FIELDS: Mapping[str, str] = table(__file__, "topics.toml", dict[str, str])
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def topic(name: str, field_values: Mapping[str, ArrayLike], table_row: str = "")
     table_row : str
         Name in ``topics.toml``, if it differs from the topic name.
     """
-    rows = [row.split() for row in FIELDS[table_row or name].splitlines()]
+    rows = [row.split() for row in TOPIC_FIELDS[table_row or name].splitlines()]
     unknown_fields = field_values.keys() - {field for _, field, *_ in rows}
     assert not unknown_fields, f"{name} has no {unknown_fields}"
     count, fields = np.size(field_values["timestamp"]), {}

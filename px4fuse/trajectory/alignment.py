@@ -134,8 +134,8 @@ def _align_means(
 
 def _principal_extents(position_m: Array) -> Array:
     """Return the RMS extents (m) about the mean along the principal directions, descending."""
-    centred = position_m - position_m.mean(axis=0)
-    return np.asarray(np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(centred)))
+    centred_m = position_m - position_m.mean(axis=0)
+    return np.asarray(np.linalg.svd(centred_m, compute_uv=False) / np.sqrt(len(centred_m)))
 
 
 def rms_m(difference_m: Array) -> float:

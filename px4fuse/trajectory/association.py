@@ -128,9 +128,9 @@ def is_bracketed(time_s: Array, reference_s: Array, limit_s: float) -> BoolArray
 
     Times that equal a reference time are included.
     """
-    right = np.clip(np.searchsorted(reference_s, time_s), 1, len(reference_s) - 1)
-    previous_s = reference_s[right - 1]
-    next_s = reference_s[right]
+    right_row = np.clip(np.searchsorted(reference_s, time_s), 1, len(reference_s) - 1)
+    previous_s = reference_s[right_row - 1]
+    next_s = reference_s[right_row]
     is_between = (previous_s <= time_s) & (time_s <= next_s) & (next_s - previous_s <= limit_s)
     return np.asarray(is_between | (previous_s == time_s) | (next_s == time_s))
 
@@ -164,10 +164,12 @@ def _pair_nearest(
     has_more = len(estimate_s) > len(reference_s)
     fewer_s = reference_s if has_more else estimate_s
     more_s = estimate_s + offset_s if has_more else reference_s - offset_s
-    right = np.minimum(np.searchsorted(more_s, fewer_s, side="right"), len(more_s) - 1)
-    left = np.maximum(right - 1, 0)
-    nearest = np.where(
-        np.abs(more_s[right] - fewer_s) < np.abs(fewer_s - more_s[left]), right, left
+    right_row = np.minimum(np.searchsorted(more_s, fewer_s, side="right"), len(more_s) - 1)
+    left_row = np.maximum(right_row - 1, 0)
+    nearest_row = np.where(
+        np.abs(more_s[right_row] - fewer_s) < np.abs(fewer_s - more_s[left_row]),
+        right_row,
+        left_row,
     )
-    pair_rows = np.flatnonzero(np.abs(more_s[nearest] - fewer_s) <= limit_s)
-    return (nearest[pair_rows], pair_rows) if has_more else (pair_rows, nearest[pair_rows])
+    pair_rows = np.flatnonzero(np.abs(more_s[nearest_row] - fewer_s) <= limit_s)
+    return (nearest_row[pair_rows], pair_rows) if has_more else (pair_rows, nearest_row[pair_rows])

@@ -163,15 +163,17 @@ def evaluate(
     if alignment is None:
         alignment, reason = choose_alignment(matched_estimate, matched_reference)
     transform = fit_alignment(matched_estimate.position_m, matched_reference.position_m, alignment)
-    aligned = matched_estimate.with_positions(
+    aligned_estimate = matched_estimate.with_positions(
         transform.apply(matched_estimate.position_m), transform.rotation
     )
-    body_rotation, notes = _estimate_body_rotation(aligned, matched_reference)
-    if body_rotation is not None and aligned.rotation is not None:
-        aligned = replace(aligned, rotation=aligned.rotation * body_rotation)
+    body_rotation, notes = _estimate_body_rotation(aligned_estimate, matched_reference)
+    if body_rotation is not None and aligned_estimate.rotation is not None:
+        aligned_estimate = replace(
+            aligned_estimate, rotation=aligned_estimate.rotation * body_rotation
+        )
     distance_m = cumulative_distance(matched_reference.position_m)
-    error_m = np.linalg.norm(aligned.position_m - matched_reference.position_m, axis=1)
-    rotations = scores.get_rotations(aligned, matched_reference, "ATE of the rotation")
+    error_m = np.linalg.norm(aligned_estimate.position_m - matched_reference.position_m, axis=1)
+    rotations = scores.get_rotations(aligned_estimate, matched_reference, "ATE of the rotation")
     rotation_error: Array | None = None
     rotation_statistics: OrUnavailable[Statistics]
     if isinstance(rotations, Unavailable):
@@ -193,13 +195,13 @@ def evaluate(
             scores.statistics(error_m), scores.rmse_interval(error_m, "ATE"), rotation_statistics
         ),
         rpe=tuple(
-            scores.relative_error(aligned, matched_reference, delta, all_pairs=all_pairs)
+            scores.relative_error(aligned_estimate, matched_reference, delta, all_pairs=all_pairs)
             for delta in rpe_deltas
         ),
         time_s=matched_estimate.time_s,
         distance_m=distance_m,
         unaligned_m=matched_estimate.position_m,
-        estimate_m=aligned.position_m,
+        estimate_m=aligned_estimate.position_m,
         reference_m=matched_reference.position_m,
         position_error_m=error_m,
         rotation_error_deg=rotation_error,
@@ -325,16 +327,16 @@ def _swap_warnings(estimate: Trajectory, reference: Trajectory) -> Iterator[str]
 
 
 def _comparison_warnings(
-    estimate: Trajectory, reference: Trajectory, matched: Association, alignment: AlignmentKind
+    estimate: Trajectory, reference: Trajectory, association: Association, alignment: AlignmentKind
 ) -> Iterator[str]:
-    if matched.coverage_estimate < MIN_COVERAGE:
+    if association.coverage_estimate < MIN_COVERAGE:
         yield (
-            f"Only {matched.coverage_estimate:.0%} of the poses of the estimate are evaluated; the "
-            "reference has no poses at the other times."
+            f"Only {association.coverage_estimate:.0%} of the poses of the estimate are evaluated; "
+            "the reference has no poses at the other times."
         )
-    if matched.coverage_reference < MIN_COVERAGE:
+    if association.coverage_reference < MIN_COVERAGE:
         yield (
-            f"The estimate covers only {matched.coverage_reference:.0%} of the time of the "
+            f"The estimate covers only {association.coverage_reference:.0%} of the time of the "
             "reference."
         )
     # A scale is also estimated if the motion does not determine the rotation
@@ -348,20 +350,22 @@ def _comparison_warnings(
 
 
 def _estimate_body_rotation(
-    aligned: Trajectory, reference: Trajectory
+    aligned_estimate: Trajectory, reference: Trajectory
 ) -> tuple[Rotation | None, tuple[str, ...]]:
     """Estimate the constant rotation between different body axes (camera and vehicle)."""
-    if aligned.rotation is None or reference.rotation is None:
+    if aligned_estimate.rotation is None or reference.rotation is None:
         return None, ()
     vehicle_frames = (*_Z_DOWN_FRAMES, *_Z_UP_FRAMES)
-    axes_differ = (aligned.frame == "camera") != (reference.frame == "camera") or any(
-        track.kind == "slam" and other.frame in vehicle_frames and track.frame not in vehicle_frames
-        for track, other in ((aligned, reference), (reference, aligned))
+    axes_differ = (aligned_estimate.frame == "camera") != (reference.frame == "camera") or any(
+        track.kind == "slam"
+        and other_track.frame in vehicle_frames
+        and track.frame not in vehicle_frames
+        for track, other_track in ((aligned_estimate, reference), (reference, aligned_estimate))
     )
     if not axes_differ:
         return None, ()
     # chordal mean (Hartley 2013, section 5.3)
-    rotation = (aligned.rotation.inv() * reference.rotation).mean()
+    rotation = (aligned_estimate.rotation.inv() * reference.rotation).mean()
     return rotation, (
         "Rotation errors exclude the estimated constant rotation from vehicle to camera axes, "
         f"{np.degrees(rotation.magnitude()):.1f}°. Position errors include their lever arm.",

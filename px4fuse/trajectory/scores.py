@@ -27,16 +27,17 @@ DELTA_TOLERANCE = 0.1
 # and MAX_DELTA_FRACTION of path length or duration
 DEFAULT_DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
 DEFAULT_TIMES_S = (1.0, 10.0, 60.0)
-MAX_DEFAULT_DISTANCES, MAX_DEFAULT_TIMES = 3, 2
+# Maximum number of default RPE deltas: distances (m) and times (s)
+MAX_DISTANCE_DELTAS, MAX_TIME_DELTAS = 3, 2
 MIN_DELTA_FRACTION, MAX_DELTA_FRACTION = 1 / 200, 1 / 5
 # Number of resamples and random seed of the bootstrap, and probability of its interval
 BOOTSTRAP_RESAMPLES, BOOTSTRAP_SEED, CONFIDENCE_LEVEL = 2000, 20120101, 0.95
 # Length of a bootstrap block, in integrated autocorrelation times of the squared errors
-BLOCK_TIMES = 3.0
+BLOCK_CORRELATION_TIMES = 3.0
 # Number of lags in the sum of autocorrelations, in integrated autocorrelation times (Sokal 1997)
-WINDOW_TIMES = 5.0
+WINDOW_CORRELATION_TIMES = 5.0
 # Minimum number of bootstrap blocks for a 95 % interval
-MIN_BLOCKS = 5.0
+MIN_BOOTSTRAP_BLOCKS = 5.0
 
 
 @dataclass(frozen=True)
@@ -155,10 +156,10 @@ def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
     max_distance_m = MAX_DELTA_FRACTION * length_m
     distances = [
         value for value in DEFAULT_DISTANCES_M if min_distance_m <= value <= max_distance_m
-    ][-MAX_DEFAULT_DISTANCES:]
+    ][-MAX_DISTANCE_DELTAS:]
     times = [
         t for t in DEFAULT_TIMES_S if 2.0 * median_interval_s <= t <= MAX_DELTA_FRACTION * span_s
-    ][-MAX_DEFAULT_TIMES:]
+    ][-MAX_TIME_DELTAS:]
     return (*(Delta(value, "m") for value in distances), *(Delta(value, "s") for value in times))
 
 
@@ -225,13 +226,13 @@ def _consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
 
 
 def relative_error(
-    aligned: Trajectory, reference: Trajectory, delta: Delta, *, all_pairs: bool = True
+    aligned_estimate: Trajectory, reference: Trajectory, delta: Delta, *, all_pairs: bool = True
 ) -> PairwiseError:
     """Compute the RPE over one delta: E = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j), Sturm (2012), eq. 1.
 
     Parameters
     ----------
-    aligned, reference : Trajectory
+    aligned_estimate, reference : Trajectory
         P and Q, with the same number of poses at the same times. Only the scale of an alignment
         affects the RPE.
     delta, all_pairs
@@ -239,7 +240,7 @@ def relative_error(
     """
     start, end = find_pairs(reference.position_m, reference.time_s, delta, all_pairs=all_pairs)
     analysis_name = f"RPE over {delta}"
-    rotations = get_rotations(aligned, reference, analysis_name)
+    rotations = get_rotations(aligned_estimate, reference, analysis_name)
     if not isinstance(rotations, Unavailable) and not len(start):
         rotations = Unavailable(
             analysis_name, f"no pair of poses with a distance of {delta}", "Use another delta."
@@ -256,7 +257,7 @@ def relative_error(
             rotation_series[start].inv() for rotation_series in rotations
         )
         estimate_motion = estimate_inverse.apply(
-            aligned.position_m[end] - aligned.position_m[start]
+            aligned_estimate.position_m[end] - aligned_estimate.position_m[start]
         )
         reference_motion = reference_inverse.apply(
             reference.position_m[end] - reference.position_m[start]
@@ -283,14 +284,14 @@ def relative_error(
 
 
 def get_rotations(
-    aligned: Trajectory, reference: Trajectory, analysis_name: str
+    aligned_estimate: Trajectory, reference: Trajectory, analysis_name: str
 ) -> tuple[Rotation, Rotation] | Unavailable:
     """Return the orientations of both trajectories; Unavailable if either has none."""
-    if aligned.rotation is not None and reference.rotation is not None:
-        return aligned.rotation, reference.rotation
+    if aligned_estimate.rotation is not None and reference.rotation is not None:
+        return aligned_estimate.rotation, reference.rotation
     return Unavailable(
         analysis_name,
-        f"the {'estimate' if aligned.rotation is None else 'reference'} has no orientation",
+        f"the {'reference' if aligned_estimate.rotation else 'estimate'} has no orientation",
         "Give a trajectory with orientation.",
     )
 
@@ -320,25 +321,29 @@ def rmse_interval(
     """
     squares = errors**2
     n = len(squares)
-    length = max(int(np.ceil(BLOCK_TIMES * autocorrelation_time(squares))), min_block, 1)
-    if n < MIN_BLOCKS * length:
+    length = max(
+        int(np.ceil(BLOCK_CORRELATION_TIMES * autocorrelation_time(squares))), min_block, 1
+    )
+    if n < MIN_BOOTSTRAP_BLOCKS * length:
         return Unavailable(
             f"interval of the {analysis_name} RMSE",
             f"the errors are correlated over {length} of {n} samples, so there are fewer than "
-            f"{MIN_BLOCKS:.0f} independent blocks",
+            f"{MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks",
             "Use a longer flight.",
         )
     sums = np.concatenate(([0.0], np.cumsum(np.concatenate((squares, squares[: length - 1])))))
     block_means = (
         sums[length:] - sums[:-length]
     ) / length  # mean squared error of each circular block
-    blocks = n / length
-    block_starts = np.random.default_rng(BOOTSTRAP_SEED).integers(0, n, (resamples, round(blocks)))
+    block_count = n / length
+    block_starts = np.random.default_rng(BOOTSTRAP_SEED).integers(
+        0, n, (resamples, round(block_count))
+    )
     means = block_means[block_starts].mean(axis=1)
-    quantile = float(stdtrit(blocks - 1.0, 0.5 + CONFIDENCE_LEVEL / 2.0))
-    tail = float(ndtr(-quantile * np.sqrt(blocks / (blocks - 1.0))))
+    quantile = float(stdtrit(block_count - 1.0, 0.5 + CONFIDENCE_LEVEL / 2.0))
+    tail = float(ndtr(-quantile * np.sqrt(block_count / (block_count - 1.0))))
     low, high = np.sqrt(np.maximum(np.quantile(means, [tail, 1.0 - tail]), 0.0))
-    return Interval(float(low), float(high), length, blocks)
+    return Interval(float(low), float(high), length, block_count)
 
 
 def autocorrelation_time(values: Array) -> float:
@@ -346,11 +351,11 @@ def autocorrelation_time(values: Array) -> float:
 
     The sum ends at a lag of five autocorrelation times (Sokal 1997, section 3).
     """
-    centred = values - values.mean()
-    if not centred.any():
+    centred_values = values - values.mean()
+    if not centred_values.any():
         return 1.0
-    n = len(centred)
-    covariance = autocovariance(centred)
+    n = len(centred_values)
+    covariance = autocovariance(centred_values)
     times = 2.0 * np.cumsum(covariance / covariance[0]) - 1.0
-    long_windows = np.flatnonzero(np.arange(n) >= WINDOW_TIMES * times)
+    long_windows = np.flatnonzero(np.arange(n) >= WINDOW_CORRELATION_TIMES * times)
     return max(1.0, float(times[long_windows[0]] if len(long_windows) else n))

@@ -121,18 +121,20 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
     )
 
 
-def _search_offset(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
+def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOffset:
     """Estimate the offset to add to the timestamps of the sparse trajectory."""
-    clock_offset_s = clock_difference(sparse, dense)
+    clock_offset_s = clock_difference(sparse_track, dense_track)
     candidates = ([] if clock_offset_s is None else [clock_offset_s]) + _find_candidates(
-        sparse, dense
+        sparse_track, dense_track
     )
     if not candidates:
         return _not_determinable(
             "the speeds are not correlated at any offset (no motion, constant speed, or different "
             "flights)"
         )
-    coarse_fits = [_refine_offset(sparse, dense, lag, SEARCH_WINDOW_S) for lag in candidates]
+    coarse_fits = [
+        _refine_offset(sparse_track, dense_track, lag, SEARCH_WINDOW_S) for lag in candidates
+    ]
     accepted_fits = [fit for fit in coarse_fits if fit is not None and fit.misfit <= MAX_MISFIT]
     accepted_fits.sort(key=lambda fit: fit.misfit)
     if not accepted_fits:
@@ -156,8 +158,11 @@ def _search_offset(sparse: Trajectory, dense: Trajectory) -> TimeOffset:
             f"{distant_fits[0].rms_m:.3g} m instead of {best_fit.rms_m:.3g} m"
         )
     # The fit is repeated with all poses that overlap at offsets near the first result
-    best_fit = _refine_offset(sparse, dense, best_fit.offset_s, FINE_SEARCH_WINDOW_S) or best_fit
-    half_interval_s = _half_interval(sparse, dense, best_fit)
+    best_fit = (
+        _refine_offset(sparse_track, dense_track, best_fit.offset_s, FINE_SEARCH_WINDOW_S)
+        or best_fit
+    )
+    half_interval_s = _half_interval(sparse_track, dense_track, best_fit)
     if not half_interval_s <= MAX_HALF_INTERVAL_S:
         interval_text = f" (95 %: ±{half_interval_s:.2g} s)" if np.isfinite(half_interval_s) else ""
         return _not_determinable(
@@ -211,14 +216,14 @@ def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArr
     return speeds, is_known
 
 
-def _find_candidates(sparse: Trajectory, dense: Trajectory) -> list[float]:
+def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[float]:
     """Return offsets with correlated speeds, best first (Padfield 2012, eqs. 3 to 9)."""
-    spans_s = [float(track.time_s[-1] - track.time_s[0]) for track in (sparse, dense)]
+    spans_s = [float(track.time_s[-1] - track.time_s[0]) for track in (sparse_track, dense_track)]
     step_s = max(GRID_STEP_S, max(spans_s) / MAX_GRID_SAMPLES)
     if min(spans_s) < 10 * step_s:
         return []
     (sparse_speeds, is_known_sparse), (dense_speeds, is_known_dense) = (
-        _speeds(track, step_s) for track in (sparse, dense)
+        _speeds(track, step_s) for track in (sparse_track, dense_track)
     )
     min_count = max(MIN_OVERLAP_S, MIN_OVERLAP_FRACTION * min(spans_s)) / step_s
     min_count = min(min_count, 0.5 * min(spans_s) / step_s)
@@ -244,8 +249,8 @@ def _find_candidates(sparse: Trajectory, dense: Trajectory) -> list[float]:
     # At index k the first sample of sparse is at sample k - (n - 1) of dense
     lags_s = (
         (order - (len(is_known_sparse) - 1)) * step_s
-        + float(dense.time_s[0])
-        - float(sparse.time_s[0])
+        + float(dense_track.time_s[0])
+        - float(sparse_track.time_s[0])
     )
     return list(lags_s.tolist())
 
@@ -284,16 +289,16 @@ class _OffsetFit:
         return max(self.rms_m / extent, MIN_MISFIT) if extent > 0.0 else float("inf")
 
 
-def _half_interval(sparse: Trajectory, dense: Trajectory, fit: _OffsetFit) -> float:
+def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _OffsetFit) -> float:
     """Return the half-width of the 95 % interval (s).
 
     Infinite if a change of position, rotation or scale has the same effect as a time offset.
     """
     n = len(fit.time_s)
     centred_m = fit.aligned_m - fit.aligned_m.mean(axis=0)
-    dense_velocity = _velocity(dense, fit.time_s + fit.offset_s)
+    dense_velocity = _velocity(dense_track, fit.time_s + fit.offset_s)
     sparse_velocity = fit.transform.rotation.apply(
-        fit.transform.scale * _velocity(sparse, fit.time_s)
+        fit.transform.scale * _velocity(sparse_track, fit.time_s)
     )
     # Remove the effect of a time offset that equals a translation, small rotation or scale
     columns = [np.tile(axis, (n, 1)) for axis in np.eye(3)]
@@ -329,27 +334,29 @@ def _correlation_length(values: Array) -> int:
 
 
 def _refine_offset(
-    sparse: Trajectory, dense: Trajectory, lag_s: float, window_s: float
+    sparse_track: Trajectory, dense_track: Trajectory, lag_s: float, window_s: float
 ) -> _OffsetFit | None:
     """Minimise the ATE over offsets around a candidate; None if too few poses overlap."""
-    time = sparse.time_s
-    gap_limit_s = max(gap_limit(dense.time_s), 0.5 * gap_limit(sparse.time_s))
+    time = sparse_track.time_s
+    gap_limit_s = max(gap_limit(dense_track.time_s), 0.5 * gap_limit(sparse_track.time_s))
     # The same poses are used at every offset, so that the objective is continuous
     window_offsets = (lag_s + shift for shift in (-window_s, 0.0, window_s))
     is_known = np.all(
-        [is_bracketed(time + offset, dense.time_s, gap_limit_s) for offset in window_offsets],
+        [is_bracketed(time + offset, dense_track.time_s, gap_limit_s) for offset in window_offsets],
         axis=0,
     )
     pose_indices = np.flatnonzero(is_known)
-    time_fraction = min(1.0, float(dense.time_s[-1] - dense.time_s[0]) / float(time[-1] - time[0]))
+    time_fraction = min(
+        1.0, float(dense_track.time_s[-1] - dense_track.time_s[0]) / float(time[-1] - time[0])
+    )
     if len(pose_indices) < max(2 * MIN_POSES, MIN_POSES_FRACTION * time_fraction * len(time)):
         return None
     pose_indices = pose_indices[:: -(-len(pose_indices) // MAX_FITTED_POSES)]
     time = time[pose_indices]
-    position = sparse.position_m[pose_indices]
+    position = sparse_track.position_m[pose_indices]
 
     def fit_at(shift_s: float) -> _OffsetFit:
-        target = positions_at(dense, time + (lag_s + shift_s))
+        target = positions_at(dense_track, time + (lag_s + shift_s))
         # The sparse trajectory is transformed: a transformed target could get the scale zero
         transform = umeyama(position, target, with_scale=True)
         return _OffsetFit(lag_s + shift_s, transform, time, transform.apply(position), target)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 # Python errors that missing or invalid values in a damaged file can raise
-BAD_VALUES = (
+BAD_VALUE_ERRORS = (
     ArithmeticError,
     AssertionError,
     LookupError,

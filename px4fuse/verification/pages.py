@@ -39,7 +39,7 @@ from px4fuse.results.reading import one_line
 from px4fuse.verification.model import PageDifference
 from px4fuse.verification.pdf_input import (
     BROKEN_PDF_ERRORS,
-    MAX_VALUES,
+    MAX_PDF_VALUES,
     PYPDF_LIMITS,
     open_strictly,
     resolve_reference,
@@ -52,15 +52,15 @@ COORDINATE_TOLERANCE_PT = 0.25
 # Relative and absolute tolerance of PDF numbers that are not coordinates: other programs save them
 # as 32-bit floats
 NUMBER_TOLERANCE = 1e-5
-# Maximum kerning (1/1000 em) of a text in which a number may differ by rounding: wider kerning
-# could rearrange digits
+# Maximum kerning (1/1000 em) of a text whose numbers may differ by rounding: a wider shift in a
+# submitted PDF could place digits in another order
 MAX_KERNING = 200.0
 # Maximum ratio of submitted to redrawn page content (bytes): PDF may write a character as four
 # bytes
-MAX_LENGTH_RATIO = 4
+MAX_CONTENT_RATIO = 4
 # Maximum time (s) and memory (bytes) for comparing two PDFs: the largest report needs 3 s and 0.3
 # GB
-TIMEOUT_S, MEMORY_BYTES = 12.0, 1_000_000_000
+TIMEOUT_S, MAX_MEMORY_BYTES = 12.0, 1_000_000_000
 MAX_LISTED_DIFFERENCES = 20
 # PDF dictionary keys that are not compared, because programs that save a PDF again change them
 _COMPRESSION_KEYS = frozenset(("/Length", "/Filter"))
@@ -116,13 +116,13 @@ Operation = tuple[str, tuple[Operand, ...]]
 
 
 def compare_pages(
-    submitted: bytes, redrawn: bytes, is_same_text: TextComparison
+    submitted_pdf: bytes, redrawn_pdf: bytes, is_same_text: TextComparison
 ) -> tuple[PageDifference, ...]:
     """Compare a submitted PDF with the redrawn report, in a process with limits.
 
     Parameters
     ----------
-    submitted : bytes
+    submitted_pdf : bytes
         PDF that :func:`px4fuse.verification.pdf_input.read_report` accepted.
     is_same_text : callable
         Returns True if two texts are equal up to the rounding of a number.
@@ -133,8 +133,8 @@ def compare_pages(
         At most MAX_LISTED_DIFFERENCES, in page order; empty if the PDF is as px4fuse writes it. If
         the comparison exceeds its limits, this is the only difference.
     """
-    job = submitted, redrawn, is_same_text
-    differences = run_one_bounded(_compare_pdfs, job, TIMEOUT_S, MEMORY_BYTES)
+    job = submitted_pdf, redrawn_pdf, is_same_text
+    differences = run_one_bounded(_compare_pdfs, job, TIMEOUT_S, MAX_MEMORY_BYTES)
     if not isinstance(differences, JobFailure):
         return differences
     reason = differences.reason.rstrip(".")
@@ -207,53 +207,60 @@ class _PdfComparison:
             yield PageDifference(0, "the file has a second table of objects", True)
 
     def _compare(
-        self, submitted: Any, redrawn: Any, key: str, page: int
+        self, submitted_value: Any, redrawn_value: Any, key: str, page: int
     ) -> Iterator[PageDifference]:
         """Yield the differences of two PDF values and of all values that they contain."""
-        remaining = [(submitted, redrawn, key)]
-        while remaining:
-            submitted, redrawn, key = remaining.pop()
+        remaining_values = [(submitted_value, redrawn_value, key)]
+        while remaining_values:
+            submitted_value, redrawn_value, key = remaining_values.pop()
             self.value_count += 1
-            if self.value_count > MAX_VALUES:
+            if self.value_count > MAX_PDF_VALUES:
                 raise LimitReachedError("the PDF has too many values")
-            if isinstance(submitted, IndirectObject):
-                if submitted.generation:  # some programs ignore the generation
+            if isinstance(submitted_value, IndirectObject):
+                if submitted_value.generation:  # some programs ignore the generation
                     yield PageDifference(
                         page, f"the PDF entry {key} is an object of a later generation", True
                     )
-                if isinstance(redrawn, IndirectObject):
-                    pair = submitted.idnum, submitted.generation, redrawn.idnum
+                if isinstance(redrawn_value, IndirectObject):
+                    pair = submitted_value.idnum, submitted_value.generation, redrawn_value.idnum
                     if pair in self.compared:
                         continue
                     self.compared.add(pair)
-            submitted, redrawn = map(resolve_reference, (submitted, redrawn))
-            if _kind(submitted) is not _kind(redrawn):
+            submitted_value, redrawn_value = map(
+                resolve_reference, (submitted_value, redrawn_value)
+            )
+            if _pdf_type_of(submitted_value) is not _pdf_type_of(redrawn_value):
                 yield PageDifference(page, f"the PDF entry {key} is of another type", True)
-            elif isinstance(redrawn, DictionaryObject):
-                yield from self._dictionaries(submitted, redrawn, key, page, remaining)
-            elif isinstance(redrawn, ArrayObject):
-                if len(submitted) != len(redrawn):
-                    expected = f"px4fuse writes {len(redrawn)}"
-                    description = f"the array {key} has {len(submitted)} elements; {expected}"
+            elif isinstance(redrawn_value, DictionaryObject):
+                yield from self._dictionaries(
+                    submitted_value, redrawn_value, key, page, remaining_values
+                )
+            elif isinstance(redrawn_value, ArrayObject):
+                if len(submitted_value) != len(redrawn_value):
+                    expected = f"px4fuse writes {len(redrawn_value)}"
+                    description = f"the array {key} has {len(submitted_value)} elements; {expected}"
                     yield PageDifference(page, description, True)
                     continue
-                pairs = zip(*map(list.__iter__, (submitted, redrawn)), strict=True)
-                remaining += [(*pair, key) for pair in pairs][::-1]
-            elif not self._is_same_value(submitted, redrawn):
-                texts = [one_line(str(value), 60) for value in (submitted, redrawn)]
+                pairs = zip(*map(list.__iter__, (submitted_value, redrawn_value)), strict=True)
+                remaining_values += [(*pair, key) for pair in pairs][::-1]
+            elif not self._is_same_value(submitted_value, redrawn_value):
+                texts = [one_line(str(value), 60) for value in (submitted_value, redrawn_value)]
                 description = f"the PDF entry {key} is {texts[0]!r}; px4fuse writes {texts[1]!r}"
                 yield PageDifference(page, description)
 
     def _dictionaries(
         self,
-        submitted: DictionaryObject,
-        redrawn: DictionaryObject,
+        submitted_dictionary: DictionaryObject,
+        redrawn_dictionary: DictionaryObject,
         key: str,
         page: int,
-        remaining: list[tuple[Any, Any, str]],
+        remaining_values: list[tuple[Any, Any, str]],
     ) -> Iterator[PageDifference]:
-        """Yield different keys and streams of PDF dictionaries; ``remaining`` gets the values."""
-        submitted_keys, redrawn_keys = _keys(submitted, key), _keys(redrawn, key)
+        """Yield different keys and streams of PDF dictionaries; collect values for comparison."""
+        submitted_keys, redrawn_keys = (
+            _compared_keys(submitted_dictionary, key),
+            _compared_keys(redrawn_dictionary, key),
+        )
         for name in sorted(submitted_keys ^ redrawn_keys):
             feature = _FEATURE_NAMES.get(name, f"an entry {one_line(name, 40)}")
             description = f"{feature} is missing"
@@ -261,60 +268,66 @@ class _PdfComparison:
                 description = f"{feature} that px4fuse does not write"
             yield PageDifference(page, description, True)
         for name in sorted(submitted_keys & redrawn_keys, reverse=True):
-            pair = submitted.raw_get(name), redrawn.raw_get(name), name
-            (self.parents if page and name == "/Parent" else remaining).append(pair)
-        if isinstance(submitted, StreamObject) and isinstance(redrawn, StreamObject):
-            yield from self._streams(submitted, redrawn, key, page)
+            pair = submitted_dictionary.raw_get(name), redrawn_dictionary.raw_get(name), name
+            (self.parents if page and name == "/Parent" else remaining_values).append(pair)
+        if isinstance(submitted_dictionary, StreamObject) and isinstance(
+            redrawn_dictionary, StreamObject
+        ):
+            yield from self._streams(submitted_dictionary, redrawn_dictionary, key, page)
 
-    def _is_same_value(self, submitted: Any, redrawn: Any) -> bool:
-        if _kind(redrawn) is float:
+    def _is_same_value(self, submitted_value: Any, redrawn_value: Any) -> bool:
+        if _pdf_type_of(redrawn_value) is float:
             return math.isclose(
-                submitted, redrawn, rel_tol=NUMBER_TOLERANCE, abs_tol=NUMBER_TOLERANCE
+                submitted_value, redrawn_value, rel_tol=NUMBER_TOLERANCE, abs_tol=NUMBER_TOLERANCE
             )
-        if _kind(redrawn) is not str:
-            return bool(submitted == redrawn)
+        if _pdf_type_of(redrawn_value) is not str:
+            return bool(submitted_value == redrawn_value)
         texts = [
             str(value) if isinstance(value, str) else value.decode("latin-1")
-            for value in (submitted, redrawn)
+            for value in (submitted_value, redrawn_value)
         ]
         if texts[0] == texts[1] or all(map(_TYPST_VERSION.fullmatch, texts)):
             return True
         return self.is_same_text(*texts)
 
     def _streams(
-        self, submitted: StreamObject, redrawn: StreamObject, key: str, page: int
+        self, submitted_stream: StreamObject, redrawn_stream: StreamObject, key: str, page: int
     ) -> Iterator[PageDifference]:
-        kind = redrawn.get("/Type")
+        kind = redrawn_stream.get("/Type")
         if kind == "/EmbeddedFile":  # the attached results, which are compared as numbers
             return
-        filters = resolve_reference(submitted.get("/Filter"))
+        filters = resolve_reference(submitted_stream.get("/Filter"))
         if filters not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf does not decode JPEG
             yield PageDifference(page, f"the PDF entry {key} has another compression", True)
             return
-        data, redrawn_data = submitted.get_data(), redrawn.get_data()
-        if data == redrawn_data or (kind == "/Metadata" and _xmp(data) == _xmp(redrawn_data)):
+        data, redrawn_data = submitted_stream.get_data(), redrawn_stream.get_data()
+        if data == redrawn_data or (
+            kind == "/Metadata" and _xmp_metadata(data) == _xmp_metadata(redrawn_data)
+        ):
             return
         is_drawing = key == "/Contents" or kind == "/Pattern"
-        if not is_drawing or len(data) > MAX_LENGTH_RATIO * len(redrawn_data):
+        if not is_drawing or len(data) > MAX_CONTENT_RATIO * len(redrawn_data):
             yield PageDifference(page, f"the content of {key} differs from the redrawn report")
         elif description := self._describe_operation_difference(data, redrawn_data):
             yield PageDifference(page, description)
 
     def _describe_operation_difference(self, submitted: bytes, redrawn: bytes) -> str:
         """Describe the first drawing operation of a page that differs; "" if there is none."""
-        operation_lists = map(_operations, (submitted, redrawn))
+        operation_lists = map(_drawing_operations, (submitted, redrawn))
         font = ""
-        for number, pair in enumerate(zip_longest(*operation_lists, fillvalue=("", ())), start=1):
-            (submitted_operator, submitted_operands), (operator, redrawn_operands) = pair
+        for number, operations in enumerate(
+            zip_longest(*operation_lists, fillvalue=("", ())), start=1
+        ):
+            (submitted_operator, submitted_operands), (operator, redrawn_operands) = operations
             if operator == "Tf":
                 font = str(redrawn_operands[0])
-            if pair[0] == pair[1] or (
+            if operations[0] == operations[1] or (
                 submitted_operator == operator
                 and _has_near_operands(operator, submitted_operands, redrawn_operands)
             ):
                 continue
             if {submitted_operator, operator} <= _TEXT_OPERATORS:
-                texts = [self._text(operands, font) for _, operands in pair]
+                texts = [self._text(operands, font) for _, operands in operations]
                 kerning = [abs(value) for value in submitted_operands if isinstance(value, float)]
                 is_narrow = max(kerning, default=0.0) < MAX_KERNING
                 if texts[0] != texts[1] and is_narrow and self.is_same_text(*texts):
@@ -355,17 +368,17 @@ def _page_references(reader: pypdf.PdfReader) -> list[Any]:
     return [*list.__iter__(tree["/Kids"])]
 
 
-def _kind(value: Any) -> type:
+def _pdf_type_of(value: Any) -> type:
     """Return the type of a PDF value: a name is not a string, a stream is not a dictionary."""
     if isinstance(value, TextStringObject | ByteStringObject):
         return str
     if isinstance(value, int | float):
         return float
     types = StreamObject, DictionaryObject, ArrayObject, NameObject
-    return next((each for each in types if isinstance(value, each)), type(value))
+    return next((pdf_type for pdf_type in types if isinstance(value, pdf_type)), type(value))
 
 
-def _keys(value: DictionaryObject, key: str) -> set[str]:
+def _compared_keys(value: DictionaryObject, key: str) -> set[str]:
     """Return the keys of a PDF dictionary that are compared; a null value is ignored."""
     keys = {name for name in value if not isinstance(value.raw_get(name), NullObject)}
     if isinstance(value, StreamObject):
@@ -375,7 +388,7 @@ def _keys(value: DictionaryObject, key: str) -> set[str]:
     return keys - {"/Params"} if value.get("/Type") == "/EmbeddedFile" else keys
 
 
-def _xmp(data: bytes) -> str:
+def _xmp_metadata(data: bytes) -> str:
     """Return XMP metadata in canonical form, without fields that other programs change."""
     # an XML document type ("<!") may contain entities that expand to huge texts
     if len(data) > MAX_XMP_BYTES or b"<!" in data:
@@ -385,7 +398,7 @@ def _xmp(data: bytes) -> str:
     return _TYPST_VERSION.sub("Typst", _XMP_WRITER_FIELDS.sub("", canonical_text))
 
 
-def _operations(content: bytes) -> Iterator[Operation]:
+def _drawing_operations(content: bytes) -> Iterator[Operation]:
     """Parse the content of a PDF page; yield each drawing operator with its operands."""
     operands: list[Operand] = []
     for match in _TOKEN.finditer(content.decode("latin-1")):
@@ -416,14 +429,16 @@ def _unescaped(match: re.Match[str]) -> str:
 
 
 def _has_near_operands(
-    operator: str, submitted: Sequence[Operand], redrawn: Sequence[Operand]
+    operator: str, submitted_operands: Sequence[Operand], redrawn_operands: Sequence[Operand]
 ) -> bool:
     """Return True if operands are equal, coordinates within COORDINATE_TOLERANCE_PT."""
-    if len(submitted) != len(redrawn):
+    if len(submitted_operands) != len(redrawn_operands):
         return False
-    first = _FIRST_COORDINATE.get(operator, len(redrawn))
-    for index, (operand, expected) in enumerate(zip(submitted, redrawn, strict=True)):
-        tolerance = COORDINATE_TOLERANCE_PT if index >= first else NUMBER_TOLERANCE
+    first_coordinate = _FIRST_COORDINATE.get(operator, len(redrawn_operands))
+    for index, (operand, expected) in enumerate(
+        zip(submitted_operands, redrawn_operands, strict=True)
+    ):
+        tolerance = COORDINATE_TOLERANCE_PT if index >= first_coordinate else NUMBER_TOLERANCE
         if operand != expected and not (
             isinstance(operand, float)
             and isinstance(expected, float)

@@ -23,17 +23,17 @@ from pypdf.generic import ArrayObject, DictionaryObject, IndirectObject, StreamO
 from px4fuse.errors import ResultsError
 from px4fuse.report.pdf import RESULTS_NAME
 from px4fuse.results.contract import AidsResults, ReportedResults, Results
-from px4fuse.results.reading import MAX_BYTES as MAX_ATTACHMENT_BYTES
+from px4fuse.results.reading import MAX_RESULTS_BYTES as MAX_ATTACHMENT_BYTES
 from px4fuse.results.reading import one_line, read_results
-from px4fuse.verification.model import BAD_VALUES
+from px4fuse.verification.model import BAD_VALUE_ERRORS
 
-MAX_BYTES = 25_000_000
+MAX_PDF_BYTES = 25_000_000
 MAX_PAGES = 100
 # Maximum size (bytes) of one inflated PDF stream, and of all inflated streams together
 MAX_CONTENT_BYTES = 20_000_000
 MAX_DOCUMENT_BYTES = 100_000_000
-MAX_OBJECTS = 20_000
-MAX_VALUES = 1_000_000
+MAX_PDF_OBJECTS = 20_000
+MAX_PDF_VALUES = 1_000_000
 # Maximum number of references to missing PDF objects: pypdf searches the whole file for each
 MAX_MISSING_OBJECTS = 100
 
@@ -43,7 +43,7 @@ _COSTLY_REASON = "reading the PDF needs more memory or time than reading a repor
 
 # Exceptions that pypdf raises for damaged PDFs; AttributeError occurred in a test of 900 PDFs with
 # changed bytes. Other exceptions are errors of px4fuse and are not caught
-BROKEN_PDF_ERRORS = (*BAD_VALUES, PyPdfError, AttributeError, zlib.error)
+BROKEN_PDF_ERRORS = (*BAD_VALUE_ERRORS, PyPdfError, AttributeError, zlib.error)
 
 # Keys of PDF dictionaries with active content. Links, comments, forms without scripts and the
 # initial view are allowed, because programs add them when they save a PDF
@@ -56,7 +56,7 @@ _ACTIVE_ACTIONS = re.compile(
 # Limits of pypdf, stricter than its defaults: reports of px4fuse need no recovery of broken
 # streams, no filters except Flate, no chains of filters and no external JBIG2 decoder
 PYPDF_LIMITS: dict[str, Any] = {
-    "maximum_declared_stream_length": MAX_BYTES,
+    "maximum_declared_stream_length": MAX_PDF_BYTES,
     "array_based_stream_maximum_output_length": MAX_CONTENT_BYTES,
     "zlib_maximum_output_length": MAX_CONTENT_BYTES,
     "zlib_maximum_recovery_input_length": 0,
@@ -129,15 +129,15 @@ def attached_results(pdf: bytes, name: str) -> Results:
 
 def open_strictly(pdf: bytes) -> pypdf.PdfReader:
     """Open a PDF without repair of damage, which programs repair differently."""
-    max_entries = 10 * MAX_OBJECTS
+    max_entries = 10 * MAX_PDF_OBJECTS
     return pypdf.PdfReader(io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=max_entries)
 
 
 def _check_file(pdf: bytes) -> None:
     for has_problem, reason in (
         (
-            len(pdf) > MAX_BYTES,
-            f"the file is larger than {MAX_BYTES // 1_000_000} MB; reports are below 2 MB.",
+            len(pdf) > MAX_PDF_BYTES,
+            f"the file is larger than {MAX_PDF_BYTES // 1_000_000} MB; reports are below 2 MB.",
         ),
         (
             not pdf.startswith(b"%PDF-"),
@@ -186,16 +186,16 @@ def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
     return min(max(input_bytes, output_bytes, 1000), limit + 1)
 
 
-def _dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, bool]]:
+def _all_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, bool]]:
     """Yield all PDF dictionaries that a viewer can reach, each once, without decoding streams.
 
     The flag is True if a viewer reaches the dictionary only by a click on a link or bookmark.
     """
     visited: set[tuple[IndirectObject, bool]] = set()
     missing_count = value_count = 0
-    remaining: list[tuple[Any, bool]] = [(reader.trailer, False)]
-    while remaining:
-        value, needs_click = remaining.pop()
+    remaining_values: list[tuple[Any, bool]] = [(reader.trailer, False)]
+    while remaining_values:
+        value, needs_click = remaining_values.pop()
         value_count += 1
         if isinstance(value, IndirectObject):
             if (value, needs_click) in visited:
@@ -206,23 +206,23 @@ def _dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, b
             is_packed = generation == 0 and number in reader.xref_objStm
             is_listed = is_packed or number in reader.xref.get(generation, {})
             missing_count += not is_listed
-            if len(visited) > MAX_OBJECTS or missing_count > MAX_MISSING_OBJECTS:
+            if len(visited) > MAX_PDF_OBJECTS or missing_count > MAX_MISSING_OBJECTS:
                 raise ResultsError(_COSTLY_REASON)
             # ISO 32000-1, 7.3.10: a reference to a missing object is null
             value = value.get_object() if is_listed else None
-        if value_count > MAX_VALUES:
+        if value_count > MAX_PDF_VALUES:
             raise ResultsError(_COSTLY_REASON)
         if isinstance(value, DictionaryObject):
             yield value, needs_click
-            remaining.extend((value.raw_get(key), key == "/A") for key in value)
+            remaining_values.extend((value.raw_get(key), key == "/A") for key in value)
         elif isinstance(value, ArrayObject):
-            remaining.extend((element, False) for element in list.__iter__(value))
+            remaining_values.extend((element, False) for element in list.__iter__(value))
 
 
 def _foreign_features(value: DictionaryObject, needs_click: bool) -> Iterator[str]:
     """Yield the features of a PDF dictionary that reports of px4fuse do not have."""
     yield from (key[1:] for key in value if _ACTIVE_KEYS.fullmatch(key))
-    action, kind = _name(value.get("/S")) or "", _name(value.get("/Type"))
+    action, kind = _pdf_name(value.get("/S")) or "", _pdf_name(value.get("/Type"))
     if _ACTIVE_ACTIONS.fullmatch(action):
         yield action[1:]
     if action == "/URI" and not needs_click:
@@ -233,7 +233,7 @@ def _foreign_features(value: DictionaryObject, needs_click: bool) -> Iterator[st
     if is_stream:
         filters = resolve_reference(value.get("/Filter"))
         filters = filters if isinstance(filters, ArrayObject) else [filters]
-        names = [_name(each) for each in filters if each is not None]
+        names = [_pdf_name(filter_object) for filter_object in filters if filter_object is not None]
         if not _ALLOWED_FILTERS.issuperset(names) or len(set(names)) != len(names):
             filter_names = " ".join(name or "?" for name in names[:3])
             yield f"a stream with other compression ({one_line(filter_names, 60)})"
@@ -244,7 +244,7 @@ def resolve_reference(value: Any) -> Any:
     return value.get_object() if isinstance(value, IndirectObject) else value
 
 
-def _name(value: object) -> str | None:
+def _pdf_name(value: object) -> str | None:
     value = resolve_reference(value)
     return str(value) if isinstance(value, str) else None
 
@@ -254,9 +254,9 @@ def _attachment(reader: pypdf.PdfReader) -> bytes:
     files: list[DictionaryObject] = []
     streams: dict[int, StreamObject] = {}
     features: set[str] = set()
-    for value, needs_click in _dictionaries(reader):
+    for value, needs_click in _all_dictionaries(reader):
         features.update(_foreign_features(value, needs_click))
-        contents: list[object] = [value] if _name(value.get("/Type")) == "/EmbeddedFile" else []
+        contents: list[object] = [value] if _pdf_name(value.get("/Type")) == "/EmbeddedFile" else []
         if "/EF" in value:
             files.append(value)
             versions = resolve_reference(value.get("/EF"))

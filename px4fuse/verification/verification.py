@@ -72,7 +72,7 @@ ESTIMATE_PATHS = (
 ITERATIONS_FIELD, MAX_MORE_ITERATIONS = "iterations", 2
 # Results fields that are not compared, because they describe the computer that made the report
 MACHINE_PATHS = ("provenance.python", "provenance.libraries")
-MAX_DIFFERENCES = 20
+MAX_LISTED_DIFFERENCES = 20
 MAX_LISTED_PAGES = 5
 MAX_TEXT_LENGTH = 120
 # Factors between a result and its printed number: 1, per cent, thousandths (mm, ms)
@@ -162,41 +162,46 @@ def split_track(source: str) -> tuple[str, str]:
 
 
 def _repeat_comparison(
-    submitted: ComparisonResults, link_file: _LinkFile
+    submitted_results: ComparisonResults, link_file: _LinkFile
 ) -> tuple[object, ReportedResults]:
-    from px4fuse.analysis import run  # noqa: PLC0415
+    from px4fuse.diagnose import diagnose  # noqa: PLC0415
     from px4fuse.results.build import results  # noqa: PLC0415
 
-    recorded = submitted.request
-    if recorded.dt_s < MIN_DT_S:
+    recorded_request = submitted_results.request
+    if recorded_request.dt_s < MIN_DT_S:
         reason = f"DT is below {MIN_DT_S:g} s, so the analysis would take too long"
         raise NotRepeatableError(reason, ASK_ADVICE)
-    hash_by_role = {file.role: file.sha256 for file in submitted.log.joined}
-    request = replace(recorded, log=link_file(recorded.log, submitted.log.sha256, "the log"))
-    if recorded.mavlink is not None:
-        link = link_file(recorded.mavlink, hash_by_role.get("mavlink"), "--mavlink")
+    hash_by_role = {file.role: file.sha256 for file in submitted_results.log.joined}
+    request = replace(
+        recorded_request,
+        log=link_file(recorded_request.log, submitted_results.log.sha256, "the log"),
+    )
+    if recorded_request.mavlink is not None:
+        link = link_file(recorded_request.mavlink, hash_by_role.get("mavlink"), "--mavlink")
         request = replace(request, mavlink=link)
-    if (position := recorded.position) is not None:
+    if (position := recorded_request.position) is not None:
         link = link_file(position.path, hash_by_role.get("position"), "--position")
         request = replace(request, position=replace(position, path=link))
-    analysis = run(request)
-    return analysis, results(recorded, analysis, submitted.student)
+    analysis = diagnose(request)
+    return analysis, results(recorded_request, analysis, submitted_results.student)
 
 
-def _repeat_loop(submitted: LoopResults, link_file: _LinkFile) -> tuple[object, ReportedResults]:
-    from px4fuse.analysis import run_loop  # noqa: PLC0415
+def _repeat_loop(
+    submitted_results: LoopResults, link_file: _LinkFile
+) -> tuple[object, ReportedResults]:
+    from px4fuse.diagnose import analyse_loop_closure  # noqa: PLC0415
     from px4fuse.results.build import loop_results  # noqa: PLC0415
 
-    recorded = submitted.request
-    path, track = split_track(recorded.source)
-    link = link_file(path, submitted.track.sha256, "the log")
-    request = replace(recorded, source=link + track)
-    if recorded.reference is not None:
-        path, track = split_track(recorded.reference)
-        sha256 = submitted.references[-1].sha256 if submitted.references else None
+    recorded_request = submitted_results.request
+    path, track = split_track(recorded_request.source)
+    link = link_file(path, submitted_results.track.sha256, "the log")
+    request = replace(recorded_request, source=link + track)
+    if recorded_request.reference is not None:
+        path, track = split_track(recorded_request.reference)
+        sha256 = submitted_results.references[-1].sha256 if submitted_results.references else None
         request = replace(request, reference=link_file(path, sha256, "--reference") + track)
-    analysis = run_loop(request)
-    return analysis, loop_results(recorded, analysis, submitted.student)
+    analysis = analyse_loop_closure(request)
+    return analysis, loop_results(recorded_request, analysis, submitted_results.student)
 
 
 def _draw_report(analysis: object, results: ReportedResults, versions: Provenance) -> bytes:
@@ -252,27 +257,32 @@ def verify(
     if results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"the student's notes have more than {MAX_NOTES_LINES} lines"
         return cannot_verify(reason, ASK_ADVICE)
-    recomputed = recompute(results, logs)
-    if isinstance(recomputed, Verdict):
-        return recomputed
-    return _verify_with_log(results, pdf, *recomputed)
+    new_results = recompute(results, logs)
+    if isinstance(new_results, Verdict):
+        return new_results
+    return _verify_with_log(results, pdf, *new_results)
 
 
-def cannot_verify(reason: str, remedy: str = "", missing: str = "") -> Verdict:
+def cannot_verify(reason: str, remedy: str = "", missing_input: str = "") -> Verdict:
     """Return the verdict "cannot verify", with the reason and the name of a missing input file."""
     reasons = (one_line(reason, 400),)
-    return Verdict("cannot verify", reasons, False, remedy=remedy, missing=missing)
+    return Verdict("cannot verify", reasons, False, remedy=remedy, missing=missing_input)
 
 
 def _verify_with_log(
-    submitted: ReportedResults, pdf: bytes, recomputed: ReportedResults, draw: Callable[[], bytes]
+    submitted_results: ReportedResults,
+    pdf: bytes,
+    new_results: ReportedResults,
+    draw: Callable[[], bytes],
 ) -> Verdict:
-    redrawn = draw()
-    if redrawn == pdf:
+    redrawn_pdf = draw()
+    if redrawn_pdf == pdf:
         reason = "the new run on the log gives an identical PDF"
-        return Verdict("verified", (reason, LIMIT_NOTE), True, page_status="same", redrawn=redrawn)
+        return Verdict(
+            "verified", (reason, LIMIT_NOTE), True, page_status="same", redrawn=redrawn_pdf
+        )
     mismatches, is_same_number, value_count = compare_results(
-        to_plain(submitted), to_plain(recomputed)
+        to_plain(submitted_results), to_plain(new_results)
     )
     reasons = [
         f"all {value_count} values agree with a new run on the log (within "
@@ -285,10 +295,12 @@ def _verify_with_log(
             f"{len(mismatches)} of {value_count} values differ from a new run on the log: {paths}"
         ]
     is_same_text = partial(is_same_text_rounded, is_same_number=is_same_number)
-    pages = compare_pages(pdf, redrawn, is_same_text)
+    pages = compare_pages(pdf, redrawn_pdf, is_same_text)
     is_foreign = any(difference.is_structural for difference in pages)
-    own_libraries = recomputed.provenance.libraries.items()
-    other_libraries = {*submitted.provenance.libraries.items()} - {*own_libraries} if pages else ()
+    own_libraries = new_results.provenance.libraries.items()
+    other_libraries = (
+        {*submitted_results.provenance.libraries.items()} - {*own_libraries} if pages else ()
+    )
     is_comparable = not (is_foreign or other_libraries)
     page_status: PageStatus = "same"
     if pages:
@@ -310,8 +322,10 @@ def _verify_with_log(
         reasons.append(f"the report was made with {versions}; this computer has other versions")
         remedy = remedy or f"Verify it with {versions}."
     reasons += [LIMIT_NOTE] * (status == "verified")
-    listed = mismatches[:MAX_DIFFERENCES]
-    return Verdict(status, tuple(reasons), True, listed, page_status, pages, redrawn, remedy)
+    listed_mismatches = mismatches[:MAX_LISTED_DIFFERENCES]
+    return Verdict(
+        status, tuple(reasons), True, listed_mismatches, page_status, pages, redrawn_pdf, remedy
+    )
 
 
 def is_same_number_rounded(pairs: Iterable[tuple[float, float]], number: str, redrawn: str) -> bool:
@@ -319,8 +333,8 @@ def is_same_number_rounded(pairs: Iterable[tuple[float, float]], number: str, re
 
     A pair contains a recorded and a recomputed result that are equal within the tolerances.
     """
-    decimals, printed = _decimals(number), (float(number), float(redrawn))
-    return decimals == _decimals(redrawn) and any(
+    decimals, printed = _decimal_count(number), (float(number), float(redrawn))
+    return decimals == _decimal_count(redrawn) and any(
         printed == (round(abs(a) * scale, decimals), round(abs(b) * scale, decimals))
         for scale in PRINTED_SCALES
         for a, b in pairs
@@ -328,7 +342,7 @@ def is_same_number_rounded(pairs: Iterable[tuple[float, float]], number: str, re
 
 
 def compare_results(
-    recorded: Mapping[str, Any], recomputed: Mapping[str, Any]
+    recorded_results: Mapping[str, Any], new_results: Mapping[str, Any]
 ) -> tuple[tuple[Mismatch, ...], TextComparison, int]:
     """Compare all values of the recorded results with those of a new run.
 
@@ -341,11 +355,11 @@ def compare_results(
     value_count : int
         Number of compared values.
     """
-    command = str(recomputed["provenance"]["command"])
+    command = str(new_results["provenance"]["command"])
     # with the value "auto" or the option --position, all numbers depend on an estimated time offset
     # or frame alignment
     is_estimate_everywhere = not {"auto", "--position"}.isdisjoint(command.split())
-    recorded_values, new_values = dict(flatten(recorded)), dict(flatten(recomputed))
+    recorded_values, new_values = dict(flatten(recorded_results)), dict(flatten(new_results))
     pairs = {
         path: (recorded_values.get(path, _ABSENT), new_values.get(path, _ABSENT))
         for path in {**new_values, **recorded_values}
@@ -396,24 +410,24 @@ def is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _is_near(path: str, submitted: float, recomputed: float, is_estimate: bool) -> bool:
-    if isinstance(recomputed, int):
+def _is_near(path: str, submitted_number: float, new_number: float, is_estimate: bool) -> bool:
+    if isinstance(new_number, int):
         tolerance: float = MAX_MORE_ITERATIONS * path.endswith(ITERATIONS_FIELD)
     elif is_estimate:
-        tolerance = ESTIMATE_RELATIVE_TOLERANCE * abs(recomputed) + ESTIMATE_ABSOLUTE_TOLERANCE
+        tolerance = ESTIMATE_RELATIVE_TOLERANCE * abs(new_number) + ESTIMATE_ABSOLUTE_TOLERANCE
     else:
-        tolerance = RELATIVE_TOLERANCE * abs(recomputed) + ABSOLUTE_TOLERANCE
-    return abs(submitted - recomputed) <= tolerance
+        tolerance = RELATIVE_TOLERANCE * abs(new_number) + ABSOLUTE_TOLERANCE
+    return abs(submitted_number - new_number) <= tolerance
 
 
-def _is_same(submitted: Any, recomputed: Any, is_same_number: TextComparison) -> bool:
+def _is_same(submitted_value: Any, new_value: Any, is_same_number: TextComparison) -> bool:
     """Return True if two values are equal, texts up to the rounding of their numbers."""
-    if isinstance(submitted, str) and isinstance(recomputed, str):
-        return is_same_text_rounded(submitted, clean_text(recomputed), is_same_number)
-    return type(submitted) is type(recomputed) and bool(submitted == recomputed)
+    if isinstance(submitted_value, str) and isinstance(new_value, str):
+        return is_same_text_rounded(submitted_value, clean_text(new_value), is_same_number)
+    return type(submitted_value) is type(new_value) and bool(submitted_value == new_value)
 
 
-def is_same_text_rounded(one: str, other: str, is_same_number: TextComparison) -> bool:
+def is_same_text_rounded(first_text: str, second_text: str, is_same_number: TextComparison) -> bool:
     """Return True if two texts are equal up to the rounding of their numbers.
 
     >>> is_same_text_rounded("0.15 m", "0.16 m", lambda one, other: True)
@@ -421,20 +435,20 @@ def is_same_text_rounded(one: str, other: str, is_same_number: TextComparison) -
     >>> is_same_text_rounded("0.15 m", "0.15 s", lambda one, other: True)
     False
     """
-    if one == other:
+    if first_text == second_text:
         return True
     # texts and numbers alternate in the lists
-    pieces, other_pieces = _NUMBER.split(one), _NUMBER.split(other)
+    pieces, other_pieces = _NUMBER.split(first_text), _NUMBER.split(second_text)
     numbers = zip(pieces[1::2], other_pieces[1::2], strict=False)
     return pieces[::2] == other_pieces[::2] and all(
         a == b or is_same_number(a, b) for a, b in numbers
     )
 
 
-def _decimals(number: str) -> int:
+def _decimal_count(number: str) -> int:
     """Count the decimal places of a printed number.
 
-    >>> _decimals("0.15"), _decimals("3"), _decimals("1.2e-3")
+    >>> _decimal_count("0.15"), _decimal_count("3"), _decimal_count("1.2e-3")
     (2, 0, 4)
     """
     mantissa, _, exponent = number.partition("e")

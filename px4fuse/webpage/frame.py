@@ -60,16 +60,16 @@ class Cell:
     bar: float | None = None
 
 
-def text_cell(text: str, below: str = "") -> Cell:
+def text_cell(text: str, text_below: str = "") -> Cell:
     """Return a cell sorted by its text."""
-    return Cell(text, text or None, below)
+    return Cell(text, text or None, text_below)
 
 
-def number_cell(value: float | None, text: str | None = None, below: str = "") -> Cell:
+def number_cell(value: float | None, text: str | None = None, text_below: str = "") -> Cell:
     """Return a cell sorted by a number; empty if the value is None or not finite."""
     if value is None or not math.isfinite(value):
         return Cell()
-    return Cell(f"{value:.4g}" if text is None else text, value, below)
+    return Cell(f"{value:.4g}" if text is None else text, value, text_below)
 
 
 Section = list[Any]
@@ -131,7 +131,7 @@ def links_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:
 
 def boxes_section(
     title: str,
-    owner: str,
+    person_id: str,
     rows: Sequence[tuple[str, float, float | None, str]],
     other_rows: Sequence[tuple[str, float | None, str]] = (),
 ) -> Section:
@@ -139,13 +139,13 @@ def boxes_section(
 
     Parameters
     ----------
-    owner : str
+    person_id : str
         Id of the person in the exported table.
     rows : sequence of (name, maximum, points, comment)
     other_rows : sequence of (name, points, comment)
         Further rows of the exported table, without boxes.
     """
-    return ["boxes", title, owner, rows, other_rows]
+    return ["boxes", title, person_id, rows, other_rows]
 
 
 # ------------------------------------------------------------------ the page
@@ -165,7 +165,7 @@ def page(
     full_table_note: str,
     ratio_axis: Mapping[str, Any] | None = None,
 ) -> str:
-    """Make the page.
+    """Make a web page with a table that can be sorted, searched and filtered.
 
     Parameters
     ----------
@@ -182,8 +182,8 @@ def page(
     full_table_note : str
         Sentence for readers without scripts: the file with all rows.
     ratio_axis : mapping, optional
-        Axis of columns with ratios: ``ends``, ``bands`` and ``marks`` (SVG paths) by the second
-        word of a cell's style class.
+        Scale of the plots in columns of ratios: ``ends``, ``bands`` and ``marks`` (SVG paths).
+        Keys are the second word of the style class of a cell.
 
     Returns
     -------

@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
-MAX_CHARACTERS = 20_000
+MAX_TEXT_LENGTH = 20_000
 # Control characters except tab and line feed, surrogates, and bidirectional overrides, which would
 # reverse the text after them
 HARMFUL_CHARACTERS = re.compile(
@@ -20,7 +20,7 @@ HARMFUL_CHARACTERS = re.compile(
 )
 
 
-def clean(text: str, max_length: int = MAX_CHARACTERS) -> str:
+def clean(text: str, max_length: int = MAX_TEXT_LENGTH) -> str:
     r"""Replace harmful characters and shorten the text to `max_length` characters.
 
     >>> clean("a\x1b\u202eb", 10), clean("abcdef", 3)
@@ -30,7 +30,7 @@ def clean(text: str, max_length: int = MAX_CHARACTERS) -> str:
     return HARMFUL_CHARACTERS.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
-def clean_values(value: Any, max_length: int = MAX_CHARACTERS) -> Any:
+def clean_values(value: Any, max_length: int = MAX_TEXT_LENGTH) -> Any:
     """Clean all texts in nested data, and convert numpy numbers to Python numbers."""
     if isinstance(value, str):
         return clean(value, max_length)

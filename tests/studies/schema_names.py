@@ -19,7 +19,7 @@ from freeze import SHOWN_DIFFERENCES, compare
 
 from px4fuse.findings.model import RENAMED_IDS
 from px4fuse.results.contract import to_json
-from px4fuse.results.model import VERSION
+from px4fuse.results.model import SCHEMA_VERSION
 
 # Old name: new name, or a pattern for the path of the parent with the new name
 FIELDS: dict[str, str | tuple[str, str]] = {
@@ -73,7 +73,7 @@ VALUES = {
     },
     "severity": {"info": "note"},
     "statistic": {"apart": "difference"},
-    "version": {"3.0": VERSION},
+    "version": {"3.0": SCHEMA_VERSION},
 }
 
 

@@ -73,10 +73,10 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
     if not len(tested_edges):
         return []
     chain = model.odometry_chain(graph, tested_edges)
-    first = graph.first[tested_edges]
+    first_node = graph.first[tested_edges]
     second = graph.second[tested_edges]
-    first_pose = int(min(first.min(), second.min()))
-    chain_edges = chain[first_pose : int(max(first.max(), second.max()))]
+    first_pose = int(min(first_node.min(), second.min()))
+    chain_edges = chain[first_pose : int(max(first_node.max(), second.max()))]
     missing_steps = np.flatnonzero(chain_edges < 0)
     if len(missing_steps):
         vertex = first_pose + int(missing_steps[0])
@@ -94,22 +94,24 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
         [np.zeros((1, *step_covariances.shape[1:])), np.cumsum(step_covariances, axis=0)]
     )
     chain_covariance = (
-        cumulative_covariance[np.maximum(first, second) - first_pose]
-        - cumulative_covariance[np.minimum(first, second) - first_pose]
+        cumulative_covariance[np.maximum(first_node, second) - first_pose]
+        - cumulative_covariance[np.minimum(first_node, second) - first_pose]
     )
     to_end = lie.adjoint(lie.inverse(poses[second - first_pose]))
     covariance = to_end @ chain_covariance @ to_end.transpose(0, 2, 1)
-    relative = lie.between(poses[first - first_pose], poses[second - first_pose])
+    relative = lie.between(poses[first_node - first_pose], poses[second - first_pose])
     residual = lie.log(lie.between(graph.measurements[tested_edges], relative))
     jacobian = lie.right_jacobian_inverse(residual)
     covariance = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
     edge_residuals = zip(tested_edges.tolist(), residual, covariance, strict=True)
-    return [_test_edge(graph, edge, r, sigma) for edge, r, sigma in edge_residuals]
+    return [_test_edge(graph, edge_index, r, sigma) for edge_index, r, sigma in edge_residuals]
 
 
-def _test_edge(graph: model.PoseGraph, edge: int, residual: Array, covariance: Array) -> GateResult:
-    vertices = int(graph.ids[graph.first[edge]]), int(graph.ids[graph.second[edge]])
-    directions, variance = model.information_eigenvectors(graph.information[edge])
+def _test_edge(
+    graph: model.PoseGraph, edge_index: int, residual: Array, covariance: Array
+) -> GateResult:
+    vertices = int(graph.ids[graph.first[edge_index]]), int(graph.ids[graph.second[edge_index]])
+    directions, variance = model.information_eigenvectors(graph.information[edge_index])
     degrees_of_freedom = len(variance)
     observed_residual = directions.T @ residual
     residual_covariance = directions.T @ covariance @ directions + np.diag(variance)
@@ -131,16 +133,16 @@ def _test_edge(graph: model.PoseGraph, edge: int, residual: Array, covariance: A
 
 def _covariances(graph: model.PoseGraph, chain_edges: IntArray) -> Array:
     """Return the covariances of odometry edges in the axes of the later pose."""
-    scale, scaled = model.scale_to_unit_diagonal(graph.information[chain_edges])
-    is_full_rank = np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
+    scale, scaled_information = model.scale_to_unit_diagonal(graph.information[chain_edges])
+    is_full_rank = np.linalg.eigvalsh(scaled_information)[:, 0] > 1e-12
     if not np.all(is_full_rank):
         edge = chain_edges[int(np.argmin(is_full_rank))]
         raise TrajectoryError(
             f"The odometry edge from vertex {graph.ids[graph.first[edge]]} to "
             f"{graph.ids[graph.second[edge]]} has no information in one direction",
-            "Give information in all directions.",
+            "Give each edge an information matrix of full rank.",
         )
-    covariance = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
+    covariance = np.linalg.inv(scaled_information) / (scale[:, :, None] * scale[:, None, :])
     is_backward = graph.first[chain_edges] > graph.second[chain_edges]
     # (Z exp(r))^-1 = Z^-1 exp(-Ad(Z) r)
     measured_adjoint = lie.adjoint(graph.measurements[chain_edges[is_backward]])

@@ -59,7 +59,7 @@ def compose(a: Array, b: Array) -> Array:
     d = _dimension(a)
     rotation = a[..., 2:] + b[..., 2:] if d == 2 else (_rotation_of(a) * _rotation_of(b)).as_quat()
     return np.concatenate(
-        [a[..., :d] + _multiply(rotation_matrix(a), b[..., :d]), rotation], axis=-1
+        [a[..., :d] + _multiply_rotations(rotation_matrix(a), b[..., :d]), rotation], axis=-1
     )
 
 
@@ -75,7 +75,9 @@ def between(a: Array, b: Array) -> Array:
     rotation = (
         b[..., 2:] - a[..., 2:] if d == 2 else (_rotation_of(a).inv() * _rotation_of(b)).as_quat()
     )
-    return np.concatenate([_multiply(inverse_rotation, b[..., :d] - a[..., :d]), rotation], axis=-1)
+    return np.concatenate(
+        [_multiply_rotations(inverse_rotation, b[..., :d] - a[..., :d]), rotation], axis=-1
+    )
 
 
 def exp(tangent: Array) -> Array:
@@ -104,7 +106,9 @@ def log(pose: Array) -> Array:
     """
     d = _dimension(pose)
     phi = wrap(pose[..., 2:]) if d == 2 else _rotation_of(pose).as_rotvec()
-    return np.concatenate([_multiply(_left_jacobian_inverse(phi), pose[..., :d]), phi], axis=-1)
+    return np.concatenate(
+        [_multiply_rotations(_left_jacobian_inverse(phi), pose[..., :d]), phi], axis=-1
+    )
 
 
 def adjoint(pose: Array) -> Array:
@@ -191,7 +195,7 @@ def _rotation_of(pose: Array) -> Rotation:
     return Rotation.from_quat(pose[..., 3:])
 
 
-def _multiply(matrix: Array, vector: Array) -> Array:
+def _multiply_rotations(matrix: Array, vector: Array) -> Array:
     return (matrix @ vector[..., None])[..., 0]
 
 

@@ -131,8 +131,8 @@ def information_eigenvectors(information: Array) -> tuple[Array, Array]:
     variance : ndarray, shape (k,)
         ``information == directions @ diag(1 / variance) @ directions.T``.
     """
-    scale, scaled = scale_to_unit_diagonal(information)
-    values, vectors = np.linalg.eigh(scaled)
+    scale, scaled_information = scale_to_unit_diagonal(information)
+    values, vectors = np.linalg.eigh(scaled_information)
     is_observed = values > MIN_OBSERVED_EIGENVALUE
     return scale[:, None] * vectors[:, is_observed], 1.0 / values[is_observed]
 
