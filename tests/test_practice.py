@@ -83,7 +83,8 @@ def flown(mistake: HiddenMistake | None, level: int, seed: int) -> Flight:
 
 
 def compared(flight: Flight, **settings: float) -> Comparison:
-    return compare(flight, Settings(**({"sigma_a_m_s2": practice.SIGMA_A_M_S2} | settings)))
+    chosen = Settings(**({"sigma_a_m_s2": practice.SIGMA_A_M_S2} | settings))
+    return compare(flight, chosen, as_sent=True)
 
 
 def kf_statistics(flight: Flight, **settings: float) -> Any:
