@@ -179,7 +179,7 @@ class Intervention(Record, frozen=True, kw_only=True):
 def interventions_for(
     causes: Iterable[Intervention], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> list[Intervention]:
-    """Return the re-runs that test causes of a mean NIS or NEES outside its limits."""
+    """Return the re-runs of one filter and axis that may explain its mean NIS or NEES."""
     return [
         intervention
         for intervention in causes
@@ -289,7 +289,7 @@ def planned_configurations(
         for change in ekf2_changes.candidates(*discrepancy)
     ]
     if isinstance(comparison.main.filters["ekf2"], FilterSummary):
-        changes += ekf2_changes.requested_axis_changes(comparison.main)
+        changes += ekf2_changes.changes_on_requested_axis(comparison.main)
     return [
         FilterConfiguration({**flown, **change})
         for change in changes
@@ -412,7 +412,7 @@ def _try_on_main_axis(changed: _FilterRerun) -> list[Trial]:
     result, owner = changed.comparison.main, changed.filter_name
     if not isinstance(result.filters[owner], FilterSummary):
         return []
-    candidates = changed.requested_axis_changes(result)
+    candidates = changed.changes_on_requested_axis(result)
     if not candidates or (before := changed.flown_outcome(result)) is None:
         return []
 
@@ -492,7 +492,10 @@ class _FilterRerun:
 
     @abstractmethod
     def other_candidates(self, tuned: AxisTuning | None) -> list[Change]:
-        """Return changes of other settings; ``tuned`` is None if the reported σ is too large."""
+        """Return changes of settings that are no position noise, time offset or heading.
+
+        ``tuned`` is None if the reported σ is too large: a larger noise is then no candidate.
+        """
 
     @abstractmethod
     def outcome(self, result: AxisComparison, change: Change) -> RunStatistics:
@@ -518,7 +521,7 @@ class _FilterRerun:
         """
         return self.outcome(result, {})
 
-    def requested_axis_changes(self, result: AxisComparison) -> list[Change]:
+    def changes_on_requested_axis(self, result: AxisComparison) -> list[Change]:
         """Return each changed setting that is re-run on the requested axis, for NIS or NEES."""
         changes = self.candidates(result, "nis")
         return changes + [
@@ -567,9 +570,9 @@ class _KfRerun(_FilterRerun):
     def kind_of(self, name: str) -> str:
         return KF_KINDS[name]
 
-    def requested_axis_changes(self, result: AxisComparison) -> list[Change]:
+    def changes_on_requested_axis(self, result: AxisComparison) -> list[Change]:
         """Return the single changes, both noises together, and the default settings."""
-        changes = super().requested_axis_changes(result)
+        changes = super().changes_on_requested_axis(result)
         noises = [change for change in changes if change.keys() <= SETTING_CHANGES]
         if len(noises) > 1:
             changes.append({name: value for change in noises for name, value in change.items()})
@@ -640,7 +643,8 @@ class _KfRerun(_FilterRerun):
             )
             axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
             if is_gnss_rotation:
-                # GNSS and ground truth refer to true north, so the attitude is misaligned
+                # GNSS and ground truth both refer to true north, so the attitude is misaligned and
+                # not one of them: the rotation applies to both
                 rotated_axis = replace(axis, direction=rotated_direction)
                 truth = project_truth(self.comparison.flight.truth, rotated_axis, segment)
         if FORWARD_BIAS in change:
@@ -707,9 +711,9 @@ class _Ekf2Rerun(_FilterRerun):
         )
         return in_log if _agrees(in_log, self.outcome(result, {})) else None
 
-    def requested_axis_changes(self, result: AxisComparison) -> list[Change]:
+    def changes_on_requested_axis(self, result: AxisComparison) -> list[Change]:
         """Return changes of one setting; a delay also as a shift of the position timestamps."""
-        changes = super().requested_axis_changes(result)
+        changes = super().changes_on_requested_axis(result)
         delays = [change for change in changes if self.inputs.aid.delay in change]
         offsets = super().time_offset_candidates() if delays else []
         return [*changes, *(offset for offset in offsets if offset not in changes)]
@@ -762,10 +766,14 @@ class _Ekf2Rerun(_FilterRerun):
         noise = tuned.sigma_z
         if (noise.low or 0.0) <= self.flown_noise_m <= (noise.high or np.inf):
             return []
-        ml_noise_m = noise.value
-        if ml_noise_m is None:  # the RMS of EKF2's innovations is an upper bound of the noise
-            ml_noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
-        return [noise_change(self.inputs.aid, self.inputs.settings, self.flown_noise_m, ml_noise_m)]
+        proposed_noise_m = noise.value
+        if proposed_noise_m is None:  # the RMS of EKF2's innovations is an upper bound of the noise
+            proposed_noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
+        return [
+            noise_change(
+                self.inputs.aid, self.inputs.settings, self.flown_noise_m, proposed_noise_m
+            )
+        ]
 
     def outcome(self, result: AxisComparison, change: Change) -> RunStatistics:
         """Replay EKF2 with the change; without a change the difference is that of the log."""

@@ -51,10 +51,10 @@ MIN_JUMP_ERROR_M = 0.5  # m; jump for an error: five times the noise of good UWB
 MIN_SCALE = 0.12  # relative scale error for a warning; simulated flights without one reach 0.11
 MIN_SCALE_ERROR = 0.15  # relative scale error for an error: 1 m in 7 m
 MIN_SCALE_SIGMAS = 3.0  # scale error in σ of its estimate; 0.3 % of correct sources exceed it
-MIN_OUTLIER_SHARE = 0.005  # of the positions; normal noise has 0.02 % beyond 3.7 σ
-MIN_OUTLIER_SHARE_ERROR = 0.02  # of the positions, for an error: one per 10 s at 5 Hz
+MIN_OUTLIER_SHARE = 0.005  # outliers over positions; normal noise has 0.02 % beyond 3.7 σ
+MIN_OUTLIER_SHARE_ERROR = 0.02  # for severity error: one outlier per 10 s at 5 Hz
 MIN_OUTLIERS = 3
-# Reported over estimated variance of the positions, or its inverse: for a warning, and for an error
+# Reported over estimated variance of the positions, or its inverse, for severity warning and error
 MIN_VARIANCE_RATIO, MIN_VARIANCE_RATIO_ERROR = 2.0, 3.0
 # Possible causes of a position jump, and action, by kind of source
 JUMP_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
