@@ -27,6 +27,7 @@ from scipy.interpolate import CubicSpline
 ROOT = Path(__file__).resolve().parents[1]
 sys.path += [str(ROOT / "tests"), str(ROOT / "tests" / "studies")]
 
+from comparisons import compare  # noqa: E402
 from exchange import replace  # noqa: E402
 from flights import aisle_flight, unexplained, with_noises  # noqa: E402
 from source_errors import coloured, held, laid_over, two_levels, white  # noqa: E402
@@ -37,8 +38,8 @@ from test_loop import LAP_S, TRUE, GivenClosure, OdometryNoise, laps  # noqa: E4
 from test_source_values import examples as value_examples  # noqa: E402
 
 import px4fuse  # noqa: E402
-from px4fuse.analysis import Analysis, explain  # noqa: E402
-from px4fuse.comparison.comparison import compare  # noqa: E402
+from px4fuse.analysis import Analysis  # noqa: E402
+from px4fuse.diagnose import explain  # noqa: E402
 from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
 from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402

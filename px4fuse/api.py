@@ -8,8 +8,9 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse import request
-from px4fuse.analysis import Analysis, run, run_what_if
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FilterSummary, UntestedFilter
+from px4fuse.diagnose import diagnose, run_what_if
 from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.whatif import WhatIf
@@ -134,7 +135,7 @@ def compare(
     if isinstance(clock_offset_s, int):
         fields["clock_offset_s"] = float(clock_offset_s)
     flight = log if isinstance(log, Flight) else None
-    return run(request.ComparisonRequest(**fields), progress, flight)
+    return diagnose(request.ComparisonRequest(**fields), progress, flight)
 
 
 def table(analysis: Analysis) -> pd.DataFrame:

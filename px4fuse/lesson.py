@@ -44,13 +44,13 @@ def example_1() -> Replay:
 
 
 def kalman_lines() -> Iterator[str]:
-    """Yield the lines of Example 1: the state after each of the six UWB updates."""
+    """Yield the lines of Example 1 as the lesson prints them: the state after each UWB update."""
     kf_run = example_1()
     for time, row in kf_run.steps.loc[kf_run.updates.index].iterrows():
         seconds = float(str(time))
         yield (
-            f"time {seconds:.1f} s: position {row['position_m']:.2f} m (true "
-            f"{TRUE_VELOCITY_M_S * seconds:.2f} m), velocity {row['velocity_m_s']:.2f} m/s, "
+            f"t {seconds:.1f} s: p {row['position_m']:.2f} (true "
+            f"{TRUE_VELOCITY_M_S * seconds:.2f}), v {row['velocity_m_s']:.2f}, "
             f"sigma_p {np.sqrt(row['position_variance_m2']):.3f} m, "
             f"sigma_v {np.sqrt(row['velocity_variance_m2_s2']):.3f} m/s"
         )

@@ -88,7 +88,10 @@ ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FRO
 
 def find_origin(kind: str, path: str) -> Origin:
     """Return the origin in :data:`ORIGINS` with this kind of source and data path."""
-    return next(origin for origin in ORIGINS if (origin.kind, origin.path) == (kind, path))
+    for origin in ORIGINS:
+        if (origin.kind, origin.path) == (kind, path):
+            return origin
+    raise ValueError(f"{kind!r}, {path!r} is not in ORIGINS of {__name__}: add an Origin")
 
 
 def with_orientation(origin: Origin, *, turns: bool) -> Origin:

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from msgspec import structs
 
-from px4fuse.analysis import run
 from px4fuse.card.build import build_card
 from px4fuse.card.model import Card
 from px4fuse.card.numbers import format_metres, format_ratio
+from px4fuse.diagnose import diagnose
 from px4fuse.explore.data import flight_data
 from px4fuse.explore.packing import Packer
 from px4fuse.explore.page import data_scripts, page_text
-from px4fuse.findings import Finding, find
+from px4fuse.findings import Finding
 from px4fuse.record import Record, table
 from px4fuse.report.card_html import card_html
 from px4fuse.request import ComparisonRequest
@@ -208,10 +208,9 @@ def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str
     simulation = flights.simulate(practice_flight.scenario, parse(options))
     flight = flights.to_flight(simulation, f"flight {number + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
-    analysis = run(request, flight=flight)
-    findings, packer = find(analysis), Packer()
-    data, card = flight_data(analysis, packer), build_card(analysis, findings, request)
-    descriptions = [_describe_mistake(*pair, findings) for pair in mistakes_and_sizes]
+    analysis, packer = diagnose(request, flight=flight), Packer()
+    data, card = flight_data(analysis, packer), build_card(analysis, request)
+    descriptions = [_describe_mistake(*pair, analysis.findings) for pair in mistakes_and_sizes]
     key = {
         "right": practice_flight.correct_answers,
         "mistakes": descriptions,

@@ -29,9 +29,11 @@ from hypothesis import HealthCheck, settings
 from pypdf import PdfWriter
 from ulog_tools import Log
 
-from px4fuse import analysis, api
+from px4fuse import api, diagnose
+from px4fuse.analysis import Analysis
 from px4fuse.assignment import truth
 from px4fuse.comparison import comparison
+from px4fuse.comparison.estimates import Progress, ignore_progress
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.filter.fast_replay import quick_replay
 from px4fuse.flight import Flight, Unavailable
@@ -149,9 +151,9 @@ def model(sample_flight: Flight) -> Model:
 
 
 @pytest.fixture(scope="session")
-def sample(sample_log: Path) -> analysis.Analysis:
+def sample(sample_log: Path) -> Analysis:
     """The sample flight, analysed once; tests must not change it."""
-    return _run_cached(ComparisonRequest(log=str(sample_log)))
+    return _diagnose_cached(ComparisonRequest(log=str(sample_log)))
 
 
 def shared(name: str) -> Path:
@@ -226,7 +228,7 @@ def cached_pages(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # The original functions, saved before a test replaces them
-_run, _read = analysis.run, analysis.read_flight
+_diagnose, _read = diagnose.diagnose, diagnose.read_flight
 _cache: dict[tuple[str | bytes, ...] | None, Any] = {}
 
 
@@ -263,9 +265,7 @@ def _cached(known: tuple[str | bytes, ...] | None, make: Callable[[], Any]) -> A
     return _cache[known]
 
 
-def _read_cached(
-    request: ComparisonRequest, progress: analysis.Progress = analysis.ignore_progress
-) -> Flight:
+def _read_cached(request: ComparisonRequest, progress: Progress = ignore_progress) -> Flight:
     return _cached(_flight_key(request), lambda: _read(request, progress))
 
 
@@ -273,24 +273,24 @@ def _read_log_cached(path: str | Path, *, system: int | None = None) -> Flight:
     return _read_cached(ComparisonRequest(log=str(path), system=system))
 
 
-def _run_cached(
+def _diagnose_cached(
     request: ComparisonRequest,
-    progress: analysis.Progress = analysis.ignore_progress,
+    progress: Progress = ignore_progress,
     flight: Flight | None = None,
-) -> analysis.Analysis:
+) -> Analysis:
     if flight is not None and flight is not _cache.get(_flight_key(request)):
-        return _run(request, progress, flight)
-    return _cached(_cache_key(request, "analysis"), lambda: _run(request, progress, flight))
+        return _diagnose(request, progress, flight)
+    return _cached(_cache_key(request, "analysis"), lambda: _diagnose(request, progress, flight))
 
 
 @pytest.fixture(scope="module")
 def cached_analyses() -> Iterator[None]:
     """Analyse equal requests on equal files once; for tests that replace no analysis."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(analysis, "read_flight", _read_cached)
+        patch.setattr(diagnose, "read_flight", _read_cached)
         patch.setattr(tracks, "read_log", _read_log_cached)
-        for place in (analysis, api):
-            patch.setattr(place, "run", _run_cached)
+        for place in (diagnose, api):
+            patch.setattr(place, "diagnose", _diagnose_cached)
         yield
 
 

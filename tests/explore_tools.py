@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from browser import Browser
 
-import px4fuse.analysis
+import px4fuse.diagnose
 from px4fuse.analysis import Analysis
 from px4fuse.request import ComparisonRequest
 
@@ -24,7 +24,7 @@ def explored(sample_log: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
 
     request = ComparisonRequest(log=str(sample_log))
     # looked up at run time, because a fixture replaces it
-    analysis = px4fuse.analysis.run(request)
+    analysis = px4fuse.diagnose.diagnose(request)
     file = tmp_path_factory.mktemp("explore") / "sample.html"
     file.write_bytes(html_text(analysis).encode())
     return file, analysis

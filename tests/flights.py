@@ -11,13 +11,17 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 import pandas as pd
-from exchange import replace
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from px4fuse.analysis import Analysis
 from px4fuse.arrays import Array
+from px4fuse.comparison.causal_replays import run_interventions
+from px4fuse.comparison.estimates import Estimates, Tuning
+from px4fuse.comparison.flight_events import collect_events
 from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.noise_differences import find_noisy_part, tune_by_axis
+from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.filter.signals import Axis, Segment, project_acceleration
 from px4fuse.filter.tuning import HORIZONTAL, tune
 from px4fuse.flight import (
@@ -334,14 +338,21 @@ def given_placement(*warnings: str) -> Alignment:
     )  # fmt: skip
 
 
-def unexplained(comparison: Comparison) -> Analysis:
-    """Return an analysis of the comparison only."""
+def unexplained(comparison: Comparison, tuning: Tuning | None = None) -> Analysis:
+    """Return an analysis of the comparison without estimates other than ``tuning``."""
     parts = {part.name: getattr(comparison, part.name) for part in fields(Comparison)}
+    missing = unavailable("estimates")
+    estimates = Estimates(
+        tuning=tuning or {}, clock=missing, heading=missing, bias_scale_jump_fit=missing,
+        source_low_pass=missing, time_correlated_noise=missing,
+        tuning_by_axis=tune_by_axis(comparison),
+        noisy_part=find_noisy_part(comparison, (tuning or {}).get(HORIZONTAL)),
+    )  # fmt: skip
+    causes, trials = run_interventions(comparison, estimates, missing)
     return Analysis(
-        **parts, tuning={}, clock=unavailable("clock offset"),
-        ekf2_model=unavailable("EKF2 replay"), difference_steps={},
-        loop=unavailable("loop closure"),
-        heading=unavailable("heading error"),
+        **parts, **vars(estimates), ekf2_model=missing, difference_steps={}, causes=causes,
+        trials=trials, events=collect_events(comparison), aids=evaluate_aids(comparison.flight),
+        loop=missing,
     )  # fmt: skip
 
 
@@ -349,4 +360,4 @@ def with_noises(comparison: Comparison) -> Analysis:
     """Return an analysis of the comparison and the maximum-likelihood noises."""
     axes = tuple(result.axis for result in comparison.axes.values())
     tuning = tune(axes, comparison.settings, (HORIZONTAL, "down"))
-    return replace(unexplained(comparison), tuning=tuning)
+    return unexplained(comparison, tuning)

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_tools import error_line, run_checked
+from comparisons import compare
 from flights import aisle_flight
 from pypdf import PdfReader
 
 from px4fuse.answer_form import MISTAKES, StudentMistake, draw_questions, form_text, read_answers
 from px4fuse.assignment.truth import quantity_truth
-from px4fuse.comparison.comparison import compare
 from px4fuse.errors import SettingsError
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings

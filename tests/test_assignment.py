@@ -11,10 +11,10 @@ from collections import Counter
 import numpy as np
 import pytest
 from cli_tools import run_checked
+from comparisons import compare
 from detector_rates import rates
 
 import px4fuse
-from px4fuse.analysis import explain
 from px4fuse.answer_form import Answers, read_answers
 from px4fuse.assignment import assignment
 from px4fuse.assignment.assignment import assign, key_path, simulate_assigned
@@ -28,9 +28,9 @@ from px4fuse.assignment.random_assignment import (
     draw,
 )
 from px4fuse.assignment.roster import Person
-from px4fuse.comparison.comparison import compare
+from px4fuse.diagnose import explain
 from px4fuse.errors import OutputError, SettingsError
-from px4fuse.findings import find, find_loop
+from px4fuse.findings import find_loop
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.simulation.mistakes import parse
@@ -180,7 +180,7 @@ def test_assigned_log_has_a_finding_for_each_mistake_of_key(tmp_path, kind, numb
     if kind == "loop":
         found = find_loop(analyse(LoopSource(trajectory_of(flight, "vio"), flight)))
     else:
-        found = find(explain(compare(flight, axes=("north", "east"))))
+        found = explain(compare(flight, axes=("north", "east"))).findings
     drawn = draw(SECRET, CLASS[number].student_id, kind, count)
     wanted = {FINDINGS[choice.mistake] for choice in choices_of(drawn)}
     assert len(wanted) == count

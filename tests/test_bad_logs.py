@@ -17,9 +17,9 @@ import pytest
 from time_limit import time_limit
 from ulog_tools import Log, make_log, position, seconds_of, selector, stamps, take, topic
 
-from px4fuse.analysis import run_or_evaluate_aids
 from px4fuse.cli import main
 from px4fuse.comparison.preparation import choose_segment, choose_source
+from px4fuse.diagnose import diagnose_or_check_aids
 from px4fuse.errors import LogError, Px4FuseError
 from px4fuse.filter.signals import make_axes
 from px4fuse.flight import Flight, Unavailable
@@ -422,7 +422,7 @@ def test_compare_of_log_with_damaged_values_gives_finite_results(tmp_path, damag
     log = make_log("v1.16", 20.0)
     damage(log)
     request = ComparisonRequest(log=str(log.write(tmp_path / "made.ulg")))
-    results = outcome_results(request, run_or_evaluate_aids(request))
+    results = outcome_results(request, diagnose_or_check_aids(request))
     assert not re.search(r"\b(nan|inf)\b|e\+[23]\d", to_json(results))
     if damage is truth_impossible:
         reason = "vehicle_local_position_groundtruth has no finite sample"

@@ -7,16 +7,18 @@ from typing import Any
 
 import pytest
 from cards import verdicts
+from comparisons import compare
+from exchange import replace
 
-from px4fuse.analysis import Analysis, explain
+from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card, build_refusal_card
 from px4fuse.card.causes import make_cause, rank_causes
 from px4fuse.card.model import Action
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.trials import RunStatistics, Trial, improvement
+from px4fuse.diagnose import explain
 from px4fuse.errors import LogError
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import Finding, find
+from px4fuse.findings import Finding
 from px4fuse.position_source import RECEIVED
 from px4fuse.readers import read_log
 from px4fuse.report.card_text import card_lines
@@ -165,7 +167,7 @@ def test_card_of_unreadable_log_shows_fault_bytes_and_action(tmp_path) -> None:
 
 
 def test_diagnosis_card_of_clean_flight_advises_no_change(sample: Analysis) -> None:
-    card = build_card(sample, (), REQUEST)
+    card = build_card(replace(sample, findings=()), REQUEST)
     assert (card.severity, card.id, card.causes) == ("clean", "", ())
     assert card.headline == "No fault found: KF and EKF2 are consistent"
     assert card.do_this == ("Change nothing.",)
@@ -174,7 +176,7 @@ def test_diagnosis_card_of_clean_flight_advises_no_change(sample: Analysis) -> N
 def test_verdicts_that_differ_by_ekf2_delay_refer_to_the_rerun() -> None:
     flight = simulate_flight(Scenario(seed=8), parse(("ekf2-delay=0.25",)))
     explained = explain(compare(flight, Settings()))
-    card = build_card(explained, find(explained), REQUEST)
+    card = build_card(explained, REQUEST)
     assert (card.id, card.causes[0].reruns[0].improves) == (
         "ekf2_ev_delay_wrong",
         "position and σ",

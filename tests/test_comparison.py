@@ -3,15 +3,14 @@
 import numpy as np
 import pandas as pd
 import pytest
+from comparisons import compare, prepare
 from exchange import replace
 from flights import Estimator, Imu, Uwb, aisle_flight
 from msgspec.structs import asdict
 from pyulog import ULog
 
 from px4fuse.arrays import Array
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import AxisComparison, Comparison, Difference, UntestedFilter
-from px4fuse.comparison.preparation import prepare
 from px4fuse.comparison.projection import project_horizon
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import Settings
@@ -230,7 +229,7 @@ class TestMissingParts:
         assert comparison.lines[0].acceleration in comparison.missing
         assert comparison.main.filters["kf"].count == 600
         with pytest.raises(SettingsError, match="`input` imu"):
-            prepare(flight, input_required=True)
+            prepare(flight, input="imu")
 
     def test_compare_without_ekf2_variances_has_rmse_but_no_nees(self) -> None:
         for result in compare(aisle_flight(ekf2=Estimator(variance_logged=False))).axes.values():

@@ -18,9 +18,10 @@ from px4fuse.convention.axes import CLOCKWISE, FAMILIES, UNITS, Axes
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import Faults, find_faults
 from px4fuse.convention.model import Convention, OrientationConvention
+from px4fuse.finding import Finding
 from px4fuse.findings import source_convention
 from px4fuse.findings.cause_grouping import CONVENTION
-from px4fuse.findings.model import Finding, finding
+from px4fuse.findings.model import finding
 from px4fuse.flight import Columns, Flight, PositionTrack
 from px4fuse.position_source import RECEIVED
 from px4fuse.readers import read_log

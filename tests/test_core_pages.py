@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from comparisons import compare
 from exchange import replace
 from flights import Estimator, Uwb, aisle_flight, unexplained, with_noises
 from matplotlib.collections import PolyCollection
@@ -12,7 +13,6 @@ from msgspec import structs
 from page_tools import axes_of, words
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.findings import Finding
 from px4fuse.flight import FlightMode, Reset

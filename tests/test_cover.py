@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from cards import SMALL_SIGMA_A, verdicts
+from comparisons import compare
 from flights import Estimator, Uwb, aisle_flight, unexplained, with_noises
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -17,7 +18,6 @@ from page_tools import axes_of, every, pdf_of, set_by_typst, smallest_type
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import Action, AidRow, Card, Cause, Note
-from px4fuse.comparison.comparison import compare
 from px4fuse.flight import Reset
 from px4fuse.report import cover, cover_panels
 from px4fuse.report.page import Page

@@ -10,9 +10,8 @@ from cli_tools import run_main
 from time_limit import time_limit
 from ulog_tools import make_log
 
-from px4fuse.analysis import run_comparison
+from px4fuse.diagnose import diagnose
 from px4fuse.errors import LogError
-from px4fuse.findings import find
 from px4fuse.flight import Ekf2, Flight
 from px4fuse.readers import read_log
 from px4fuse.readers.ulog import read_ulog
@@ -160,7 +159,7 @@ def test_read_truncated_log_states_that_it_ends_in_flight(
     assert f"ends within a message after {flight.log.duration_s:.1f} s, in flight" in text
     if share > 0.1:
         return
-    found = find(run_comparison(ComparisonRequest(log=str(path))))
+    found = diagnose(ComparisonRequest(log=str(path))).findings
     (named,) = [one for one in found if one.id == "log_damaged"]
     assert "the file ends within a message" in named.message.lower()
 

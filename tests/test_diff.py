@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import pytest
+from comparisons import compare
 from detector_rates import RIGHT
 from exchange import replace
 from msgspec import structs
 
-from px4fuse.analysis import explain
-from px4fuse.comparison.comparison import compare
+from px4fuse.diagnose import explain
 from px4fuse.ekf2.aids import AidAxis, AidResult
 from px4fuse.fleet.changes import compare_numbers, list_changes
 from px4fuse.fleet.inputs import DiffInput

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from comparisons import compare
 from exchange import replace
 from flights import Estimator, Uwb, aisle_flight
 
 from px4fuse.alignment.merge_recordings import join
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.flight_events import collect_events, source_gaps
 from px4fuse.flight import Flight, FlightMode, Reset, Unavailable
 from px4fuse.log import Dropout

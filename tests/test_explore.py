@@ -16,16 +16,18 @@ import numpy as np
 import pytest
 from browser import Browser, Elements
 from cli_tools import error_line, run_checked
+from comparisons import compare
 from exchange import replace
 from explore_tools import ask, box, mouse, open_view, settle, show
 from flights import Imu, aisle_flight, unexplained
 
-from px4fuse.analysis import Analysis, run_comparison
+from px4fuse.analysis import Analysis
 from px4fuse.card.numbers import format_ratio
 from px4fuse.cli.compare import compare as compare_command
 from px4fuse.cli.options import comparison_request, read_student
-from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.comparison import compare as compare_prepared
 from px4fuse.comparison.model import FILTERS, AxisComparison
+from px4fuse.diagnose import prepare_comparison
 from px4fuse.explore import page as pages
 from px4fuse.explore.page import html_text
 from px4fuse.flight import Flight
@@ -165,7 +167,7 @@ def test_explore_page_slider_values_match_the_shown_command(
     segment = explored[1].segment
     assert (request.start_s, request.end_s) == pytest.approx((segment.start_s, segment.end_s))
     assert request.heading_deg == pytest.approx(explored[1].main.axis.heading_deg)
-    comparison = run_comparison(request)
+    comparison = compare_prepared(prepare_comparison(request))
     north = next(result for result in comparison.axes.values() if result.axis.name == "north")
     shown = page.ask(TABLE)
     assert shown != before

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import Browser
+from comparisons import compare
 from exchange import replace
 from explore_tools import ask
 from flights import Imu, Uwb, aisle_flight
 
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import shift_clock
 from px4fuse.explore.data import OFFSET_HALF_RANGE_S, raw_source, replay_signals

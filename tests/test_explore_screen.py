@@ -13,9 +13,11 @@ import pytest
 from browser import Browser
 from explore_tools import ask, axe, open_view, serious, settle, show
 
-from px4fuse.analysis import Analysis, run, run_comparison
+from px4fuse.analysis import Analysis
 from px4fuse.card.numbers import axis_fraction, format_metres, format_ratio
 from px4fuse.card.verdicts import verdicts
+from px4fuse.comparison.comparison import compare as compare_prepared
+from px4fuse.diagnose import diagnose, prepare_comparison
 from px4fuse.explore.page import html_text
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
@@ -187,7 +189,7 @@ def test_explore_page_card_after_change_equals_python_ratios(
         start_s=analysis.segment.start_s, end_s=analysis.segment.end_s,
         heading_deg=analysis.main.axis.heading_deg,
     )  # fmt: skip
-    main = run_comparison(request, flight=analysis.flight).main
+    main = compare_prepared(prepare_comparison(request, flight=analysis.flight)).main
     source, truth = verdicts(main)[:2]
     rows = page.ask(ROWS)
     for verdict in (source, truth):
@@ -207,7 +209,7 @@ def test_explore_page_card_after_change_equals_python_ratios(
 def test_explore_page_apply_button_sets_values_of_command(
     browser: Browser, sample_log: Path, tmp_path: Path
 ) -> None:
-    analysis = run(ComparisonRequest(log=str(sample_log), sigma_a_m_s2=0.001))
+    analysis = diagnose(ComparisonRequest(log=str(sample_log), sigma_a_m_s2=0.001))
     file = tmp_path / "small.html"
     file.write_bytes(html_text(analysis).encode())
     show(browser, file)
@@ -358,7 +360,7 @@ def _shifted(analysis: Analysis, offset_s: float) -> Any:
         start_s=analysis.segment.start_s, end_s=analysis.segment.end_s,
         heading_deg=analysis.main.axis.heading_deg,
     )  # fmt: skip
-    return run_comparison(request, flight=analysis.flight)
+    return compare_prepared(prepare_comparison(request, flight=analysis.flight))
 
 
 # ------------------------------------------------------------------ accessibility

@@ -8,13 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from cli_tools import run_checked, run_main
+from comparisons import compare
 from conftest import REPOSITORY
 from exchange import replace
 from flights import Estimator, aisle_flight
 from msgspec import structs
 from ulog_tools import make_log
 
-from px4fuse.comparison.comparison import compare
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import ned_acceleration

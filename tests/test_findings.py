@@ -11,13 +11,14 @@ import numpy as np
 import pandas as pd
 import pytest
 from cli_tools import run_main
+from comparisons import compare
 from exchange import replace
 from flights import Estimator, Imu, Uwb, aisle_flight, given_placement, unexplained, with_noises
 from golden_tools import assert_matches_golden, rounded, value
 
-from px4fuse.analysis import run_comparison
-from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.comparison import compare as compare_prepared
 from px4fuse.comparison.model import Comparison
+from px4fuse.diagnose import prepare_comparison
 from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
@@ -354,7 +355,7 @@ def test_source_of_part_of_flight_is_first_finding(
     cases = shared_logs.parent / "cases"
     position = file and PositionFile(path=str(cases / file), frame="enu")
     request = ComparisonRequest(log=str(shared_logs / f"{log}.ulg"), position=position or None)
-    first, *_ = found(run_comparison(request))
+    first, *_ = found(compare_prepared(prepare_comparison(request)))
     # EKF2 fused its own source besides the file
     assert (first.id, first.severity) == (finding, "warning" if file else "error")
     assert f"in flight at {at_s} s: EKF2's error is " in first.title

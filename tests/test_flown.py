@@ -5,12 +5,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from comparisons import compare
 from flights import with_noises
 
-from px4fuse.analysis import explain
 from px4fuse.card.build import build_card
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import FILTERS
+from px4fuse.diagnose import explain
 from px4fuse.filter.time_offset import MAX_CHANGE_P
 from px4fuse.findings import find
 from px4fuse.readers import read_log
@@ -157,7 +157,7 @@ def test_flight_with_known_fault_has_expected_finding(shared_logs, name):
 def test_diagnosis_card_of_known_fault_shows_filter_reruns(shared_logs, name):
     log = shared_logs / "simulated" / f"{name}.ulg"
     analysis, flown = explain(compare(read_log(log))), FLIGHTS[name]
-    cause = build_card(analysis, find(analysis), ComparisonRequest(log=log.name)).causes[0]
+    cause = build_card(analysis, ComparisonRequest(log=log.name)).causes[0]
     assert flown.reruns == tuple(
         (rerun.label, rerun.position_rmse_m, rerun.source_ratio) for rerun in cause.reruns
     )

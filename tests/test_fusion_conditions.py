@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from comparisons import compare
 from findings_tools import NONE, analysis, made, moving, named, only, positions, source
 
-from px4fuse.comparison.comparison import compare
 from px4fuse.ekf2.fusion_conditions import Attempt, find_unmet
 from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.findings import ekf2_not_fusing

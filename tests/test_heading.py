@@ -19,6 +19,7 @@ from px4fuse.filter.frame_rotation import (
     estimate_heading_error,
 )
 from px4fuse.filter.settings import Settings
+from px4fuse.filter.signals import ned_acceleration, project_acceleration
 from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
@@ -37,9 +38,9 @@ def simulated(*mistakes: str, seed: int = 3, **scenario: float) -> Flight:
 
 def estimate(flight: Flight, sigma_z_m: float = SIGMA_UWB_M) -> HeadingError | Unavailable:
     track, _ = choose_source(flight)
-    return estimate_heading_error(
-        flight, track, choose_segment(flight, track), Settings(), sigma_z_m
-    )
+    segment = choose_segment(flight, track)
+    acceleration = project_acceleration(ned_acceleration(flight), np.eye(3)[0], segment)
+    return estimate_heading_error(flight, track, segment, acceleration, Settings(), sigma_z_m)
 
 
 def rotated(quaternions: pd.DataFrame, misalignment_deg: np.ndarray) -> pd.DataFrame:

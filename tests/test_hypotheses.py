@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from comparisons import compare
 from exchange import replace
 from findings_tools import made as part_of
 from flights import aisle_flight, unavailable, unexplained
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import estimate_frame_rotation, estimate_noises_and_clock
 from px4fuse.filter.hypotheses import DesignMatrix, fit_bias_scale_jumps, make_design_matrix
 from px4fuse.filter.kalman import replay

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from cli_tools import run_main
 from click.testing import CliRunner
+from comparisons import compare
 from exchange import replace
 from flights import Estimator, Uwb, aisle_flight
 from mavlink_tools import Aisle
 from ulog_tools import Log, load, make_log, odometry, stamps, take, topic
 
 from px4fuse.cli import cli
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import choose_source
+from px4fuse.diagnose import explain
 from px4fuse.errors import Px4FuseError
-from px4fuse.findings import find
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.inspect.inventory import AnalysisOption, Inventory, Source, take_inventory, to_plain
 from px4fuse.log import Dropout, Sender
@@ -175,7 +175,7 @@ def test_info_on_damaged_log_states_the_damage_first(tmp_path, sample_log):
     inventory = take_inventory(read_log(path))
     assert any("damaged" in note for note in inventory.notes)
     assert "link" in remedies(inventory)[0]
-    (named,) = [f for f in find(compare(read_log(path))) if f.id == "log_damaged"]
+    (named,) = [f for f in explain(compare(read_log(path))).findings if f.id == "log_damaged"]
     assert not any("SD card" in remedy for remedy in (*remedies(inventory), named.remedy))
     ulog = bytearray(sample_log.read_bytes())
     ulog[1_500_000:1_504_096] = bytes(4096)
@@ -269,7 +269,7 @@ def test_info_prints_log_dropouts_and_advice(monkeypatch, tmp_path, sample_fligh
     log = replace(sample_flight.log, format="MAVLink tlog", senders=senders, dropouts=dropouts,
                   start_unix_s=1e18)  # fmt: skip
     flight = replace(sample_flight, log=log)
-    monkeypatch.setattr("px4fuse.analysis.read_log", lambda _, **__: flight)
+    monkeypatch.setattr("px4fuse.diagnose.read_log", lambda _, **__: flight)
     assert take_inventory(flight).start_utc is None
     text = info(tmp_path / "any.tlog")
     assert widest(text) <= WIDTH

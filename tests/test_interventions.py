@@ -6,22 +6,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from comparisons import compare
 from exchange import replace
 
-from px4fuse.analysis import Analysis, explain
+from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import (
-    CLOCK_OFFSET,
-    FORWARD_BIAS,
     MIN_EXPLAINED_SHARE,
-    OUTLIERS,
-    ROTATION,
     Intervention,
     find_cause,
     planned_configurations,
     run_interventions,
 )
-from px4fuse.comparison.causal_replays import RIGHT_BIAS as TO_RIGHT
-from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.changes import CLOCK_OFFSET, FORWARD_BIAS, OUTLIERS, ROTATION
+from px4fuse.comparison.changes import RIGHT_BIAS as TO_RIGHT
+from px4fuse.diagnose import explain
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.model import replay_settings, with_misaligned_positions, with_position_noise
 from px4fuse.ekf2.whatif import what_if
@@ -127,7 +125,7 @@ def test_kf_rerun_equals_compare_with_the_changed_setting(analysis, of) -> None:
         kf = of_comparison.axes["north"].filters["kf"]
         return float(kf.nis_mean if of == "nis" else kf.truth.nees_position_mean)
 
-    assert found.before == statistic(analysis)
+    assert found.before == pytest.approx(statistic(analysis), rel=1e-9)
     # the re-run's NEES is at KF's steps, that of the comparison at EKF2's sample times
     assert found.after == pytest.approx(statistic(again), rel=1e-6 if of == "nis" else 0.1)
     assert found.explained_fraction == pytest.approx(
@@ -139,14 +137,14 @@ def test_ekf2_rerun_equals_what_if_with_the_same_change() -> None:
     analysis = flown("ekf2-noise=0.03")
     found = [find_cause(analysis.causes, "ekf2", axis) for axis in ("north", "east")]
     model, change = analysis.ekf2_model, found[0].change  # type: ignore[union-attr]
-    replays = what_if(replace(model), [change])  # a copy without cached replays
+    replays = what_if(replace(model, runs=()), [change])  # a copy without cached replays
     for one, axis in zip(found, ("north", "east"), strict=True):
-        assert one.before == analysis.axes[axis].filters["ekf2"].nis_mean
+        assert one.before == pytest.approx(replays.replayed.axes[axis].nis_mean, rel=1e-9)
+        assert one.before == pytest.approx(analysis.axes[axis].filters["ekf2"].nis_mean, rel=0.1)
         assert one.after == pytest.approx(replays.whatif[0].axes[axis].nis_mean, rel=1e-9)
     # the configuration was planned with EKF2 as flown; other positions give another replay
-    known = analysis, analysis.tuning, analysis.clock, analysis.heading
     assert FilterConfiguration({**model.inputs.settings, **change}) in planned_configurations(
-        *known, model.inputs
+        analysis, analysis, model.inputs
     )
     once, other = (
         replay_settings(of, [change])[0] for of in (model, with_position_noise(model, 0.01, 1))
@@ -202,8 +200,7 @@ def test_ekf2_rerun_candidates_include_non_default_parameters() -> None:
     settings = {**analysis.ekf2_model.inputs.settings, "EKF2_ACC_NOISE": 0.5, "EKF2_GYR_NOISE": 0.1}
     inputs = replace(analysis.ekf2_model.inputs, settings=settings)
     model = replace(analysis.ekf2_model, inputs=inputs)
-    rows, _ = run_interventions(analysis, analysis.tuning, analysis.clock, analysis.heading,
-                         analysis.bias_scale_jump_fit, model)  # fmt: skip
+    rows, _ = run_interventions(analysis, analysis, model)
     tried = [one.change for one in rows if (one.axis, one.statistic) == ("aisle", "nis")]
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
@@ -240,12 +237,8 @@ def test_filter_rerun_without_required_data_is_skipped() -> None:
     analysis = flown("nlos=7%", sigma_z=0.05)
     missing = Unavailable("it", "not known", "None.")
 
-    def tried(**parts: Any) -> set[tuple[str, str]]:
-        known: dict[str, Any] = {
-            "tuning": analysis.tuning, "clock": analysis.clock, "heading": analysis.heading,
-            "bias_scale_jump_fit": analysis.bias_scale_jump_fit, "model": analysis.ekf2_model,
-        }  # fmt: skip
-        rows, _ = run_interventions(analysis, **{**known, **parts})
+    def tried(model: Any = analysis.ekf2_model, **parts: Any) -> set[tuple[str, str]]:
+        rows, _ = run_interventions(analysis, replace(analysis, **parts), model)
         return {(row.filter, name) for row in rows for name in row.change}
 
     assert tried() == {("kf", "sigma_z_m"), ("kf", OUTLIERS), ("ekf2", OUTLIERS)}

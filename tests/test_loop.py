@@ -109,10 +109,9 @@ def test_loop_corrections_of_sample_flight_reduce_ate(sample_loop):
     for way, within in (("by_distance_plain", 1e-9), ("by_distance", 1e-9), ("gated", 0.02)):
         position = path(sample_loop, way).trajectory.position_m
         assert np.linalg.norm(position[-1] - position[0] - end) < within
-    for way in ("pose_graph_dcs", "pose_graph_gnc"):
-        robust = sample_loop.corrections[way]  # type: ignore[index]
-        assert isinstance(robust, Unavailable)
-        assert robust.reason == SINGLE_LOOP_REASON
+    robust = sample_loop.corrections["pose_graph_gnc"]
+    assert isinstance(robust, Unavailable)
+    assert robust.reason == SINGLE_LOOP_REASON
 
 
 def test_loop_on_lesson_example_2_equals_lesson_output() -> None:
@@ -230,13 +229,12 @@ def test_false_loop_closure_is_rejected_among_true_ones() -> None:
     assert all(judged.accepted for judged in true)
     without = rmse(clean, "all")
     assert without < 0.6 * rmse(clean, "uncorrected")
-    # used without a gate it deforms the path; gate, DCS and GNC exclude it
+    # used without a gate it deforms the path; gate and GNC exclude it
     assert rmse(fooled, "all") > 3.0 * without
-    for name in ("gated", "dcs", "gnc"):
+    for name in ("gated", "gnc"):
         assert rmse(fooled, name) == pytest.approx(without, rel=0.05), name
-    for name in ("weight_dcs", "weight_gnc"):
-        assert getattr(false, name) < 0.05
-        assert min(getattr(judged, name) for judged in true) > 0.5
+    assert false.weight_gnc < 0.05
+    assert min(judged.weight_gnc for judged in true) > 0.5
     named = [finding.id for finding in find_loop(fooled)]
     assert named[0] == "false_loop_closure"
     assert "loop_closure_inconsistent" not in named

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from comparisons import compare
 from mavlink_tools import (
     AUTOPILOT,
     BOOT_S,
@@ -46,9 +47,8 @@ from pandas.testing import assert_frame_equal
 from scipy.spatial.transform import Rotation
 from time_limit import time_limit
 
-from px4fuse.comparison.comparison import compare
+from px4fuse.diagnose import explain
 from px4fuse.errors import LogError, MissingDataError
-from px4fuse.findings import find
 from px4fuse.flight import Columns, Ekf2, Flight, Truth, Unavailable
 from px4fuse.inspect.inventory import take_inventory
 from px4fuse.position_source import MOTION_CAPTURE, RECEIVED
@@ -431,7 +431,11 @@ def test_ardupilot_messages_contain_no_px4_advice(read, missing_messages):
     texts = [str(part) for part in take_inventory(flight).advice]
     texts += [str(part) for part in flight.missing]
     if flight.positions:
-        texts += [f"{f.message} {f.remedy}" for f in find(compare(flight)) if f.id != "not_px4"]
+        texts += [
+            f"{f.message} {f.remedy}"
+            for f in explain(compare(flight)).findings
+            if f.id != "not_px4"
+        ]
     else:
         with pytest.raises(MissingDataError) as refused:
             compare(flight)
@@ -511,7 +515,7 @@ def test_mavlink_gnss_position_is_relative_to_autopilot_origin(read, origin, clo
     assert track.samples[Columns.POSITION].to_numpy() == pytest.approx(true, abs=exact_m)
     variance = track.samples[Columns.POSITION_VARIANCE].iloc[0]
     assert variance.to_numpy() == pytest.approx([0.09, 0.09, 0.25])
-    result = compare(flight, sigma_z_given=False)
+    result = compare(flight, sigma_z_m=None)
     assert result.source.name == "GPS_RAW_INT"
     assert result.settings.sigma_z_m == 0.5  # EKF2_GPS_P_NOISE is the lower limit
 

@@ -11,21 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 from cli_tools import error_line, run_checked
+from comparisons import compare
 from ekf2_tools import opened
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
-from px4fuse.analysis import Analysis, explain
-from px4fuse.comparison.causal_replays import (
-    POSITION_VARIANCES,
-    ROTATION,
-    find_cause,
-    interventions_for,
-)
-from px4fuse.comparison.comparison import compare
+from px4fuse.analysis import Analysis
+from px4fuse.comparison.causal_replays import POSITION_VARIANCES, find_cause, interventions_for
+from px4fuse.comparison.changes import ROTATION
 from px4fuse.comparison.projection import project as project_state
 from px4fuse.comparison.remedy import aid_of
+from px4fuse.diagnose import explain
 from px4fuse.ekf2.model import replay_settings
 from px4fuse.ekf2.whatif import HEADING_LOGGED_NOTE, what_if
 from px4fuse.errors import SettingsError

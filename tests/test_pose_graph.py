@@ -290,31 +290,31 @@ def ate(poses: np.ndarray, truth: np.ndarray) -> float:
 
 
 def test_robust_pose_graph_removes_false_loop_closure() -> None:
-    """ATE of DCS and GNC is within 5 % of the solution without the false closure."""
-    off: dict[str, list[float]] = {"none": [], "dcs": [], "gnc": []}
+    """ATE is within 5 % of the solution without the false closure."""
+    off: dict[bool, list[float]] = {False: [], True: []}
     for seed in range(SEEDS):
         graph, truth, true = laps(seed)
         known = ate(solve(graph.select_edges(true)).poses, truth)
-        for method in ("none", "dcs", "gnc"):
-            solution = solve(graph, robust_method=method)
+        for robust in (False, True):
+            solution = solve(graph, robust=robust)
             # plain least squares may not converge with a false closure
-            assert solution.converged or method == "none"
-            off[method].append(ate(solution.poses, truth) / known - 1.0)
+            assert solution.converged or not robust
+            off[robust].append(ate(solution.poses, truth) / known - 1.0)
             assert np.all((solution.weights >= 0.0) & (solution.weights <= 1.0))
             assert np.all(solution.weights[graph.is_successive] == 1.0)
             squared = residuals(graph, solution.poses).chi2
             assert solution.cost == pytest.approx(0.5 * np.sum(solution.weights * squared))
-            if method != "none":
-                assert solution.weights[~true].max() < 0.05, (method, seed)
-    within = {method: np.mean(np.abs(values) <= 0.05) for method, values in off.items()}
-    assert within["gnc"] == within["dcs"] == 1.0
-    assert within["none"] < 0.2
+            if robust:
+                assert solution.weights[~true].max() < 0.05, seed
+    within = {robust: np.mean(np.abs(values) <= 0.05) for robust, values in off.items()}
+    assert within[True] == 1.0
+    assert within[False] < 0.2
 
 
 def test_gnc_pose_graph_keeps_weight_1_of_true_loop_closures() -> None:
     for seed in range(2):
         graph, _, _ = laps(seed, false=0)
-        robust = solve(graph, robust_method="gnc")
+        robust = solve(graph, robust=True)
         assert robust.weights.min() == 1.0
         assert robust.cost == pytest.approx(solve(graph).cost, rel=1e-8)
 
@@ -322,13 +322,12 @@ def test_gnc_pose_graph_keeps_weight_1_of_true_loop_closures() -> None:
 def test_robust_pose_graph_reweights_only_given_loop_closures() -> None:
     graph, _, true = laps(0)
     plain = solve(graph).cost
-    for method in ("dcs", "gnc"):
-        sure = solve(graph, robust_method=method, is_closure=np.zeros(len(true), dtype=bool))
-        np.testing.assert_array_equal(sure.weights, 1.0)
-        assert sure.cost == plain
-        told = solve(graph, robust_method=method, is_closure=~true)
-        np.testing.assert_array_equal(told.weights[true], 1.0)
-        assert told.weights[~true].max() < 0.05
+    sure = solve(graph, robust=True, is_closure=np.zeros(len(true), dtype=bool))
+    np.testing.assert_array_equal(sure.weights, 1.0)
+    assert sure.cost == plain
+    told = solve(graph, robust=True, is_closure=~true)
+    np.testing.assert_array_equal(told.weights[true], 1.0)
+    assert told.weights[~true].max() < 0.05
 
 
 # --- covariance and gate --------------------------------------------------------------------------

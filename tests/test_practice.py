@@ -18,13 +18,13 @@ import pytest
 from browser import Browser
 from cards import SMALL_SIGMA_A
 from cli_tools import run_checked
+from comparisons import compare
 from explore_tools import ask, axe, serious, settle, show
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
 from px4fuse import practice
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.filter.settings import Settings
 from px4fuse.flight import Flight

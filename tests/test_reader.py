@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from comparisons import compare
 from exchange import replace
 from ulog_tools import (
     AXES,
@@ -26,7 +27,6 @@ from ulog_tools import (
     topic,
 )
 
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.errors import MissingDataError
 from px4fuse.flight import Columns, Reset, Unavailable

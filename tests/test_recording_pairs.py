@@ -1,10 +1,10 @@
 """IMU rate that the estimate of a clock offset needs."""
 
 import pytest
+from comparisons import compare
 from exchange import replace
 from flights import Imu, aisle_flight
 
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.flight import Unavailable

@@ -4,14 +4,16 @@ import re
 from functools import cache
 
 import pytest
+from comparisons import compare
 from exchange import replace
 
-from px4fuse.analysis import Analysis, explain
+from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy as remedies
-from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.causal_replays import run_interventions
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import ml_ekf2_parameters, noise_used_m
 from px4fuse.comparison.trials import RunStatistics, Trial, find_trial, has_effect, improvement
+from px4fuse.diagnose import explain
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, ekf2_rejecting, find, source_clock
@@ -137,12 +139,14 @@ def test_recommended_rerun_is_smallest_sufficient_change() -> None:
 
 
 def offset(analysis: Analysis, offset_s: float) -> Analysis:
-    """Make the analysis with another estimated time offset."""
+    """Make the analysis with another estimated time offset, and its re-runs."""
     clock = replace(
         analysis.clock, offset_s=offset_s, interval_s=(offset_s - 0.01, offset_s + 0.01),
         sigma_s=0.005, is_determinable=True, change_p_value=None,
     )  # fmt: skip
-    return replace(analysis, clock=clock)
+    changed = replace(analysis, clock=clock)
+    causes, trials = run_interventions(changed, changed, changed.ekf2_model)
+    return replace(changed, causes=causes, trials=trials)
 
 
 def test_estimated_ekf2_parameters_follow_noise_and_time_offset(sample: Analysis) -> None:

@@ -209,7 +209,9 @@ def offset(**changes: Any) -> ClockOffset:
 def with_clock(found: ClockOffset | Unavailable, delay_ms: float = 0.0) -> Any:
     log = SimpleNamespace(name="x.ulg", parameters={"EKF2_EV_DELAY": delay_ms})
     settings, flight = SimpleNamespace(clock_offset_s=0.0), SimpleNamespace(log=log)
-    return SimpleNamespace(clock=found, settings=settings, flight=flight, source=source())
+    return SimpleNamespace(
+        clock=found, settings=settings, flight=flight, source=source(), convention=None
+    )
 
 
 def test_report_page_on_time_offset_is_printed_only_with_result() -> None:

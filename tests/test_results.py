@@ -5,14 +5,14 @@ import math
 
 import jsonschema
 import pytest
+from comparisons import compare
 from exchange import replace
 from flights import unexplained
 from results_tools import EXAMPLE, LOOP, changed_results, decode_results
 
 import px4fuse
-from px4fuse.analysis import explain
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import UntestedFilter
+from px4fuse.diagnose import explain
 from px4fuse.errors import ResultsError
 from px4fuse.flight import Flight
 from px4fuse.report.pdf import render

@@ -210,7 +210,8 @@ def test_clock_shift_changes_only_timestamps():
     moved = shift_clock(track, -0.1)
     np.testing.assert_allclose(moved.samples.index, track.samples.index - 0.1, atol=1e-12)
     np.testing.assert_array_equal(moved.samples, track.samples)
-    assert replace(moved, samples=track.samples) == track
+    kept = {name: getattr(track, name) for name in ("samples", "invalid", "status")}
+    assert replace(moved, **kept) == track
 
 
 def test_axis_contains_only_measurements_of_evaluated_segment():

@@ -7,13 +7,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from cli_tools import run_checked
+from comparisons import compare
 from exchange import replace
 from flights import unexplained
 from scipy.integrate import cumulative_simpson
 from scipy.spatial.transform import Rotation
 
 import px4fuse
-from px4fuse.comparison.comparison import compare
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.likelihood import innovations, preintegrate

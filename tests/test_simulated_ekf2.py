@@ -3,11 +3,12 @@
 import numpy as np
 import pandas as pd
 import pytest
+from comparisons import compare
 from exchange import replace
 from flights import unexplained
 from scipy.spatial.transform import Rotation
 
-from px4fuse.comparison.comparison import compare
+from px4fuse.diagnose import explain
 from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.replay import Agreement
@@ -208,7 +209,9 @@ def test_simulated_ekf2_holds_position_if_fusion_is_disabled(clean):
     assert len(record.vision_age_s) == len(plain.vision_age_s)
     # EKF2 holds its position after 5 s, while the vehicle flies 12 m back and forth
     assert rmse(flight, 10.0, 50.0) > 2.0 > 10.0 * rmse(clean, 10.0, 50.0)
-    (finding,) = (item for item in find(compare(flight, RIGHT)) if item.id == "ekf2_not_fusing")
+    (finding,) = (
+        item for item in explain(compare(flight, RIGHT)).findings if item.id == "ekf2_not_fusing"
+    )
     assert "EKF2_EV_CTRL" in finding.message
 
 

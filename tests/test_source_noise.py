@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 import source_errors as errors
+from comparisons import compare
 from exchange import replace
 from scipy.interpolate import CubicSpline
 
-from px4fuse.analysis import Analysis, explain
-from px4fuse.comparison.comparison import compare
+from px4fuse.analysis import Analysis
+from px4fuse.diagnose import explain
 from px4fuse.filter import correlated_noise
 from px4fuse.filter.correlated_noise import fit_time_correlation
 from px4fuse.filter.fitting import Noises
@@ -61,7 +62,9 @@ def analysed(
 
 def root_findings(analysis: Analysis) -> dict[str, Finding]:
     """Findings by id without infos, KF settings and consequences."""
-    left_out = ("sigma_", "ekf2_not_logged")
+    left_out = {f"sigma_{one}_too_{size}" for one in "az" for size in ("large", "small")} | {
+        "ekf2_not_logged"
+    }
     return {
         one.id: one for one in find(analysis)
         if one.severity != "note" and one.caused_by is None and not one.id.startswith(left_out)

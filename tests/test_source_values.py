@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pandas as pd
 import pytest
+from comparisons import compare
 from conftest import shared
 from exchange import replace
 from flights import Estimator, Uwb, aisle_flight, unexplained
@@ -15,8 +16,8 @@ from studies.expected_cases import judge, run
 from ulog_tools import make_log, odometry
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import compare
 from px4fuse.convention.model import Convention
+from px4fuse.finding import Finding
 from px4fuse.findings import (
     ekf2_not_fusing,
     source_convention,
@@ -25,7 +26,7 @@ from px4fuse.findings import (
     source_values,
 )
 from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.model import Finding, finding
+from px4fuse.findings.model import finding
 from px4fuse.flight import Columns, Flight
 from px4fuse.log import SHARED_STAMPS, ClockMap
 from px4fuse.readers import read_log

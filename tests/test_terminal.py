@@ -18,8 +18,8 @@ from exchange import replace
 from rich.console import Console
 
 from px4fuse.analysis import Analysis
-from px4fuse.analysis import run as analyse
 from px4fuse.cli.outputs import default_report, progress, terminal
+from px4fuse.diagnose import diagnose as analyse
 from px4fuse.errors import OutputError
 from px4fuse.report import card_text, screen
 from px4fuse.report.card_text import card_lines, with_typed_path

@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from comparisons import compare
 from exchange import replace
 from filter_tools import COUNT, SETTINGS, TRUE, made_flight, modelled
 from flights import line
@@ -11,7 +12,6 @@ from scipy.interpolate import CubicSpline
 from scipy.stats import binom, norm
 
 from px4fuse.cli.tune import format_noise_estimate
-from px4fuse.comparison.comparison import compare
 from px4fuse.filter.likelihood import PROFILE_DROP, innovations, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis

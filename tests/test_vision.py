@@ -13,11 +13,11 @@ import jsonschema
 import numpy as np
 import pandas as pd
 import pytest
+from comparisons import compare
 from ekf2_tools import opened, step_matrix, step_noise, step_state
 from exchange import replace
 
-from px4fuse.analysis import explain, run_what_if
-from px4fuse.comparison.comparison import compare
+from px4fuse.diagnose import explain, run_what_if
 from px4fuse.ekf2 import steps
 from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun, run_segment
 from px4fuse.ekf2.inputs import Inputs, ReceivedPositions

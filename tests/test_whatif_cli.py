@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from cli_tools import run_checked
 
-from px4fuse.analysis import WhatIfAnalysis, run_what_if
+from px4fuse.analysis import WhatIfAnalysis
+from px4fuse.diagnose import run_what_if
 from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.errors import MissingDataError, SettingsError

@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from comparisons import compare
 from exchange import replace
 from flights import unexplained
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.difference_steps import (
     add_sentences,
     corrected_settings,

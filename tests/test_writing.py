@@ -22,7 +22,8 @@ from exchange import replace
 from ulog_tools import make_log
 
 from px4fuse import writing
-from px4fuse.analysis import run_comparison
+from px4fuse.comparison.comparison import compare as compare_prepared
+from px4fuse.diagnose import prepare_comparison
 from px4fuse.errors import OutputError
 from px4fuse.report import fonts, pdf
 from px4fuse.request import ComparisonRequest
@@ -359,7 +360,7 @@ def test_terminal_output_to_closed_pipe_exits_with_0(desk, command) -> None:
 
 def test_clock_offset_auto_is_zero_if_not_significant(sample_log) -> None:
     request = ComparisonRequest(log=str(sample_log), clock_offset_s="auto", axes=("north", "east"))
-    found = run_comparison(request)
+    found = compare_prepared(prepare_comparison(request))
     assert found.settings.clock_offset_s == 0.0
     (said,) = (note for note in found.notes if note.startswith("--clock-offset auto: "))
     low, high = re.search(r"95 % (\S+)(?: s)? to (\S+)", said).groups()
@@ -372,7 +373,8 @@ def test_clock_offset_auto_corrects_late_timestamps(shared_logs) -> None:
         log=str(shared_logs / "simulated" / "v1.16.1_aisle_clock_late.ulg"), axes=("aisle",)
     )
     late, found = (
-        run_comparison(replace(request, clock_offset_s=offset_s)) for offset_s in (0.0, "auto")
+        compare_prepared(prepare_comparison(replace(request, clock_offset_s=offset_s)))
+        for offset_s in (0.0, "auto")
     )
     assert found.settings.clock_offset_s == pytest.approx(-0.25, abs=0.05)
     before_m, after_m = (one.main.filters["kf"].truth.position_rmse_m for one in (late, found))

@@ -10,6 +10,7 @@ from px4fuse.answer_form import GATE_UPDATES, FormQuestion, draw_questions
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
+from px4fuse.comparison.preparation import prepare
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.model import (
     COVARIANCE_COLUMNS,
@@ -23,6 +24,7 @@ from px4fuse.flight import Ekf2, Unavailable
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.record import Record, table
+from px4fuse.request import SIGMA_Z_M, ComparisonRequest
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED_MISTAKES
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
@@ -100,7 +102,9 @@ class FormTruth(Record, frozen=True):
 def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
     """Compute the right answers from a simulation and its analysis with default settings."""
     answer = flights.answer(simulation)
-    comparison = compare(flights.to_flight(simulation), Settings())
+    flight = flights.to_flight(simulation)
+    request = ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M)
+    comparison = compare(prepare(flight, request))
     mistakes = tuple(
         _true_mistake(name, values, answer["truth"], comparison)
         for name, values in answer["mistakes"].items()

@@ -49,7 +49,8 @@ from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings.model import Finding, group_by_root
+from px4fuse.finding import Finding
+from px4fuse.findings.model import group_by_root
 from px4fuse.flight import Ekf2, Unavailable, source_name
 from px4fuse.log import LogInfo
 from px4fuse.reading import display_name, file_size, read_head
@@ -94,25 +95,20 @@ SENTENCES_BY_SOURCE_FAULT = (
 
 
 def build_card(
-    analysis: Analysis,
-    findings: Sequence[Finding],
-    request: ComparisonRequest,
-    student: tuple[str, str] = ("", ""),
+    analysis: Analysis, request: ComparisonRequest, student: tuple[str, str] = ("", "")
 ) -> Card:
     """Build the diagnosis card of a comparison.
 
     Parameters
     ----------
     analysis : Analysis
-    findings : sequence of Finding
-        Most severe first; a finding that is a consequence follows its cause.
     request : ComparisonRequest
         Options of the user, which the commands on the card repeat without paths.
     student : (str, str)
         Name and id of the student.
     """
     result, source, segment = analysis.main, analysis.source, analysis.segment
-    roots = [group[0] for group in group_by_root(findings)]
+    roots = [group[0] for group in group_by_root(analysis.findings)]
     verdicts = make_verdicts(result)
     ranked_causes = rank_causes(analysis, roots)
     causes = tuple(
@@ -124,7 +120,9 @@ def build_card(
     horizon_ratio = None if causes else _horizon_ratio(analysis)
     if horizon_ratio is not None:
         verdicts = (*verdicts[:-1], replace(verdicts[-1], is_explained=True))
-    reconcile = _reconcile(analysis, verdicts, causes, [finding.id for finding in findings])
+    reconcile = _reconcile(
+        analysis, verdicts, causes, [finding.id for finding in analysis.findings]
+    )
     if not reconcile and any(verdict.is_explained for verdict in verdicts) and may_drift:
         reconcile = DRIFT_HIDES_ERROR
     if horizon_ratio is not None:
@@ -160,13 +158,10 @@ def build_card(
 
 
 def build_aids_card(
-    analysis: AidsOnlyAnalysis,
-    findings: Sequence[Finding],
-    request: ComparisonRequest,
-    student: tuple[str, str] = ("", ""),
+    analysis: AidsOnlyAnalysis, request: ComparisonRequest, student: tuple[str, str] = ("", "")
 ) -> Card:
     """Build the card of a flight without a position source, from EKF2's aiding sources."""
-    roots = [group[0] for group in group_by_root(findings)]
+    roots = [group[0] for group in group_by_root(analysis.findings)]
     faults = [finding for finding in roots if finding.severity != "note"]
     causes = tuple(make_plain_cause(finding) for finding in faults[:MAX_CAUSES])
     missing_data = analysis.missing_data

@@ -12,12 +12,7 @@ from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import Action, Cause, FilterName, Rerun, Target, Verdict
-from px4fuse.comparison.causal_replays import (
-    CLOCK_OFFSET,
-    OUTLIERS,
-    SIGMA_A,
-    SIGMA_Z,
-)
+from px4fuse.comparison.changes import CLOCK_OFFSET, OUTLIERS, SIGMA_A, SIGMA_Z
 from px4fuse.comparison.trials import (
     Trial,
     enters_band,
@@ -32,8 +27,9 @@ from px4fuse.comparison.trials import (
 from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CONVENTION
-from px4fuse.findings.model import CATALOGUE, Finding
+from px4fuse.findings.model import CATALOGUE
 from px4fuse.flight import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 from px4fuse.text import with_log_name

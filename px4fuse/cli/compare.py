@@ -54,8 +54,9 @@ def compare(
     mistakes and how to fix them. Writes a PDF report and the results as JSON, for example
     reports/LOG_sigma-z-0.05.pdf and .json.
     """
-    from px4fuse.analysis import failed_checks, run_or_evaluate_aids
+    from px4fuse.analysis import failed_checks
     from px4fuse.card.build import build_refusal_card
+    from px4fuse.diagnose import diagnose_or_check_aids
     from px4fuse.memory import release_free_memory
     from px4fuse.report.terminal import card_page, summary
     from px4fuse.results.build import outcome_results
@@ -65,7 +66,7 @@ def compare(
     outputs.report_paths(output, json_path)  # report an invalid path before the long analysis
     try:
         with outputs.progress(json_path) as show_progress:
-            outcome = run_or_evaluate_aids(request, show_progress)
+            outcome = diagnose_or_check_aids(request, show_progress)
             results = outcome_results(request, outcome, student)
             release_free_memory()  # the report modules, imported next, need memory
             if output is None and json_path is None:

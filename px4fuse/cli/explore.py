@@ -23,13 +23,13 @@ def explore(log: Path | None, output: Path | None, **option_values: Any) -> None
     and errors. A step view shows each prediction and update, and a tour explains the main effects.
     The page is one file and needs no network.
     """
-    from px4fuse.analysis import run
+    from px4fuse.diagnose import diagnose
 
     log = log or sample_log()
     request = options.comparison_request(log, option_values)
     target = outputs.web_page(output, Path("reports", f"{log.stem}{settings_name(request)}.html"))
     with outputs.progress(target) as show_progress:
-        analysis = run(request, show_progress)
+        analysis = diagnose(request, show_progress)
         show_progress("writing the page")
         # imported after the analysis, so that its errors are shown without the slow import of Bokeh
         from px4fuse.explore.page import html_text

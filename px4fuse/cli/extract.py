@@ -56,7 +56,7 @@ def extract(
             '--format parquet requires pyarrow. Run pip install "px4fuse[parquet]", or '
             "use --format csv."
         )
-    from px4fuse.analysis import read_flight
+    from px4fuse.diagnose import read_flight
     from px4fuse.inspect import tables as extraction
     from px4fuse.results.contract import to_json
 

@@ -53,7 +53,7 @@ def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
     Lists topics, rates (Hz) and gaps, the possible analyses, the reasons why other analyses are
     not possible, and settings to log the missing data on the next flight.
     """
-    from px4fuse.analysis import read_flight
+    from px4fuse.diagnose import read_flight
     from px4fuse.inspect.inventory import take_inventory, to_plain
 
     request = comparison_request(log, option_values)

@@ -162,7 +162,7 @@ def loop(
     trajectory (TUM, EuRoC, ORB-SLAM3), or a pose graph (g2o), which is optimised. Writes a PDF
     report and the results as JSON, except for a pose graph.
     """
-    from px4fuse.analysis import analyse_loop_closure
+    from px4fuse.diagnose import analyse_loop_closure
     from px4fuse.loop.tracks import file_name, is_g2o, split_part
     from px4fuse.report.loop import summary
     from px4fuse.results.build import loop_results

@@ -20,8 +20,8 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
     from the IMU and the positions (EKF2's attitude is not used). LOG is a PX4 ULog or a MAVLink
     recording.
     """
-    from px4fuse.analysis import prepare_comparison
     from px4fuse.comparison.estimates import estimate_noises_and_clock
+    from px4fuse.diagnose import prepare_comparison
     from px4fuse.errors import MissingDataError
     from px4fuse.flight import Unavailable
     from px4fuse.report.clock import clock_advice

@@ -42,8 +42,8 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
     Prints the estimates for each axis with 95 % intervals, and compares them with --sigma-a and
     --sigma-z. LOG is a PX4 ULog or a MAVLink recording.
     """
-    from px4fuse.analysis import prepare_comparison
     from px4fuse.comparison.estimates import tuned as tuned_noises
+    from px4fuse.diagnose import prepare_comparison
     from px4fuse.errors import MissingDataError
     from px4fuse.results.build import tuning_results
 

@@ -67,7 +67,7 @@ def whatif(
     px4fuse tune and px4fuse sync). --without gnss_pos --from 60 omits the GNSS positions from 60 s
     on.
     """
-    from px4fuse.analysis import run_what_if
+    from px4fuse.diagnose import run_what_if
     from px4fuse.report.whatif import summary
     from px4fuse.request import WhatIfRequest
     from px4fuse.results.build import whatif_results

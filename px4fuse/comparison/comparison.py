@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,44 +20,18 @@ from px4fuse.comparison.model import (
     UntestedFilter,
     Updates,
 )
-from px4fuse.comparison.preparation import Choices, prepare
 from px4fuse.filter.consistency import DEFAULT_GATE, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
-from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, Segment
-from px4fuse.flight import RECORD_NOT_LOGGED, Ekf2, Flight, Truth, Unavailable, sample_rate
+from px4fuse.flight import RECORD_NOT_LOGGED, Ekf2, Truth, Unavailable, sample_rate
 
 STATE_COLUMNS = ("position_m", "velocity_m_s")
 VARIANCE_COLUMNS = ("position_variance_m2", "velocity_variance_m2_s2")
 Frame = pd.DataFrame | Unavailable
 
 
-def compare(
-    flight: Flight, settings: Settings | None = None, **choices: Unpack[Choices]
-) -> Comparison:
-    """Replay a flight with KF and compare it with EKF2, and with ground truth if available.
-
-    Parameters
-    ----------
-    flight : Flight
-    settings : Settings, optional
-    **choices
-        See :class:`~px4fuse.comparison.preparation.Choices`.
-
-    Raises
-    ------
-    MissingDataError
-        The flight has no position source, or the source lacks a requested axis.
-    SettingsError
-        The segment is empty.
-    """
-    return compare_prepared(prepare(flight, settings, **choices))
-
-
-def compare_prepared(
-    prepared: Comparison, progress: Callable[[str], None] = lambda _: None
-) -> Comparison:
-    """Run KF on a prepared comparison, and add the results per axis and the horizontal NIS."""
+def compare(prepared: Comparison, progress: Callable[[str], None] = lambda _: None) -> Comparison:
+    """Run KF on a prepared flight, and compare it with EKF2 and with ground truth if available."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, note = projection.continuous_state(ekf2, prepared.source, prepared.segment)
@@ -66,7 +40,7 @@ def compare_prepared(
         if not state.equals(ekf2.state):
             # without its resets, the state is in another frame than positions at the fusion horizon
             ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
-    progress(", ".join(line.name for line in prepared.lines))
+    progress(f"running KF along {', '.join(line.name for line in prepared.lines)}")
     axes = {
         line.name: _compare_axis(prepared, ekf2, replay(line, prepared.settings))
         for line in prepared.lines

@@ -7,7 +7,7 @@ odometry (``Origin.may_drift``). Its scale and heading errors resemble a changin
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from msgspec import structs
@@ -15,9 +15,18 @@ from scipy.special import stdtr
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.noise_differences import NoisyPart, find_noisy_part, tune_by_axis
+from px4fuse.filter.correlated_noise import (
+    SourceLowPass,
+    TimeCorrelatedNoise,
+    fit_time_correlation,
+    fit_time_correlation_to_truth,
+)
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.frame_rotation import HeadingError, estimate_heading_error
+from px4fuse.filter.hypotheses import OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit, fit_bias_scale_jumps
 from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, SignalCache
+from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import MAX_HALF_INTERVAL_S, ClockOffset, estimate_time_offset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
 from px4fuse.flight import Flight, Unavailable
@@ -36,8 +45,45 @@ MIN_CHANGE_S = 0.10
 # Minimum number of parts of the flight before and after a change of the time offset
 MIN_PARTS = 2
 
+# Axes of the noise estimates in a report; north and east have one estimate
+REPORTED_AXES = (HORIZONTAL, "down")
+
 Progress = Callable[[str], None]
 Tuning = Mapping[str, AxisTuning | Unavailable]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimates:
+    """Maximum-likelihood estimates from positions and IMU.
+
+    Attributes
+    ----------
+    tuning : mapping from axis name, or "horizontal", to AxisTuning or Unavailable
+        Noises.
+    clock : ClockOffset or Unavailable
+        Time offset between position source and IMU.
+    heading : HeadingError or Unavailable
+        Yaw misalignment of the position frame.
+    bias_scale_jump_fit : BiasScaleJumpFit or Unavailable
+        Accelerometer biases, scale factor error and position jumps, fitted to innovations.
+    source_low_pass : SourceLowPass or Unavailable
+        Low-pass filter of the position source.
+    time_correlated_noise : TimeCorrelatedNoise or Unavailable
+        Time-correlated noise of the position source, without jumps.
+    tuning_by_axis : tuple of AxisTuning
+        Noises along north and east, if their mean NIS differs; not for GNSS and odometry.
+    noisy_part : NoisyPart or None
+        Part of the flight with larger innovations; not for odometry.
+    """
+
+    tuning: Tuning
+    clock: ClockOffset | Unavailable
+    heading: HeadingError | Unavailable
+    bias_scale_jump_fit: BiasScaleJumpFit | Unavailable
+    source_low_pass: SourceLowPass | Unavailable
+    time_correlated_noise: TimeCorrelatedNoise | Unavailable
+    tuning_by_axis: tuple[AxisTuning, ...] = ()
+    noisy_part: NoisyPart | None = None
 
 
 def ignore_progress(_: str) -> None:
@@ -53,6 +99,24 @@ def first_axis_tuning(tuning: Tuning, *names: str) -> AxisTuning | None:
 def value_or_bound(noise: Noise, fallback: float) -> float:
     """Return the estimate of a noise, else its upper bound, else ``fallback``."""
     return noise.value or noise.high or fallback
+
+
+def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Estimates:
+    """Estimate the noises first, because all other estimates depend on them."""
+    names = REPORTED_AXES if {"north", "east"} <= {line.name for line in comparison.lines} else None
+    tuning, clock = estimate_noises_and_clock(comparison, progress, names)
+    fit, low_pass, correlated_noise = _fit_source_errors(comparison, tuning, clock)
+    source, is_odometry = comparison.source, comparison.source.orientation is not None
+    return Estimates(
+        tuning=tuning,
+        clock=clock,
+        heading=estimate_frame_rotation(comparison, tuning, clock, progress),
+        bias_scale_jump_fit=fit,
+        source_low_pass=low_pass,
+        time_correlated_noise=correlated_noise,
+        tuning_by_axis=() if is_odometry or source.origin.is_gnss else tune_by_axis(comparison),
+        noisy_part=None if is_odometry else find_noisy_part(comparison, tuning.get(HORIZONTAL)),
+    )
 
 
 def tuned(
@@ -131,9 +195,76 @@ def estimate_frame_rotation(
         comparison.flight,
         comparison.source,
         comparison.segment,
+        comparison.lines[0].acceleration,
         comparison.settings,
         sigma_z_m,
         offset_s,
+    )
+
+
+def _fit_source_errors(
+    comparison: Comparison, tuning: Tuning, clock: ClockOffset | Unavailable
+) -> tuple[
+    BiasScaleJumpFit | Unavailable,
+    SourceLowPass | Unavailable,
+    TimeCorrelatedNoise | Unavailable,
+]:
+    """Fit biases, scale and jumps, then the time correlation that remains without the jumps."""
+    horizontal = _horizontal_axes(comparison, tuning)
+    if isinstance(horizontal, Unavailable):
+        return horizontal, horizontal, horizontal
+    flight, settings, (axes, axis_tuning) = comparison.flight, comparison.settings, horizontal
+    offset_s = 0.0
+    if isinstance(clock, ClockOffset) and clock.is_determinable:
+        offset_s = clock.remaining_s if abs(clock.remaining_s) > clock.three_sigma_s else 0.0
+    fit = fit_bias_scale_jumps(
+        flight,
+        axes,
+        settings,
+        sigma_a_m_s2=value_or_bound(axis_tuning.sigma_a_two_state, settings.sigma_a_m_s2),
+        sigma_z_m=value_or_bound(axis_tuning.sigma_z, settings.sigma_z_m),
+        outlier_time_s=axis_tuning.outlier_time_s,
+        clock_offset_s=offset_s,
+    )
+    jumps = fit.jumps if isinstance(fit, BiasScaleJumpFit) else ()
+    # the exact time of a jump is unknown, so measurements just after the jump are excluded
+    time_s, excluded_s = axes[0].measurement_time_s, axis_tuning.outlier_time_s
+    for jump in jumps:
+        is_after_jump = (time_s >= jump.time_s) & (time_s < jump.time_s + OUTLIERS_AFTER_STEP_S)
+        excluded_s = np.union1d(excluded_s, time_s[is_after_jump])
+    correlation = fit_time_correlation(
+        flight,
+        axes,
+        settings,
+        axis_tuning.noises,
+        outlier_time_s=excluded_s,
+        clock_offset_s=offset_s,
+        jumps=jumps,
+    )
+    if isinstance(correlation, Unavailable):
+        return fit, correlation, correlation
+    low_pass, correlated_noise = correlation
+    truths = [comparison.axes[axis.name].truth for axis in axes]
+    known_truths = [truth for truth in truths if not isinstance(truth, Unavailable)]
+    if len(known_truths) == len(axes):
+        correlated_noise = fit_time_correlation_to_truth(
+            axes, known_truths, excluded_s, offset_s, jumps, correlated_noise
+        )
+    return fit, low_pass, correlated_noise
+
+
+def _horizontal_axes(
+    comparison: Comparison, tuning: Tuning
+) -> tuple[tuple[Axis, ...], AxisTuning] | Unavailable:
+    """Return the horizontal axes with a noise estimate, and the estimate."""
+    for name, axis_names in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
+        axis_tuning = tuning.get(name)
+        if isinstance(axis_tuning, AxisTuning) and comparison.axes.keys() >= set(axis_names):
+            return tuple(comparison.axes[axis].axis for axis in axis_names), axis_tuning
+    return Unavailable(
+        "causes other than noise",
+        "the noises along the horizontal axes could not be estimated",
+        "Analyse the axes north and east, or the axis aisle (--axis).",
     )
 
 

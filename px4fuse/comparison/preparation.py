@@ -1,7 +1,7 @@
 """Choice of position source, segment and axes of a comparison, before any filter runs."""
 
+import math
 from dataclasses import replace
-from typing import TypedDict, Unpack
 
 import numpy as np
 from msgspec import structs
@@ -15,7 +15,7 @@ from px4fuse.errors import MissingDataError, SettingsError, suggest_name
 from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
 from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable
-from px4fuse.position_source import POSITION_FILE, PositionKind
+from px4fuse.position_source import POSITION_FILE
 from px4fuse.readers.mavlink_messages import POSITION_INPUTS
 from px4fuse.readers.px4_innovations import (
     GNSS,
@@ -24,7 +24,7 @@ from px4fuse.readers.px4_innovations import (
     with_gnss_innovations,
 )
 from px4fuse.readers.px4_topics import TOPIC_ORIGINS
-from px4fuse.request import HeightName
+from px4fuse.request import SIGMA_Z_M, ComparisonRequest, HeightName
 from px4fuse.text import capitalise_first
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
@@ -40,65 +40,33 @@ NO_SEPARATE_TRUTH = Unavailable(
 GNSS_AXES = (AISLE, "north", "east")
 
 
-class Choices(TypedDict, total=False):
-    """Optional arguments of :func:`prepare`.
-
-    Attributes
-    ----------
-    axes : tuple of str
-        From "north", "east", "down", "aisle"; default: all that the source supports, with GNSS the
-        horizontal ones.
-    heading_deg : float
-        Heading of the aisle axis.
-    position_source : str
-        Name of a track of the flight.
-    source_kind : {"uwb", "vio", "mocap", "gnss"}
-        Kind of the source; default: from its messages.
-    height : {"gnss", "barometer"}
-        Height source of "down" with GNSS; default: the one that EKF2 fused, GNSS first.
-    start_s, end_s : float
-        Start and end of the segment, seconds from the first data.
-    input_required : bool
-        True: raise SettingsError if the log has no acceleration, instead of ``input="zero"``.
-    sigma_z_given : bool
-        Default True. If False, SIGMA_Z of GNSS is EKF2's median √R, if logged.
-    """
-
-    axes: tuple[str, ...] | None
-    heading_deg: float | None
-    position_source: str | None
-    source_kind: PositionKind | None
-    height: HeightName | None
-    start_s: float | None
-    end_s: float | None
-    input_required: bool
-    sigma_z_given: bool
-
-
-def prepare(
-    flight: Flight,
-    settings: Settings | None = None,
-    **choices: Unpack[Choices],
-) -> Comparison:
-    """Choose position source, segment and axes of a comparison.
-
-    Parameters
-    ----------
-    flight : Flight
-    settings : Settings, optional
-    **choices
-        See :class:`Choices`.
+def prepare(flight: Flight, request: ComparisonRequest) -> Comparison:
+    """Choose the source, the segment and the axes of a flight; the recordings are already read.
 
     Raises
     ------
     MissingDataError
         The flight has no position source, or the source lacks a requested axis.
     SettingsError
-        The segment is empty, or required acceleration is missing.
+        A setting is out of range, the segment is empty, or required acceleration is missing.
     """
-    settings = settings or Settings()
-    track, reason = choose_source(flight, choices.get("position_source"))
-    if kind := choices.get("source_kind"):
+    clock_offset_s = request.clock_offset_s
+    for name in ("start_s", "end_s", "clock_offset_s"):
+        value = getattr(request, name)
+        if isinstance(value, float) and not math.isfinite(value):
+            raise SettingsError(f"`{name}` {value:g} is not a finite number.")
+    settings = Settings(
+        sigma_a_m_s2=request.sigma_a_m_s2,
+        sigma_z_m=SIGMA_Z_M if request.sigma_z_m is None else request.sigma_z_m,
+        dt_s=request.dt_s,
+        input=request.input or "imu",
+        # for a position file, align_position_file has already applied the time offset
+        clock_offset_s=clock_offset_s
+        if isinstance(clock_offset_s, float) and request.position is None
+        else 0.0,
+    )
+    track, reason = choose_source(flight, request.position_source)
+    if kind := request.source_kind:
         track = replace(track, origin=structs.replace(track.origin, kind=kind))
     track = shift_clock(track, settings.clock_offset_s)
     convention = None if track.origin.is_gnss else check_convention(flight, track)
@@ -108,25 +76,25 @@ def prepare(
     settings = replace(settings, clock_offset_s=settings.clock_offset_s - late_s)
     flight, track = correct(flight, track, convention)
     track = _move_to_vehicle(track, flight)
-    track = _use_barometer_height(track, flight, choices.get("height"))
+    track = _use_barometer_height(track, flight, request.height)
     flight = select_innovations(flight, track)
     missing = flight.missing
-    segment = choose_segment(flight, track, choices.get("start_s"), choices.get("end_s"))
-    names, heading_deg = choices.get("axes"), choices.get("heading_deg")
+    segment = choose_segment(flight, track, request.start_s, request.end_s)
+    names: tuple[str, ...] | None = request.axes or None
     if names is None and track.origin.fused_as_gnss:
         names = GNSS_AXES
-    lines = make_axes(flight, track, segment, names=names, heading_deg=heading_deg)
+    lines = make_axes(flight, track, segment, names=names, heading_deg=request.heading_deg)
     if isinstance(flight.truth, Truth) and flight.truth.name == track.name:
         flight = replace(flight, truth=NO_SEPARATE_TRUTH)
     notes = (*flight.log.notes, *track.notes)
-    if track.origin.fused_as_gnss and not choices.get("sigma_z_given", True):
+    if track.origin.fused_as_gnss and request.sigma_z_m is None:
         default_m = PARAMETERS[GNSS_POS.noise].default
         sigma_z_m = observation_variance(flight, track, lines[0], segment, default_m) ** 0.5
         if sigma_z_m >= SIGMA_Z_RANGE_M[0]:
             settings = replace(settings, sigma_z_m=float(f"{sigma_z_m:.3g}"))
     acceleration = lines[0].acceleration
     if settings.input == "imu" and isinstance(acceleration, Unavailable):
-        if choices.get("input_required"):
+        if request.input == "imu":
             raise SettingsError(f"{flight.log.name}: `input` imu is not possible: {acceleration}")
         settings = replace(settings, input="zero")
         notes += (f"no acceleration input ({acceleration.reason}): KF assumes constant velocity",)

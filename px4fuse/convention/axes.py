@@ -172,7 +172,7 @@ class Hypothesis:
 
 
 def search(positions: Positions, imu: ImuMotion, heading_from: str) -> list[Hypothesis]:
-    """Return the refined hypotheses, best first; empty without enough overlap."""
+    """Return the refined hypotheses, best first; empty without enough overlap or motion."""
     source, refined = positions.motion(imu), []
     for candidate in find_candidates(source, imu):
         start = replace(candidate, heading_from=heading_from)
@@ -181,7 +181,7 @@ def search(positions: Positions, imu: ImuMotion, heading_from: str) -> list[Hypo
             nearest = [0.0, candidate.remainder_rad, *[0.0] * 5]
             start = replace(start, parameters=start.parameters - nearest, has_rotation=False)
             refined.append(refine(start, positions, source, imu))
-    return sorted(refined, key=lambda one: -one.score)
+    return sorted((one for one in refined if one.score > -np.inf), key=lambda one: -one.score)
 
 
 def find_candidates(source: SourceMotion, imu: ImuMotion) -> list[Hypothesis]:

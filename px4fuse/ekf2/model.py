@@ -11,7 +11,7 @@ filter configurations run together, to save time.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -92,17 +92,17 @@ class Model:
         Replay with the logged parameters.
     agreement : Agreement
         Agreement of ``flown`` with the log.
-    runs : list of SegmentRun
+    runs : tuple of SegmentRun
         One run per segment, with the filter configurations already computed: logged parameters,
         logged parameters with logged rejections, and the result of ``request_configurations``.
     """
 
     flight: Flight
     inputs: Inputs
-    intervals: dict[Timing, tuple[Intervals, ...]]
+    intervals: Mapping[Timing, tuple[Intervals, ...]]
     flown: Ekf2Replay
     agreement: Agreement
-    runs: list[SegmentRun] = field(default_factory=list, init=False)
+    runs: tuple[SegmentRun, ...] = ()
 
     __repr__ = one_line_repr
 
@@ -188,9 +188,7 @@ def _open_without_aids(
         agreement, doubtful={**doubtful_aids, **agreement.doubtful}, **failed_fields
     )
     replay = structs.replace(replay, agreement=agreement)
-    model = Model(flight, inputs, intervals_by_timing, replay, agreement)
-    model.runs.extend(runs)
-    return model
+    return Model(flight, inputs, intervals_by_timing, replay, agreement, tuple(runs))
 
 
 def replay_with_logged_rejections(model: Model) -> Ekf2Replay:
@@ -267,7 +265,7 @@ def replay_settings(
                 inputs.received, rejected=rejected_flags, reset=no_reset, correction_m=None
             ),
         )
-        model = replace(model, inputs=inputs)
+        model = replace(model, inputs=inputs, runs=())
     configurations = [
         FilterConfiguration(
             {**inputs.settings, **change},
@@ -316,7 +314,7 @@ def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
             noise = rng.normal(scale=sigma_m, size=samples.position_m.shape)
             new_inputs[name] = replace(samples, position_m=samples.position_m + noise)
     # the noise changes positions only, not their times, so the intervals remain valid
-    return replace(model, inputs=replace(inputs, **new_inputs))
+    return replace(model, inputs=replace(inputs, **new_inputs), runs=())
 
 
 def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float) -> Model:
@@ -336,7 +334,8 @@ def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float)
         velocity_m_s=None if velocity is None else velocity @ rotation,
     )
     intervals = {} if delay_s else model.intervals
-    return replace(model, inputs=replace(model.inputs, received=received), intervals=intervals)
+    inputs = replace(model.inputs, received=received)
+    return replace(model, inputs=inputs, intervals=intervals, runs=())
 
 
 def delayed_tracks(
@@ -354,8 +353,8 @@ def delayed_tracks(
         )
 
 
-def _run_model(model: Model, configurations: Sequence[FilterConfiguration]) -> list[SegmentRun]:
-    """Run filter configurations, or return the stored runs of the model if they contain all."""
+def _run_model(model: Model, configurations: Sequence[FilterConfiguration]) -> Sequence[SegmentRun]:
+    """Run filter configurations, or return the stored runs of the model if these contain all."""
     if model.runs and all(
         configuration in model.runs[0].configurations for configuration in configurations
     ):

@@ -22,9 +22,9 @@ from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, continu
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import (
     IMU_GAP_S,
+    Acceleration,
     Segment,
     cut_to_segment,
-    ned_acceleration,
     too_few_measurements,
 )
 from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
@@ -136,6 +136,7 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     flight: Flight,
     track: PositionTrack,
     segment: Segment,
+    acceleration: Acceleration | Unavailable,
     settings: Settings,
     sigma_z_m: float,
     offset_s: float = 0.0,
@@ -147,6 +148,8 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     flight : Flight
     track : PositionTrack
     segment : Segment
+    acceleration : Acceleration or Unavailable
+        Acceleration along any axis, with that in NED.
     settings : Settings
         Only ``dt_s`` is used, to which SIGMA_A refers.
     sigma_z_m : float
@@ -171,14 +174,13 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
         )
         if orientation_result is not None and orientation_result.drifts:
             return orientation_result
-    acceleration = ned_acceleration(flight)
     if isinstance(acceleration, Unavailable):
         return acceleration
     samples = cut_to_segment(track.samples, segment)[Columns.POSITION[:2]].dropna()
     samples = samples.set_axis(samples.index.to_numpy() + offset_s)
-    first_s, last_s = acceleration.index[[0, -1]]
+    first_s, last_s = acceleration.time_s[[0, -1]]
     samples = samples[(samples.index >= first_s) & (samples.index <= last_s)]
-    if np.median(np.diff(acceleration.index)) > MAX_IMU_INTERVAL_S:
+    if np.median(np.diff(acceleration.time_s)) > MAX_IMU_INTERVAL_S:
         return Unavailable(
             "heading error", "the IMU rate is too low", "Log sensor_combined at full rate."
         )
@@ -253,7 +255,7 @@ def _compare_orientations(
 
 
 def _estimate_from_positions(
-    acceleration: pd.DataFrame, samples: pd.DataFrame, dt_s: float, sigma_z: float
+    acceleration: Acceleration, samples: pd.DataFrame, dt_s: float, sigma_z: float
 ) -> HeadingError:
     """Estimate the frame's rotation as a filter state, with maximum-likelihood noises of a grid."""
     time = samples.index.to_numpy()
@@ -286,14 +288,13 @@ def _estimate_from_positions(
     )
 
 
-def _interval_inputs(acceleration: pd.DataFrame, time: Array) -> tuple[Array, Array, Array]:
+def _interval_inputs(acceleration: Acceleration, time: Array) -> tuple[Array, Array, Array]:
     """Integrate the acceleration over each interval between positions.
 
     Return Δp (m) and Δv (m/s) north and east, shape (n, 4); interval lengths (s); and a mask of
     intervals with an IMU gap.
     """
-    imu_s = acceleration.index.to_numpy()
-    acceleration_m_s2 = acceleration.to_numpy()[:, :2]
+    imu_s, acceleration_m_s2 = acceleration.time_s, acceleration.ned_m_s2[:, :2]
     velocity = cumulative_integral(acceleration_m_s2, imu_s)
     integrals = np.hstack([velocity, cumulative_integral(velocity, imu_s)])
     integrals = np.column_stack([np.interp(time, imu_s, column) for column in integrals.T])

@@ -36,7 +36,7 @@ from px4fuse.filter.likelihood import (
     preintegrate,
 )
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis, ned_acceleration, too_few_measurements
+from px4fuse.filter.signals import Acceleration, Axis, too_few_measurements
 from px4fuse.filter.steps import Timeline, make_timeline
 from px4fuse.flight import Columns, Flight, Unavailable
 from px4fuse.notebook_display import one_line_repr
@@ -569,13 +569,11 @@ def make_design_matrix(
 
     The axes have the same measurement times; ``clock_offset_s`` is added to the timestamps.
     """
-    acceleration = ned_acceleration(flight)
-    attitude = flight.attitude
-    for input_data in (acceleration, axes[0].acceleration, attitude):
-        if isinstance(input_data, Unavailable):
-            return input_data
-    assert isinstance(acceleration, pd.DataFrame)
-    assert isinstance(attitude, pd.DataFrame)
+    acceleration, attitude = axes[0].acceleration, flight.attitude
+    if isinstance(acceleration, Unavailable):
+        return acceleration
+    if isinstance(attitude, Unavailable):
+        return attitude
     if len(axes[0].measurement_time_s) <= MIN_MEASUREMENTS:
         return too_few_measurements(
             ANALYSIS_NAME, len(axes[0].measurement_time_s), MIN_MEASUREMENTS
@@ -622,14 +620,15 @@ def _integrate_signal(acceleration_m_s2: Array, time_s: ArrayLike, timeline: Tim
 
 
 def _common_accelerations(
-    attitude: pd.DataFrame, acceleration: pd.DataFrame
-) -> list[tuple[pd.Index, Array]]:
+    attitude: pd.DataFrame, acceleration: Acceleration
+) -> list[tuple[Array, Array]]:
     """Return times and NED accelerations of unit biases forward and right, and a unit rotation."""
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
-    biases = [(attitude.index, body_to_ned.apply(np.eye(3)[axis])) for axis in (FORWARD, RIGHT)]
-    north, east, _ = acceleration.to_numpy().T
-    return [*biases, (acceleration.index, np.column_stack([-east, north, 0.0 * north]))]
+    attitude_s = attitude.index.to_numpy()
+    biases = [(attitude_s, body_to_ned.apply(np.eye(3)[axis])) for axis in (FORWARD, RIGHT)]
+    north, east, _ = acceleration.ned_m_s2.T
+    return [*biases, (acceleration.time_s, np.column_stack([-east, north, 0.0 * north]))]
 
 
 def _hat_functions(start_s: float, end_s: float) -> ArrayPair:

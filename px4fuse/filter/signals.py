@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import pandas as pd
@@ -131,22 +130,12 @@ def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     """Return the acceleration in NED without gravity, at the IMU's timestamps.
 
     Logs with PX4's default profile contain the attitude at a tenth of the IMU's rate, so the
-    attitude is interpolated (slerp, Shoemake 1985). The result is cached as long as the flight
-    exists.
+    attitude is interpolated (slerp, Shoemake 1985).
 
     Returns
     -------
     DataFrame, shape (n, 3), m/s², or Unavailable
     """
-    if flight not in _NED_ACCELERATIONS:
-        _NED_ACCELERATIONS[flight] = _ned_acceleration(flight)
-    return _NED_ACCELERATIONS[flight]
-
-
-_NED_ACCELERATIONS: WeakKeyDictionary[Flight, pd.DataFrame | Unavailable] = WeakKeyDictionary()
-
-
-def _ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     if isinstance(flight.imu, Unavailable):
         return flight.imu
     if isinstance(flight.attitude, Unavailable):

@@ -9,9 +9,9 @@ and meaning to ``catalogue.toml``, and the rates to ``tests/studies/rates.csv``.
 
 from collections.abc import Callable, Mapping
 
-from px4fuse.analysis import Analysis, explain
-from px4fuse.comparison.model import Comparison
+from px4fuse.analysis import Analysis
 from px4fuse.ekf2.aids import AidResult
+from px4fuse.finding import Finding, Severity
 from px4fuse.findings import (
     aids,
     ekf2_noise,
@@ -34,7 +34,7 @@ from px4fuse.findings import (
     source_values,
 )
 from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.model import TITLES, Finding, Findings, Severity, group_by_root
+from px4fuse.findings.model import TITLES, Findings, group_by_root
 from px4fuse.loop.model import Loop
 
 __all__ = [
@@ -72,15 +72,8 @@ DETECTORS: tuple[Callable[[Analysis], Findings], ...] = (
 )
 
 
-def find(subject: Analysis | Comparison) -> tuple[Finding, ...]:
-    """Return the findings of a flight, most severe first, each cause followed by its consequences.
-
-    Parameters
-    ----------
-    subject : Analysis or Comparison
-        For a comparison, the re-runs with changed settings are computed first (some seconds).
-    """
-    analysis = subject if isinstance(subject, Analysis) else explain(subject)
+def find(analysis: Analysis) -> tuple[Finding, ...]:
+    """Return the findings, most severe first, each cause followed by its consequences."""
     findings = [found for detect in DETECTORS for found in detect(analysis)]
     return group_by_cause(source_convention.apply_convention(analysis, findings))
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison import causal_replays
+from px4fuse.comparison import changes
 from px4fuse.comparison.causal_replays import Intervention
 from px4fuse.comparison.model import FilterName
 from px4fuse.comparison.remedy import aid_of, format_settings
@@ -23,12 +23,12 @@ def classify_cause(analysis: Analysis, cause: Intervention | None) -> str:
         return kinds.ELSEWHERE
     aid = aid_of(analysis)
     kind_by_change = {
-        causal_replays.OUTLIERS: kinds.OUTLIERS,
-        causal_replays.CLOCK_OFFSET: kinds.CLOCK,
+        changes.OUTLIERS: kinds.OUTLIERS,
+        changes.CLOCK_OFFSET: kinds.CLOCK,
         aid.delay: kinds.CLOCK,
-        causal_replays.ROTATION: kinds.FRAME,
-        causal_replays.FORWARD_BIAS: kinds.ACCELEROMETER,
-        causal_replays.SIGMA_Z: kinds.NOISE,
+        changes.ROTATION: kinds.FRAME,
+        changes.FORWARD_BIAS: kinds.ACCELEROMETER,
+        changes.SIGMA_Z: kinds.NOISE,
         aid.noise: kinds.NOISE,
         aid.gate: kinds.GATE,
     }
@@ -52,7 +52,7 @@ def format_change(analysis: Analysis, cause: Intervention) -> str:
     return " and ".join(
         _format_one_change(analysis, cause, name)
         for name in cause.change
-        if name not in causal_replays.ACCOMPANYING_CHANGES
+        if name not in changes.ACCOMPANYING_CHANGES
     )
 
 
@@ -71,23 +71,23 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
     """Format the action for a change that a re-run confirms, one sentence per changed quantity."""
     actions, change = [], dict(change)
     is_gnss = analysis.source.origin.is_gnss
-    if change.pop(causal_replays.OUTLIERS, None):
+    if change.pop(changes.OUTLIERS, None):
         place = "Give the antenna a free view of the sky" if is_gnss else "Restore line of sight"
         actions.append(f"{place}, or remove the outliers at the sender.")
-    if change.pop(causal_replays.FORWARD_BIAS, None) is not None:
+    if change.pop(changes.FORWARD_BIAS, None) is not None:
         actions.append("Calibrate the accelerometer and the level horizon.")
-        change.pop(causal_replays.RIGHT_BIAS)
-    if turn_deg := change.pop(causal_replays.ROTATION, None):
+        change.pop(changes.RIGHT_BIAS)
+    if turn_deg := change.pop(changes.ROTATION, None):
         # GNSS positions refer to true north, so a rotation is an error of EKF2's heading
         actions.append(
             "Calibrate the magnetometer, away from metal."
             if is_gnss
             else f"Rotate the positions by {turn_deg:+.0f}° before they are sent."
         )
-    if (offset_s := change.pop(causal_replays.CLOCK_OFFSET, None)) is not None:
+    if (offset_s := change.pop(changes.CLOCK_OFFSET, None)) is not None:
         verb = f"Subtract {-offset_s:.3f} s from" if offset_s < 0 else f"Add {offset_s:.3f} s to"
         actions.append(f"{verb} the timestamps at the sender.")
-    settings = {name: change.pop(name) for name in causal_replays.SETTING_CHANGES & change.keys()}
+    settings = {name: change.pop(name) for name in changes.SETTING_CHANGES & change.keys()}
     if change:
         actions.append(f"Set {format_settings(change)}.")
     if settings:
@@ -108,16 +108,16 @@ def format_kf_settings(settings: Mapping[str, float]) -> str:
 def _format_one_change(analysis: Analysis, cause: Intervention, name: str) -> str:
     value, settings = cause.change[name], analysis.settings
     match name:
-        case causal_replays.OUTLIERS:
+        case changes.OUTLIERS:
             return f"{value:.0f} outlier{'s' if value > 1 else ''} removed"
-        case causal_replays.CLOCK_OFFSET:
+        case changes.CLOCK_OFFSET:
             offset_s = value - (settings.clock_offset_s if cause.filter == "kf" else 0.0)
             late = "late" if offset_s < 0 else "early"
             return f"timestamps corrected ({abs(offset_s):.2g} s {late})"
-        case causal_replays.FORWARD_BIAS:
-            right = cause.change[causal_replays.RIGHT_BIAS]
+        case changes.FORWARD_BIAS:
+            right = cause.change[changes.RIGHT_BIAS]
             return f"accelerometer bias removed ({value:+.2f} m/s² forward, {right:+.2f} right)"
-        case causal_replays.ROTATION:
+        case changes.ROTATION:
             is_drifting = isinstance(analysis.heading, HeadingError) and analysis.heading.drifts
             mean = " on average" if is_drifting else ""
             return (
@@ -125,7 +125,7 @@ def _format_one_change(analysis: Analysis, cause: Intervention, name: str) -> st
                 if analysis.source.origin.is_gnss
                 else f"positions rotated by {value:+.0f}°{mean}"
             )
-        case causal_replays.SIGMA_A | causal_replays.SIGMA_Z:
+        case changes.SIGMA_A | changes.SIGMA_Z:
             label, unit = name[:7].upper(), SETTING_UNITS[name]
             return f"{label} {value:.2g} {unit} instead of {getattr(settings, name):g} {unit}"
     assert not isinstance(analysis.ekf2_model, Unavailable)  # EKF2 was replayed with the change

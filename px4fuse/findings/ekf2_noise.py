@@ -11,7 +11,8 @@ from px4fuse.comparison.remedy import aid_of, format_settings
 from px4fuse.comparison.trials import Trial, find_trial, ratio_pairs
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.findings.model import Findings, Severity, finding, format_percent
+from px4fuse.finding import Severity
+from px4fuse.findings.model import Findings, finding, format_percent
 from px4fuse.flight import Unavailable, source_name
 from px4fuse.text import format_factor
 

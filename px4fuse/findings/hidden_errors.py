@@ -30,9 +30,10 @@ from px4fuse.comparison.model import (
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CAUSE
 from px4fuse.findings.cause_text import classify_cause, format_action, is_refuted
-from px4fuse.findings.model import Finding, Findings, error, finding, format_percent, note
+from px4fuse.findings.model import Findings, error, finding, format_percent, note
 from px4fuse.flight import Unavailable, source_name
 from px4fuse.loop.model import Loop
 from px4fuse.text import format_metres, format_ratio

@@ -7,15 +7,9 @@ from px4fuse.analysis import Analysis
 from px4fuse.ekf2.inputs import MAX_LOST_SHARE, lost_imu_fraction
 from px4fuse.filter.hypotheses import MIN_BIAS_M_S2, BiasScaleJumpFit
 from px4fuse.filter.signals import Segment, cut_to_segment, imu_gaps
+from px4fuse.finding import MIN_SPAN_S
 from px4fuse.findings.missing import DEFAULT_PROFILE, VISION_PROFILE_BIT
-from px4fuse.findings.model import (
-    MIN_SPAN_S,
-    Findings,
-    error,
-    finding,
-    format_percent,
-    warning,
-)
+from px4fuse.findings.model import Findings, error, finding, format_percent, warning
 from px4fuse.flight import Columns, Ekf2, Flight, sample_rate
 from px4fuse.record import Span
 

@@ -1,7 +1,8 @@
 """False or inconsistent loop closures, excessive odometry drift, and an assumed landing place."""
 
 from px4fuse.analysis import Analysis
-from px4fuse.findings.model import Finding, Findings, error, note, warning
+from px4fuse.finding import Finding
+from px4fuse.findings.model import Findings, error, note, warning
 from px4fuse.loop.model import LANDING_SOURCE, Closure, Loop
 from px4fuse.text import capitalise_first
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA

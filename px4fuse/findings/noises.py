@@ -13,15 +13,12 @@ from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import (
-    SIGMA_A,
-    SIGMA_Z,
-    SMALLEST_SIGMA_Z_M,
     Intervention,
     find_cause,
     interventions_for,
     is_inconsistent,
-    tuning_of_axis,
 )
+from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z, SMALLEST_SIGMA_Z_M, tuning_of_axis
 from px4fuse.comparison.estimates import first_axis_tuning
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
@@ -31,6 +28,7 @@ from px4fuse.ekf2_parameters import BAROMETER
 from px4fuse.filter.settings import SETTING_UNITS, Settings
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
+from px4fuse.finding import SEVERITIES, Finding, Severity
 from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, NOISE
 from px4fuse.findings.cause_text import (
     classify_cause,
@@ -39,16 +37,7 @@ from px4fuse.findings.cause_text import (
     is_refuted,
 )
 from px4fuse.findings.hidden_errors import find_hidden_errors
-from px4fuse.findings.model import (
-    SEVERITIES,
-    Finding,
-    Findings,
-    Severity,
-    error,
-    finding,
-    format_percent,
-    lower_severity,
-)
+from px4fuse.findings.model import Findings, error, finding, format_percent, lower_severity
 from px4fuse.findings.source_positions import hardly_moved
 from px4fuse.flight import Columns, Unavailable, sample_rate
 from px4fuse.request import COMPARISON_OPTIONS

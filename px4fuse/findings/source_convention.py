@@ -18,8 +18,9 @@ from px4fuse.convention.texts import (
     describe_conversion,
     describe_unit,
 )
+from px4fuse.finding import Finding, Severity
 from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION, MISLEADING, UNUSABLE
-from px4fuse.findings.model import CATALOGUE, Finding, Findings, Severity, finding
+from px4fuse.findings.model import CATALOGUE, Findings, finding
 from px4fuse.flight import PositionTrack, positions_of, source_name
 from px4fuse.text import capitalise_first
 

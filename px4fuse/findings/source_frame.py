@@ -2,8 +2,9 @@
 
 from px4fuse.analysis import Analysis
 from px4fuse.filter.frame_rotation import MAX_DRIFT_P_VALUE, HeadingError
+from px4fuse.finding import Finding, Severity
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSING_SHARE_ERROR
-from px4fuse.findings.model import Finding, Findings, Severity, finding, fraction_on, note, warning
+from px4fuse.findings.model import Findings, finding, fraction_on, note, warning
 from px4fuse.flight import Ekf2, Unavailable, positions_of, source_name
 from px4fuse.text import capitalise_first
 

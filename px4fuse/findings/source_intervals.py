@@ -18,7 +18,8 @@ from px4fuse.ekf2.fusion_conditions import EV_START_INTERVAL_S
 from px4fuse.ekf2_parameters import AIDS, EV_POS, Aid
 from px4fuse.filter.kalman import state_at, variance_at
 from px4fuse.filter.signals import cut_to_segment
-from px4fuse.findings.model import Finding, Findings, finding, format_percent, note, warning
+from px4fuse.finding import Finding
+from px4fuse.findings.model import Findings, finding, format_percent, note, warning
 from px4fuse.flight import Ekf2, Unavailable, positions_of, step_values_at
 from px4fuse.position_source import ALIGNED, PositionKind
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS

@@ -19,12 +19,12 @@ from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, Bi
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.finding import Severity
 from px4fuse.findings.cause_grouping import ANNOUNCED, CAUSE, GROUND
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
 from px4fuse.findings.missing import MIN_INNOVATION_SHARE
 from px4fuse.findings.model import (
     Findings,
-    Severity,
     error,
     finding,
     format_count,

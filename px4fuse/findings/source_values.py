@@ -20,7 +20,8 @@ from px4fuse.text import capitalise_first
 MIN_STEP_M = 0.05  # m; its error (1 σ) is 0.29 of it, so smaller steps are below the noise of UWB
 MIN_OFFSET_M = 0.1  # m between two senders; the noise of good UWB
 MIN_OFFSET_SIGMAS = 4.0  # of the offset in one window; white noise of one sender has 1 to 2
-WINDOW, MIN_WINDOWS = 16, 5  # samples, of which a lost one reverses the order of two senders
+WINDOW = 16  # samples, of which a lost one reverses the order of two senders
+MIN_WINDOWS = 10  # with fewer, 1 of 60 flights at 2 Hz with 5 % outliers looks like two senders
 # Median difference (m) from EKF2's own position: of a source that EKF2 does not fuse, and of one
 # that it follows
 MAX_COPY_M, MAX_FOLLOWED_COPY_M = 0.01, 0.001
@@ -161,7 +162,7 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     weight = ((time_s[1:-1] - time_s[:-2]) / (time_s[2:] - time_s[:-2]))[:, None]
     offset_m = position_m[1:-1] - (1.0 - weight) * position_m[:-2] - weight * position_m[2:]
     offset_m[::2] *= -1.0
-    windows_m = offset_m[: count * WINDOW].reshape(count, WINDOW, -1).mean(axis=1)
+    windows_m = np.median(offset_m[: count * WINDOW].reshape(count, WINDOW, -1), axis=1)
     direction = windows_m[np.argmax(np.linalg.norm(windows_m, axis=1))]
     windows_m[windows_m @ direction < 0.0] *= -1.0
     offset = np.median(windows_m, axis=0)

@@ -7,7 +7,7 @@ from typing import Literal
 
 from msgspec.structs import replace
 
-from px4fuse.analysis import run_or_evaluate_aids
+from px4fuse.diagnose import diagnose_or_check_aids
 from px4fuse.errors import LogError, ResultsError
 from px4fuse.reading import display_name, files_by_sha256, read_bytes_limited, read_head
 from px4fuse.request import ComparisonRequest
@@ -85,7 +85,7 @@ def _analyse_log(path: Path, other_input: DiffInput | None, progress: Progress) 
         request = replace(
             request, **{name: getattr(other_input.results.request, name) for name in fields}
         )
-    result = run_or_evaluate_aids(request, progress)
+    result = diagnose_or_check_aids(request, progress)
     text = to_json(outcome_results(request, result))  # to_json rounds the numbers as in a report
     results = read_results(text.encode())
     assert isinstance(results, Results)

@@ -85,8 +85,8 @@ def failure_row(error: Px4FuseError, status: str, name: str = "") -> Row:
 
 def _compare_log(job: Job, path: Path, sha256: str) -> Outcome:
     # imported here, because only the worker processes need these modules
-    from px4fuse.analysis import AidsOnlyAnalysis, read_flight, run_or_evaluate_aids  # noqa: PLC0415
-    from px4fuse.findings import find_aids  # noqa: PLC0415
+    from px4fuse.analysis import AidsOnlyAnalysis  # noqa: PLC0415
+    from px4fuse.diagnose import diagnose_or_check_aids, read_flight  # noqa: PLC0415
     from px4fuse.results.build import log_record, results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
 
@@ -95,9 +95,9 @@ def _compare_log(job: Job, path: Path, sha256: str) -> Outcome:
     try:
         flight = read_flight(request)
         row |= log_columns(log_record(flight))
-        analysis = run_or_evaluate_aids(request, flight=flight)
+        analysis = diagnose_or_check_aids(request, flight=flight)
         if isinstance(analysis, AidsOnlyAnalysis):
-            row |= finding_columns(find_aids(analysis.aids), analysis.aids)
+            row |= finding_columns(analysis.findings, analysis.aids)
             missing_data = MissingDataError(
                 analysis.missing_data.reason, analysis.missing_data.remedy
             )

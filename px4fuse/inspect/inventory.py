@@ -10,7 +10,7 @@ import pandas as pd
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.flight_events import max_interval_s
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.preparation import select_innovations
+from px4fuse.comparison.preparation import prepare, select_innovations
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.inputs import prepare_inputs
 from px4fuse.errors import MissingDataError, Px4FuseError
@@ -25,7 +25,7 @@ from px4fuse.findings import ekf2_not_fusing, finding_title, imu, missing, recor
 from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable, sample_rate
 from px4fuse.inspect.tables import NO_POSITION, unavailable_parts
 from px4fuse.log import Stream
-from px4fuse.request import with_options
+from px4fuse.request import ComparisonRequest, with_options
 from px4fuse.text import capitalise_first, to_json_types, utc_time
 
 SCHEMA_NAME = "px4fuse-info"
@@ -172,7 +172,7 @@ def take_inventory(flight: Flight) -> Inventory:
     """List the contents of a flight, the possible analyses and the advice on logging."""
     comparison, reason, remedy = None, "", ""
     try:
-        comparison = compare(flight)
+        comparison = compare(prepare(flight, ComparisonRequest(log=flight.log.name)))
         reason = comparison.source_reason
     except Px4FuseError as error:
         reason = with_options(error.reason).removeprefix(f"{flight.log.name}: ")

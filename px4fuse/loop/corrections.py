@@ -15,7 +15,7 @@ from px4fuse.loop.model import LANDING_SOURCE, Closure, CorrectedPath, Correctio
 from px4fuse.loop.odometry import ClosureWithEnd
 from px4fuse.record import to_serializable
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
-from px4fuse.trajectory.graph.analysis import ROBUST_METHODS, SOLUTIONS
+from px4fuse.trajectory.graph.analysis import ROBUST, SOLUTIONS
 from px4fuse.trajectory.graph.covariance import gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution, solve
@@ -97,7 +97,7 @@ def solve_pose_graphs(
     closures: tuple[Closure, ...],
     progress: Callable[[str], None],
 ) -> tuple[dict[CorrectionName, Corrected], tuple[Closure, ...]]:
-    """Optimise the graph with all closures, with accepted closures only, and by robust methods.
+    """Optimise the graph with all closures, with accepted closures only, and robustly.
 
     Return the corrected paths, and the closures with their weights from robust optimisation.
     """
@@ -113,10 +113,10 @@ def solve_pose_graphs(
     is_rejected[is_closure] = [not closure.accepted for closure in closures]
     for solution_name, label in SOLUTIONS.items():
         name = f"pose_graph_{solution_name}"
-        robust_method = ROBUST_METHODS.get(solution_name, "none")
+        robust = solution_name == ROBUST
         is_gated = solution_name == "gated"
         progress(f"optimising: {label}")
-        if robust_method != "none" and len(closures) < 2:
+        if robust and len(closures) < 2:
             corrections[name] = Unavailable(
                 label, SINGLE_LOOP_REASON, "Give further closures with --closure."
             )
@@ -128,15 +128,15 @@ def solve_pose_graphs(
             is_used = ~is_rejected if is_gated else np.ones_like(is_rejected)
             solution = solve(
                 graph.select_edges(is_used),
-                robust_method=robust_method,
+                robust=robust,
                 is_closure=is_closure[is_used],
             )
             corrected_path = _interpolate_corrections(path, nodes, graph.poses, solution.poses)
             corrections[name] = corrected_path, solution
-            if robust_method != "none":
+            if robust:
                 weights = solution.weights[is_closure].tolist()
                 closures = tuple(
-                    structs.replace(closure, **{f"weight_{solution_name}": weight})
+                    structs.replace(closure, weight_gnc=weight)
                     for closure, weight in zip(closures, weights, strict=True)
                 )
     return corrections, closures

@@ -22,7 +22,6 @@ CorrectionName = Literal[
     "by_distance",
     "pose_graph_all",
     "pose_graph_gated",
-    "pose_graph_dcs",
     "pose_graph_gnc",
 ]
 # Source of the loop closure between take-off and landing
@@ -88,7 +87,7 @@ class OdometryNoise(Record, frozen=True, omit_defaults=False):
 
 
 class Closure(Record, frozen=True, kw_only=True):
-    """Loop closure (two times at the same place), with gate result and weights of robust methods.
+    """Loop closure (two times at the same place), with gate result and robust weight.
 
     Attributes
     ----------
@@ -102,8 +101,8 @@ class Closure(Record, frozen=True, kw_only=True):
         Closure error of the odometry: odometry minus true displacement.
     d2, degrees_of_freedom, p, accepted
         See :class:`~px4fuse.trajectory.graph.covariance.GateResult`.
-    weight_dcs, weight_gnc : float or None
-        Weights of robust optimisation, 0 to 1; None with a single closure (no redundancy).
+    weight_gnc : float or None
+        Weight of robust optimisation, 0 to 1; None with a single closure (no redundancy).
     """
 
     time_1_s: float
@@ -115,7 +114,6 @@ class Closure(Record, frozen=True, kw_only=True):
     degrees_of_freedom: Count
     p: Share
     accepted: bool
-    weight_dcs: float | None = None
     weight_gnc: float | None = None
 
     def __str__(self) -> str:

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.preparation import prepare
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
@@ -19,6 +20,7 @@ from px4fuse.readers.common import finite_rows
 from px4fuse.readers.text_table import decode_text
 from px4fuse.readers.trajectory import read_trajectory
 from px4fuse.reading import display_name, read_head
+from px4fuse.request import SIGMA_Z_M, ComparisonRequest
 from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
 TrackName = Literal["vio", "ekf2", "kf", "truth"]
@@ -89,7 +91,8 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
 
 
 def _make_kf_trajectory(flight: Flight) -> Trajectory:
-    kf_comparison = compare(flight, axes=AXIS_NAMES)
+    request = ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M, axes=AXIS_NAMES)
+    kf_comparison = compare(prepare(flight, request))
     columns = zip(Columns.POSITION, kf_comparison.axes.values(), strict=True)
     position = pd.DataFrame({name: axis.replay.steps["position_m"] for name, axis in columns})
     settings = kf_comparison.settings

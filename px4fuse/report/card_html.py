@@ -16,7 +16,6 @@ from px4fuse.card.numbers import axis_fraction, format_ratio
 from px4fuse.card.verdicts import verdicts
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import Reference
-from px4fuse.findings import find
 from px4fuse.report.card_text import (
     FILTER_NAMES,
     LABELLED_TICKS,
@@ -56,7 +55,7 @@ def card_of(analysis: Analysis) -> Card:
             "This analysis contains no request, so its command is unknown.",
             "Create it with px4fuse.compare.",
         )
-    card = build_card(analysis, find(analysis), analysis.request)
+    card = build_card(analysis, analysis.request)
     return with_typed_path(card, analysis.request.log)
 
 

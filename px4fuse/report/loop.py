@@ -54,7 +54,6 @@ CLOSURE_HEAD = (
     "degrees of\nfreedom",
     "p",
     "gate",
-    "DCS\nweight",
     "GNC\nweight",
 )
 TITLE = "Loop closure"
@@ -87,8 +86,8 @@ def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> N
     page.write(
         (
             "d²: squared Mahalanobis distance of the closure given drift and closure "
-            "noise. p: probability of a larger d² for a true closure. DCS and GNC "
-            "weights: 1 keeps the closure, 0 drops it."
+            "noise. p: probability of a larger d² for a true closure. GNC weight: "
+            "1 keeps the closure, 0 drops it."
         ),
         colour=MUTED_COLOUR,
     )
@@ -220,12 +219,11 @@ def write_scores(page: Page, loop: Loop) -> None:
             format_p_value(closure.p).removeprefix("p "),
             "accepted" if closure.accepted else "REJECTED",
         ]
-        weights = closure.weight_dcs, closure.weight_gnc
-        cells += ["–" if weight is None else f"{weight:.2f}" for weight in weights]
+        cells.append("–" if closure.weight_gnc is None else f"{closure.weight_gnc:.2f}")
         colour = "black" if closure.accepted else style.SEVERITY_COLOURS["error"]
         rows.append([(cell, colour) for cell in cells])
     if rows:
-        page.table(CLOSURE_HEAD, rows, right_aligned_columns=(1, 2, 3, 4, 6, 7))
+        page.table(CLOSURE_HEAD, rows, right_aligned_columns=(1, 2, 3, 4, 6))
     for reference in loop.references:
         scores = {
             corrected_path.name: corrected_path.scores[reference.name]

@@ -11,7 +11,7 @@ from px4fuse.card.build import build_aids_card, build_card
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
-from px4fuse.findings import find, find_aids, find_loop
+from px4fuse.findings import find_loop
 from px4fuse.flight import Flight, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.record import to_serializable
@@ -41,6 +41,7 @@ _COPIED_FIELDS = (
     "trials",
     "causes",
     "loop",
+    "findings",
     "notes",
     "missing",
     "convention",
@@ -51,16 +52,12 @@ def results(
     request: ComparisonRequest, analysis: Analysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults:
     """Return the results of ``px4fuse compare`` on a flight with positions for KF."""
-    findings = find(analysis)
     return within_bounds(
         contract.ComparisonResults(
             **_flight_fields(contract.COMPARISON_SCHEMA, request, analysis),
             **{name: to_serializable(getattr(analysis, name)) for name in _COPIED_FIELDS},
             aids={} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
-            card=build_card(
-                analysis, findings, request.without_paths(), (student.name, student.id)
-            ),
-            findings=findings,
+            card=build_card(analysis, request.without_paths(), (student.name, student.id)),
             student=student,
         )
     )
@@ -72,15 +69,12 @@ def outcome_results(
     """Return the results of ``px4fuse compare``, also for a flight without positions for KF."""
     if isinstance(outcome, Analysis):
         return results(request, outcome, student)
-    findings = find_aids(outcome.aids)
     return within_bounds(
         contract.AidsResults(
             **_common_fields(contract.AIDS_SCHEMA, request, outcome.flight),
             aids=dict(outcome.aids),
-            card=build_aids_card(
-                outcome, findings, request.without_paths(), (student.name, student.id)
-            ),
-            findings=findings,
+            card=build_aids_card(outcome, request.without_paths(), (student.name, student.id)),
+            findings=outcome.findings,
             missing=(outcome.missing_data, *outcome.flight.missing),
             student=student,
         )

@@ -164,7 +164,7 @@ def split_track(source: str) -> tuple[str, str]:
 def _repeat_comparison(
     submitted_results: ComparisonResults, link_file: _LinkFile
 ) -> tuple[object, ReportedResults]:
-    from px4fuse.analysis import run  # noqa: PLC0415
+    from px4fuse.diagnose import diagnose  # noqa: PLC0415
     from px4fuse.results.build import results  # noqa: PLC0415
 
     recorded_request = submitted_results.request
@@ -182,14 +182,14 @@ def _repeat_comparison(
     if (position := recorded_request.position) is not None:
         link = link_file(position.path, hash_by_role.get("position"), "--position")
         request = replace(request, position=replace(position, path=link))
-    analysis = run(request)
+    analysis = diagnose(request)
     return analysis, results(recorded_request, analysis, submitted_results.student)
 
 
 def _repeat_loop(
     submitted_results: LoopResults, link_file: _LinkFile
 ) -> tuple[object, ReportedResults]:
-    from px4fuse.analysis import analyse_loop_closure  # noqa: PLC0415
+    from px4fuse.diagnose import analyse_loop_closure  # noqa: PLC0415
     from px4fuse.results.build import loop_results  # noqa: PLC0415
 
     recorded_request = submitted_results.request

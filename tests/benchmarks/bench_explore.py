@@ -41,7 +41,7 @@ def main() -> None:
     from browser import BROWSERS, Browser
     from explore_tools import ask, show
 
-    from px4fuse.analysis import run
+    from px4fuse.diagnose import diagnose
     from px4fuse.explore.page import html_text
     from px4fuse.request import ComparisonRequest
 
@@ -51,7 +51,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         browser = Browser(program, Path(folder, "profile"))
         try:
-            analysis = run(ComparisonRequest(log=str(LOG)))
+            analysis = diagnose(ComparisonRequest(log=str(LOG)))
             file = Path(folder, "page.html")
             file.write_bytes(html_text(analysis).encode())
             show(browser, file)

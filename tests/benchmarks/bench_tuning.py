@@ -23,8 +23,8 @@ RUNS = 3
 
 def main() -> None:
     import filter_tools
+    from comparisons import compare
 
-    from px4fuse.comparison.comparison import compare
     from px4fuse.comparison.estimates import estimate_noises_and_clock
     from px4fuse.filter.kalman import replay
     from px4fuse.filter.likelihood import preintegrate, score_grid

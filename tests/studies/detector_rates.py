@@ -20,10 +20,10 @@ from types import MappingProxyType
 from typing import Any
 
 import pandas as pd
+from comparisons import compare
 from scipy.stats import binomtest
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import estimate_frame_rotation, estimate_noises_and_clock
 from px4fuse.ekf2.model import open_model
 from px4fuse.filter.settings import Settings

@@ -40,11 +40,11 @@ from class_tools import run_in_turn  # noqa: E402
 from conftest import blank_page  # noqa: E402
 
 from px4fuse import answer_form, workers  # noqa: E402
-from px4fuse.analysis import run_or_evaluate_aids  # noqa: E402
 from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key  # noqa: E402
 from px4fuse.assignment.roster import read_people, read_roster  # noqa: E402
 from px4fuse.assignment.sheet import read_sheet  # noqa: E402
 from px4fuse.cli import cli  # noqa: E402
+from px4fuse.diagnose import diagnose_or_check_aids  # noqa: E402
 from px4fuse.errors import Px4FuseError  # noqa: E402
 from px4fuse.grading import grade as grading  # noqa: E402
 from px4fuse.grading.entries import read_overrides  # noqa: E402
@@ -272,7 +272,7 @@ def _flights() -> list[bytes]:
 def _compared(path: Path) -> object:
     """Run ``compare`` without drawing: findings and results of a log."""
     request = ComparisonRequest(log=str(path))
-    return to_json(outcome_results(request, run_or_evaluate_aids(request)))
+    return to_json(outcome_results(request, diagnose_or_check_aids(request)))
 
 
 LOG = str(REPOSITORY / "sample_logs/aisle_uwb.ulg")

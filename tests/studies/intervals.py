@@ -15,9 +15,9 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 
 import numpy as np
+from comparisons import compare
 from detector_rates import DEFAULT, SCENARIOS, clean
 
-from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise

@@ -31,11 +31,11 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from comparisons import compare
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from px4fuse.analysis import explain
-from px4fuse.comparison.comparison import compare
+from px4fuse.diagnose import explain
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
 from px4fuse.flight import Columns, Flight, Unavailable

@@ -10,20 +10,19 @@ from px4fuse.flight import Unavailable
 from px4fuse.record import Count, Record
 from px4fuse.trajectory.graph.covariance import GateResult, gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
-from px4fuse.trajectory.graph.solver import GraphSolution, Robust, Solution, solve
+from px4fuse.trajectory.graph.solver import GraphSolution, Solution, solve
 
 # Maximum number of closures for robust optimisation by default: with more closures the optimisation
 # takes minutes
 MAX_ROBUST_CLOSURES = 1000
+# Key of the solution by robust optimisation (graduated non-convexity)
+ROBUST = "gnc"
 # Labels of the pose graph solutions, by the key in results.json
 SOLUTIONS: Mapping[str, str] = {
     "all": "pose graph, all closures",
     "gated": "pose graph, gated",
-    "dcs": "pose graph, DCS",
-    "gnc": "pose graph, GNC",
+    ROBUST: "pose graph, GNC",
 }
-# Robust optimisation method by key of the solution
-ROBUST_METHODS: Mapping[str, Robust] = {"dcs": "dcs", "gnc": "gnc"}
 
 
 class Graph(Record, frozen=True, kw_only=True):
@@ -70,7 +69,7 @@ def analyse_graph(
     *,
     run_robust: bool | None = None,
 ) -> SolvedGraph:
-    """Test the closures of a pose graph, and optimise it by least squares and by robust methods.
+    """Test the closures of a pose graph, and optimise it by least squares and robustly.
 
     Edges between successive vertices are odometry, all other edges are closures.
 
@@ -98,9 +97,8 @@ def analyse_graph(
         )
     count = int(np.count_nonzero(is_closure))
     if count > 1 and (count <= MAX_ROBUST_CLOSURES if run_robust is None else run_robust):
-        for solution, method in ROBUST_METHODS.items():
-            progress(f"optimising: {SOLUTIONS[solution]}")
-            solutions[solution] = solve(graph, robust_method=method, is_closure=is_closure)
+        progress(f"optimising: {SOLUTIONS[ROBUST]}")
+        solutions[ROBUST] = solve(graph, robust=True, is_closure=is_closure)
     return SolvedGraph(
         name=name,
         dimension=graph.dimension,

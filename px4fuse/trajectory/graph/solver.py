@@ -1,8 +1,6 @@
 """Pose graph optimisation by Levenberg-Marquardt, optionally robust against false closures."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from scipy.special import gammaincinv
@@ -15,11 +13,6 @@ from px4fuse.trajectory.graph import lie, model
 from px4fuse.trajectory.graph.model import PoseGraph, Residuals
 from px4fuse.trajectory.graph.system import normal_equations, solve_normal_equations
 
-Robust = Literal["none", "dcs", "gnc"]
-# Robust kernel: computes weights of the information and costs of all edges from their squared
-# residuals
-Kernel = Callable[[Array], tuple[Array, Array]]
-
 MAX_ITERATIONS = 100
 # Defaults of LevenbergMarquardtParams in GTSAM
 _INITIAL_DAMPING, _DAMPING_FACTOR, _MAX_DAMPING = 1e-5, 10.0, 1e5
@@ -30,9 +23,7 @@ _FLOAT_EPSILON = float(np.finfo(float).eps)
 # which need less precision
 _STAGE_TOLERANCE, _STAGE_ITERATIONS = 1e-6, 20
 
-# Parameter Phi of dynamic covariance scaling (Agarwal 2013, section IV)
-DCS_PHI = 1.0
-# Probability that the squared residual of a true closure is not truncated by "gnc"
+# Probability that the squared residual of a true closure is not truncated
 GNC_PROBABILITY = 0.99
 # Probability that the cost of a true closure is below the cost of dropping the closure
 DROP_PROBABILITY = 0.999
@@ -99,7 +90,7 @@ class _Minimum:
 
 
 def solve(
-    graph: PoseGraph, *, robust_method: Robust = "none", is_closure: BoolArray | None = None
+    graph: PoseGraph, *, robust: bool = False, is_closure: BoolArray | None = None
 ) -> Solution:
     """Optimise the poses by Levenberg-Marquardt, as GTSAM does.
 
@@ -107,25 +98,17 @@ def solve(
     of steps are those of GTSAM's LevenbergMarquardtOptimizer, so px4fuse and GTSAM reach the same
     minimum from the same start. The tolerances are 1e-10, relative and absolute.
 
-    ``dcs`` multiplies the information of closures by s², s = min(1, 2 Phi / (Phi + chi²)), Phi = 1
-    (Agarwal et al. 2013, Robust map optimization using dynamic covariance scaling, eq. 15). This is
-    an M-estimator with many minima (MacTavish and Barfoot 2015, At all costs). The optimisation
-    starts from the solution of ``gnc``. If odometry drifts, true closures have a large chi² at the
-    initial poses and at the least-squares solution, so a start there would drop them. The lowest of
-    several minima would not be a better choice: with Phi = 1 a dropped closure costs at most 1.5,
-    and a true closure with 3 degrees of freedom costs 1.5 on average.
-
-    ``gnc`` minimises truncated least squares by graduated non-convexity (Yang et al. 2020, eq. 13
+    ``robust`` minimises truncated least squares by graduated non-convexity (Yang 2020, eq. 13
     and 14; control parameter from barc² / (2 max r² - barc²), times 1.4 per stage). The truncation
     is at the 99 % point of chi-square, with the rank of the closure's information as degrees of
-    freedom. ``gnc`` runs from the least-squares solution and from the initial poses, and the result
+    freedom. It runs from the least-squares solution and from the initial poses, and the result
     with the lower cost is used. In this cost a dropped closure costs the 99.9 % point of
     chi-square, the limit of the gate. Finally up to 20 dropped closures are restored one by one if
     that lowers the cost. Final weights are 0 or 1.
 
     Parameters
     ----------
-    robust_method : {"none", "dcs", "gnc"}
+    robust : bool
     is_closure : ndarray of bool, shape (m,), optional
         Mask of the edges that may be false; all other edges have weight 1. By default all edges
         between poses that are not successive.
@@ -133,8 +116,8 @@ def solve(
     Raises
     ------
     TrajectoryError
-        The graph has no edges, is not connected, contains a number that is not finite, or ``gnc``
-        drops all edges to some poses.
+        The graph has no edges, is not connected, contains a number that is not finite, or robust
+        optimisation drops all edges to some poses.
     """
     model.require_connected(graph, np.ones(len(graph.first), bool), "the edges")
     is_doubtful = ~graph.is_successive if is_closure is None else is_closure
@@ -145,21 +128,10 @@ def solve(
             "The pose graph contains a pose or measurement that is not finite or too large",
             "Correct the number, or remove the edge.",
         )
-    plain_minimum = _minimise(graph, start, _least_squares_kernel(np.ones(len(is_doubtful))))
     weights = np.ones(len(is_doubtful))
-    minimum = plain_minimum
-    if robust_method != "none" and np.any(is_doubtful):
-        minimum, weights = _solve_gnc(graph, start, plain_minimum, is_doubtful)
-        if robust_method == "dcs":
-            kernel = _dcs_kernel(is_doubtful)
-            dcs_minimum = _minimise(graph, minimum.state, kernel)
-            minimum = _Minimum(
-                dcs_minimum.state,
-                dcs_minimum.cost,
-                minimum.iterations + dcs_minimum.iterations,
-                dcs_minimum.converged,
-            )
-            weights = kernel(minimum.state.chi2)[0]
+    minimum = _minimise(graph, start, weights)
+    if robust and np.any(is_doubtful):
+        minimum, weights = _solve_gnc(graph, start, minimum, is_doubtful)
     return Solution(
         poses=minimum.state.poses,
         cost=0.5 * float(np.sum(weights * minimum.state.chi2)),
@@ -174,15 +146,14 @@ def solve(
 def _minimise(
     graph: PoseGraph,
     state: Residuals,
-    kernel: Kernel,
+    weights: Array,
     tolerance: float = _TOLERANCE,
     max_iterations: int = MAX_ITERATIONS,
 ) -> _Minimum:
-    """Minimise the cost from the poses of ``state``, like GTSAM's LevenbergMarquardtOptimizer."""
+    """Minimise the cost from ``state``, like GTSAM's LevenbergMarquardtOptimizer."""
     damping = _INITIAL_DAMPING
     iterations = 0
-    weights, costs = kernel(state.chi2)
-    cost = float(np.sum(costs))
+    cost = float(np.sum(0.5 * weights * state.chi2))
     while iterations < max_iterations and cost > _TOLERANCE:
         # d r / d x_j = J, d r / d x_i = -J A, with A the adjoint of x_i relative to x_j
         jacobian = lie.right_jacobian_inverse(state.residual)
@@ -206,8 +177,7 @@ def _minimise(
                 trial = model.residuals(
                     graph, lie.compose(state.poses, lie.exp(tangent.reshape(len(graph), -1)))
                 )
-                trial_weights, costs = kernel(trial.chi2)
-                drop = cost - float(np.sum(costs))
+                drop = cost - float(np.sum(0.5 * weights * trial.chi2))
                 is_flat = abs(drop) < tolerance * cost
             is_accepted = (
                 predicted_drop > _FLOAT_EPSILON * cost and drop > _MIN_FIDELITY * predicted_drop
@@ -218,7 +188,6 @@ def _minimise(
         if not is_accepted:
             return _Minimum(state, cost, iterations, is_flat)
         state = trial
-        weights = trial_weights
         cost_before = cost
         cost = cost - drop
         iterations += 1
@@ -226,19 +195,6 @@ def _minimise(
         if drop <= max(tolerance * cost_before, _TOLERANCE):
             return _Minimum(state, cost, iterations, True)
     return _Minimum(state, cost, iterations, cost <= _TOLERANCE)
-
-
-def _least_squares_kernel(weights: Array) -> Kernel:
-    return lambda chi2: (weights, 0.5 * weights * chi2)
-
-
-def _dcs_kernel(is_doubtful: BoolArray) -> Kernel:
-    def kernel(chi2: Array) -> tuple[Array, Array]:
-        is_beyond = is_doubtful & (chi2 > DCS_PHI)
-        scale = np.where(is_beyond, 2.0 * DCS_PHI / (DCS_PHI + chi2), 1.0)
-        return scale**2, np.where(is_beyond, scale * chi2 - 0.5 * DCS_PHI, 0.5 * chi2)
-
-    return kernel
 
 
 def _solve_gnc(
@@ -271,7 +227,7 @@ def _solve_gnc(
     for edge in dropped[np.argsort(minimum.state.chi2[dropped])][:_MAX_RETRIED_CLOSURES]:
         trial_weights = weights.copy()
         trial_weights[edge] = 1.0
-        trial = _minimise(graph, minimum.state, _least_squares_kernel(trial_weights))
+        trial = _minimise(graph, minimum.state, trial_weights)
         iteration_count += trial.iterations
         if (cost := truncated_cost(trial.state, trial_weights)) < lowest_cost:
             lowest_cost = cost
@@ -292,9 +248,7 @@ def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tupl
         for _ in range(_MAX_GNC_STAGES):
             ratio = np.maximum(state.chi2 / bound, 1e-200)  # not 0; the weight is 1 anyway
             weights = np.clip(np.sqrt(control * (control + 1.0) / ratio) - control, 0.0, 1.0)
-            stage = _minimise(
-                graph, state, _least_squares_kernel(weights), _STAGE_TOLERANCE, _STAGE_ITERATIONS
-            )
+            stage = _minimise(graph, state, weights, _STAGE_TOLERANCE, _STAGE_ITERATIONS)
             state = stage.state
             iteration_count = iteration_count + stage.iterations
             if np.all((weights < 1e-6) | (weights > 1.0 - 1e-6)):
@@ -302,7 +256,7 @@ def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tupl
             control *= _GNC_FACTOR
     weights = (state.chi2 <= bound).astype(float)
     for _ in range(_MAX_TRUNCATION_ROUNDS):
-        minimum_state = _minimise(graph, state, _least_squares_kernel(weights))
+        minimum_state = _minimise(graph, state, weights)
         state = minimum_state.state
         iteration_count = iteration_count + minimum_state.iterations
         # Each round decreases the truncated cost, so the iteration ends

@@ -1,0 +1,227 @@
+"""Changes of a filter or of its data that may explain a discrepancy; a re-run tests them.
+
+Changes of EKF2 need its ``inputs``; without inputs, the changes are those of KF.
+"""
+
+import numpy as np
+
+from px4fuse.comparison.estimates import Estimates, Tuning, first_axis_tuning
+from px4fuse.comparison.model import AxisComparison, Comparison, FilterSummary
+from px4fuse.comparison.remedy import ml_delay_change, noise_change
+from px4fuse.comparison.trials import Change, Statistic
+from px4fuse.ekf2.inputs import Inputs
+from px4fuse.ekf2_parameters import EV_POS, GNSS_VEL, PARAMETERS
+from px4fuse.filter.frame_rotation import HeadingError
+from px4fuse.filter.settings import Settings
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.flight import Unavailable
+from px4fuse.log import LogInfo
+
+CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
+FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
+# Changes that correct a sensor fault; they are preferred to changes of settings
+SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
+# Minimum SIGMA_Z (m) of a re-run: accuracy of motion capture in flight
+SMALLEST_SIGMA_Z_M = 0.005
+SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
+# Kind of a change of KF, by the name of the changed setting or data
+KF_KINDS = {
+    SIGMA_A: "noises",
+    SIGMA_Z: "noises",
+    OUTLIERS: "outliers",
+    CLOCK_OFFSET: "time offset",
+    ROTATION: "rotation",
+    FORWARD_BIAS: "bias",
+    RIGHT_BIAS: "bias",
+}
+# Parameters that a change of another parameter requires; they do not count as separate changes
+ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
+SETTING_CHANGES = frozenset((SIGMA_A, SIGMA_Z))
+ACC_NOISE = "EKF2_ACC_NOISE"
+# Minimum ratio of the estimated SIGMA_A to EKF2_ACC_NOISE for a re-run with a larger
+# EKF2_ACC_NOISE: SIGMA_A also covers tilt error and bias
+VIBRATION_FACTOR = 3.0
+# EKF2 parameters that are re-run with PX4's default value if another value was flown
+PARAMETERS_OF_EKF2 = (
+    ACC_NOISE,
+    "EKF2_GYR_NOISE",
+    "EKF2_ACC_B_NOISE",
+    "EKF2_GYR_B_NOISE",
+    GNSS_VEL.noise,
+    GNSS_VEL.gate,
+)
+# Minimum misalignment in standard deviations of its estimate for a re-run with rotated positions
+HEADING_SIGMAS = 3.0
+
+
+def candidate_changes(
+    comparison: Comparison,
+    estimates: Estimates,
+    inputs: Inputs | None,
+    result: AxisComparison,
+    statistic: Statistic,
+) -> list[Change]:
+    """Return the changes that may explain a mean NIS or NEES outside its limits."""
+    summary, origin = result.filters["kf" if inputs is None else "ekf2"], comparison.source.origin
+    assert isinstance(summary, FilterSummary)  # else it has no discrepancy
+    is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
+    tuned = tuning_of_axis(estimates.tuning, result.axis.name)
+    changes = list[Change]()
+    # innovations do not show the slow errors of GNSS or of a drifting source, so they do not
+    # justify a smaller noise
+    hides_slow_errors = origin.may_drift or origin.is_gnss
+    if tuned is not None and not (is_underconfident and hides_slow_errors):
+        changes += (
+            _kf_noises(comparison.settings, tuned, is_underconfident)
+            if inputs is None
+            else _ekf2_noise(inputs, summary, tuned)
+        )
+    if tuned is not None and not is_underconfident and len(tuned.outlier_time_s):
+        changes.append({OUTLIERS: float(len(tuned.outlier_time_s))})
+    delay = {} if inputs is None else ml_delay_change(comparison, inputs, estimates.clock)
+    changes += [delay] if delay else _time_offset(comparison, estimates, inputs)
+    if result.axis.name == "down":
+        return changes
+    if isinstance(heading := estimates.heading, HeadingError):
+        is_significant = abs(heading.misalignment_deg) > HEADING_SIGMAS * heading.sigma_deg
+        changes += [{ROTATION: -round(heading.misalignment_deg, 1)}] if is_significant else []
+    if inputs is None:
+        return changes + _without_bias(estimates)
+    changes += _px4_defaults(comparison.flight.log, inputs)
+    if tuned is not None and not is_underconfident:
+        changes += _vibration_noise(comparison.settings, inputs, tuned)
+    return changes
+
+
+def main_axis_changes(
+    comparison: Comparison, estimates: Estimates, inputs: Inputs | None
+) -> list[Change]:
+    """Return the changes to be re-run along the main axis, each once.
+
+    For KF also both noises together and the default settings; for EKF2 a delay also as a shift of
+    the position timestamps.
+    """
+    changes = list[Change]()
+    for statistic in ("nis", "nees"):
+        found = candidate_changes(comparison, estimates, inputs, comparison.main, statistic)
+        changes += [change for change in found if change not in changes]
+    if inputs is not None:
+        has_delay = any(inputs.aid.delay in change for change in changes)
+        offsets = _time_offset(comparison, estimates, inputs) if has_delay else []
+        return [*changes, *(offset for offset in offsets if offset not in changes)]
+    noises = [change for change in changes if change.keys() <= SETTING_CHANGES]
+    if len(noises) > 1:
+        changes.append({name: value for change in noises for name, value in change.items()})
+    defaults = default_settings(comparison)
+    return [*changes, *([defaults] if defaults and noises else [])]
+
+
+def change_kinds(comparison: Comparison, inputs: Inputs | None, change: Change) -> tuple[str, ...]:
+    """Return the kind of each part of a change, see :attr:`.trials.Trial.kinds`."""
+    if inputs is None and change == default_settings(comparison):
+        return ("defaults",)
+    kinds: dict[str, str] = {}
+    if inputs is not None:
+        aid = inputs.aid
+        kinds = {aid.noise: "noise", aid.gate: "gate", aid.delay: "delay"}
+    names = [name for name in change if name not in ACCOMPANYING_CHANGES]
+    return tuple(
+        dict.fromkeys(KF_KINDS.get(name) or kinds.get(name, "process noise") for name in names)
+    )
+
+
+def default_settings(comparison: Comparison) -> Change:
+    """Return the default of each noise of KF that was set; GNSS uses SIGMA_Z from EKF2."""
+    chosen, default = comparison.settings, Settings()
+    names = (SIGMA_A,) if comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
+    return {
+        name: getattr(default, name)
+        for name in names
+        if getattr(chosen, name) != getattr(default, name)
+    }
+
+
+def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
+    """Return the noise estimate of an axis; of both horizontal axes together if available."""
+    return first_axis_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
+
+
+def _time_offset(
+    comparison: Comparison, estimates: Estimates, inputs: Inputs | None
+) -> list[Change]:
+    """Return a change of the time offset, if its part not yet applied is significant."""
+    clock, applied_s = estimates.clock, comparison.settings.clock_offset_s
+    if isinstance(clock, Unavailable) or not clock.is_determinable:
+        return []
+    offset_s = applied_s + clock.remaining_s
+    unapplied_s = offset_s - (applied_s if inputs is None else 0.0)
+    is_significant = abs(unapplied_s) > clock.three_sigma_s
+    return [{CLOCK_OFFSET: round(offset_s, 3)}] if is_significant else []
+
+
+def _kf_noises(settings: Settings, tuned: AxisTuning, is_underconfident: bool) -> list[Change]:
+    """Return SIGMA_A and SIGMA_Z estimates whose 95 % interval excludes the setting."""
+    changes = list[Change]()
+    for name, noise in ((SIGMA_A, tuned.sigma_a_two_state), (SIGMA_Z, tuned.sigma_z)):
+        chosen_sigma = getattr(settings, name)
+        ml_sigma = noise.value or (noise.high if is_underconfident else None) or 0.0
+        bound = noise.high if is_underconfident else noise.low
+        if noise.value is None and name == SIGMA_Z:
+            ml_sigma = max(ml_sigma, SMALLEST_SIGMA_Z_M)
+        if (
+            ml_sigma
+            and bound is not None
+            and (chosen_sigma > bound if is_underconfident else chosen_sigma < bound)
+        ):
+            changes.append({name: float(f"{ml_sigma:.3g}")})
+    return changes
+
+
+def _without_bias(estimates: Estimates) -> list[Change]:
+    """Return the removal of the accelerometer biases, if they are significant."""
+    fit = estimates.bias_scale_jump_fit
+    if isinstance(fit, Unavailable) or not fit.has_bias:
+        return []
+    biases = {FORWARD_BIAS: fit.forward_bias, RIGHT_BIAS: fit.right_bias}
+    return [{name: round(bias.value, 3) for name, bias in biases.items()}]
+
+
+def _ekf2_noise(inputs: Inputs, summary: FilterSummary, tuned: AxisTuning) -> list[Change]:
+    """Return the estimated position noise if its 95 % interval excludes EKF2's value."""
+    aid, flown, noise = inputs.aid, inputs.settings, tuned.sigma_z
+    uses_reported = not aid.noise_mode or flown[aid.noise_mode] != 1.0
+    reported_m2 = inputs.received.variance_m2[:, :2] * uses_reported
+    flown_m = float(np.sqrt(np.median(np.maximum(reported_m2, flown[aid.noise] ** 2))))
+    if (noise.low or 0.0) <= flown_m <= (noise.high or np.inf):
+        return []
+    proposed_noise_m = noise.value
+    if proposed_noise_m is None:  # the RMS of EKF2's innovations is an upper bound of the noise
+        proposed_noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
+    return [noise_change(aid, flown, flown_m, proposed_noise_m)]
+
+
+def _px4_defaults(log: LogInfo, inputs: Inputs) -> list[Change]:
+    """Return PX4's default of the gate, if it is wider, and of each other changed parameter."""
+    gate, flown = inputs.aid.gate, inputs.settings
+    defaults = {name: log.default_of(name) for name in (gate, *PARAMETERS_OF_EKF2)}
+    return [
+        {name: value}
+        for name, value in defaults.items()
+        if name in flown
+        and not np.isclose(flown[name], value, rtol=1e-3)
+        and (name != gate or flown[name] < value)
+    ]
+
+
+def _vibration_noise(settings: Settings, inputs: Inputs, tuned: AxisTuning) -> list[Change]:
+    """Return the maximum-likelihood process noise for vibration, within PX4's range.
+
+    EKF2 adds (EKF2_ACC_NOISE · step)² to the velocity variance in each step; KF adds
+    SIGMA_A² · DT² in each DT.
+    """
+    steps = settings.dt_s / inputs.step_s
+    flown, px4_maximum = inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
+    if (tuned.sigma_a_two_state.low or 0.0) * steps**0.5 <= VIBRATION_FACTOR * flown:
+        return []
+    ml_noise = min((tuned.sigma_a_two_state.value or 0.0) * steps**0.5, px4_maximum)
+    return [{ACC_NOISE: float(f"{ml_noise:.2g}")}] if ml_noise > flown else []

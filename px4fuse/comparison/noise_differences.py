@@ -1,0 +1,94 @@
+"""Position noise that differs between north and east, or between parts of the flight."""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from px4fuse.arrays import Array, BoolArray
+from px4fuse.comparison.model import Comparison, north_and_east
+from px4fuse.filter.likelihood import innovations, preintegrate
+from px4fuse.filter.tuning import AxisTuning, tune
+from px4fuse.flight import Unavailable
+
+# Minimum ratio of the mean NIS of both axes for a noise estimate of each axis, which takes time
+MIN_AXIS_NIS_RATIO = 1.7
+MAX_PARTS, MIN_PART_COUNT = 12, 25  # number of parts of the flight, and measurements in each part
+
+
+class NoisyPart(NamedTuple):
+    """Part of the flight with larger innovations: times (s) and ratio of σ to the rest."""
+
+    start_s: float
+    end_s: float
+    ratio: float
+    ratio_without_outliers: float
+
+
+def tune_by_axis(comparison: Comparison) -> tuple[AxisTuning, ...]:
+    """Estimate the noises along north and along east; empty if their mean NIS is similar."""
+    axes = north_and_east(comparison)
+    summaries = [axis.filters["kf"] for axis in axes]
+    nis = [summary.nis_mean for summary in summaries if not isinstance(summary, Unavailable)]
+    if len(nis) < 2 or max(nis) < MIN_AXIS_NIS_RATIO * min(nis):
+        return ()
+    return tuple(
+        axis_tuning
+        for axis in axes
+        for axis_tuning in tune((axis.axis,), comparison.settings, (axis.axis.name,)).values()
+        if isinstance(axis_tuning, AxisTuning)
+    )
+
+
+def find_noisy_part(
+    comparison: Comparison, axis_tuning: AxisTuning | Unavailable | None
+) -> NoisyPart | None:
+    """Find the contiguous part of the flight in which most innovations are larger.
+
+    ``axis_tuning`` is the noise estimate of both horizontal axes.
+    """
+    settings = comparison.settings
+    if axis_tuning is None:
+        return None
+    # noise estimates are unavailable if a third of the measurements resemble outliers
+    sigma_a: float | None = settings.sigma_a_m_s2
+    sigma_z: float | None = settings.sigma_z_m
+    outlier_time_s = np.zeros(0)
+    if isinstance(axis_tuning, AxisTuning):
+        sigma_a, sigma_z = axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value
+        outlier_time_s = axis_tuning.outlier_time_s
+    lines = [result.axis for result in north_and_east(comparison)]
+    if sigma_a is None or sigma_z is None or len(lines) < 2:
+        return None
+    increments_by_axis = [preintegrate(line, settings) for line in lines]
+    time = lines[0].measurement_time_s[-len(increments_by_axis[0].measurement_m) :]
+    if len(time) < MAX_PARTS * MIN_PART_COUNT // 2:
+        return None
+    count = min(MAX_PARTS, len(time) // MIN_PART_COUNT)
+    edges = np.linspace(0, len(time), count + 1).astype(int)
+
+    def relative_innovations(is_excluded: BoolArray | None) -> Array:
+        # wrong noises change the size of innovations along the flight, so estimated noises are used
+        axis_innovations = [
+            innovations(increments, sigma_a, sigma_z, is_excluded)
+            for increments in increments_by_axis
+        ]
+        normalised = np.abs([nu / np.sqrt(s) for nu, s in axis_innovations])
+        # dividing by the median of each axis removes the effect of unequal axes
+        return np.asarray(normalised / np.median(normalised, axis=1, keepdims=True))
+
+    sizes = relative_innovations(None)
+    part_sigma = np.array([np.median(sizes[:, low:high]) for low, high in pairwise(edges)])
+    is_noisy = part_sigma > np.sqrt(part_sigma.min() * part_sigma.max())
+    first_part = int(np.argmax(is_noisy))
+    end_part = first_part + int(np.argmin(np.append(is_noisy[first_part:], False)))
+    if is_noisy.sum() != end_part - first_part or is_noisy.all() or not is_noisy.any():
+        return None  # the noisy parts are not one contiguous time
+    is_quiet = np.ones(len(time), bool)
+    is_quiet[edges[first_part] : edges[end_part]] = False
+    ratios = (
+        float(np.median(relative[:, ~is_quiet]) / np.median(relative[:, is_quiet]))
+        for relative in (sizes, relative_innovations(np.isin(time, outlier_time_s)))
+    )
+    start_s, end_s = time[[edges[first_part], edges[end_part] - 1]].tolist()
+    return NoisyPart(start_s, end_s, *ratios)

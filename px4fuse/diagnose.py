@@ -1,0 +1,297 @@
+"""Diagnosis of one flight from its request, stage by stage as in the lab.
+
+Read the recordings, prepare source and axes, run KF and compare with EKF2, estimate noises and time
+offset, re-run the filters with one change each, and find mistakes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from msgspec import structs
+
+from px4fuse.analysis import AidsOnlyAnalysis, Analysis, WhatIfAnalysis
+from px4fuse.comparison.causal_replays import Reruns, planned_configurations, run_interventions
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.difference_steps import (
+    corrected_settings,
+    explain_ekf2_difference,
+    explanation_configurations,
+)
+from px4fuse.comparison.estimates import (
+    Estimates,
+    Progress,
+    estimate,
+    estimate_noises_and_clock,
+    ignore_progress,
+)
+from px4fuse.comparison.flight_events import collect_events
+from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.preparation import explain_missing_source, prepare
+from px4fuse.comparison.remedy import ml_ekf2_parameters
+from px4fuse.ekf2.aids import evaluate_aids
+from px4fuse.ekf2.filter_recursion import FilterConfiguration
+from px4fuse.ekf2.inputs import Inputs
+from px4fuse.ekf2.model import Model, open_model
+from px4fuse.ekf2.steps import DifferenceExplanation
+from px4fuse.ekf2.whatif import sweep_values, what_if
+from px4fuse.ekf2_parameters import check_parameters
+from px4fuse.errors import LogError, MissingDataError, SettingsError
+from px4fuse.filter.signals import AISLE
+from px4fuse.findings import find, find_aids
+from px4fuse.flight import Flight, Unavailable
+from px4fuse.loop.model import Loop
+from px4fuse.readers import read_log
+from px4fuse.reading import display_name
+from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
+
+
+def diagnose(
+    request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
+) -> Analysis:
+    """Read a flight, compare KF with EKF2, explain the differences and find mistakes.
+
+    Parameters
+    ----------
+    request : ComparisonRequest
+    progress : callable
+        Function that receives the name of each step of the computation.
+    flight : Flight, optional
+        Flight from the recordings of the request; without it, the recordings are read.
+
+    Raises
+    ------
+    LogError, MissingDataError, SettingsError
+        A file cannot be read, the flight lacks required data, or a setting is out of range.
+    """
+    prepared = prepare_comparison(request, progress, flight)
+    return replace(explain(compare(prepared, progress), progress), request=request)
+
+
+def explain(compared: Comparison, progress: Progress = ignore_progress) -> Analysis:
+    """Estimate noises and time offset, re-run both filters with changes, and find mistakes."""
+    estimates = estimate(compared, progress)
+    progress("replaying EKF2")
+    reruns = intervene(compared, estimates)
+    progress("searching for a loop closure")
+    from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync
+
+    analysis = Analysis(
+        **vars(compared),
+        **vars(estimates),
+        **vars(reruns),
+        events=collect_events(compared),
+        aids=evaluate_aids(compared.flight),
+        loop=analyse_flight_loop(compared.flight, progress),
+    )
+    return replace(analysis, findings=find(analysis))
+
+
+def intervene(compared: Comparison, estimates: Estimates) -> Reruns:
+    """Replay EKF2, replace the properties of KF by those of EKF2, and re-run both with changes."""
+    corrected = corrected_settings(compared, estimates.tuning)
+
+    def needed_configurations(inputs: Inputs) -> list[FilterConfiguration]:
+        return [
+            *explanation_configurations(compared, inputs, corrected),
+            *planned_configurations(compared, estimates, inputs),
+        ]
+
+    model = open_model(compared.flight, needed_configurations)
+    steps = explain_ekf2_difference(compared, model, estimates.clock, corrected)
+    causes, trials = run_interventions(compared, estimates, model)
+    if isinstance(model, Model):  # frees most of the memory; a later replay is computed again
+        model = replace(model, runs=(), intervals={})
+    return Reruns(ekf2_model=model, difference_steps=steps, causes=causes, trials=trials)
+
+
+def diagnose_or_check_aids(
+    request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
+) -> Analysis | AidsOnlyAnalysis:
+    """Run :func:`diagnose`; for a flight without positions, check EKF2's aiding sources only.
+
+    Raises
+    ------
+    LogError, MissingDataError, SettingsError
+        See :func:`diagnose`; also if the flight has no positions and no innovations of EKF2.
+    """
+    flight = flight or read_flight(request, progress)
+    has_named_source = request.position_source is not None
+    if has_named_source or any(track.origin.is_automatic for track in flight.positions):
+        return diagnose(request, progress, flight)
+    no_position, aids = explain_missing_source(flight), evaluate_aids(flight)
+    if isinstance(aids, Unavailable):
+        if flight.airborne == ():
+            raise MissingDataError(
+                f"{flight.log.name}: the vehicle did not fly, so no analysis is possible "
+                f"({aids.reason}). px4fuse info {flight.log.name} lists the logged data."
+            )
+        raise MissingDataError(
+            f"{flight.log.name}: {no_position.reason}, and EKF2's aiding sources cannot be "
+            f"checked: {aids.reason}",
+            no_position.remedy,
+        )
+    return AidsOnlyAnalysis(flight, aids, no_position, find_aids(aids))
+
+
+def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress) -> Flight:
+    """Read the recordings of a request and join them into one flight.
+
+    Raises
+    ------
+    LogError, MissingDataError, SettingsError
+        A file cannot be read, or does not belong to the flight.
+    """
+    log = Path(request.log)
+    progress(f"reading {display_name(log)}")
+    flight = read_log(log, system=request.system if request.mavlink is None else None)
+    # imported on demand, as alignment imports scipy.signal and scipy.ndimage, which takes 0.2 s
+    if request.mavlink is not None:
+        from px4fuse.alignment.merge_recordings import join  # noqa: PLC0415
+
+        mavlink_flight = read_log(Path(request.mavlink), system=request.system)
+        if not mavlink_flight.log.format.startswith("MAVLink"):
+            raise LogError(
+                f"--mavlink {mavlink_flight.log.name} is a {mavlink_flight.log.format}, not a "
+                "MAVLink recording.",
+                "Give the ULog as LOG and the recording (.tlog) with --mavlink.",
+            )
+        flight = join(flight, mavlink_flight)
+    position, offset = request.position, request.clock_offset_s
+    if position is None:
+        return flight
+    from px4fuse.alignment.placement import align_position_file  # noqa: PLC0415
+    from px4fuse.readers.position_csv import read_position_csv  # noqa: PLC0415
+
+    units = {"time_unit": position.time_unit, "length_unit": position.length_unit}
+    position_file = read_position_csv(Path(position.path), columns=position.columns, **units)
+    clock_offset_s = None if isinstance(offset, str) else offset
+    return align_position_file(
+        flight,
+        position_file,
+        frame=position.frame,
+        yaw_deg=position.yaw_deg,
+        clock_offset_s=clock_offset_s,
+    )
+
+
+def prepare_comparison(
+    request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
+) -> Comparison:
+    """Read a flight and select position source, time span and axes, without running KF.
+
+    Arguments and errors are those of :func:`diagnose`.
+    """
+    flight = flight or read_flight(request, progress)
+    prepared = prepare(flight, request)
+    if request.clock_offset_s != AUTO or request.position is not None:
+        return prepared
+    _, clock = estimate_noises_and_clock(prepared, progress)
+    if isinstance(clock, Unavailable) or not clock.is_determinable:
+        raise MissingDataError(
+            f"{flight.log.name}: the time offset cannot be estimated from this flight "
+            f"({clock.reason}).",
+            "Give --clock-offset SECONDS, or omit --clock-offset.",
+        )
+    low, high = clock.interval_s
+    if low <= 0.0 <= high:
+        note = (
+            f"--clock-offset auto: the time offset {clock.offset_s:+.3f} s (95 % {low:+.3f} to "
+            f"{high:+.3f} s) is not significant and was not applied"
+        )
+        return replace(prepared, notes=(*prepared.notes, note))
+    return prepare(flight, structs.replace(request, clock_offset_s=clock.offset_s))
+
+
+def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progress) -> Loop:
+    """Read a flight or a trajectory, measure its loop closure error and correct the path.
+
+    Raises
+    ------
+    TrajectoryError, LogError, MissingDataError, SettingsError
+        A file cannot be read or lacks required data, or a setting is out of range.
+    """
+    from px4fuse.loop.analysis import analyse  # noqa: PLC0415 - not for tune and sync
+    from px4fuse.loop.tracks import read_source  # noqa: PLC0415
+
+    for name in ("start_s", "end_s"):
+        if not math.isfinite(getattr(request, name) or 0.0):
+            raise SettingsError(f"`{name}` {getattr(request, name):g} is not a finite number.")
+    progress(f"reading {display_name(Path(request.source))}")
+    system, reference = request.system, None
+    source = read_source(request.source, frame=request.frame, system=system)
+    if request.reference is not None:
+        reference = read_source(request.reference, default="truth", system=system).trajectory
+    return analyse(source, request, reference, progress)
+
+
+def run_what_if(
+    request: WhatIfRequest, progress: Progress = ignore_progress, flight: Flight | None = None
+) -> WhatIfAnalysis:
+    """Read a flight and replay EKF2 with other parameters; arguments as in :func:`diagnose`.
+
+    Raises
+    ------
+    LogError, MissingDataError, SettingsError
+        A file cannot be read, EKF2 cannot be replayed from it or the replay does not agree with
+        the log, or a parameter is unknown or out of PX4's range.
+    """
+    changes, sweep = check_parameters(request.changes), request.sweep
+    values: list[float] = []
+    if sweep is not None:
+        values = sweep_values(sweep.parameter, sweep.low, sweep.high, sweep.count)
+        if sweep.parameter in changes:
+            raise SettingsError(
+                f"{sweep.parameter} is both set and swept.", f"Set or sweep {sweep.parameter}."
+            )
+    recordings = ComparisonRequest(log=request.log, mavlink=request.mavlink, system=request.system)
+    flight = flight or read_flight(recordings, progress)
+    progress("replaying EKF2")
+    model = open_model(flight)
+    if isinstance(model, Unavailable):
+        raise MissingDataError(f"{flight.log.name}: {model.what}: {model.reason}", model.remedy)
+    is_default_change = not changes and sweep is None and not request.without
+    difference_steps: Mapping[str, DifferenceExplanation | Unavailable] = {}
+    comparison = None
+    try:
+        if model.agreement.good:
+            recordings = structs.replace(recordings, axes=("north", "east", AISLE))
+            comparison = compare(prepare(flight, recordings))
+    except MissingDataError:  # a replay of EKF2 is possible without a comparison with KF
+        if is_default_change:
+            raise
+    if comparison is not None:
+        tuning, clock = estimate_noises_and_clock(comparison, progress)
+        corrected = corrected_settings(comparison, tuning)
+        difference_steps = explain_ekf2_difference(comparison, model, clock, corrected)
+        if is_default_change:
+            changes = ml_ekf2_parameters(comparison, model, tuning, clock)
+            if not changes:
+                raise MissingDataError(_explain_missing_change(comparison, model))
+    settings = [changes] if changes or request.without else []
+    settings += [{**changes, sweep.parameter: value} for value in values] if sweep else []
+    progress("replaying EKF2 with other parameters")
+    replays = what_if(model, settings, request.without)
+    if isinstance(replays, Unavailable):
+        raise MissingDataError(
+            f"{flight.log.name}: {replays.what}: {replays.reason}", replays.remedy
+        )
+    return WhatIfAnalysis(
+        flight, replays, changes, is_default_change, difference_steps, request.without
+    )
+
+
+def _explain_missing_change(comparison: Comparison, model: Model) -> str:
+    """Format the error that a log does not determine maximum-likelihood parameters of EKF2."""
+    source = comparison.source
+    reason = f"noise and delay of {source.name} cannot be estimated from this log"
+    if source.origin.is_gnss or source.origin.may_drift:
+        reason = (
+            f"innovations do not show the slow errors of {source.name}, and the delay of "
+            f"{source.name} is correct or cannot be estimated"
+        )
+    name, noise = comparison.flight.log.name, model.inputs.aid.noise
+    return f"{name}: {reason}. Give a changed parameter, for example `changes` {noise}=0.1."

@@ -1,0 +1,61 @@
+"""Record of a finding, which the detectors in :mod:`px4fuse.findings` make."""
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from px4fuse.record import Record, Span
+
+Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "note")
+MAX_LISTED_SPANS = 3  # time spans of a finding; more spans are printed as one range
+MIN_SPAN_S = 0.05  # s; a shorter span is printed as a single time
+
+
+class Finding(Record, frozen=True, omit_defaults=False):
+    """Mistake or condition of a flight that the log shows.
+
+    Attributes
+    ----------
+    id : str
+        Key of the catalogue, in snake case; it does not change between versions.
+    severity : {"error", "warning", "note"}
+        error: the comparison or the flight is misleading; warning: a number is wrong or missing;
+        note: background for reading the report.
+    message : str
+        The fault, then its effect with numbers.
+    remedy : str
+        Action: a command, a parameter with its value, or a check.
+    evidence : dict
+        Numbers that the finding is based on, with units in their names.
+    title : str
+        First sentence of the message, without full stop: the fault with its numbers.
+    caused_by : str or None
+        Id of the finding that causes this one: the nearest preceding finding with this id.
+    spans_s : tuple of (float, float)
+        Start and end of each occurrence, seconds from the first data; empty if the finding
+        concerns the whole flight.
+    """
+
+    id: Annotated[str, Meta(pattern="^[a-z0-9_]+$")]
+    severity: Severity
+    message: str
+    remedy: str
+    evidence: Mapping[str, int | float | str] = {}
+    title: str = ""
+    caused_by: str | None = None
+    spans_s: tuple[Span, ...] = ()
+
+    @property
+    def when(self) -> str:
+        """Time spans as text; empty if the finding concerns the whole flight."""
+        if len(self.spans_s) > MAX_LISTED_SPANS:
+            return f"from {self.spans_s[0][0]:.1f} s to {self.spans_s[-1][1]:.1f} s"
+        return ", ".join(
+            f"{start:.1f} s to {end:.1f} s" if end - start > MIN_SPAN_S else f"{start:.1f} s"
+            for start, end in self.spans_s
+        )
+
+    def __repr__(self) -> str:
+        return f"<{self.severity} {self.id}: {self.message} {self.remedy}>"
