@@ -27,7 +27,7 @@ FRAMES: Final[dict[str, tuple[Array, Array]]] = {
 }
 MAX_COPY_DEG = 0.15  # copies differ by up to 0.03°, fused motion capture by more than 0.2°
 COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
-MAX_TILT_DEG, MAX_HEADING_DEG = 6.0, 12.0  # median differences of a correct convention
+MAX_TILT_DEG, MAX_HEADING_DEG = 6.0, 12.0  # median tilt, heading difference if correct
 MIN_DIFFERENCE_DEG = 0.7
 SCORE_PER_S = 0.5
 MIN_LOG_ODDS = 4.0

@@ -163,7 +163,7 @@ def _check_gap(attempt: Attempt) -> Unmet | None:
     limit_s = EV_STOP_INTERVAL_S if is_short else STOP_S
     times_s = attempt.source.samples.index.to_numpy()
     start_s, end_s = attempt.span_s
-    # fusion stops when the gap has lasted for the limit
+    # EKF2 stops fusion when the gap has lasted for limit_s
     before = times_s[times_s < start_s]
     after = times_s[times_s >= start_s]
     last_s = before[-1] if len(before) else start_s
@@ -354,7 +354,8 @@ VISION_CONDITIONS: Conditions = {
 GNSS_CONDITIONS: Conditions = {
     "switch": _check_switch,
     "fault": _check_gnss_fault,
-    # without a fix the reader has no samples; while none arrive, the flags of the checks stay
+    # before the gap: without a fix, the reader omits all samples, and the log contains the flags of
+    # the last checks
     "checks": _check_gnss_quality,
     "gap": _check_gap,
     "alignment": _check_alignment,
