@@ -293,8 +293,9 @@ def check_answers(answers: Answers) -> None:
 
 def _require_choice(field: str, value: str, choices: Any) -> None:
     if value not in choices:
-        allowed = _join_quoted(choices) or "the allowed values (none: leave it empty)"
-        raise ValueError(f"{field} {value!r} is not one of {allowed}")
+        allowed = _join_quoted(choices)
+        reason = f"is not one of {allowed}" if allowed else "is not allowed: leave this field empty"
+        raise ValueError(f"{field} {value!r} {reason}")
 
 
 def form_name(log_name: str) -> str:

@@ -50,7 +50,11 @@ from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
 
 
 def diagnose(
-    request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
+    request: ComparisonRequest,
+    progress: Progress = ignore_progress,
+    flight: Flight | None = None,
+    *,
+    as_sent: bool = False,
 ) -> Analysis:
     """Read a flight, compare KF with EKF2, explain the differences and find mistakes.
 
@@ -61,13 +65,15 @@ def diagnose(
         Function that receives the name of each step of the computation.
     flight : Flight, optional
         Flight from the recordings of the request; without it, the recordings are read.
+    as_sent : bool
+        True to analyse the positions as sent, without the check of their axes, unit and clock.
 
     Raises
     ------
     LogError, MissingDataError, SettingsError
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
-    prepared = prepare_comparison(request, progress, flight)
+    prepared = prepare_comparison(request, progress, flight, as_sent=as_sent)
     return replace(explain(compare(prepared, progress), progress), request=request)
 
 
@@ -179,14 +185,18 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
 
 
 def prepare_comparison(
-    request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
+    request: ComparisonRequest,
+    progress: Progress = ignore_progress,
+    flight: Flight | None = None,
+    *,
+    as_sent: bool = False,
 ) -> Comparison:
     """Read a flight and select position source, time span and axes, without running KF.
 
     Arguments and errors are those of :func:`diagnose`.
     """
     flight = flight or read_flight(request, progress)
-    prepared = prepare(flight, request)
+    prepared = prepare(flight, request, as_sent=as_sent)
     if request.clock_offset_s != AUTO or request.position is not None:
         return prepared
     _, clock = estimate_noises_and_clock(prepared, progress)
@@ -203,7 +213,8 @@ def prepare_comparison(
             f"{high:+.3f} s) is not significant and was not applied"
         )
         return replace(prepared, notes=(*prepared.notes, note))
-    return prepare(flight, structs.replace(request, clock_offset_s=clock.offset_s))
+    request = structs.replace(request, clock_offset_s=clock.offset_s)
+    return prepare(flight, request, as_sent=as_sent)
 
 
 def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progress) -> Loop:

@@ -33,7 +33,7 @@ def example_1() -> Replay:
         name="aisle",
         direction=np.array([1.0, 0.0, 0.0]),
         heading_deg=0.0,
-        note="aisle of UAT 366, Example 1",
+        note="along the aisle of Example 1 in course UAT 366",
         measurement_time_s=time,
         measurement_m=TRUE_VELOCITY_M_S * time + np.array(UWB_NOISE_M),
         acceleration=Unavailable(

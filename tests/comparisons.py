@@ -17,8 +17,10 @@ def request_of(settings: Settings | None = None, **choices: Any) -> ComparisonRe
     return ComparisonRequest(log="made.ulg", **{**parts, **choices})
 
 
-def prepare(flight: Flight, settings: Settings | None = None, **choices: Any) -> Comparison:
-    return preparation.prepare(flight, request_of(settings, **choices))
+def prepare(
+    flight: Flight, settings: Settings | None = None, *, as_sent: bool = False, **choices: Any
+) -> Comparison:
+    return preparation.prepare(flight, request_of(settings, **choices), as_sent=as_sent)
 
 
 def compare(flight: Flight, settings: Settings | None = None, **choices: Any) -> Comparison:

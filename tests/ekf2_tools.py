@@ -22,7 +22,7 @@ def opened(flight: Flight) -> Model:
 
 def step_matrix(segment: ReplaySegment, k: int, *, trapezoid: bool = True) -> np.ndarray:
     """Return ∂(state after step k) / ∂(state before); PX4's covariance has no trapezoid."""
-    dt, after = segment.step_s[k], segment.rotation[k + 1]
+    dt, after = segment.step_s[k], segment.body_to_ned[k + 1]
     F = EYE.copy()
     F[0:3, 9:12] = -after * dt
     F[3:6, 0:3] = -skew(after @ segment.force_m_s2[k]) * dt
@@ -39,7 +39,7 @@ def step_noise(segment: ReplaySegment, k: int, gyro: float, force: float) -> np.
 
 def step_state(segment: ReplaySegment, k: int, x: np.ndarray) -> np.ndarray:
     """Predict the state by one step, directly from the equations."""
-    dt, after = segment.step_s[k], segment.rotation[k + 1]
+    dt, after = segment.step_s[k], segment.body_to_ned[k + 1]
     force = after @ segment.force_m_s2[k]
     x = x.copy()
     velocity = x[3:6].copy()

@@ -295,7 +295,7 @@ def test_compare_without_position_evaluates_aiding_sources(tmp_path: Path) -> No
     found = read_results(report.with_suffix(".json").read_bytes())
     assert found.log.sha256 in PdfReader(report).pages[-1].extract_text().replace("\n", "")
     refused = run("verify", report, log).exception
-    assert "contains only EKF2 aids, no KF results" in str(refused)
+    assert "contains only EKF2 aiding sources, no KF results" in str(refused)
 
 
 def test_compare_of_log_without_take_off_raises_missing_data(tmp_path: Path) -> None:

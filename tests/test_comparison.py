@@ -139,13 +139,13 @@ def test_position_source_kind_sets_drift_and_gnss_flags(sample_flight: Flight) -
         assert said.horizontal == plain.horizontal
 
 
-class TestMadeFlight:
+class TestSimulatedFlight:
     @pytest.mark.parametrize("nis", [0.01, 1.0, 20.0])
     def test_ekf2_sigma_ratio_equals_simulated_ratio(self, nis: float) -> None:
         comparison = compare(aisle_flight(ekf2=Estimator(nis=nis)))
         assert comparison.horizontal.get("ekf2").sigma_ratio == pytest.approx(nis**0.5, rel=0.05)
 
-    def test_ekf2_errors_and_sigmas_equal_simulated_values(self, made: Comparison) -> None:
+    def test_ekf2_rmse_nees_and_sigma_equal_simulated_values(self, made: Comparison) -> None:
         """P⁻ = S - R and P⁺ = P⁻R/S, with P⁻ = (0.06 m)² and R = (0.10 m)²."""
         for result in made.axes.values():
             ekf2 = result.filters["ekf2"]

@@ -122,7 +122,7 @@ def assert_found(convention: Convention, **expected: object) -> None:
 
 
 @pytest.mark.parametrize("index", range(0, len(ALL_AXES), 5))
-def test_check_random_axes_unit_and_offset_are_found(index):
+def test_check_convention_finds_axes_unit_and_time_offset(index):
     rng = np.random.default_rng(index)
     axes, unit = ALL_AXES[index], [*UNITS][index % 4]
     late_s = float(rng.uniform(-8.0, 8.0))
@@ -131,7 +131,7 @@ def test_check_random_axes_unit_and_offset_are_found(index):
 
 
 @pytest.mark.parametrize("rotation_deg", [-170.0, -60.0, 25.0, 45.0, 100.0])
-def test_check_rotated_positions_have_their_rotation(rotation_deg):
+def test_check_convention_finds_rotation_of_positions(rotation_deg):
     found = check_convention(flown(), sent(flown(), rotation_deg=rotation_deg))
     quarter = CLOCKWISE.index(found.x)
     assert not found.is_mirrored
@@ -140,12 +140,12 @@ def test_check_rotated_positions_have_their_rotation(rotation_deg):
 
 
 @pytest.mark.parametrize("clock_drift", [-0.04, -0.01, 0.02])
-def test_check_clock_drift_is_found(clock_drift):
+def test_check_convention_finds_clock_drift(clock_drift):
     found = check_convention(flown(), sent(flown(), clock_drift=clock_drift, late_s=1.0))
     assert_found(found, clock_drift=clock_drift)
 
 
-def test_check_clean_source_is_ned_in_metres():
+def test_check_convention_of_correct_source_is_ned_in_metres():
     track = flown().positions[0]
     found = check_convention(flown(), track)
     assert_found(found)
@@ -154,28 +154,28 @@ def test_check_clean_source_is_ned_in_metres():
     assert found.scale == pytest.approx(1.0, abs=0.1)  # odometry drifts
 
 
-def test_check_noise_without_motion_is_not_determinable():
+def test_check_convention_of_pure_noise_is_not_determinable():
     track = sent(flown())
     noise = np.random.default_rng(2).normal(0.0, 0.3, (len(track.samples), 3))
     samples = track.samples.assign(**dict(zip(Columns.POSITION, noise.T, strict=True)))
     assert check_convention(flown(), replace(track, samples=samples)).verdict == "not determinable"
 
 
-def test_check_repeated_positions_are_left_out():
+def test_check_convention_omits_repeated_positions():
     track = sent(flown())
     samples = track.samples.copy()
     samples.iloc[200:260] = samples.iloc[199].to_numpy()
     assert_found(check_convention(flown(), replace(track, samples=samples)))
 
 
-def test_check_without_height_axes_are_found():
+def test_check_convention_without_height_finds_axes():
     track = sent(flown())
     samples = track.samples.assign(down_m=np.nan)
     assert_found(check_convention(flown(), replace(track, samples=samples)))
 
 
 @pytest.mark.parametrize("frames", ["ENU", "NWU"])
-def test_check_orientation_of_ros_frames_is_found(frames):
+def test_check_convention_finds_ros_frames_of_orientation(frames):
     time, attitude = oriented(flown())
     quaternion = multiply(multiply(np.array(NED_TO[frames]), attitude), np.array(NED_TO["NWU"]))
     track = with_orientation(sent(flown(), ENU if frames == "ENU" else NWU), quaternion, time)
@@ -185,7 +185,7 @@ def test_check_orientation_of_ros_frames_is_found(frames):
 
 
 @pytest.mark.parametrize("error_deg", [-90.0, 45.0, 180.0])
-def test_check_heading_error_of_the_orientation_is_found(error_deg):
+def test_check_convention_finds_heading_error_of_orientation(error_deg):
     time, attitude = oriented(flown())
     track = with_orientation(sent(flown()), multiply(yaw(error_deg), attitude), time)
     found = check_convention(flown(), track).orientation
@@ -194,7 +194,7 @@ def test_check_heading_error_of_the_orientation_is_found(error_deg):
     assert difference == pytest.approx(0.0, abs=3.0)
 
 
-def test_check_orientation_with_w_last_has_its_order():
+def test_check_convention_finds_quaternion_order_with_w_last():
     found = check_convention(flown(), w_last(flown())).orientation
     assert (found.verdict, found.order) == ("determined", "x y z w")
 

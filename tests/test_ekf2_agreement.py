@@ -148,7 +148,7 @@ def test_ekf2_replay_agreement_statistics_equal_their_formulas():
     assert found.velocity_rms_difference_m_s == pytest.approx(0.25)
 
 
-def test_velocity_agreement_of_constant_innovations_is_empty():
+def test_constant_innovations_have_no_velocity_statistics():
     """np.corrcoef of a constant is NaN, with a warning."""
     index = pd.Index(10.0 + np.arange(30.0))
     updates = pd.DataFrame(0.1, index=index, columns=VELOCITY_UPDATE_COLUMNS)
@@ -216,7 +216,7 @@ def test_ekf2_replay_agreement_without_state_is_unavailable():
     assert unknown.reason == "EKF2's position is not logged in the replayed time"
 
 
-def test_logged_innovations_with_missing_axis_are_empty():
+def test_logged_innovations_without_one_axis_are_an_empty_table():
     frame = pd.DataFrame({"innovation_m": [0.1], "innovation_variance_m2": 0.1, "rejected": 0.0})
     for other in (NONE, frame.assign(rejected=np.nan)):
         ekf2 = made(Ekf2, innovations={"north": frame, "east": other}, innovation_topics=AID)

@@ -324,7 +324,7 @@ def test_ekf2_replay_segment_of_turning_vehicle_has_known_values():
     assert_allclose(found.time_s, steps, atol=1e-9)
     assert_allclose(found.step_s, 0.01, atol=1e-9)
     turned = to_matrix(facing(steps))
-    assert_allclose(found.rotation, turned, atol=1e-6)
+    assert_allclose(found.body_to_ned, turned, atol=1e-6)
     assert_allclose(found.correction_rad, 0.0, atol=1e-6)
     # body frame at the end of the step, without bias
     assert_allclose(found.force_m_s2, [[0.8, 0.0, -10.0]] * 100, atol=5e-3)

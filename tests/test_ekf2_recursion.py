@@ -59,7 +59,7 @@ def test_vision_measurements_apply_lever_arm_and_noise_minimum():
     vision = made(ReceivedPositions, position_m=np.array([[1.0, 2.0, 3.0]]),
                   variance_m2=np.array([[0.04, 0.0001, 0.0]]))  # fmt: skip
     turned = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
-    segment = made(ReplaySegment, rotation=np.array([np.eye(3), turned]))
+    segment = made(ReplaySegment, body_to_ned=np.array([np.eye(3), turned]))
     parameters = {
         "EKF2_EVP_NOISE": np.array([0.1, 0.001]), "EKF2_EV_NOISE_MD": np.array([0.0, 1.0]),
         "EKF2_EV_POS_X": np.array([0.0, 0.3]), "EKF2_EV_POS_Y": np.zeros(2),
@@ -251,7 +251,7 @@ def test_ekf2_replay_start_correlation_equals_kalman_filter():
     turn = Rotation.from_euler("z", 110.0, degrees=True).as_matrix()
     count = 6000
     segment = made(
-        ReplaySegment, step_s=np.full(count, 0.01), rotation=np.tile(turn, (count + 1, 1, 1)),
+        ReplaySegment, step_s=np.full(count, 0.01), body_to_ned=np.tile(turn, (count + 1, 1, 1)),
         force_m_s2=np.zeros((count, 3)) - GRAVITY_M_S2, variance=np.empty(15),
     )  # fmt: skip
     P = np.diag(np.repeat([0.1, 0.3, 0.5, 1e-5, 0.2], 3) ** 2)
@@ -329,7 +329,7 @@ def at_rest(
     flat = np.zeros((count, 3))
     segment = ReplaySegment(
         time_s=10.0 + 0.01 * np.arange(count + 1), step_s=np.full(count, 0.01),
-        rotation=np.tile(np.eye(3), (count + 1, 1, 1)), correction_rad=flat,
+        body_to_ned=np.tile(np.eye(3), (count + 1, 1, 1)), correction_rad=flat,
         force_m_s2=flat - GRAVITY_M_S2,
         accelerometer_bias_m_s2=np.zeros(3), state=np.zeros(15), variance=np.full(15, 1e-4),
         down_m=np.full(count + 1, down_m),

@@ -48,7 +48,7 @@ def flow_of(noise_m_s: float = 0.0, every: int = 10) -> pd.DataFrame:
     """Return logged flow rows of a sensor at 50 Hz."""
     (segment,) = model().inputs.segments
     times = np.arange(segment.time_s[0] + 1.0, segment.time_s[-1] - 0.5, INTERVAL_S)
-    turn = segment.rotation[np.searchsorted(segment.time_s, times - 1e-9)]
+    turn = segment.body_to_ned[np.searchsorted(segment.time_s, times - 1e-9)]
     raw = np.einsum("nji,nj->ni", turn, true_velocity(times))[:, :2]
     raw += np.random.default_rng(1).normal(0.0, 1.0, raw.shape) * noise_m_s
     remaining = low_pass_weights(raw)[::every]
@@ -67,7 +67,7 @@ def flying(noise_m_s: float = 0.3) -> Model:
     return replace(model(), inputs=replace(inputs, segments=segments))
 
 
-def test_optical_flow_mean_between_logged_rows_is_recovered(tmp_path):
+def test_optical_flow_mean_is_computed_from_filtered_velocity(tmp_path):
     log = gnss_log("v1.16")
     log["estimator_states"]["states"][:, :4] = [1.0, 0.0, 0.0, 0.0]
     at = stamps(20.0, 50.0)
@@ -205,7 +205,7 @@ def test_ekf2_replay_start_covariance_uses_data_before_start():
     assert segment.history is not None
     assert segment.history.time_s[-1] == pytest.approx(segment.time_s[0], abs=1e-6)
     assert segment.history.time_s[0] < 1.0
-    of_tilt = segment.correlation[:2, 12:15] @ segment.rotation[0].T
+    of_tilt = segment.correlation[:2, 12:15] @ segment.body_to_ned[0].T
     # θ × f = Rb with f = -g: the north bias couples with the east tilt, and vice versa
     np.testing.assert_allclose(of_tilt[:, :2], [[0.0, 0.98], [-0.98, 0.0]], atol=0.02)
 

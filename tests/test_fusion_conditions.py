@@ -123,7 +123,7 @@ def test_constant_positions_are_not_to_be_fused() -> None:
     assert finding.remedy == "Leave bit 0 of EKF2_EV_CTRL unset."
 
 
-def test_position_file_beside_gnss_is_nothing_to_fuse() -> None:
+def test_position_file_that_ekf2_did_not_get_has_no_finding() -> None:
     beside = unfused(source={"origin": POSITION_FILE}, ekf2={"parameters": {"EKF2_EV_CTRL": 0.0}})
     assert named(ekf2_not_fusing.detect, beside) == {}
     # EKF2 received the same or another source

@@ -198,7 +198,7 @@ def test_mean_of_filtered_magnetometer_samples_is_recovered() -> None:
     fields = [*Columns.EARTH_FIELD, *Columns.BODY_FIELD]
     delayed = pd.DataFrame(dict(zip(fields, [*EARTH, *body], strict=True)), [99.0, 200.0])
     matrices = rotation.as_matrix()
-    segment = made(ReplaySegment, time_s=time_s, rotation=matrices, attitude_error_rad=error)
+    segment = made(ReplaySegment, time_s=time_s, body_to_ned=matrices, attitude_error_rad=error)
     found = _mean_field(segment, delayed, measured_at_s[remaining], filtered[remaining])
     near = np.flatnonzero(np.diff(remaining) < 20) + 1
     assert found.sample_count.tolist() == np.diff(remaining)[near - 1].tolist()

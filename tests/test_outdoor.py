@@ -177,7 +177,7 @@ def test_simulated_outdoor_mistake_is_cause_of_ekf2_error(
     assert found.is_sufficient
 
 
-def test_outdoor_vibration_is_partly_explained_by_noise() -> None:
+def test_nees_with_vibration_is_partly_corrected_by_acc_noise() -> None:
     """EKF2_ACC_NOISE corrects the filter, but the output predictor still integrates vibration."""
     analysis = flown("vibration=1")
     (tried,) = interventions_for(analysis.causes, "ekf2", "aisle", "nees")

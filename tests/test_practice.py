@@ -83,7 +83,8 @@ def flown(mistake: HiddenMistake | None, level: int, seed: int) -> Flight:
 
 
 def compared(flight: Flight, **settings: float) -> Comparison:
-    return compare(flight, Settings(**({"sigma_a_m_s2": practice.SIGMA_A_M_S2} | settings)))
+    chosen = Settings(**({"sigma_a_m_s2": practice.SIGMA_A_M_S2} | settings))
+    return compare(flight, chosen, as_sent=True)
 
 
 def kf_statistics(flight: Flight, **settings: float) -> Any:
@@ -321,7 +322,7 @@ def test_practice_page_gives_half_a_point_for_half_an_answer(browser: Browser, q
     assert points == [0.5, 1, 0, 0.5]
 
 
-def test_practice_page_card_names_an_undetected_mistake() -> None:
+def test_practice_page_summary_names_undetected_mistake() -> None:
     clean = structs.replace(SMALL_SIGMA_A, severity="clean", causes=(), headline="No fault found")
     described = [{"fault": "gate of EKF2 too small", "size": "EKF2_EVP_GATE 1.4"}]
     named = practice._name_mistakes(clean, described)

@@ -60,7 +60,7 @@ def innovations(made: Flight, axis: str, segment: Segment = WHOLE) -> pd.DataFra
     return project_innovations(made, made.ekf2, made.positions[0], axes_of(made)[axis], segment)
 
 
-def test_aisle_innovations_combine_north_and_east() -> None:
+def test_innovations_on_rotated_axis_combine_north_and_east() -> None:
     got = innovations(with_innovations(flight(), north=NORTH, east=EAST), "aisle")
     assert got.index.tolist() == pytest.approx([1.2, 1.4, 1.6])
     for k, time in enumerate(got.index):

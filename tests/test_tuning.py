@@ -235,7 +235,7 @@ def test_tune_estimates_random_walk_of_drifting_source() -> None:
         (Noise(None, None, None), "unknown"),
     ],
 )
-def test_noise_text_at_end_of_search_range_is_a_bound(noise: Noise, said: str) -> None:
+def test_format_noise_without_interval_states_bound(noise: Noise, said: str) -> None:
     assert format_noise(noise, "m") == said
 
 

@@ -183,7 +183,7 @@ def flying(vision: ReceivedPositions | None, seconds: float = 40.0, **settings: 
     unknown = np.full((count, 3), np.inf)
     segment = replace(
         whole, time_s=whole.time_s[:count], step_s=whole.step_s[: count - 1],
-        rotation=whole.rotation[:count], correction_rad=whole.correction_rad[: count - 1],
+        body_to_ned=whole.body_to_ned[:count], correction_rad=whole.correction_rad[: count - 1],
         force_m_s2=whole.force_m_s2[: count - 1], down_m=whole.down_m[:count], field=None,
         heights=None, state=whole.state[:15], variance=whole.variance[:15],
         bad_acceleration_share=None,
@@ -253,7 +253,7 @@ def test_vision_lever_arm_is_subtracted_in_replay() -> None:
     inputs, vision, lever_arm_m = flying(sent()), sent(), np.array([1.5, -0.5, 0.8])
     (segment,) = inputs.segments
     step = np.searchsorted(segment.time_s, vision.stamp_s - 0.5 * inputs.step_s - 1e-9)
-    turn = segment.rotation[np.minimum(step, len(segment.rotation) - 1)]
+    turn = segment.body_to_ned[np.minimum(step, len(segment.body_to_ned) - 1)]
     beside = replace(vision, position_m=vision.position_m + turn @ lever_arm_m)
     settings = {
         f"EKF2_EV_POS_{axis}": value for axis, value in zip("XYZ", lever_arm_m, strict=True)

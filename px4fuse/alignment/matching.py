@@ -109,8 +109,8 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     }
     missing_options = [f"`{name}`" for name, value in given_parameters.items() if value is None]
     reasons = []
-    # If options give all parameters, the parameters are only checked, and only against EKF2: the
-    # band-passed IMU motion is not accurate enough for a check
+    # If options give clock offset, frame and yaw, they are only checked, and only against EKF2:
+    # the band-passed IMU motion is not accurate enough for a check
     reference_kinds = (tracks.make_ekf2_references, tracks.make_imu_references)
     for references in reference_kinds if missing_options else reference_kinds[:1]:
         try:

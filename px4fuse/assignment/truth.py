@@ -38,7 +38,7 @@ MIN_REJECTED_FRACTION = 0.005
 # Minimum position reset of EKF2 (m) that a complete answer must name, and time (s) after the start
 # in which resets are ignored, because EKF2 resets to its first position
 MIN_RESET_M, EKF2_START_S = 0.2, 5.0
-# Answers on EKF2's behaviour, and the kinds of mistakes for which each is required or allowed
+# Answers of the form on EKF2's behaviour, and kinds of mistakes that require or allow each
 BEHAVIOUR_RULES = table(__file__, "did.toml", dict[str, dict[str, set[str]]])
 
 

@@ -511,13 +511,12 @@ def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> st
         return f"{text}. Both filters have the fault, so this difference does not show it."
     after = {trial.filter: trial.after.difference_rms_m for trial in reversed(trials)}
     filter_name: FilterName = "ekf2" if filter_names == {"ekf2"} or set(after) == {"ekf2"} else "kf"
-    after_m = after.get(filter_name)
-    if after_m is None:
+    difference_after_m = after.get(filter_name)
+    if difference_after_m is None:
         return f"{text}."
     predicted = "predicted " if filter_name == "ekf2" else ""
-    return (
-        f"{text}; {format_metres(after_m)} m {predicted}with {FILTER_NAMES[filter_name]} corrected."
-    )
+    difference_text = f"{format_metres(difference_after_m)} m {predicted}with"
+    return f"{text}; {difference_text} {FILTER_NAMES[filter_name]} corrected."
 
 
 def _make_notes(roots: Sequence[Finding], log: str) -> tuple[Note, ...]:

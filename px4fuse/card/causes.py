@@ -103,12 +103,12 @@ class RankedCause(NamedTuple):
 
 
 def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCause]:
-    """Return the causes of a flight in the order of the card.
+    """Return the causes of a flight in the order of the report's summary.
 
     First come findings that make the verdicts meaningless, then those whose re-run makes a filter
-    consistent, then those whose re-run halves |ln ratio|, then other errors and warnings. A fault
-    of the source precedes a setting that would only hide it, or that leaves the error against
-    ground truth as it is.
+    consistent, then those whose re-run halves |ln(actual ÷ reported σ)|, then other errors and
+    warnings. A fault of the source precedes a setting that would only hide it, or that leaves the
+    error against ground truth as it is.
     """
     ranked_causes = []
     for finding in roots:
@@ -270,9 +270,8 @@ def _make_actions(
             and trial.change.keys() <= PARAMETERS.keys()
         ):
             actions.append(set_parameters(analysis, trial.change))
-    actions.sort(
-        key=lambda action: action.target == "KF"
-    )  # fix the vehicle before the analysis of this log
+    # actions on KF last: correct the vehicle before this log is analysed again
+    actions.sort(key=lambda action: action.target == "KF")
     targets = {action.target for group in (actions, *alternatives) for action in group}
     reasons = {
         name: reason

@@ -1,4 +1,4 @@
-"""Records of the diagnosis card; they are part of the results."""
+"""Summary of a report (headline, verdicts, causes, actions); part of the JSON results."""
 
 from collections.abc import Mapping
 from typing import Annotated, Literal

@@ -144,7 +144,7 @@ def _system_error(error: OSError, written: str) -> Px4FuseError:
 
 
 def _check_memory() -> None:
-    # with less memory, libraries end the process without a message
+    # below MIN_ADDRESS_SPACE_BYTES, libraries end the process without a message
     try:
         import resource
     except ImportError:  # Windows has no memory limit for a process

@@ -155,7 +155,7 @@ class Intervention(Record, frozen=True, kw_only=True):
 def interventions_for(
     causes: Iterable[Intervention], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> list[Intervention]:
-    """Return the re-runs that test causes of a mean NIS or NEES outside its limits."""
+    """Return the re-runs of one filter and axis that may explain its mean NIS or NEES."""
     return [
         intervention
         for intervention in causes
@@ -490,7 +490,8 @@ def _rerun_kf(
         )
         axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
         if is_gnss_rotation:
-            # GNSS and ground truth refer to true north, so the attitude is misaligned
+            # GNSS and ground truth both refer to true north, so the attitude is misaligned and
+            # not one of them: the rotation applies to both
             rotated_axis = replace(axis, direction=rotated_direction)
             truth = project_truth(comparison.flight.truth, rotated_axis, segment)
     if FORWARD_BIAS in change:

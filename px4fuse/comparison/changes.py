@@ -194,10 +194,10 @@ def _ekf2_noise(inputs: Inputs, summary: FilterSummary, tuned: AxisTuning) -> li
     flown_m = float(np.sqrt(np.median(np.maximum(reported_m2, flown[aid.noise] ** 2))))
     if (noise.low or 0.0) <= flown_m <= (noise.high or np.inf):
         return []
-    ml_noise_m = noise.value
-    if ml_noise_m is None:  # the RMS of EKF2's innovations is an upper bound of the noise
-        ml_noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
-    return [noise_change(aid, flown, flown_m, ml_noise_m)]
+    proposed_noise_m = noise.value
+    if proposed_noise_m is None:  # the RMS of EKF2's innovations is an upper bound of the noise
+        proposed_noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
+    return [noise_change(aid, flown, flown_m, proposed_noise_m)]
 
 
 def _px4_defaults(log: LogInfo, inputs: Inputs) -> list[Change]:

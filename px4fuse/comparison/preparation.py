@@ -40,8 +40,10 @@ NO_SEPARATE_TRUTH = Unavailable(
 GNSS_AXES = (AISLE, "north", "east")
 
 
-def prepare(flight: Flight, request: ComparisonRequest) -> Comparison:
+def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False) -> Comparison:
     """Choose the source, the segment and the axes of a flight; the recordings are already read.
+
+    ``as_sent`` leaves out the check of the source's axes, unit and clock, and its corrections.
 
     Raises
     ------
@@ -69,7 +71,8 @@ def prepare(flight: Flight, request: ComparisonRequest) -> Comparison:
     if kind := request.source_kind:
         track = replace(track, origin=structs.replace(track.origin, kind=kind))
     track = shift_clock(track, settings.clock_offset_s)
-    convention = None if track.origin.is_gnss else check_convention(flight, track)
+    is_in_ned = track.origin.is_gnss or track.origin.path == "aligned by EKF2"
+    convention = None if as_sent or is_in_ned else check_convention(flight, track)
     if convention is not None and settings.clock_offset_s:  # a chosen time offset is not changed
         convention = structs.replace(convention, late_s=0.0)
     late_s = find_faults(convention, flight, track.frame).late_s

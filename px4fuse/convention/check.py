@@ -34,9 +34,9 @@ from px4fuse.convention.texts import format_axes
 from px4fuse.flight import Columns, Flight, PositionTrack
 from px4fuse.trajectory.rotation import heading
 
-MIN_LOG_ODDS = 4.0  # to the best other convention
-MIN_GAIN = 8.0  # log likelihood over no relation
-MIN_GAIN_PER_WINDOW = (0.15, 0.4)  # of a determined and of an ambiguous convention
+MIN_LOG_ODDS = 4.0  # log likelihood minus that of the best other convention
+MIN_GAIN = 8.0  # log likelihood minus that of positions without relation to the motion
+MIN_GAIN_PER_WINDOW = (0.15, 0.4)  # if the convention is determined, or ambiguous
 MIN_SCALE, MAX_SCALE = 0.88, 1.12  # distances of the source over those of the IMU
 # Residuals over those that explain the noise of the source and the minimum error (m) of the IMU
 MAX_RESIDUAL_RATIO, IMU_ERROR_M = 2.4, 0.05

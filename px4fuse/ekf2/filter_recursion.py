@@ -703,7 +703,7 @@ def _settled_correlation(segment: ReplaySegment) -> Array:
     acceleration cancel: θ × f = Rb.
     """
     to_earth = np.eye(STATE_COUNT)
-    to_earth[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.rotation[0]
+    to_earth[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.body_to_ned[0]
     P = np.diag(np.diagonal(to_earth @ np.diag(segment.variance) @ to_earth.T))
     for tilt, bias, acceleration_per_rad in ((1, BIAS_NORTH, -GRAVITY), (0, BIAS_EAST, GRAVITY)):
         P[tilt, bias] = P[bias, tilt] = (
@@ -767,7 +767,7 @@ def _measurements(
         :, :, None
     ]
     measured_values, noise = np.full((2, len(event_steps), len(offset_m), 6), np.nan)
-    lever_arm_ned = (segment.rotation[event_steps] @ offset_m)[..., 0]
+    lever_arm_ned = (segment.body_to_ned[event_steps] @ offset_m)[..., 0]
     measured_values[..., 3:] = received.position_m[sample][:, None] - lever_arm_ned
     if aid.noise_mode:
         uses_reported_noise = uses_reported_noise & (parameters[aid.noise_mode] != 1.0)
@@ -780,7 +780,7 @@ def _measurements(
     if received.velocity_m_s is not None and received.velocity_variance_m2_s2 is not None:
         # velocity of the antenna relative to the IMU during rotation
         rotation_rate = (
-            np.diff(segment.rotation, axis=0)[event_steps - 1]
+            np.diff(segment.body_to_ned, axis=0)[event_steps - 1]
             / segment.step_s[event_steps - 1, None, None]
         )
         lever_arm_ned = (rotation_rate @ offset_m)[..., 0]

@@ -38,7 +38,7 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     step, weight = low_pass_weights(
         segment, flow.index.to_numpy(), count, interval_s, FLOW_FILTER_WEIGHT
     )
-    rotation_to_body = segment.rotation[step].swapaxes(2, 3)[:, :, :2]
+    rotation_to_body = segment.body_to_ned[step].swapaxes(2, 3)[:, :, :2]
     imu_velocity = np.einsum(
         "ki,kiab,kib->ka", weight, rotation_to_body, segment.imu_velocity_m_s[step]
     )

@@ -172,7 +172,7 @@ def _check_gap(attempt: Attempt) -> Iterator[Unmet]:
     limit_s = EV_STOP_INTERVAL_S if is_short else STOP_S
     times_s = attempt.source.samples.index.to_numpy()
     start_s, end_s = attempt.span_s
-    # fusion stops when the gap has lasted for the limit
+    # EKF2 stops fusion when the gap has lasted for limit_s
     last_s = max(times_s[times_s < start_s], default=start_s)
     duration_s = np.min(times_s[times_s >= start_s], initial=end_s) - last_s
     if duration_s > limit_s + attempt.interval_s:
@@ -349,5 +349,6 @@ VISION_CONDITIONS = (
     _check_alignment,
     _check_gate,
 )
-# Without a fix the reader has no samples; while none arrive, the flags of the checks stay
+# Checks before the gap: without a fix, the reader omits all samples, and the log contains the flags
+# of the last checks
 GNSS_CONDITIONS = (_check_switch, _check_gnss, _check_gap, _check_alignment, _check_gate)

@@ -191,7 +191,7 @@ class Inputs:
         Maximum interval between height and heading measurements in a gap of the position source.
     vision : ReceivedPositions or None
         External vision that EKF2 fused in addition to GNSS; NaN while disabled.
-    height_reason : str
+    logged_height_reason : str
         Reason why the replay of a flight with GNSS uses the logged EKF2 height; empty if it fuses
         height sensors.
     """
@@ -207,7 +207,7 @@ class Inputs:
     imu_offset_m: Array
     aid: Aid = EV_POS
     max_interval_s: float = MAX_INTERVAL_S
-    height_reason: str = ""
+    logged_height_reason: str = ""
     vision: ReceivedPositions | None = None
 
     __repr__ = one_line_repr
@@ -301,14 +301,14 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if len(flow):
         gate = record.parameters.get(FLOW.gate, FLOW.default_gate)
         segments = tuple(add_flow_samples(segment, flow, gate) for segment in segments)
-    height_reason = "; ".join(
+    logged_height_reason = "; ".join(
         f"{AIDS[name].label}: {reason}"
         for name, reason in doubtful_aids.items()
         if name not in (FLOW.name, EV_POS.name)
     )
-    if is_gnss and not height_reason:
+    if is_gnss and not logged_height_reason:
         new_segments = add_heights(flight, ekf2, record, segments)
-        segments, height_reason = (
+        segments, logged_height_reason = (
             (segments, new_segments) if isinstance(new_segments, str) else (new_segments, "")
         )
     other_aids = [EV_POS] if vision else []
@@ -328,7 +328,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         and bool(ekf2.fusing["vertical"].mean() > 0.5),
         imu_offset_m=np.array([record.parameters.get(f"EKF2_IMU_POS_{x}", 0.0) for x in "XYZ"]),
         aid=aid,
-        height_reason=height_reason,
+        logged_height_reason=logged_height_reason,
         vision=vision,
     )
 

@@ -201,7 +201,7 @@ def _effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
     first_start = start[longest_first]
     attitude, velocity, position = effects = np.zeros((3, len(end), 3, EFFECT_COLUMN_COUNT))
     attitude[:, :, 0:3] = np.eye(3)
-    force_m_s2 = rotate(segment.rotation[1:], segment.force_m_s2)
+    force_m_s2 = rotate(segment.body_to_ned[1:], segment.force_m_s2)
     steps = np.arange(int(length.max(initial=0)))
     for step_number, count in zip(
         steps, np.searchsorted(-length[longest_first], -steps), strict=True
@@ -211,7 +211,7 @@ def _effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
         dt = segment.step_s[step][:, None, None]
         force = force_m_s2[step]
         # sensitivity of attitude to gyro bias, and of velocity to accelerometer bias, in one step
-        rotation_step = -segment.rotation[1:][step] * dt
+        rotation_step = -segment.body_to_ned[1:][step] * dt
         position[rows] += 0.5 * dt * velocity[rows]
         velocity[rows] += (-skew(force) * dt) @ attitude[rows]
         velocity[rows, :, 6:9] += rotation_step

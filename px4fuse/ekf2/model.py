@@ -171,13 +171,13 @@ def _open_without_aids(
         return agreement
     rejected_share = max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
     if rejected_share > MANY_REJECTIONS_SHARE and np.isfinite(inputs.received.rejected).any():
-        logged_agreement = agreement_with_log(
+        agreement_with_decisions = agreement_with_log(
             flight, _make_replay(inputs, runs, configurations[1], {})
         )
-        if isinstance(logged_agreement, Agreement):
+        if isinstance(agreement_with_decisions, Agreement):
             has_all_decisions = inputs.received.correction_m is not None
             agreement = with_logged_rejections(
-                agreement, logged_agreement, has_all_decisions=has_all_decisions
+                agreement, agreement_with_decisions, has_all_decisions=has_all_decisions
             )
     # the agreement of an omitted aiding source is from the replay that contained this source
     failed_fields = {
@@ -224,7 +224,7 @@ def replay_settings(
     inputs = model.inputs
     unmodelled = PARAMETERS.keys() - inputs.settings.keys()
     unused_parameters = dict.fromkeys(unmodelled, f"EKF2 fused {inputs.aid.label} in this log")
-    height_text = f"the replay uses the logged EKF2 height ({inputs.height_reason})"
+    height_text = f"the replay uses the logged EKF2 height ({inputs.logged_height_reason})"
     if inputs.aid == GNSS_POS:
         reason = "the log does not contain all fused magnetometer samples"
         unused_parameters |= dict.fromkeys(
@@ -232,7 +232,7 @@ def replay_settings(
         )
         unused_parameters |= dict.fromkeys(
             unmodelled & BAROMETER.own_parameters,
-            height_text if inputs.height_reason else "EKF2 fused no barometer height",
+            height_text if inputs.logged_height_reason else "EKF2 fused no barometer height",
         )
     if inputs.rules.uses_delay_as_horizon:
         firmware = model.flight.log.firmware
@@ -246,7 +246,7 @@ def replay_settings(
     without = without or {}
     fused_aids = modelled_aids(inputs) if without else []
     if unknown_aids := without.keys() - set(fused_aids):
-        height_note = f"; {height_text}" if inputs.height_reason else ""
+        height_note = f"; {height_text}" if inputs.logged_height_reason else ""
         raise SettingsError(
             f"{min(unknown_aids)}: in this log the replay fuses only {', '.join(fused_aids)}"
             f"{height_note}."
@@ -486,7 +486,9 @@ def _delayed_and_published(
     published_track = publish(
         segment, state, reset, published_rotation, lag, configuration.settings
     )
-    heading = np.arctan2(segment.rotation[:, 1, 0], segment.rotation[:, 0, 0]) + state[:, HEADING]
+    heading = (
+        np.arctan2(segment.body_to_ned[:, 1, 0], segment.body_to_ned[:, 0, 0]) + state[:, HEADING]
+    )
     delayed_track = _published_columns(run, state).assign(heading_rad=heading)
     return delayed_track, _published_columns(run, np.hstack([state[:, THETA], *published_track]))
 
@@ -505,7 +507,7 @@ def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Ar
     segment = run.segment
     event_states = run.state[:, configuration_index]
     count = len(segment.step_s)
-    rotation = segment.rotation[1:]
+    rotation = segment.body_to_ned[1:]
     dt = segment.step_s[:, None]
     interval = np.searchsorted(event_steps, np.arange(count), side="right")
     first_step = np.searchsorted(interval, interval)

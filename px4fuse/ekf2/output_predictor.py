@@ -76,7 +76,7 @@ def publish(
     mean_step = float(np.mean(segment.step_s))
     # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
     force = segment.force_m_s2 - delay_by(state[:, ACCELEROMETER_BIAS], lag)[1:]
-    force = rotate(segment.rotation[1:], force)
+    force = rotate(segment.body_to_ned[1:], force)
     velocity_increments = (
         force + np.cross(attitude_difference_rad[1:], force) + GRAVITY_M_S2
     ) * step_s

@@ -72,7 +72,7 @@ EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)  # NED and FRD, with 21 s
 
 @dataclass(frozen=True)
 class SensorSamples:
-    """Magnetometer or optical flow data of one segment: m means, each over several samples.
+    """Magnetometer or optical flow data of one segment: m means, each over successive samples.
 
     k is the number of measured components: 3 for a magnetometer, 2 for optical flow.
 
@@ -81,8 +81,8 @@ class SensorSamples:
     step : ndarray of int, shape (m,)
         Prediction step after which EKF2 fuses the last sample of each mean.
     value : ndarray, shape (m, k)
-        Magnetic field (gauss, body FRD); or velocity forward and right (m/s) minus the velocity
-        change that the IMU measured since the start of the segment.
+        Magnetometer: field (gauss, body FRD). Optical flow: velocity forward and right (m/s)
+        minus the velocity change that the IMU measured since the start of the segment.
     rotation_to_body : ndarray, shape (m, k, 3)
         Mean rotation from NED to the body axes.
     sample_count : ndarray, shape (m,)
@@ -150,8 +150,8 @@ class ReplaySegment:
     time_s : ndarray, shape (n + 1,)
         Time of the start, then of the end of each step.
     step_s : ndarray, shape (n,)
-    rotation : ndarray, shape (n + 1, 3, 3)
-        Nominal attitude, body FRD to NED.
+    body_to_ned : ndarray, shape (n + 1, 3, 3)
+        Rotation matrices of the nominal attitude, body FRD to NED.
     correction_rad : ndarray, shape (n, 3)
         Rotation of the nominal attitude in each step minus the rotation measured by the gyro, plus
         the rotation of the earth.
@@ -194,7 +194,7 @@ class ReplaySegment:
 
     time_s: Array
     step_s: Array
-    rotation: Array
+    body_to_ned: Array
     correction_rad: Array
     force_m_s2: Array
     accelerometer_bias_m_s2: Array
@@ -218,7 +218,7 @@ class ReplaySegment:
     @cached_property
     def imu_velocity_m_s(self) -> Array:
         """Velocity change since the start, integrated from the IMU (m/s, NED), shape (n + 1, 3)."""
-        force = rotate(self.rotation[1:], self.force_m_s2) + GRAVITY_M_S2
+        force = rotate(self.body_to_ned[1:], self.force_m_s2) + GRAVITY_M_S2
         velocity_increments = np.cumsum(force * self.step_s[:, None], axis=0)
         return np.concatenate([np.zeros((1, 3)), velocity_increments])
 
@@ -463,7 +463,7 @@ def _make_segment(
     return ReplaySegment(
         time_s=times,
         step_s=step,
-        rotation=to_matrix(nominal),
+        body_to_ned=to_matrix(nominal),
         correction_rad=to_vector(multiply(extra_rotation[1:], conjugate(extra_rotation[:-1]))),
         force_m_s2=velocity_increments / step[:, None],
         accelerometer_bias_m_s2=bias,
@@ -535,7 +535,7 @@ def _mean_field(
     decay = ((1.0 - share) ** count)[:, None]
     innovation = (filtered_gauss[rows] - decay * filtered_gauss[rows - 1]) / (1.0 - decay)
     step, weight = low_pass_weights(segment, measured_at_s, count, between_s / count, share)
-    rotation_to_body = segment.rotation[step].swapaxes(2, 3)
+    rotation_to_body = segment.body_to_ned[step].swapaxes(2, 3)
     earth, body = (
         np.column_stack(
             [np.interp(measured_at_s, delayed_state.index, delayed_state[name]) for name in names]
@@ -596,7 +596,7 @@ def add_field_states(
         Magnetic fields of earth (NED) and body (FRD) at the start, and their variances.
     """
     step, is_inside = sample_steps(segment, measured_at_s)
-    rotation_to_body = segment.rotation[step].transpose(0, 2, 1)
+    rotation_to_body = segment.body_to_ned[step].transpose(0, 2, 1)
     count = len(step)
     return replace(
         segment,

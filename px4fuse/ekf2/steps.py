@@ -137,7 +137,7 @@ class DifferenceSteps(Record, frozen=True, kw_only=True):
     steps : tuple of Step
         Replacements of KF properties by EKF2 properties, one after the other.
     unexplained_mean_square_m2, unexplained_velocity_mean_square_m2_s2 : float
-        Remainder: mean square difference between the complete replay and the logged EKF2.
+        Remainder: mean square difference between the replay with all steps and the logged EKF2.
     position_rmse_to_truth_m : mapping from "kf" and "ekf2" to float or Unavailable
         Position RMSE against ground truth.
     spans_s : tuple of (float, float)
@@ -177,7 +177,7 @@ class DifferenceExplanation(DifferenceSteps, frozen=True, kw_only=True, eq=False
     Attributes
     ----------
     times_s, kf_minus_ekf2_m, unexplained_m : ndarray
-        EKF2 sample times; position differences KF - EKF2 and complete replay - EKF2.
+        EKF2 sample times; position differences KF - EKF2, and replay with all steps - EKF2.
     cause : str
         Sentence about the property with the largest contribution.
     """

@@ -57,7 +57,7 @@ def vision_samples(
     is_usable[:-1] &= step[1:] > step[:-1]  # EKF2 fuses only the newer of two samples in one step
     step = step[is_usable]
     lever_arm_m = np.array([settings[name] for name in EV_POS.lever_arm]) - inputs.imu_offset_m
-    position_m = (vision.position_m[is_usable] - segment.rotation[step] @ lever_arm_m)[:, :2]
+    position_m = (vision.position_m[is_usable] - segment.body_to_ned[step] @ lever_arm_m)[:, :2]
     more_columns = measured_at_s[is_usable], time_s[step], *vision.variance_m2[is_usable, :2].T
     return samples_by_event(segment, event_steps, step, position_m, slice(0, 2), *more_columns)
 
@@ -162,7 +162,7 @@ class VisionFilter:
         noise_m2 = self.noise_m2[slot, e]
         HP = P[:, HORIZONTAL_POSITION] - age_s[:, None] * P[:, HORIZONTAL_VELOCITY]
         S = HP[:, :, HORIZONTAL_POSITION] - age_s[:, None] * HP[:, :, HORIZONTAL_VELOCITY]
-        diagonal = S.reshape(len(S), -1)[:, ::3]  # view, to add R to S in slot
+        diagonal = S.reshape(len(S), -1)[:, ::3]  # view of S: `diagonal += R` changes S
         distance_m = (
             self.position_m[slot, e] - x[:, HORIZONTAL_POSITION] + age_s * x[:, HORIZONTAL_VELOCITY]
         )

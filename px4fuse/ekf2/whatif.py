@@ -295,7 +295,10 @@ def _heading_and_height_notes(model: Model) -> tuple[str, str]:
             "Heading is replayed with the magnetometer (as flown it differs from the log by "
             f"{difference_deg:.1f}° RMS)"
         )
-    return heading, HEIGHT_LOGGED_NOTE if model.inputs.height_reason else HEIGHT_REPLAYED_NOTE
+    return (
+        heading,
+        HEIGHT_LOGGED_NOTE if model.inputs.logged_height_reason else HEIGHT_REPLAYED_NOTE,
+    )
 
 
 def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUE_COUNT) -> list[float]:

@@ -292,8 +292,8 @@ def _step_chi_squares(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, times: Array
 ) -> Array:
     """Return χ² of a jump at each time: reduction of the squared residuals, summed over axes."""
-    data, columns, log_s_sum = design.whitened_design(sigma_a, is_skipped)
-    base_fit = design.regress(data, columns, log_s_sum, is_skipped)
+    data, columns, log_variance_sum = design.whitened_design(sigma_a, is_skipped)
+    base_fit = design.regress(data, columns, log_variance_sum, is_skipped)
     chi_square = np.zeros(len(times))
     for batch in np.array_split(np.arange(len(times)), -(-len(times) // STEP_BATCH_SIZE)):
         step_signals = unit_steps(design.time_s, times[batch])
@@ -391,7 +391,7 @@ class DesignFit:
 
     @property
     def axis_rms(self) -> Array:
-        """RMS residual along each axis in units of √S; 1 is the minimum, as for correct noises."""
+        """RMS residual along each axis in units of √S; at least 1, the value for correct noises."""
         mean_square = np.bincount(self.axis, self.residual**2) / np.bincount(self.axis)
         return np.sqrt(np.maximum(mean_square, 1.0))
 
@@ -466,11 +466,11 @@ class DesignMatrix:
         return self.regress(*self.whitened_design(sigma_a, is_skipped, scale), is_skipped)
 
     def regress(
-        self, data: Array, columns: Array, log_s_sum: float, is_skipped: BoolArray
+        self, data: Array, columns: Array, log_variance_sum: float, is_skipped: BoolArray
     ) -> DesignFit:
         """Fit whitened innovations with whitened columns, without the skipped measurements.
 
-        ``data``, ``columns`` and ``log_s_sum`` are the result of :meth:`whitened_design`.
+        ``data``, ``columns`` and ``log_variance_sum`` are the result of :meth:`whitened_design`.
         """
         axis = np.repeat(np.arange(len(data)), np.count_nonzero(~is_skipped))
         data = data[:, ~is_skipped].ravel()
@@ -485,15 +485,15 @@ class DesignMatrix:
         covariance = cho_solve(factor, np.eye(count))
         coefficients = covariance @ moment
         square_sum = float(data @ data - coefficients @ moment)
-        score = 0.5 * (square_sum + log_s_sum) + float(np.sum(np.log(np.diag(factor[0]))))
+        score = 0.5 * (square_sum + log_variance_sum) + float(np.sum(np.log(np.diag(factor[0]))))
         residual_rms = float(np.sqrt(max(square_sum, 0.0) / max(len(data) - CONSTANT_COUNT, 1)))
         residual = data - columns @ coefficients
         return DesignFit(axis, residual, coefficients, covariance, square_sum, score, residual_rms)
 
     def residual_squares(self, sigma_a: float, is_skipped: BoolArray) -> Array:
         """Return the squared normalised residual of each measurement, summed over axes."""
-        data, columns, log_s_sum = self.whitened_design(sigma_a, is_skipped)
-        fit = self.regress(data, columns, log_s_sum, is_skipped)
+        data, columns, log_variance_sum = self.whitened_design(sigma_a, is_skipped)
+        fit = self.regress(data, columns, log_variance_sum, is_skipped)
         residual = data - columns @ fit.coefficients
         return np.asarray(np.sum(residual**2, axis=0)) / max(fit.residual_rms, 1.0) ** 2
 
@@ -515,7 +515,7 @@ class DesignMatrix:
         scale_factors = np.ones(1 + CONSTANT_COUNT)
         scale_factors[[0, 1 + ROTATION]] = scale
         zero_signal = np.zeros_like(self.hat_signals[0])
-        log_s_sum = 0.0
+        log_variance_sum = 0.0
         for axis_group in self.axis_groups:
             intervals = [self.intervals[axis] for axis in axis_group]
             dp = [
@@ -533,8 +533,10 @@ class DesignMatrix:
             ]
             dp, dv = ([*signal, 0.0 * self.step_columns] for signal in (dp, dv))
             group_signals = _replace_signals(intervals[0], *map(np.hstack, (dp, dv, measurements)))
-            normalised, group_log_s_sum = self.whitened(group_signals, scale * sigma_a, is_skipped)
-            log_s_sum += len(axis_group) * group_log_s_sum
+            normalised, group_log_variance_sum = self.whitened(
+                group_signals, scale * sigma_a, is_skipped
+            )
+            log_variance_sum += len(axis_group) * group_log_variance_sum
             *axis_signals, common_signals = np.split(
                 normalised, len(scale_factors) * np.arange(1, 1 + len(intervals)), 1
             )
@@ -547,7 +549,7 @@ class DesignMatrix:
                     first_hat : first_hat + hat_count, first_step : first_step + step_count
                 ]
                 columns[axis][:, common_columns] = common_signals
-        return data, columns, log_s_sum
+        return data, columns, log_variance_sum
 
 
 def _replace_signals(

@@ -202,8 +202,10 @@ class PreparedMotion:
         ratio_fits = fit_ratios(
             position_batches, ratios, noises.random_walk_m / sigma, coarse_motion.weight, sigma
         )
-        scores = np.stack([fit.scaled(sigma).scores()[0] for fit in ratio_fits])
-        factor_index, offset_index = np.unravel_index(np.argmin(scores), scores.shape)
+        minus_log_likelihood = np.stack([fit.scaled(sigma).scores()[0] for fit in ratio_fits])
+        factor_index, offset_index = np.unravel_index(
+            np.argmin(minus_log_likelihood), minus_log_likelihood.shape
+        )
         sigma_a = noises.sigma_a_m_s2 * factors[int(factor_index)]
         return float(offsets[offset_index]), replace(noises, sigma_a_m_s2=sigma_a)
 

@@ -162,7 +162,9 @@ class Positions:
 
 @dataclass(frozen=True)
 class FittedPositions:
-    """Likelihood of positions with one SIGMA_A and SIGMA_Z, for T time offsets.
+    """Likelihood of positions in s segments with one SIGMA_A and SIGMA_Z, for T time offsets.
+
+    c is the number of unknown constants.
 
     Attributes
     ----------
@@ -194,7 +196,7 @@ class FittedPositions:
     def scores_by_segment(self, scales: Array = UNIT_SCALE) -> Array:
         """Return -ln p of each segment without the log-determinant, shape (k, s, T).
 
-        ``scales`` are k factors on all noises.
+        ``scales`` are k factors on all noises; s segments, T time offsets.
         """
         gram = self.gram / scales[:, None, None, None, None] ** 2
         sigma = self.constant_sigma

@@ -23,8 +23,8 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
 # Evidence key of time-correlated noise: ratio of its white part to the measurement σ that a filter
 # assumes. Present only if the ratio is large: the assumed σ is then a separate fault
 WHITE_RATIO = "white_over_assumed"
-# Values of CAUSE in a finding about an aiding source: its sensor is that of the position source, or
-# its mean innovation changes in flight
+# Values of CAUSE in a finding about an aiding source: this and the position source are the same
+# sensor, or the mean innovation of the aiding source changes in flight
 SENSOR, CHANGE = "the source's sensor", "change"
 # Kind of cause of ekf2_resets: all position resets follow a gap in the position source
 GAP = "gap"

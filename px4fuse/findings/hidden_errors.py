@@ -40,8 +40,8 @@ from px4fuse.text import format_metres, format_ratio
 from px4fuse.trajectory.alignment import fit_alignment
 
 MIN_NEES_ERROR = 16.0  # mean NEES from which the finding is an error: position errors of 4 σ
-# Maximum position RMSE of KF over that of EKF2 for a fault of EKF2 alone: the source, which both
-# filters use, then causes less than half of EKF2's mean square error
+# Maximum position RMSE of KF over that of EKF2 if only EKF2 has a fault. Both filters use the same
+# source: it then causes at most 0.7² (49 %) of EKF2's mean square error
 MAX_KF_ERROR_RATIO = 0.7
 # Maximum position RMSE after alignment over RMSE before, for a misaligned frame as main cause
 MAX_ALIGNED_SHARE = 0.5

@@ -18,8 +18,8 @@ from px4fuse.record import table
 # Deduction (points) for each false mistake, which the flight does not have, and number of false
 # mistakes from which the right ones have no points either
 FALSE_MISTAKE_POINTS, MAX_FALSE_MISTAKES = 10.0, 3
-# Fractions of the points if the answer form names another mistake instead: a related mistake, a
-# wrong EKF2 noise instead of a wrong reported variance, and a consequence of the mistake
+# Fractions of the points if the answer form names another mistake: a related mistake; ekf2-noise
+# for r-scale, which both make the same R wrong; a consequence of the mistake
 NEIGHBOUR_FRACTION, SAME_NUMBER_FRACTION, EFFECT_FRACTION = 0.4, 2.0 / 3.0, 0.15
 # Mistakes that can be guessed without a measurement: only the correct size has points. A nearly
 # correct size has no points, because the assigned sizes are close to each other
@@ -150,7 +150,7 @@ def _match_mistakes(answers: Answers, truth: FormTruth) -> tuple[list[Match], li
     ]
     match_by_kind: dict[str, tuple[StudentMistake, float]] = {}
     pairs = [
-        (kind_fraction(mistake.kind, student_mistake.kind), mistake.kind, student_mistake)
+        (fraction_for_named_kind(mistake.kind, student_mistake.kind), mistake.kind, student_mistake)
         for mistake in truth.mistakes
         for student_mistake in unmatched
     ]
@@ -166,7 +166,7 @@ def _match_mistakes(answers: Answers, truth: FormTruth) -> tuple[list[Match], li
     return matches, unmatched
 
 
-def kind_fraction(kind: str, named_kind: str) -> float:
+def fraction_for_named_kind(kind: str, named_kind: str) -> float:
     """Return the fraction of the points if a form names ``named_kind``, the flight has ``kind``."""
     if kind == named_kind:
         return 1.0
@@ -309,7 +309,7 @@ def _ekf2_behaviour_fraction(answers: Answers, truth: FormTruth) -> float:
 
 
 def _quantities_fraction(answers: Answers, truth: FormTruth) -> float:
-    """Return the fraction of the points for the computed numbers of KF."""
+    """Return the fraction of the points for the numbers of KF that the student computed."""
     # an empty list of updates is the right answer on most flights, so it has no points
     known_count = sum(value not in (None, ()) for value in truth.quantities)
     pairs = zip(answers.quantities, truth.quantities, strict=False)

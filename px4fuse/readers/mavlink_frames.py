@@ -260,7 +260,7 @@ def _remove_nested_frames(frames: Integers) -> Integers:
 def _find_possible_frames(
     content_bytes: NDArray[np.uint8], block_start: int
 ) -> tuple[Integers, Integers]:
-    """Return start, end and message id of possible frames, and the offset of their checksums."""
+    """Return two arrays about possible frames: start, end and message id; and checksum offset."""
     block = content_bytes[block_start : block_start + BLOCK_BYTES]
     start = (
         np.flatnonzero((block == MAGIC_BYTE_1) | (block == MAGIC_BYTE_2)).astype(np.int64)

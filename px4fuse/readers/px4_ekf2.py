@@ -227,11 +227,11 @@ def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -
     >>> samples_per_step(0.010, 0.004, [0, 4, 6, 14])
     2
     """
-    rounded_ratio = target_s / interval_s + 0.5
+    ratio_plus_half = target_s / interval_s + 0.5
     # The added 1e-6 makes the result independent of the rounding of timestamps to µs
-    samples = max(int(rounded_ratio + 1e-6), 1)
+    samples = max(int(ratio_plus_half + 1e-6), 1)
     gaps = np.diff(np.asarray(ends, dtype=float))
-    if samples > 1 and abs(rounded_ratio - samples) < MAX_HALF_DISTANCE and len(gaps):
+    if samples > 1 and abs(ratio_plus_half - samples) < MAX_HALF_DISTANCE and len(gaps):
         fits_larger, fits_smaller = (
             np.mean(gaps % count == 0.0) > 0.9 for count in (samples, samples - 1)
         )

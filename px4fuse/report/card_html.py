@@ -85,13 +85,15 @@ def card_html(
         more=" and ".join(
             text for text, parts in (("causes", card.causes), ("notes", card.notes)) if parts
         ).capitalize(),
-        first_actions=[row for row in marked_actions(card.causes[0]) if _is_prominent(row)]
+        first_actions=[
+            row for row in marked_actions(card.causes[0]) if _is_alternative_or_command(row)
+        ]
         if card.causes
         else [],
         rows_of=lambda cause: [
             row
             for row in marked_actions(cause)
-            if cause is not card.causes[0] or not _is_prominent(row)
+            if cause is not card.causes[0] or not _is_alternative_or_command(row)
         ],
         rerun_rows=_rerun_rows,
         signs=SEVERITY_SIGNS,
@@ -178,7 +180,7 @@ def _value(verdict: Verdict) -> str:
     return f"{format_ratio(verdict.ratio or 0.0)}, {verdict.word}{explained}"
 
 
-def _is_prominent(row: tuple[str, Action]) -> bool:
+def _is_alternative_or_command(row: tuple[str, Action]) -> bool:
     return bool(row[0] or row[1].commands)
 
 

@@ -213,7 +213,7 @@ def _make_segment(
         ReplaySegment(
             time_s=time_s,
             step_s=np.diff(time_s),
-            rotation=rotation,
+            body_to_ned=rotation,
             correction_rad=to_vector(
                 multiply(attitude_difference[1:], conjugate(attitude_difference[:-1]))
             ),
@@ -322,7 +322,7 @@ def _make_topic_track(
         reset_sum_m[step:, :2] += reset_m
     # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
     gyro_bias_ned = np.einsum(
-        "nij,nj->ni", segment.rotation[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:]
+        "nij,nj->ni", segment.body_to_ned[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:]
     )
     attitude_steps = -segment.correction_rad - gyro_bias_ned * segment.step_s[:, None]
     gyro_attitude_error = state[0, THETA] + np.concatenate(

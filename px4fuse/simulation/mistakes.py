@@ -137,7 +137,7 @@ def parse(texts: Iterable[str]) -> Mistakes:
         name, equals, values = text.strip().partition("=")
         if name not in MISTAKES:
             raise SettingsError(
-                f"--mistake {text}: {name} is not a known mistake",
+                f"--mistake {text}: {name} is not a mistake that px4fuse simulates",
                 f"{suggest_name(name, MISTAKES)}Choose from {', '.join(MISTAKES)}.",
             )
         mistake = MISTAKES[name]

@@ -165,7 +165,7 @@ def limit_rate(full_topic: Topic, rate_hz: float) -> Topic:
 
 
 def logged_imu(full_topic: Topic, mistakes: Mistakes, motion: Motion) -> Topic:
-    """Return sensor_combined as logged: with the gap and the reduced rate of the mistakes."""
+    """Return sensor_combined as logged, with the gap and the reduced rate of ``mistakes``."""
     times_s = time_s(full_topic)
     is_outside_gap = _is_outside_gap(
         times_s, mistakes.imu_dropout_s, mistakes.imu_dropout_at_s, motion.duration_s

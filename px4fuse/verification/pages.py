@@ -256,7 +256,7 @@ class _PdfComparison:
         page: int,
         remaining_values: list[tuple[Any, Any, str]],
     ) -> Iterator[PageDifference]:
-        """Yield different keys and streams of PDF dictionaries; collect values for comparison."""
+        """Yield different keys and streams of PDF dictionaries; append values to compare later."""
         submitted_keys, redrawn_keys = (
             _compared_keys(submitted_dictionary, key),
             _compared_keys(redrawn_dictionary, key),

@@ -94,7 +94,7 @@ def read_report(pdf: bytes, name: str) -> ReportedResults:
         return results
     reason = f"the attached {RESULTS_NAME} contains no results of compare or loop"
     if isinstance(results, AidsResults):
-        reason = f"the attached {RESULTS_NAME} contains only EKF2 aids, no KF results"
+        reason = f"the attached {RESULTS_NAME} contains only EKF2 aiding sources, no KF results"
     raise ResultsError(f"{one_line(name, 200)}: {reason}.")
 
 

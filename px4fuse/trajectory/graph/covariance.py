@@ -83,7 +83,7 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
         raise TrajectoryError(
             f"The closures cannot be tested, because no odometry edge connects vertices "
             f"{graph.ids[vertex]} and {graph.ids[vertex + 1]}",
-            "Add the edge.",
+            "Add an odometry edge between these vertices.",
         )
     poses = lie.chain(model.odometry_steps(graph, chain_edges))
     step_adjoints = lie.adjoint(poses[1:])
@@ -113,7 +113,7 @@ def _test_edge(
     vertices = int(graph.ids[graph.first[edge_index]]), int(graph.ids[graph.second[edge_index]])
     directions, variance = model.information_eigenvectors(graph.information[edge_index])
     degrees_of_freedom = len(variance)
-    observed_residual = directions.T @ residual
+    projected_residual = directions.T @ residual
     residual_covariance = directions.T @ covariance @ directions + np.diag(variance)
     is_testable = degrees_of_freedom and np.isfinite(residual_covariance).all()
     if (
@@ -126,7 +126,7 @@ def _test_edge(
             "information is zero, or differs too much from the odometry information",
             "Give information matrices of similar magnitude.",
         )
-    d2 = float(observed_residual @ np.linalg.solve(residual_covariance, observed_residual))
+    d2 = float(projected_residual @ np.linalg.solve(residual_covariance, projected_residual))
     p = float(chdtrc(degrees_of_freedom, d2))
     return GateResult(*vertices, d2, degrees_of_freedom, p, p >= GATE_ALPHA)
 
