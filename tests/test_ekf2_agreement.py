@@ -182,7 +182,14 @@ def compared(
     frame.loc[frame.index[-2:], "rejected"] = 1.0
     state = pd.DataFrame(0.0, index=time, columns=Columns.STATE)
     innovations = {"north": frame, "east": frame}
-    ekf2 = made(Ekf2, aids={}, innovations=innovations, innovation_topics=AID, state=state[:states])
+    ekf2 = made(
+        Ekf2,
+        aids={},
+        states={},
+        innovations=innovations,
+        innovation_topics=AID,
+        state=state[:states],
+    )
     updates = pd.DataFrame({"rejected": 0.0, "fused_at_s": time}, index=time)
     for axis in ("north", "east"):
         updates[f"innovation_{axis}_m"] = nu
@@ -219,5 +226,7 @@ def test_ekf2_replay_agreement_without_state_is_unavailable():
 def test_logged_innovations_without_one_axis_are_an_empty_table():
     frame = pd.DataFrame({"innovation_m": [0.1], "innovation_variance_m2": 0.1, "rejected": 0.0})
     for other in (NONE, frame.assign(rejected=np.nan)):
-        ekf2 = made(Ekf2, innovations={"north": frame, "east": other}, innovation_topics=AID)
+        ekf2 = made(
+            Ekf2, states={}, innovations={"north": frame, "east": other}, innovation_topics=AID
+        )
         assert logged_innovations(ekf2).empty

@@ -121,7 +121,7 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
         )  # fmt: skip
         ekf2 = made(
             Ekf2, record=record, innovations={"north": pd.DataFrame()}, horizon_s=horizon_s,
-            step_s=0.01, fusing=fusing, aids={},
+            step_s=0.01, fusing=fusing, aids={}, states={},
         )  # fmt: skip
         imu = pd.DataFrame(index=np.delete(interval_s * np.arange(1000), without))
         return prepare_inputs(
