@@ -495,7 +495,7 @@ def test_explain_command_prints_meaning_and_example_of_finding(typed, monkeypatc
 
 def test_explain_unmeasured_finding_prints_not_measured(monkeypatch, capsys) -> None:
     _, out, _ = run_main(monkeypatch, capsys, "explain", "not_px4")
-    assert "Not measured" in out
+    assert "No rates are measured" in out
 
 
 def test_explain_command_without_argument_lists_all_findings(monkeypatch, capsys) -> None:
