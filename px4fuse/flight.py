@@ -49,7 +49,8 @@ SOURCE_NAMES: Mapping[PositionKind, str] = {
 }
 
 
-NO_INVALID_ROWS: pd.Series[str] = pd.Series(dtype=str, index=pd.Index([], dtype=np.float64))
+# Of objects, because pandas reserves 1 GB of address space for its first column of strings
+NO_INVALID_ROWS: pd.Series[str] = pd.Series(dtype=object, index=pd.Index([], dtype=np.float64))
 
 
 class Columns:
