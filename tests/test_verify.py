@@ -130,7 +130,8 @@ def scaled(value: Any, share: float) -> Any:
 
 def move_lines(pdf: bytes, by: float) -> bytes:
     """Move all lines and marks by a distance."""
-    ends = re.compile(rb"(\d[\d.]*) (\d[\d.]*) ([ml])\b")
+    # not the numbers of an alternative text such as (σ of 0.084 0.064 m)
+    ends = re.compile(rb"(\d[\d.]*) (\d[\d.]*) ([ml])\b(?![^()\n]*\)>>)")
 
     def moved(match: re.Match[bytes]) -> bytes:
         return b"%.6f %.6f %s" % (float(match[1]) + by, float(match[2]) + by, match[3])
