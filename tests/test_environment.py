@@ -82,12 +82,12 @@ def test_command_under_small_memory_limit_reports_the_limit(tmp_path) -> None:
 
 
 def test_exhausted_memory_prints_one_error_line(monkeypatch, capsys, tmp_path) -> None:
-    from px4fuse import analysis
+    from px4fuse import diagnose
 
     def exhausted(*_: object) -> None:
         raise MemoryError("Unable to allocate 7.46 MiB")
 
-    monkeypatch.setattr(analysis, "read_flight", exhausted)
+    monkeypatch.setattr(diagnose, "read_flight", exhausted)
     monkeypatch.chdir(tmp_path)
     code, out, err = run_main(monkeypatch, capsys, "info", LOG, "--json", "i.json")
     assert (code, out) == (2, "")

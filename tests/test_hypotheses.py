@@ -15,7 +15,7 @@ from findings_tools import made as part_of
 from flights import aisle_flight, unavailable, unexplained
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.estimates import estimate_frame_rotation, estimate_noises_and_clock
+from px4fuse.comparison.estimates import _fit_source_errors, estimate
 from px4fuse.filter.hypotheses import DesignMatrix, fit_bias_scale_jumps, make_design_matrix
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import innovations, preintegrate
@@ -48,9 +48,7 @@ DETECTORS = (
 def analysed(flight: Flight, settings: Settings = RIGHT, **span: float) -> Analysis:
     """Analyse a flight for the detectors: noises, time offset and frame misalignment."""
     comparison = compare(flight, settings, axes=("north", "east"), **span)
-    tuning, clock = estimate_noises_and_clock(comparison)
-    heading = estimate_frame_rotation(comparison, tuning, clock)
-    return replace(unexplained(comparison), tuning=tuning, clock=clock, heading=heading)
+    return replace(unexplained(comparison), **vars(estimate(comparison)))
 
 
 @cache
@@ -239,7 +237,8 @@ def test_outlier_burst_is_not_reported_as_position_jump() -> None:
 def test_time_offset_is_not_reported_as_low_pass() -> None:
     late = flown("clock-offset=250ms", passes=6)
     assert late.source_low_pass.gain_nats == 0.0
-    assert replace(late, clock=unavailable("clock offset")).source_low_pass.gain_nats > 3.0
+    _, low_pass, _ = _fit_source_errors(late, late.tuning, unavailable("clock offset"))
+    assert low_pass.gain_nats > 3.0
 
 
 # ------------------------------------------------------------------ arrival times
@@ -284,9 +283,14 @@ def test_flight_without_required_data_gives_no_bias_finding(mistake, change) -> 
 
 
 def test_bias_fit_without_tuned_noises_is_unavailable() -> None:
-    untuned = replace(flown("jump=1,40s"), tuning={})
-    assert isinstance(untuned.bias_scale_jump_fit, Unavailable)
-    assert isinstance(untuned.source_low_pass, Unavailable)
+    tuned = flown("jump=1,40s")
+    fit, low_pass, correlated_noise = _fit_source_errors(tuned, {}, tuned.clock)
+    assert isinstance(fit, Unavailable)
+    assert isinstance(low_pass, Unavailable)
+    untuned = replace(
+        tuned, tuning={}, bias_scale_jump_fit=fit, source_low_pass=low_pass,
+        time_correlated_noise=correlated_noise,
+    )  # fmt: skip
     assert found(untuned) == {}
 
 

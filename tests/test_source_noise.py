@@ -62,9 +62,7 @@ def analysed(
 
 def root_findings(analysis: Analysis) -> dict[str, Finding]:
     """Findings by id without infos, KF settings and consequences."""
-    left_out = {f"sigma_{one}_too_{size}" for one in "az" for size in ("large", "small")} | {
-        "ekf2_not_logged"
-    }
+    left_out = ("sigma_", "ekf2_not_logged")
     return {
         one.id: one for one in find(analysis)
         if one.severity != "note" and one.caused_by is None and not one.id.startswith(left_out)

@@ -13,7 +13,7 @@ Order = Literal["w x y z", "x y z w"]
 Frames = Literal["FRD to NED", "FLU to ENU", "FLU to NWU", "FLU to NED", "FRD to ENU"]
 
 
-class OrientationConvention(Record, frozen=True, kw_only=True):
+class OrientationConvention(Record, frozen=True, kw_only=True, omit_defaults=False):
     """Convention of the orientation of a position source.
 
     Attributes

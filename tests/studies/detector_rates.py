@@ -24,7 +24,10 @@ from comparisons import compare
 from scipy.stats import binomtest
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.estimates import estimate_frame_rotation, estimate_noises_and_clock
+from px4fuse.comparison.causal_replays import run_interventions
+from px4fuse.comparison.estimates import estimate
+from px4fuse.comparison.flight_events import collect_events
+from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.model import open_model
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find, find_loop
@@ -211,12 +214,13 @@ def _fly(job: Job) -> list[tuple[str, ...]]:
 def _explain(flight: Flight, condition: Condition) -> Analysis:
     """Make the analysis for the detectors, without the steps from KF to EKF2, which are slow."""
     comparison = compare(flight, condition.settings, axes=("north", "east"))
-    tuning, clock = estimate_noises_and_clock(comparison)
+    estimates = estimate(comparison)
     model = open_model(flight) if condition.ekf2 else NOT_ASKED
-    heading = estimate_frame_rotation(comparison, tuning, clock)
+    causes, trials = run_interventions(comparison, estimates, model)
     return Analysis(
-        **vars(comparison), tuning=tuning, clock=clock, ekf2_model=model, difference_steps={},
-        loop=analyse_flight_loop(flight), heading=heading,
+        **vars(comparison), **vars(estimates), ekf2_model=model, difference_steps={},
+        causes=causes, trials=trials, events=collect_events(comparison),
+        aids=evaluate_aids(flight), loop=analyse_flight_loop(flight),
     )  # fmt: skip
 
 
