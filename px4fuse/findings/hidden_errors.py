@@ -47,7 +47,7 @@ MAX_KF_ERROR_RATIO = 0.7
 MAX_ALIGNED_SHARE = 0.5
 DRIFT_REMEDY = (
     "Send an absolute position (GNSS, UWB) as well in the next flight. A loop closure (px4fuse "
-    "loop) corrects the path of this flight, not the filters."
+    "loop LOG) corrects the path of this flight, not the filters."
 )
 FRAME_REMEDY = "Rotate and shift the frame of the source into that of the ground truth."
 EKF2_REMEDY = (
