@@ -46,7 +46,7 @@ from px4fuse.filter.settings import Settings  # noqa: E402
 from px4fuse.findings import TITLES, Finding, find, find_aids, find_loop, source_frame  # noqa: E402
 from px4fuse.findings.cause_grouping import CONSEQUENCES, RECORDING, effect_ids  # noqa: E402
 from px4fuse.findings.model import CATALOGUE, GROUPS  # noqa: E402
-from px4fuse.flight import Columns  # noqa: E402
+from px4fuse.flight.model import Columns  # noqa: E402
 from px4fuse.report.panels import INNOVATIONS, POSITION, SIGMA_P  # noqa: E402
 from px4fuse.simulation.flights import simulate_flight  # noqa: E402
 from px4fuse.simulation.mistakes import parse  # noqa: E402

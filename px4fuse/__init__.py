@@ -14,11 +14,11 @@ _MODULES = {
     "Analysis": "px4fuse.analysis",
     "Px4FuseError": "px4fuse.errors",
     "Settings": "px4fuse.filter.settings",
-    "Unavailable": "px4fuse.record",
-    "batch": "px4fuse.fleet.run",
+    "Unavailable": "px4fuse.core.record",
+    "run_batch": "px4fuse.batch.run",
     "close_loop": "px4fuse.api",
     "compare": "px4fuse.api",
-    "diff": "px4fuse.fleet.changes",
+    "diff": "px4fuse.batch.changes",
     "evaluate": "px4fuse.api",
     "find": "px4fuse.findings",
     "read_log": "px4fuse.readers",
@@ -40,15 +40,15 @@ if _typing.TYPE_CHECKING:
     from px4fuse.api import what_if as what_if
     from px4fuse.api import write_page as write_page
     from px4fuse.api import write_report as write_report
+    from px4fuse.batch.changes import diff as diff
+    from px4fuse.batch.run import run_batch as run_batch
+    from px4fuse.core.record import Unavailable as Unavailable
     from px4fuse.errors import Px4FuseError as Px4FuseError
     from px4fuse.filter.kalman import replay as replay
     from px4fuse.filter.settings import Settings as Settings
     from px4fuse.findings import find as find
-    from px4fuse.fleet.changes import diff as diff
-    from px4fuse.fleet.run import batch as batch
     from px4fuse.readers import read_log as read_log
     from px4fuse.readers.trajectory import read_trajectory as read_trajectory
-    from px4fuse.record import Unavailable as Unavailable
 else:
 
     def __dir__():

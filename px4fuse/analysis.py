@@ -9,14 +9,14 @@ from px4fuse.comparison.causal_replays import Reruns
 from px4fuse.comparison.estimates import Estimates
 from px4fuse.comparison.flight_events import Events
 from px4fuse.comparison.model import AxisComparison, Comparison
+from px4fuse.core.notebook_display import display_html, one_line_repr
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Ekf2Replay
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2.whatif import WhatIf
 from px4fuse.finding import Finding
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.model import Loop
-from px4fuse.notebook_display import display_html, one_line_repr
 from px4fuse.request import ComparisonRequest
 
 

@@ -10,21 +10,21 @@ from msgspec import structs
 from px4fuse import request
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FilterSummary, UntestedFilter
+from px4fuse.core.notebook_display import display_html
+from px4fuse.core.writing import write_all
 from px4fuse.diagnose import diagnose, run_what_if
 from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.whatif import WhatIf
 from px4fuse.errors import MissingDataError, OutputError, SettingsError
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.model import Loop
 from px4fuse.loop.tracks import LoopSource, read_source
-from px4fuse.notebook_display import display_html
 from px4fuse.readers import read_log
 from px4fuse.trajectory import evaluation
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.model import Trajectory
-from px4fuse.writing import write_all
 
 Pathlike = str | Path
 Progress = Callable[[str], None]

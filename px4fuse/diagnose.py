@@ -32,20 +32,20 @@ from px4fuse.comparison.flight_events import collect_events
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import explain_missing_source, prepare
 from px4fuse.comparison.remedy import ml_ekf2_parameters
+from px4fuse.core.reading import display_name
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2.whatif import sweep_values, what_if
-from px4fuse.ekf2_parameters import check_parameters
 from px4fuse.errors import LogError, MissingDataError, SettingsError
 from px4fuse.filter.signals import AISLE
 from px4fuse.findings import find, find_aids
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight.ekf2_parameters import check_parameters
+from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.readers import read_log
-from px4fuse.reading import display_name
 from px4fuse.request import AUTO, ComparisonRequest, LoopRequest, WhatIfRequest
 
 

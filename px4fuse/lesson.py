@@ -10,7 +10,7 @@ import numpy as np
 from px4fuse.filter.kalman import Replay, replay
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
-from px4fuse.flight import Unavailable
+from px4fuse.flight.model import Unavailable
 from px4fuse.loop.closure import distribute_by_distance
 from px4fuse.trajectory.model import cumulative_distance
 

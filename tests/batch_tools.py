@@ -15,7 +15,7 @@ from unittest import mock
 
 import failing_jobs
 
-from px4fuse.fleet import job
+from px4fuse.batch import job
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 

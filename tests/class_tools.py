@@ -11,10 +11,10 @@ from pathlib import Path
 
 from conftest import REPORT, blank_page
 
-from px4fuse import workers
-from px4fuse.grading import grade as grading
-from px4fuse.grading import records
-from px4fuse.grading.model import Entry, GradedReport, Item
+from px4fuse.classroom.grading import grade as grading
+from px4fuse.classroom.grading import records
+from px4fuse.classroom.grading.model import Entry, GradedReport, Item
+from px4fuse.core import workers
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import log_sha256, verify
 

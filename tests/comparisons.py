@@ -5,7 +5,7 @@ from typing import Any
 from px4fuse.comparison import comparison, preparation
 from px4fuse.comparison.model import Comparison
 from px4fuse.filter.settings import Settings
-from px4fuse.flight import Flight
+from px4fuse.flight.model import Flight
 from px4fuse.request import ComparisonRequest
 
 

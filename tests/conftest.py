@@ -31,12 +31,12 @@ from ulog_tools import Log
 
 from px4fuse import api, diagnose
 from px4fuse.analysis import Analysis
-from px4fuse.assignment import truth
+from px4fuse.classroom.assignment import truth
 from px4fuse.comparison import comparison
 from px4fuse.comparison.estimates import Progress, ignore_progress
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.filter.fast_replay import quick_replay
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop import tracks
 from px4fuse.readers import read_log
 from px4fuse.report import pdf

@@ -6,7 +6,7 @@ from px4fuse.ekf2.inputs import FusionRules, Inputs
 from px4fuse.ekf2.intervals import Events
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment
-from px4fuse.flight import Flight
+from px4fuse.flight.model import Flight
 from px4fuse.trajectory.rotation import skew
 
 EYE = np.eye(15)

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array
 from px4fuse.comparison.preparation import choose_segment, choose_source
+from px4fuse.core.arrays import Array
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, make_axes
-from px4fuse.flight import Columns, Flight
+from px4fuse.flight.model import Columns, Flight
 
 # --- axes that follow the model of KF ---
 

@@ -13,7 +13,6 @@ from exchange import replace
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import Intervention
 from px4fuse.comparison.model import FILTERS, ErrorsAgainstTruth, FilterSummary, UntestedFilter
-from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.hypotheses import BiasScaleJumpFit, Estimate, Jump
 from px4fuse.filter.settings import Settings
@@ -21,8 +20,9 @@ from px4fuse.filter.signals import Segment
 from px4fuse.filter.time_offset import ClockOffset, PartOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings import Finding
-from px4fuse.flight import NO_INVALID_ROWS, Columns, Ekf2, FusionRecord, Unavailable
-from px4fuse.position_source import RECEIVED
+from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.model import NO_INVALID_ROWS, Columns, Ekf2, FusionRecord, Unavailable
+from px4fuse.flight.position_source import RECEIVED
 
 T = TypeVar("T")
 

@@ -15,16 +15,17 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from px4fuse.analysis import Analysis
-from px4fuse.arrays import Array
 from px4fuse.comparison.causal_replays import run_interventions
 from px4fuse.comparison.estimates import Estimates, Tuning
 from px4fuse.comparison.flight_events import collect_events
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.noise_differences import find_noisy_part, tune_by_axis
+from px4fuse.core.arrays import Array
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.filter.signals import Axis, Segment, project_acceleration
 from px4fuse.filter.tuning import HORIZONTAL, tune
-from px4fuse.flight import (
+from px4fuse.flight.log import Dropout, LogInfo
+from px4fuse.flight.model import (
     AXIS_NAMES,
     Alignment,
     Columns,
@@ -35,8 +36,7 @@ from px4fuse.flight import (
     Truth,
     Unavailable,
 )
-from px4fuse.log import Dropout, LogInfo
-from px4fuse.position_source import RECEIVED, Origin
+from px4fuse.flight.position_source import RECEIVED, Origin
 
 Span = tuple[float, float]
 

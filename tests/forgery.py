@@ -21,8 +21,8 @@ from pypdf.generic import (
     NumberObject,
 )
 
+from px4fuse.core.reading import files_by_sha256
 from px4fuse.errors import ResultsError
-from px4fuse.reading import files_by_sha256
 from px4fuse.results.contract import ReportedResults, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.verification import verification

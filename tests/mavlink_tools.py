@@ -21,8 +21,8 @@ from flights import GRAVITY_M_S2, motion
 from pymavlink.dialects.v20 import all as dialect
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array
-from px4fuse.flight import Flight, PositionTrack
+from px4fuse.core.arrays import Array
+from px4fuse.flight.model import Flight, PositionTrack
 
 Address = tuple[int, int]
 

@@ -14,8 +14,8 @@ from class_tools import make_report
 from conftest import REPORT, SAMPLES
 from ulog_tools import make_log
 
-from px4fuse.answer_form import form_text
-from px4fuse.assignment.key import AnswerKey, key_text
+from px4fuse.classroom.assignment.key import AnswerKey, key_text
+from px4fuse.results.answer_form import form_text
 
 # Command, its inputs, its options for an output file (with the required ending), and the names that
 # it writes to the folder of -o ("" for the folder itself)

@@ -5,8 +5,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+from px4fuse.core.record import Unavailable
 from px4fuse.loop.model import Closure, Correction, LoopResult, OdometryNoise, TrueEnd
-from px4fuse.record import Unavailable
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults, Results, to_plain
 from px4fuse.results.model import Student, provenance, schema_of

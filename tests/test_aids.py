@@ -15,13 +15,13 @@ from ulog_tools import gnss_log, seconds_of, stamps
 
 from px4fuse.analysis import AidsOnlyAnalysis, failed_checks
 from px4fuse.ekf2.aids import AidResult, evaluate_aids
-from px4fuse.ekf2_parameters import AIDS
 from px4fuse.errors import MissingDataError
 from px4fuse.findings import aids as aids_detector
 from px4fuse.findings import find_aids
 from px4fuse.findings.aids import detect_in_aids
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
-from px4fuse.flight import AidLog, Flight, Unavailable
+from px4fuse.flight.ekf2_parameters import AIDS
+from px4fuse.flight.model import AidLog, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.results.reading import read_results
 

@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 
 from px4fuse.alignment.placement import align_position_file
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.flight import Alignment, Columns, Flight, PositionTrack, Reset
-from px4fuse.log import InputFile
-from px4fuse.position_source import POSITION_FILE
+from px4fuse.flight.log import InputFile
+from px4fuse.flight.model import Alignment, Columns, Flight, PositionTrack, Reset
+from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers import read_log
 from px4fuse.readers.position_csv import SAMPLE_COLUMNS, PositionRecording, read_position_csv
 

@@ -11,11 +11,17 @@ from comparisons import compare
 from flights import aisle_flight
 from pypdf import PdfReader
 
-from px4fuse.answer_form import MISTAKES, StudentMistake, draw_questions, form_text, read_answers
-from px4fuse.assignment.truth import quantity_truth
+from px4fuse.classroom.assignment.truth import quantity_truth
 from px4fuse.errors import SettingsError
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
+from px4fuse.results.answer_form import (
+    MISTAKES,
+    StudentMistake,
+    draw_questions,
+    form_text,
+    read_answers,
+)
 from px4fuse.results.contract import ComparisonResults
 from px4fuse.results.reading import read_results
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED

@@ -15,11 +15,10 @@ from comparisons import compare
 from detector_rates import rates
 
 import px4fuse
-from px4fuse.answer_form import Answers, read_answers
-from px4fuse.assignment import assignment
-from px4fuse.assignment.assignment import assign, key_path, simulate_assigned
-from px4fuse.assignment.key import AnswerKey, key_text, read_key
-from px4fuse.assignment.random_assignment import (
+from px4fuse.classroom.assignment import assignment
+from px4fuse.classroom.assignment.assignment import assign, key_path, simulate_assigned
+from px4fuse.classroom.assignment.key import AnswerKey, key_text, read_key
+from px4fuse.classroom.assignment.random_assignment import (
     ASSIGNABLE_MISTAKES,
     COUNT_FRACTIONS,
     EASIEST_DIFFICULTY,
@@ -27,12 +26,13 @@ from px4fuse.assignment.random_assignment import (
     LOOP_FRACTION,
     draw,
 )
-from px4fuse.assignment.roster import Person
+from px4fuse.classroom.assignment.roster import Person
 from px4fuse.diagnose import explain
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.findings import find_loop
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
+from px4fuse.results.answer_form import Answers, read_answers
 from px4fuse.simulation.mistakes import parse
 
 pytestmark = pytest.mark.usefixtures("quick_filter")

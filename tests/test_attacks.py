@@ -28,13 +28,13 @@ from forgery import (
 )
 from results_tools import LOOP, changed_results, decode_results
 
-from px4fuse.answer_form import form_text
-from px4fuse.assignment.key import Answer, AnswerKey
-from px4fuse.assignment.truth import form_truth
+from px4fuse.classroom.assignment.key import Answer, AnswerKey
+from px4fuse.classroom.assignment.truth import form_truth
+from px4fuse.classroom.grading.model import GradedReport
+from px4fuse.classroom.grading.rubric import Rubric, grade_unreadable, read_rubric, score_report
 from px4fuse.errors import ResultsError
-from px4fuse.grading.model import GradedReport
-from px4fuse.grading.rubric import Rubric, grade_unreadable, read_rubric, score_report
 from px4fuse.report import pdf as pdf_module
+from px4fuse.results.answer_form import form_text
 from px4fuse.results.contract import ReportedResults
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import parse

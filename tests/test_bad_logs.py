@@ -22,8 +22,8 @@ from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.diagnose import diagnose_or_check_aids
 from px4fuse.errors import LogError, Px4FuseError
 from px4fuse.filter.signals import make_axes
-from px4fuse.flight import Flight, Unavailable
-from px4fuse.inspect.inventory import take_inventory
+from px4fuse.flight.model import Flight, Unavailable
+from px4fuse.info.inventory import take_inventory
 from px4fuse.readers import ULOG_MAGIC, read_log
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import outcome_results

@@ -31,21 +31,21 @@ from msgspec import structs
 from ulog_tools import gnss_log
 
 import px4fuse
-from px4fuse import workers
+from px4fuse.batch import engine, job, run
+from px4fuse.batch.engine import connect_cluster, run_jobs
+from px4fuse.batch.job import Job
+from px4fuse.batch.logs import find_logs
+from px4fuse.batch.rows import COLUMN_TYPES, axis_rows, csv_bytes, log_columns, make_table
+from px4fuse.batch.run import BatchResult, load_cached_rows
+from px4fuse.batch.terminal import format_summary
 from px4fuse.cli.outputs import terminal
+from px4fuse.core import workers
+from px4fuse.core.workers import JobFailure, run_bounded
 from px4fuse.errors import OutputError, SettingsError
-from px4fuse.fleet import engine, job, run
-from px4fuse.fleet.engine import connect_cluster, run_jobs
-from px4fuse.fleet.job import Job
-from px4fuse.fleet.logs import find_logs
-from px4fuse.fleet.rows import COLUMN_TYPES, axis_rows, csv_bytes, log_columns, make_table
-from px4fuse.fleet.run import BatchResult, load_cached_rows
-from px4fuse.fleet.terminal import format_summary
 from px4fuse.report.screen import show
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.contract import schema, to_json
 from px4fuse.results.reading import read_results
-from px4fuse.workers import JobFailure, run_bounded
 
 
 @pytest.fixture(autouse=True)
@@ -86,7 +86,7 @@ def undisturbed(flights, memory, tmp_path_factory) -> pd.DataFrame:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "run_bounded", run_in_turn)
         remember(patch, memory)
-        return px4fuse.batch(flights, tmp_path_factory.mktemp("undisturbed"), workers=1)
+        return px4fuse.run_batch(flights, tmp_path_factory.mktemp("undisturbed"), workers=1)
 
 
 def assert_same(table: pd.DataFrame, expected: pd.DataFrame) -> None:
@@ -123,7 +123,7 @@ def test_batch_table_has_numbers_or_failure_reason_per_log(tmp_path):
     (logs / "dataflash.BIN").write_bytes(b"\xa3\x95" * 50)
     (logs / "notes.txt").write_text("no log")
     output = tmp_path / "out"
-    table = px4fuse.batch(logs, output, reports=True)
+    table = px4fuse.run_batch(logs, output, reports=True)
 
     assert list(table.columns) == list(COLUMN_TYPES)
     of = {name: rows.reset_index(drop=True) for name, rows in table.groupby("name")}
@@ -203,7 +203,7 @@ def test_batch_csv_leaves_missing_numbers_empty(tmp_path):
 @pytest.mark.usefixtures("in_this_process")
 def test_batch_log_without_position_has_status_not_compared(tmp_path):
     log = gnss_log("v1.16").write(tmp_path / "a.ulg")
-    row = px4fuse.batch(log, tmp_path / "out").loc[0]
+    row = px4fuse.run_batch(log, tmp_path / "out").loc[0]
     assert (row["status"], row["axis"]) == ("not compared", "")
     assert row["firmware"] == "PX4 v1.16.0"
     assert row["duration_s"] > 10
@@ -216,7 +216,7 @@ def test_batch_log_without_position_has_status_not_compared(tmp_path):
 @pytest.mark.usefixtures("in_this_process")
 def test_batch_gnss_flight_has_one_table_row_per_axis(shared_logs):
     (log,) = shared_logs.glob("simulated/*no_uwb.ulg")
-    table = px4fuse.batch(log)
+    table = px4fuse.run_batch(log)
     assert table["axis"].tolist() == ["aisle", "north", "east"]
     assert table["aids"].str.startswith("gnss_pos underconfident;gnss_vel ").all()
 
@@ -230,28 +230,29 @@ def test_batch_second_run_processes_only_new_logs(flights, tmp_path, monkeypatch
     shutil.copytree(flights, logs)
     (logs / "f3.ulg").rename(tmp_path / "f3.ulg")
     (logs / "late.ulg").write_bytes(b"")
-    px4fuse.batch(logs, output)
+    px4fuse.run_batch(logs, output)
     times = {file: file.stat().st_mtime_ns for file in (output / "results").iterdir()}
     assert len(times) == len([*(output / "rows").iterdir()]) == 2  # a failed log has no cached rows
     (tmp_path / "f3.ulg").rename(logs / "f3.ulg")
     (logs / "f2.ulg").rename(logs / "renamed.ulg")
     (logs / "late.ulg").write_bytes(tiny_log(9))
     said: list[tuple[str, int, int]] = []
-    table = px4fuse.batch(logs, output, progress=lambda *step: said.append(step))
+    table = px4fuse.run_batch(logs, output, progress=lambda *step: said.append(step))
     assert said[-1] == ("comparing logs, 0 failed", 4, 4)
     after = {file: file.stat().st_mtime_ns for file in (output / "results").iterdir()}
     assert {file: after[file] for file in times} == times
     assert len(after) == 4
-    fresh = px4fuse.batch(logs)
+    fresh = px4fuse.run_batch(logs)
     assert_same(table.assign(results=""), fresh)
     # another run with other settings replaced the cached rows
     monkeypatch.setattr(run, "load_cached_rows", lambda *_: iter(()))
     assert (
-        "replaced the rows of this log" in px4fuse.batch(logs / "f1.ulg", output).loc[0, "reason"]
+        "replaced the rows of this log"
+        in px4fuse.run_batch(logs / "f1.ulg", output).loc[0, "reason"]
     )
     monkeypatch.setattr(run, "load_cached_rows", load_cached_rows)
     # other settings are compared again
-    other = px4fuse.batch(logs / "f1.ulg", output, sigma_z_m=0.2)
+    other = px4fuse.run_batch(logs / "f1.ulg", output, sigma_z_m=0.2)
     assert other.loc[0, "settings"] == "px4fuse compare LOG --sigma-z 0.2"
     assert other.loc[0, "kf_nis_mean"] < table.loc[0, "kf_nis_mean"]
 
@@ -287,7 +288,7 @@ def test_batch_hanging_log_does_not_affect_other_logs(tmp_path, monkeypatch):
     def end_waiting(what: str, done: int, of: int) -> None:
         clock.ahead_s = 600.0 * (done == 2)
 
-    table = px4fuse.batch(logs, workers=2, progress=end_waiting).set_index("name")
+    table = px4fuse.run_batch(logs, workers=2, progress=end_waiting).set_index("name")
     assert table.loc["well.ulg", "status"].tolist() == ["done"] * 4
     hang, crash = table.loc["hang.ulg"], table.loc["crash.ulg"]
     assert (hang["status"], crash["status"]) == ("failed", "failed")
@@ -336,7 +337,7 @@ def test_batch_interrupted_run_reuses_finished_results(
 
     monkeypatch.setattr(run, "write_all", full)
     with pytest.raises(ends, match=r"No space left .*"):
-        px4fuse.batch(flights, tmp_path)
+        px4fuse.run_batch(flights, tmp_path)
     monkeypatch.setattr(run, "write_all", write_all)
     if ends is KeyboardInterrupt:  # the table has been written
         assert len(set(pd.read_parquet(tmp_path / "fleet.parquet")["name"])) == 1
@@ -381,7 +382,7 @@ def test_batch_table_has_one_row_per_invalid_log(tmp_path):
 def test_batch_rejects_settings_that_fit_only_one_flight(flights):
     for settings in ({"mavlink": "a.tlog"}, {"sigma": 1.0}, {"sigma_z_m": 0.0}):
         with pytest.raises(SettingsError):
-            px4fuse.batch(flights, **settings)
+            px4fuse.run_batch(flights, **settings)
     for name, package in (("slurm", "dask-jobqueue"), ("kubernetes", "dask-kubernetes")):
         assert f"pip install {package}" in command("--scheduler", name).output
 
@@ -426,7 +427,7 @@ def test_batch_processes_all_shared_logs_without_exception(shared_logs, tmp_path
         for file in sorted(shared_logs.glob("*/*"))
         if file.suffix != ".json" and not re.match(others, file.name)
     ]
-    table = px4fuse.batch(files, tmp_path, reports=True, workers=2)
+    table = px4fuse.run_batch(files, tmp_path, reports=True, workers=2)
     assert set(table["log"]) == set(files)
     validator = jsonschema.Draft202012Validator(schema())
     for log, rows in table.groupby("log"):
@@ -459,7 +460,7 @@ def test_batch_unreachable_cluster_raises_one_line_error(monkeypatch, flights):
         assert client is None  # a failed client is not the default of this session
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(SettingsError, match=r'pip install "px4fuse\[batch\]"'):
-        px4fuse.batch(flights, scheduler="tcp://127.0.0.1:1")
+        px4fuse.run_batch(flights, scheduler="tcp://127.0.0.1:1")
 
 
 def started_worker(address: str, log: Path, path: str) -> Any:

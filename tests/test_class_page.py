@@ -18,12 +18,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pypdf import PdfReader
 
-from px4fuse.answer_form import Answers, StudentMistake
-from px4fuse.grading.class_page import count_tenths, html_text
-from px4fuse.grading.model import Entry, GradedReport, Item, Override
-from px4fuse.grading.outputs import anonymise_entry
+from px4fuse.classroom.grading.class_page import count_tenths, html_text
+from px4fuse.classroom.grading.model import Entry, GradedReport, Item, Override
+from px4fuse.classroom.grading.outputs import anonymise_entry
+from px4fuse.html.safe import MAX_TEXT_LENGTH
+from px4fuse.results.answer_form import Answers, StudentMistake
 from px4fuse.verification.model import Mismatch, PageDifference, Verdict
-from px4fuse.webpage.safe import MAX_TEXT_LENGTH
 
 MARKUP = '<img src=x onerror="window.alive=1"><b>bold</b>'
 BREAKOUT = "</script ></script\n<script>window.alive=2</script><!-- \u2028 ]]> & &lt;"

@@ -12,9 +12,9 @@ from exchange import replace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from px4fuse.grading.model import Entry, GradedReport, Item
-from px4fuse.grading.outputs import FIRST_COLUMNS, LAST_COLUMNS, csv_text
-from px4fuse.spreadsheet import MAX_CELL_LENGTH, neutralise_formulas, neutralise_id
+from px4fuse.classroom.grading.model import Entry, GradedReport, Item
+from px4fuse.classroom.grading.outputs import FIRST_COLUMNS, LAST_COLUMNS, csv_text
+from px4fuse.core.spreadsheet import MAX_CELL_LENGTH, neutralise_formulas, neutralise_id
 from px4fuse.verification.model import Verdict
 
 VERIFIED = Verdict("verified", (), True)

@@ -27,9 +27,9 @@ from scipy.spatial.transform import Rotation
 from scipy.special import stdtr
 from scipy.stats import binom, chi2, ttest_ind
 
-from px4fuse.arrays import Array
 from px4fuse.comparison import estimates
 from px4fuse.comparison.estimates import MIN_PARTS, estimate_noises_and_clock, widen_for_drift
+from px4fuse.core.arrays import Array
 from px4fuse.filter import time_offset
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.imu_motion import (
@@ -42,8 +42,8 @@ from px4fuse.filter.imu_motion import (
 from px4fuse.filter.likelihood import PROFILE_DROP, profile_interval
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset, PartOffset
-from px4fuse.flight import Columns, Flight, Unavailable
-from px4fuse.position_source import (
+from px4fuse.flight.model import Columns, Flight, Unavailable
+from px4fuse.flight.position_source import (
     ALIGNED,
     GNSS,
     LOGGED_BY_EKF2,

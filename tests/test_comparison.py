@@ -9,12 +9,12 @@ from flights import Estimator, Imu, Uwb, aisle_flight
 from msgspec.structs import asdict
 from pyulog import ULog
 
-from px4fuse.arrays import Array
 from px4fuse.comparison.model import AxisComparison, Comparison, Difference, UntestedFilter
 from px4fuse.comparison.projection import project_horizon
+from px4fuse.core.arrays import Array
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import Settings
-from px4fuse.flight import Flight, Reset, Truth, Unavailable
+from px4fuse.flight.model import Flight, Reset, Truth, Unavailable
 
 pytestmark = pytest.mark.usefixtures("quick_filter")
 

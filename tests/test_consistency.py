@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
+from px4fuse.core.text import count_noun
 from px4fuse.filter.consistency import Consistency, assess, assess_horizontal, nis_band
-from px4fuse.flight import Unavailable
-from px4fuse.text import count_noun
+from px4fuse.flight.model import Unavailable
 
 # n, and 95 % band of the mean NIS with two degrees of freedom, as published for real flights
 BANDS_OF_TWO = [(128, 1.67, 2.36), (72, 1.56, 2.49), (179, 1.72, 2.30), (103, 1.63, 2.40)]

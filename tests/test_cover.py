@@ -18,7 +18,7 @@ from page_tools import axes_of, every, pdf_of, set_by_typst, smallest_type
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import Action, AidRow, Card, Cause, Note
-from px4fuse.flight import Reset
+from px4fuse.flight.model import Reset
 from px4fuse.report import cover, cover_panels
 from px4fuse.report.page import Page
 from px4fuse.report.style import report_style

@@ -12,7 +12,7 @@ from ulog_tools import make_log
 
 from px4fuse.diagnose import diagnose
 from px4fuse.errors import LogError
-from px4fuse.flight import Ekf2, Flight
+from px4fuse.flight.model import Ekf2, Flight
 from px4fuse.readers import read_log
 from px4fuse.readers.ulog import read_ulog
 from px4fuse.request import ComparisonRequest

@@ -8,11 +8,11 @@ from detector_rates import RIGHT
 from exchange import replace
 from msgspec import structs
 
+from px4fuse.batch.changes import compare_numbers, list_changes
+from px4fuse.batch.inputs import DiffInput
+from px4fuse.batch.measures import MEASURES, ComparedNumber, collect_numbers
 from px4fuse.diagnose import explain
 from px4fuse.ekf2.aids import AidAxis, AidResult
-from px4fuse.fleet.changes import compare_numbers, list_changes
-from px4fuse.fleet.inputs import DiffInput
-from px4fuse.fleet.measures import MEASURES, ComparedNumber, collect_numbers
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
 from px4fuse.results.contract import ChangeResults, ComparisonResults, to_json

@@ -15,8 +15,8 @@ from cli_tools import run_checked
 from conftest import REPOSITORY as ROOT
 from matplotlib import pyplot
 
+from px4fuse.batch import run
 from px4fuse.cli import COMMANDS, cli
-from px4fuse.fleet import run
 
 pytestmark = pytest.mark.usefixtures("cached_analyses")
 

@@ -9,7 +9,7 @@ from findings_tools import made
 
 from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.ekf2.inputs import MODEL_NOTE
-from px4fuse.flight import FusionRecord
+from px4fuse.flight.model import FusionRecord
 from px4fuse.readers.px4_positions import EARTH_RADIUS_M
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse

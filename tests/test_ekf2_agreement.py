@@ -27,7 +27,7 @@ from px4fuse.ekf2.replay import (
     match_updates,
     with_logged_rejections,
 )
-from px4fuse.flight import AidLog, Columns, Ekf2, FusionRecord, Unavailable
+from px4fuse.flight.model import AidLog, Columns, Ekf2, FusionRecord, Unavailable
 
 AID = ("estimator_aid_src_ev_pos",)
 

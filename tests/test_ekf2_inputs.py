@@ -35,16 +35,24 @@ from px4fuse.ekf2.replay_segments import (
     step_ends,
 )
 from px4fuse.ekf2.whatif import sweep_values
-from px4fuse.ekf2_parameters import (
+from px4fuse.errors import SettingsError
+from px4fuse.flight.ekf2_parameters import (
     GNSS_POS,
     PARAMETERS,
     check_parameters,
     effective_settings,
     fuses_by_mask,
 )
-from px4fuse.errors import SettingsError
-from px4fuse.flight import Columns, Ekf2, Flight, FusionRecord, PositionTrack, Reset, Unavailable
-from px4fuse.position_source import (
+from px4fuse.flight.model import (
+    Columns,
+    Ekf2,
+    Flight,
+    FusionRecord,
+    PositionTrack,
+    Reset,
+    Unavailable,
+)
+from px4fuse.flight.position_source import (
     ALIGNED,
     GNSS,
     LOGGED_BY_EKF2,

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from px4fuse.ekf2.model import open_model
-from px4fuse.flight import Unavailable
+from px4fuse.flight.model import Unavailable
 from px4fuse.readers import read_log
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))

@@ -19,8 +19,8 @@ from px4fuse.ekf2.model import (
     run_configurations,
 )
 from px4fuse.ekf2.replay import HORIZONTAL
-from px4fuse.flight import Flight, Unavailable
-from px4fuse.position_source import RECEIVED
+from px4fuse.flight.model import Flight, Unavailable
+from px4fuse.flight.position_source import RECEIVED
 from px4fuse.readers import read_log
 
 

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from ulog_tools import GENERATIONS, covariances, make_log, stamps, topic
 
 from px4fuse.alignment.merge_recordings import shift_times
-from px4fuse.flight import Columns, Unavailable
+from px4fuse.flight.model import Columns, Unavailable
 from px4fuse.readers import read_log
 
 QUATERNION = Rotation.from_euler("ZYX", [40.0, 10.0, -5.0], degrees=True).as_quat(scalar_first=True)

@@ -37,8 +37,8 @@ from px4fuse.ekf2.intervals import (
 )
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment, add_field_states
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, effective_settings
 from px4fuse.errors import SettingsError
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, effective_settings
 from px4fuse.trajectory.rotation import skew
 
 

@@ -32,12 +32,12 @@ from px4fuse.ekf2.steps import (
     step_configurations,
 )
 from px4fuse.ekf2.whatif import AxisSummary, Summary, _longest_between_fusions, _notes, what_if
-from px4fuse.ekf2_parameters import GNSS_POS
 from px4fuse.errors import SettingsError
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
-from px4fuse.flight import Columns, Flight, Truth, Unavailable
+from px4fuse.flight.ekf2_parameters import GNSS_POS
+from px4fuse.flight.model import Columns, Flight, Truth, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate, to_ulog
 from px4fuse.simulation.mistakes import parse

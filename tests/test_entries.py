@@ -10,11 +10,9 @@ import pytest
 from class_tools import graded_report
 from exchange import replace
 
-from px4fuse.answer_form import Answers, StudentMistake
-from px4fuse.assignment.roster import Person
-from px4fuse.errors import SettingsError
-from px4fuse.grading.class_page import _point_boxes
-from px4fuse.grading.entries import (
+from px4fuse.classroom.assignment.roster import Person
+from px4fuse.classroom.grading.class_page import _point_boxes
+from px4fuse.classroom.grading.entries import (
     Course,
     add_time_zone,
     build_entries,
@@ -23,10 +21,12 @@ from px4fuse.grading.entries import (
     parse_moodle_time,
     read_overrides,
 )
-from px4fuse.grading.model import Override, Submission
-from px4fuse.grading.outputs import feedback_text
-from px4fuse.grading.rubric import read_rubric
-from px4fuse.grading.submissions import parse_origin
+from px4fuse.classroom.grading.model import Override, Submission
+from px4fuse.classroom.grading.outputs import feedback_text
+from px4fuse.classroom.grading.rubric import read_rubric
+from px4fuse.classroom.grading.submissions import parse_origin
+from px4fuse.errors import SettingsError
+from px4fuse.results.answer_form import Answers, StudentMistake
 from px4fuse.verification.model import Verdict
 
 DUE = parse_due_time("2026-11-20 12:00:00 +01:00")

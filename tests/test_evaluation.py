@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from trajectory_tools import NAMES, PUBLISHED, SHIFT, TURN, flight, read_public, transformed
 
 from px4fuse.errors import SettingsError, TrajectoryError
-from px4fuse.flight import Unavailable
+from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.alignment import AlignmentKind, fit_alignment
 from px4fuse.trajectory.association import Method, associate
 from px4fuse.trajectory.evaluation import choose_alignment, evaluate

@@ -13,8 +13,8 @@ from flights import Estimator, Uwb, aisle_flight
 
 from px4fuse.alignment.merge_recordings import join
 from px4fuse.comparison.flight_events import collect_events, source_gaps
-from px4fuse.flight import Flight, FlightMode, Reset, Unavailable
-from px4fuse.log import Dropout
+from px4fuse.flight.log import Dropout
+from px4fuse.flight.model import Flight, FlightMode, Reset, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.common import mode_spans
 

@@ -30,7 +30,7 @@ from px4fuse.comparison.model import FILTERS, AxisComparison
 from px4fuse.diagnose import prepare_comparison
 from px4fuse.explore import page as pages
 from px4fuse.explore.page import html_text
-from px4fuse.flight import Flight
+from px4fuse.flight.model import Flight
 from px4fuse.request import ComparisonRequest
 
 pytestmark = pytest.mark.usefixtures("cached_analyses")

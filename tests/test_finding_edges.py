@@ -62,9 +62,9 @@ from px4fuse.findings import (
 )
 from px4fuse.findings.cause_grouping import ELSEWHERE, GAP
 from px4fuse.findings.model import fraction_on, spans_with_value, zero_length_spans
-from px4fuse.flight import Columns, Reset, Unavailable
-from px4fuse.log import ClockMap, Dropout
-from px4fuse.position_source import (
+from px4fuse.flight.log import ClockMap, Dropout
+from px4fuse.flight.model import Columns, Reset, Unavailable
+from px4fuse.flight.position_source import (
     ALIGNED,
     FROM_INNOVATIONS,
     GNSS,

@@ -24,9 +24,9 @@ from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import TITLES, Finding, find, group_by_root
 from px4fuse.findings.model import CATALOGUE, GROUPS, load_examples
-from px4fuse.flight import AXIS_NAMES, AidLog, Columns, Flight, Reset, Unavailable
-from px4fuse.log import ClockMap, Dropout
-from px4fuse.position_source import ALIGNED, LOGGED_BY_EKF2
+from px4fuse.flight.log import ClockMap, Dropout
+from px4fuse.flight.model import AXIS_NAMES, AidLog, Columns, Flight, Reset, Unavailable
+from px4fuse.flight.position_source import ALIGNED, LOGGED_BY_EKF2
 from px4fuse.readers import read_log
 from px4fuse.request import ComparisonRequest, PositionFile
 

@@ -16,9 +16,9 @@ from explore_tools import axe, serious
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from px4fuse.fleet.page import html_text, logs_of, sort_logs
+from px4fuse.batch.page import html_text, logs_of, sort_logs
+from px4fuse.html.frame import MAX_PAGE_ROWS
 from px4fuse.report.card_html import MARK_PATHS
-from px4fuse.webpage.frame import MAX_PAGE_ROWS
 
 MARKUP = '<img src=x onerror="window.alive=1"><b>bold</b>'
 BREAKOUT = "</script ></noscript\n><script>window.alive=2</script><!-- \u2028 & &lt;"

@@ -14,7 +14,7 @@ from px4fuse.ekf2.inputs import read_gnss
 from px4fuse.ekf2.magnetometer import EventSamples, mean_by_event
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.whatif import what_if
-from px4fuse.flight import Columns, Flight, Reset
+from px4fuse.flight.model import Columns, Flight, Reset
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.simulation.flights import simulate_flight

@@ -14,23 +14,23 @@ from exchange import replace
 from form_guesses import at_random, constants
 from scipy.stats import spearmanr
 
-from px4fuse.answer_form import (
+from px4fuse.classroom.assignment.random_assignment import draw
+from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake, VerdictTruth, form_truth
+from px4fuse.classroom.grading.form_points import (
+    PART_NAMES,
+    POINTS_TABLE,
+    form_points,
+    panels,
+    right_corrections,
+)
+from px4fuse.cli.simulate import simulate
+from px4fuse.results.answer_form import (
     CORRECTIONS,
     MISTAKES,
     PANELS,
     Answers,
     StudentMistake,
     update_renamed_values,
-)
-from px4fuse.assignment.random_assignment import draw
-from px4fuse.assignment.truth import FormTruth, TrueMistake, VerdictTruth, form_truth
-from px4fuse.cli.simulate import simulate
-from px4fuse.grading.form_points import (
-    PART_NAMES,
-    POINTS_TABLE,
-    form_points,
-    panels,
-    right_corrections,
 )
 from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED

@@ -28,16 +28,16 @@ from scipy.spatial.transform import Rotation
 from ulog_tools import gnss_log
 
 import px4fuse
+from px4fuse.batch.page import html_text
 from px4fuse.cli import COMMANDS as CLI_COMMANDS
+from px4fuse.core.text import to_json_types
 from px4fuse.explore.data import flight_data
 from px4fuse.explore.figures import document_json
 from px4fuse.explore.packing import Packer
-from px4fuse.fleet.page import html_text
 from px4fuse.report import pdf
 from px4fuse.simulation.flights import answer, simulate
 from px4fuse.simulation.mistakes import MISTAKES, parse
 from px4fuse.simulation.scenario import KINDS, make_scenario
-from px4fuse.text import to_json_types
 
 NOTES = """# What I saw
 

@@ -17,17 +17,17 @@ from conftest import LOG, REPORT, REPORT_PAGES
 from forgery import forged, with_results
 from pypdf import PdfReader, PdfWriter
 
-from px4fuse.assignment.key import Answer, AnswerKey
-from px4fuse.assignment.roster import file_names
+from px4fuse.classroom.assignment.key import Answer, AnswerKey
+from px4fuse.classroom.assignment.roster import file_names
+from px4fuse.classroom.grading.entries import Course
+from px4fuse.classroom.grading.grade import GradeOutcome, grade
+from px4fuse.classroom.grading.model import Entry, GradedReport
+from px4fuse.classroom.grading.rubric import read_rubric
 from px4fuse.cli.outputs import Interrupted
-from px4fuse.grading.entries import Course
-from px4fuse.grading.grade import GradeOutcome, grade
-from px4fuse.grading.model import Entry, GradedReport
-from px4fuse.grading.rubric import read_rubric
-from px4fuse.reading import files_by_sha256
+from px4fuse.core.reading import files_by_sha256
+from px4fuse.core.workers import JobFailure
 from px4fuse.verification import pages
 from px4fuse.verification.model import Verdict
-from px4fuse.workers import JobFailure
 
 pytestmark = pytest.mark.usefixtures("cached_analyses")
 
@@ -206,7 +206,7 @@ def test_grade_report_without_its_log_makes_points_pending(tmp_path) -> None:
 @pytest.mark.usefixtures("jobs_in_process")
 def test_interrupted_grade_command_tells_how_to_continue(tmp_path, monkeypatch) -> None:
     """Each name is one line; an interrupted run prints how to continue."""
-    import px4fuse.grading.grade as module
+    import px4fuse.classroom.grading.grade as module
 
     one = GradedReport("a.pdf", "Ada\nPoints 120\n" + "A" * 100_000, "1", UNKNOWN)
     entry = Entry(one.student, one.student_id, one)
@@ -231,7 +231,7 @@ def test_grade_output_file_names_are_safe_and_unique() -> None:
 
 
 def test_grade_command_passes_all_course_options(tmp_path, monkeypatch) -> None:
-    import px4fuse.grading.grade as module
+    import px4fuse.classroom.grading.grade as module
 
     noted = Mock(return_value=GradeOutcome((), (), 0, ()))
     monkeypatch.setattr(module, "grade", noted)

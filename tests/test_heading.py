@@ -20,7 +20,7 @@ from px4fuse.filter.frame_rotation import (
 )
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import ned_acceleration, project_acceleration
-from px4fuse.flight import Columns, Flight, Unavailable
+from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse

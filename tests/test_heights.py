@@ -20,7 +20,7 @@ from px4fuse.ekf2.model import Model, run_configurations
 from px4fuse.ekf2.replay_segments import HeightSamples, ReplaySegment
 from px4fuse.ekf2.whatif import HEIGHT_LOGGED_NOTE, HEIGHT_REPLAYED_NOTE, what_if
 from px4fuse.errors import SettingsError
-from px4fuse.flight import AidLog, Flight
+from px4fuse.flight.model import AidLog, Flight
 from px4fuse.readers import read_log
 from px4fuse.report.difference_page import format_agreement
 from px4fuse.report.whatif import rows

@@ -24,7 +24,7 @@ from px4fuse.findings import Finding, imu, noises, source_clock, source_conventi
 from px4fuse.findings import source_intervals as intervals
 from px4fuse.findings import source_positions as sent
 from px4fuse.findings import source_stamps as stamps
-from px4fuse.flight import Columns, Flight, Unavailable
+from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario

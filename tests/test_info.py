@@ -17,10 +17,10 @@ from px4fuse.cli import cli
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.diagnose import explain
 from px4fuse.errors import Px4FuseError
-from px4fuse.flight import Flight, Unavailable
-from px4fuse.inspect.inventory import AnalysisOption, Inventory, Source, take_inventory, to_plain
-from px4fuse.log import Dropout, Sender
-from px4fuse.position_source import GNSS
+from px4fuse.flight.log import Dropout, Sender
+from px4fuse.flight.model import Flight, Unavailable
+from px4fuse.flight.position_source import GNSS
+from px4fuse.info.inventory import AnalysisOption, Inventory, Source, take_inventory, to_plain
 from px4fuse.readers import read_log
 
 WIDTH = 80
@@ -291,7 +291,7 @@ def test_info_describes_or_rejects_each_shared_log(shared_logs, monkeypatch, cap
         taken.append(take_inventory(flight))
         return taken[-1]
 
-    monkeypatch.setattr("px4fuse.inspect.inventory.take_inventory", take)
+    monkeypatch.setattr("px4fuse.info.inventory.take_inventory", take)
     for path in paths:
         code, out, err = run_main(monkeypatch, capsys, "info", path)
         assert code in ((0,) if path.suffix == ".ulg" else (0, 2)), path.name

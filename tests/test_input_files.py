@@ -134,9 +134,9 @@ def test_batch_refuses_output_folder_that_contains_logs(tmp_path, monkeypatch) -
 
 
 def test_write_to_protected_input_file_is_refused(tmp_path) -> None:
-    from px4fuse.input_files import inputs_protected
-    from px4fuse.reading import read_text
-    from px4fuse.writing import write_all
+    from px4fuse.core.input_files import inputs_protected
+    from px4fuse.core.reading import read_text
+    from px4fuse.core.writing import write_all
 
     path, other = tmp_path / "a", tmp_path / "b"
     path.write_text("mine")
@@ -151,7 +151,12 @@ def test_write_to_protected_input_file_is_refused(tmp_path) -> None:
 
 def test_protected_inputs_without_inodes_are_compared_by_path(tmp_path, monkeypatch) -> None:
     """Simulate a file system that ignores case and gives every file the inode 0."""
-    from px4fuse.input_files import add_input, check_output_folder, check_outputs, inputs_protected
+    from px4fuse.core.input_files import (
+        add_input,
+        check_output_folder,
+        check_outputs,
+        inputs_protected,
+    )
 
     real, real_names = Path.stat, Path.iterdir
 

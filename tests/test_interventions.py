@@ -25,7 +25,7 @@ from px4fuse.ekf2.model import replay_settings, with_misaligned_positions, with_
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import Settings
-from px4fuse.flight import Columns, Unavailable
+from px4fuse.flight.model import Columns, Unavailable
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario

@@ -10,7 +10,7 @@ from ulog_tools import load
 
 from px4fuse.alignment.merge_recordings import join, shift_times
 from px4fuse.errors import MissingDataError
-from px4fuse.flight import AXIS_NAMES, Columns, Flight, FlightMode, Reset, Unavailable
+from px4fuse.flight.model import AXIS_NAMES, Columns, Flight, FlightMode, Reset, Unavailable
 from px4fuse.readers import read_log
 
 POSITION_TOPICS = ("vehicle_visual_odometry", "estimator_aid_src_ev_pos")

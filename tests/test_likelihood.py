@@ -22,7 +22,7 @@ from px4fuse.filter.likelihood import (
 )
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
-from px4fuse.flight import Flight
+from px4fuse.flight.model import Flight
 
 SIGMA_A = [0.05, 0.5, 5.0]
 SIGMA_Z = [0.02, 0.1, 1.0]

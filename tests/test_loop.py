@@ -13,7 +13,7 @@ from trajectory_tools import noisy_odometry, square
 
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.findings import find_loop
-from px4fuse.flight import Unavailable
+from px4fuse.flight.model import Unavailable
 from px4fuse.lesson import ODOMETRY_M, loop_lines
 from px4fuse.loop.analysis import analyse, analyse_flight_loop
 from px4fuse.loop.corrections import BY_DISTANCE, POSITIONS_ONLY, SINGLE_LOOP_REASON

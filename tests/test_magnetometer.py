@@ -11,7 +11,7 @@ from ulog_tools import Log, gnss_log, seconds_of, stamps, topic
 
 from px4fuse.ekf2.magnetometer import EventSamples, fuse_field, mean_by_event
 from px4fuse.ekf2.replay_segments import ReplaySegment, SensorSamples, _field_span, _mean_field
-from px4fuse.flight import Columns, FusionRecord
+from px4fuse.flight.model import Columns, FusionRecord
 from px4fuse.readers import read_log
 
 EARTH = np.array([0.21, 0.015, 0.43])

@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 from scipy.special import expit
 from scipy.stats import norm
 
-from px4fuse.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, IntArray
 from px4fuse.filter.fitting import (
     START_OUTLIER_SHARE,
     START_OUTLIER_WIDTH,

@@ -28,7 +28,7 @@ from mavlink_tools import (
 )
 
 from px4fuse.errors import SettingsError
-from px4fuse.flight import Flight, sample_rate
+from px4fuse.flight.model import Flight, sample_rate
 from px4fuse.readers import read_log
 from px4fuse.readers.mavlink_clocks import Line, fit_least_delay, map_clock
 

@@ -28,7 +28,7 @@ from mavlink_tools import (
 )
 
 from px4fuse.errors import LogError
-from px4fuse.flight import Flight
+from px4fuse.flight.model import Flight
 from px4fuse.readers import mavlink_frames, read_log
 from px4fuse.readers.mavlink_frames import Frames, message_name, read_frames
 

@@ -31,14 +31,14 @@ from findings_tools import (
 )
 
 from px4fuse.comparison.trials import RunStatistics, Trial
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import Noise
 from px4fuse.findings import cause_text, ekf2_noise, hidden_errors, loops, noises
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.noises import _has_default_noises
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS
+from px4fuse.flight.position_source import GNSS, RECEIVED
 from px4fuse.loop.model import Closure, Loop, TrueEnd
-from px4fuse.position_source import GNSS, RECEIVED
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
 HOVERING = source(samples=positions(np.arange(0.0, 120.0)))

@@ -29,7 +29,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find, source_clock
-from px4fuse.flight import Columns
+from px4fuse.flight.model import Columns
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_positions import project, unproject
 from px4fuse.simulation import sensors

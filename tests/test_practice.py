@@ -24,11 +24,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
-from px4fuse import practice
 from px4fuse.comparison.model import AxisComparison, Comparison
+from px4fuse.explore import practice
+from px4fuse.explore.practice import FAULT_CHOICES, NOISY_UWB, HiddenMistake, draw
 from px4fuse.filter.settings import Settings
-from px4fuse.flight import Flight
-from px4fuse.practice import FAULT_CHOICES, NOISY_UWB, HiddenMistake, draw
+from px4fuse.flight.model import Flight
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
@@ -352,7 +352,7 @@ def test_practice_command_writes_one_html_page(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(click, "launch", opened.append)
     # the content of the page is tested above
-    monkeypatch.setattr("px4fuse.practice.practice_text", lambda *given: repr(given[:3]))
+    monkeypatch.setattr("px4fuse.explore.practice.practice_text", lambda *given: repr(given[:3]))
     run_checked("practice", "--seed", "3", "--flights", "1")
     page = tmp_path / "reports" / "practice_3.html"
     assert [file for file in tmp_path.rglob("*") if file.is_file()] == [page]

@@ -29,8 +29,8 @@ from ulog_tools import (
 
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.errors import MissingDataError
-from px4fuse.flight import Columns, Reset, Unavailable
-from px4fuse.position_source import (
+from px4fuse.flight.model import Columns, Reset, Unavailable
+from px4fuse.flight.position_source import (
     ALIGNED,
     FROM_INNOVATIONS,
     GNSS,

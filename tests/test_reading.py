@@ -11,9 +11,9 @@ from cli_tools import run_main
 from conftest import REPOSITORY
 from time_limit import time_limit
 
-from px4fuse import workers
+from px4fuse.core import workers
+from px4fuse.core.reading import display_name, max_log_bytes, read_bytes_limited, read_text
 from px4fuse.errors import LogError, Px4FuseError
-from px4fuse.reading import display_name, max_log_bytes, read_bytes_limited, read_text
 from px4fuse.verification.model import Verdict
 from px4fuse.verification.verification import log_sha256
 

@@ -11,7 +11,7 @@ from cli_tools import contents, run_main
 from conftest import REPOSITORY
 from ulog_tools import make_log
 
-from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.flight.ekf2_parameters import PARAMETERS
 
 pytestmark = pytest.mark.usefixtures("cached_analyses")
 

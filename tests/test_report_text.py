@@ -22,7 +22,7 @@ from px4fuse.filter.likelihood import filter_states, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.time_offset import ClockOffset, PartOffset
 from px4fuse.findings import Finding
-from px4fuse.flight import Unavailable
+from px4fuse.flight.model import Unavailable
 from px4fuse.report import clock, fonts, notes
 from px4fuse.report.notes import write
 from px4fuse.report.page import Block, Page, replace_unprintable

@@ -14,7 +14,7 @@ import px4fuse
 from px4fuse.comparison.model import UntestedFilter
 from px4fuse.diagnose import explain
 from px4fuse.errors import ResultsError
-from px4fuse.flight import Flight
+from px4fuse.flight.model import Flight
 from px4fuse.report.pdf import render
 from px4fuse.request import ComparisonRequest
 from px4fuse.results import build

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from class_tools import entry
 
-from px4fuse.assignment.roster import Person, Register, read_people, read_roster
-from px4fuse.assignment.sheet import Sheet, read_sheet
+from px4fuse.classroom.assignment.roster import Person, Register, read_people, read_roster
+from px4fuse.classroom.assignment.sheet import Sheet, read_sheet
+from px4fuse.classroom.grading.model import ExportOrigin
+from px4fuse.classroom.grading.outputs import fill_grades, find_grade_column
 from px4fuse.errors import SettingsError
-from px4fuse.grading.model import ExportOrigin
-from px4fuse.grading.outputs import fill_grades, find_grade_column
 
 SUBMITTED = "Friday, 20 November 2026, 11:58 PM"
 # format of mod/assign/gradingtable.php of Moodle

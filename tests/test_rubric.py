@@ -4,8 +4,8 @@ import tomllib
 
 import pytest
 
+from px4fuse.classroom.grading.rubric import AnyItem, parse_rubric, read_rubric, rubric_text
 from px4fuse.errors import SettingsError
-from px4fuse.grading.rubric import AnyItem, parse_rubric, read_rubric, rubric_text
 
 ITEM = '[[item]]\ntitle = "T"\npoints = 5\n'
 NOTES = ITEM + 'check = "verified"\n'

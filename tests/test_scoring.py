@@ -18,15 +18,15 @@ from results_tools import (
     finding,
 )
 
-from px4fuse.answer_form import Answers, StudentMistake
-from px4fuse.assignment.key import Answer, AnswerKey
-from px4fuse.assignment.truth import FormTruth, TrueMistake, VerdictTruth
+from px4fuse.classroom.assignment.key import Answer, AnswerKey
+from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake, VerdictTruth
+from px4fuse.classroom.grading.flags import flag_equal_contents, flag_settings
+from px4fuse.classroom.grading.model import Entry, GradedReport
+from px4fuse.classroom.grading.outputs import feedback_text
+from px4fuse.classroom.grading.rubric import parse_rubric, read_rubric, score_report
 from px4fuse.errors import ResultsError
 from px4fuse.findings import TITLES
-from px4fuse.grading.flags import flag_equal_contents, flag_settings
-from px4fuse.grading.model import Entry, GradedReport
-from px4fuse.grading.outputs import feedback_text
-from px4fuse.grading.rubric import parse_rubric, read_rubric, score_report
+from px4fuse.results.answer_form import Answers, StudentMistake
 from px4fuse.results.contract import to_plain
 from px4fuse.simulation.flights import HARDWARE
 from px4fuse.verification.model import Verdict

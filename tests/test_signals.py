@@ -24,9 +24,17 @@ from px4fuse.filter.signals import (
     project_acceleration,
     step_means,
 )
-from px4fuse.flight import AXIS_NAMES, Columns, Ekf2, Flight, PositionTrack, Reset, Unavailable
-from px4fuse.log import LogInfo
-from px4fuse.position_source import RECEIVED
+from px4fuse.flight.log import LogInfo
+from px4fuse.flight.model import (
+    AXIS_NAMES,
+    Columns,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Reset,
+    Unavailable,
+)
+from px4fuse.flight.position_source import RECEIVED
 
 GRAVITY = 9.80665
 NORTH = np.array([1.0, 0.0, 0.0])

@@ -20,7 +20,7 @@ from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, make_axes, project_acceleration, step_means
 from px4fuse.findings import find
-from px4fuse.flight import Columns
+from px4fuse.flight.model import Columns
 from px4fuse.simulation import sensors
 from px4fuse.simulation.flights import answer, simulate, simulate_flight, to_flight, to_ulog
 from px4fuse.simulation.mistakes import MISTAKES, Mistakes, active_mistakes, format_mistake, parse

@@ -15,7 +15,7 @@ from px4fuse.ekf2.replay import Agreement
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_ekf2 import samples_per_step
 from px4fuse.simulation import ekf2, sensors

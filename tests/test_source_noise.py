@@ -18,7 +18,7 @@ from px4fuse.filter.fitting import Noises
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, find
 from px4fuse.findings.source_noise import detect, detect_noise_variation
-from px4fuse.flight import Columns, Flight, Unavailable
+from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.scenario import Scenario

@@ -27,8 +27,8 @@ from px4fuse.findings import (
 )
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.model import finding
-from px4fuse.flight import Columns, Flight
-from px4fuse.log import SHARED_STAMPS, ClockMap
+from px4fuse.flight.log import SHARED_STAMPS, ClockMap
+from px4fuse.flight.model import Columns, Flight
 from px4fuse.readers import read_log
 from px4fuse.readers.common import find_invalid, rounding_step
 from px4fuse.readers.position_csv import read_position_csv

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import pytest
 
-from px4fuse.assignment.roster import Person
+from px4fuse.classroom.assignment.roster import Person
+from px4fuse.classroom.grading import submissions
+from px4fuse.classroom.grading.model import Submission
+from px4fuse.classroom.grading.submissions import add_origins, find_submissions, parse_origin, read
+from px4fuse.core.reading import files_by_sha256
 from px4fuse.errors import ResultsError, SettingsError
-from px4fuse.grading import submissions
-from px4fuse.grading.model import Submission
-from px4fuse.grading.submissions import add_origins, find_submissions, parse_origin, read
-from px4fuse.reading import files_by_sha256
 from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_report
 
 PDF = b"%PDF-1.4 a small one\n%%EOF\n"

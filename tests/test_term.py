@@ -13,13 +13,13 @@ import pytest
 from class_tools import make_report, skip_verification, write_zip
 from golden_tools import assert_matches_golden
 
-from px4fuse.assignment.key import Answer, AnswerKey
-from px4fuse.assignment.roster import read_people
-from px4fuse.assignment.sheet import read_sheet
-from px4fuse.grading.entries import Course, parse_due_time, parse_late_rule
-from px4fuse.grading.grade import GradeOutcome, grade
-from px4fuse.grading.model import Entry
-from px4fuse.grading.rubric import read_rubric, rubric_text
+from px4fuse.classroom.assignment.key import Answer, AnswerKey
+from px4fuse.classroom.assignment.roster import read_people
+from px4fuse.classroom.assignment.sheet import read_sheet
+from px4fuse.classroom.grading.entries import Course, parse_due_time, parse_late_rule
+from px4fuse.classroom.grading.grade import GradeOutcome, grade
+from px4fuse.classroom.grading.model import Entry
+from px4fuse.classroom.grading.rubric import read_rubric, rubric_text
 
 STUDENTS = range(1, 41)
 MOODLE, CANVAS, BLACKBOARD = range(1, 16), range(16, 28), range(28, 39)  # 39 and 40 submit nothing

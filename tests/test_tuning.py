@@ -24,7 +24,7 @@ from px4fuse.filter.tuning import (
     tune,
     tune_axes,
 )
-from px4fuse.flight import Columns, Flight, Unavailable
+from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.report.sensitivity import format_noise
 
 SIGMA_A, SIGMA_Z, SEEDS = TRUE.sigma_a_m_s2, TRUE.sigma_z_m, 40

@@ -46,8 +46,8 @@ from pypdf.generic import (
 )
 from results_tools import finding
 
+from px4fuse.core.reading import files_by_sha256
 from px4fuse.errors import ResultsError
-from px4fuse.reading import files_by_sha256
 from px4fuse.results.contract import to_json, to_plain
 from px4fuse.verification import pages, verification
 from px4fuse.verification.pdf_input import read_report

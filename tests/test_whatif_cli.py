@@ -16,7 +16,7 @@ from px4fuse.diagnose import run_what_if
 from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.flight import Flight
+from px4fuse.flight.model import Flight
 from px4fuse.report.whatif import NOT_PREDICTABLE, column_heads, rows, sweep_notes, sweep_table
 from px4fuse.request import Sweep, WhatIfRequest, command_line
 from px4fuse.results.contract import WhatIfResults, schema

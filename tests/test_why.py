@@ -17,7 +17,7 @@ from px4fuse.comparison.difference_steps import (
 from px4fuse.ekf2.steps import NOISE, SAMPLES, STEPS, TIMESTAMPS, DifferenceExplanation
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
-from px4fuse.flight import Unavailable
+from px4fuse.flight.model import Unavailable
 from px4fuse.report.difference_page import draw, unexplained_note
 from px4fuse.report.style import report_style
 

@@ -12,8 +12,8 @@ from contextlib import closing
 import pytest
 from failing_jobs import run_job
 
-from px4fuse import workers
-from px4fuse.workers import JobFailure, run_bounded
+from px4fuse.core import workers
+from px4fuse.core.workers import JobFailure, run_bounded
 
 MEMORY = 1_500_000_000
 
@@ -103,7 +103,7 @@ def test_closing_the_worker_pool_ends_all_processes():
 INTERRUPTED = """
 import os, sys, time
 sys.path.insert(0, {tests!r})
-from px4fuse.workers import run_bounded
+from px4fuse.core.workers import run_bounded
 from failing_jobs import run_job
 
 if __name__ == "__main__":
@@ -140,7 +140,7 @@ def test_worker_process_does_not_import_from_current_folder(tmp_path):
 def test_worker_with_closed_pipe_ends_without_traceback():
     script = """if True:
         from multiprocessing import Pipe
-        from px4fuse.workers import _run_worker
+        from px4fuse.core.workers import _run_worker
         parent, worker = Pipe()
         parent.close()
         _run_worker(worker, len, None)

@@ -21,13 +21,13 @@ from conftest import SAMPLES
 from exchange import replace
 from ulog_tools import make_log
 
-from px4fuse import writing
 from px4fuse.comparison.comparison import compare as compare_prepared
+from px4fuse.core import writing
+from px4fuse.core.writing import STANDARD_OUTPUT, write_all
 from px4fuse.diagnose import prepare_comparison
 from px4fuse.errors import OutputError
 from px4fuse.report import fonts, pdf
 from px4fuse.request import ComparisonRequest
-from px4fuse.writing import STANDARD_OUTPUT, write_all
 
 pytestmark = pytest.mark.usefixtures("cached_analyses")
 
@@ -396,7 +396,7 @@ def test_command_with_closed_standard_output_exits_with_0(words: str) -> None:
 def test_output_to_pipe_without_reader_ends_after_timeout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample_log: Path
 ) -> None:
-    monkeypatch.setattr("px4fuse.writing.READER_TIMEOUT_S", 0.1)
+    monkeypatch.setattr("px4fuse.core.writing.READER_TIMEOUT_S", 0.1)
     os.mkfifo(tmp_path / "pipe")
     pipe = tmp_path / "pipe"
     assert "the pipe has no reader" in error_line("info", sample_log, "--json", pipe)

@@ -16,7 +16,7 @@ from exchange import replace
 from numpy.typing import ArrayLike, NDArray
 from pyulog import ULog
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
 from px4fuse.simulation.ulog_writer import Topic, encode
 
 START_US = 5_000_000

@@ -7,8 +7,8 @@ from px4fuse.convention.axes import UNITS
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import MIN_ROTATION_DEG
 from px4fuse.convention.texts import FRAME_AXES, UNIT_NAMES, describe_axes, describe_unit
-from px4fuse.flight import Columns, Flight, PositionTrack, time_index
-from px4fuse.position_source import POSITION_FILE
+from px4fuse.flight.model import Columns, Flight, PositionTrack, time_index
+from px4fuse.flight.position_source import POSITION_FILE
 
 MAX_SPAN_S = 7200.0  # of file and log; the search takes 1 s per hour
 

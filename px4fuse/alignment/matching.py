@@ -14,7 +14,7 @@ from px4fuse.alignment.time_and_pose_fit import (
     Fit,
 )
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, SampledTrack
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_PEAK_RATIO
 
 # Frames to try if yaw is estimated; nwu is not tried, because it is enu rotated by 90°

@@ -9,8 +9,8 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.errors import MissingDataError
-from px4fuse.flight import Columns, Ekf2, Flight, Unavailable, sort_by_preference, time_index
-from px4fuse.log import InputFile
+from px4fuse.flight.log import InputFile
+from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, sort_by_preference, time_index
 from px4fuse.readers.common import collect_unavailable
 
 # Names of the record fields that contain times (s)

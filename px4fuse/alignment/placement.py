@@ -23,11 +23,11 @@ from px4fuse.alignment.file_convention import explain_mismatch
 from px4fuse.alignment.matching import AlignmentProblem, Match
 from px4fuse.alignment.time_and_pose_fit import MIN_CONCORDANCE, truncated_rms
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.flight import Alignment, Flight, PositionTrack, Unavailable
-from px4fuse.log import SHARED_STAMPS, ClockMap, InputFile
-from px4fuse.position_source import POSITION_FILE
+from px4fuse.flight.log import SHARED_STAMPS, ClockMap, InputFile
+from px4fuse.flight.model import Alignment, Flight, PositionTrack, Unavailable
+from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers.common import finite_rows
 from px4fuse.readers.position_csv import PositionRecording
 

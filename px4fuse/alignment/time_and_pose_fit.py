@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 
 from px4fuse.alignment import tracks
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, SampledTrack
-from px4fuse.arrays import Array, Complex
+from px4fuse.core.arrays import Array, Complex
 from px4fuse.trajectory.correlation import autocovariance, moments
 from px4fuse.trajectory.time_offset import GRID_STEP_S
 

@@ -12,7 +12,6 @@ import pandas as pd
 from msgspec.structs import replace
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
-from px4fuse.arrays import Array
 from px4fuse.card.causes import (
     FILTER_NAMES,
     RankedCause,
@@ -42,8 +41,10 @@ from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth
 from px4fuse.comparison.projection import project_horizon
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import improvement
+from px4fuse.core.arrays import Array
+from px4fuse.core.reading import display_name, file_size, read_head
+from px4fuse.core.text import lower_first, with_log_name
 from px4fuse.ekf2.inputs import horizontal_resets_s
-from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.settings import Settings
@@ -51,11 +52,10 @@ from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.model import group_by_root
-from px4fuse.flight import Ekf2, Unavailable, source_name
-from px4fuse.log import LogInfo
-from px4fuse.reading import display_name, file_size, read_head
+from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.log import LogInfo
+from px4fuse.flight.model import Ekf2, Unavailable, source_name
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
-from px4fuse.text import lower_first, with_log_name
 
 MAX_ACTIONS = 3
 # Minimum fraction of positions rejected by EKF2 that the effect on the card states

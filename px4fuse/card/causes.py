@@ -24,15 +24,15 @@ from px4fuse.comparison.trials import (
     ratios,
     reduction,
 )
-from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.core.text import with_log_name
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CONVENTION
 from px4fuse.findings.model import CATALOGUE
-from px4fuse.flight import PositionTrack, Unavailable
+from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
-from px4fuse.text import with_log_name
 
 # Kinds of change (:attr:`Trial.kinds`) whose re-runs test a finding, by the id of the finding
 RERUN_KINDS: Mapping[str, frozenset[str]] = {

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from px4fuse.comparison.trials import Improvement
+from px4fuse.core.record import Count, NotNegative, Positive, Record, Share, Span
 from px4fuse.filter.consistency import CONSISTENT_RATIOS, Reference
-from px4fuse.record import Count, NotNegative, Positive, Record, Share, Span
 
 FilterName = Literal["kf", "ekf2"]
 CardSeverity = Literal["clean", "note", "warning", "error", "refused"]

@@ -3,8 +3,8 @@
 import math
 
 from px4fuse.card.model import AXIS_ENDS
-from px4fuse.text import format_metres as format_metres  # noqa: PLC0414 - public re-export
-from px4fuse.text import format_ratio as format_ratio  # noqa: PLC0414 - public re-export
+from px4fuse.core.text import format_metres as format_metres  # noqa: PLC0414 - public re-export
+from px4fuse.core.text import format_ratio as format_ratio  # noqa: PLC0414 - public re-export
 
 
 def axis_fraction(ratio: float) -> float:

@@ -6,16 +6,16 @@ truth it is √(mean NEES) at the times of EKF2's published position.
 
 import numpy as np
 
-from px4fuse.arrays import Array
 from px4fuse.card.model import FilterName, Verdict
 from px4fuse.comparison.comparison import normalised_position_errors
 from px4fuse.comparison.model import AxisComparison, FilterSummary
+from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import (
     Reference,
     classify_ratio,
     ratio_interval,
 )
-from px4fuse.flight import Unavailable
+from px4fuse.flight.model import Unavailable
 
 # Length (s) of the blocks of the bootstrap: position errors are correlated over seconds
 BOOTSTRAP_BLOCK_S = 10.0

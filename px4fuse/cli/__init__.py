@@ -13,9 +13,9 @@ from pathlib import Path
 import click
 
 from px4fuse.cli.outputs import Interrupted, written_so_far
+from px4fuse.core.input_files import inputs_protected
+from px4fuse.core.threads import ONE_THREAD
 from px4fuse.errors import OutputError, Px4FuseError, SettingsError, to_one_line
-from px4fuse.input_files import inputs_protected
-from px4fuse.threads import ONE_THREAD
 
 # Help text of each command; --help does not import the modules of the commands, which is slow
 COMMANDS = {

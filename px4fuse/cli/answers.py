@@ -18,8 +18,8 @@ def answers(log: Path, output: Path | None) -> None:
     The form contains questions on the mistakes of the flight, the behaviour of EKF2, and three
     numbers. Complete the form and give it to px4fuse compare --answers.
     """
-    from px4fuse.answer_form import form_name, form_text
-    from px4fuse.reading import read_log_bytes
+    from px4fuse.core.reading import read_log_bytes
+    from px4fuse.results.answer_form import form_name, form_text
 
     target = output or log.with_name(form_name(log.name))
     sha256 = hashlib.sha256(read_log_bytes(log)).hexdigest()

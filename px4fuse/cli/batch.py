@@ -10,10 +10,10 @@ from typing import Any, Literal
 
 import click
 
+from px4fuse.batch import TIMEOUT_S
 from px4fuse.cli import options, outputs
 from px4fuse.cli.compare import SEVERITIES, Severity
 from px4fuse.errors import SettingsError
-from px4fuse.fleet import TIMEOUT_S
 
 FAILED_STATUS = "failed"
 # Types of clusters for which --scheduler NAME prints instructions, from NAME.txt in this folder
@@ -79,8 +79,8 @@ def batch(
         raise SettingsError("batch requires an output folder: -o DIR.")
     if scheduler is not None and option_values["workers"] is not None:
         raise SettingsError("--workers applies to this computer. Omit --workers with --scheduler.")
-    from px4fuse.fleet.run import run
-    from px4fuse.fleet.terminal import format_summary
+    from px4fuse.batch.run import run
+    from px4fuse.batch.terminal import format_summary
 
     gc.enable()  # Dask leaves reference cycles, which would fill the memory in a long run
     try:

@@ -7,9 +7,9 @@ from typing import Any, Literal, get_args
 import click
 
 from px4fuse.cli import options, outputs
+from px4fuse.core.writing import STANDARD_OUTPUT
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.request import settings_name
-from px4fuse.writing import STANDARD_OUTPUT
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES = get_args(Severity)
@@ -56,8 +56,8 @@ def compare(
     """
     from px4fuse.analysis import failed_checks
     from px4fuse.card.build import build_refusal_card
+    from px4fuse.core.memory import release_free_memory
     from px4fuse.diagnose import diagnose_or_check_aids
-    from px4fuse.memory import release_free_memory
     from px4fuse.report.terminal import card_page, summary
     from px4fuse.results.build import outcome_results
 

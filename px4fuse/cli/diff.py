@@ -24,8 +24,8 @@ def diff(a: Path, b: Path, json_path: Path | None) -> None:
     NEES is consistent if σ is at most 2 times too small or too large. The exit code is 2 for
     invalid input, otherwise 0.
     """
-    from px4fuse.fleet.changes import diff as compare_inputs
-    from px4fuse.fleet.terminal import format_differences
+    from px4fuse.batch.changes import diff as compare_inputs
+    from px4fuse.batch.terminal import format_differences
 
     outputs.check_targets([json_path])  # report an invalid output path before the long analysis
     with outputs.progress(json_path) as show_progress:

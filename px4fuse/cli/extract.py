@@ -18,9 +18,9 @@ from px4fuse.cli.options import (
     output_option,
 )
 from px4fuse.cli.outputs import write_outputs
+from px4fuse.core.input_files import check_output_folder, inputs_not_registered
+from px4fuse.core.reading import read_text
 from px4fuse.errors import OutputError, to_one_line
-from px4fuse.input_files import check_output_folder, inputs_not_registered
-from px4fuse.reading import read_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,7 +57,7 @@ def extract(
             "use --format csv."
         )
     from px4fuse.diagnose import read_flight
-    from px4fuse.inspect import tables as extraction
+    from px4fuse.info import tables as extraction
     from px4fuse.results.contract import to_json
 
     flight = extraction.with_best_source(read_flight(comparison_request(log, option_values)))

@@ -18,12 +18,12 @@ from px4fuse.cli.options import (
     output_option,
 )
 from px4fuse.cli.outputs import Interrupted, progress, write_and_print, write_new
+from px4fuse.core.input_files import add_input, check_output_folder
+from px4fuse.core.reading import files_below
 from px4fuse.errors import OutputError, SettingsError
-from px4fuse.input_files import add_input, check_output_folder
-from px4fuse.reading import files_below
 
 if TYPE_CHECKING:
-    from px4fuse.grading.grade import GradeOutcome
+    from px4fuse.classroom.grading.grade import GradeOutcome
     from px4fuse.report.page import Page
 
 
@@ -131,12 +131,12 @@ def grade(
     (id, item or total, points, comment) replace computed points. A second run verifies only changed
     reports. Submitted files are never executed, and are read with limits of time and memory.
     """
-    from px4fuse.assignment.key import read_key
-    from px4fuse.assignment.roster import read_people
-    from px4fuse.assignment.sheet import read_sheet
-    from px4fuse.grading.entries import Course, parse_due_time, parse_late_rule
-    from px4fuse.grading.grade import grade as grade_submissions
-    from px4fuse.grading.rubric import read_rubric, rubric_text
+    from px4fuse.classroom.assignment.key import read_key
+    from px4fuse.classroom.assignment.roster import read_people
+    from px4fuse.classroom.assignment.sheet import read_sheet
+    from px4fuse.classroom.grading.entries import Course, parse_due_time, parse_late_rule
+    from px4fuse.classroom.grading.grade import grade as grade_submissions
+    from px4fuse.classroom.grading.rubric import read_rubric, rubric_text
 
     if write_rubric is not None:
         write_new(write_rubric, rubric_text().encode())
@@ -196,9 +196,9 @@ def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None
 def _page(outcome: GradeOutcome) -> Page:
     from collections import Counter
 
+    from px4fuse.core.text import one_line
     from px4fuse.report.page import Page
     from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
-    from px4fuse.results.reading import one_line
 
     page, rows = Page(), []
     for entry in outcome.entries:

@@ -10,11 +10,11 @@ import click
 
 from px4fuse.cli.options import InputPath, comparison_request, flight_options, json_option
 from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
-from px4fuse.record import Unavailable
-from px4fuse.text import join_first
+from px4fuse.core.record import Unavailable
+from px4fuse.core.text import join_first
 
 if TYPE_CHECKING:
-    from px4fuse.inspect.inventory import Inventory, Source
+    from px4fuse.info.inventory import Inventory, Source
     from px4fuse.report.page import Cell, Page
     from px4fuse.request import ComparisonRequest
 
@@ -54,7 +54,7 @@ def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
     not possible, and settings to log the missing data on the next flight.
     """
     from px4fuse.diagnose import read_flight
-    from px4fuse.inspect.inventory import take_inventory, to_plain
+    from px4fuse.info.inventory import take_inventory, to_plain
 
     request = comparison_request(log, option_values)
     check_targets([json_path])

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, get_args
 import click
 
 from px4fuse.cli import options, outputs
+from px4fuse.core.reading import display_name
+from px4fuse.core.writing import STANDARD_OUTPUT
 from px4fuse.errors import SettingsError
-from px4fuse.reading import display_name
 from px4fuse.request import (
     FrameName,
     GivenClosure,
@@ -19,7 +20,6 @@ from px4fuse.request import (
     command_line,
     settings_name,
 )
-from px4fuse.writing import STANDARD_OUTPUT
 
 if TYPE_CHECKING:
     from px4fuse.loop.model import Loop

@@ -15,10 +15,11 @@ import click
 from click.core import ParameterSource
 
 from px4fuse.cli.outputs import OPENS_OUTPUT_KEY
+from px4fuse.core.input_files import add_input
+from px4fuse.core.reading import max_log_bytes, read_text
+from px4fuse.core.units import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import DT_RANGE_S, SIGMA_A_RANGE_M_S2, SIGMA_Z_RANGE_M
-from px4fuse.input_files import add_input
-from px4fuse.reading import max_log_bytes, read_text
 from px4fuse.request import (
     AUTO,
     DT_S,
@@ -29,7 +30,6 @@ from px4fuse.request import (
     PositionFile,
     SourceKind,
 )
-from px4fuse.units import UNIT_NAMES, convert_to_unit
 
 if TYPE_CHECKING:
     from px4fuse.results.model import Student
@@ -86,7 +86,7 @@ class TypedQuantity(click.ParamType["float | str"]):
     Parameters
     ----------
     unit : str
-        One of :data:`px4fuse.units.UNIT_NAMES`.
+        One of :data:`px4fuse.core.units.UNIT_NAMES`.
     example : float
         Number that the error message suggests if the typed text is not a number.
     auto : bool
@@ -404,7 +404,7 @@ def read_student(option_values: dict[str, Any]) -> Student:
     """
     from msgspec import UNSET
 
-    from px4fuse.answer_form import read_answers
+    from px4fuse.results.answer_form import read_answers
     from px4fuse.results.model import MAX_NOTES_BYTES, Student
 
     name, student_id = option_values.pop("student") or "", option_values.pop("student_id") or ""

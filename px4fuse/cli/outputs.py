@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import click
 
+from px4fuse.core.input_files import check_outputs
+from px4fuse.core.writing import STANDARD_OUTPUT, write_all, written_before
 from px4fuse.errors import OutputError, ResultsError, to_one_line
-from px4fuse.input_files import check_outputs
-from px4fuse.writing import STANDARD_OUTPUT, write_all, written_before
 
 if TYPE_CHECKING:
     from msgspec import Struct

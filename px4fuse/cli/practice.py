@@ -63,7 +63,7 @@ def practice(
     target = web_page(output, Path("reports", f"practice_{seed}.html"))
     ctx.meta[OPENS_OUTPUT_KEY] = sys.stdout.isatty() if opened is None else opened
     with progress(target) as show_progress:
-        from px4fuse.practice import practice_text
+        from px4fuse.explore.practice import practice_text
 
         page = practice_text(seed, level, flights, show_progress)
         if output is None:

@@ -19,9 +19,9 @@ from px4fuse.cli.options import (
     typed_parameters,
 )
 from px4fuse.cli.outputs import check_targets, progress, write_and_print
+from px4fuse.core.input_files import check_output_folder
+from px4fuse.core.reading import read_text
 from px4fuse.errors import OutputError, SettingsError, to_one_line
-from px4fuse.input_files import check_output_folder
-from px4fuse.reading import read_text
 from px4fuse.simulation.mistakes import MISTAKES, active_mistakes, format_mistake, parse
 from px4fuse.simulation.scenario import (
     DEFAULTS_OF_KIND,
@@ -33,7 +33,7 @@ from px4fuse.simulation.scenario import (
 )
 
 if TYPE_CHECKING:
-    from px4fuse.assignment.random_assignment import FlightKind
+    from px4fuse.classroom.assignment.random_assignment import FlightKind
     from px4fuse.report.page import Page
     from px4fuse.simulation.flights import Simulation
 
@@ -239,7 +239,7 @@ def _check_options(assignment: Path | None) -> None:
 
 
 def _read_secret(file: Path | None) -> bytes | None:
-    from px4fuse.assignment.random_assignment import encode_secret
+    from px4fuse.classroom.assignment.random_assignment import encode_secret
 
     if file is None:
         return None
@@ -266,9 +266,12 @@ def _write_assignment(
     preview: bool,
 ) -> None:
     """Write one flight per student and the answer key; with ``preview``, only print the flights."""
-    from px4fuse.assignment import assignment
-    from px4fuse.assignment.random_assignment import EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
-    from px4fuse.assignment.roster import read_roster
+    from px4fuse.classroom.assignment import assignment
+    from px4fuse.classroom.assignment.random_assignment import (
+        EASIEST_DIFFICULTY,
+        HARDEST_DIFFICULTY,
+    )
+    from px4fuse.classroom.assignment.roster import read_roster
     from px4fuse.report.page import Page
 
     students, page, closing_texts = read_roster(roster), Page(), dict[str, str]()

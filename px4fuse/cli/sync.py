@@ -23,7 +23,7 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
     from px4fuse.comparison.estimates import estimate_noises_and_clock
     from px4fuse.diagnose import prepare_comparison
     from px4fuse.errors import MissingDataError
-    from px4fuse.flight import Unavailable
+    from px4fuse.flight.model import Unavailable
     from px4fuse.report.clock import clock_advice
     from px4fuse.report.page import Page
     from px4fuse.results.build import sync_results

@@ -9,7 +9,7 @@ import click
 
 from px4fuse.cli.options import InputPath, analysis_options, comparison_request, json_option
 from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
-from px4fuse.record import Unavailable
+from px4fuse.core.record import Unavailable
 
 if TYPE_CHECKING:
     from px4fuse.comparison.model import Comparison

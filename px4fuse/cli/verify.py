@@ -13,8 +13,8 @@ import click
 
 from px4fuse.cli.options import InputPath, json_option, max_size_option, open_option, output_option
 from px4fuse.cli.outputs import check_targets, progress, result_files, write_and_print
+from px4fuse.core.reading import display_name, files_by_sha256, read_bytes_limited
 from px4fuse.errors import LogError
-from px4fuse.reading import display_name, files_by_sha256, read_bytes_limited
 
 if TYPE_CHECKING:
     from px4fuse.report.page import Page
@@ -44,9 +44,9 @@ def verify(
 
     Exit code 0: verified; 1: differences, another log, or not verifiable; 2: invalid input.
     """
+    from px4fuse.core.workers import JobFailure, run_one_bounded
     from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_report
     from px4fuse.verification.verification import verify as verify_report
-    from px4fuse.workers import JobFailure, run_one_bounded
 
     content = read_bytes_limited(
         report, LogError, MAX_PDF_BYTES, size_remedy="Give a report, which has less than 2 MB"
@@ -86,9 +86,9 @@ def _verdict_data(pdf: bytes, verdict: Verdict) -> dict[str, object]:
 
 
 def _page(name: str, verdict: Verdict, output: Path | None) -> Page:
+    from px4fuse.core.text import one_line
     from px4fuse.report.page import Page
     from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
-    from px4fuse.results.reading import one_line
     from px4fuse.verification.verification import LIMIT_NOTE
 
     page = Page()

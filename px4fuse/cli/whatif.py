@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from px4fuse.cli import options, outputs
+from px4fuse.core.units import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError
-from px4fuse.units import UNIT_NAMES, convert_to_unit
 
 if TYPE_CHECKING:
     from px4fuse.request import Sweep
@@ -117,7 +117,7 @@ def _parse_sweep(text: str) -> Sweep:
 
 
 def _parse_number(option_text: str, name: str, value: str) -> float:
-    from px4fuse.ekf2_parameters import PARAMETERS
+    from px4fuse.flight.ekf2_parameters import PARAMETERS
 
     try:
         return float(value)

@@ -20,7 +20,6 @@ import pandas as pd
 from msgspec import structs
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array
 from px4fuse.comparison.changes import (
     ACCOMPANYING_CHANGES,
     CLOCK_OFFSET,
@@ -48,13 +47,14 @@ from px4fuse.comparison.model import (
 from px4fuse.comparison.projection import project, project_truth
 from px4fuse.comparison.remedy import is_fused_source
 from px4fuse.comparison.trials import Change, RunStatistics, Statistic, Trial, distance_from_one
+from px4fuse.core.arrays import Array
+from px4fuse.core.record import Positive, Record
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings, with_misaligned_positions
 from px4fuse.ekf2.replay import HORIZONTAL as HORIZONTAL_AXES
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Ekf2Replay, inside_spans
 from px4fuse.ekf2.steps import DifferenceExplanation
-from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.fast_replay import quick_replay
 from px4fuse.filter.settings import Settings
@@ -66,8 +66,8 @@ from px4fuse.filter.signals import (
     weighted_sum,
 )
 from px4fuse.filter.tuning import HORIZONTAL
-from px4fuse.flight import Columns, Unavailable
-from px4fuse.record import Positive, Record
+from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.model import Columns, Unavailable
 
 # Mean NEES from which position errors are larger than the reported σ: errors of 2 σ; flights
 # without a fault have less than 3

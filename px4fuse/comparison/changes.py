@@ -10,12 +10,12 @@ from px4fuse.comparison.model import AxisComparison, Comparison, FilterSummary
 from px4fuse.comparison.remedy import ml_delay_change, noise_change
 from px4fuse.comparison.trials import Change, Statistic
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2_parameters import EV_POS, GNSS_VEL, PARAMETERS
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.flight import Unavailable
-from px4fuse.log import LogInfo
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_VEL, PARAMETERS
+from px4fuse.flight.log import LogInfo
+from px4fuse.flight.model import Unavailable
 
 CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
 FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"

@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.arrays import Array
 from px4fuse.comparison import projection
 from px4fuse.comparison.model import (
     AxisComparison,
@@ -20,10 +19,11 @@ from px4fuse.comparison.model import (
     UntestedFilter,
     Updates,
 )
+from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import DEFAULT_GATE, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
 from px4fuse.filter.signals import Axis, Segment
-from px4fuse.flight import RECORD_NOT_LOGGED, Ekf2, Truth, Unavailable, sample_rate
+from px4fuse.flight.model import RECORD_NOT_LOGGED, Ekf2, Truth, Unavailable, sample_rate
 
 STATE_COLUMNS = ("position_m", "velocity_m_s")
 VARIANCE_COLUMNS = ("position_variance_m2", "velocity_variance_m2_s2")

@@ -28,7 +28,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
-from px4fuse.flight import Unavailable
+from px4fuse.flight.model import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
 # Maximum relative difference of the position RMSEs of KF and EKF2 that texts call equal

@@ -13,9 +13,9 @@ import numpy as np
 from msgspec import structs
 from scipy.special import stdtr
 
-from px4fuse.arrays import Array
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.noise_differences import NoisyPart, find_noisy_part, tune_by_axis
+from px4fuse.core.arrays import Array
 from px4fuse.filter.correlated_noise import (
     SourceLowPass,
     TimeCorrelatedNoise,
@@ -29,7 +29,7 @@ from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, SignalCache
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import MAX_HALF_INTERVAL_S, ClockOffset, estimate_time_offset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight.model import Flight, Unavailable
 
 # Minimum IMU rate (Hz) for an estimate of the time offset
 MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array
 from px4fuse.comparison.model import Comparison
-from px4fuse.flight import Ekf2, Flight, FlightMode, Unavailable
-from px4fuse.record import Span
+from px4fuse.core.arrays import Array
+from px4fuse.core.record import Span
+from px4fuse.flight.model import Ekf2, Flight, FlightMode, Unavailable
 
 # Minimum length of a gap in the position source, in s and in intervals of the source; jitter and
 # single lost positions are shorter

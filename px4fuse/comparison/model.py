@@ -8,14 +8,8 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.convention.model import Convention
-from px4fuse.errors import MissingDataError, suggest_name
-from px4fuse.filter.consistency import Consistency, HorizontalNis, classify_ratio
-from px4fuse.filter.kalman import Replay
-from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import AISLE, Axis, Segment
-from px4fuse.flight import Flight, PositionTrack
-from px4fuse.notebook_display import one_line_repr
-from px4fuse.record import (
+from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.core.record import (
     Count,
     NotNegative,
     OrUnavailable,
@@ -26,6 +20,12 @@ from px4fuse.record import (
     Unavailable,
     Vector,
 )
+from px4fuse.errors import MissingDataError, suggest_name
+from px4fuse.filter.consistency import Consistency, HorizontalNis, classify_ratio
+from px4fuse.filter.kalman import Replay
+from px4fuse.filter.settings import Settings
+from px4fuse.filter.signals import AISLE, Axis, Segment
+from px4fuse.flight.model import Flight, PositionTrack
 
 FilterName = Literal["kf", "ekf2"]
 FILTERS: tuple[FilterName, FilterName] = ("kf", "ekf2")

@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from px4fuse.arrays import Array, BoolArray
 from px4fuse.comparison.model import Comparison, north_and_east
+from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.tuning import AxisTuning, tune
-from px4fuse.flight import Unavailable
+from px4fuse.flight.model import Unavailable
 
 # Minimum ratio of the mean NIS of both axes for a noise estimate of each axis, which takes time
 MIN_AXIS_NIS_RATIO = 1.7

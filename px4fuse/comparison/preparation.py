@@ -10,12 +10,13 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.projection import observation_variance
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import correct, find_faults
-from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
+from px4fuse.core.text import capitalise_first
 from px4fuse.errors import MissingDataError, SettingsError, suggest_name
 from px4fuse.filter.settings import SIGMA_Z_RANGE_M, Settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
-from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable
-from px4fuse.position_source import POSITION_FILE
+from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
+from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable
+from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers.mavlink_messages import POSITION_INPUTS
 from px4fuse.readers.px4_innovations import (
     GNSS,
@@ -25,7 +26,6 @@ from px4fuse.readers.px4_innovations import (
 )
 from px4fuse.readers.px4_topics import TOPIC_ORIGINS
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest, HeightName
-from px4fuse.text import capitalise_first
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
 # Origins of position sources by their PX4 topic or MAVLink message

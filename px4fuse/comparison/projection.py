@@ -7,10 +7,10 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array
-from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS
+from px4fuse.core.arrays import Array
 from px4fuse.filter.signals import AISLE, Axis, Segment, cut_to_segment, weighted_sum
-from px4fuse.flight import (
+from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS
+from px4fuse.flight.model import (
     AXIS_NAMES,
     Columns,
     Ekf2,

@@ -9,11 +9,11 @@ from px4fuse.comparison.estimates import Tuning, first_axis_tuning
 from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model
-from px4fuse.ekf2_parameters import EV_POS, PARAMETERS, Aid
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
-from px4fuse.flight import Unavailable
+from px4fuse.flight.ekf2_parameters import EV_POS, PARAMETERS, Aid
+from px4fuse.flight.model import Unavailable
 
 # Minimum ratio of √R to EKF2_EVP_NOISE with which R is the variance that the sender reports
 MIN_REPORTED_RATIO = 1.25

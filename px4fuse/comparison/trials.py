@@ -5,8 +5,8 @@ from collections.abc import Iterable, Mapping
 from typing import Literal
 
 from px4fuse.comparison.model import FilterName
+from px4fuse.core.record import Count, NotNegative, Positive, Record, Share
 from px4fuse.filter.consistency import Reference, classify_ratio
-from px4fuse.record import Count, NotNegative, Positive, Record, Share
 
 Statistic = Literal["nis", "nees", "difference"]
 Change = Mapping[str, float]

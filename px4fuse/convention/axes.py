@@ -18,9 +18,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from px4fuse.arrays import Array, IntArray
 from px4fuse.convention.model import Axes, Direction, HeadingSource, Unit
 from px4fuse.convention.motion import GRID_S, WINDOW_S, ImuMotion, SourceMotion
+from px4fuse.core.arrays import Array, IntArray
 
 MAX_OFFSET_S = 10.0
 MIN_OVERLAP_S = 10.0

@@ -31,7 +31,7 @@ from px4fuse.convention.motion import (
 )
 from px4fuse.convention.orientation import check_orientation
 from px4fuse.convention.texts import format_axes
-from px4fuse.flight import Columns, Flight, PositionTrack
+from px4fuse.flight.model import Columns, Flight, PositionTrack
 from px4fuse.trajectory.rotation import heading
 
 MIN_LOG_ODDS = 4.0  # log likelihood minus that of the best other convention

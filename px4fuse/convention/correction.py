@@ -7,13 +7,13 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.arrays import Array
 from px4fuse.convention.axes import CLOCKWISE, UNITS, without_drift
 from px4fuse.convention.model import Convention
 from px4fuse.convention.motion import read_inertial, replace_heading
 from px4fuse.convention.orientation import to_attitude
 from px4fuse.convention.texts import FRAME_AXES, OPPOSITE, format_axes
-from px4fuse.flight import Columns, Ekf2, Flight, PositionTrack, time_index
+from px4fuse.core.arrays import Array
+from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack, time_index
 from px4fuse.trajectory.rotation import from_elements, heading
 
 # Minimum rotation (°) of a frame with other axes, and of a frame that is only rotated: smaller

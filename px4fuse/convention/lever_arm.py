@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from px4fuse.arrays import Array
 from px4fuse.convention.motion import (
     GRID_S,
     WINDOW_S,
@@ -10,7 +9,8 @@ from px4fuse.convention.motion import (
     motion_from_imu,
     read_inertial,
 )
-from px4fuse.flight import Columns, Flight, PositionTrack
+from px4fuse.core.arrays import Array
+from px4fuse.flight.model import Columns, Flight, PositionTrack
 from px4fuse.trajectory.rotation import to_matrix
 
 # Minimum lever arm: m (twice the noise of good UWB), and σ; sources without one have up to 1.5

@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from px4fuse.record import NotNegative, Positive, Record
+from px4fuse.core.record import NotNegative, Positive, Record
 
 Verdict = Literal["determined", "ambiguous", "doubtful", "not determinable"]
 Direction = Literal["north", "east", "south", "west", "up", "down"]

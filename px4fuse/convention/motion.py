@@ -14,11 +14,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from px4fuse.arrays import Array, BoolArray, cumulative_integral
 from px4fuse.convention.model import HeadingSource
+from px4fuse.core.arrays import Array, BoolArray, cumulative_integral
 from px4fuse.ekf2.replay import inside_spans
 from px4fuse.filter.signals import imu_gaps
-from px4fuse.flight import Columns, Flight, Unavailable
+from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.trajectory.association import gap_limit, is_bracketed
 from px4fuse.trajectory.rotation import (
     conjugate,

@@ -10,9 +10,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from px4fuse.arrays import Array
 from px4fuse.convention.model import Frames, Order, OrientationConvention
 from px4fuse.convention.motion import Inertial
+from px4fuse.core.arrays import Array
 from px4fuse.ekf2.replay import inside_spans
 from px4fuse.trajectory.rotation import from_vector, heading, interpolate, multiply, to_matrix
 

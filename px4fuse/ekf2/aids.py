@@ -11,11 +11,11 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array, BoolArray
-from px4fuse.ekf2_parameters import AIDS, Aid
+from px4fuse.core.arrays import Array, BoolArray
+from px4fuse.core.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 from px4fuse.filter.consistency import assess, classify_mean_nis, nis_band
-from px4fuse.flight import AidLog, Ekf2, Flight, Unavailable, step_values_at
-from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
+from px4fuse.flight.ekf2_parameters import AIDS, Aid
+from px4fuse.flight.model import AidLog, Ekf2, Flight, Unavailable, step_values_at
 
 AidVerdict = Literal[
     "consistent",
@@ -184,8 +184,8 @@ def evaluate_aids(flight: Flight) -> dict[str, AidResult] | Unavailable:
     Returns
     -------
     mapping from PX4's name of the aiding source to AidResult, or Unavailable
-        In the order of :data:`~px4fuse.ekf2_parameters.AIDS`. Unavailable without EKF2, without
-        innovations, or without a flight.
+        In the order of :data:`~px4fuse.flight.ekf2_parameters.AIDS`. Unavailable without EKF2,
+        without innovations, or without a flight.
     """
     if isinstance(flight.ekf2, Unavailable):
         return flight.ekf2

@@ -8,7 +8,7 @@ Source: PX4-Autopilot ``EKF/bias_estimator`` (``bias_estimator.cpp``; before v1.
 
 import numpy as np
 
-from px4fuse.arrays import Array, BoolArray
+from px4fuse.core.arrays import Array, BoolArray
 
 # Noise density (m/s/√Hz) of the random walk of the bias (bias_nsd, common.h)
 BIAS_DENSITY = 0.13

@@ -10,8 +10,8 @@ radius uses q to the power 2.5, an ellipsoid's has 1.5), ``EKF/ekf_helper.cpp`` 
 
 import numpy as np
 
-from px4fuse.arrays import Array
-from px4fuse.flight import FusionRecord
+from px4fuse.core.arrays import Array
+from px4fuse.flight.model import FusionRecord
 from px4fuse.readers.px4_positions import EARTH_RADIUS_M
 
 EARTH_RATE_RAD_S = 7.292115e-5

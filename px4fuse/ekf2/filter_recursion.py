@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from px4fuse.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.ekf2.flow import fuse_flow
 from px4fuse.ekf2.heights import MIN_GATE, MIN_SIGMA, SENSORS, HeightFilter, barometer_samples
 from px4fuse.ekf2.inputs import FusionRules, Inputs
@@ -35,8 +36,7 @@ from px4fuse.ekf2.replay_segments import (
     ReplaySegment,
 )
 from px4fuse.ekf2.vision import VisionFilter, set_states, vision_samples
-from px4fuse.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
-from px4fuse.notebook_display import one_line_repr
+from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG, Aid
 
 # Flight time (s) of a preliminary filter run that estimates the correlations of the initial state
 CORRELATION_PASS_S = 8.0

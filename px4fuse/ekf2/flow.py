@@ -14,10 +14,10 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
 from px4fuse.ekf2.magnetometer import EventSamples, fuse_mean
 from px4fuse.ekf2.replay_segments import VELOCITY, ReplaySegment, SensorSamples, low_pass_weights
-from px4fuse.flight import FLOW_FILTER_WEIGHT
+from px4fuse.flight.model import FLOW_FILTER_WEIGHT
 
 
 def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) -> ReplaySegment:
@@ -27,7 +27,7 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
     ----------
     segment : ReplaySegment
     flow : DataFrame
-        Logged optical flow, see :attr:`px4fuse.flight.FusionRecord.flow`.
+        Logged optical flow, see :attr:`px4fuse.flight.model.FusionRecord.flow`.
     gate : float
         Innovation gate in √S.
     """

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from px4fuse.core.record import Span
 from px4fuse.ekf2.intervals import MAX_LATENESS_S
-from px4fuse.ekf2_parameters import AID_MASK, Aid
-from px4fuse.flight import Columns, Ekf2, PositionTrack, step_values_at
-from px4fuse.record import Span
+from px4fuse.flight.ekf2_parameters import AID_MASK, Aid
+from px4fuse.flight.model import Columns, Ekf2, PositionTrack, step_values_at
 
 EV_START_INTERVAL_S = 0.2  # s; EV_MAX_INTERVAL of PX4 v1.14 and later (ev_control.cpp)
 EV_STOP_INTERVAL_S = 0.4  # s; two times EV_MAX_INTERVAL (ev_pos_control.cpp)

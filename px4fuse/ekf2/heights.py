@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.ekf2.bias import BiasEstimator
 from px4fuse.ekf2.replay_segments import (
     HeightSamples,
@@ -25,8 +25,8 @@ from px4fuse.ekf2.replay_segments import (
     sample_steps,
     samples_by_event,
 )
-from px4fuse.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, fuses_by_mask
-from px4fuse.flight import GROUND_EFFECT, Ekf2, Flight, FusionRecord, step_values_at
+from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, fuses_by_mask
+from px4fuse.flight.model import GROUND_EFFECT, Ekf2, Flight, FusionRecord, step_values_at
 
 VELOCITY_DOWN, DOWN = 5, 8  # indices in the state
 SENSORS = (BAROMETER, GNSS_HGT)

@@ -11,7 +11,8 @@ from types import MappingProxyType
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.core.arrays import Array, BoolArray, IntArray
+from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.ekf2.earth_model import ekf2_metres_per_metre
 from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.heights import add_heights
@@ -23,7 +24,7 @@ from px4fuse.ekf2.replay_segments import (
     find_replay_segments,
     predict_s,
 )
-from px4fuse.ekf2_parameters import (
+from px4fuse.flight.ekf2_parameters import (
     AID_MASK,
     AIDS,
     BAROMETER,
@@ -37,7 +38,7 @@ from px4fuse.ekf2_parameters import (
     effective_settings,
     fuses_by_mask,
 )
-from px4fuse.flight import (
+from px4fuse.flight.model import (
     Columns,
     Ekf2,
     Flight,
@@ -46,8 +47,7 @@ from px4fuse.flight import (
     Unavailable,
     step_values_at,
 )
-from px4fuse.notebook_display import one_line_repr
-from px4fuse.position_source import POSITION_FILE
+from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers.px4_innovations import fused_aid, with_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE

@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.core.arrays import Array, BoolArray, IntArray
+from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.replay_segments import (
     BIASES,
@@ -33,7 +34,6 @@ from px4fuse.ekf2.replay_segments import (
     VELOCITY,
     ReplaySegment,
 )
-from px4fuse.notebook_display import one_line_repr
 from px4fuse.trajectory.rotation import rotate, skew
 
 # Maximum time (s) from the passage of the fusion horizon to the arrival of a sample that EKF2 still

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from px4fuse.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, IntArray
 from px4fuse.ekf2.replay_segments import BODY_FIELD, EARTH_FIELD, THETA, SensorSamples
 from px4fuse.trajectory.rotation import skew
 

@@ -20,7 +20,9 @@ import pandas as pd
 from msgspec import structs
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
+from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.core.record import Span
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
     POSITION_COLUMNS,
@@ -51,7 +53,8 @@ from px4fuse.ekf2.replay_segments import (
     VELOCITY,
     ReplaySegment,
 )
-from px4fuse.ekf2_parameters import (
+from px4fuse.errors import SettingsError
+from px4fuse.flight.ekf2_parameters import (
     BAROMETER,
     EV_POS,
     FIELD_NOISES,
@@ -62,11 +65,8 @@ from px4fuse.ekf2_parameters import (
     PARAMETERS,
     check_parameters,
 )
-from px4fuse.errors import SettingsError
-from px4fuse.flight import Columns, Ekf2, Flight, Unavailable
-from px4fuse.notebook_display import one_line_repr
+from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable
 from px4fuse.readers.px4_innovations import with_gnss_innovations
-from px4fuse.record import Span
 from px4fuse.trajectory.rotation import rotate
 
 # Maximum delay (s) of the fusion horizon: PX4's maximum of EKF2_DELAY_MAX

@@ -17,7 +17,7 @@ from scipy.linalg import lapack
 from scipy.sparse import csr_array, eye_array
 from scipy.sparse.linalg import spsolve
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,

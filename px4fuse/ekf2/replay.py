@@ -8,17 +8,26 @@ import pandas as pd
 from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.core.arrays import Array, BoolArray, IntArray
+from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.core.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
+from px4fuse.core.text import count_noun
 from px4fuse.ekf2.inputs import ANALYSIS_NAME, aid_source, replayed_aid, same_sample
 from px4fuse.ekf2.replay_segments import SETTLING_S
-from px4fuse.ekf2_parameters import AIDS, FLOW, GNSS_HGT, GNSS_VEL, MAG
 from px4fuse.filter import signals
 from px4fuse.filter.frame_rotation import heading_rad
-from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Columns, Ekf2, Flight, Truth, Unavailable
-from px4fuse.notebook_display import one_line_repr
+from px4fuse.flight.ekf2_parameters import AIDS, FLOW, GNSS_HGT, GNSS_VEL, MAG
+from px4fuse.flight.model import (
+    AXIS_NAMES,
+    AidLog,
+    AxisName,
+    Columns,
+    Ekf2,
+    Flight,
+    Truth,
+    Unavailable,
+)
 from px4fuse.readers.px4_innovations import innovations_along
-from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
-from px4fuse.text import count_noun
 
 Spans = tuple[Span, ...]
 HORIZONTAL: tuple[AxisName, AxisName] = ("north", "east")

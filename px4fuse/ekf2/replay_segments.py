@@ -12,12 +12,12 @@ import numpy as np
 import pandas as pd
 from scipy.linalg import block_diag
 
-from px4fuse.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.core.record import Span
 from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
-from px4fuse.flight import BAD_ACCELERATION, Columns, Ekf2, Flight, FusionRecord, Unavailable
-from px4fuse.notebook_display import one_line_repr
+from px4fuse.flight.model import BAD_ACCELERATION, Columns, Ekf2, Flight, FusionRecord, Unavailable
 from px4fuse.readers.px4_ekf2 import rows_of_timestamps, samples_per_step
-from px4fuse.record import Span
 from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,

@@ -20,18 +20,18 @@ from itertools import chain
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
+from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.core.record import Count, NotNegative, Record, Span
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, delayed_tracks, modelled_aids, replay_with_logged_rejections
 from px4fuse.ekf2.replay import Ekf2Replay, Spans, along, inside_spans, rms_to_truth
-from px4fuse.ekf2_parameters import EV_POS, FLOW, GNSS_POS, MAG
 from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
-from px4fuse.flight import Columns, Ekf2, Truth, Unavailable
-from px4fuse.notebook_display import one_line_repr
-from px4fuse.record import Count, NotNegative, Record, Span
+from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, MAG
+from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable
 
 ANALYSIS_NAME = "difference KF - EKF2"
 OTHER_TIME = Unavailable(

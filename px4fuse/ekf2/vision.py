@@ -15,14 +15,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.ekf2.bias import BiasEstimator
 from px4fuse.ekf2.heights import MIN_GATE, MIN_SIGMA
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.intervals import MAX_LATENESS_S
 from px4fuse.ekf2.replay import UPDATE_COLUMNS
 from px4fuse.ekf2.replay_segments import ReplaySegment, pad_samples, samples_by_event
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 
 # State indices of horizontal velocity and horizontal position
 HORIZONTAL_VELOCITY, HORIZONTAL_POSITION = slice(3, 5), slice(6, 8)

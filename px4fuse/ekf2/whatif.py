@@ -11,7 +11,9 @@ import numpy as np
 import pandas as pd
 from msgspec.structs import replace
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
+from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.core.record import Count, NotNegative, Record, Share
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.ekf2.model import Model, modelled_aids, replay_settings, with_position_noise
 from px4fuse.ekf2.replay import (
@@ -26,13 +28,11 @@ from px4fuse.ekf2.replay import (
     logged_innovations,
     rms_to_truth,
 )
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, MAG, check_parameters
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.frame_rotation import heading_rad
-from px4fuse.flight import AxisName, Columns, Ekf2, Flight, Unavailable
-from px4fuse.notebook_display import one_line_repr
-from px4fuse.record import Count, NotNegative, Record, Share
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, MAG, check_parameters
+from px4fuse.flight.model import AxisName, Columns, Ekf2, Flight, Unavailable
 
 ANALYSIS_NAME = "EKF2 what-if"
 # Minimum ratio of the number of logged innovations to the number of replayed innovations: with

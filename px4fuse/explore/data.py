@@ -17,7 +17,6 @@ from px4fuse.card.verdicts import verdicts
 from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth
 from px4fuse.comparison.preparation import shift_clock
 from px4fuse.comparison.remedy import aid_of
-from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.explore.packing import COARSE_SCALE, Packer
 from px4fuse.filter.consistency import CONFIDENCE_LEVEL, Consistency
 from px4fuse.filter.model import INITIAL_COVARIANCE
@@ -30,7 +29,8 @@ from px4fuse.filter.settings import (
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, cut_to_segment, imu_gaps, weighted_sum
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.flight import Columns, PositionTrack, Unavailable
+from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.model import Columns, PositionTrack, Unavailable
 from px4fuse.report.card_html import MARK_PATHS
 from px4fuse.request import ComparisonRequest, WhatIfRequest, command_line
 

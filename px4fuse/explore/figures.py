@@ -14,12 +14,12 @@ from bokeh.models import (
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
-from px4fuse.arrays import Array
 from px4fuse.card.model import SIGMA_RATIO_BANDS
 from px4fuse.comparison.estimates import Tuning
+from px4fuse.core.arrays import Array
+from px4fuse.core.record import Record, table
 from px4fuse.explore.data import Data
 from px4fuse.filter.tuning import AxisTuning
-from px4fuse.record import Record, table
 
 Style = dict[str, Any]  # options of a drawing function of Bokeh
 # The page's script sets the colours by `name`. KF is solid and round, EKF2 dashed and square, as in

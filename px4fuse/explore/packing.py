@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
 
 # Steps per unit: 1.5e-11 m, m/s or s, 1 % of the tolerance between the page's KF and Python's
 FINE_SCALE = 2.0**36

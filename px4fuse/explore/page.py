@@ -9,8 +9,8 @@ from px4fuse.analysis import Analysis
 from px4fuse.explore.data import Data, flight_data, ranges
 from px4fuse.explore.figures import FIGURES, document_json, has_reference
 from px4fuse.explore.packing import Packer
+from px4fuse.html.safe import clean_values, inert_json, load_template, policy_hash, read_asset
 from px4fuse.report.card_html import axis_figures, card_html, card_of, card_style
-from px4fuse.webpage.safe import clean_values, inert_json, load_template, policy_hash, read_asset
 
 MAX_LOG_TEXT_LENGTH = 2000  # maximum length of a text from a log; longer ones are shortened
 SCRIPT_NAMES = ("card", "step", "times", "tour")

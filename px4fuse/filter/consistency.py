@@ -12,9 +12,17 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import chdtrc, gammaincinv, stdtr
 
-from px4fuse.arrays import Array, ArrayPair
-from px4fuse.record import Correlation, Count, NotNegative, Positive, Record, Share, Unavailable
-from px4fuse.text import count_noun
+from px4fuse.core.arrays import Array, ArrayPair
+from px4fuse.core.record import (
+    Correlation,
+    Count,
+    NotNegative,
+    Positive,
+    Record,
+    Share,
+    Unavailable,
+)
+from px4fuse.core.text import count_noun
 
 # "underconfident": the reported σ is too large; "overconfident": the reported σ is too small
 Verdict = Literal["consistent", "underconfident", "overconfident"]

@@ -30,14 +30,14 @@ import pandas as pd
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
 from px4fuse.filter.fitting import NoiseFit, Noises, fit_noises, maximise_likelihood
 from px4fuse.filter.hypotheses import Jump, unit_steps
 from px4fuse.filter.imu_motion import PreparedMotion, SignalCache, prepare_motion
 from px4fuse.filter.likelihood import PROFILE_DROP
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, too_few_measurements
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight.model import Flight, Unavailable
 
 MIN_MEASUREMENTS = 100
 # Maximum number of measurements, to limit the computing time: only the middle of a longer flight is

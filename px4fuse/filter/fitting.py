@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import chdtri, comb, expit
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
 from px4fuse.filter.likelihood import Preintegrated
 from px4fuse.filter.marginal_likelihood import (
     FittedPositions,

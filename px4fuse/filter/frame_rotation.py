@@ -16,7 +16,9 @@ import pandas as pd
 from msgspec import structs
 from scipy.special import chdtrc
 
-from px4fuse.arrays import Array, ArrayPair, cumulative_integral
+from px4fuse.core.arrays import Array, ArrayPair, cumulative_integral
+from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.core.record import NotNegative, Record, Share
 from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S
 from px4fuse.filter.model import INITIAL_SIGMA_P_M, INITIAL_SIGMA_V_M_S, continuous_noise_unit
 from px4fuse.filter.settings import Settings
@@ -27,9 +29,7 @@ from px4fuse.filter.signals import (
     cut_to_segment,
     too_few_measurements,
 )
-from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
-from px4fuse.notebook_display import one_line_repr
-from px4fuse.record import NotNegative, Record, Share
+from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.trajectory.rotation import heading
 
 # Length (s) of the parts of the flight over which the heading error is averaged

@@ -27,7 +27,8 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from px4fuse.arrays import Array, ArrayPair, BoolArray, IntArray, cumulative_integral
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, cumulative_integral
+from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.filter.likelihood import (
     Preintegrated,
     innovations,
@@ -38,8 +39,7 @@ from px4fuse.filter.likelihood import (
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Acceleration, Axis, too_few_measurements
 from px4fuse.filter.steps import Timeline, make_timeline
-from px4fuse.flight import Columns, Flight, Unavailable
-from px4fuse.notebook_display import one_line_repr
+from px4fuse.flight.model import Columns, Flight, Unavailable
 
 ANALYSIS_NAME = "causes beyond noise"
 MIN_MEASUREMENTS = 50

@@ -24,13 +24,13 @@ import pandas as pd
 from scipy import constants
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.arrays import Array, IntArray, cumulative_integral
+from px4fuse.core.arrays import Array, IntArray, cumulative_integral
+from px4fuse.core.record import Span
 from px4fuse.filter.fitting import Noises, fit_ratios
 from px4fuse.filter.marginal_likelihood import Positions, centre_on_path
 from px4fuse.filter.model import continuous_noise_unit
 from px4fuse.filter.signals import imu_gaps
-from px4fuse.flight import Columns, Flight, Unavailable
-from px4fuse.record import Span
+from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.trajectory.rotation import cumulative_product, from_vector, multiply, rotate, to_matrix
 
 # Prior σ of the unknown constants, wide for consumer sensors: initial tilt and heading (rad), gyro

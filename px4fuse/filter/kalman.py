@@ -18,12 +18,12 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.filter import model
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import Timeline, make_timeline
-from px4fuse.notebook_display import one_line_repr
 
 StateRow = tuple[float, ...]
 # Columns of ``Replay.updates``

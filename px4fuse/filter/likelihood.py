@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 from scipy.special import chdtri
 
-from px4fuse.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.filter.model import (
     INITIAL_COVARIANCE,
     Symmetric,

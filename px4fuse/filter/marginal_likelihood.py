@@ -30,7 +30,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import lapack
 
-from px4fuse.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 
 UNIT_SCALE = np.ones(1)
 # SIGMA_A (m/s²) and SIGMA_Z (m) of the smooth path that is subtracted from the positions

@@ -17,7 +17,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
 
 STATE_COLUMNS = ["position_m", "velocity_m_s"]
 COVARIANCE_COLUMNS = ["position_variance_m2", "covariance_m2_s", "velocity_variance_m2_s2"]

@@ -16,11 +16,11 @@ from numpy.typing import ArrayLike
 from scipy import constants
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.arrays import Array, BoolArray, cumulative_integral
+from px4fuse.core.arrays import Array, BoolArray, cumulative_integral
+from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.core.record import Span
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.flight import AXIS_NAMES, Columns, Flight, PositionTrack, Unavailable
-from px4fuse.notebook_display import one_line_repr
-from px4fuse.record import Span
+from px4fuse.flight.model import AXIS_NAMES, Columns, Flight, PositionTrack, Unavailable
 
 AISLE = "aisle"
 # Maximum interval (s) between IMU samples: a longer interval is a gap

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from px4fuse.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis, step_means
-from px4fuse.flight import Unavailable
+from px4fuse.flight.model import Unavailable
 
 # Maximum difference (s) of two times that count as equal: timestamps have a resolution of 1 µs
 MAX_SAME_TIME_S = 5e-7

@@ -20,7 +20,9 @@ from msgspec import structs
 from scipy.interpolate import CubicSpline
 from scipy.special import chdtrc
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
+from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.core.record import Count, NotNegative, Record, Share, Span
 from px4fuse.filter.fitting import Noises, fit_noises, fit_ratios, maximise_likelihood
 from px4fuse.filter.imu_motion import (
     COARSE_MEASUREMENTS,
@@ -35,9 +37,7 @@ from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_int
 from px4fuse.filter.marginal_likelihood import FittedPositions, products_by_segment
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, cut_to_segment
-from px4fuse.flight import Columns, Flight, PositionTrack, Unavailable
-from px4fuse.notebook_display import one_line_repr
-from px4fuse.record import Count, NotNegative, Record, Share, Span
+from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 
 # Number of time offsets at which the likelihood is computed near its maximum
 FINE_OFFSETS = 11

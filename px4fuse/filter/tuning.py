@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from px4fuse.arrays import Array, BoolArray
+from px4fuse.core.arrays import Array, BoolArray
+from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.core.record import Count, NotNegative, OrUnavailable, Record
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_M_S2,
@@ -36,9 +38,7 @@ from px4fuse.filter.likelihood import (
 )
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, too_few_measurements
-from px4fuse.flight import Flight, Unavailable
-from px4fuse.notebook_display import one_line_repr
-from px4fuse.record import Count, NotNegative, OrUnavailable, Record
+from px4fuse.flight.model import Flight, Unavailable
 
 HORIZONTAL = "horizontal"
 NoiseInterval = tuple[NotNegative, NotNegative | None]

@@ -9,13 +9,13 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import airborne_spans
+from px4fuse.core.record import Span
+from px4fuse.core.text import capitalise_first, format_number, format_ratio
 from px4fuse.ekf2.aids import NOT_FUSED_LIMIT_S, WINDOW_S, AidResult
-from px4fuse.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
-from px4fuse.flight import Unavailable
-from px4fuse.record import Span
-from px4fuse.text import capitalise_first, format_number, format_ratio
+from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
+from px4fuse.flight.model import Unavailable
 
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
 # Time (s) after take-off in which EKF2 does not fuse the barometer: the ground changes the pressure

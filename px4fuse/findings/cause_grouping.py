@@ -4,9 +4,9 @@ from collections.abc import Iterable, Mapping
 
 from msgspec.structs import replace
 
+from px4fuse.core.record import table
 from px4fuse.finding import SEVERITIES, Finding
 from px4fuse.findings.model import TITLES, group_by_root
-from px4fuse.record import table
 
 # Key in Finding.evidence for the kind of cause, which re-runs with changed settings or data show
 CAUSE = "cause"

@@ -8,12 +8,12 @@ from px4fuse.comparison.causal_replays import Intervention
 from px4fuse.comparison.model import FilterName
 from px4fuse.comparison.remedy import aid_of, format_settings
 from px4fuse.comparison.trials import can_improve, improvement
-from px4fuse.ekf2_parameters import PARAMETERS
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import SETTING_UNITS
 from px4fuse.findings import cause_grouping as kinds
 from px4fuse.findings.model import format_percent
-from px4fuse.flight import Unavailable
+from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.model import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
 

@@ -9,12 +9,12 @@ import math
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.remedy import aid_of, format_settings
 from px4fuse.comparison.trials import Trial, find_trial, ratio_pairs
+from px4fuse.core.text import format_factor
 from px4fuse.filter.consistency import classify_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Severity
 from px4fuse.findings.model import Findings, finding, format_percent
-from px4fuse.flight import Unavailable, source_name
-from px4fuse.text import format_factor
+from px4fuse.flight.model import Unavailable, source_name
 
 # Minimum ratio of flown and estimated noise (σ) for an error; below, EKF2's error hardly changes
 MIN_RATIO_ERROR = 2.0

@@ -4,6 +4,8 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.comparison.model import Comparison
+from px4fuse.core.record import Span
+from px4fuse.core.text import capitalise_first, format_metres
 from px4fuse.ekf2.fusion_conditions import (
     EV_START_INTERVAL_S,
     EV_STOP_INTERVAL_S,
@@ -19,10 +21,8 @@ from px4fuse.findings.model import (
     spans_with_value,
     warning,
 )
-from px4fuse.flight import Ekf2, PositionTrack, Truth, Unavailable, positions_of
-from px4fuse.position_source import POSITION_FILE
-from px4fuse.record import Span
-from px4fuse.text import capitalise_first, format_metres
+from px4fuse.flight.model import Ekf2, PositionTrack, Truth, Unavailable, positions_of
+from px4fuse.flight.position_source import POSITION_FILE
 
 MIN_FUSING_SHARE_ERROR = 0.5  # fused fraction of the segment; below, other sensors dominate: error
 MIN_FUSING_SHARE_WARNING = 0.98  # fused fraction of the segment; 2 % of a minute are about 1 s

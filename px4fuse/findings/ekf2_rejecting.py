@@ -6,11 +6,11 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import Trial, improvement, preference
-from px4fuse.ekf2_parameters import GNSS_POS
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_text import format_action
 from px4fuse.findings.model import Findings, finding, format_percent, zero_length_spans
-from px4fuse.flight import Ekf2, Unavailable
+from px4fuse.flight.ekf2_parameters import GNSS_POS
+from px4fuse.flight.model import Ekf2, Unavailable
 
 REJECTED_SHARE_WARNING = 0.01  # rejected fraction for a warning; 6e-7 if consistent, with 5 √S
 REJECTED_SHARE_ERROR = 0.20  # rejected fraction for an error: R or the time offset is wrong

@@ -7,7 +7,7 @@ from px4fuse.comparison.flight_events import airborne_spans
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, GAP
 from px4fuse.findings.model import Findings, finding, format_count, warning, zero_length_spans
-from px4fuse.flight import Ekf2, Reset
+from px4fuse.flight.model import Ekf2, Reset
 
 # Time (s) after take-off in which EKF2 usually resets its height
 TAKE_OFF_S = 10.0

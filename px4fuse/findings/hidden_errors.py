@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.arrays import Array
 from px4fuse.comparison.causal_replays import (
     ErrorAboveSigma,
     Intervention,
@@ -27,6 +26,8 @@ from px4fuse.comparison.model import (
     FilterName,
     north_and_east,
 )
+from px4fuse.core.arrays import Array
+from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -34,9 +35,8 @@ from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CAUSE
 from px4fuse.findings.cause_text import classify_cause, format_action, is_refuted
 from px4fuse.findings.model import Findings, error, finding, format_percent, note
-from px4fuse.flight import Unavailable, source_name
+from px4fuse.flight.model import Unavailable, source_name
 from px4fuse.loop.model import Loop
-from px4fuse.text import format_metres, format_ratio
 from px4fuse.trajectory.alignment import fit_alignment
 
 MIN_NEES_ERROR = 16.0  # mean NEES from which the finding is an error: position errors of 4 σ

@@ -4,14 +4,14 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
+from px4fuse.core.record import Span
 from px4fuse.ekf2.inputs import MAX_LOST_SHARE, lost_imu_fraction
 from px4fuse.filter.hypotheses import MIN_BIAS_M_S2, BiasScaleJumpFit
 from px4fuse.filter.signals import Segment, cut_to_segment, imu_gaps
 from px4fuse.finding import MIN_SPAN_S
 from px4fuse.findings.missing import DEFAULT_PROFILE, VISION_PROFILE_BIT
 from px4fuse.findings.model import Findings, error, finding, format_percent, warning
-from px4fuse.flight import Columns, Ekf2, Flight, sample_rate
-from px4fuse.record import Span
+from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
 BIAS_ERROR_M_S2 = 0.3  # m/s²; bias from which the finding is an error: 0.15 m after 1 s
 TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))  # tilt error equivalent to a bias of 1 m/s²

@@ -1,10 +1,10 @@
 """False or inconsistent loop closures, excessive odometry drift, and an assumed landing place."""
 
 from px4fuse.analysis import Analysis
+from px4fuse.core.text import capitalise_first
 from px4fuse.finding import Finding
 from px4fuse.findings.model import Findings, error, note, warning
 from px4fuse.loop.model import LANDING_SOURCE, Closure, Loop
-from px4fuse.text import capitalise_first
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
 MAX_DROPPED_SHARE = 0.5  # of the closures; most closures of a flight are true, so more are drift

@@ -4,11 +4,11 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FILTERS, Comparison, FilterName, FilterSummary
+from px4fuse.core.text import capitalise_first
 from px4fuse.filter.consistency import CONSISTENT_RATIOS, ratio_interval
 from px4fuse.findings.model import Findings, note, warning
-from px4fuse.flight import Ekf2, Unavailable, positions_of
-from px4fuse.position_source import RECEIVED
-from px4fuse.text import capitalise_first
+from px4fuse.flight.model import Ekf2, Unavailable, positions_of
+from px4fuse.flight.position_source import RECEIVED
 
 RECEIVED_TOPIC = "vehicle_visual_odometry"
 DEFAULT_PROFILE = 1  # SDLOG_PROFILE bit 0, logged_topics.cpp

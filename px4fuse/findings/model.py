@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 import pandas as pd
 
+from px4fuse.core.record import Record, Span, table
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import SEVERITIES, Finding, Severity
-from px4fuse.record import Record, Span, table
 
 
 class CatalogueEntry(Record, frozen=True):

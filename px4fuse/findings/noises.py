@@ -24,7 +24,7 @@ from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, Filter
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of, format_settings, noise_change
 from px4fuse.comparison.trials import can_improve, find_trial
-from px4fuse.ekf2_parameters import BAROMETER
+from px4fuse.core.text import format_factor, format_number, format_ratio
 from px4fuse.filter.settings import SETTING_UNITS, Settings
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
@@ -39,9 +39,9 @@ from px4fuse.findings.cause_text import (
 from px4fuse.findings.hidden_errors import find_hidden_errors
 from px4fuse.findings.model import Findings, error, finding, format_percent, lower_severity
 from px4fuse.findings.source_positions import hardly_moved
-from px4fuse.flight import Columns, Unavailable, sample_rate
+from px4fuse.flight.ekf2_parameters import BAROMETER
+from px4fuse.flight.model import Columns, Unavailable, sample_rate
 from px4fuse.request import COMPARISON_OPTIONS
-from px4fuse.text import format_factor, format_number, format_ratio
 
 MIN_NOISE_RATIO = 1.5  # setting over estimate (σ) or its inverse; below, the track hardly changes
 MIN_NOISE_RATIO_ERROR = 4.0  # setting over estimate (σ) or its inverse, for severity "error"

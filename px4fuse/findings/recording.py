@@ -4,10 +4,10 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
+from px4fuse.core.text import capitalise_first, format_number
 from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.findings.model import Findings, finding, format_count, note, warning
-from px4fuse.flight import Ekf2, Flight
-from px4fuse.text import capitalise_first, format_number
+from px4fuse.flight.model import Ekf2, Flight
 
 
 def detect(analysis: Analysis) -> Findings:

@@ -4,11 +4,11 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
 from px4fuse.comparison.model import Comparison, FilterName
 from px4fuse.comparison.trials import Trial
-from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS, RECEIVER_DELAYS
 from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
 from px4fuse.findings.model import Findings, error, finding, warning
 from px4fuse.findings.source_positions import find_low_pass
 from px4fuse.findings.source_stamps import find_synchronisation
+from px4fuse.flight.ekf2_parameters import GNSS_POS, PARAMETERS, RECEIVER_DELAYS
 
 MIN_OFFSET_S = 0.03  # s; offset for a warning; at 1 m/s a third of the noise of good UWB (0.1 m)
 MIN_OFFSET_ERROR_S = 0.10  # s; offset for an error; at 1 m/s the noise of good UWB (0.1 m)

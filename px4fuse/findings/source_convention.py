@@ -19,11 +19,11 @@ from px4fuse.convention.texts import (
     describe_unit,
     format_axes,
 )
+from px4fuse.core.text import capitalise_first
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION, MISLEADING, UNUSABLE
 from px4fuse.findings.model import CATALOGUE, Findings, error, warning
-from px4fuse.flight import PositionTrack, positions_of, source_name
-from px4fuse.text import capitalise_first
+from px4fuse.flight.model import PositionTrack, positions_of, source_name
 
 CORRECT_FIRST = "Correct the position source first."
 # Findings about EKF2's parameters or the alignment, which a wrong source makes false

@@ -1,12 +1,12 @@
 """Position frame in FRD or misaligned, EKF2 heading errors, and alignment of a position file."""
 
 from px4fuse.analysis import Analysis
+from px4fuse.core.text import capitalise_first
 from px4fuse.filter.frame_rotation import MAX_DRIFT_P_VALUE, HeadingError
 from px4fuse.finding import Finding, Severity
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSING_SHARE_ERROR
 from px4fuse.findings.model import Findings, finding, fraction_on, note, warning
-from px4fuse.flight import Ekf2, Unavailable, positions_of, source_name
-from px4fuse.text import capitalise_first
+from px4fuse.flight.model import Ekf2, Unavailable, positions_of, source_name
 
 MIN_HEADING_SIGMAS = 4.0  # misalignment in σ; flights without a mistake reach 3.2
 MIN_HEADING_ERROR_DEG = 5.0  # °; real flights had errors of 3 to 4° of the magnetic heading

@@ -10,21 +10,21 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import reported_sigma
 from px4fuse.comparison.flight_events import max_interval_s
+from px4fuse.core.arrays import Array
+from px4fuse.core.record import Span
+from px4fuse.core.text import capitalise_first, format_metres
 from px4fuse.ekf2.aids import NOT_FUSED_LIMIT_S
 from px4fuse.ekf2.fusion_conditions import EV_START_INTERVAL_S
-from px4fuse.ekf2_parameters import AIDS, EV_POS, Aid
 from px4fuse.filter.kalman import state_at, variance_at
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.finding import Finding
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
-from px4fuse.flight import Ekf2, Unavailable, positions_of, step_values_at
-from px4fuse.position_source import ALIGNED, PositionKind
+from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, Aid
+from px4fuse.flight.model import Ekf2, Unavailable, positions_of, step_values_at
+from px4fuse.flight.position_source import ALIGNED, PositionKind
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
-from px4fuse.record import Span
-from px4fuse.text import capitalise_first, format_metres
 
 MIN_LOST_SHARE = 0.02  # of the positions; PX4 v1.14 and later loses 0 to 0.3 %, v1.13 8 to 9 %
 MIN_INTERVALS = 50  # minimum number of intervals for the detection of downsampling

@@ -9,6 +9,7 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import ErrorsAgainstTruth
+from px4fuse.core.text import capitalise_first, format_number
 from px4fuse.filter.consistency import CONSISTENT_RATIOS
 from px4fuse.filter.correlated_noise import TimeCorrelatedNoise
 from px4fuse.filter.signals import cut_to_segment
@@ -16,8 +17,7 @@ from px4fuse.findings.cause_grouping import WHITE_RATIO
 from px4fuse.findings.model import Findings, error, format_percent, note, warning
 from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_NATS, hardly_moved
-from px4fuse.flight import Columns, positions_of, source_name
-from px4fuse.text import capitalise_first, format_number
+from px4fuse.flight.model import Columns, positions_of, source_name
 
 MIN_CORRELATION_GAIN_NATS = 5.0  # log-likelihood gain; 1 of 400 flights without mistake exceeds it
 MIN_REPEAT_SHARE = 0.05  # of the positions, for a warning

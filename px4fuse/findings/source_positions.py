@@ -12,8 +12,9 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.arrays import Array
 from px4fuse.comparison.model import Comparison, north_and_east
+from px4fuse.core.arrays import Array
+from px4fuse.core.text import capitalise_first, format_factor, format_metres
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit
 from px4fuse.filter.signals import cut_to_segment
@@ -33,9 +34,8 @@ from px4fuse.findings.model import (
     zero_length_spans,
 )
 from px4fuse.findings.source_stamps import detect_arrival_times
-from px4fuse.flight import Columns, Unavailable, positions_of, source_name
-from px4fuse.position_source import PositionKind
-from px4fuse.text import capitalise_first, format_factor, format_metres
+from px4fuse.flight.model import Columns, Unavailable, positions_of, source_name
+from px4fuse.flight.position_source import PositionKind
 
 MIN_MOTION_RANGE_M = 0.5  # m; extent (5 to 95 % of the positions); below, the vehicle only hovers
 NOISE_RANGE_FACTOR = 1.25 * 3.29  # extent (5 to 95 %) of white noise in σ, with a margin of 25 %

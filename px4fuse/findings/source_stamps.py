@@ -4,12 +4,12 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
+from px4fuse.core.text import format_metres
 from px4fuse.ekf2.fusion_conditions import SET_TIMESTAMP, STAMP_FAULTS, SYNCHRONISE
 from px4fuse.findings.model import Findings, error, fraction_on, note, warning
-from px4fuse.flight import ARRIVAL_METHODS, Ekf2, FusionRecord, Unavailable, positions_of
-from px4fuse.log import SHARED_STAMPS, ClockMap
-from px4fuse.text import format_metres
+from px4fuse.flight.log import SHARED_STAMPS, ClockMap
+from px4fuse.flight.model import ARRIVAL_METHODS, Ekf2, FusionRecord, Unavailable, positions_of
 
 MAX_RECEIPT_JITTER_S = 0.010  # s; 1 cm at 1 m/s, a tenth of the noise of good UWB (0.1 m)
 MAX_ARRIVAL_AGE_S = 0.001  # s; PX4's time from receiving a message to publishing its position

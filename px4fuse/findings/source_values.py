@@ -7,15 +7,15 @@ import pandas as pd
 from scipy.interpolate import CubicHermiteSpline
 
 from px4fuse.analysis import Analysis
-from px4fuse.arrays import Array
 from px4fuse.comparison.flight_events import max_interval_s
 from px4fuse.convention.lever_arm import estimate_lever_arm
+from px4fuse.core.arrays import Array
+from px4fuse.core.record import Span
+from px4fuse.core.text import capitalise_first
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.findings.model import Findings, error, note, warning
 from px4fuse.findings.source_intervals import CHECKS, state_errors_after
-from px4fuse.flight import Columns, Ekf2, Unavailable, positions_of, source_name
-from px4fuse.record import Span
-from px4fuse.text import capitalise_first
+from px4fuse.flight.model import Columns, Ekf2, Unavailable, positions_of, source_name
 
 MIN_STEP_M = 0.05  # m; its error (1 σ) is 0.29 of it, so smaller steps are below the noise of UWB
 MIN_OFFSET_M = 0.1  # m between two senders; the noise of good UWB

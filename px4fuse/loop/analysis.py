@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from px4fuse.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, IntArray
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop import loop_segment
 from px4fuse.loop.closure import choose_key_frames, default_key_frame_spacing_m, to_z_down
 from px4fuse.loop.corrections import (

@@ -7,13 +7,13 @@ import numpy as np
 from msgspec import structs
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.record import to_serializable
 from px4fuse.errors import Px4FuseError
-from px4fuse.flight import Unavailable
+from px4fuse.flight.model import Unavailable
 from px4fuse.loop.closure import correct_by_distance, distribute_by_distance
 from px4fuse.loop.model import LANDING_SOURCE, Closure, CorrectedPath, CorrectionName
 from px4fuse.loop.odometry import ClosureWithEnd
-from px4fuse.record import to_serializable
 from px4fuse.trajectory.evaluation import Evaluation, evaluate
 from px4fuse.trajectory.graph.analysis import ROBUST, SOLUTIONS
 from px4fuse.trajectory.graph.covariance import gate_edges

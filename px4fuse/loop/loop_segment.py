@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.closure import DOWN, heading_change_rad
 from px4fuse.loop.model import TrueEnd
 from px4fuse.request import Landing

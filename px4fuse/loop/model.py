@@ -6,10 +6,10 @@ from typing import Literal
 
 import numpy as np
 
-from px4fuse.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.core.record import Count, NotNegative, OrUnavailable, Record, Share, Unavailable
 from px4fuse.errors import MissingDataError
-from px4fuse.notebook_display import one_line_repr
-from px4fuse.record import Count, NotNegative, OrUnavailable, Record, Share, Unavailable
 from px4fuse.trajectory.evaluation import Evaluation, Score
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution

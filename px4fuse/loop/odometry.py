@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array, IntArray
-from px4fuse.flight import Unavailable
+from px4fuse.core.arrays import Array, IntArray
+from px4fuse.flight.model import Unavailable
 from px4fuse.loop.closure import DOWN, heading_change_rad
 from px4fuse.loop.model import OdometryNoise, TrueEnd
 from px4fuse.request import GivenClosure

@@ -8,18 +8,26 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.arrays import Array
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.preparation import prepare
 from px4fuse.comparison.projection import continuous_state
+from px4fuse.core.arrays import Array
+from px4fuse.core.reading import display_name, read_head
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
-from px4fuse.flight import AXIS_NAMES, Columns, Ekf2, Flight, PositionTrack, Truth, Unavailable
+from px4fuse.flight.model import (
+    AXIS_NAMES,
+    Columns,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Truth,
+    Unavailable,
+)
 from px4fuse.readers import read_log
 from px4fuse.readers.common import finite_rows
 from px4fuse.readers.text_table import decode_text
 from px4fuse.readers.trajectory import read_trajectory
-from px4fuse.reading import display_name, read_head
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest
 from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 

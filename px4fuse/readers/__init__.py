@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
+from px4fuse.core.reading import display_name, read_head, read_log_bytes
 from px4fuse.errors import LogError, SettingsError
-from px4fuse.flight import Flight
-from px4fuse.reading import display_name, read_head, read_log_bytes
+from px4fuse.flight.model import Flight
 
 _SNIFF_BYTES = 16
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
@@ -53,7 +53,8 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
     ------
     LogError
         The file is missing, empty, not a regular file, larger than
-        :data:`px4fuse.reading.max_log_bytes`, of an unknown format, or contains no usable data.
+        :data:`px4fuse.core.reading.max_log_bytes`, of an unknown format, or contains no usable
+        data.
     SettingsError
         ``system`` is not a system id in the recording, or is given for a ULog.
     """

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array, BoolArray
-from px4fuse.flight import Columns, Ekf2, FlightMode, Spans, Unavailable
+from px4fuse.core.arrays import Array, BoolArray
+from px4fuse.flight.model import Columns, Ekf2, FlightMode, Spans, Unavailable
 
 # Maximum absolute value (SI units) of valid positions, velocities, accelerations and angles:
 # larger values are from damaged bytes

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from px4fuse.flight import Columns
+from px4fuse.flight.model import Columns
 
 # Maximum absolute value of valid fields: larger values are from damaged bytes. The largest valid
 # values are UNIX times in µs (1.8e15)

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
+from px4fuse.core.reading import display_name, read_bytes_limited
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.text_table import Rows, decode_text, format_line_error, quote
 from px4fuse.readers.trajectory import MAX_COORDINATE_M
-from px4fuse.reading import display_name, read_bytes_limited
 from px4fuse.trajectory.graph.initialisation import initialise
 from px4fuse.trajectory.graph.model import FROM_FILE, PoseGraph
 

@@ -10,14 +10,15 @@ from types import MappingProxyType
 import numpy as np
 import pandas as pd
 
-from px4fuse.ekf2_parameters import (
+from px4fuse.flight.ekf2_parameters import (
     EV_POS,
     GNSS_POS,
     REPORTED_PARAMETERS,
     effective_settings,
     replace_invalid_parameters,
 )
-from px4fuse.flight import (
+from px4fuse.flight.log import LogInfo, UnusedData
+from px4fuse.flight.model import (
     AXIS_NAMES,
     Columns,
     Ekf2,
@@ -27,7 +28,6 @@ from px4fuse.flight import (
     TableOrUnavailable,
     Unavailable,
 )
-from px4fuse.log import LogInfo, UnusedData
 from px4fuse.readers import common
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import mavlink_senders as senders

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import theilslopes
 
-from px4fuse.arrays import Array
-from px4fuse.log import ClockMap
+from px4fuse.core.arrays import Array
+from px4fuse.flight.log import ClockMap
 
 # Maximum median difference (s) between the timestamps of a sender and the boot time of receipt, for
 # timestamps that count as boot time

@@ -18,7 +18,7 @@ from fastcrc.crc16 import mcrf4xx  # CRC-16/MCRF4XX is MAVLink's X.25 checksum
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as dialect
 
-from px4fuse.arrays import BoolArray, IntArray
+from px4fuse.core.arrays import BoolArray, IntArray
 from px4fuse.errors import LogError
 
 Integers = NDArray[np.int64]

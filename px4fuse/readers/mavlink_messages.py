@@ -9,10 +9,10 @@ from typing import Any
 
 import msgspec
 
-from px4fuse.flight import RECORD_NOT_LOGGED, Unavailable
-from px4fuse.position_source import Origin, find_origin
+from px4fuse.core.record import table
+from px4fuse.flight.model import RECORD_NOT_LOGGED, Unavailable
+from px4fuse.flight.position_source import Origin, find_origin
 from px4fuse.readers.field_maps import Layout, expand_layouts
-from px4fuse.record import table
 
 AUTOPILOT_COMPONENT_ID = 1  # MAV_COMP_ID_AUTOPILOT1
 INVALID_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: sent by ground stations, cameras, companions

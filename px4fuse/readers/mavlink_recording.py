@@ -8,9 +8,9 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array, IntArray
-from px4fuse.flight import Columns, time_index
-from px4fuse.log import Stream
+from px4fuse.core.arrays import Array, IntArray
+from px4fuse.flight.log import Stream
+from px4fuse.flight.model import Columns, time_index
 from px4fuse.readers.common import MIN_QUATERNION_NORM
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.mavlink_clocks import MIN_UNIX_TIME_S, Line, fit_least_delay, is_running_clock
@@ -66,7 +66,7 @@ class Recording:
         Sentences on unreadable parts of the file.
     notes : list of str
     restarts, receive_time_reversals : int or None
-        See :class:`~px4fuse.log.LogInfo`.
+        See :class:`~px4fuse.flight.log.LogInfo`.
     dropped : dict
         Number of samples with an invalid timestamp, by message; filled by :meth:`read`.
     streams : dict

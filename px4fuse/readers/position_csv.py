@@ -17,15 +17,15 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array, median_interval
+from px4fuse.core.arrays import Array, median_interval
+from px4fuse.core.reading import display_name, read_bytes_limited
 from px4fuse.errors import LogError, SettingsError
-from px4fuse.flight import NO_INVALID_ROWS, time_index
+from px4fuse.flight.model import NO_INVALID_ROWS, time_index
 from px4fuse.readers import position_names
 from px4fuse.readers.common import find_invalid, rounding_step
 from px4fuse.readers.position_names import LENGTH_UNITS, TIME_UNITS, ColumnMeaning, read_column_name
 from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, decode_text, quote
 from px4fuse.readers.ulog_topics import longest_increasing_run
-from px4fuse.reading import display_name, read_bytes_limited
 
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
@@ -78,7 +78,7 @@ class PositionRecording:
     metres_per_unit : float
         Factor that was applied to the first position column.
     invalid : Series
-        Rows that are no measurement, as in :class:`~px4fuse.flight.PositionTrack`.
+        Rows that are no measurement, as in :class:`~px4fuse.flight.model.PositionTrack`.
     step_m : float
         Rounding step of the coarsest horizontal coordinate; 0 if there is none.
     """

@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, Aid
-from px4fuse.flight import AidLog, StepFunctions, step_values_at
+from px4fuse.flight.ekf2_parameters import AIDS, DISTURBANCES, Aid
+from px4fuse.flight.model import AidLog, StepFunctions, step_values_at
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import join_nearest
 from px4fuse.readers.field_maps import Layout

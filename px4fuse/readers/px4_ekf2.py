@@ -10,10 +10,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from px4fuse import flight
-from px4fuse.arrays import Array, IntArray, median_interval
-from px4fuse.ekf2_parameters import AIDS, DISTURBANCES, EV_POS, FLOW, effective_settings
-from px4fuse.flight import (
+from px4fuse.core.arrays import Array, IntArray, median_interval
+from px4fuse.flight import model as flight
+from px4fuse.flight.ekf2_parameters import AIDS, DISTURBANCES, EV_POS, FLOW, effective_settings
+from px4fuse.flight.model import (
     Columns,
     Ekf2,
     FusionRecord,

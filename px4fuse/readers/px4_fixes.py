@@ -3,8 +3,8 @@
 import numpy as np
 import pandas as pd
 
-from px4fuse.arrays import Array
-from px4fuse.flight import Columns, Ekf2, Unavailable, time_index
+from px4fuse.core.arrays import Array
+from px4fuse.flight.model import Columns, Ekf2, Unavailable, time_index
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.readers.ulog_topics import Topics

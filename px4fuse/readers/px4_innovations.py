@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from px4fuse.ekf2_parameters import GNSS_POS, TABLES
-from px4fuse.flight import AXIS_NAMES, AidLog, AxisName, Ekf2, TableOrUnavailable, Unavailable
+from px4fuse.flight.ekf2_parameters import GNSS_POS, TABLES
+from px4fuse.flight.model import AXIS_NAMES, AidLog, AxisName, Ekf2, TableOrUnavailable, Unavailable
 
 Innovations = dict[AxisName, TableOrUnavailable]
 
@@ -87,7 +87,7 @@ def innovations_by_axis(
     ----------
     aids : mapping from PX4 name to AidLog
     fusion_flags : DataFrame or Unavailable
-        Fusion flags, see :class:`~px4fuse.flight.Ekf2`.
+        Fusion flags, see :class:`~px4fuse.flight.model.Ekf2`.
     gate : float
         Innovation gate (√S), used to compute rejections if they are not logged.
     source : Ekf2Source

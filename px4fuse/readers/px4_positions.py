@@ -9,9 +9,10 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.arrays import Array, IntArray
-from px4fuse.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, effective_settings
-from px4fuse.flight import (
+from px4fuse.core.arrays import Array, IntArray
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, effective_settings
+from px4fuse.flight.log import SENDER_CLOCK, SHARED_STAMPS, ClockMap
+from px4fuse.flight.model import (
     NO_INVALID_ROWS,
     Columns,
     Ekf2,
@@ -22,8 +23,7 @@ from px4fuse.flight import (
     sort_by_preference,
     time_index,
 )
-from px4fuse.log import SENDER_CLOCK, SHARED_STAMPS, ClockMap
-from px4fuse.position_source import Origin, with_orientation
+from px4fuse.flight.position_source import Origin, with_orientation
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import (
     find_invalid,
@@ -108,7 +108,7 @@ def make_track(
     needed_columns : list of str
         Columns in which a valid sample must be finite.
     track_fields
-        Other fields of :class:`~px4fuse.flight.PositionTrack`.
+        Other fields of :class:`~px4fuse.flight.model.PositionTrack`.
     """
     status = samples[[name for name in STATUS_COLUMNS if name in samples]]
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)

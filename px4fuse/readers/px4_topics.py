@@ -12,10 +12,10 @@ from typing import Any
 
 import msgspec
 
-from px4fuse.ekf2_parameters import AIDS
-from px4fuse.position_source import Origin, find_origin
+from px4fuse.core.record import table
+from px4fuse.flight.ekf2_parameters import AIDS
+from px4fuse.flight.position_source import Origin, find_origin
 from px4fuse.readers.field_maps import Layout, expand_layouts
-from px4fuse.record import table
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.arrays import Array, BoolArray
+from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.errors import TrajectoryError
 
 # Minimum and maximum valid UNIX time (s): the years 2000 and 2100

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array, BoolArray
+from px4fuse.core.arrays import Array, BoolArray
+from px4fuse.core.reading import display_name, read_bytes_limited
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, Rows, decode_text, is_number, quote
-from px4fuse.reading import display_name, read_bytes_limited
 from px4fuse.trajectory.model import MIN_POSES, Frame, Kind, Trajectory
 
 MAX_FILE_BYTES = 500_000_000

@@ -4,8 +4,9 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.ekf2_parameters import BAROMETER
-from px4fuse.flight import (
+from px4fuse.flight.ekf2_parameters import BAROMETER
+from px4fuse.flight.log import UnusedData
+from px4fuse.flight.model import (
     MODES_NOT_LOGGED,
     Columns,
     Flight,
@@ -16,7 +17,6 @@ from px4fuse.flight import (
     Unavailable,
     time_index,
 )
-from px4fuse.log import UnusedData
 from px4fuse.readers import common
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.field_maps import Layout

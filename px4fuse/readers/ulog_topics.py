@@ -21,14 +21,18 @@ from numpy.typing import NDArray
 from pyulog import ULog
 from pyulog.exceptions import ULogException
 
-from px4fuse.arrays import IntArray
-from px4fuse.ekf2_parameters import PARAMETERS, REPORTED_PARAMETERS, replace_invalid_parameters
+from px4fuse.core.arrays import IntArray
+from px4fuse.core.text import join_first
 from px4fuse.errors import LogError
-from px4fuse.flight import time_index
-from px4fuse.log import Dropout, LogInfo, Stream
+from px4fuse.flight.ekf2_parameters import (
+    PARAMETERS,
+    REPORTED_PARAMETERS,
+    replace_invalid_parameters,
+)
+from px4fuse.flight.log import Dropout, LogInfo, Stream
+from px4fuse.flight.model import time_index
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
-from px4fuse.text import join_first
 
 _MICROSECOND = 1e-6
 # Maximum delay (s) from measurement to publication: with a longer delay the measurement time is not

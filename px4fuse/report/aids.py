@@ -6,14 +6,14 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
+from px4fuse.core.text import format_number
 from px4fuse.ekf2.aids import AidResult, flight_span
 from px4fuse.findings import Finding
-from px4fuse.flight import AidLog, Flight, Unavailable, step_values_at
+from px4fuse.flight.model import AidLog, Flight, Unavailable, step_values_at
 from px4fuse.report import style
 from px4fuse.report.event_marks import GROUND_BAND
 from px4fuse.report.page import Cell, Page, appendix_title
 from px4fuse.report.phrases import format_sigma_verdict, write_findings
-from px4fuse.text import format_number
 
 TITLE = "Aiding sources of EKF2"
 LEAD_TEXT = (

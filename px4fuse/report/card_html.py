@@ -16,6 +16,7 @@ from px4fuse.card.numbers import axis_fraction, format_ratio
 from px4fuse.card.verdicts import verdicts
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import Reference
+from px4fuse.html.safe import load_template, read_asset
 from px4fuse.report.card_text import (
     FILTER_NAMES,
     LABELLED_TICKS,
@@ -28,7 +29,6 @@ from px4fuse.report.card_text import (
     rerun_start,
     with_typed_path,
 )
-from px4fuse.webpage.safe import load_template, read_asset
 
 SEVERITY_SIGNS = {
     "error": "■ ERROR",
@@ -152,7 +152,7 @@ def band_limits() -> str:
 
 
 def card_style() -> str:
-    """Return the style sheet of the card; its colours are in ``webpage/colours.css``."""
+    """Return the style sheet of the card; its colours are in ``html/colours.css``."""
     return read_asset("card.css", "px4fuse.report")
 
 

@@ -6,15 +6,15 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import aid_of, delay_ms
 from px4fuse.convention.correction import find_faults
-from px4fuse.ekf2_parameters import PARAMETERS
+from px4fuse.core.text import format_p_value
 from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
 from px4fuse.findings import Finding
 from px4fuse.findings.source_clock import clock_offset_option_s
-from px4fuse.flight import Unavailable
+from px4fuse.flight.ekf2_parameters import PARAMETERS
+from px4fuse.flight.model import Unavailable
 from px4fuse.report.page import Page, draw_legend_above
 from px4fuse.report.style import KF_BAND_COLOUR, KF_LINE, Axes
 from px4fuse.results.contract import ComparisonResults
-from px4fuse.text import format_p_value
 
 CURVE_HEIGHT = 170.0  # height (points) of the axes
 MAX_DROP_NATS = 12.0  # lower end of the log-likelihood axis, in nats below the maximum

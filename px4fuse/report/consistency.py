@@ -11,9 +11,10 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison, FilterSummary, UntestedFilter
 from px4fuse.comparison.trials import Statistic
+from px4fuse.core.text import format_number, format_p_value
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
 from px4fuse.findings.cause_text import format_change, format_explained_share
-from px4fuse.flight import Unavailable
+from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks
 from px4fuse.report.page import Cell, Page, draw_legend_above, halves
 from px4fuse.report.panels import normalised_innovations
@@ -29,7 +30,6 @@ from px4fuse.report.style import (
     line_style,
     set_plain_ticks,
 )
-from px4fuse.text import format_number, format_p_value
 
 MAX_LAG = 20
 MAX_NORMALISED = 4.0

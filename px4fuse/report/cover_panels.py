@@ -12,14 +12,14 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.arrays import Array
 from px4fuse.card.build import horizontal_resets
 from px4fuse.card.model import Card
 from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.comparison.comparison import kf_state_and_variance, position_errors, reported_sigma
 from px4fuse.comparison.model import FILTERS, AxisComparison
+from px4fuse.core.arrays import Array
 from px4fuse.filter.signals import AISLE, cut_to_segment
-from px4fuse.flight import Ekf2, Truth
+from px4fuse.flight.model import Ekf2, Truth
 from px4fuse.report import style
 from px4fuse.report.card_text import FILTER_NAMES
 from px4fuse.report.event_marks import (

@@ -7,12 +7,13 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
+from px4fuse.core.text import capitalise_first
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
 from px4fuse.ekf2.steps import DifferenceExplanation
-from px4fuse.ekf2_parameters import AIDS
 from px4fuse.filter.signals import AISLE
-from px4fuse.flight import Unavailable
+from px4fuse.flight.ekf2_parameters import AIDS
+from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks
 from px4fuse.report.page import Page, halves
 from px4fuse.report.style import (
@@ -25,7 +26,6 @@ from px4fuse.report.style import (
     Axes,
     draw_curve,
 )
-from px4fuse.text import capitalise_first
 
 TITLE = "Difference between KF and EKF2, step by step"
 ROW_HEIGHT, LABEL_WIDTH = 12.0, 140.0  # height of a bar and width of its label (points)

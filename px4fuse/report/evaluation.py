@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from px4fuse.arrays import Array, IntArray
-from px4fuse.flight import Unavailable
+from px4fuse.core.arrays import Array, IntArray
+from px4fuse.flight.model import Unavailable
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.report import style
 from px4fuse.report.page import PAGE_WIDTH, Page, halves

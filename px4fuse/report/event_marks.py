@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.page import Page
 from px4fuse.report.style import (

@@ -11,8 +11,8 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison
+from px4fuse.core.record import Span
 from px4fuse.filter.signals import Segment
-from px4fuse.record import Span
 from px4fuse.report import event_marks, panels, style
 from px4fuse.report.difference_page import unexplained_note
 from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from px4fuse.analysis import Analysis
+from px4fuse.core.text import capitalise_first, format_p_value, join_first
 from px4fuse.findings import Finding, group_by_root
-from px4fuse.flight import Unavailable
+from px4fuse.flight.model import Unavailable
 from px4fuse.loop import corrections
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.loop.corrections import SINGLE_LOOP_REASON
@@ -17,7 +18,6 @@ from px4fuse.report.page import Cell, Page, appendix_title
 from px4fuse.report.phrases import student_line, write_finding
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, MUTED_COLOUR, Axes, set_map_axes
 from px4fuse.results.contract import LoopResults
-from px4fuse.text import capitalise_first, format_p_value, join_first
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.analysis import MAX_ROBUST_CLOSURES, SOLUTIONS, SolvedGraph
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA

@@ -13,10 +13,10 @@ from itertools import accumulate
 from typing import TYPE_CHECKING
 
 from px4fuse.analysis import Analysis
-from px4fuse.answer_form import Answers, form_rows
 from px4fuse.errors import SettingsError
 from px4fuse.report.page import Page, appendix_title
 from px4fuse.report.style import MUTED_COLOUR
+from px4fuse.results.answer_form import Answers, form_rows
 from px4fuse.results.contract import AidsResults, ComparisonResults, LoopResults
 
 if TYPE_CHECKING:

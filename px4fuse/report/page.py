@@ -11,8 +11,8 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from px4fuse.core.text import with_log_name
 from px4fuse.report.style import FONT, MUTED_COLOUR, Artist, Axes
-from px4fuse.text import with_log_name
 
 # points; widths of the text, of the tick labels left of axes, of the labels before texts
 PAGE_WIDTH, AXIS_LEFT, LABEL_WIDTH = 178.0 * 72.0 / 25.4, 30.0, 52.0

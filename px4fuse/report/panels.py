@@ -12,7 +12,7 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.consistency import Consistency
-from px4fuse.flight import Unavailable
+from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks, style
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import filters_by_name, format_verdict

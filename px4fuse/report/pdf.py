@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from importlib import metadata
 from typing import Any
 
-from px4fuse.memory import release_free_memory
+from px4fuse.core.memory import release_free_memory
 from px4fuse.report import (
     aids,
     clock,

@@ -12,16 +12,16 @@ from px4fuse.comparison.model import (
     FilterSummary,
     UntestedFilter,
 )
+from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.findings import Finding, finding_title, group_by_root
-from px4fuse.flight import Alignment, Truth, Unavailable
-from px4fuse.log import ClockMap
+from px4fuse.flight.log import ClockMap
+from px4fuse.flight.model import Alignment, Truth, Unavailable
 from px4fuse.report.page import styled_text
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.model import Student
-from px4fuse.text import capitalise_first, format_factor, format_number
 
 if TYPE_CHECKING:
     from px4fuse.analysis import Analysis

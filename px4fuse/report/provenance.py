@@ -4,8 +4,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
-from px4fuse.flight import Flight, PositionTrack, Unavailable
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
+from px4fuse.flight.model import Flight, PositionTrack, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.report import clock, fonts
 from px4fuse.report.cover import ALL_FINDINGS

@@ -6,15 +6,15 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.arrays import Array
 from px4fuse.comparison.model import AxisComparison, Comparison
+from px4fuse.core.arrays import Array
+from px4fuse.core.text import format_factor, format_number
 from px4fuse.filter.fitting import START_OUTLIER_WIDTH
 from px4fuse.filter.likelihood import FilterStates, filter_states, preintegrate, score_grid
 from px4fuse.filter.tuning import HORIZONTAL, MIN_MEASUREMENTS, AxisTuning, Noise
-from px4fuse.flight import Unavailable
+from px4fuse.flight.model import Unavailable
 from px4fuse.report.page import Page, draw_legend_above, halves
 from px4fuse.report.style import KF_COLOUR, set_plain_ticks
-from px4fuse.text import format_factor, format_number
 
 NOISE_FACTOR = 4.0
 # Label of each compared pair of noises, and its factors on SIGMA_A and SIGMA_Z

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
 
 if TYPE_CHECKING:
     import pandas as pd

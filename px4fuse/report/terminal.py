@@ -5,6 +5,7 @@ from typing import Any
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.card.model import Card
 from px4fuse.comparison.model import Comparison
+from px4fuse.core.text import capitalise_first
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.findings import group_by_root
 from px4fuse.report.aids import write_aids_of_comparison, write_aids_only
@@ -18,7 +19,6 @@ from px4fuse.report.phrases import (
     write_finding,
 )
 from px4fuse.report.style import MUTED_COLOUR
-from px4fuse.text import capitalise_first
 
 ERROR_LEGEND = (
     "KF-EKF2 is the RMS difference of position and velocity; RMSE is against ground truth. A "

@@ -5,14 +5,14 @@ from collections.abc import Callable
 from typing import Any
 
 from px4fuse.analysis import WhatIfAnalysis
+from px4fuse.core.text import format_number
 from px4fuse.ekf2.replay import HORIZONTAL
 from px4fuse.ekf2.whatif import ADDED_NOISE_M, HEIGHT_TIMEOUT_S, MAX_REJECTED_SHARE, Summary
-from px4fuse.ekf2_parameters import AIDS, PARAMETERS
 from px4fuse.filter.signals import AISLE
-from px4fuse.flight import Unavailable
+from px4fuse.flight.ekf2_parameters import AIDS, PARAMETERS
+from px4fuse.flight.model import Unavailable
 from px4fuse.report.difference_page import format_agreement, write_explanation
 from px4fuse.report.page import Page
-from px4fuse.text import format_number
 
 NOT_PREDICTABLE = "not predictable"
 Rows = tuple[tuple[str, Callable[[Any], str]], ...]

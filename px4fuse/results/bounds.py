@@ -13,8 +13,8 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 import msgspec
 from msgspec.structs import fields, replace
 
+from px4fuse.core.record import Unavailable
 from px4fuse.errors import ResultsError
-from px4fuse.record import Unavailable
 
 # Maximum absolute length (m), and ratio of two quantities, in results of a flight
 MAX_LENGTH_M, MAX_RATIO = 1e9, 1e6

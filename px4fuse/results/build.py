@@ -9,12 +9,12 @@ import msgspec
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis, WhatIfAnalysis
 from px4fuse.card.build import build_aids_card, build_card
 from px4fuse.comparison.model import Comparison
+from px4fuse.core.record import to_serializable
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import find_loop
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.model import Loop
-from px4fuse.record import to_serializable
 from px4fuse.request import (
     ComparisonRequest,
     EvaluationRequest,

@@ -17,6 +17,7 @@ from px4fuse.comparison.causal_replays import Intervention
 from px4fuse.comparison.model import AxisResult, FilterName
 from px4fuse.comparison.trials import Trial
 from px4fuse.convention.model import Convention
+from px4fuse.core.record import Count, OrUnavailable, Positive, Record, Sha256, Span, Unavailable
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.replay import Agreement, Replayed
 from px4fuse.ekf2.steps import DifferenceSteps
@@ -26,11 +27,10 @@ from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.time_offset import Clock
 from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.findings import Finding
-from px4fuse.flight import Alignment
-from px4fuse.log import ClockMap, InputFile, LogInfo
+from px4fuse.flight.log import ClockMap, InputFile, LogInfo
+from px4fuse.flight.model import Alignment
+from px4fuse.flight.position_source import DataPath, PositionKind
 from px4fuse.loop.model import LoopResult
-from px4fuse.position_source import DataPath, PositionKind
-from px4fuse.record import Count, OrUnavailable, Positive, Record, Sha256, Span, Unavailable
 from px4fuse.request import AxisName, ComparisonRequest, InputName, LoopRequest, WhatIfRequest
 from px4fuse.results.model import SCHEMA_VERSION, Provenance, Schema, Student, Version
 from px4fuse.trajectory.evaluation import Score

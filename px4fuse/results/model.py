@@ -7,8 +7,8 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from px4fuse.answer_form import Answers
-from px4fuse.record import Record
+from px4fuse.core.record import Record
+from px4fuse.results.answer_form import Answers
 
 # Version of the results schema: a new field increases the minor version, another change the major
 SCHEMA_VERSION = "4.0"

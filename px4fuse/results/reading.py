@@ -2,15 +2,14 @@
 
 import json
 import re
-import unicodedata
-from functools import cache
 from typing import Any, get_args
 
 import msgspec
 from msgspec.structs import fields
 
+from px4fuse.core.record import decode_record_or_unavailable
+from px4fuse.core.text import clean_text, one_line
 from px4fuse.errors import ResultsError
-from px4fuse.record import decode_record_or_unavailable
 from px4fuse.results.bounds import types_of
 from px4fuse.results.contract import RESULTS_BY_SCHEMA, Results
 from px4fuse.results.model import SCHEMA_VERSION
@@ -99,42 +98,3 @@ def _clean_values(value: Any) -> Any:
     if isinstance(value, int) and value.bit_length() > INTEGER_BITS:
         raise ValueError("an integer is too large")
     return list(map(_clean_values, value)) if isinstance(value, list) else value
-
-
-def clean_text(text: str) -> str:
-    r"""Remove characters that control a terminal, a page layout or the text direction.
-
-    These are control characters other than newline and tab, bidirectional embeddings, overrides
-    and isolates, line and paragraph separators, tag characters, noncharacters and lone surrogates.
-    Letters and symbols of all languages remain.
-
-    >>> clean_text("Zo\u00eb\x1b[2J \u202egnp.exe\ud800")
-    'Zoë[2J gnp.exe'
-    """
-    return text if text.isascii() and text.isprintable() else "".join(filter(_is_harmless, text))
-
-
-def one_line(text: str, length: int) -> str:
-    r"""Clean a text (see :func:`clean_text`) and shorten it to one line of ``length`` characters.
-
-    >>> one_line("a\nb\t c", 4)
-    'a b…'
-    """
-    # the text is cut first, because cleaning millions of characters would be slow
-    line = " ".join(clean_text(text[: 10 * length]).split())
-    return line if len(line) <= length else line[: length - 1].rstrip() + "…"
-
-
-@cache
-def _is_harmless(character: str) -> bool:
-    code = ord(character)
-    if character in "\n\t":
-        return True
-    return not (
-        unicodedata.category(character) in {"Cc", "Cs", "Zl", "Zp"}
-        or 0x202A <= code <= 0x202E
-        or 0x2066 <= code <= 0x2069
-        or 0xE0000 <= code <= 0xE007F
-        or 0xFDD0 <= code <= 0xFDEF
-        or code & 0xFFFE == 0xFFFE
-    )

@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.core.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.filter_recursion import (
     EAST,
     HEADING,
@@ -42,7 +42,14 @@ from px4fuse.ekf2.replay_segments import (
     downsample_imu,
     step_ends,
 )
-from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid, effective_settings
+from px4fuse.flight.ekf2_parameters import (
+    BAROMETER,
+    GNSS_POS,
+    GNSS_VEL,
+    MAG,
+    Aid,
+    effective_settings,
+)
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ekf2_topics import VEHICLE_AID_SOURCE_HZ, TopicTrack, ekf2_topics
 from px4fuse.simulation.mistakes import Mistakes

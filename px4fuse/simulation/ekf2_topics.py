@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.core.arrays import Array, BoolArray, IntArray
 from px4fuse.ekf2.filter_recursion import EAST, NORTH, POSITION_COLUMNS, SegmentRun
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.replay_segments import POSITION
-from px4fuse.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid
+from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid
 from px4fuse.readers.px4_ekf2 import MAG_3D_BIT
 from px4fuse.readers.px4_positions import unproject
 from px4fuse.simulation import sensors

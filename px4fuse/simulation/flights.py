@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from px4fuse.core.text import to_json_types
 from px4fuse.ekf2.inputs import MODEL_NOTE
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.errors import SettingsError
-from px4fuse.flight import Flight
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
+from px4fuse.flight.model import Flight
 from px4fuse.readers.ulog import read_ulog
 from px4fuse.readers.ulog_topics import NOTE_KEY
 from px4fuse.simulation import ekf2, sensors
@@ -18,7 +19,6 @@ from px4fuse.simulation.mistakes import MISTAKES, Mistakes, active_mistakes, for
 from px4fuse.simulation.motion import Motion, plan
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic, encode
-from px4fuse.text import to_json_types
 
 NO_MISTAKES = Mistakes()
 # Values of the PX4 parameters that let EKF2 fuse horizontal positions, with GNSS also velocity

@@ -7,10 +7,10 @@ mistake has a default size that px4fuse detects easily.
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
+from px4fuse.core.record import table
+from px4fuse.core.units import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError, suggest_name
-from px4fuse.record import table
 from px4fuse.simulation.scenario import KINDS, Kind, bounded_number, quantities
-from px4fuse.units import UNIT_NAMES, convert_to_unit
 
 
 @dataclass(frozen=True)

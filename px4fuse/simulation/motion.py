@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import constants
 
-from px4fuse.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.scenario import CORNER_DURATION_S, START_STOP_S, Scenario

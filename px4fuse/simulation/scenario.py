@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from px4fuse.ekf2_parameters import EV_POS, GNSS_POS, Aid
 from px4fuse.errors import SettingsError
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, Aid
 
 Kind = Literal["aisle", "loop", "outdoor"]
 Yaw = Literal["fixed", "follow"]
@@ -34,7 +34,7 @@ class Bounds:
     ----------
     low, high : float
     unit : str
-        As in :data:`px4fuse.units.UNIT_NAMES`.
+        As in :data:`px4fuse.core.units.UNIT_NAMES`.
     cli_name : str
         Name of the option, or placeholder in the syntax of a `--mistake`.
     meaning : str

@@ -11,8 +11,8 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array, BoolArray
-from px4fuse.ekf2_parameters import GNSS_POS, PARAMETERS
+from px4fuse.core.arrays import Array, BoolArray
+from px4fuse.flight.ekf2_parameters import GNSS_POS, PARAMETERS
 from px4fuse.readers.px4_positions import unproject
 from px4fuse.readers.px4_topics import GPS_POSITION
 from px4fuse.simulation.mistakes import Mistakes

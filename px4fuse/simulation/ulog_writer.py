@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from px4fuse.core.record import table
 from px4fuse.readers import ULOG_MAGIC
-from px4fuse.record import table
 
 _ULOG_VERSION = b"\x01"
 # ULog names of numpy types; for integer types ULog adds "_t"

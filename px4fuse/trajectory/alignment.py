@@ -10,9 +10,9 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
+from px4fuse.core.record import Count, Record, Vector
 from px4fuse.errors import TrajectoryError
-from px4fuse.record import Count, Record, Vector
 from px4fuse.trajectory.model import MIN_POSES
 
 AlignmentKind = Literal["none", "yaw", "se3", "sim3"]

@@ -6,9 +6,9 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Slerp
 
-from px4fuse.arrays import Array, BoolArray, IntArray, median_interval
+from px4fuse.core.arrays import Array, BoolArray, IntArray, median_interval
+from px4fuse.core.record import Count, NotNegative, Record
 from px4fuse.errors import TrajectoryError
-from px4fuse.record import Count, NotNegative, Record
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
 Method = Literal["interpolate", "nearest"]

@@ -5,7 +5,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from px4fuse.arrays import Array, BoolArray, Complex
+from px4fuse.core.arrays import Array, BoolArray, Complex
 
 Series = TypeVar("Series", Array, Complex)
 

@@ -14,12 +14,12 @@ import numpy as np
 from msgspec import structs
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array, median_interval
+from px4fuse.core.arrays import Array, median_interval
+from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.core.record import OrUnavailable, Record
+from px4fuse.core.text import capitalise_first
 from px4fuse.errors import TrajectoryError
-from px4fuse.flight import Unavailable
-from px4fuse.notebook_display import one_line_repr
-from px4fuse.record import OrUnavailable, Record
-from px4fuse.text import capitalise_first
+from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory import scores
 from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit_alignment, umeyama
 from px4fuse.trajectory.association import Association, Method, associate

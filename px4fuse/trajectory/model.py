@@ -10,9 +10,9 @@ import numpy as np
 from msgspec import Meta
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array, BoolArray, IntArray
-from px4fuse.notebook_display import one_line_repr
-from px4fuse.record import Count, Record
+from px4fuse.core.arrays import Array, BoolArray, IntArray
+from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.core.record import Count, Record
 
 # Source of a trajectory; "slam": SLAM in the frame of its first key frame (such as ORB-SLAM3)
 Kind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
 
 
 def multiply(a: Array, b: Array) -> Array:

@@ -10,11 +10,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, stdtrit
 
-from px4fuse.arrays import Array, IntArray, median_interval
+from px4fuse.core.arrays import Array, IntArray, median_interval
+from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.core.record import Count, NotNegative, OrUnavailable, Record
 from px4fuse.errors import SettingsError
-from px4fuse.flight import Unavailable
-from px4fuse.notebook_display import one_line_repr
-from px4fuse.record import Count, NotNegative, OrUnavailable, Record
+from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.correlation import autocovariance
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 

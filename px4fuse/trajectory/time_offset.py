@@ -19,8 +19,8 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Slerp
 from scipy.special import stdtrit
 
-from px4fuse.arrays import Array, BoolArray, median_interval
-from px4fuse.record import Record, Span
+from px4fuse.core.arrays import Array, BoolArray, median_interval
+from px4fuse.core.record import Record, Span
 from px4fuse.trajectory.alignment import Transform, rms_m, umeyama
 from px4fuse.trajectory.association import gap_limit, is_bracketed, positions_at
 from px4fuse.trajectory.correlation import autocovariance, moments

@@ -35,7 +35,8 @@ from pypdf.generic import (
     TextStringObject,
 )
 
-from px4fuse.results.reading import one_line
+from px4fuse.core.text import one_line
+from px4fuse.core.workers import JobFailure, run_one_bounded
 from px4fuse.verification.model import PageDifference
 from px4fuse.verification.pdf_input import (
     BROKEN_PDF_ERRORS,
@@ -44,7 +45,6 @@ from px4fuse.verification.pdf_input import (
     open_strictly,
     resolve_reference,
 )
-from px4fuse.workers import JobFailure, run_one_bounded
 
 # Maximum difference (pt) of equal coordinates: different OpenBLAS kernels move points by at most
 # 0.07 pt, and 0.25 pt is not visible

@@ -1,7 +1,7 @@
 """Reading of the results from submitted PDFs, which may be malicious.
 
 Nothing in the PDF is executed, no link is followed, and nothing is written to disk. This module
-checks sizes before pypdf reads the PDF, and sets the limits of pypdf. :mod:`px4fuse.workers`
+checks sizes before pypdf reads the PDF, and sets the limits of pypdf. :mod:`px4fuse.core.workers`
 limits time and memory.
 
 Only the attached results are read. The pages are counted but not read, because px4fuse draws the
@@ -20,11 +20,12 @@ import pypdf
 from pypdf.errors import DependencyError, LimitReachedError, PyPdfError
 from pypdf.generic import ArrayObject, DictionaryObject, IndirectObject, StreamObject
 
+from px4fuse.core.text import one_line
 from px4fuse.errors import ResultsError
 from px4fuse.report.pdf import RESULTS_NAME
 from px4fuse.results.contract import AidsResults, ReportedResults, Results
 from px4fuse.results.reading import MAX_RESULTS_BYTES as MAX_ATTACHMENT_BYTES
-from px4fuse.results.reading import one_line, read_results
+from px4fuse.results.reading import read_results
 from px4fuse.verification.model import BAD_VALUE_ERRORS
 
 MAX_PDF_BYTES = 25_000_000

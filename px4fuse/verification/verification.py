@@ -23,6 +23,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
+from px4fuse.core.text import clean_text, one_line
 from px4fuse.errors import Px4FuseError, SettingsError
 from px4fuse.results.contract import (
     ComparisonResults,
@@ -32,7 +33,6 @@ from px4fuse.results.contract import (
     to_plain,
 )
 from px4fuse.results.model import LIBRARIES, Provenance
-from px4fuse.results.reading import clean_text, one_line
 from px4fuse.verification.model import Mismatch, PageStatus, Status, Verdict
 from px4fuse.verification.pages import TextComparison, compare_pages
 

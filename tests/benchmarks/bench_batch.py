@@ -17,9 +17,9 @@ from pathlib import Path
 
 import psutil
 
-from px4fuse.fleet.job import Job, analyse
-from px4fuse.fleet.logs import find_logs
-from px4fuse.fleet.run import run
+from px4fuse.batch.job import Job, analyse
+from px4fuse.batch.logs import find_logs
+from px4fuse.batch.run import run
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation.flights import simulate, to_ulog
 from px4fuse.simulation.scenario import Scenario

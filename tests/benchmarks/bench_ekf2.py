@@ -23,7 +23,7 @@ from px4fuse.ekf2.model import Model, open_model, replay_settings
 from px4fuse.ekf2.replay import Agreement
 from px4fuse.ekf2.steps import FIELD_STEP, FLOW_STEP, STEPS, VELOCITY_STEP, explain_by_steps
 from px4fuse.ekf2.whatif import Summary, WhatIf, what_if
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.readers import read_log
 
 REPOSITORY = Path(__file__).parents[2]

@@ -22,17 +22,17 @@ from pathlib import Path
 
 from click.testing import CliRunner
 
+from px4fuse.classroom.grading.rubric import rubric_text
 from px4fuse.cli import cli
-from px4fuse.grading.rubric import rubric_text
 from px4fuse.simulation.flights import simulate, to_ulog
 from px4fuse.simulation.scenario import Scenario
 
 GRADE = """
 import json, re, resource, sys, time
 from pathlib import Path
-from px4fuse.grading.entries import Course
-from px4fuse.grading.grade import grade
-from px4fuse.grading.rubric import read_rubric
+from px4fuse.classroom.grading.entries import Course
+from px4fuse.classroom.grading.grade import grade
+from px4fuse.classroom.grading.rubric import read_rubric
 if __name__ == "__main__":
     reports, logs, output, rubric = (Path(word) for word in sys.argv[1:])
     start = time.perf_counter()

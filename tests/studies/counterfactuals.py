@@ -16,7 +16,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.whatif import WhatIf, what_if
-from px4fuse.flight import Unavailable
+from px4fuse.flight.model import Unavailable
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Kind, make_scenario

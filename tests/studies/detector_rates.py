@@ -31,7 +31,7 @@ from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.model import open_model
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find, find_loop
-from px4fuse.flight import Flight, Unavailable
+from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.analysis import analyse, analyse_flight_loop
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.simulation.flights import simulate_flight

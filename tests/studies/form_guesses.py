@@ -17,7 +17,11 @@ from statistics import fmean
 import numpy as np
 from msgspec.structs import replace
 
-from px4fuse.answer_form import (
+from px4fuse.classroom.assignment.assignment import simulate_assigned
+from px4fuse.classroom.assignment.roster import Person
+from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake
+from px4fuse.classroom.grading.form_points import form_points, panels, right_corrections
+from px4fuse.results.answer_form import (
     CORRECTIONS,
     EKF2_BEHAVIOURS,
     MISTAKES,
@@ -26,10 +30,6 @@ from px4fuse.answer_form import (
     Answers,
     StudentMistake,
 )
-from px4fuse.assignment.assignment import simulate_assigned
-from px4fuse.assignment.roster import Person
-from px4fuse.assignment.truth import FormTruth, TrueMistake
-from px4fuse.grading.form_points import form_points, panels, right_corrections
 
 SECRET = b"form guesses"
 SHA256 = "0" * 64

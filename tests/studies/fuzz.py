@@ -39,21 +39,22 @@ import ulog_tools  # noqa: E402
 from class_tools import run_in_turn  # noqa: E402
 from conftest import blank_page  # noqa: E402
 
-from px4fuse import answer_form, workers  # noqa: E402
-from px4fuse.assignment.key import Answer, AnswerKey, key_text, read_key  # noqa: E402
-from px4fuse.assignment.roster import read_people, read_roster  # noqa: E402
-from px4fuse.assignment.sheet import read_sheet  # noqa: E402
+from px4fuse.classroom.assignment.key import Answer, AnswerKey, key_text, read_key  # noqa: E402
+from px4fuse.classroom.assignment.roster import read_people, read_roster  # noqa: E402
+from px4fuse.classroom.assignment.sheet import read_sheet  # noqa: E402
+from px4fuse.classroom.grading import grade as grading  # noqa: E402
+from px4fuse.classroom.grading.entries import read_overrides  # noqa: E402
+from px4fuse.classroom.grading.rubric import read_rubric, rubric_text  # noqa: E402
 from px4fuse.cli import cli  # noqa: E402
+from px4fuse.core import workers  # noqa: E402
 from px4fuse.diagnose import diagnose_or_check_aids  # noqa: E402
 from px4fuse.errors import Px4FuseError  # noqa: E402
-from px4fuse.grading import grade as grading  # noqa: E402
-from px4fuse.grading.entries import read_overrides  # noqa: E402
-from px4fuse.grading.rubric import read_rubric, rubric_text  # noqa: E402
 from px4fuse.readers import read_log  # noqa: E402
 from px4fuse.readers.g2o import read_g2o  # noqa: E402
 from px4fuse.readers.position_csv import read_position_csv  # noqa: E402
 from px4fuse.readers.trajectory import read_trajectory  # noqa: E402
 from px4fuse.request import ComparisonRequest  # noqa: E402
+from px4fuse.results import answer_form  # noqa: E402
 from px4fuse.results.build import outcome_results  # noqa: E402
 from px4fuse.results.contract import to_json  # noqa: E402
 from px4fuse.results.reading import read_results  # noqa: E402

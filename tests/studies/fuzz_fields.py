@@ -60,8 +60,8 @@ from pypdf import PdfReader  # noqa: E402
 from ulog_tools import Log, load  # noqa: E402
 
 from px4fuse.cli import cli  # noqa: E402
-from px4fuse.ekf2_parameters import PARAMETER_RANGES  # noqa: E402
 from px4fuse.errors import Px4FuseError  # noqa: E402
+from px4fuse.flight.ekf2_parameters import PARAMETER_RANGES  # noqa: E402
 from px4fuse.readers import mavlink, read_log, ulog  # noqa: E402
 from px4fuse.report import pdf  # noqa: E402
 from px4fuse.results.bounds import MAX_LENGTH_M, MAX_RATIO  # noqa: E402

@@ -45,13 +45,13 @@ from fuzz_fields import (  # noqa: E402
 )
 from ulog_tools import load  # noqa: E402
 
-from px4fuse import workers  # noqa: E402
-from px4fuse.assignment.key import AnswerKey, key_text  # noqa: E402
+from px4fuse.classroom.assignment.key import AnswerKey, key_text  # noqa: E402
+from px4fuse.classroom.grading import grade as grading  # noqa: E402
+from px4fuse.classroom.grading.rubric import rubric_text  # noqa: E402
 from px4fuse.cli import COMMANDS, cli  # noqa: E402
+from px4fuse.core import workers  # noqa: E402
 from px4fuse.errors import Px4FuseError  # noqa: E402
 from px4fuse.findings.model import CATALOGUE  # noqa: E402
-from px4fuse.grading import grade as grading  # noqa: E402
-from px4fuse.grading.rubric import rubric_text  # noqa: E402
 from px4fuse.report import pdf  # noqa: E402
 from px4fuse.simulation.mistakes import MISTAKES  # noqa: E402
 

@@ -38,7 +38,7 @@ from scipy.interpolate import CubicSpline
 from px4fuse.diagnose import explain
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
-from px4fuse.flight import Columns, Flight, Unavailable
+from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
 
 Values = NDArray[np.float64]

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from px4fuse.core.record import Count, Record
 from px4fuse.errors import TrajectoryError
-from px4fuse.flight import Unavailable
-from px4fuse.record import Count, Record
+from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.graph.covariance import GateResult, gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import GraphSolution, Solution, solve

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import chdtrc
 
-from px4fuse.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.record import Count, NotNegative, Record, Share
 from px4fuse.errors import TrajectoryError
-from px4fuse.record import Count, NotNegative, Record, Share
 from px4fuse.trajectory.graph import lie, model
 
 # Probability that the gate rejects a true closure

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie, model
 from px4fuse.trajectory.graph.model import PoseGraph

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 from scipy.spatial.transform import Rotation
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
 from px4fuse.trajectory.rotation import from_elements, skew
 
 # Maximum angle (rad) for power series instead of quotients, which lose precision at small angles:

@@ -8,9 +8,9 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from px4fuse.arrays import Array, BoolArray, IntArray
+from px4fuse.core.arrays import Array, BoolArray, IntArray
+from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.errors import TrajectoryError
-from px4fuse.notebook_display import one_line_repr
 from px4fuse.trajectory.graph import lie
 
 # Minimum eigenvalue of an information matrix with unit diagonal: directions with smaller

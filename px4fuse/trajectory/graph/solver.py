@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaincinv
 
-from px4fuse.arrays import Array, BoolArray
+from px4fuse.core.arrays import Array, BoolArray
+from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.core.record import Count, NotNegative, Record
 from px4fuse.errors import TrajectoryError
-from px4fuse.notebook_display import one_line_repr
-from px4fuse.record import Count, NotNegative, Record
 from px4fuse.trajectory.graph import lie, model
 from px4fuse.trajectory.graph.model import PoseGraph, Residuals
 from px4fuse.trajectory.graph.system import normal_equations, solve_normal_equations

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from px4fuse.arrays import Array
+from px4fuse.core.arrays import Array
 from px4fuse.trajectory.graph.model import PoseGraph
 
 # Options relax and panel_size of scipy's SuperLU: with values above the defaults (10 and 20)

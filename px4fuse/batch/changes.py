@@ -1,0 +1,186 @@
+"""Differences between two comparisons in settings, numbers and findings: ``px4fuse diff``."""
+
+import math
+import shlex
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+
+from px4fuse.batch.inputs import DiffInput, Progress, Results, read_inputs
+from px4fuse.batch.measures import (
+    ABSOLUTE_TOLERANCE,
+    FILTER_LABELS,
+    RELATIVE_TOLERANCE,
+    ComparedNumber,
+    collect_numbers,
+)
+from px4fuse.batch.rows import value_at
+from px4fuse.comparison.causal_replays import is_inconsistent
+from px4fuse.comparison.model import FilterSummary
+from px4fuse.core.text import format_factor, format_number
+from px4fuse.results import contract
+from px4fuse.results.model import provenance, schema_of
+
+# Maximum √(mean NEES) of a consistent filter; the minimum is 1 / maximum. The limits are wide,
+# because errors in a flight are correlated and EKF2's output predictor delays its position
+MAX_NEES_SIGMA_RATIO = 2.0
+# Label of each setting or property of a flight that px4fuse diff compares, and path in the results
+SETTING_LABELS = {
+    "SIGMA_A (m/s²)": "settings.sigma_a_m_s2",
+    "SIGMA_Z (m)": "settings.sigma_z_m",
+    "DT (s)": "settings.dt_s",
+    "input": "settings.input",
+    "added time offset (s)": "settings.clock_offset_s",
+    "start of the analysis (s)": "settings.start_s",
+    "end of the analysis (s)": "settings.end_s",
+    "position source": "source.name",
+    "firmware": "log.firmware",
+    "firmware hash": "log.firmware_hash",
+    "hardware": "log.hardware",
+    "px4fuse": "provenance.px4fuse",
+}
+
+
+def diff(
+    a: str | Path, b: str | Path, *, progress: Progress = lambda _: None
+) -> contract.ChangeResults:
+    """List the settings, numbers and findings that differ from A to B.
+
+    Parameters
+    ----------
+    a, b : str or Path
+        Flight logs, or reports (PDF) or results (JSON) of ``px4fuse compare``. If one input is a
+        log, it is analysed with the settings in the other input.
+    progress : callable
+        Function that receives the name of each step of the computation.
+
+    Raises
+    ------
+    LogError, MissingDataError, ResultsError
+        A file cannot be read or is not from ``px4fuse compare``, or A and B are the same file.
+    """
+    return list_changes(*read_inputs(Path(a), Path(b), progress))
+
+
+def list_changes(a: DiffInput, b: DiffInput) -> contract.ChangeResults:
+    """List the settings, numbers and findings that differ between two results of comparisons."""
+    findings = tuple(_finding_changes(a.results, b.results))
+    return contract.ChangeResults(
+        schema=schema_of(contract.CHANGES_SCHEMA),
+        a=_describe_input(a),
+        b=_describe_input(b),
+        settings=tuple(_setting_changes(a.results, b.results)),
+        numbers=tuple(compare_numbers(collect_numbers(a.results), collect_numbers(b.results))),
+        findings=findings,
+        worse=tuple(_worse_verdicts(a.results, b.results, findings)),
+        provenance=provenance(shlex.join(["px4fuse", "diff", a.file_name, b.file_name])),
+    )
+
+
+def _describe_input(diff_input: DiffInput) -> contract.DiffInput:
+    log = diff_input.results.log
+    return contract.DiffInput(
+        given=diff_input.file_name,
+        kind=diff_input.kind,
+        log=log.name,
+        log_sha256=log.sha256,
+        px4fuse=diff_input.results.provenance.px4fuse,
+    )
+
+
+def _setting_changes(a: Results, b: Results) -> Iterator[contract.SettingChange]:
+    values_a, values_b = (
+        {name: value_at(results, path) for name, path in SETTING_LABELS.items()}
+        | _parameters(results)
+        for results in (a, b)
+    )
+    for name in {**values_a, **values_b}:
+        if (value_a := values_a.get(name)) != (value_b := values_b.get(name)):
+            yield contract.SettingChange(name, value_a, value_b)
+
+
+def _parameters(results: Results) -> dict[str, float]:
+    """Return the PX4 parameters in the results, rounded to 6 digits because they are float32."""
+    parameters = (value_at(results, "ekf2_replay.settings") or {}) | dict(results.log.parameters)
+    return {name: float(f"{parameters[name]:.6g}") for name in sorted(parameters)}
+
+
+def compare_numbers(
+    numbers_a: Mapping[str, ComparedNumber], numbers_b: Mapping[str, ComparedNumber]
+) -> Iterator[contract.NumberChange]:
+    """Yield the numbers that differ between A and B, or that only one of them contains.
+
+    Parameters
+    ----------
+    numbers_a, numbers_b : mapping
+        Numbers of A and B, by their path in the results.
+    """
+    for path in {**numbers_a, **numbers_b}:
+        a, b = numbers_a.get(path), numbers_b.get(path)
+        if (
+            a
+            and b
+            and math.isclose(
+                a.value, b.value, rel_tol=RELATIVE_TOLERANCE, abs_tol=ABSOLUTE_TOLERANCE
+            )
+        ):
+            continue
+        number = a or b
+        assert number is not None
+        yield contract.NumberChange(
+            path=path,
+            label=number.label,
+            unit=number.unit,
+            a=None if a is None else a.value,
+            b=None if b is None else b.value,
+            a_interval=None if a is None else a.interval,
+            b_interval=None if b is None else b.interval,
+        )
+
+
+def _finding_changes(a: Results, b: Results) -> Iterator[contract.FindingChange]:
+    """Yield the findings that only A or only B contains with the same id and severity."""
+    sides: tuple[tuple[Results, Results, contract.DiffSide], ...] = ((b, a, "B"), (a, b, "A"))
+    for results, other_results, only_in in sides:
+        ids = {(finding.id, finding.severity) for finding in other_results.findings}
+        for finding in results.findings:
+            if (finding.id, finding.severity) not in ids:
+                yield contract.FindingChange(finding.id, finding.severity, finding.message, only_in)
+
+
+def _worse_verdicts(
+    a: Results, b: Results, findings: Iterable[contract.FindingChange]
+) -> Iterator[str]:
+    """Yield a sentence for each verdict that is worse in B, and for each new error finding."""
+    verdicts_a, verdicts_b = _verdicts_by_axis(a), _verdicts_by_axis(b)
+    for name, (value_a, was_consistent) in verdicts_a.items():
+        value_b, is_consistent = verdicts_b.get(name, (value_a, True))
+        if was_consistent and not is_consistent:
+            ratio = value_b**0.5
+            factor = format_factor(max(ratio, 1.0 / ratio))
+            verdict, size = (
+                ("overconfident", "small") if ratio > 1.0 else ("underconfident", "large")
+            )
+            yield (
+                f"{name}: {format_number(value_a)} (consistent) → {format_number(value_b)} "
+                f"({verdict}, σ {factor} times too {size})."
+            )
+    error_ids = [
+        finding.id for finding in findings if (finding.only_in, finding.severity) == ("B", "error")
+    ]
+    for finding_id in dict.fromkeys(error_ids):
+        yield f"New finding of severity error: {finding_id}."
+
+
+def _verdicts_by_axis(results: Results) -> dict[str, tuple[float, bool]]:
+    """Return mean NIS and mean NEES by label ("Mean NIS of KF, north"), with True if consistent."""
+    verdicts: dict[str, tuple[float, bool]] = {}
+    for axis, result in (value_at(results, "axes") or {}).items():
+        for name, label in FILTER_LABELS.items():
+            summary = result.filters[name]
+            if isinstance(summary, FilterSummary):
+                is_consistent = not is_inconsistent(summary)
+                verdicts[f"Mean NIS of {label}, {axis}"] = summary.nis_mean, is_consistent
+            if (nees := value_at(summary, "truth.nees_position_mean")) is not None:
+                is_consistent = MAX_NEES_SIGMA_RATIO**-2 <= nees <= MAX_NEES_SIGMA_RATIO**2
+                verdicts[f"Mean NEES of {label}, {axis}"] = nees, is_consistent
+    return verdicts

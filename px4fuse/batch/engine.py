@@ -1,0 +1,159 @@
+"""Execution of the jobs of ``px4fuse batch`` on this computer or on a Dask cluster.
+
+Each job analyses one log in a process of :mod:`px4fuse.core.workers`, with limits of time and
+memory. On a cluster, the Dask workers start these processes.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import sys
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from importlib import metadata
+from typing import TYPE_CHECKING, Any
+
+from px4fuse.core.text import one_line
+from px4fuse.core.workers import Job, JobFailure, Result
+from px4fuse.errors import Px4FuseError, SettingsError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+# Maximum time (s) until the Dask scheduler answers, and until it has a worker
+CONNECT_TIMEOUT_S = 15.0
+# Number of logs per Dask task: they share one process, because its imports take 2 s
+JOBS_PER_TASK = 4
+
+
+@contextmanager
+def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
+    """Connect to a Dask cluster; provide its client, or None to run the jobs on this computer.
+
+    Parameters
+    ----------
+    scheduler : str, optional
+        Address of a running Dask scheduler; default: the Dask client of this Python session, if
+        there is one, else this computer.
+
+    Raises
+    ------
+    SettingsError
+        Dask is not installed, the scheduler does not answer or has no workers, or a worker
+        has another version of px4fuse.
+    """
+    if scheduler is None:
+        client = _session_client()
+        if client is not None:
+            _check_workers(client)
+        yield client
+        return
+    try:
+        from distributed import Client  # noqa: PLC0415 - of the extra `batch`
+        from distributed.utils import silence_logging_cmgr  # noqa: PLC0415
+    except ImportError as error:
+        raise SettingsError(
+            "--scheduler requires Dask.", 'Run pip install "px4fuse[batch]".'
+        ) from error
+    try:
+        # a client whose connection fails must not become the Dask client of this Python session
+        client = Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise SettingsError(
+            f"--scheduler {scheduler}: no Dask scheduler answers ({one_line(str(error), 120)}).",
+            "Start a Dask scheduler with: dask scheduler",
+        ) from error
+    # without this, Dask prints tracebacks when the scheduler ends
+    with silence_logging_cmgr(logging.CRITICAL), client, client.as_current():
+        _check_workers(client)
+        yield client
+
+
+def _session_client() -> Client | None:
+    if "distributed" not in sys.modules:
+        return None
+    from distributed import default_client  # noqa: PLC0415
+
+    try:
+        client: Client = default_client()
+    except ValueError:  # this Python session has no Dask client
+        return None
+    return client
+
+
+def _check_workers(client: Client) -> None:
+    address = client.scheduler_info()["address"]
+    try:
+        client.wait_for_workers(1, timeout=CONNECT_TIMEOUT_S)
+    except TimeoutError as error:
+        raise SettingsError(
+            f"The Dask scheduler {address} has no workers.",
+            f"Start workers with: dask worker {address} --nthreads 1",
+        ) from error
+    own_version = metadata.version("px4fuse")
+    for name, worker_version in client.run(metadata.version, "px4fuse", on_error="return").items():
+        if worker_version != own_version:
+            worker_text = (
+                f"px4fuse {worker_version}" if isinstance(worker_version, str) else "no px4fuse"
+            )
+            raise SettingsError(
+                f"Dask worker {name} has {worker_text}; this computer has px4fuse {own_version}.",
+                "Install the same version of px4fuse on the worker and on this computer.",
+            )
+
+
+def run_jobs(
+    client: Client | None,
+    work: Callable[..., Iterator[tuple[int, Result | JobFailure]]],
+    jobs: Sequence[Job],
+    processes: int | None = None,
+) -> Generator[tuple[Job, Result | JobFailure]]:
+    """Yield each job with its result, in the order in which jobs finish.
+
+    Parameters
+    ----------
+    client : Client or None
+        Client of a cluster; None for processes of this computer.
+    work : callable
+        :func:`~px4fuse.core.workers.run_bounded` with its function and limits.
+    processes : int, optional
+        Number of parallel processes on this computer; default: number of cores.
+
+    Raises
+    ------
+    Px4FuseError
+        The connection to the scheduler was lost.
+    """
+    if client is None:
+        for index, result in work(jobs, processes=processes):
+            yield jobs[index], result
+        return
+    from distributed import as_completed  # noqa: PLC0415
+
+    chunks = [jobs[start : start + JOBS_PER_TASK] for start in range(0, len(jobs), JOBS_PER_TASK)]
+    futures = dict(
+        zip(client.map(partial(_run_chunk, work), chunks, pure=False), chunks, strict=True)
+    )
+    try:
+        for future in as_completed(list(futures)):
+            chunk = futures.pop(future)
+            if future.status not in ("finished", "error"):
+                raise Px4FuseError("the connection to the Dask scheduler was lost.")
+            # the worker process ended several times, or cannot load the job
+            error = future.exception()
+            failure = JobFailure(one_line(f"{type(error).__name__}: {error}", 300))
+            results = [failure] * len(chunk) if error else future.result()
+            yield from zip(chunk, results, strict=True)
+    finally:
+        if futures and client.status == "running":
+            client.cancel(list(futures))
+
+
+def _run_chunk(work: Callable[..., Iterator[tuple[int, Any]]], jobs: Sequence[Any]) -> list[Any]:
+    """Run the jobs of one Dask task in sequence, in a child process of the Dask worker."""
+    # a Dask worker is a daemon process by default, which Python does not allow to start processes
+    multiprocessing.current_process().daemon = False
+    results_by_index = dict(work(jobs, processes=1))
+    return [results_by_index[index] for index in range(len(jobs))]

@@ -1,0 +1,92 @@
+"""Inputs of ``px4fuse diff``: a log, a report (PDF) with its results, or results (JSON)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from msgspec.structs import replace
+
+from px4fuse.core.reading import display_name, files_by_sha256, read_bytes_limited, read_head
+from px4fuse.diagnose import diagnose_or_check_aids
+from px4fuse.errors import LogError, ResultsError
+from px4fuse.request import ComparisonRequest
+from px4fuse.results.build import outcome_results
+from px4fuse.results.contract import AidsResults, ComparisonResults, to_json
+from px4fuse.results.reading import MAX_RESULTS_BYTES, read_results
+from px4fuse.verification.pdf_input import MAX_PDF_BYTES, attached_results
+
+Kind = Literal["log", "report", "results"]
+Progress = Callable[[str], None]
+Results = ComparisonResults | AidsResults
+# Fields of the settings that px4fuse diff takes from the results of one input to analyse the log of
+# the other input. Settings in _SEGMENT_FIELDS are used only if both inputs are of the same log
+_FILTER_FIELDS = ("sigma_a_m_s2", "sigma_z_m", "dt_s", "input", "axes", "clock_offset_s")
+_SEGMENT_FIELDS = ("heading_deg", "start_s", "end_s", "position_source", "source_kind", "height")
+
+
+@dataclass(frozen=True)
+class DiffInput:
+    """Results of the input A or B of ``px4fuse diff``."""
+
+    file_name: str
+    kind: Kind
+    results: Results
+
+
+def read_inputs(
+    a: Path, b: Path, progress: Progress = lambda _: None
+) -> tuple[DiffInput, DiffInput]:
+    """Read the inputs A and B; analyse a log with the settings in the results of the other input.
+
+    Raises
+    ------
+    LogError, MissingDataError
+        A log cannot be read, or does not contain the required data.
+    ResultsError
+        An input cannot be read or is not from ``px4fuse compare``, or A and B are the same file.
+    """
+    first_input, second_input = (_read_attached(path) for path in (a, b))
+    if a.samefile(b):
+        raise ResultsError(f"{display_name(a)}: A and B are the same file. Give two files.")
+    return (
+        first_input or _analyse_log(a, second_input, progress),
+        second_input or _analyse_log(b, first_input, progress),
+    )
+
+
+def _read_attached(path: Path) -> DiffInput | None:
+    """Return the results in a report (PDF) or a JSON file; None for a log."""
+    name, head = display_name(path), read_head(path, 64, LogError)
+    is_report = head.startswith(b"%PDF-")
+    if not is_report and not head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{"):
+        return None
+    limit = MAX_PDF_BYTES if is_report else MAX_RESULTS_BYTES
+    advice = (
+        "Give a report, which has less than 2 MB"
+        if is_report
+        else "Give results of px4fuse compare"
+    )
+    content = read_bytes_limited(path, ResultsError, limit, size_remedy=advice)
+    results = (attached_results if is_report else read_results)(content, name)
+    if not isinstance(results, Results):
+        raise ResultsError(
+            f"{name} contains results with the schema {results.schema.name}, which px4fuse diff "
+            "cannot compare. Give a log, or a report or results of px4fuse compare."
+        )
+    return DiffInput(name, "report" if is_report else "results", results)
+
+
+def _analyse_log(path: Path, other_input: DiffInput | None, progress: Progress) -> DiffInput:
+    request = ComparisonRequest(log=str(path))
+    if other_input is not None:
+        is_same = other_input.results.log.sha256 in files_by_sha256([path])
+        fields = (*_FILTER_FIELDS, *_SEGMENT_FIELDS) if is_same else _FILTER_FIELDS
+        request = replace(
+            request, **{name: getattr(other_input.results.request, name) for name in fields}
+        )
+    result = diagnose_or_check_aids(request, progress)
+    text = to_json(outcome_results(request, result))  # to_json rounds the numbers as in a report
+    results = read_results(text.encode())
+    assert isinstance(results, Results)
+    return DiffInput(display_name(path), "log", results)

@@ -1,0 +1,128 @@
+"""Job of ``px4fuse batch``: analysis of one log, with its table rows, results and report."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from px4fuse.batch.logs import local_file
+from px4fuse.batch.rows import FAILED, NOT_COMPARED, Row, axis_rows, finding_columns, log_columns
+from px4fuse.core.reading import files_by_sha256, max_log_bytes
+from px4fuse.errors import LogError, MissingDataError, Px4FuseError
+from px4fuse.request import ComparisonRequest, with_options
+
+
+@dataclass(frozen=True)
+class Job:
+    """Log that ``px4fuse batch`` analyses, with settings and limits.
+
+    Attributes
+    ----------
+    address : str
+        Absolute path or URL of the log.
+    request : ComparisonRequest
+        Settings of the analysis; ``address`` replaces the log in the request.
+    with_report : bool
+        True to make the PDF report.
+    max_bytes : int
+        Maximum size of the log (bytes).
+    finished_hashes : frozenset of str
+        SHA-256 of all logs with the size of this log whose results already exist.
+    """
+
+    address: str
+    request: ComparisonRequest
+    with_report: bool
+    max_bytes: int
+    finished_hashes: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Table rows, results and report of one log in ``px4fuse batch``.
+
+    Attributes
+    ----------
+    sha256 : str
+        SHA-256 of the log; empty if the log could not be read.
+    rows : tuple of Row
+        One row per axis. A single row if the log could not be compared. No row if the results of
+        the log already exist.
+    results, report : bytes
+        Results (JSON) and report (PDF); empty if not made.
+    """
+
+    sha256: str
+    rows: tuple[Row, ...] = ()
+    results: bytes = b""
+    report: bytes = b""
+
+
+def analyse(job: Job) -> Outcome:
+    """Compare one log as ``px4fuse compare`` does; after an error, one row contains the reason."""
+    sha256 = ""
+    max_log_bytes.set(job.max_bytes)
+    try:
+        with local_file(job.address) as path:
+            sha256 = _sha256(path)
+            if sha256 in job.finished_hashes:
+                return Outcome(sha256)
+            outcome = _compare_log(job, path, sha256)
+            if _sha256(path) != sha256:
+                remedy = "Run the same command again when the file is complete."
+                raise LogError("the file changed while it was read", remedy)
+            return outcome
+    except Px4FuseError as error:
+        return Outcome(sha256, (failure_row(error, FAILED) | {"log_sha256": sha256},))
+
+
+def failure_row(error: Px4FuseError, status: str, name: str = "") -> Row:
+    """Return the table row of a log that could not be compared, with reason and action."""
+    reason = with_options(error.reason).removeprefix(f"{name}: ")
+    return {"status": status, "reason": reason, "remedy": with_options(error.remedy)}
+
+
+def _compare_log(job: Job, path: Path, sha256: str) -> Outcome:
+    # imported here, because only the worker processes need these modules
+    from px4fuse.analysis import AidsOnlyAnalysis  # noqa: PLC0415
+    from px4fuse.diagnose import diagnose_or_check_aids, read_flight  # noqa: PLC0415
+    from px4fuse.results.build import log_record, results  # noqa: PLC0415
+    from px4fuse.results.contract import to_json  # noqa: PLC0415
+
+    request = msgspec.structs.replace(job.request, log=str(path))
+    row: Row = {"name": path.name, "log_sha256": sha256}
+    try:
+        flight = read_flight(request)
+        row |= log_columns(log_record(flight))
+        analysis = diagnose_or_check_aids(request, flight=flight)
+        if isinstance(analysis, AidsOnlyAnalysis):
+            row |= finding_columns(analysis.findings, analysis.aids)
+            missing_data = MissingDataError(
+                analysis.missing_data.reason, analysis.missing_data.remedy
+            )
+            return Outcome(sha256, (row | failure_row(missing_data, NOT_COMPARED, path.name),))
+        contract_results = results(request, analysis)
+        results_json, report = to_json(contract_results), b""
+        if job.with_report:
+            from px4fuse.report.pdf import render  # noqa: PLC0415
+
+            report = render(analysis, contract_results, results_json)
+    except Px4FuseError as error:
+        status = NOT_COMPARED if isinstance(error, MissingDataError) else FAILED
+        return Outcome(sha256, (row | failure_row(error, status, path.name),))
+    return Outcome(sha256, tuple(axis_rows(contract_results)), results_json.encode(), report)
+
+
+def _sha256(path: Path) -> str:
+    (sha256,) = files_by_sha256([path])
+    return sha256
+
+
+def file_stem(name: str, sha256: str) -> str:
+    """Return a file name for the outputs of a log: its name and the start of its SHA-256.
+
+    >>> file_stem("Flug 3.ulg", "ab" * 32)
+    'Flug_3-abababababab'
+    """
+    return f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', Path(name).stem)[:60]}-{sha256[:12]}"

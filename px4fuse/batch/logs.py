@@ -1,0 +1,160 @@
+"""Search for logs among files, folders, globs and URLs (with fsspec)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from px4fuse.core.input_files import add_input
+from px4fuse.core.reading import max_log_bytes
+from px4fuse.core.text import one_line
+from px4fuse.errors import LogError, SettingsError
+
+if TYPE_CHECKING:
+    from fsspec import AbstractFileSystem
+
+#: Suffixes of the files in a folder that are logs; a file that the user names may have any suffix
+LOG_SUFFIXES = (".ulg", ".tlog", ".bin")
+
+
+@dataclass(frozen=True, order=True)
+class LogAddress:
+    """Name, address and size of a log, before the log is read.
+
+    Attributes
+    ----------
+    name : str
+        File name without folder.
+    log : str
+        Path or URL in the table; relative to the working directory if the user's argument is.
+    address : str
+        Absolute path or URL, with which a worker process opens the log.
+    size_bytes : int or None
+        Size of the log; None if the file system does not provide it.
+    """
+
+    name: str
+    log: str
+    address: str
+    size_bytes: int | None
+
+
+def find_logs(patterns: Iterable[str]) -> list[LogAddress]:
+    """Find the different logs among files, folders, globs and URLs, sorted by name.
+
+    Parameters
+    ----------
+    patterns : iterable of str
+        Files, folders (in which files with LOG_SUFFIXES are logs), globs and URLs.
+
+    Raises
+    ------
+    SettingsError
+        A pattern matches no log, or a URL requires a package that is not installed.
+    """
+    logs_by_address = {log.address: log for pattern in patterns for log in _logs_in(pattern)}
+    if not logs_by_address:
+        raise SettingsError("no logs were given. Give files, folders, globs or URLs.")
+    return sorted(logs_by_address.values())
+
+
+def _logs_in(pattern: str) -> list[LogAddress]:
+    if not pattern:
+        raise SettingsError("the name of a log is empty", "Give files, folders, globs or URLs.")
+    file_system, root = _file_system(pattern)
+    try:
+        if file_system.isdir(root):
+            all_files = file_system.find(root, detail=True)
+            info_by_path = {
+                path: info
+                for path, info in all_files.items()
+                if PurePosixPath(path).suffix.lower() in LOG_SUFFIXES
+            }
+        elif file_system.exists(root):  # a worker process rejects devices and pipes
+            info_by_path = {root: file_system.info(root) if file_system.isfile(root) else {}}
+        else:
+            all_files = (
+                file_system.glob(root, detail=True)
+                if any(wildcard in pattern for wildcard in "*?[")
+                else {}
+            )
+            info_by_path = {
+                path: info for path, info in all_files.items() if info["type"] == "file"
+            }
+    # OSError, or an exception of the package for this type of URL (unknown account or bucket)
+    except Exception as error:
+        raise SettingsError(
+            f"{pattern}: cannot be read ({one_line(str(error), 200) or type(error).__name__})."
+        ) from error
+    if not info_by_path:
+        raise SettingsError(
+            f"{pattern}: no logs found",
+            f"Give existing logs, or folders with logs ({', '.join(LOG_SUFFIXES)}).",
+        )
+    found_logs = []
+    for path, info in info_by_path.items():
+        address = path if _is_local(file_system) else file_system.unstrip_protocol(path)
+        is_relative = _is_local(file_system) and not Path(pattern).is_absolute()
+        log = os.path.relpath(path) if is_relative else address
+        found_logs.append(LogAddress(_file_name(path), log, address, info.get("size")))
+        if _is_local(file_system):
+            add_input(Path(path))
+    return found_logs
+
+
+@contextmanager
+def local_file(address: str) -> Iterator[Path]:
+    """Provide the path of a log on this computer; the log of a URL is downloaded temporarily.
+
+    Raises
+    ------
+    LogError
+        The log is too large.
+    SettingsError
+        The URL requires a package that is not installed.
+    """
+    file_system, path = _file_system(address)
+    if _is_local(file_system):
+        yield Path(path)
+        return
+    size, limit = file_system.info(path).get("size"), max_log_bytes.get()
+    if size is not None and size > limit:
+        raise LogError(
+            f"the file has {size / 1e6:,.0f} MB; the limit is {limit / 1e6:,.0f} MB",
+            "Increase the limit with --max-size MB.",
+        )
+    with TemporaryDirectory(prefix="px4fuse-") as folder:
+        local_path = Path(folder, _file_name(path))
+        file_system.get_file(path, str(local_path))
+        yield local_path
+
+
+def _file_system(address: str) -> tuple[AbstractFileSystem, str]:
+    from fsspec.core import url_to_fs  # noqa: PLC0415 - needs the extra `batch`
+
+    try:
+        file_system, path = url_to_fs(address)
+    except ImportError as error:  # the cause of the error names the missing package
+        package = getattr(error.__cause__, "name", None) or "the package of this type of URL"
+        raise SettingsError(
+            f"{address}: this type of URL requires {package}.", f'Run pip install "{package}".'
+        ) from error
+    except ValueError as error:  # the protocol of the URL is unknown
+        raise SettingsError(f"{address}: {error}", "Give a path or another URL.") from error
+    return file_system, path
+
+
+def _is_local(file_system: AbstractFileSystem) -> bool:
+    from fsspec.implementations.local import LocalFileSystem  # noqa: PLC0415
+
+    return isinstance(file_system, LocalFileSystem)
+
+
+def _file_name(path: str) -> str:
+    """Return the file name in a path or URL, without the query of a URL."""
+    return PurePosixPath(path.partition("?")[0]).name or "log"

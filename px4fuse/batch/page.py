@@ -1,0 +1,303 @@
+"""Web page of ``px4fuse batch``: a sortable table with one row per log."""
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import PurePosixPath
+from typing import Any
+
+import pandas as pd
+
+from px4fuse.batch.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, RESULT_PATHS
+from px4fuse.card.model import AXIS_ENDS, SIGMA_RATIO_BANDS
+from px4fuse.card.numbers import format_metres, format_ratio
+from px4fuse.core.text import format_number, join_first
+from px4fuse.findings import finding_title
+from px4fuse.html import frame
+from px4fuse.html.frame import Cell, Column, Row, Section
+from px4fuse.html.safe import clean, load_template, local_link
+from px4fuse.report.card_html import MARK_PATHS, SEVERITY_SIGNS, band_limits
+from px4fuse.report.card_text import FILTER_NAMES, MARKS
+
+# Columns of the four σ ratios (KF and EKF2, against source and ground truth), in the order of the
+# verdicts of the diagnosis (Card)
+SIGMA_RATIO_COLUMNS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
+SEVERITIES = ("error", "warning", "note", "clean", "refused")
+FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
+# Columns that the page shows after a click on a row: one value per axis (AXIS_COLUMNS) or per log
+AXIS_COLUMNS = [name for name, path in RESULT_PATHS.items() if "{" in path]
+LOG_COLUMNS = [
+    name
+    for name, path in RESULT_PATHS.items()
+    if name
+    not in (
+        *AXIS_COLUMNS,
+        "axis",
+        "status",
+        "reason",
+        "remedy",
+        "severity",
+        "headline",
+        "action",
+        "changed",
+        "verdicts",
+        "findings",
+        "results",
+        "report",
+    )
+]
+# Name of the group of columns that the page shows on request
+EXTRA_COLUMN_GROUP = "numbers"
+# Label of each page filter, by the first word of its tags
+PAGE_FILTERS = {
+    "severity": "Diagnosis",
+    "status": "Status",
+    "vehicle": "Vehicle",
+    "firmware": "Firmware",
+    "finding": "Finding",
+    "remedy": "Action",
+}
+# Axes whose numbers represent the log in the table: the aisle, else north and east, else down
+MAIN_AXES = (("aisle",), ("north", "east"), ("down",))
+
+#: One log on the page: the non-empty columns of its rows, preferably of MAIN_AXES, and
+#: ``severity`` (also of logs without a result), ``verdict_texts`` (four verdicts), ``status``
+#: ("done" if one axis is done), ``missing_results`` (reasons for missing results, with actions),
+#: ``axes`` (rows with an axis), ``findings`` (ids) and ``tags`` (labels by value of page filters)
+Log = Mapping[str, Any]
+
+
+def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
+    """Write the table of logs as one HTML file.
+
+    Parameters
+    ----------
+    table : DataFrame
+        One row per log and axis, with the columns of :data:`px4fuse.batch.rows.COLUMN_TYPES`; a log
+        that could not be read has one row without axis.
+    title : str
+        Title of the page.
+    made_with : str
+        Name and version of px4fuse.
+    """
+    logs = sort_logs(logs_of(table))
+    names = short_names(logs)
+    rows = [
+        Row(_log_cells(log, names), tuple(log["tags"]), _log_details(log), _side_sections(log))
+        for log in logs
+    ]
+    counts = Counter(log["severity"] for log in logs)
+    parts = (
+        ("error", "with an error"),
+        ("warning", "with a warning"),
+        ("clean", "without a fault"),
+        ("refused", "not analysed"),
+    )
+    count_text = ", ".join(f"{counts[name]} {text}" for name, text in parts if counts[name])
+    return frame.page(
+        title=title,
+        subtitle=f"{len(logs)} log{'' if len(logs) == 1 else 's'}"
+        f"{f': {count_text}' if count_text else ''}. Compared with {made_with}.",
+        html_above=load_template("batch/axis.html").render(limits=band_limits()),
+        noun=("log", "logs"),
+        columns=(
+            Column("Sign", "rank"),
+            Column("Log", "name"),
+            Column("Diagnosis and first action", "full"),
+            *(
+                Column(
+                    f"{FILTER_NAMES[filter_name]} {MARKS[reference_name]}",
+                    "ratio",
+                    visible_from="tablet",
+                )
+                for filter_name, reference_name in (name.split("_") for name in SIGMA_RATIO_COLUMNS)
+            ),
+            Column("KF − EKF2 (m)", "number", visible_from="tablet"),
+            *(
+                Column(label, "line", EXTRA_COLUMN_GROUP)
+                for label in ("Date (UTC)", "Vehicle", "Firmware")
+            ),
+            Column("SIGMA_Z estimate (m)", "number", EXTRA_COLUMN_GROUP),
+            Column("Time offset (s)", "number", EXTRA_COLUMN_GROUP),
+            Column("Findings", "rank", EXTRA_COLUMN_GROUP),
+        ),
+        rows=rows,
+        filters=_page_filters(logs),
+        groups=[(EXTRA_COLUMN_GROUP, "more columns")],
+        placeholder="search by name, vehicle, firmware or finding",
+        full_table_note="All rows are in fleet.csv.",
+        ratio_axis={"bands": SIGMA_RATIO_BANDS, "ends": AXIS_ENDS, "marks": MARK_PATHS},
+    )
+
+
+def _log_cells(log: Log, names: Mapping[str, str]) -> tuple[Cell, ...]:
+    finding_titles = [finding_title(finding) for finding in log["findings"]]
+    vehicle = log.get("vehicle", "")
+    severity, action = log["severity"], log.get("action", "")
+    style = "command" if action.startswith(("px4fuse ", "param ")) else ""
+    return (
+        Cell(SEVERITY_SIGNS[severity], SEVERITIES.index(severity), style_class=f"sign {severity}"),
+        Cell(log["name"], log["name"], log.get("changed", "")),
+        Cell(log["headline"], log["headline"], action, style_class=style),
+        *(
+            _ratio_cell(log.get(f"{name}_ratio"), name, word)
+            for name, word in zip(SIGMA_RATIO_COLUMNS, log["verdict_texts"], strict=True)
+        ),
+        _value_cell(log.get("difference_rms_m"), format_metres),
+        frame.text_cell(log.get("date", "")[:10]),
+        frame.text_cell(names.get(vehicle, str(vehicle))),
+        frame.text_cell(log.get("firmware", "")),
+        _value_cell(log.get("sigma_z_m"), format_number),
+        _value_cell(log.get("clock_offset_s"), format_number),
+        Cell()
+        if log["status"] == FAILED
+        else frame.number_cell(
+            float(len(finding_titles)), text_below=join_first(finding_titles, 2)
+        ),
+    )
+
+
+def _ratio_cell(ratio: float | None, name: str, word: str) -> Cell:
+    filter_name, _, reference_name = name.partition("_")
+    emphasis = " loud" if word in ("overconfident", "underconfident") else ""
+    if ratio is None:
+        return Cell()
+    return Cell(format_ratio(ratio), ratio, style_class=f"{filter_name} {reference_name}{emphasis}")
+
+
+def sort_logs(logs: Iterable[Log]) -> list[Log]:
+    """Sort logs by severity, then by the largest |ln(σ ratio)|, then by position RMSE."""
+
+    def rank(log: Log) -> tuple[float, ...]:
+        ratios = [log[key] for name in SIGMA_RATIO_COLUMNS if log.get(key := f"{name}_ratio")]
+        largest_log_ratio = max((abs(math.log(ratio)) for ratio in ratios), default=0.0)
+        return (
+            SEVERITIES.index(log["severity"]),
+            -largest_log_ratio,
+            -log.get("position_rmse_m", 0.0),
+        )
+
+    return sorted(logs, key=rank)
+
+
+def _value_cell(value: float | None, format_value: Callable[[float], str]) -> Cell:
+    return Cell() if value is None else frame.number_cell(value, format_value(value))
+
+
+def _log_details(log: Log) -> tuple[Section, ...]:
+    axes = [
+        [name, *(_format_value(axis.get(name, "")) for axis in log["axes"])]
+        for name in AXIS_COLUMNS
+        if any(name in axis for axis in log["axes"])
+    ]
+    titles = ["", *(axis["axis"] for axis in log["axes"])]
+    return (
+        frame.list_section(
+            "Missing results",
+            [reason for reason, _ in log["missing_results"] if reason],
+            is_warning=True,
+        ),
+        frame.list_section(
+            "Actions", list(dict.fromkeys(r for _, r in log["missing_results"] if r))
+        ),
+        frame.list_section(
+            "Findings", [f"{finding_title(id_)} ({id_})" for id_ in log["findings"]]
+        ),
+        frame.table_section("Axes", titles if axes else (), axes, range(1, len(titles))),
+    )
+
+
+def _side_sections(log: Log) -> tuple[Section, ...]:
+    return (
+        frame.links_section(
+            "Files", [(label, local_link(log.get(name, ""))) for label, name in FILE_LINKS]
+        ),
+        frame.pairs_section(
+            "Flight", [(name, _format_value(log.get(name, ""))) for name in LOG_COLUMNS]
+        ),
+    )
+
+
+def _format_value(value: str | float) -> str:
+    return value if isinstance(value, str) else format_number(float(value))
+
+
+def _page_filters(logs: Sequence[Log]) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Return the page filters with their options and log counts, most frequent option first."""
+    counts = Counter(tag for log in logs for tag in log["tags"])
+    label_by_tag: Mapping[str, str] = {
+        tag: label for log in logs for tag, label in log["tags"].items()
+    }
+    filters = []
+    for kind, label in PAGE_FILTERS.items():
+        options = [
+            (tag, f"{clean(label_by_tag[tag], 60)} ({count})")
+            for tag, count in counts.most_common()
+            if tag.startswith(f"{kind}:")
+        ]
+        if options:
+            filters.append((label, [("", "All"), *options]))
+    return filters
+
+
+# -------------------- combination of the table rows of each log
+
+
+def logs_of(table: pd.DataFrame) -> list[Log]:
+    """Combine the table rows of each log into one :data:`Log`, in the order of the table."""
+    rows: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    present = (table.notna() & (table != "")).to_numpy()
+    for row, is_present in zip(table.to_dict("records"), present, strict=True):
+        row_values = {
+            str(column): value
+            for (column, value), is_value_present in zip(row.items(), is_present, strict=True)
+            if is_value_present
+        }
+        rows[str(row["log"])].append(row_values)
+    return [_log_summary(axes) for axes in rows.values()]
+
+
+def _log_summary(rows: Sequence[Mapping[str, Any]]) -> Log:
+    axes = [row for row in rows if "axis" in row]
+    main_rows = next(
+        (m for names in MAIN_AXES if (m := [a for a in axes if a["axis"] in names])), rows
+    )
+    log: dict[str, Any] = {}
+    for row in reversed((*main_rows, *rows)):
+        log |= row
+    reasons_and_remedies = ((row.get("reason", ""), row.get("remedy", "")) for row in rows)
+    log |= {
+        "name": log.get("name") or PurePosixPath(log["log"]).name or "unnamed",
+        "status": DONE if any(row["status"] == DONE for row in rows) else rows[0]["status"],
+        "missing_results": tuple(dict.fromkeys(pair for pair in reasons_and_remedies if any(pair))),
+        "axes": axes,
+        "findings": [id_ for id_ in log.get("findings", "").split(FINDING_SEPARATOR) if id_],
+    }
+    refused = log["status"] if log["status"] == NOT_COMPARED else "refused"
+    log |= {
+        "severity": log.get("severity", "refused"),
+        "headline": log.get("headline", f"{refused}: {log.get('reason', '')}"),
+        "action": log.get("action") or log.get("remedy", "") * ("headline" not in log),
+        "verdict_texts": (log.get("verdicts", "").split(FINDING_SEPARATOR) + [""] * 4)[:4],
+    }
+    return log | {"tags": _log_tags(log)}
+
+
+def _log_tags(log: Log) -> dict[str, str]:
+    tags = {
+        f"severity:{log['severity']}": log["severity"],
+        f"status:{log['status']}": log["status"],
+    }
+    for name in ("vehicle", "firmware"):
+        tags[f"{name}:{log.get(name, '')}"] = log.get(name, f"{name} unknown")
+    tags |= {f"finding:{finding}": finding_title(finding) for finding in log["findings"]}
+    return tags | {
+        f"remedy:{remedy}": remedy or "no action" for _, remedy in log["missing_results"]
+    }
+
+
+def short_names(logs: Sequence[Log]) -> dict[str, str]:
+    """Map long ids of flight controllers (above 20 characters) to their last 8, if all differ."""
+    long_ids = {vehicle for log in logs if len(vehicle := log.get("vehicle", "")) > 20}
+    short_ids = {vehicle: f"…{vehicle[-8:]}" for vehicle in long_ids}
+    return short_ids if len(set(short_ids.values())) == len(short_ids) else {}

@@ -1,0 +1,176 @@
+"""Rows of the table of ``px4fuse batch``: one row per axis of a log, from its results."""
+
+import csv
+import shlex
+from collections.abc import Iterable, Mapping
+from functools import reduce
+from importlib.resources import files
+from typing import Any
+
+import pandas as pd
+
+from px4fuse.card.model import Card
+from px4fuse.core.record import Unavailable
+from px4fuse.core.spreadsheet import neutralise_formulas
+from px4fuse.core.text import utc_time
+from px4fuse.ekf2.aids import AidResult
+from px4fuse.findings import Finding
+from px4fuse.request import quote_command
+from px4fuse.results.contract import ComparisonResults, Log
+
+DONE, NOT_COMPARED, FAILED = "done", "not compared", "failed"
+FINDING_SEPARATOR = ";"
+# Name of the noise estimate by axis: north and east share the estimate "horizontal"
+_TUNING_OF_AXIS = {"north": "horizontal", "east": "horizontal"}
+
+
+def read_rows(name: str) -> list[dict[str, str]]:
+    """Read a CSV file of this folder as dicts by column title."""
+    with files("px4fuse.batch").joinpath(name).open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+_COLUMNS = read_rows("columns.csv")
+#: Path of each table column in the results; empty if a column combines several fields
+RESULT_PATHS = {row["column"]: row["path"] for row in _COLUMNS}
+#: Data type of each table column; missing numbers are NA, and missing texts are empty
+COLUMN_TYPES = {row["column"]: row["type"] for row in _COLUMNS}
+
+Row = dict[str, Any]
+
+
+def value_at(results: object, path: str) -> Any:
+    """Return the value at a path in the results (keys joined by dots); None if it is missing."""
+
+    def child(parent: Any, name: str) -> Any:
+        if isinstance(parent, tuple):
+            return parent[int(name)]
+        return parent.get(name) if isinstance(parent, Mapping) else getattr(parent, name, None)
+
+    return reduce(child, path.split("."), results)
+
+
+def axis_rows(results: ComparisonResults) -> list[Row]:
+    """Return the table rows of one log, one per axis; columns without a value are absent.
+
+    SIGMA_Z and SIGMA_A are maximum-likelihood estimates; north and east have a common estimate. A
+    time offset that is not determinable from the flight is absent.
+    """
+    common_columns = log_columns(results.log) | finding_columns(results.findings, results.aids)
+    common_columns |= card_columns(results.card)
+    has_time_offset = bool(value_at(results, "clock.is_determinable"))
+    rows = []
+    for name, axis in results.axes.items():
+        unavailable = next(
+            (summary for summary in axis.filters.values() if isinstance(summary, Unavailable)), None
+        )
+        row = common_columns | {
+            "axis": name,
+            "status": NOT_COMPARED if isinstance(axis.filters["kf"], Unavailable) else DONE,
+            "reason": f"{unavailable.what}: {unavailable.reason}" if unavailable else "",
+            "remedy": unavailable.remedy if unavailable else "",
+        }
+        for column, path in RESULT_PATHS.items():
+            if column not in row and path and (has_time_offset or not path.startswith("clock.")):
+                tuned_axis = _TUNING_OF_AXIS.get(name, name)
+                row[column] = value_at(results, path.format(axis=name, tuned=tuned_axis))
+        rows.append(row)
+    return rows
+
+
+def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) -> Row:
+    """Return findings that no other finding causes, and verdicts on EKF2's aiding sources."""
+    causes = [finding for finding in findings if finding.caused_by is None]
+    aid_verdicts = [
+        f"{name} {aid.verdict}" for name, aid in aids.items() if aid.verdict != "disabled"
+    ]
+    return {
+        "aids": FINDING_SEPARATOR.join(aid_verdicts),
+        "findings": FINDING_SEPARATOR.join(finding.id for finding in causes),
+        "severities": sorted({finding.severity for finding in causes}),
+    }
+
+
+def card_columns(card: Card) -> Row:
+    """Return the table columns with the diagnosis, which is the same for all axes of a log."""
+    rmse_m = card.effect.position_rmse_m.values() if card.effect else ()
+    return {
+        "severity": card.severity,
+        "headline": card.headline,
+        "action": first_action(card),
+        "changed": "; ".join((*card.identity.changed, *card.identity.parameters)),
+        "verdicts": FINDING_SEPARATOR.join(
+            f"{verdict.word}, explained" if verdict.is_explained else verdict.word
+            for verdict in card.verdicts
+        ),
+        **{f"{verdict.filter}_{verdict.against}_ratio": verdict.ratio for verdict in card.verdicts},
+        "position_rmse_m": max(rmse_m, default=None),
+        "difference_rms_m": card.effect.difference_rms_m if card.effect else None,
+    }
+
+
+def first_action(card: Card) -> str:
+    """Return the first action of a diagnosis: the commands or, without commands, the sentence."""
+    if not card.causes:
+        return ""
+    first_cause = card.causes[0]
+    for action in (
+        *(first_cause.alternatives[0] if first_cause.alternatives else ()),
+        *first_cause.actions,
+    ):
+        if action.commands:
+            return "\n".join(action.commands)
+        if not action.sentence.startswith("no "):
+            break
+    return card.do_this[0] if card.do_this else ""
+
+
+def with_log_path(row: Row, path: str) -> Row:
+    """Replace the file name in the command of a table row by the path of the log.
+
+    >>> row = {"name": "a.ulg", "action": "px4fuse compare a.ulg --sigma-a 0.4"}
+    >>> with_log_path(row, "my logs/a.ulg")["action"]
+    "px4fuse compare 'my logs/a.ulg' --sigma-a 0.4"
+    """
+    action = row.get("action", "")
+    if not action.startswith("px4fuse "):
+        return row
+    words = [path if word == row["name"] else word for word in shlex.split(action)]
+    return row | {"action": quote_command(words)}
+
+
+def log_columns(log: Log) -> Row:
+    start, values = utc_time(log.start_unix_s), {"log": log}
+    paths = {name: path for name, path in RESULT_PATHS.items() if path.startswith("log.")}
+    return {name: value_at(values, path) for name, path in paths.items()} | {
+        "airframe": f"{airframe:g}" if (airframe := log.parameters.get("SYS_AUTOSTART")) else "",
+        "date": f"{start[:19]}Z" if start else "",
+    }
+
+
+def make_table(rows: Iterable[Row]) -> pd.DataFrame:
+    text_columns = dict.fromkeys((name for name, kind in COLUMN_TYPES.items() if kind == "str"), "")
+    filled_rows = [text_columns | clean_row(row) for row in rows]
+    return pd.DataFrame(filled_rows, columns=list(COLUMN_TYPES)).astype(COLUMN_TYPES)
+
+
+def clean_row(row: Row) -> Row:
+    """Remove missing values from a row, and replace bytes of file names that are not UTF-8."""
+    return {
+        name: value.encode(errors="replace").decode() if isinstance(value, str) else value
+        for name, value in row.items()
+        if value is not None
+    }
+
+
+def csv_bytes(table: pd.DataFrame) -> bytes:
+    """Format the table as CSV for Excel and LibreOffice, without active formulas."""
+    text_columns = {
+        name: table[name].map(neutralise_formulas)
+        for name, kind in COLUMN_TYPES.items()
+        if kind == "str"
+    }
+    text = table.assign(**text_columns).to_csv(
+        index=False, lineterminator="\r\n", float_format="%.10g"
+    )
+    return ("\ufeff" + text).encode()

@@ -1,0 +1,325 @@
+"""Run of ``px4fuse batch``: compares logs in worker processes, and writes the table."""
+
+import io
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, field
+from functools import partial
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
+
+import msgspec
+import pandas as pd
+
+from px4fuse.batch import TIMEOUT_S
+from px4fuse.batch.engine import connect_cluster, run_jobs
+from px4fuse.batch.job import Job, Outcome, analyse, failure_row, file_stem
+from px4fuse.batch.logs import LogAddress, find_logs
+from px4fuse.batch.page import html_text
+from px4fuse.batch.rows import (
+    FAILED,
+    NOT_COMPARED,
+    Row,
+    clean_row,
+    csv_bytes,
+    make_table,
+    with_log_path,
+)
+from px4fuse.core.input_files import check_output_folder
+from px4fuse.core.reading import max_log_bytes
+from px4fuse.core.workers import MAX_MEMORY_BYTES, JobFailure, run_bounded
+from px4fuse.core.writing import write_all
+from px4fuse.errors import LogError, Px4FuseError, SettingsError
+from px4fuse.filter.settings import Settings
+from px4fuse.request import ComparisonRequest, command_line
+
+# Table columns with the paths of a log's outputs, relative to the output folder
+FILE_COLUMNS = ("results", "report")
+RESUME_NOTE = "Finished results are kept. Run the same command to continue."
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class BatchResult:
+    """Table and written files of a run of ``px4fuse batch``.
+
+    Attributes
+    ----------
+    table : DataFrame
+        One row per log and axis, with the columns of :data:`px4fuse.batch.rows.COLUMN_TYPES`.
+    reused_count : int
+        Number of logs whose results are from an earlier run.
+    severities : frozenset of str
+        Severities of all findings.
+    written : tuple of Path
+        Files of the table.
+    """
+
+    table: pd.DataFrame
+    reused_count: int
+    severities: frozenset[str]
+    written: tuple[Path, ...]
+
+
+class CachedRows(msgspec.Struct, frozen=True):
+    """Table rows of a log in a cache file, for one version of px4fuse and one set of settings."""
+
+    sha256: str
+    px4fuse: str
+    settings: str
+    size_bytes: int | None
+    rows: Annotated[list[Row], msgspec.Meta(min_length=1)]
+
+    @property
+    def file(self) -> str:
+        return f"rows/{self.sha256}.json"
+
+
+@dataclass(frozen=True)
+class _RunState:
+    """State of a run of ``px4fuse batch``: settings, and the logs that are finished so far."""
+
+    output: Path
+    px4fuse: str
+    settings: str
+    # SHA-256 of the logs that did not fail, by address
+    hash_by_address: dict[str, str] = field(default_factory=dict)
+    # first of the logs with the same content, by SHA-256; only this log has table rows
+    first_log_by_hash: dict[str, LogAddress] = field(default_factory=dict)
+    # table rows of the logs that failed, by address
+    failed_rows: dict[str, Row] = field(default_factory=dict)
+    # SHA-256 of the logs whose results are from an earlier run
+    reused_hashes: set[str] = field(default_factory=set)
+
+
+def run_batch(
+    paths: str | Path | Iterable[str | Path],
+    output: str | Path | None = None,
+    *,
+    reports: bool = False,
+    **settings: Any,
+) -> pd.DataFrame:
+    """Compare many logs as :func:`px4fuse.compare` does, on this computer or a Dask cluster.
+
+    If the Python session has a Dask client (``distributed.Client``), its cluster is used.
+
+    Parameters
+    ----------
+    paths : str, Path or iterable of them
+        Files, folders, globs and URLs.
+    output : str or Path, optional
+        Folder for the table and the results of each log; a second run processes only new and
+        failed logs. By default no file is written.
+    reports : bool
+        True to write a PDF report for each log.
+    timeout_s : float
+        Maximum time for one log.
+    scheduler : str, optional
+        Address of a Dask scheduler.
+    workers : int, optional
+        Number of processes on this computer; by default the number of cores.
+    memory_gb : float
+        Maximum address space for one log, of which libraries use 0.6 GB; only on Linux.
+    progress : callable
+        Function of the activity, the number of finished logs, and the number of all logs.
+    **settings
+        The arguments above, and the arguments of :func:`px4fuse.compare`, such as ``sigma_z_m``.
+
+    Returns
+    -------
+    DataFrame
+        One row per log and axis; one row with the reason for a log that could not be compared.
+
+    Raises
+    ------
+    SettingsError
+        There are no logs, a setting is out of range, or the cluster is not usable.
+    OutputError
+        A result cannot be written.
+    """
+    sources = (paths,) if isinstance(paths, str | Path) else paths
+    with TemporaryDirectory(prefix="px4fuse-") as temporary_folder:
+        folder = Path(temporary_folder if output is None else output)
+        batch_result = run(
+            map(str, sources), folder, reports=reports and output is not None, **settings
+        )
+    return (
+        batch_result.table
+        if output is not None
+        else batch_result.table.assign(results="", report="")
+    )
+
+
+def run(
+    paths: Iterable[str],
+    output: Path,
+    *,
+    reports: bool = False,
+    timeout_s: float = TIMEOUT_S,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    memory_gb: float = MAX_MEMORY_BYTES / 1e9,
+    progress: Progress = lambda *_: None,
+    **settings: Any,
+) -> BatchResult:
+    """Compare many logs as :func:`batch` does, and write table and results to a folder.
+
+    If the run ends early (Ctrl-C, full disk, lost cluster), the folder contains the finished
+    results, and a table of them if the table can be written.
+
+    Raises
+    ------
+    SettingsError
+        See :func:`batch`.
+    OutputError
+        A result cannot be written.
+    Px4FuseError
+        The connection to the cluster was lost.
+    """
+    if find_spec("fsspec") is None or find_spec("pyarrow") is None:
+        raise SettingsError(
+            "batch requires fsspec and pyarrow", 'Run pip install "px4fuse[batch]".'
+        )
+    logs = find_logs(paths)
+    check_output_folder(output)
+    try:
+        request = ComparisonRequest(log="LOG", **settings)
+    except TypeError as error:
+        raise SettingsError(f"a setting is unknown ({error}).") from error
+    if request.mavlink is not None or request.position is not None:
+        raise SettingsError(
+            "`mavlink` and `position` are files of one flight and not available for many logs."
+        )
+    sigma_z_m = Settings().sigma_z_m if request.sigma_z_m is None else request.sigma_z_m
+    # not used; raises SettingsError if a setting is out of range
+    Settings(request.sigma_a_m_s2, sigma_z_m, request.dt_s)
+    state = _RunState(output, metadata.version("px4fuse"), command_line(request))
+    hashes_by_size = _cached_hashes(state, reports)
+    log_by_address = {log.address: log for log in logs}
+    jobs = [
+        Job(
+            log.address,
+            request,
+            reports,
+            max_log_bytes.get(),
+            frozenset(hashes_by_size[log.size_bytes]),
+        )
+        for log in logs
+    ]
+    run_in_processes = partial(
+        run_bounded, analyse, timeout_s=timeout_s, memory_bytes=int(memory_gb * 1e9)
+    )
+    with (
+        connect_cluster(scheduler) as client,
+        closing(run_jobs(client, run_in_processes, jobs, workers)) as finished_jobs,
+    ):
+        progress("comparing logs", 0, len(jobs))
+        try:
+            try:
+                for number, (job, outcome) in enumerate(finished_jobs, 1):
+                    _cache_outcome(state, log_by_address[job.address], outcome)
+                    progress(f"comparing logs, {len(state.failed_rows)} failed", number, len(jobs))
+            finally:
+                batch_result = _write_table(state, logs)
+        except Px4FuseError as error:
+            raise type(error)(f"{error} {RESUME_NOTE}") from error
+    return batch_result
+
+
+def _cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]]:
+    """Return the SHA-256 of the logs with finished outputs in the folder, by size of the log."""
+    hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
+    for cached_rows in load_cached_rows(state.output, state.px4fuse, state.settings):
+        first_row = cached_rows.rows[0]
+        files = [state.output / first_row.get(kind, "") for kind in FILE_COLUMNS[: 1 + reports]]
+        if "axis" not in first_row or all(file.is_file() for file in files):
+            hashes_by_size[cached_rows.size_bytes].add(cached_rows.sha256)
+    return hashes_by_size
+
+
+def load_cached_rows(folder: Path, px4fuse: str, settings: str) -> Iterator[CachedRows]:
+    """Yield the cached table rows in a folder for this px4fuse version and these settings."""
+    for file in sorted((folder / "rows").glob("*.json")):
+        try:
+            cached_rows = msgspec.json.decode(file.read_bytes(), type=CachedRows)
+        except (OSError, msgspec.MsgspecError):
+            continue  # no cache file of this px4fuse version, so the log is compared again
+        if (cached_rows.px4fuse, cached_rows.settings) == (px4fuse, settings):
+            yield cached_rows
+
+
+def _cache_outcome(state: _RunState, log: LogAddress, outcome: Outcome | JobFailure) -> None:
+    """Add the outcome of a log to the state of the run, and write its results to the folder."""
+    if isinstance(outcome, JobFailure):
+        remedy = "Increase --timeout or --memory, or run px4fuse compare on this log."
+        outcome = Outcome("", (failure_row(LogError(outcome.reason.rstrip("."), remedy), FAILED),))
+    if outcome.rows and outcome.rows[0]["status"] == FAILED:
+        state.failed_rows[log.address] = outcome.rows[0]
+        return
+    first_log = min(log, state.first_log_by_hash.get(outcome.sha256, log))
+    if not outcome.rows:
+        state.reused_hashes.add(outcome.sha256)
+    elif first_log is log:
+        _write_log(state, log, outcome)
+    state.hash_by_address[log.address] = outcome.sha256
+    state.first_log_by_hash[outcome.sha256] = first_log
+
+
+def _write_log(state: _RunState, log: LogAddress, outcome: Outcome) -> None:
+    stem = f"results/{file_stem(log.name, outcome.sha256)}"
+    named_contents = {f"{stem}.json": outcome.results, f"{stem}.pdf": outcome.report}
+    files = {
+        kind: name if named_contents[name] else ""
+        for kind, name in zip(FILE_COLUMNS, named_contents, strict=True)
+    }
+    rows = [clean_row(row) | files for row in outcome.rows]
+    cached_rows = CachedRows(outcome.sha256, state.px4fuse, state.settings, log.size_bytes, rows)
+    contents = named_contents | {cached_rows.file: msgspec.json.encode(cached_rows)}
+    write_all({state.output / name: content for name, content in contents.items() if content})
+
+
+def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
+    """Write the table of the logs that are finished so far, as CSV, Parquet and web page."""
+    severities: set[str] = set()
+    rows_by_hash = {
+        cached_rows.sha256: cached_rows.rows
+        for cached_rows in load_cached_rows(state.output, state.px4fuse, state.settings)
+    }
+
+    def rows_of_log(log: LogAddress) -> Iterable[Row]:
+        if log.address not in state.hash_by_address:
+            return [state.failed_rows[log.address]] if log.address in state.failed_rows else []
+        sha256 = state.hash_by_address[log.address]
+        first_log = state.first_log_by_hash[sha256]
+        if first_log is log and sha256 in rows_by_hash:
+            return rows_by_hash[sha256]
+        status, reason = NOT_COMPARED, f"the log is identical to {first_log.log}, see its rows"
+        if first_log is log:
+            status = FAILED
+            reason = "another px4fuse batch with this output folder replaced the rows of this log"
+        return [{"status": status, "log_sha256": sha256, "reason": reason}]
+
+    def rows() -> Iterator[Row]:
+        for log in logs:
+            common_columns = {"log": log.log, "name": log.name}
+            common_columns |= {"px4fuse": state.px4fuse, "settings": state.settings}
+            for row in rows_of_log(log):
+                severities.update(row.get("severities", ()))
+                yield with_log_path(row, log.log) | common_columns
+
+    table = make_table(rows())
+    page = html_text(table, state.output.resolve().name, f"px4fuse {state.px4fuse}")
+    parquet = io.BytesIO()
+    table.to_parquet(parquet, index=False)
+    contents = {
+        state.output / "fleet.parquet": parquet.getvalue(),
+        state.output / "fleet.csv": csv_bytes(table),
+        state.output / "fleet.html": page.encode(),
+    }
+    write_all(contents)
+    return BatchResult(table, len(state.reused_hashes), frozenset(severities), tuple(contents))

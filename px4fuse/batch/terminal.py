@@ -1,0 +1,135 @@
+"""Terminal output of ``px4fuse batch`` and ``px4fuse diff``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from px4fuse.batch.measures import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
+from px4fuse.batch.page import SIGMA_RATIO_COLUMNS, Log, logs_of, sort_logs
+from px4fuse.batch.rows import FAILED
+from px4fuse.card.numbers import format_ratio
+from px4fuse.core.text import format_number
+from px4fuse.report.card_html import SEVERITY_SIGNS
+from px4fuse.report.page import Cell, Page, styled_text
+from px4fuse.report.style import MUTED_COLOUR, SEVERITY_COLOURS
+from px4fuse.results.contract import ChangeResults, Interval
+
+if TYPE_CHECKING:
+    from px4fuse.batch.run import BatchResult
+
+# Maximum numbers of reasons for missing results, and of logs, that the summary lists
+MAX_LISTED_REASONS, MAX_LISTED_LOGS = 8, 40
+RATIO_NOTE = "Ratio of actual to reported σ: ● innovation ÷ √S, ◆ error ÷ σ (ground truth)"
+RED, YELLOW = SEVERITY_COLOURS["error"], SEVERITY_COLOURS["warning"]
+NUMBER_HEADS = ("number", "A", "95 %", "B", "95 %", "unit")
+
+
+def format_summary(batch_result: BatchResult) -> Page:
+    """Format a run of ``px4fuse batch``: reasons for missing results, and diagnoses of all logs."""
+    page, logs = Page(), batch_result.table.drop_duplicates("log")
+    uncompared = logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)["log"]
+    causes = uncompared.agg(["count", "first"]).reset_index()
+    sorted_causes = causes.sort_values("count", ascending=False, kind="stable")
+    for cause in sorted_causes.head(MAX_LISTED_REASONS).to_dict("records"):
+        template = "{first}: {status}: {reason}. {remedy}"
+        if cause["count"] > 1:
+            template = "{count} logs, for example {first}: {status}: {reason}. {remedy}"
+        page.write(
+            template.format_map(cause).rstrip(), colour=RED if cause["status"] == FAILED else YELLOW
+        )
+    if len(sorted_causes) > MAX_LISTED_REASONS:
+        remaining_count = len(sorted_causes) - MAX_LISTED_REASONS
+        page.write(f"fleet.html lists {remaining_count} more reasons for logs without a result.")
+    entries = sort_logs(logs_of(batch_result.table))
+    if entries:
+        rows = [_diagnosis(log) for log in entries[:MAX_LISTED_LOGS]]
+        page.table(
+            ("", "log", "diagnosis", "KF ●", "◆", "EKF2 ●", "◆"),
+            rows,
+            right_aligned_columns=(3, 4, 5, 6),
+        )
+        page.write(RATIO_NOTE, colour=MUTED_COLOUR)
+    if len(entries) > MAX_LISTED_LOGS:
+        page.write(f"fleet.html lists {len(entries) - MAX_LISTED_LOGS} more logs.")
+    counts = logs["status"].value_counts()
+    status_counts = ", ".join(f"{count} {status}" for status, count in counts.items())
+    retry_note = " Run the same command to repeat failed logs." if FAILED in counts else ""
+    reused_text = f"{batch_result.reused_count} reused from an earlier run"
+    page.write(f"{len(logs)} logs: {status_counts}; {reused_text}.{retry_note}")
+    return page
+
+
+def _diagnosis(log: Log) -> tuple[Cell, ...]:
+    colour = SEVERITY_COLOURS.get(log["severity"], MUTED_COLOUR)
+    ratios = (log.get(f"{name}_ratio") for name in SIGMA_RATIO_COLUMNS)
+    return (
+        (SEVERITY_SIGNS[log["severity"]][0], colour),
+        log["name"],
+        log["headline"],
+        *("–" if ratio is None else format_ratio(ratio) for ratio in ratios),
+    )
+
+
+def format_differences(results: ChangeResults) -> Page:
+    """Format the output of ``px4fuse diff``: differences, and verdicts that are worse in B."""
+    page = Page()
+    for name, diff_input in (("A", results.a), ("B", results.b)):
+        log = (
+            diff_input.kind
+            if diff_input.given == diff_input.log
+            else f"{diff_input.kind} of {diff_input.log}"
+        )
+        versions = f"SHA-256 {diff_input.log_sha256[:12]}, px4fuse {diff_input.px4fuse}"
+        page.write_labelled(name, f"{diff_input.given} ({log}), {versions}")
+    if results.settings:
+        settings = [
+            (setting.name, _format_setting(setting.a), _format_setting(setting.b))
+            for setting in results.settings
+        ]
+        page.table(("setting", "A", "B"), settings)
+    rows = []
+    for number in results.numbers:
+        factor, unit = (100.0, "%") if number.unit == "share" else (1.0, number.unit)
+        cells = [
+            cell
+            for value, interval in ((number.a, number.a_interval), (number.b, number.b_interval))
+            for cell in (_format_value(value, factor), _format_interval(interval))
+        ]
+        rows.append((number.label, *cells, unit))
+    if rows:
+        page.table(NUMBER_HEADS, rows, right_aligned_columns=(1, 2, 3, 4))
+    tolerance_text = f"{100.0 * RELATIVE_TOLERANCE:g} % or {ABSOLUTE_TOLERANCE:g}"
+    page.write(
+        f"Numbers that differ by less than {tolerance_text} are not listed.", colour=MUTED_COLOUR
+    )
+    for finding in results.findings:
+        styled = styled_text(
+            f"{finding.severity}: {finding.message}", 8.0, SEVERITY_COLOURS[finding.severity]
+        )
+        page.write_labelled(f"Only {finding.only_in}", styled)
+    for text in results.worse:
+        page.write_labelled("Worse", styled_text(text, 8.0, RED))
+    if not results.worse:
+        page.write("No verdict is worse in B than in A.")
+    return page
+
+
+def _format_setting(value: float | str | None) -> str:
+    if value is None:
+        return "–"
+    return value if isinstance(value, str) else f"{value:.6g}"
+
+
+def _format_value(value: float | None, factor: float) -> str:
+    return "" if value is None else format_number(factor * value)
+
+
+def _format_interval(interval: Interval | None) -> str:
+    if interval is None:
+        return ""
+    low, high = interval
+    return (
+        f"above {format_number(low)}"
+        if high is None
+        else f"{format_number(low)} to {format_number(high)}"
+    )

@@ -1,0 +1,1 @@
+"""Assignments for a course, and grading of the submitted reports."""

@@ -1,0 +1,189 @@
+"""Writing of an assignment: log and answer form for each student, and the answer key."""
+
+import hashlib
+import secrets
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from px4fuse.classroom.assignment.key import Answer, AnswerKey, key_text, read_key
+from px4fuse.classroom.assignment.random_assignment import AssignedFlight, FlightKind, draw
+from px4fuse.classroom.assignment.roster import Person, normalise_text
+from px4fuse.classroom.assignment.truth import form_truth
+from px4fuse.core.input_files import inputs_not_registered
+from px4fuse.core.text import to_json_types
+from px4fuse.core.writing import write_all
+from px4fuse.errors import OutputError, SettingsError
+from px4fuse.results.answer_form import form_name, form_text
+from px4fuse.simulation import flights
+from px4fuse.simulation.mistakes import parse
+
+# True values of the simulation that the answer key lists
+TRUTH_NAMES = (
+    "duration_s",
+    "sigma_z_m",
+    "sigma_a_m_s2",
+    "reported_sigma_m",
+    "clock_offset_to_add_s",
+    "path_length_m",
+    "closure_error_m",
+)
+
+
+def simulate_assigned(
+    secret: bytes, student: Person, kind: FlightKind, count: int | None = None, truth: bool = True
+) -> tuple[bytes, Answer]:
+    """Simulate the flight of one student; return the log (ULog) and the right answers."""
+    assigned_flight = draw(secret, student.student_id, kind, count, truth)
+    simulation = flights.simulate(assigned_flight.scenario, parse(assigned_flight.mistake_options))
+    log = flights.to_ulog(simulation)
+    sha256 = hashlib.sha256(log).hexdigest()
+    true_values = flights.answer(simulation)["truth"]
+    return log, Answer(
+        student_id=student.student_id,
+        name=student.name,
+        file=student.file,
+        sha256=sha256,
+        scenario=to_json_types(asdict(assigned_flight.scenario)),
+        mistakes=assigned_flight.mistake_options,
+        truth={name: float(true_values[name]) for name in TRUTH_NAMES},
+        difficulty=assigned_flight.difficulty,
+        form=form_truth(simulation, sha256),
+    )
+
+
+def key_path(folder: Path, key_option: Path | None) -> Path:
+    """Return the path of the answer key, by default beside the folder for the students.
+
+    Raises
+    ------
+    OutputError
+        The path is inside the folder for the students.
+    """
+    resolved_folder = folder.resolve()
+    path = key_option or resolved_folder.parent / f"{resolved_folder.name}_answers.json"
+    if resolved_folder in (path.resolve(), *path.resolve().parents):
+        raise OutputError(
+            f"The answer key {path} would be in the students' folder, where students can read it. "
+            "Choose another folder with --answer."
+        )
+    return path
+
+
+def assign(
+    students: Sequence[Person],
+    folder: Path,
+    key_file: Path,
+    secret: bytes | None,
+    kind: FlightKind,
+    count: int | None = None,
+    truth: bool = True,
+    progress: Callable[[int, int], None] = lambda *_: None,
+) -> tuple[AnswerKey, int]:
+    """Write the log and the answer form of each student to a folder, and the answer key.
+
+    An existing log or form is never replaced: it must be identical. Students can be added to an
+    existing key; the entries of the other students must be unchanged.
+
+    Parameters
+    ----------
+    secret : bytes or None
+        None for the secret in the existing key, or for a new random secret.
+    count : int, optional
+        Number of mistakes per flight; drawn at random by default.
+    truth : bool
+        True if the logs of aisle flights contain the ground truth.
+    progress : callable
+        Called after each flight with the number of finished flights and the number of students.
+
+    Returns
+    -------
+    key : AnswerKey
+        Right answers for all students.
+    written_count : int
+        Number of written logs; the other logs existed already.
+
+    Raises
+    ------
+    SettingsError
+        One flight cannot have this many mistakes.
+    OutputError
+        A file exists with other content, or cannot be written.
+    """
+    with inputs_not_registered():
+        key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
+    answers = {normalise_text(answer.student_id): answer for answer in key.answers}
+    _check_extends(
+        key_file,
+        key.kind == kind and answers.keys() <= {normalise_text(s.student_id) for s in students},
+    )
+    new_secret = key.secret
+    if secret is None:
+        new_secret = new_secret or secrets.token_urlsafe(24)
+        secret = new_secret.encode()
+    elif new_secret.encode() != secret:
+        new_secret = ""
+    written_count = 0
+    for finished_count, student in enumerate(students, start=1):
+        log, answer = simulate_assigned(secret, student, kind, count, truth)
+        stored_answer = answers.setdefault(normalise_text(student.student_id), answer)
+        _check_extends(key_file, stored_answer.sha256 == answer.sha256)
+        form = form_text(student.file, answer.sha256).encode()
+        contents = {folder / student.file: log, folder / form_name(student.file): form}
+        missing_contents = {
+            path: content for path, content in contents.items() if not _is_written(path, content)
+        }
+        key = AnswerKey(kind, tuple(answers.values()), new_secret)
+        # the answer key is written before the log, because an interrupted run needs its secret
+        write_all({key_file: key_text(key).encode()})
+        key_file.chmod(0o600)  # only the instructor can read the answer key
+        write_all(missing_contents)
+        written_count += folder / student.file in missing_contents
+        progress(finished_count, len(students))
+    return key, written_count
+
+
+def preview(
+    students: Sequence[Person],
+    key_file: Path,
+    secret: bytes | None,
+    kind: FlightKind,
+    count: int | None = None,
+) -> list[AssignedFlight]:
+    """Draw the flights that :func:`assign` would simulate, without writing files.
+
+    Raises
+    ------
+    SettingsError
+        One flight cannot have this many mistakes, or no secret was given or stored.
+    """
+    if secret is None:
+        stored_key = read_key(key_file) if key_file.exists() else None
+        if stored_key is None or not stored_key.secret:
+            raise SettingsError(
+                "--preview requires --secret-file: --preview stores no secret, so the next run "
+                "would draw other flights."
+            )
+        secret = stored_key.secret.encode()
+    return [draw(secret, student.student_id, kind, count) for student in students]
+
+
+def _is_written(path: Path, content: bytes) -> bool:
+    """Return True if the file exists with this content; raise OutputError if it has another."""
+    if not path.exists() and not path.is_symlink():
+        return False
+    if path.is_file() and path.stat().st_size == len(content) and path.read_bytes() == content:
+        return True
+    raise OutputError(
+        f"{path} exists with other content and was not overwritten. Use the same secret and "
+        "options as for the existing files, or another folder (-o)."
+    )
+
+
+def _check_extends(key_file: Path, is_extension: bool) -> None:
+    if not is_extension:
+        raise OutputError(
+            f"{key_file} is the answer key of other flights and was not overwritten. Use the "
+            "secret, options and students of the existing key (you can add students), or another "
+            "file (--answer)."
+        )

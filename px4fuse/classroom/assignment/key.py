@@ -1,0 +1,123 @@
+"""Answer key of an assignment: flight, mistakes and right answers for each student."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from px4fuse.classroom.assignment.roster import MAX_STUDENTS, Person, Register, normalise_text
+from px4fuse.classroom.assignment.truth import FormTruth
+from px4fuse.core.reading import read_text
+from px4fuse.errors import SettingsError
+from px4fuse.results.answer_form import update_renamed_values
+
+# Maximum size (bytes) of an answer key: the key of 1000 students has two million bytes
+MAX_KEY_BYTES = 20_000_000
+KEY_NOTE = (
+    "For the instructor only: this file lists the mistakes of every student's flight. Do not hand "
+    "it out, and do not put it into the students' folder."
+)
+_Text = Annotated[str, Meta(max_length=1000)]
+_Number = Annotated[float, Meta(gt=-1e12, lt=1e12)]
+_Texts = Annotated[
+    tuple[Annotated[str, Meta(min_length=1, max_length=200)], ...], Meta(max_length=20)
+]
+
+
+class Answer(msgspec.Struct, frozen=True, rename={"student_id": "id"}):
+    """Assigned flight of one student, with its mistakes and the right answers.
+
+    Attributes
+    ----------
+    student_id, name : str
+        As in the class list.
+    file, sha256 : str
+        File name and SHA-256 of the student's log.
+    scenario : dict
+        Fields of :class:`px4fuse.simulation.scenario.Scenario`.
+    mistakes : tuple of str
+        Values of ``px4fuse simulate --mistake``; empty for a flight without a mistake.
+    truth : dict
+        True values of the simulation that the log does not contain, for example ``sigma_z_m``.
+    difficulty : float or None
+        See :class:`px4fuse.classroom.assignment.random_assignment.AssignedFlight`.
+    form : FormTruth or None
+        Right answers to the student's answer form.
+    """
+
+    student_id: Annotated[str, Meta(max_length=1000, pattern=r"\S")]
+    name: _Text
+    file: _Text
+    sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+    scenario: dict[str, str | int | float | bool | None] = {}
+    mistakes: _Texts = ()
+    truth: dict[str, _Number] = {}
+    difficulty: _Number | None = None
+    form: FormTruth | None = None
+
+
+class _Schema(msgspec.Struct, frozen=True):
+    name: Literal["px4fuse-assignment"] = "px4fuse-assignment"
+    version: Literal[3] = 3
+
+
+class AnswerKey(msgspec.Struct, frozen=True):
+    """Right answers for all students of a class, and the secret; written as JSON.
+
+    Attributes
+    ----------
+    kind : str
+        Kind of all flights: "aisle", "loop" or "mixed".
+    answers : tuple of Answer
+        Assigned flight and right answers of each student.
+    secret : str
+        Random secret that determined the flights; "" if the instructor chose and keeps the secret.
+    """
+
+    kind: _Text
+    answers: Annotated[tuple[Answer, ...], Meta(min_length=1, max_length=MAX_STUDENTS)] = (
+        msgspec.field(name="students")
+    )
+    secret: _Text = ""
+    schema: _Schema = _Schema()
+    note: str = KEY_NOTE
+
+    def __repr__(self) -> str:  # without the secret, which an error message must not show
+        return f"AnswerKey({self.kind!r}, {len(self.answers)} students)"
+
+    def of_student(self, student_id: str) -> Answer | None:
+        """Return flight and right answers of a student; leading zeros of the id may be missing."""
+        register = Register(Person(answer.student_id) for answer in self.answers)
+        student_index = register.student_index(Person(student_id))
+        return None if student_index is None else self.answers[student_index]
+
+    def of_log(self, sha256: str) -> Answer | None:
+        """Return flight and right answers for the log with this SHA-256; None if not assigned."""
+        return next((answer for answer in self.answers if answer.sha256 == sha256), None)
+
+
+def key_text(key: AnswerKey) -> str:
+    """Format the answer key as JSON with line breaks."""
+    return msgspec.json.format(msgspec.json.encode(key), indent=1).decode() + "\n"
+
+
+def read_key(path: Path) -> AnswerKey:
+    """Read the answer key of an assignment.
+
+    Raises
+    ------
+    SettingsError
+        The file cannot be read, or was not written by ``px4fuse simulate --assignment``.
+    """
+    text = read_text(path, SettingsError, MAX_KEY_BYTES, name=str(path))
+    try:
+        key = msgspec.convert(update_renamed_values(msgspec.json.decode(text)), AnswerKey)
+        if len({normalise_text(answer.student_id) for answer in key.answers}) < len(key.answers):
+            raise ValueError("two students have the same id")
+    except (msgspec.MsgspecError, RecursionError, ValueError) as error:
+        raise SettingsError(
+            f"{path} is not an answer key of this px4fuse version ({error}).",
+            "Give the file that px4fuse simulate --assignment wrote.",
+        ) from error
+    return key

@@ -1,0 +1,255 @@
+"""Class list: reading of tables of learning platforms, and identification of students."""
+
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from operator import attrgetter
+from pathlib import Path
+
+from px4fuse.classroom.assignment.sheet import Sheet, read_sheet
+from px4fuse.core.record import table
+from px4fuse.core.text import one_line
+from px4fuse.errors import SettingsError
+
+MAX_NAME_LENGTH = 200
+MAX_STUDENTS = 1000
+# Maximum length (characters) of a file name without suffix: systems allow 255 bytes, and a
+# character has up to 4 bytes
+MAX_STEM_LENGTH = 48
+# File names that Windows reserves
+RESERVED_NAMES = {"con", "prn", "aux", "nul"} | {
+    f"{n}{i}" for n in ("com", "lpt") for i in range(10)
+}
+ROSTER_COLUMNS = table(__file__, "columns.toml", dict[str, tuple[str, ...]])
+# Fields of a student that another list adds if the class list does not contain them
+ADDED_FIELDS = ("name", "email", "login", "submitted")
+# Names of rows in Canvas gradebooks that are not students, without blanks and punctuation
+NOT_STUDENT_NAMES = ("pointspossible", "studenttest")
+
+
+@dataclass(frozen=True)
+class Person:
+    """Student of the class.
+
+    Attributes
+    ----------
+    student_id, name, email : str
+        As in the class list.
+    login : str
+        Login on Blackboard or ILIAS.
+    numbers : dict
+        Number of the student on each learning platform, by name of the platform.
+    submitted : str
+        Submission time as in Moodle's worksheet.
+    """
+
+    student_id: str
+    name: str = ""
+    email: str = ""
+    login: str = ""
+    numbers: dict[str, str] = field(default_factory=dict)
+    submitted: str = ""
+
+    @property
+    def file(self) -> str:
+        """File name of the student's assigned log, made from the id."""
+        return f"{file_stem(self.student_id)}.ulg"
+
+
+def read_people(sheet: Sheet) -> tuple[Person, ...]:
+    """Read the students from a class list, Moodle worksheet or Canvas gradebook.
+
+    Titles of the columns: id (Student ID, ID number, Matrikelnummer, SIS User ID), login (Username,
+    SIS Login ID), email, name (or first and last name).
+
+    Raises
+    ------
+    SettingsError
+        No column identifies the students, or two rows have the same id.
+    """
+    if all(sheet.column(titles) is None for titles in ROSTER_COLUMNS.values()):
+        raise SettingsError(
+            f"{sheet.path}: no column identifies the student.",
+            "Give one column the title id, email or name.",
+        )
+    row_by_id: dict[str, int] = {}
+    people = []
+    for row_number, row in enumerate(sheet.rows, start=2):
+        person = read_student(sheet, row)
+        if person is None:
+            continue
+        normalised_id = normalise_text(person.student_id)
+        if normalised_id and row_by_id.setdefault(normalised_id, row_number) != row_number:
+            raise SettingsError(
+                f"{sheet.path}: rows {row_by_id[normalised_id]} and {row_number} have the same id "
+                f"{one_line(person.student_id, 40)!r}.",
+                "Give each student a unique id.",
+            )
+        people.append(person)
+    return tuple(people)
+
+
+def read_roster(path: Path) -> tuple[Person, ...]:
+    """Read the class list of an assignment; each student must have a unique id.
+
+    Raises
+    ------
+    SettingsError
+        The file is not a table of students, an id cannot be used as a file name, or the number of
+        students is zero or above MAX_STUDENTS.
+    """
+    people = read_people(read_sheet(path))
+    if not people or len(people) > MAX_STUDENTS:
+        raise SettingsError(
+            f"{path} contains {len(people)} students.",
+            f"Give a class list with 1 to {MAX_STUDENTS}.",
+        )
+    stems: dict[str, Person] = {}
+    for person in people:
+        stem = file_stem(person.student_id)
+        if stem is None or stems.setdefault(stem.casefold(), person) is not person:
+            student_text = one_line(person.student_id or person.name, 40)
+            raise SettingsError(
+                f"{path}: the id of {student_text!r} cannot be used as a file name.",
+                "Give each student a unique id with letters or digits.",
+            )
+    return people
+
+
+def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
+    """Return the student in a row of a class list; None if the row contains no student."""
+    cells = {
+        field_name: one_line(sheet.cell(row, titles), MAX_NAME_LENGTH)
+        for field_name, titles in ROSTER_COLUMNS.items()
+    }
+    name = cells["name"] or f"{cells['first']} {cells['last']}".strip()
+    if re.sub(r"\W", "", name.casefold()) in NOT_STUDENT_NAMES:
+        return None
+    numbers = {}
+    if participant := re.search(r"\d+$", sheet.cell(row, ("identifier",))):
+        numbers["moodle"] = participant[0]
+    if sheet.column(("sisuserid", "sisloginid")) is not None:
+        numbers |= {"canvas": number} if (number := sheet.cell(row, ("id",))) else {}
+        cells["student_id"] = one_line(sheet.cell(row, ("sisuserid",)), MAX_NAME_LENGTH)
+    student_id = cells["student_id"] or cells["login"] or cells["email"]
+    submission_time = sheet.cell(row, ("lastmodifiedsubmission",))
+    person = Person(student_id, name, cells["email"], cells["login"], numbers, submission_time)
+    return person if student_id or name or numbers else None
+
+
+class Register:
+    """Students of the class; other lists add missing data, but no further students."""
+
+    def __init__(self, people: Iterable[Person] = (), *other_lists: Iterable[Person]) -> None:
+        self.people = list(people)
+        for other in chain.from_iterable(other_lists):
+            index = self.student_index(other)
+            if index is not None:
+                student = self.people[index]
+                fields = {
+                    name: getattr(student, name) or getattr(other, name) for name in ADDED_FIELDS
+                }
+                numbers = other.numbers | student.numbers
+                self.people[index] = replace(student, numbers=numbers, **fields)
+
+    def student_index(self, other: Person) -> int | None:
+        """Return the index of a person in the class; None if the person is not identified.
+
+        The first of these fields that matches exactly one student decides: platform number, id,
+        email, login, name. Leading zeros of ids may be missing, because spreadsheets remove them.
+        """
+        criteria: tuple[tuple[Callable[[str, str], bool], Callable[[Person], str], str], ...] = (
+            *(
+                (_is_same_text, lambda person, at=platform: person.numbers.get(at, ""), value)
+                for platform, value in other.numbers.items()
+            ),
+            (_is_same_text, attrgetter("student_id"), other.student_id),
+            (is_same_id, attrgetter("student_id"), other.student_id),
+            (_is_same_text, attrgetter("email"), other.email),
+            # in a class list without logins, the ids may be the logins
+            (_is_same_text, lambda person: person.login or person.student_id, other.login),
+            (is_same_name, attrgetter("name"), other.name),
+        )
+        for is_same, field_of, value in criteria:
+            matches = [
+                i for i, person in enumerate(self.people) if is_same(field_of(person), value)
+            ]
+            if len(matches) == 1:
+                return matches[0]
+        return None
+
+
+def normalise_text(text: str) -> str:
+    """Normalise an id or name for comparison: Unicode NFKC, lower case, no outer blanks."""
+    return unicodedata.normalize("NFKC", text).strip().casefold()
+
+
+def _is_same_text(stated_text: str, other_text: str) -> bool:
+    return normalise_text(stated_text) == normalise_text(other_text) != ""
+
+
+def is_same_id(student_id: str, other_id: str) -> bool:
+    """Return True if two ids are equal except for case and leading zeros.
+
+    >>> is_same_id("0042", "42"), is_same_id("S1", "s1 "), is_same_id("00", "0")
+    (True, True, False)
+    """
+    return normalise_text(student_id).lstrip("0") == normalise_text(other_id).lstrip("0") != ""
+
+
+def is_same_name(name: str, other_name: str) -> bool:
+    """Return True if two names have the same words in any order, or joined as Canvas joins them.
+
+    >>> is_same_name("Ada Lovelace", "Lovelace, Ada"), is_same_name("Ada Lovelace", "lovelaceada")
+    (True, True)
+    >>> is_same_name("Ada", "ada lovelace"), is_same_name("", "")
+    (False, False)
+    """
+    words, other_words = (
+        re.findall(r"[^\W_]+", normalise_text(text)) for text in (name, other_name)
+    )
+    short, long = sorted((words, other_words), key=len)
+    rotated_words = ("".join(long[start:] + long[:start]) for start in range(len(long)))
+    is_joined = len(short) == 1 < len(long) and short[0] in rotated_words
+    return bool(short) and (sorted(words) == sorted(other_words) or is_joined)
+
+
+def file_stem(student_id: str) -> str | None:
+    """Convert a student id to a file name that all systems allow; None without letter or digit.
+
+    >>> file_stem("s01/2026"), file_stem("../../x"), file_stem("nul"), file_stem("=;")
+    ('s01_2026', '_.._x', '_nul', None)
+    >>> file_stem("com1.txt"), file_stem("-rf"), file_stem("a."), len(file_stem("x" * 300))
+    ('_com1.txt', 'rf', 'a', 48)
+    """
+    text = unicodedata.normalize("NFC", student_id.strip())
+    safe_characters = "".join(c if c.isalnum() or c in "-_.@+" else "_" for c in text)
+    if not any(c.isalnum() for c in safe_characters):
+        return None
+    stem = safe_characters[:MAX_STEM_LENGTH].lstrip(".-+@").rstrip(".")
+    return f"_{stem}" if stem.split(".")[0].casefold() in RESERVED_NAMES else stem
+
+
+def make_unique(names: Iterable[str], pattern: str = "{} ({})") -> list[str]:
+    """Append numbers to repeated names, so that all names differ in more than case.
+
+    >>> make_unique(["notes", "cover", "Notes"])
+    ['notes', 'cover', 'Notes (2)']
+    """
+    unique_names: dict[str, str] = {}
+    repetition_count: Counter[str] = Counter()
+    for name in names:
+        unique_name, normalised_name = name, name.casefold()
+        while unique_name.casefold() in unique_names:
+            repetition_count[normalised_name] += 1
+            unique_name = pattern.format(name, repetition_count[normalised_name] + 1)
+        unique_names[unique_name.casefold()] = unique_name
+    return list(unique_names.values())
+
+
+def file_names(stems: Iterable[str]) -> list[str]:
+    """Make file names that all systems allow and that differ in more than case."""
+    return make_unique((file_stem(stem) or "report" for stem in stems), "{}-{}")

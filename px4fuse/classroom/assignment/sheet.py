@@ -1,0 +1,131 @@
+"""CSV tables of learning platforms and instructors: reading, and writing of a changed copy.
+
+The reader detects encoding (UTF-8 with and without byte order mark, UTF-16, Windows-1252) and
+separator. A copy has the encoding and the separator of the original.
+"""
+
+import codecs
+import csv
+import io
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from px4fuse.core.reading import read_bytes_limited
+from px4fuse.errors import SettingsError
+
+MAX_TABLE_BYTES = 20_000_000
+COLUMN_SEPARATORS = ",;\t|"
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """CSV table with a header.
+
+    Attributes
+    ----------
+    head : tuple of str
+        Titles of the columns.
+    rows : tuple of tuple of str
+        Cells of each row, at least as many as titles.
+    """
+
+    path: Path
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    encoding: str = "utf-8"
+    separator: str = ","
+
+    def column(self, titles: Sequence[str]) -> int | None:
+        """Return the index of the column with the first title that exists; None if none exists."""
+        plain_titles = [normalise_title(title) for title in self.head]
+        return next((plain_titles.index(title) for title in titles if title in plain_titles), None)
+
+    def cell(self, row: Sequence[str], titles: Sequence[str]) -> str:
+        """Return the cell of a row in the column with the first title that exists, or ""."""
+        column_index = self.column(titles)
+        return "" if column_index is None else row[column_index].strip()
+
+    @property
+    def text(self) -> str:
+        """Table as CSV (RFC 4180), with the original separator."""
+        csv_file = io.StringIO()
+        csv.writer(csv_file, delimiter=self.separator).writerows((self.head, *self.rows))
+        return csv_file.getvalue()
+
+    def content(self) -> bytes:
+        """Encode the table in its original encoding."""
+        try:
+            return self.text.encode(self.encoding)
+        except UnicodeEncodeError:  # Windows-1252 does not have all characters of a feedback text
+            return self.text.encode("utf-8-sig")
+
+
+def normalise_title(title: str) -> str:
+    """Normalise a column title for comparison: lower-case letters and digits.
+
+    >>> normalise_title("Last modified (grade)"), normalise_title("E-Mail-Adresse")
+    ('lastmodifiedgrade', 'emailadresse')
+    """
+    return "".join(filter(str.isalnum, title.casefold()))
+
+
+def read_sheet(path: Path) -> Sheet:
+    """Read a CSV table with a header.
+
+    Raises
+    ------
+    SettingsError
+        The file cannot be read, is not text, or has no header.
+    """
+    content = read_bytes_limited(
+        path,
+        SettingsError,
+        MAX_TABLE_BYTES,
+        name=str(path),
+        size_remedy="Give a CSV table of one class",
+    )
+    if content.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
+        raise SettingsError(f"{path} is a spreadsheet, not a CSV file.", "Save it as CSV.")
+    encoding = "utf-8-sig" if content.startswith(codecs.BOM_UTF8) else "utf-8"
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encoding = "utf-16"
+    try:
+        text = content.decode(encoding)
+    except UnicodeDecodeError:  # spreadsheet programs on Windows write Windows-1252
+        encoding = "cp1252"
+        text = content.decode(encoding, errors="replace")
+    if "\0" in text:
+        raise SettingsError(f"{path} is not a text file.", "Give a CSV file with a header.")
+    header = next((line for line in text.splitlines() if line.strip()), "")
+    # separators in quoted titles are not counted
+    separator = max(COLUMN_SEPARATORS, key=re.sub(r'"[^"]*"', "", header).count)
+    try:
+        lines = [*csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)]
+    except csv.Error as error:
+        raise SettingsError(f"{path} is not a CSV file ({error}).") from error
+    head, *rows = [cells for cells in lines if any(map(str.strip, cells))] or [[]]
+    if not head:
+        raise SettingsError(f"{path} is empty.", "Give a CSV file with a header.")
+    padded_rows = (tuple(cells + [""] * (len(head) - len(cells))) for cells in rows)
+    return Sheet(path, tuple(head), tuple(padded_rows), encoding, separator)
+
+
+def format_cell_number(value: float | None) -> str:
+    """Format a number for a cell; "" if the number is absent or not finite.
+
+    >>> format_cell_number(7.0), format_cell_number(0.1 + 0.2), format_cell_number(float("nan"))
+    ('7', '0.3', '')
+    """
+    return "" if value is None or not math.isfinite(value) else f"{value:.10g}"
+
+
+def parse_decimal(text: str) -> float | None:
+    """Parse a number with decimal point or comma; None if the text is not a number.
+
+    >>> parse_decimal("12,5"), parse_decimal("1_5"), parse_decimal("nan")
+    (12.5, None, None)
+    """
+    return float(text.replace(",", ".")) if re.fullmatch(r"[+-]?\d+([.,]\d*)?", text) else None

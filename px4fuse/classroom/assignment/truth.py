@@ -1,0 +1,223 @@
+"""Right answers to the answer form about a simulated flight."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.estimates import estimate_noises_and_clock
+from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
+from px4fuse.comparison.preparation import prepare
+from px4fuse.core.record import Record, table
+from px4fuse.filter.kalman import replay
+from px4fuse.filter.model import (
+    COVARIANCE_COLUMNS,
+    process_noise_unit,
+    symmetric_matrix,
+    transition,
+)
+from px4fuse.filter.settings import Settings
+from px4fuse.filter.time_offset import ClockOffset
+from px4fuse.flight.model import Ekf2, Unavailable
+from px4fuse.loop.analysis import analyse
+from px4fuse.loop.tracks import LoopSource, trajectory_of
+from px4fuse.request import SIGMA_Z_M, ComparisonRequest
+from px4fuse.results.answer_form import GATE_UPDATES, FormQuestion, draw_questions
+from px4fuse.simulation import flights
+from px4fuse.simulation.mistakes import MISTAKES as SIMULATED_MISTAKES
+from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
+
+# Relative tolerance of the size of a mistake in a right answer
+SIZE_TOLERANCE = 0.15
+# Tolerance (m) of the loop closure error in a right answer
+CLOSURE_TOLERANCE_M = 0.3
+# Minimum fraction of samples rejected by EKF2 for which a complete answer must name rejections
+MIN_REJECTED_FRACTION = 0.005
+# Minimum position reset of EKF2 (m) that a complete answer must name, and time (s) after the start
+# in which resets are ignored, because EKF2 resets to its first position
+MIN_RESET_M, EKF2_START_S = 0.2, 5.0
+# Answers of the form on EKF2's behaviour, and kinds of mistakes that require or allow each
+BEHAVIOUR_RULES = table(__file__, "did.toml", dict[str, dict[str, set[str]]])
+
+
+class TrueMistake(Record, frozen=True):
+    """Mistake of a simulated flight, with the limits of right answers.
+
+    Attributes
+    ----------
+    size : float or None
+        Size in the first unit of the mistake in ``form.toml``.
+    low, high : float or None
+        Smallest and largest size that is a right answer.
+    from_s, until_s : float or None
+        Start and end of the mistake (s since the first data); both None for the whole flight.
+    """
+
+    kind: str
+    size: float | None = None
+    low: float | None = None
+    high: float | None = None
+    from_s: float | None = None
+    until_s: float | None = None
+
+
+class VerdictTruth(Record, frozen=True):
+    """Right verdict on the reported σ of a filter, and the factor by which σ is wrong.
+
+    ``verdict`` is "" if the flight has too few data for a verdict.
+    """
+
+    verdict: str
+    factor: float | None = None
+
+
+class FormTruth(Record, frozen=True):
+    """Right answers to the answer form about one flight.
+
+    Attributes
+    ----------
+    mistakes : tuple of TrueMistake
+        Mistakes of the flight.
+    sigma_z_m : float
+        True noise of the position source (m, 1 σ).
+    kf, ekf2 : VerdictTruth
+        Verdicts on KF and EKF2.
+    ekf2_did, ekf2_did_also : tuple of str
+        Behaviour of EKF2 that a complete answer names, and further behaviour that is not wrong.
+    quantities : tuple
+        Answers to :func:`px4fuse.results.answer_form.draw_questions`; None if the flight is too
+        short.
+    """
+
+    mistakes: tuple[TrueMistake, ...]
+    sigma_z_m: float
+    kf: VerdictTruth
+    ekf2: VerdictTruth
+    ekf2_did: tuple[str, ...]
+    ekf2_did_also: tuple[str, ...]
+    quantities: tuple[float | tuple[float, ...] | None, ...]
+
+
+def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
+    """Compute the right answers from a simulation and its analysis with default settings."""
+    answer = flights.answer(simulation)
+    flight = flights.to_flight(simulation)
+    request = ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M)
+    comparison = compare(prepare(flight, request))
+    mistakes = tuple(
+        _true_mistake(name, values, answer["truth"], comparison)
+        for name, values in answer["mistakes"].items()
+    )
+    sigma_z_m = answer["truth"]["sigma_z_m"]
+    return FormTruth(
+        mistakes,
+        sigma_z_m,
+        _verdict(comparison, "kf"),
+        _verdict(comparison, "ekf2"),
+        *_ekf2_behaviour(comparison, mistakes, sigma_z_m),
+        tuple(quantity_truth(comparison.main, question) for question in draw_questions(log_sha256)),
+    )
+
+
+def _true_mistake(
+    name: str, values: Mapping[str, Any], truth: Mapping[str, Any], comparison: Comparison
+) -> TrueMistake:
+    sizes = SIMULATED_MISTAKES[name].sizes
+    if not sizes:
+        return TrueMistake(name)
+    size = values[sizes[0]]
+    tolerance = SIZE_TOLERANCE * abs(size)
+    if name == "open-end":  # the student measures the closure error, which includes odometry drift
+        odometry = trajectory_of(comparison.flight, "vio")
+        measured_m = analyse(LoopSource(odometry, comparison.flight)).closure_error_m
+        size, tolerance = measured_m if isinstance(measured_m, float) else size, CLOSURE_TOLERANCE_M
+    low, high = size - tolerance, size + tolerance
+    if name == "clock-offset":  # all values in the 95 % interval of the estimate are right
+        _, time_offset = estimate_noises_and_clock(comparison)
+        if isinstance(time_offset, ClockOffset) and time_offset.is_determinable:
+            low, high = min(low, -time_offset.interval_s[1]), max(high, -time_offset.interval_s[0])
+    from_s = until_s = None
+    match name:
+        case "clock-jump":
+            until_s = TIMESYNC_CONVERGED_S
+        case "open-end":
+            _, from_s = truth["airborne_s"]
+        case "nlos" if truth["outlier_time_s"]:
+            from_s, *_, until_s = truth["outlier_time_s"] * 2
+        case "dropout" | "imu-dropout" | "jump" | "heading" | "mag":
+            from_s = values[sizes[1]]
+            until_s = from_s + abs(size) if name.endswith("dropout") else None
+    return TrueMistake(name, size, low, high, from_s, until_s)
+
+
+def _verdict(comparison: Comparison, filter_name: FilterName) -> VerdictTruth:
+    filter_summary = comparison.main.filters[filter_name]
+    if not isinstance(filter_summary, FilterSummary):
+        return VerdictTruth("")
+    is_consistent = filter_summary.verdict == "consistent"
+    factor = None if is_consistent else filter_summary.sigma_error_factor
+    return VerdictTruth(filter_summary.verdict, factor)
+
+
+def _ekf2_behaviour(
+    comparison: Comparison, mistakes: tuple[TrueMistake, ...], sigma_z_m: float
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return behaviour of EKF2 that a complete answer names, and further behaviour not wrong."""
+    size_of = {mistake.kind: mistake.size or 0.0 for mistake in mistakes}
+    required, allowed = (
+        [behaviour for behaviour, kinds in BEHAVIOUR_RULES[rule].items() if kinds & size_of.keys()]
+        for rule in ("required", "allowed")
+    )
+    if size_of.get("ekf2-noise", 0.0) > sigma_z_m:
+        required.append("weighted the positions too little")
+    innovations = comparison.main.ekf2_innovations
+    if not isinstance(innovations, Unavailable):
+        has_bad_samples = "nlos" in size_of or "jump" in size_of
+        if (innovations["rejected"] > 0).mean() > MIN_REJECTED_FRACTION:
+            required.append("rejected outliers" if has_bad_samples else "rejected good samples")
+    ekf2 = comparison.flight.ekf2
+    since_s = comparison.segment.start_s + EKF2_START_S
+    for reset in ekf2.resets if isinstance(ekf2, Ekf2) else ():
+        is_large = reset.quantity == "position" and math.hypot(*reset.delta[:2]) > MIN_RESET_M
+        if is_large and reset.time_s > since_s:
+            required.append("dead-reckoned, then reset")
+    if not required:
+        required, allowed = ["normal"], ["followed the positions", *allowed]
+    required = [*dict.fromkeys(required)]
+    return tuple(required), tuple(each for each in dict.fromkeys(allowed) if each not in required)
+
+
+def quantity_truth(
+    result: AxisComparison, question: FormQuestion
+) -> float | tuple[float, ...] | None:
+    """Compute the right answer by a run of KF with the settings of the question.
+
+    Returns None if the flight has too few measurements. For "prediction", the answer is the
+    position σ (m) after predictions with F and Q in steps of DT, without an update.
+    """
+    settings = Settings(question.sigma_a_m_s2, question.sigma_z_m)
+    kf_replay = replay(result.axis, settings)
+    updates = kf_replay.updates.iloc[question.update - 1 :]
+    if updates.empty:
+        return None
+    row, covariance = updates.iloc[0], kf_replay.steps.loc[updates.index[0], COVARIANCE_COLUMNS]
+    nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
+    match question.kind:
+        case "gate":
+            is_outside = nis.iloc[: GATE_UPDATES + 1] > question.duration_or_gate**2
+            outside_numbers = np.flatnonzero(is_outside) + question.update
+            return tuple(outside_numbers.astype(float).tolist())
+        case "prediction":
+            p, f = symmetric_matrix(tuple(covariance)), transition(settings.dt_s)
+            q = symmetric_matrix(process_noise_unit(settings.dt_s))
+            q *= settings.sigma_a_m_s2**2 * settings.dt_s
+            for _ in range(round(question.duration_or_gate / settings.dt_s)):
+                p = f @ p @ f.T + q
+            return math.sqrt(p[0, 0])
+        case "nis":
+            return float(nis.iloc[0])
+        case "variance":
+            return float(covariance.iloc[0])
+    return float(row["gain_position" if question.kind == "gain" else "innovation_m"])

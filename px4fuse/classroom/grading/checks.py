@@ -1,0 +1,533 @@
+"""Checks that score a report: each check is a class of rubric items with its parameters as fields.
+
+``rubric.toml`` describes the checks of the report (verified, number, answers, text), of the filter
+(tuning, consistent, clock) and of the loop.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Literal
+
+import msgspec
+from msgspec import Meta
+
+from px4fuse.classroom.assignment.key import Answer, AnswerKey
+from px4fuse.classroom.grading.form_points import FormPoints, form_points
+from px4fuse.comparison.model import ErrorsAgainstTruth
+from px4fuse.core.record import OrUnavailable, Share
+from px4fuse.core.text import capitalise_first, format_factor, format_length, one_line
+from px4fuse.filter.consistency import HorizontalNis
+from px4fuse.filter.time_offset import Clock
+from px4fuse.filter.tuning import HORIZONTAL
+from px4fuse.loop.model import Correction, CorrectionName, LoopResult
+from px4fuse.results.answer_form import Answers, check_answers
+from px4fuse.results.contract import (
+    TUNED_FIELDS,
+    ComparisonResults,
+    LoopResults,
+    ReportedResults,
+    to_plain,
+)
+from px4fuse.trajectory.evaluation import Score
+from px4fuse.verification.model import Verdict
+from px4fuse.verification.verification import flatten, is_number, log_sha256
+
+MAX_QUOTE_LENGTH = 160
+BOTH_AXES_ADVICE = " (the axes north and east are required: omit --axis)"
+# Regular expression of one character that is not a control character
+_PLAIN_CHARACTER = r"[^\x00-\x1f\x7f]"
+Text = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN_CHARACTER}*$")]
+Title = Annotated[
+    str,
+    Meta(max_length=200, pattern=rf"^{_PLAIN_CHARACTER}*[^\s\x00-\x1f\x7f]{_PLAIN_CHARACTER}*$"),
+]
+Bound = Annotated[float, Meta(ge=-1e12, le=1e12)]
+Factor = Annotated[float, Meta(ge=1.0, le=1000.0)]
+# Fraction of the maximum points (0 to 1), and sentences for the student with the reason
+FractionAndReason = tuple[float, str]
+
+
+class RubricItem(
+    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="check"
+):
+    """Item of the rubric, for which a report gets points; subclasses implement the checks.
+
+    Attributes
+    ----------
+    points : float
+        Maximum points.
+    report : {"any", "compare", "loop"}
+        Command that makes the reports to which the item applies.
+    needs_key : bool
+        True if the item is used only with an answer key.
+    by_hand : bool
+        True if the instructor scores the item.
+    """
+
+    needs_key: ClassVar[bool] = False
+    by_hand: ClassVar[bool] = False
+
+    title: Title
+    points: Annotated[float, Meta(ge=0.0, le=1000.0)]
+    report: Literal["any", "compare", "loop"] = "any"
+
+    def score(self, check_input: CheckInput) -> FractionAndReason:
+        """Return the fraction of the maximum points (0 to 1), and sentences with the reason."""
+        raise NotImplementedError
+
+    def applies(self, kind: str, key: AnswerKey | None) -> bool:
+        """Return True if the item scores reports of the command ``kind`` (compare or loop)."""
+        return self.report in ("any", kind) and (key is not None or not self.needs_key)
+
+
+def fraction_for_deviation(deviation_factor: float, factor: float) -> float:
+    """Return the fraction of the points for a value that is wrong by ``deviation_factor``.
+
+    The fraction is 1 without deviation, and 0 from ``factor`` on. In between it decreases linearly
+    with the logarithm of the deviation.
+
+    >>> [round(fraction_for_deviation(off, 4.0), 2) for off in (1.0, 2.0, 4.0, 9.0)]
+    [1.0, 0.5, 0.0, 0.0]
+    """
+    if deviation_factor <= 1.0:
+        return 1.0
+    return max(1.0 - math.log(deviation_factor) / math.log(factor), 0.0) if factor > 1.0 else 0.0
+
+
+@dataclass(frozen=True)
+class CheckInput:
+    """Data for scoring one report: results, verdict of the verification, and answer key.
+
+    ``submitter_id`` is the student id according to the learning platform.
+    """
+
+    results: ReportedResults
+    verdict: Verdict
+    key: AnswerKey | None
+    submitter_id: str = ""
+
+    @property
+    def comparison(self) -> ComparisonResults | None:
+        """Results of a compare report; None for a loop report."""
+        return None if isinstance(self.results, LoopResults) else self.results
+
+    @cached_property
+    def values(self) -> dict[str, Any]:
+        """Values of the results by path, for example ``settings.sigma_z_m``."""
+        return dict(flatten(to_plain(self.results)))
+
+    @cached_property
+    def answer(self) -> Answer | None:
+        """Right answers about the log of the report; None if the log was not assigned."""
+        return None if self.key is None else self.key.of_log(log_sha256(self.results))
+
+    @cached_property
+    def assigned_answer(self) -> Answer | None:
+        """Flight assigned to the student, by the id on the platform, else the id in the report."""
+        if self.key is None:
+            return None
+        stated_id = shorten_text(self.results.student.id)
+        return self.key.of_student(self.submitter_id) or self.key.of_student(stated_id)
+
+    @cached_property
+    def is_own_log(self) -> bool:
+        """True if the log was assigned to this student, or there is no answer key."""
+        assigned_sha256 = self.assigned_answer and self.assigned_answer.sha256
+        return self.key is None or assigned_sha256 == log_sha256(self.results)
+
+    @cached_property
+    def form(self) -> Answers | str:
+        """Answer form of the student, or the reason why it is missing."""
+        answers = self.results.student.answers
+        if not isinstance(answers, Answers):
+            return "your report contains no answer form. Make the report with --answers FILE"
+        try:
+            check_answers(answers)
+        except ValueError as error:
+            return f"your answer form cannot be read ({shorten_text(str(error))})"
+        if answers.log_sha256 != log_sha256(self.results):
+            return "your answer form was made for another log than your report"
+        return answers
+
+    @cached_property
+    def form_points(self) -> FormPoints | str:
+        """Points of the answer form, or the reason why the form has no points."""
+        assigned_answer = self.assigned_answer
+        if self.answer is None or (assigned_answer and not self.is_own_log):
+            file_text = format_reason(assigned_answer.file if assigned_answer else "")
+            return (
+                f"this report is not about the log that you were given{file_text}. Make a "
+                "report of that log, with your --id"
+            )
+        if isinstance(self.form, str):
+            return self.form
+        if self.answer.form is None:
+            return "the answer key contains no right answers to the form"
+        return form_points(self.form, self.answer.form)
+
+    def names_mistake(self, *kinds: str) -> bool:
+        """Return True if the student's answer form names a mistake of one of these kinds."""
+        form = self.form
+        return isinstance(form, Answers) and any(mistake.kind in kinds for mistake in form.mistakes)
+
+    def has_finding(self, finding: str) -> bool:
+        """Return True if the report contains a finding with this id."""
+        return any(recorded.id == finding for recorded in self.results.findings)
+
+    def missing_reason(self, path: str) -> str:
+        """Return the reason why a value is missing, in brackets; "" if the results state none."""
+        parent = path
+        while parent:
+            for _, reason in values_at(self.values, f"{parent}.reason"):
+                return format_reason(reason)
+            parent = parent.rpartition(".")[0]
+        return BOTH_AXES_ADVICE if HORIZONTAL in path else ""
+
+
+def values_at(values: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
+    """Return the paths in the results that match a pattern, with their values.
+
+    In the pattern, ``*`` matches any key, and quotes enclose a key that contains dots.
+
+    >>> values_at({"a.b.c.0": 1, "a.b.c.d.0": 2}, 'a."b.c".*')
+    [('a.b.c.0', 1)]
+    """
+    pattern = re.compile(re.escape(path.replace('"', "")).replace(r"\*", "[^.]*"))
+    return [(name, value) for name, value in values.items() if pattern.fullmatch(name)]
+
+
+def shorten_text(value: str) -> str:
+    """Shorten a text to one line of MAX_QUOTE_LENGTH characters, without control characters."""
+    return one_line(value, MAX_QUOTE_LENGTH)
+
+
+def format_reason(reason: str) -> str:
+    """Format a reason in brackets, with a leading blank; "" without a reason."""
+    text = shorten_text(reason).rstrip(".")
+    return f" ({text})" if text else ""
+
+
+# ------------------------------------------------------------------ checks of any report
+
+
+NO_COMPARISON: FractionAndReason = (0.0, "Your report is not a compare report.")
+
+
+class VerifiedItem(RubricItem, frozen=True, tag="verified"):
+    """Check that the numbers of the report agree with a new run of the analysis on its log."""
+
+    def score(self, check_input: CheckInput) -> FractionAndReason:
+        """Return 1 for a verified report, else 0."""
+        verdict = check_input.verdict
+        reason_text = format_reason("".join(verdict.reasons[:1]))
+        return float(verdict.status == "verified"), f"Verification: {verdict.status}{reason_text}."
+
+
+class NumberItem(RubricItem, frozen=True, tag="number"):
+    """Check that a number of the report is within bounds.
+
+    If ``path`` matches several numbers, the worst counts. Outside the bounds the points decrease
+    linearly to zero at ``zero_at``; without ``zero_at`` the points are zero.
+    """
+
+    path: Text
+    name: Text = ""
+    unit: Text = ""
+    at_least: Bound = -math.inf
+    at_most: Bound = math.inf
+    zero_at: Bound | None = None
+    advice: Text = ""
+
+    def __post_init__(self) -> None:
+        bounded = math.isfinite(self.at_least) or math.isfinite(self.at_most)
+        is_zero_outside = self.zero_at is None or self._excess(self.zero_at) >= 0.0
+        if not bounded or self.at_least > self.at_most or not is_zero_outside:
+            raise ValueError(
+                "give at_least, at_most or both (at_least <= at_most); zero_at must be outside"
+            )
+
+    def _excess(self, number: float) -> float:
+        """Return the distance from the nearer bound to the number; negative within the bounds."""
+        return max(self.at_least - number, number - self.at_most)
+
+    def _fraction(self, number: float) -> float:
+        excess = self._excess(number)
+        if excess <= 0.0:
+            return 1.0
+        width = 0.0 if self.zero_at is None else self._excess(self.zero_at)
+        return max(1.0 - excess / width, 0.0) if width > 0.0 else 0.0
+
+    def score(self, check_input: CheckInput) -> FractionAndReason:
+        """Return 1 within the bounds; outside, the score decreases linearly to 0 at ``zero_at``."""
+        values = values_at(check_input.values, self.path)
+        numbers = [
+            (self._fraction(value), value, path) for path, value in values if is_number(value)
+        ]
+        if not numbers:
+            label = self.name or f"the number {self.path}"
+            reason_text = check_input.missing_reason(self.path)
+            return 0.0, f"Your report has no number for {label}{reason_text}."
+        fraction, number, path = min(numbers, key=lambda each: each[0])
+        label = self.name or f"the number {shorten_text(path)}"
+        bounds = (("at least", self.at_least), ("at most", self.at_most))
+        limits = [f"{word} {bound:.4g}" for word, bound in bounds if math.isfinite(bound)]
+        statement = f"{capitalise_first(label)} is {f'{number:.4g} {self.unit}'.strip()}"
+        advice = f" {self.advice}" if fraction < 1.0 and self.advice else ""
+        return fraction, f"{statement}; required: {' and '.join(limits)}.{advice}"
+
+
+class AnswersItem(RubricItem, frozen=True, tag="answers"):
+    """Compare the student's answer form with the answer key."""
+
+    needs_key: ClassVar[bool] = True
+
+    def score(self, check_input: CheckInput) -> FractionAndReason:
+        """Return the points of the answer form as a fraction, and the right and false answers."""
+        form_result = check_input.form_points
+        if isinstance(form_result, str):
+            return 0.0, f"{capitalise_first(form_result)}."
+        points_text = ", ".join(
+            f"{name} {form_result.points_by_part[name]:.3g} of {max_points:g}"
+            for name, max_points in form_result.max_points_by_part.items()
+            if max_points
+        )
+        feedback = capitalise_first("; ".join(form_result.feedback))
+        return form_result.fraction, f"Points of 100: {points_text}. {feedback}."
+
+
+class TextItem(RubricItem, frozen=True, tag="text"):
+    """Text that the student writes about the flight (``--notes``); the instructor scores it."""
+
+    needs_key: ClassVar[bool] = True
+    by_hand: ClassVar[bool] = True
+
+    def score(self, check_input: CheckInput) -> FractionAndReason:
+        """Return 0 points, which the instructor replaces."""
+        if not check_input.results.student.notes.strip():
+            return 0.0, "Your report has no text. Write a text and add it with --notes."
+        return 0.0, "Your instructor reads your text and gives points for it."
+
+
+# ------------------------------------------------------------------ checks of the settings of KF
+
+
+# Ids of the findings that report a time offset which changes during the flight
+CHANGING_CLOCK_FINDINGS = ("source_time_offset_changes", "source_timestamps_are_arrival_times")
+Sigma = Literal["sigma_z_m", "sigma_a_m_s2"]
+# Name in messages, unit and command-line option of the measurement noise and process noise of KF
+NOISE_SETTINGS: dict[Sigma, tuple[str, str, str]] = {
+    "sigma_z_m": ("SIGMA_Z", "m", "--sigma-z"),
+    "sigma_a_m_s2": ("SIGMA_A", "m/s²", "--sigma-a"),
+}
+
+
+class TuningItem(RubricItem, frozen=True, tag="tuning"):
+    """Check that SIGMA_A or SIGMA_Z is within the 95 % interval of the estimate."""
+
+    setting: Sigma
+    factor: Factor = 2.0
+
+    def score(self, check_input: CheckInput) -> FractionAndReason:
+        """Return 1 within the 95 % interval, and 0 if the noise is outside by ``factor``."""
+        if check_input.comparison is None:
+            return NO_COMPARISON
+        return _score_tuning(check_input, check_input.comparison, self.setting, self.factor)
+
+
+def _score_tuning(
+    check_input: CheckInput, comparison: ComparisonResults, name: Sigma, factor: float = 2.0
+) -> FractionAndReason:
+    label, unit, option = NOISE_SETTINGS[name]
+    chosen_value: float = getattr(comparison.settings, name)
+    horizontal_tuning = comparison.tuning.get(HORIZONTAL)
+    interval = getattr(horizontal_tuning, f"{TUNED_FIELDS[name]}_interval", None)
+    if interval is None or interval[1] is None:
+        reason_text = check_input.missing_reason(f"tuning.{HORIZONTAL}")
+        return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
+    low, high = interval
+    may_drift = check_input.has_finding("source_may_drift") or check_input.has_finding(
+        "source_drift"
+    )
+    if name == "sigma_z_m" and may_drift:
+        # innovations do not show the drift of a source, so each SIGMA_Z up to the error of KF is
+        # right
+        high = max(high, _largest_source_error_m(comparison))
+    deviation_factor = max(chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0)
+    interval_text = (
+        f"the 95 % interval of the maximum-likelihood estimate ({low:.3g} to {high:.3g} {unit})"
+    )
+    statement = f"Your {label} {chosen_value:.3g} {unit} is"
+    if deviation_factor == 1.0:
+        return 1.0, f"{statement} within {interval_text}."
+    side, factor_text = "above" if chosen_value > high else "below", format_factor(deviation_factor)
+    return fraction_for_deviation(deviation_factor, factor), (
+        f"{statement} {side} {interval_text} by a factor of {factor_text}. "
+        f"Set {option} within this interval."
+    )
+
+
+def _largest_source_error_m(comparison: ComparisonResults) -> float:
+    """Return the largest position RMSE or loop closure error (m) of KF; 0 without both."""
+    truths = [axis.filters["kf"].truth for axis in comparison.axes.values()]
+    errors_m = [truth.position_rmse_m for truth in truths if isinstance(truth, ErrorsAgainstTruth)]
+    if isinstance(comparison.loop, LoopResult):
+        errors_m.append(comparison.loop.closure_error_m or 0.0)
+    return max(errors_m, default=0.0)
+
+
+class ConsistencyItem(RubricItem, frozen=True, tag="consistent"):
+    """Check that KF is consistent, or that no other SIGMA_A and SIGMA_Z would make it consistent.
+
+    A reported σ that is too small or too large by ``factor`` or more gives no points.
+    """
+
+    factor: Factor = 2.0
+
+    def score(self, check_input: CheckInput) -> FractionAndReason:
+        """Score the verdict on the joint NIS of KF along north and east."""
+        comparison = check_input.comparison
+        if comparison is None:
+            return NO_COMPARISON
+        nis_result = comparison.horizontal.get("kf")
+        if not isinstance(nis_result, HorizontalNis):
+            reason_text = check_input.missing_reason(f"{HORIZONTAL}.kf")
+            return 0.0, f"Your report has no verdict on KF{reason_text}."
+        if nis_result.verdict == "consistent":
+            return 1.0, "KF is consistent."
+        side = "small" if nis_result.nis_mean > 1.0 else "large"
+        factor_text = format_factor(nis_result.sigma_error_factor)
+        statement = f"The reported σ of KF is {factor_text} times too {side}"
+        if all(_score_tuning(check_input, comparison, name)[0] == 1.0 for name in NOISE_SETTINGS):
+            return 1.0, (
+                f"{statement}. SIGMA_A and SIGMA_Z are within their 95 % intervals, so other "
+                "settings do not make KF consistent."
+            )
+        return fraction_for_deviation(nis_result.sigma_error_factor, self.factor), (
+            f"{statement}. Compare SIGMA_A and SIGMA_Z with the maximum-likelihood estimates, and "
+            "look for errors that are not white noise."
+        )
+
+
+class ClockItem(RubricItem, frozen=True, tag="clock"):
+    """Check that the applied time offset of the position source agrees with the estimated one.
+
+    ``undeterminable``: fraction of the points if the flight does not determine the offset. An
+    assigned log gives all points in this case, because the student could not choose the flight.
+    ``margin_s``: accepted distance (s) of the applied offset from its 95 % interval.
+    """
+
+    margin_s: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.03
+    undeterminable: Share = 0.5
+
+    def score(self, check_input: CheckInput) -> FractionAndReason:
+        """Return 1 if applied and estimated time offset agree, else 0 or ``undeterminable``."""
+        if check_input.comparison is None:
+            return NO_COMPARISON
+        clock = check_input.comparison.clock
+        if not isinstance(clock, Clock) or not clock.is_determinable:
+            fraction = self.undeterminable if isinstance(clock, Clock) else 0.0
+            reason_text = format_reason(clock.reason or "")
+            statement = f"The time offset cannot be estimated from your flight{reason_text}."
+            return 1.0 if check_input.answer is not None else fraction, statement
+        (low, high), applied_s = clock.interval_s, clock.applied_s
+        statement = f"You applied a time offset of {applied_s:.3f} s"
+        if low - self.margin_s <= applied_s <= high + self.margin_s:
+            return 1.0, f"{statement}; the estimate is {low:.3f} to {high:.3f} s (95 %)."
+        if any(map(check_input.has_finding, CHANGING_CLOCK_FINDINGS)):
+            if check_input.names_mistake("clock-jump", "clock-drift"):
+                return 1.0, "The time offset changes in your flight, as your form states."
+            statement = "The time offset changes in your flight. State the time in your form."
+            return self.undeterminable, statement
+        statement = f"{statement}, but the estimate is {low:.3f} to {high:.3f} s (95 %)"
+        return 0.0, f"{statement}. Use --clock-offset auto."
+
+
+# ------------------------------------------------------------------ check of a loop
+
+
+# Maximum distance (m) between take-off and landing place of a closed loop
+MAX_CLOSED_LOOP_M = 0.5
+# Fraction of the points for a smaller ATE, if the report has no reference trajectory to compute the
+# ATE
+NO_REFERENCE_FRACTION = 0.5
+
+
+class LoopItem(RubricItem, frozen=True, tag="loop"):
+    """Check that the loop closure is measured and accepted, the path corrected and its ATE smaller.
+
+    Each of the four conditions gives a quarter of the points. If the vehicle did not land at the
+    take-off place (according to the answer key), a report without an accepted closure gets all
+    points.
+    """
+
+    def score(self, check_input: CheckInput) -> FractionAndReason:
+        """Return the fraction of the points, and sentences about loop closure error and ATE."""
+        loop = check_input.results.loop
+        closures = loop.closures if isinstance(loop, LoopResult) else ()
+        is_accepted = any(closure.accepted for closure in closures)
+        answer = check_input.answer
+        landing_distance_m = answer.truth.get("closure_error_m", 0.0) if answer else 0.0
+        if landing_distance_m > MAX_CLOSED_LOOP_M and not is_accepted:
+            return 1.0, (
+                f"Your vehicle landed {format_length(landing_distance_m)} from the take-off place, "
+                "so it is right that no loop closure was accepted."
+            )
+        if not isinstance(loop, LoopResult) or loop.closure_error_m is None:
+            unavailable = loop.true_end if isinstance(loop, LoopResult) else loop
+            reason_text = format_reason(getattr(unavailable, "reason", ""))
+            return 0.0, f"Your report contains no loop closure error{reason_text}."
+        if loop.is_absolute_track:
+            reason = "The track in your report does not drift. Use odometry, for example LOG:vio."
+            return 0.0, reason
+        error_text, path_text = map(format_length, (loop.closure_error_m, loop.path_length_m))
+        statement = f"You measured a loop closure error of {error_text} after {path_text}"
+        if not is_accepted:
+            return 0.25, f"{statement}. No closure was accepted."
+        quarter_count, comment = _score_corrections(loop.corrections)
+        return (2.0 + quarter_count) / 4.0, f"{statement}. The closure was accepted. {comment}"
+
+
+def _score_corrections(
+    corrections: Mapping[CorrectionName, OrUnavailable[Correction]],
+) -> FractionAndReason:
+    """Return the quarters of the points: 1 for a corrected path, 1 more for a smaller ATE."""
+    correction_names: tuple[CorrectionName, ...] = (
+        "by_distance_plain",
+        "by_distance",
+        "pose_graph_gated",
+    )
+    paths = map(corrections.get, correction_names)
+    corrected_paths = [path for path in paths if isinstance(path, Correction)]
+    if not corrected_paths:
+        return 0.0, "The path was not corrected."
+    ate_before_m = _ate_by_reference(corrections.get("uncorrected"))
+    pairs = [
+        (ate_before_m[name], after_m)
+        for correction in corrected_paths
+        for name, after_m in _ate_by_reference(correction).items()
+        if ate_before_m.get(name)
+    ]
+    if not pairs:
+        return 1.0 + NO_REFERENCE_FRACTION, (
+            "The path was corrected. The report contains no ATE: add a trajectory with --reference."
+        )
+    before_m, after_m = min(pairs, key=lambda pair: pair[1] / pair[0])
+    statement = f"The path was corrected: ATE {before_m:.3g} → {after_m:.3g} m"
+    if after_m < before_m:
+        return 2.0, f"{statement}."
+    return 1.0, f"{statement}. Explain why the correction increases the error."
+
+
+def _ate_by_reference(correction: object) -> dict[str, float]:
+    """Return the ATE (m) of a corrected path against each reference trajectory."""
+    scores = correction.scores if isinstance(correction, Correction) else {}
+    return {
+        name: score.ate.translation_m.rmse
+        for name, score in scores.items()
+        if isinstance(score, Score)
+    }

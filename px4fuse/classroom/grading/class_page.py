@@ -1,0 +1,258 @@
+"""Class page: a web page with statistics of the class, and a table with one row per student.
+
+Texts of students cannot act as HTML or scripts: see :mod:`px4fuse.html`. The page links to the
+redrawn PDFs in the folder ``reports/`` beside it.
+"""
+
+import math
+import statistics
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from px4fuse.classroom.assignment.sheet import format_cell_number
+from px4fuse.classroom.grading.model import (
+    TOTAL_TITLE,
+    Entry,
+    GradedReport,
+    Item,
+    Override,
+    list_titles,
+)
+from px4fuse.core.text import format_number
+from px4fuse.html import frame
+from px4fuse.html.frame import Cell, Column, Row, Section
+from px4fuse.html.safe import load_template, local_link
+from px4fuse.results.answer_form import form_rows
+
+BIN_COUNT = 10
+MISSING_REPORT = "no submission"
+# CSS style and symbol of each verification status, in the order in which the class table sorts them
+STATUS_STYLES: dict[str, tuple[str, str]] = {
+    "verified": ("good", "✓"),
+    "numbers differ": ("bad", "≠"),
+    "other log": ("odd", "⇄"),
+    "cannot verify": ("open", "?"),
+    "page differs": ("odd", "≠"),
+    MISSING_REPORT: ("open", "–"),
+}
+STATUSES = tuple(STATUS_STYLES)
+FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "set by instructor")
+
+
+def html_text(entries: Sequence[Entry], title: str, made_with: str) -> str:
+    """Format the class page as HTML; the same input gives the same text, without a date.
+
+    Parameters
+    ----------
+    entries : sequence of Entry
+        Rows of the class table.
+    title : str
+        Title of the page.
+    made_with : str
+        Name and version of the program.
+    """
+    items, numbers = list_titles(entries)
+    counts = Counter(tag for entry in entries for tag in _entry_tags(entry))
+    tags = (*FILTER_TAGS, *sorted(tag for tag in counts if tag not in FILTER_TAGS))
+    options = [(tag, f"{tag} ({counts[tag]})") for tag in tags if counts[tag]]
+    return frame.page(
+        title=title,
+        subtitle=f"{len(entries)} {'student' if len(entries) == 1 else 'students'}, graded with "
+        f"{made_with}",
+        html_above=_above_html(entries, counts),
+        noun=("student", "students"),
+        columns=(
+            Column("Student"),
+            Column("Id", "line", visible_from="tablet"),
+            Column("Status", "rank"),
+            Column("Points", "number"),
+            Column("Handed in", "line", visible_from="desk"),
+            Column("Flags", "rank", visible_from="desk"),
+            *(Column(name, "number", "items") for name in items),
+            *(Column(name, "number", "numbers") for name in numbers),
+        ),
+        rows=[_class_row(entry, items, numbers) for entry in entries],
+        filters=[("Status", [("", f"Everyone ({len(entries)})"), *options])],
+        groups=(("items", "Points of each item"), ("numbers", "Numbers")),
+        placeholder="search for name, id, file or flag",
+        full_table_note="All rows are in class.csv.",
+    )
+
+
+def _above_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
+    """Format the HTML above the class table: reports by status, and distributions of points."""
+    totals = [entry.total for entry in entries if entry.total is not None]
+    max_points = max((entry.max_points for entry in entries if entry.max_points > 0.0), default=1.0)
+    reports = [report for entry in entries if (report := entry.counted_report)]
+    return load_template("classroom/grading/above.html").render(
+        students=len(entries),
+        counts=counts,
+        averages=(statistics.fmean(totals), statistics.median(totals)) if totals else (),
+        totals=count_tenths(totals, max_points) if totals else (),
+        max_points_text=format_cell_number(max_points),
+        max_points_edge=format_number(max_points),
+        pending_points=[report.points for report in reports if report.instructor_action],
+        number=format_cell_number,
+        items=list(_item_statistics(reports)),
+    )
+
+
+def _item_statistics(reports: Sequence[GradedReport]) -> Iterator[tuple[Any, ...]]:
+    """Yield title, distribution, mean and maximum of the points for each rubric item."""
+    items_by_title: dict[str, list[Item]] = defaultdict(list)
+    for report in reports:
+        for item in () if report.instructor_action else report.items:
+            items_by_title[item.title].append(item)
+    for title, items in items_by_title.items():
+        fractions = [item.points / item.max_points if item.max_points else 0.0 for item in items]
+        mean = statistics.fmean(item.points for item in items)
+        max_text = format_cell_number(max(item.max_points for item in items))
+        zero_count = sum(fraction <= 0.0 for fraction in fractions)
+        full_count = sum(fraction >= 1.0 for fraction in fractions)
+        yield title, count_tenths(fractions, 1.0), mean, max_text, zero_count, full_count
+
+
+def count_tenths(values: Sequence[float], maximum: float) -> list[tuple[int, str]]:
+    """Count the values in each tenth of 0 to ``maximum``; return (count, lower edge) of each.
+
+    >>> count_tenths([0.0, 5.0, 5.5, 9.0], 10.0)[5]
+    (2, '5')
+    """
+    counts, edges = np.histogram(np.clip(values, 0.0, maximum), BIN_COUNT, (0.0, maximum))
+    lower_edges = (format_number(round(edge, 2)) for edge in edges.tolist())
+    return list(zip(counts.tolist(), lower_edges, strict=False))
+
+
+def _entry_tags(entry: Entry) -> list[str]:
+    report = entry.counted_report
+    tags = [report.status if report else MISSING_REPORT]
+    tags += ["flagged"] * bool(entry.flags) + ["late"] * bool(entry.late_s)
+    if report:
+        tags += ["pending"] * bool(report.instructor_action) + ["to read"] * report.awaits_points
+        tags += [
+            f"missed: {mistake}" for mistake, is_named in report.mistakes.items() if not is_named
+        ]
+    return tags + ["set by instructor"] * bool(entry.overrides or entry.comment)
+
+
+def _class_row(entry: Entry, items: Sequence[str], numbers: Sequence[str]) -> Row:
+    report = entry.counted_report
+    status = report.status if report else MISSING_REPORT
+    style, symbol = STATUS_STYLES[status]
+    count = len(entry.flags)
+    flag_count_text = f"{count} flag{'s' if count > 1 else ''}" if count else ""
+    file = report.submission if report else ""
+    late_s = entry.late_s or 0.0
+    minutes_text = f"{math.ceil(late_s / 60.0)} min late" * bool(late_s)
+    late_text = f"{late_s / 3600.0:.1f} h late" if late_s >= 3600.0 else minutes_text
+    points_by_title = {item.title: item.points for item in report.items} if report else {}
+    number_values = report.numbers if report else {}
+    cells = (
+        Cell(entry.display_name, entry.student or None, file),
+        frame.text_cell(entry.student_id),
+        Cell(f"{symbol} {status}", float(STATUSES.index(status)), flag_count_text, style),
+        _points_cell(entry),
+        frame.text_cell(entry.submission_time, late_text),
+        Cell("\n".join(entry.flags), float(count), "", "flags"),
+        *(frame.number_cell(points_by_title.get(name)) for name in items),
+        *(frame.number_cell(number_values.get(name)) for name in numbers),
+    )
+    # overrides.csv identifies students by id or file; a row with pseudonym has neither
+    boxes = (_point_boxes(entry),) if entry.student_id or file else ()
+    # a row with pseudonym has no link, because the file name may contain the student's name
+    links = [("Redrawn from the log (PDF)", local_link(report.redrawn_path))] if report else []
+    link_sections = (frame.links_section("Report", links),)
+    return Row(cells, tuple(_entry_tags(entry)), (*_entry_details(entry), *boxes), link_sections)
+
+
+def _entry_details(entry: Entry) -> Iterator[Section]:
+    """Yield the sections that the class page shows if a row is opened."""
+    report, comment = entry.counted_report, frame.prose_section("Your comment", entry.comment)
+    if report is None:
+        yield frame.list_section("Missing", ["No submission."])
+        yield comment
+        return
+    verdict = report.verdict
+    differences = [
+        (difference.path, difference.recorded, difference.recomputed)
+        for difference in verdict.differences
+    ]
+    items = [
+        (
+            item.title,
+            format_cell_number(item.points),
+            format_cell_number(item.max_points),
+            item.comment,
+        )
+        for item in report.items
+    ]
+    named_texts = [
+        f"{name}: {'named' if is_named else 'not named'} in the answer form"
+        for name, is_named in report.mistakes.items()
+    ]
+    attempts = [
+        f"{other_report.submission}: {other_report.status}" for other_report in entry.other_reports
+    ]
+    yield frame.list_section("Flags", entry.flags, is_warning=True)
+    actions = list(filter(None, [report.instructor_action]))
+    yield frame.list_section("Pending: action required", actions, is_warning=True)
+    yield frame.list_section("Verification", verdict.reasons)
+    titles = ("Value", "Report", "New run") if differences else ()
+    yield frame.table_section("Numbers that differ", titles, differences)
+    title = "Points (proposed)" if report.instructor_action else "Points"
+    item_titles = ("Item", "Points", "Of", "Comment") if items else ()
+    yield frame.table_section(title, item_titles, items, (1, 2))
+    yield comment
+    yield frame.list_section("Mistakes of this flight", named_texts)
+    yield frame.pairs_section("Answer form", [*form_rows(report.form)] if report.form else [])
+    yield frame.prose_section("Text of the student", report.notes)
+    yield frame.list_section("Other attempts", attempts)
+
+
+def _points_cell(entry: Entry) -> Cell:
+    report = entry.counted_report
+    if entry.total is None:
+        proposed_text = (
+            f"{format_cell_number(report.points)} proposed"
+            if report and report.counted_points is None
+            else ""
+        )
+        return Cell("pending" if proposed_text else "–", None, proposed_text)
+    fraction = (
+        min(max(entry.total / entry.max_points, 0.0), 1.0) if entry.max_points > 0.0 else None
+    )
+    notes = [f"{format_cell_number(entry.deduction)} deducted (late)"] * bool(entry.deduction)
+    notes += ["set by instructor"] * any(
+        override.points is not None for override in entry.overrides.values()
+    )
+    text = f"{format_cell_number(entry.total)} / {format_cell_number(entry.max_points)}"
+    return Cell(text, entry.total, ", ".join(notes), "", fraction)
+
+
+def _point_boxes(entry: Entry) -> Section:
+    """Make input boxes for the rubric items that the instructor scores, and for the total.
+
+    Other rows of overrides.csv are included, because the downloaded file replaces overrides.csv.
+    """
+    report = entry.counted_report
+    max_by_title = {
+        item.title: item.max_points
+        for item in (report.items if report else ())
+        if item.is_scored_by_instructor
+    }
+    max_by_title[TOTAL_TITLE] = entry.max_points
+    override_by_title = {title: entry.overrides.get(title, Override()) for title in max_by_title}
+    rows = [
+        (title, max_by_title[title], override.points, override.comment)
+        for title, override in override_by_title.items()
+    ]
+    other_rows = [
+        (title, override.points, override.comment)
+        for title, override in entry.overrides.items()
+        if title not in max_by_title
+    ]
+    identity = entry.student_id or (report.submission if report else "")
+    return frame.boxes_section("Your points and comments", identity, rows, other_rows)

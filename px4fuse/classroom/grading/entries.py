@@ -1,0 +1,514 @@
+"""Rows of the class table: the report that counts, late deduction, and the instructor's points.
+
+Points that the instructor writes into ``overrides.csv`` replace the computed points. A late
+deduction is a percentage of the maximum points for each started day (or hour) after the due time,
+at most the maximum that the rule states. The total is never negative.
+"""
+
+import math
+import re
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+from px4fuse.classroom.assignment.key import AnswerKey
+from px4fuse.classroom.assignment.roster import Person, Register, normalise_text, read_people
+from px4fuse.classroom.assignment.sheet import Sheet, format_cell_number, parse_decimal, read_sheet
+from px4fuse.classroom.grading.flags import flag_equal_contents
+from px4fuse.classroom.grading.model import (
+    TOTAL_TITLE,
+    Entry,
+    GradedReport,
+    Item,
+    Override,
+    Submission,
+)
+from px4fuse.classroom.grading.rubric import Rubric
+from px4fuse.core.text import clean_text, one_line
+from px4fuse.errors import SettingsError
+
+TIME_FORMAT = "%Y-%m-%d %H:%M"
+# Table of the instructor's points and comments, which px4fuse never overwrites
+OVERRIDES_NAME = "overrides.csv"
+OVERRIDE_TITLES = ("id", "item", "points", "comment")
+OVERRIDES_TEMPLATE = "\ufeff" + ",".join(OVERRIDE_TITLES) + "\r\n"
+MAX_OVERRIDE_POINTS = 1e6
+MAX_COMMENT_LENGTH = 10_000
+
+# Points or comment of the instructor, by student id and item title as typed ("": the whole report)
+Overrides = Mapping[str, Mapping[str, Override]]
+# Syntax of the option --late, for example "10 % / day up to 50 %"
+_LATE_RULE = re.compile(
+    r"(?P<rate>\d+(?:\.\d+)?)\s*%\s*/\s*(?P<unit>day|hour)"
+    r"(?:\s+up to\s+(?P<most>\d+(?:\.\d+)?)\s*%)?"
+)
+# Formats of submission times in Moodle's worksheets (English), with a 12-hour and a 24-hour clock
+_MOODLE_FORMATS = ("%A, %d %B %Y, %I:%M %p", "%A, %d %B %Y, %H:%M")
+
+
+@dataclass(frozen=True)
+class LateRule:
+    """Rule of the instructor for the deduction of points for late submissions.
+
+    Attributes
+    ----------
+    fraction_per_unit : float
+        Fraction of the maximum points that is deducted for each started unit of time.
+    unit_s : float
+        Unit of time: a day or an hour (s).
+    max_fraction : float
+        Largest fraction of the maximum points that is deducted.
+    text : str
+        Rule as the instructor typed it.
+    """
+
+    fraction_per_unit: float
+    unit_s: float
+    max_fraction: float
+    text: str
+
+    def deduction(self, late_s: float, max_points: float) -> float:
+        """Compute the points to deduct from a submission that is late by ``late_s`` seconds.
+
+        >>> parse_late_rule("10%/day").deduction(86_401.0, 50.0)
+        10.0
+        >>> parse_late_rule("10%/day up to 30%").deduction(1e9, 50.0)
+        15.0
+        """
+        units = math.ceil(max(late_s, 0.0) / self.unit_s)
+        return round(max_points * min(units * self.fraction_per_unit, self.max_fraction), 2)
+
+
+@dataclass(frozen=True)
+class Course:
+    """Class list, answer key, logs and rules for grading, without the submissions.
+
+    Attributes
+    ----------
+    rubric : Rubric
+        Items that give points.
+    key : AnswerKey or None
+        Right answers about each student's flight.
+    logs : sequence of Path
+        Flight logs, and folders of logs. The SHA-256 identifies the log of a report.
+    title : str
+        Title of the class page; by default the title of the rubric.
+    roster : tuple of Person or None
+        Class list; by default the students of the answer key, else of the worksheets.
+    worksheets : tuple of Sheet
+        Tables of learning platforms, into which the grades are entered.
+    column : str
+        Title of the grade column in the worksheets; "" if each has only one grade column.
+    attempt : {"latest", "best", "first"}
+        Report of a student that counts.
+    due : datetime or None
+        Due time, with time zone.
+    include_pending : bool
+        True to count the points of reports on which the instructor still has to decide.
+    late_rule : LateRule or None
+        Deduction for late submissions.
+    anonymous : bool
+        True to show pseudonyms instead of names on the class page.
+    """
+
+    rubric: Rubric
+    key: AnswerKey | None = None
+    logs: Sequence[Path] = ()
+    title: str = ""
+    roster: tuple[Person, ...] | None = None
+    worksheets: tuple[Sheet, ...] = ()
+    column: str = ""
+    attempt: Literal["latest", "best", "first"] = "latest"
+    due: datetime | None = None
+    late_rule: LateRule | None = None
+    include_pending: bool = False
+    anonymous: bool = False
+
+    @cached_property
+    def register(self) -> Register:
+        """Students of the class, with the data of all worksheets."""
+        people_by_sheet = [read_people(sheet) for sheet in self.worksheets]
+        answers = self.key.answers if self.key else ()
+        assigned_people = tuple(Person(answer.student_id, answer.name) for answer in answers)
+        people = self.roster or assigned_people or next(iter(people_by_sheet), ())
+        return Register(people, *people_by_sheet)
+
+
+# Submitted report of a student: sort key (submission time, time of the zip entry), graded report,
+# and row of the class table as if the student had submitted only this report
+Attempt = tuple[tuple[float, float], GradedReport, Entry]
+
+
+def build_entries(
+    reports: Sequence[GradedReport],
+    submissions: Sequence[Submission],
+    course: Course,
+    overrides: Overrides,
+) -> tuple[tuple[Entry, ...], tuple[str, ...]]:
+    """Make the rows of the class table: all students, then the reports of unknown students.
+
+    A report belongs to the student that the platform names. If the class list does not contain this
+    student, the id in the report decides, then the name in the report. Without a class list, each
+    student that a report or a platform names has a row.
+
+    Parameters
+    ----------
+    reports, submissions : sequences
+        Graded reports and their files, in the same order.
+
+    Returns
+    -------
+    entries : tuple of Entry
+        Rows of the class table.
+    notes : tuple of str
+        Sentences about overrides that match no student or item.
+    """
+    has_list = bool(course.register.people)
+    register = course.register if has_list else _collect_students(reports, submissions)
+    attempts: dict[int | None, list[Attempt]] = defaultdict(list)
+    for report, submission in zip(reports, submissions, strict=True):
+        student_index = register.student_index(submission.origin.person)
+        if student_index is None:
+            student_index = register.student_index(Person(report.student_id, report.student))
+        attempts[student_index].append(
+            _make_attempt(report, submission, course, student_index, register)
+        )
+    max_points = max((report.max_points for report in reports), default=0.0)
+    rows = [
+        _choose_attempt(attempts[student_index], course)
+        if attempts[student_index]
+        else Entry(person.name, person.student_id, None, max_points=max_points)
+        for student_index, person in enumerate(register.people)
+    ]
+    flag = "Neither the report nor the platform names a student."
+    if has_list:
+        flag = "The student is not in the class list."
+    rows += [replace(row, flags=(flag, *row.flags)) for *_, row in attempts[None]]
+    overrides_by_row, notes = match_overrides(overrides, rows)
+    flags = flag_equal_contents([row.counted_report for row in rows if row.counted_report])
+    final_rows = (
+        _apply_overrides(*row_and_overrides, flags, course)
+        for row_and_overrides in zip(rows, overrides_by_row, strict=True)
+    )
+    return tuple(final_rows), notes
+
+
+def _collect_students(
+    reports: Sequence[GradedReport], submissions: Sequence[Submission]
+) -> Register:
+    """Collect the students that learning platforms and reports name, if there is no class list."""
+    register = Register()
+    for report, submission in zip(reports, submissions, strict=True):
+        person = submission.origin.person
+        stated_index = register.student_index(Person(report.student_id))
+        if person.numbers or person.login:
+            if register.student_index(person) is not None:
+                continue
+            # if another student has this id already, only the platform identifies this student
+            free_id = report.student_id if stated_index is None else ""
+            student_id = person.student_id or free_id
+            name = one_line(report.student if student_id else person.name, 200) or person.name
+            student_id = next(filter(None, (student_id, person.login, *person.numbers.values())))
+            register.people.append(replace(person, student_id=student_id, name=name))
+        elif report.student_id and stated_index is None:
+            register.people.append(Person(report.student_id, one_line(report.student, 200)))
+    return register
+
+
+def _make_attempt(
+    report: GradedReport,
+    submission: Submission,
+    course: Course,
+    student_index: int | None,
+    register: Register,
+) -> Attempt:
+    """Make the row of the class table for a student with this report only, and its sort key."""
+    origin, due_time = submission.origin, course.due
+    platform = origin.platform.capitalize()
+    person = Person(report.student_id) if student_index is None else register.people[student_index]
+    stated_time = origin.time or parse_moodle_time(person.submitted)
+    time, zip_time = (
+        time and add_time_zone(time, due_time) for time in (stated_time, submission.time)
+    )
+    late_s, flags = None, []
+    if due_time is not None and time is not None:
+        # UNIX times are subtracted, because datetime ignores daylight saving in one time zone
+        late_s = max(time.timestamp() - due_time.timestamp(), 0.0)
+    elif origin.is_late:
+        flags.append(
+            f"{platform} marks the file as late without a time, so no points were deducted."
+        )
+    elif course.late_rule and due_time and zip_time and zip_time.timestamp() > due_time.timestamp():
+        flags.append(
+            f"The time in the zip file ({zip_time:{TIME_FORMAT}}) is after the due time. It may be "
+            "the time of the download, so no points were deducted."
+        )
+    if origin.is_imitated:
+        flags.append(
+            "The file name looks like a file name of a platform, but a student wrote it "
+            f"(platform of the export: {platform or 'none'})."
+        )
+    stated_index = register.student_index(Person(report.student_id)) if platform else None
+    if stated_index is not None and student_index not in (None, stated_index):
+        stated_person = register.people[stated_index]
+        flags.append(
+            f"The id in the report is that of {stated_person.student_id} "
+            f"({stated_person.name or 'no name'}), but {platform} names another student."
+        )
+    rule = course.late_rule
+    entry = Entry(
+        person.name or one_line(report.student or origin.person.name, 200),
+        person.student_id,
+        report,
+        submission_time="" if time is None else time.strftime(TIME_FORMAT),
+        late_s=late_s,
+        deduction=rule.deduction(late_s, report.max_points) if rule and late_s else 0.0,
+        max_points=report.max_points,
+        flags=tuple(flags),
+    )
+    sort_key = (time.timestamp() if time else 0.0, zip_time.timestamp() if zip_time else 0.0)
+    return sort_key, report, entry
+
+
+def _points_after_deduction(attempt: Attempt) -> float:
+    _, report, entry = attempt
+    return max(report.points - entry.deduction, 0.0)
+
+
+def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
+    """Choose the report of a student that counts, and add flags if the choice is ambiguous."""
+    # several reports of one submission have the same time; points are the second sort key
+    ordered = sorted(attempts, key=lambda a: (a[0], _points_after_deduction(a), a[1].submission))
+    # reports without open action of the instructor are preferred, then other reports, then other
+    # files
+    with_report = [attempt for attempt in ordered if attempt[1].version]
+    without_action = [attempt for attempt in with_report if not attempt[1].instructor_action]
+    eligible = without_action or with_report or ordered
+    chosen_key, chosen_report, entry = {
+        "latest": eligible[-1],
+        # of several reports in the first submission, the report with the most points
+        "first": [attempt for attempt in eligible if attempt[0] == eligible[0][0]][-1],
+        "best": max(reversed(eligible), key=_points_after_deduction),
+    }[course.attempt]
+    flags = list(entry.flags)
+    other_reports = tuple(report for _, report, _ in ordered if report is not chosen_report)
+    forms = [report.form for sort_key, report, _ in eligible if sort_key == chosen_key]
+    # students must not hand in several forms with different guesses, of which the best would count
+    if course.attempt != "best" and len(set(forms)) > 1:
+        action = f"Ask which of {len(forms)} reports counts: their forms differ."
+        chosen_report = replace(chosen_report, instructor_action=action)
+    elif len(forms) > 1 and any(chosen_key):
+        flags.append(f"{len(forms)} reports have the same time; the best one counts.")
+    for sort_key, report, _ in ordered:
+        if (
+            report in other_reports
+            and sort_key >= chosen_key
+            and (report.instructor_action or not report.version)
+        ):
+            reason = "is pending" if report.version else "is not a report"
+            flags.append(f"{one_line(report.submission, 80)} {reason}, so another file counts.")
+    return replace(
+        entry, counted_report=chosen_report, other_reports=other_reports, flags=tuple(flags)
+    )
+
+
+def _apply_overrides(
+    entry: Entry,
+    own_overrides: Mapping[str, Override],
+    flags_by_submission: Mapping[str, Sequence[str]],
+    course: Course,
+) -> Entry:
+    """Apply the instructor's points and comments, compute the total, and add flags."""
+    report, total, flags = entry.counted_report, None, entry.flags
+    if report is not None:
+        items = (_override_item(item, own_overrides.get(item.title)) for item in report.items)
+        report = replace(report, items=tuple(items))
+        flags = (*flags, *report.flags, *flags_by_submission.get(report.submission, ()))
+        if report.counted_points is not None or course.include_pending:
+            total = round(max(report.points - entry.deduction, 0.0), 2)
+    on_report, on_total = (own_overrides.get(title, Override()) for title in ("", TOTAL_TITLE))
+    return replace(
+        entry,
+        counted_report=report,
+        overrides=own_overrides,
+        comment="\n".join(filter(None, (on_report.comment, on_total.comment))),
+        total=total if on_total.points is None else on_total.points,
+        flags=flags,
+    )
+
+
+def _override_item(item: Item, override: Override | None) -> Item:
+    """Replace the points of a rubric item by the instructor's points, and append the comment."""
+    if override is None:
+        return item
+    comment = item.comment
+    if override.comment:
+        comment += f" Your instructor: {override.comment}"
+    if override.points is None:
+        return replace(item, comment=comment)
+    if override.points != item.points:
+        comment = f"{comment} (Your instructor gave {format_cell_number(override.points)} points.)"
+    return replace(item, points=override.points, comment=comment, awaits_points=False)
+
+
+# ------------------------------------------------------------------ overrides
+
+
+def read_overrides(path: Path) -> Overrides:
+    """Read the instructor's points and comments from ``overrides.csv``, if the file exists.
+
+    Columns: id (as in class.csv, or the file name of the report), item (a title of the rubric,
+    "total", or empty for a comment on the whole report), points, comment.
+
+    Raises
+    ------
+    SettingsError
+        A column is missing, or points are not a valid number.
+    """
+    if not path.exists():
+        return {}
+    sheet = read_sheet(path)
+    missing_titles = [title for title in OVERRIDE_TITLES if sheet.column((title,)) is None]
+    if missing_titles:
+        remedy = f"Required columns: {', '.join(OVERRIDE_TITLES)}."
+        raise SettingsError(f"{path}: no column {', '.join(missing_titles)}.", remedy)
+    overrides: dict[str, dict[str, Override]] = defaultdict(dict)
+    for row_number, row in enumerate(sheet.rows, start=2):
+        student, item_title, points, comment = (
+            sheet.cell(row, (title,)).removeprefix("'") for title in OVERRIDE_TITLES
+        )
+        value = parse_decimal(points)
+        problem = ""
+        if item_title in overrides[student]:
+            item_text = one_line(item_title, 40) or "(whole report)"
+            problem = f"a second row for student {one_line(student, 40)}, item {item_text}"
+        elif points and (
+            value is None or not 0.0 <= value <= MAX_OVERRIDE_POINTS or not item_title
+        ):
+            points_text = one_line(points, 20)
+            problem = f"points {points_text!r}: give a number of 0 or more, and an item or total"
+        if problem:
+            raise SettingsError(f"{path}: row {row_number}: {problem}.")
+        overrides[student][item_title] = Override(value, clean_text(comment[:MAX_COMMENT_LENGTH]))
+    return overrides
+
+
+def match_overrides(
+    overrides: Overrides, entries: Sequence[Entry]
+) -> tuple[list[dict[str, Override]], tuple[str, ...]]:
+    """Match the instructor's points and comments with the rows of the class table.
+
+    Returns
+    -------
+    matched_overrides : list of dict
+        Points and comments for each row, by title of an item, "total", or "" (the whole report).
+    notes : tuple of str
+        Sentences about points and comments that match no row or item.
+    """
+    matched_overrides: list[dict[str, Override]] = [{} for _ in entries]
+    all_points = (report.max_points for entry in entries for report in entry.reports)
+    max_total = max(all_points, default=MAX_OVERRIDE_POINTS)
+    people = Register(
+        Person(entry.student_id, login=report.submission if report else "")
+        for entry in entries
+        for report in [entry.counted_report]
+    )
+    notes = []
+    for student, override_by_item in overrides.items():
+        # the instructor may type an id, with or without leading zeros, or a file name
+        student_index = people.student_index(Person(student, login=student))
+        student_text = one_line(student, 40) or "(empty)"
+        if student_index is None:
+            notes.append(f"{OVERRIDES_NAME}: no student has the id {student_text}.")
+            continue
+        max_by_title = {TOTAL_TITLE: max_total, "": MAX_OVERRIDE_POINTS}
+        if report := entries[student_index].counted_report:
+            max_by_title |= {item.title: item.max_points for item in report.items}
+            max_by_title[TOTAL_TITLE] = report.max_points
+        titles = {normalise_text(title): title for title in max_by_title}
+        for item, override in override_by_item.items():
+            title, problem = titles.get(normalise_text(item)), ""
+            if title is None:
+                problem = f"student {student_text} has no item {one_line(item, 60)!r}"
+            elif title in matched_overrides[student_index]:
+                problem = f"student {student_text} has two rows for {title or 'the whole report'!r}"
+            elif (override.points or 0.0) > max_by_title[title]:
+                limit = f"{max_by_title[title]:g} points of {one_line(title, 60)!r}"
+                problem = f"student {student_text} cannot have more than {limit}"
+            else:
+                matched_overrides[student_index][title] = override
+            notes += [f"{OVERRIDES_NAME}: {problem}."] if problem else []
+    return matched_overrides, tuple(notes)
+
+
+# ------------------------------------------------------------------ due time
+
+
+def parse_late_rule(text: str) -> LateRule:
+    """Parse a late rule such as ``10%/day`` or ``10%/day up to 50%``.
+
+    Raises
+    ------
+    SettingsError
+        The text is not a late rule.
+    """
+    match = _LATE_RULE.fullmatch(text.strip())
+    if match is None or not 0.0 <= float(match["rate"]) <= 100.0:
+        raise SettingsError(f"--late {text!r} is not a rule. Use 10%/day or 10%/day up to 50%.")
+    unit_s = {"day": 86_400.0, "hour": 3_600.0}[match["unit"]]
+    max_fraction = min(float(match["most"] or 100.0) / 100.0, 1.0)
+    return LateRule(float(match["rate"]) / 100.0, unit_s, max_fraction, text.strip())
+
+
+def parse_due_time(text: str) -> datetime:
+    """Parse a due time: ``2026-11-20 23:59``, optionally with ``+01:00`` or ``Europe/Berlin``.
+
+    The default time zone is that of this computer. A date without a time means the end of the day,
+    and a time without seconds the end of the minute.
+
+    Raises
+    ------
+    SettingsError
+        The text is not a valid time.
+    """
+    parts = text.split()
+    try:
+        zone = ZoneInfo(parts.pop()) if parts and parts[-1][0].isalpha() else None
+        time = datetime.fromisoformat("T".join(parts[:2]) + "".join(parts[2:]))
+    except (ZoneInfoNotFoundError, ValueError, OSError) as error:
+        raise SettingsError(
+            f"--due {text!r} is not a valid time. Use '2026-11-20 23:59', optionally "
+            "followed by a time zone ('+01:00' or 'Europe/Berlin')."
+        ) from error
+    clock = re.search(r"\d\d:\d\d(:\d\d)?", text)
+    if clock is None:
+        time = time.replace(hour=23, minute=59)
+    if clock is None or clock[1] is None:
+        time = time.replace(second=59)
+    return time.replace(tzinfo=zone) if zone else time if time.tzinfo else time.astimezone()
+
+
+def add_time_zone(time: datetime, due: datetime | None) -> datetime:
+    """Add the time zone of the due time, or of this computer, to a time without time zone."""
+    if time.tzinfo is not None:
+        return time
+    return time.replace(tzinfo=due.tzinfo) if due is not None else time.astimezone()
+
+
+def parse_moodle_time(text: str) -> datetime | None:
+    """Parse the submission time in Moodle's worksheet; None for an unsupported format.
+
+    >>> parse_moodle_time("Friday, 20 November 2026, 11:58 PM").isoformat()
+    '2026-11-20T23:58:00'
+    >>> parse_moodle_time("-")
+    """
+    for time_format in _MOODLE_FORMATS:
+        with suppress(ValueError):
+            return datetime.strptime(text.strip(), time_format)
+    return None

@@ -1,0 +1,223 @@
+"""Flags: sentences for the instructor about suspicious reports, without effect on points.
+
+A flag does not prove a copy: two students may fly together, and students who follow the advice of
+px4fuse get the same settings.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from decimal import Decimal
+from itertools import combinations
+from operator import attrgetter
+from typing import Any
+
+from px4fuse.classroom.assignment.roster import normalise_text
+from px4fuse.classroom.grading.model import GradedReport
+from px4fuse.core.text import capitalise_first, join_first, one_line
+from px4fuse.filter.tuning import NoiseEstimate
+from px4fuse.request import LoopRequest
+from px4fuse.results.contract import LoopResults, ReportedResults
+from px4fuse.simulation import flights
+from px4fuse.verification.model import Verdict
+
+# Minimum number of equal numbers in two answer forms that are flagged as copies, and relative
+# tolerance of equal numbers, which detects a copy with small changes
+MIN_SAME_NUMBERS, SAME_NUMBER_TOLERANCE = 3, 0.02
+# Minimum fraction of the log between --start and --end: a report on a shorter segment is flagged
+MIN_SEGMENT_FRACTION = 0.5
+# Maximum factor between SIGMA_A or SIGMA_Z and its maximum-likelihood estimate, above or below
+MAX_SETTING_FACTOR = 30.0
+# Maximum factor between --drift or --heading-drift and its default value, above or below
+MAX_DRIFT_FACTOR = 4.0
+# Maximum number of reports with equal contents that a flag lists
+MAX_LISTED_REPORTS = 4
+# Pairs of reports with equal contents
+Pairs = Iterator[tuple[GradedReport, GradedReport]]
+
+
+def flag_pages(verdict: Verdict) -> Iterator[str]:
+    """Yield a flag with the first difference if a PDF differs from the redrawn report."""
+    if verdict.pages:
+        first_page, *further_pages = verdict.pages
+        more_text = f" The PDF has {len(further_pages)} more differences." if further_pages else ""
+        yield (
+            "The PDF differs from the report that px4fuse draws from the log. "
+            f"{capitalise_first(first_page.sentence)}.{more_text} Read the redrawn report."
+        )
+
+
+def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[str]:
+    """Yield flags about unusual settings of one report.
+
+    ``has_key``: True if there is an answer key; a simulated log is then expected.
+    """
+    if isinstance(results, LoopResults):
+        yield from _flag_drift(results.request)
+        return
+    settings, whole_s = results.settings, results.log.duration_s
+    fraction = (settings.end_s - settings.start_s) / whole_s if whole_s else 1.0
+    has_segment = (results.request.start_s, results.request.end_s) != (None, None)
+    if has_segment and fraction < MIN_SEGMENT_FRACTION:
+        yield (
+            f"The student analysed only {fraction:.0%} of the log ({settings.start_s:.1f} to "
+            f"{settings.end_s:.1f} s of {whole_s:.1f} s). Ask for the reason."
+        )
+    if not {"north", "east", "aisle"} & set(results.axes):
+        yield "Only the vertical axis was analysed (--axis)."
+    without_imu = any(finding.id == "acceleration_not_logged" for finding in results.findings)
+    if settings.input == "zero" and not without_imu:
+        yield "The IMU was not used (--input zero)."
+    source = results.source
+    tracks_as_received = [track.name for track in source.available if track.path == "as received"]
+    if tracks_as_received and source.path != "as received":
+        yield (
+            f"The position source is {source.name} ({source.path}), not "
+            f"{tracks_as_received[0]}, the positions as received by PX4."
+        )
+    estimates = [
+        estimate for estimate in results.tuning.values() if isinstance(estimate, NoiseEstimate)
+    ]
+    for name, label in (("sigma_z_m", "SIGMA_Z"), ("sigma_a_m_s2", "SIGMA_A")):
+        value = getattr(settings, name)
+        ml_values = [ml_value for estimate in estimates if (ml_value := getattr(estimate, name))]
+        if ml_values and not (
+            min(ml_values) / MAX_SETTING_FACTOR < value < MAX_SETTING_FACTOR * max(ml_values)
+        ):
+            yield (
+                f"{label} {value:g} differs by more than a factor of {MAX_SETTING_FACTOR:g} from "
+                f"its maximum-likelihood estimate ({ml_values[0]:.3g})."
+            )
+    if results.log.hardware == flights.HARDWARE and not has_key:
+        yield "The log is simulated (px4fuse simulate), not a real flight."
+
+
+def _flag_drift(request: LoopRequest) -> Iterator[str]:
+    """Yield flags about an odometry drift in the options that is far from the default.
+
+    The chi-square test of a loop closure uses this drift.
+    """
+    defaults = LoopRequest(source="")
+    for option, unit, drift, default in (
+        ("--drift", "m", request.position_drift_m, defaults.position_drift_m),
+        ("--heading-drift", "°", request.heading_drift_deg, defaults.heading_drift_deg),
+    ):
+        if not default / MAX_DRIFT_FACTOR <= drift <= default * MAX_DRIFT_FACTOR:
+            yield (
+                f"{option} is {drift:g} {unit} per 100 m (default {default:g} {unit}). The test of "
+                "the loop closure depends on this value. Ask for the reason."
+            )
+
+
+def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
+    """Return the numbers in an answer form, by (mistake, "size" or "value") or ("", question)."""
+    if report.form is None:
+        return {}
+    answers: dict[tuple[str, str], object] = {
+        (mistake.kind, name): getattr(mistake, name)
+        for mistake in report.form.mistakes
+        for name in ("size", "value")
+    }
+    answers |= {("", f"q{index}"): number for index, number in enumerate(report.form.quantities)}
+    return {key: float(n) for key, n in answers.items() if isinstance(n, float | int)}
+
+
+def _count_same_numbers(numbers: Mapping[Any, float], other_numbers: Mapping[Any, float]) -> int:
+    """Count the equal numbers of two answer forms that have more than one digit.
+
+    Sizes and answers are equal within SAME_NUMBER_TOLERANCE, values of corrections exactly.
+    """
+    return sum(
+        _count_digits(number) > 1
+        and abs(number - other_numbers[key])
+        <= (key[1] != "value") * SAME_NUMBER_TOLERANCE * abs(number)
+        for key, number in numbers.items()
+        if key in other_numbers
+    )
+
+
+def _student_key(report: GradedReport) -> str:
+    return normalise_text(report.student_id) or normalise_text(report.student) or report.submission
+
+
+# Checks for equal contents of two reports: text of the flag, function that returns the compared
+# content, and function that returns an owner. Reports with the same owner are not flagged: two
+# reports of one student may be about the same log
+COMMON_CHECKS: tuple[
+    tuple[str, Callable[[GradedReport], object], Callable[[GradedReport], str]], ...
+] = (
+    ("This PDF is identical to that of {}.", attrgetter("sha256"), attrgetter("submission")),
+    (
+        "The id in this report is also in that of {}.",
+        lambda report: normalise_text(report.student_id),
+        attrgetter("submission"),
+    ),
+    ("This report is about the same log as that of {}.", attrgetter("log_sha256"), _student_key),
+    (
+        "The numbers are those of {}, but the log has another SHA-256: it is a changed copy.",
+        lambda report: (
+            report.verdict.status == "verified"
+            and len(report.numbers) >= MIN_SAME_NUMBERS
+            and tuple(report.numbers.values())
+        ),
+        attrgetter("log_sha256"),
+    ),
+)
+
+
+def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequence[str]]:
+    """Return the flags about equal contents of two reports, by name of the submission."""
+    flags_by_submission: dict[str, list[str]] = defaultdict(list)
+    for sentence, pairs in (
+        *(
+            (sentence, _same_pairs(reports, key_of, owner_of))
+            for sentence, key_of, owner_of in COMMON_CHECKS
+        ),
+        ("The answer form has the same numbers as that of {}.", _copied_forms(reports)),
+    ):
+        texts_by_submission: dict[str, list[str]] = defaultdict(list)
+        for first_report, second_report in pairs:
+            for report, other_report in (
+                (first_report, second_report),
+                (second_report, first_report),
+            ):
+                file = one_line(other_report.submission, 80)
+                texts_by_submission[report.submission].append(
+                    f"{_student_text(other_report)} ({file})"
+                )
+        for name, texts in texts_by_submission.items():
+            flags_by_submission[name].append(
+                sentence.format(join_first(texts, MAX_LISTED_REPORTS, "; "))
+            )
+    return flags_by_submission
+
+
+def _same_pairs(
+    reports: Sequence[GradedReport],
+    key_of: Callable[[GradedReport], object],
+    owner_of: Callable[[GradedReport], str],
+) -> Pairs:
+    groups: dict[object, list[GradedReport]] = defaultdict(list)
+    for report in reports:
+        groups[key_of(report)].append(report)
+    for key, group in groups.items():
+        for report, other_report in combinations(group if key else (), 2):
+            if owner_of(report) != owner_of(other_report):
+                yield report, other_report
+
+
+def _copied_forms(reports: Sequence[GradedReport]) -> Pairs:
+    """Yield pairs of reports of different students whose answer forms have the same numbers."""
+    numbers_by_report = [(report, _form_numbers(report)) for report in reports]
+    for (report, numbers), (other_report, other_numbers) in combinations(numbers_by_report, 2):
+        is_copied = _count_same_numbers(numbers, other_numbers) >= MIN_SAME_NUMBERS
+        if is_copied and _student_key(report) != _student_key(other_report):
+            yield report, other_report
+
+
+def _student_text(report: GradedReport) -> str:
+    names = filter(None, (report.student.strip(), report.student_id.strip()))
+    return one_line(", ".join(names) or report.submission, 80)
+
+
+def _count_digits(number: float) -> int:
+    return len(Decimal(repr(abs(number))).normalize().as_tuple().digits) if number else 0

@@ -1,0 +1,334 @@
+"""Points of a student's answer form (0 to 100), by comparison with the answer key.
+
+The constants reproduce points that an instructor gave by hand. Guessing is not rewarded: each false
+mistake (named in the form, but not in the flight) costs points, and a mistake that can be guessed
+without a measurement has points only with the correct size.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import msgspec
+
+from px4fuse.classroom.assignment.truth import FormTruth, TrueMistake
+from px4fuse.core.record import table
+from px4fuse.results.answer_form import (
+    MISTAKES,
+    NO_MISTAKE_KIND,
+    Answers,
+    QuantityAnswer,
+    StudentMistake,
+)
+
+# Deduction (points) for each false mistake, which the flight does not have, and number of false
+# mistakes from which the right ones have no points either
+FALSE_MISTAKE_POINTS, MAX_FALSE_MISTAKES = 10.0, 3
+# Fractions of the points if the answer form names another mistake: a related mistake; ekf2-noise
+# for r-scale, which both make the same R wrong; a consequence of the mistake
+NEIGHBOUR_FRACTION, SAME_NUMBER_FRACTION, EFFECT_FRACTION = 0.4, 2.0 / 3.0, 0.15
+# Mistakes that can be guessed without a measurement: only the correct size has points. A nearly
+# correct size has no points, because the assigned sizes are close to each other
+GUESSABLE_KINDS = frozenset(("open-end",))
+ANY_BOUNDS = (-math.inf, math.inf)
+# Tolerance of start and end of a mistake: the larger of a duration (s) and a fraction of the time
+TIME_TOLERANCE_S, TIME_TOLERANCE_FRACTION = 2.0, 0.05
+# Relative tolerances of a computed number for full points and for half of the points
+FULL_TOLERANCE, HALF_TOLERANCE = 0.02, 0.10
+# Relative tolerance of the size of a mistake for half of the points
+HALF_SIZE_TOLERANCE = 0.4
+
+
+@dataclass(frozen=True)
+class _CorrectionRule:
+    """Parameter that corrects mistakes, and its right values, from ``form_points.toml``.
+
+    Attributes
+    ----------
+    fraction_by_mistake : mapping
+        Fraction of the points for this correction, by mistake.
+    right_values : (float, float) or str
+        Smallest and largest right value, or the name of a rule in :func:`right_corrections`.
+    only_if_late : bool
+        True if the correction is right for late timestamps only.
+    """
+
+    parameter: str
+    fraction_by_mistake: Mapping[str, float]
+    right_values: tuple[float, float] | str = ANY_BOUNDS
+    only_if_late: bool = False
+
+
+POINTS_TABLE = table(__file__, "form_points.toml", dict)
+CORRECTIONS = msgspec.convert(POINTS_TABLE["corrections"], tuple[_CorrectionRule, ...])
+NEIGHBOURS = msgspec.convert([*POINTS_TABLE["neighbours"].values()], tuple[frozenset[str], ...])
+PART_NAMES = tuple(POINTS_TABLE["weights"])
+
+
+@dataclass(frozen=True)
+class FormPoints:
+    """Points of a student's answer form.
+
+    Attributes
+    ----------
+    points_by_part : mapping
+        Points of each part of the form: "mistakes", "sizes", "correction", ....
+    max_points_by_part : mapping
+        Maximum points of each part of the form.
+    feedback : tuple of str
+        Clauses for the student about right, missed and false mistakes.
+    is_named_by_mistake : mapping
+        True for each mistake of the flight that the form names.
+    """
+
+    points_by_part: Mapping[str, float]
+    max_points_by_part: Mapping[str, float]
+    feedback: tuple[str, ...] = ()
+    is_named_by_mistake: Mapping[str, bool] = field(default_factory=dict)
+
+    @property
+    def fraction(self) -> float:
+        """Sum of the points divided by the maximum, 0 to 1."""
+        return sum(self.points_by_part.values()) / sum(self.max_points_by_part.values())
+
+
+def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
+    """Compute the points of an answer form by comparison with the right answers."""
+    is_clean_named = not truth.mistakes and answers.names_no_mistake
+    weights = POINTS_TABLE["weights_clean" if is_clean_named else "weights"]
+    fractions = dict.fromkeys(PART_NAMES, 0.0)
+    matches, false_mistakes = _match_mistakes(answers, truth)
+    if truth.mistakes and len(false_mistakes) < MAX_FALSE_MISTAKES:
+        fractions |= _mistake_fractions(matches, truth)
+    fractions["numbers"] = quantities_fraction = _quantities_fraction(answers, truth)
+    # half of the points for the verdicts if no computed number is right, because most verdicts can
+    # be guessed
+    fractions["verdicts"] = _verdicts_fraction(answers, truth) * (
+        1.0 if quantities_fraction else 0.5
+    )
+    points_by_part = {name: weights[name] * fraction for name, fraction in fractions.items()}
+    if is_clean_named:
+        points_by_part["mistakes"] = weights["mistakes"]
+    elif truth.mistakes and all(mistake.size is None for mistake in truth.mistakes):
+        # no mistake of this flight has a size, so the part "mistakes" gets the points of "sizes"
+        # too
+        points_by_part["mistakes"] += weights["sizes"] * fractions["mistakes"]
+    points_by_part["mistakes"] -= FALSE_MISTAKE_POINTS * len(false_mistakes)
+    points_by_part["mistakes"] = max(points_by_part["mistakes"], 0.0)
+    named_kinds = [student_mistake.kind for student_mistake in answers.mistakes]
+    is_named_by_mistake = {mistake.kind: mistake.kind in named_kinds for mistake in truth.mistakes}
+    feedback = tuple(_mistake_feedback(matches, false_mistakes, is_clean_named))
+    return FormPoints(points_by_part, weights, feedback, is_named_by_mistake)
+
+
+# Mistake of the flight, best matching mistake in the answer form, and fraction of the points
+Match = tuple[TrueMistake, StudentMistake | None, float]
+
+
+def _mistake_feedback(
+    matches: list[Match], false_mistakes: list[StudentMistake], is_clean_named: bool
+) -> Iterator[str]:
+    """Yield a clause for each right or missed mistake, and one for all false mistakes."""
+    if not matches:
+        yield f"your flight has no mistake{', as your form states' * is_clean_named}"
+    for mistake, student_mistake, _ in matches:
+        mistake_text = f"{mistake.kind} ({MISTAKES[mistake.kind].description})"
+        if student_mistake is None:
+            yield f"you did not name {mistake_text}"
+        elif student_mistake.kind != mistake.kind:
+            yield f"you named {student_mistake.kind} instead of {mistake_text}"
+        else:
+            yield f"you named {mistake.kind}, which is right"
+    if false_mistakes:
+        kinds = ", ".join(student_mistake.kind for student_mistake in false_mistakes)
+        yield f"your flight does not have {kinds}"
+
+
+def _match_mistakes(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[StudentMistake]]:
+    """Match each mistake of the flight with one in the form; also return unmatched form mistakes.
+
+    Equal mistakes are matched first, then related mistakes, then consequences.
+    """
+    unmatched = [
+        student_mistake
+        for student_mistake in answers.mistakes
+        if student_mistake.kind != NO_MISTAKE_KIND
+    ]
+    match_by_kind: dict[str, tuple[StudentMistake, float]] = {}
+    pairs = [
+        (fraction_for_named_kind(mistake.kind, student_mistake.kind), mistake.kind, student_mistake)
+        for mistake in truth.mistakes
+        for student_mistake in unmatched
+    ]
+    for fraction, kind, student_mistake in sorted(pairs, key=lambda pair: -pair[0]):
+        if fraction and kind not in match_by_kind and student_mistake in unmatched:
+            match_by_kind[kind] = student_mistake, fraction
+            unmatched.remove(student_mistake)
+    no_match = (None, 0.0)
+    matches = [
+        (true_mistake, *match_by_kind.get(true_mistake.kind, no_match))
+        for true_mistake in truth.mistakes
+    ]
+    return matches, unmatched
+
+
+def fraction_for_named_kind(kind: str, named_kind: str) -> float:
+    """Return the fraction of the points if a form names ``named_kind``, the flight has ``kind``."""
+    if kind == named_kind:
+        return 1.0
+    if (kind, named_kind) == ("r-scale", "ekf2-noise"):
+        return SAME_NUMBER_FRACTION
+    if any({kind, named_kind} <= group for group in NEIGHBOURS):
+        return NEIGHBOUR_FRACTION
+    return EFFECT_FRACTION if named_kind in POINTS_TABLE["effects"].get(kind, ()) else 0.0
+
+
+def _mistake_fractions(matches: list[Match], truth: FormTruth) -> dict[str, float]:
+    """Return the fraction of the points for four parts of the form, as mean over all mistakes."""
+    sized_count = sum(mistake.size is not None for mistake, _, _ in matches)
+    fractions = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
+    for mistake, student_mistake, fraction in matches:
+        if student_mistake is None:
+            continue
+        size_points = size_fraction(mistake, student_mistake)
+        weight = (size_points if mistake.kind in GUESSABLE_KINDS else 1.0) / len(matches)
+        time_weight = weight if student_mistake.kind == mistake.kind else 0.5 * weight
+        fractions["mistakes"] += fraction / len(matches)
+        fractions["time and panel"] += (
+            time_and_panel_fraction(mistake, student_mistake) * time_weight
+        )
+        fractions["correction"] += correction_fraction(mistake, student_mistake, truth) * weight
+        fractions["sizes"] += size_points / max(sized_count, 1)
+    return fractions
+
+
+def size_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> float:
+    """Return the fraction of the points for the size of a mistake: 1, 1/2 (close), 1/3, or 0.
+
+    1/3 is for the wrong sign, and for the size of a related mistake.
+    """
+    size = student_mistake.size_in_first_unit()
+    if mistake.size is None or mistake.low is None or mistake.high is None or size is None:
+        return 0.0
+    if student_mistake.kind != mistake.kind:
+        first_units = [[*MISTAKES[kind].units][:1] for kind in (student_mistake.kind, mistake.kind)]
+        is_right = mistake.low <= size <= mistake.high and first_units[0] == first_units[1]
+        return is_right / 3.0
+    is_close = abs(size - mistake.size) <= HALF_SIZE_TOLERANCE * abs(mistake.size)
+    close_fraction = 0.5 * (is_close and mistake.kind not in GUESSABLE_KINDS)
+    return _value_fraction(size, mistake.low, mistake.high, close_fraction)
+
+
+def time_and_panel_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> float:
+    """Return the fraction of the points for time and report panel of a mistake: half for each."""
+    if mistake.from_s is None and mistake.until_s is None:
+        is_time_right = student_mistake.when == "whole flight"
+    else:
+        times = (mistake.from_s, student_mistake.from_s), (mistake.until_s, student_mistake.until_s)
+        is_time_right = not student_mistake.when and all(
+            named_s is not None
+            and abs(named_s - true_s) <= max(TIME_TOLERANCE_S, TIME_TOLERANCE_FRACTION * true_s)
+            for true_s, named_s in times
+            if true_s is not None
+        )
+    return 0.5 * is_time_right + 0.5 * (student_mistake.panel in panels(mistake.kind))
+
+
+def panels(kind: str) -> list[str]:
+    """Return the panels of the report that show a kind of mistake."""
+    return [*(panel for panel, kinds in POINTS_TABLE["shows"].items() if kind in kinds), "cover"]
+
+
+def correction_fraction(
+    mistake: TrueMistake, student_mistake: StudentMistake, truth: FormTruth
+) -> float:
+    """Return the fraction of the points for a named correction and the value given with it."""
+    value = student_mistake.value_in_first_unit()
+    fractions = [
+        fraction
+        if (low, high) == ANY_BOUNDS
+        else fraction * (0.5 if value is None else _value_fraction(value, low, high, 0.5))
+        for parameter, (low, high), fraction in right_corrections(mistake, truth)
+        if parameter == student_mistake.parameter
+    ]
+    return max(fractions, default=0.0)
+
+
+def _value_fraction(value: float, low: float, high: float, fallback: float) -> float:
+    """Return 1 for a value within bounds, 1/3 for a wrong sign, ``fallback`` for other values."""
+    if low <= value <= high:
+        return 1.0
+    return 1.0 / 3.0 if low <= -value <= high else fallback
+
+
+# Parameter that corrects a mistake, bounds of its right values, and fraction of the points
+RightCorrection = tuple[str, tuple[float, float], float]
+
+
+def right_corrections(mistake: TrueMistake, truth: FormTruth) -> tuple[RightCorrection, ...]:
+    """Return the parameters that correct a mistake, with bounds of their right values."""
+    size, low, high = (value or 0.0 for value in (mistake.size, mistake.low, mistake.high))
+    from_s = mistake.from_s or 0.0
+    until_s = from_s if mistake.until_s is None else mistake.until_s
+    bounds = {
+        "negated": (-high, -low),
+        "size": (low, high),
+        "milliseconds": (1e3 * low, 1e3 * high),
+        "twice": (2.0 * size, 1e4),
+        "factors": (100.0 / (100.0 + high), 100.0 / (100.0 + low)),
+        "noise": (0.8 * truth.sigma_z_m, 1.25 * truth.sigma_z_m),
+        "after": (until_s - 1.0, until_s + 15.0),
+        "before": (from_s - 15.0, from_s + 1.0),
+    }
+    return tuple(
+        (
+            rule.parameter,
+            bounds[values] if isinstance(values := rule.right_values, str) else values,
+            0.0 if rule.only_if_late and size <= 0.0 else rule.fraction_by_mistake[mistake.kind],
+        )
+        for rule in CORRECTIONS
+        if mistake.kind in rule.fraction_by_mistake
+    )
+
+
+def _verdicts_fraction(answers: Answers, truth: FormTruth) -> float:
+    """Return the fraction of the points for the verdicts on KF and EKF2, and EKF2's behaviour."""
+    pairs = (answers.verdict_kf, truth.kf.verdict), (answers.verdict_ekf2, truth.ekf2.verdict)
+    right_count = sum(bool(answer) and answer == right for answer, right in pairs)
+    return (right_count + _ekf2_behaviour_fraction(answers, truth)) / 3.0
+
+
+def _ekf2_behaviour_fraction(answers: Answers, truth: FormTruth) -> float:
+    """Return 1 if the form names EKF2's behaviour completely, 1/2 with one error, else 0.
+
+    An error is a missing or a false statement.
+    """
+    stated_behaviours, required_behaviours = set(answers.ekf2_did), set(truth.ekf2_did)
+    also_allowed = set(truth.ekf2_did_also)
+    false_count = len(stated_behaviours - required_behaviours - also_allowed)
+    if len(stated_behaviours) == false_count or false_count > 1:
+        return 0.0
+    is_complete = required_behaviours <= stated_behaviours or (
+        len(required_behaviours) == 1 and stated_behaviours & also_allowed
+    )
+    return 1.0 if is_complete and not false_count else 0.5
+
+
+def _quantities_fraction(answers: Answers, truth: FormTruth) -> float:
+    """Return the fraction of the points for the numbers of KF that the student computed."""
+    # an empty list of updates is the right answer on most flights, so it has no points
+    known_count = sum(value not in (None, ()) for value in truth.quantities)
+    pairs = zip(answers.quantities, truth.quantities, strict=False)
+    return sum(_quantity_fraction(*pair) for pair in pairs) / max(known_count, 1)
+
+
+def _quantity_fraction(answer: QuantityAnswer, true_value: QuantityAnswer) -> float:
+    if isinstance(answer, tuple) and isinstance(true_value, tuple):
+        difference_count = len(set(answer) ^ set(true_value))
+        has_right_number = not set(answer).isdisjoint(true_value)
+        return max(1.0 - 0.5 * difference_count, 0.0) * has_right_number
+    if isinstance(answer, float | int) and isinstance(true_value, float | int):
+        for tolerance, fraction in ((FULL_TOLERANCE, 1.0), (HALF_TOLERANCE, 0.5)):
+            if abs(answer - true_value) <= tolerance * abs(true_value):
+                return fraction
+    return 0.0

@@ -1,0 +1,151 @@
+"""Grading of a class: verification of all submissions in parallel, and output files."""
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from px4fuse.classroom.assignment.key import AnswerKey
+from px4fuse.classroom.grading import submissions
+from px4fuse.classroom.grading.entries import OVERRIDES_NAME, Course, build_entries, read_overrides
+from px4fuse.classroom.grading.model import Entry, GradedReport, Submission
+from px4fuse.classroom.grading.outputs import find_grade_column, write_class
+from px4fuse.classroom.grading.records import RECORDS_FOLDER, load_or_verify
+from px4fuse.classroom.grading.rubric import Rubric, grade_unreadable, score_report
+from px4fuse.core.reading import files_by_sha256, max_log_bytes
+from px4fuse.core.text import one_line
+from px4fuse.core.workers import JobFailure, run_bounded
+from px4fuse.errors import ResultsError
+
+FAILED_REMEDY = "Do not open the file. Ask for the PDF that px4fuse wrote."
+
+
+@dataclass(frozen=True)
+class GradeOutcome:
+    """Result of grading a class.
+
+    Attributes
+    ----------
+    entries : tuple of Entry
+        Rows of the class table: students of the class list, then unknown students.
+    notes : tuple of str
+        Sentences about ignored files and overrides, and grades that could not be entered.
+    reused_count : int
+        Number of reports whose stored verification was loaded.
+    written_paths : tuple of Path
+        Files and folders that were written.
+    """
+
+    entries: tuple[Entry, ...]
+    notes: tuple[str, ...]
+    reused_count: int
+    written_paths: tuple[Path, ...]
+
+    @property
+    def reports(self) -> tuple[GradedReport, ...]:
+        """All reports by student; the first report of each student counts."""
+        return tuple(report for entry in self.entries for report in entry.reports)
+
+
+def grade(
+    paths: Sequence[Path],
+    course: Course,
+    output: Path,
+    *,
+    processes: int | None = None,
+    progress: Callable[[int, int], None] = lambda *_: None,
+) -> GradeOutcome:
+    """Grade all submissions of a class.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Submitted PDFs, and folders and zip files with PDFs.
+    course : Course
+        Class list, rubric, answer key and logs.
+    output : Path
+        Folder for the class table (``class.csv``, ``class.html``), redrawn ``reports/``,
+        ``feedback/``, ``grades/`` for learning platforms, and ``records/``: stored verifications,
+        which make a second run fast. ``overrides.csv`` in this folder is read.
+    processes : int, optional
+        Number of processes; by default one per core.
+    progress : callable
+        Called with the number of finished submissions and the number of all submissions.
+
+    Raises
+    ------
+    SettingsError
+        No submission was found, or ``overrides.csv`` or a worksheet is not valid.
+    OutputError
+        The folder cannot be written.
+    """
+    overrides = read_overrides(output / OVERRIDES_NAME)
+    for worksheet in course.worksheets:
+        find_grade_column(worksheet, course.column)
+    unread_notes = [
+        f"{one_line(file.name, 80)} was not read; only {OVERRIDES_NAME} is read."
+        for file in sorted(output.glob("overrides*"))
+        if file.name != OVERRIDES_NAME
+    ]
+    found_submissions, notes = submissions.find_submissions(paths)
+    jobs = []
+    for submission in found_submissions:
+        student_index = course.register.student_index(submission.origin.person)
+        submitter_id = (
+            "" if student_index is None else course.register.people[student_index].student_id
+        )
+        jobs.append((submission, submitter_id))
+    rules, logs = (course.rubric, course.key), files_by_sha256(course.logs)
+    records = output / RECORDS_FOLDER
+    grade_job = partial(grade_submission, *rules, logs, records, max_log_bytes.get())
+    graded_by_index: dict[int, GradedReport] = {}
+    reused_count = 0
+    progress(0, len(found_submissions))
+    with closing(run_bounded(grade_job, jobs, processes=processes)) as results:
+        for index, result in results:
+            if isinstance(result, JobFailure):
+                reason = f"the grading of this file failed: {result.reason}"
+                report, is_loaded = grade_unreadable(*rules, reason, FAILED_REMEDY), False
+            else:
+                report, is_loaded = result
+            submission, student = found_submissions[index], report.student
+            if not student and not report.student_id:
+                student = submission.origin.person.name
+            graded_by_index[index] = replace(report, submission=submission.name, student=student)
+            reused_count += is_loaded
+            progress(len(graded_by_index), len(found_submissions))
+    graded = [graded_by_index[index] for index in range(len(found_submissions))]
+    entries, override_notes = build_entries(graded, found_submissions, course, overrides)
+    written_paths, class_notes = write_class(entries, course, output)
+    all_notes = *notes, *unread_notes, *override_notes, *class_notes
+    return GradeOutcome(entries, all_notes, reused_count, written_paths)
+
+
+def grade_submission(
+    rubric: Rubric,
+    key: AnswerKey | None,
+    logs: Mapping[str, Path],
+    records: Path,
+    max_bytes: int,
+    job: tuple[Submission, str],
+) -> tuple[GradedReport, bool]:
+    """Read, verify and score one submission, in a separate process.
+
+    ``job`` is the submission and the student id according to the learning platform. Returns the
+    graded report, and True if a stored verification was loaded.
+    """
+    max_log_bytes.set(max_bytes)
+    submission, submitter_id = job
+    assigned_hashes = frozenset(answer.sha256 for answer in key.answers) if key else frozenset()
+    sha256, is_loaded = "", False
+    try:
+        content = submissions.read(submission)
+        sha256 = hashlib.sha256(content).hexdigest()
+        results, verdict, is_loaded = load_or_verify(records, content, logs, assigned_hashes)
+    except ResultsError as error:
+        graded_report = grade_unreadable(rubric, key, f"{error.reason}.", error.remedy)
+    else:
+        graded_report = score_report(results, verdict, rubric, key, submitter_id)
+    return replace(graded_report, sha256=sha256), is_loaded

@@ -1,0 +1,428 @@
+"""Output files of grading: class table and page, redrawn reports, feedback, platform tables.
+
+px4fuse enters grades into copies of the tables that learning platforms export, and feedback if a
+table has a column for it. All other cells stay unchanged. The row of a student without a grade (no
+submission, or points not decided yet) is not changed: platforms delete a grade if the cell is
+empty, and read 0 as a grade.
+
+- Moodle: "Using Assignment", Offline grading worksheet, docs.moodle.org.
+  ``mod/assign/feedback/offline/importgradeslib.php`` finds "Identifier" ("Participant 12"), "Grade"
+  and "Last modified (grade)" by their titles, reads "Feedback comments" as HTML, ignores grades
+  above "Maximum Grade", and reads numbers in the language of the site.
+- Canvas: "How do I import grades in the Gradebook?", Instructor Guide: the exported gradebook, with
+  Student, ID, SIS User ID, SIS Login ID, Section, and ``Title (12345)`` for an assignment. Columns
+  marked "(read only)" in the row "Points Possible" are ignored.
+- Other platforms: a table with a column of ids, logins, emails or names, and a grade column with
+  the title of ``--column`` or one of :data:`GRADE_TITLES`.
+"""
+
+import html
+import itertools
+import random
+import re
+import textwrap
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib import metadata
+from operator import itemgetter
+from pathlib import Path
+
+from px4fuse.classroom.assignment.roster import (
+    Register,
+    file_names,
+    make_unique,
+    normalise_text,
+    read_student,
+)
+from px4fuse.classroom.assignment.sheet import Sheet, format_cell_number, parse_decimal, read_sheet
+from px4fuse.classroom.grading.checks import shorten_text
+from px4fuse.classroom.grading.class_page import html_text
+from px4fuse.classroom.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
+from px4fuse.classroom.grading.model import TOTAL_TITLE, Entry, GradedReport, list_titles
+from px4fuse.classroom.grading.records import RECORDS_FOLDER, REDRAWN_SUFFIX
+from px4fuse.core.input_files import inputs_not_registered
+from px4fuse.core.spreadsheet import neutralise_formulas, neutralise_id
+from px4fuse.core.text import join_first, one_line
+from px4fuse.core.writing import write_all
+from px4fuse.errors import SettingsError
+from px4fuse.html.safe import load_template
+
+# Folder of the reports that px4fuse draws again from the logs, to be read instead of submitted PDFs
+REPORTS_FOLDER = "reports"
+FEEDBACK_FOLDER = "feedback"
+GRADES_FOLDER = "grades"
+NAMES_FILE = "names.csv"
+NAMES_TITLES = ("pseudonym", "id", "name")
+# Columns of the class table, before and after the columns of rubric items and report numbers
+FIRST_COLUMNS = (
+    "file",
+    "student",
+    "id",
+    "status",
+    "points",
+    "pending points",
+    "of",
+    "deducted",
+    "total",
+)
+LAST_COLUMNS = (
+    "handed in",
+    "hours late",
+    "pending",
+    "comment",
+    "flags",
+    "other files",
+    "reasons",
+    "log SHA-256",
+)
+LIST_SEPARATOR = " | "
+# Maximum number of reasons of the verdict in the feedback for a student
+MAX_REASONS = 4
+# Titles of grade columns in tables of learning platforms, as lower-case letters and digits
+GRADE_TITLES = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
+MAX_GRADE_TITLES = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
+# Titles of feedback columns, which the learning platform reads as HTML, or as HTML or text
+HTML_COMMENT_TITLES = ("feedbackcomments", "feedbackalskommentar")
+COMMENT_TITLES = (*HTML_COMMENT_TITLES, "feedbacktolearner", "feedback", "comment")
+_ASSIGNMENT_NUMBER = re.compile(r" \(\d+\)$")
+# Text in columns that Canvas computes and px4fuse therefore does not change
+READ_ONLY_MARK = "(read only)"
+
+
+def write_class(
+    entries: Sequence[Entry], course: Course, output: Path
+) -> tuple[tuple[Path, ...], tuple[str, ...]]:
+    """Write all output files of grading. An existing ``overrides.csv`` is not overwritten.
+
+    Parameters
+    ----------
+    entries : sequence of Entry
+        Rows of the class table: the students in ``course.register`` first, in the same order.
+
+    Returns
+    -------
+    written : tuple of Path
+        Files and folders.
+    notes : tuple of str
+        Sentences about grades that could not be entered.
+
+    Raises
+    ------
+    OutputError
+        The folder cannot be written.
+    """
+    title = course.title or course.rubric.title or "Class"
+    stems = file_names([_entry_identity(entry, stem=True) for entry in entries])
+    page_entries = [
+        _copy_redrawn(entry, stem, output) for entry, stem in zip(entries, stems, strict=True)
+    ]
+    has_redrawn = any(
+        entry.counted_report and entry.counted_report.redrawn_path for entry in page_entries
+    )
+    feedback_texts = [feedback_text(entry, title) for entry in entries]
+    contents = {"class.csv": csv_text(entries).encode()}
+    if course.anonymous:
+        page_entries, names_table = _anonymise_entries(page_entries, output / NAMES_FILE)
+        contents[NAMES_FILE] = names_table.encode()
+    made_with = f"px4fuse {metadata.version('px4fuse')}"
+    contents["class.html"] = html_text(page_entries, title, made_with).encode()
+    if not (output / OVERRIDES_NAME).exists():
+        contents[OVERRIDES_NAME] = OVERRIDES_TEMPLATE.encode()
+    for stem, text in zip(stems, feedback_texts, strict=True):
+        contents[f"{FEEDBACK_FOLDER}/{stem}.txt"] = text.encode()
+    notes: list[str] = []
+    names = make_unique((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
+    for sheet, name in zip(course.worksheets, names, strict=True):
+        filled_sheet, sheet_notes = fill_grades(
+            sheet, entries, course.register, course.column, feedback_texts
+        )
+        contents[f"{GRADES_FOLDER}/{name}"] = filled_sheet.content()
+        notes += sheet_notes
+    write_all({output / name: content for name, content in contents.items()})
+    outputs = ["class.csv", "class.html", *[REPORTS_FOLDER] * has_redrawn, FEEDBACK_FOLDER]
+    outputs += [GRADES_FOLDER] * bool(course.worksheets) + [OVERRIDES_NAME]
+    return tuple(output / name for name in outputs), tuple(notes)
+
+
+def _entry_identity(entry: Entry, stem: bool = False) -> str:
+    """Return id, else name, else file name: the identity of a row in all runs of grading."""
+    file = entry.counted_report.submission if entry.counted_report else ""
+    return entry.student_id or (Path(file).stem if stem else entry.student or file)
+
+
+def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
+    """Copy a redrawn report to the folder ``reports``, and add its path to the row."""
+    report = entry.counted_report
+    if report is None or not report.sha256:
+        return entry
+    redrawn_file = output / RECORDS_FOLDER / f"{report.sha256}{REDRAWN_SUFFIX}"
+    if not redrawn_file.exists():
+        return entry
+    name = f"{REPORTS_FOLDER}/{stem}.pdf"
+    write_all({output / name: redrawn_file.read_bytes()})
+    return replace(entry, counted_report=replace(report, redrawn_path=name))
+
+
+def _anonymise_entries(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
+    """Replace names by pseudonyms and sort by pseudonym; also return the table of names as CSV.
+
+    Pseudonyms are assigned in random order. A later run reads the pseudonyms from the table at
+    ``path``.
+    """
+    names_by_identity: dict[str, tuple[str, str]] = {}
+    if path.exists():
+        with inputs_not_registered():
+            sheet = read_sheet(path)
+        for row in sheet.rows:
+            name, identity, student = (
+                sheet.cell(row, (t,)).removeprefix("'") for t in NAMES_TITLES
+            )
+            names_by_identity[identity] = name, student
+    used_names = {name for name, _ in names_by_identity.values()}
+    numbered_names = (f"Student {number:03}" for number in itertools.count(1))
+    free_names = (name for name in numbered_names if name not in used_names)
+    students = {_entry_identity(entry): entry.student for entry in entries}
+    new_identities = [identity for identity in students if identity not in names_by_identity]
+    random.SystemRandom().shuffle(new_identities)
+    for identity in new_identities:
+        names_by_identity[identity] = next(free_names), students[identity]
+    rows = (
+        (name, neutralise_id(identity), neutralise_formulas(student))
+        for identity, (name, student) in sorted(names_by_identity.items(), key=itemgetter(1))
+    )
+    anonymous_entries = [
+        anonymise_entry(entry, names_by_identity[_entry_identity(entry)][0]) for entry in entries
+    ]
+    names_table = "\ufeff" + Sheet(path, NAMES_TITLES, tuple(rows)).text
+    return sorted(anonymous_entries, key=lambda entry: entry.student), names_table
+
+
+def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
+    """Return a row with pseudonym, status, points and answer form, without the student's texts."""
+    report = entry.counted_report
+    if report is not None:
+        report = GradedReport(
+            "",
+            "",
+            "",
+            replace(report.verdict, reasons=(), differences=()),
+            tuple(replace(item, comment="") for item in report.items),
+            instructor_action=report.instructor_action
+            and "The instructor has to decide on the points.",
+            form=report.form,
+            numbers=report.numbers,
+            mistakes=report.mistakes,
+        )
+    return Entry(
+        pseudonym,
+        "",
+        report,
+        submission_time=entry.submission_time,
+        late_s=entry.late_s,
+        deduction=entry.deduction,
+        total=entry.total,
+        max_points=entry.max_points,
+        flags=("This report is flagged.",) * bool(entry.flags),
+    )
+
+
+# ------------------------------------------------------------------ the class table
+
+
+def csv_text(entries: Sequence[Entry]) -> str:
+    """Format the class table as CSV for spreadsheet programs; points include the instructor's.
+
+    The text begins with the byte order mark, by which Excel detects UTF-8, and lines end with CRLF.
+    """
+    items, numbers = list_titles(entries)
+    titles = tuple(map(neutralise_formulas, (*FIRST_COLUMNS, *items, *numbers, *LAST_COLUMNS)))
+    rows = []
+    for entry in entries:
+        report = entry.counted_report
+        points_by_title = {item.title: item.points for item in report.items} if report else {}
+        row: list[str | float | None] = [
+            report.submission if report else "",
+            entry.student,
+            None,
+            report.status if report else "missing",
+            report.counted_points if report else None,
+            report.points if report and report.counted_points is None else None,
+            entry.max_points,
+            entry.deduction or None,
+            entry.total,
+            *map(points_by_title.get, items),
+            *(report.numbers.get(title) if report else None for title in numbers),
+            entry.submission_time,
+            None if entry.late_s is None else entry.late_s / 3600.0,
+            report.instructor_action if report else "",
+            entry.comment,
+            LIST_SEPARATOR.join(entry.flags),
+            LIST_SEPARATOR.join(other.submission for other in entry.other_reports),
+            LIST_SEPARATOR.join(report.verdict.reasons) if report else "",
+            report.log_sha256 if report else "",
+        ]
+        cells = [
+            neutralise_formulas(value) if isinstance(value, str) else format_cell_number(value)
+            for value in row
+        ]
+        cells[FIRST_COLUMNS.index("id")] = neutralise_id(entry.student_id)
+        rows.append(tuple(cells))
+    return "\ufeff" + Sheet(Path(), titles, tuple(rows)).text
+
+
+# ------------------------------------------------------------------ feedback
+
+
+def feedback_text(entry: Entry, class_name: str = "") -> str:
+    """Format the feedback for one student, without the flags for the instructor."""
+    graded = entry.counted_report
+    reasons = graded.verdict.reasons[:MAX_REASONS] if graded else ()
+    text = load_template("classroom/grading/feedback.j2").render(
+        entry=entry,
+        graded=graded,
+        class_name=class_name,
+        reasons="; ".join(filter(None, (shorten_text(reason).rstrip(".") for reason in reasons))),
+        is_total_set=TOTAL_TITLE in entry.overrides,
+        line=shorten_text,
+        number=format_cell_number,
+        wrapped=_wrap_text,
+    )
+    return text.rstrip("\n") + "\n"
+
+
+def _wrap_text(text: str, indent: str = "") -> str:
+    return textwrap.fill(
+        text,
+        88,
+        initial_indent=indent,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+# ------------------------------------------------------------------ platform tables
+
+
+def find_grade_column(sheet: Sheet, column_title: str) -> int:
+    """Return the index of the grade column in a table of a learning platform.
+
+    Parameters
+    ----------
+    column_title : str
+        Title of the column, for Canvas without the number in brackets; "" if the table has only one
+        grade column.
+
+    Raises
+    ------
+    SettingsError
+        No column matches, or several match.
+    """
+    title_by_index = {
+        index: title
+        for index, title in enumerate(sheet.head)
+        if not any(READ_ONLY_MARK in row[index] for row in sheet.rows[:3])
+    }
+    grade_index = sheet.column(GRADE_TITLES)
+    plain_titles = {
+        index: _ASSIGNMENT_NUMBER.sub("", title) for index, title in title_by_index.items()
+    }
+    assignments = [index for index, title in title_by_index.items() if plain_titles[index] != title]
+    matches = [
+        index
+        for index, title in title_by_index.items()
+        if normalise_text(column_title) in map(normalise_text, (title, plain_titles[index]))
+    ]
+    columns = assignments if grade_index is None else [grade_index]
+    # Moodle's worksheets have only one grade column: another title is for another table
+    if column_title and (matches or sheet.column(("identifier",)) is None):
+        columns = matches
+    if len(columns) == 1:
+        return columns[0]
+    problem = "the table has several grade columns" if columns else "no grade column matches"
+    titles = ", ".join(one_line(plain_titles[index], 40) for index in assignments or title_by_index)
+    remedy = f"Name one of them with --column: {one_line(titles, 300)}."
+    raise SettingsError(f"{sheet.path}: {problem}.", remedy)
+
+
+def fill_grades(
+    sheet: Sheet, entries: Sequence[Entry], register: Register, column: str, feedback: Sequence[str]
+) -> tuple[Sheet, tuple[str, ...]]:
+    """Enter grades and feedback into a table of a learning platform.
+
+    Parameters
+    ----------
+    entries : sequence of Entry
+        Rows of the class table: the students in ``register`` first, in the same order.
+    column : str
+        Title of the grade column; "" if the table has only one.
+    feedback : sequence of str
+        Feedback for the student of each row.
+
+    Returns
+    -------
+    filled_sheet : Sheet
+        Copy of the table with grades and feedback.
+    notes : tuple of str
+        Sentences about grades that were not entered, or are above the maximum.
+
+    Raises
+    ------
+    SettingsError
+        The table does not have exactly one grade column with this title.
+    """
+    grade_index, feedback_index = find_grade_column(sheet, column), sheet.column(COMMENT_TITLES)
+    format_feedback = (
+        neutralise_formulas if sheet.column(HTML_COMMENT_TITLES) is None else escape_html
+    )
+    cells = [list(row) for row in sheet.rows]
+    names = [one_line(entry.student or entry.student_id, 40) for entry in entries]
+    has_decimal_comma = any(re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells for cell in row)
+    notes, found_people = [], set()
+    for row in cells:
+        person = read_student(sheet, row)
+        student_index = register.student_index(person) if person else None
+        if student_index is None:
+            continue
+        found_people.add(student_index)
+        total = entries[student_index].total
+        if total is None:
+            continue
+        max_points = _max_points(sheet, row, grade_index)
+        if max_points is not None and total > max_points:
+            notes.append(
+                f"{sheet.path.name}: {names[student_index]} has {total:.10g} points, above the "
+                f"maximum of {max_points:.10g} on the platform. Increase the maximum there."
+            )
+        row[grade_index] = format_cell_number(total).replace(".", "," if has_decimal_comma else ".")
+        if feedback_index is not None and feedback_index != grade_index:
+            row[feedback_index] = format_feedback(feedback[student_index])
+    missing_names = [
+        names[index]
+        for index in range(len(register.people))
+        if index not in found_people and entries[index].total is not None
+    ]
+    if missing_names:
+        notes.append(
+            f"{sheet.path.name} has no row for {join_first(missing_names, 4)}. These grades were "
+            "not entered."
+        )
+    return replace(sheet, rows=tuple(map(tuple, cells))), tuple(notes)
+
+
+def _max_points(sheet: Sheet, row: Sequence[str], grade_index: int) -> float | None:
+    """Return the maximum points on the learning platform, if its table contains them."""
+    maximum_texts = (
+        cells[grade_index] for cells in sheet.rows[:3] if "points possible" in cells[0].casefold()
+    )
+    return parse_decimal(next(maximum_texts, sheet.cell(row, MAX_GRADE_TITLES)))
+
+
+def escape_html(text: str) -> str:
+    r"""Escape a text that the learning platform displays as HTML; keep the line breaks.
+
+    >>> escape_html("a <b>\n 1")
+    'a &lt;b&gt;<br>&nbsp;1'
+    """
+    lines = html.escape(text, quote=False).rstrip("\n").split("\n")
+    return "<br>".join(re.sub(r"^ +", lambda m: "&nbsp;" * len(m[0]), line) for line in lines)

@@ -1,0 +1,139 @@
+"""Stored verifications, which are valid until the report, a log or a version changes.
+
+The SHA-256 of the PDF identifies the record of its verification, which is valid while library
+versions and available input files are unchanged. The record contains no points, so that a new
+rubric needs no new verification.
+"""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import msgspec
+
+from px4fuse.core.writing import write_all
+from px4fuse.errors import ResultsError
+from px4fuse.results.contract import ReportedResults, file_hashes_in, to_json
+from px4fuse.results.model import provenance
+from px4fuse.results.reading import read_results
+from px4fuse.verification.model import Verdict
+from px4fuse.verification.pdf_input import read_report
+from px4fuse.verification.verification import log_sha256, verify
+
+# Subfolder of the output folder for stored verifications
+RECORDS_FOLDER = "records"
+# Suffix of a redrawn report, whose name is the SHA-256 of the submitted PDF
+REDRAWN_SUFFIX = ".pdf"
+
+
+@dataclass(frozen=True)
+class VerificationRecord:
+    """Stored verification of one report.
+
+    Attributes
+    ----------
+    dependencies : dict
+        Library versions, and availability of input files, for which the record is valid.
+    results : str
+        Results attached to the PDF, as JSON.
+    verdict : Verdict
+        Result of the verification, without the redrawn PDF.
+    """
+
+    dependencies: dict[str, str]
+    results: str
+    verdict: Verdict
+
+
+def load_or_verify(
+    records: Path, pdf: bytes, logs: Mapping[str, Path], assigned_hashes: frozenset[str]
+) -> tuple[ReportedResults, Verdict, bool]:
+    """Read and verify a report, or load its stored verification.
+
+    Parameters
+    ----------
+    records : Path
+        Folder of the stored verifications.
+    pdf : bytes
+        Content of the submitted file.
+    logs : mapping
+        Logs and other input files by SHA-256.
+    assigned_hashes : frozenset of str
+        SHA-256 of the logs in the answer key. A report on one of these logs gets the verdict
+        "cannot verify", not "other log", if the log is not in ``logs``.
+
+    Returns
+    -------
+    results : ComparisonResults or LoopResults
+        Results attached to the PDF.
+    verdict : Verdict
+        Result of the verification.
+    is_loaded : bool
+        True if a stored verification was loaded.
+
+    Raises
+    ------
+    ResultsError
+        The file is not a report.
+    """
+    sha256 = hashlib.sha256(pdf).hexdigest()
+    if loaded := _load_record(records, sha256, logs, assigned_hashes):
+        return *loaded, True
+    results = read_report(pdf, "The file")
+    attached = to_json(results)
+    dependencies = _dependencies(attached, logs, assigned_hashes)
+    is_log_missing = dependencies.get(log_sha256(results)) == "assigned"
+    verdict = verify(results, pdf, {} if is_log_missing else logs)
+    files = {REDRAWN_SUFFIX: verdict.redrawn} if verdict.redrawn else {}
+    stored_verdict = replace(verdict, redrawn=b"")
+    record = VerificationRecord(dependencies, attached, stored_verdict)
+    _write_record(records, sha256, record, files)
+    return results, stored_verdict, False
+
+
+def _dependencies(
+    results: str, logs: Mapping[str, Path], assigned_hashes: frozenset[str]
+) -> dict[str, str]:
+    """Return library versions, and the availability of each input file of a report by SHA-256.
+
+    Availability: "available", "assigned" (in the answer key, but not available), or "missing".
+    """
+    return _versions() | {
+        name: "available" if name in logs else "assigned" if name in assigned_hashes else "missing"
+        for name in sorted(set(file_hashes_in(results)))
+    }
+
+
+@cache
+def _versions() -> dict[str, str]:
+    versions = provenance("")
+    return {**versions.libraries, "px4fuse": versions.px4fuse}
+
+
+def _write_record(
+    records: Path, sha256: str, record: VerificationRecord, files: Mapping[str, bytes]
+) -> None:
+    for old_file in records.glob(f"{sha256}.*"):
+        # the JSON record is not deleted: another process may read it for an identical PDF
+        if old_file.suffix != ".json":
+            old_file.unlink(missing_ok=True)
+    contents = {**files, ".json": msgspec.json.encode(record)}
+    write_all({records / f"{sha256}{suffix}": content for suffix, content in contents.items()})
+
+
+def _load_record(
+    records: Path, sha256: str, logs: Mapping[str, Path], assigned_hashes: frozenset[str]
+) -> tuple[ReportedResults, Verdict] | None:
+    """Load a stored verification; None if there is none, or its dependencies have changed."""
+    try:
+        content = (records / f"{sha256}.json").read_bytes()
+        record = msgspec.json.decode(content, type=VerificationRecord)
+        if record.dependencies != _dependencies(record.results, logs, assigned_hashes):
+            return None
+        results = read_results(record.results.encode())
+    # if the stored verification cannot be read, the report is verified again
+    except (OSError, msgspec.MsgspecError, ResultsError):
+        return None
+    return (results, record.verdict) if isinstance(results, ReportedResults) else None

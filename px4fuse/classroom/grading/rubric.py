@@ -1,0 +1,238 @@
+"""Rubric, the instructor's table of items that give points: reading, and scoring of a report.
+
+An item has a title, points, a check of :mod:`px4fuse.classroom.grading.checks` and parameters of
+the check. A number that a report does not contain gives no points and a comment.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, Union
+
+import msgspec
+from msgspec import Meta
+
+from px4fuse.classroom.assignment.key import AnswerKey
+from px4fuse.classroom.assignment.roster import make_unique
+from px4fuse.classroom.grading.checks import (
+    CheckInput,
+    RubricItem,
+    Text,
+    format_reason,
+    shorten_text,
+)
+from px4fuse.classroom.grading.flags import flag_pages, flag_settings
+from px4fuse.classroom.grading.model import TOTAL_TITLE, GradedReport, Item
+from px4fuse.core.reading import read_text
+from px4fuse.core.text import one_line
+from px4fuse.errors import SettingsError
+from px4fuse.results.answer_form import Answers
+from px4fuse.results.contract import ReportedResults
+from px4fuse.verification.model import Verdict
+from px4fuse.verification.verification import cannot_verify, log_sha256
+
+DEFAULT_NAME = "rubric.toml"
+MAX_RUBRIC_BYTES = 1_000_000
+RUBRIC_HELP = "Write a commented example with px4fuse grade --write-rubric FILE.toml."
+
+# Numbers of a report in the class table: column title, and path in the results
+TABLE_NUMBERS = (
+    ("SIGMA_A (m/s²)", "settings.sigma_a_m_s2"),
+    ("SIGMA_Z (m)", "settings.sigma_z_m"),
+    ("mean NIS north", "axes.north.filters.kf.nis_mean"),
+    ("mean NIS east", "axes.east.filters.kf.nis_mean"),
+    (
+        "position RMSE against ground truth, aisle (m)",
+        "axes.aisle.filters.kf.truth.position_rmse_m",
+    ),
+    ("closure error (m)", "loop.closure_error_m"),
+)
+
+if TYPE_CHECKING:
+    AnyItem = RubricItem
+else:
+    # union of the item classes of all checks; the field "check" of the TOML file selects one
+    AnyItem = Union[tuple(RubricItem.__subclasses__())]  # noqa: UP007
+# Rule for the points of a report: the instructor decides (pending), zero points, or the points
+# count
+PointsRule = Literal["pending", "zero", "count"]
+
+
+class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Items that give points to a report, and rules for reports that are not fully verified.
+
+    Attributes
+    ----------
+    title : str
+        Title of the class page.
+    unverified : {"pending", "zero"}
+        Rule for a report that could not be verified.
+    others_log : {"pending", "zero", "count"}
+        Rule for a report on a log that was not given to the student.
+    pages : {"count", "pending", "zero"}
+        Rule for a verified report with pages that differ from the redrawn report.
+    items : tuple of RubricItem
+        Items with points and check.
+    """
+
+    title: Text = ""
+    unverified: Literal["pending", "zero"] = "pending"
+    others_log: PointsRule = "pending"
+    pages: PointsRule = "count"
+    items: Annotated[tuple[AnyItem, ...], Meta(min_length=1, max_length=100)] = msgspec.field(
+        name="item"
+    )
+
+    def __post_init__(self) -> None:
+        titles = [TOTAL_TITLE, *(item.title for item in self.items)]
+        for title, unique_title in zip(titles, make_unique(titles), strict=True):
+            if title != unique_title:
+                use = "reserved for the sum" if title.casefold() == TOTAL_TITLE else "not unique"
+                raise ValueError(f"the title {title!r} is {use}. Give each item another title")
+
+
+def rubric_text() -> str:
+    """Return the default rubric (TOML) with its comments, as an example to edit."""
+    return files("px4fuse.classroom.grading").joinpath(DEFAULT_NAME).read_text(encoding="utf-8")
+
+
+def read_rubric(path: Path | None) -> Rubric:
+    """Read and check a rubric; None for the default rubric.
+
+    Raises
+    ------
+    SettingsError
+        The file cannot be read or is not a rubric; the message names the item and the field.
+    """
+    if path is None:
+        return parse_rubric(rubric_text(), DEFAULT_NAME)
+    return parse_rubric(read_text(path, SettingsError, MAX_RUBRIC_BYTES, name=str(path)), str(path))
+
+
+def parse_rubric(text: str, source_name: str) -> Rubric:
+    """Parse and check the text of a rubric; ``source_name`` is its name in errors."""
+    try:
+        return msgspec.convert(tomllib.loads(text.replace("\r\n", "\n")), Rubric)
+    # tomllib raises ValueError for a syntax error, and for an integer with very many digits
+    except (msgspec.ValidationError, ValueError, RecursionError) as error:
+        message = re.sub(r"`\$\.item\[(\d+)\]\.?([^`]*)`", _describe_place, str(error))
+        raise SettingsError(f"{source_name}: {one_line(message, 300)}", RUBRIC_HELP) from error
+
+
+def _describe_place(path: re.Match[str]) -> str:
+    """Replace the path in an error of msgspec by the item number (from 1) and the field."""
+    return f"item {int(path[1]) + 1}{f', {path[2]}' * bool(path[2])}"
+
+
+# ------------------------------------------------------------------ points
+
+
+def score_report(
+    results: ReportedResults,
+    verdict: Verdict,
+    rubric: Rubric,
+    key: AnswerKey | None,
+    submitter_id: str = "",
+) -> GradedReport:
+    """Score a report, and add flags and the action that the instructor has to take.
+
+    Items for reports of another command are omitted, and without an answer key also items that need
+    a key. The caller adds the file name of the report. ``submitter_id`` is the student id according
+    to the learning platform; it takes precedence over the id in the report.
+    """
+    check_input = CheckInput(results, verdict, key, submitter_id)
+    points_rule, rule_text = _points_rule(check_input, rubric)
+    student, command = results.student, "compare" if check_input.comparison else "loop"
+    graded_items = []
+    for item in rubric.items:
+        if not item.applies(command, key):
+            continue
+        fraction, comment = 0.0, f"No points: {rule_text}."
+        if points_rule != "zero":
+            fraction, comment = item.score(check_input)
+        awaits_points = item.by_hand and bool(student.notes.strip()) and points_rule != "zero"
+        points = round(item.points * min(max(fraction, 0.0), 1.0), 2)
+        graded_items.append(
+            Item(item.title, points, item.points, comment, item.by_hand, awaits_points)
+        )
+    form_result, values = check_input.form_points, check_input.values
+    return GradedReport(
+        "",
+        student.name,
+        student.id,
+        verdict,
+        tuple(graded_items),
+        flags=(
+            *flag_pages(verdict),
+            *flag_settings(results, key is not None),
+            *([] if check_input.is_own_log else [_foreign_log_advice(check_input)]),
+        ),
+        instructor_action=rule_text if points_rule == "pending" else "",
+        mistakes={}
+        if isinstance(form_result, str) or not check_input.is_own_log
+        else form_result.is_named_by_mistake,
+        form=check_input.form if isinstance(check_input.form, Answers) else None,
+        numbers={title: float(values[path]) for title, path in TABLE_NUMBERS if path in values},
+        log_sha256=log_sha256(results),
+        version=results.provenance.px4fuse,
+        notes=student.notes,
+    )
+
+
+def _points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[PointsRule, str]:
+    """Return the rule for the points, and the reason; for "pending" the instructor's action."""
+    verdict = check_input.verdict
+    reason = format_reason("".join(verdict.reasons[:1]))
+    if verdict.status == "numbers differ":
+        return "zero", f"the numbers of your report differ from those of its log{reason}"
+    # problems of the report: rule of the rubric, text for the student, action of the instructor
+    problems: list[tuple[PointsRule, str, str]] = []
+    if verdict.status != "verified":
+        action = verdict.remedy or f"Check the report by hand: it was not verified{reason}."
+        problems.append((rubric.unverified, f"your report could not be verified{reason}", action))
+    elif verdict.page_status == "differ":
+        reason_text = "pages of your PDF differ from those that px4fuse draws from the log"
+        problems.append((rubric.pages, reason_text, "Compare the pages with the redrawn report."))
+    if not check_input.is_own_log:
+        reason_text = "your report is not about the log that you were given"
+        problems.append((rubric.others_log, reason_text, _foreign_log_advice(check_input)))
+    if check_input.key is not None and getattr(check_input.results.request, "position", None):
+        action = (
+            "Ask for the origin of the position file (--position): the assignment contains no "
+            "position files."
+        )
+        problems.append(("pending", "", action))
+    for rule, reason_text, _ in problems:
+        if rule == "zero":
+            return "zero", reason_text
+    action = " ".join(action for rule, _, action in problems if rule == "pending")
+    return ("pending", action) if action else ("count", "")
+
+
+def _foreign_log_advice(check_input: CheckInput) -> str:
+    """Describe the instructor's action for a report on a log of another student."""
+    student_id = shorten_text(check_input.results.student.id)
+    id_text = f"the id in the report is {student_id}" if student_id else "the report has no id"
+    if check_input.submitter_id:
+        id_text += f", and {shorten_text(check_input.submitter_id)} handed it in"
+    if check_input.answer is None:
+        return "The report is not about a log of the answer key. Ask for a report on that log."
+    given_to = shorten_text(check_input.answer.student_id)
+    return f"Find out who wrote the report: its log was given to student {given_to}, but {id_text}."
+
+
+def grade_unreadable(
+    rubric: Rubric, key: AnswerKey | None, reason: str, remedy: str = ""
+) -> GradedReport:
+    """Return a graded report with zero points, for a file that is not a report."""
+    comment = f"No points: the file is not a px4fuse report ({shorten_text(reason).rstrip('.')})."
+    verdict, items = cannot_verify(reason, remedy), rubric.items
+    graded_items = tuple(
+        Item(item.title, 0.0, item.points, comment)
+        for item in items
+        if item.applies("compare", key)
+    )
+    return GradedReport("", "", "", verdict, graded_items, instructor_action=remedy)

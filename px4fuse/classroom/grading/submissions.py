@@ -1,0 +1,423 @@
+"""Search for submitted PDFs in folders and in zip files of learning platforms, with their students.
+
+Zip files are not unpacked to disk, and the names in them are never used as paths. The platform
+writes the beginning of a path, and students choose the rest. Therefore the first part of a path
+that matches a pattern of ``platforms.toml`` identifies the student.
+
+Sources of the patterns:
+
+- Moodle: ``mod/assign/feedback/file/importziplib.php`` of its repository, which reads the names:
+  ``{full name}_{participant}_assignsubmission_{plugin}_``, since 4.1 without the last ``_``.
+- Canvas: "How do I download all student submissions for an assignment?", Instructor Guide:
+  ``{surnamefirst}[_LATE]_{user}_{submission}_{file}``.
+- Blackboard Learn: "Download assignments", Instructor Help:
+  ``{assignment}_{user name}_attempt_{year-month-day-hour-minute-second}_{file}``.
+- Gradescope: "Exporting submissions", Help Center: ``submission_{number}``, and
+  ``submission_metadata.yml`` with names, ids (``:sid:``) and times.
+- ILIAS: multi-feedback of ``components/ILIAS/Exercise`` in its repository:
+  ``{last}_{first}_{login}_{user}/``. The name of a late file begins with "Late Submission - " if
+  the language of the instructor is English; for other languages use ``--due``.
+"""
+
+import re
+import stat
+import struct
+import zipfile
+import zlib
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import IO
+
+from px4fuse.classroom.assignment.roster import Person, make_unique
+from px4fuse.classroom.grading.model import UNKNOWN_SUBMITTER, ExportOrigin, Submission
+from px4fuse.core.input_files import add_input
+from px4fuse.core.reading import files_below
+from px4fuse.core.record import table
+from px4fuse.core.text import clean_text, one_line
+from px4fuse.errors import ResultsError, SettingsError
+from px4fuse.verification.model import BAD_VALUE_ERRORS
+from px4fuse.verification.pdf_input import MAX_PDF_BYTES
+
+# Maximum number of entries of a submitted zip file
+MAX_ZIP_ENTRIES = 10_000
+# Maximum size (bytes) of the table of contents of a zip file, which zipfile reads completely
+MAX_DIRECTORY_BYTES = 4_000_000
+# Maximum sum (bytes) of the unpacked sizes of the entries of a zip file: they may share their data
+MAX_TOTAL_BYTES = 4_000_000_000
+# Maximum ratio of unpacked to packed size of a zip entry: a PDF is compressed already, so that its
+# ratio is near 1
+MAX_COMPRESSION_RATIO = 100
+# Maximum length (characters) of a file name in messages
+MAX_NAME_LENGTH = 200
+# Year that zip programs write if an entry has no time
+ZIP_EPOCH_YEAR = 1980
+
+_TOO_LARGE_REASON = (
+    f"the file is larger than {MAX_PDF_BYTES // 1_000_000} MB; reports are below 2 MB."
+)
+# General purpose bit flags of a zip entry (APPNOTE.TXT of PKWARE, 4.4.4)
+_ENCRYPTED_FLAG = 1
+_UTF8_FLAG = 0x800
+GRADESCOPE_METADATA = "submission_metadata.yml"
+# Pattern of the file paths in an export, by learning platform
+PLATFORMS = {
+    name: re.compile(pattern)
+    for name, pattern in table(__file__, "platforms.toml", dict[str, str]).items()
+}
+# Texts that a platform writes once into a path: the student wrote any further occurrence
+_PLATFORM_NAMES = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
+BLACKBOARD_TIME_FORMAT = "%Y-%m-%d-%H-%M-%S"
+_SUBMISSION_BLOCK = re.compile(
+    r"^(?:submission_)?(\d+)(?:\.pdf)?:\s*\n((?:[ -].*\n?)*)", re.MULTILINE
+)
+_SUBMITTERS_BLOCK = re.compile(r"^  :submitters:\s*\n((?:  - .*\n?|    .*\n?)*)", re.MULTILINE)
+
+
+class _EntryError(Exception):
+    """Zip entry or file that is not read; the argument is the reason."""
+
+
+_BROKEN_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryError)
+# BAD_VALUE_ERRORS contains RuntimeError, and so the NotImplementedError that zipfile raises
+_UNREADABLE_ERRORS = (_EntryError, *_BROKEN_ZIP_ERRORS, *BAD_VALUE_ERRORS)
+
+
+def _unread_reason(error: Exception) -> str:
+    """Return the reason why a file was not read, for a message that begins with its name."""
+    if isinstance(error, _EntryError):
+        return str(error)
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else "damaged"
+    return f"the file cannot be read ({reason})."
+
+
+def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
+    """Find the PDFs in files, folders and zip files, and identify the students by the file names.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        PDFs, folders (searched with their subfolders), and zip files exported by platforms. A zip
+        file inside a folder or a zip file was written by a student and is not opened. Gradescope's
+        ``submission_metadata.yml`` is read unless it is inside a submission.
+
+    Returns
+    -------
+    submissions : tuple of Submission
+        Submitted PDFs sorted by name, with unreadable ones.
+    notes : tuple of str
+        Sentences about ignored files.
+
+    Raises
+    ------
+    SettingsError
+        A path does not exist, or no PDF was found.
+    """
+    notes: list[str] = []
+    submission_by_path: dict[tuple[Path, str], Submission] = {}
+    origin_by_number: dict[str, ExportOrigin] = {}
+    other_count = zip_count = 0
+    for path in paths:
+        is_export = path.is_file() and path.name.lower().endswith(".zip")
+        for submission in (_zip_submissions if is_export else _folder_submissions)(path, notes):
+            add_input(submission.file)
+            suffix = submission.name.lower()[-4:]
+            if suffix in (".pdf", ".zip"):
+                submission_by_path.setdefault((submission.file, submission.zip_entry), submission)
+                zip_count += suffix == ".zip"
+            elif not _is_metadata(submission.name):
+                other_count += 1
+            else:
+                try:
+                    text = read(submission).decode("utf-8", errors="replace")
+                    origin_by_number |= read_gradescope_metadata(text)
+                except ResultsError as error:
+                    notes.append(str(error))
+    if other_count:
+        notes.append(f"Ignored files (not PDF): {other_count}.")
+    if zip_count:
+        notes.append(
+            f"Zip files not opened: {zip_count}. Name the export of a platform on the command line."
+        )
+    if not submission_by_path:
+        raise SettingsError(one_line(" ".join(["No PDF found.", *notes]), 500))
+    ordered = sorted(
+        submission_by_path.values(),
+        key=lambda each: (each.name.casefold(), each.name, each.file, each.zip_entry),
+    )
+    names = make_unique(_short_name(submission.name) for submission in ordered)
+    renamed = [replace(each, name=name) for each, name in zip(ordered, names, strict=True)]
+    return tuple(add_origins(renamed, origin_by_number)), tuple(notes)
+
+
+def add_origins(
+    submissions: Sequence[Submission], origin_by_number: Mapping[str, ExportOrigin]
+) -> Iterator[Submission]:
+    """Add student and learning platform to submissions.
+
+    All files of an export (zip file or top-level folder) are from the platform whose pattern
+    matches most of them, so that a student cannot imitate the file names of another platform.
+
+    Parameters
+    ----------
+    origin_by_number : mapping
+        Students and times of Gradescope, by submission number.
+    """
+    exports = [item.file if item.zip_entry else item.name.partition("/")[0] for item in submissions]
+    platform_counts: dict[object, Counter[str]] = defaultdict(Counter)
+    for export, submission in zip(exports, submissions, strict=True):
+        platform_counts[export].update(filter(None, [parse_origin(submission.name).platform]))
+    for export, submission in zip(exports, submissions, strict=True):
+        platforms = [platform for platform, _ in platform_counts[export].most_common(1)]
+        origin = parse_origin(submission.name, platforms)
+        if origin.platform in ("gradescope", ""):
+            # Gradescope exports PDF assignments as 123456.pdf
+            stem = submission.name.rpartition("/")[2].casefold().removesuffix(".pdf")
+            origin = origin_by_number.get(origin.person.numbers.get("gradescope", stem), origin)
+        yield replace(submission, origin=origin)
+
+
+def read(submission: Submission) -> bytes:
+    """Read a submission of at most :data:`~px4fuse.verification.pdf_input.MAX_PDF_BYTES` bytes.
+
+    Raises
+    ------
+    ResultsError
+        The submission cannot be read.
+    """
+    try:
+        with submission.file.open("rb") as file:
+            if submission.zip_entry:
+                with _open_zip(file) as archive:
+                    content = _read_entry(archive, submission.zip_entry)
+            else:
+                content = file.read(MAX_PDF_BYTES + 1)
+        if len(content) > MAX_PDF_BYTES:
+            raise _EntryError(_TOO_LARGE_REASON)
+    except _UNREADABLE_ERRORS as error:
+        name = one_line(submission.name, MAX_NAME_LENGTH)
+        raise ResultsError(f"{name}: {_unread_reason(error)}") from error
+    return content
+
+
+def _is_metadata(name: str) -> bool:
+    *folders, file = name.split("/")
+    is_submitted = any(folder.startswith("submission_") for folder in folders)
+    return file == GRADESCOPE_METADATA and not is_submitted
+
+
+class _LimitedFile:
+    """Zip file whose ``read`` returns at most MAX_DIRECTORY_BYTES."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self.seek, self.tell, self.seekable = file.seek, file.tell, file.seekable
+        self.close = file.close
+
+    def read(self, size: int = -1) -> bytes:
+        if size > MAX_DIRECTORY_BYTES:
+            raise zipfile.BadZipFile("the table of contents of the zip file is too large")
+        # zipfile calls read() without a size only to find the end of the archive
+        return self._file.read(size if size >= 0 else MAX_DIRECTORY_BYTES)
+
+
+@contextmanager
+def _open_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
+    with zipfile.ZipFile(_LimitedFile(file)) as archive:
+        if len(archive.infolist()) > MAX_ZIP_ENTRIES:
+            raise _EntryError(f"the zip file has more than {MAX_ZIP_ENTRIES} entries.")
+        yield archive
+
+
+def _zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
+    """Return the files in a zip file; if it cannot be read, return none and add a note."""
+    try:
+        with path.open("rb") as file, _open_zip(file) as archive:
+            entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+        # zipfile never returns more than the declared size of an entry
+        if sum(entry.file_size for entry in entries) > MAX_TOTAL_BYTES:
+            raise _EntryError(f"the zip file unpacks to more than {MAX_TOTAL_BYTES // 10**9} GB.")
+    except _UNREADABLE_ERRORS as error:
+        notes.append(f"{_short_name(path.name)} was ignored: {_unread_reason(error)}")
+        return []
+    last_by_name = {entry.filename: entry for entry in entries}
+    if duplicate_count := len(entries) - len(last_by_name):
+        notes.append(
+            f"{_short_name(path.name)}: {duplicate_count} entries have duplicate names; "
+            "only the last entry of each name was read."
+        )
+    submissions = (
+        Submission(path.resolve(), name, _entry_label(entry), _entry_time(entry))
+        for name, entry in last_by_name.items()
+    )
+    return [
+        submission
+        for submission in submissions
+        if not any(map(_is_hidden, submission.name.split("/")))
+    ]
+
+
+def _folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
+    """Yield the regular files of a folder and its subfolders, except hidden files."""
+    if path.is_file():
+        yield Submission(path.resolve(), "", path.name)
+        return
+    if not path.is_dir():
+        raise SettingsError(f"{one_line(str(path), MAX_NAME_LENGTH)} is not a file or folder.")
+    root = path.resolve()
+    outside_count = 0
+    for file in files_below(root):  # symbolic links to folders are not entered
+        name = file.relative_to(root)
+        if any(map(_is_hidden, name.parts)):
+            continue
+        try:
+            resolved_path = file.resolve(strict=True)
+            # only regular files: reading a named pipe would wait forever
+            is_inside = resolved_path.is_relative_to(root) and resolved_path.is_file()
+        except (OSError, RuntimeError):  # symbolic link without target, or circular
+            is_inside = False
+        if is_inside:
+            yield Submission(resolved_path, "", name.as_posix())
+        outside_count += not is_inside
+    if outside_count:
+        notes.append(
+            f"{one_line(path.name, MAX_NAME_LENGTH)}: {outside_count} links out of the folder, "
+            "special files or unreadable folders were ignored."
+        )
+
+
+def _is_hidden(name: str) -> bool:
+    return name.startswith(".") or name == "__MACOSX"
+
+
+def _entry_time(entry: zipfile.ZipInfo) -> datetime | None:
+    """Return the time of a zip entry, in an unknown time zone; None without a valid time."""
+    try:
+        time = datetime(*entry.date_time)
+    except ValueError:
+        return None
+    return time if time.year > ZIP_EPOCH_YEAR else None
+
+
+def _entry_label(entry: zipfile.ZipInfo) -> str:
+    """Return the path of a zip entry for messages, without ``.``, ``..`` and drive letters."""
+    name = entry.filename
+    if not entry.flag_bits & _UTF8_FLAG:
+        # zipfile decodes names without UTF-8 flag as code page 437, but most programs write UTF-8
+        with suppress(UnicodeError):
+            name = name.encode("cp437").decode("utf-8")
+    folders = (each for each in re.split(r"[/\\]", name) if each not in ("", ".", ".."))
+    return "/".join(folder for folder in folders if folder[1:] != ":")
+
+
+def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
+    """Read an entry of a zip file; reject types of entries that learning platforms do not write."""
+    entry = archive.getinfo(name)
+    max_bytes = max(1_000_000, MAX_COMPRESSION_RATIO * entry.compress_size)
+    reason = ""
+    if entry.flag_bits & _ENCRYPTED_FLAG:
+        reason = "the zip entry is encrypted."
+    elif stat.S_ISLNK(entry.external_attr >> 16):
+        reason = "the zip entry is a symbolic link."
+    elif entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        reason = "the compression method of the zip entry is not supported."
+    elif entry.file_size > MAX_PDF_BYTES:
+        reason = _TOO_LARGE_REASON
+    elif entry.file_size > max_bytes:
+        reason = f"the zip entry is compressed more than {MAX_COMPRESSION_RATIO} times."
+    if reason:
+        raise _EntryError(reason)
+    # zipfile returns at most the declared size
+    return archive.read(entry)
+
+
+def _short_name(name: str) -> str:
+    """Format a file name on one line; shorten a long name in the middle."""
+    line = " ".join(clean_text(name[-10 * MAX_NAME_LENGTH :]).split())
+    if len(line) > MAX_NAME_LENGTH:
+        half_length = MAX_NAME_LENGTH // 2
+        line = f"{line[:half_length]}…{line[1 - half_length :]}"
+    return line or "no name"
+
+
+# ------------------------------------------------------------------ student and time in exports
+
+
+def parse_origin(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportOrigin:
+    """Return student and submission time of a file, from its path in an export.
+
+    >>> parse_origin("Doe Jane_4711_assignsubmission_file_/report.pdf").person.name
+    'Doe Jane'
+    >>> parse_origin("doejane_LATE_12345_67890_report-1.pdf").person.numbers
+    {'canvas': '12345'}
+    >>> parse_origin("Lab 3_jdoe_attempt_2026-11-20-12-34-56_report.pdf").time
+    datetime.datetime(2026, 11, 20, 12, 34, 56)
+    >>> parse_origin("report.pdf") == ExportOrigin()
+    True
+    """
+    tail = name
+    while tail:
+        for platform in platforms:
+            match = PLATFORMS[platform].match(tail)
+            if match is None:
+                continue
+            fields = {key: value or "" for key, value in match.groupdict().items()}
+            time_text = fields.get("time", "")
+            try:
+                time = datetime.strptime(time_text, BLACKBOARD_TIME_FORMAT) if time_text else None
+            except ValueError:  # a platform writes valid times, so a student wrote this name
+                continue
+            names = (fields.get(key) for key in ("name", "first", "last"))
+            numbers = {platform: fields["number"]} if "number" in fields else {}
+            full_name, login = " ".join(filter(None, names)), fields.get("login", "")
+            person = Person("", full_name, "", login, numbers)
+            expected_count = platform in ("moodle", "blackboard")
+            is_imitated = len(_PLATFORM_NAMES.findall(name)) > expected_count
+            return ExportOrigin(platform, person, time, bool(fields.get("late")), is_imitated)
+        tail = tail.partition("/")[2]
+    return UNKNOWN_SUBMITTER
+
+
+def read_gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
+    r"""Read students and times from Gradescope's ``submission_metadata.yml``, by submission number.
+
+    Only keys at the indentation that Gradescope writes are read; texts of students are indented
+    further. A group submission belongs to its first member.
+
+    >>> text = "submission_7:\n  :submitters:\n  - :name: Ada\n    :sid: '12'\n"
+    >>> read_gradescope_metadata(text)["7"].person.student_id
+    '12'
+    """
+    origins = {}
+    for number, block in _SUBMISSION_BLOCK.findall(text.replace("\r\n", "\n")):
+        submitters = _SUBMITTERS_BLOCK.search(block)
+        name, student_id, email = (
+            _yaml_value(submitters[1] if submitters else "", rf"  (?:- |  ):{key}")
+            for key in ("name", "sid", "email")
+        )
+        person = Person(student_id, name, email, "", {"gradescope": number})
+        time = _parse_time(_yaml_value(block, "  :created_at"))
+        origins[number] = ExportOrigin("gradescope", person, time)
+    return origins
+
+
+def _yaml_value(block: str, key: str) -> str:
+    """Return the value of the first line with a YAML key, without quotes."""
+    match = re.search(rf"^{key}: *(['\"]?)(.*)\1 *$", block, re.MULTILINE)
+    return match[2] if match else ""
+
+
+def _parse_time(value: str) -> datetime | None:
+    """Parse a time in Gradescope's YAML file; UTC without time zone, None if not valid.
+
+    >>> _parse_time("2026-11-20 12:34:56.123456000 Z").isoformat()
+    '2026-11-20T12:34:56.123456+00:00'
+    """
+    try:
+        time = datetime.fromisoformat(re.sub(r" (?=Z|[+-]\d)", "", value))
+    except ValueError:
+        return None
+    return time if time.tzinfo else time.replace(tzinfo=UTC)

@@ -1,0 +1,1 @@
+"""Records, files, texts and processes that every package uses."""

@@ -1,0 +1,108 @@
+"""Register of the input files of a command, to which px4fuse never writes.
+
+Files are identified by device and inode, so that a file is recognised by a link, another path, or a
+name in another case. Readers add each file that they open, and
+:func:`px4fuse.core.writing.write_all` raises an error for a registered file. Only the main process
+of a command has a register, and adds the files of its worker processes before they start.
+"""
+
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from px4fuse.errors import OutputError
+
+# Device and inode of a file or folder; its path on a file system without inodes
+_Identity = tuple[int, int] | str
+
+
+@dataclass(frozen=True)
+class _Register:
+    """Input files, folders that contain them, and folders whose parents are registered."""
+
+    inputs: set[_Identity] = field(default_factory=set)
+    input_by_folder: dict[_Identity, Path] = field(default_factory=dict)
+    registered_folders: set[Path] = field(default_factory=set)
+
+
+_register: ContextVar[_Register | None] = ContextVar("register", default=None)
+
+
+@contextmanager
+def inputs_protected() -> Iterator[None]:
+    """Register all files that are read inside the context, and reject writing to them."""
+    token = _register.set(_Register())
+    try:
+        yield
+    finally:
+        _register.reset(token)
+
+
+@contextmanager
+def inputs_not_registered() -> Iterator[None]:
+    """Do not register files that are read inside the context, because the command replaces them."""
+    token = _register.set(None)
+    try:
+        yield
+    finally:
+        _register.reset(token)
+
+
+def add_input(path: Path) -> None:
+    """Register an input file or folder; a path that does not exist is ignored."""
+    register = _register.get()
+    if register is None or (identity := _identity(path)) is None:
+        return
+    register.inputs.add(identity)
+    for folder in {path.absolute().parent, path.resolve().parent} - register.registered_folders:
+        register.registered_folders.add(folder)
+        for parent in map(_identity, (folder, *folder.parents)):
+            if parent is not None:
+                register.input_by_folder.setdefault(parent, path)
+
+
+def check_outputs(targets: Iterable[Path]) -> None:
+    """Raise an OutputError if an output is a registered input file or folder."""
+    register = _register.get() or _Register()
+    for target in targets:
+        if _identity(target) in register.inputs:
+            raise OutputError(
+                f"{target} is an input of this command and was not overwritten. Choose "
+                "another output name."
+            )
+
+
+def check_output_folder(folder: Path) -> None:
+    """Raise an OutputError if the output folder is a file or contains an input, also by a link.
+
+    Files in the folder and in its subfolders are checked, because outputs are written to both.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"-o {folder} is not a folder. Choose another name.")
+    register = _register.get() or _Register()
+    entries = _entries(folder)
+    for path in (folder, *entries, *(child for entry in entries for child in _entries(entry))):
+        if (identity := _identity(path)) is None:
+            continue
+        input_path = path if identity in register.inputs else register.input_by_folder.get(identity)
+        if input_path is not None:
+            raise OutputError(
+                f"-o {folder} contains an input of this command, {input_path}",
+                "Choose another folder.",
+            )
+
+
+def _entries(folder: Path) -> list[Path]:
+    return list(folder.iterdir()) if folder.is_dir() else []
+
+
+def _identity(path: Path) -> _Identity | None:
+    with suppress(OSError, ValueError):  # ValueError: a path that contains NUL
+        status = path.stat()
+        if status.st_ino:
+            return status.st_dev, status.st_ino
+        return os.path.normcase(path.resolve()).casefold()
+    return None

@@ -1,0 +1,48 @@
+"""Display of results in notebooks: HTML, and records with tables or arrays as short texts."""
+
+from collections.abc import Mapping
+from functools import singledispatch
+from typing import Any
+
+# Maximum length (characters) of a text field in the representation of a record
+MAX_TEXT_LENGTH = 60
+
+
+@singledispatch
+def display_html(result: object) -> str | None:
+    """Return a result as HTML for notebooks; None if notebooks show its text representation.
+
+    The function of a type is registered by the module that formats it, because the module of the
+    type must not import that module.
+    """
+    return None
+
+
+def one_line_repr(result: Any) -> str:
+    """Format a record on one line; a table or array is shown by its shape.
+
+    >>> import pandas as pd
+    >>> from px4fuse.flight.model import Truth
+    >>> one_line_repr(Truth("mocap", pd.DataFrame({"north_m": [0.0, 1.0]})))
+    "Truth(name='mocap', samples=<2 × 1>)"
+    """
+    names = getattr(result, "__struct_fields__", None) or result.__dataclass_fields__
+    values = ((name, getattr(result, name)) for name in names)
+    field_texts = ", ".join(
+        f"{name}={_format_value(value)}" for name, value in values if value is not None
+    )
+    return f"{type(result).__name__}({field_texts})"
+
+
+def _format_value(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, str):
+        return repr(
+            value if len(value) <= MAX_TEXT_LENGTH else f"{value[: MAX_TEXT_LENGTH - 3]}..."
+        )
+    if shape := getattr(value, "shape", ()):
+        return f"<{' × '.join(f'{length:,}' for length in shape)}>"
+    if isinstance(value, int):
+        return repr(value)
+    return f"<{len(value):,}>" if isinstance(value, Mapping | tuple) else type(value).__name__

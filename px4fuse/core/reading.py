@@ -1,0 +1,220 @@
+"""Reading of input files: regular files only, up to a size limit.
+
+Each file is registered as an input, so that no output replaces it. Type and size are checked before
+a file is opened, because reading a device, named pipe or socket may never end, and a sparse file
+may be larger than the memory.
+"""
+
+import hashlib
+import os
+import stat
+from collections.abc import Iterable
+from contextlib import suppress
+from contextvars import ContextVar
+from pathlib import Path
+
+from px4fuse.core.input_files import add_input
+from px4fuse.errors import LogError, Px4FuseError, suggest_name, to_one_line
+
+#: Maximum size (bytes) of a flight log, which ``--max-size`` sets for one command
+max_log_bytes: ContextVar[int] = ContextVar("max_log_bytes", default=2_000_000_000)
+_SIZE_REMEDY = "Cut the log to the flight, or increase the limit with --max-size MB"
+_BYTES_PER_MB = 1_000_000
+
+
+def display_name(path: Path) -> str:
+    r"""Return the file name in a path for messages, as one line that is not empty.
+
+    >>> display_name(Path("logs/a.ulg")), display_name(Path(".")), display_name(Path("a\nb"))
+    ('a.ulg', '.', 'a b')
+    """
+    return to_one_line(path.name or str(path))
+
+
+def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int:
+    """Return the size (bytes) of a regular file, and register the file as an input.
+
+    Parameters
+    ----------
+    path : Path
+        File whose symbolic links are followed.
+    error_type : type
+        Type of the error to raise.
+    name : str, optional
+        Name of the file in messages; by default :func:`display_name`.
+
+    Raises
+    ------
+    Px4FuseError
+        The file is missing, not accessible, or not a regular file; of type ``error_type``.
+    """
+    name = name or display_name(path)
+    try:
+        status = path.stat()
+    except (OSError, ValueError) as error:  # ValueError: the path contains NUL
+        suggestion = ""
+        with suppress(OSError):  # no suggestion if the folder cannot be listed
+            if isinstance(error, FileNotFoundError):
+                suggestion = suggest_name(path.name, os.listdir(path.parent)).strip()  # noqa: PTH208
+        raise _unreadable(name, error, error_type, suggestion) from error
+    if stat.S_ISDIR(status.st_mode):
+        raise error_type(f"{name} is a folder", "Give a file.")
+    if not stat.S_ISREG(status.st_mode):
+        raise error_type(
+            f"{name} is not a regular file (device, pipe or socket).", "Save its data to a file."
+        )
+    add_input(path)
+    return status.st_size
+
+
+def read_head(path: Path, count: int, error_type: type[Px4FuseError]) -> bytes:
+    """Read the first bytes of a regular file, at most ``count``; errors are of ``error_type``."""
+    file_size(path, error_type)
+    return _read(path, count, error_type, display_name(path))
+
+
+def read_bytes_limited(
+    path: Path,
+    error_type: type[Px4FuseError],
+    limit_bytes: int,
+    *,
+    name: str = "",
+    size_remedy: str = "Cut the file to the flight",
+    empty_remedy: str | None = None,
+) -> bytes:
+    """Read all bytes of a regular file up to a size limit.
+
+    Parameters
+    ----------
+    error_type : type
+        Type of the error to raise.
+    name : str, optional
+        Name of the file in messages; by default :func:`display_name`.
+    size_remedy : str
+        Action in the error for a file that is too large.
+    empty_remedy : str, optional
+        Action in the error for an empty file; without this argument, empty files are accepted.
+
+    Raises
+    ------
+    Px4FuseError
+        The file cannot be read, is too large or empty; of type ``error_type``.
+    """
+    name = name or display_name(path)
+    size = file_size(path, error_type, name)
+    content = b"" if size > limit_bytes else _read(path, size + 1, error_type, name)
+    if len(content) > size:  # the file grows, or is in /proc, in which all sizes are 0
+        content = _read(path, limit_bytes + 1, error_type, name)
+    if (actual_size := max(size, len(content))) > limit_bytes:
+        raise error_type(_too_large(name, actual_size, limit_bytes), f"{size_remedy}.")
+    if empty_remedy is not None and not content:
+        raise error_type(f"{name}: the file is empty", f"{empty_remedy}.")
+    return content
+
+
+def read_log_bytes(path: Path) -> bytes:
+    """Read all bytes of a flight log, up to :data:`max_log_bytes`.
+
+    Raises
+    ------
+    LogError
+        The log cannot be read, is not a regular file, is empty or too large.
+    """
+    limit, empty_remedy = max_log_bytes.get(), "Copy the log from the vehicle again"
+    return read_bytes_limited(
+        path, LogError, limit, size_remedy=_SIZE_REMEDY, empty_remedy=empty_remedy
+    )
+
+
+def read_text(
+    path: Path,
+    error_type: type[Px4FuseError],
+    limit_bytes: int,
+    *,
+    name: str = "",
+    size_remedy: str = "Shorten the file",
+) -> str:
+    """Read a text file in UTF-8, or in UTF-16 as written by Windows shells.
+
+    Arguments and errors are those of :func:`read_bytes_limited`.
+    """
+    name = name or display_name(path)
+    content = read_bytes_limited(path, error_type, limit_bytes, name=name, size_remedy=size_remedy)
+    is_utf16 = content.startswith((b"\xff\xfe", b"\xfe\xff"))
+    try:
+        return content.decode("utf-16" if is_utf16 else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise error_type(
+            f"{name} is not a UTF-8 text file (byte {error.start}).", "Save the file as UTF-8."
+        ) from error
+
+
+def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
+    """Return the paths of files by their SHA-256, with all regular files in folders.
+
+    Files in folders are ignored if they are larger than :data:`max_log_bytes`. Of files with the
+    same content, the first is returned.
+
+    Raises
+    ------
+    LogError
+        A path is not a regular file or a folder, or the file is too large or cannot be read.
+    """
+    file_by_hash: dict[str, Path] = {}
+    limit = max_log_bytes.get()
+    for path in paths:
+        if path.is_dir():
+            files = [
+                f for f in files_below(path) if f.is_file() and file_size(f, LogError) <= limit
+            ]
+        elif (size := file_size(path, LogError)) > limit:
+            raise LogError(_too_large(display_name(path), size, limit), f"{_SIZE_REMEDY}.")
+        else:
+            files = [path]
+        for file in files:
+            try:
+                with file.open("rb") as stream:
+                    sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+            except OSError as error:
+                raise _unreadable(display_name(file), error, LogError) from error
+            file_by_hash.setdefault(sha256, file)
+    return file_by_hash
+
+
+def files_below(folder: Path) -> list[Path]:
+    """Return all files in a folder and its subfolders, sorted; links to folders are not followed.
+
+    A folder that cannot be listed is returned as a file, so that its reading raises the error.
+    """
+    files: list[Path] = []
+    open_folders = [folder]
+    while open_folders:
+        folder_path = open_folders.pop()
+        try:
+            with os.scandir(folder_path) as entries:
+                for entry in entries:
+                    target = open_folders if entry.is_dir(follow_symlinks=False) else files
+                    target.append(Path(entry.path))
+        except OSError:
+            files.append(folder_path)
+    return sorted(files)
+
+
+def _read(path: Path, count: int, error_type: type[Px4FuseError], name: str) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(count)
+    except OSError as error:
+        raise _unreadable(name, error, error_type) from error
+
+
+def _unreadable(
+    name: str, error: Exception, error_type: type[Px4FuseError], remedy: str = ""
+) -> Px4FuseError:
+    reason = getattr(error, "strerror", None) or error
+    return error_type(f"{name}: cannot be read ({reason}).", remedy)
+
+
+def _too_large(name: str, *sizes: int) -> str:
+    size, limit = (f"{n / _BYTES_PER_MB:,.{0 if n >= 10 * _BYTES_PER_MB else 2}f}" for n in sizes)
+    return f"{name}: the file has {size} MB; the limit is {limit} MB"

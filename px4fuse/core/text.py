@@ -1,0 +1,185 @@
+"""Formatting of numbers and short texts, and conversion of records to JSON types."""
+
+import math
+import re
+import shlex
+import unicodedata
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from datetime import UTC, datetime
+from decimal import Decimal
+from functools import cache
+from typing import Any
+
+import msgspec
+
+
+def to_json_types(value: object) -> Any:
+    """Convert records, mappings and tuples to dicts and lists for JSON.
+
+    None, NaN and infinity in a dict are omitted.
+
+    >>> to_json_types({"rate_hz": float("nan"), "topics": ("a", "b")})
+    {'topics': ['a', 'b']}
+    """
+    if isinstance(value, msgspec.Struct):
+        value = msgspec.structs.asdict(value)
+    elif is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in fields(value)}
+    if isinstance(value, Mapping):
+        children = {str(name): to_json_types(child) for name, child in value.items()}
+        return {name: child for name, child in children.items() if child is not None}
+    if isinstance(value, list | tuple):
+        return list(map(to_json_types, value))
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def utc_time(unix_s: float | None) -> str | None:
+    """Format a UNIX time (s) as ISO 8601 with milliseconds; None if unknown or out of range.
+
+    >>> utc_time(1.5), utc_time(1e18)
+    ('1970-01-01T00:00:01.500+00:00', None)
+    """
+    if unix_s is None:
+        return None
+    try:
+        return datetime.fromtimestamp(unix_s, UTC).isoformat(timespec="milliseconds")
+    except (OverflowError, ValueError, OSError):
+        return None
+
+
+def format_number(value: float, digits: int = 3) -> str:
+    """Format a number with ``digits`` significant digits and without an exponent.
+
+    >>> [format_number(value) for value in (0.811, 22.41, 3412.0, 4.2e6, 0.0129, 2.9e-05, 0.0)]
+    ['0.811', '22.4', '3,410', '4,200,000', '0.0129', '0.000029', '0']
+    """
+    return f"{Decimal(f'{value:.{digits}g}'):,f}"
+
+
+def count_noun(count: int, noun: str) -> str:
+    """Format a count with its noun.
+
+    >>> count_noun(1, "innovation"), count_noun(2, "innovation")
+    ('1 innovation', '2 innovations')
+    """
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def format_factor(factor: float) -> str:
+    """Format a factor with 2 significant digits, or 3 below 2.
+
+    >>> [format_factor(f) for f in (1.18, 9.87, 61.2, 388.0, 3412.0, 5.13e6)]
+    ['1.18', '9.9', '61', '390', '3,400', '5,100,000']
+    """
+    return format_number(factor, 3 if factor < 2.0 else 2)
+
+
+def capitalise_first(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def lower_first(text: str) -> str:
+    """Return a sentence as the continuation of another one; acronyms such as UWB stay."""
+    return text if text[1:2].isupper() else text[:1].lower() + text[1:]
+
+
+def join_first(names: Sequence[str], max_count: int, separator: str = ", ") -> str:
+    """Join the first ``max_count`` names, and append the number of further names.
+
+    >>> join_first("abcd", 2), join_first("ab", 2)
+    ('a, b and 2 more', 'a, b')
+    """
+    suffix = f" and {len(names) - max_count} more" if len(names) > max_count else ""
+    return separator.join(names[:max_count]) + suffix
+
+
+def format_p_value(p: float) -> str:
+    """Format a p-value with 2 digits; below 0.001, the text is "p < 0.001".
+
+    >>> [format_p_value(p) for p in (0.43, 0.0214, 0.00051, 3e-113, 0.0)]
+    ['p 0.43', 'p 0.021', 'p < 0.001', 'p < 0.001', 'p < 0.001']
+    """
+    return "p < 0.001" if p < 0.001 else f"p {format_number(p, 2)}"
+
+
+def format_length(metres: float) -> str:
+    """Format a length (m) with its unit: mm, cm or m.
+
+    >>> [format_length(m) for m in (0.0041, 0.0612, 0.336, 1.42, 23.4, 250.0)]
+    ['4 mm', '6 cm', '34 cm', '1.4 m', '23 m', '250 m']
+    """
+    for limit, unit, scale in ((0.0095, "mm", 1e3), (0.995, "cm", 1e2)):
+        if metres < limit:
+            return f"{metres * scale:.0f} {unit}"
+    return f"{metres:.{1 if metres < 9.95 else 0}f} m"
+
+
+def format_ratio(ratio: float) -> str:
+    """Format a σ ratio (actual σ over reported σ).
+
+    >>> [format_ratio(ratio) for ratio in (128.2, 21.04, 4.52, 1.214, 0.926, 0.0012)]
+    ['128', '21', '4.5', '1.21', '0.93', '0.001']
+    """
+    decimals = sum(ratio < limit for limit in (9.95, 1.995, 0.00995))
+    return f"{ratio:.{decimals}f}"
+
+
+def format_metres(length_m: float) -> str:
+    """Format a length (m) in metres, without the unit.
+
+    >>> [format_metres(length) for length in (2981.4, 12.34, 2.114, 0.388, 0.0623, 0.0004)]
+    ['2981', '12.3', '2.11', '0.39', '0.062', '0.000']
+    """
+    decimals = sum(abs(length_m) < limit for limit in (99.95, 9.995, 0.0995))
+    return f"{length_m:.{decimals}f}"
+
+
+def with_log_name(text: str, log: str) -> str:
+    """Replace the placeholder LOG in commands by the name of the log, quoted for a shell.
+
+    >>> with_log_name("Check the time offset (px4fuse sync LOG).", "my log.ulg")
+    "Check the time offset (px4fuse sync 'my log.ulg')."
+    """
+    return re.sub(r"(px4fuse \w+) LOG\b", lambda match: f"{match[1]} {shlex.quote(log)}", text)
+
+
+def clean_text(text: str) -> str:
+    r"""Remove characters that control a terminal, a page layout or the text direction.
+
+    These are control characters other than newline and tab, bidirectional embeddings, overrides
+    and isolates, line and paragraph separators, tag characters, noncharacters and lone surrogates.
+    Letters and symbols of all languages remain.
+
+    >>> clean_text("Zo\u00eb\x1b[2J \u202egnp.exe\ud800")
+    'Zoë[2J gnp.exe'
+    """
+    return text if text.isascii() and text.isprintable() else "".join(filter(_is_harmless, text))
+
+
+def one_line(text: str, length: int) -> str:
+    r"""Clean a text (see :func:`clean_text`) and shorten it to one line of ``length`` characters.
+
+    >>> one_line("a\nb\t c", 4)
+    'a b…'
+    """
+    # the text is cut first, because cleaning millions of characters would be slow
+    line = " ".join(clean_text(text[: 10 * length]).split())
+    return line if len(line) <= length else line[: length - 1].rstrip() + "…"
+
+
+@cache
+def _is_harmless(character: str) -> bool:
+    code = ord(character)
+    if character in "\n\t":
+        return True
+    return not (
+        unicodedata.category(character) in {"Cc", "Cs", "Zl", "Zp"}
+        or 0x202A <= code <= 0x202E
+        or 0x2066 <= code <= 0x2069
+        or 0xE0000 <= code <= 0xE007F
+        or 0xFDD0 <= code <= 0xFDEF
+        or code & 0xFFFE == 0xFFFE
+    )

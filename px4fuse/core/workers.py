@@ -1,0 +1,212 @@
+"""Worker processes for untrusted files, with limits of time and memory for each job.
+
+Each process has a pipe and a deadline, so that a job may hang, crash or use all memory without
+effect on other jobs. Process pools are not sufficient: in ``concurrent.futures`` a killed process
+ends the pool (BrokenProcessPool), ``multiprocessing.Pool`` waits forever for the result of a killed
+process, and Pebble's pool (5.2) ends if a process dies before its job is registered.
+"""
+
+import multiprocessing
+import os
+import pickle
+import signal
+import threading
+import time
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from typing import Any, TypeVar
+
+from px4fuse.core.text import one_line
+from px4fuse.core.threads import ONE_THREAD
+from px4fuse.errors import Px4FuseError
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+# Maximum number of jobs of a worker process, because caches of libraries grow; a lower number would
+# cost time, because the imports of a new process take 2 s
+JOBS_PER_WORKER = 80
+# Default maximum time (s) and memory (bytes) of a job; a report of a 10-minute flight takes 60 s
+TIMEOUT_S, MAX_MEMORY_BYTES = 120.0, 4_000_000_000
+# Maximum time (s) for the imports of a new process on a slow and busy computer
+START_TIMEOUT_S = 180.0
+# Environment variables of worker processes. PYTHONSAFEPATH prevents imports from the current
+# folder, by which a submitted functools.py would be executed
+_ENVIRONMENT = {"PYTHONSAFEPATH": "1", **ONE_THREAD}
+
+
+@dataclass(frozen=True)
+class JobFailure:
+    """Failure of a job in a worker process, used in place of its result; the reason is one line."""
+
+    reason: str
+
+
+class _Worker:
+    """Worker process with its current job, and the pipe through which it is controlled."""
+
+    def __init__(self, function: Callable[[Any], Any], memory_bytes: int | None, job: int) -> None:
+        # spawn works on all systems and does not copy the memory of the parent
+        context = multiprocessing.get_context("spawn")
+        self.pipe, child_pipe = context.Pipe()
+        self.process = context.Process(
+            target=_run_worker, args=(child_pipe, function, memory_bytes)
+        )
+        environment = dict(os.environ)
+        os.environ.update(_ENVIRONMENT)
+        try:
+            self.process.start()
+        finally:
+            os.environ.clear()
+            os.environ.update(environment)
+        child_pipe.close()  # only the worker process may keep this end of the pipe open
+        self.is_ready = False
+        self.job = job
+        self.jobs_done = 0
+        self.deadline = time.monotonic() + START_TIMEOUT_S
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.join()
+        self.process.close()
+        self.pipe.close()
+
+
+def run_bounded(
+    function: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    *,
+    processes: int | None = None,
+    timeout_s: float = TIMEOUT_S,
+    memory_bytes: int | None = MAX_MEMORY_BYTES,
+) -> Generator[tuple[int, Result | JobFailure]]:
+    """Call a function on every job in worker processes, with limits of time and memory for a job.
+
+    A process that hangs, dies or uses too much memory is replaced, and the other jobs continue. All
+    processes end when this generator ends (error, Ctrl-C, ``close``).
+
+    Parameters
+    ----------
+    function : callable
+        Function at the top level of a module, because function, jobs and results are pickled.
+    processes : int, optional
+        Number of parallel processes; by default the number of cores.
+    timeout_s : float
+        Maximum time for one job, without the start of its process.
+    memory_bytes : int or None
+        Maximum address space of one process (RLIMIT_AS), of which libraries use about 0.6 GB; None
+        for no limit. The limit has no effect on Windows and macOS.
+
+    Yields
+    ------
+    (int, object)
+        Index of a job and its result or :class:`JobFailure`, in the order in which jobs finish.
+    """
+    waiting_jobs = list(range(len(jobs)))[::-1]
+    workers: dict[Connection, _Worker] = {}
+    try:
+        while waiting_jobs or workers:
+            while waiting_jobs and len(workers) < (processes or os.cpu_count() or 1):
+                # the job is assigned before the process starts, so that a failed start ends one job
+                new_worker = _Worker(function, memory_bytes, waiting_jobs.pop())
+                workers[new_worker.pipe] = new_worker
+            # the wait ends at the first deadline or if a pipe has data
+            first_deadline = min(worker.deadline for worker in workers.values())
+            ready_pipes = wait(workers, max(0.0, first_deadline - time.monotonic()))
+            for pipe, worker in list(workers.items()):
+                if pipe in ready_pipes:
+                    is_usable, result = _receive_result(worker)
+                    if is_usable and not worker.is_ready:
+                        worker.is_ready = True
+                    else:
+                        yield worker.job, result
+                        worker.jobs_done += 1
+                        if not is_usable or worker.jobs_done >= JOBS_PER_WORKER or not waiting_jobs:
+                            workers.pop(pipe).end()
+                            continue
+                        worker.job = waiting_jobs.pop()
+                    worker.deadline = time.monotonic() + timeout_s
+                    # the next read of the pipe detects that the worker process has died
+                    with suppress(BrokenPipeError, ConnectionResetError):
+                        pipe.send(jobs[worker.job])
+                elif time.monotonic() >= worker.deadline:
+                    limit = timeout_s if worker.is_ready else START_TIMEOUT_S
+                    workers.pop(pipe).end()
+                    yield worker.job, JobFailure(f"the time limit of {limit:g} s was exceeded.")
+    finally:
+        for worker in workers.values():
+            worker.end()
+
+
+def run_one_bounded(
+    function: Callable[[Job], Result],
+    job: Job,
+    timeout_s: float,
+    memory_bytes: int = MAX_MEMORY_BYTES,
+) -> Result | JobFailure:
+    """Call a function on one job in a worker process, with limits as in :func:`run_bounded`."""
+    results = run_bounded(function, [job], timeout_s=timeout_s, memory_bytes=memory_bytes)
+    with closing(results):
+        return next(results)[1]
+
+
+def _receive_result(worker: _Worker) -> tuple[bool, Any]:
+    """Return True if the worker process can take more jobs, and the result that it sent."""
+    try:
+        message: tuple[bool, Any] = worker.pipe.recv()
+    except (EOFError, OSError):
+        worker.process.join(5)
+        phase = "a job" if worker.is_ready else "its start"
+        code = worker.process.exitcode
+        return False, JobFailure(f"the worker process ended during {phase} (exit code {code}).")
+    # unpickling runs code of the classes of the result, which may raise any exception
+    except Exception as error:  # noqa: BLE001
+        return False, JobFailure(f"the result could not be unpickled ({type(error).__name__}).")
+    return message
+
+
+def _run_worker(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int | None) -> None:
+    """Run jobs in a worker process in sequence, until its pipe is closed."""
+    # the parent process handles Ctrl-C and ends its worker processes
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _limit_memory(memory_bytes)
+    with suppress(EOFError, OSError):  # the parent process closed the pipe, or was killed
+        pipe.send((True, None))
+        while True:
+            pipe.send_bytes(_result_of(function, pipe.recv()))
+
+
+def _result_of(function: Callable[[Any], Any], job: Any) -> bytes:
+    """Run a job in a worker process; return the pickled message for :func:`_receive_result`."""
+    try:
+        return pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)
+    except MemoryError:
+        # the next job would not have enough memory, so the process ends
+        failure = JobFailure("the memory limit for one file was exceeded.")
+        return pickle.dumps((False, failure))
+    except Exception as error:  # noqa: BLE001 - the failure of a job is its result
+        kind = "" if isinstance(error, Px4FuseError) else f"{type(error).__name__}: "
+        return pickle.dumps((True, JobFailure(one_line(f"{kind}{error}", 300))))
+
+
+def _end_with_parent() -> None:
+    """End this worker process when its parent process ends or is killed."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _limit_memory(memory_bytes: int | None) -> None:
+    try:
+        import resource  # noqa: PLC0415 - not on Windows
+    except ImportError:
+        return
+    # no core dump, because it would contain the file of a student
+    for resource_kind, limit in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, memory_bytes)):
+        if limit is not None:
+            with suppress(ValueError, OSError):  # macOS rejects some limits
+                resource.setrlimit(resource_kind, (limit, limit))

@@ -1,0 +1,138 @@
+"""Writing of output files: each file is written under a temporary name and then renamed."""
+
+import errno
+import os
+import secrets
+import stat
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import IO
+
+from px4fuse.core.input_files import check_outputs
+from px4fuse.errors import OutputError
+
+STANDARD_OUTPUT = Path("-")
+# Maximum time (s) to wait for a program that reads a named pipe
+READER_TIMEOUT_S = 5.0
+# True on Windows, on which a file cannot be replaced while another program has it open
+LOCKS_OPEN_FILES = sys.platform == "win32"
+# Maximum number of paths that a message lists; if there are more, it contains their number
+_MAX_LISTED = 4
+
+
+def write_all(
+    contents: Mapping[Path, bytes], on_written: Callable[[Path], None] = lambda _: None
+) -> None:
+    """Write outputs in the order of ``contents``, and stop at the first that cannot be written.
+
+    A regular file is written under a temporary name in the same folder and renamed, so that the
+    path always leads to the old or the complete new file. For a symbolic link, the file that it
+    points to is replaced. Standard output, devices and named pipes are written directly.
+
+    Parameters
+    ----------
+    contents : mapping from Path to bytes
+        Missing folders are created. :data:`STANDARD_OUTPUT` is standard output.
+    on_written : callable
+        Function that is called with each path after its output is written.
+
+    Raises
+    ------
+    OutputError
+        An output is an input of this command, so nothing is written; or an output cannot be
+        written, and the message lists the outputs written before.
+    BrokenPipeError
+        The reader of a pipe has ended. All other outputs are written.
+    """
+    check_outputs(path for path in contents if path != STANDARD_OUTPUT)
+    written_files: list[Path] = []
+    pipe_error = None
+    for path, content in contents.items():
+        try:
+            _write(path, content)
+        except BrokenPipeError as error:  # the reader has ended (| head)
+            pipe_error = error
+            continue
+        except OSError as error:
+            raise _make_output_error(path, error, written_files) from error
+        written_files.append(path)
+        on_written(path)
+    if pipe_error is not None:
+        raise pipe_error
+
+
+def written_before(paths: Sequence[Path]) -> str:
+    """Format the list of the outputs that a run wrote before it ended early.
+
+    >>> written_before([Path("a.pdf"), Path("a.json")])
+    'already written: a.pdf, a.json'
+    """
+    is_listed = len(paths) <= _MAX_LISTED
+    return f"already written: {', '.join(map(str, paths)) if is_listed else f'{len(paths)} files'}"
+
+
+def _write(path: Path, content: bytes) -> None:
+    if path == STANDARD_OUTPUT or _is_standard_output(path):
+        sys.stdout.flush()
+        sys.stdout.buffer.write(content)
+        sys.stdout.flush()
+    elif stat.S_ISREG(mode := _file_mode(path)):
+        _replace(path.resolve(), content)
+    else:
+        with _open_pipe(path) if stat.S_ISFIFO(mode) else path.open("wb") as file:
+            file.write(content)
+
+
+def _is_standard_output(path: Path) -> bool:
+    """Return True if standard output is redirected to this file."""
+    try:
+        return os.path.samestat(path.stat(), os.fstat(1))
+    except OSError:  # the file does not exist, or standard output is closed
+        return False
+
+
+def _file_mode(path: Path) -> int:
+    """Return type and permissions of a file; for a new file, the type of a regular file."""
+    try:
+        return path.stat().st_mode
+    except FileNotFoundError:
+        return stat.S_IFREG
+
+
+def _replace(target: Path, content: bytes) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    # the temporary name is short, because the target's name may have the maximum length
+    temporary = target.with_name(f".px4fuse-{secrets.token_hex(8)}")
+    try:
+        with temporary.open("xb") as file:
+            file.write(content)
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _open_pipe(path: Path) -> IO[bytes]:
+    """Open a named pipe; wait at most READER_TIMEOUT_S for a program that reads it."""
+    deadline = time.monotonic() + READER_TIMEOUT_S
+    while True:
+        try:
+            descriptor = os.open(path, os.O_WRONLY | os.O_NONBLOCK)
+        except OSError as error:
+            if error.errno != errno.ENXIO or time.monotonic() > deadline:
+                raise
+            time.sleep(0.05)
+        else:
+            os.set_blocking(descriptor, True)
+            return os.fdopen(descriptor, "wb")
+
+
+def _make_output_error(path: Path, error: OSError, written_files: Sequence[Path]) -> OutputError:
+    name = "standard output" if path == STANDARD_OUTPUT else path
+    reason = "the pipe has no reader" if error.errno == errno.ENXIO else error.strerror
+    already_written = f"; {written_before(written_files)}" if written_files else ""
+    remedy = "Choose another name."
+    if LOCKS_OPEN_FILES and isinstance(error, PermissionError):
+        remedy = "Close the program that has the file open, or choose another name."
+    return OutputError(f"{name}: cannot be written ({reason}){already_written}", remedy)

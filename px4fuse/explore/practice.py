@@ -1,0 +1,279 @@
+"""Practice page: simulated flights with mistakes that the student has to identify.
+
+The page contains the right answers, compressed so that students do not read them by accident.
+"""
+
+import base64
+import json
+import re
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from msgspec import structs
+
+from px4fuse.card.build import build_card
+from px4fuse.card.model import Card
+from px4fuse.card.numbers import format_metres, format_ratio
+from px4fuse.core.record import Record, table
+from px4fuse.diagnose import diagnose
+from px4fuse.explore.data import flight_data
+from px4fuse.explore.packing import Packer
+from px4fuse.explore.page import data_scripts, page_text
+from px4fuse.findings import Finding
+from px4fuse.report.card_html import card_html
+from px4fuse.request import ComparisonRequest
+from px4fuse.simulation import flights
+from px4fuse.simulation.mistakes import parse
+from px4fuse.simulation.scenario import Scenario
+
+# Pairs of right answers that one flight can combine: the first mistake affects the whole flight,
+# the second single samples. A wrong noise would hide another mistake, so it is not combined
+COMBINABLE_GROUPS = ({"clock", "source"}, {"clock", "gate"}, {"frame", "source"}, {"frame", "gate"})
+MAX_LEVEL = 3
+MAX_SEED = 2**32 - 1
+SIGMA_A_M_S2, SIGMA_Z_M = 0.10, 0.10
+# Scenario of the simulated flights: less than a minute, with two turns. The IMU errors are small,
+# because large errors would resemble a time offset or a misaligned position frame
+SCENARIO_VALUES: dict[str, Any] = {
+    "passes": 3,
+    "speed_m_s": 1.5,
+    "sigma_a_m_s2": 0.05,
+    "accel_bias_sigma_m_s2": 0.005,
+    "gyro_bias_sigma_rad_s": 0.0002,
+    "tilt_error_deg": 0.02,
+    "yaw_error_deg": 0.2,
+}
+# Smallest and largest length (m) of a pass along the aisle, which is drawn for each flight
+AISLE_LENGTH_RANGE_M = (8.0, 12.0)
+# Finding of the analysis that contains the time span of each mistake
+FINDING_WITH_TIME = {
+    "nlos": "source_outliers",
+    "jump": "source_position_jump",
+    "dropout": "source_gap",
+}
+NO_MISTAKE = "No mistake: about 5 % of the innovations are outside ±2√S, and they are white."
+# Name of the mistake "SIGMA_Z of KF is too small", which is a wrong setting and no fault in the log
+NOISY_UWB = "noisy-uwb"
+
+
+class HiddenMistake(Record, frozen=True):
+    """Mistake in a practice flight that the student has to identify.
+
+    Attributes
+    ----------
+    choice : str
+        Right answer, a key of :data:`FAULT_CHOICES`.
+    mistake : str
+        Name in :data:`px4fuse.simulation.mistakes.MISTAKES`, or :data:`NOISY_UWB`.
+    sizes : tuple of str
+        Size for each level of difficulty, as after ``px4fuse simulate --mistake NAME=``.
+    view : str
+        View of the page that shows the mistake.
+    fault : str
+        Description of the mistake for the student.
+    size_text : str
+        Text of the size; {0} and {1} are replaced by the numbers in ``sizes``.
+    symptom : str
+        Effect on the plots, and the setting that confirms the mistake.
+    has_either_sign : bool
+        True if the sign of the size is drawn at random.
+    """
+
+    choice: str
+    mistake: str
+    sizes: tuple[str, str, str]
+    view: str
+    fault: str
+    size_text: str
+    symptom: str
+    has_either_sign: bool = False
+
+
+class MistakeTable(Record, frozen=True):
+    """Possible answers with their texts, and mistakes of practice flights (``practice.toml``)."""
+
+    choices: dict[str, str]
+    mistakes: tuple[HiddenMistake, ...]
+
+
+_TABLES = table(__file__, "practice.toml", MistakeTable)
+FAULT_CHOICES, HIDDEN_MISTAKES = _TABLES.choices, _TABLES.mistakes
+
+
+@dataclass(frozen=True)
+class PracticeFlight:
+    """Simulated flight of the practice page.
+
+    Attributes
+    ----------
+    scenario : Scenario
+        Settings of the simulation.
+    mistakes : tuple of HiddenMistake
+        No, one or two mistakes with different right answers.
+    sizes : tuple of str
+        Sizes of the mistakes, as after ``px4fuse simulate --mistake NAME=``.
+    """
+
+    scenario: Scenario
+    mistakes: tuple[HiddenMistake, ...]
+    sizes: tuple[str, ...]
+
+    @property
+    def correct_answers(self) -> list[str]:
+        """Right answers about the mistakes of the flight, sorted."""
+        return sorted({mistake.choice for mistake in self.mistakes}) or ["nothing"]
+
+
+def draw(seed: int, level: int = 1, count: int = 10) -> tuple[PracticeFlight, ...]:
+    """Draw random flights in which all right answers occur equally often.
+
+    Parameters
+    ----------
+    seed : int
+        Random seed; the same seed, level and count give the same flights.
+    level : {1, 2, 3}
+        Level of difficulty: a large mistake (1), a smaller one (2), or up to two small ones (3).
+    count : int
+        Number of flights.
+    """
+    rng = np.random.default_rng([seed, level, count])
+    names: list[str] = []
+    while len(names) < count:
+        names += [str(name) for name in rng.permutation(list(FAULT_CHOICES))]
+    return tuple(_draw_flight(rng, name, level) for name in names[:count])
+
+
+def _draw_flight(rng: np.random.Generator, choice: str, level: int) -> PracticeFlight:
+    def draw_one(choices: list[HiddenMistake]) -> list[HiddenMistake]:
+        return [choices[rng.integers(len(choices))]] if choices else []
+
+    mistakes = draw_one([mistake for mistake in HIDDEN_MISTAKES if mistake.choice == choice])
+    if level == MAX_LEVEL and mistakes and rng.random() < 0.5:
+        pairs = ((mistake, {mistake.choice, choice}) for mistake in HIDDEN_MISTAKES)
+        mistakes += draw_one([mistake for mistake, pair in pairs if pair in COMBINABLE_GROUPS])
+    sizes, noise_m = [], SIGMA_Z_M
+    for mistake in mistakes:
+        sign = "-" if mistake.has_either_sign and rng.random() < 0.5 else ""
+        sizes.append(f"{sign}{mistake.sizes[level - 1]}")
+        if mistake.mistake == NOISY_UWB:
+            noise_m = float(sizes[-1])
+    scenario = Scenario(
+        **SCENARIO_VALUES,
+        length_m=round(float(rng.uniform(*AISLE_LENGTH_RANGE_M)), 1),
+        heading_deg=round(float(rng.uniform(0.0, 359.0)), 0),
+        sigma_uwb_m=noise_m,
+        seed=int(rng.integers(MAX_SEED)),
+    )
+    return PracticeFlight(scenario, tuple(mistakes), tuple(sizes))
+
+
+def practice_text(
+    seed: int,
+    level: int = 1,
+    count: int = 10,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> str:
+    """Simulate the flights of :func:`draw`, and return the practice page (HTML) about them.
+
+    ``progress`` is called with a text, the number of finished flights, and the number of flights.
+    """
+    scripts = []
+    data: dict[str, Any] = {}
+    for number, practice_flight in enumerate(draw(seed, level, count)):
+        progress(f"flight {number + 1}", number, count)
+        data, script = _flight_data(practice_flight, number)
+        scripts.append(script)
+    return page_text(
+        "\n".join(scripts),
+        data,
+        command="practice",
+        title="simulated flights with known faults",
+        about=f"seed {seed}, level {level}",
+        flight_count=count,
+        choices=FAULT_CHOICES,
+    )
+
+
+def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str, Any], str]:
+    """Return the plot data of a flight, and HTML elements with the data and the right answer."""
+    mistakes_and_sizes = [*zip(practice_flight.mistakes, practice_flight.sizes, strict=True)]
+    options = [
+        f"{mistake.mistake}={size}"
+        for mistake, size in mistakes_and_sizes
+        if mistake.mistake != NOISY_UWB
+    ]
+    simulation = flights.simulate(practice_flight.scenario, parse(options))
+    flight = flights.to_flight(simulation, f"flight {number + 1}")
+    request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
+    # a corrected frame would hide the mistake
+    analysis, packer = diagnose(request, flight=flight, as_sent=True), Packer()
+    data, card = flight_data(analysis, packer), build_card(analysis, request)
+    descriptions = [_describe_mistake(*pair, analysis.findings) for pair in mistakes_and_sizes]
+    key = {
+        "right": practice_flight.correct_answers,
+        "mistakes": descriptions,
+        "rerun": _rerun_sentence(card) if descriptions else NO_MISTAKE,
+        "card": card_html(_name_mistakes(card, descriptions), has_apply=True),
+    }
+    compressed_key = base64.b64encode(zlib.compress(json.dumps(key).encode())).decode()
+    scripts = data_scripts(data, analysis, packer, f"-{number}")
+    return data, f'{scripts}\n<script type="text/plain" id="key-{number}">{compressed_key}</script>'
+
+
+def _describe_mistake(
+    mistake: HiddenMistake, size: str, findings: tuple[Finding, ...]
+) -> dict[str, Any]:
+    """Describe a mistake for the page: fault, size, time, symptom, and the view that shows it."""
+    finding_id = FINDING_WITH_TIME.get(mistake.mistake)
+    spans = [span for finding in findings if finding.id == finding_id for span in finding.spans_s]
+    time = f"{spans[0][0]:.1f} to {spans[-1][1]:.1f} s" if spans else "whole flight"
+    return {
+        "fault": mistake.fault,
+        "size": mistake.size_text.format(*size_in_words(size)),
+        "time": time,
+        "symptom": mistake.symptom,
+        "view": mistake.view,
+        "span": list(spans[0]) if spans else None,
+    }
+
+
+def size_in_words(size: str) -> list[str]:
+    """Split the size of a mistake at commas, and add a blank before each unit.
+
+    >>> size_in_words("5%,2m"), size_in_words("-400ms"), size_in_words("0.3")
+    (['5 %', '2 m'], ['-400 ms'], ['0.3'])
+    """
+    return [re.sub(r"(?<=\d)(?=[^\d.])", " ", part).replace("deg", "°") for part in size.split(",")]
+
+
+def _rerun_sentence(card: Card) -> str:
+    """Describe the most effective re-run with one change: RMSE and innovation before and after."""
+    reruns = (rerun for cause in card.causes for rerun in cause.reruns)
+    best_rerun = next((rerun for rerun in reruns if rerun.improves != "nothing"), None)
+    if best_rerun is None:
+        return "No re-run with one change corrects this flight."
+    changes = [
+        f"{name} {format_value(values[0])} → {format_value(values[1])}{unit}"
+        for name, values, format_value, unit in (
+            ("position RMSE", best_rerun.position_rmse_m, format_metres, " m"),
+            ("innovation ÷ √S", best_rerun.source_ratio, format_ratio, ""),
+        )
+        if values is not None
+    ]
+    return f"Re-run of {best_rerun.label}: {', '.join(changes)}."
+
+
+def _name_mistakes(card: Card, descriptions: Sequence[Mapping[str, Any]]) -> Card:
+    """Replace the headline of the diagnosis if the analysis did not detect the mistake."""
+    if card.causes or not descriptions:
+        return card
+    fault = "; ".join(f"{mistake['fault']}: {mistake['size']}" for mistake in descriptions)
+    return structs.replace(
+        card,
+        severity="warning",
+        headline=fault[0].upper() + fault[1:],
+        do_this=("None of the automatic checks finds this mistake. Compare the plots.",),
+    )

@@ -1,0 +1,1 @@
+"""Records of a recorded flight: its sensors, position sources and EKF2's topics."""

@@ -1,0 +1,238 @@
+"""Aiding sources and parameters of EKF2: PX4 names by role, defaults, units and ranges.
+
+``ekf2_parameters.toml`` has one entry per aiding source and per parameter. Other modules get the
+names of the parameters of external vision and GNSS from the aiding source (``EV_POS.noise``).
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import msgspec
+
+from px4fuse.core.record import table
+from px4fuse.errors import SettingsError, suggest_name
+
+
+@dataclass(frozen=True)
+class Aid:
+    """Aiding source of EKF2: a kind of measurement that EKF2 can fuse, with its parameters.
+
+    Attributes
+    ----------
+    name : str
+        PX4's name, as in ``estimator_aid_src_<name>``.
+    switch : str
+        Name of the parameter that enables fusion, from PX4 v1.14 on; before, EKF2_AID_MASK does.
+    noise, gate, delay : str
+        Names of the parameters for measurement noise (σ), gate (√S) and age (ms).
+    noise_mode : str
+        Name of the parameter that, if 1, makes EKF2 ignore reported variances; else empty.
+    lever_arm : tuple of str
+        Names of the parameters for the position of the sensor (m, FRD).
+    label, unit : str
+        Name for users, and unit of the innovations.
+    noise_origin : str
+        Origin of the measurement variance if it is not ``noise`` alone; else empty.
+    default_gate : float
+        Gate (√S) if the log does not contain the parameter ``gate``.
+    axes : tuple of str
+        Axes of the innovations, in PX4's order.
+    fields : tuple of str
+        Fields of ``estimator_innovations`` and ``_variances``, by axis; empty without these fields.
+    old_fields : tuple of str
+        Fields of ``ekf2_innovations`` (v1.8 to v1.10); ``_var`` is appended for the variance.
+    flags : tuple of tuple of str
+        Groups of fields of ``estimator_status_flags``. EKF2 is configured to fuse the aiding source
+        if a flag is set in the first group that the log contains.
+    status_bit : int or None
+        Bit of ``estimator_status.control_mode_flags`` with the same meaning as ``flags``.
+    """
+
+    name: str
+    switch: str = ""
+    noise: str = ""
+    gate: str = ""
+    delay: str = ""
+    noise_mode: str = ""
+    lever_arm: tuple[str, ...] = ()
+    label: str = ""
+    unit: str = "m"
+    noise_origin: str = ""
+    default_gate: float = 5.0
+    axes: tuple[str, ...] = ()
+    fields: tuple[str, ...] = ()
+    old_fields: tuple[str, ...] = ()
+    flags: tuple[tuple[str, ...], ...] = ()
+    status_bit: int | None = None
+
+    @property
+    def own_parameters(self) -> frozenset[str]:
+        """Names of the parameters that affect only the measurements of this aiding source."""
+        return frozenset((self.noise, self.gate, self.delay, self.noise_mode))
+
+    def logged_parameters(self, logged_values: Mapping[str, float]) -> dict[str, float]:
+        """Return the logged parameters of this aiding source, including the ``switch``."""
+        names = (self.noise, self.delay, self.gate, self.noise_mode, self.switch, AID_MASK)
+        return {name: float(logged_values[name]) for name in names if name in logged_values}
+
+
+AID_MASK = "EKF2_AID_MASK"
+# Parameter of PX4 main since 2026: EKF2 gets the measurement time of a GNSS fix from the driver
+GNSS_MODE = "EKF2_GPS_MODE"
+# Relative tolerance of PX4's parameter ranges, because logged values are float32 (rounding 6e-8)
+FLOAT32_TOLERANCE = 1e-6
+# Parameters from PX4 v1.17 on for the age (ms) of a fix of the first GNSS receiver, which EKF2
+# subtracts from the timestamp of the fix
+RECEIVER_DELAYS = ("SENS_GNSS0_DELAY", "SENS_GPS0_DELAY")
+
+
+class Parameter(NamedTuple):
+    """Unit of an EKF2 parameter, PX4's default from v1.14 on, and PX4's range (ends included)."""
+
+    unit: str
+    default: float
+    minimum: float
+    maximum: float
+
+    @property
+    def printed_unit(self) -> str:
+        """Unit with superscripts: "m/s²" for "m/s^2"."""
+        return self.unit.replace("^2", "²").replace("^3", "³")
+
+    def describe_range_error(self, value: float) -> str:
+        """Return " 9 m is outside PX4's range 0.01 to 5" for a value outside the range, else ""."""
+        low = self.minimum - FLOAT32_TOLERANCE * abs(self.minimum)
+        high = self.maximum + FLOAT32_TOLERANCE * abs(self.maximum)
+        if low <= value <= high:
+            return ""
+        unit = f" {self.unit}" if self.unit else ""
+        return f" {value:g}{unit} is outside PX4's range {self.minimum:g} to {self.maximum:g}"
+
+
+TABLES = table(__file__, "ekf2_parameters.toml", dict)
+# Keys of TABLES whose text contains several names, separated by blanks
+NAME_LISTS = ("axes", "fields", "old_fields", "lever_arm")
+AIDS, DISTURBANCES = (
+    {
+        name: msgspec.convert(
+            {"name": name, **row} | {key: row[key].split() for key in NAME_LISTS if key in row}, Aid
+        )
+        for name, row in rows.items()
+    }
+    for rows in (TABLES["aids"], TABLES["disturbances"])
+)
+EV_POS, GNSS_POS, GNSS_VEL, GNSS_HGT, BAROMETER, FLOW, MAG = map(
+    AIDS.__getitem__,
+    ("ev_pos", "gnss_pos", "gnss_vel", "gnss_hgt", "baro_hgt", "optical_flow", "mag"),
+)
+PARAMETERS = msgspec.convert(TABLES["parameters"], dict[str, Parameter])
+# Parameters of the EKF2 model, and other logged parameters with which px4fuse computes
+PARAMETER_RANGES = PARAMETERS | msgspec.convert(TABLES["logged"], dict[str, Parameter])
+FIELD_NOISES = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
+# Defaults of PX4 up to v1.13 that differ from the defaults of later releases (ekf2_params.c)
+OLD_DEFAULTS: Mapping[str, float] = {EV_POS.delay: 175.0}
+# Names of the logged parameters that the results contain
+REPORTED_PARAMETERS: tuple[str, ...] = tuple(TABLES["reported"].split())
+
+
+def effective_settings(
+    logged_values: Mapping[str, float], aid: Aid = EV_POS, *other_aids: Aid
+) -> dict[str, float]:
+    """Return the parameter values of the EKF2 model: the logged value, else PX4's default.
+
+    Parameters
+    ----------
+    logged_values : mapping
+        Parameter values in the log, by PX4 name.
+    aid, *other_aids : Aid
+        Aiding sources that EKF2 fuses; parameters of other aiding sources are omitted.
+    """
+    used_switches = {fused_aid.switch for fused_aid in (aid, *other_aids)}
+    excluded_names = {
+        name
+        for other_aid in (EV_POS, GNSS_POS, GNSS_VEL, MAG, BAROMETER)
+        if other_aid.switch not in used_switches
+        for name in (
+            *other_aid.own_parameters,
+            *other_aid.lever_arm,
+            *(FIELD_NOISES if other_aid == MAG else ()),
+        )
+    }
+    defaults = {
+        name: parameter.default
+        for name, parameter in PARAMETERS.items()
+        if name not in excluded_names
+    }
+    if fuses_by_mask(logged_values) and aid == EV_POS:
+        defaults |= OLD_DEFAULTS
+    return {name: float(logged_values.get(name, default)) for name, default in defaults.items()}
+
+
+def fuses_by_mask(logged_values: Mapping[str, float]) -> bool:
+    """Return True if EKF2_AID_MASK selects the aiding sources in this log (PX4 up to v1.13)."""
+    return AID_MASK in logged_values and EV_POS.switch not in logged_values
+
+
+def replace_invalid_parameters(
+    logged_values: Mapping[str, float],
+) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Replace logged parameters that are not finite or outside PX4's range by their defaults.
+
+    Returns
+    -------
+    valid : dict
+        All parameters, except non-finite ones whose default is not in ``PARAMETER_RANGES``.
+    notes : tuple of str
+        One sentence per parameter that was replaced or omitted.
+
+    Examples
+    --------
+    >>> replace_invalid_parameters({"EKF2_EVP_GATE": 0.0, "SYS_AUTOSTART": 4001.0})[0]
+    {'EKF2_EVP_GATE': 5.0, 'SYS_AUTOSTART': 4001.0}
+    """
+    valid, notes = {}, []
+    defaults = {name: parameter.default for name, parameter in PARAMETER_RANGES.items()}
+    if fuses_by_mask(logged_values):
+        defaults |= OLD_DEFAULTS
+    for name, value in logged_values.items():
+        parameter = PARAMETER_RANGES.get(name)
+        fault = "" if parameter is None else parameter.describe_range_error(value)
+        if not math.isfinite(value):
+            fault = " is not a finite number"
+        if not fault:
+            valid[name] = value
+        elif parameter is None:
+            notes.append(f"{name}{fault} and is not used.")
+        else:
+            valid[name] = defaults[name]
+            notes.append(f"{name}{fault}; the default {valid[name]:g} is used.")
+    return valid, tuple(notes)
+
+
+def check_parameters(changes: Mapping[str, float]) -> dict[str, float]:
+    """Return changes of EKF2 parameters if the EKF2 model contains all of them.
+
+    Raises
+    ------
+    SettingsError
+        The EKF2 model does not contain a parameter, or a value is outside PX4's range.
+
+    Examples
+    --------
+    >>> check_parameters({"EKF2_EVP_NOISE": 0.2})
+    {'EKF2_EVP_NOISE': 0.2}
+    """
+    for name, value in changes.items():
+        parameter = PARAMETERS.get(name)
+        if parameter is None:
+            raise SettingsError(
+                f"{name} is not a parameter of the EKF2 replay",
+                f"{suggest_name(name, PARAMETERS)}Choose from {', '.join(PARAMETERS)}.",
+            )
+        if fault := parameter.describe_range_error(value):
+            raise SettingsError(f"{name}{fault} (default {parameter.default:g}).")
+        if name == EV_POS.noise_mode and value not in (0.0, 1.0):
+            raise SettingsError(f"{name}={value:g} is not possible. Give 0 or 1.")
+    return {name: float(value) for name, value in changes.items()}

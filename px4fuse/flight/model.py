@@ -1,0 +1,591 @@
+"""Data model of a flight, created by the readers and used by all other modules.
+
+Times are seconds on the autopilot's boot clock since the first sample of data, whose boot time is
+``LogInfo.boot_time_s``. They are *measurement* times, not publication times. Vectors are NED
+(north, east, down) in m, m/s and m/s², or body FRD (forward, right, down) if stated. Time series
+are pandas frames with the index ``time_s``; column names contain the unit.
+
+Missing data are :class:`Unavailable`, which the report lists. They are never replaced by zero, an
+empty plot or a "pass".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal, TypeAlias
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from px4fuse.core.arrays import Array, BoolArray
+from px4fuse.core.notebook_display import one_line_repr
+from px4fuse.core.record import NotNegative, Record, Span, Vector
+from px4fuse.core.record import Unavailable as Unavailable  # noqa: PLC0414 - public re-export
+from px4fuse.flight.ekf2_parameters import BAROMETER, Aid
+from px4fuse.flight.log import ClockMap, InputFile, LogInfo, Stream, UnusedData
+from px4fuse.flight.position_source import Origin, PositionKind
+
+AxisName = Literal["north", "east", "down"]
+TableOrUnavailable = pd.DataFrame | Unavailable
+# Step functions of flight time by name: values are valid until the next index
+StepFunctions: TypeAlias = "Mapping[str, pd.Series[float]]"
+# Intervals (start, end) in s of flight time
+Spans = tuple[Span, ...]
+# Minimum fraction of sample intervals of up to three times the median for a regular rate; with a
+# smaller fraction, the samples arrive in bursts
+MIN_REGULAR_FRACTION = 0.8
+# Values of ClockMap.method for which the timestamps are not times of measurement
+ARRIVAL_METHODS = ("arrival time", "receive time", "position in the stream")
+BODY_AXES = ("forward", "right", "down")
+AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
+SOURCE_NAMES: Mapping[PositionKind, str] = {
+    "uwb": "UWB",
+    "vio": "VIO",
+    "mocap": "MOCAP",
+    "gnss": "GNSS",
+    "file": "position file",
+}
+
+
+# Of objects, because pandas reserves 1 GB of address space for its first column of strings
+NO_INVALID_ROWS: pd.Series[str] = pd.Series(dtype=object, index=pd.Index([], dtype=np.float64))
+
+
+class Columns:
+    """Column names of all tables of a flight, with units."""
+
+    POSITION: Final = ["north_m", "east_m", "down_m"]
+    VELOCITY: Final = ["north_m_s", "east_m_s", "down_m_s"]
+    STATE: Final = POSITION + VELOCITY
+    POSITION_VARIANCE: Final = ["north_m2", "east_m2", "down_m2"]
+    VELOCITY_VARIANCE: Final = ["north_m2_s2", "east_m2_s2", "down_m2_s2"]
+    SPECIFIC_FORCE: Final = ["forward_m_s2", "right_m_s2", "down_m_s2"]
+    ANGULAR_RATE: Final = ["forward_rad_s", "right_rad_s", "down_rad_s"]
+    QUATERNION: Final = ["w", "x", "y", "z"]
+    ROTATION_VARIANCE: Final = ["forward_rad2", "right_rad2", "down_rad2"]
+    # State and variances of EKF2 at the fusion horizon, common to all PX4 releases
+    GYRO_BIAS: Final = [f"gyro_bias_{axis}_rad_s" for axis in BODY_AXES]
+    ACCELEROMETER_BIAS: Final = [f"accelerometer_bias_{axis}_m_s2" for axis in BODY_AXES]
+    EARTH_FIELD: Final = [f"earth_field_{axis}_gauss" for axis in AXIS_NAMES]
+    BODY_FIELD: Final = [f"body_field_{axis}_gauss" for axis in BODY_AXES]
+    FIELD_INNOVATION: Final = [f"innovation_{axis}_gauss" for axis in BODY_AXES]
+    DELAYED_STATE: Final = [
+        *QUATERNION,
+        *VELOCITY,
+        *POSITION,
+        *GYRO_BIAS,
+        *ACCELEROMETER_BIAS,
+        *EARTH_FIELD,
+        *BODY_FIELD,
+    ]
+    DELAYED_VARIANCE: Final = [
+        *(f"attitude_{axis}_rad2" for axis in AXIS_NAMES),
+        *VELOCITY_VARIANCE,
+        *POSITION_VARIANCE,
+        *(f"{name.removesuffix('_rad_s')}_rad2_s2" for name in GYRO_BIAS),
+        *(f"{name.removesuffix('_m_s2')}_m2_s4" for name in ACCELEROMETER_BIAS),
+        *(f"{name}2" for name in (*EARTH_FIELD, *BODY_FIELD)),
+    ]
+
+
+@dataclass(frozen=True)
+class FlightMode:
+    """Time interval (s) in one flight mode, with the name that QGroundControl shows."""
+
+    start_s: float
+    end_s: float
+    name: str
+
+
+class Alignment(Record, frozen=True, kw_only=True):
+    """Alignment of an external position file with the flight in time and space.
+
+    A position p of the file becomes origin + Rz(yaw) · C · p, where C converts the frame of the
+    file to NED.
+
+    Attributes
+    ----------
+    frame, frame_reason : str
+        "ned", "enu" or "nwu", and the reason.
+    yaw_deg : float
+        Rotation about down after C, clockwise seen from above.
+    yaw_sigma_deg : float or None
+        Standard deviation of an estimated yaw.
+    yaw_reason : str
+    origin_m : tuple of float
+        Translation after the rotation (NED).
+    clock_offset_s : float
+        Offset added to the timestamps of the file to obtain boot times.
+    clock_offset_sigma_s : float or None
+        Standard deviation of an estimated clock offset.
+    clock_reason : str
+    reference : str
+        Reference of the estimates: "EKF2 position", "IMU", or "" if nothing was estimated.
+    correlation : float or None
+        Correlation of the track with the reference after alignment; 1 is perfect.
+    residual_rms_m : float or None
+        Horizontal residual (RMS per axis); None if the reference has no position.
+    misplaced : tuple of str
+        Sentences on errors of the frame.
+    warnings : tuple of str
+        Sentences on values with a large uncertainty.
+    """
+
+    frame: str
+    frame_reason: str
+    yaw_deg: float
+    yaw_sigma_deg: NotNegative | None = None
+    yaw_reason: str
+    origin_m: Vector
+    clock_offset_s: float
+    clock_offset_sigma_s: NotNegative | None = None
+    clock_reason: str
+    reference: str
+    correlation: float | None = None
+    residual_rms_m: NotNegative | None = None
+    misplaced: tuple[str, ...] = ()
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PositionTrack:
+    """Positions of one external source over time.
+
+    Attributes
+    ----------
+    name : str
+        Name for ``--position-source``; the PX4 topic if there is one.
+    origin : Origin
+        Kind of the position source, and data path of the positions from sender to log.
+    description : str
+        Description for the user.
+    samples : DataFrame, shape (n, 6)
+        ``north_m, east_m, down_m`` and the reported variances ``north_m2, east_m2, down_m2`` (NaN
+        if not sent or not logged). Rows without position are dropped.
+    frame : str
+        "NED", "FRD" (x is forward at start, not north) or "unknown".
+    clock : str
+        Clock of the timestamps.
+    topics : tuple of str
+        Topics or messages with the data.
+    log : str
+        Name of the file with the data.
+    clock_map : ClockMap or None
+        Map from the sender's clock to the boot clock, if px4fuse made one.
+    alignment : Alignment or None
+        Alignment of a track from a position file.
+    orientation : DataFrame, shape (m, 7), or None
+        Quaternion ``w, x, y, z`` that rotates body FRD to ``frame``, and the reported variances
+        about the body axes ``forward_rad2, right_rad2, down_rad2`` (NaN if not sent). None if the
+        sender gave no orientation or a constant one: a positioning system, not odometry.
+    velocity : DataFrame, shape (n, 6), or None
+        ``north_m_s, east_m_s, down_m_s`` and their variances ``north_m2_s2, …`` at the times of
+        ``samples``, if the source measures velocity (GNSS).
+    age_s : float
+        Delay from measurement to timestamp that EKF2 assumes and that is already subtracted.
+    barometer : DataFrame or None
+        Barometer height ``down_m`` at its times, if it is used for the down axis.
+    lever_arm_m : tuple of float
+        Sensor position in the body frame (forward, right, down) that EKF2 assumes; the track is
+        the position of the sensor.
+    notes : tuple of str
+        Sentences on joined and dropped samples.
+    invalid : Series
+        Rows without a measurement, not in ``samples``, by time, with the reason:
+        "NaN", "zero" (0, 0, 0 without a position) or "held" (the last position sent again).
+    status : DataFrame
+        ``reset_counter``, ``quality`` and ``age_s`` (arrival - timestamp) at the times of the
+        source; only those that are logged.
+    step_m : float
+        Rounding step of the coarsest horizontal coordinate as sent; 0 if there is none.
+    """
+
+    name: str
+    origin: Origin
+    description: str
+    samples: pd.DataFrame
+    frame: str
+    clock: str
+    topics: tuple[str, ...]
+    log: str = ""
+    clock_map: ClockMap | None = None
+    alignment: Alignment | None = None
+    orientation: pd.DataFrame | None = None
+    velocity: pd.DataFrame | None = None
+    age_s: float = 0.0
+    barometer: pd.DataFrame | None = None
+    lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    notes: tuple[str, ...] = ()
+    invalid: pd.Series[str] = field(default_factory=lambda: NO_INVALID_ROWS)
+    status: pd.DataFrame = field(default_factory=pd.DataFrame)
+    step_m: float = 0.0
+
+    __repr__ = one_line_repr
+
+    def aid(self, axis: str) -> Aid | None:
+        """Return the aiding source of EKF2 that fuses this track along an axis, if any."""
+        return self.origin.aid if axis != "down" or self.barometer is None else BAROMETER
+
+    def description_fields(self) -> dict[str, Any]:
+        """Return the fields that describe the track in results.json, by name."""
+        names = (
+            "name",
+            "kind",
+            "path",
+            "description",
+            "frame",
+            "clock",
+            "reconstructed",
+            "topics",
+            "log",
+            "alignment",
+        )
+        return {
+            name: getattr(self.origin if hasattr(self.origin, name) else self, name)
+            for name in names
+        }
+
+    @property
+    def rate_hz(self) -> float:
+        """Sample rate (Hz) without gaps; NaN for fewer than two samples."""
+        return sample_rate(self.samples)
+
+
+def source_name(source: PositionTrack) -> str:
+    """Return the usual name of a position source, such as "UWB", instead of its topic."""
+    return SOURCE_NAMES[source.origin.kind]
+
+
+def positions_of(source: PositionTrack) -> str:
+    """Return the noun phrase for the positions of a source: "UWB positions"."""
+    if source.origin.kind == "file":
+        return "positions of the file"
+    return f"{source_name(source)} positions"
+
+
+@dataclass(frozen=True)
+class Reset:
+    """Reset of EKF2's published state: the new state is the old one plus ``delta``.
+
+    Attributes
+    ----------
+    time_s : float
+        Time of the first sample after the reset.
+    quantity : str
+        "position" or "velocity".
+    delta : tuple of float
+        North, east, down (m or m/s); 0 for axes that were not reset.
+    """
+
+    time_s: float
+    quantity: Literal["position", "velocity"]
+    delta: tuple[float, float, float]
+
+
+EKF2_STEP_S = 0.010  # s; default of EKF2_PREDICT_US (ekf2_params.c)
+BIAS_NOT_LOGGED = Unavailable(
+    "EKF2 accelerometer bias",
+    "estimator_sensor_bias and estimator_states are not logged",
+    "Record a ULog with SDLOG_PROFILE bit 0 (default).",
+)
+HORIZON_NOT_LOGGED = Unavailable(
+    "EKF2 fusion horizon",
+    "the log has no separate times of fusion and publication",
+    "Record a ULog with PX4 v1.13 or newer.",
+)
+
+
+RECORD_NOT_LOGGED = Unavailable(
+    "EKF2 state at the fusion horizon",
+    "estimator_states is not logged",
+    "Add a ULog of PX4 v1.12 or newer, recorded with SDLOG_PROFILE bit 0 (default).",
+)
+
+
+GROUND_EFFECT, BAD_ACCELERATION = "gnd_effect", "bad_acc_vertical"
+# Weight of a new sample in EKF2's low-pass filter of optical flow (_flow_vel_body_lpf in ekf.h)
+FLOW_FILTER_WEIGHT = 0.1
+
+
+@dataclass(frozen=True)
+class FusionRecord:
+    """Logged data of EKF2 at its fusion horizon, from which the replay starts.
+
+    Attributes
+    ----------
+    parameters : mapping
+        All EKF2_ parameters at the start of the log, by PX4 name, in PX4 units.
+    delayed : DataFrame, shape (n, 43)
+        State and variances at the fusion horizon. ``w, x, y, z`` rotates body FRD to NED; velocity
+        and position are NED (horizontal position NaN if PX4 stores latitude and longitude); biases
+        of gyro (rad/s) and accelerometer (m/s²) are in body FRD; magnetic fields of the earth
+        (NED) and the body (FRD) are in gauss. Then the variances of attitude error about north,
+        east and down, of velocity, position, the biases and both fields.
+    per_step_biases : bool
+        True if this release stores biases as increments per prediction (up to v1.14).
+    other_aiding : tuple of str
+        Horizontal aids besides vision position that EKF2 used at any time.
+    vision_age_s : Series
+        Delay (s) from measurement to publication of each external vision sample, indexed by
+        measurement time; empty if not logged.
+    field_gauss : DataFrame, shape (m, 4) or (m, 7)
+        Measured magnetic field (body FRD) and ``fused_3d``, 1 while EKF2 fuses all components, 0
+        while it fuses the heading only; empty if not logged. Since v1.16 also EKF2's low-pass
+        filtered innovations (expected minus measured).
+    flow : DataFrame, shape (l, 5)
+        Velocity from optical flow, ``forward_m_s`` and ``right_m_s`` (body FRD): weighted mean of
+        ``samples`` values at intervals of ``interval_s``, with a higher weight of later values
+        (:data:`FLOW_FILTER_WEIGHT`). The index is the time of the last value; ``noise_m2_s2`` is R
+        of each value. Empty if not logged.
+    latitude_deg : float
+        Latitude of the origin; NaN if not logged.
+    altitude_m : float
+        Altitude of the origin if EKF2 stores altitude above sea level (since v1.16); otherwise 0.
+    height_bias : mapping from PX4's name of an aid to DataFrame, shape (k, 2)
+        Height of the aid minus height of the reference: ``bias_m``, with variance ``bias_m2``.
+    states : mapping from :data:`GROUND_EFFECT` and :data:`BAD_ACCELERATION` to Series
+        Step functions: 1 while EKF2 detects ground effect on the barometer, or wrong vertical
+        acceleration; otherwise 0. Contains logged states only.
+    """
+
+    parameters: Mapping[str, float]
+    delayed: pd.DataFrame
+    per_step_biases: bool
+    other_aiding: tuple[str, ...]
+    vision_age_s: pd.Series
+    field_gauss: pd.DataFrame = field(default_factory=pd.DataFrame)
+    flow: pd.DataFrame = field(default_factory=pd.DataFrame)
+    latitude_deg: float = np.nan
+    altitude_m: float = 0.0
+    height_bias: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    states: StepFunctions = field(default_factory=dict)
+
+    __repr__ = one_line_repr
+
+    @property
+    def stores_latitude(self) -> bool:
+        """True if EKF2 stores its position as latitude and longitude (since v1.16)."""
+        return not np.isfinite(self.delayed["north_m"]).any()
+
+    def was_in_state(self, state: str, times_s: Array) -> BoolArray:
+        """Return a mask of the times in the state, a key of ``states``; all False if not logged."""
+        steps = self.states.get(state)
+        return (
+            np.zeros(len(times_s), bool) if steps is None else step_values_at(steps, times_s) > 0.0
+        )
+
+
+@dataclass(frozen=True)
+class AidLog:
+    """Logged innovations, variances and fusion results of one aiding source of EKF2.
+
+    Attributes
+    ----------
+    topics : tuple of str
+        Topics with the innovations and their variances.
+    axes : tuple of str
+    samples : DataFrame
+        Indexed by measurement time, for each axis: ``innovation_<axis>`` (measurement minus
+        prediction) and ``variance_<axis>`` (S). From ``estimator_aid_src`` topics also
+        ``noise_<axis>`` (R), ``ratio_<axis>`` (ν²/(gate²·S)), ``fused`` and ``rejected`` (1 or 0),
+        for external vision position ``observation_<axis>``. In the unit of the aid or its square.
+    enabled : Series or None
+        Step function: 1 while fusion of the aid is enabled, otherwise 0; None if not logged.
+    parameters : mapping
+        EKF2 parameters of the aid at the start of the log, by PX4 name.
+    excluded_count : int
+        Number of innovations that were dropped because no variance is near in time.
+    """
+
+    topics: tuple[str, ...]
+    axes: tuple[str, ...]
+    samples: pd.DataFrame
+    enabled: pd.Series[float] | None
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    excluded_count: int = 0
+
+    __repr__ = one_line_repr
+
+
+def step_values_at(steps: pd.Series[float], times: pd.Index[float] | Array) -> Array:
+    """Return the values of a step function at times; before its first time, its first value."""
+    rows = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
+    return np.asarray(steps, dtype=np.float64)[rows]
+
+
+@dataclass(frozen=True)
+class Ekf2:
+    """State, variances and innovations of EKF2, from the primary instance at each time.
+
+    Attributes
+    ----------
+    state : DataFrame, shape (n, 6)
+        Position and velocity (m, m/s, NED) as published, including resets.
+    variance : DataFrame, shape (n, 6), or Unavailable
+        Position and velocity variances (m², m²/s²).
+    innovations : mapping from axis name to DataFrame or Unavailable
+        ``innovation_m`` (measurement minus prediction; opposite to PX4's sign),
+        ``innovation_variance_m2``, ``observation_variance_m2`` (NaN if not logged),
+        ``test_ratio``, ``fused``, ``rejected`` (1, 0, or NaN if not logged).
+    innovation_topics : tuple of str
+    fusing : DataFrame or Unavailable
+        Step functions ``horizontal``, ``vertical``, ``yaw``: 1 while EKF2 reports fusion of this
+        component of external vision.
+    resets : tuple of Reset
+    instances : tuple of (float, int)
+        (Start time, primary instance from then on).
+    gate : float
+        EKF2_EVP_GATE (in √S).
+    notes : tuple of str
+        Sentences on dropped samples and on the origin of the timestamps.
+    accelerometer_bias : DataFrame, shape (n, 3), or Unavailable
+        Estimated bias (m/s², body FRD) that EKF2 subtracts from the specific force.
+    step_s : float
+        Prediction interval.
+    horizon_s : float or Unavailable
+        Delay of the fusion horizon: the state at t contains measurements up to t - horizon,
+        propagated to t with the IMU.
+    record : FusionRecord or Unavailable
+        Data at the fusion horizon.
+    aids : mapping from PX4 name to AidLog
+        Logged data of all aids that EKF2 can fuse.
+    states : mapping from name to Series
+        Step functions, only those that are logged: 1 while an aid is enabled, by its PX4 name;
+        ``tilt_align``, ``yaw_align``, ``gnss_fault``, and the keys of :attr:`FusionRecord.states`;
+        ``xy_valid``, ``xy_global``; ``failed_checks``: ``estimator_status.gps_check_fail_flags``.
+    parameters : mapping
+        All EKF2_ parameters at the start of the log, by PX4 name, in PX4 units.
+    """
+
+    state: pd.DataFrame
+    variance: TableOrUnavailable
+    innovations: Mapping[AxisName, TableOrUnavailable]
+    innovation_topics: tuple[str, ...]
+    fusing: TableOrUnavailable
+    resets: tuple[Reset, ...]
+    instances: tuple[tuple[float, int], ...]
+    gate: float
+    notes: tuple[str, ...] = ()
+    accelerometer_bias: TableOrUnavailable = BIAS_NOT_LOGGED
+    step_s: float = EKF2_STEP_S
+    horizon_s: float | Unavailable = HORIZON_NOT_LOGGED
+    record: FusionRecord | Unavailable = RECORD_NOT_LOGGED
+    aids: Mapping[str, AidLog] = field(default_factory=dict)
+    states: StepFunctions = field(default_factory=dict)
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+    __repr__ = one_line_repr
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ground truth that no estimator used: from simulation or motion capture.
+
+    Attributes
+    ----------
+    name : str
+        Topic, message or track name.
+    samples : DataFrame, shape (n, 6)
+        Position and velocity (m, m/s, NED); velocity is NaN if not logged.
+    attitude : DataFrame, shape (m, 4), or None
+        Quaternion ``w, x, y, z`` that rotates body FRD to NED; None if not logged.
+    """
+
+    name: str
+    samples: pd.DataFrame
+    attitude: pd.DataFrame | None = None
+
+    __repr__ = one_line_repr
+
+
+MODES_NOT_LOGGED = Unavailable(
+    "flight modes",
+    "vehicle_status is not logged or not usable",
+    "Record with SDLOG_PROFILE bit 0 (default).",
+)
+
+
+# eq=False: hash and equality by identity, because caches use flights as keys
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """One recorded flight.
+
+    Attributes
+    ----------
+    log : LogInfo
+    imu : DataFrame or Unavailable
+        Specific force (m/s², body FRD, not bias corrected), angular rate (rad/s, body FRD) and, if
+        logged, ``clipped``: above 0 if an accelerometer reached the limit of its range.
+    attitude : DataFrame or Unavailable
+        Quaternion w, x, y, z that rotates body FRD to NED.
+    positions : tuple of PositionTrack
+        All external position tracks, in order of preference.
+    ekf2 : Ekf2 or Unavailable
+    truth : Truth or Unavailable
+    airborne : tuple of (float, float), or Unavailable
+        Intervals (s) in which the land detector reports flight; empty if none.
+    missing : tuple of Unavailable
+        Missing data, with reason and action.
+    streams : mapping from part to Stream
+        Source of each available kind of data: "imu", "attitude", "ekf2_state", "ekf2_variance",
+        "ekf2_innovations", "ekf2_fusing", "truth", "airborne".
+    clocks : tuple of ClockMap
+        Maps from other clocks to the boot clock.
+    unused : tuple of UnusedData
+        Other position-related data in the log that px4fuse does not use.
+    inputs : tuple of InputFile
+        Files read in addition to the log.
+    modes : tuple of FlightMode, or Unavailable
+        Flight modes in order of time, without overlap.
+    tumble_spans : tuple of (float, float)
+        Intervals (s) in which PX4's failure detector reports roll or pitch beyond the limits.
+    barometer : DataFrame or None
+        Barometer height ``down_m``, with unknown zero.
+    """
+
+    log: LogInfo
+    imu: TableOrUnavailable
+    attitude: TableOrUnavailable
+    positions: tuple[PositionTrack, ...]
+    ekf2: Ekf2 | Unavailable
+    truth: Truth | Unavailable
+    airborne: Spans | Unavailable
+    missing: tuple[Unavailable, ...] = ()
+    streams: Mapping[str, Stream] = field(default_factory=dict)
+    clocks: tuple[ClockMap, ...] = ()
+    unused: tuple[UnusedData, ...] = ()
+    inputs: tuple[InputFile, ...] = ()
+    modes: tuple[FlightMode, ...] | Unavailable = MODES_NOT_LOGGED
+    tumble_spans: Spans = ()
+    barometer: pd.DataFrame | None = None
+
+    __repr__ = one_line_repr
+
+
+def time_index(time_s: NDArray[Any]) -> pd.Index[float]:
+    """Return the index ``time_s`` (s) of a table of a flight."""
+    index: pd.Index[float] = pd.Index(time_s, name="time_s")
+    return index
+
+
+def sort_by_preference(tracks: Iterable[PositionTrack]) -> tuple[PositionTrack, ...]:
+    """Sort position tracks by preference for a comparison, best first."""
+    return tuple(sorted(tracks, key=lambda track: track.origin.preference))
+
+
+def sample_rate(samples: pd.DataFrame) -> float:
+    """Return the sample rate (Hz) of a time-indexed frame without gaps; NaN below two samples.
+
+    The rate is the inverse mean of all intervals up to three times the median. The median alone
+    would be wrong for a decimated topic, which alternates between two intervals. For samples in
+    bursts, without a regular interval, the mean of all intervals is used.
+    """
+    if len(samples) < 2:
+        return float("nan")
+    intervals = samples.index.to_series().diff().dropna()
+    regular_intervals = intervals[intervals <= 3.0 * intervals.median()]
+    if len(regular_intervals) < MIN_REGULAR_FRACTION * len(intervals):
+        regular_intervals = intervals
+    return float(1.0 / regular_intervals.mean())

@@ -1,0 +1,99 @@
+"""Origin of a position track: kind of position source, and data path from sender to log."""
+
+from typing import Literal
+
+from msgspec.structs import replace
+
+from px4fuse.core.record import Record
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, Aid
+
+PositionKind = Literal["uwb", "vio", "mocap", "gnss", "file"]
+DataPath = Literal[
+    "given file", "as received", "aligned by EKF2", "kept by EKF2", "rebuilt from innovations"
+]
+
+
+class Origin(Record, frozen=True):
+    """Kind of a position source, and the data path of its positions from the sender to the log.
+
+    Attributes
+    ----------
+    kind : str
+        "uwb" is any positioning system without orientation, "vio" is any odometry.
+    path : str
+        Data path from the sender to the log.
+    aid : Aid or None
+        Aiding source as which EKF2 fuses the positions; None if EKF2 never fuses them.
+    is_automatic : bool
+        True if px4fuse may select the source by default; for GNSS, True only if EKF2 fused it.
+    """
+
+    kind: PositionKind
+    path: DataPath
+    aid: Aid | None
+    is_automatic: bool = True
+
+    @property
+    def may_drift(self) -> bool:
+        """True if the position error may grow with the distance travelled, as for odometry.
+
+        A log does not distinguish odometry from motion capture sent in the same messages, so both
+        may drift.
+        """
+        return self.kind == "vio"
+
+    @property
+    def reconstructed(self) -> bool:
+        """True if the positions are derived from EKF2's logged data, not logged as received."""
+        return self.path in ("kept by EKF2", "rebuilt from innovations")
+
+    @property
+    def has_all_samples(self) -> bool:
+        """True if the position track contains all samples of the sender."""
+        return self.path in ("given file", "as received")
+
+    @property
+    def is_vision(self) -> bool:
+        return self.aid == EV_POS
+
+    @property
+    def fused_as_gnss(self) -> bool:
+        return self.aid == GNSS_POS
+
+    @property
+    def is_gnss(self) -> bool:
+        """True for GNSS, whose multipath and atmospheric errors are correlated over minutes.
+
+        R must be larger than the variance estimated from differences of consecutive positions.
+        """
+        return self.kind == "gnss"
+
+    @property
+    def preference(self) -> int:
+        """Index in :data:`ORIGINS`; the position source with the smallest index is preferred."""
+        origins = [(origin.aid, origin.path) for origin in ORIGINS]
+        return origins.index((self.aid, self.path))
+
+
+POSITION_FILE = Origin("file", "given file", EV_POS)
+RECEIVED = Origin("uwb", "as received", EV_POS)
+MOTION_CAPTURE = Origin("mocap", "as received", None)
+ALIGNED = Origin("uwb", "aligned by EKF2", EV_POS)
+LOGGED_BY_EKF2 = Origin("uwb", "kept by EKF2", EV_POS)
+FROM_INNOVATIONS = Origin("uwb", "rebuilt from innovations", EV_POS)
+GNSS = Origin("gnss", "as received", GNSS_POS, is_automatic=False)
+# All origins in order of preference. px4fuse assumes that EKF2 fused the source of a position file
+ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS, GNSS)
+
+
+def find_origin(kind: str, path: str) -> Origin:
+    """Return the origin in :data:`ORIGINS` with this kind of source and data path."""
+    for origin in ORIGINS:
+        if (origin.kind, origin.path) == (kind, path):
+            return origin
+    raise ValueError(f"{kind!r}, {path!r} is not in ORIGINS of {__name__}: add an Origin")
+
+
+def with_orientation(origin: Origin, *, turns: bool) -> Origin:
+    """Change the kind "uwb" to "vio" if the source reports a changing orientation (``turns``)."""
+    return replace(origin, kind="vio") if origin.kind == "uwb" and turns else origin

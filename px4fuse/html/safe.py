@@ -1,0 +1,86 @@
+"""Escaping of text and numbers from data, so they cannot execute in a web page."""
+
+import base64
+import hashlib
+import json
+import re
+from functools import cache
+from importlib.resources import files
+from pathlib import PurePosixPath
+from typing import Any
+from urllib.parse import quote
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+
+MAX_TEXT_LENGTH = 20_000
+# Control characters except tab and line feed, surrogates, and bidirectional overrides, which would
+# reverse the text after them
+HARMFUL_CHARACTERS = re.compile(
+    "[\0-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069]"
+)
+
+
+def clean(text: str, max_length: int = MAX_TEXT_LENGTH) -> str:
+    r"""Replace harmful characters and shorten the text to `max_length` characters.
+
+    >>> clean("a\x1b\u202eb", 10), clean("abcdef", 3)
+    ('a��b', 'abc…')
+    """
+    text = text if len(text) <= max_length else text[:max_length] + "…"
+    return HARMFUL_CHARACTERS.sub("\N{REPLACEMENT CHARACTER}", text)
+
+
+def clean_values(value: Any, max_length: int = MAX_TEXT_LENGTH) -> Any:
+    """Clean all texts in nested data, and convert numpy numbers to Python numbers."""
+    if isinstance(value, str):
+        return clean(value, max_length)
+    if isinstance(value, dict):
+        return {
+            clean(str(name), max_length): clean_values(element, max_length)
+            for name, element in value.items()
+        }
+    if isinstance(value, list | tuple):
+        return [clean_values(element, max_length) for element in value]
+    return value.item() if hasattr(value, "item") else value
+
+
+def inert_json(value: object) -> str:
+    """Encode as JSON in ASCII without <, > and &, so that HTML parsers find no markup."""
+    text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", r"\u003c").replace(">", r"\u003e").replace("&", r"\u0026")
+
+
+def policy_hash(text: str) -> str:
+    """Return the SHA-256 hash with which a content security policy allows a script or style."""
+    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+def local_link(path: str) -> str:
+    r"""Return a relative path as a URL, "" for an absolute path, so that data cannot add web links.
+
+    >>> local_link("results/a b.json"), local_link("javascript:alert(1)")
+    ('results/a%20b.json', 'javascript%3Aalert%281%29')
+    >>> local_link("//example.org/x"), local_link("C:\\x")
+    ('', 'C%3A%5Cx')
+    """
+    if PurePosixPath(path).is_absolute():
+        return ""
+    return quote(path.encode("utf-8", "replace"))
+
+
+@cache
+def load_template(name: str) -> Template:
+    """Load a template of the package; it cleans and escapes all inserted text."""
+    environment = Environment(
+        loader=PackageLoader("px4fuse", ""),
+        autoescape=True,
+        trim_blocks=True,
+        finalize=lambda value: clean(value) if type(value) is str else value,
+        undefined=StrictUndefined,
+    )
+    return environment.get_template(name)
+
+
+def read_asset(name: str, package: str = "px4fuse.html") -> str:
+    """Read a text file of a package, by default of the files shared by all pages."""
+    return files(package).joinpath(name).read_text(encoding="utf-8")

@@ -1,0 +1,424 @@
+"""Contents of a log, possible analyses, and advice on logging for the next flight."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.flight_events import max_interval_s
+from px4fuse.comparison.model import Comparison
+from px4fuse.comparison.preparation import prepare, select_innovations
+from px4fuse.core.text import capitalise_first, to_json_types, utc_time
+from px4fuse.ekf2.aids import evaluate_aids
+from px4fuse.ekf2.inputs import prepare_inputs
+from px4fuse.errors import MissingDataError, Px4FuseError
+from px4fuse.filter.signals import (
+    IMU_GAP_INTERVALS,
+    IMU_GAP_S,
+    Segment,
+    cut_to_segment,
+    ned_acceleration,
+)
+from px4fuse.findings import ekf2_not_fusing, finding_title, imu, missing, recording
+from px4fuse.flight.log import Stream
+from px4fuse.flight.model import (
+    Columns,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Truth,
+    Unavailable,
+    sample_rate,
+)
+from px4fuse.info.tables import NO_POSITION, unavailable_parts
+from px4fuse.request import ComparisonRequest, with_options
+
+SCHEMA_NAME = "px4fuse-info"
+SCHEMA_VERSION = "1.0"
+# Fields of Flight that the JSON output of px4fuse info contains without change
+FLIGHT_FIELDS = ("log", "airborne", "clocks", "missing", "unused", "inputs")
+# Displayed name of each kind of data in a flight, by its name in Flight.streams
+PART_LABELS = {
+    "imu": "IMU",
+    "attitude": "attitude",
+    "position": "position",
+    "ekf2_state": "EKF2 state",
+    "ekf2_variance": "EKF2 variance",
+    "ekf2_innovations": "innovations",
+    "ekf2_fusing": "fusion flags",
+    "truth": "ground truth",
+    "airborne": "land detector",
+}
+# Analyses of px4fuse compare, with the data (EKF2 or ground truth) that each of them requires
+PARTS_OF_COMPARE = {
+    "EKF2 states": "ekf2_state",
+    "EKF2 variances": "ekf2_variance",
+    "EKF2 consistency": "ekf2_innovations",
+    "error": "truth",
+}
+NO_COMPARISON = Unavailable("comparison", "the log contains no position to compare with", "")
+TimeSpans = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class AnalysisOption:
+    """Analysis of px4fuse; ``reason``: data used, or why the analysis is not possible."""
+
+    name: str
+    possible: bool
+    reason: str
+
+
+@dataclass(frozen=True)
+class LoggingAdvice:
+    """Action before the next flight, and the analyses or data that the action makes possible."""
+
+    remedy: str
+    improves: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """Gaps in one kind of data: sample intervals that are longer than ``limit_s``.
+
+    Attributes
+    ----------
+    count : int
+    total_s, longest_s : float
+        Sum and maximum of the gap lengths; 0 without gaps.
+    limit_s : float
+        IMU: the larger of 0.1 s and five median sample intervals, as in KF. Other data: the larger
+        of 1 s and five median sample intervals.
+    """
+
+    count: int
+    total_s: float
+    longest_s: float
+    limit_s: float
+
+
+@dataclass(frozen=True)
+class Source:
+    """Kind of data in a flight with topics, rate and gaps, or the reason why the data are missing.
+
+    Attributes
+    ----------
+    part : str
+        Kind of data: a value of :data:`PART_LABELS`.
+    name : str
+        Name of a position track, else of the first topic; empty if the data are missing.
+    topics : tuple of str
+    clock, log : str
+        Clock of the timestamps, and name of the file.
+    samples : int or None
+        Number of samples; None for the land detector, of which a Flight contains no samples.
+    rate_hz : float or None
+        Median rate, on which gaps have no effect; None with less than two samples.
+    gaps : Gaps or None
+    start_s, end_s : float or None
+        Times of the first and last sample, in seconds after the first data.
+    chosen : bool
+        True for the position source that ``px4fuse compare`` uses by default.
+    description : str
+        Description of a position track.
+    unavailable : str
+        Reason why the data are missing; empty if they are available.
+    """
+
+    part: str
+    name: str = ""
+    topics: tuple[str, ...] = ()
+    clock: str = ""
+    log: str = ""
+    samples: int | None = None
+    rate_hz: float | None = None
+    gaps: Gaps | None = None
+    start_s: float | None = None
+    end_s: float | None = None
+    chosen: bool = False
+    description: str = ""
+    unavailable: str = ""
+
+
+@dataclass(frozen=True)
+class Inventory:
+    """Contents of a log, as ``px4fuse info`` shows them.
+
+    Attributes
+    ----------
+    flight : Flight
+        Flight with the EKF2 innovations of the default position source.
+    start_utc : str or None
+        UTC of the first data, ISO 8601.
+    sources : tuple of Source
+        All kinds of data in the flight, and all position tracks in order of preference.
+    source_reason : str
+        Reason for the position source that ``px4fuse compare`` uses, or why there is none.
+    segment : Segment or None
+        Time span that ``px4fuse compare`` analyses by default.
+    abilities : tuple of AnalysisOption
+    advice : tuple of LoggingAdvice
+        Different actions, the most important first.
+    notes : tuple of str
+        Sentences about damage of the file, clocks and EKF2 data.
+    """
+
+    flight: Flight
+    start_utc: str | None
+    sources: tuple[Source, ...]
+    source_reason: str
+    segment: Segment | None
+    abilities: tuple[AnalysisOption, ...]
+    advice: tuple[LoggingAdvice, ...]
+    notes: tuple[str, ...]
+
+
+def take_inventory(flight: Flight) -> Inventory:
+    """List the contents of a flight, the possible analyses and the advice on logging."""
+    comparison, reason, remedy = None, "", ""
+    try:
+        comparison = compare(prepare(flight, ComparisonRequest(log=flight.log.name)))
+        reason = comparison.source_reason
+    except Px4FuseError as error:
+        reason = with_options(error.reason).removeprefix(f"{flight.log.name}: ")
+        remedy = with_options(error.remedy)
+        if not isinstance(error, MissingDataError):
+            remedy = "Record the whole flight: set SDLOG_MODE to 0 (logging from arming)."
+    if comparison is not None:
+        flight = select_innovations(flight, comparison.source)
+    log = flight.log
+    is_incomplete = log.ends_in_flight and not log.damage
+    return Inventory(
+        flight=flight,
+        start_utc=utc_time(log.start_unix_s),
+        sources=tuple(_sources(flight, comparison, reason)),
+        source_reason=reason,
+        segment=None if comparison is None else comparison.segment,
+        abilities=tuple(_analysis_options(flight, comparison, reason)),
+        advice=_logging_advice(flight, comparison, remedy),
+        notes=(
+            *log.damage,
+            *(
+                ("the log ends in flight and does not contain the landing",)
+                if is_incomplete
+                else ()
+            ),
+            *log.notes,
+            *(() if comparison is None else comparison.source.notes),
+            *(flight.ekf2.notes if isinstance(flight.ekf2, Ekf2) else ()),
+        ),
+    )
+
+
+def to_plain(inventory: Inventory) -> dict[str, Any]:
+    """Convert the inventory of a log to JSON types; unknown values are absent."""
+    inventory_fields = {field.name: getattr(inventory, field.name) for field in fields(inventory)}
+    flight: Flight = inventory_fields.pop("flight")
+    flight_fields = {name: getattr(flight, name) for name in FLIGHT_FIELDS}
+    if isinstance(flight.airborne, Unavailable):
+        del flight_fields["airborne"]
+    data: dict[str, Any] = to_json_types(flight_fields | inventory_fields)
+    return {"schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION}, **data}
+
+
+def _data_by_part(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unavailable]:
+    """Return all data of a flight except positions, by their names in Flight.streams.
+
+    Without EKF2 data, the result contains the EKF2 state as unavailable, and no other EKF2 data.
+    EKF2 innovations are along the axis with the most samples.
+    """
+    ekf2, truth = flight.ekf2, flight.truth
+    data_by_part = {"imu": flight.imu, "attitude": flight.attitude}
+    if isinstance(ekf2, Unavailable):
+        data_by_part["ekf2_state"] = ekf2
+    else:
+        innovations = max(
+            ekf2.innovations.values(),
+            key=lambda samples: len(samples) if isinstance(samples, pd.DataFrame) else -1,
+        )
+        data_by_part |= {"ekf2_state": ekf2.state, "ekf2_variance": ekf2.variance}
+        data_by_part |= {"ekf2_innovations": innovations, "ekf2_fusing": ekf2.fusing}
+    samples = truth if isinstance(truth, Unavailable) else truth.samples
+    return {**data_by_part, "truth": samples, "airborne": flight.airborne}
+
+
+def _sources(flight: Flight, comparison: Comparison | None, reason: str) -> Iterator[Source]:
+    data_by_part = _data_by_part(flight)
+    for key, name in PART_LABELS.items():
+        if key in data_by_part:
+            yield _source(name, data_by_part[key], flight.streams.get(key))
+        for track in flight.positions if key == "position" else ():
+            yield _source(
+                name,
+                track.samples,
+                track,
+                name=track.name,
+                description=track.description,
+                chosen=comparison is not None and track.name == comparison.source.name,
+            )
+        if key == "position" and not flight.positions:
+            yield Source(name, unavailable=reason)
+
+
+def _source(
+    part: str,
+    data: pd.DataFrame | TimeSpans | Unavailable,
+    stream: Stream | PositionTrack | None,
+    **source_fields: Any,
+) -> Source:
+    if isinstance(data, Unavailable):
+        return Source(part, unavailable=data.reason)
+    if stream is not None:
+        source_fields = {"name": stream.topics[0] if stream.topics else "", **source_fields}
+        source_fields |= {"topics": stream.topics, "clock": stream.clock, "log": stream.log}
+    if isinstance(data, pd.DataFrame):
+        source_fields["samples"] = len(data)
+        times_s = data.index.tolist()
+    else:
+        times_s = [time_s for span in data for time_s in span]
+    if times_s:
+        source_fields |= {"start_s": times_s[0], "end_s": times_s[-1]}
+    if isinstance(data, pd.DataFrame) and len(data) > 1:
+        source_fields |= {
+            "rate_hz": sample_rate(data),
+            "gaps": _measure_gaps(data, is_imu=part == PART_LABELS["imu"]),
+        }
+    return Source(part, **source_fields)
+
+
+def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
+    intervals = np.diff(samples.index.to_numpy())
+    limit_s = (
+        max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(intervals)))
+        if is_imu
+        else float(max_interval_s(1.0 / sample_rate(samples)))
+    )
+    long_intervals = intervals[intervals > limit_s]
+    return Gaps(
+        len(long_intervals),
+        float(long_intervals.sum()),
+        float(long_intervals.max(initial=0.0)),
+        limit_s,
+    )
+
+
+def _analysis_options(
+    flight: Flight, comparison: Comparison | None, reason: str
+) -> Iterator[AnalysisOption]:
+    acceleration: object = ned_acceleration(flight)
+    rows_by_name: dict[str, tuple[object, str]] = {}
+    if comparison is None:
+        yield AnalysisOption("compare", False, reason)
+    else:
+        source, segment = comparison.source, comparison.segment
+        count, span = len(cut_to_segment(source.samples, segment)), (segment.start_s, segment.end_s)
+        description = "KF with position source {}, {} samples, {:.1f} s to {:.1f} s"
+        yield AnalysisOption("compare", True, description.format(source.name, count, *span))
+        acceleration = comparison.lines[0].acceleration
+        rows_by_name = _ekf2_and_truth_rows(comparison)
+    imu_reason = " ".join(finding.message for finding in imu.detect_low_rates(flight))
+    if isinstance(acceleration, Unavailable):
+        imu_reason = f"{acceleration.reason}; KF assumes constant velocity"
+    acceleration_text = "IMU rotated into NED with the attitude, gravity removed"
+    yield AnalysisOption("acceleration", not imu_reason, imu_reason or acceleration_text)
+    data_by_part = _data_by_part(flight)
+    for name, key in PARTS_OF_COMPARE.items():
+        result, description = rows_by_name.get(name, (NO_COMPARISON, ""))
+        logged_data = data_by_part.get(key, flight.ekf2)
+        if isinstance(logged_data, Unavailable):
+            result = logged_data
+        yield _analysis_option(name, result, description)
+    aids, ekf2 = evaluate_aids(flight), flight.ekf2
+    if isinstance(aids, dict) and isinstance(ekf2, Ekf2):
+        rates = (f"{aid.label} {_rate_text(ekf2.aids[name].samples)}" for name, aid in aids.items())
+        description = ", ".join(rates)
+    yield _analysis_option("aids", aids, description)
+    inputs = prepare_inputs(flight)
+    if not isinstance(inputs, Unavailable):
+        replayed_s = sum(float(np.ptp(segment.time_s)) for segment in inputs.segments)
+        description = f"EKF2 replay with {inputs.aid.label}, {replayed_s:.0f} s"
+    yield _analysis_option("what-if", inputs, description)
+
+
+def _rate_text(samples: pd.DataFrame) -> str:
+    return f"{sample_rate(samples):.2g} Hz" if len(samples) > 1 else "1 sample"
+
+
+def _analysis_option(name: str, part: object, description: str) -> AnalysisOption:
+    if isinstance(part, Unavailable):
+        return AnalysisOption(name, False, part.reason)
+    return AnalysisOption(name, True, description)
+
+
+def _ekf2_and_truth_rows(comparison: Comparison) -> dict[str, tuple[object, str]]:
+    first_axis, truth = next(iter(comparison.axes.values())), comparison.flight.truth
+    innovations = {name: axis.ekf2_innovations for name, axis in comparison.axes.items()}
+    counts = [
+        f"{axis_name} {len(innovation_table)}"
+        for axis_name, innovation_table in innovations.items()
+        if isinstance(innovation_table, pd.DataFrame)
+    ]
+    summaries = [axis.filters["ekf2"] for axis in comparison.axes.values()]
+    quantities_text = "position only"
+    if isinstance(truth, Truth) and truth.samples[Columns.VELOCITY].notna().any(axis=None):
+        quantities_text = "position and velocity"
+    return {
+        "EKF2 states": (
+            first_axis.difference,
+            f"{_count_text(first_axis.ekf2_state)} of EKF2 position and velocity",
+        ),
+        "EKF2 variances": (first_axis.ekf2_variance, _count_text(first_axis.ekf2_variance)),
+        "EKF2 consistency": (
+            next(
+                (summary for summary in summaries if not isinstance(summary, Unavailable)),
+                summaries[0],
+            ),
+            f"number of EKF2 innovations: {', '.join(counts)}",
+        ),
+        "error": (
+            first_axis.truth,
+            f"RMSE and NEES of {quantities_text} against {getattr(truth, 'name', '')}",
+        ),
+    }
+
+
+def _count_text(part: pd.DataFrame | Unavailable) -> str:
+    return "" if isinstance(part, Unavailable) else f"{len(part)} samples"
+
+
+def _logging_advice(
+    flight: Flight, comparison: Comparison | None, remedy: str
+) -> tuple[LoggingAdvice, ...]:
+    """Collect the different actions of findings about the recording, and of missing data."""
+    findings = [*recording.detect_lost_data(flight), *recording.detect_clocks_set_back(flight)]
+    actions_and_purposes = [(remedy, "position")] if remedy else []
+    if comparison is not None:
+        findings += [
+            *missing.detect_source_not_logged(comparison),
+            *ekf2_not_fusing.detect_missing_fusion(comparison),
+        ]
+        findings += [
+            *missing.detect_missing_innovations(comparison),
+            *recording.detect_dropouts(comparison),
+        ]
+    findings += imu.detect_low_rates(flight)
+    actions_and_purposes += [
+        (finding.remedy, finding_title(finding.id)) for finding in findings if finding.remedy
+    ]
+    # advice on data other than main_parts is for ULogs, because only PX4 can log these data
+    main_parts = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
+    actions_and_purposes += [
+        (part.remedy, part.what)
+        for part in unavailable_parts(flight)
+        if part is not NO_POSITION
+        and (flight.log.has_ulog or any(part is main_part for main_part in main_parts))
+    ]
+    purposes_by_action: dict[str, dict[str, None]] = {}
+    for action, purpose in actions_and_purposes:
+        purposes_by_action.setdefault(capitalise_first(action), {})[purpose] = None
+    return tuple(
+        LoggingAdvice(action, tuple(purposes)) for action, purposes in purposes_by_action.items()
+    )

@@ -1,0 +1,265 @@
+"""Tables of a flight for ``px4fuse extract``, with a data dictionary of all columns."""
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from io import StringIO
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from msgspec import structs
+
+from px4fuse.comparison.preparation import choose_source, select_innovations
+from px4fuse.core.text import to_json_types
+from px4fuse.errors import MissingDataError
+from px4fuse.filter.signals import ned_acceleration
+from px4fuse.flight.model import Ekf2, Flight, PositionTrack, Truth, Unavailable
+
+SCHEMA_NAME = "px4fuse-flight"
+SCHEMA_VERSION = "1.0"
+# Components of a vector or quaternion, by the word that represents them in columns.csv
+COMPONENTS = {
+    "AXIS": ("north", "east", "down"),
+    "BODY": ("forward", "right", "down"),
+    "WXYZ": ("w", "x", "y", "z"),
+}
+DICTIONARY_COLUMNS = ["table", "column", "unit", "frame", "meaning", "source_topic", "clock"]
+# Characters of track names that are not used in file names, as some systems do not allow them
+_UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9_-]+")
+# Maximum length (characters) of a table name, which is a file name
+MAX_NAME_LENGTH = 80
+NO_POSITION = Unavailable(
+    "external position",
+    "the log contains no position track. px4fuse info LOG lists settings to log one",
+    "",
+)
+
+
+@dataclass(frozen=True)
+class DescribedTable:
+    """Exported table; ``columns`` has one row of the data dictionary per column of ``data``."""
+
+    name: str
+    data: pd.DataFrame
+    columns: pd.DataFrame
+
+
+def with_best_source(flight: Flight) -> Flight:
+    """Return the flight with the EKF2 innovations of the default position source."""
+    try:
+        return select_innovations(flight, choose_source(flight)[0])
+    except MissingDataError:
+        return flight
+
+
+def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:
+    """Return the tables of a flight: one row per sample, one unit per column.
+
+    Returns
+    -------
+    mapping from table name to DataFrame
+        The first column of a time series is ``time_s``. Table names are valid file names. Data that
+        are missing in the log have no table; see :func:`unavailable_parts`.
+    """
+    return {table.name: table.data for table in _tables(flight)}
+
+
+def data_dictionary(flight: Flight) -> pd.DataFrame:
+    """Return the data dictionary, with one row per column of every table.
+
+    Returns
+    -------
+    DataFrame
+        Columns of :data:`DICTIONARY_COLUMNS`; units are ASCII.
+    """
+    descriptions = [table.columns for table in _tables(flight)]
+    if not descriptions:
+        return pd.DataFrame(columns=DICTIONARY_COLUMNS)
+    return pd.concat(descriptions, ignore_index=True)[DICTIONARY_COLUMNS]
+
+
+def unavailable_parts(flight: Flight) -> tuple[Unavailable, ...]:
+    """List the missing data of a flight, which have no table, with the reasons."""
+    ekf2 = flight.ekf2
+    sections: list[object] = [flight.imu, flight.attitude, ekf2]
+    if isinstance(ekf2, Ekf2):
+        sections += [*ekf2.innovations.values(), ekf2.variance, ekf2.fusing]
+    if not any(isinstance(section, Unavailable) for section in (flight.imu, flight.attitude)):
+        sections.append(ned_acceleration(flight))
+    sections += [flight.airborne, flight.truth]
+    unavailable = [section for section in sections if isinstance(section, Unavailable)]
+    if not flight.positions:
+        unavailable.append(NO_POSITION)
+    return tuple(dict.fromkeys(unavailable))
+
+
+def description(flight: Flight) -> dict[str, Any]:
+    """Return log, topics, clocks and missing data of a flight, in JSON types for flight.json."""
+    ekf2 = flight.ekf2
+    description_fields: dict[str, Any] = {
+        "schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION},
+        "log": flight.log,
+        "streams": flight.streams,
+        "positions": [
+            {"table": table, **track.description_fields()} for table, track in _named_tracks(flight)
+        ],
+        "ekf2": {"gate": ekf2.gate, "notes": ekf2.notes} if isinstance(ekf2, Ekf2) else None,
+        "clocks": flight.clocks,
+        "missing": tuple(dict.fromkeys((*unavailable_parts(flight), *flight.missing))),
+        "unused": flight.unused,
+        "inputs": flight.inputs,
+    }
+    data: dict[str, Any] = to_json_types(description_fields)
+    return data
+
+
+@cache
+def _column_descriptions() -> pd.DataFrame:
+    """Read columns.csv: unit, frame and meaning of each column, indexed by table."""
+    lines = files("px4fuse.info").joinpath("columns.csv").read_text("utf-8").splitlines()
+    for word, names in COMPONENTS.items():
+        lines = [
+            line.replace(word, name)
+            for line in lines
+            for name in (names if word in line else [word])
+        ]
+    return pd.read_csv(StringIO("\n".join(lines)), index_col="table", keep_default_na=False)
+
+
+def _table(
+    name: str,
+    data: pd.DataFrame,
+    origin: tuple[tuple[str, ...], str] = ((), ""),
+    described_name: str = "",
+    **values: str,
+) -> DescribedTable:
+    """Make a table with the columns that columns.csv lists for it.
+
+    Parameters
+    ----------
+    origin : (tuple of str, str)
+        Topics and clock of the data.
+    described_name : str
+        Name of the table in columns.csv; by default ``name``.
+    **values
+        Values for the names in braces in columns.csv.
+    """
+    tables_in_csv = ["any table"] * ("time_s" in data) + [described_name or name]
+    columns = _column_descriptions().loc[tables_in_csv].map(lambda cell: cell.format(**values))
+    topics, clock = origin
+    columns = columns.assign(table=name, source_topic=" ".join(topics), clock=clock)
+    return DescribedTable(name, data.reindex(columns=columns["column"].tolist()), columns)
+
+
+def _stream_table(
+    flight: Flight, name: str, data: pd.DataFrame | Unavailable
+) -> Iterator[DescribedTable]:
+    if isinstance(data, pd.DataFrame):
+        yield _table(name, _with_time_column(data), _topics_and_clock(flight, name))
+
+
+def _with_time_column(data: pd.DataFrame) -> pd.DataFrame:
+    return data.rename_axis("time_s").reset_index()
+
+
+def _tables(flight: Flight) -> Iterator[DescribedTable]:
+    yield from _stream_table(flight, "imu", flight.imu)
+    yield from _stream_table(flight, "attitude", flight.attitude)
+    acceleration = ned_acceleration(flight)
+    if isinstance(acceleration, pd.DataFrame):
+        data = acceleration.set_axis(["north_m_s2", "east_m_s2", "down_m_s2"], axis=1)
+        imu, clock = _topics_and_clock(flight, "imu")
+        attitude, _ = _topics_and_clock(flight, "attitude")
+        yield _table("acceleration_ned", _with_time_column(data), ((*imu, *attitude), clock))
+    for name, track in _named_tracks(flight):
+        values = {"frame": track.frame, "description": track.description}
+        origin = (track.topics, track.clock)
+        yield _table(name, _with_time_column(track.samples), origin, "position", **values)
+        if track.orientation is not None:
+            orientation_table = _with_time_column(track.orientation)
+            yield _table(
+                f"orientation_{name.partition('_')[2]}",
+                orientation_table,
+                origin,
+                "orientation",
+                **values,
+            )
+    if isinstance(flight.ekf2, Ekf2):
+        yield from _ekf2_tables(flight, flight.ekf2)
+    if isinstance(flight.truth, Truth):
+        yield from _stream_table(flight, "truth", flight.truth.samples)
+    log = flight.log
+    if not isinstance(flight.airborne, Unavailable):
+        spans = _numeric_table(["time_s", "end_s"], flight.airborne)
+        yield _table("airborne", spans, _topics_and_clock(flight, "airborne"))
+    if log.dropouts:
+        rows = [(dropout.start_s, dropout.duration_s) for dropout in log.dropouts]
+        yield _table("dropouts", _numeric_table(["time_s", "duration_s"], rows))
+    if parameters := _parameters(flight):
+        yield _table("parameters", pd.DataFrame(parameters.items(), columns=["name", "value"]))
+    if flight.clocks:
+        clock_table = pd.DataFrame([structs.asdict(clock) for clock in flight.clocks])
+        # the column must be float, because distinct_stamps is NaN for a usable clock
+        yield _table("clocks", clock_table.astype({"distinct_stamps": np.float64}))
+
+
+def _parameters(flight: Flight) -> dict[str, float]:
+    """Return the PX4 parameters that the log, the EKF2 replay and the aiding sources use."""
+    logged_values = dict(flight.log.parameters)
+    if isinstance(flight.ekf2, Ekf2):
+        for record_or_aid in (flight.ekf2.record, *flight.ekf2.aids.values()):
+            logged_values |= (
+                {} if isinstance(record_or_aid, Unavailable) else record_or_aid.parameters
+            )
+    return logged_values
+
+
+def _numeric_table(columns: list[str], rows: Iterable[tuple[float, ...]]) -> pd.DataFrame:
+    return pd.DataFrame(list(rows), columns=columns, dtype=np.float64)
+
+
+def _ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
+    yield from _stream_table(flight, "ekf2_state", ekf2.state)
+    yield from _stream_table(flight, "ekf2_variance", ekf2.variance)
+    axis_tables = [
+        axis_innovations.assign(axis=axis)
+        for axis, axis_innovations in ekf2.innovations.items()
+        if isinstance(axis_innovations, pd.DataFrame)
+    ]
+    if axis_tables:
+        innovation_table = pd.concat(axis_tables).sort_index(kind="stable")
+        yield from _stream_table(flight, "ekf2_innovations", innovation_table)
+    yield from _stream_table(flight, "ekf2_fusing", ekf2.fusing)
+    origin = _topics_and_clock(flight, "ekf2_state")
+    deltas = [reset.delta for reset in ekf2.resets]
+    resets = _numeric_table(["delta_north", "delta_east", "delta_down"], deltas)
+    resets["time_s"] = np.array([reset.time_s for reset in ekf2.resets], np.float64)
+    resets["quantity"] = np.array([reset.quantity for reset in ekf2.resets], object)
+    yield _table("resets", resets, origin)
+    # the start time of the first EKF2 instance is minus infinity in a Flight
+    first_time_s = min(float(ekf2.state.index[0]), 0.0)
+    instance_rows = [(max(time_s, first_time_s), instance) for time_s, instance in ekf2.instances]
+    instances = _numeric_table(["time_s", "instance"], instance_rows).astype({"instance": np.int64})
+    yield _table("instances", instances, origin)
+
+
+def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
+    """Yield each position track with a table name; ignoring case, all names are different."""
+    used_names: set[str] = set()
+    for track in flight.positions:
+        # with the prefix, no name is one that Windows reserves (con, aux, ...)
+        stem = _UNSAFE_CHARACTERS.sub("_", f"position_{track.name}")[:MAX_NAME_LENGTH].rstrip("_")
+        name, number = stem, 1
+        while name.lower() in used_names:
+            number += 1
+            name = f"{stem}_{number}"
+        used_names.add(name.lower())
+        yield name, track
+
+
+def _topics_and_clock(flight: Flight, part: str) -> tuple[tuple[str, ...], str]:
+    stream = flight.streams.get(part)
+    return ((), "") if stream is None else (stream.topics, stream.clock)

@@ -1,0 +1,380 @@
+"""Answer form in which a student names the mistakes of a flight: questions, and reading.
+
+``form.toml`` lists the allowed answers. Reading checks the syntax, not whether answers are right.
+"""
+
+import hashlib
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from px4fuse.core.reading import read_text
+from px4fuse.core.record import Record, Sha256, table
+from px4fuse.errors import SettingsError
+
+# Maximum size (bytes) of an answer form and maximum length (characters) of its lines: tomllib needs
+# seconds and gigabytes for a dotted key of 64 kB
+MAX_FORM_BYTES, MAX_LINE_LENGTH = 20_000, 500
+MAX_MISTAKES = 20
+NO_MISTAKE_KIND = "none"
+EMPTY_CELL = "\u2013"
+
+
+class MistakeKind(Record, frozen=True, rename={"size_quantity": "in"}):
+    """Mistake that a flight can have: description, quantity of its size, and allowed sizes.
+
+    ``range``: smallest and largest size, in the first unit of the quantity.
+    """
+
+    description: str
+    size_quantity: str = ""
+    range: tuple[float, float] = (-1e6, 1e6)
+
+    @property
+    def units(self) -> Mapping[str, float]:
+        """Factors that convert each unit of the size to the first unit; empty without a size."""
+        return _UNITS[self.size_quantity]
+
+
+class FormChoices(Record, frozen=True):
+    """Allowed answers of the answer form (``form.toml``); ``renamed``: new names of old answers."""
+
+    behaviours: tuple[str, ...]
+    panels: tuple[str, ...]
+    units: dict[str, dict[str, float]]
+    mistakes: dict[str, MistakeKind]
+    corrections: dict[str, str]
+    renamed: dict[str, str]
+
+
+_CHOICES = table(__file__, "form.toml", FormChoices)
+_UNITS: Mapping[str, Mapping[str, float]] = {"": {}, **_CHOICES.units}
+MISTAKES, EKF2_BEHAVIOURS, PANELS = _CHOICES.mistakes, _CHOICES.behaviours, _CHOICES.panels
+# Corrections of mistakes that a form can name, with the units of their values (empty: no value)
+CORRECTIONS = {name: _UNITS[units] for name, units in _CHOICES.corrections.items()}
+VERDICTS = ("consistent", "overconfident", "underconfident")
+
+Number = Annotated[float, Meta(gt=-1e9, lt=1e9)]
+Unit = Annotated[str, Meta(max_length=10)]
+VerdictWord = Literal["", "consistent", "overconfident", "underconfident"]
+# Answer to a question about a number: the number, a list of update numbers, or None (left blank)
+QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
+
+
+class StudentMistake(Record, frozen=True):
+    """Mistake of a flight that a student names in the answer form.
+
+    Attributes
+    ----------
+    kind : str
+        One of :data:`MISTAKES`.
+    size : float or None
+        Size of the mistake with sign, in ``unit``.
+    when : str
+        "whole flight", or empty if ``from_s`` and ``until_s`` (s since the first data) are given.
+    parameter : str
+        Correction of the mistake, one of :data:`CORRECTIONS`, with its ``value`` in ``value_unit``.
+    panel : str
+        Panel of the report that shows the mistake, one of :data:`PANELS`.
+    """
+
+    kind: str
+    size: Number | None = None
+    unit: Unit = ""
+    when: Literal["", "whole flight"] = ""
+    from_s: Number | None = None
+    until_s: Number | None = None
+    parameter: str = ""
+    value: Number | None = None
+    value_unit: Unit = ""
+    panel: str = ""
+
+    def size_in_first_unit(self) -> float | None:
+        """Convert the size to the first unit of the mistake, such as a factor of 1.05 to 5 %."""
+        units = MISTAKES[self.kind].units
+        if self.size is None or not units:
+            return None
+        if self.unit == "factor" and self.kind == "scale":
+            return (self.size - 1.0) * 100.0
+        return self.size * (units[self.unit] if self.unit else next(iter(units.values())))
+
+    def value_in_first_unit(self) -> float | None:
+        """Convert the value of the correction to the first unit of its parameter, cm to m."""
+        units = CORRECTIONS.get(self.parameter, {})
+        if self.value is None or not units:
+            return self.value
+        return self.value * units.get(self.value_unit, 1.0)
+
+
+class Answers(Record, frozen=True, kw_only=True):
+    """Student's answers about one flight; answers left blank are absent.
+
+    Attributes
+    ----------
+    log_sha256 : str
+        SHA-256 of the flight log.
+    verdict_kf, verdict_ekf2 : str
+        Verdict on the reported σ of KF and EKF2, one of :data:`VERDICTS`.
+    ekf2_did : tuple of str
+        Behaviour of EKF2, from :data:`EKF2_BEHAVIOURS`.
+    quantities : tuple of (float, tuple of float, or None)
+        Answers to :func:`draw_questions`; a tuple lists update numbers.
+    """
+
+    log_sha256: Sha256
+    mistakes: Annotated[tuple[StudentMistake, ...], Meta(max_length=MAX_MISTAKES)] = ()
+    verdict_kf: VerdictWord = ""
+    verdict_ekf2: VerdictWord = ""
+    ekf2_did: Annotated[tuple[str, ...], Meta(max_length=len(EKF2_BEHAVIOURS))] = ()
+    quantities: Annotated[tuple[QuantityAnswer, ...], Meta(max_length=10)] = ()
+
+    @property
+    def names_no_mistake(self) -> bool:
+        """True if the form states that the flight has no mistake."""
+        return [mistake.kind for mistake in self.mistakes] == [NO_MISTAKE_KIND]
+
+
+QuestionKind = Literal["gain", "variance", "innovation", "nis", "prediction", "gate"]
+# Quantities that the questions of a form can request: one of each pair is drawn at random
+_QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
+    ("gain", "variance"),
+    ("innovation", "nis"),
+    ("prediction", "gate"),
+)
+
+
+class FormQuestion(Record, frozen=True):
+    """Question to the student about a number of KF that no report prints.
+
+    Attributes
+    ----------
+    kind : str
+        Requested quantity along the main horizontal axis of the flight ("aisle").
+    update : int
+        Number of the KF update, from 1; the first measurement sets the state and is not counted.
+    sigma_a_m_s2, sigma_z_m : float
+        Settings of KF for this question.
+    duration_or_gate : float
+        For "prediction": time without measurement (s). For "gate": gate (in √S).
+    """
+
+    kind: QuestionKind
+    update: int
+    sigma_a_m_s2: float
+    sigma_z_m: float
+    duration_or_gate: float = 0.0
+
+    @property
+    def text(self) -> str:
+        """Question as the answer form prints it."""
+        update, number = self.update, f"{self.duration_or_gate:g}"
+        quantity = {
+            "gain": f"position gain of update {update}",
+            "variance": f"position variance after update {update} (m²)",
+            "innovation": f"innovation of update {update} (m)",
+            "nis": f"NIS of update {update}",
+            "prediction": f"position sigma (m) {number} s after update {update}, no measurement",
+            "gate": f"list of the updates {update} to {update + GATE_UPDATES} with an innovation "
+            f"outside {number} sqrt(S); KF uses these updates, too",
+        }[self.kind]
+        return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
+
+
+# Number of KF updates that a question about the innovation gate covers
+GATE_UPDATES = 20
+
+
+def draw_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
+    """Draw three questions at random, with the SHA-256 of the log as seed."""
+    random_bytes = iter(hashlib.sha256(f"px4fuse answers {log_sha256}".encode()).digest())
+
+    def draw_between(low: float, high: float, decimals: int) -> float:
+        return round(low + (high - low) * next(random_bytes) / 255.0, decimals)
+
+    settings = (draw_between(0.2, 0.45, 2), draw_between(0.06, 0.14, 3))
+    first_kind, second_kind, third_kind = (pair[next(random_bytes) % 2] for pair in _QUESTION_PAIRS)
+    limits = (1.0, 4.0) if third_kind == "prediction" else (1.3, 2.0)
+    duration_or_gate = draw_between(*limits, 1)
+    return (
+        FormQuestion(first_kind, 2 + next(random_bytes) % 7, *settings),
+        FormQuestion(second_kind, 20 + next(random_bytes) % 130, *settings),
+        FormQuestion(third_kind, 20 + next(random_bytes) % 100, *settings, duration_or_gate),
+    )
+
+
+def read_answers(path: Path) -> Answers:
+    """Read the answer form of a student and check its syntax.
+
+    Raises
+    ------
+    SettingsError
+        The file is not an answer form, or an answer is not allowed.
+    """
+    text = read_text(path, SettingsError, MAX_FORM_BYTES, name=str(path))
+    if any(len(line) > MAX_LINE_LENGTH for line in text.splitlines()):
+        raise SettingsError(f"{path}: a line has more than {MAX_LINE_LENGTH} characters.")
+    try:
+        answers = msgspec.convert(_as_record(tomllib.loads(text)), Answers)
+        check_answers(answers)
+    except (tomllib.TOMLDecodeError, RecursionError, msgspec.ValidationError, ValueError) as error:
+        raise SettingsError(f"{path}: {error}", "Correct the form with the answers.") from error
+    return answers
+
+
+def _as_record(form: dict[str, Any]) -> dict[str, Any]:
+    filled_form = _without_blanks(update_renamed_values(form))
+    mistakes = filled_form.pop("mistake", ())
+    quantities = msgspec.convert(filled_form.pop("quantities", {}), dict[str, Any])
+    names = [f"q{number}" for number in range(1, len(draw_questions("")) + 1)]
+    if unknown_fields := sorted({*quantities, *({"mistakes"} & filled_form.keys())} - set(names)):
+        raise ValueError(f"the field {unknown_fields[0]} is not one of mistake, {', '.join(names)}")
+    return {
+        **filled_form,
+        "mistakes": mistakes,
+        "quantities": tuple(quantities.get(name) for name in names),
+    }
+
+
+def update_renamed_values(value: Any) -> Any:
+    """Replace names and values of answer forms and answer keys written before schema version 4."""
+    if isinstance(value, dict):
+        return {
+            update_renamed_values(key): update_renamed_values(part) for key, part in value.items()
+        }
+    if isinstance(value, list):
+        return [update_renamed_values(part) for part in value]
+    return _CHOICES.renamed.get(value, value) if isinstance(value, str) else value
+
+
+def _without_blanks(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_blanks(part) for key, part in value.items() if part != ""}
+    if isinstance(value, list):
+        return [part for part in map(_without_blanks, value) if part not in ("", {})]
+    return value
+
+
+def check_answers(answers: Answers) -> None:
+    """Raise ValueError if an answer is not allowed, out of range, or names a mistake twice."""
+    kinds = [student_mistake.kind for student_mistake in answers.mistakes]
+    for kind in kinds:
+        _require_choice("kind", kind, MISTAKES)
+        if kinds.count(kind) > 1:
+            raise ValueError(f"kind {kind!r} is given twice; give each kind of mistake once")
+    if NO_MISTAKE_KIND in kinds and len(kinds) > 1:
+        raise ValueError('kind "none" is given together with a mistake; give only one of them')
+    for behaviour in answers.ekf2_did:
+        _require_choice("ekf2_did", behaviour, EKF2_BEHAVIOURS)
+    for student_mistake in answers.mistakes:
+        mistake = MISTAKES[student_mistake.kind]
+        for field, choices in (
+            ("parameter", CORRECTIONS),
+            ("panel", PANELS),
+            ("unit", mistake.units),
+            ("value_unit", CORRECTIONS.get(student_mistake.parameter)),
+        ):
+            value = getattr(student_mistake, field)
+            if value and choices is not None:
+                _require_choice(f"{student_mistake.kind}: {field}", value, choices)
+        low, high = mistake.range
+        size = student_mistake.size_in_first_unit()
+        if size is not None and not low <= size <= high:
+            unit, limits = next(iter(mistake.units)), f"{low:g} to {high:g}"
+            raise ValueError(
+                f"{student_mistake.kind}: size {size:g} is out of range ({limits} {unit})"
+            )
+
+
+def _require_choice(field: str, value: str, choices: Any) -> None:
+    if value not in choices:
+        allowed = _join_quoted(choices)
+        reason = f"is not one of {allowed}" if allowed else "is not allowed: leave this field empty"
+        raise ValueError(f"{field} {value!r} {reason}")
+
+
+def form_name(log_name: str) -> str:
+    """Return the file name of the answer form of a log.
+
+    >>> form_name("s07.ulg")
+    's07.answers.toml'
+    """
+    return f"{Path(log_name).stem}.answers.toml"
+
+
+def form_text(log_name: str, log_sha256: str) -> str:
+    """Return an empty answer form (TOML) for a log; its comments list all allowed answers."""
+    template = Template(
+        files("px4fuse.results").joinpath("answer_form.toml").read_text(encoding="utf-8")
+    )
+    questions = [
+        f'# {question.text}\nq{number} = ""{"    # such as [61, 64]" * (question.kind == "gate")}'
+        for number, question in enumerate(draw_questions(log_sha256), start=1)
+    ]
+    kinds = (
+        f"{name:13} {mistake.description}{_format_units(mistake.units)}"
+        for name, mistake in MISTAKES.items()
+    )
+    return template.substitute(
+        log=log_name,
+        form=form_name(log_name),
+        sha256=log_sha256,
+        verdicts=_join_quoted(VERDICTS),
+        behaviours=_format_block(_format_in_threes(EKF2_BEHAVIOURS)),
+        kinds=_format_block(kinds),
+        corrections=_format_block(name + _format_units(CORRECTIONS[name]) for name in CORRECTIONS),
+        panels=_format_block(_format_in_threes(PANELS)),
+        questions="\n".join(questions),
+    )
+
+
+def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
+    """Yield question and answer of each row of a completed form, for the PDF and the class page."""
+    yield "Verdict on KF", answers.verdict_kf or EMPTY_CELL
+    yield "Verdict on EKF2", answers.verdict_ekf2 or EMPTY_CELL
+    yield "Behaviour of EKF2", ", ".join(answers.ekf2_did) or EMPTY_CELL
+    for mistake in answers.mistakes:
+        size_units = MISTAKES.get(mistake.kind, MistakeKind("")).units
+        value_units = CORRECTIONS.get(mistake.parameter, {})
+        value = _format_number_with_unit(mistake.value, mistake.value_unit, value_units)
+        from_text = "" if mistake.from_s is None else f"from {mistake.from_s:g} s"
+        until_text = "" if mistake.until_s is None else f"until {mistake.until_s:g} s"
+        details = (
+            _format_number_with_unit(mistake.size, mistake.unit, size_units),
+            mistake.when or f"{from_text} {until_text}".strip(),
+            f"shown in {mistake.panel}" if mistake.panel else "",
+            f"{mistake.parameter} {value}".strip(),
+        )
+        yield mistake.kind, "; ".join(filter(None, details)) or EMPTY_CELL
+    for question, answer in zip(
+        draw_questions(answers.log_sha256), answers.quantities, strict=False
+    ):
+        numbers = answer if isinstance(answer, tuple) else (answer,)
+        numbers_text = ", ".join(f"{number:g}" for number in numbers if number is not None)
+        yield question.text, numbers_text or EMPTY_CELL
+
+
+def _format_number_with_unit(number: float | None, unit: str, units: Mapping[str, float]) -> str:
+    return "" if number is None else f"{number:g} {unit or next(iter(units), '')}".rstrip()
+
+
+def _format_units(units: Mapping[str, float]) -> str:
+    unit_text = ", ".join(filter(None, units))
+    return f" [{unit_text}]" if unit_text else ""
+
+
+def _format_block(lines: Iterable[str]) -> str:
+    return "\n".join(f"#     {line}" for line in lines)
+
+
+def _join_quoted(names: Iterable[str]) -> str:
+    return ", ".join(f'"{name}"' for name in names)
+
+
+def _format_in_threes(names: tuple[str, ...]) -> Iterator[str]:
+    return (_join_quoted(names[start : start + 3]) for start in range(0, len(names), 3))
