@@ -41,7 +41,6 @@ from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth
 from px4fuse.comparison.projection import project_horizon
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import improvement
-from px4fuse.core.arrays import Array
 from px4fuse.core.reading import display_name, file_size, read_head
 from px4fuse.core.text import lower_first, with_log_name
 from px4fuse.ekf2.inputs import horizontal_resets_s
@@ -238,8 +237,11 @@ def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:
 
 
 def _make_effect(analysis: Analysis) -> Effect:
-    result, has_ekf2 = analysis.main, isinstance(analysis.flight.ekf2, Ekf2)
-    difference = result.difference
+    result, difference = analysis.main, analysis.main.difference
+    reset_count, flight = None, analysis.segment.flight
+    if isinstance(analysis.flight.ekf2, Ekf2):
+        resets_s = horizontal_resets_s(analysis.flight.ekf2)
+        reset_count = int(((flight.start_s < resets_s) & (resets_s <= flight.end_s)).sum())
     return Effect(
         axis=describe_axis(analysis, result),
         position_rmse_m={
@@ -250,15 +252,8 @@ def _make_effect(analysis: Analysis) -> Effect:
         horizontal_rmse_m=_horizontal_rmse_m(analysis),
         difference_rms_m=None if isinstance(difference, Unavailable) else difference.position_rms_m,
         rejected_fraction=result.rejected_fraction,
-        horizontal_resets=len(horizontal_resets(analysis)) if has_ekf2 else None,
+        horizontal_resets=reset_count,
     )
-
-
-def horizontal_resets(analysis: Analysis) -> Array:
-    """Return the times (s) of EKF2's horizontal position resets in the segment."""
-    ekf2, segment = analysis.flight.ekf2, analysis.segment.flight
-    times = horizontal_resets_s(ekf2) if isinstance(ekf2, Ekf2) else np.empty(0)
-    return times[(segment.start_s < times) & (times <= segment.end_s)]
 
 
 def describe_axis(analysis: Analysis, result: AxisComparison) -> str:

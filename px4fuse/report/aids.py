@@ -13,6 +13,7 @@ from px4fuse.flight.model import AidLog, Flight, Unavailable, step_values_at
 from px4fuse.report import style
 from px4fuse.report.event_marks import GROUND_BAND
 from px4fuse.report.page import Cell, Page, appendix_title
+from px4fuse.report.panels import draw_dots
 from px4fuse.report.phrases import format_sigma_verdict, write_findings
 
 TITLE = "Aiding sources of EKF2"
@@ -21,8 +22,7 @@ LEAD_TEXT = (
     "Time-correlated errors, wrong delays and wrong headings hardly change the NIS."
 )
 AID_PANEL_HEIGHT = 21.0  # height (points) of the axes of one aiding source
-MAX_NORMALISED = 4.0  # larger normalised innovations ν/√S are drawn at the edge of the axes
-MAX_DRAWN_INNOVATIONS = 400  # maximum number of drawn innovations per component of an aiding source
+MAX_NORMALISED = 4.0  # normalised innovations ν/√S beyond are drawn as triangles
 # Aiding sources that add this page to a comparison, if EKF2 fused one of them
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
@@ -139,7 +139,7 @@ def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) 
     page.write_small(
         "95 % of the normalised innovations ν/√S are expected within ±2 (lines). Hollow samples "
         "were not fused; in grey times fusion was disabled. Values beyond "
-        f"±{MAX_NORMALISED:g} are drawn at the edge."
+        f"±{MAX_NORMALISED:g} are drawn as triangles."
     )
     for name in fused_names:
         _draw_aid_panel(
@@ -157,13 +157,8 @@ def _draw_aid_panel(
     )
     for axis in log.axes:
         normalised = samples[f"innovation_{axis}"] / np.sqrt(samples[f"variance_{axis}"])
-        clipped = normalised.clip(-MAX_NORMALISED, MAX_NORMALISED).to_numpy()
         for mask, dot_style in ((is_fused, style.EKF2_DOTS), (~is_fused, style.EKF2_REJECTED)):
-            if mask.any():
-                dots = style.decimate_series(
-                    samples.index.to_numpy()[mask], clipped[mask], MAX_DRAWN_INNOVATIONS
-                )
-                axes.plot(*dots, **dot_style | {"ms": 1.4})
+            draw_dots(axes, normalised[mask], MAX_NORMALISED, dot_style | {"ms": 1.4})
     for limit in (-2.0, 2.0):
         axes.axhline(limit, color="black", lw=0.4, ls=(0, (1, 1.5)))
     if log.enabled is not None:

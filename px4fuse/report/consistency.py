@@ -89,7 +89,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         _draw_histogram(left, series)
         _draw_autocorrelation(right, series)
         for axes in (left, right):
-            draw_legend_above(axes, handlelength=1.4)
+            draw_legend_above(axes)
         page.add_columns(left_page, right_page)
     else:
         kf_summary = result.filters["kf"]

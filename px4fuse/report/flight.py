@@ -13,11 +13,11 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison
 from px4fuse.core.record import Span
 from px4fuse.filter.signals import Segment
-from px4fuse.report import event_marks, panels, style
+from px4fuse.report import panels, style
 from px4fuse.report.difference_page import unexplained_note
 from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page
 from px4fuse.report.phrases import filters_by_name, verdict_notes
-from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, Artist, Axes
+from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, Axes
 
 ZOOM_UPDATES = 15
 MIN_ZOOM_S = 1.0
@@ -28,29 +28,13 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw position and velocity along the main axis over time."""
     result = analysis.main
     page = Page(f"Position and velocity along {result.axis.label}")
-    _write_legend(page, analysis)
+    panels.add_legend(page, analysis)
     panels.POSITION.draw_on_page(
         page, analysis, result, with_time_label=False, with_mode_names=True
     )
     panels.VELOCITY.draw_on_page(page, analysis, result, with_time_label=True)
     page.write(unexplained_note(analysis), above=6.0)
     yield page
-
-
-def _write_legend(page: Page, analysis: Analysis) -> None:
-    from matplotlib.lines import Line2D  # noqa: PLC0415
-    from matplotlib.patches import Patch  # noqa: PLC0415
-
-    result = analysis.main
-    lines: list[Artist] = [
-        Line2D([], [], **{**style.MEASUREMENT_DOTS, "ms": 5.0}, label="measurement"),
-        Line2D([], [], **LINES["KF"], label="KF"),
-        Patch(facecolor=style.KF_BAND_COLOUR, lw=0, label="KF ±2σ"),
-    ]
-    for name, track in (("EKF2", result.ekf2_state), ("ground truth", result.truth)):
-        if isinstance(track, pd.DataFrame):
-            lines.append(Line2D([], [], **LINES[name], label=name))
-    page.legend([*lines, *event_marks.legend_entries(analysis)])
 
 
 def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:

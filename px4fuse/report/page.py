@@ -258,16 +258,16 @@ def appendix_title(title: str) -> str:
     return f"Appendix: {title[0].lower()}{title[1:]}"
 
 
-def draw_legend_above(axes: Axes, column_count: int = 9, **options: Any) -> None:
+def draw_legend_above(axes: Axes) -> None:
     """Draw the legend of a panel above its axes, at the right."""
     axes.legend(
         loc="lower right",
         bbox_to_anchor=(1.0, 1.0),
-        ncols=column_count,
+        ncols=9,
         borderaxespad=0.0,
         borderpad=0.1,
         columnspacing=1.2,
-        **options,
+        handlelength=1.4,
     )
 
 

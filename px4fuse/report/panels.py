@@ -14,9 +14,17 @@ from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.consistency import Consistency
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks, style
-from px4fuse.report.page import Page
+from px4fuse.report.page import Block, Page
 from px4fuse.report.phrases import filters_by_name, format_verdict
-from px4fuse.report.style import DOTS, LINES, Axes, draw_curve, draw_sigma_band, set_log_scale
+from px4fuse.report.style import (
+    DOTS,
+    LINES,
+    Artist,
+    Axes,
+    draw_curve,
+    draw_sigma_band,
+    set_log_scale,
+)
 
 NARROW_HEIGHT = 72.0  # points; height of the axes in the three-column appendix
 # Half height of the innovation axes: EDGE_FACTOR times the larger of 2√S and the 99 % quantile of
@@ -92,6 +100,23 @@ class Panel(NamedTuple):
             axes.locator_params(axis="x", nbins=4)
         self.draw(axes, result.in_flight)
         page.write_small(numbers)
+
+
+def add_legend(page: Page, analysis: Analysis) -> Block:
+    """Add the legend of the tracks and events of a flight."""
+    from matplotlib.lines import Line2D  # noqa: PLC0415
+    from matplotlib.patches import Patch  # noqa: PLC0415
+
+    result = analysis.main
+    lines: list[Artist] = [
+        Line2D([], [], **{**style.MEASUREMENT_DOTS, "ms": 5.0}, label="position"),
+        Line2D([], [], **LINES["KF"], label="KF"),
+        Patch(facecolor=style.KF_BAND_COLOUR, lw=0, label="±2σ reported"),
+    ]
+    for name, track in (("EKF2", result.ekf2_state), ("ground truth", result.truth)):
+        if isinstance(track, pd.DataFrame):
+            lines.append(Line2D([], [], **LINES[name], label=name))
+    return page.legend([*lines, *event_marks.legend_entries(analysis)])
 
 
 def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
@@ -172,6 +197,18 @@ def normalised_innovations(result: AxisComparison) -> dict[str, pd.Series[float]
     }
 
 
+def draw_dots(
+    axes: Axes, values: pd.Series[float], limit: float, marker_style: dict[str, Any]
+) -> None:
+    """Draw dots up to a limit on both sides of zero, and triangles there for values beyond it."""
+    draw_curve(axes, values[values.abs() <= limit], **marker_style)
+    for sign, marker in ((1.0, "^"), (-1.0, "v")):
+        beyond = values[sign * values > limit]
+        triangles = {**marker_style, "marker": marker, "ms": 3.2, "clip_on": False}
+        if len(beyond):
+            draw_curve(axes, 0.0 * beyond + sign * limit, **triangles)
+
+
 def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     """Draw the innovations of KF and EKF2 with ±2√S; rejected ones are hollow."""
     half_height, updates, ekf2_innovations = (
@@ -195,22 +232,8 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
             *dots,
         ]
     for values, marker_style in dots:
-        draw_curve(axes, values[values.abs() <= half_height], **marker_style)
-        for sign, marker in ((1.0, "^"), (-1.0, "v")):
-            outside_times = values.index[sign * values > half_height]
-            edge_style: dict[str, Any] = {
-                **marker_style,
-                "marker": marker,
-                "ms": 3.2,
-                "clip_on": False,
-            }
-            if len(outside_times):
-                axes.plot(
-                    outside_times,
-                    np.full(len(outside_times), sign * 0.96 * half_height),
-                    **edge_style,
-                )
-    axes.set_ylim(-half_height, half_height)
+        draw_dots(axes, values, half_height, marker_style)
+    axes.set_ylim(-1.04 * half_height, 1.04 * half_height)
 
 
 def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
