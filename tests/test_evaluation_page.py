@@ -21,7 +21,6 @@ from px4fuse.report.evaluation import (
     quarters_sentence,
     rpe_growth_sentence,
     unaligned_sentence,
-    worst_poses_sentence,
 )
 from px4fuse.report.page import Page
 from px4fuse.report.style import report_style
@@ -109,14 +108,6 @@ def test_rmse_per_quarter_of_growing_error_equals_integral() -> None:
     expected = np.sqrt((ends[1:] ** 3 - ends[:-1] ** 3) / 3.0)
     np.testing.assert_allclose(quarter_rmse(score), expected, rtol=0.01)
     assert ", ".join(f"{q:.3f}" for q in quarter_rmse(score)) in quarters_sentence(score)
-
-
-@pytest.mark.parametrize(("error", "share"), [
-    (np.full(2000, 0.3), "10%"), (np.arange(2000) // 100 == 7, "100%"), (np.zeros(2000), "0%"),
-], ids=["even", "a peak", "none"])  # fmt: skip
-def test_evaluation_report_states_error_of_worst_tenth_of_poses(error, share) -> None:
-    sentence = worst_poses_sentence(evaluate_with_error(across(error.astype(np.float64))))
-    assert f"contribute {share} of the squared error" in sentence
 
 
 @pytest.mark.parametrize(("kind", "times"), [("noise", 1.0), ("walk", 10**0.5), ("scale", 10.0)])

@@ -34,7 +34,6 @@ from px4fuse.card.model import (
     Note,
     Verdict,
 )
-from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.card.verdicts import verdicts as make_verdicts
 from px4fuse.comparison.flight_events import MIN_GAP_S
 from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth
@@ -42,7 +41,7 @@ from px4fuse.comparison.projection import project_horizon
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import improvement
 from px4fuse.core.reading import display_name, file_size, read_head
-from px4fuse.core.text import lower_first, with_log_name
+from px4fuse.core.text import format_metres, format_ratio, lower_first, with_log_name
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.filter.consistency import classify_ratio

@@ -6,7 +6,7 @@ RMSE, or if no re-run can show its effect. A change of a filter is proposed only
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from msgspec import structs
 
@@ -124,16 +124,13 @@ def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCaus
         ranked_causes.append(
             RankedCause(finding, _cause_rank(finding, trials), sum(map(reduction, trials)), trials)
         )
-    has_cause = any(trial.finding.id not in VERDICT_FINDINGS for trial in ranked_causes)
-    ranked_causes = [
-        trial for trial in ranked_causes if not (has_cause and trial.finding.id in VERDICT_FINDINGS)
-    ]
+    faults = [cause for cause in ranked_causes if cause.finding.id not in VERDICT_FINDINGS]
     return sorted(
-        ranked_causes,
-        key=lambda trial: (
-            trial.tier,
-            trial.tier in (1, 2, 3) and _is_setting(trial.finding),
-            -trial.reduction,
+        faults or ranked_causes,
+        key=lambda cause: (
+            cause.tier,
+            cause.tier in (1, 2, 3) and _is_setting(cause.finding),
+            -cause.reduction,
         ),
     )
 
@@ -172,7 +169,7 @@ def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial,
 
 
 def can_show_effect(trial: Trial) -> bool:
-    """Return False if only ground truth, which is missing, could show the effect of a re-run."""
+    """Return False if the effect of a re-run is visible only in ground truth and there is none."""
     has_truth = trial.before.position_rmse_m is not None
     return has_truth or UNSEEN_CHANGE_KINDS.isdisjoint(trial.kinds) or has_effect(trial)
 
@@ -207,14 +204,10 @@ def make_plain_cause(finding: Finding) -> Cause:
         id=finding.id,
         severity="error" if finding.severity == "error" else "warning",
         title=finding.title,
-        why=_cause_reason(finding),
+        why=finding.message.removeprefix(finding.title).lstrip(". "),
         spans_s=finding.spans_s,
         actions=(Action(_target_of(finding), finding.remedy),) if finding.remedy else (),
     )
-
-
-def _cause_reason(finding: Finding) -> str:
-    return finding.message.removeprefix(finding.title).lstrip(". ")
 
 
 def _make_actions(
@@ -225,13 +218,8 @@ def _make_actions(
     request: ComparisonRequest,
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
     """Return the alternatives, of which one action is enough, and the other actions."""
-    finding, by_kind = (
-        ranked_cause.finding,
-        {
-            (useful_trial.filter, useful_trial.kinds[0]): useful_trial
-            for useful_trial in useful_trials
-        },
-    )
+    finding = ranked_cause.finding
+    by_kind = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
     alternatives: tuple[tuple[Action, ...], ...] = ()
     actions: list[Action] = []
     general_action = None
@@ -349,24 +337,23 @@ def set_parameters(analysis: Analysis, change: Mapping[str, float]) -> Action:
 
 
 def _rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
-    ratios_before, ratios_after = ratios(trial.before), ratios(trial.after)
-    rejected_fractions = _change_pair(trial.before.rejected_fraction, trial.after.rejected_fraction)
+    before, after = trial.before, trial.after
+    ratios_before, ratios_after = ratios(before), ratios(after)
+    pairs: dict[str, Any] = {
+        "position_rmse_m": (before.position_rmse_m, after.position_rmse_m),
+        "source_ratio": (ratios_before.get("source"), ratios_after.get("source")),
+        "truth_ratio": (ratios_before.get("truth"), ratios_after.get("truth")),
+    }
+    rejected_fractions = before.rejected_fraction or 0.0, after.rejected_fraction or 0.0
+    if max(rejected_fractions) >= MIN_SHOWN_REJECTION:
+        pairs["rejected_fraction"] = before.rejected_fraction, after.rejected_fraction
     return Rerun(
         label=_trial_label(trial, trials),
         is_prediction=trial.filter == "ekf2",
         from_s=trial.from_s,
-        position_rmse_m=_change_pair(trial.before.position_rmse_m, trial.after.position_rmse_m),
-        source_ratio=_change_pair(ratios_before.get("source"), ratios_after.get("source")),
-        truth_ratio=_change_pair(ratios_before.get("truth"), ratios_after.get("truth")),
-        rejected_fraction=rejected_fractions
-        if rejected_fractions and max(rejected_fractions) >= MIN_SHOWN_REJECTION
-        else None,
         improves=improvement(trial),
+        **{name: pair for name, pair in pairs.items() if None not in pair},
     )
-
-
-def _change_pair(before: float | None, after: float | None) -> tuple[float, float] | None:
-    return None if before is None or after is None else (before, after)
 
 
 def _trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
@@ -402,15 +389,11 @@ def _closing_sentence(
         return "Both values are consistent; the default needs no option."
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     for trial in useful_trials:
-        name = next(iter(trial.change))
         if trial.kinds != ("noise",) or not isinstance(horizontal_tuning, AxisTuning):
             continue
-        default = analysis.flight.log.default_of(name)
-        if (
-            (horizontal_tuning.sigma_z.low or 0.0)
-            <= default
-            <= (horizontal_tuning.sigma_z.high or 0.0)
-        ):
+        default = analysis.flight.log.default_of(next(iter(trial.change)))
+        sigma_z = horizontal_tuning.sigma_z
+        if (sigma_z.low or 0.0) <= default <= (sigma_z.high or 0.0):
             return f"PX4's default, {default:g} m, is inside the 95 % interval: it is as good."
     ratios_after = [
         math.sqrt(trial.after.nees_mean) for trial in useful_trials if trial.after.nees_mean

@@ -1,5 +1,6 @@
 """Summary of a report (headline, verdicts, causes, actions); part of the JSON results."""
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
@@ -25,6 +26,16 @@ MAX_CAUSES = 3
 # Maximum number of notes that cover and terminal print; further ones are counted
 MAX_NOTES = 3
 MAX_HEADLINE_LENGTH = 84
+
+
+def axis_fraction(ratio: float) -> float:
+    """Return the place of a ratio of actual to reported σ on the logarithmic axis (0 to 1).
+
+    >>> axis_fraction(0.1), axis_fraction(1.0), axis_fraction(10.0)
+    (0.0, 0.5, 1.0)
+    """
+    low, high = (math.log10(end) for end in AXIS_ENDS)
+    return (math.log10(ratio) - low) / (high - low)
 
 
 class Verdict(Record, frozen=True, kw_only=True):

@@ -16,8 +16,8 @@ from msgspec import structs
 
 from px4fuse.card.build import build_card
 from px4fuse.card.model import Card
-from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.core.record import Record, table
+from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.diagnose import diagnose
 from px4fuse.explore.data import flight_data
 from px4fuse.explore.packing import Packer

@@ -49,15 +49,12 @@ class Cell:
         Second line in small print.
     style_class : str
         "" for text, "flags" for one flag per line, else the CSS class of a label.
-    bar : float or None
-        Length of a bar below the text, 0 to 1.
     """
 
     text: str = ""
     value: float | str | None = None
     below: str = ""
     style_class: str = ""
-    bar: float | None = None
 
 
 def text_cell(text: str, text_below: str = "") -> Cell:
@@ -232,8 +229,7 @@ def page(
 def _compact(cell: Cell) -> list[Any]:
     """Return the fields of a cell as a list without empty ends; value True: equal to the text."""
     value = True if cell.value == cell.text else "" if cell.value is None else cell.value
-    bar = "" if cell.bar is None else round(cell.bar, 3)
-    fields = [cell.text, value, cell.below, cell.style_class, bar]
+    fields = [cell.text, value, cell.below, cell.style_class]
     while fields and fields[-1] == "":
         fields.pop()
     return fields

@@ -11,9 +11,9 @@ from markupsafe import Markup
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card, describe_axis
-from px4fuse.card.model import AXIS_TICKS, SIGMA_RATIO_BANDS, Action, Card, Rerun, Verdict
-from px4fuse.card.numbers import axis_fraction, format_ratio
+from px4fuse.card.model import AXIS_TICKS, SIGMA_RATIO_BANDS, Card, Rerun, Verdict, axis_fraction
 from px4fuse.card.verdicts import verdicts
+from px4fuse.core.text import format_ratio
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import Reference
 from px4fuse.html.safe import load_template, read_asset
@@ -22,6 +22,8 @@ from px4fuse.report.card_text import (
     LABELLED_TICKS,
     MARKS,
     QUANTITIES,
+    SEVERITY_SIGNS,
+    band_limits,
     format_spans,
     format_target,
     marked_actions,
@@ -30,13 +32,6 @@ from px4fuse.report.card_text import (
     with_typed_path,
 )
 
-SEVERITY_SIGNS = {
-    "error": "■ ERROR",
-    "warning": "▲ WARNING",
-    "note": "● NOTE",
-    "clean": "✓ NO FAULT",
-    "refused": "✕ REFUSED",
-}
 # SVG paths of the mark of a ratio; triangles mark ratios beyond the ends of the axis
 MARK_PATHS = {
     "source": "M-5.5 0a5.5 5.5 0 1 0 11 0a5.5 5.5 0 1 0-11 0",
@@ -85,16 +80,7 @@ def card_html(
         more=" and ".join(
             text for text, parts in (("causes", card.causes), ("notes", card.notes)) if parts
         ).capitalize(),
-        first_actions=[
-            row for row in marked_actions(card.causes[0]) if _is_alternative_or_command(row)
-        ]
-        if card.causes
-        else [],
-        rows_of=lambda cause: [
-            row
-            for row in marked_actions(cause)
-            if cause is not card.causes[0] or not _is_alternative_or_command(row)
-        ],
+        marked_actions=marked_actions,
         rerun_rows=_rerun_rows,
         signs=SEVERITY_SIGNS,
         target=format_target,
@@ -140,17 +126,6 @@ def axis_figures(analysis: Analysis) -> str:
     )
 
 
-def band_limits() -> str:
-    """Format the limits of the consistent ratios against source and ground truth.
-
-    >>> band_limits()
-    '● 0.8 to 1.25, ◆ 0.67 to 1.5'
-    """
-    return ", ".join(
-        f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in SIGMA_RATIO_BANDS.items()
-    )
-
-
 def card_style() -> str:
     """Return the style sheet of the card; its colours are in ``html/colours.css``."""
     return read_asset("card.css", "px4fuse.report")
@@ -178,10 +153,6 @@ def alternative_text(verdicts: Sequence[Verdict]) -> str:
 def _value(verdict: Verdict) -> str:
     explained = ", explained" if verdict.is_explained else ""
     return f"{format_ratio(verdict.ratio or 0.0)}, {verdict.word}{explained}"
-
-
-def _is_alternative_or_command(row: tuple[str, Action]) -> bool:
-    return bool(row[0] or row[1].commands)
 
 
 def _rerun_rows(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:

@@ -3,13 +3,14 @@
 Commands and the headline never wrap; other texts wrap with a hanging indent.
 """
 
+import json
 import re
 import shlex
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-from msgspec.structs import replace
+from msgspec import convert, to_builtins
 
 from px4fuse.card.model import (
     AXIS_TICKS,
@@ -21,8 +22,9 @@ from px4fuse.card.model import (
     Cause,
     Rerun,
     Verdict,
+    axis_fraction,
 )
-from px4fuse.card.numbers import axis_fraction, format_metres, format_ratio
+from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.consistency import Reference
 from px4fuse.request import quote_command
 
@@ -37,8 +39,13 @@ LABELLED_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
 MARKS = {"source": "●", "truth": "◆"}
 QUANTITIES = {"source": "source: innovation ÷ √S", "truth": "ground truth: error ÷ σ"}
 FILTER_NAMES = {"kf": "KF", "ekf2": "EKF2"}
-# Severities that a headline names differently
-SEVERITY_LABELS = {"clean": "ok", "note": "note"}
+SEVERITY_SIGNS = {
+    "error": "■ ERROR",
+    "warning": "▲ WARNING",
+    "note": "● NOTE",
+    "clean": "✓ NO FAULT",
+    "refused": "✕ REFUSED",
+}
 STYLES = {"error": "bold red", "warning": "bold yellow", "note": "cyan", "clean": "bold green"}
 # Replacements of characters for terminals whose encoding lacks them
 ASCII_REPLACEMENTS = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/--23x") | str.maketrans(
@@ -145,38 +152,14 @@ def with_typed_path(card: Card, path: str | None) -> Card:
     >>> with_typed_path(card, "my logs/a.ulg").causes[0].actions[0].commands
     ("px4fuse compare 'my logs/a.ulg' --sigma-z 1",)
     """
-    if path is None or path == card.identity.file:
+    if path is None:
         return card
-    name = card.identity.file
-
-    pattern = re.compile(rf"(px4fuse \w+ ){re.escape(shlex.quote(name))}")
-
-    def with_path(text: str) -> str:
-        return pattern.sub(lambda match: f"{match[1]}{quote_command([path])}", text)
-
-    def typed(action: Action) -> Action:
-        commands = tuple(
-            quote_command([path if word == name else word for word in shlex.split(command)])
-            if action.where == "shell"
-            else command
-            for command in action.commands
-        )
-        return replace(action, commands=commands, sentence=with_path(action.sentence))
-
-    causes = tuple(
-        replace(
-            cause,
-            actions=tuple(map(typed, cause.actions)),
-            alternatives=tuple(tuple(map(typed, group)) for group in cause.alternatives),
-        )
-        for cause in card.causes
+    name, typed_name = (
+        json.dumps(text)[1:-1] for text in (shlex.quote(card.identity.file), quote_command([path]))
     )
-    return replace(
-        card,
-        causes=causes,
-        do_this=tuple(map(with_path, card.do_this)),
-        notes=tuple(replace(note, action=with_path(note.action)) for note in card.notes),
-    )
+    command = re.compile(rf"(px4fuse \w+ ){re.escape(name)}")
+    content = command.sub(lambda match: match[1] + typed_name, json.dumps(to_builtins(card)))
+    return convert(json.loads(content), Card)
 
 
 def to_ascii(text: str) -> str:
@@ -186,6 +169,17 @@ def to_ascii(text: str) -> str:
     'error / sigma 7.2 -> 1.2'
     """
     return text.translate(ASCII_REPLACEMENTS)
+
+
+def band_limits() -> str:
+    """Format the limits of the consistent ratios against source and ground truth.
+
+    >>> band_limits()
+    '● 0.8 to 1.25, ◆ 0.67 to 1.5'
+    """
+    return ", ".join(
+        f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in SIGMA_RATIO_BANDS.items()
+    )
 
 
 def axis_text(ratio: float | None, reference: Reference) -> str:
@@ -225,7 +219,7 @@ def _identity_line(card: Card) -> Iterator[Line]:
 
 def headline(card: Card) -> Iterator[Line]:
     """Yield the line with severity, id and headline."""
-    label = SEVERITY_LABELS.get(card.severity, card.severity)
+    label = "ok" if card.severity == "clean" else card.severity
     name = f"{label}[{card.id}]" if card.id else label
     yield Line(f"{name}: {card.headline}", STYLES[card.severity])
 
@@ -338,10 +332,7 @@ def _verdict_axis(card: Card) -> Iterator[Line]:
     yield Line("")
     heading = "Reported uncertainty: RMS of actual ÷ reported"
     yield from _wrapped_lines(f"{heading}{axis_text}", "", "  ")
-    limits = ", ".join(
-        f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in SIGMA_RATIO_BANDS.items()
-    )
-    legend = f"  ░ consistent ({limits})"
+    legend = f"  ░ consistent ({band_limits()})"
     sides = f"{'σ too large':<{AXIS_WIDTH // 2}}{'σ too small':>{AXIS_WIDTH - AXIS_WIDTH // 2}}"
     yield Line(f"{'':{AXIS_INDENT}}{sides}")
     yield Line(f"{legend:{AXIS_INDENT}}{_ticks_line()}")

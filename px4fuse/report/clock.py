@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable, Iterator
 
+import numpy as np
+
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.remedy import aid_of, delay_ms
@@ -64,36 +66,23 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
         advice["Result"] = f"The position timestamps are {abs(offset):.3f} s {side}."
         typed_offset = clock_offset_option_s(comparison, clock)
         advice["Re-run"] = f"px4fuse compare LOG --clock-offset {typed_offset:.3f}"
-    configured_delay_ms, delay_name = delay_ms(comparison), aid_of(comparison).delay
-    age_s = comparison.source.age_s
-    min_delay_s, max_delay_s = age_s - high, age_s - low
-    if (
-        configured_delay_ms is not None
-        and min_delay_s - NEGLIGIBLE_OFFSET_S
-        <= configured_delay_ms * 1e-3
-        <= max_delay_s + NEGLIGIBLE_OFFSET_S
-    ):
-        advice["PX4"] = f"{delay_name} {configured_delay_ms:g} ms is within the 95 % interval."
-    elif (
-        configured_delay_ms is not None and 1e3 * (age_s - offset) > PARAMETERS[delay_name].maximum
-    ):
-        advice["PX4"] = (
-            f"{delay_name} cannot exceed {PARAMETERS[delay_name].maximum:g} ms. Correct the "
-            "sender's clock."
-        )
-    elif configured_delay_ms is not None and offset > age_s and configured_delay_ms <= 0.0:
-        advice["PX4"] = (
-            f"The maximum-likelihood {delay_name} is {1e3 * (age_s - offset):.0f} ms, but "
-            f"{delay_name} cannot be negative. Correct the sender's clock."
-        )
-    elif configured_delay_ms is not None:
-        ml_delay_ms, min_ms, max_ms = (
-            max(1e3 * s, 0.0) for s in (age_s - offset, min_delay_s, max_delay_s)
-        )
-        advice["PX4"] = (
-            f"Set {delay_name} to {ml_delay_ms:.0f} ms (now {configured_delay_ms:g} ms; 95 % "
-            f"{min_ms:.0f} to {max_ms:.0f} ms), or correct the sender's clock."
-        )
+    delay_name, age_s = aid_of(comparison).delay, comparison.source.age_s
+    if (configured_delay_ms := delay_ms(comparison)) is not None:
+        ml_delay_ms, min_ms, max_ms = (1e3 * (age_s - s) for s in (offset, high, low))
+        largest_ms, tolerance_ms = PARAMETERS[delay_name].maximum, 1e3 * NEGLIGIBLE_OFFSET_S
+        if min_ms - tolerance_ms <= configured_delay_ms <= max_ms + tolerance_ms:
+            advice["PX4"] = f"{delay_name} {configured_delay_ms:g} ms is within the 95 % interval."
+        elif max_ms < 0.0 or min_ms > largest_ms:
+            advice["PX4"] = (
+                f"The maximum-likelihood {delay_name} is {ml_delay_ms:.0f} ms, but PX4 allows 0 to "
+                f"{largest_ms:g} ms. Correct the sender's clock."
+            )
+        else:
+            best_ms, min_ms, max_ms = np.clip((ml_delay_ms, min_ms, max_ms), 0.0, largest_ms)
+            advice["PX4"] = (
+                f"Set {delay_name} to {best_ms:.0f} ms (now {configured_delay_ms:g} ms; 95 % "
+                f"{min_ms:.0f} to {max_ms:.0f} ms), or correct the sender's clock."
+            )
     if clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P:
         offset_texts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)
         advice["Changes"] = (

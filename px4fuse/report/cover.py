@@ -16,8 +16,9 @@ from px4fuse.card.model import (
     Card,
     Cause,
     Verdict,
+    axis_fraction,
 )
-from px4fuse.card.numbers import axis_fraction, format_ratio
+from px4fuse.core.text import format_ratio
 from px4fuse.filter.consistency import Reference
 from px4fuse.report import fonts
 from px4fuse.report.card_text import (
@@ -26,6 +27,8 @@ from px4fuse.report.card_text import (
     MARKS,
     MAX_COMMAND_LENGTH,
     QUANTITIES,
+    SEVERITY_SIGNS,
+    band_limits,
     format_spans,
     marked_actions,
     note_texts,
@@ -41,8 +44,6 @@ from px4fuse.results.contract import AidsResults, ComparisonResults
 # Maximum number of changed settings in the head; with more, their number is printed
 MAX_CHANGED_SETTINGS = 3
 MAX_FILE_LENGTH = 56  # maximum number of characters of the file name in the head
-SEVERITY_SIGNS = {"error": "■", "warning": "▲", "note": "●", "clean": "✓"}
-SEVERITY_WORDS = {"error": "ERROR", "warning": "WARNING", "note": "NOTE", "clean": "NO FAULT"}
 AXIS_TITLE = "Is the reported uncertainty right?"
 AXIS_TEXT = "RMS of actual ÷ reported"
 TERMS_NOTE = (
@@ -80,7 +81,6 @@ def add_card(page: Page, card: Card) -> Block:
     return page.add(
         "cover",
         sign=SEVERITY_SIGNS[card.severity],
-        word=SEVERITY_WORDS[card.severity],
         colour=SEVERITY_COLOURS[card.severity],
         file=_shorten_middle(identity.file),
         student=[text for text in (identity.student, identity.student_id) if text],
@@ -138,18 +138,13 @@ def _format_changed(changed_options: Sequence[str]) -> str:
 
 def _axis_data(card: Card) -> dict[str, Any]:
     """Return the heading and the rows of the logarithmic axis of σ ratios."""
-    limits = [
-        f"{MARKS[name]} {low:g} to {high:g}"
-        for name, (low, high) in SIGMA_RATIO_BANDS.items()
-        if name == "source" or not card.aids
-    ]
     intervals = "" if card.aids else " · ├─┤ 95 % interval"
     ends = " and ".join(AXIS_TICKS[end] for end in AXIS_ENDS)
     axis_text = f", {card.effect.axis}" if card.effect else ""
     return {
         "axis_title": AXIS_TITLE,
         "axis_text": AIDS_HEADING if card.aids else f"{AXIS_TEXT}{axis_text}",
-        "axis_legend": f"grey: consistent ({', '.join(limits)}){intervals} · ◀ ▶ beyond {ends}",
+        "axis_legend": f"grey: consistent ({band_limits()}){intervals} · ◀ ▶ beyond {ends}",
         "ticks": [
             {"fraction": axis_fraction(tick), "label": label} for tick, label in AXIS_TICKS.items()
         ],

@@ -13,10 +13,10 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import Card
-from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.comparison.comparison import kf_state_and_variance, position_errors, reported_sigma
 from px4fuse.comparison.model import FILTERS, AxisComparison
 from px4fuse.core.arrays import Array
+from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.signals import AISLE, cut_to_segment
 from px4fuse.flight.model import Ekf2, Truth
 from px4fuse.report import event_marks, style

@@ -1,7 +1,6 @@
 """Page on trajectory errors: map coloured by error, APE and RPE (the names of the tool evo)."""
 
 from collections.abc import Iterator, Mapping
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +10,7 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.report import style
 from px4fuse.report.page import PAGE_WIDTH, Page, halves
-from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Axes, Colormap
+from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Axes
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
 from px4fuse.trajectory.scores import Interval, PairwiseError, Statistics
@@ -36,8 +35,6 @@ REFERENCE_LINE = style.line_style(TRUTH_COLOUR, 0.8, (0, (4, 2)))
 STATISTIC_LINES = (
     ("max", "max", style.line_style(MUTED_COLOUR, 0.8, (0, (1, 1.5)))),
     ("rmse", "RMSE", style.line_style(EKF2_COLOUR, 1.4)),
-    ("mean", "mean", style.line_style("black", 0.9, (0, (5, 2)))),
-    ("median", "median", style.line_style("black", 0.9, (0, (5, 1.5, 1, 1.5)))),
 )
 NEGLIGIBLE_ERROR_M = 1e-6  # smaller errors are rounding errors
 SHADES_CAPTION = "Darker poses have a larger error; × marks the largest one."
@@ -52,17 +49,6 @@ ERROR_TABLE_HEAD = (
     "n",
     "rotation\nRMSE (°)",
 )
-
-
-@cache
-def error_colours() -> Colormap:
-    """Return a colour map from light to dark that stays readable in grey and on white."""
-    import matplotlib as mpl  # noqa: PLC0415
-    from matplotlib.colors import LinearSegmentedColormap  # noqa: PLC0415
-
-    rgba = mpl.colormaps["YlOrRd"](np.linspace(0.3, 1.0, 128)) * (1.0, 1.0, 1.0, 1.0)
-    rgba[:, :3] *= np.linspace(1.0, 0.55, 128)[:, np.newaxis]
-    return LinearSegmentedColormap.from_list("error", rgba)
 
 
 class View(NamedTuple):
@@ -155,7 +141,7 @@ def draw_path(axes: Axes, evaluation: Evaluation, view: View) -> None:
         path[::stride, 1],
         c=error[::stride],
         s=9.0,
-        cmap=error_colours(),
+        cmap="copper_r",  # from light to dark, readable in grey and on white
         linewidths=0,
         vmin=0.0,
         vmax=max(float(error.max()), MIN_ERROR_RANGE_M),
@@ -189,7 +175,6 @@ def _draw_panels(page: Page, evaluation: Evaluation) -> None:
     axes = left.panel("APE over time (m)", "", PANEL_HEIGHT)
     draw_ape(axes, evaluation, *time_from_start(evaluation))
     page.legend(axes.get_legend_handles_labels()[0])
-    left.write_small(worst_poses_sentence(evaluation))
     axes = right.panel("APE over distance (m)", "", PANEL_HEIGHT)
     draw_ape(axes, evaluation, evaluation.distance_m, "distance along the reference (m)")
     right.write_small(quarters_sentence(evaluation))
@@ -202,7 +187,7 @@ def _draw_panels(page: Page, evaluation: Evaluation) -> None:
 
 
 def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) -> None:
-    """Draw the APE with its RMSE, mean, median and maximum as horizontal lines."""
+    """Draw the APE with its RMSE and maximum as horizontal lines."""
     error, low, high = evaluation.position_error_m, float(x_values[0]), float(x_values[-1])
     shown_along, values = style.decimate_series(x_values, error, style.MAX_POINTS_NARROW)
     gap_indices = np.searchsorted(shown_along, x_values[_gap_indices(evaluation.time_s)])
@@ -360,18 +345,6 @@ def vertical_error_sentence(evaluation: Evaluation, axis: int) -> str:
     return (
         f"Along {name} the RMSE is {format_metres(float(np.sqrt(squares[axis])))}: "
         f"{squares[axis] / squares.sum():.0%} of the squared error."
-    )
-
-
-def worst_poses_sentence(evaluation: Evaluation) -> str:
-    """State the fraction of the squared error that the worst 10 % of the poses contribute."""
-    squared_errors = np.sort(evaluation.position_error_m**2)
-    worst_share = squared_errors[-max(1, len(squared_errors) // 10) :].sum() / max(
-        squared_errors.sum(), NEGLIGIBLE_ERROR_M**2
-    )
-    return (
-        f"The worst 10 % of the poses contribute {worst_share:.0%} of the squared error. "
-        "A constant error contributes 10 %; a few large errors contribute much more."
     )
 
 

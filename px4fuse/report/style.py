@@ -20,10 +20,9 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
-    from matplotlib.colors import Colormap
 else:  # importing matplotlib takes 0.3 s, which text-only commands save
-    Artist = Axes = Colormap = Any
-__all__ = ["Artist", "Axes", "Colormap"]  # matplotlib types for annotations
+    Artist = Axes = Any
+__all__ = ["Artist", "Axes"]  # matplotlib types for annotations
 
 FONT = "DejaVu Sans"
 STYLE_SHEET = Path(__file__).with_name("report.mplstyle")
