@@ -165,9 +165,9 @@
   });
   headRow.append(...heads);
 
-  const draw = (count = size) => {
+  const draw = () => {
     for (const entry of entries) entry.row = null;
-    const shown = matches.slice(firstShown, firstShown + count);
+    const shown = matches.slice(firstShown, firstShown + size);
     body.replaceChildren(...shown.map(makeRow));
     for (const entry of shown) unfold(entry, entry.open);
     const last = Math.ceil(matches.length / size);
@@ -282,11 +282,6 @@
     box.addEventListener("change", groups);
   }
   addEventListener("resize", fit);
-  addEventListener("beforeprint", () => {
-    firstShown = 0;
-    draw(matches.length);
-  });
-  addEventListener("afterprint", () => draw());
   document.documentElement.classList.add("live");
   for (const node of queryAll(".controls, .keys")) node.hidden = false;
   frame.prepend(listTable);

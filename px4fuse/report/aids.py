@@ -60,7 +60,7 @@ def draw_aids_only(analysis: AidsOnlyAnalysis, _: object) -> Iterator[Page]:
 def write_aids_only(page: Page, analysis: AidsOnlyAnalysis, findings: tuple[Finding, ...]) -> None:
     """Write the table of EKF2's aiding sources and the findings."""
     write_aids(page, analysis.aids)
-    page.heading("Findings", 10.5, above=12.0)
+    page.heading("Findings")
     write_findings(page, findings)
 
 
@@ -135,7 +135,7 @@ def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) 
     if isinstance(flight.ekf2, Unavailable) or isinstance(span, Unavailable):
         return
     fused_names = [name for name, aid in aids.items() if aid.verdict != "disabled"]
-    page.heading("Normalised innovations of each aiding source", above=8.0)
+    page.heading("Normalised innovations of each aiding source")
     page.write_small(
         "95 % of the normalised innovations ν/√S are expected within ±2 (lines). Hollow samples "
         "were not fused; in grey times fusion was disabled. Values beyond "

@@ -120,7 +120,7 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
             "same positions, so it is not used."
         ),
     )
-    page.write_labelled_texts(clock_advice(analysis, clock), size=8.5)
+    page.write_labelled_texts(clock_advice(analysis, clock))
     (low, high), estimate_s = clock.interval_s, clock.offset_s
     curve_sentence = (
         f"Maximum at {estimate_s:+.3f} s; 95 % interval {low:+.3f} to {high:+.3f} s. The "

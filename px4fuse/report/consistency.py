@@ -95,7 +95,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         kf_summary = result.filters["kf"]
         reason = kf_summary.reason if isinstance(kf_summary, Unavailable) else "too few innovations"
         page.write(f"The consistency along {axis_text} is not tested: {reason}.")
-    page.heading("All axes", above=12.0)
+    page.heading("All axes")
     head = [*VERDICT_HEAD, "n", "beyond\n2√S", "t of\nmean", "lag 1", "Ljung-\nBox"]
     page.table(
         head,
@@ -126,7 +126,7 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
             )
     if not rows:
         return
-    page.heading(f"Tested causes along {axis.label}", above=12.0)
+    page.heading(f"Tested causes along {axis.label}")
     head = ["filter", "change", "quantity", "as flown", "with change", "explains"]
     page.table(head, rows, right_aligned_columns=(3, 4))
     page.write(

@@ -51,7 +51,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     )
     for name, explanation in explanations.items():
         if isinstance(explanation, Unavailable):
-            page.heading(f"{name}: no result", 9.5, above=10.0)
+            page.heading(f"{name}: no result")
             page.write(f"{capitalise_first(explanation.reason)}. {explanation.remedy}")
         else:
             _draw_axis(page, name, explanation, analysis)
@@ -119,7 +119,7 @@ def _draw_axis(
     page: Page, name: str, explanation: DifferenceExplanation, analysis: Analysis
 ) -> None:
     spans = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in explanation.spans_s)
-    page.heading(f"{name}, {spans}", 9.5, above=10.0)
+    page.heading(f"{name}, {spans}")
     for sentence in explanation.sentences:
         page.write(sentence, size=8.5, above=1.0)
     names = [step.name for step in explanation.steps]

@@ -9,7 +9,7 @@ from px4fuse.core.arrays import Array, IntArray
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.report import style
-from px4fuse.report.page import PAGE_WIDTH, Page, halves
+from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page, halves
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Axes
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
@@ -29,7 +29,8 @@ MAX_FLAT_RATIO = 0.1
 MIN_GAP_STEPS = 10.0
 MAX_PATH_POINTS = 1200
 MIN_ERROR_RANGE_M = 1e-3  # minimum range of an error axis, so that rounding errors look small
-PANEL_HEIGHT, MAP_HEIGHT, MAP_GAP = 76.0, 128.0, 16.0  # heights and gap (points)
+PANEL_HEIGHT = 76.0  # height (points) of the axes of an error
+MAP_HEIGHT = 128.0  # height (points) of the axes of a map
 MAX_DELTA_LABELS = 12
 REFERENCE_LINE = style.line_style(TRUTH_COLOUR, 0.8, (0, (4, 2)))
 STATISTIC_LINES = (
@@ -105,7 +106,7 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     """Draw both paths before alignment, and in each view the aligned path coloured by error."""
     map_views, is_aligned = path_views(evaluation), evaluation.alignment != "none"
     count = len(map_views) + is_aligned
-    width = (PAGE_WIDTH - MAP_GAP * (count - 1)) / count
+    width = (PAGE_WIDTH - COLUMN_GAP * (count - 1)) / count
     columns, estimate_handle = [], []
     if is_aligned:
         columns.append(Page(width=width))
@@ -129,7 +130,7 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
             SHADES_CAPTION if view is map_views[0] else vertical_error_sentence(evaluation, view.up)
         )
     page.legend([*axes.get_legend_handles_labels()[0], *estimate_handle])
-    page.add_columns(*columns, gap=MAP_GAP)
+    page.add_columns(*columns)
 
 
 def draw_path(axes: Axes, evaluation: Evaluation, view: View) -> None:

@@ -82,7 +82,7 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
 def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
     write_loop(page, loop, findings)
     _draw_map(page, loop)
-    page.heading("Closures and scores", 10.5, above=14.0)
+    page.heading("Closures and scores")
     page.write(
         (
             "d²: squared Mahalanobis distance of the closure given drift and closure "
@@ -232,7 +232,7 @@ def write_scores(page: Page, loop: Loop) -> None:
         evaluations = {
             name: score for name, score in scores.items() if isinstance(score, Evaluation)
         }
-        page.heading(f"RPE against {reference.name}", 10.5, above=14.0)
+        page.heading(f"RPE against {reference.name}")
         missing_reasons = (
             score.reason for score in scores.values() if isinstance(score, Unavailable)
         )

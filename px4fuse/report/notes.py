@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from markdown_it.token import Token
     from markdown_it.tree import SyntaxTreeNode
 
-BODY_SIZE = 8.5
 HEADING_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
 INDENT = 12.0  # points
 MAX_INDENTS = 8
@@ -118,12 +117,12 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, mark: str
     indent = INDENT * min(indent_level, MAX_INDENTS)
     children = node.children
     if mark and (not children or children[0].type.endswith("_list")):
-        page.write("", size=BODY_SIZE, indent=indent, mark=mark)
+        page.write("", indent=indent, mark=mark)
         mark = ""
     for child in children:
         match child.type:
             case "heading":
-                size = HEADING_SIZES.get(child.tag, BODY_SIZE)
+                size = HEADING_SIZES.get(child.tag, 8.0)
                 page.write(_inline_text(child), size=size, bold=True, indent=indent, above=6.0)
             case "bullet_list" | "ordered_list":
                 first_number = int(child.attrs.get("start", 1))
@@ -142,14 +141,10 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, mark: str
                 head, *body = ([_inline_text(cell) for cell in row] for row in rows)
                 page.table(head, body, column_widths=[1.0] * len(head))
             case "html_block":
-                page.write(
-                    TAG_PATTERN.sub("", child.content).strip(), size=BODY_SIZE, indent=indent
-                )
+                page.write(TAG_PATTERN.sub("", child.content).strip(), indent=indent)
             case _:  # paragraphs; a horizontal rule has no text
                 above = 0.0 if mark else 2.0
-                page.write(
-                    _inline_text(child), size=BODY_SIZE, indent=indent, mark=mark, above=above
-                )
+                page.write(_inline_text(child), indent=indent, mark=mark, above=above)
         mark = ""
 
 

@@ -143,7 +143,7 @@ def _write_section(
     """Write a heading, then labelled and plain texts in small print; nothing without texts."""
     labelled_texts, plain_texts = list(labelled_texts), list(plain_texts)
     if labelled_texts or plain_texts:
-        page.heading(title, 9.5, above=9.0)
+        page.heading(title)
     for label, text in labelled_texts:
         page.write_labelled(
             label,
