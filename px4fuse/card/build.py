@@ -56,7 +56,7 @@ from px4fuse.flight.model import Ekf2, Unavailable, source_name
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
 
 MAX_ACTIONS = 3
-# Minimum fraction of positions rejected by EKF2 that the effect on the card states
+# Minimum fraction of positions rejected by EKF2 for a sentence on the card
 MIN_NAMED_REJECTION = 0.01
 BETTER_POSITION = ("position and σ", "position")
 # Aiding sources whose √S is usually too large with PX4's default noises, which is no fault
@@ -65,15 +65,15 @@ DRIFT_HIDES_ERROR = (
     "σ too large against the source is not a fault here: the source may drift, and innovations do "
     "not show drift. Do not lower the noises for it."
 )
-# Number of first bytes that the card of an unreadable log shows, and those of each ULog
-SHOWN_BYTE_COUNT, ULOG_HEAD = 4, "55 4C 6F 67"
+SHOWN_BYTE_COUNT = 4  # number of bytes of an unreadable log that its card shows
+ULOG_HEAD = "55 4C 6F 67"  # first bytes of each ULog
 HEADING_HIDES_ERROR = (
     "Both filters rotate the measured acceleration by the wrong heading and return to the position "
     "at each update, so the innovations show only a part of the error."
 )
 UNEXPLAINED_DIFFERENCE = "The two verdicts differ, and no tested change explains it."
 NO_FAULT_HEADLINE = "No fault found: KF and EKF2 are consistent"
-# Findings about the source with the sentence on verdicts that differ
+# Explanation of differing verdicts, by the ids of findings about the position source
 SENTENCES_BY_SOURCE_FAULT = (
     (
         {"source_axes_wrong", "source_orientation_wrong", "source_unit_wrong"},
@@ -158,7 +158,7 @@ def build_card(
 def build_aids_card(
     analysis: AidsOnlyAnalysis, request: ComparisonRequest, student: tuple[str, str] = ("", "")
 ) -> Card:
-    """Build the card of a flight without a position source, from EKF2's aiding sources."""
+    """Build the card of a flight without a position source."""
     roots = [group[0] for group in group_by_root(analysis.findings)]
     faults = [finding for finding in roots if finding.severity != "note"]
     causes = tuple(make_plain_cause(finding) for finding in faults[:MAX_CAUSES])
@@ -189,7 +189,7 @@ def build_aids_card(
 def build_refusal_card(error: LogError | MissingDataError, path: Path) -> Card:
     """Build the card of a log that cannot be analysed: fault, first bytes of the file, and fix."""
     facts = {}
-    with suppress(LogError):  # without access to the file, the error states the reason
+    with suppress(LogError):  # the headline states the reason if the file cannot be read
         head = read_head(path, SHOWN_BYTE_COUNT, LogError).hex(" ").upper()
         size = file_size(path, LogError)
         facts["read"] = f"{size:,} bytes, beginning with {head} (ULog: {ULOG_HEAD})"
@@ -329,7 +329,7 @@ def _bracketed_lengths(label: str, lengths_m: Mapping[FilterName, float]) -> str
 
 
 def _action_sentences(causes: Sequence[Cause]) -> tuple[str, ...]:
-    """Return at most three actions, with the number of the cause if there are several causes."""
+    """Return at most three recommended actions."""
     texts: list[str] = []
     for number, cause in enumerate(causes, 1):
         sentences = [_action_sentence(action) for action in cause.actions if _is_change(action)]
@@ -347,7 +347,9 @@ def _is_change(action: Action) -> bool:
 
 def _action_sentence(action: Action) -> str:
     if action.where == "console":
-        one_change = action.sentence.partition(" ")[2]  # the command states the parameter
+        one_change = action.sentence.partition(" ")[
+            2
+        ]  # without the parameter's name, which the command contains
         change = one_change if len(action.commands) == 1 else action.sentence
         return f"EKF2: {', '.join(action.commands)} ({change})."
     if action.where == "shell":
@@ -360,7 +362,7 @@ def _action_sentence(action: Action) -> str:
 def _mark_explained(
     verdicts: Sequence[Verdict], causes: Sequence[Cause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
-    """Mark the inconsistent verdicts of filters that need no change.
+    """Mark inconsistent verdicts of filters that need no change.
 
     If the source may drift, a σ that is too large against the source is not a fault.
     """
@@ -390,10 +392,9 @@ def _mark_explained(
 
 
 def _horizon_ratio(analysis: Analysis) -> float | None:
-    """Return EKF2's error ÷ σ at the fusion horizon, or None unless it is consistent only there.
+    """Return EKF2's error ÷ σ at the fusion horizon if it is consistent only there, else None.
 
     The published position includes the lag of EKF2's output predictor, which σ does not describe.
-    None if the published position is consistent, or if the horizon is not logged or not consistent.
     """
     result, ekf2 = analysis.main, analysis.flight.ekf2
     published_verdict = make_verdicts(result)[-1]
@@ -476,7 +477,7 @@ def _verdicts_differ(source: Verdict, truth: Verdict, *, is_corrected: bool) -> 
 
 
 def _gate_sentence(analysis: Analysis) -> str:
-    """State how many positions EKF2's gate rejected, and innovation ÷ √S of the accepted ones."""
+    """Explain that EKF2's gate rejected positions, so its state is better than its innovations."""
     innovations = analysis.main.ekf2_innovations
     assert not isinstance(innovations, Unavailable)  # else EKF2 has no verdict
     accepted = innovations[~(innovations["rejected"] > 0.0)]

@@ -34,7 +34,7 @@ from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 
-# Kinds of change (:attr:`Trial.kinds`) whose re-runs test a finding, by the id of the finding
+# Kinds of changes whose re-runs test a finding (:attr:`Trial.kinds`), by id of the finding
 RERUN_KINDS: Mapping[str, frozenset[str]] = {
     "source_time_offset": frozenset({"time offset", "delay"}),
     "ekf2_ev_delay_wrong": frozenset({"delay", "time offset"}),
@@ -54,7 +54,7 @@ RERUN_KINDS: Mapping[str, frozenset[str]] = {
     "ekf2_overconfident": frozenset({"process noise"}),
     "ekf2_underconfident": frozenset({"process noise"}),
 }
-# Findings that make the verdicts meaningless; they are the first causes on the card
+# Ids of findings that make the verdicts meaningless, so they are the first causes on the card
 MEANINGLESS_VERDICT_FINDINGS = (
     "log_damaged",
     "not_px4",
@@ -62,7 +62,7 @@ MEANINGLESS_VERDICT_FINDINGS = (
     "imu_samples_missing",
     "ekf2_not_fusing",
 )
-# Findings that only state a verdict on σ; they are causes on the card if there is no other cause
+# Ids of findings that only repeat a verdict on σ; the card lists them without any other cause only
 VERDICT_FINDINGS = frozenset(
     {
         "error_exceeds_reported_sigma",
@@ -73,11 +73,11 @@ VERDICT_FINDINGS = frozenset(
     }
 )
 SETTING_CHANGE_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
-# Kinds of change that shift both filters with the source, which only ground truth shows
+# Kinds of changes that move both filters with the position source, which only ground truth shows
 UNSEEN_CHANGE_KINDS = frozenset({"time offset", "delay", "rotation"})
-# Endings of names of parameters that PX4 reads at boot only (reboot_required in its metadata)
+# Endings of the names of parameters that PX4 reads only at boot (reboot_required in its metadata)
 REBOOT_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
-# Minimum fraction of positions rejected by EKF2 for a column of the re-run table
+# Minimum fraction of positions rejected by EKF2 for a column in the table of re-runs
 MIN_SHOWN_REJECTION = 0.005
 TARGETS: Mapping[str, Target] = {
     "position source": "sender",
@@ -88,13 +88,13 @@ TARGETS: Mapping[str, Target] = {
     "loops": "source",
     "logging": "logging",
 }
-# Devices or persons that act against a finding, if they differ from those of its group
+# Target of the action against a finding, by id, if it differs from the target of its group
 TARGETS_BY_ID: Mapping[str, Target] = {"source_drift": "source", "ekf2_not_fusing": "sender"}
 FILTER_NAMES: Mapping[FilterName, Target] = {"kf": "KF", "ekf2": "EKF2"}
 
 
 class RankedCause(NamedTuple):
-    """Finding with the re-runs that test it; the card lists causes by tier, 0 first."""
+    """Finding with the re-runs that test it; the card lists causes in ascending tier."""
 
     finding: Finding
     tier: int
@@ -103,19 +103,22 @@ class RankedCause(NamedTuple):
 
 
 def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCause]:
-    """Return the causes of a flight in the order of the report's summary.
+    """Return the causes of a flight in the order of the card.
 
-    First come findings that make the verdicts meaningless, then those whose re-run makes a filter
-    consistent, then those whose re-run halves |ln(actual ÷ reported σ)|, then other errors and
-    warnings. A fault of the source precedes a setting that would only hide it, or that leaves the
-    error against ground truth as it is.
+    1. Findings that make the verdicts meaningless.
+    2. Findings whose re-run makes a filter consistent.
+    3. Findings whose re-run halves the logarithm of a σ ratio.
+    4. Other errors, and settings that leave the error against ground truth unchanged.
+    5. Other warnings.
+
+    Within a tier, faults of the position source precede settings that would only hide them.
     """
     ranked_causes = []
     for finding in roots:
         if finding.severity == "note":
             continue
         trials = confirming_trials(analysis.trials, finding)
-        if finding.id in VERDICT_FINDINGS:  # a verdict remains a cause without a re-run that helps
+        if finding.id in VERDICT_FINDINGS:  # a verdict is a cause even if no re-run improves it
             trials = tuple(filter(is_useful, trials))
         elif trials and not any(
             has_effect(trial) or not can_show_effect(trial) for trial in trials
@@ -175,7 +178,7 @@ def can_show_effect(trial: Trial) -> bool:
 
 
 def is_useful(trial: Trial) -> bool:
-    """Return True unless a re-run shows that its change improves nothing."""
+    """Return True if a re-run is better than the flight, or if no ground truth can show it."""
     return improvement(trial) != "nothing" or not can_show_effect(trial)
 
 
@@ -185,7 +188,7 @@ def make_cause(
     verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> Cause:
-    """Make the numbered cause of a finding, with actions for sender, KF and EKF2."""
+    """Make the cause of a finding, with actions for the sender, KF and EKF2."""
     finding, trials = ranked_cause.finding, ranked_cause.trials
     useful_trials = [trial for trial in trials if is_useful(trial)]
     alternatives, actions = _make_actions(analysis, ranked_cause, useful_trials, verdicts, request)
@@ -199,7 +202,7 @@ def make_cause(
 
 
 def make_plain_cause(finding: Finding) -> Cause:
-    """Make the numbered cause of a finding that no re-run tests."""
+    """Make the cause of a finding without re-runs."""
     return Cause(
         id=finding.id,
         severity="error" if finding.severity == "error" else "warning",
@@ -217,7 +220,7 @@ def _make_actions(
     verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
-    """Return the alternatives, of which one action is enough, and the other actions."""
+    """Return the alternatives, of which one is enough, and the other actions."""
     finding = ranked_cause.finding
     by_kind = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
     alternatives: tuple[tuple[Action, ...], ...] = ()
@@ -258,7 +261,7 @@ def _make_actions(
             and trial.change.keys() <= PARAMETERS.keys()
         ):
             actions.append(set_parameters(analysis, trial.change))
-    # actions on KF last: correct the vehicle before this log is analysed again
+    # actions on KF are last, because the vehicle must be corrected first
     actions.sort(key=lambda action: action.target == "KF")
     targets = {action.target for group in (actions, *alternatives) for action in group}
     reasons = {
@@ -306,7 +309,7 @@ def _target_of(finding: Finding, source: PositionTrack | None = None) -> Target:
 def run_again(
     request: ComparisonRequest, change: Mapping[str, float], defaults: Mapping[str, float]
 ) -> Action:
-    """Return the command that runs KF with changed settings; ``defaults`` would be as good."""
+    """Return the action to run KF with changed settings."""
     command = command_line(structs.replace(request, **change))
     options = " and ".join(
         f"{COMPARISON_OPTIONS[name]} (default {defaults[name]:g})" for name in defaults
@@ -316,7 +319,7 @@ def run_again(
 
 
 def set_parameters(analysis: Analysis, change: Mapping[str, float]) -> Action:
-    """Return the console lines that set parameters of EKF2, with old and new values."""
+    """Return the action to set EKF2 parameters in the MAVLink console."""
     model = analysis.ekf2_model
     flown_settings = {} if isinstance(model, Unavailable) else model.inputs.settings
     texts, commands, needs_reboot = [], [], False
@@ -378,7 +381,7 @@ def _trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
 def _closing_sentence(
     analysis: Analysis, useful_trials: Sequence[Trial], alternatives: Sequence[object]
 ) -> str:
-    """Return the sentence below the re-runs: one action is enough, or the default is as good."""
+    """Return the sentence below the table of re-runs."""
     if alternatives:
         return (
             "Not both: the offset would be corrected twice. One offset, two signs: --clock-offset "

@@ -1,4 +1,4 @@
-"""Page on EKF2's aids: table of verdicts and normalised innovations of each aid."""
+"""Page on the aiding sources of EKF2: a table of verdicts, and plots of the innovations."""
 
 from collections.abc import Iterator, Mapping
 
@@ -22,13 +22,13 @@ LEAD_TEXT = (
     "Time-correlated errors, wrong delays and wrong headings hardly change the NIS."
 )
 AID_PANEL_HEIGHT = 21.0  # height (points) of the axes of one aiding source
-MAX_NORMALISED = 4.0  # normalised innovations ν/√S beyond are drawn as triangles
-# Aiding sources that add this page to a comparison, if EKF2 fused one of them
+MAX_NORMALISED = 4.0  # maximum ν/√S of the plots; larger values are drawn as triangles
+# Aiding sources of which EKF2 must fuse at least one for this page in the report of a comparison
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the appendix on aiding sources if EKF2 fused a horizontal one besides vision."""
+    """Draw the appendix on EKF2's aiding sources if EKF2 fused GNSS, optical flow or a global position."""
     page = Page(appendix_title(TITLE), LEAD_TEXT)
     aid_results = write_aids_of_comparison(page, analysis)
     if aid_results:
@@ -37,7 +37,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def write_aids_of_comparison(page: Page, analysis: Analysis) -> Mapping[str, AidResult]:
-    """Write the table of aiding sources and return them; {} if EKF2 fused vision only."""
+    """Write and return the aiding sources; {} if EKF2 fused neither GNSS nor optical flow."""
     aid_results = analysis.aids
     if isinstance(aid_results, Unavailable):
         return {}
@@ -50,7 +50,7 @@ def write_aids_of_comparison(page: Page, analysis: Analysis) -> Mapping[str, Aid
 
 
 def draw_aids_only(analysis: AidsOnlyAnalysis, _: object) -> Iterator[Page]:
-    """Draw EKF2's aiding sources on the cover of a flight without a position source."""
+    """Draw EKF2's aiding sources of a flight without a position source."""
     page = Page(TITLE, LEAD_TEXT)
     write_aids(page, analysis.aids)
     _draw_aid_panels(page, analysis.flight, analysis.aids)
@@ -157,7 +157,7 @@ def _draw_aid_panel(
     )
     for axis in log.axes:
         normalised = samples[f"innovation_{axis}"] / np.sqrt(samples[f"variance_{axis}"])
-        for mask, dot_style in ((is_fused, style.EKF2_DOTS), (~is_fused, style.EKF2_REJECTED)):
+        for mask, dot_style in ((is_fused, style.DOTS["EKF2"]), (~is_fused, style.EKF2_REJECTED)):
             draw_dots(axes, normalised[mask], MAX_NORMALISED, dot_style | {"ms": 1.4})
     for limit in (-2.0, 2.0):
         axes.axhline(limit, color="black", lw=0.4, ls=(0, (1, 1.5)))

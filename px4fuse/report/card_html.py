@@ -32,7 +32,7 @@ from px4fuse.report.card_text import (
     with_typed_path,
 )
 
-# SVG paths of the mark of a ratio; triangles mark ratios beyond the ends of the axis
+# SVG path of the symbol for a σ ratio: against source, ground truth, and beyond the axis ends
 MARK_PATHS = {
     "source": "M-5.5 0a5.5 5.5 0 1 0 11 0a5.5 5.5 0 1 0-11 0",
     "truth": "M-6.5 0L0-6.5L6.5 0L0 6.5z",
@@ -40,11 +40,11 @@ MARK_PATHS = {
     "above": "M-5-7L7 0L-5 7z",
 }
 SPOKEN_QUANTITIES = {"source": "innovation over root S", "truth": "error over sigma"}
-HALF_HEIGHT = 5  # half the height (pixels) of the end ticks of an interval
+HALF_HEIGHT = 5  # half the height (pixels) of the end bars of a 95 % interval
 
 
 def card_of(analysis: Analysis) -> Card:
-    """Return the card of an analysis that has a request, with the path of the log as typed."""
+    """Return the diagnosis card of an analysis, with the path of the log as typed."""
     if analysis.request is None:
         raise SettingsError(
             "This analysis contains no request, so its command is unknown.",
@@ -90,7 +90,7 @@ def card_html(
 
 
 def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
-    """Return the verdicts on their logarithmic axis as an HTML figure.
+    """Draw σ ratios on their logarithmic axis as an HTML figure.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str
 
 
 def axis_figures(analysis: Analysis) -> str:
-    """Return an HTML figure of the four verdicts for each analysed axis."""
+    """Return an HTML figure with the four σ ratios of KF and EKF2 for each axis."""
     return "".join(
         axis_html(verdicts(result), describe_axis(analysis, result), name)
         for name, result in analysis.axes.items()
@@ -127,18 +127,18 @@ def axis_figures(analysis: Analysis) -> str:
 
 
 def card_style() -> str:
-    """Return the style sheet of the card; its colours are in ``html/colours.css``."""
+    """Return the style sheet of the diagnosis card, without its colours."""
     return read_asset("card.css", "px4fuse.report")
 
 
 def notebook_html(card: Card) -> str:
-    """Return the card with its style and colours, for a notebook."""
+    """Return the diagnosis card with its style and colours, for a notebook."""
     colours = read_asset("colours.css").replace(":root", ".px4fuse-card")
     return f"<style>{colours}{card_style()}</style>{card_html(card, is_open=True)}"
 
 
 def alternative_text(verdicts: Sequence[Verdict]) -> str:
-    """Describe the verdicts on the axis for screen readers.
+    """Describe the σ ratios and their verdicts for screen readers.
 
     >>> alternative_text([Verdict(filter="kf", against="truth", ratio=7.2, word="overconfident")])
     'KF, error over sigma: 7.2, overconfident.'
@@ -164,7 +164,7 @@ def _percent(ratio: float) -> str:
 
 
 def _drawing(verdict: Verdict) -> dict[str, Any]:
-    """Return the SVG attributes of the band, the 95 % interval and the mark of a ratio."""
+    """Return the SVG attributes for one σ ratio: its consistent band, 95 % interval and mark."""
     if verdict.ratio is None:
         return {}
     low, high = (axis_fraction(end) for end in SIGMA_RATIO_BANDS[verdict.against])

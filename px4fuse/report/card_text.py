@@ -30,11 +30,11 @@ from px4fuse.request import quote_command
 
 CARD_WIDTH = 100
 AXIS_WIDTH = 37
-# Number of columns before the axis of ratios, and before the text beside a label
-AXIS_INDENT, TEXT_INDENT = 58, 11
-# Maximum length of a command beside its label; a longer one is on a separate line
+AXIS_INDENT = 58  # number of characters left of the axis of σ ratios
+TEXT_INDENT = 11  # number of characters left of a text with a label
+# Maximum length of a command on the line of its label; longer commands have their own line
 MAX_COMMAND_LENGTH = 74
-# Ticks of the axis of ratios that have room for a label
+# Ticks of the axis of σ ratios that have a label
 LABELLED_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
 MARKS = {"source": "●", "truth": "◆"}
 QUANTITIES = {"source": "source: innovation ÷ √S", "truth": "ground truth: error ÷ σ"}
@@ -47,7 +47,7 @@ SEVERITY_SIGNS = {
     "refused": "✕ REFUSED",
 }
 STYLES = {"error": "bold red", "warning": "bold yellow", "note": "cyan", "clean": "bold green"}
-# Replacements of characters for terminals whose encoding lacks them
+# ASCII replacements of characters, for terminals with an ASCII encoding
 ASCII_REPLACEMENTS = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/--23x") | str.maketrans(
     {"√": "sqrt ", "σ": "sigma", "→": "->", "°": " deg", "±": "+-", "ν": "nu", "…": "..."}
 )
@@ -125,7 +125,7 @@ def card_lines(card: Card) -> Iterator[Line]:
 
 
 def note_texts(card: Card, place: str) -> list[str]:
-    """Format the first notes of a card, and count the others, which stand at ``place``."""
+    """Format the first notes of a card, and the number of the other notes with their place."""
     texts = [
         " ".join(filter(None, (f"note[{note.id}]: {note.text}", note.action)))
         for note in card.notes[:MAX_NOTES]
@@ -135,7 +135,7 @@ def note_texts(card: Card, place: str) -> list[str]:
 
 
 def closing_lines(card: Card) -> Iterator[Line]:
-    """Yield the last lines of a card: where to read more, and what the console of a command is."""
+    """Yield the last lines of a card: commands for details, and an explanation of the console."""
     has_console = any(action.where == "console" for action in _all_actions(card))
     sentences = ["More: -v.", *([CONSOLE_NOTE] if has_console else [])]
     sentences += [f"Meaning: px4fuse explain {card.id}"] if card.id else []
@@ -143,7 +143,7 @@ def closing_lines(card: Card) -> Iterator[Line]:
 
 
 def with_typed_path(card: Card, path: str | None) -> Card:
-    """Replace the file name of the log in all commands of a card by the path as typed.
+    """Replace the log's file name in all commands of a card by the path that the user typed.
 
     >>> from px4fuse.card.model import Identity
     >>> action = Action("KF", commands=("px4fuse compare a.ulg --sigma-z 1",), where="shell")
@@ -163,7 +163,7 @@ def with_typed_path(card: Card, path: str | None) -> Card:
 
 
 def to_ascii(text: str) -> str:
-    """Replace the characters of :data:`ASCII_REPLACEMENTS`, for terminals that cannot print them.
+    """Replace characters that ASCII terminals cannot print.
 
     >>> to_ascii("error ÷ σ 7.2 → 1.2")
     'error / sigma 7.2 -> 1.2'
@@ -183,7 +183,7 @@ def band_limits() -> str:
 
 
 def axis_text(ratio: float | None, reference: Reference) -> str:
-    """Draw one ratio on the logarithmic axis with the band of consistent ratios.
+    """Draw one σ ratio on a logarithmic axis with the band of consistent ratios.
 
     >>> axis_text(0.93, "source")
     '────────────────░●░░░────────────────'
@@ -243,7 +243,7 @@ def _cause_lines(cause: Cause) -> Iterator[Line]:
 
 
 def marked_actions(cause: Cause) -> list[tuple[str, Action]]:
-    """Return the actions of a cause, with "EITHER " and "OR " before alternatives."""
+    """Return the actions of a cause; alternative actions begin with "EITHER " or "OR "."""
     alternatives = [
         ("OR " if place else "EITHER ", action)
         for place, alternative in enumerate(cause.alternatives)
@@ -253,7 +253,7 @@ def marked_actions(cause: Cause) -> list[tuple[str, Action]]:
 
 
 def format_target(action: Action) -> str:
-    """Format the target of an action with the place where its commands are typed."""
+    """Format the target of an action with the program for its commands: "EKF2 (console)"."""
     return f"{action.target} ({action.where})" if action.where else action.target
 
 
@@ -283,7 +283,7 @@ def _rerun_table(reruns: Sequence[Rerun]) -> Iterator[Line]:
 
 
 def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
-    """Return the columns of the re-run table, each with its heading; empty columns are left out."""
+    """Return the columns of the table of re-runs with their headings; empty columns are omitted."""
     columns = (
         ("re-run of this log", [rerun.label for rerun in reruns]),
         (
@@ -299,7 +299,7 @@ def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
 
 
 def rerun_start(reruns: Sequence[Rerun]) -> str:
-    """Return the sentence on the time from which EKF2's replay predicts, "" without a replay."""
+    """Return the sentence on the start time of EKF2's replay; "" if EKF2 was not replayed."""
     starts = {rerun.from_s for rerun in reruns if rerun.is_prediction and rerun.from_s is not None}
     if not starts:
         return ""
@@ -381,7 +381,7 @@ def _aid_axis(aids: Sequence[AidRow]) -> Iterator[Line]:
 
 
 def format_spans(cause: Cause) -> str:
-    """Format the times of a cause, from the first to the last; "" for the whole flight."""
+    """Format the time from the begin to the end of a fault; "" for the whole flight."""
     if not cause.spans_s:
         return ""
     first_s, last_s = cause.spans_s[0][0], cause.spans_s[-1][1]

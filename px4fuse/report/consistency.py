@@ -1,4 +1,4 @@
-"""Appendix: consistency tests of KF and EKF2 (mean NIS, distribution, whiteness)."""
+"""Appendix on the consistency of KF and EKF2: mean NIS, distribution and whiteness tests."""
 
 from __future__ import annotations
 
@@ -34,13 +34,15 @@ from px4fuse.report.style import (
 MAX_LAG = 20
 MAX_NORMALISED = 4.0
 HISTOGRAM_EDGES = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 33)
-# Maximum of the density axis, at which the normal curve (maximum 0.4) is visible
+# Maximum of the density axis, so that the normal density (maximum 0.4) remains visible
 MAX_DENSITY = 1.6
-# Maximum p value of the Ljung-Box test for innovations that the caption calls not white
+# Maximum p value of the Ljung-Box test for innovations that are not white
 MAX_NON_WHITE_P = 0.01
-RUNNING_HEIGHT, LOWER_HEIGHT, LEGEND_HEIGHT = 140.0, 150.0, 14.0  # heights (points)
+RUNNING_HEIGHT = 140.0  # height (points) of the axes of the running mean NIS
+LOWER_HEIGHT = 150.0  # height (points) of the axes of distribution and autocorrelation
+LEGEND_HEIGHT = 14.0  # height (points) of a legend above the axes
 BAND_GREY = "#dcdcdc"
-# Label of each statistic that a re-run changes, and the power of the statistic that is printed
+# Label of each tested statistic, and the exponent with which its value is printed
 CAUSE_STATISTICS: Mapping[Statistic, tuple[str, float]] = {
     "nis": ("mean NIS", 1.0),
     "nees": ("√NEES", 0.5),
@@ -107,7 +109,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _write_causes(page: Page, analysis: Analysis) -> None:
-    """Write the table of re-runs of KF and EKF2 with one change along the main axis."""
+    """Write the table of tested causes: KF and EKF2 re-run with one changed setting each."""
     axis = analysis.main.axis
     rows: list[list[Cell]] = []
     for cause in analysis.causes:
@@ -222,7 +224,7 @@ def _draw_autocorrelation(axes: Axes, series: Series) -> None:
 
 
 def _whiteness_bound(values: pd.Series[float]) -> float:
-    """Return the half width of the 95 % band for the autocorrelation of white innovations."""
+    """Return the half width of the 95 % band of the autocorrelation of white noise."""
     return float(1.96 / np.sqrt(len(values)))
 
 
@@ -230,7 +232,7 @@ def _whiteness_sentence(result: AxisComparison, series: Series) -> str:
     sentences = []
     for name, values in series.items():
         consistency = filters_by_name(result)[name]
-        assert isinstance(consistency, Consistency)  # else the filter has no innovations
+        assert isinstance(consistency, Consistency)  # filters without innovations have no series
         r, p = consistency.lag1_autocorrelation, consistency.ljung_box_p
         interpretation = "white" if p >= MAX_NON_WHITE_P else "not white"
         if p < MAX_NON_WHITE_P and abs(r) > _whiteness_bound(values):

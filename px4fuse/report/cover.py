@@ -1,6 +1,6 @@
-"""Cover of a report: the diagnosis card, and panels that fill the rest of the page.
+"""Cover of a report: the diagnosis card, and plots below it.
 
-Texts and numbers are those of the card; ``cover.typ`` places them.
+``cover.typ`` places the texts of the card.
 """
 
 from collections.abc import Iterator, Sequence
@@ -41,7 +41,7 @@ from px4fuse.report.style import SEVERITY_COLOURS
 from px4fuse.report.typesetting import measure_free_height
 from px4fuse.results.contract import AidsResults, ComparisonResults
 
-# Maximum number of changed settings in the head; with more, their number is printed
+# Maximum number of changed settings that the head lists; more settings are counted
 MAX_CHANGED_SETTINGS = 3
 MAX_FILE_LENGTH = 56  # maximum number of characters of the file name in the head
 AXIS_TITLE = "Is the reported uncertainty right?"
@@ -57,7 +57,7 @@ ALL_FINDINGS = "All findings"
 
 
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
-    """Draw the cover: measure the height that the card leaves, and draw the panels for it."""
+    """Draw the cover: the diagnosis card, and plots in the height below it."""
     page = Page()
     block = add_card(page, results.card)
     write_panels(block, analysis, results.card, free_height(page))
@@ -65,14 +65,14 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
 
 
 def draw_aids_only(_: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
-    """Draw the cover of a flight without a position source; the aids follow on the same page."""
+    """Draw the cover of a flight without a position source."""
     page = Page()
     add_card(page, results.card)
     yield page
 
 
 def add_card(page: Page, card: Card) -> Block:
-    """Add the texts of a card to a page; the panels go into ``blocks`` of the returned block."""
+    """Add the texts of a diagnosis card to a page; plots are added to ``blocks`` of the returned block."""
     identity = card.identity
     flight = identity.firmware, identity.hardware, f"{identity.duration_s:.1f} s", identity.source
     further_causes_text = (
@@ -109,7 +109,7 @@ def add_card(page: Page, card: Card) -> Block:
 
 
 def free_height(page: Page) -> float:
-    """Return the height (pt) that is left below the card on the page where it ends."""
+    """Return the height (points) below the card on the last page of the card."""
     return measure_free_height(to_typst_data(page.blocks, ""), fonts.font_names(str(page.blocks)))
 
 
@@ -137,7 +137,7 @@ def _format_changed(changed_options: Sequence[str]) -> str:
 
 
 def _axis_data(card: Card) -> dict[str, Any]:
-    """Return the heading and the rows of the logarithmic axis of σ ratios."""
+    """Return heading, ticks and rows of the logarithmic axis of σ ratios."""
     intervals = "" if card.aids else " · ├─┤ 95 % interval"
     ends = " and ".join(AXIS_TICKS[end] for end in AXIS_ENDS)
     axis_text = f", {card.effect.axis}" if card.effect else ""
@@ -184,7 +184,7 @@ def _aid_row(row: AidRow) -> dict[str, Any]:
 def _ratio_marks(
     ratio: float | None, reference: Reference, interval: tuple[float, float] | None
 ) -> dict[str, Any]:
-    """Return the places (0 to 1) of a ratio, its interval and its band on the axis."""
+    """Return the positions of a σ ratio, its interval and its band on the axis (0 to 1)."""
     fraction = 0.5 if ratio is None else axis_fraction(ratio)
     beyond = 1 if fraction > 1.0 else -1 if fraction < 0.0 else 0
     return {

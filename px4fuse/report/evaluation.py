@@ -15,7 +15,7 @@ from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
 from px4fuse.trajectory.scores import Interval, PairwiseError, Statistics
 
-# Indices of the coordinates drawn to the right, drawn upwards, and vertical; True if that is down
+# Index of the axis to the right, upwards, and vertical; True if the vertical axis points down
 PAGE_AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
     "NED": (1, 0, 2, True),
     "FRD": (1, 0, 2, True),
@@ -23,21 +23,21 @@ PAGE_AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
     "camera": (0, 2, 1, True),
     "unknown": (0, 1, 2, False),
 }
-# Maximum height / length of a path whose page has no side view
+# Maximum ratio of height to length of a path without a side view
 MAX_FLAT_RATIO = 0.1
-# Minimum time between two poses, in median times, at which the drawn path is interrupted
+# Minimum time between two poses for a gap in the drawn path, in median times between poses
 MIN_GAP_STEPS = 10.0
-MAX_PATH_POINTS = 1200
-MIN_ERROR_RANGE_M = 1e-3  # minimum range of an error axis, so that rounding errors look small
-PANEL_HEIGHT = 76.0  # height (points) of the axes of an error
+MAX_PATH_POINTS = 1200  # maximum number of drawn points of a path
+MIN_ERROR_RANGE_M = 1e-3  # minimum range of an error axis (m), so that rounding errors look small
+PANEL_HEIGHT = 76.0  # height (points) of the axes of APE and RPE
 MAP_HEIGHT = 128.0  # height (points) of the axes of a map
-MAX_DELTA_LABELS = 12
+MAX_DELTA_LABELS = 12  # maximum number of labels on the axis of RPE distances and times
 REFERENCE_LINE = style.line_style(TRUTH_COLOUR, 0.8, (0, (4, 2)))
 STATISTIC_LINES = (
     ("max", "max", style.line_style(MUTED_COLOUR, 0.8, (0, (1, 1.5)))),
     ("rmse", "RMSE", style.line_style(EKF2_COLOUR, 1.4)),
 )
-NEGLIGIBLE_ERROR_M = 1e-6  # smaller errors are rounding errors
+NEGLIGIBLE_ERROR_M = 1e-6  # maximum error (m) by rounding
 SHADES_CAPTION = "Darker poses have a larger error; × marks the largest one."
 ERROR_TABLE_HEAD = (
     "error",
@@ -53,7 +53,7 @@ ERROR_TABLE_HEAD = (
 
 
 class View(NamedTuple):
-    """View of a path: indices and names of the coordinates drawn to the right and upwards."""
+    """Direction of view on a path: indices and names of the axes to the right and upwards."""
 
     across: int
     up: int
@@ -225,7 +225,7 @@ def _rpe_statistics(evaluation: Evaluation) -> list[tuple[PairwiseError, Statist
 
 
 def time_from_start(evaluation: Evaluation) -> tuple[Array, str]:
-    """Return the time of each pose since the origin of the time axis (s), and the axis label."""
+    """Return the time of each pose (s) on the time axis, and the label of the axis."""
     origin_s = time_origin_s(evaluation)
     return evaluation.time_s - origin_s, "time from the first pose (s)" if origin_s else "time (s)"
 
@@ -236,7 +236,7 @@ def _gap_indices(time_s: Array) -> IntArray:
 
 
 def plot_path(axes: Axes, positions: Array, time_s: Array, **style: Any) -> None:
-    """Draw a path, shape (n, 2), reduced to MAX_PATH_POINTS and interrupted at gaps in time."""
+    """Draw a path, shape (n, 2), with gaps where the time has gaps."""
     gaps = _gap_indices(time_s)
     evenly_spaced = np.linspace(0, len(positions) - 1, min(len(positions), MAX_PATH_POINTS)).astype(
         np.intp
@@ -257,7 +257,7 @@ def format_metres(value: float) -> str:
 
 
 def time_origin_s(evaluation: Evaluation) -> float:
-    """Return the origin of the time axes: the first pose if timestamps are UNIX time, else 0 s."""
+    """Return the time (s) of the first pose if timestamps are UNIX time, else 0."""
     start = float(evaluation.time_s[0])
     return start if start > MIN_UNIX_TIME_S else 0.0
 
@@ -291,7 +291,7 @@ def write_evaluation(page: Page, evaluation: Evaluation) -> None:
 
 
 def error_rows(evaluation: Evaluation) -> list[list[str]]:
-    """Return the table rows of the ATE and of each RPE, with the columns of ERROR_TABLE_HEAD."""
+    """Return the rows of the error table: ATE, then each RPE."""
     errors: dict[str, AbsoluteError | PairwiseError] = {"ATE (m)": evaluation.ate}
     errors |= {f"RPE {error.delta_text} (m)": error for error in evaluation.rpe}
     rows = []
@@ -309,7 +309,7 @@ def error_rows(evaluation: Evaluation) -> list[list[str]]:
 
 
 def missing_reasons(evaluation: Evaluation) -> list[str]:
-    """Return a sentence with the reason for each missing quantity, without repetitions."""
+    """Return a sentence on each missing error statistic, without repetitions."""
     quantities = [
         evaluation.ate.interval_m,
         evaluation.ate.rotation_deg,
@@ -322,7 +322,7 @@ def missing_reasons(evaluation: Evaluation) -> list[str]:
 
 
 def unaligned_sentence(evaluation: Evaluation) -> str:
-    """Caption of the map before alignment: RMSE, and the transform of the alignment."""
+    """Return the caption of the map before alignment: RMSE and alignment transform."""
     estimate_m, reference_m = evaluation.unaligned_m, evaluation.reference_m
     rmse_m = float(np.sqrt(((estimate_m - reference_m) ** 2).sum(axis=1).mean()))
     alignment = evaluation.transform
@@ -338,7 +338,7 @@ def unaligned_sentence(evaluation: Evaluation) -> str:
 
 
 def vertical_error_sentence(evaluation: Evaluation, axis: int) -> str:
-    """State the RMSE along the vertical axis and its fraction of the mean squared error."""
+    """Return a sentence on the RMSE along the vertical axis."""
     squares = ((evaluation.estimate_m - evaluation.reference_m) ** 2).mean(axis=0)
     name = AXES_OF_FRAME[evaluation.reference.frame][axis]
     if not squares.any():
@@ -350,7 +350,7 @@ def vertical_error_sentence(evaluation: Evaluation, axis: int) -> str:
 
 
 def quarter_rmse(evaluation: Evaluation) -> list[float]:
-    """Return the RMSE (m) of each quarter of the reference path that contains poses."""
+    """Return the RMSE (m) of each quarter of the path that contains poses."""
     distance_m = evaluation.distance_m
     edges = np.linspace(0.0, distance_m[-1], 5)
     quarter_index = np.clip(np.searchsorted(edges, distance_m, side="right") - 1, 0, 3)
@@ -359,7 +359,7 @@ def quarter_rmse(evaluation: Evaluation) -> list[float]:
 
 
 def quarters_sentence(evaluation: Evaluation) -> str:
-    """Caption of the APE over distance: RMSE per quarter of the path."""
+    """Return the caption of the APE over distance: RMSE of each quarter of the path."""
     rmse_text = ", ".join(f"{rmse_m:.3f}" for rmse_m in quarter_rmse(evaluation))
     return (
         f"RMSE per quarter of the path: {rmse_text} m. Drift grows along the path. After "
@@ -368,7 +368,7 @@ def quarters_sentence(evaluation: Evaluation) -> str:
 
 
 def rpe_growth_sentence(rpe: tuple[PairwiseError, ...]) -> str:
-    """Caption of the RPE panel: growth of the RPE with delta, which separates noise from drift."""
+    """Return the caption of the RPE plot: growth of the RPE with the distance or time."""
     interval_note = "RMSE with its 95 % interval."
     rmse: dict[tuple[str, float], float] = {
         (error.unit, error.delta): error.translation_m.rmse
@@ -404,7 +404,7 @@ def describe_track(path: Trajectory) -> str:
 
 
 def describe_method(evaluation: Evaluation) -> str:
-    """Format alignment, association and time offset of an evaluation on one line."""
+    """Format alignment, number of pose pairs and time offset of an evaluation."""
     association = evaluation.association
     offset = evaluation.time_offset.offset_s
     offset_text = "" if not offset else f"; time offset {offset:+.3f} s"

@@ -1,7 +1,7 @@
 """Pages on the flight: position, velocity, innovations and σ of KF and EKF2 over time.
 
-The main axis has two pages, with a zoom into single predictions and updates; the other axes share
-one page.
+The main axis has two pages, with a plot of single predictions and updates. The other axes share one
+page.
 """
 
 from collections.abc import Iterator
@@ -19,9 +19,9 @@ from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page
 from px4fuse.report.phrases import filters_by_name, verdict_notes
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, Axes
 
-ZOOM_UPDATES = 15
-MIN_ZOOM_S = 1.0
-ZOOM_HEIGHT = 125.0  # height (points) of the axes of the zoom
+ZOOM_UPDATES = 15  # number of updates in the plot of single predictions and updates
+MIN_ZOOM_S = 1.0  # minimum duration (s) of that plot
+ZOOM_HEIGHT = 125.0  # height (points) of its axes
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
@@ -38,7 +38,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw innovations, σ_p and σ_v along the main axis over time, with a zoom."""
+    """Draw innovations, σ_p and σ_v along the main axis over time, and σ_p over a few updates."""
     result = analysis.main
     page = Page(f"Innovations and variances along {result.axis.label}")
     for panel in (panels.INNOVATIONS, panels.SIGMA_P, panels.SIGMA_V):
@@ -53,7 +53,7 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _draw_zoom(page: Page, analysis: Analysis) -> None:
-    """Draw σ_p in each prediction and update during a short part of the flight."""
+    """Draw the growth of σ_p by predictions and its reduction by updates over a few seconds."""
     result = analysis.main
     start_s, end_s = window = zoom_window(result, analysis.segment)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
@@ -79,7 +79,7 @@ def _draw_zoom(page: Page, analysis: Analysis) -> None:
 
 
 def zoom_window(result: AxisComparison, segment: Segment) -> Span:
-    """Return start and end (s) of the zoom, which contains about ZOOM_UPDATES updates.
+    """Return start and end (s) of the plot of a few updates.
 
     The zoom is centred on the middle measurement (of EKF2, if logged), so it avoids gaps.
     """
@@ -99,7 +99,7 @@ def zoom_window(result: AxisComparison, segment: Segment) -> Span:
 def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
     updates, steps = result.replay.updates, result.replay.steps
     prior, posterior = updates["prior_position_variance_m2"], steps["position_variance_m2"]
-    # sort stably, so that the prior variance precedes the posterior at the time of an update
+    # a stable sort keeps the prior variance before the posterior variance of the same update
     variances = pd.concat([prior, posterior]).sort_index(kind="stable").loc[slice(*window)]
     dots = style.dot_style(KF_COLOUR, ".", 2.4) | {"ls": "-", "lw": 1.1}
     axes.plot(variances.index, np.sqrt(variances), **dots)
@@ -118,7 +118,7 @@ def _draw_sawtooth(axes: Axes, result: AxisComparison, window: Span) -> None:
 
 
 def zoom_sentence(result: AxisComparison) -> str:
-    """Return the caption of the zoom: σ_p before and after an update of KF and of EKF2."""
+    """Return the caption: σ_p of KF and EKF2 before and after an update."""
     texts = []
     for name, filter_summary in filters_by_name(result).items():
         prior_m, posterior_m = (
@@ -142,7 +142,7 @@ def zoom_sentence(result: AxisComparison) -> str:
 
 
 def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the axes except the main axis, one column each; no page without such axes."""
+    """Draw one column for each axis other than the main axis; no page without such an axis."""
     secondary_axes = analysis.secondary_axes
     if not secondary_axes:
         return

@@ -33,7 +33,7 @@ LEAD = (
 MAX_LISTED_CLOSURES = 10  # maximum number of rejected closures that the terminal lists
 RED = style.SEVERITY_COLOURS["error"]
 PATH_STYLES = {
-    corrections.UNCORRECTED: style.EKF2_LINE,
+    corrections.UNCORRECTED: LINES["EKF2"],
     corrections.POSITIONS_ONLY: style.line_style("#79b294", 1.3, (0, (1.2, 1.2))),
     corrections.BY_DISTANCE: style.line_style("#3a7d5c", 1.0, (0, (6, 1.2, 1, 1.2))),
     SOLUTIONS["gated"]: style.line_style(KF_COLOUR, 1.2),
@@ -95,7 +95,7 @@ def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> N
 
 
 def shown_paths(loop: Loop) -> list[CorrectedPath]:
-    """Return the corrected paths for the map, one per kind of correction."""
+    """Return the corrected paths that the map shows."""
     return [path for path in loop.reported_paths if path.name in PATH_STYLES]
 
 
@@ -106,7 +106,7 @@ def _draw_map(page: Page, loop: Loop) -> None:
 
 
 def draw_map(axes: Axes, loop: Loop) -> None:
-    """Draw each corrected path from above, with the end of the odometry and the true end."""
+    """Draw the uncorrected and corrected paths from above, with the closure error as an arrow."""
     path = loop.odometry.trajectory
     names = AXES_OF_FRAME[path.frame]
     _draw_reference(axes, loop)
@@ -136,7 +136,7 @@ def draw_map(axes: Axes, loop: Loop) -> None:
 
 
 def _draw_reference(axes: Axes, loop: Loop) -> None:
-    """Draw the first reference, aligned to the odometry's frame with the best correction."""
+    """Draw the reference trajectory in the frame of the odometry."""
     for reference in loop.references[:1]:
         score = loop.best.scores.get(reference.name)
         if isinstance(score, Evaluation):
@@ -162,7 +162,7 @@ def summary(loop: Loop, findings: tuple[Finding, ...]) -> Page:
 
 
 def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
-    """Write closure error, gate, and a table of the corrected paths with their ATE."""
+    """Write the closure error, the test of the closure, and the ATE of each corrected path."""
     path = loop.odometry.trajectory
     track_text = (
         f"{path.name}: {TRACK_KINDS[path.kind]}, {len(path)} poses, "
@@ -208,7 +208,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
 
 
 def write_scores(page: Page, loop: Loop) -> None:
-    """Write the tables of closures (gate, weights) and RPE, and the method of the evaluation."""
+    """Write a table of the loop closures, and a table of the RPE against each reference."""
     rows: list[list[Cell]] = []
     for closure in loop.closures:
         cells = [
@@ -272,7 +272,7 @@ def _format_span(loop: Loop) -> str:
 
 
 def describe_closure_error(loop: Loop) -> str:
-    """Format the loop closure error in m, in percent of the path, per axis and in heading."""
+    """Format the closure error in m, in percent of the path length, and its heading error."""
     error, misclosure = loop.closure_error_m, loop.closure_error_axes_m
     if error is None or misclosure is None:
         return f"path {loop.path_length_m:.1f} m; the loop is open (--open): no closure error"
@@ -287,7 +287,7 @@ def describe_closure_error(loop: Loop) -> str:
 
 
 def describe_gate(closure: Closure) -> str:
-    """Format the chi-square test of one loop closure."""
+    """Format the chi-square test of a loop closure."""
     verdict = "accepted (consistent with the stated drift)"
     if not closure.accepted:
         verdict = "REJECTED (not explained by the stated drift)"
@@ -298,7 +298,7 @@ def describe_gate(closure: Closure) -> str:
 
 
 def closure_name(closure: Closure, loop: Loop) -> str:
-    """Format the two times of a loop closure (s); UNIX timestamps count from the first pose."""
+    """Format the times of the two poses of a loop closure (s)."""
     if closure.source == LANDING_SOURCE:
         return "take-off and landing"
     origin_s = loop.start_s if loop.start_s > MIN_UNIX_TIME_S else 0.0
@@ -320,7 +320,7 @@ def by_distance_sentence(loop: Loop) -> str:
 
 
 def missing_corrections(loop: Loop) -> list[str]:
-    """Return why corrections of the path were not computed, each reason once."""
+    """Return a sentence on each missing correction of the path, without repetitions."""
     unavailable = [
         correction
         for correction in loop.corrections.values()
@@ -353,7 +353,7 @@ def format_correction(correction: CorrectedPath) -> str:
 
 
 def graph_summary(solved_graph: SolvedGraph) -> Page:
-    """Make the terminal page of a pose graph: gate, solver and costs."""
+    """Make the terminal page of a pose graph: tested closures, solver and costs."""
     page = Page()
     page.write_labelled(
         "Graph",

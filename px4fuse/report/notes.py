@@ -25,17 +25,17 @@ if TYPE_CHECKING:
     from markdown_it.tree import SyntaxTreeNode
 
 HEADING_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
-INDENT = 12.0  # points
-MAX_INDENTS = 8
-# Each level takes three levels of Python's call stack, which is limited to 1000
+INDENT = 12.0  # indent (points) of each list level
+MAX_INDENTS = 8  # maximum number of indents of a text
+# Maximum depth of nested Markdown: each level needs three of Python's 1000 stack levels
 MAX_NESTING = 100
-# An opening $ has no space after it, a closing $ no space before and no digit after it, so prices
-# such as $5 and $10 are not mathematics
+# No space follows an opening $. No space precedes and no digit follows a closing $, so prices such
+# as $5 and $10 are not mathematics
 MATHS_PATTERN = re.compile(r"\$\$(.+?)\$\$|\$(?!\s)((?:\\.|[^$\\])+?)(?<!\s)\$(?!\d)", re.DOTALL)
 COMMAND_PATTERN = re.compile(r"\\([A-Za-z]+|.)")
 FRACTION_PATTERN = re.compile(r"\\frac\s*\{([^{}]*)\}\s*\{([^{}]*)\}")
 TAG_PATTERN = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
-# TeX commands without an HTML entity of the same name and meaning
+# Text of each TeX command without an HTML entity of the same name and meaning
 SYMBOLS = {
     "cdot": "·",
     "sqrt": "√",
@@ -54,7 +54,7 @@ SYMBOLS = {
 
 
 def draw(subject: object, results: ComparisonResults | AidsResults | LoopResults) -> Iterator[Page]:
-    """Draw the answer form and the notes of the student; no page if both are missing."""
+    """Draw the answer form and the notes of the student; no page without both."""
     title, answers = "Student notes", results.student.answers
     page = Page(appendix_title(title) if isinstance(subject, Analysis) else title)
     if isinstance(answers, Answers):
@@ -113,7 +113,7 @@ def parse(notes: str, name: str = "the notes") -> list[Token]:
 
 
 def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, mark: str = "") -> None:
-    """Write the blocks below a Markdown node, with the list mark before the first line."""
+    """Write the child blocks of a Markdown node; `mark` precedes the first line of a list item."""
     indent = INDENT * min(indent_level, MAX_INDENTS)
     children = node.children
     if mark and (not children or children[0].type.endswith("_list")):
@@ -170,7 +170,7 @@ def _node_text(node: SyntaxTreeNode) -> str:
 
 
 def _parse_maths(state: StateInline, silent: bool) -> bool:
-    """Parse mathematics in dollar signs (rule of markdown-it); code and escapes take precedence."""
+    """Parse mathematics between dollar signs as a rule of markdown-it."""
     maths_match = MATHS_PATTERN.match(state.src, state.pos)
     if maths_match is None:
         return False
@@ -186,6 +186,6 @@ def _tex_to_text(maths: str) -> str:
 
 
 def _maths_symbol(command_match: re.Match[str]) -> str:
-    """Return the Unicode character of a TeX command; most names equal those of HTML entities."""
+    """Return the Unicode character of a TeX command, from HTML entities with the same name."""
     name = command_match[1]
     return SYMBOLS[name] if name in SYMBOLS else html5.get(f"{name};", name)

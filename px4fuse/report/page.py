@@ -48,7 +48,7 @@ class Page:
             self.add("title", text=title, lead=lead)
 
     def add(self, kind: str, **fields: Any) -> Block:
-        """Add a block of a kind that ``report.typ`` sets, and return it."""
+        """Add a block, which ``report.typ`` typesets according to its kind, and return it."""
         self.blocks.append({"kind": kind, **fields})
         return self.blocks[-1]
 
@@ -85,7 +85,7 @@ class Page:
         colour: str = "black",
         bold: bool = True,
     ) -> None:
-        """Write a label with paragraphs beside it, styled by :func:`styled_text`."""
+        """Write a label and, right of it, paragraphs."""
         styled_texts = [styled_text(text) if isinstance(text, str) else text for text in texts]
         styled_label = styled_text(label, 8.0, colour, bold)
         self.add("labelled", label=styled_label, texts=styled_texts, width=width, above=above)
@@ -133,7 +133,7 @@ class Page:
         right: float = AXES_RIGHT,
         is_compact: bool = False,
     ) -> Axes:
-        """Add axes as wide as the column, below a title and a caption; return them.
+        """Add axes below a title and a caption; return the axes.
 
         Parameters
         ----------
@@ -168,7 +168,7 @@ class Page:
         return axes
 
     def legend(self, entries: Iterable[Artist]) -> Block:
-        """Add a legend for several panels, on as many lines as its entries need."""
+        """Add a legend on as many lines as its entries need."""
         from matplotlib.figure import Figure  # noqa: PLC0415
 
         rows: list[list[Artist]] = [[]]
@@ -256,7 +256,7 @@ def appendix_title(title: str) -> str:
 
 
 def draw_legend_above(axes: Axes) -> None:
-    """Draw the legend of a panel above its axes, at the right."""
+    """Draw the legend of axes above them, at the right."""
     axes.legend(
         loc="lower right",
         bbox_to_anchor=(1.0, 1.0),
@@ -269,7 +269,7 @@ def draw_legend_above(axes: Axes) -> None:
 
 
 def replace_unprintable(text: str) -> str:
-    """Remove control characters, split long words, replace characters without a font by □."""
+    """Remove control characters, split long words, and replace characters without a font by □."""
     from px4fuse.report import fonts  # noqa: PLC0415 - as in :meth:`Page.panel`
 
     return "".join(
@@ -280,7 +280,7 @@ def replace_unprintable(text: str) -> str:
 
 
 def to_typst_data(block: Any, log: str) -> Any:
-    """Convert blocks for Typst: printable text, commands with the log's name, figures as SVG."""
+    """Convert blocks to data for Typst: printable texts, and figures as SVG."""
     if isinstance(block, str):
         return replace_unprintable(with_log_name(block, log))
     if isinstance(block, Mapping):
@@ -304,7 +304,7 @@ def _figure_svg(block: Mapping[str, Any]) -> str:
 
 
 def _place_axes(block: Mapping[str, Any]) -> None:
-    """Set the height of the figure and the place of its axes, with room for the labels it has."""
+    """Set the height of the figure and the position of its axes according to the labels."""
     axes, width, height = block["axes"], block["width"], block["height"]
     left, right, above = block["margins"]
     has_tick_labels = axes.axison and axes.xaxis.get_tick_params()["labelbottom"]

@@ -46,7 +46,7 @@ def format_settings(settings: Settings) -> str:
 
 
 def format_verdict(consistency: Consistency | Unavailable) -> str:
-    """Format the verdict on the σ of a filter; "not logged" without its innovations."""
+    """Format the verdict on the reported σ of a filter; "not logged" without innovations."""
     if isinstance(consistency, Unavailable):
         return "not logged"
     return format_sigma_verdict(consistency.verdict, consistency.sigma_error_factor)
@@ -78,7 +78,7 @@ def verdict_rows(
     axes: Iterable[AxisComparison],
     extra_cells: Callable[[AxisComparison, str, FilterSummary | UntestedFilter], Sequence[str]],
 ) -> list[list[Cell]]:
-    """Return a table row per axis and filter: mean NIS, its band, verdict, then the extra cells."""
+    """Return a table row for each axis and filter: mean NIS, its 95 % band, verdict, extra cells."""
     rows: list[list[Cell]] = []
     for result in axes:
         for name, consistency in filters_by_name(result).items():
@@ -133,7 +133,7 @@ def _format_rms(statistic: object, field: str) -> str:
 
 
 def verdict_notes(comparison: Comparison) -> list[str]:
-    """Return notes on verdicts about σ that could be misread.
+    """Return notes against misreading the verdicts on σ.
 
     They concern a source that may drift, deviations too small for a finding, and innovations that
     are consistent but not white.
@@ -185,7 +185,7 @@ def format_clock_map(clock: ClockMap) -> str:
 
 
 def describe_alignment(alignment: Alignment) -> dict[str, str]:
-    """Return the alignment of a position file with the flight as labelled texts."""
+    """Format the alignment of a position file with the flight, by label."""
     north, east, down = alignment.origin_m
     yaw = "" if alignment.yaw_sigma_deg is None else f" ± {alignment.yaw_sigma_deg:.2f}°"
     sigma, residual = alignment.clock_offset_sigma_s, alignment.residual_rms_m
@@ -207,7 +207,7 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
 def tuning_advice(
     comparison: Comparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
 ) -> dict[str, str]:
-    """Return the actions after noise estimation by label: command, PX4 parameter, cautions.
+    """Return the recommended actions after noise estimation, by label.
 
     Commands are written as ``px4fuse compare LOG``; the terminal replaces LOG.
     """
@@ -272,12 +272,12 @@ def tuning_advice(
 
 
 def student_line(student: Student, separator: str) -> str:
-    """Join the student's name and id; either may be empty."""
+    """Join the name and the id of the student."""
     return separator.join(filter(None, (student.name, student.id)))
 
 
 def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
-    """Write all findings, each with its consequences."""
+    """Write all findings, each followed by its consequences."""
     if not findings:
         page.write("None.")
     for findings_of_cause in group_by_root(findings):
@@ -285,7 +285,7 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
 
 
 def write_finding(page: Page, group: list[Finding]) -> None:
-    """Write severity, time, title with id, message, action and consequences of a finding."""
+    """Write one finding and its consequences."""
     finding, *consequences = group
     title = f"{capitalise_first(finding_title(finding.id))} [{finding.id}]"
     texts = [styled_text(title, 8.0, bold=True), styled_text(finding.message, 8.0)]

@@ -140,7 +140,7 @@ def _write_section(
     labelled_texts: Iterable[tuple[str, str]] = (),
     plain_texts: Iterable[str] = (),
 ) -> None:
-    """Write a heading, then labelled and plain texts in small print; nothing without texts."""
+    """Write a heading and texts in small print; nothing without texts."""
     labelled_texts, plain_texts = list(labelled_texts), list(plain_texts)
     if labelled_texts or plain_texts:
         page.heading(title)

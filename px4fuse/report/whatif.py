@@ -22,7 +22,7 @@ NOT_PREDICTABLE = "not predictable"
 
 
 def column_heads(analysis: WhatIfAnalysis) -> list[str]:
-    """Return the heads of the columns of EKF2: logged, replayed, replayed with changes."""
+    """Return the headings of the columns: EKF2 logged, replayed, replayed with changes."""
     change_texts = [
         f"{name} {format_number(value)} {PARAMETERS[name].unit}".rstrip()
         for name, value in analysis.changes.items()
@@ -40,7 +40,7 @@ def column_heads(analysis: WhatIfAnalysis) -> list[str]:
 
 
 def rows(analysis: WhatIfAnalysis) -> list[list[str]]:
-    """Return the table rows: label, then the statistic of the logged, replayed and changed EKF2."""
+    """Return a row for each EKF2 statistic: label, and values as logged, replayed and changed."""
     result = analysis.whatif
     labels = _statistics(result.replayed, result.replayed)
     columns = [
@@ -53,7 +53,7 @@ def rows(analysis: WhatIfAnalysis) -> list[list[str]]:
 
 
 def _statistics(summary: Summary, replayed: Summary) -> dict[str, str]:
-    """Format the statistics of EKF2 by label; ``replayed`` decides on heading and height."""
+    """Format the statistics of EKF2, by label. ``replayed`` decides on heading and height."""
     texts = dict[str, str]()
     for name, axis in summary.axes.items():
         texts |= _nis_texts(name, axis) | {
@@ -88,7 +88,7 @@ def _fusion_texts(summary: Summary) -> dict[str, str]:
 
 
 def sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
-    """Return the column heads, and a row of EKF2 statistics per value of the swept parameter."""
+    """Return the column headings, and a row of EKF2 statistics per value of the swept parameter."""
     name, rows = swept_parameter(analysis), []
     unit = PARAMETERS[name].unit
     for summary in sweep_summaries(analysis):
