@@ -347,9 +347,8 @@ def _is_change(action: Action) -> bool:
 
 def _action_sentence(action: Action) -> str:
     if action.where == "console":
-        one_change = action.sentence.partition(" ")[
-            2
-        ]  # without the parameter's name, which the command contains
+        # the command already contains the name of the parameter
+        one_change = action.sentence.partition(" ")[2]
         change = one_change if len(action.commands) == 1 else action.sentence
         return f"EKF2: {', '.join(action.commands)} ({change})."
     if action.where == "shell":

@@ -28,7 +28,7 @@ OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 
 def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the appendix on EKF2's aiding sources if EKF2 fused GNSS, optical flow or a global position."""
+    """Draw the appendix on EKF2's aiding sources if EKF2 fused GNSS or optical flow."""
     page = Page(appendix_title(TITLE), LEAD_TEXT)
     aid_results = write_aids_of_comparison(page, analysis)
     if aid_results:

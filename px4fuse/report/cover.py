@@ -72,7 +72,7 @@ def draw_aids_only(_: AidsOnlyAnalysis, results: AidsResults) -> Iterator[Page]:
 
 
 def add_card(page: Page, card: Card) -> Block:
-    """Add the texts of a diagnosis card to a page; plots are added to ``blocks`` of the returned block."""
+    """Add the texts of a card to a page; plots are added to ``blocks`` of the result."""
     identity = card.identity
     flight = identity.firmware, identity.hardware, f"{identity.duration_s:.1f} s", identity.source
     further_causes_text = (

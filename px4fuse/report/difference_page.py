@@ -46,9 +46,9 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     page = Page(
         TITLE,
         (
-            "KF is replayed with its settings and equations replaced by those of EKF2, one at a time "
-            "(px4fuse's model of EKF2). Each bar is the resulting reduction of the mean square "
-            "difference KF - EKF2; a hatched bar is an increase. The bars add up to 100 %."
+            "KF is replayed with its settings and equations replaced by those of EKF2, one at "
+            "a time (px4fuse's model of EKF2). Each bar is the resulting reduction of the mean "
+            "square difference KF - EKF2; a hatched bar is an increase. The bars add up to 100 %."
         ),
     )
     for name, explanation in explanations.items():
@@ -165,7 +165,7 @@ def _draw_axis(
 
 
 def _draw_waterfall(axes: Axes, names: list[str], shares: Array, unexplained_share: float) -> None:
-    """Draw the mean square of KF - EKF2, its reduction by each replaced setting, and the rest (%)."""
+    """Draw the mean square of KF - EKF2 and its reduction by each replaced setting (%)."""
     bar_ends = 100.0 - np.concatenate([[0.0], np.cumsum(shares)])
     rows, right_end = len(names) + 2, max(100.0, float(bar_ends.max()))
     style: dict[str, Any] = {"height": 0.7, "edgecolor": KF_COLOUR, "lw": 0.6, "color": KF_COLOUR}

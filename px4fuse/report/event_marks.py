@@ -34,7 +34,7 @@ MODE_LETTER_WIDTH = 5.0  # mean width (points) of a letter of a flight mode's na
 
 
 class Mark(NamedTuple):
-    """Events of one type on a time axis: bands if `height` is None, else markers at a height of 0 to 1."""
+    """Events of one type on a time axis: bands without `height`, else markers at 0 to 1."""
 
     label: str
     spans_or_times: Sequence[Any] | Array

@@ -19,7 +19,7 @@ MAX_LISTED_CHARACTERS = 12  # maximum number of missing characters in the advice
 
 @cache
 def font_of(character: str) -> str | None:
-    """Return the name of a font with the character: DejaVu Sans if possible; None without a font."""
+    """Return the name of a font with the character, if possible DejaVu Sans; else None."""
     if ord(character) in _characters(font_manager.findfont(FONT)):
         return FONT
     return next(

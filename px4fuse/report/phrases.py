@@ -78,7 +78,7 @@ def verdict_rows(
     axes: Iterable[AxisComparison],
     extra_cells: Callable[[AxisComparison, str, FilterSummary | UntestedFilter], Sequence[str]],
 ) -> list[list[Cell]]:
-    """Return a table row for each axis and filter: mean NIS, its 95 % band, verdict, extra cells."""
+    """Return a table row for each axis and filter: mean NIS, 95 % band, verdict, extra cells."""
     rows: list[list[Cell]] = []
     for result in axes:
         for name, consistency in filters_by_name(result).items():
