@@ -16,7 +16,6 @@ from trajectory_tools import flight, transformed
 from px4fuse.loop.tracks import read_source
 from px4fuse.report.evaluation import (
     draw,
-    path_views,
     quarter_rmse,
     quarters_sentence,
     rpe_growth_sentence,
@@ -127,24 +126,6 @@ def test_rpe_growth_distinguishes_noise_from_drift(kind: str, times: float) -> N
 
 
 # -- panels ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("frame", "axes"), [
-    ("NED", (1, 0)), ("FRD", (1, 0)), ("ENU", (0, 1)), ("camera", (0, 2)), ("unknown", (0, 1)),
-])  # fmt: skip
-def test_flat_trajectory_is_drawn_without_side_view(frame, axes) -> None:
-    spatial = replace(flight(), frame=frame)
-    vertical = 3 - sum(axes)
-    level = spatial.position_m.copy()
-    level[:, vertical] *= 0.01
-    for position, count in ((spatial.position_m, 2), (level, 1)):
-        one = replace(spatial, position_m=position)
-        views = path_views(evaluate(one, one, alignment="none"))
-        assert (views[0].across, views[0].up) == axes
-        assert len(views) == count
-    side = path_views(evaluate(spatial, spatial, alignment="none"))[1]
-    assert side.up == vertical
-    assert side.is_down == (frame in ("NED", "FRD", "camera"))
 
 
 def test_evaluation_report_without_alignment_omits_its_plot() -> None:

@@ -16,7 +16,7 @@ from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, Section
 from px4fuse.html.safe import clean, load_template, local_link
 from px4fuse.report.card_html import MARK_PATHS
-from px4fuse.report.card_text import FILTER_NAMES, MARKS, SEVERITY_SIGNS, band_limits
+from px4fuse.report.card_text import MARKS, SEVERITY_SIGNS, band_limits
 
 # Columns of the four σ ratios (KF and EKF2, against source and ground truth), in the order of the
 # verdicts of the diagnosis (Card)
@@ -105,7 +105,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             Column("Diagnosis and first action", "full"),
             *(
                 Column(
-                    f"{FILTER_NAMES[filter_name]} {MARKS[reference_name]}",
+                    f"{filter_name.upper()} {MARKS[reference_name]}",
                     "ratio",
                     visible_from="tablet",
                 )

@@ -13,7 +13,6 @@ from msgspec.structs import replace
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.card.causes import (
-    FILTER_NAMES,
     RankedCause,
     can_show_effect,
     make_cause,
@@ -21,6 +20,7 @@ from px4fuse.card.causes import (
     rank_causes,
 )
 from px4fuse.card.model import (
+    FILTER_NAMES,
     MAX_CAUSES,
     MAX_HEADLINE_LENGTH,
     Action,

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import Action, Cause, FilterName, Rerun, Target, Verdict
+from px4fuse.card.model import FILTER_NAMES, Action, Cause, FilterName, Rerun, Target, Verdict
 from px4fuse.comparison.changes import CLOCK_OFFSET, OUTLIERS, SIGMA_A, SIGMA_Z
 from px4fuse.comparison.trials import (
     Trial,
@@ -90,7 +90,6 @@ TARGETS: Mapping[str, Target] = {
 }
 # Target of the action against a finding, by id, if it differs from the target of its group
 TARGETS_BY_ID: Mapping[str, Target] = {"source_drift": "source", "ekf2_not_fusing": "sender"}
-FILTER_NAMES: Mapping[FilterName, Target] = {"kf": "KF", "ekf2": "EKF2"}
 
 
 class RankedCause(NamedTuple):

@@ -14,6 +14,7 @@ FilterName = Literal["kf", "ekf2"]
 CardSeverity = Literal["clean", "note", "warning", "error", "refused"]
 VerdictWord = Literal["consistent", "overconfident", "underconfident", "not evaluated"]
 Target = Literal["sender", "receiver", "source", "logging", "flight", "KF", "EKF2", "KF, EKF2"]
+FILTER_NAMES: Mapping[FilterName, Target] = {"kf": "KF", "ekf2": "EKF2"}
 
 # Limits of the σ ratio of a consistent filter: against the source, and against ground truth
 SIGMA_RATIO_BANDS = CONSISTENT_RATIOS

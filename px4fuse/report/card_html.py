@@ -11,14 +11,21 @@ from markupsafe import Markup
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card, describe_axis
-from px4fuse.card.model import AXIS_TICKS, SIGMA_RATIO_BANDS, Card, Rerun, Verdict, axis_fraction
+from px4fuse.card.model import (
+    AXIS_TICKS,
+    FILTER_NAMES,
+    SIGMA_RATIO_BANDS,
+    Card,
+    Rerun,
+    Verdict,
+    axis_fraction,
+)
 from px4fuse.card.verdicts import verdicts
 from px4fuse.core.text import format_ratio
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import Reference
 from px4fuse.html.safe import load_template, read_asset
 from px4fuse.report.card_text import (
-    FILTER_NAMES,
     LABELLED_TICKS,
     MARKS,
     QUANTITIES,

@@ -14,6 +14,7 @@ from msgspec import convert, to_builtins
 
 from px4fuse.card.model import (
     AXIS_TICKS,
+    FILTER_NAMES,
     MAX_NOTES,
     SIGMA_RATIO_BANDS,
     Action,
@@ -38,7 +39,6 @@ MAX_COMMAND_LENGTH = 74
 LABELLED_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
 MARKS = {"source": "●", "truth": "◆"}
 QUANTITIES = {"source": "source: innovation ÷ √S", "truth": "ground truth: error ÷ σ"}
-FILTER_NAMES = {"kf": "KF", "ekf2": "EKF2"}
 SEVERITY_SIGNS = {
     "error": "■ ERROR",
     "warning": "▲ WARNING",

@@ -10,6 +10,7 @@ from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.card.model import (
     AXIS_ENDS,
     AXIS_TICKS,
+    FILTER_NAMES,
     SIGMA_RATIO_BANDS,
     Action,
     AidRow,
@@ -23,7 +24,6 @@ from px4fuse.filter.consistency import Reference
 from px4fuse.report import fonts
 from px4fuse.report.card_text import (
     AIDS_HEADING,
-    FILTER_NAMES,
     MARKS,
     MAX_COMMAND_LENGTH,
     QUANTITIES,

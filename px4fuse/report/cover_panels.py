@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import Card
+from px4fuse.card.model import FILTER_NAMES, Card
 from px4fuse.comparison.comparison import kf_state_and_variance, position_errors, reported_sigma
 from px4fuse.comparison.model import FILTERS, AxisComparison
 from px4fuse.core.arrays import Array
@@ -20,7 +20,6 @@ from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.signals import AISLE, cut_to_segment
 from px4fuse.flight.model import Ekf2, Truth
 from px4fuse.report import event_marks, style
-from px4fuse.report.card_text import FILTER_NAMES
 from px4fuse.report.page import (
     AXES_RIGHT,
     AXIS_LABEL_HEIGHT,

@@ -1,7 +1,7 @@
 """Page on trajectory errors: map coloured by error, APE and RPE (the names of the tool evo)."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -9,22 +9,20 @@ from px4fuse.core.arrays import Array, IntArray
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.report import style
-from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page, halves
+from px4fuse.report.page import Page, halves
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Axes
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
 from px4fuse.trajectory.scores import Interval, PairwiseError, Statistics
 
-# Index of the axis to the right, upwards, and vertical; True if the vertical axis points down
-PAGE_AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
-    "NED": (1, 0, 2, True),
-    "FRD": (1, 0, 2, True),
-    "ENU": (0, 1, 2, False),
-    "camera": (0, 2, 1, True),
-    "unknown": (0, 1, 2, False),
+# Indices of the axes that the map shows to the right and upwards
+MAP_AXES: Mapping[Frame, tuple[int, int]] = {
+    "NED": (1, 0),
+    "FRD": (1, 0),
+    "ENU": (0, 1),
+    "camera": (0, 2),
+    "unknown": (0, 1),
 }
-# Maximum ratio of height to length of a path without a side view
-MAX_FLAT_RATIO = 0.1
 # Minimum time between two poses for a gap in the drawn path, in median times between poses
 MIN_GAP_STEPS = 10.0
 MAX_PATH_POINTS = 1200  # maximum number of drawn points of a path
@@ -38,7 +36,6 @@ STATISTIC_LINES = (
     ("rmse", "RMSE", style.line_style(EKF2_COLOUR, 1.4)),
 )
 NEGLIGIBLE_ERROR_M = 1e-6  # maximum error (m) by rounding
-SHADES_CAPTION = "Darker poses have a larger error; × marks the largest one."
 ERROR_TABLE_HEAD = (
     "error",
     "RMSE",
@@ -50,40 +47,6 @@ ERROR_TABLE_HEAD = (
     "n",
     "rotation\nRMSE (°)",
 )
-
-
-class View(NamedTuple):
-    """Direction of view on a path: indices and names of the axes to the right and upwards."""
-
-    across: int
-    up: int
-    is_down: bool
-    names: tuple[str, str]
-
-    def project(self, position_m: Array) -> Array:
-        """Project positions, shape (n, 3), to page coordinates, shape (n, 2)."""
-        return np.asarray(position_m[:, (self.across, self.up)])
-
-
-def path_views(evaluation: Evaluation) -> list[View]:
-    """Return the view from above, and the side view if the path is not flat."""
-    across, up, vertical_axis, is_down = PAGE_AXES[evaluation.reference.frame]
-    names = AXES_OF_FRAME[evaluation.reference.frame]
-    extent = np.maximum(
-        np.ptp(evaluation.reference_m, axis=0), np.ptp(evaluation.estimate_m, axis=0)
-    )
-    horizontal_axis = across if extent[across] >= extent[up] else up
-    all_views = [
-        View(across, up, False, (names[across], names[up])),
-        View(
-            horizontal_axis, vertical_axis, is_down, (names[horizontal_axis], names[vertical_axis])
-        ),
-    ]
-    return (
-        all_views
-        if extent[vertical_axis] > MAX_FLAT_RATIO * extent[horizontal_axis]
-        else all_views[:1]
-    )
 
 
 def draw(evaluation: Evaluation, _: object) -> Iterator[Page]:
@@ -103,41 +66,36 @@ def draw(evaluation: Evaluation, _: object) -> Iterator[Page]:
 
 
 def _draw_maps(page: Page, evaluation: Evaluation) -> None:
-    """Draw both paths before alignment, and in each view the aligned path coloured by error."""
-    map_views, is_aligned = path_views(evaluation), evaluation.alignment != "none"
-    count = len(map_views) + is_aligned
-    width = (PAGE_WIDTH - COLUMN_GAP * (count - 1)) / count
+    """Draw both paths from above before the alignment, and the aligned path coloured by error."""
+    frame, is_aligned = evaluation.reference.frame, evaluation.alignment != "none"
+    map_axes = list(MAP_AXES[frame])
+    right, up = (AXES_OF_FRAME[frame][index] for index in map_axes)
     columns, estimate_handle = [], []
     if is_aligned:
-        columns.append(Page(width=width))
+        columns.append(halves()[0])
         axes = columns[-1].panel("Before alignment", "", MAP_HEIGHT, left=34.0)
-        for position, line_style, label in (
+        for position_m, line_style, label in (
             (evaluation.reference_m, REFERENCE_LINE, "reference"),
             (evaluation.unaligned_m, {"color": KF_COLOUR, "lw": 1.2}, "estimate"),
         ):
-            plot_path(
-                axes, map_views[0].project(position), evaluation.time_s, label=label, **line_style
-            )
-        _set_map_frame(axes, map_views[0])
+            plot_path(axes, position_m[:, map_axes], evaluation.time_s, label=label, **line_style)
+        style.set_map_axes(axes, right, up)
         estimate_handle = axes.get_legend_handles_labels()[0][1:]
         columns[-1].write_small(unaligned_sentence(evaluation))
-    for view in map_views:
-        columns.append(Page(width=width))
-        title = f"{'Aligned path' if is_aligned else 'Path'} coloured by error"
-        axes = columns[-1].panel(title, "", MAP_HEIGHT, left=34.0, right=40.0)
-        draw_path(axes, evaluation, view)
-        columns[-1].write_small(
-            SHADES_CAPTION if view is map_views[0] else vertical_error_sentence(evaluation, view.up)
-        )
+    columns.append(halves()[1])
+    title = f"{'Aligned path' if is_aligned else 'Path'} coloured by error"
+    axes = columns[-1].panel(title, "", MAP_HEIGHT, left=34.0, right=40.0)
+    _draw_path(axes, evaluation, map_axes)
+    style.set_map_axes(axes, right, up)
+    columns[-1].write_small("Darker poses have a larger error; × marks the largest one.")
     page.legend([*axes.get_legend_handles_labels()[0], *estimate_handle])
     page.add_columns(*columns)
 
 
-def draw_path(axes: Axes, evaluation: Evaluation, view: View) -> None:
-    """Draw the aligned path coloured by error, with the reference dashed."""
-    error, path = evaluation.position_error_m, view.project(evaluation.estimate_m)
+def _draw_path(axes: Axes, evaluation: Evaluation, map_axes: list[int]) -> None:
+    error, path = evaluation.position_error_m, evaluation.estimate_m[:, map_axes]
     stride = max(1, len(error) // MAX_PATH_POINTS)
-    scatter_points = axes.scatter(
+    dots = axes.scatter(
         path[::stride, 0],
         path[::stride, 1],
         c=error[::stride],
@@ -147,28 +105,14 @@ def draw_path(axes: Axes, evaluation: Evaluation, view: View) -> None:
         vmin=0.0,
         vmax=max(float(error.max()), MIN_ERROR_RANGE_M),
     )
-    plot_path(
-        axes,
-        view.project(evaluation.reference_m),
-        evaluation.time_s,
-        label="reference",
-        **REFERENCE_LINE,
-    )
+    reference_m = evaluation.reference_m[:, map_axes]
+    plot_path(axes, reference_m, evaluation.time_s, label="reference", **REFERENCE_LINE)
     axes.plot(*path[0], "o", color="white", mec="black", ms=5, mew=1.0, label="start", zorder=5)
     worst_point = path[np.argmax(error)]
     axes.plot(*worst_point, "x", color="black", ms=7, mew=1.6, label="largest error", zorder=5)
-    _set_map_frame(axes, view)
-    bar = axes.figure.colorbar(scatter_points, cax=axes.inset_axes((1.02, 0.0, 0.03, 1.0)))
+    bar = axes.figure.colorbar(dots, cax=axes.inset_axes((1.02, 0.0, 0.03, 1.0)))
     bar.set_label("APE (m)", labelpad=1)
     bar.outline.set_linewidth(0.5)
-
-
-def _set_map_frame(axes: Axes, view: View) -> None:
-    style.set_map_axes(axes, *view.names)
-    axes.locator_params(axis="x", nbins=4)
-    axes.locator_params(axis="y", nbins=6)
-    if view.is_down:
-        axes.invert_yaxis()
 
 
 def _draw_panels(page: Page, evaluation: Evaluation) -> None:
@@ -334,18 +278,6 @@ def unaligned_sentence(evaluation: Evaluation) -> str:
         f"RMSE before alignment {format_metres(rmse_m)}. Alignment: rotation "
         f"{np.degrees(alignment.rotation.magnitude()):.1f}°, translation {format_metres(shift_m)}"
         f"{scale_text} (choice of frame, not an error)."
-    )
-
-
-def vertical_error_sentence(evaluation: Evaluation, axis: int) -> str:
-    """Return a sentence on the RMSE along the vertical axis."""
-    squares = ((evaluation.estimate_m - evaluation.reference_m) ** 2).mean(axis=0)
-    name = AXES_OF_FRAME[evaluation.reference.frame][axis]
-    if not squares.any():
-        return "Estimate and reference are equal: the RMSE is zero along every axis."
-    return (
-        f"Along {name} the RMSE is {format_metres(float(np.sqrt(squares[axis])))}: "
-        f"{squares[axis] / squares.sum():.0%} of the squared error."
     )
 
 

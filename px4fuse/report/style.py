@@ -144,6 +144,8 @@ def set_map_axes(axes: Axes, right: str, up: str) -> None:
     axes.set_aspect("equal", adjustable="datalim", anchor="W")
     axes.grid(True, axis="both")
     axes.set(xlabel=f"{right} (m)", ylabel=f"{up} (m)")
+    axes.locator_params(axis="x", nbins=6)
+    axes.locator_params(axis="y", nbins=6)
 
 
 def decimate_series(time: Array, value: Array, limit: int = MAX_POINTS) -> tuple[Array, Array]:
