@@ -13,6 +13,7 @@ from page_tools import every, words
 from scipy.spatial.transform import Rotation
 from trajectory_tools import flight, transformed
 
+from px4fuse.core.text import format_metres
 from px4fuse.loop.tracks import read_source
 from px4fuse.report.evaluation import (
     draw,
@@ -92,11 +93,11 @@ def test_unaligned_rmse_in_evaluation_report_equals_evo() -> None:
     ape.process_data(sync.associate_trajectories(of_evo(true), of_evo(estimate)))
     rmse = ape.get_statistic(metrics.StatisticsType.rmse)
     sentence = unaligned_sentence(score)
-    assert f"RMSE before alignment {rmse:.3f} m" in sentence
+    assert f"RMSE before alignment {format_metres(rmse)} m" in sentence
     assert f"rotation {np.degrees(0.5):.1f}°" in sentence
     assert "scale" not in sentence
     centre = true.position_m.mean(axis=0) - estimate.position_m.mean(axis=0)
-    assert f"translation {np.linalg.norm(centre):.3f} m" in sentence
+    assert f"translation {format_metres(np.linalg.norm(centre))} m" in sentence
     half = transformed(true, Rotation.identity(), np.zeros(3), 0.5, kind="slam")
     assert ", scale 2 (" in unaligned_sentence(evaluate(half, true, alignment="sim3"))
 

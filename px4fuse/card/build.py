@@ -128,9 +128,9 @@ def build_card(
     elif reconcile == UNEXPLAINED_DIFFERENCE:
         verdicts = tuple(replace(verdict, is_explained=False) for verdict in verdicts)
     effect = _make_effect(analysis)
-    severity: CardSeverity = causes[0].severity if causes else _severity_without_cause(verdicts)
+    severity: CardSeverity = "note" if any(verdict.is_loud for verdict in verdicts) else "clean"
     return Card(
-        severity=severity,
+        severity=causes[0].severity if causes else severity,
         id=causes[0].id if causes else "",
         headline=_headline(causes, verdicts),
         effect=effect,
@@ -202,10 +202,6 @@ def build_refusal_card(error: LogError | MissingDataError, path: Path) -> Card:
         facts=facts,
         identity=Identity(file=display_name(path)),
     )
-
-
-def _severity_without_cause(verdicts: Sequence[Verdict]) -> CardSeverity:
-    return "note" if any(verdict.is_loud for verdict in verdicts) else "clean"
 
 
 def _headline(causes: Sequence[Cause], verdicts: Sequence[Verdict]) -> str:

@@ -21,7 +21,6 @@ from px4fuse.report.panels import normalised_innovations
 from px4fuse.report.phrases import VERDICT_HEAD, filters_by_name, verdict_rows
 from px4fuse.report.style import (
     DOTS,
-    KF_BAND_COLOUR,
     KF_COLOUR,
     LINES,
     MUTED_COLOUR,
@@ -41,7 +40,6 @@ MAX_NON_WHITE_P = 0.01
 RUNNING_HEIGHT = 140.0  # height (points) of the axes of the running mean NIS
 LOWER_HEIGHT = 150.0  # height (points) of the axes of distribution and autocorrelation
 LEGEND_HEIGHT = 14.0  # height (points) of a legend above the axes
-BAND_GREY = "#dcdcdc"
 # Label of each tested statistic, and the exponent with which its value is printed
 CAUSE_STATISTICS: Mapping[Statistic, tuple[str, float]] = {
     "nis": ("mean NIS", 1.0),
@@ -133,9 +131,9 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     page.table(head, rows, right_aligned_columns=(3, 4))
     page.write(
         (
-            "Each row is a re-run with one change. 'all': the change brings the quantity "
-            "into its band. Otherwise: explained share of the logarithm of the quantity (for "
-            "distances: of the mean square). A share of 50 % or more counts as the cause."
+            "Each row is a re-run with one changed setting. 'all': with the change, the quantity "
+            "is in its 95 % band. Otherwise: reduction of the logarithm of the quantity (for "
+            "distances: of the mean square). A change with 50 % or more is a cause."
         ),
         colour=MUTED_COLOUR,
     )
@@ -163,11 +161,8 @@ def _draw_running_nis(axes: Axes, series: Series) -> None:
         drawn_counts = np.unique(np.geomspace(3, len(number), 60).astype(int))
         low, high = np.array([nis_band(int(count)) for count in drawn_counts]).T
         time = values.index[drawn_counts - 1]
-        if name == "KF":
-            axes.fill_between(time, low, high, color=BAND_GREY, lw=0, label="95 % band KF")
-        else:
-            axes.plot(time, low, **_thin_line_style(name))
-            axes.plot(time, high, **_thin_line_style(name), label="95 % band EKF2")
+        axes.plot(time, low, **_thin_line_style(name))
+        axes.plot(time, high, **_thin_line_style(name), label=f"95 % band {name}")
         settled_nis = running.iloc[len(running) // 4 :]
         lowest_nis, highest_nis = (
             min(lowest_nis, 0.7 * settled_nis.min()),
@@ -181,7 +176,7 @@ def _draw_running_nis(axes: Axes, series: Series) -> None:
 def _draw_histogram(axes: Axes, series: Series) -> None:
     x = np.linspace(-MAX_NORMALISED, MAX_NORMALISED, 81)
     normal_density = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
-    axes.fill_between(x, normal_density, color=BAND_GREY, lw=0, label="normal")
+    axes.fill_between(x, normal_density, color="#dcdcdc", lw=0, label="normal")
     density_limit = 0.4
     for name, values in series.items():
         density, _ = np.histogram(
@@ -204,18 +199,8 @@ def _draw_autocorrelation(axes: Axes, series: Series) -> None:
         dots = DOTS[name] | {"ms": 3.0, "mew": 0.6, "mfc": KF_COLOUR if name == "KF" else "white"}
         axes.plot(positions, r, **dots, label=name)
         bound = _whiteness_bound(values)
-        if name == "KF":
-            axes.axhspan(
-                -bound,
-                bound,
-                color=KF_BAND_COLOUR,
-                lw=0,
-                zorder=0.5,
-                label="95 % band of white noise",
-            )
-        else:
-            for level in (-bound, bound):
-                axes.axhline(level, **_thin_line_style(name))
+        axes.axhline(-bound, **_thin_line_style(name))
+        axes.axhline(bound, **_thin_line_style(name), label=f"95 % band {name}")
     axes.axhline(0.0, color="black", lw=0.5)
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, -0.3), -1.05), min(max(high, 0.3), 1.05))
@@ -236,8 +221,7 @@ def _whiteness_sentence(result: AxisComparison, series: Series) -> str:
         r, p = consistency.lag1_autocorrelation, consistency.ljung_box_p
         interpretation = "white" if p >= MAX_NON_WHITE_P else "not white"
         if p < MAX_NON_WHITE_P and abs(r) > _whiteness_bound(values):
-            cause = "lags" if r > 0.0 else "follows measurement noise"
-            interpretation = f"the filter {cause}"
+            interpretation = f"{name} {'lags' if r > 0.0 else 'follows measurement noise'}"
         sentences.append(
             f"{name}: lag-1 autocorrelation {r:+.2f}, Ljung-Box test {format_p_value(p)}: "
             f"{interpretation}."

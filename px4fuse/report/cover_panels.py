@@ -23,8 +23,6 @@ from px4fuse.report import event_marks, style
 from px4fuse.report.page import (
     AXES_RIGHT,
     AXIS_LABEL_HEIGHT,
-    COLUMN_GAP,
-    PAGE_WIDTH,
     TICKS_HEIGHT,
     UNLABELLED_HEIGHT,
     Block,
@@ -41,10 +39,10 @@ POINTS_PER_MM = 72.0 / 25.4
 MIN_LONG_RATIO = 2.2
 # Limits (points) of the height of the map, with title and labels
 MAP_HEIGHTS = 40.0 * POINTS_PER_MM, 53.0 * POINTS_PER_MM
-# Minimum total height (points) of plots in two columns
-MIN_HALVES_HEIGHT = 50.0 * POINTS_PER_MM
-# Minimum total height (points) of plots in three columns; with less, the plots are on the next page
-MIN_THIRDS_HEIGHT = 38.0 * POINTS_PER_MM
+# Minimum height (points) of all plots; with less height, the plots are on the next page
+MIN_HEIGHT = 38.0 * POINTS_PER_MM
+# Minimum height (points) of all plots for a plot of the innovations
+MIN_INNOVATIONS_HEIGHT = 50.0 * POINTS_PER_MM
 # Limits (points) of the height of the innovation plot, with title and labels
 INNOVATION_HEIGHTS = 27.0 * POINTS_PER_MM, 38.0 * POINTS_PER_MM
 # Minimum height (points) of each plot of a position error
@@ -121,7 +119,7 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free_height: floa
     errors, innovations = _error_plots(analysis, card), _innovation_plot(analysis.main)
     flight_map = _flight_map(analysis, card)
     height = free_height - legend["height"] - UNUSED_HEIGHT
-    if height < MIN_THIRDS_HEIGHT:
+    if height < MIN_HEIGHT:
         height = NEXT_PAGE_HEIGHT
         page.blocks.insert(0, {"kind": "break"})
     min_height = MAP_HEIGHTS[0] + INNOVATION_HEIGHTS[0] + len(errors) * MIN_ERROR_HEIGHT
@@ -132,13 +130,10 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free_height: floa
         error_heights = _equal_heights(page, errors, height - map_height - innovation_height)
         _draw_plots(page, analysis, [*errors, innovations], [*error_heights, innovation_height])
         return
-    columns, map_height = list(halves()), height
+    columns, map_height = halves(), height
     if not errors:
         errors = [innovations]
-    elif height < MIN_HALVES_HEIGHT:
-        columns = [Page(width=(PAGE_WIDTH - 2.0 * COLUMN_GAP) / 3.0) for _ in range(3)]
-        _draw_plots(columns[2], analysis, [innovations], [height])
-    else:
+    elif height >= MIN_INNOVATIONS_HEIGHT:
         map_height -= innovation_height
     _draw_map(columns[0], analysis, flight_map, map_height)
     if map_height < height:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.text import format_metres
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.report import style
@@ -144,7 +145,7 @@ def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) ->
     )
     for name, title, line_style in STATISTIC_LINES:
         value = getattr(evaluation.ate.translation_m, name)
-        axes.axhline(value, label=f"{title} {format_metres(value)}", zorder=3, **line_style)
+        axes.axhline(value, label=f"{title} {format_metres(value)} m", zorder=3, **line_style)
     axes.set(xlim=(low, max(high, low + 1e-6)), xlabel=label)
     axes.set_ylim(0.0, 1.08 * max(float(error.max()), MIN_ERROR_RANGE_M))
     axes.locator_params(axis="x", nbins=6)
@@ -191,15 +192,6 @@ def plot_path(axes: Axes, positions: Array, time_s: Array, **style: Any) -> None
     )
 
 
-def format_metres(value: float) -> str:
-    """Format a length with three decimals, one from 10 m on.
-
-    >>> format_metres(0.0512), format_metres(31.26)
-    ('0.051 m', '31.3 m')
-    """
-    return f"{value:.3f} m" if abs(value) < 10.0 else f"{value:.1f} m"
-
-
 def time_origin_s(evaluation: Evaluation) -> float:
     """Return the time (s) of the first pose if timestamps are UNIX time, else 0."""
     start = float(evaluation.time_s[0])
@@ -212,8 +204,8 @@ def summary(evaluation: Evaluation) -> str:
     preposition = "without" if evaluation.alignment == "none" else "after"
     error = evaluation.ate.translation_m
     return (
-        f"ATE {format_metres(error.rmse)} (RMSE {preposition} alignment). Largest error "
-        f"{format_metres(error.max)} at "
+        f"ATE {format_metres(error.rmse)} m (RMSE {preposition} alignment). Largest error "
+        f"{format_metres(error.max)} m at "
         f"{evaluation.time_s[worst_index] - time_origin_s(evaluation):.1f} s, after "
         f"{evaluation.distance_m[worst_index]:.1f} m of the path."
     )
@@ -222,7 +214,7 @@ def summary(evaluation: Evaluation) -> str:
 def write_evaluation(page: Page, evaluation: Evaluation) -> None:
     """Write estimate, reference, method and the table of error statistics."""
     page.write_labelled("Estimate", describe_track(evaluation.estimate))
-    page.write_labelled("Against", describe_track(evaluation.reference))
+    page.write_labelled("Reference", describe_track(evaluation.reference))
     page.write_labelled("Method", describe_method(evaluation))
     for text in evaluation.warnings:
         page.write(text, bold=True, colour=style.SEVERITY_COLOURS["warning"])
@@ -275,8 +267,8 @@ def unaligned_sentence(evaluation: Evaluation) -> str:
         np.linalg.norm(alignment.apply(estimate_m.mean(axis=0)) - estimate_m.mean(axis=0))
     )
     return (
-        f"RMSE before alignment {format_metres(rmse_m)}. Alignment: rotation "
-        f"{np.degrees(alignment.rotation.magnitude()):.1f}°, translation {format_metres(shift_m)}"
+        f"RMSE before alignment {format_metres(rmse_m)} m. Alignment: rotation "
+        f"{np.degrees(alignment.rotation.magnitude()):.1f}°, translation {format_metres(shift_m)} m"
         f"{scale_text} (choice of frame, not an error)."
     )
 

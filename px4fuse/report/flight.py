@@ -13,6 +13,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison
 from px4fuse.core.record import Span
 from px4fuse.filter.signals import Segment
+from px4fuse.flight.model import Unavailable
 from px4fuse.report import panels, style
 from px4fuse.report.difference_page import unexplained_note
 from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page
@@ -69,13 +70,10 @@ def _draw_zoom(page: Page, analysis: Analysis) -> None:
         lw=1.2,
     )
     axes.set_xlabel(style.TIME_LABEL)
-    symbols = []
-    if isinstance(result.ekf2_innovations, pd.DataFrame):
-        symbols += ["triangle up before an update", "triangle down after it"]
-    if isinstance(result.ekf2_variance, pd.DataFrame):
-        symbols.append("square for the logged σ")
-    ekf2_legend = f" Symbols of EKF2: {', '.join(symbols)}." if symbols else ""
-    page.write_small(f"The line is σ of KF; grey ticks mark measurements.{ekf2_legend}")
+    symbols = ""
+    if not isinstance(result.ekf2_state, Unavailable):
+        symbols = " EKF2: ▵ before and ▾ after an update, □ logged σ."
+    page.write_small(f"The line is σ of KF; grey ticks mark measurements.{symbols}")
 
 
 def zoom_window(result: AxisComparison, segment: Segment) -> Span:

@@ -57,7 +57,6 @@ CLOSURE_HEAD = (
     "GNC\nweight",
 )
 TITLE = "Loop closure"
-MAX_MAP_POINTS = 2000  # maximum number of drawn points per path
 MAP_HEIGHT = 290.0  # height (points) of the axes of the map
 
 
@@ -111,15 +110,8 @@ def draw_map(axes: Axes, loop: Loop) -> None:
     names = AXES_OF_FRAME[path.frame]
     _draw_reference(axes, loop)
     for corrected_path in shown_paths(loop):
-        position = corrected_path.trajectory.position_m[
-            :: max(1, len(corrected_path.trajectory) // MAX_MAP_POINTS)
-        ]
-        axes.plot(
-            position[:, 1],
-            position[:, 0],
-            label=corrected_path.name,
-            **PATH_STYLES[corrected_path.name],
-        )
+        track, name = corrected_path.trajectory, corrected_path.name
+        plot_path(axes, track.position_m[:, (1, 0)], track.time_s, label=name, **PATH_STYLES[name])
     start, end = path.position_m[[0, -1]][:, (1, 0)]
     axes.plot(*start, "o", color="black", ms=5, label="start", zorder=5)
     axes.plot(
@@ -218,9 +210,9 @@ def write_scores(page: Page, loop: Loop) -> None:
             f"{closure.degrees_of_freedom}",
             format_p_value(closure.p).removeprefix("p "),
             "accepted" if closure.accepted else "REJECTED",
+            "–" if closure.weight_gnc is None else f"{closure.weight_gnc:.2f}",
         ]
-        cells.append("–" if closure.weight_gnc is None else f"{closure.weight_gnc:.2f}")
-        colour = "black" if closure.accepted else style.SEVERITY_COLOURS["error"]
+        colour = "black" if closure.accepted else RED
         rows.append([(cell, colour) for cell in cells])
     if rows:
         page.table(CLOSURE_HEAD, rows, right_aligned_columns=(1, 2, 3, 4, 6))
@@ -288,12 +280,10 @@ def describe_closure_error(loop: Loop) -> str:
 
 def describe_gate(closure: Closure) -> str:
     """Format the chi-square test of a loop closure."""
-    verdict = "accepted (consistent with the stated drift)"
-    if not closure.accepted:
-        verdict = "REJECTED (not explained by the stated drift)"
+    verdict = "accepted: consistent" if closure.accepted else "REJECTED: not consistent"
     return (
         f"d² {closure.d2:.1f} with {closure.degrees_of_freedom} degrees of freedom, "
-        f"p {closure.p:.2g} (rejected below {GATE_ALPHA:g}): {verdict}"
+        f"p {closure.p:.2g} (rejected below {GATE_ALPHA:g}); {verdict} with the stated drift"
     )
 
 

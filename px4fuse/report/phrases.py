@@ -165,13 +165,6 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     return notes
 
 
-def format_consequences(consequences: Sequence[Finding]) -> str:
-    """Format the findings that are consequences of another finding, with their ids."""
-    return "Consequences: " + " ".join(
-        f"{finding.title} [{finding.id}]." for finding in consequences
-    )
-
-
 def format_clock_map(clock: ClockMap) -> str:
     """Format the mapping of a clock to the autopilot's boot clock."""
     is_note_sufficient = clock.method in ("boot clock", "arrival time") or "own speed" in clock.note
@@ -292,7 +285,8 @@ def write_finding(page: Page, group: list[Finding]) -> None:
     if finding.remedy:
         texts.append(styled_text(f"Action: {finding.remedy}", 8.0, MUTED_COLOUR))
     if consequences:
-        texts.append(styled_text(format_consequences(consequences), 8.0, MUTED_COLOUR))
+        titles = " ".join(f"{finding.title} [{finding.id}]." for finding in consequences)
+        texts.append(styled_text(f"Consequences: {titles}", 8.0, MUTED_COLOUR))
     page.write_labelled(
         f"{finding.severity}\n{finding.when}".strip(),
         *texts,

@@ -75,9 +75,6 @@ def show(console: Console, blocks: Iterable[Block], request: Request | None = No
                 console.print()
             case "card" | "closing" | "headline":
                 _show_card(console, CARD_LINES[block["kind"]], block["card"], request)
-            case "columns":
-                for column in block["columns"]:
-                    show(console, column, request)
 
 
 def _show_card(
