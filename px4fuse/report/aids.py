@@ -83,21 +83,19 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
             f"{aid.longest_gap_duration_s:.1f}",
             noise,
         ]
-        for name, axis in aid.axes.items():
-            low, high = axis.nis_band
-            rows.append(
-                [
-                    *aid_cells,
-                    name,
-                    f"{axis.samples}",
-                    format_number(axis.nis_mean),
-                    f"{low:.2f} – {high:.2f}",
-                    f"{axis.mean_normalised_innovation:+.2f}",
-                ]
-            )
+        axis_rows: list[list[Cell]] = [
+            [
+                name,
+                f"{axis.samples}",
+                format_number(axis.nis_mean),
+                "{:.2f} – {:.2f}".format(*axis.nis_band),
+                f"{axis.mean_normalised_innovation:+.2f}",
+            ]
+            for name, axis in aid.axes.items()
+        ] or [[""] * 5]
+        for axis_cells in axis_rows:
+            rows.append([*aid_cells, *axis_cells])
             aid_cells = [""] * len(aid_cells)
-        if not aid.axes:
-            rows.append([*aid_cells, *[""] * 5])
     page.table(
         [
             "aiding source",

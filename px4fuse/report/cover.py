@@ -41,8 +41,6 @@ from px4fuse.report.style import SEVERITY_COLOURS
 from px4fuse.report.typesetting import measure_free_height
 from px4fuse.results.contract import AidsResults, ComparisonResults
 
-# Maximum number of changed settings that the head lists; more settings are counted
-MAX_CHANGED_SETTINGS = 3
 MAX_FILE_LENGTH = 56  # maximum number of characters of the file name in the head
 AXIS_TITLE = "Is the reported uncertainty right?"
 AXIS_TEXT = "RMS of actual ÷ reported"
@@ -75,9 +73,7 @@ def add_card(page: Page, card: Card) -> Block:
     """Add the texts of a card to a page; plots are added to ``blocks`` of the result."""
     identity = card.identity
     flight = identity.firmware, identity.hardware, f"{identity.duration_s:.1f} s", identity.source
-    further_causes_text = (
-        [f"{card.more_causes} more causes are listed in {ALL_FINDINGS}"] if card.more_causes else []
-    )
+    more_causes = f"{card.more_causes} more causes are listed in {ALL_FINDINGS}"
     return page.add(
         "cover",
         sign=SEVERITY_SIGNS[card.severity],
@@ -85,7 +81,7 @@ def add_card(page: Page, card: Card) -> Block:
         file=_shorten_middle(identity.file),
         student=[text for text in (identity.student, identity.student_id) if text],
         flight=" · ".join(filter(None, flight)),
-        changed=_format_changed(identity.changed),
+        changed=f"KF changed: {', '.join(identity.changed)}" if identity.changed else "",
         settings=f"KF: {identity.settings}" if identity.settings else "",
         parameters=", ".join(identity.parameters),
         headline=card.headline,
@@ -97,7 +93,7 @@ def add_card(page: Page, card: Card) -> Block:
         causes_title="Cause and fix" if len(card.causes) == 1 else "Causes and fixes",
         causes_legend=_causes_legend(card.causes),
         causes=[_cause_data(number, cause) for number, cause in enumerate(card.causes, start=1)],
-        more_causes="".join(further_causes_text),
+        more_causes=more_causes if card.more_causes else "",
         difference=card.difference,
         notes=note_texts(card, f"in {ALL_FINDINGS}"),
         terms=AIDS_TERMS if card.aids else TERMS_NOTE,
@@ -123,17 +119,6 @@ def _shorten_middle(name: str) -> str:
     return (
         name if len(name) <= MAX_FILE_LENGTH else f"{name[: half_length - 1]}…{name[-half_length:]}"
     )
-
-
-def _format_changed(changed_options: Sequence[str]) -> str:
-    if not changed_options:
-        return ""
-    text = (
-        ", ".join(changed_options)
-        if len(changed_options) <= MAX_CHANGED_SETTINGS
-        else f"{len(changed_options)} settings"
-    )
-    return f"KF changed: {text}"
 
 
 def _axis_data(card: Card) -> dict[str, Any]:
