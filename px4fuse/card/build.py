@@ -69,7 +69,7 @@ SHOWN_BYTE_COUNT = 4  # number of bytes of an unreadable log that its card shows
 ULOG_HEAD = "55 4C 6F 67"  # first bytes of each ULog
 HEADING_HIDES_ERROR = (
     "Both filters rotate the measured acceleration by the wrong heading and return to the position "
-    "at each update, so the innovations show only a part of the error."
+    "at each update, so the innovations show little of the error."
 )
 UNEXPLAINED_DIFFERENCE = "The two verdicts differ, and no tested change explains it."
 NO_FAULT_HEADLINE = "No fault found: KF and EKF2 are consistent"
@@ -449,13 +449,13 @@ def _reconcile(
         ):
             noise = f" of {format_metres(sigma)} m"
         return (
-            f"Source: the noise{noise} from sample to sample is less than both filters assume. "
-            "Ground truth: the source as a whole drifts, which no innovation can show."
+            f"The noise of the source{noise} is less than both filters assume. The drift of the "
+            "source does not appear in the innovations, so only ground truth shows it."
         )
     if "source_noise_time_correlated" in ids:
         return (
             "Innovations show only the error that changes from sample to sample. Both filters "
-            "follow the slow part, so it shows against ground truth alone."
+            "follow the slow error, so only ground truth shows it."
         )
     unexplained_text = (
         HEADING_HIDES_ERROR if "ekf2_heading_error" in ids else UNEXPLAINED_DIFFERENCE
@@ -481,9 +481,9 @@ def _gate_sentence(analysis: Analysis) -> str:
     )
     rejected_count = int((innovations["rejected"] > 0.0).sum())
     return (
-        f"EKF2's gate rejected {rejected_count} of {len(innovations)} positions. They count among "
-        f"the innovations, but did not move its state. Over the accepted positions its innovation "
-        f"÷ √S is {format_ratio(ratio)}."
+        f"EKF2's gate rejected {rejected_count} of {len(innovations)} positions, so they did not "
+        "change its state, although their innovations are evaluated. Over the accepted positions, "
+        f"EKF2's innovation ÷ √S is {format_ratio(ratio)}."
     )
 
 
@@ -498,7 +498,9 @@ def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> st
         if improvement(trial) in BETTER_POSITION or not can_show_effect(trial)
     }
     if len(filter_names) == 2:
-        return f"{text}. Both filters have the fault, so this difference does not show it."
+        return (
+            f"{text}. The fault affects both filters equally, so this difference does not show it."
+        )
     after = {trial.filter: trial.after.difference_rms_m for trial in reversed(trials)}
     filter_name: FilterName = "ekf2" if filter_names == {"ekf2"} or set(after) == {"ekf2"} else "kf"
     difference_after_m = after.get(filter_name)

@@ -293,7 +293,7 @@ def _no_change_reason(
         if filter_name == "kf":
             return "no option rejects outliers; do not raise --sigma-z for them"
         if words.get("truth", "consistent") == "consistent":
-            return "no change: its gate rejects outliers, and σ covers the error"
+            return "no change: the gate rejects outliers, and the reported σ is consistent"
     return (
         f"no setting {'removes drift' if finding.id == 'source_drift' else 'corrects this fault'}"
     )
@@ -388,7 +388,7 @@ def _closing_sentence(
             "position (ms)."
         )
     if any(trial.kinds == ("defaults",) for trial in useful_trials):
-        return "Both values are consistent; the default needs no option."
+        return "KF is consistent with both values. The default needs no option."
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     for trial in useful_trials:
         if trial.kinds != ("noise",) or not isinstance(horizontal_tuning, AxisTuning):
@@ -396,7 +396,7 @@ def _closing_sentence(
         default = analysis.flight.log.default_of(next(iter(trial.change)))
         sigma_z = horizontal_tuning.sigma_z
         if (sigma_z.low or 0.0) <= default <= (sigma_z.high or 0.0):
-            return f"PX4's default, {default:g} m, is inside the 95 % interval: it is as good."
+            return f"PX4's default of {default:g} m is within the 95 % interval, so it is as good."
     ratios_after = [
         math.sqrt(trial.after.nees_mean) for trial in useful_trials if trial.after.nees_mean
     ]

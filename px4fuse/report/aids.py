@@ -124,7 +124,7 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
 def format_aid_verdict(aid: AidResult) -> str:
     """Format the verdict on an aiding source, with the factor between reported and actual σ."""
     if aid.verdict == "not_fused":
-        return f"not fused for {aid.longest_gap_duration_s:.1f} s"
+        return f"not fused for up to {aid.longest_gap_duration_s:.1f} s"
     return format_sigma_verdict(aid.verdict, max(aid.nis_mean, 1.0 / aid.nis_mean) ** 0.5)
 
 

@@ -52,8 +52,8 @@ ASCII_REPLACEMENTS = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/-
     {"√": "sqrt ", "σ": "sigma", "→": "->", "°": " deg", "±": "+-", "ν": "nu", "…": "..."}
 )
 AIDS_HEADING = (
-    "Innovation ÷ √S of the aiding sources that EKF2 fused. Below 1: √S is larger than needed. For "
-    "barometer, magnetometer and gravity that is usual and not a fault."
+    "RMS of innovation ÷ √S of each aiding source that EKF2 fused. A value below 1 means that √S "
+    "is too large. For barometer, magnetometer and gravity this is usual and not a fault."
 )
 CONSOLE_NOTE = "Console means the MAVLink Console of QGroundControl."
 
@@ -304,8 +304,8 @@ def rerun_start(reruns: Sequence[Rerun]) -> str:
     if not starts:
         return ""
     return (
-        f"EKF2 (replay) is a prediction: both values are of the replay from {min(starts):.0f} s "
-        "on, without gaps."
+        f"EKF2 (replay) is a prediction. Both values are from the replay after {min(starts):.0f} "
+        "s, without gaps."
     )
 
 

@@ -123,9 +123,9 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     page.write_labelled_texts(clock_advice(analysis, clock))
     (low, high), estimate_s = clock.interval_s, clock.offset_s
     curve_sentence = (
-        f"Maximum at {estimate_s:+.3f} s; 95 % interval {low:+.3f} to {high:+.3f} s. The "
-        "interval also includes the IMU noise, so it is wider than the curve shows. "
-        f"{clock.count} measurements."
+        f"The log-likelihood has its maximum at {estimate_s:+.3f} s; 95 % interval {low:+.3f} to "
+        f"{high:+.3f} s. The interval also includes the IMU noise, so it is wider than the curve "
+        f"shows. {clock.count} measurements."
     )
     title = "Log-likelihood relative to its maximum (nats, downwards)"
     draw_curve(page.panel(title, curve_sentence, CURVE_HEIGHT, above=14.0), clock)

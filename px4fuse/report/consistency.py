@@ -131,8 +131,8 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     page.table(head, rows, right_aligned_columns=(3, 4))
     page.write(
         (
-            "Each row is a re-run with one changed setting. 'all': with the change, the quantity "
-            "is in its 95 % band. Otherwise: reduction of the logarithm of the quantity (for "
+            "Each row is a re-run with one changed setting. 'all': the change makes the quantity "
+            "consistent. Otherwise: reduction of the logarithm of the quantity (for "
             "distances: of the mean square). A change with 50 % or more is a cause."
         ),
         colour=MUTED_COLOUR,

@@ -27,7 +27,7 @@ from px4fuse.report.style import (
     draw_curve,
 )
 
-TITLE = "Difference between KF and EKF2, step by step"
+TITLE = "Difference between KF and EKF2, setting by setting"
 ROW_HEIGHT = 12.0  # height (points) of a bar with its gap
 LABEL_WIDTH = 140.0  # width (points) of the labels of bars
 LEFT_COLUMN_FRACTION = 0.62  # fraction of the page width for the column with the labels of bars
@@ -145,7 +145,7 @@ def _draw_axis(
         _draw_waterfall(axes, names, 100.0 * steps / total, 100.0 * unexplained_mean_square / total)
     axes.set_yticklabels([])
     page.add_columns(*columns)
-    title = "Position difference KF - EKF2 (m, dark) and unexplained part (light)"
+    title = "Position difference KF - EKF2 (m, dark) and unexplained rest (light)"
     axes = event_marks.panel(
         page,
         analysis,

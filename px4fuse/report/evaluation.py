@@ -286,8 +286,8 @@ def quarters_sentence(evaluation: Evaluation) -> str:
     """Return the caption of the APE over distance: RMSE of each quarter of the path."""
     rmse_text = ", ".join(f"{rmse_m:.3f}" for rmse_m in quarter_rmse(evaluation))
     return (
-        f"RMSE per quarter of the path: {rmse_text} m. Drift grows along the path. After "
-        "alignment its error is large at both ends."
+        f"RMSE per quarter of the path: {rmse_text} m. An error by drift grows along the path; "
+        "after alignment it is large at both ends."
     )
 
 

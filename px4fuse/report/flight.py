@@ -125,7 +125,9 @@ def zoom_sentence(result: AxisComparison) -> str:
         )
         if prior_m is None or posterior_m is None:
             if name == "EKF2":
-                texts.append("EKF2: S or R not logged, so σ before and after the update is unknown")
+                texts.append(
+                    "σ of EKF2 before and after the update is unknown, because S or R is not logged"
+                )
             continue
         reduction = 1.0 - posterior_m**2 / prior_m**2
         change_text = f"{name} {prior_m:.3f} to {posterior_m:.3f} m, {reduction:.0%} less variance"

@@ -194,7 +194,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
         if names
         else (
             "No ground truth and no reference trajectory, so the error of the path is "
-            "unknown. Give one with --reference FILE."
+            "unknown. Add a reference trajectory with --reference FILE."
         )
     )
 
@@ -300,12 +300,15 @@ def by_distance_sentence(loop: Loop) -> str:
     if "by_distance_plain" not in loop.paths:
         return ""
     heading_deg = loop.heading_error_deg
-    headings = "With headings, each step is also rotated by its share of the heading error."
+    headings = (
+        "The correction with headings also rotates each motion by a part of the heading error."
+    )
     if isinstance(heading_deg, Unavailable):
         headings = f"The correction of headings is missing: {heading_deg.reason}."
     return (
-        "The correction by distance, positions only, moves each position by its share of the "
-        f"closure error (Example 2 of lesson UAT 366, module 2). {headings}"
+        "The correction by distance shifts each position by a part of the closure error that is "
+        "proportional to its distance from the start (lesson UAT 366, module 2, Example 2). "
+        f"{headings}"
     )
 
 
@@ -356,7 +359,7 @@ def graph_summary(solved_graph: SolvedGraph) -> Page:
     if isinstance(gates, Unavailable):
         page.write_labelled("Gate", f"not applied: {gates.reason}")
     elif not gates:
-        page.write_labelled("Gate", "no closures to test: every edge is odometry")
+        page.write_labelled("Gate", "the graph has no loop closures to test")
     else:
         rejected_gates = [gate for gate in gates if not gate.accepted]
         lines = [f"{g.first} – {g.second}: d² {g.d2:.1f}, p {g.p:.2g}" for g in rejected_gates]
@@ -369,7 +372,8 @@ def graph_summary(solved_graph: SolvedGraph) -> Page:
         and (~solved_graph.graph.is_successive).sum() > MAX_ROBUST_CLOSURES
     ):
         page.write_labelled(
-            "Robust", "not solved for this many closures; add --robust (takes some minutes)"
+            "Robust",
+            "the robust solution is not computed for so many closures; add --robust (some minutes)",
         )
     unconverged = [
         SOLUTIONS[key] for key, solution in solved_graph.solutions.items() if not solution.converged

@@ -157,10 +157,10 @@ def verdict_notes(comparison: Comparison) -> list[str]:
     ]
     if correlated:
         notes.append(
-            "Innovations are not white, although their size is consistent (Ljung-Box test, p < "
-            f"{MIN_WHITE_P:g}): {'; '.join(correlated)}. Positive: the filter lags, SIGMA_A may "
-            "be too small. Negative: the filter follows the measurement noise, SIGMA_A may be too "
-            "large."
+            "Innovations are not white, although their variance is consistent (Ljung-Box test, p "
+            f"< {MIN_WHITE_P:g}): {'; '.join(correlated)}. If the autocorrelation is positive, the "
+            "filter lags and SIGMA_A may be too small. If it is negative, the filter follows the "
+            "measurement noise and SIGMA_A may be too large."
         )
     return notes
 
@@ -232,8 +232,8 @@ def tuning_advice(
     elif sigma_z.value is None:
         bound = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
         advice["SIGMA_Z"] = (
-            f"SIGMA_Z cannot be estimated at this logging rate{bound}: the process noise between "
-            "samples masks it. Log the source at a higher rate."
+            f"SIGMA_Z cannot be estimated at this logging rate{bound}: it is masked by the process "
+            "noise between samples. Log the source at a higher rate."
         )
     elif log.autopilot == "PX4" and not drifts and comparison.source.origin.is_vision:
         px4_value = log.parameters.get("EKF2_EVP_NOISE")

@@ -168,7 +168,7 @@ def summary(analysis: WhatIfAnalysis) -> Page:
     log, whatif_result = analysis.flight.log, analysis.whatif
     page.write_labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
     spans = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.evaluated_s)
-    page.write_labelled("Used", f"All columns contain {spans} of the flight.")
+    page.write_labelled("Used", f"All columns are evaluated from {spans} of the flight.")
     page.write_labelled("Replay", format_agreement(whatif_result.agreement))
     head = ["", *column_heads(analysis)]
     page.table(head, rows(analysis), right_aligned_columns=range(1, len(head)))
