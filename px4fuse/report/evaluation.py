@@ -214,7 +214,7 @@ def summary(evaluation: Evaluation) -> str:
 def write_evaluation(page: Page, evaluation: Evaluation) -> None:
     """Write estimate, reference, method and the table of error statistics."""
     page.write_labelled("Estimate", describe_track(evaluation.estimate))
-    page.write_labelled("Reference", describe_track(evaluation.reference))
+    page.write_labelled("Against", describe_track(evaluation.reference))
     page.write_labelled("Method", describe_method(evaluation))
     for text in evaluation.warnings:
         page.write(text, bold=True, colour=style.SEVERITY_COLOURS["warning"])
