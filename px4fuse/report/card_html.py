@@ -23,7 +23,6 @@ from px4fuse.card.model import (
 from px4fuse.card.verdicts import verdicts
 from px4fuse.core.text import format_ratio
 from px4fuse.errors import SettingsError
-from px4fuse.filter.consistency import Reference
 from px4fuse.html.safe import load_template, read_asset
 from px4fuse.report.card_text import (
     LABELLED_TICKS,
@@ -61,12 +60,7 @@ def card_of(analysis: Analysis) -> Card:
     return with_typed_path(card, analysis.request.log)
 
 
-def card_html(
-    card: Card,
-    *,
-    is_open: bool = False,
-    has_apply: bool = False,
-) -> str:
+def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> str:
     """Return the card as an HTML element; :func:`card_style` has its style.
 
     Parameters
@@ -84,9 +78,6 @@ def card_html(
         figure=axis_html(card.verdicts, card.effect.axis)
         if card.verdicts and card.effect is not None
         else "",
-        more=" and ".join(
-            text for text, parts in (("causes", card.causes), ("notes", card.notes)) if parts
-        ).capitalize(),
         marked_actions=marked_actions,
         rerun_rows=_rerun_rows,
         signs=SEVERITY_SIGNS,
@@ -150,16 +141,15 @@ def alternative_text(verdicts: Sequence[Verdict]) -> str:
     >>> alternative_text([Verdict(filter="kf", against="truth", ratio=7.2, word="overconfident")])
     'KF, error over sigma: 7.2, overconfident.'
     """
-    return " ".join(
-        f"{FILTER_NAMES[verdict.filter]}, {SPOKEN_QUANTITIES[verdict.against]}: "
-        + (f"not evaluated, {verdict.reason}." if verdict.ratio is None else f"{_value(verdict)}.")
-        for verdict in verdicts
-    )
-
-
-def _value(verdict: Verdict) -> str:
-    explained = ", explained" if verdict.is_explained else ""
-    return f"{format_ratio(verdict.ratio or 0.0)}, {verdict.word}{explained}"
+    sentences = []
+    for verdict in verdicts:
+        value = f"not evaluated, {verdict.reason}"
+        if verdict.ratio is not None:
+            explained = ", explained" if verdict.is_explained else ""
+            value = f"{format_ratio(verdict.ratio)}, {verdict.word}{explained}"
+        quantity = f"{FILTER_NAMES[verdict.filter]}, {SPOKEN_QUANTITIES[verdict.against]}"
+        sentences.append(f"{quantity}: {value}.")
+    return " ".join(sentences)
 
 
 def _rerun_rows(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
@@ -175,6 +165,8 @@ def _drawing(verdict: Verdict) -> dict[str, Any]:
     if verdict.ratio is None:
         return {}
     low, high = (axis_fraction(end) for end in SIGMA_RATIO_BANDS[verdict.against])
+    fraction = axis_fraction(verdict.ratio)
+    symbol = "below" if fraction < 0.0 else "above" if fraction > 1.0 else verdict.against
     marks = []
     if verdict.interval is not None:
         left_percent, right_percent = (_percent(max(end, 1e-9)) for end in verdict.interval)
@@ -189,10 +181,5 @@ def _drawing(verdict: Verdict) -> dict[str, Any]:
         ),
         "interval": [Markup(mark) for mark in marks],
         "mark": Markup(f' x="{_percent(verdict.ratio)}%"'),
-        "path": MARK_PATHS[_shape(verdict.ratio, verdict.against)],
+        "path": MARK_PATHS[symbol],
     }
-
-
-def _shape(ratio: float, reference: Reference) -> str:
-    fraction = axis_fraction(ratio)
-    return reference if 0.0 <= fraction <= 1.0 else "above" if fraction > 1.0 else "below"

@@ -136,7 +136,9 @@ def note_texts(card: Card, place: str) -> list[str]:
 
 def closing_lines(card: Card) -> Iterator[Line]:
     """Yield the last lines of a card: commands for details, and an explanation of the console."""
-    has_console = any(action.where == "console" for action in _all_actions(card))
+    has_console = any(
+        action.where == "console" for cause in card.causes for _, action in marked_actions(cause)
+    )
     sentences = ["More: -v.", *([CONSOLE_NOTE] if has_console else [])]
     sentences += [f"Meaning: px4fuse explain {card.id}"] if card.id else []
     yield from _wrapped_lines(" ".join(sentences), "", "")
@@ -396,10 +398,3 @@ def _labelled_lines(label: str, text: str) -> Iterator[Line]:
 def _wrapped_lines(text: str, first_indent: str, indent: str) -> Iterator[Line]:
     if text:
         yield Line(text, "", first_indent, indent, wraps=True)
-
-
-def _all_actions(card: Card) -> Iterator[Action]:
-    for cause in card.causes:
-        yield from cause.actions
-        for alternative in cause.alternatives:
-            yield from alternative
