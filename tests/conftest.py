@@ -277,9 +277,11 @@ def _diagnose_cached(
     request: ComparisonRequest,
     progress: Progress = ignore_progress,
     flight: Flight | None = None,
+    *,
+    as_sent: bool = False,
 ) -> Analysis:
-    if flight is not None and flight is not _cache.get(_flight_key(request)):
-        return _diagnose(request, progress, flight)
+    if as_sent or (flight is not None and flight is not _cache.get(_flight_key(request))):
+        return _diagnose(request, progress, flight, as_sent=as_sent)
     return _cached(_cache_key(request, "analysis"), lambda: _diagnose(request, progress, flight))
 
 

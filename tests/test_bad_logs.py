@@ -91,7 +91,7 @@ def read_and_make_axes(path: Path) -> Flight | None:
         ),
     ],
 )  # fmt: skip
-def test_read_log_of_other_file_format_is_rejected(tmp_path, content, words):
+def test_read_log_of_unsupported_file_format_is_rejected(tmp_path, content, words):
     path = tmp_path / "other.ulg"
     path.write_bytes(content)
     assert words in read_error(path)
@@ -110,7 +110,9 @@ def test_read_log_of_other_file_format_is_rejected(tmp_path, content, words):
         ("log.pdf", b"%PDF-1.7 and so on", "the file is a PDF", "verify log.pdf LOG"),
     ],
 )
-def test_read_log_of_other_file_type_suggests_right_command(tmp_path, name, content, what, command):
+def test_read_log_of_unsuitable_file_suggests_another_command(
+    tmp_path, name, content, what, command
+):
     (tmp_path / name).write_bytes(content)
     message = read_error(tmp_path / name)
     assert message.startswith(f"{name}: {what}")
@@ -187,7 +189,7 @@ def write_and_read(log: Log, tmp_path: Path) -> Flight:
         ("vehicle_land_detected", "airborne"),
     ],
 )
-def test_read_log_without_topic_disables_only_its_data(tmp_path, topic, part):
+def test_read_log_without_one_topic_lacks_only_data_of_topic(tmp_path, topic, part):
     """Only the part of the missing topic is unavailable."""
     flight = write_and_read(make_log("v1.16", 2.0).drop(topic), tmp_path)
     for name in ("imu", "attitude", "ekf2", "airborne"):
@@ -242,7 +244,7 @@ def test_read_log_rejects_log_whose_timestamps_are_all_zero(tmp_path):
     assert "all timestamps are zero" in read_error(log.write(tmp_path / "zero.ulg"))
 
 
-def test_read_log_notes_a_topic_with_zero_timestamps(tmp_path):
+def test_read_log_adds_note_on_topic_with_zero_timestamps(tmp_path):
     """ekf2_innovations of a real log of 2016 had this fault."""
     log = make_log("v1.9", 2.0)
     log["ekf2_innovations"]["timestamp"][:] = 0
@@ -367,7 +369,7 @@ def test_px4_parameter_out_of_range_is_replaced_by_default(tmp_path, parameter, 
     assert all(aid.parameters.get(parameter) != value for aid in flight.ekf2.aids.values())
 
 
-def test_px4_parameter_at_float32_end_of_range_is_kept(tmp_path):
+def test_px4_parameter_at_float32_limit_of_range_is_accepted(tmp_path):
     log = make_log("v1.16", 2.0)
     lowest = float(np.float32(0.01))  # 0.0099999998
     log.parameters |= {"EKF2_EVP_NOISE": lowest, "EKF2_GYR_NOISE": float(np.float32(0.1))}

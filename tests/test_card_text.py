@@ -44,7 +44,7 @@ def test_diagnosis_card_text_has_at_most_40_lines() -> None:
         assert part in whole
 
 
-def test_diagnosis_card_text_marks_alternatives_either_or() -> None:
+def test_diagnosis_card_text_joins_alternatives_by_either_or() -> None:
     cause = replace(SMALL_SIGMA_A.causes[0], alternatives=((SENDER,), (DELAY,)))
     card = replace(SMALL_SIGMA_A, causes=(cause,))
     lines = text_of(card)

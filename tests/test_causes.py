@@ -28,7 +28,7 @@ def test_consequences_of_causes_name_only_existing_findings() -> None:
     assert listed | set(CONSEQUENCES) | NOISES | RECORDING <= set(TITLES)
 
 
-def test_nested_causes_of_findings_are_listed_inner_first() -> None:
+def test_cause_table_lists_inner_causes_before_outer_causes() -> None:
     outer = list(CONSEQUENCES)
     for at, cause in enumerate(outer):
         assert set(effect_ids(cause)) & set(outer) <= set(outer[:at]), cause
@@ -99,6 +99,6 @@ def test_consistency_notes_of_white_innovations_are_empty(sample: Analysis) -> N
     assert verdict_notes(replace(sample, axes={"east": white})) == []
 
 
-def test_consistency_notes_name_a_source_that_may_drift(sample: Analysis) -> None:
+def test_consistency_note_states_that_odometry_may_drift(sample: Analysis) -> None:
     turning = replace(sample.source, origin=replace(sample.source.origin, kind="vio"))
     assert "source may drift" in verdict_notes(replace(sample, source=turning))[0]

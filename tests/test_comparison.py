@@ -92,7 +92,7 @@ class TestSample:
                 reported = np.interp(error.index, column.index, column, np.nan, np.nan)
                 assert nees == pytest.approx(np.nanmean(error**2 / reported))
 
-    def test_ekf2_delayed_state_equals_position_before_update(
+    def test_ekf2_state_at_fusion_horizon_is_state_before_update(
         self, sample, sample_flight, sample_log
     ):
         """Published positions include the output predictor's lag, which no variance contains."""
@@ -246,7 +246,7 @@ class TestMissingParts:
             assert result.filters["ekf2"].sigma_p_before_update_m is None
             assert isinstance(result.difference, Difference)
 
-    def test_compare_with_short_ground_truth_interpolates_variance(self, made: Comparison) -> None:
+    def test_ekf2_nees_uses_variance_interpolated_to_ground_truth(self, made: Comparison) -> None:
         """EKF2's variances are logged at 1 Hz: none is within these 0.8 s of ground truth."""
         samples = made.flight.truth.samples.loc[40.1:40.9]
         flight = replace(made.flight, truth=Truth("0.8 s", samples))
@@ -271,7 +271,7 @@ class TestMissingParts:
 
 
 class TestRobustness:
-    def test_compare_removes_and_notes_ekf2_frame_reset(self, made: Comparison) -> None:
+    def test_compare_removes_ekf2_frame_reset_and_adds_note(self, made: Comparison) -> None:
         reset = Reset(60.0, "position", (5.0, -3.0, 0.0))
         comparison = compare(aisle_flight(ekf2=Estimator(resets=(reset,))))
         assert any("resets removed: 1 of horizontal position" in note for note in comparison.notes)

@@ -72,7 +72,7 @@ def test_report_cover_prints_texts_of_the_diagnosis_card() -> None:
     assert [each for each in expected if each not in text] == []
 
 
-def test_report_cover_marks_alternative_actions_either_or() -> None:
+def test_report_cover_joins_alternative_actions_by_either_or() -> None:
     sender = Action("sender", "subtract 0.264 s")
     console = Action("EKF2", commands=("param set EKF2_EV_DELAY 264", "reboot"), where="console")
     cause = Cause(
@@ -86,7 +86,7 @@ def test_report_cover_marks_alternative_actions_either_or() -> None:
     assert "console: MAVLink Console of QGroundControl" in text
 
 
-def test_report_cover_counts_notes_beyond_three() -> None:
+def test_report_cover_shows_3_notes_and_counts_the_others() -> None:
     notes = tuple(Note(f"note_{number}", f"Text {number}.") for number in range(5))
     text = text_of(replace(SMALL_SIGMA_A, notes=notes, more_causes=4))
     assert "note[note_2]: Text 2." in text
@@ -116,7 +116,7 @@ def test_report_cover_explained_verdict_is_not_emphasised() -> None:
     assert all(row["quiet"] and not row["loud"] for row in block["rows"])
 
 
-def test_report_cover_ratio_beyond_scale_is_drawn_as_triangle() -> None:
+def test_sigma_ratio_beyond_plot_scale_is_drawn_as_triangle() -> None:
     ratios = verdicts(
         (0.05, "underconfident"), (0.1, "underconfident"), (10.0, "overconfident"),
         (35.0, "overconfident"),
@@ -196,7 +196,7 @@ def test_report_cover_omits_plots_of_missing_data(changes, titles) -> None:
     assert len(set_by_typst(page)) == 1
 
 
-def test_track_outside_map_is_marked_with_exit_distance() -> None:
+def test_track_outside_map_has_arrow_and_distance_from_map() -> None:
     x = np.array([1.0, 5.0, 12.0, 13.0, 5.0, 5.0, 5.0])
     y = np.array([1.0, 1.0, 1.0, 1.0, 1.0, -3.0, 1.0])
     found = list(cover_panels._map_exits((x, y), LIMITS))
@@ -254,7 +254,7 @@ def test_report_cover_long_text_moves_plots_to_second_page(eventful: Analysis, c
     assert "Innovations ÷ √S" in second
 
 
-def test_report_sections_stay_with_their_first_plot() -> None:
+def test_report_section_title_is_on_page_of_its_first_plot() -> None:
     sections = [Page(f"Section {number}") for number in range(4)]
     for section in sections:
         section.panel("Panel", "", 210.0)

@@ -148,7 +148,7 @@ def test_ekf2_replay_agreement_statistics_equal_their_formulas():
     assert found.velocity_rms_difference_m_s == pytest.approx(0.25)
 
 
-def test_constant_innovations_have_no_velocity_statistics():
+def test_constant_velocity_innovations_have_no_correlation():
     """np.corrcoef of a constant is NaN, with a warning."""
     index = pd.Index(10.0 + np.arange(30.0))
     updates = pd.DataFrame(0.1, index=index, columns=VELOCITY_UPDATE_COLUMNS)

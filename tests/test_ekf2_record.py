@@ -87,7 +87,7 @@ def test_read_ekf2_record_lists_other_aiding_sources(read, flag, names):
     assert read(log).ekf2.record.other_aiding == names
 
 
-def test_vision_age_equals_delay_until_publication(read):
+def test_vision_age_is_publication_time_minus_sample_time(read):
     log = made_log("v1.16")
     fields = log["vehicle_visual_odometry"]
     age = read(log).ekf2.record.vision_age_s

@@ -75,7 +75,7 @@ def test_what_if_without_replay_agreement_is_unavailable(model):
         assert "no reason" in result.reason
 
 
-def test_kf_ekf2_difference_steps_add_up_to_total_difference(model):
+def test_contributions_to_kf_ekf2_difference_add_up_to_total(model):
     for axis in explain_by_steps(model).values():
         assert axis.longest_rejection is None
         assert tuple(step.name for step in axis.steps) == STEPS
@@ -104,7 +104,7 @@ def test_kf_ekf2_difference_without_common_time_is_unavailable(model):
 # ----------------------------------------------------------- cases with a known answer
 
 
-def test_each_kf_ekf2_difference_step_changes_one_property():
+def test_kf_ekf2_explanation_changes_one_property_at_a_time():
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(ReceivedPositions)
     plain = (made(ReplaySegment, flow=None, heights=None),)
@@ -231,7 +231,7 @@ def flown(tmp_path: Path, mistake: str, seed: int) -> Model:
     ("ekf2-noise=0.02", 1, {"EKF2_EVP_NOISE": 0.1}),
     ("ekf2-noise=0.02", 2, {"EKF2_EVP_NOISE": 0.1}), ("ekf2-gate=1", 1, {"EKF2_EVP_GATE": 5.0}),
 ])  # fmt: skip
-def test_what_if_on_flight_with_rejections_predicts_correction(tmp_path, mistake, seed, changes):
+def test_what_if_predicts_flight_with_corrected_ekf2_parameter(tmp_path, mistake, seed, changes):
     """Only with the logged rejections does the replay agree with these logs."""
     faulty, correct = flown(tmp_path, mistake, seed), flown(tmp_path, "", seed)
     assert faulty.agreement.rejected_fraction_logged > 0.35

@@ -379,7 +379,7 @@ def test_evaluate_camera_track_removes_mounting_rotation() -> None:
         assert evaluate(same, reference, alignment="se3").body_rotation is None
 
 
-def test_evaluate_with_doubtful_arguments_gives_warnings() -> None:
+def test_evaluate_with_implausible_arguments_gives_warnings() -> None:
     truth = flight()
     vio = transformed(truth, Rotation.from_euler("z", 1.0), SHIFT, kind="vio", name="log:vio")
     slam = replace(vio, kind="slam", name="slam")

@@ -211,7 +211,7 @@ def test_explore_page_invalid_input_shows_a_message(page: Browser) -> None:
     assert page.ask(VALUES) == ["0.5", "0.2", "0", "0.1"]
 
 
-def test_explore_page_steps_show_numbers_of_each_measurement(
+def test_explore_page_step_view_shows_one_measurement_at_a_time(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     result = explored[1].main

@@ -160,7 +160,7 @@ ROWS = """Object.fromEntries([...document.querySelectorAll('#card [data-filter]'
 }))"""
 
 
-def test_explore_page_shows_analysed_card_until_settings_change(
+def test_explore_page_shows_card_of_report_until_settings_change(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     card = card_of(explored[1])
@@ -179,7 +179,7 @@ def test_explore_page_shows_analysed_card_until_settings_change(
     assert card.headline in page.ask("document.querySelector('#card h2').textContent")
 
 
-def test_explore_page_card_after_change_equals_python_ratios(
+def test_explore_page_sigma_ratios_after_change_equal_python(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     analysis = explored[1]

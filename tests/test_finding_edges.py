@@ -108,7 +108,7 @@ def test_status_flag_before_first_sample_has_first_value() -> None:
     assert spans_with_value(0.0, flag, Segment(40.0, 50.0, "")) == ((40.0, 50.0),)
 
 
-def test_group_findings_lists_consequences_behind_root_cause() -> None:
+def test_group_findings_lists_consequences_below_root_cause() -> None:
     first, other = make_finding("kf_underconfident"), make_finding("no_motion", "note")
     follows = make_finding("kf_underconfident", caused_by="kf_underconfident")
     assert group_by_root([first, follows, other]) == [[first, follows], [other]]
@@ -329,7 +329,7 @@ def test_error_beyond_sigma_finding_names_axis_and_action() -> None:
 
 @pytest.mark.parametrize(("left", "frame"), [(0.45, True), (0.55, False)])
 @pytest.mark.parametrize("drifts", [False, True])
-def test_error_beyond_sigma_finding_states_aligned_rmse(
+def test_error_beyond_sigma_finding_tests_rmse_after_alignment(
     left: float, frame: bool, drifts: bool
 ) -> None:
     """Circle of 5 m with a shift and an error that changes its sign with each sample."""
@@ -521,7 +521,7 @@ def test_heading_drift_finding_states_heading_at_both_ends() -> None:
     assert (finding.evidence["from_deg"], finding.evidence["p"]) == (2.0, 1e-300)
 
 
-def test_heading_angles_are_printed_within_half_a_turn() -> None:
+def test_heading_angles_are_printed_from_minus_180_to_180_deg() -> None:
     finding = only(source_frame.detect, analysis(heading=heading_error(170.0, 230.0, p=0.0)))
     assert "It is +170° from 0 to 10 s and -130° from 10 to 20 s" in finding.message
     finding = only(source_frame.detect, analysis(heading=heading_error(340.0)))
@@ -973,7 +973,7 @@ def test_change_of_time_offset_with_small_p_value_is_reported(p: float | None, t
 
 
 @pytest.mark.parametrize(("after_m", "there"), [(1.005, True), (1.0051, False), (0.5, True)])
-def test_time_offset_that_increases_true_error_has_no_finding(after_m, there) -> None:
+def test_time_offset_correction_that_increases_rmse_is_rejected(after_m, there) -> None:
     shifted = rerun("kf", "time offset", {"clock_offset_s": 0.123}, after_m)
     one = analysis(clock=late(0.12345), trials=(shifted,))
     assert severity(source_clock.detect, one) == ("error" if there else None)

@@ -349,7 +349,7 @@ def test_crash_flight_lists_tumbling_as_first_finding(shared_logs: Path) -> None
     ("simulated/v1.16.1_aisle_nominal", "case17.csv", "source_stops", 50.9, 0.12),
     ("simulated/v1.16.1_aisle_10hz", "case18.csv", "source_begins", 63.3, 0.05),
 ])  # fmt: skip
-def test_source_of_part_of_flight_is_first_finding(
+def test_source_that_covers_part_of_flight_is_first_finding(
     log: str, file: str | None, finding: str, at_s: float, error_m: float, shared_logs: Path
 ) -> None:
     cases = shared_logs.parent / "cases"
@@ -366,7 +366,7 @@ def test_source_of_part_of_flight_is_first_finding(
 @pytest.mark.parametrize(("gap_s", "reset_s", "cause"), [
     ((-1.0, 40.0), 40.4, "source_begins"), ((80.0, 130.0), 90.0, "source_stops"),
 ])  # fmt: skip
-def test_reset_in_time_without_source_has_it_as_cause(
+def test_ekf2_reset_without_source_has_missing_source_as_cause(
     gap_s: tuple[float, float], reset_s: float, cause: str
 ) -> None:
     resets = (Reset(reset_s, "position", (16.0, 0.0, 0.0)),)

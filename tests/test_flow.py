@@ -106,7 +106,7 @@ def test_optical_flow_mean_is_computed_from_filtered_velocity(tmp_path):
 
 
 @pytest.mark.parametrize("every", [1, 10])
-def test_optical_flow_samples_give_velocity_at_next_update(every):
+def test_optical_flow_mean_equals_velocity_at_time_of_update(every):
     """The motion since a sample is known from the IMU, so corners cause no innovations."""
     (segment,) = model().inputs.segments
     with_flow = add_flow_samples(segment, flow_of(every=every), 3.0)

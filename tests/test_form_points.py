@@ -90,7 +90,7 @@ def parts(answers: Answers, truth: FormTruth = TRUTH) -> list[float]:
     return [round(found[name], 2) for name in PART_NAMES]
 
 
-def test_answer_form_offers_correct_answers_for_each_mistake() -> None:
+def test_answer_form_offers_correct_answers_for_each_fault() -> None:
     assert set(SIMULATED) == set(MISTAKES) - {"none", "vio-drift"}
     assert set(POINTS_TABLE["shows"]) | {"cover"} == set(PANELS)
     for name in SIMULATED:
@@ -100,7 +100,7 @@ def test_answer_form_offers_correct_answers_for_each_mistake() -> None:
         assert set(panels(name)) > {"cover"}
 
 
-def test_correct_answer_form_has_full_and_empty_form_no_points() -> None:
+def test_correct_answer_form_earns_all_and_empty_form_no_points() -> None:
     assert form_points(RIGHT, TRUTH).points_by_part == FULL
     assert parts(Answers(log_sha256=SHA256)) == [0.0] * 6
     assert form_points(RIGHT, TRUTH).is_named_by_mistake == {"clock-offset": True, "dropout": True}
@@ -141,7 +141,7 @@ def test_partly_correct_answer_form_has_partial_points(
     assert form_points(answers, TRUTH).points_by_part == pytest.approx({**FULL, **less}, abs=0.01)
 
 
-def test_answer_form_for_clean_flight_must_name_no_mistake() -> None:
+def test_answer_form_for_clean_flight_must_name_no_fault() -> None:
     none = Answers(log_sha256=SHA256, mistakes=(StudentMistake("none"),))
     assert parts(none, CLEAN) == [40.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     assert form_points(none, CLEAN).fraction == 0.4
@@ -153,7 +153,7 @@ def test_answer_form_for_clean_flight_must_name_no_mistake() -> None:
     assert parts(RIGHT, CLEAN)[:4] == [0.0] * 4
 
 
-def test_loop_open_end_answer_needs_its_size_for_all_points() -> None:
+def test_open_loop_end_answer_earns_all_points_only_with_size() -> None:
     landed = TrueMistake("open-end", 5.0, 4.25, 5.75, 60.0, None)
     truth = replace(CLEAN, mistakes=(landed,), quantities=())
     claim = StudentMistake("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")
@@ -183,7 +183,7 @@ def test_same_answers_for_all_loop_flights_earn_few_points() -> None:
             assert np.mean([form_points(form, one).fraction for one in truths]) <= 0.35
 
 
-def test_correct_loop_open_end_size_includes_odometry_drift() -> None:
+def test_correct_size_of_open_loop_end_includes_odometry_drift() -> None:
     """A student cannot separate the drift from the measured closure error."""
     scenario = Scenario(kind="loop", passes=1, vio_drift=0.02, seed=4, truth=False)
     (wrong,) = form_truth(flights.simulate(scenario, parse(("open-end=5m",))), SHA256).mistakes

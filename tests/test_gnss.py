@@ -297,7 +297,7 @@ def test_ground_truth_of_gnss_flight_is_relative_to_ekf2_origin(fused, tmp_path)
 @pytest.mark.parametrize(("least_m", "eph_m", "expected"), [
     (2.0, 0.3, True), (0.5, 0.45, False), (0.5, 0.9, False), (None, 0.3, False),
 ])  # fmt: skip
-def test_gnss_noise_is_reduced_only_if_above_receiver_accuracy(
+def test_smaller_gnss_noise_is_advised_if_above_receiver_sigma(
     least_m, eph_m, expected, tmp_path, monkeypatch
 ):
     log = outdoors(eph_m=eph_m)

@@ -204,7 +204,7 @@ def test_grade_report_without_its_log_makes_points_pending(tmp_path) -> None:
 
 
 @pytest.mark.usefixtures("jobs_in_process")
-def test_interrupted_grade_command_tells_how_to_continue(tmp_path, monkeypatch) -> None:
+def test_interrupted_grade_command_prints_how_to_continue(tmp_path, monkeypatch) -> None:
     """Each name is one line; an interrupted run prints how to continue."""
     import px4fuse.classroom.grading.grade as module
 

@@ -71,7 +71,7 @@ def test_consistent_flight_has_no_causes_of_inconsistency() -> None:
         ("ekf2-delay=0.175", {}, "ekf2", "nees", {"EKF2_EV_DELAY": (0, 0)}),
     ],
 )  # fmt: skip
-def test_cause_found_for_simulated_mistake_is_that_mistake(
+def test_cause_found_for_simulated_fault_is_that_fault(
     mistake, settings, owner, of, change
 ) -> None:
     analysis = flown(*filter(None, (mistake,)), **settings)
@@ -95,7 +95,7 @@ def test_kf_rerun_without_bias_equals_corrected_acceleration() -> None:
     assert found.after == pytest.approx(again.nis_mean, rel=1e-6)
 
 
-def test_filter_rerun_for_vibration_raises_ekf2_acc_noise() -> None:
+def test_filter_rerun_for_vibration_increases_ekf2_acc_noise() -> None:
     analysis = flown("vibration=1.5")
     found = cause(analysis, "ekf2", "nis")
     assert found.change == {"EKF2_ACC_NOISE": 1.0}  # PX4's maximum
@@ -103,7 +103,7 @@ def test_filter_rerun_for_vibration_raises_ekf2_acc_noise() -> None:
     assert not any("EKF2_ACC_NOISE" in row.change for row in flown("nlos=7%").causes)
 
 
-def test_time_offset_applied_to_kf_is_tried_for_ekf2() -> None:
+def test_time_offset_applied_to_kf_is_also_tested_for_ekf2() -> None:
     bare = flown("clock-offset=-0.19")
     offset_s = cause(bare, "kf", "nees").change[CLOCK_OFFSET]
     analysis = explain(compare(bare.flight, replace(RIGHT, clock_offset_s=offset_s)))

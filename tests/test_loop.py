@@ -150,7 +150,7 @@ def test_loop_correction_with_heading_keeps_rpe_over_10_m(sample_loop: Loop) -> 
     assert plain > 1.1 * before
 
 
-def test_loop_correction_without_heading_has_only_one_path(sample, sample_loop) -> None:
+def test_loop_corrections_without_heading_error_are_equal(sample, sample_loop) -> None:
     assert [part.name for part in sample_loop.reported_paths[1:3]] == [POSITIONS_ONLY, BY_DISTANCE]
     found = analyse_loop(sample, landed_at=Landing(0.0, 0.0))
     assert isinstance(found.heading_error_deg, Unavailable)
@@ -272,7 +272,7 @@ def test_loop_with_open_end_is_rejected_and_not_corrected() -> None:
     assert find_loop(opened) == ()
 
 
-def test_loop_closes_heading_only_if_start_and_end_are_similar() -> None:
+def test_loop_closure_corrects_heading_only_if_headings_agree() -> None:
     _, odometry = laps(1, 4, OdometryNoise())
     turned = close_loop(odometry)  # the vehicle lands with another heading
     assert isinstance(turned.heading_error_deg, Unavailable)
@@ -317,7 +317,7 @@ def test_loop_with_assumed_landing_point_is_reported(sample: LoopSource, sample_
     assert find_loop(analyse_loop(sample, landed_at=Landing(0.0, 0.0))) == ()
 
 
-def test_loop_of_odometry_that_stops_in_flight_has_no_end(sample: LoopSource) -> None:
+def test_loop_of_odometry_that_stops_in_flight_has_no_closure(sample: LoopSource) -> None:
     """Without ground truth; the place at which the odometry stops is not the landing place."""
     flight = replace(sample.flight, truth=Unavailable("ground truth", "not logged", "Log it."))
     (start_s, landing_s), trajectory = flight.airborne[0], sample.trajectory

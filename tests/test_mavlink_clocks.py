@@ -423,7 +423,7 @@ def test_timesync_that_contradicts_receive_time_is_ignored():
     np.testing.assert_allclose(found.to_boot.at(stamps), received, atol=1e-6)
 
 
-def test_mavlink_clock_mapping_by_reported_offset_is_equal():
+def test_mavlink_clock_mapping_equals_reported_offset_and_drift():
     """boot = timestamp + offset + drift · (timestamp - middle of the timestamps)."""
     received = 20.0 + 1.0001 * np.arange(0.0, 100.0, 0.1)
     stamps, found = map_unix_timestamps(received, *NO_EXCHANGES)

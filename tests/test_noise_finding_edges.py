@@ -330,7 +330,7 @@ def test_ekf2_noise_is_default_unless_sender_reports_another(flown, used_m, defa
         ("ekf2", {"EKF2_ACC_NOISE": 0.35}, "process noise", "Set EKF2_ACC_NOISE to 0.35 m/s²."),
     ],
 )  # fmt: skip
-def test_inconsistent_filter_action_follows_from_its_cause(owner, change, kind, action) -> None:
+def test_action_for_inconsistent_filter_depends_on_its_cause(owner, change, kind, action) -> None:
     # changes that explain less than 0.5 or more than 1.5 are not causes
     causes = (tried(owner, {"sigma_z_m": 7.0}, explained_fraction=0.4), tried(owner, change),
               tried(owner, {"sigma_z_m": 7.0}, explained_fraction=1.6))  # fmt: skip

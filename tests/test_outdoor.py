@@ -116,7 +116,7 @@ def test_simulated_magnetometer_and_height_have_stated_noise(tmp_path: Path) -> 
     assert error[20:].std() == pytest.approx(reported, rel=0.3)
 
 
-def test_outdoor_flight_without_mistake_is_consistent() -> None:
+def test_outdoor_flight_without_fault_is_consistent() -> None:
     analysis = flown()
     assert roots(analysis) == []
     for name, axes in {"gnss_pos": 2, "gnss_vel": 3}.items():
@@ -155,7 +155,7 @@ def test_outdoor_flight_without_mistake_is_consistent() -> None:
         ("slow-error=0.5,30", "source_noise_time_correlated"),
     ],
 )
-def test_simulated_outdoor_mistake_is_first_finding(mistake: str, root: str) -> None:
+def test_simulated_outdoor_fault_is_first_finding(mistake: str, root: str) -> None:
     """Mistakes for which GNSS takes other branches in the findings than indoor positions."""
     assert roots(flown(mistake))[0] == root
 
@@ -168,7 +168,7 @@ def test_simulated_outdoor_mistake_is_first_finding(mistake: str, root: str) -> 
         ("r-scale=0.1", "nis", "EKF2_GPS_P_NOISE", 0.4, 0.02),
     ],
 )
-def test_simulated_outdoor_mistake_is_cause_of_ekf2_error(
+def test_simulated_outdoor_fault_is_cause_of_ekf2_error(
     mistake: str, of: Any, name: str, value: float, within: float
 ) -> None:
     analysis = flown(mistake)

@@ -120,7 +120,7 @@ def test_filter_rerun_improvement_names_improved_quantity(nis, nees, rmse_m, exp
     assert has_effect(one) is has
 
 
-def test_recommended_rerun_is_smallest_sufficient_change() -> None:
+def test_recommended_rerun_has_the_fewest_sufficient_changes() -> None:
     right, near = (
         RunStatistics(nis_mean=1.0, nees_mean=1.0),
         RunStatistics(nis_mean=1.2, nees_mean=1.2),
@@ -149,7 +149,7 @@ def offset(analysis: Analysis, offset_s: float) -> Analysis:
     return replace(changed, causes=causes, trials=trials)
 
 
-def test_estimated_ekf2_parameters_follow_noise_and_time_offset(sample: Analysis) -> None:
+def test_recommended_ekf2_parameters_equal_noise_and_delay(sample: Analysis) -> None:
     model, comparison = sample.ekf2_model, sample
 
     def estimated(analysis: Analysis) -> dict[str, float]:

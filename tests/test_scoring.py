@@ -156,7 +156,7 @@ def test_rubric_check_gives_points_and_comment(check, results, given, points, sa
     assert said in comment
 
 
-def test_rubric_check_clock_of_assigned_flight_gives_full_points():
+def test_unclear_time_offset_of_assigned_flight_earns_all_points():
     assert check_points("clock", UNCLEAR, key=key())[0] == 1.0
 
 

@@ -370,7 +370,7 @@ def test_ekf2_resets_outside_the_segment_change_no_state(reset_s, said):
     assert bool(said) == bool(statement)
 
 
-def test_axis_label_of_aisle_is_main_axis() -> None:
+def test_axis_aisle_of_wide_track_is_labelled_main_axis() -> None:
     flight = aisle_flight()
     labels = {axis.name: axis.label for axis in make_axes(flight, flight.positions[0], ALL)}
     assert (labels["north"], labels["aisle"]) == ("north", "the main axis")

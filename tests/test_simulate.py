@@ -256,7 +256,7 @@ class TestMistakes:
         noisy = simulate(replace(AISLE, ekf2=False), parse(["smoothed=1s"])).positions.error_m
         assert np.std(noisy[:25]) < 0.07  # on the ground; 0.10 m without the filter
 
-    def test_no_vvo_mistake_removes_vehicle_visual_odometry(self):
+    def test_no_vvo_fault_removes_vehicle_visual_odometry(self):
         remaining = to_flight(simulate(AISLE, parse(["no-vvo"]))).positions
         assert [round(track.rate_hz) for track in remaining] == [2, 2]
         flight = to_flight(simulate(replace(AISLE, ekf2=False), parse(["no-vvo"])))
@@ -317,7 +317,7 @@ def test_simulation_scenario_with_invalid_value_raises_error(changes):
     (Scenario(passes=100, length_m=100.0), [], "limited to 3600 s"),
     (AISLE, ["dropout=600s,0s"], "vehicle_visual_odometry contains no data"),
 ])  # fmt: skip
-def test_simulate_with_unsuitable_mistake_raises_error(scenario, texts, expected):
+def test_simulate_with_unsuitable_fault_raises_error(scenario, texts, expected):
     with pytest.raises(SettingsError, match=expected):
         simulate(scenario, parse(texts))
 
@@ -325,7 +325,7 @@ def test_simulate_with_unsuitable_mistake_raises_error(scenario, texts, expected
 # --- ULog and memory
 
 
-def test_simulated_ulog_contains_no_names_of_mistakes():
+def test_simulated_ulog_contains_no_names_of_faults():
     texts = [name for name, one in MISTAKES.items() if "aisle" in one.kinds and name != "no-vvo"]
     content = to_ulog(simulate(AISLE, parse(texts)))
     for name in (*MISTAKES, *(field for mistake in MISTAKES.values() for field in mistake.fields)):

@@ -79,7 +79,7 @@ def test_simulated_ekf2_of_clean_flight_agrees_with_replay(clean):
     (("ekf2-delay=175ms",), AISLE),
     ((), Scenario(kind="loop", passes=1, seed=5)),
 ], ids=["outliers", "delay", "loop"])  # fmt: skip
-def test_simulated_ekf2_with_mistakes_agrees_with_replay(texts, scenario):
+def test_simulated_ekf2_with_faults_agrees_with_replay(texts, scenario):
     found = agreement(flown(*texts, scenario=scenario))
     assert found.good
     assert found.decisions_same > 0.99

@@ -106,7 +106,7 @@ def test_tune_with_two_axes_narrows_the_noise_interval() -> None:
 # --- the map ---
 
 
-def test_tuned_noise_intervals_equal_likelihood_profile() -> None:
+def test_tuned_noise_intervals_equal_profile_likelihood() -> None:
     axis = modelled(5)
     found = tuned(axis)
     assert len(found.outlier_time_s) == 0

@@ -47,7 +47,7 @@ def test_explained_kf_ekf2_difference_equals_kf_minus_ekf2(sample: Analysis) -> 
     )
 
 
-def test_kf_setting_changes_only_its_step_of_kf_ekf2_difference(sample: Analysis) -> None:
+def test_kf_setting_changes_only_its_part_of_kf_ekf2_difference(sample: Analysis) -> None:
     plain = of(sample)
     zero = explain_again(sample, Settings(input="zero"))
     assert zero.steps[0].name == SAMPLES
