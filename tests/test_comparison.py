@@ -125,7 +125,7 @@ class TestSample:
             assert found.nees_velocity_mean == pytest.approx(np.mean(ev**2 / vv), rel=1e-9)
 
 
-def test_position_source_kind_sets_drift_and_gnss_flags(sample_flight: Flight) -> None:
+def test_position_source_kind_determines_drift_and_gnss_flags(sample_flight: Flight) -> None:
     plain = compare(sample_flight)
     for kind, drifts, slow in (
         ("uwb", False, False), ("vio", True, False), ("mocap", False, False), ("gnss", False, True),
@@ -180,9 +180,7 @@ class TestSimulatedFlight:
         assert other == pytest.approx(one, rel=0.1)
 
     @pytest.mark.parametrize(("heading", "name"), [(0.0, "north"), (90.0, "east")])
-    def test_aisle_axis_with_north_or_east_heading_equals_that_axis(
-        self, made, heading, name
-    ) -> None:
+    def test_aisle_axis_with_heading_0_equals_north_and_90_east(self, made, heading, name) -> None:
         aisle = compare(made.flight, axes=("aisle",), heading_deg=heading).main
         same = made[name]
         assert asdict(aisle.difference) == pytest.approx(asdict(same.difference))
@@ -220,7 +218,7 @@ class TestMissingParts:
                 assert part == comparison.flight.ekf2
 
     @pytest.mark.parametrize("left_out", ["imu", "attitude_hz"])
-    def test_compare_without_acceleration_notes_constant_velocity(self, left_out) -> None:
+    def test_compare_without_imu_states_constant_velocity_model(self, left_out) -> None:
         flight = aisle_flight(**{left_out: None})
         comparison = compare(flight, Settings(sigma_z_m=0.2))
         assert comparison.settings == Settings(sigma_z_m=0.2, input="zero")

@@ -100,13 +100,13 @@ def test_report_cover_shows_3_notes_and_counts_the_others() -> None:
     [("reconcile", ""), ("difference", ""), ("causes", ()), ("notes", ()), ("do_this", ()),
      ("effect_text", ""), ("verdicts", ())],
 )  # fmt: skip
-def test_report_cover_row_without_text_takes_no_space(field: str, empty: Any) -> None:
+def test_report_cover_has_no_space_for_an_empty_row(field: str, empty: Any) -> None:
     card = replace(SMALL_SIGMA_A, reconcile="The two verdicts differ.")
     heights = [cover.free_height(page_of(each)) for each in (card, replace(card, **{field: empty}))]
     assert heights[1] > heights[0] + 8.0
 
 
-def test_report_cover_explained_verdict_is_not_emphasised() -> None:
+def test_report_cover_verdict_with_explanation_is_not_bold() -> None:
     card = replace(
         SMALL_SIGMA_A,
         verdicts=tuple(replace(each, is_explained=True) for each in SMALL_SIGMA_A.verdicts[:2]),
@@ -220,7 +220,7 @@ def test_innovations_beyond_plot_scale_are_drawn_as_triangles(eventful: Analysis
     assert {abs(value) for line in edges for value in line.get_ydata()} == {4.0}
 
 
-def test_error_plot_title_says_if_curve_is_flat_on_its_scale(eventful: Analysis) -> None:
+def test_error_plot_title_states_that_a_small_curve_looks_flat(eventful: Analysis) -> None:
     error, sigma = (pd.Series(pair, [0.0, 9.0]) for pair in ([0.02, -0.05], [0.05, 0.06]))
     label, sigmas = "EKF2 error (m)", {"EKF2": sigma}
     titles = [

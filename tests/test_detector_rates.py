@@ -68,7 +68,7 @@ def test_faults_with_detection_rate_100_percent_are_found() -> None:
         assert condition.finding in found(20_000, condition)
 
 
-def test_detection_rate_table_counts_found_and_first_findings() -> None:
+def test_detection_rate_table_has_rates_of_found_and_first() -> None:
     usual, yaw = clean(DEFAULT), Condition("source_frame_misaligned", "--mistake yaw=30")
     flown = [Job(0, (usual,)), Job(1, (usual,)), Job(FAULTY_SEED, (yaw,))]
     made = pd.DataFrame(

@@ -110,7 +110,7 @@ def test_ekf2_replay_agreement_verdict_changes_at_its_limits(
     (agreeing(0.949), False), (agreeing(s=1.051), False), (agreeing(published_m=0.29), True),
     (agreeing(published_m=0.31), False),
 ])  # fmt: skip
-def test_ekf2_replay_agreement_is_decided_with_logged_rejections(axis, good):
+def test_ekf2_replay_agreement_is_tested_with_logged_rejections(axis, good):
     """The replay with logged rejections overrides the other verdict, good or bad."""
     own_gate = Agreement(
         north=agreeing(0.5), east=agreeing(0.5), ev_pos={}, samples=50,

@@ -285,7 +285,7 @@ def test_ekf2_position_corrections_by_fusion_exclude_resets():
     ([2.75] * 7, [0, 6], [3, 6]),
     ([3.2] * 9, [0, 2, 6], [2, 4, 6, 8]),  # 2.5 samples, rounded as the log shows
 ])  # fmt: skip
-def test_ekf2_prediction_step_ends_by_count_or_duration(interval_ms, known, ends):
+def test_ekf2_prediction_step_ends_after_sample_count_or_time(interval_ms, known, ends):
     found = step_ends(np.array(interval_ms) * 1e-3, np.array(known, int), 0.008)
     assert found.tolist() == ends
 

@@ -52,7 +52,7 @@ def test_read_ekf2_states_layout_is_equal_for_each_px4_release(read, generation)
     assert row[Columns.DELAYED_VARIANCE[15:]].to_numpy() == pytest.approx(of_fields)
 
 
-def test_quaternion_variance_converts_to_sampled_angle_variance(read):
+def test_attitude_variance_equals_variance_of_sampled_angles(read):
     log = made_log("v1.14")
     variance = np.array([1e-5, 4e-5, 2e-5, 3e-5])
     log["estimator_states"]["covariances"][:, :4] = variance

@@ -150,7 +150,7 @@ def test_fusion_horizon_equals_length_of_ekf2_buffer(settings, by_delay, timing)
     assert (shifted.delay_s, shifted.horizon_s) == pytest.approx((-0.035, math.inf))
 
 
-def test_ekf2_replay_of_delay_max_for_px4_v1_14_raises_error():
+def test_what_if_with_ekf2_delay_max_on_px4_v1_14_raises_error():
     rules = replace(RULES, uses_delay_as_horizon=True)
     received = made(ReceivedPositions, uses_sender_times=False)
     inputs = made(Inputs, rules=rules, settings={}, aid=EV_POS, received=received)
@@ -209,7 +209,7 @@ def on_gnss(north_m: list[float], north_m_s: list[float], **more: Any) -> Segmen
     return at_rest(north_m, aid=GNSS_POS, rules=GNSS_RULES, speed_m_s=speed, **more)
 
 
-def test_ekf2_replay_with_gnss_limits_tilt_variance_to_log():
+def test_tilt_variance_of_gnss_replay_is_at_most_the_logged_one():
     """Tilt is corrected as by a measurement to the logged variance, and only with GNSS."""
     fixes = [0.0] * 20
     free, limited = (on_gnss(fixes, fixes, tilt_rad2=tilt) for tilt in (np.inf, 2.5e-5))

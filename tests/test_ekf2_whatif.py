@@ -170,7 +170,7 @@ def test_longest_run_of_ekf2_rejections_has_start_and_duration():
     assert _longest_rejection(one, still, (22.4, 24.4), ((0.0, 99.0),)) is None
 
 
-def test_rmse_to_ground_truth_uses_only_common_times():
+def test_rmse_against_ground_truth_uses_only_common_times():
     times, direction = np.array([9.0, 10.0, 15.0, 20.0, 21.0]), np.array([0.6, 0.8, 0.0])
     frame = pd.DataFrame(0.0, index=[10.0, 20.0], columns=Columns.STATE)
     truth = made(Truth, samples=frame.assign(north_m=[0.0, 2.0], east_m=2.0))

@@ -265,7 +265,9 @@ def test_instructor_overrides_replace_points_and_add_comments(tmp_path) -> None:
         )),
     ], ids=["points above the maximum", "duplicate row"],
 )  # fmt: skip
-def test_instructor_override_with_excess_points_is_noted(rows, points, told, tmp_path) -> None:
+def test_instructor_override_above_maximum_points_gives_a_note(
+    rows, points, told, tmp_path
+) -> None:
     (ada, _), notes = make_entries(TWO, overrides=write_overrides(tmp_path, *rows))
     assert (ada.counted_report.points, ada.total) == points
     assert notes == tuple(f"overrides.csv: {one}." for one in told)

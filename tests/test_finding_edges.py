@@ -277,7 +277,7 @@ def test_ekf2_rejection_severity_follows_rejected_fraction(
             assert finding.remedy.endswith(remedy)
 
 
-def test_recommended_action_must_halve_ekf2_rejections() -> None:
+def test_action_is_recommended_only_if_it_halves_ekf2_rejections() -> None:
     frame = rejected(20, 100)
     for after, improves, action in (
         (0.09, True, "Set EKF2_EVP_NOISE to 0.1 m."), (0.1, True, CHECK_FIRST),
@@ -474,7 +474,7 @@ def test_wrong_frame_of_position_file_is_reported_as_error() -> None:
 
 
 @pytest.mark.parametrize(("until_s", "expected"), [(60.0, "warning"), (60.1, "note")])
-def test_severity_of_frame_without_north_depends_on_fused_yaw(
+def test_frame_without_north_is_note_only_if_ekf2_fused_its_yaw(
     until_s: float, expected: str
 ) -> None:
     frd = source(frame="FRD")

@@ -385,7 +385,7 @@ def test_positions_lost_by_logger_are_no_gap_of_the_source(sample_flight: Flight
     assert finding.spans_s == (pytest.approx((40.0, 60.0), abs=0.2),)
 
 
-def test_each_finding_has_a_test_with_a_simulated_fault() -> None:
+def test_each_finding_is_tested_with_a_simulated_fault() -> None:
     assert set(TITLES) == {fault.id for fault in FAULTS} | TESTED_ELSEWHERE
 
 

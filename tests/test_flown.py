@@ -177,7 +177,7 @@ OVERSTATED = {
 
 
 @pytest.mark.parametrize(("name", "factor"), OVERSTATED.items())
-def test_motion_capture_flights_are_found_underconfident(shared_logs, name, factor):
+def test_ekf2_on_motion_capture_flights_is_underconfident(shared_logs, name, factor):
     """Sent with an orientation, as odometry is; all noises are defaults."""
     flight = read_log(shared_logs / "real" / f"{name}.ulg")
     whole = compare(flight, start_s=0.0, end_s=flight.log.duration_s)

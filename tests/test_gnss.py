@@ -462,7 +462,7 @@ def test_what_if_gnss_settings_match_independent_replay(models):
 
 
 @pytest.mark.reallogs
-def test_what_if_with_other_gnss_delay_changes_heading(models):
+def test_what_if_with_correct_gnss_delay_reduces_heading_error(models):
     """An independent replay with a magnetometer gives 4.7° before and 1.5° after."""
 
     def heading_deg(name: str, **settings: float) -> tuple[float, float]:

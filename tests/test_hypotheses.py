@@ -197,7 +197,7 @@ def test_simulated_fault_is_first_finding_with_its_size(mistake, name, severity,
         ("sigma_a_too_large", "", {"sigma_a_m_s2": 2.0}, "error", "--sigma-a 0.2|--sigma-a 0.3"),
     ],
 )
-def test_finding_of_simulated_fault_gives_a_command(
+def test_finding_of_simulated_fault_contains_a_command(
     name, mistake, settings, severity, remedy
 ) -> None:
     named = found(analysed(flight(), replace(RIGHT, **settings)) if settings else flown(mistake))

@@ -82,7 +82,7 @@ def test_cause_found_for_simulated_fault_is_that_fault(
     assert found.is_complete_cause
 
 
-def test_kf_rerun_without_bias_equals_corrected_acceleration() -> None:
+def test_kf_rerun_without_bias_equals_run_on_unbiased_imu() -> None:
     analysis = flown("accel-bias=0.5")
     found, imu = cause(analysis, "kf"), analysis.flight.imu
     without = imu[Columns.SPECIFIC_FORCE] - [

@@ -223,7 +223,7 @@ def test_kf_prediction_formulas_equal_matrix_products(dt: float) -> None:
     )
 
 
-def test_kf_continuous_process_noise_is_limit_of_short_steps() -> None:
+def test_kf_process_noise_sum_of_short_steps_equals_closed_form() -> None:
     count, total = 10_000, 0.7
     dt = total / count
     covariance = (0.0, 0.0, 0.0)

@@ -105,7 +105,7 @@ def test_banded_solver_equals_dense_normal_equations(seed: int) -> None:
     np.testing.assert_allclose(system.position_variance(), variance, rtol=1e-6)
 
 
-def test_banded_factorisation_with_singular_q_stays_accurate() -> None:
+def test_banded_factorisation_with_singular_q_is_accurate() -> None:
     """Q of a single step has rank one, so the term that makes it invertible is below rounding."""
     step, joined = np.full(19, 0.09755900000000004), np.ones(19, dtype=bool)
     unit = 0.1 * step * np.stack([step**2 / 4.0, step / 2.0, np.ones(19)])
@@ -252,7 +252,7 @@ def test_single_position_in_a_segment_adds_no_likelihood(start_known: bool) -> N
         np.testing.assert_allclose(one.constants(), none.constants(), rtol=1e-9, atol=1e-12)
 
 
-def test_fitted_imu_constants_equal_dense_solution() -> None:
+def test_fitted_imu_biases_equal_dense_least_squares() -> None:
     part = with_constants(offsets=1)
     # without the third axis, which has too few measurements
     part = replace(part, measurement_m=part.measurement_m * [1.0, 1.0, np.nan])
@@ -464,7 +464,7 @@ def test_maximum_likelihood_fit_finds_simulated_outliers(clean, share, size_m, l
 
 
 @pytest.mark.parametrize(("axes", "share", "width"), [(1, 0.15, 4.0), (2, 0.1, 5.0), (2, 0.3, 3.0)])
-def test_sigma_widening_for_outliers_equals_likelihood_curvature(axes, share, width):
+def test_noise_sigma_with_outliers_equals_likelihood_curvature(axes, share, width):
     """Without motion the likelihood has a closed form."""
     rng = np.random.default_rng(axes)
     wrong = rng.random(4000) < share

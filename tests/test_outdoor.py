@@ -209,7 +209,7 @@ def test_what_if_with_correct_gnss_delay_equals_correct_flight() -> None:
     assert result.logged.position_rmse_to_truth_m > 1.4 * true.position_rmse_to_truth_m
 
 
-def test_what_if_without_magnetometer_keeps_heading(tmp_path: Path) -> None:
+def test_what_if_without_magnetometer_replay_uses_logged_heading(tmp_path: Path) -> None:
     log = tmp_path / "a.ulg"  # a log file has the true attitude, a flight in memory has not
     # with a heading mistake EKF2 fuses the magnetic heading only
     log.write_bytes(to_ulog(simulate(OUTDOOR, parse(["ekf2-delay=0", "heading=3"]))))
@@ -236,7 +236,7 @@ def test_time_offset_message_names_gnss_receiver_delay() -> None:
     assert int(estimate_ms) == pytest.approx(110 + 250, abs=60)
 
 
-def test_magnetometer_change_is_the_cause_of_its_rejections() -> None:
+def test_magnetometer_shift_is_the_cause_of_its_missing_fusion() -> None:
     changed, starved = [item for item in find(flown("mag=0.2")) if item.id.startswith("aid_")]
     assert (changed.id, starved.id) == ("aid_innovation_shift", "aid_not_fused")
     assert starved.caused_by == "aid_innovation_shift"

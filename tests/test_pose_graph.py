@@ -230,7 +230,7 @@ def test_solve_invalid_pose_graph_states_reason() -> None:
 # --- starts --------------------------------------------------------------------------------------
 
 
-def test_pose_graph_of_star_edges_is_initialised_exactly() -> None:
+def test_star_shaped_pose_graph_is_initialised_exactly() -> None:
     # star of vertices with edges in both directions
     unit = "1 0 0 1 0 1"
     text = "".join(f"EDGE_SE2 {9 if k % 2 else k} {k if k % 2 else 9} 1 0 1 {unit}\n" for k in (

@@ -199,7 +199,7 @@ def test_read_position_csv_keeps_microseconds_of_ns_timestamps(read):
 
 
 @pytest.mark.parametrize("rate", [0.2, 200])
-def test_read_position_csv_with_rate_at_limit_adds_no_note(read, rate):
+def test_read_position_csv_with_0_2_or_200_hz_adds_no_note(read, rate):
     stamps = [str(round(1e9 * (0.98 * i / rate + 1795253650))) for i in range(ROWS)]
     file = read(table({"t": stamps, "x": X, "y": Y, "z": Z}))
     assert np.diff(file.samples.index) == pytest.approx(0.98 / rate, abs=1e-6)

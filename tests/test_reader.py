@@ -383,7 +383,7 @@ def test_ekf2_is_unavailable_if_other_estimator_was_active(read, parameters, rea
     assert flight.positions[0].name == "vehicle_visual_odometry"
 
 
-def test_ekf2_gate_is_read_if_estimator_group_selects_ekf2(read):
+def test_ekf2_gate_of_px4_v1_11_log_is_read_from_parameter(read):
     log = make_log("v1.11")
     log.parameters |= {"SYS_MC_EST_GROUP": 2, "EKF2_EVP_GATE": 3.0}
     ekf2 = read(log).ekf2
@@ -451,7 +451,7 @@ def test_unfused_gnss_is_used_as_source_only_on_request(read):
 
 
 @pytest.mark.parametrize("delay_ms", [0.0, 175.0])
-def test_estimator_aid_src_ev_pos_times_exclude_ekf2_delay(read, delay_ms):
+def test_times_of_estimator_aid_src_ev_pos_exclude_ekf2_delay(read, delay_ms):
     """EKF2 subtracts EKF2_EV_DELAY and half its prediction interval from the timestamp."""
     log = make_log("v1.16").drop("vehicle_visual_odometry")
     log.parameters["EKF2_EV_DELAY"] = delay_ms
@@ -462,7 +462,7 @@ def test_estimator_aid_src_ev_pos_times_exclude_ekf2_delay(read, delay_ms):
     assert_equals_external_vision(track)
 
 
-def test_estimator_aid_src_height_logged_at_other_time_is_nan(read):
+def test_position_sample_without_logged_height_has_nan_height(read):
     """The logger decimates heights separately, so their times may differ from the positions."""
     log = make_log("v1.16").drop("vehicle_visual_odometry")
     stamped = log["estimator_aid_src_ev_hgt"]["timestamp_sample"]

@@ -69,7 +69,7 @@ def with_form(kinds, results=EXAMPLE, **values):
 # ------------------------------------------------------------------ checks
 
 
-def test_rubric_check_verified_without_log_gives_zero_points():
+def test_report_graded_without_its_log_earns_no_verified_points():
     pdf = (ROOT / "reports" / "example" / "aisle_uwb.pdf").read_bytes()
     verdict = verify(read_report(pdf, "a.pdf"), pdf, {})
     assert check_points("verified", verdict=verdict)[0] == 0.0
@@ -419,7 +419,7 @@ class TestClassFlags:
         assert "The id in this report is also in that of" in made["5.pdf"][0]
         assert "identical to that of" in made["8.pdf"][0]
 
-    def test_two_reports_of_one_student_are_flagged_only_for_the_id(self):
+    def test_two_reports_of_one_student_are_flagged_for_their_id(self):
         two = [
             report(1, log_sha256="x"),
             report(1, log_sha256="x", sha256="z", submission="b.pdf"),

@@ -111,7 +111,7 @@ def test_simulated_open_end_equals_loop_closure_error(left_out, texts):
 
 
 @pytest.mark.parametrize("yaw", ["fixed", "follow"])
-def test_simulated_aisle_path_has_given_length_and_yaw_mode(yaw):
+def test_simulated_aisle_flight_has_given_length_and_yaw_mode(yaw):
     motion = motion_of(replace(AISLE, wander_m=0.0, yaw=yaw))
     state = motion.at(np.linspace(0.0, motion.duration_s, 5001))
     assert (state.position_m @ direction(30.0)).max() == pytest.approx(12.0, abs=1e-9)

@@ -108,7 +108,7 @@ def test_simulated_ekf2_of_clean_flights_is_consistent():
     assert np.median(stated) == pytest.approx(0.06, abs=0.01)
 
 
-def test_simulated_ekf2_delayed_state_is_consistent(clean):
+def test_simulated_ekf2_is_consistent_at_its_fusion_horizon(clean):
     """Position and velocity at the fusion horizon, their variances, and the estimated biases."""
     record, truth = clean.ekf2.record, clean.truth.samples
     later = record.delayed[record.delayed.index > 15.0]
@@ -173,7 +173,7 @@ def test_imu_samples_per_ekf2_step_are_rounded_to_nearest():
     assert samples_per_step(0.01, 0.004 + 1e-12) == samples_per_step(0.01, 0.004 - 1e-12) == 3
 
 
-def test_imu_samples_per_ekf2_step_at_half_follow_the_log():
+def test_imu_samples_per_ekf2_step_near_2_5_follow_the_log():
     """EKF2 rounds a measured mean: 2.5 samples become two or three."""
     by_two, by_three = 2 * np.arange(0, 60, 7), 3 * np.arange(0, 60, 7)
     ends = by_two, by_three, [5], [0, 25, 50]

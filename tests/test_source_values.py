@@ -86,7 +86,7 @@ def test_constant_positions_at_rest_are_valid():
 
 
 @pytest.mark.parametrize(("origin", "step"), [(5_334_567.0, 0.5), (691_234.0, 0.0625)])
-def test_rounding_step_of_32_bit_floats_is_their_resolution(origin, step):
+def test_rounding_step_of_float32_positions_is_found(origin, step):
     values = origin + np.random.default_rng(1).normal(0.0, 5.0, 400)
     assert rounding_step(values.astype(np.float32).astype(float)) == step
     assert rounding_step(values) < 0.01
@@ -119,7 +119,7 @@ def test_read_log_reads_reset_counter_and_quality(tmp_path):
     assert set(status["quality"]) == {-1.0}
 
 
-def test_read_position_csv_keeps_the_times_without_position(tmp_path):
+def test_read_position_csv_lists_times_of_rows_without_position(tmp_path):
     rows = [f"{0.1 * at:.1f},{at + 5},{at},{at}" for at in range(40)]
     rows[10:12] = ["1.0,nan,nan,nan", "1.1,,,"]
     rows[20] = "2.0,0,0,0"
@@ -305,7 +305,7 @@ def test_source_without_lever_arm_has_no_lever_arm_finding():
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", CASES)
-def test_findings_of_test_case_equal_the_expected_ones(name):
+def test_findings_of_logged_test_case_equal_expected_findings(name):
     folder = shared("cases")
     case = json.loads((folder / "EXPECTED.json").read_text())["cases"][name]
     result, first, harmful = judge(case, run(case["command"], folder))

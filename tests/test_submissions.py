@@ -166,7 +166,7 @@ def test_find_submissions_notes_unreadable_gradescope_metadata(tmp_path):
     )
 
 
-def test_find_submissions_keeps_times_of_zip_entries(tmp_path):
+def test_find_submissions_reads_times_of_zip_entries(tmp_path):
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         archive.writestr(zipfile.ZipInfo("a.pdf", (2026, 11, 20, 12, 34, 56)), PDF)
@@ -261,7 +261,7 @@ def test_find_submissions_searches_1500_nested_folders(tmp_path):
 # ------------------------------------------------------------------ names
 
 
-def test_find_submissions_cleans_file_names(tmp_path):
+def test_find_submissions_removes_control_characters_from_names(tmp_path):
     shown_as = {
         "../../../etc/x.pdf": "etc/x.pdf",
         "C:\\Windows\\system32\\y.pdf": "Windows/system32/y.pdf",

@@ -39,7 +39,7 @@ def swept(sample_log: Path) -> WhatIfAnalysis:
     return run_what_if(request)
 
 
-def test_whatif_command_writes_logged_replayed_and_changed(sample_log: Path) -> None:
+def test_whatif_command_writes_logged_and_replayed_ekf2_results(sample_log: Path) -> None:
     options = "--set", "EKF2_EVP_NOISE=0.3", "--json", "-"
     text = run_checked("whatif", sample_log, *options).stdout
     said = json.loads(text)
@@ -51,7 +51,7 @@ def test_whatif_command_writes_logged_replayed_and_changed(sample_log: Path) -> 
     assert said["whatif"]["north"]["nis_mean"] < 0.3 * said["replayed"]["north"]["nis_mean"]
 
 
-def test_whatif_command_without_vision_drifts_afterwards(sample_log: Path) -> None:
+def test_whatif_command_without_vision_predicts_position_drift(sample_log: Path) -> None:
     options = "--without", "ev_pos", "--from", "100", "--json", "-"
     said = json.loads(run_checked("whatif", sample_log, *options).stdout)
     jsonschema.validate(said, schema())
