@@ -189,7 +189,7 @@ def write_and_read(log: Log, tmp_path: Path) -> Flight:
         ("vehicle_land_detected", "airborne"),
     ],
 )
-def test_read_log_without_one_topic_lacks_only_data_of_topic(tmp_path, topic, part):
+def test_read_log_without_one_topic_contains_all_other_data(tmp_path, topic, part):
     """Only the part of the missing topic is unavailable."""
     flight = write_and_read(make_log("v1.16", 2.0).drop(topic), tmp_path)
     for name in ("imu", "attitude", "ekf2", "airborne"):
@@ -225,7 +225,7 @@ def rich_log() -> Log:
 
 
 @pytest.mark.parametrize("name", sorted(rich_log().names()))
-def test_read_log_succeeds_if_any_one_field_is_missing(tmp_path, name):
+def test_read_log_succeeds_without_any_single_field(tmp_path, name):
     """Fields may be missing in other PX4 releases or in a damaged format."""
     for field in rich_log()[name].keys() - {"timestamp"}:
         log = rich_log()

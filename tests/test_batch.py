@@ -350,7 +350,7 @@ def test_batch_interrupted_run_reuses_finished_results(
 
 
 @pytest.mark.usefixtures("in_this_process")  # one of them
-def test_two_simultaneous_batch_runs_in_one_folder_succeed(tmp_path):
+def test_two_simultaneous_batch_runs_with_one_folder_succeed(tmp_path):
     """Both runs succeed, and the table is complete."""
     logs, out = tiny_logs(tmp_path / "logs", 3, truth=False), tmp_path / "out"
     with running(logs, out, "--workers", "1") as other:

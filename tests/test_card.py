@@ -88,7 +88,7 @@ def test_rank_causes_lists_source_fault_before_wrong_setting() -> None:
         (outcome(0.3, 1.0, 0.29), "nothing"),  # the ratio against the source gets worse
     ],
 )
-def test_improvement_by_filter_rerun_is_position_sigma_or_none(after, improves) -> None:
+def test_filter_rerun_improves_position_sigma_both_or_nothing(after, improves) -> None:
     assert improvement(trial("noises", after)) == improves
 
 
@@ -126,7 +126,7 @@ def test_cause_with_improving_rerun_recommends_its_parameter() -> None:
     assert rank_causes(analysis(fails), [vibration])[0].trials == ()
 
 
-def test_equal_actions_for_kf_and_ekf2_are_merged_in_one_row() -> None:
+def test_diagnosis_card_merges_equal_actions_for_kf_and_ekf2() -> None:
     ratios = [(3.0, "overconfident")] * 4
     gap = Finding("source_gap", "warning", "No position for 8 s.", "Check the link.", {})
     flight = analysis()

@@ -199,7 +199,7 @@ def test_check_convention_finds_quaternion_order_with_w_last():
     assert (found.verdict, found.order) == ("determined", "x y z w")
 
 
-def test_check_attitude_sent_back_to_ekf2_is_marked_copied():
+def test_check_attitude_copied_from_ekf2_is_detected():
     assert check_convention(flown(), copied(flown())).orientation.verdict == "copied"
 
 

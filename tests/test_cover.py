@@ -231,7 +231,7 @@ def test_error_plot_title_states_that_a_small_curve_looks_flat(eventful: Analysi
     assert titles[1] == f"{titles[0]}, at most 0.050, flat on this scale"
 
 
-def test_sigma_beyond_plot_scale_is_marked_with_its_value() -> None:
+def test_sigma_beyond_plot_scale_is_annotated_with_its_value() -> None:
     axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
     axes.set(xlim=(0.0, 9.0), ylim=(-1.0, 1.0))
     cover_panels._draw_sigma(axes, pd.Series([0.1, 2.0, 0.1], [0.0, 4.0, 9.0]), "KF")

@@ -223,7 +223,7 @@ def test_ekf2_replay_agreement_without_state_is_unavailable():
     assert unknown.reason == "EKF2's position is not logged in the replayed time"
 
 
-def test_logged_innovations_without_one_axis_are_an_empty_table():
+def test_logged_innovations_without_one_axis_give_empty_table():
     frame = pd.DataFrame({"innovation_m": [0.1], "innovation_variance_m2": 0.1, "rejected": 0.0})
     for other in (NONE, frame.assign(rejected=np.nan)):
         ekf2 = made(

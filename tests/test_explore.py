@@ -56,7 +56,7 @@ def page_of(analysis: Analysis, file: Path) -> Path:
 # ------------------------------------------------------------------ without a browser
 
 
-def test_explore_page_content_policy_allows_only_own_scripts(
+def test_explore_page_content_policy_allows_only_its_scripts(
     explored: tuple[Path, Analysis],
 ) -> None:
     text = explored[0].read_text(encoding="utf-8")

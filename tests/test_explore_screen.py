@@ -270,7 +270,7 @@ def test_explore_page_address_restores_all_settings(
 # ------------------------------------------------------------------ the step
 
 
-def test_explore_page_ellipse_equals_covariance_in_each_step(
+def test_explore_page_ellipse_shows_covariance_of_each_step(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     open_view(page, "step")

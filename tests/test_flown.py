@@ -154,7 +154,7 @@ def test_flight_with_known_fault_has_expected_finding(shared_logs, name):
 
 
 @pytest.mark.parametrize("name", [name for name, flown in FLIGHTS.items() if flown.reruns])
-def test_diagnosis_card_of_known_fault_shows_filter_reruns(shared_logs, name):
+def test_diagnosis_card_of_faulty_flight_shows_filter_reruns(shared_logs, name):
     log = shared_logs / "simulated" / f"{name}.ulg"
     analysis, flown = explain(compare(read_log(log))), FLIGHTS[name]
     cause = build_card(analysis, ComparisonRequest(log=log.name)).causes[0]

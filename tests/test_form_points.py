@@ -163,7 +163,7 @@ def test_open_loop_end_answer_earns_all_points_only_with_size() -> None:
     assert parts(measured, truth)[:4] == [30.0, 15.0, 10.0, 15.0]
 
 
-def test_same_answers_for_all_loop_flights_earn_few_points() -> None:
+def test_guessed_answers_for_all_loop_flights_earn_few_points() -> None:
     """300 drawn loops with their closure errors and verdicts.
 
     Most have no update outside the gate, so an empty list is not counted as an answer.

@@ -344,7 +344,7 @@ OF_OTHERS = ("EKF2_EV", "vision", "anchor", "UWB", "line of sight", " tag ")
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", FLIGHTS)
-def test_compare_of_real_gnss_flights_gives_known_numbers(name, shared_logs):
+def test_compare_of_real_gnss_flights_equals_reference_numbers(name, shared_logs):
     folder = shared_logs / "gps"
     analysis = px4fuse.compare(folder / f"{name}.ulg")
     injected = json.loads((folder / f"{name}.json").read_text())

@@ -281,7 +281,7 @@ def test_info_prints_log_dropouts_and_advice(monkeypatch, tmp_path, sample_fligh
 
 
 @pytest.mark.reallogs
-def test_info_describes_or_rejects_each_shared_log(shared_logs, monkeypatch, capsys):
+def test_info_describes_or_rejects_each_test_log(shared_logs, monkeypatch, capsys):
     kinds = ("real/*.ulg", "simulated/*.ulg", "mavlink/*")
     paths = sorted(path for kind in kinds for path in shared_logs.glob(kind))
     assert len(paths) > 30
@@ -316,7 +316,7 @@ def test_info_describes_or_rejects_each_shared_log(shared_logs, monkeypatch, cap
             assert any(remedy in a.remedy for a in inventory.advice), path.name
 
 
-def test_info_succeeds_on_log_that_lacks_any_one_topic(sample_log, tmp_path):
+def test_info_succeeds_on_log_without_any_single_topic(sample_log, tmp_path):
     whole = load(sample_log)
     short = Log([take(t, range(0, len(t.fields["timestamp"]), 40)) for t in whole.topics])
     for name in sorted(short.names()):

@@ -133,7 +133,7 @@ def test_kf_rerun_equals_compare_with_the_changed_setting(analysis, of) -> None:
     )
 
 
-def test_ekf2_rerun_equals_what_if_with_the_same_change() -> None:
+def test_ekf2_rerun_equals_what_if_with_the_same_parameters() -> None:
     analysis = flown("ekf2-noise=0.03")
     found = [find_cause(analysis.causes, "ekf2", axis) for axis in ("north", "east")]
     model, change = analysis.ekf2_model, found[0].change  # type: ignore[union-attr]
@@ -205,7 +205,7 @@ def test_ekf2_rerun_candidates_include_non_default_parameters() -> None:
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
 
-def test_cause_must_explain_50_to_150_percent_of_inconsistency() -> None:
+def test_cause_explains_50_to_150_percent_of_inconsistency() -> None:
     def one(change: Any, explains: float, *, into: bool = False) -> Intervention:
         return Intervention(
             statistic="nis", filter="kf", axis="aisle", change=change, before=9.0,

@@ -95,7 +95,7 @@ def axis() -> Axis:
 
 @settings(max_examples=60)
 @given(axis=any_axis(), chosen=any_settings)
-def test_kf_replay_of_any_axis_equals_plain_recursion(axis: Axis, chosen: Settings) -> None:
+def test_kf_replay_of_any_axis_equals_textbook_recursion(axis: Axis, chosen: Settings) -> None:
     run = replay(axis, chosen)
     states, updates = plain_replay(axis, chosen)
     np.testing.assert_allclose(run.steps[STATE], states, rtol=1e-9, atol=1e-9)

@@ -382,7 +382,7 @@ def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
         (fused(0.1), Noise(None, None, 0.2), {}, "Set EKF2_EVP_NOISE to 0.2 m (EKF2 uses 0.1 m)."),
     ],
 )  # fmt: skip
-def test_overconfident_ekf2_without_replay_recommends_noise(
+def test_noise_of_overconfident_ekf2_is_advised_without_replay(
     one, estimate, parameters, text
 ) -> None:
     flown = analysis(axes=(one,), log=log(parameters=parameters), tuning=tuned(estimate))

@@ -194,7 +194,7 @@ def keys(file: Path) -> list[dict[str, Any]]:
     return [json.loads(zlib.decompress(base64.b64decode(text))) for text in packed]
 
 
-def test_practice_page_source_does_not_reveal_answers(quiz: Path) -> None:
+def test_practice_page_html_source_does_not_show_solutions(quiz: Path) -> None:
     source = quiz.read_text(encoding="utf-8")
     answers = keys(quiz)
     assert [one["right"] for one in answers] == [

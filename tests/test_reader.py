@@ -508,7 +508,7 @@ def test_read_ulog_reads_ground_truth_of_simulation(read):
     assert (flight.truth.samples[Columns.VELOCITY] == 0.25).all(axis=None)
 
 
-def test_motion_capture_is_ground_truth_only_beside_other_source(read):
+def test_motion_capture_is_ground_truth_if_other_source_exists(read):
     log = make_log("v1.16").add(odometry("vehicle_mocap_odometry", 10.0, 16))
     assert read(log).truth.name == "vehicle_mocap_odometry"
     log.drop(*(n for n in log.names() if "_ev_" in n or n == "vehicle_visual_odometry"))
@@ -645,7 +645,7 @@ REAL = {
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", REAL)
-def test_read_log_of_real_logs_gives_known_duration_and_source(shared_logs, name):
+def test_read_log_of_real_logs_gives_their_duration_and_source(shared_logs, name):
     duration_s, source = REAL[name]
     flight = read_log(shared_logs / "real" / f"{name}.ulg")
     assert flight.log.duration_s == pytest.approx(duration_s, abs=0.06)

@@ -218,7 +218,7 @@ class TestForm:
         items = assess_results(mistyped, key=key(), submitter_id=submitter_id).items
         assert [item.points for item in items if "Mistakes" in item.title] == [points]
 
-    def test_student_notes_await_points_of_instructor(self):
+    def test_points_for_student_notes_are_pending_until_graded(self):
         for notes, awaits_points in (("", False), ("I saw a gap.", True)):
             made = assess_results(with_notes(notes, student__id="s01"), key=key())
             assert (made.awaits_points, made.counted_points is None, made.items[-1].points) == (
@@ -250,7 +250,7 @@ class TestScore:
         assert zero.instructor_action == ""
 
     @pytest.mark.parametrize("student_id", ["s02", "S02", "ѕ02", "s77", "", " "])
-    def test_report_on_log_of_other_student_follows_rubric_rule(self, student_id):
+    def test_report_on_log_of_other_student_is_graded_by_rubric_rule(self, student_id):
         given = changed_results(student__id=student_id)
         said = f"id in the report is {student_id}" if student_id.strip() else "report has no id"
         assert (

@@ -361,7 +361,7 @@ def test_ekf2_reset_along_an_unmeasured_axis_is_kept():
 @pytest.mark.parametrize(("reset_s", "said"), [
     (0.5, ""), (1.0, ""), (1.1, "kept"), (17.9, "kept"), (18.0, "kept"), (18.5, ""),
 ])  # fmt: skip
-def test_ekf2_resets_outside_evaluated_segment_are_kept(reset_s, said):
+def test_ekf2_resets_outside_evaluated_segment_are_not_removed(reset_s, said):
     """A reset at the start defines the frame; one at the end affects the last sample only."""
     ekf2 = ekf2_of(np.zeros(3), [Reset(reset_s, "position", (5.0, 5.0, 0.0))])
     state, statement = continuous_state(ekf2, noisy_track(), Segment(1.0, 18.0, ""))

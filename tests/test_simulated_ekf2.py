@@ -218,7 +218,7 @@ def test_simulated_ekf2_holds_position_if_fusion_is_disabled(clean):
 # --- the log
 
 
-def test_simulated_log_notes_that_ekf2_is_simulated(clean, tmp_path):
+def test_simulated_log_has_note_that_ekf2_is_simulated(clean, tmp_path):
     path = tmp_path / "flight.ulg"
     path.write_bytes(to_ulog(simulate(AISLE)))
     assert read_log(path).log.notes == clean.log.notes == (MODEL_NOTE,)

@@ -157,7 +157,7 @@ def test_find_submissions_reads_gradescope_metadata(tmp_path):
         assert found.origin.time.isoformat() == "2026-11-20T22:59:01.123456+00:00"
 
 
-def test_find_submissions_notes_unreadable_gradescope_metadata(tmp_path):
+def test_unreadable_gradescope_metadata_give_a_note(tmp_path):
     bomb = zipped({"submission_metadata.yml": b" " * 5_000_000, "submission_3.pdf": PDF})
     (found,), (note,) = find_submissions([write(tmp_path / "export.zip", bomb)])
     assert found.origin.person == Person("", numbers={"gradescope": "3"})

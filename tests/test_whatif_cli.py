@@ -92,7 +92,7 @@ def test_whatif_command_without_set_uses_estimated_parameters(estimated: WhatIfA
     assert all(len(cells) == len(column_heads(estimated)) == 3 for cells in table.values())
 
 
-def test_whatif_sweep_keeps_parameters_given_with_set(swept: WhatIfAnalysis) -> None:
+def test_whatif_sweep_also_applies_parameters_of_set_option(swept: WhatIfAnalysis) -> None:
     first, *values = swept.whatif.whatif
     assert dict(first.changed) == {"EKF2_EVP_GATE": 3.0}
     assert [v.changed["EKF2_EVP_NOISE"] for v in values] == pytest.approx([0.05, 0.1, 0.2])
