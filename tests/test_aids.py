@@ -1,4 +1,4 @@
-"""EKF2's aids: reading from logs of each release, and consistency of their innovations."""
+"""EKF2's aiding sources: reading from logs of each release, and consistency tests."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -94,7 +94,7 @@ def test_gap_of_disabled_aiding_source_is_not_reported() -> None:
     before_gap = log.samples.loc[:20.0]
     outage = evaluate(replace(log, samples=pd.concat([before_gap, log.samples.loc[40.0:]])))
     assert (outage.verdict, outage.longest_gap_s) == ("not_fused", (20.0, 40.0))
-    # disabled at once: no gap
+    # EKF2 disables the aiding source at once, so there is no gap
     enabled = steps((0.0, 1.0), (20.05, 0.0), (40.0, 1.0))
     given_up = evaluate(replace(log, samples=outage_free(log, 20.0, 40.0), enabled=enabled))
     assert given_up.verdict == "consistent"
@@ -239,7 +239,7 @@ def test_shift_of_mean_innovation_is_reported_with_its_time() -> None:
     )
     # a change of KF's own source is another finding
     assert not [*detect_in_aids({"gnss_vel": found}, "gnss_pos")]
-    # the same for an aid that is rejected after the change
+    # an aiding source that EKF2 rejects after the change has the same finding
     rejected = replace(found, verdict="not_fused")
     (starved,) = detect_in_aids({"gnss_vel": rejected}, "gnss_pos")
     assert starved.evidence[CAUSE] == SENSOR
@@ -282,7 +282,6 @@ def test_compare_checks_option_exits_with_1_on_bad_verdict(tmp_path, monkeypatch
 
 @pytest.mark.parametrize(("sigma", "bad"), [(0.5, False), (0.25, False), (1.5, True)])
 def test_compare_checks_option_accepts_underconfident_sources(sigma: float, bad: bool) -> None:
-    """Overconfident aids fail, underconfident ones do not."""
     made = with_aids(gnss_pos=aid_log(sigma=sigma))
     alone = AidsOnlyAnalysis(made, evaluate_aids(made), Unavailable("it", "not there", "Log it."))
     assert failed_checks(alone) == ({"GNSS position": "overconfident"} if bad else {})

@@ -37,10 +37,10 @@ from px4fuse.simulation.mistakes import parse
 
 pytestmark = pytest.mark.usefixtures("quick_filter")
 SECRET = b"a secret for tests"
-# Flight of student s1 with SECRET: seed, noise and heading, and the mistakes
+# Flight of student s1 with SECRET: seed, noise and heading, and the faults
 PINNED = ((759547191, 0.109, -14.4), ("clock-jump=53ms", "ekf2-off"))
 CLASS = tuple(Person(f"s{n:02d}", f"Name {n}") for n in range(3))
-# Finding that reports each mistake
+# Finding that reports each fault
 FINDINGS = {
     "clock-offset": "source_time_offset", "clock-jump": "source_timestamps_are_arrival_times",
     "yaw": "source_frame_misaligned", "nlos": "source_outliers", "dropout": "source_gap",
@@ -191,7 +191,7 @@ def test_assigned_log_has_a_finding_for_each_fault_of_key(tmp_path, kind, number
 
 
 class TestAssign:
-    """All tests use flights with two mistakes, which are simulated once."""
+    """All tests use flights with two faults, which are simulated once."""
 
     @pytest.fixture(autouse=True)
     def fixed_secret(self, monkeypatch):

@@ -190,7 +190,6 @@ def write_and_read(log: Log, tmp_path: Path) -> Flight:
     ],
 )
 def test_read_log_without_one_topic_contains_all_other_data(tmp_path, topic, part):
-    """Only the part of the missing topic is unavailable."""
     flight = write_and_read(make_log("v1.16", 2.0).drop(topic), tmp_path)
     for name in ("imu", "attitude", "ekf2", "airborne"):
         assert isinstance(getattr(flight, name), Unavailable) == (name == part)
@@ -258,7 +257,6 @@ def test_read_log_adds_note_on_topic_with_zero_timestamps(tmp_path):
              "vehicle_local_position", "estimator_aid_src_ev_pos"],
 )  # fmt: skip
 def test_read_log_drops_swapped_timestamps_with_a_note(tmp_path, name):
-    """Samples out of order are dropped and counted; the others keep their times."""
     log = make_log("v1.16", 4.0)
     index = next(i for i, made in enumerate(log.topics) if made.name == name)
     count = len(log[name]["timestamp"])
@@ -276,7 +274,6 @@ def test_read_log_drops_swapped_timestamps_with_a_note(tmp_path, name):
 
 
 def test_read_log_with_reboot_keeps_the_longer_part(tmp_path):
-    """After a reboot during the log, the longer part is kept."""
     log = make_log("v1.16", 4.0)
     for made in log.topics:
         for name in ("timestamp", "timestamp_sample"):
@@ -302,7 +299,6 @@ MISSING_PARTS = {
 @pytest.mark.parametrize("value", [np.nan, -np.inf])
 @pytest.mark.parametrize(("name", "field"), MISSING_PARTS)
 def test_log_field_without_finite_values_is_unavailable(tmp_path, name, field, value):
-    """A part without finite values is unavailable, not zero; other parts stay."""
     log = make_log("v1.16", 2.0)
     log[name][field][:] = value
     flight = read_and_make_axes(log.write(tmp_path / "made.ulg"))

@@ -351,7 +351,6 @@ def test_batch_interrupted_run_reuses_finished_results(
 
 @pytest.mark.usefixtures("in_this_process")  # one of them
 def test_two_simultaneous_batch_runs_with_one_folder_succeed(tmp_path):
-    """Both runs succeed, and the table is complete."""
     logs, out = tiny_logs(tmp_path / "logs", 3, truth=False), tmp_path / "out"
     with running(logs, out, "--workers", "1") as other:
         while not out.exists():
@@ -417,7 +416,7 @@ def test_find_logs_accepts_folders_globs_and_urls(tmp_path, monkeypatch):
 
 @pytest.mark.reallogs
 def test_batch_processes_all_test_logs_without_exception(shared_logs, tmp_path):
-    """All shared logs except those of other tests, two long ones, and second recordings.
+    """Analyse all logs of ``../shared/logs``, except long ones and those of other tests.
 
     test_gnss.py has the GNSS flights; test_flown.py and test_whatif_cli.py have other releases.
     """

@@ -39,7 +39,7 @@ CHANGES = {
 def outcome(
     source: float, truth: float | None = None, rmse_m: float | None = None
 ) -> RunStatistics:
-    """Return an outcome with these ratios of actual to reported σ."""
+    """Return the result of a filter run with these σ ratios (actual over reported)."""
     nees = None if truth is None else truth**2
     return RunStatistics(
         innovations=600, nis_mean=source**2, nees_mean=nees, position_rmse_m=rmse_m
@@ -74,7 +74,7 @@ def test_rank_causes_lists_source_fault_before_wrong_setting() -> None:
     assert [(each.finding.id, each.tier) for each in ranked] == [
         ("source_time_offset", 1), ("sigma_z_too_small", 1),
     ]  # fmt: skip
-    # the larger reduction is that of the setting
+    # the setting reduces the error more, but a source fault comes first
     assert ranked[1].reduction > ranked[0].reduction
 
 
@@ -85,7 +85,7 @@ def test_rank_causes_lists_source_fault_before_wrong_setting() -> None:
         (outcome(1.0, 3.0, 0.2), "position"),
         (outcome(1.0, 1.0, 0.29), "σ only"),
         (outcome(1.0, 2.9, 0.29), "nothing"),
-        (outcome(0.3, 1.0, 0.29), "nothing"),  # the ratio against the source gets worse
+        (outcome(0.3, 1.0, 0.29), "nothing"),  # the σ ratio against the source becomes worse
     ],
 )
 def test_filter_rerun_improves_position_sigma_both_or_nothing(after, improves) -> None:

@@ -40,7 +40,7 @@ UNDERSTATED, REJECTING = "ekf2_overconfident", "ekf2_rejects_positions"
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        # the cause gets the severity of its consequence
+        # the finding that is the cause gets the severity of its consequence
         ([one(REJECTING, "error"), one(UNDERSTATED)],
          [(UNDERSTATED, "error", None), (REJECTING, "error", UNDERSTATED)]),
         # a wrong variance is a consequence of the cause in its evidence

@@ -1,4 +1,4 @@
-"""Convention of the positions against ground truth: axes, unit, clock and orientation."""
+"""Checks of axes, unit, clock and orientation of a position source with known errors."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from detector_rates import (
 TABLE = rates()
 # Findings listed behind their cause
 CONSEQUENCES = ("ekf2_rejects_positions", "aid_not_fused", "aid_overconfident")
-# Mistakes too small to be detected; the reason is in the file of the detector
+# Faults too small to be detected; the reason is in the file of the detector
 NOT_DETECTABLE = {
     ("source_scale_error", "--mistake scale=5%"),
     ("source_downsampled", "--mistake decimate=2.5Hz"),

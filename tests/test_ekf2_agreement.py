@@ -51,7 +51,7 @@ def test_ekf2_replay_evaluation_excludes_first_5_s_of_segments():
     replay = made(Ekf2Replay, stretches_s=((10.0, 30.0), (40.0, 60.0)), flow_only_spans_s=())
     evaluated_spans = replay.evaluated_s
     assert evaluated_spans == ((15.0, 30.0), (45.0, 60.0))
-    # times with flow as the only aid, and the seconds after them, are excluded
+    # times with flow as the only aiding source, and the seconds after them, are excluded
     carried = made(Ekf2Replay, stretches_s=replay.stretches_s,
                    flow_only_spans_s=((20.0, 23.0), (52.0, 58.0)))  # fmt: skip
     assert carried.evaluated_s == ((15.0, 20.0), (28.0, 30.0), (45.0, 52.0))

@@ -175,7 +175,7 @@ GNSS_RULES = replace(
 def test_ekf2_position_is_reset_to_gnss_after_7_or_14_s(
     gap_s, velocity_gap_s, resets_velocity, resets
 ):
-    """shouldResetGpsFusion of gps_control.cpp; from main of 2026 on aids are independent."""
+    """shouldResetGpsFusion: from PX4 main of 2026 on, a position reset ignores the velocity."""
     rules = replace(GNSS_RULES, resets_velocity=resets_velocity)
     _, taken, reset, *_ = deciding(gap_s=gap_s, velocity_gap_s=velocity_gap_s, rules=rules, left=9)
     assert (taken, reset) == (False, resets)
@@ -284,7 +284,7 @@ def test_ekf2_replay_gnss_reset_sets_position_and_velocity():
 
 
 def test_ekf2_replay_does_not_fuse_a_lost_aiding_source():
-    """Ten fixes at the origin, then ten 1 m north with 0.5 m/s; the aid is lost at 11.05 s."""
+    """Ten fixes at the origin, ten fixes 1 m north with 0.5 m/s; GNSS is lost at 11.05 s."""
     fixes, speeds = [0.0] * 10 + [1.0] * 10, [0.0] * 10 + [0.5] * 10
     done = {name: on_gnss(fixes, speeds, without=dict.fromkeys(name.split(), 11.05))
             for name in ("", "gnss_pos", "gnss_vel", "gnss_pos gnss_vel")}  # fmt: skip

@@ -1,4 +1,4 @@
-"""EKF2 with other parameters, and steps from KF to EKF2: sums, sweeps and messages."""
+"""EKF2 replay with other parameters, and explanation of the difference between KF and EKF2."""
 
 import math
 from pathlib import Path
@@ -266,7 +266,7 @@ def test_what_if_with_many_rejections_is_marked_unpredictable(model):
 
 
 def test_what_if_result_sensitive_to_noise_is_unpredictable(model, monkeypatch):
-    """Each of the three numbers just inside and just outside its limit."""
+    """Vary NIS, rejections and RMSE just inside and just outside their limits."""
     north = AxisSummary(1.0, (0.9, 1.1), 0.1, 0.1, 0.1)
     base = Summary(
         changed={"EKF2_EVP_GATE": 3.0}, north=north, east=north, samples=500, rejected_fraction=0.2,

@@ -439,7 +439,6 @@ def test_position_source_not_logged_as_received_is_reported(
 def test_position_gap_above_1_s_and_five_intervals_is_reported(
     rate_hz: float, least_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The limit is five intervals, but at least 1 s."""
     for gap_s, there in ((least_s, False), (least_s + 0.25, True)):
         monkeypatch.setattr(source_intervals, "state_errors_after", lambda *_: "Errors.")
         time = np.concatenate([np.arange(10.0, 20.5, 0.5), [20.0 + gap_s, 20.5 + gap_s]])

@@ -41,9 +41,9 @@ pytestmark = pytest.mark.usefixtures("quick_filter")
 
 @dataclass(frozen=True)
 class Fault:
-    """A mistake in a flight, the expected finding, and its expected evidence.
+    """Simulated fault, with the expected finding and its evidence.
 
-    The other fields make the flight: options of aisle_flight, filter settings, a change.
+    The other fields define the flight: options of aisle_flight, KF settings, and a change of it.
     """
 
     id: str
@@ -54,7 +54,7 @@ class Fault:
     change: Change = lambda flight: flight
 
     def fly(self, **other: Any) -> Flight:
-        """Make the flight with the mistake."""
+        """Make the flight with the fault."""
         return self.change(aisle_flight(**{**self.flight, **other}))
 
 
@@ -271,7 +271,7 @@ TESTED_ELSEWHERE = {
     "source_timestamps_shared", "source_position_held", "source_zero_positions",
     "source_without_position",
 }  # fmt: skip
-# Second finding of severity error that the mistake causes
+# Second finding of severity error that the fault causes
 ALSO_ERROR = {
     "kf_overconfident": "sigma_z_too_small",
     "kf_underconfident": "sigma_z_too_large",
@@ -304,7 +304,7 @@ MISSING_FIELD: list[tuple[str, dict[str, Any], str | None]] = [
 
 
 def found(comparison: Comparison, *, tuned: bool = False) -> tuple[Finding, ...]:
-    """Find all mistakes of a comparison without re-runs, and check the form of each finding."""
+    """Find all faults of a comparison without re-runs, and check the form of each finding."""
     findings = find(with_noises(comparison) if tuned else unexplained(comparison))
     earlier_ids: set[str | None] = {None}
     for finding in findings:

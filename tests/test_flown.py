@@ -1,4 +1,4 @@
-"""Flights with known faults: expected findings, remedies and steps from KF to EKF2."""
+"""Flights with known faults: expected findings, actions and differences KF - EKF2."""
 
 import json
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ def about(value: float, rel: float = 0.1) -> Any:
 
 
 class Flown(NamedTuple):
-    """Expected findings (id, severity, evidence, text of the remedy) and texts of the steps.
+    """Expected findings (id, severity, evidence, action) and explanation of KF - EKF2.
 
     ``reruns`` are those of the first cause on the card: label, position RMSE (m) before and after,
     √(mean NIS) before and after. ``console`` are the lines that set EKF2's parameters.

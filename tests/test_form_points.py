@@ -75,7 +75,7 @@ CLEAN = FormTruth(
 
 
 def with_claim(**values: Any) -> Answers:
-    """Return the correct form with another first mistake."""
+    """Return the correct form with another first fault."""
     first, second = RIGHT.mistakes
     return replace(RIGHT, mistakes=(replace(first, **values), second))
 
@@ -112,7 +112,7 @@ GATE = {"parameter": "EKF2_EVP_GATE", "value": 3.0, "value_unit": "sd"}
 NO_MISTAKES = {"mistakes": 0.0, "sizes": 0.0, "time and panel": 0.0, "correction": 0.0}
 # A form, and its parts with reduced points
 HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
-    # wrong sign: a third of the points for size and cure of this mistake
+    # wrong sign: a third of the points for the size and the action of this fault
     (with_claim(size=-190.0, value=0.2), {"sizes": 10.0, "correction": 10.0}),
     (with_claim(size=140.0), {"sizes": 11.25}),
     (with_claim(size=900.0, value=-0.9), {"sizes": 7.5, "correction": 11.25}),
@@ -120,9 +120,9 @@ HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
     (with_claim(when=""), {"time and panel": 7.5}),
     (with_claim(**DELAY), {}),
     (with_claim(**GATE), {"correction": 7.5}),
-    # similar mistake: 0.4 of the kind, a third of the size, half of the time
+    # similar fault: 0.4 of the kind, a third of the size, half of the time
     (with_claim(kind="ekf2-delay"), {"mistakes": 21.0, "sizes": 10.0, "time and panel": 7.5}),
-    # each wrong mistake costs 10 points
+    # each wrong fault costs 10 points
     (with_false("yaw"), {"mistakes": 20.0}),
     (with_false("yaw", "nlos", "scale"), NO_MISTAKES),
     (replace(RIGHT, mistakes=(StudentMistake("none"),)), NO_MISTAKES),
@@ -283,7 +283,7 @@ def test_answer_form_points_agree_with_manual_grading(shared_logs: Path) -> None
 
 
 def test_random_answer_forms_earn_at_most_20_percent() -> None:
-    """500 random forms on flights with two mistakes, one and none."""
+    """500 random forms on flights with two faults, one and none."""
     rng = np.random.default_rng(5)
     truths = (TRUTH, replace(TRUTH, mistakes=(LATE,)), CLEAN)
     earned = [form_points(at_random(rng), truths[n % 3]).fraction for n in range(500)]

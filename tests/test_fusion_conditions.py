@@ -179,6 +179,6 @@ def test_gnss_fusion_without_flags_follows_from_global_position() -> None:
     assert fused_aid(ekf2)
     assert not fused_aid(ekf2, "baro_hgt")
     assert not fused_aid(made(Ekf2, aids={}, states={"xy_global": on(0.0)}))
-    # flags without an aid mean that EKF2 did not fuse it
+    # flags without an aiding source mean that EKF2 did not fuse it
     flags = {"xy_global": on(1.0), "tilt_align": on(1.0)}
     assert not fused_aid(made(Ekf2, aids={}, states=flags))

@@ -316,7 +316,7 @@ def test_smaller_gnss_noise_is_advised_if_above_receiver_sigma(
 
 # -------------------------------------------------------------------- flights of PX4's EKF2
 
-# First finding above a note, if any; verdicts of some aids; reason why EKF2 is not replayed
+# By flight: first finding above a note; verdicts of aiding sources; reason without EKF2 replay
 FLIGHTS: dict[str, tuple[str | None, dict[str, str], str]] = {
     "main202603_gps_outage_flow":
         ("source_gap", {"gnss_pos": "not_fused", "gnss_vel": "not_fused"}, ""),
@@ -381,7 +381,7 @@ def test_compare_of_real_gnss_flights_equals_reference_numbers(name, shared_logs
 
 
 def as_in_the_log(found: dict[str, AidResult], truth: dict[str, Any]) -> int:
-    """Compare the NIS of aids with numbers computed without px4fuse; return their count."""
+    """Compare the mean NIS of aiding sources with independent values; return their number."""
     stated = {
         # the stated number excludes rejected samples otherwise
         aid: one["mean_nis" if one["rejected_share"] > 0.0 else "mean_nis_fused"]
@@ -415,7 +415,7 @@ def models(shared_logs: Path, model_of: Any) -> dict[str, Model]:
 
 @pytest.mark.reallogs
 def test_ekf2_model_of_real_gnss_flights_agrees_with_log(models):
-    """Flights without rejections, and one that rejects almost half."""
+    """EKF2 rejects no fix on most of the flights, and almost half of the fixes on one."""
     for name in ("delay0", "fullrate", "nominal"):
         agreement = models[name].agreement
         assert agreement.good
@@ -489,7 +489,7 @@ def test_what_if_with_correct_gnss_delay_reduces_heading_error(models):
 
 @pytest.mark.reallogs
 def test_what_if_without_aiding_source_predicts_position_error(models):
-    """93 s without an aid: the error agrees with the noise of the remaining aids."""
+    """The error after 93 s agrees with the noise of the remaining aiding sources."""
 
     def without(*names: str) -> tuple[Summary, float]:
         found = what_if(models["nominal"], [{}], dict.fromkeys(names, 60.0))

@@ -267,7 +267,7 @@ def test_ekf2_replay_of_heights_without_data_states_reason() -> None:
     record = ekf2.record
 
     def why(enabled: dict[str, float], rows: int = 1, **parameters: float) -> str:
-        """Return the reason for aids enabled from the start (1) or from 60 s on (0)."""
+        """Return the reason for aiding sources enabled from the start (1) or from 60 s on (0)."""
         found = {
             name: made(AidLog, enabled=pd.Series([share, 1.0], index=[0.0, 60.0]))
             for name, share in enabled.items()

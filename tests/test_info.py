@@ -86,7 +86,6 @@ def test_info_rows_match_contents_of_flight(sample_flight):
 
 
 def test_info_sample_counts_match_those_of_compare(sample_flight):
-    """The counts are those of the samples that compare uses."""
     inventory = take_inventory(sample_flight)
     comparison = compare(sample_flight)
     assert all(ability.possible for ability in inventory.abilities)

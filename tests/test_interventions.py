@@ -165,7 +165,7 @@ def test_cause_states_position_difference_before_and_after() -> None:
     assert row.change == cause(kf_case, "kf").change
     assert row.explained_fraction == pytest.approx(1.0 - (row.after / row.before) ** 2)
     assert row.explained_fraction > 0.8
-    # corrected EKF2 differs from KF as much as EKF2 in the same flight without the mistake
+    # corrected EKF2 differs from KF as much as EKF2 in the same flight without the fault
     ekf2_case = flown("ekf2-gate=1", passes=6)
     right = compare(simulate_flight(Scenario(seed=5)), RIGHT)
     (row,) = [

@@ -239,7 +239,6 @@ def test_likelihood_with_imu_biases_equals_dense_joint_normal() -> None:
 
 @pytest.mark.parametrize("start_known", [True, False])
 def test_single_position_in_a_segment_adds_no_likelihood(start_known: bool) -> None:
-    """A single position in a stretch has the same likelihood as none."""
     part = with_constants()
     if not start_known:
         part = replace(part, prior_precision=np.zeros((COUNT, 2)))

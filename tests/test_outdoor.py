@@ -156,7 +156,7 @@ def test_outdoor_flight_without_fault_is_consistent() -> None:
     ],
 )
 def test_simulated_outdoor_fault_is_first_finding(mistake: str, root: str) -> None:
-    """Mistakes for which GNSS takes other branches in the findings than indoor positions."""
+    """Faults for which GNSS takes other branches in the findings than indoor positions."""
     assert roots(flown(mistake))[0] == root
 
 
@@ -211,7 +211,7 @@ def test_what_if_with_correct_gnss_delay_equals_correct_flight() -> None:
 
 def test_what_if_without_magnetometer_replay_uses_logged_heading(tmp_path: Path) -> None:
     log = tmp_path / "a.ulg"  # a log file has the true attitude, a flight in memory has not
-    # with a heading mistake EKF2 fuses the magnetic heading only
+    # with a heading fault EKF2 fuses the magnetic heading only
     log.write_bytes(to_ulog(simulate(OUTDOOR, parse(["ekf2-delay=0", "heading=3"]))))
     model = opened(read_log(log))
     result = what_if(model, [{"EKF2_GPS_DELAY": 110.0}])

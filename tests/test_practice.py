@@ -1,4 +1,4 @@
-"""Practice page: random sets, symptoms of each mistake, questions, answers and score."""
+"""Practice page: random sets, symptoms of each fault, questions, answers and score."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-# A set without a mistake, with one of the source, and with one of the frame
+# A set without a fault, with one of the source, and with one of the frame
 SEED, COUNT = 5, 3
 
 
@@ -68,7 +68,7 @@ def test_practice_level_3_has_some_flights_with_two_faults() -> None:
 
 
 def flown(mistake: HiddenMistake | None, level: int, seed: int) -> Flight:
-    """Simulate a practice flight with one mistake of a level, or without a mistake."""
+    """Simulate a practice flight with one fault of a level, or without a fault."""
     size = "" if mistake is None else mistake.sizes[level - 1]
     noisy = mistake is not None and mistake.mistake == NOISY_UWB
     scenario = Scenario(
@@ -96,7 +96,7 @@ LEVELS_AND_SEEDS = [(1, 1), (3, 3)]
 
 
 def hidden(name: str) -> HiddenMistake:
-    """Return the mistake with this name in px4fuse simulate."""
+    """Return the fault with this name in px4fuse simulate."""
     return next(one for one in practice.HIDDEN_MISTAKES if one.mistake == name)
 
 
@@ -208,7 +208,7 @@ def test_practice_page_html_source_does_not_show_solutions(quiz: Path) -> None:
     for one in answers:
         assert one["rerun"]
         assert "px4fuse-card" in one["card"]
-        # a flight with a mistake is never called consistent
+        # a flight with a fault is never called consistent
         assert ("No fault found" in one["card"]) == (one["right"] == ["nothing"])
         for mistake in one["mistakes"]:
             assert mistake["size"] not in source

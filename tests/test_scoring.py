@@ -160,7 +160,7 @@ def test_unclear_time_offset_of_assigned_flight_earns_all_points():
     assert check_points("clock", UNCLEAR, key=key())[0] == 1.0
 
 
-# ------------------------------------------------------------------ mistakes
+# ------------------------------------------------------------------ faults
 
 
 TRUTH = FormTruth(

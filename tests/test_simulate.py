@@ -1,4 +1,4 @@
-"""Simulated flights against ground truth: motion, sensors, mistakes, ULog and command."""
+"""Simulated flights against ground truth: motion, sensors, faults, ULog and command."""
 
 import json
 from dataclasses import fields
@@ -175,7 +175,7 @@ def test_simulated_vio_drift_has_given_rate():
     assert source.distance_m == pytest.approx(32.0, rel=0.1)
 
 
-# --- mistakes
+# --- faults
 
 
 class TestMistakes:
@@ -365,7 +365,7 @@ def test_kf_with_true_noises_is_consistent(errors, off, share):
 
 @pytest.mark.parametrize("scenario", [Scenario(seed=7, passes=4), LOOP], ids=["aisle", "loop"])
 def test_simulated_clean_flight_has_only_notes_as_findings(scenario):
-    """The VIO of a loop drifts, which is not a mistake; its effect on the filters is reported."""
+    """The VIO of a loop drifts, which is not a fault; its effect on the filters is reported."""
     settings = Settings(sigma_a_m_s2=0.2, sigma_z_m=scenario.source_sigma_m)
     compared = compare(simulate_flight(scenario), settings)
     findings = find(unexplained(compared))

@@ -196,7 +196,7 @@ def test_simulated_ekf2_ignores_samples_with_older_timestamps():
     assert np.all(np.diff(rows.stamp_s) > 0)
 
 
-# --- mistakes in EKF2 parameters
+# --- faults in EKF2 parameters
 
 
 def test_simulated_ekf2_holds_position_if_fusion_is_disabled(clean):

@@ -1,4 +1,4 @@
-"""Values and timestamps of a source that are no measurement: reading, findings, shared cases."""
+"""Invalid values and timestamps of a position source: reading, findings and logged flights."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def track(count: int = 60) -> pd.DataFrame:
 
 
 def invalid(samples: pd.DataFrame) -> dict[str, list[int]]:
-    """Return the rows of each reason."""
+    """Return the row numbers of invalid positions by reason."""
     reason = find_invalid(samples, ["x", "y", "z"]).to_numpy()
     return {name: np.flatnonzero(reason == name).tolist() for name in sorted({*reason} - {""})}
 

@@ -1,4 +1,4 @@
-"""External vision besides GNSS in the EKF2 model.
+"""External vision in addition to GNSS in the EKF2 model.
 
 References are a plain EKF that fuses both one after the other at their own steps, and the scalar
 equations of PX4's bias estimator.
@@ -276,7 +276,6 @@ def test_vision_position_bias_estimates_frame_offset() -> None:
 
 
 def test_vision_jump_is_rejected_until_its_bias_is_reset() -> None:
-    """A jump of vision by 20 m does not move EKF2."""
     vision = sent(sigma_m=0.05)
     at_s = float(on_gnss().inputs.segments[0].time_s[0]) + 20.0
     jumped = replace(vision, position_m=vision.position_m + 20.0 * (vision.stamp_s > at_s)[:, None])

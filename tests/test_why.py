@@ -1,4 +1,4 @@
-"""Difference KF - EKF2: steps, sentences, and cases without a page."""
+"""Explanation of the difference KF - EKF2: contributions, texts, and cases without a page."""
 
 from typing import Any
 
