@@ -112,7 +112,7 @@ class TestDraw:
         names = {choice.mistake for one in flights for choice in choices_of(one)}
         assert names == {choice.mistake for choice in ASSIGNABLE_MISTAKES[kind]}
 
-    def test_mixed_assignment_draws_aisle_and_loop_flights(self):
+    def test_mixed_assignment_contains_aisle_and_loop_flights(self):
         mixed = [draw(SECRET, f"s{n}", "mixed") for n in range(1000)]
         kinds = Counter(one.scenario.kind for one in mixed)
         assert kinds["loop"] / 1000 == pytest.approx(LOOP_FRACTION, abs=0.05)

@@ -106,7 +106,7 @@ def test_report_cover_has_no_space_for_an_empty_row(field: str, empty: Any) -> N
     assert heights[1] > heights[0] + 8.0
 
 
-def test_report_cover_verdict_with_explanation_is_not_bold() -> None:
+def test_explained_verdict_on_report_cover_is_not_bold() -> None:
     card = replace(
         SMALL_SIGMA_A,
         verdicts=tuple(replace(each, is_explained=True) for each in SMALL_SIGMA_A.verdicts[:2]),

@@ -319,7 +319,7 @@ def test_explore_page_space_key_starts_and_pauses_animation(page: Browser) -> No
 # ------------------------------------------------------------------ the tour
 
 
-def test_explore_page_tour_shows_numbers_of_the_flight(
+def test_explore_page_tour_shows_results_of_the_flight(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     analysis = explored[1]

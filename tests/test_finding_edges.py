@@ -871,7 +871,7 @@ def test_position_jump_finding_states_count_and_largest_jump() -> None:
     assert finding.spans_s == ((30.0, 30.0), (60.0, 60.0))
 
 
-def test_scale_error_finding_states_too_long_or_too_short() -> None:
+def test_scale_error_finding_states_if_distances_are_too_long() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
         finding = only(source_positions.detect_scale_error, scaled(signed))
         assert finding.title == f"UWB distances are 20 % too {word}"
@@ -963,7 +963,7 @@ def test_time_offset_action_includes_the_offset_already_applied() -> None:
 
 
 @pytest.mark.parametrize(("p", "there"), [(0.005, False), (0.0049, True), (None, False)])
-def test_change_of_time_offset_with_small_p_value_is_reported(p: float | None, there: bool) -> None:
+def test_significant_change_of_time_offset_is_reported(p: float | None, there: bool) -> None:
     found = only(source_clock.detect, analysis(clock=late(0.1, change_p_value=p)))
     assert found.id == ("source_time_offset_changes" if there else "source_time_offset")
     if there:

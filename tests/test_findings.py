@@ -376,7 +376,7 @@ def test_ekf2_reset_without_source_has_missing_source_as_cause(
     assert "by up to 16.00 m" in reset.message
 
 
-def test_positions_lost_by_logger_are_no_gap_of_the_source(sample_flight: Flight) -> None:
+def test_positions_lost_by_logger_are_not_reported_as_source_gap(sample_flight: Flight) -> None:
     samples = sample_flight.positions[0].samples
     lost = with_source(samples=samples.drop(samples.loc[40.0:60.0].index))(sample_flight)
     lost = replace(lost, positions=(*lost.positions, *sample_flight.positions[1:]))
@@ -394,7 +394,7 @@ def test_each_finding_is_tested_with_a_simulated_fault() -> None:
     list(enumerate(FAULTS)),
     ids=[f"{fault.id}-{fault.severity}" for fault in FAULTS],
 )
-def test_each_simulated_fault_gives_only_its_finding_as_error(at: int, fault: Fault) -> None:
+def test_simulated_fault_has_only_its_finding_of_severity_error(at: int, fault: Fault) -> None:
     """Messages and actions are compared with tests/golden/findings.txt (see test_golden)."""
     is_tuned = "sigma_z_asked_m" in fault.evidence or fault.id == "process_noise_near_zero"
     findings = found(compare(fault.fly(), Settings(**fault.settings)), tuned=is_tuned)
@@ -459,7 +459,7 @@ def test_finding_catalogue_entry_has_known_group() -> None:
         assert entry.meaning.endswith(".")
 
 
-def test_explain_command_examples_state_measured_rates() -> None:
+def test_explain_command_examples_state_measured_detection_rates() -> None:
     examples = load_examples()
     assert list(examples) == list(CATALOGUE)
     rows = pd.read_csv(Path(__file__).parent / "studies" / "rates.csv")

@@ -463,7 +463,7 @@ def test_maximum_likelihood_fit_finds_simulated_outliers(clean, share, size_m, l
 
 
 @pytest.mark.parametrize(("axes", "share", "width"), [(1, 0.15, 4.0), (2, 0.1, 5.0), (2, 0.3, 3.0)])
-def test_noise_sigma_with_outliers_equals_likelihood_curvature(axes, share, width):
+def test_sigma_of_noise_estimate_equals_likelihood_curvature(axes, share, width):
     """Without motion the likelihood has a closed form."""
     rng = np.random.default_rng(axes)
     wrong = rng.random(4000) < share

@@ -147,7 +147,9 @@ def test_outliers_and_jumps_are_not_reported_as_correlated_noise() -> None:
     ("model", "sigma_z_m", "contradicts"),
     [(partial(errors.coloured, tau_s=20.0), 0.10, True), (errors.white, 0.14, False)],
 )
-def test_smaller_noise_must_agree_with_ground_truth(model, sigma_z_m, contradicts) -> None:
+def test_smaller_noise_is_advised_only_if_ground_truth_agrees(
+    model, sigma_z_m, contradicts
+) -> None:
     """The estimate is 0.7 SIGMA_Z in both cases; the first one has time-correlated errors too."""
     analysis = analysed(model, truth_for=sigma_z_m)
     tried = [
