@@ -71,7 +71,7 @@ def test_compare_report_prints_special_characters_of_student(report):
 
 @pytest.mark.usefixtures("no_drawing")
 @pytest.mark.parametrize(("severity", "code"), [("note", 1), ("warning", 1), ("error", 0)])
-def test_compare_fail_on_severity_sets_exit_code(tmp_path, sample_log, severity, code):
+def test_compare_fail_on_option_sets_exit_code(tmp_path, sample_log, severity, code):
     command = "compare", sample_log, "-o", tmp_path / "a.pdf", "--fail-on", severity
     run_checked(*command, "--sigma-z", "0.12", code=code)  # the finding is a warning
     run_checked(*command, code=0)  # the flight has no finding

@@ -476,7 +476,7 @@ def stated(
         (LOGGED_BY_EKF2, True),
     ],
 )
-def test_vision_source_with_orientation_is_marked_as_drifting(origin, drifts) -> None:
+def test_vision_source_with_orientation_is_treated_as_drifting(origin, drifts) -> None:
     assert with_orientation(origin, turns=True).may_drift is drifts
     assert not with_orientation(origin, turns=False).may_drift
 

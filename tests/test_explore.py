@@ -140,7 +140,7 @@ def cells(result: AxisComparison) -> dict[str, list[str]]:
     return expected
 
 
-def test_explore_page_slider_values_match_the_shown_command(
+def test_explore_page_sliders_equal_values_of_shown_command(
     page: Browser, explored: tuple[Path, Analysis], sample_log: Path
 ) -> None:
     before = page.ask(TABLE)

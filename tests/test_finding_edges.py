@@ -175,7 +175,7 @@ def test_log_dropouts_outside_evaluated_segment_are_ignored() -> None:
         (60.0, {"ekf2_fusion_interrupted": "warning"}), (59.9, {"ekf2_not_fusing": "error"}),
     ],
 )  # fmt: skip
-def test_ekf2_not_fusing_severity_follows_fraction_of_time(
+def test_severity_of_missing_ekf2_fusion_depends_on_its_duration(
     until_s: float, expected: dict[str, str]
 ) -> None:
     one = analysis(ekf2=with_fusion((0.0, 1.0), (until_s, 0.0)))
@@ -258,7 +258,7 @@ def rejected(count: int, of: int) -> pd.DataFrame:
     ("count", "of", "expected"),
     [(1, 100, "warning"), (1, 101, None), (20, 100, "error"), (19, 100, "warning")],
 )
-def test_ekf2_rejection_severity_follows_rejected_fraction(
+def test_ekf2_rejection_severity_depends_on_rejected_fraction(
     count: int, of: int, expected: str | None
 ) -> None:
     """EKF2 rejects the horizontal vector, so the main axis is used."""
@@ -473,7 +473,7 @@ def test_wrong_frame_of_position_file_is_reported_as_error() -> None:
 
 
 @pytest.mark.parametrize(("until_s", "expected"), [(60.0, "warning"), (60.1, "note")])
-def test_frame_without_north_is_note_only_if_ekf2_fused_its_yaw(
+def test_frd_frame_finding_is_only_a_note_if_ekf2_fused_its_yaw(
     until_s: float, expected: str
 ) -> None:
     frd = source(frame="FRD")

@@ -248,7 +248,7 @@ def with_ekf2(*mistakes: str) -> Analysis:
 
 
 @pytest.mark.parametrize(("jump", "severity"), [("50ms", "warning"), ("300ms", "error")])
-def test_clock_jump_severity_follows_its_size(jump, severity):
+def test_clock_jump_severity_depends_on_its_size(jump, severity):
     (finding,) = stamps.detect_arrival_times(with_ekf2(f"clock-jump={jump}"))
     assert finding.severity == severity
     assert finding.evidence["until_s"] == pytest.approx(50.0, abs=0.5)

@@ -250,7 +250,7 @@ def test_inconsistent_filter_severity_changes_at_nis_of_4() -> None:
     )
 
 
-def test_inconsistent_filter_finding_groups_horizontal_axes() -> None:
+def test_inconsistent_filter_finding_combines_north_and_east() -> None:
     axes = (kf(0.1, "aisle"), kf(2.0), kf(3.0, "east"), kf(9.0, "down"))
     found = tuple(noises.detect_inconsistent_variances(analysis(axes=axes)))
     assert [(one.id, one.caused_by, one.evidence["axis"]) for one in found] == [

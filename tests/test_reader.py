@@ -430,7 +430,7 @@ def test_position_sources_are_listed_in_order_of_preference(read):
         assert "--position-source" in reason
 
 
-def test_choosing_missing_position_source_lists_available_ones(read):
+def test_choosing_missing_position_source_lists_other_sources(read):
     flight = read(make_log("v1.16"))
     with pytest.raises(MissingDataError, match="vehicle_mocap_odometry") as error:
         choose_source(flight, "vehicle_mocap_odometry")
@@ -527,7 +527,7 @@ STREAMS = {
 
 
 @pytest.mark.parametrize("generation", STREAMS)
-def test_data_streams_name_their_topics_clock_and_file(read, generation):
+def test_data_streams_state_their_topics_clock_and_file(read, generation):
     streams = read(make_log(generation)).streams
     of_ekf2 = ("ekf2_innovations", "ekf2_fusing", "ekf2_variance")
     assert [streams[part].topics[0] for part in of_ekf2] == STREAMS[generation]

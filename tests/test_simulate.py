@@ -100,7 +100,7 @@ class TestMotion:
 
 
 @pytest.mark.parametrize(("left_out", "texts"), [(0.0, []), (2.5, ["open-end=2.5m"])])
-def test_simulated_open_end_equals_loop_closure_error(left_out, texts):
+def test_simulated_loop_with_open_end_has_given_closure_error(left_out, texts):
     scenario = replace(LOOP, passes=2)
     flown = simulate(scenario, parse(texts))
     first, last = flown.motion.at(np.array([0.0, flown.motion.duration_s])).position_m

@@ -121,7 +121,7 @@ def test_simulated_ekf2_is_consistent_at_its_fusion_horizon(clean):
     assert last["accelerometer_bias_down_m_s2"] == pytest.approx(bias[2], abs=0.05)
 
 
-def test_simulated_ekf2_start_at_rest_levels_attitude():
+def test_simulated_ekf2_at_rest_estimates_level_attitude():
     tilt = Rotation.from_euler("x", 0.1).as_matrix()
     gravity = np.array([0.0, 0.0, 9.80665])
     bias, rate = np.array([0.03, -0.02, 0.05]), np.array([0.002, -0.001, 0.003])
