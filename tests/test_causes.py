@@ -23,12 +23,12 @@ def one(name: str, severity: str = "warning", **evidence: str) -> Finding:
     return Finding(name, severity, f"{name}.", "Do.", evidence)  # type: ignore[arg-type]
 
 
-def test_consequences_of_causes_name_only_existing_findings() -> None:
+def test_cause_table_contains_only_existing_finding_ids() -> None:
     listed = {name for cause in CONSEQUENCES for name in effect_ids(cause)}
     assert listed | set(CONSEQUENCES) | NOISES | RECORDING <= set(TITLES)
 
 
-def test_cause_table_lists_inner_causes_before_outer_causes() -> None:
+def test_cause_table_lists_dependent_causes_before_root_causes() -> None:
     outer = list(CONSEQUENCES)
     for at, cause in enumerate(outer):
         assert set(effect_ids(cause)) & set(outer) <= set(outer[:at]), cause

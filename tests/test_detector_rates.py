@@ -36,7 +36,7 @@ def test_false_alarm_rate_on_clean_flights_is_at_most_2_percent() -> None:
 
 
 @pytest.mark.parametrize("finding", sorted({condition.finding for condition in CONDITIONS}))
-def test_each_simulated_fault_is_first_finding_in_95_percent(finding) -> None:
+def test_simulated_fault_is_first_finding_on_95_percent_of_logs(finding) -> None:
     rows = TABLE[(TABLE["finding"] == finding) & (TABLE["condition"] != CLEAN)]
     assert rows["rate" if finding in CONSEQUENCES else "first"].max() >= 0.95
 
@@ -68,7 +68,7 @@ def test_faults_with_detection_rate_100_percent_are_found() -> None:
         assert condition.finding in found(20_000, condition)
 
 
-def test_detection_rate_table_has_rates_of_found_and_first() -> None:
+def test_detection_rate_table_counts_first_and_other_findings() -> None:
     usual, yaw = clean(DEFAULT), Condition("source_frame_misaligned", "--mistake yaw=30")
     flown = [Job(0, (usual,)), Job(1, (usual,)), Job(FAULTY_SEED, (yaw,))]
     made = pd.DataFrame(

@@ -236,7 +236,7 @@ def test_time_offset_message_names_gnss_receiver_delay() -> None:
     assert int(estimate_ms) == pytest.approx(110 + 250, abs=60)
 
 
-def test_magnetometer_shift_is_the_cause_of_its_missing_fusion() -> None:
+def test_magnetometer_disturbance_is_cause_of_missing_fusion() -> None:
     changed, starved = [item for item in find(flown("mag=0.2")) if item.id.startswith("aid_")]
     assert (changed.id, starved.id) == ("aid_innovation_shift", "aid_not_fused")
     assert starved.caused_by == "aid_innovation_shift"

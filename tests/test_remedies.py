@@ -114,7 +114,9 @@ def trial(after: RunStatistics, change: str = "sigma_z_m", kind: str = "noises")
         (13.3, 9.0, 0.5, "nothing", False),
     ],
 )
-def test_filter_rerun_improvement_names_improved_quantity(nis, nees, rmse_m, expected, has) -> None:
+def test_filter_rerun_improvement_states_improved_quantity(
+    nis, nees, rmse_m, expected, has
+) -> None:
     one = trial(RunStatistics(nis_mean=nis, nees_mean=nees, position_rmse_m=rmse_m))
     assert improvement(one) == expected
     assert has_effect(one) is has

@@ -69,7 +69,7 @@ def with_form(kinds, results=EXAMPLE, **values):
 # ------------------------------------------------------------------ checks
 
 
-def test_report_graded_without_its_log_earns_no_verified_points():
+def test_report_without_log_earns_no_points_for_verification():
     pdf = (ROOT / "reports" / "example" / "aisle_uwb.pdf").read_bytes()
     verdict = verify(read_report(pdf, "a.pdf"), pdf, {})
     assert check_points("verified", verdict=verdict)[0] == 0.0
