@@ -51,8 +51,13 @@ PART_LABELS = {
     "truth": "ground truth",
     "airborne": "land detector",
 }
-# Names of the analyses of px4fuse compare that need EKF2 or ground truth
-ANALYSES_WITH_EKF2 = ("EKF2 states", "EKF2 variances", "EKF2 consistency")
+# Samples that each analysis of px4fuse compare needs, by the name of the analysis
+SAMPLES_BY_ANALYSIS = {
+    "EKF2 states": "samples of EKF2's position and velocity",
+    "EKF2 variances": "samples of EKF2's variances",
+    "EKF2 consistency": "EKF2 innovations",
+    "error": "samples of ground truth",
+}
 NO_COMPARISON = Unavailable("comparison", "the log contains no position to compare with", "")
 TimeSpans = tuple[tuple[float, float], ...]
 
@@ -339,7 +344,7 @@ def _analysis_option(name: str, part: object, description: str) -> AnalysisOptio
 
 def _comparison_options(flight: Flight, comparison: Comparison | None) -> Iterator[AnalysisOption]:
     """Yield the analyses that compare KF with EKF2 and with ground truth."""
-    parts: dict[str, object] = dict.fromkeys(ANALYSES_WITH_EKF2, flight.ekf2)
+    parts: dict[str, object] = dict.fromkeys(SAMPLES_BY_ANALYSIS, flight.ekf2)
     parts["error"] = flight.truth
     if comparison is not None:
         line, segment, ekf2 = comparison.lines[0], comparison.segment, flight.ekf2
@@ -354,9 +359,9 @@ def _comparison_options(flight: Flight, comparison: Comparison | None) -> Iterat
         parts = dict(zip(parts, (state, variance, innovations, truth), strict=True))
     for name, part in parts.items():
         has_data = not isinstance(part, Unavailable)
-        samples = f"{len(part)} samples" if isinstance(part, pd.DataFrame) else ""
+        count = f"{len(part)} {SAMPLES_BY_ANALYSIS[name]}" if isinstance(part, pd.DataFrame) else ""
         yield _analysis_option(
-            name, NO_COMPARISON if comparison is None and has_data else part, samples
+            name, NO_COMPARISON if comparison is None and has_data else part, count
         )
 
 
