@@ -68,7 +68,7 @@ def test_report_cover_prints_texts_of_the_diagnosis_card() -> None:
     assert [each for each in expected if each not in text] == []
 
 
-def test_report_cover_marks_alternative_actions_either_or() -> None:
+def test_report_cover_joins_alternative_actions_by_either_or() -> None:
     sender = Action("sender", "subtract 0.264 s")
     console = Action("EKF2", commands=("param set EKF2_EV_DELAY 264", "reboot"), where="console")
     cause = Cause(
@@ -82,7 +82,7 @@ def test_report_cover_marks_alternative_actions_either_or() -> None:
     assert "console: MAVLink Console of QGroundControl" in text
 
 
-def test_report_cover_counts_notes_beyond_three() -> None:
+def test_report_cover_shows_3_notes_and_counts_the_others() -> None:
     notes = tuple(Note(f"note_{number}", f"Text {number}.") for number in range(5))
     text = text_of(replace(SMALL_SIGMA_A, notes=notes, more_causes=4))
     assert "note[note_2]: Text 2." in text
@@ -96,13 +96,13 @@ def test_report_cover_counts_notes_beyond_three() -> None:
     [("reconcile", ""), ("difference", ""), ("causes", ()), ("notes", ()), ("do_this", ()),
      ("effect_text", ""), ("verdicts", ())],
 )  # fmt: skip
-def test_report_cover_row_without_text_takes_no_space(field: str, empty: Any) -> None:
+def test_report_cover_has_no_space_for_an_empty_row(field: str, empty: Any) -> None:
     card = replace(SMALL_SIGMA_A, reconcile="The two verdicts differ.")
     heights = [cover.free_height(page_of(each)) for each in (card, replace(card, **{field: empty}))]
     assert heights[1] > heights[0] + 8.0
 
 
-def test_report_cover_explained_verdict_is_not_emphasised() -> None:
+def test_explained_verdict_on_report_cover_is_not_bold() -> None:
     card = replace(
         SMALL_SIGMA_A,
         verdicts=tuple(replace(each, is_explained=True) for each in SMALL_SIGMA_A.verdicts[:2]),
@@ -112,7 +112,7 @@ def test_report_cover_explained_verdict_is_not_emphasised() -> None:
     assert all(row["quiet"] and not row["loud"] for row in block["rows"])
 
 
-def test_report_cover_ratio_beyond_scale_is_drawn_as_triangle() -> None:
+def test_sigma_ratio_beyond_plot_scale_is_drawn_as_triangle() -> None:
     ratios = verdicts(
         (0.05, "underconfident"), (0.1, "underconfident"), (10.0, "overconfident"),
         (35.0, "overconfident"),
@@ -230,7 +230,7 @@ def test_report_cover_long_text_moves_plots_to_second_page(eventful: Analysis, c
     assert "Innovations ÷ √S" in second
 
 
-def test_report_sections_stay_with_their_first_plot() -> None:
+def test_report_section_title_is_on_page_of_its_first_plot() -> None:
     sections = [Page(f"Section {number}") for number in range(4)]
     for section in sections:
         section.panel("Panel", "", 210.0)
