@@ -141,7 +141,7 @@ def test_report_cover_lists_sigma_ratios_of_aiding_sources() -> None:
     text = text_of(card)
     assert "barometer height 0.57" in text
     assert "magnetometer x not evaluated" in text
-    assert "that is usual and not a fault" in text
+    assert "this is usual and not a fault" in text
 
 
 def test_report_cover_right_to_left_name_precedes_the_id() -> None:
