@@ -105,10 +105,10 @@ def build_card(
     student : (str, str)
         Name and id of the student.
     """
-    result, source, segment = analysis.main, analysis.source, analysis.segment
-    roots = [group[0] for group in group_by_root(analysis.findings)]
-    verdicts = make_verdicts(result)
-    ranked_causes = rank_causes(analysis, roots)
+    source, segment = analysis.source, analysis.segment
+    root_findings = [group[0] for group in group_by_root(analysis.findings)]
+    verdicts = make_verdicts(analysis.main)
+    ranked_causes = rank_causes(analysis, root_findings)
     causes = tuple(
         make_cause(analysis, ranked_finding, verdicts, request)
         for ranked_finding in ranked_causes[:MAX_CAUSES]
@@ -118,9 +118,7 @@ def build_card(
     horizon_ratio = None if causes else _horizon_ratio(analysis)
     if horizon_ratio is not None:
         verdicts = (*verdicts[:-1], replace(verdicts[-1], is_explained=True))
-    reconcile = _reconcile(
-        analysis, verdicts, causes, [finding.id for finding in analysis.findings]
-    )
+    reconcile = _reconcile(analysis, verdicts, causes)
     if not reconcile and any(verdict.is_explained for verdict in verdicts) and may_drift:
         reconcile = DRIFT_HIDES_ERROR
     if horizon_ratio is not None:
@@ -141,7 +139,7 @@ def build_card(
         difference=_difference_text(effect, ranked_causes),
         causes=causes,
         more_causes=max(len(ranked_causes) - MAX_CAUSES, 0),
-        notes=_make_notes(roots, request.log),
+        notes=_make_notes(root_findings, request.log),
         identity=_identity(
             analysis.flight.log,
             request,
@@ -159,8 +157,8 @@ def build_aids_card(
     analysis: AidsOnlyAnalysis, request: ComparisonRequest, student: tuple[str, str] = ("", "")
 ) -> Card:
     """Build the card of a flight without a position source."""
-    roots = [group[0] for group in group_by_root(analysis.findings)]
-    faults = [finding for finding in roots if finding.severity != "note"]
+    root_findings = [group[0] for group in group_by_root(analysis.findings)]
+    faults = [finding for finding in root_findings if finding.severity != "note"]
     causes = tuple(make_plain_cause(finding) for finding in faults[:MAX_CAUSES])
     missing_data = analysis.missing_data
     return Card(
@@ -170,7 +168,7 @@ def build_aids_card(
         do_this=_action_sentences(causes),
         causes=causes,
         more_causes=max(len(faults) - MAX_CAUSES, 0),
-        notes=_make_notes(roots, request.log),
+        notes=_make_notes(root_findings, request.log),
         aids=tuple(
             AidRow(
                 label=aid.label,
@@ -344,9 +342,9 @@ def _is_change(action: Action) -> bool:
 def _action_sentence(action: Action) -> str:
     if action.where == "console":
         # the command already contains the name of the parameter
-        one_change = action.sentence.partition(" ")[2]
-        change = one_change if len(action.commands) == 1 else action.sentence
-        return f"EKF2: {', '.join(action.commands)} ({change})."
+        value_change = action.sentence.partition(" ")[2]
+        change_text = value_change if len(action.commands) == 1 else action.sentence
+        return f"EKF2: {', '.join(action.commands)} ({change_text})."
     if action.where == "shell":
         options = action.commands[0].partition(" --")[2]
         return f"KF: {action.sentence or 'run again with'} --{options}."
@@ -398,9 +396,9 @@ def _horizon_ratio(analysis: Analysis) -> float | None:
     horizon = project_horizon(ekf2, result.axis, analysis.segment)
     if horizon is None or not isinstance(result.truth, pd.DataFrame):
         return None
-    truth = result.truth["position_m"]
-    error = horizon["position_m"] - np.interp(horizon.index, truth.index, truth, np.nan, np.nan)
-    nees = float(np.nanmean(np.square(error) / horizon["position_variance_m2"]))
+    true_m = result.truth["position_m"]
+    error_m = horizon["position_m"] - np.interp(horizon.index, true_m.index, true_m, np.nan, np.nan)
+    nees = float(np.nanmean(np.square(error_m) / horizon["position_variance_m2"]))
     ratio = math.sqrt(nees) if math.isfinite(nees) else math.inf
     return ratio if classify_ratio(ratio, "truth") == "consistent" else None
 
@@ -412,9 +410,7 @@ def _horizon_sentence(ratio: float) -> str:
     )
 
 
-def _reconcile(
-    analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence[Cause], ids: Sequence[str]
-) -> str:
+def _reconcile(analysis: Analysis, verdicts: Sequence[Verdict], causes: Sequence[Cause]) -> str:
     """Explain why verdicts against source and ground truth differ; "" if they agree."""
     corrected = {
         "ekf2" if rerun.is_prediction else "kf"
@@ -432,8 +428,9 @@ def _reconcile(
     ]
     if not differing:
         return ""
+    finding_ids = {finding.id for finding in analysis.findings}
     for ids_of_source, sentence in SENTENCES_BY_SOURCE_FAULT:
-        if not ids_of_source.isdisjoint(ids):
+        if not finding_ids.isdisjoint(ids_of_source):
             return sentence
     if corrected.issuperset(differing):
         filters = " and ".join(FILTER_NAMES[filter_name] for filter_name in differing)
@@ -452,15 +449,15 @@ def _reconcile(
             f"The noise of the source{noise} is less than both filters assume. The drift of the "
             "source does not appear in the innovations, so only ground truth shows it."
         )
-    if "source_noise_time_correlated" in ids:
+    if "source_noise_time_correlated" in finding_ids:
         return (
             "Innovations show only the error that changes from sample to sample. Both filters "
             "follow the slow error, so only ground truth shows it."
         )
     unexplained_text = (
-        HEADING_HIDES_ERROR if "ekf2_heading_error" in ids else UNEXPLAINED_DIFFERENCE
+        HEADING_HIDES_ERROR if "ekf2_heading_error" in finding_ids else UNEXPLAINED_DIFFERENCE
     )
-    is_gated = "source_outliers" in ids and "ekf2" in differing
+    is_gated = "source_outliers" in finding_ids and "ekf2" in differing
     return _gate_sentence(analysis) if is_gated else unexplained_text
 
 
@@ -511,10 +508,10 @@ def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> st
     return f"{text}; {difference_text} {FILTER_NAMES[filter_name]} corrected."
 
 
-def _make_notes(roots: Sequence[Finding], log: str) -> tuple[Note, ...]:
+def _make_notes(root_findings: Sequence[Finding], log_name: str) -> tuple[Note, ...]:
     return tuple(
-        Note(finding.id, f"{finding.title}.", with_log_name(finding.remedy, log))
-        for finding in roots
+        Note(finding.id, f"{finding.title}.", with_log_name(finding.remedy, log_name))
+        for finding in root_findings
         if finding.severity == "note"
     )
 

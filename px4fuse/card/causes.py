@@ -101,7 +101,7 @@ class RankedCause(NamedTuple):
     trials: tuple[Trial, ...]
 
 
-def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCause]:
+def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[RankedCause]:
     """Return the causes of a flight in the order of the card.
 
     1. Findings that make the verdicts meaningless.
@@ -113,7 +113,7 @@ def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCaus
     Within a tier, faults of the position source precede settings that would only hide them.
     """
     ranked_causes = []
-    for finding in roots:
+    for finding in root_findings:
         if finding.severity == "note":
             continue
         trials = confirming_trials(analysis.trials, finding)
