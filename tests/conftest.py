@@ -31,11 +31,8 @@ from ulog_tools import Log
 
 from px4fuse import api, diagnose
 from px4fuse.analysis import Analysis
-from px4fuse.classroom.assignment import truth
-from px4fuse.comparison import comparison
 from px4fuse.comparison.estimates import Progress, ignore_progress
 from px4fuse.ekf2.model import Model, open_model
-from px4fuse.filter.fast_replay import quick_replay
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop import tracks
 from px4fuse.readers import read_log
@@ -292,10 +289,3 @@ def cached_analyses() -> Iterator[None]:
         for place in (diagnose, api):
             patch.setattr(place, "diagnose", _diagnose_cached)
         yield
-
-
-@pytest.fixture
-def quick_filter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replace KF by the fast filter, which agrees within 1e-9 (test_likelihood.py)."""
-    for module in (comparison, truth):
-        monkeypatch.setattr(module, "replay", quick_replay)

@@ -29,7 +29,6 @@ from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-pytestmark = pytest.mark.usefixtures("quick_filter")
 RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
 OF_CAUSES = (
     imu.detect_bias,
@@ -70,7 +69,7 @@ def found(analysis: Analysis, detectors: tuple[Any, ...] = DETECTORS) -> dict[st
 
 
 def test_bias_regression_columns_equal_kf_step_responses() -> None:
-    """Compare innovations with and without a step with filterpy replays."""
+    """Compare innovations with and without a step with KF replays."""
     north = compare(aisle_flight(duration_s=30.0), RIGHT, axes=("north",))["north"].axis
     step = np.where(north.measurement_time_s >= 12.0, 0.7, 0.0)
     intervals = preintegrate(north, RIGHT)

@@ -25,7 +25,6 @@ from px4fuse.simulation.scenario import Scenario
 
 RIGHT = Settings(0.27, 0.10)
 NONE = np.zeros(0)
-pytestmark = pytest.mark.usefixtures("quick_filter")
 NEW = {
     "source_noise_time_correlated",
     "source_samples_repeated",

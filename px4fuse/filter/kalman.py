@@ -1,4 +1,4 @@
-"""KF: the two-state Kalman filter of the lesson UAT 366, module 2, computed with filterpy.
+"""KF: the two-state Kalman filter of the lesson UAT 366, module 2.
 
 State x = [position, velocity] along one axis; the input u is the acceleration over the step::
 
@@ -7,13 +7,11 @@ State x = [position, velocity] along one axis; the input u is the acceleration o
                x = x + Ky         P = (I - KH)P
 
 F, B, Q and H are defined in :mod:`px4fuse.filter.model`, the prediction steps in
-:mod:`px4fuse.filter.steps`.
-:mod:`~px4fuse.filter.fast_replay` and :mod:`~px4fuse.filter.likelihood` run KF many times; their
-faster recursions have the same results to 1e-9.
+:mod:`px4fuse.filter.steps`. :mod:`~px4fuse.filter.likelihood` runs KF for many settings together;
+the results are equal to 1e-9.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -23,9 +21,8 @@ from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.filter import model
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
-from px4fuse.filter.steps import Timeline, make_timeline
+from px4fuse.filter.steps import make_timeline
 
-StateRow = tuple[float, ...]
 # Columns of ``Replay.updates``
 UPDATE_COLUMNS = [
     "measurement_m",
@@ -65,7 +62,7 @@ class Replay:
     settings: Settings
     steps: pd.DataFrame
     updates: pd.DataFrame
-    input_gap_s: float = field(default=0.0)
+    input_gap_s: float = 0.0
 
     __repr__ = one_line_repr
 
@@ -86,71 +83,40 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     SettingsError
         ``settings.input`` is "imu" and the axis has no acceleration.
     """
-    # late import: filterpy imports scipy.stats, which takes 0.3 s
-    from filterpy.kalman import KalmanFilter  # noqa: PLC0415
-
     timeline = make_timeline(axis, settings, initial)
-    initial_state = initial or InitialState(timeline.time_s[0], axis.measurement_m[0])
-    kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
-    kalman.x = np.array([[initial_state.position_m], [initial_state.velocity_m_s]])
-    kalman.P = model.symmetric_matrix(model.INITIAL_COVARIANCE)
-    kalman.H = model.H
-    kalman.R = np.array([[settings.sigma_z_m**2]])
-    kalman.inv = np.reciprocal  # S is 1 by 1
-    states = [_state_row(kalman.x, kalman.P)]
+    measured_m = axis.measurement_m.tolist()
+    position, velocity = measured_m[0], 0.0
+    if initial is not None:
+        position, velocity = initial.position_m, initial.velocity_m_s
+    covariance = model.INITIAL_COVARIANCE
+    states = [(position, velocity, *covariance)]
     updates = []
-    for dt_s, acceleration, gap_variance, measurement_index in zip(
-        np.diff(timeline.time_s),
-        timeline.acceleration_m_s2,
-        timeline.input_variance_m2_s4,
-        timeline.measurement_index[1:],
+    # Python floats are much faster than arrays of one element
+    for dt_s, acceleration, noise_density, measurement_index in zip(
+        np.diff(timeline.time_s).tolist(),
+        timeline.acceleration_m_s2.tolist(),
+        ((settings.sigma_a_m_s2**2 + timeline.input_variance_m2_s4) * settings.dt_s).tolist(),
+        timeline.measurement_index[1:].tolist(),
         strict=True,
     ):
-        Q = (
-            (settings.sigma_a_m_s2**2 + gap_variance)
-            * settings.dt_s
-            * model.symmetric_matrix(model.process_noise_unit(dt_s))
-        )
-        kalman.predict(
-            u=np.array([[acceleration]]), B=model.input_matrix(dt_s), F=model.transition(dt_s), Q=Q
+        position, velocity, covariance = model.predict_step(
+            position, velocity, covariance, acceleration, noise_density, dt_s
         )
         if measurement_index >= 0:
-            z = axis.measurement_m[measurement_index]
-            kalman.update(z)
-            y = kalman.y[0, 0]
-            S = kalman.S[0, 0]
-            K = kalman.K[:, 0]
-            x = kalman.x_prior
-            P = kalman.P_prior
-            updates.append((z, y, S, *K, x[0, 0], P[0, 0], P[1, 1]))
-        states.append(_state_row(kalman.x, kalman.P))
-    return make_replay(axis, settings, timeline, states, updates)
-
-
-def make_replay(
-    axis: Axis,
-    settings: Settings,
-    timeline: Timeline,
-    states: Sequence[StateRow],
-    updates: Sequence[StateRow],
-) -> Replay:
-    """Build a run of KF from the rows (state, covariance) of ``steps`` and those of ``updates``."""
+            z = measured_m[measurement_index]
+            innovation_and_gains, updated_state = model.update_step(
+                position, velocity, covariance, z, settings.sigma_z_m**2
+            )
+            updates.append((z, *innovation_and_gains, position, covariance[0], covariance[2]))
+            position, velocity, covariance = updated_state
+        states.append((position, velocity, *covariance))
     time_arrays = timeline.time_s, timeline.time_s[timeline.measurement_index >= 0]
     time, update_index = (pd.Index(times_s, name="time_s") for times_s in time_arrays)
     steps = pd.DataFrame(states, index=time, columns=model.STATE_COLUMNS + model.COVARIANCE_COLUMNS)
     steps["acceleration_m_s2"] = np.append(timeline.acceleration_m_s2, 0.0)
     steps["input_variance_m2_s4"] = np.append(timeline.input_variance_m2_s4, 0.0)
-    return Replay(
-        axis,
-        settings,
-        steps,
-        pd.DataFrame(updates, update_index, UPDATE_COLUMNS),
-        timeline.input_gap_s,
-    )
-
-
-def _state_row(x: Array, P: Array) -> StateRow:
-    return x[0, 0], x[1, 0], P[0, 0], P[0, 1], P[1, 1]
+    update_table = pd.DataFrame(updates, update_index, UPDATE_COLUMNS)
+    return Replay(axis, settings, steps, update_table, timeline.input_gap_s)
 
 
 def _step_before(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
