@@ -195,7 +195,6 @@ def estimate_frame_rotation(
         comparison.flight,
         comparison.source,
         comparison.segment,
-        comparison.lines[0].acceleration,
         comparison.settings,
         sigma_z_m,
         offset_s,

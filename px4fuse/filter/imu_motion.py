@@ -220,6 +220,7 @@ def prepare_motion(
     weight: Array | None = None,
     signals: SignalCache | None = None,
     heading_sigma_rad: float = float(CONSTANT_SIGMAS[2]),
+    max_segment_s: float = MAX_SEGMENT_S,
 ) -> PreparedMotion | Unavailable:
     """Cut measurements into segments without a gap in IMU or attitude.
 
@@ -232,6 +233,8 @@ def prepare_motion(
         See :class:`PreparedMotion`; weights are 1 by default.
     signals : dict, optional
         Signals of this flight to reuse; new signals are added to it.
+    max_segment_s : float
+        Maximum length of a segment.
 
     Returns
     -------
@@ -255,7 +258,7 @@ def prepare_motion(
         if not len(covered_rows):
             continue
         covered_s = time_s[covered_rows]
-        count = max(1, int(np.ceil((covered_s[-1] - covered_s[0]) / MAX_SEGMENT_S)))
+        count = max(1, int(np.ceil((covered_s[-1] - covered_s[0]) / max_segment_s)))
         cut_times_s = np.linspace(covered_s[0], covered_s[-1], count + 1)[1:-1]
         for segment_rows in np.split(covered_rows, np.searchsorted(covered_s, cut_times_s)):
             if len(segment_rows) >= MIN_SEGMENT_MEASUREMENTS:

@@ -188,10 +188,13 @@ class FittedPositions:
         log_determinant = self.log_determinant + 2.0 * self.degrees_of_freedom * math.log(sigma)
         return replace(self, gram=self.gram / sigma**2, log_determinant=log_determinant)
 
+    def information(self) -> Array:
+        """Return the inverse covariance of the unknown constants, shape (s, T, c, c)."""
+        return np.asarray(self.gram[..., 1:, 1:] + np.diag(self.constant_sigma**-2.0))
+
     def constants(self) -> Array:
         """Return the maximum-likelihood values of the unknown constants, shape (s, T, c)."""
-        information = self.gram[..., 1:, 1:] + np.diag(self.constant_sigma**-2.0)
-        return np.asarray(-np.linalg.solve(information, self.gram[..., 1:, :1])[..., 0])
+        return np.asarray(-np.linalg.solve(self.information(), self.gram[..., 1:, :1])[..., 0])
 
     def scores_by_segment(self, scales: Array = UNIT_SCALE) -> Array:
         """Return -ln p of each segment without the log-determinant, shape (k, s, T).

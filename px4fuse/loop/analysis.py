@@ -144,7 +144,6 @@ def analyse(
         closures=gated_closures,
         corrections=score_paths(path, distance_corrections | graph_corrections, references),
         notes=tuple(note for note in notes if note),
-        nodes=frame_indices,
         distance_m=distance_m,
         graph=graph,
         references=references,

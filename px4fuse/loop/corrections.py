@@ -193,7 +193,6 @@ def score_paths(
         return CorrectedPath(
             name=CORRECTION_LABELS[name],
             trajectory=path,
-            moved_m=displacement_m,
             correction_max_m=float(displacement_m.max()),
             correction_rms_m=float(np.sqrt(np.mean(displacement_m**2))),
             scores={reference.name: score(path, reference) for reference in references},

@@ -84,7 +84,6 @@ class _Minimum:
     """Result of one minimisation by Levenberg-Marquardt."""
 
     state: Residuals
-    cost: float
     iterations: int
     converged: bool
 
@@ -186,15 +185,15 @@ def _minimise(
                 break
             damping *= _DAMPING_FACTOR
         if not is_accepted:
-            return _Minimum(state, cost, iterations, is_flat)
+            return _Minimum(state, iterations, is_flat)
         state = trial
         cost_before = cost
         cost = cost - drop
         iterations += 1
         damping /= _DAMPING_FACTOR
         if drop <= max(tolerance * cost_before, _TOLERANCE):
-            return _Minimum(state, cost, iterations, True)
-    return _Minimum(state, cost, iterations, cost <= _TOLERANCE)
+            return _Minimum(state, iterations, True)
+    return _Minimum(state, iterations, cost <= _TOLERANCE)
 
 
 def _solve_gnc(
@@ -234,7 +233,7 @@ def _solve_gnc(
             minimum = trial
             weights = trial_weights
     model.require_connected(graph, weights > 0.0, "the edges that gnc did not drop")
-    return _Minimum(minimum.state, minimum.cost, iteration_count, minimum.converged), weights
+    return _Minimum(minimum.state, iteration_count, minimum.converged), weights
 
 
 def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tuple[_Minimum, Array]:
@@ -264,4 +263,4 @@ def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tupl
         if np.array_equal(new_weights, weights):
             break
         weights = new_weights
-    return _Minimum(state, minimum_state.cost, iteration_count, minimum_state.converged), weights
+    return _Minimum(state, iteration_count, minimum_state.converged), weights
