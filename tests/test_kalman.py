@@ -59,7 +59,10 @@ def plain_replay(axis: Axis, chosen: Settings) -> tuple[list[list[float]], list[
     z_at = dict(zip(measured, axis.measurement_m.tolist(), strict=True))
     steps = steps_of(measured, chosen.dt_s)
     if chosen.input == "imu":
-        imu = axis.acceleration.time_s.tolist(), axis.acceleration.value_m_s2.tolist()
+        imu = (
+            axis.acceleration.time_s.tolist(),
+            (axis.acceleration.ned_m_s2 @ axis.direction).tolist(),
+        )
     q, r = chosen.sigma_a_m_s2**2 * chosen.dt_s, chosen.sigma_z_m**2
     x = [z_at[measured[0]], 0.0]
     P = [[0.5**2, 0.0], [0.0, 1.0**2]]
@@ -173,7 +176,7 @@ def test_kf_state_does_not_depend_on_later_measurements(axis, chosen, data) -> N
     arrival = axis.measurement_time_s[changed]
     measured = axis.measurement_m.copy()
     measured[changed] += 100.0
-    imu = axis.acceleration.time_s, axis.acceleration.value_m_s2
+    imu = axis.acceleration.time_s, (axis.acceleration.ned_m_s2 @ axis.direction)
     other = line(axis.measurement_time_s, measured, imu)
     times = np.append(np.linspace(axis.measurement_time_s[0], arrival - 1e-9, 50), arrival)
 

@@ -187,7 +187,7 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
 
 
 def _mean_per_part(time_s: Array, rotation_rad: Array, sigma_rad: Array) -> tuple[HeadingPart, ...]:
-    """Average rotation and σ (rad) over parts of the flight with equal duration; return degrees."""
+    """Average rotation and σ (rad) over parts of equal duration; convert to degrees."""
     # parts of a long, downsampled track may be longer, to contain enough samples
     count = max(
         int(min((time_s[-1] - time_s[0]) / PART_LENGTH_S, len(time_s) / (2 * MIN_PART_SAMPLES))), 1
@@ -214,7 +214,7 @@ def heading_rad(quaternions: pd.DataFrame) -> Array:
 def _compare_orientations(
     attitude: pd.DataFrame, orientation: pd.DataFrame, segment: Segment, offset_s: float
 ) -> HeadingError | None:
-    """Return the heading of the source minus EKF2's logged heading; None with too few samples."""
+    """Compare the source's heading with EKF2's logged heading; return None with too few samples."""
     samples = cut_to_segment(orientation, segment)
     time_s = samples.index.to_numpy() + offset_s
     attitude_s = attitude.index.to_numpy()
@@ -248,9 +248,9 @@ def _compare_orientations(
 def _estimate_from_positions(
     flight: Flight, samples: pd.DataFrame, noises: Noises, dt_s: float, *, is_constant: bool
 ) -> HeadingError | Unavailable:
-    """Estimate the heading error at the start of each part, with maximum-likelihood noises.
+    """Estimate the heading error at the start of each part of the flight, from positions and IMU.
 
-    ``is_constant`` states that the heading error is the same in all parts.
+    With ``is_constant``, all parts have the same heading error.
     """
     time_s = samples.index.to_numpy()
     part_length_s = max(

@@ -49,8 +49,10 @@ COARSE_MEASUREMENTS = 600
 SIGNALS_PER_BATCH = 2**16
 # Minimum number of time offsets that are computed together
 MIN_BATCH_OFFSETS = 3
-# Minimum number of measurements in all segments together, and in each segment
-MIN_MEASUREMENTS, MIN_SEGMENT_MEASUREMENTS = 30, 15
+# Minimum number of measurements in all segments together
+MIN_MEASUREMENTS = 30
+# Minimum number of measurements in a segment
+MIN_SEGMENT_MEASUREMENTS = 15
 # Minimum number of measurements in a segment after downsampling
 MIN_KEPT_MEASUREMENTS = 5
 # Interval (s) over which the IMU is averaged before integration
@@ -297,7 +299,7 @@ def prepare_motion(
 
 
 def _covered_spans(imu_s: Array, attitude_s: Array) -> list[Span]:
-    """Return the spans (s) without a gap in IMU or attitude; none if the IMU rate is too low."""
+    """Find the time spans (s) without a gap in IMU or attitude; none if the IMU rate is too low."""
     if len(imu_s) < 2 or np.median(np.diff(imu_s)) > MAX_IMU_INTERVAL_S:
         return []
     gaps = np.flatnonzero(imu_gaps(imu_s))

@@ -120,9 +120,9 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
 
 
 def _step_before(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
-    """Return the last prediction step before each time, and the time since that step (s).
+    """Find KF's last prediction step before each time.
 
-    Return also a mask of times outside the run.
+    Return the index of the step, the time since the step (s), and a mask of times outside the run.
     """
     step_times_s = run.steps.index.to_numpy()
     step_index = np.clip(

@@ -84,11 +84,6 @@ class Acceleration:
 
     __repr__ = one_line_repr
 
-    @property
-    def value_m_s2(self) -> Array:
-        """Acceleration along the axis, shape (n,)."""
-        return np.asarray(self.ned_m_s2 @ self.direction)
-
 
 @dataclass(frozen=True)
 class Axis:

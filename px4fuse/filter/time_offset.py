@@ -43,9 +43,11 @@ from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 FINE_OFFSETS = 11
 # Number of time offsets of the reported likelihood curve, interpolated between the FINE_OFFSETS
 CURVE_OFFSETS = 121
-# Prior σ (rad) of EKF2's heading, by default and with GNSS. With a GNSS delay that is wrong by
-# 0.2 s, EKF2 rotates its heading by 5° to fit the positions: a narrow prior would hide the offset
-HEADING_SIGMA_RAD, GNSS_HEADING_SIGMA_RAD = float(CONSTANT_SIGMAS[2]), 0.2
+# Prior σ (rad) of EKF2's heading if the positions are not from GNSS
+HEADING_SIGMA_RAD = float(CONSTANT_SIGMAS[2])
+# Prior σ (rad) of EKF2's heading with GNSS: wide, because with a GNSS delay that is wrong by 0.2 s
+# EKF2 rotates its heading by 5° to fit the positions, and a narrow prior would hide the offset
+GNSS_HEADING_SIGMA_RAD = 0.2
 # Maximum half-width (s) of the 95 % interval of a time offset that counts as determined
 MAX_HALF_INTERVAL_S = 0.15
 # Maximum σ (s) of the time offset in a part of the flight: parts with a larger σ are ignored in the
@@ -349,7 +351,7 @@ def _simulate_variance_factor(
 
 
 def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
-    """Return the minimum of a profile by a parabola, and σ from the curvature of the parabola."""
+    """Find the minimum of a profile by a parabola; return position, and σ from the curvature."""
     index = int(np.clip(np.argmin(profile), 1, len(grid) - 2))
     step = grid[1] - grid[0]
     shift, curvature = parabola_vertex(profile, index)
@@ -387,7 +389,7 @@ def _offset_per_part(
 
 
 def _fit_clock_drift(part_offsets: tuple[PartOffset, ...]) -> tuple[float | None, float | None]:
-    """Return the drift of the source's clock (ppm) and its standard deviation."""
+    """Fit the drift of the source's clock to the offsets of the parts: drift and σ (ppm)."""
     if len(part_offsets) < 3:
         return None, None
     rows = [

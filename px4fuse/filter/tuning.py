@@ -364,7 +364,7 @@ def _noise_with_interval(
     search_range: tuple[float, float],
     variance_factor: float = 1.0,
 ) -> Noise:
-    """Return a noise with its 95 % interval, without a value at an end of the search range."""
+    """Add the 95 % interval to a noise; omit a value at an end of the search range."""
     value = float(np.exp(best_logs[0]))
     low, high = profile_ends(score, best_logs, search_range, variance_factor)
     is_inside = (
@@ -419,7 +419,7 @@ def _assess_innovations(
 def _check_held_out(
     name: str, intervals: list[Preintegrated], chosen_noises: Noises, fit: NoiseFit
 ) -> HeldOutCheck | Unavailable:
-    """Estimate the noises with the first half of the measurements, test them with the second."""
+    """Estimate the noises from the first half of the measurements, and test them on the rest."""
     half_count = len(fit.weight) // 2
     if half_count < MIN_MEASUREMENTS:
         return Unavailable(

@@ -154,7 +154,7 @@ def analyse(
 def _find_true_end(
     path: Trajectory, request: LoopRequest, truth_end: TrueEnd | str | None, segment: Segment
 ) -> TrueEnd | Unavailable:
-    """Return the landing place: as measured, or from ground truth, or else the take-off place."""
+    """Find the landing place: as measured, from ground truth, or assumed at the take-off place."""
     if request.landed_at is not None:
         if not request.closed_loop:
             raise SettingsError(
@@ -188,7 +188,7 @@ def _is_absolute(trajectory: Trajectory, flight: Flight) -> bool:
 
 
 def _choose_key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
-    """Return the indices of the key frames, and at each pose the distance along the key frames."""
+    """Choose key frames; return their indices, and the distance along them at each pose (m)."""
     _require_in_range("key_frames_m", spacing_m, 1e-3)
     frame_indices = choose_key_frames(path.position_m, spacing_m)
     distance_m = cumulative_distance(path.position_m[frame_indices])

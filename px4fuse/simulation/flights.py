@@ -23,9 +23,12 @@ from px4fuse.simulation.ulog_writer import Topic, encode
 NO_MISTAKES = Mistakes()
 # Values of the PX4 parameters that let EKF2 fuse horizontal positions, with GNSS also velocity
 FUSION_ON_VALUES = {EV_POS.switch: 1, GNSS_POS.switch: 5}
-# SDLOG_PROFILE with and without the topics of external vision
-PROFILE_WITH_VISION, PROFILE_DEFAULT = 129, 1
-PX4_RELEASE = 1 << 24 | 16 << 16 | 255  # v1.16.0, whose topics are simulated
+# SDLOG_PROFILE that logs the topics of external vision
+PROFILE_WITH_VISION = 129
+# SDLOG_PROFILE that does not log the topics of external vision
+PROFILE_DEFAULT = 1
+# PX4 v1.16.0, whose topics are simulated
+PX4_RELEASE = 1 << 24 | 16 << 16 | 255
 HARDWARE = "px4fuse simulation"
 ANSWER_SCHEMA = {"name": "px4fuse-answer", "version": 1}
 

@@ -23,18 +23,22 @@ from px4fuse.simulation.scenario import CORNER_DURATION_S, START_STOP_S, Scenari
 
 # Time (s) on the ground before take-off and after landing
 TIME_ON_GROUND_S = 6.0
-CLIMB_M_S = 0.75  # m/s; climb and descent rate
-CLIMB_RAMP_S = 1.5  # s; duration of each change of the climb rate
+# Maximum climb and descent rate (m/s)
+CLIMB_M_S = 0.75
+# Duration (s) of each change of the climb rate
+CLIMB_RAMP_S = 1.5
 # Maximum flight time (s): the log then has 70 MB
 MAX_FLIGHT_S = 3600.0
 # Time (s) in which the slow deviation grows after take-off and decreases before landing
 FADE_S = 3.0
 # Time (s) of a 180° turn at the end of the aisle with --yaw follow
 TURN_ROUND_S = 4.0
-# Maximum time (s) between two ramps that are continuous
+# Maximum time (s) between the end of a ramp and the start of the next ramp that continues it
 MIN_RAMP_DISTANCE_S = 1e-9
-# Range of periods (s), and number, of the sines of the slow deviation from the path
-DEVIATION_PERIODS_S, DEVIATION_SINE_COUNT = (3.0, 20.0), 4
+# Range of the periods (s) of the sines that are the slow deviation from the path
+DEVIATION_PERIODS_S = (3.0, 20.0)
+# Number of sines in the slow deviation from the path
+DEVIATION_SINE_COUNT = 4
 
 
 def _ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:

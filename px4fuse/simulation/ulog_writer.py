@@ -71,7 +71,6 @@ def encode(
     parameters: Mapping[str, int | float],
     info: Mapping[str, int | str],
     start_us: int,
-    dropouts_ms: Sequence[int] = (),
 ) -> bytes:
     """Encode a ULog file; equal input gives equal bytes.
 
@@ -85,8 +84,6 @@ def encode(
         An int is written as uint32.
     start_us : int
         Boot time (µs) at which logging starts.
-    dropouts_ms : sequence of int
-        Durations (ms) of logger dropouts; their messages are written after the data.
     """
     content = [
         ULOG_MAGIC + _ULOG_VERSION,
@@ -116,7 +113,6 @@ def encode(
         data_messages[index]
         for index in np.argsort(np.concatenate(timestamps_us), kind="stable").tolist()
     ]
-    content += [_message("O", struct.pack("<H", length)) for length in dropouts_ms]
     return b"".join(content)
 
 

@@ -36,8 +36,10 @@ MIN_DOUBTFUL_OFFSET_S = 0.1
 # estimate are probably interchanged
 MAX_INTERVAL_RATIO = 5.0
 
-# Frames with vertical z axis
-_Z_DOWN_FRAMES, _Z_UP_FRAMES = ("NED", "FRD"), ("ENU",)
+# Frames with the z axis down
+_Z_DOWN_FRAMES = ("NED", "FRD")
+# Frames with the z axis up
+_Z_UP_FRAMES = ("ENU",)
 # Kinds of trajectories in a frame with unknown vertical direction
 _KINDS_WITHOUT_VERTICAL = ("slam", "unknown")
 # File names of monocular SLAM, of which the scale is unknown
@@ -261,7 +263,7 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
 def _choose_time_offset(
     estimate: Trajectory, reference: Trajectory, given_s: float | Literal["auto"] | None
 ) -> tuple[TimeOffset, list[str]]:
-    """Return the offset to add to the timestamps of the estimate, and warnings."""
+    """Choose the offset to add to the timestamps of the estimate; return also warnings."""
     if isinstance(given_s, float | int):
         return TimeOffset(
             offset_s=given_s, is_determinable=True, reason="The time offset is as requested."

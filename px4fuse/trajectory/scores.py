@@ -22,15 +22,22 @@ Unit = Literal["frames", "m", "s"]
 # Maximum relative deviation of the distance of an RPE pair from delta, if all pairs are used:
 # default of the evo package
 DELTA_TOLERANCE = 0.1
-# Default distances and times of RPE pairs, which are used if they are between MIN_DELTA_FRACTION
-# and MAX_DELTA_FRACTION of path length or duration
+# Default distances (m) of RPE pairs
 DEFAULT_DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
+# Default times (s) between the two poses of an RPE pair
 DEFAULT_TIMES_S = (1.0, 10.0, 60.0)
-# Maximum number of default RPE deltas: distances (m) and times (s)
-MAX_DISTANCE_DELTAS, MAX_TIME_DELTAS = 3, 2
-MIN_DELTA_FRACTION, MAX_DELTA_FRACTION = 1 / 200, 1 / 5
-# Number of resamples and random seed of the bootstrap, and probability of its interval
-BOOTSTRAP_RESAMPLES, BOOTSTRAP_SEED, CONFIDENCE_LEVEL = 2000, 20120101, 0.95
+# Maximum number of default distances and of default times of RPE pairs
+MAX_DISTANCE_DELTAS = 3
+MAX_TIME_DELTAS = 2
+# Minimum and maximum of a default distance or time, as fraction of path length or duration
+MIN_DELTA_FRACTION = 1 / 200
+MAX_DELTA_FRACTION = 1 / 5
+# Number of bootstrap resamples
+BOOTSTRAP_RESAMPLES = 2000
+# Seed of the random bootstrap resamples
+BOOTSTRAP_SEED = 20120101
+# Probability of the bootstrap interval
+CONFIDENCE_LEVEL = 0.95
 # Length of a bootstrap block, in integrated autocorrelation times of the squared errors
 BLOCK_CORRELATION_TIMES = 3.0
 # Number of lags in the sum of autocorrelations, in integrated autocorrelation times (Sokal 1997)
