@@ -285,7 +285,7 @@ def test_formatted_mistake_option_is_parsed_to_same_mistake(name):
 
 @pytest.mark.parametrize(("text", "expected"), [
     ("fog", "Choose from clock-offset, clock-drift"),
-    ("dropout = 8s", "is not a mistake that px4fuse simulates"),
+    ("dropout = 8s", "cannot inject the fault dropout "),
     ("nlos=5s", "give percent"),
     ("nlos=80%", "give 0 to 50 %"),
     ("nlos=5%,1m,2", r"give nlos=PERCENT\[,SIZE\]"),

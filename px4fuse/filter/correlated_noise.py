@@ -65,7 +65,8 @@ MIN_GAIN_NATS = 2.0
 OFFSET_PENALTY_NATS = 2.0
 # Search range (s) of the time constant of a low pass
 LOW_PASS_TAU_S = (0.02, 3.0)
-LOG_TAU_TOLERANCE = 0.05  # tolerance of ln τ of a low pass
+# Tolerance of ln τ of a low pass
+LOG_TAU_TOLERANCE = 0.05
 # Maximum number of measurements in the fit to ground truth, to limit the computing time
 MAX_TRUTH_MEASUREMENTS = 300
 # Minimum gain of log-likelihood over white noise in the fit to ground truth: likelihood ratio 150,
@@ -84,7 +85,7 @@ CORRELATED_FRACTIONS = np.linspace(0.05, 0.999, 20)
 
 @dataclass(frozen=True)
 class SourceLowPass:
-    """Low-pass filter by which the sender averages the positions.
+    """Low-pass filter of the position source, which averages successive positions.
 
     Attributes
     ----------

@@ -30,22 +30,22 @@ from px4fuse.filter.signals import Segment, cut_to_segment, too_few_measurements
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.trajectory.rotation import heading
 
-# Length (s) of the parts of the flight with separate heading errors: with a measured orientation,
-# and minimum with positions only
+# Length (s) of the parts of the flight whose headings are compared, with a measured orientation
 PART_LENGTH_S = 2.0
+# Length (s) of the parts of the flight with separate heading errors, without a measured orientation
 POSITION_PART_LENGTH_S = 15.0
-# Minimum length (s) of a part with positions only, between gaps of the IMU
+# Minimum length (s) of such a part between gaps of the IMU
 MIN_POSITION_PART_S = 5.0
 MIN_PARTS = 3
 MIN_MEASUREMENTS = 50
-MIN_PART_SAMPLES = 3  # minimum number of samples in a part of the flight
+# Minimum number of samples in a part of the flight
+MIN_PART_SAMPLES = 3
 # Maximum number of measurements; longer tracks are downsampled: more measurements take time and
 # hardly improve the heading
 MAX_MEASUREMENTS = 1000
-# Maximum p-value of the hypothesis "constant heading error", for a heading error that counts as
-# changing in flight
+# Maximum p-value of the hypothesis "constant heading error" for reporting a change in flight
 MAX_DRIFT_P_VALUE = 0.002
-# Minimum change (°) over the flight of a heading error that counts as changing in flight
+# Minimum change (°) of the heading error in flight for reporting the change
 MIN_DRIFT_DEG = 5.5
 # Maximum yaw rate at which the headings of source and EKF2 are compared: at a higher rate, a delay
 # of 0.2 s would look like a heading error of more than 2°

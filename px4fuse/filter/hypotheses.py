@@ -53,7 +53,8 @@ FORWARD, RIGHT, ROTATION = range(3)
 CONSTANT_COUNT = 3
 # Grid of factors on KF's SIGMA_A: less acceleration noise remains after biases and tilt are fitted
 SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
-SCALE_GRID = np.linspace(0.7, 1.3, 7)  # scale factors of the source that are tested
+# Tested scale factors of the position source
+SCALE_GRID = np.linspace(0.7, 1.3, 7)
 # Maximum number of times at which a jump of the positions is tested
 MAX_TESTED_TIMES = 800
 # Number of jump times that are tested together, to limit memory

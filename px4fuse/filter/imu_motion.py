@@ -66,7 +66,7 @@ MAX_IMU_INTERVAL_S = 0.025
 
 @dataclass(frozen=True)
 class Signals:
-    """Motion of one segment from the IMU, and sensitivity of the motion to each unknown constant.
+    """Motion of one segment from the IMU, and its sensitivity to constant attitude and IMU errors.
 
     ``table`` contains position, velocity and acceleration along each axis of NED at each time; its
     shape is (n, 3, 3, 1 + constants). Index 0 of the last dimension is the motion with all

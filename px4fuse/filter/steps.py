@@ -10,7 +10,7 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis, step_means
 from px4fuse.flight.model import Unavailable
 
-# Maximum difference (s) of two times that count as equal: timestamps have a resolution of 1 µs
+# Maximum difference (s) of two equal timestamps: timestamps have a resolution of 1 µs
 MAX_SAME_TIME_S = 5e-7
 
 

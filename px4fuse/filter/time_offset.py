@@ -48,13 +48,12 @@ HEADING_SIGMA_RAD = float(CONSTANT_SIGMAS[2])
 # Prior σ (rad) of EKF2's heading with GNSS: wide, because with a GNSS delay that is wrong by 0.2 s
 # EKF2 rotates its heading by 5° to fit the positions, and a narrow prior would hide the offset
 GNSS_HEADING_SIGMA_RAD = 0.2
-# Maximum half-width (s) of the 95 % interval of a time offset that counts as determined
+# Maximum half-width (s) of the 95 % interval for accepting a time offset
 MAX_HALF_INTERVAL_S = 0.15
 # Maximum σ (s) of the time offset in a part of the flight: parts with a larger σ are ignored in the
 # test for a change of the offset
 MAX_PART_SIGMA_S = 0.15
-# Maximum p-value of the hypothesis "constant time offset", for an offset that counts as changing in
-# flight
+# Maximum p-value of the hypothesis "constant time offset" for reporting a change in flight
 MAX_CHANGE_P = 0.005
 # Minimum significant time offset, in σ: false alarm probability 0.3 %
 MIN_OFFSET_SIGMAS = 3.0

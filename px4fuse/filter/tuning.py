@@ -46,15 +46,16 @@ NoiseInterval = tuple[NotNegative, NotNegative | None]
 GRID_SIZE = 40
 # Half-width of the likelihood map along each side, in σ of the estimate
 MAP_HALF_WIDTH_SIGMAS = 4.5
-MIN_MEASUREMENTS = 30  # minimum number of positions for an estimate of the noises
+# Minimum number of positions for an estimate of the noises
+MIN_MEASUREMENTS = 30
 # Maximum fraction of outliers for an estimate of the noises
 MAX_OUTLIER_SHARE = 0.3
 # Factors on KF's SIGMA_A that give initial values for the fit with biases
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value of the random walk (m/√s) of a source that may drift
 START_RANDOM_WALK_M = 0.02
-# Maximum ratio between an estimate and an end of the search range at which the maximum of the
-# likelihood counts as being at this end
+# Maximum ratio between an estimate and an end of the search range for reporting a bound instead of
+# the estimate
 MAX_SEARCH_END_RATIO = 1.001
 
 

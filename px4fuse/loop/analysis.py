@@ -23,14 +23,15 @@ from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Trajectory, components_by_axis, cumulative_distance
 
-# Minimum time (s) in options that counts as UNIX time, if the timestamps of the trajectory are UNIX
-# time: smaller times count from the first pose
+# Minimum UNIX time (s) in options, if the timestamps of the trajectory are UNIX time: smaller times
+# are times after the first pose
 MIN_UNIX_TIME_S = 1e6
 # Minimum path length (m) of a loop
 MIN_PATH_M = 2.0
-# Limits for a loop analysis in ``px4fuse compare``: minimum path length (m), and maximum distance
-# between both ends of the path as fraction of the path length
+# Minimum path length (m) for a loop analysis in ``px4fuse compare``
 MIN_FLIGHT_LOOP_PATH_M = 10.0
+# Maximum distance between both ends of the path for a loop analysis in ``px4fuse compare``, as
+# fraction of the path length
 MAX_END_DISTANCE_FRACTION = 0.10
 # Maximum value (m or °) of the options for drift, key frame spacing and σ
 MAX_OPTION_VALUE = 100.0

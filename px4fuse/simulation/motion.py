@@ -1,4 +1,4 @@
-"""True motion of a simulated flight: a smooth path, and the attitude that a quadrotor needs for it.
+"""True motion of a simulated flight: a smooth path, and the attitude of a quadrotor on this path.
 
 Each velocity change is a quintic ramp, so that the acceleration is continuous and the jerk bounded.
 In the air, a

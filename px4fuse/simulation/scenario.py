@@ -1,4 +1,4 @@
-"""Path and sensors of a simulated flight without mistakes."""
+"""Path and sensors of a simulated flight without injected faults."""
 
 import math
 from collections.abc import Mapping
@@ -66,7 +66,7 @@ def quantities(record: type) -> dict[str, Bounds]:
 
 @dataclass(frozen=True)
 class Scenario:
-    """Path and sensors of a simulated flight, without mistakes.
+    """Path and sensors of a simulated flight, without injected faults.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class Scenario:
         True if the log contains the output of px4fuse's EKF2 model.
     seed : int
         Seed of all random numbers. Each sensor has a separate stream of random numbers, so a
-        mistake in one sensor does not change the noise of other sensors.
+        fault in one sensor does not change the noise of other sensors.
 
     Raises
     ------

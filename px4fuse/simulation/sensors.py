@@ -1,4 +1,4 @@
-"""Simulated sensor topics as PX4 v1.16 logs them, with the mistakes of the flight."""
+"""Simulated sensor topics as PX4 v1.16 logs them, with the injected faults of the flight."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -81,7 +81,7 @@ def random_stream(scenario: Scenario, name: Stream) -> np.random.Generator:
 
 @dataclass(frozen=True)
 class SimulatedPositions:
-    """Simulated positions, without those that the mistakes remove.
+    """Simulated positions, without those that injected faults remove.
 
     Attributes
     ----------
@@ -280,7 +280,7 @@ def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
 
 
 def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SimulatedPositions:
-    """Simulate UWB (aisle), VIO (loop) or GNSS (outdoor) positions with the mistakes."""
+    """Simulate UWB (aisle), VIO (loop) or GNSS (outdoor) positions with injected faults."""
     timing_rng = random_stream(scenario, Stream.TIMING)
     interval_s = 1.0 / scenario.source_rate_hz
     count = int((motion.duration_s - FIRST_POSITION_S) / interval_s)

@@ -52,7 +52,8 @@ def topic(name: str, field_values: Mapping[str, ArrayLike], table_row: str = "")
     table_row : str
         Name in ``topics.toml``, if it differs from the topic name.
     """
-    rows = [row.split() for row in TOPIC_FIELDS[table_row or name].splitlines()]
+    rows = [["uint64", field] for field in ("timestamp", "timestamp_sample")]
+    rows += [row.split() for row in TOPIC_FIELDS[table_row or name].splitlines()]
     unknown_fields = field_values.keys() - {field for _, field, *_ in rows}
     assert not unknown_fields, f"{name} has no {unknown_fields}"
     count, fields = np.size(field_values["timestamp"]), {}

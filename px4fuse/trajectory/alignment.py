@@ -1,4 +1,4 @@
-"""Alignment of an estimated trajectory with a reference: transform that does not count as error.
+"""Alignment of an estimated trajectory with a reference before the error is computed.
 
 Estimators that use gravity are aligned in yaw and position (4 degrees of freedom), so tilt counts
 as error (Zhang & Scaramuzza 2018). SLAM with the frame of its first key frame is aligned in

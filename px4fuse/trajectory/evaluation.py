@@ -340,7 +340,7 @@ def _with_reference_body_axes(
 ) -> tuple[Trajectory, tuple[str, ...]]:
     """Rotate the body axes of the estimate to those of the reference: camera against vehicle.
 
-    The constant rotation between them is estimated, so it does not count as error.
+    The constant rotation between them is estimated, so it is no error.
     """
     vehicle_frames = (*_Z_DOWN_FRAMES, *_Z_UP_FRAMES)
     axes_differ = (aligned_estimate.frame == "camera") != (reference.frame == "camera") or any(

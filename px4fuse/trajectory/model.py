@@ -32,7 +32,7 @@ AXES_OF_FRAME: Mapping[Frame, tuple[str, str, str]] = {
 AxisComponents = Annotated[dict[str, float], Meta(min_length=3, max_length=3)]
 
 
-# Name of the opposite direction of each direction
+# Opposite direction, by direction
 OPPOSITE_DIRECTIONS = {
     "north": "south",
     "east": "west",

@@ -13,8 +13,7 @@ from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
 
-# Minimum eigenvalue of an information matrix with unit diagonal: directions with smaller
-# eigenvalues count as not measured
+# Minimum eigenvalue of an information matrix with unit diagonal for a measured direction
 MIN_OBSERVED_EIGENVALUE = 1e-9
 # Sources of the initial poses
 FROM_FILE = "the file's vertices"
