@@ -162,7 +162,6 @@ class FilterStates:
     gain: Array
     velocity_m_s: Array
     sigma_p_m: Array
-    sigma_v_m_s: Array
     nis: Array
 
 
@@ -174,8 +173,8 @@ def filter_states(
     ``sigma_a_m_s2`` and ``sigma_z_m`` are broadcast against each other to a grid.
     """
     rows = [
-        (k0, v, np.sqrt(p00), np.sqrt(p11), nu**2 / s)
-        for nu, s, k0, _, v, (p00, _, p11) in run_filter(intervals, sigma_a_m_s2, sigma_z_m, None)
+        (k0, v, np.sqrt(p00), nu**2 / s)
+        for nu, s, k0, _, v, (p00, _, _) in run_filter(intervals, sigma_a_m_s2, sigma_z_m, None)
     ]
     return FilterStates(*(np.array(column) for column in zip(*rows, strict=True)))
 

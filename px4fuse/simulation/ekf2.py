@@ -90,10 +90,11 @@ NO_AID_TIMEOUT_S = 5.0
 # Initial σ of tilt, velocity, position, gyro bias and accelerometer bias: EKF2_ANGERR_INIT,
 # EKF2_GPS_V_NOISE, EKF2_GPS_P_NOISE, EKF2_GBIAS_INIT and EKF2_ABIAS_INIT (covariance.cpp)
 INITIAL_SIGMA = np.repeat([0.1, 0.3, 0.5, 0.1, 0.2], 3)
-# Time (s) at rest before the log, and σ of specific force (m/s²), angular rate (rad/s) and velocity
-# (m/s) at rest. With them the model has the σ that EKF2 v1.16 reports on the ground: gyro bias
-# 0.0005 rad/s, velocity 0.06 m/s, horizontal accelerometer bias 0.17 m/s²
+# Time (s) at rest before the log
 REST_BEFORE_LOG_S = 10.0
+# σ of specific force (m/s²), angular rate (rad/s) and velocity (m/s) at rest. With these values the
+# model has the σ that EKF2 v1.16 reports on the ground: gyro bias 0.0005 rad/s, velocity 0.06 m/s,
+# horizontal accelerometer bias 0.17 m/s²
 REST_SIGMA = np.repeat([0.05, 0.0005, 0.06], 3)
 # σ of EKF2's heading (rad) as PX4 v1.16 logs it in flight
 HEADING_SIGMA_RAD = 0.03

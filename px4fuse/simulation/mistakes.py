@@ -125,7 +125,7 @@ def parse(texts: Iterable[str]) -> Mistakes:
     Parameters
     ----------
     texts : iterable of str
-        ``NAME``, ``NAME=VALUE`` or ``NAME=VALUE,VALUE``; of repeated names the last one counts.
+        ``NAME``, ``NAME=VALUE`` or ``NAME=VALUE,VALUE``; a repeated name replaces the previous one.
 
     Raises
     ------

@@ -88,8 +88,6 @@ class SimulatedPositions:
     topic : Topic
     is_outlier : ndarray of bool, shape (n,)
         True for positions that are simulated outliers.
-    error_m : ndarray, shape (n, 3)
-        Measured minus true position, NED.
     position_m : ndarray, shape (n, 3)
         Measured position, NED.
     velocity_m_s : ndarray, shape (n, 3), or None
@@ -102,7 +100,6 @@ class SimulatedPositions:
 
     topic: Topic
     is_outlier: BoolArray
-    error_m: Array
     position_m: Array
     velocity_m_s: Array | None
     measured_s: Array
@@ -339,7 +336,6 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Simulat
     return SimulatedPositions(
         topic=topic,
         is_outlier=is_outlier[is_logged],
-        error_m=(position_m - state.position_m)[is_logged],
         position_m=position_m[is_logged],
         velocity_m_s=velocity_m_s,
         measured_s=time_s[is_logged],

@@ -237,7 +237,8 @@ def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[
     min_count = max(MIN_OVERLAP_S, MIN_OVERLAP_FRACTION * min(spans_s)) / step_s
     min_count = min(min_count, 0.5 * min(spans_s) / step_s)
     correlations = []
-    for a, b in zip(sparse_speeds, dense_speeds, strict=False):  # angular speeds if both have them
+    # angular speeds are only compared if both trajectories have orientations
+    for a, b in zip(sparse_speeds, dense_speeds, strict=False):
         speed_moments = moments(a, b, is_known_sparse, is_known_dense)
         # Exclude lags at which a trajectory is at rest: its variance is a rounding error
         is_usable = speed_moments.count >= min_count
@@ -366,7 +367,7 @@ def _refine_offset(
 
     def fit_at(shift_s: float) -> _OffsetFit:
         target = positions_at(dense_track, time + (lag_s + shift_s))
-        # The sparse trajectory is transformed: a transformed target could get the scale zero
+        # The sparse trajectory is transformed, because a transformed target could get the scale zero
         transform = umeyama(position, target, with_scale=True)
         return _OffsetFit(lag_s + shift_s, transform, time, transform.apply(position), target)
 

@@ -176,7 +176,6 @@ def _minimise(
             is_flat = False
             step = solve_normal_equations(matrix, gradient, damping)
             if step is not None:
-                # Decrease of the linearised cost
                 predicted_drop = 0.5 * float(np.sum(step * (damping * step + gradient)))
                 tangent = np.concatenate([np.zeros(graph.degrees_of_freedom), step[:, 0]])
                 trial = model.residuals(
