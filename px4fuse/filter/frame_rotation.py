@@ -34,7 +34,7 @@ from px4fuse.trajectory.rotation import heading
 PART_LENGTH_S = 2.0
 # Length (s) of the parts of the flight with separate heading errors, without a measured orientation
 POSITION_PART_LENGTH_S = 15.0
-# Minimum length (s) of such a part between gaps of the IMU
+# Minimum length (s) of a part without a measured orientation, between gaps of the IMU
 MIN_POSITION_PART_S = 5.0
 MIN_PARTS = 3
 MIN_MEASUREMENTS = 50

@@ -367,7 +367,7 @@ def _refine_offset(
 
     def fit_at(shift_s: float) -> _OffsetFit:
         target = positions_at(dense_track, time + (lag_s + shift_s))
-        # The sparse trajectory is transformed, because a transformed target could get the scale zero
+        # The sparse trajectory is transformed: a transformed target could get the scale zero
         transform = umeyama(position, target, with_scale=True)
         return _OffsetFit(lag_s + shift_s, transform, time, transform.apply(position), target)
 
