@@ -33,9 +33,11 @@ from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.trajectory.rotation import cumulative_product, from_vector, multiply, rotate, to_matrix
 
+# Prior σ (rad) of the tilt and heading at the start of a segment
+HEADING_SIGMA_RAD = 0.05
 # Prior σ of the unknown constants, wide for consumer sensors: initial tilt and heading (rad), gyro
 # bias (rad/s), accelerometer bias (m/s²), scale of the positions (1)
-CONSTANT_SIGMAS = np.repeat([0.05, 0.004, 0.3, 0.1], [3, 3, 3, 1])
+CONSTANT_SIGMAS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
 # Maximum length (s) of a segment: the linearisation requires small angles. In 30 s a gyro bias of
 # 0.004 rad/s rotates the attitude by 0.12 rad, with a second-order error of 0.07 m/s²
 MAX_SEGMENT_S = 30.0
@@ -125,7 +127,7 @@ class PreparedMotion:
     directions: Array
     dt_s: float
     imu_interval_s: float
-    heading_sigma_rad: float = float(CONSTANT_SIGMAS[2])
+    heading_sigma_rad: float = HEADING_SIGMA_RAD
 
     def downsample(self, count: int) -> PreparedMotion:
         """Keep about ``count`` of the measurements; all if these would be too few per segment."""
@@ -221,7 +223,7 @@ def prepare_motion(
     dt_s: float,
     weight: Array | None = None,
     signals: SignalCache | None = None,
-    heading_sigma_rad: float = float(CONSTANT_SIGMAS[2]),
+    heading_sigma_rad: float = HEADING_SIGMA_RAD,
     max_segment_s: float = MAX_SEGMENT_S,
 ) -> PreparedMotion | Unavailable:
     """Cut measurements into segments without a gap in IMU or attitude.

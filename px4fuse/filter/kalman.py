@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.arrays import Array, BoolArray, IntArray
 from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.filter import model
 from px4fuse.filter.settings import InitialState, Settings
@@ -135,22 +135,22 @@ def _step_before(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArra
     )
 
 
-def state_at(run: Replay, times_s: Array) -> ArrayPair:
+def state_at(run: Replay, times_s: Array) -> Array:
     """Predict position (m) and velocity (m/s) at each time from KF's last step before that time.
 
     Interpolation between two prediction steps would use a measurement before it is received. The
-    result is NaN outside the run.
+    result has the shape (2, n); it is NaN outside the run.
     """
     index, elapsed_s, is_outside = _step_before(run, times_s)
     position, velocity, acceleration = (
         run.steps[column].to_numpy()[index]
         for column in (*model.STATE_COLUMNS, "acceleration_m_s2")
     )
-    position, velocity = model.propagate_state(position, velocity, acceleration, elapsed_s)
-    return np.where(is_outside, np.nan, position), np.where(is_outside, np.nan, velocity)
+    state = model.propagate_state(position, velocity, acceleration, elapsed_s)
+    return np.where(is_outside, np.nan, state)
 
 
-def variance_at(run: Replay, times_s: Array) -> ArrayPair:
+def variance_at(run: Replay, times_s: Array) -> Array:
     """Return the variances (m², m²/s²) of the results of :func:`state_at`: FPFᵀ + Q."""
     index, elapsed_s, is_outside = _step_before(run, times_s)
     p00, p01, p11 = run.steps[model.COVARIANCE_COLUMNS].to_numpy()[index].T
@@ -158,6 +158,5 @@ def variance_at(run: Replay, times_s: Array) -> ArrayPair:
     noise_density = (run.settings.sigma_a_m_s2**2 + gap_variance) * run.settings.dt_s
     p00, _, p11 = model.propagate_covariance((p00, p01, p11), elapsed_s)
     q00, _, q11 = model.process_noise_unit(elapsed_s)
-    return np.where(is_outside, np.nan, p00 + noise_density * q00), np.where(
-        is_outside, np.nan, p11 + noise_density * q11
-    )
+    variances = p00 + noise_density * q00, p11 + noise_density * q11
+    return np.where(is_outside, np.nan, variances)

@@ -121,10 +121,8 @@ def integrate_acceleration(timeline: Timeline, acceleration_m_s2: Array) -> Arra
         zeros,
         remaining_s,
     )
-    # the type annotations of numpy declare weighted bincounts as integers
-    return np.asarray(np.bincount(interval_index, dp), float), np.asarray(
-        np.bincount(interval_index, dv), float
-    )
+    dp, dv = (np.bincount(interval_index, increment).astype(float) for increment in (dp, dv))
+    return dp, dv
 
 
 def _interval_index(timeline: Timeline) -> tuple[IntArray, IntArray, Array]:

@@ -27,7 +27,7 @@ from px4fuse.filter.fitting import Noises, fit_noises, fit_ratios, maximise_like
 from px4fuse.filter.imu_motion import (
     COARSE_MEASUREMENTS,
     COARSE_OFFSETS,
-    CONSTANT_SIGMAS,
+    HEADING_SIGMA_RAD,
     MAX_OFFSET_S,
     PreparedMotion,
     SignalCache,
@@ -43,8 +43,6 @@ from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 FINE_OFFSETS = 11
 # Number of time offsets of the reported likelihood curve, interpolated between the FINE_OFFSETS
 CURVE_OFFSETS = 121
-# Prior σ (rad) of EKF2's heading if the positions are not from GNSS
-HEADING_SIGMA_RAD = float(CONSTANT_SIGMAS[2])
 # Prior σ (rad) of EKF2's heading with GNSS: wide, because with a GNSS delay that is wrong by 0.2 s
 # EKF2 rotates its heading by 5° to fit the positions, and a narrow prior would hide the offset
 GNSS_HEADING_SIGMA_RAD = 0.2
