@@ -36,7 +36,9 @@ PART_LENGTH_S = 2.0
 POSITION_PART_LENGTH_S = 15.0
 # Minimum length (s) of a part without a measured orientation, between gaps of the IMU
 MIN_POSITION_PART_S = 5.0
+# Minimum number of parts of the flight for a comparison of orientations
 MIN_PARTS = 3
+# Minimum number of positions for an estimate without a measured orientation
 MIN_MEASUREMENTS = 50
 # Minimum number of samples in a part of the flight
 MIN_PART_SAMPLES = 3
@@ -60,7 +62,7 @@ MAX_LINEARISATIONS = 5
 MAX_FINAL_STEP_RAD = 0.01
 # Prior σ of the heading error at the start of a part: wide, because the frame may be misaligned
 HEADING_SIGMA_RAD = 1.0
-# Minimum scale of the motion from the IMU relative to the positions
+# Minimum ratio of the motion from the IMU to the motion of the positions
 MIN_SCALE = 0.1
 # Index of the heading error among the unknown constants of a part of the flight
 HEADING_CONSTANT = 2
@@ -299,9 +301,11 @@ def _estimate_from_positions(
         if abs(step_rad) < MAX_FINAL_STEP_RAD:
             break
     difference_rad = error_rad - step_rad
-    # the variance between the parts beyond their σ is the variance of the heading error itself
-    drift_variance = 0.0 if is_constant else np.mean(difference_rad**2 - variance)
-    drift_fraction = np.maximum(drift_variance, 0.0) / (np.maximum(drift_variance, 0.0) + variance)
+    # variance of the heading error itself: variance of the estimates minus their σ²
+    excess_variance = max(float(np.mean(difference_rad**2 - variance)), 0.0)
+    drift_variance = 0.0 if is_constant else excess_variance
+    # estimates are moved towards their mean by the fraction of their variance that is noise
+    drift_fraction = drift_variance / (drift_variance + variance)
     rotation_rad = float(np.angle(np.exp(1j * rotation_rad)))
     parts = [
         spans_s[is_long],
