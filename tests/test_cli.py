@@ -83,7 +83,7 @@ def test_help_command_does_not_import_slow_libraries():
         "import sys\n"
         "from px4fuse.cli import cli\n"
         "cli.main(['--help'], standalone_mode=False)\n"
-        "heavy = {'pandas', 'matplotlib', 'scipy', 'numpy', 'pyulog', 'rich'}\n"
+        "heavy = {'pandas', 'matplotlib', 'scipy', 'numpy', 'pyulog', 'filterpy', 'rich'}\n"
         "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
     )
     finished = subprocess.run(

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 import pytest
 from filter_tools import any_axis, any_settings
-from filterpy.kalman import KalmanFilter
 from flights import line
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -206,24 +206,12 @@ def test_kf_replay_adds_process_noise_during_imu_gap() -> None:
     assert np.all(raised > whole.steps.loc[at, "position_variance_m2"])
 
 
-def test_kf_replay_equals_filterpy(axis: Axis) -> None:
+def test_kf_fast_replay_equals_replay_with_filterpy(axis: Axis) -> None:
     chosen = Settings(sigma_a_m_s2=0.7, sigma_z_m=0.2)
-    run = replay(axis, chosen)
-    kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
-    kalman.x = np.array([[axis.measurement_m[0]], [0.0]])
-    kalman.P, kalman.R = np.diag([0.25, 1.0]), np.array([[0.2**2]])
-    kalman.H = np.array([[1.0, 0.0]])
-    for (before, step), now in zip(
-        run.steps.iloc[:-1].iterrows(), run.steps.index[1:], strict=True
-    ):
-        dt = now - before
-        b = np.array([[dt**2 / 2.0], [dt]])
-        noise = 0.7**2 * chosen.dt_s * b @ b.T / dt
-        kalman.predict(np.array([[step["acceleration_m_s2"]]]), b, model.transition(dt), noise)
-        if now in run.updates.index:
-            kalman.update(run.updates.loc[now, "measurement_m"])
-        row = [*kalman.x[:, 0], *kalman.P[0], kalman.P[1, 1]]
-        np.testing.assert_allclose(run.steps.loc[now, STATE], row, rtol=1e-9)
+    with_filterpy, fast = replay(axis, chosen), replay(axis, chosen, fast=True)
+    for name in ("steps", "updates"):
+        expected, actual = getattr(with_filterpy, name), getattr(fast, name)
+        pd.testing.assert_frame_equal(actual, expected, rtol=1e-9)
 
 
 # ---- formulas by elements against their matrices ----

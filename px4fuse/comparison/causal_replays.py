@@ -507,7 +507,7 @@ def _rerun_kf(
         measurement_time_s=time_s[is_used] + shift_s,
         measurement_m=axis.measurement_m[is_used],
     )
-    run, state = replay(axis, settings), result.ekf2_state
+    run, state = replay(axis, settings, fast=True), result.ekf2_state
     return _statistics(
         run.updates["innovation_m"].to_numpy(),
         run.updates["innovation_variance_m2"].to_numpy(),

@@ -76,7 +76,7 @@ def explain_ekf2_difference(
     settings = _settings(comparison, model.inputs, corrected)
     changed = _with_changes(comparison.settings, corrected)
     runs = {
-        name: replay(axis.axis, changed) if corrected else axis.replay
+        name: replay(axis.axis, changed, fast=True) if corrected else axis.replay
         for name, axis in results.items()
     }
     explanations = steps.explain_by_steps(model, settings, runs)

@@ -1,4 +1,4 @@
-"""KF: the two-state Kalman filter of the lesson UAT 366, module 2.
+"""KF: the two-state Kalman filter of the lesson UAT 366, module 2, computed with filterpy.
 
 State x = [position, velocity] along one axis; the input u is the acceleration over the step::
 
@@ -11,7 +11,9 @@ F, B, Q and H are defined in :mod:`px4fuse.filter.model`, the prediction steps i
 the results are equal to 1e-9.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,6 +25,7 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import make_timeline
 
+Rows = list[tuple[float, ...]]
 # Columns of ``Replay.updates``
 UPDATE_COLUMNS = [
     "measurement_m",
@@ -67,7 +70,9 @@ class Replay:
     __repr__ = one_line_repr
 
 
-def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) -> Replay:
+def replay(
+    axis: Axis, settings: Settings, initial: InitialState | None = None, *, fast: bool = False
+) -> Replay:
     """Run KF along one axis.
 
     Parameters
@@ -77,6 +82,8 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     initial : InitialState, optional
         By default the position of the first measurement and velocity zero; the first measurement is
         then not fused.
+    fast : bool
+        True for repeated runs: floats instead of filterpy, with the same results to 1e-9.
 
     Raises
     ------
@@ -84,32 +91,19 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
         ``settings.input`` is "imu" and the axis has no acceleration.
     """
     timeline = make_timeline(axis, settings, initial)
-    measured_m = axis.measurement_m.tolist()
-    position, velocity = measured_m[0], 0.0
-    if initial is not None:
-        position, velocity = initial.position_m, initial.velocity_m_s
-    covariance = model.INITIAL_COVARIANCE
-    states = [(position, velocity, *covariance)]
-    updates = []
-    # Python floats are much faster than arrays of one element
-    for dt_s, acceleration, noise_density, measurement_index in zip(
+    initial_state = initial or InitialState(timeline.time_s[0], axis.measurement_m[0])
+    run_filter = _run_floats if fast else _run_filterpy
+    states, updates = run_filter(
+        initial_state,
+        settings.sigma_z_m**2,
         np.diff(timeline.time_s).tolist(),
         timeline.acceleration_m_s2.tolist(),
         ((settings.sigma_a_m_s2**2 + timeline.input_variance_m2_s4) * settings.dt_s).tolist(),
-        timeline.measurement_index[1:].tolist(),
-        strict=True,
-    ):
-        position, velocity, covariance = model.predict_step(
-            position, velocity, covariance, acceleration, noise_density, dt_s
-        )
-        if measurement_index >= 0:
-            z = measured_m[measurement_index]
-            innovation_and_gains, updated_state = model.update_step(
-                position, velocity, covariance, z, settings.sigma_z_m**2
-            )
-            updates.append((z, *innovation_and_gains, position, covariance[0], covariance[2]))
-            position, velocity, covariance = updated_state
-        states.append((position, velocity, *covariance))
+        [
+            axis.measurement_m[index] if index >= 0 else None
+            for index in timeline.measurement_index[1:]
+        ],
+    )
     time_arrays = timeline.time_s, timeline.time_s[timeline.measurement_index >= 0]
     time, update_index = (pd.Index(times_s, name="time_s") for times_s in time_arrays)
     steps = pd.DataFrame(states, index=time, columns=model.STATE_COLUMNS + model.COVARIANCE_COLUMNS)
@@ -117,6 +111,68 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     steps["input_variance_m2_s4"] = np.append(timeline.input_variance_m2_s4, 0.0)
     update_table = pd.DataFrame(updates, update_index, UPDATE_COLUMNS)
     return Replay(axis, settings, steps, update_table, timeline.input_gap_s)
+
+
+def _run_filterpy(
+    initial: InitialState, measurement_variance: float, *inputs: Sequence[Any]
+) -> tuple[Rows, Rows]:
+    """Predict and update KF with filterpy.
+
+    ``inputs`` has for each step its length (s), the acceleration (m/s²), the noise density SIGMA_A²
+    · DT (m²/s³), and the measured position (m) at its end, or None. Return the rows of
+    :attr:`Replay.steps` (states and covariances) and of :attr:`Replay.updates`.
+    """
+    from px4fuse.filter.filterpy_import import KalmanFilter  # noqa: PLC0415 - takes 0.1 s
+
+    kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
+    kalman.x = np.array([[initial.position_m], [initial.velocity_m_s]])
+    kalman.P = model.symmetric_matrix(model.INITIAL_COVARIANCE)
+    kalman.H = np.array([[1.0, 0.0]])
+    kalman.R = np.array([[measurement_variance]])
+    kalman.inv = np.reciprocal  # S is 1 by 1
+    states: Rows = [(initial.position_m, initial.velocity_m_s, *model.INITIAL_COVARIANCE)]
+    updates: Rows = []
+    for dt_s, acceleration, noise_density, z in zip(*inputs, strict=True):
+        kalman.predict(
+            u=np.array([[acceleration]]),
+            B=np.array([[dt_s**2 / 2.0], [dt_s]]),
+            F=model.transition(dt_s),
+            Q=noise_density * model.symmetric_matrix(model.process_noise_unit(dt_s)),
+        )
+        if z is not None:
+            kalman.update(z)
+            x, P, K = kalman.x_prior, kalman.P_prior, kalman.K
+            updates.append(
+                (z, kalman.y[0, 0], kalman.S[0, 0], K[0, 0], K[1, 0], x[0, 0], P[0, 0], P[1, 1])
+            )
+        x, P = kalman.x, kalman.P
+        states.append((x[0, 0], x[1, 0], P[0, 0], P[0, 1], P[1, 1]))
+    return states, updates
+
+
+def _run_floats(
+    initial: InitialState, measurement_variance: float, *inputs: Sequence[Any]
+) -> tuple[Rows, Rows]:
+    """Predict and update KF with floats; arguments and results of :func:`_run_filterpy`."""
+    position, velocity, covariance = (
+        initial.position_m,
+        initial.velocity_m_s,
+        model.INITIAL_COVARIANCE,
+    )
+    states: Rows = [(position, velocity, *covariance)]
+    updates: Rows = []
+    for dt_s, acceleration, noise_density, z in zip(*inputs, strict=True):
+        position, velocity, covariance = model.predict_step(
+            position, velocity, covariance, acceleration, noise_density, dt_s
+        )
+        if z is not None:
+            innovation_and_gains, updated_state = model.update_step(
+                position, velocity, covariance, z, measurement_variance
+            )
+            updates.append((z, *innovation_and_gains, position, covariance[0], covariance[2]))
+            position, velocity, covariance = updated_state
+        states.append((position, velocity, *covariance))
+    return states, updates
 
 
 def _step_before(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:

@@ -13,7 +13,7 @@ from px4fuse.results.answer_form import Answers
 # Version of the results schema: a new field increases the minor version, another change the major
 SCHEMA_VERSION = "4.0"
 # Libraries that affect the numbers in the results
-LIBRARIES = ("numpy", "scipy", "pandas", "pyulog", "pymavlink", "matplotlib", "pypdf")
+LIBRARIES = ("numpy", "scipy", "pandas", "pyulog", "pymavlink", "filterpy", "matplotlib", "pypdf")
 MAX_NOTES_BYTES = 200_000
 MAX_PERSON_LENGTH = 10_000
 
