@@ -24,7 +24,6 @@ ULOG, TLOG = (str(SAMPLES / f"aisle_uwb.{ending}") for ending in ("ulg", "tlog")
 # A value of each field that differs from its default
 CHANGED: dict[str, Any] = {
     "log": TLOG,
-    "mavlink": TLOG,
     "system": 250,
     "position": PositionFile(path=str(SAMPLES / "aisle_uwb_external.csv")),
     "position_source": "estimator_aid_src_ev_pos",

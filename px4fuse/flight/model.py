@@ -300,7 +300,7 @@ HORIZON_NOT_LOGGED = Unavailable(
 RECORD_NOT_LOGGED = Unavailable(
     "EKF2 state at the fusion horizon",
     "estimator_states is not logged",
-    "Add a ULog of PX4 v1.12 or newer, recorded with SDLOG_PROFILE bit 0 (default).",
+    "Give a ULog of PX4 v1.12 or newer, recorded with SDLOG_PROFILE bit 0 (default).",
 )
 
 
