@@ -32,7 +32,7 @@ from px4fuse.readers import common
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import mavlink_senders as senders
 from px4fuse.readers.mavlink_clocks import MIN_UNIX_TIME_S
-from px4fuse.readers.mavlink_frames import MESSAGE_IDS, read_frames
+from px4fuse.readers.mavlink_frames import MESSAGE_IDS, VEHICLE_TYPES, read_frames
 from px4fuse.readers.mavlink_positions import pressure_altitude, read_positions, read_truth
 from px4fuse.readers.mavlink_recording import (
     RECEIPT_CLOCK,
@@ -330,9 +330,7 @@ def _describe_log(
         uid = bytes(version["uid2"]).hex()
         vehicle = uid if uid.strip("0") else ""
     heartbeats = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))
-    vehicle_name = messages.VEHICLE_TYPES.get(
-        next(iter(heartbeats["type"].tolist()), -1), "vehicle"
-    )
+    vehicle_name = VEHICLE_TYPES.get(next(iter(heartbeats["type"].tolist()), -1), "vehicle")
     dropped = sorted(recording.dropped.items())
     return LogInfo(
         name=frames.name,

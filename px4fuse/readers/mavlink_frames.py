@@ -46,6 +46,11 @@ MAX_RECEIVE_TIME_DISTANCE_US = 3 * 24 * 3600 * 1_000_000
 MESSAGE_IDS: Mapping[str, int] = {
     message.msgname: at for at, message in dialect.mavlink_map.items()
 }
+# Vehicle type by number of the MAV_TYPE: "quadrotor" for MAV_TYPE_QUADROTOR
+VEHICLE_TYPES = {
+    number: entry.name.removeprefix("MAV_TYPE_").replace("_", " ").lower()
+    for number, entry in dialect.enums["MAV_TYPE"].items()
+} | {6: "ground station", 18: "companion computer"}
 # CRC_EXTRA by message id, the last byte in the checksum; -1 for unknown messages
 _CRC_EXTRA = np.full(
     max(1 << 16, *(number + 1 for number in dialect.mavlink_map)), -1, dtype=np.int16

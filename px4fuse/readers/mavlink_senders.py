@@ -17,7 +17,7 @@ from px4fuse.readers.mavlink_clocks import (
     is_running_clock,
     map_clock,
 )
-from px4fuse.readers.mavlink_frames import Address, Frames
+from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, Address, Frames
 from px4fuse.readers.mavlink_recording import MIN_RESTART_STEP_S, Recording, map_boot_to_unix
 
 # Maximum number of senders that are read and described; those with most messages are chosen
@@ -211,9 +211,7 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
         description = "sender without heartbeat"
         if address in vehicles:
             vehicle_type, autopilot = vehicles[address]
-            description = messages.VEHICLE_TYPES.get(
-                vehicle_type, f"vehicle of MAV_TYPE {vehicle_type}"
-            )
+            description = VEHICLE_TYPES.get(vehicle_type, f"vehicle of MAV_TYPE {vehicle_type}")
             if autopilot != messages.INVALID_AUTOPILOT:
                 description = f"{messages.AUTOPILOTS.get(autopilot, 'autopilot')} {description}"
         lost_fraction = _lost_fraction(frames, address)
