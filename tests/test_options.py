@@ -86,5 +86,5 @@ def test_each_field_of_the_request_is_described_in_the_guide() -> None:
 def test_unknown_kind_of_position_source_is_named_in_the_error() -> None:
     for origin in ORIGINS:
         assert find_origin(origin.kind, origin.path) is origin
-    with pytest.raises(ValueError, match="'lidar', 'as received' is not in ORIGINS"):
+    with pytest.raises(KeyError, match="'lidar', 'as received'"):
         find_origin("lidar", "as received")

@@ -9,7 +9,7 @@ import pandas as pd
 from msgspec import structs
 from scipy import constants
 
-from px4fuse.flight.model import Columns, PositionTrack, Truth, Unavailable, sort_by_preference
+from px4fuse.flight.model import Columns, PositionTrack, Truth, Unavailable
 from px4fuse.flight.position_source import GNSS, with_orientation
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import px4_positions
@@ -60,10 +60,7 @@ def read_positions(
         ]
     fixes = (_read_gnss(recording, layout, delay_s) for layout in messages.GNSS_LAYOUTS)
     tracks_and_missing += [track for track in fixes if track]
-    missing_tracks = tuple(item for item in tracks_and_missing if isinstance(item, Unavailable))
-    return sort_by_preference(
-        item for item in tracks_and_missing if isinstance(item, PositionTrack)
-    ), missing_tracks
+    return px4_positions.split_tracks(tracks_and_missing)
 
 
 def _read_track(
