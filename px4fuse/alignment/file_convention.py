@@ -1,4 +1,4 @@
-"""Convention of a position file that matches neither EKF2 nor the IMU as stated."""
+"""Axes and unit of a position file that does not match the motion of the flight."""
 
 import pandas as pd
 

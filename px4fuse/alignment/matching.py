@@ -28,10 +28,10 @@ GOOD_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
 MAX_CLOCK_SIGMA_S = 0.5
 # Minimum ratio of the residual in the second best frame to the residual in the best frame
 MIN_FRAME_RATIO = 1.3
-# Minimum ratio of the residual with the given yaw to the residual with estimated yaw and origin,
+# Minimum ratio of the residual with the user's yaw to the residual with estimated yaw and origin,
 # for a frame that is misaligned
 MIN_ROTATION_RATIO = 2.0
-# Minimum residual (m, RMS) with the given yaw, for a frame that is misaligned
+# Minimum residual (m, RMS) with the user's yaw, for a frame that is misaligned
 MIN_ROTATION_RMS_M = 0.3
 
 
@@ -68,7 +68,7 @@ class Match:
     residuals_m : dict from frame to float
         Residual in each frame that was tried, best first.
     fit : Fit
-        Fit with the given yaw; with estimated yaw if none was given.
+        Fit with the yaw of the user; without it, with estimated yaw.
     free_yaw_fit : Fit
         Fit with estimated yaw.
     is_rotated : bool

@@ -100,7 +100,7 @@ def _track_without_gaps(time_s: Array, position_m: Array) -> SampledTrack:
 
 
 def resample_to_grid(track: SampledTrack) -> SampledTrack:
-    """Resample a track to a regular grid, with gaps marked."""
+    """Resample a track to a regular time grid; samples inside gaps are invalid."""
     grid = np.arange(track.time_s[0], track.time_s[-1], GRID_STEP_S)
     is_known = is_bracketed(grid, track.time_s, gap_limit(track.time_s, MIN_GAP_LIMIT_S))
     return SampledTrack(grid, track.at(grid)[0], is_known)
