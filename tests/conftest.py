@@ -232,21 +232,20 @@ _cache: dict[tuple[str | bytes, ...] | None, Any] = {}
 def _cache_key(request: ComparisonRequest, what: str) -> tuple[str | bytes, ...] | None:
     """Return the cache key: names and contents of the files, without their folders."""
     position = request.position
-    paths = [request.log, request.mavlink, None if position is None else position.path]
+    paths = [request.log, None if position is None else position.path]
     files = [Path(path) for path in paths if path is not None]
     if any(not file.is_file() for file in files):
         return None
     named = replace(
         request,
         log=Path(request.log).name,
-        mavlink=request.mavlink and Path(request.mavlink).name,
         position=position and replace(position, path=Path(position.path).name),
     )
     return (what, repr(named), *(sha256(file.read_bytes()).digest() for file in files))
 
 
 def _flight_key(request: ComparisonRequest) -> tuple[str | bytes, ...] | None:
-    names = ("log", "mavlink", "system", "position", "clock_offset_s")
+    names = ("log", "system", "position", "clock_offset_s")
     return _cache_key(
         ComparisonRequest(**{name: getattr(request, name) for name in names}), "flight"
     )
