@@ -108,10 +108,10 @@ def intervene(compared: Comparison, estimates: Estimates) -> Reruns:
 
     model = open_model(compared.flight, needed_configurations)
     steps = explain_ekf2_difference(compared, model, estimates.clock, corrected)
-    causes, trials = run_interventions(compared, estimates, model)
+    trials = run_interventions(compared, estimates, model)
     if isinstance(model, Model):  # frees most of the memory; a later replay is computed again
         model = replace(model, runs=(), intervals={})
-    return Reruns(ekf2_model=model, difference_steps=steps, causes=causes, trials=trials)
+    return Reruns(ekf2_model=model, difference_steps=steps, trials=trials)
 
 
 def diagnose_or_check_aids(

@@ -26,7 +26,7 @@ from px4fuse.findings import TITLES, Finding, find, group_by_root
 from px4fuse.findings.model import CATALOGUE, GROUPS, load_examples
 from px4fuse.flight.log import ClockMap, Dropout
 from px4fuse.flight.model import AXIS_NAMES, AidLog, Columns, Flight, Reset, Unavailable
-from px4fuse.flight.position_source import ALIGNED, LOGGED_BY_EKF2
+from px4fuse.flight.position_source import ALIGNED
 from px4fuse.readers import read_log
 from px4fuse.request import ComparisonRequest, PositionFile
 
@@ -195,18 +195,11 @@ FAULTS = [
           ekf2(resets=(STEP_UP,))),
     Fault("ekf2_instance_switch", "warning", {"count": 2, "at_s": 30.0},
           ekf2(instances=((-math.inf, 0), (30.0, 1), (80.0, 0)))),
-    # the interval of √(mean NIS) contains the limit 0.8
-    Fault("ekf2_innovations_decimated", "note", {"logged": 200, "measurements": 600},
-          ekf2(every=3, nis=0.7)),
     Fault("ekf2_simulated", "note", change=with_log(notes=(MODEL_NOTE,))),
     Fault("ekf2_not_logged", "warning", flight={"ekf2": None}),
     # the position source
     Fault("source_not_logged", "warning", {"rate_hz": about(4.0), "sdlog_profile": 1},
           {"uwb": Uwb(name=ALIGNED_TOPIC, origin=ALIGNED, rate_hz=4.0), "parameters": NO_VISION}),
-    Fault("source_rate_limited_by_logger", "note",
-          {"rate_hz": about(2.0), "logger_limit_hz": 2.0},
-          {"uwb": Uwb(name="estimator_aid_src_ev_pos", origin=LOGGED_BY_EKF2, rate_hz=2.0),
-           **ekf2(nis=0.6)}),
     Fault("source_rate_at_limit", "note", {"rate_hz": about(4.0), "longest_s": about(1.0, 1e-6)},
           {"uwb": Uwb(rate_hz=4.0, gap_s=(40.0, 48.0)),
            "parameters": {**NO_VISION, "EKF2_EV_CTRL": 15},
@@ -287,7 +280,6 @@ MISSING_FIELD: list[tuple[str, dict[str, Any], str | None]] = [
     ("ekf2_rejects_positions", ekf2(innovations_logged=False), None),
     ("ekf2_rejects_positions", ekf2(rejected_fraction=0.5, rejected_logged=False), None),
     ("ekf2_underconfident", ekf2(innovations_logged=False), None),
-    ("ekf2_innovations_decimated", ekf2(innovations_logged=False), None),
     ("ekf2_resets", {"ekf2": None}, "ekf2_not_logged"),
     ("imu_gap", {"imu": None}, "acceleration_not_logged"),
     ("imu_rate_too_low", {"imu": None}, "acceleration_not_logged"),
@@ -297,9 +289,6 @@ MISSING_FIELD: list[tuple[str, dict[str, Any], str | None]] = [
     # an unknown EKF2 noise is not printed as a number
     ("no_finding", {"parameters": {}, **ekf2(nis=0.02, noise_logged=False)},
      "ekf2_underconfident"),
-    # innovations are not decimated if the source is rebuilt from them
-    ("ekf2_innovations_decimated",
-     {"uwb": Uwb(name="estimator_aid_src_ev_pos", origin=LOGGED_BY_EKF2), **ekf2(every=3)}, None),
 ]  # fmt: skip
 
 
@@ -473,7 +462,7 @@ def test_explain_command_examples_state_measured_rates() -> None:
 
 @pytest.mark.parametrize(
     "typed",
-    ["source_scale_error", "Source-Scale-Error", "source_scale_wrong"],  # former name
+    ["source_scale_error", "Source-Scale-Error"],
 )
 def test_explain_command_prints_meaning_and_example_of_finding(typed, monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "2000")  # no line breaks

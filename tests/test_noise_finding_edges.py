@@ -50,8 +50,10 @@ def trial(
     change: dict[str, float], after: float = 1.0, owner: Any = "kf", kind: str = "noises"
 ) -> Trial:
     """Make a re-run that changes the mean NIS from 16 to ``after``."""
-    return Trial(filter=owner, kinds=(kind,), change=change, before=RunStatistics(nis_mean=16.0),
-                 after=RunStatistics(nis_mean=after))  # fmt: skip
+    before, after_change = RunStatistics(nis_mean=16.0), RunStatistics(nis_mean=after)
+    return Trial(
+        filter=owner, axis="north", kinds=(kind,), change=change, before=before, after=after_change
+    )
 
 
 # ---------------------------------------------------------------- SIGMA_Z and SIGMA_A
@@ -335,7 +337,7 @@ def test_inconsistent_filter_action_follows_from_its_cause(owner, change, kind, 
     causes = (tried(owner, {"sigma_z_m": 7.0}, explained_fraction=0.4), tried(owner, change),
               tried(owner, {"sigma_z_m": 7.0}, explained_fraction=1.6))  # fmt: skip
     one = axis("north", **{owner: statement(9.0, "overconfident")})
-    finding = only(noises.detect_inconsistent_variances, analysis(axes=(one,), causes=causes))
+    finding = only(noises.detect_inconsistent_variances, analysis(axes=(one,), trials=causes))
     assert finding.remedy.endswith(action)
     assert finding.evidence["cause"] == kind
 
@@ -343,15 +345,15 @@ def test_inconsistent_filter_action_follows_from_its_cause(owner, change, kind, 
 def test_filter_rerun_that_improves_nothing_is_not_advised() -> None:
     change = {"sigma_z_m": 2.0}
     for after, action in ((1.0, "Set SIGMA_Z to 2 m (--sigma-z 2)."), (9.0, noises.NOT_EXPLAINED)):
-        one = analysis(axes=(kf(9.0),), causes=(tried("kf", change),), tuning=tuned(),
-                       trials=(trial(change, after), trial(change, 9.0, "ekf2")))  # fmt: skip
+        one = analysis(axes=(kf(9.0),), tuning=tuned(), trials=(
+            tried("kf", change), trial(change, after), trial(change, 9.0, "ekf2")))  # fmt: skip
         assert only(noises.detect_inconsistent_variances, one).remedy == action
 
 
 def test_inconsistent_filter_without_cause_recommends_a_check() -> None:
     causes = (tried("kf", {"sigma_z_m": 7.0}, explained_fraction=0.4),
               tried("kf", {"sigma_z_m": 2.0}, "east"))  # fmt: skip
-    one = analysis(axes=(kf(9.0),), causes=causes, tuning=tuned())
+    one = analysis(axes=(kf(9.0),), trials=causes, tuning=tuned())
     finding = only(noises.detect_inconsistent_variances, one)
     assert (finding.evidence["cause"], finding.remedy) == ("elsewhere", noises.NOT_EXPLAINED)
     unknown = only(noises.detect_inconsistent_variances, analysis(axes=(kf(9.0),)))
@@ -359,8 +361,9 @@ def test_inconsistent_filter_without_cause_recommends_a_check() -> None:
 
 
 def test_smaller_noise_that_contradicts_truth_is_not_advised() -> None:
-    contradicted = replace(tried("kf", {"sigma_z_m": 0.5}, before=0.2), contradicts_truth=True)
-    one = analysis(axes=(kf(0.2),), causes=(contradicted,))
+    contradicted = tried("kf", {"sigma_z_m": 0.5}, before=0.2)
+    contradicted = replace(contradicted, after=replace(contradicted.after, nees_mean=4.0))
+    one = analysis(axes=(kf(0.2),), trials=(contradicted,))
     finding = only(noises.detect_inconsistent_variances, one)
     assert (finding.remedy, finding.severity) == (noises.KEEP_NOISES_TRUTH, "note")
     assert finding.evidence["cause"] == "elsewhere"
@@ -418,7 +421,7 @@ def test_wrong_ekf2_noise_finding_names_parameter_or_sensor(
     estimate_m = 4.0 * flown_m if flown_m == PARAMETERS[aid.noise].default else 0.1
     outcome = RunStatistics(nis_mean=16.0 if estimate_m > flown_m else 0.1)
     change = {aid.noise: estimate_m}
-    rerun = Trial(filter="ekf2", kinds=("noise",), change=change, before=outcome,
+    rerun = Trial(filter="ekf2", axis="north", kinds=("noise",), change=change, before=outcome,
                   after=RunStatistics(nis_mean=1.0))  # fmt: skip
     model = SimpleNamespace(inputs=SimpleNamespace(settings={aid.noise: flown_m}))
     result = axis("north", rejected_fraction=rejected)

@@ -12,8 +12,10 @@ from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import Action, Cause, FilterName, Rerun, Target, Verdict
-from px4fuse.comparison.changes import CLOCK_OFFSET, OUTLIERS, SIGMA_A, SIGMA_Z
+from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
 from px4fuse.comparison.trials import (
+    CLOCK_OFFSET,
+    OUTLIERS,
     Trial,
     enters_band,
     halves,
@@ -114,7 +116,7 @@ def rank_causes(analysis: Analysis, roots: Sequence[Finding]) -> list[RankedCaus
     for finding in roots:
         if finding.severity == "note":
             continue
-        trials = confirming_trials(analysis.trials, finding)
+        trials = confirming_trials(analysis.main_trials, finding)
         if finding.id in VERDICT_FINDINGS:  # a verdict remains a cause without a re-run that helps
             trials = tuple(filter(is_useful, trials))
         elif trials and not any(

@@ -3,24 +3,32 @@
 Changes of EKF2 need its ``inputs``; without inputs, the changes are those of KF.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from px4fuse.comparison.estimates import Estimates, Tuning, first_axis_tuning
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterSummary
 from px4fuse.comparison.remedy import ml_delay_change, noise_change
-from px4fuse.comparison.trials import Change, Statistic
+from px4fuse.comparison.trials import (
+    ACCOMPANYING_CHANGES,
+    CLOCK_OFFSET,
+    DISCREPANCIES,
+    FORWARD_BIAS,
+    OUTLIERS,
+    RIGHT_BIAS,
+    ROTATION,
+    Change,
+    Statistic,
+)
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_VEL, PARAMETERS
+from px4fuse.flight.ekf2_parameters import GNSS_VEL, PARAMETERS
 from px4fuse.flight.log import LogInfo
 from px4fuse.flight.model import Unavailable
 
-CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
-FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
-# Changes that correct a sensor fault; they are preferred to changes of settings
-SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
 # Minimum SIGMA_Z (m) of a re-run: accuracy of motion capture in flight
 SMALLEST_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
@@ -34,8 +42,6 @@ KF_KINDS = {
     FORWARD_BIAS: "bias",
     RIGHT_BIAS: "bias",
 }
-# Parameters that a change of another parameter requires; they do not count as separate changes
-ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
 SETTING_CHANGES = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
 # Minimum ratio of the estimated SIGMA_A to EKF2_ACC_NOISE for a re-run with a larger
@@ -101,19 +107,24 @@ def main_axis_changes(
     For KF also both noises together and the default settings; for EKF2 a delay also as a shift of
     the position timestamps.
     """
-    changes = list[Change]()
-    for statistic in ("nis", "nees"):
-        found = candidate_changes(comparison, estimates, inputs, comparison.main, statistic)
-        changes += [change for change in found if change not in changes]
+    changes = unique_changes(
+        change
+        for statistic in DISCREPANCIES[::-1]
+        for change in candidate_changes(comparison, estimates, inputs, comparison.main, statistic)
+    )
     if inputs is not None:
         has_delay = any(inputs.aid.delay in change for change in changes)
         offsets = _time_offset(comparison, estimates, inputs) if has_delay else []
-        return [*changes, *(offset for offset in offsets if offset not in changes)]
+        return unique_changes([*changes, *offsets])
     noises = [change for change in changes if change.keys() <= SETTING_CHANGES]
     if len(noises) > 1:
         changes.append({name: value for change in noises for name, value in change.items()})
     defaults = default_settings(comparison)
     return [*changes, *([defaults] if defaults and noises else [])]
+
+
+def unique_changes(changes: Iterable[Change]) -> list[Change]:
+    return list({frozenset(change.items()): change for change in changes}.values())
 
 
 def change_kinds(comparison: Comparison, inputs: Inputs | None, change: Change) -> tuple[str, ...]:

@@ -4,13 +4,37 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Literal
 
+import numpy as np
+
 from px4fuse.comparison.model import FilterName
 from px4fuse.core.record import Count, NotNegative, Positive, Record, Share
-from px4fuse.filter.consistency import Reference, classify_ratio
+from px4fuse.filter.consistency import Reference, classify_ratio, nis_band
+from px4fuse.flight.ekf2_parameters import EV_POS
 
 Statistic = Literal["nis", "nees", "difference"]
+# Statistics whose value outside its limits is explained by re-runs
+DISCREPANCIES: tuple[Statistic, Statistic] = ("nees", "nis")
 Change = Mapping[str, float]
+# Names of changes other than settings and parameters
+CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
+FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
+# Minimum mean NEES at which errors exceed the reported σ: errors of 2 σ; flights without a fault
+# have less than 3
+MIN_NEES_FINDING = 4.0
+# Maximum mean NEES after a change to a smaller noise, if the mean NEES was above 1 before
+MAX_NEES_AFTER_CHANGE = 2.0
+# Maximum distance from 1 of the explained fraction of a cause, which explains at least half
+MAX_CAUSE_DISTANCE = 0.5
+# Maximum distance from 1 of the explained fraction for a sensor fault to be the only cause: the
+# noises of the re-run are approximate
+SENSOR_CAUSE_TOLERANCE = 0.25
+# Maximum distance from 1 of the explained fraction of a change that is combined with another one
+MAX_HELPFUL_DISTANCE = 0.9
+# Changes that correct a sensor fault; they are preferred to changes of settings
+SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
+# Changes that another change requires; they are not counted
+ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
 # Minimum factor on a σ ratio, or relative change of the position RMSE, for a re-run to have an
 # effect
 MIN_RATIO_CHANGE, MIN_RMSE_CHANGE = 1.10, 0.05
@@ -52,18 +76,25 @@ class RunStatistics(Record, frozen=True, kw_only=True):
 
 
 class Trial(Record, frozen=True, kw_only=True):
-    """Re-run of one filter along the main axis with one or two changes.
+    """Re-run of one filter along one axis with one change, or with two.
 
     Attributes
     ----------
     filter : {"kf", "ekf2"}
+    axis : str
     kinds : tuple of str
         Kind of each change: for KF noises, defaults or bias, for EKF2 delay, noise, gate or process
         noise, for both outliers, time offset or rotation.
     change : mapping from name to value
-        See :class:`px4fuse.comparison.causal_replays.Intervention`.
+        Fields of Settings, PX4 parameters, ``turned_deg`` (rotation of the positions, clockwise
+        from above), ``outliers_left_out`` (number), and the removed accelerometer biases
+        ``bias_forward_m_s2`` and ``bias_right_m_s2``.
+    discrepancies : tuple of {"nis", "nees"}
+        Statistics outside their limits that the change may explain.
     before : RunStatistics
-        Statistics as flown, of the same samples; for EKF2 from the log.
+        Statistics as flown, of the same samples.
+    is_logged : bool
+        False if ``before`` is of a replay of EKF2, because it differs from the log.
     after : RunStatistics
         Statistics with the change; for EKF2 from its replay.
     from_s : float or None
@@ -71,11 +102,103 @@ class Trial(Record, frozen=True, kw_only=True):
     """
 
     filter: FilterName
+    axis: str
     kinds: tuple[str, ...]
     change: Change
+    discrepancies: tuple[Statistic, ...] = ()
     before: RunStatistics
+    is_logged: bool = True
     after: RunStatistics
     from_s: float | None = None
+
+    @property
+    def corrects_sensor(self) -> bool:
+        """True if the change corrects a sensor fault instead of a setting."""
+        return not SENSOR_CHANGES.isdisjoint(self.change)
+
+
+def explained_fraction(trial: Trial, statistic: Statistic) -> float:
+    """Return the fraction of ln(mean NIS) or ln(mean NEES) that a change removes.
+
+    Above 1 the change overshoots. For the RMS difference KF - EKF2, the fraction of the mean
+    square; 0 without a difference.
+    """
+    before, after = trial.before.value(statistic), trial.after.value(statistic)
+    if not before or not after:
+        return 0.0
+    if statistic == "difference":
+        return 1.0 - (after / before) ** 2
+    return 1.0 - float(np.log(after) / np.log(before))
+
+
+def is_sufficient(trial: Trial, statistic: Statistic) -> bool:
+    """Return True if the mean NIS is then in its 95 % band, or the mean NEES below its limit."""
+    low, high = nis_band(trial.after.innovations) if statistic == "nis" else (0.0, MIN_NEES_FINDING)
+    return low <= (trial.after.value(statistic) or np.nan) <= high
+
+
+def contradicts_truth(trial: Trial, statistic: Statistic) -> bool:
+    """Return True if the reported σ of a re-run is smaller than the errors against ground truth."""
+    nees, nis, nees_after = trial.before.nees_mean, trial.before.nis_mean, trial.after.nees_mean
+    if statistic != "nis" or nis is None or nis >= 1.0 or nees_after is None:
+        return False
+    return nees_after >= (MAX_NEES_AFTER_CHANGE if nees and nees > 1.0 else MIN_NEES_FINDING)
+
+
+def find_trials(
+    trials: Iterable[Trial], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
+) -> list[Trial]:
+    """Return the re-runs of one filter and axis that may explain its mean NIS or NEES."""
+    return [
+        trial
+        for trial in trials
+        if (trial.filter, trial.axis) == (filter_name, axis) and statistic in trial.discrepancies
+    ]
+
+
+def find_cause(
+    trials: Iterable[Trial], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
+) -> Trial | None:
+    """Return the re-run that explains a mean NIS or NEES outside its limits; None without one.
+
+    A cause explains 50 to 150 % of the logarithm and does not contradict ground truth. Preferred
+    are, in this order, complete causes, fewer changes, sensor faults, and fractions near 1.
+    """
+
+    def rank(trial: Trial) -> tuple[bool, int, bool, float]:
+        distance = abs(explained_fraction(trial, statistic) - 1.0)
+        is_complete = trial.corrects_sensor and distance <= SENSOR_CAUSE_TOLERANCE
+        return (
+            not (is_complete or is_sufficient(trial, statistic)),
+            len(trial.change.keys() - ACCOMPANYING_CHANGES),
+            not trial.corrects_sensor,
+            distance,
+        )
+
+    causes = (
+        trial
+        for trial in find_trials(trials, filter_name, axis, statistic)
+        if abs(explained_fraction(trial, statistic) - 1.0) <= MAX_CAUSE_DISTANCE
+        and not contradicts_truth(trial, statistic)
+    )
+    return min(causes, key=rank, default=None)
+
+
+def helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]:
+    """Return the re-runs that partly explain a discrepancy, best first; empty if one is enough."""
+
+    def distance(trial: Trial) -> float:
+        return abs(explained_fraction(trial, statistic) - 1.0)
+
+    helpful = sorted(
+        (
+            trial
+            for trial in trials
+            if statistic in trial.discrepancies and distance(trial) < MAX_HELPFUL_DISTANCE
+        ),
+        key=distance,
+    )
+    return [] if any(is_sufficient(trial, statistic) for trial in helpful) else helpful
 
 
 def distance_from_one(outcome: RunStatistics) -> float:

@@ -70,7 +70,6 @@ RECORDING = frozenset(
         "log_damaged",
         "logger_dropouts",
         "imu_rate_too_low",
-        "source_rate_limited_by_logger",
         "source_begins",
         "source_gap",
         "source_gap_in_log",

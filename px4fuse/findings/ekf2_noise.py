@@ -25,7 +25,7 @@ MIN_NAMED_REJECTION = 0.05
 def detect(analysis: Analysis) -> Findings:
     """Detect a measurement noise whose change makes EKF2's innovations consistent in a replay."""
     aid = aid_of(analysis)
-    trial = find_trial(analysis.trials, "ekf2", "noise", aid.noise)
+    trial = find_trial(analysis.main_trials, "ekf2", "noise", aid.noise)
     if trial is None or not _corrects_innovations(trial):
         return
     assert not isinstance(analysis.ekf2_model, Unavailable)  # a re-run of EKF2 needs its model

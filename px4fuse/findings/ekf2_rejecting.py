@@ -70,7 +70,7 @@ def _detect_rejections(analysis: Analysis) -> Findings:
 def _remedy(analysis: Analysis, result: AxisComparison) -> str:
     """Format the change whose re-run prevents most rejections; without one, a check."""
     aid = aid_of(analysis, result.axis.name)
-    trials = [trial for trial in analysis.trials if _prevents_rejections(trial)]
+    trials = [trial for trial in analysis.main_trials if _prevents_rejections(trial)]
     if trials and result is analysis.main:
         return format_action(analysis, min(trials, key=preference).change)
     place = "the reception" if aid == GNSS_POS else "the line of sight"

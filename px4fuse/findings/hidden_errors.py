@@ -12,12 +12,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import (
-    ErrorAboveSigma,
-    Intervention,
-    error_above_reported_sigma,
-    find_cause,
-)
+from px4fuse.comparison.causal_replays import ErrorAboveSigma, error_above_reported_sigma
 from px4fuse.comparison.model import (
     FILTERS,
     AxisComparison,
@@ -26,6 +21,7 @@ from px4fuse.comparison.model import (
     FilterName,
     north_and_east,
 )
+from px4fuse.comparison.trials import Trial, find_cause
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.errors import TrajectoryError
@@ -116,7 +112,7 @@ def make_error_finding(
     (worst_filter, main_axis, worst), may_drift = hidden[0], analysis.source.origin.may_drift
     evidence: dict[str, float | str] = {"axis": main_axis, "filter": worst_filter}
     ratios, sentences = dict[str, float](), list[str]()
-    causes = dict[FilterName, Intervention]()
+    causes = dict[FilterName, Trial]()
     for filter_name in FILTERS:
         label = filter_name.upper()
         for _, axis, excess in [entry for entry in hidden if entry[0] == filter_name][:1]:
@@ -126,7 +122,7 @@ def make_error_finding(
                 f"{filter_name}_position_rmse_m": excess.rmse_m,
                 f"{filter_name}_sigma_p_m": excess.reported_sigma_m,
             }
-            cause = find_cause(analysis.causes, filter_name, axis, "nees")
+            cause = find_cause(analysis.trials, filter_name, axis, "nees")
             if cause is not None and not is_refuted(analysis, filter_name, cause):
                 causes[filter_name] = cause
             ratios[label] = excess.nees**0.5

@@ -27,11 +27,6 @@ CATALOGUE: Mapping[str, CatalogueEntry] = table(
 )
 GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "logging")
 TITLES: Mapping[str, str] = {name: entry.title for name, entry in CATALOGUE.items()}
-# Present finding id, by the id before schema 4 of the results
-RENAMED_IDS: Mapping[str, str] = dict(
-    line.split()
-    for line in table(__file__, "renamed_ids.toml", dict[str, str])["renamed_ids"].splitlines()
-)
 
 
 class Example(Record, frozen=True):

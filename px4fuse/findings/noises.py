@@ -12,18 +12,20 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.causal_replays import (
-    Intervention,
-    find_cause,
-    interventions_for,
-    is_inconsistent,
-)
+from px4fuse.comparison.causal_replays import is_inconsistent
 from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z, SMALLEST_SIGMA_Z_M, tuning_of_axis
 from px4fuse.comparison.estimates import first_axis_tuning
 from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of, format_settings, noise_change
-from px4fuse.comparison.trials import can_improve, find_trial
+from px4fuse.comparison.trials import (
+    Trial,
+    can_improve,
+    contradicts_truth,
+    find_cause,
+    find_trial,
+    find_trials,
+)
 from px4fuse.core.text import format_factor, format_number, format_ratio
 from px4fuse.filter.settings import SETTING_UNITS, Settings
 from px4fuse.filter.signals import cut_to_segment
@@ -195,11 +197,11 @@ def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
 
     If no re-run could show an improvement, the action is a run with the estimate.
     """
-    if trial := find_trial(analysis.trials, "kf", "noises", name):
+    if trial := find_trial(analysis.main_trials, "kf", "noises", name):
         return format_kf_settings(trial.change)
     if any(
         trial.filter == "kf" and trial.change.keys() == {name} and can_improve(trial)
-        for trial in analysis.trials
+        for trial in analysis.main_trials
     ):
         return NO_IMPROVEMENT
     value = max(value, SMALLEST_SIGMA_Z_M) if name == SIGMA_Z else value
@@ -319,7 +321,7 @@ def _variance_finding(
     ):
         remedy_text, cause = KEEP_NOISES_TRUTH, ELSEWHERE
     else:
-        rerun = find_cause(analysis.causes, filter_name, result.axis.name)
+        rerun = find_cause(analysis.trials, filter_name, result.axis.name)
         cause = classify_cause(analysis, rerun)
         remedy_text = _remedy(analysis, filter_name, result, axis_tuning, rerun)
         severity = "note" if remedy_text == KEEP_NOISES_TRUTH else severity
@@ -393,12 +395,12 @@ def _remedy(
     filter_name: FilterName,
     result: AxisComparison,
     axis_tuning: AxisTuning | None,
-    cause: Intervention | None,
+    cause: Trial | None,
 ) -> str:
     if cause is not None and not is_refuted(analysis, filter_name, cause):
         return format_action(analysis, cause.change)
-    reruns = interventions_for(analysis.causes, filter_name, result.axis.name)
-    if any(rerun.contradicts_truth for rerun in reruns):
+    reruns = find_trials(analysis.trials, filter_name, result.axis.name)
+    if any(contradicts_truth(rerun, "nis") for rerun in reruns):
         return KEEP_NOISES_TRUTH
     if axis_tuning is None:
         return UNKNOWN_NOISE

@@ -23,7 +23,6 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Severity
 from px4fuse.findings.cause_grouping import ANNOUNCED, CAUSE, GROUND
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
-from px4fuse.findings.missing import MIN_INNOVATION_SHARE
 from px4fuse.findings.model import (
     Findings,
     error,
@@ -54,6 +53,8 @@ MIN_SCALE_SIGMAS = 3.0  # scale error in σ of its estimate; 0.3 % of correct so
 MIN_OUTLIER_SHARE = 0.005  # outliers over positions; normal noise has 0.02 % beyond 3.7 σ
 MIN_OUTLIER_SHARE_ERROR = 0.02  # for severity error: one outlier per 10 s at 5 Hz
 MIN_OUTLIERS = 3
+# Minimum fraction of the innovations that must be logged to count rejected outliers
+MIN_INNOVATION_SHARE = 0.75
 # Reported over estimated variance of the positions, or its inverse, for severity warning and error
 MIN_VARIANCE_RATIO, MIN_VARIANCE_RATIO_ERROR = 2.0, 3.0
 # Possible causes of a position jump, and action, by kind of source

@@ -399,9 +399,6 @@ def _logging_advice(
         findings += [
             *missing.detect_source_not_logged(comparison),
             *ekf2_not_fusing.detect_missing_fusion(comparison),
-        ]
-        findings += [
-            *missing.detect_missing_innovations(comparison),
             *recording.detect_dropouts(comparison),
         ]
     findings += imu.detect_low_rates(flight)
