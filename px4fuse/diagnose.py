@@ -1,7 +1,12 @@
-"""Diagnosis of one flight from its request, stage by stage as in the lab.
+"""Diagnosis of one flight from its request, in the order of the lab.
 
-Read the recordings, prepare source and axes, run KF and compare with EKF2, estimate noises and time
-offset, re-run the filters with one change each, and find mistakes.
+1. read: recordings → Flight
+2. prepare: position source, time span and axes
+3. filter: run KF along each axis
+4. compare: KF, EKF2 and ground truth
+5. estimate: noises, time offset, frame misalignment, biases
+6. intervene: re-run both filters with one change at a time
+7. find: faults of the flight, with their causes
 """
 
 from __future__ import annotations
@@ -15,7 +20,7 @@ from msgspec import structs
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis, WhatIfAnalysis
 from px4fuse.comparison.causal_replays import Reruns, planned_configurations, run_interventions
-from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.comparison.difference_steps import (
     corrected_settings,
     explain_ekf2_difference,
@@ -34,8 +39,6 @@ from px4fuse.comparison.preparation import explain_missing_source, prepare
 from px4fuse.comparison.remedy import ml_ekf2_parameters
 from px4fuse.core.reading import display_name
 from px4fuse.ekf2.aids import evaluate_aids
-from px4fuse.ekf2.filter_recursion import FilterConfiguration
-from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2.whatif import sweep_values, what_if
@@ -73,42 +76,46 @@ def diagnose(
     LogError, MissingDataError, SettingsError
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
+    flight = flight or read_flight(request, progress)
     prepared = prepare_comparison(request, progress, flight, as_sent=as_sent)
-    return replace(explain(compare(prepared, progress), progress), request=request)
+    kf_runs = run_kf(prepared, progress)
+    comparison = compare(prepared, kf_runs)
+    return replace(explain(comparison, progress), request=request)
 
 
-def explain(compared: Comparison, progress: Progress = ignore_progress) -> Analysis:
-    """Estimate noises and time offset, re-run both filters with changes, and find mistakes."""
-    estimates = estimate(compared, progress)
-    progress("replaying EKF2")
-    reruns = intervene(compared, estimates)
+def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
+    """Estimate noises and time offset, re-run both filters with changes, and find faults."""
+    estimates = estimate(comparison, progress)
+    reruns = intervene(comparison, estimates, progress)
     progress("searching for a loop closure")
     from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync
 
     analysis = Analysis(
-        **vars(compared),
+        **vars(comparison),
         **vars(estimates),
         **vars(reruns),
-        events=collect_events(compared),
-        aids=evaluate_aids(compared.flight),
-        loop=analyse_flight_loop(compared.flight, progress),
+        events=collect_events(comparison),
+        aids=evaluate_aids(comparison.flight),
+        loop=analyse_flight_loop(comparison.flight, progress),
     )
     return replace(analysis, findings=find(analysis))
 
 
-def intervene(compared: Comparison, estimates: Estimates) -> Reruns:
-    """Replay EKF2, replace the properties of KF by those of EKF2, and re-run both with changes."""
-    corrected = corrected_settings(compared, estimates.tuning)
-
-    def needed_configurations(inputs: Inputs) -> list[FilterConfiguration]:
-        return [
-            *explanation_configurations(compared, inputs, corrected),
-            *planned_configurations(compared, estimates, inputs),
-        ]
-
-    model = open_model(compared.flight, needed_configurations)
-    steps = explain_ekf2_difference(compared, model, estimates.clock, corrected)
-    trials = run_interventions(compared, estimates, model)
+def intervene(
+    comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
+) -> Reruns:
+    """Replay EKF2, replace KF's settings by EKF2's one at a time, and re-run both with changes."""
+    progress("replaying EKF2")
+    corrected = corrected_settings(comparison, estimates.tuning)
+    model = open_model(
+        comparison.flight,
+        lambda inputs: [
+            *explanation_configurations(comparison, inputs, corrected),
+            *planned_configurations(comparison, estimates, inputs),
+        ],
+    )
+    steps = explain_ekf2_difference(comparison, model, estimates.clock, corrected)
+    trials = run_interventions(comparison, estimates, model)
     if isinstance(model, Model):  # frees most of the memory; a later replay is computed again
         model = replace(model, runs=(), intervals={})
     return Reruns(ekf2_model=model, difference_steps=steps, trials=trials)
@@ -270,7 +277,8 @@ def run_what_if(
     try:
         if model.agreement.good:
             recordings = structs.replace(recordings, axes=("north", "east", AISLE))
-            comparison = compare(prepare(flight, recordings))
+            prepared = prepare(flight, recordings)
+            comparison = compare(prepared, run_kf(prepared))
     except MissingDataError:  # a replay of EKF2 is possible without a comparison with KF
         if is_default_change:
             raise
@@ -281,7 +289,11 @@ def run_what_if(
         if is_default_change:
             changes = ml_ekf2_parameters(comparison, model, tuning, clock)
             if not changes:
-                raise MissingDataError(_explain_missing_change(comparison, model))
+                name, noise = comparison.source.name, model.inputs.aid.noise
+                raise MissingDataError(
+                    f"{flight.log.name}: this log shows no better noise or delay for {name}.",
+                    f"Give a changed parameter, for example `changes` {noise}=0.1.",
+                )
     settings = [changes] if changes or request.without else []
     settings += [{**changes, sweep.parameter: value} for value in values] if sweep else []
     progress("replaying EKF2 with other parameters")
@@ -293,16 +305,3 @@ def run_what_if(
     return WhatIfAnalysis(
         flight, replays, changes, is_default_change, difference_steps, request.without
     )
-
-
-def _explain_missing_change(comparison: Comparison, model: Model) -> str:
-    """Format the error that a log does not determine maximum-likelihood parameters of EKF2."""
-    source = comparison.source
-    reason = f"noise and delay of {source.name} cannot be estimated from this log"
-    if source.origin.is_gnss or source.origin.may_drift:
-        reason = (
-            f"innovations do not show the slow errors of {source.name}, and the delay of "
-            f"{source.name} is correct or cannot be estimated"
-        )
-    name, noise = comparison.flight.log.name, model.inputs.aid.noise
-    return f"{name}: {reason}. Give a changed parameter, for example `changes` {noise}=0.1."

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from browser import Browser, Elements
 from cli_tools import error_line, run_checked
-from comparisons import compare
+from comparisons import compare, compare_prepared
 from exchange import replace
 from explore_tools import ask, box, mouse, open_view, settle, show
 from flights import Imu, aisle_flight, unexplained
@@ -25,7 +25,6 @@ from px4fuse.analysis import Analysis
 from px4fuse.card.numbers import format_ratio
 from px4fuse.cli.compare import compare as compare_command
 from px4fuse.cli.options import comparison_request, read_student
-from px4fuse.comparison.comparison import compare as compare_prepared
 from px4fuse.comparison.model import FILTERS, AxisComparison
 from px4fuse.diagnose import prepare_comparison
 from px4fuse.explore import page as pages

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import Browser
+from comparisons import compare_prepared
 from explore_tools import ask, axe, open_view, serious, settle, show
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.numbers import axis_fraction, format_metres, format_ratio
 from px4fuse.card.verdicts import verdicts
-from px4fuse.comparison.comparison import compare as compare_prepared
 from px4fuse.diagnose import diagnose, prepare_comparison
 from px4fuse.explore.page import html_text
 from px4fuse.filter.kalman import replay

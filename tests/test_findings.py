@@ -11,12 +11,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from cli_tools import run_main
-from comparisons import compare
+from comparisons import compare, compare_prepared
 from exchange import replace
 from flights import Estimator, Imu, Uwb, aisle_flight, given_placement, unexplained, with_noises
 from golden_tools import assert_matches_golden, rounded, value
 
-from px4fuse.comparison.comparison import compare as compare_prepared
 from px4fuse.comparison.model import Comparison
 from px4fuse.diagnose import prepare_comparison
 from px4fuse.ekf2.inputs import MODEL_NOTE

@@ -71,7 +71,7 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable
 
-# Maximum mean NIS with which innovations do not show that the reported σ is too small
+# Maximum mean NIS of innovations that do not show a reported σ that is too small
 MAX_UNREMARKABLE_NIS = 1.5
 # Columns of an EKF2 replay for north and east
 INNOVATION_COLUMNS, INNOVATION_VARIANCE_COLUMNS = UPDATE_COLUMNS[:2], UPDATE_COLUMNS[2:4]
@@ -80,7 +80,7 @@ OBSERVATION_VARIANCES = [f"observation_variance_{axis}_m2" for axis in HORIZONTA
 NO_DIFFERENCE = Unavailable(
     "difference KF - EKF2", "the filters use different frames after the change", ""
 )
-# Maximum ratio of a statistic in the replay as flown and in the log, for re-runs to be valid
+# Maximum ratio of an RMSE or σ ratio in the log and in the replay of EKF2 as flown
 MAX_REPLAY_FACTOR = 1.10
 
 

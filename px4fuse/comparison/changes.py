@@ -44,10 +44,10 @@ KF_KINDS = {
 }
 SETTING_CHANGES = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
-# Minimum ratio of the estimated SIGMA_A to EKF2_ACC_NOISE for a re-run with a larger
-# EKF2_ACC_NOISE: SIGMA_A also covers tilt error and bias
+# Minimum ratio of estimated SIGMA_A and EKF2_ACC_NOISE for a re-run with a larger EKF2_ACC_NOISE:
+# SIGMA_A also covers tilt error and bias
 VIBRATION_FACTOR = 3.0
-# EKF2 parameters that are re-run with PX4's default value if another value was flown
+# EKF2 parameters that are re-run with PX4's default if another value was flown
 PARAMETERS_OF_EKF2 = (
     ACC_NOISE,
     "EKF2_GYR_NOISE",
@@ -56,7 +56,7 @@ PARAMETERS_OF_EKF2 = (
     GNSS_VEL.noise,
     GNSS_VEL.gate,
 )
-# Minimum misalignment in standard deviations of its estimate for a re-run with rotated positions
+# Minimum misalignment in σ of its estimate for a re-run with rotated positions
 HEADING_SIGMAS = 3.0
 
 

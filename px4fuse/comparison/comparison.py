@@ -30,8 +30,16 @@ VARIANCE_COLUMNS = ("position_variance_m2", "velocity_variance_m2_s2")
 Frame = pd.DataFrame | Unavailable
 
 
-def compare(prepared: Comparison, progress: Callable[[str], None] = lambda _: None) -> Comparison:
-    """Run KF on a prepared flight, and compare it with EKF2 and with ground truth if available."""
+def run_kf(
+    prepared: Comparison, progress: Callable[[str], None] = lambda _: None
+) -> dict[str, Replay]:
+    """Run KF along each axis of a prepared flight."""
+    progress(f"running KF along {', '.join(line.name for line in prepared.lines)}")
+    return {line.name: replay(line, prepared.settings) for line in prepared.lines}
+
+
+def compare(prepared: Comparison, kf_runs: Mapping[str, Replay]) -> Comparison:
+    """Compare the runs of KF with EKF2, and both with ground truth if available."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, note = projection.continuous_state(ekf2, prepared.source, prepared.segment)
@@ -40,11 +48,7 @@ def compare(prepared: Comparison, progress: Callable[[str], None] = lambda _: No
         if not state.equals(ekf2.state):
             # without its resets, the state is in another frame than positions at the fusion horizon
             ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
-    progress(f"running KF along {', '.join(line.name for line in prepared.lines)}")
-    axes = {
-        line.name: _compare_axis(prepared, ekf2, replay(line, prepared.settings))
-        for line in prepared.lines
-    }
+    axes = {name: _compare_axis(prepared, ekf2, kf_run) for name, kf_run in kf_runs.items()}
     innovations: dict[FilterName, dict[str, Frame]] = {
         "kf": {name: axis.replay.updates for name, axis in axes.items()},
         "ekf2": {name: axis.ekf2_innovations for name, axis in axes.items()},

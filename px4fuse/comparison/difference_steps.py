@@ -31,17 +31,18 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.model import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
-# Maximum relative difference of the position RMSEs of KF and EKF2 that texts call equal
+# Maximum relative difference of the position RMSEs of KF and EKF2 that sentences call the same
 EQUAL_RMSE_TOLERANCE = 0.05
-# Minimum fraction of the mean square difference for the second largest step to be mentioned
+# Minimum fraction of the mean square difference for a sentence on the second largest step
 MIN_NOTABLE_SHARE = 0.05
 # Minimum ratio of a KF noise setting and its estimate for the setting to be corrected first
 MIN_SETTING_RATIO = 4.0
-# Minimum change of the KF position (m) by an EKF2 property for which KF and EKF2 count as different
+# Minimum change (m) of the position for an EKF2 property to be listed as a step
 MIN_STEP_EFFECT_M = 1e-6
-# Minimum difference KF - EKF2 outside the replayed times that is reported: in m, and as a factor on
-# the largest difference in the replayed times
-MIN_UNREPLAYED_M, MIN_UNREPLAYED_RATIO = 0.5, 3.0
+# Minimum difference KF - EKF2 (m) outside the replayed times for a sentence
+MIN_UNREPLAYED_M = 0.5
+# Minimum ratio of the largest differences KF - EKF2 outside and inside the replayed times
+MIN_UNREPLAYED_RATIO = 3.0
 
 
 def explain_ekf2_difference(

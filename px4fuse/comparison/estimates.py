@@ -33,14 +33,14 @@ from px4fuse.flight.model import Flight, Unavailable
 
 # Minimum IMU rate (Hz) for an estimate of the time offset
 MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
-# Minimum IMU rate (Hz) of telemetry: PX4 publishes vehicle_imu at 200 Hz (IMU_INTEG_RATE), and a
-# lower telemetry rate skips samples
+# Minimum IMU rate (Hz) of telemetry: PX4 publishes vehicle_imu at 200 Hz (IMU_INTEG_RATE), and
+# slower telemetry skips samples
 MIN_TELEMETRY_IMU_HZ = 200.0
-# Ratio of measured to nominal IMU rate that is sufficient: measured rates are up to 2 % lower
+# Minimum ratio of measured and nominal IMU rate: measured rates are up to 2 % lower
 CLOCK_RATE_MARGIN = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
-# Minimum change (s) of the time offset in flight; drift of the source may cause a smaller one
+# Minimum change (s) of the time offset in flight: drift of the source may cause a smaller one
 MIN_CHANGE_S = 0.10
 # Minimum number of parts of the flight before and after a change of the time offset
 MIN_PARTS = 2

@@ -11,9 +11,12 @@ from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.tuning import AxisTuning, tune
 from px4fuse.flight.model import Unavailable
 
-# Minimum ratio of the mean NIS of both axes for a noise estimate of each axis, which takes time
+# Minimum ratio of the mean NIS of both axes for separate noise estimates, which take time
 MIN_AXIS_NIS_RATIO = 1.7
-MAX_PARTS, MIN_PART_COUNT = 12, 25  # number of parts of the flight, and measurements in each part
+# Maximum number of parts into which a flight is divided
+MAX_PARTS = 12
+# Minimum number of measurements in each part of a flight
+MIN_PART_COUNT = 25
 
 
 class NoisyPart(NamedTuple):

@@ -28,15 +28,15 @@ from px4fuse.readers.px4_topics import TOPIC_ORIGINS
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
-# Origins of position sources by their PX4 topic or MAVLink message
+# Origins of position sources, by PX4 topic or MAVLink message
 LOGGED_ORIGINS = TOPIC_ORIGINS | {source.name: source.origin for source in POSITION_INPUTS}
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
     "KF uses the only ground truth of the log as its position source",
     "Choose another --position-source, then this source is the ground truth.",
 )
-# Default axes with GNSS as source; without down, because GNSS height is much noisier and SIGMA_Z is
-# one number for all axes
+# Default axes for GNSS. Down is not included: GNSS height is much noisier, and SIGMA_Z is one
+# number for all axes
 GNSS_AXES = (AISLE, "north", "east")
 
 

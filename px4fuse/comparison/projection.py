@@ -25,17 +25,17 @@ from px4fuse.flight.model import (
 EKF2_MIN_NOISE_M = 0.01
 # EKF2's factor from GNSS position noise to height noise, in σ (gnss_height_control.cpp)
 GNSS_HEIGHT_SCALE = 1.5
-# Minimum number of samples that two tracks have in common for statistics of their difference
+# Minimum number of common samples of two tracks for statistics of their difference
 MIN_COMMON_SAMPLES = 3
-# Projected quantity: its NED columns, and the power of the direction that weights them
+# NED columns of each projected quantity, and the power of the direction that weights them
 PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_m": (Columns.POSITION, 1),
     "velocity_m_s": (Columns.VELOCITY, 1),
     "position_variance_m2": (Columns.POSITION_VARIANCE, 2),
     "velocity_variance_m2_s2": (Columns.VELOCITY_VARIANCE, 2),
 }
-# EKF2's position jumps at resets are removed only if this reduces its median squared distance to
-# the measurements to this fraction. Otherwise the published state, used in flight, is kept
+# Maximum ratio of the median squared distances to the measurements, without and with EKF2's
+# position resets, for the resets to be removed
 MAX_DISTANCE_RATIO = 0.95
 
 

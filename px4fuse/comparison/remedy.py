@@ -15,11 +15,13 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.ekf2_parameters import EV_POS, PARAMETERS, Aid
 from px4fuse.flight.model import Unavailable
 
-# Minimum ratio of √R to EKF2_EVP_NOISE with which R is the variance that the sender reports
+# Minimum ratio of √R and EKF2_EVP_NOISE for an R that the sender reports
 MIN_REPORTED_RATIO = 1.25
-# Prediction step of EKF2 (ms, EKF2_PREDICT_US), and transmission time of a position message (ms)
-PREDICTION_STEP_MS, TRANSMISSION_MS = 10.0, 30.0
-# Multiple (ms) to which EKF2_DELAY_MAX is rounded up
+# Prediction step (ms) of EKF2 (EKF2_PREDICT_US)
+PREDICTION_STEP_MS = 10.0
+# Transmission time (ms) of a position message
+TRANSMISSION_MS = 30.0
+# Step (ms) to which EKF2_DELAY_MAX is rounded up
 DELAY_MAX_STEP_MS = 50.0
 
 

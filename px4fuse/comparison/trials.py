@@ -12,21 +12,21 @@ from px4fuse.filter.consistency import Reference, classify_ratio, nis_band
 from px4fuse.flight.ekf2_parameters import EV_POS
 
 Statistic = Literal["nis", "nees", "difference"]
-# Statistics whose value outside its limits is explained by re-runs
+# Statistics that re-runs try to bring inside their limits
 DISCREPANCIES: tuple[Statistic, Statistic] = ("nees", "nis")
 Change = Mapping[str, float]
-# Names of changes other than settings and parameters
+# Names of changes of data in Trial.change
 CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
 FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
-# Minimum mean NEES at which errors exceed the reported σ: errors of 2 σ; flights without a fault
-# have less than 3
+# Minimum mean NEES for errors larger than the reported σ: 2 σ; flights without a fault have less
+# than 3
 MIN_NEES_FINDING = 4.0
 # Maximum mean NEES after a change to a smaller noise, if the mean NEES was above 1 before
 MAX_NEES_AFTER_CHANGE = 2.0
-# Maximum distance from 1 of the explained fraction of a cause, which explains at least half
+# Maximum distance from 1 of the explained fraction of a cause: it explains at least half
 MAX_CAUSE_DISTANCE = 0.5
-# Maximum distance from 1 of the explained fraction for a sensor fault to be the only cause: the
+# Maximum distance from 1 of the explained fraction of a sensor fault that is the only cause: the
 # noises of the re-run are approximate
 SENSOR_CAUSE_TOLERANCE = 0.25
 # Maximum distance from 1 of the explained fraction of a change that is combined with another one
@@ -35,12 +35,13 @@ MAX_HELPFUL_DISTANCE = 0.9
 SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
 # Changes that another change requires; they are not counted
 ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
-# Minimum factor on a σ ratio, or relative change of the position RMSE, for a re-run to have an
-# effect
-MIN_RATIO_CHANGE, MIN_RMSE_CHANGE = 1.10, 0.05
-# Minimum relative reduction of the position RMSE for a re-run to improve the position
+# Minimum factor on a σ ratio for a re-run with an effect
+MIN_RATIO_CHANGE = 1.10
+# Minimum relative change of the position RMSE for a re-run with an effect
+MIN_RMSE_CHANGE = 0.05
+# Minimum relative reduction of the position RMSE for a re-run that improves the position
 POSITION_IMPROVEMENT = 0.20
-# A re-run leaves an error if ln(error ÷ σ) stays above this fraction of its value before
+# Maximum ratio of ln(error ÷ σ) after and before a re-run that corrects the error
 MAX_ERROR_LEFT = 0.75
 
 

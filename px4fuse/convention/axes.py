@@ -22,26 +22,48 @@ from px4fuse.convention.model import Axes, Direction, HeadingSource, Unit
 from px4fuse.convention.motion import GRID_S, WINDOW_S, ImuMotion, SourceMotion
 from px4fuse.core.arrays import Array, IntArray
 
+# Maximum tested time offset (s) of the positions
 MAX_OFFSET_S = 10.0
+# Minimum common time (s) of positions and IMU
 MIN_OVERLAP_S = 10.0
-# Minimum scale (m) of the residuals: IMU noise, tilt and interpolation over T
-MIN_SIGMA_M, MIN_SIGMA_DOWN_M = 0.05, 0.08
+# Minimum scale (m) of the horizontal residuals: IMU noise, tilt and interpolation over T
+MIN_SIGMA_M = 0.05
+# Minimum scale (m) of the vertical residuals
+MIN_SIGMA_DOWN_M = 0.08
+# Degrees of freedom of the Student distribution of the residuals
 FREEDOM = 4.0
-UNITS: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}  # m
-SMALL_ROTATION = np.radians(8.0)  # a smaller rotation is not another convention
+# Length units in metres
+UNITS: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
+# Maximum rotation (rad) that is not a different convention
+SMALL_ROTATION = np.radians(8.0)
+# Maximum time offset (s) without a lower prior
 SMALL_OFFSET_S = 0.3
-# Log prior odds of a rotation, a time offset and a unit other than metres
-ROTATION_ODDS, OFFSET_ODDS, UNIT_ODDS = -1.0, -2.0, -2.0
-BAROMETER_SIGMA_M, BAROMETER_WEIGHT = 0.5, 6.0
-MAX_REFINED, MAX_DEFICIT = 8, 60.0  # hypotheses of the coarse search that are refined
-MAX_ROWS = 1200  # of the refinement
+# Log prior odds of a rotated frame
+ROTATION_ODDS = -1.0
+# Log prior odds of a large time offset
+OFFSET_ODDS = -2.0
+# Log prior odds of a unit other than metres
+UNIT_ODDS = -2.0
+# Standard deviation (m) of barometer heights
+BAROMETER_SIGMA_M = 0.5
+# Number of independent barometer heights in the likelihood
+BAROMETER_WEIGHT = 6.0
+# Maximum number of hypotheses of the coarse search that are refined
+MAX_REFINED = 8
+# Maximum log likelihood ratio of the best hypothesis to another one that is refined
+MAX_DEFICIT = 60.0
+# Maximum number of samples in the refinement
+MAX_ROWS = 1200
+# Number of Gauss-Newton steps
 ITERATIONS = 7
-MAX_STEP_S = 0.15  # of the time offset per iteration
-# Prior precision of time offset (s), rotation (rad), drift of the gyro's heading (σ 0.05 °/s),
-# clock drift, accelerometer bias (σ 0.3 m/s²)
+# Maximum change (s) of the time offset in one Gauss-Newton step
+MAX_STEP_S = 0.15
+# Prior precision of Hypothesis.parameters: gyro heading drift (σ 0.05 °/s), accelerometer bias (σ
+# 0.3 m/s²)
 PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
+# Horizontal directions, clockwise from above
 CLOCKWISE: tuple[Direction, ...] = ("north", "east", "south", "west")
-# Log prior odds of axes. Left-handed frames: one wrong sign, or x and y exchanged
+# Log prior odds of the axes x, y, z. Left-handed frames have one wrong sign, or x and y exchanged
 AXES_ODDS: Final[dict[Axes, float]] = {
     ("north", "east", "down"): 1.0,  # as stated
     ("east", "north", "up"): -0.5,

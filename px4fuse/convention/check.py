@@ -34,18 +34,33 @@ from px4fuse.convention.texts import format_axes
 from px4fuse.flight.model import Columns, Flight, PositionTrack
 from px4fuse.trajectory.rotation import heading
 
-MIN_LOG_ODDS = 4.0  # log likelihood minus that of the best other convention
-MIN_GAIN = 8.0  # log likelihood minus that of positions without relation to the motion
-MIN_GAIN_PER_WINDOW = (0.15, 0.4)  # if the convention is determined, or ambiguous
-MIN_SCALE, MAX_SCALE = 0.88, 1.12  # distances of the source over those of the IMU
-# Residuals over those that explain the noise of the source and the minimum error (m) of the IMU
-MAX_RESIDUAL_RATIO, IMU_ERROR_M = 2.4, 0.05
-MAX_LOGGED_DEFICIT = 20.0  # by which the logged heading may fit worse than the gyro's
-MIN_DRIFT_GAIN = 15.0  # log likelihood gained by a clock drift
+# Minimum log likelihood ratio to the second best convention for an unambiguous result
+MIN_LOG_ODDS = 4.0
+# Minimum log likelihood ratio to positions that are unrelated to the motion
+MIN_GAIN = 8.0
+# Minimum log likelihood ratio for each window, for an unambiguous and for an ambiguous convention
+MIN_GAIN_PER_WINDOW = (0.15, 0.4)
+# Range of the ratio of distances from the source and from the IMU, for a certain convention
+MIN_SCALE, MAX_SCALE = 0.88, 1.12
+# Maximum ratio of the residuals to those that source noise and IMU error explain
+MAX_RESIDUAL_RATIO = 2.4
+# Minimum position error (m) of the IMU
+IMU_ERROR_M = 0.05
+# Maximum log likelihood ratio of the gyro's heading to the logged heading, for the logged one to be
+# used
+MAX_LOGGED_DEFICIT = 20.0
+# Minimum gain of the log likelihood for accepting a clock drift
+MIN_DRIFT_GAIN = 15.0
+# Tested clock drifts (rate of the clock minus 1)
 DRIFTS = np.linspace(-0.05, 0.05, 21)
-MAX_REPEATED_SHARE = 0.5  # of repeated positions that are left out; also minimum share with height
-# Sums of the squares of the coefficients of third and second differences
-THIRD_DIFFERENCE, SECOND_DIFFERENCE = 20.0, 6.0
+# Maximum fraction of repeated positions that are left out
+MAX_REPEATED_SHARE = 0.5
+# Minimum fraction of positions with a height, for the height to be used
+MIN_HEIGHT_SHARE = 0.5
+# Sum of the squared coefficients of third differences
+THIRD_DIFFERENCE = 20.0
+# Sum of the squared coefficients of second differences
+SECOND_DIFFERENCE = 6.0
 
 
 def check_convention(
@@ -92,7 +107,7 @@ def check_convention(
 def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -> Positions:
     """Return the positions without repeated ones; a missing height is 0."""
     samples, barometer = track.samples[Columns.POSITION], flight.barometer
-    if samples["down_m"].notna().mean() < MAX_REPEATED_SHARE:
+    if samples["down_m"].notna().mean() < MIN_HEIGHT_SHARE:
         samples = samples.assign(down_m=0.0)
     samples = samples.dropna()
     is_repeated = (samples.diff() == 0.0).all(axis=1)

@@ -16,11 +16,15 @@ from px4fuse.core.arrays import Array
 from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack, time_index
 from px4fuse.trajectory.rotation import from_elements, heading
 
-# Minimum rotation (°) of a frame with other axes, and of a frame that is only rotated: smaller
-# ones are in the reach of the estimate of the heading error
-MIN_REMAINDER_DEG, MIN_ROTATION_DEG = 8.0, 15.0
-MIN_LATE_S = 0.5  # smaller time offsets are in the reach of the estimate of the time offset
-MIN_HEADING_ERROR_DEG = 10.0  # of an orientation relative to its own positions
+# Minimum rotation (°) of a frame with wrong axes: the estimate of the heading error covers less
+MIN_REMAINDER_DEG = 8.0
+# Minimum rotation (°) of a frame that is only rotated
+MIN_ROTATION_DEG = 15.0
+# Minimum time offset (s) for a correction: the estimate of the time offset covers smaller ones
+MIN_LATE_S = 0.5
+# Minimum heading error (°) of an orientation relative to its own positions
+MIN_HEADING_ERROR_DEG = 10.0
+# Kinds of orientation faults; empty without a fault
 OrientationFault = Literal["", "copied", "order", "frames", "heading"]
 
 

@@ -13,9 +13,13 @@ from px4fuse.core.arrays import Array
 from px4fuse.flight.model import Columns, Flight, PositionTrack
 from px4fuse.trajectory.rotation import to_matrix
 
-# Minimum lever arm: m (twice the noise of good UWB), and σ; sources without one have up to 1.5
-MIN_ARM_M, MIN_ARM_SIGMAS = 0.2, 4.0
-CLIPPED_SIGMAS = 3.0  # residuals beyond are left out
+# Minimum lever arm (m) for a finding: twice the noise of good UWB
+MIN_ARM_M = 0.2
+# Minimum lever arm in σ for a finding: sources without a lever arm reach 1.5
+MIN_ARM_SIGMAS = 4.0
+# Maximum residual in σ of a sample that is used
+CLIPPED_SIGMAS = 3.0
+# Number of least squares fits with outlier removal
 ITERATIONS = 4
 
 

@@ -32,16 +32,23 @@ from px4fuse.trajectory.rotation import (
     to_vector,
 )
 
+# Standard gravity (m/s²)
 GRAVITY_M_S2 = 9.80665
-WINDOW_S = 2.0  # T
-GRID_S = 0.1  # interval of the second differences
-STEP_S = 0.02  # integration step of the IMU
+# Time T (s) of the second differences
+WINDOW_S = 2.0
+# Interval (s) between second differences
+GRID_S = 0.1
+# Integration step (s) of the IMU
+STEP_S = 0.02
+# Length (s) of the running mean that is subtracted from the second differences
 HIGH_PASS_S = 12.0
-# Length (s) of the running mean of the specific force that defines the vertical, applied twice. A
-# symmetric mean causes no delay; a causal correction towards gravity delays the result by 0.02 s
+# Length (s) of the running mean of the specific force, which defines the vertical. A symmetric mean
+# causes no delay
 LEVELLING_S = 40.0
+# Length (s) of the windows for the estimate of the gyro bias
 GYRO_BIAS_WINDOW_S = 1.0
-MIN_GAP_S = 0.35  # gap of a source
+# Minimum interval (s) of positions that is a gap
+MIN_GAP_S = 0.35
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,11 @@ from px4fuse.ekf2.replay import inside_spans
 from px4fuse.trajectory.rotation import from_vector, heading, interpolate, multiply, to_matrix
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
-FRD_FLU = np.array([0.0, 1.0, 0.0, 0.0])  # half a turn about x
+# Quaternion (w, x, y, z) of half a turn about x, from FLU to FRD
+FRD_FLU = np.array([0.0, 1.0, 0.0, 0.0])
+# Quaternion (w, x, y, z) from ENU to NED
 ENU_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
-# Rotations of world and body to NED and FRD
+# Quaternions of the rotations of world and body to NED and FRD, by stated frames
 FRAMES: Final[dict[Frames, tuple[Array, Array]]] = {
     "FRD to NED": (IDENTITY, IDENTITY),
     "FLU to ENU": (ENU_NED, FRD_FLU),
@@ -28,13 +30,25 @@ FRAMES: Final[dict[Frames, tuple[Array, Array]]] = {
     "FRD to ENU": (ENU_NED, IDENTITY),
 }
 ORDERS: tuple[Order, Order] = ("w x y z", "x y z w")
-MAX_COPY_DEG = 0.15  # copies differ by up to 0.03°, fused motion capture by more than 0.2°
+# Maximum median difference (°) of a copied attitude: copies differ by 0.03°, fused motion capture
+# by more than 0.2°
+MAX_COPY_DEG = 0.15
+# Tested delays (s) of a copied attitude
 COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
-MAX_TILT_DEG, MAX_HEADING_DEG = 6.0, 12.0  # median tilt, heading difference if correct
-MIN_DIFFERENCE_DEG = 0.7  # noise of tilt and heading; smaller differences score equally
-SCORE_PER_S = 0.5  # log likelihood per second and factor e of the differences
-MIN_LOG_ODDS = 4.0  # to the best other convention
-MAX_SAMPLES, MIN_SAMPLES = 600, 20
+# Maximum median tilt difference (°) of a correct convention
+MAX_TILT_DEG = 6.0
+# Maximum median heading difference (°) of a correct convention
+MAX_HEADING_DEG = 12.0
+# Minimum difference (°) that lowers the score: noise of tilt and heading
+MIN_DIFFERENCE_DEG = 0.7
+# Log likelihood per second, for a factor e of the differences
+SCORE_PER_S = 0.5
+# Minimum log likelihood ratio to the second best convention
+MIN_LOG_ODDS = 4.0
+# Maximum number of samples that are compared with the attitude
+MAX_SAMPLES = 600
+# Minimum number of samples in flight
+MIN_SAMPLES = 20
 
 
 class Candidate(NamedTuple):

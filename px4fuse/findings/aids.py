@@ -18,12 +18,13 @@ from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.flight.model import Unavailable
 
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
-# Time (s) after take-off in which EKF2 does not fuse the barometer: the ground changes the pressure
+# Time (s) after take-off in which a barometer that is not fused is no fault: the ground changes the
+# pressure
 TAKE_OFF_S = 10.0
-# Minimum ratio of EKF2's largest height error in a gap of the barometer to the height RMSE outside
-# the gap, from which the gap is a warning instead of a note
+# Minimum ratio of EKF2's largest height error in a gap of the barometer to its height RMSE outside
+# the gap, for severity warning
 MIN_HEIGHT_ERROR_RATIO = 3.0
-# Check of a sensor that EKF2 does not fuse, by the PX4 parameter that enables its fusion
+# Action for a sensor that EKF2 does not fuse, by the PX4 parameter that enables its fusion
 CHECKS = {
     "EKF2_BARO_CTRL": "Shield the barometer from propeller wash and light.",
     "EKF2_GPS_CTRL": "Give the antenna a free view of the sky.",

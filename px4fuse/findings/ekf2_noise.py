@@ -16,9 +16,10 @@ from px4fuse.finding import Severity
 from px4fuse.findings.model import Findings, finding, format_percent
 from px4fuse.flight.model import Unavailable, source_name
 
-# Minimum ratio of flown and estimated noise (σ) for an error; below, EKF2's error hardly changes
+# Minimum ratio of flown and estimated noise (σ) for severity error: a smaller one hardly changes
+# EKF2's error
 MIN_RATIO_ERROR = 2.0
-# Minimum fraction of positions rejected by EKF2 for the title to contain it
+# Minimum fraction of rejected positions for the title to state it
 MIN_NAMED_REJECTION = 0.05
 
 

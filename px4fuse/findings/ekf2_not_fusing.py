@@ -24,11 +24,18 @@ from px4fuse.findings.model import (
 from px4fuse.flight.model import Ekf2, PositionTrack, Truth, Unavailable, positions_of
 from px4fuse.flight.position_source import POSITION_FILE
 
-MIN_FUSING_SHARE_ERROR = 0.5  # fused fraction of the segment; below, other sensors dominate: error
-MIN_FUSING_SHARE_WARNING = 0.98  # fused fraction of the segment; 2 % of a minute are about 1 s
-MIN_LIMITING_INTERVAL_S = 0.18  # s; 10 % of jitter reaches EV_START_INTERVAL_S: fusion starts late
+# Minimum fraction of the segment with fusion for a severity below error: with less, EKF2 uses other
+# sensors most of the time
+MIN_FUSING_SHARE_ERROR = 0.5
+# Minimum fraction of the segment with fusion for no finding: 2 % of a minute are about 1 s
+MIN_FUSING_SHARE_WARNING = 0.98
+# Minimum interval (s) of positions that may delay the start of fusion: with 10 % of jitter it
+# reaches EV_START_INTERVAL_S
+MIN_LIMITING_INTERVAL_S = 0.18
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
-MIN_INVALID_DISTANCE_M = 1.0  # m; less before take-off, where EKF2 needs no position
+# Minimum distance (m) to the reference for a finding of an invalid position: it is smaller before
+# take-off
+MIN_INVALID_DISTANCE_M = 1.0
 
 
 def detect(analysis: Comparison) -> Findings:

@@ -12,9 +12,13 @@ from px4fuse.findings.model import Findings, finding, format_percent, zero_lengt
 from px4fuse.flight.ekf2_parameters import GNSS_POS
 from px4fuse.flight.model import Ekf2, Unavailable
 
-REJECTED_SHARE_WARNING = 0.01  # rejected fraction for a warning; 6e-7 if consistent, with 5 √S
-REJECTED_SHARE_ERROR = 0.20  # rejected fraction for an error: R or the time offset is wrong
-MAX_REJECTED_RATIO = 0.5  # rejected fraction with over without a change that prevents rejections
+# Minimum fraction of rejected samples for a warning: a consistent filter with a gate of 5 √S
+# rejects 6e-7
+REJECTED_SHARE_WARNING = 0.01
+# Minimum fraction of rejected samples for an error: R or the time offset is wrong
+REJECTED_SHARE_ERROR = 0.20
+# Maximum ratio of rejected fractions after and before a change that prevents rejections
+MAX_REJECTED_RATIO = 0.5
 
 
 def detect(analysis: Analysis) -> Findings:

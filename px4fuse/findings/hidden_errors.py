@@ -35,11 +35,12 @@ from px4fuse.flight.model import Unavailable, source_name
 from px4fuse.loop.model import Loop
 from px4fuse.trajectory.alignment import fit_alignment
 
-MIN_NEES_ERROR = 16.0  # mean NEES from which the finding is an error: position errors of 4 σ
-# Maximum position RMSE of KF over that of EKF2 if only EKF2 has a fault. Both filters use the same
-# source: it then causes at most 0.7² (49 %) of EKF2's mean square error
+# Minimum mean NEES for severity error: position errors of 4 σ
+MIN_NEES_ERROR = 16.0
+# Maximum ratio of the position RMSEs of KF and EKF2 for a fault of EKF2 alone: the common source
+# then causes at most half of EKF2's mean square error
 MAX_KF_ERROR_RATIO = 0.7
-# Maximum position RMSE after alignment over RMSE before, for a misaligned frame as main cause
+# Maximum ratio of the position RMSE after and before alignment for a misaligned frame
 MAX_ALIGNED_SHARE = 0.5
 DRIFT_REMEDY = (
     "Send an absolute position (GNSS, UWB) as well in the next flight. A loop closure (px4fuse "

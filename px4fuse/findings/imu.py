@@ -13,15 +13,24 @@ from px4fuse.findings.missing import DEFAULT_PROFILE, VISION_PROFILE_BIT
 from px4fuse.findings.model import Findings, error, finding, format_percent, warning
 from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
-BIAS_ERROR_M_S2 = 0.3  # m/s²; bias from which the finding is an error: 0.15 m after 1 s
-TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))  # tilt error equivalent to a bias of 1 m/s²
-MIN_IMU_GAP_S = 0.2  # s; total length of reported gaps: two prediction steps of KF
-MIN_IMU_RATE_HZ = 50.0  # Hz; 5 IMU samples per DT of 0.1 s, with a margin against aliasing
-MIN_ATTITUDE_RATE_HZ = 10.0  # Hz; tilt can be interpolated over 0.1 s
-MAX_CLIPPED_S = 0.1  # s; total clipping that is not reported: a touch-down clips one or two samples
-MIN_CLIPPING_PAUSE_S = 2.0  # s; time without clipping that separates two reported time spans
-HIGH_RATE_BIT = 16  # SDLOG_PROFILE bit 4: full IMU rate (logged_topics.cpp)
-RATE_MARGIN = 0.98  # ratio; measured message rates are up to 2 % below the requested rate
+# Minimum accelerometer bias (m/s²) for severity error: a position error of 0.15 m after 1 s
+BIAS_ERROR_M_S2 = 0.3
+# Tilt error (°) with the same effect as an accelerometer bias of 1 m/s²
+TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
+# Minimum time (s) without IMU samples for a finding: two prediction steps of KF
+MIN_IMU_GAP_S = 0.2
+# Minimum IMU rate (Hz): 5 samples in each DT of 0.1 s, so that vibration is not aliased
+MIN_IMU_RATE_HZ = 50.0
+# Minimum attitude rate (Hz) for interpolation
+MIN_ATTITUDE_RATE_HZ = 10.0
+# Maximum time (s) of clipping without a finding: a touch-down clips one or two samples
+MAX_CLIPPED_S = 0.1
+# Minimum time (s) without clipping between two reported time spans
+MIN_CLIPPING_PAUSE_S = 2.0
+# Bit 4 of SDLOG_PROFILE: full IMU rate (logged_topics.cpp)
+HIGH_RATE_BIT = 16
+# Minimum ratio of measured and requested rate: measured rates are up to 2 % lower
+RATE_MARGIN = 0.98
 
 
 def detect(analysis: Analysis) -> Findings:

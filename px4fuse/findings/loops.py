@@ -7,9 +7,11 @@ from px4fuse.findings.model import Findings, error, note, warning
 from px4fuse.loop.model import LANDING_SOURCE, Closure, Loop
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
-MAX_DROPPED_SHARE = 0.5  # of the closures; most closures of a flight are true, so more are drift
+# Maximum fraction of dropped closures: if more are dropped, the stated drift is too small
+MAX_DROPPED_SHARE = 0.5
 EVIDENCE = ("time_1_s", "time_2_s", "distance_m", "d2", "degrees_of_freedom", "p")
-MIN_KEPT_WEIGHT = 0.5  # weight of a used closure; GNC weights end at 0 or 1 (Yang et al. 2020)
+# Minimum weight of a closure that GNC uses; its final weights are near 0 or 1 (Yang et al. 2020)
+MIN_KEPT_WEIGHT = 0.5
 
 
 def detect(analysis: Analysis) -> Findings:

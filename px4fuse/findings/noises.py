@@ -45,18 +45,22 @@ from px4fuse.flight.ekf2_parameters import BAROMETER
 from px4fuse.flight.model import Columns, Unavailable, sample_rate
 from px4fuse.request import COMPARISON_OPTIONS
 
-MIN_NOISE_RATIO = 1.5  # setting over estimate (σ) or its inverse; below, the track hardly changes
-MIN_NOISE_RATIO_ERROR = 4.0  # setting over estimate (σ) or its inverse, for severity "error"
-MIN_RESPONSE_TIME_S = 2.5  # s; minimum response time of KF for Q almost zero: vehicles turn in less
-INTERVAL_WIDENING = (
-    1.5  # factor on the 95 % interval (log scale); 0.3 % of correct settings exceed it
-)
-MIN_LAG1_AUTOCORRELATION = 0.3  # of the innovations; white ones: below 2/√n, 0.2 for n = 100
+# Minimum ratio of a setting and its estimate (σ) for a warning: with less the track hardly changes
+MIN_NOISE_RATIO = 1.5
+# Minimum ratio of a setting and its estimate (σ) for severity error
+MIN_NOISE_RATIO_ERROR = 4.0
+# Minimum response time (s) of KF for Q almost zero: vehicles turn faster
+MIN_RESPONSE_TIME_S = 2.5
+# Factor on the 95 % interval (log scale) of a setting: 0.3 % of correct settings are outside
+INTERVAL_WIDENING = 1.5
+# Minimum lag-1 autocorrelation of the innovations for a lagging KF: white ones have less than 0.2
+MIN_LAG1_AUTOCORRELATION = 0.3
 
-MIN_SIGMA_RATIO_ERROR = 2.0  # reported over actual σ, or its inverse, for severity "error"
-# Maximum ratio of two estimates of one noise: twice the standard error of a median of 100 values
+# Minimum ratio of actual and reported σ, or its inverse, for severity error
+MIN_SIGMA_RATIO_ERROR = 2.0
+# Maximum ratio of two estimates of the same noise: two standard errors of a median of 100 values
 NOISE_RATIO_TOLERANCE = 1.25
-# Actions if no re-run explains an inconsistent variance
+# Actions for an inconsistent filter whose cause no re-run shows
 NOT_EXPLAINED = (
     "No tested change of noise, time offset, frame or outliers explains this. Check the IMU "
     "(rate, gaps, vibration)."

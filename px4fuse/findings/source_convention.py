@@ -26,7 +26,7 @@ from px4fuse.findings.model import CATALOGUE, Findings, error, warning
 from px4fuse.flight.model import PositionTrack, positions_of, source_name
 
 CORRECT_FIRST = "Correct the position source first."
-# Findings about EKF2's parameters or the alignment, which a wrong source makes false
+# Findings that are false if the source is wrong: they concern EKF2's parameters or the alignment
 FALSE_AFTER = (
     "ekf2_noise_too_small",
     "ekf2_noise_too_large",
@@ -38,7 +38,7 @@ FALSE_AFTER = (
     "source_drift",
     "error_exceeds_reported_sigma",
 )
-# Findings that remain true, with another action
+# Findings that remain true if the source is wrong, with CORRECT_FIRST as action
 EFFECTS = (
     "ekf2_overconfident",
     "ekf2_rejects_positions",
@@ -53,7 +53,7 @@ EFFECTS = (
 UNAFFECTED_GROUPS = ("logging", "IMU")
 
 
-# Id of the finding, kind of the fault, message and action
+# Id of the finding, kind of fault, message and action
 Fault = tuple[str, str, str, str]
 
 

@@ -26,21 +26,28 @@ from px4fuse.flight.model import Ekf2, Unavailable, positions_of, step_values_at
 from px4fuse.flight.position_source import ALIGNED, PositionKind
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 
-MIN_LOST_SHARE = 0.02  # of the positions; PX4 v1.14 and later loses 0 to 0.3 %, v1.13 8 to 9 %
-MIN_INTERVALS = 50  # minimum number of intervals for the detection of downsampling
-MIN_DOWNSAMPLED_SHARE = 0.25  # of the positions that the source measured; a radio link loses less
-# Minimum fraction of intervals with both of two neighbouring multiples of the source's interval,
-# and with each of them. Downsampling to a fixed rate causes such intervals, lost messages do not
-MIN_NEIGHBOURS_SHARE, MIN_MULTIPLE_SHARE = 0.85, 0.1
-# Maximum RMS distance of the intervals from whole multiples (in source intervals): 0.29 if random,
-# 0.03 with the jitter of a source
+# Minimum fraction of lost positions for a finding: PX4 v1.14 and later loses 0.3 %
+MIN_LOST_SHARE = 0.02
+# Minimum number of intervals for the detection of downsampling
+MIN_INTERVALS = 50
+# Minimum fraction of missing positions for downsampling: a radio link loses less
+MIN_DOWNSAMPLED_SHARE = 0.25
+# Minimum fraction of intervals with one of two neighbouring multiples of the source's interval.
+# Downsampling to a fixed rate causes such intervals, lost messages do not
+MIN_NEIGHBOURS_SHARE = 0.85
+# Minimum fraction of intervals with each of these two multiples
+MIN_MULTIPLE_SHARE = 0.1
+# Maximum RMS distance of intervals from whole multiples, in intervals of the source: jitter causes
+# 0.03, random intervals 0.29
 MAX_MULTIPLE_RMS = 0.06
-MAX_DIVISOR = 4  # median interval over source interval that is tested
-# Minimum flight time without a source that begins or stops in flight: the land detector is seconds
-# late
+# Maximum tested ratio of the median interval to the interval of the source
+MAX_DIVISOR = 4
+# Minimum time (s) in flight without a source that begins late or stops: the land detector is
+# seconds late
 MIN_PARTIAL_S = 3.0
-SMALLEST_TIME_S = 1e-6  # s; KF at this time before a position has not used the position
-# Things to check after a gap in the position source, by its kind
+# Time (s) before a position at which KF has not used the position yet
+SMALLEST_TIME_S = 1e-6
+# Text of the check after a gap in the position source, by kind of source
 CHECKS: Mapping[PositionKind, str] = {
     "uwb": "line of sight to the anchors and the link",
     "vio": "light and texture in view of the camera and the link",

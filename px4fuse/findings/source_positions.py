@@ -36,27 +36,46 @@ from px4fuse.findings.source_stamps import detect_arrival_times
 from px4fuse.flight.model import Columns, Unavailable, positions_of, source_name
 from px4fuse.flight.position_source import PositionKind
 
-MIN_MOTION_RANGE_M = 0.5  # m; extent (5 to 95 % of the positions); below, the vehicle only hovers
-NOISE_RANGE_FACTOR = 1.25 * 3.29  # extent (5 to 95 %) of white noise in σ, with a margin of 25 %
-SECOND_DIFFERENCE_FACTOR = 6.0**0.5 / 1.4826  # median |second difference| over σ of white noise
-MIN_LOW_PASS_GAIN_NATS = 6.0  # log-likelihood gain; flights without a low pass have 0 to 2
-MIN_LAG_NATS = 1.0  # log-likelihood of a low pass minus that of time-correlated noise without lag
-MIN_LAG_S = 0.05  # s; lag for severity warning; at 1 m/s half of the noise of good UWB (0.1 m)
-MIN_LAG_ERROR_S = 0.10  # s; lag for severity error; at 1 m/s the noise of good UWB (0.1 m)
-MIN_JUMP_M = 0.2  # m; jump for severity warning: twice the noise of good UWB (0.1 m)
-MIN_JUMP_SIGMAS = 5.0  # jump in σ of the time-correlated noise, whose changes have up to √2 σ
-MAX_RESET_DISTANCE_S = 1.0  # s from a jump to its reset_counter; two intervals at 2 Hz
-MIN_JUMP_ERROR_M = 0.5  # m; jump for severity error: five times the noise of good UWB (0.1 m)
-MIN_SCALE = 0.12  # relative scale error for severity warning; correct simulated flights reach 0.11
-MIN_SCALE_ERROR = 0.15  # relative scale error for severity error: 1 m in 7 m
-MIN_SCALE_SIGMAS = 3.0  # scale error in σ of its estimate; 0.3 % of correct sources exceed it
-MIN_OUTLIER_SHARE = 0.005  # outliers over positions; normal noise has 0.02 % beyond 3.7 σ
-MIN_OUTLIER_SHARE_ERROR = 0.02  # for severity error: one outlier per 10 s at 5 Hz
+# Minimum extent (m) of the positions, from 5 to 95 %, for a vehicle that moves
+MIN_MOTION_RANGE_M = 0.5
+# Extent of white noise in σ, from 5 to 95 %, with a margin of 25 %
+NOISE_RANGE_FACTOR = 1.25 * 3.29
+# Ratio of the median absolute second difference to the σ of white noise
+SECOND_DIFFERENCE_FACTOR = 6.0**0.5 / 1.4826
+# Minimum gain of the log likelihood for a low pass: flights without a low pass have 0 to 2
+MIN_LOW_PASS_GAIN_NATS = 6.0
+# Minimum log likelihood of a low pass relative to time-correlated noise without lag
+MIN_LAG_NATS = 1.0
+# Minimum lag (s) of a low pass for a warning: at 1 m/s half of the noise of good UWB (0.1 m)
+MIN_LAG_S = 0.05
+# Minimum lag (s) of a low pass for severity error: at 1 m/s the noise of good UWB (0.1 m)
+MIN_LAG_ERROR_S = 0.10
+# Minimum position jump (m) for a warning: twice the noise of good UWB (0.1 m)
+MIN_JUMP_M = 0.2
+# Minimum jump in σ of the time-correlated noise, which changes by up to √2 σ
+MIN_JUMP_SIGMAS = 5.0
+# Maximum time (s) between a jump and its reset_counter: two intervals at 2 Hz
+MAX_RESET_DISTANCE_S = 1.0
+# Minimum position jump (m) for severity error: five times the noise of good UWB (0.1 m)
+MIN_JUMP_ERROR_M = 0.5
+# Minimum scale error (ratio minus 1) for a warning: correct simulated flights reach 0.11
+MIN_SCALE = 0.12
+# Minimum scale error (ratio minus 1) for severity error: 1 m in 7 m
+MIN_SCALE_ERROR = 0.15
+# Minimum scale error in σ of its estimate: 0.3 % of correct sources exceed it
+MIN_SCALE_SIGMAS = 3.0
+# Minimum fraction of outliers for a warning: normal noise has 0.02 % beyond 3.7 σ
+MIN_OUTLIER_SHARE = 0.005
+# Minimum fraction of outliers for severity error: one in 10 s at 5 Hz
+MIN_OUTLIER_SHARE_ERROR = 0.02
+# Minimum number of outliers for a finding
 MIN_OUTLIERS = 3
-# Minimum fraction of the innovations that must be logged to count rejected outliers
+# Minimum fraction of logged innovations for a count of the rejected outliers
 MIN_INNOVATION_SHARE = 0.75
-# Reported over estimated variance of the positions, or its inverse, for severity warning and error
-MIN_VARIANCE_RATIO, MIN_VARIANCE_RATIO_ERROR = 2.0, 3.0
+# Minimum ratio of reported and estimated position variance, or its inverse, for a warning
+MIN_VARIANCE_RATIO = 2.0
+# Minimum ratio of reported and estimated position variance, or its inverse, for severity error
+MIN_VARIANCE_RATIO_ERROR = 3.0
 # Possible causes of a position jump, and action, by kind of source
 JUMP_CAUSES: Mapping[PositionKind, tuple[str, str]] = {
     "uwb": (

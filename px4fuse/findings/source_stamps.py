@@ -11,12 +11,19 @@ from px4fuse.findings.model import Findings, error, fraction_on, note, warning
 from px4fuse.flight.log import SHARED_STAMPS, ClockMap
 from px4fuse.flight.model import ARRIVAL_METHODS, Ekf2, FusionRecord, Unavailable, positions_of
 
-MAX_RECEIPT_JITTER_S = 0.010  # s; 1 cm at 1 m/s, a tenth of the noise of good UWB (0.1 m)
-MAX_ARRIVAL_AGE_S = 0.001  # s; PX4's time from receiving a message to publishing its position
-MIN_LATENCY_S = 0.02  # s; latency for a warning; at 1 m/s a fifth of the UWB noise (0.1 m)
-MIN_LATENCY_ERROR_S = 0.10  # s; latency for an error; at 1 m/s the UWB noise (0.1 m)
-MIN_SAMPLES = 10  # minimum number of positions with arrival times, and with measurement times
-MIN_CONSISTENT_SHARE = 0.95  # of these positions have this kind of timestamp; a few come late
+# Maximum jitter (s) of receive times without a finding: at 1 m/s a tenth of the noise of good UWB
+# (0.1 m)
+MAX_RECEIPT_JITTER_S = 0.010
+# Maximum age (s) of a position whose timestamp is its arrival time: PX4 publishes it within 1 ms
+MAX_ARRIVAL_AGE_S = 0.001
+# Minimum latency (s) for a warning: at 1 m/s a fifth of the noise of good UWB (0.1 m)
+MIN_LATENCY_S = 0.02
+# Minimum latency (s) for severity error: at 1 m/s the noise of good UWB (0.1 m)
+MIN_LATENCY_ERROR_S = 0.10
+# Minimum number of positions with arrival times, and of positions with measurement times
+MIN_SAMPLES = 10
+# Minimum fraction of positions with the same kind of timestamp: a few come late
+MIN_CONSISTENT_SHARE = 0.95
 ANSWER_TIMESYNC = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "
     "every request). Send positions only after 500 answers, which take 50 s at 10 Hz."

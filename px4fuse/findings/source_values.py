@@ -17,17 +17,26 @@ from px4fuse.findings.model import Findings, error, note, warning
 from px4fuse.findings.source_intervals import CHECKS, state_errors_after
 from px4fuse.flight.model import Columns, Ekf2, Unavailable, positions_of, source_name
 
-MIN_STEP_M = 0.05  # m; its error (1 σ) is 0.29 of it, so smaller steps are below the noise of UWB
-MIN_OFFSET_M = 0.1  # m between two senders; the noise of good UWB
-MIN_OFFSET_SIGMAS = 4.0  # of the offset in one window; white noise of one sender has 1 to 2
-WINDOW = 16  # samples, of which a lost one reverses the order of two senders
-MIN_WINDOWS = 10  # with fewer, 1 of 60 flights at 2 Hz with 5 % outliers looks like two senders
-# Median difference (m) from EKF2's own position: of a source that EKF2 does not fuse, and of one
-# that it follows
-MAX_COPY_M, MAX_FOLLOWED_COPY_M = 0.01, 0.001
-MIN_COPY_SPEED_M_S = 0.2  # m/s; at rest any source may equal EKF2's position
-DELAYS_S = np.arange(0.0, 0.305, 0.005)  # s, from EKF2's position to the timestamp of its copy
-# Id of the finding, fault and action, by the reason why rows are no measurement
+# Minimum rounding step (m) for a finding: smaller steps cause an error (0.29 steps, 1 σ) below the
+# noise of UWB
+MIN_STEP_M = 0.05
+# Minimum distance (m) between two senders for a finding: the noise of good UWB
+MIN_OFFSET_M = 0.1
+# Minimum distance between two senders in σ of its estimate: white noise of one sender reaches 2
+MIN_OFFSET_SIGMAS = 4.0
+# Number of samples in which two senders alternate regularly; a lost sample reverses their order
+WINDOW = 16
+# Minimum number of windows: with fewer, outliers of one sender resemble two senders
+MIN_WINDOWS = 10
+# Maximum median distance (m) from EKF2's position of a copy that EKF2 does not fuse
+MAX_COPY_M = 0.01
+# Maximum median distance (m) from EKF2's position of a copy that EKF2 fuses, and so follows
+MAX_FOLLOWED_COPY_M = 0.001
+# Minimum speed (m/s) for the comparison with EKF2: at rest any source may equal EKF2's position
+MIN_COPY_SPEED_M_S = 0.2
+# Tested times (s) between EKF2's position and the timestamp of its copy
+DELAYS_S = np.arange(0.0, 0.305, 0.005)
+# Id of the finding, fault and action, by the reason why a row contains no measurement
 INVALID: Mapping[str, tuple[str, str, str]] = {
     "zero": (
         "source_zero_positions",

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.comparison.flight_events import max_interval_s
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import prepare, select_innovations
@@ -180,7 +180,8 @@ def take_inventory(flight: Flight) -> Inventory:
     """List the contents of a flight, the possible analyses and the advice on logging."""
     comparison, reason, remedy = None, "", ""
     try:
-        comparison = compare(prepare(flight, ComparisonRequest(log=flight.log.name)))
+        prepared = prepare(flight, ComparisonRequest(log=flight.log.name))
+        comparison = compare(prepared, run_kf(prepared))
         reason = comparison.source_reason
     except Px4FuseError as error:
         reason = with_options(error.reason).removeprefix(f"{flight.log.name}: ")

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
 from px4fuse.comparison.preparation import prepare
@@ -105,7 +105,8 @@ def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
     answer = flights.answer(simulation)
     flight = flights.to_flight(simulation)
     request = ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M)
-    comparison = compare(prepare(flight, request))
+    prepared = prepare(flight, request)
+    comparison = compare(prepared, run_kf(prepared))
     mistakes = tuple(
         _true_mistake(name, values, answer["truth"], comparison)
         for name, values in answer["mistakes"].items()
