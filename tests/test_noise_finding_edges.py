@@ -220,7 +220,7 @@ def test_near_zero_process_noise_finding_states_response_time() -> None:
     finding = only(noises.detect_process_noise_near_zero, analysis(axes=(following(0.05), slower)))
     assert finding.remedy == "Increase SIGMA_A (--sigma-a)."
     assert finding.title == "SIGMA_A 1 m/s² makes Q almost zero: KF ignores new positions"
-    assert "5.0 % between updates, and the gain falls to 0.05. KF needs 5 s" in finding.message
+    assert "so the gain falls to 0.05. KF needs 5 s" in finding.message
     assert finding.evidence["response_s"] == pytest.approx(5.0)
     one = analysis(axes=(following(0.05),), tuning=tuned(None, Noise(2.3456, 2.0, 3.0)),
                    trials=(trial({"sigma_a_m_s2": 2.35}),))  # fmt: skip

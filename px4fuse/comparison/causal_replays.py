@@ -40,6 +40,7 @@ from px4fuse.comparison.projection import project, project_truth
 from px4fuse.comparison.remedy import is_fused_source
 from px4fuse.comparison.trials import (
     CLOCK_OFFSET,
+    DISCREPANCIES,
     FORWARD_BIAS,
     MIN_NEES_FINDING,
     OUTLIERS,
@@ -186,7 +187,7 @@ def planned_configurations(
     return [
         FilterConfiguration({**flown, **change})
         for result in comparison.axes.values()
-        for change in _changes_along(comparison, estimates, inputs, result)
+        for change, _ in _changes_along(comparison, estimates, inputs, result)
         if change.keys() <= flown.keys()
     ]
 
@@ -196,30 +197,31 @@ def is_inconsistent(statement: FilterSummary | UntestedFilter) -> TypeGuard[Filt
     return not isinstance(statement, Unavailable) and statement.verdict != "consistent"
 
 
-def _candidates_by_discrepancy(
-    comparison: Comparison, estimates: Estimates, inputs: Inputs | None, result: AxisComparison
-) -> dict[Statistic, list[Change]]:
-    """Return the changes that may explain each discrepancy of a filter along an axis."""
-    summary = result.filters["kf" if inputs is None else "ekf2"]
-    found: list[Statistic] = ["nees"] if error_above_reported_sigma(summary) else []
-    found += ["nis"] if is_inconsistent(summary) else []
-    if inputs is not None and result.axis.name == "down":
-        found = []  # the EKF2 replay is horizontal
-    return {
-        statistic: candidate_changes(comparison, estimates, inputs, result, statistic)
-        for statistic in found
-    }
-
-
 def _changes_along(
     comparison: Comparison, estimates: Estimates, inputs: Inputs | None, result: AxisComparison
-) -> list[Change]:
-    """Return the changes that are re-run along an axis, each once."""
+) -> list[tuple[Change, tuple[Statistic, ...]]]:
+    """Return the changes to re-run along an axis, with the discrepancies they may explain."""
     summary = result.filters["kf" if inputs is None else "ekf2"]
-    if result is comparison.main and isinstance(summary, FilterSummary):
-        return main_axis_changes(comparison, estimates, inputs)
-    candidates = _candidates_by_discrepancy(comparison, estimates, inputs, result)
-    return unique_changes(chain.from_iterable(candidates.values()))
+    if not isinstance(summary, FilterSummary) or (
+        inputs is not None and result.axis.name == "down"
+    ):
+        return []  # the EKF2 replay is horizontal
+    has_discrepancy = {
+        "nees": error_above_reported_sigma(summary) is not None,
+        "nis": is_inconsistent(summary),
+    }
+    candidates = {
+        statistic: candidate_changes(comparison, estimates, inputs, result, statistic)
+        for statistic in DISCREPANCIES
+        if has_discrepancy[statistic]
+    }
+    changes = unique_changes(chain.from_iterable(candidates.values()))
+    if result is comparison.main:
+        changes = main_axis_changes(comparison, estimates, inputs)
+    return [
+        (change, tuple(statistic for statistic in candidates if change in candidates[statistic]))
+        for change in changes
+    ]
 
 
 def _try_changes(
@@ -230,7 +232,6 @@ def _try_changes(
     if not changes:
         return []
     before, is_logged = _flown_statistics(each, result)
-    candidates = _candidates_by_discrepancy(comparison, estimates, each.inputs, result)
 
     def run(change: Change, discrepancies: Iterable[Statistic]) -> Trial:
         after = each.rerun(result, change)
@@ -250,11 +251,8 @@ def _try_changes(
             from_s=None if each.model is None else each.model.flown.evaluated_s[0][0],
         )
 
-    trials = [
-        run(change, (statistic for statistic in candidates if change in candidates[statistic]))
-        for change in changes
-    ]
-    for statistic in candidates:
+    trials = [run(change, discrepancies) for change, discrepancies in changes]
+    for statistic in DISCREPANCIES:
         helpful = helpful_trials(trials, statistic)
         trials += [
             run({**helpful[0].change, **other.change}, (statistic,)) for other in helpful[1:]
@@ -290,9 +288,9 @@ def _flown_statistics(each: _Filter, result: AxisComparison) -> tuple[RunStatist
         (in_log.nees_mean, replayed.nees_mean, MAX_REPLAY_FACTOR**2),
     )
     agrees = all(
-        one and other and 1.0 / factor <= one / other <= factor
-        for one, other, factor in pairs
-        if one is not None
+        logged_value and replayed_value and 1.0 / factor <= logged_value / replayed_value <= factor
+        for logged_value, replayed_value, factor in pairs
+        if logged_value is not None
     )
     return (in_log, True) if agrees else (replayed, False)
 

@@ -102,7 +102,7 @@ def candidate_changes(
 def main_axis_changes(
     comparison: Comparison, estimates: Estimates, inputs: Inputs | None
 ) -> list[Change]:
-    """Return the changes to be re-run along the main axis, each once.
+    """Return the changes that are re-run along the main axis, each once.
 
     For KF also both noises together and the default settings; for EKF2 a delay also as a shift of
     the position timestamps.
@@ -128,7 +128,7 @@ def unique_changes(changes: Iterable[Change]) -> list[Change]:
 
 
 def change_kinds(comparison: Comparison, inputs: Inputs | None, change: Change) -> tuple[str, ...]:
-    """Return the kind of each part of a change, see :attr:`.trials.Trial.kinds`."""
+    """Return the kinds of a change, see :attr:`.trials.Trial.kinds`."""
     if inputs is None and change == default_settings(comparison):
         return ("defaults",)
     kinds: dict[str, str] = {}
@@ -142,7 +142,7 @@ def change_kinds(comparison: Comparison, inputs: Inputs | None, change: Change) 
 
 
 def default_settings(comparison: Comparison) -> Change:
-    """Return the default of each noise of KF that was set; GNSS uses SIGMA_Z from EKF2."""
+    """Return the default noises of KF, where the user chose others."""
     chosen, default = comparison.settings, Settings()
     names = (SIGMA_A,) if comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
     return {
@@ -153,14 +153,14 @@ def default_settings(comparison: Comparison) -> Change:
 
 
 def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
-    """Return the noise estimate of an axis; of both horizontal axes together if available."""
+    """Return the noise estimate of an axis; north and east share one estimate."""
     return first_axis_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
 def _time_offset(
     comparison: Comparison, estimates: Estimates, inputs: Inputs | None
 ) -> list[Change]:
-    """Return a change of the time offset, if its part not yet applied is significant."""
+    """Return the estimated time offset, if the part that is not yet applied is significant."""
     clock, applied_s = estimates.clock, comparison.settings.clock_offset_s
     if isinstance(clock, Unavailable) or not clock.is_determinable:
         return []
@@ -171,7 +171,7 @@ def _time_offset(
 
 
 def _kf_noises(settings: Settings, tuned: AxisTuning, is_underconfident: bool) -> list[Change]:
-    """Return SIGMA_A and SIGMA_Z estimates whose 95 % interval excludes the setting."""
+    """Return the estimates of SIGMA_A and SIGMA_Z that differ significantly from the setting."""
     changes = list[Change]()
     for name, noise in ((SIGMA_A, tuned.sigma_a_two_state), (SIGMA_Z, tuned.sigma_z)):
         chosen_sigma = getattr(settings, name)
@@ -189,7 +189,7 @@ def _kf_noises(settings: Settings, tuned: AxisTuning, is_underconfident: bool) -
 
 
 def _without_bias(estimates: Estimates) -> list[Change]:
-    """Return the removal of the accelerometer biases, if they are significant."""
+    """Return the significant accelerometer biases, to be removed."""
     fit = estimates.bias_scale_jump_fit
     if isinstance(fit, Unavailable) or not fit.has_bias:
         return []
@@ -198,7 +198,7 @@ def _without_bias(estimates: Estimates) -> list[Change]:
 
 
 def _ekf2_noise(inputs: Inputs, summary: FilterSummary, tuned: AxisTuning) -> list[Change]:
-    """Return the estimated position noise if its 95 % interval excludes EKF2's value."""
+    """Return the estimated position noise, if it differs significantly from EKF2's."""
     aid, flown, noise = inputs.aid, inputs.settings, tuned.sigma_z
     uses_reported = not aid.noise_mode or flown[aid.noise_mode] != 1.0
     reported_m2 = inputs.received.variance_m2[:, :2] * uses_reported
@@ -212,7 +212,7 @@ def _ekf2_noise(inputs: Inputs, summary: FilterSummary, tuned: AxisTuning) -> li
 
 
 def _px4_defaults(log: LogInfo, inputs: Inputs) -> list[Change]:
-    """Return PX4's default of the gate, if it is wider, and of each other changed parameter."""
+    """Return PX4's default of each changed noise, and of a gate that is too small."""
     gate, flown = inputs.aid.gate, inputs.settings
     defaults = {name: log.default_of(name) for name in (gate, *PARAMETERS_OF_EKF2)}
     return [

@@ -283,20 +283,14 @@ def missing_imu_rate(flight: Flight) -> Unavailable | None:
     rate_hz = 1.0 / float(np.median(np.diff(flight.imu.index.to_numpy())))
     if rate_hz >= CLOCK_RATE_MARGIN * needed_hz:
         return None
-    rate_text = f"{rate_hz:.{1 if rate_hz < 10 else 0}f} Hz"
-    rate_note = f"the IMU was logged at {rate_text}"
+    rate_note = f"the IMU was logged at {rate_hz:.3g} Hz"
     remedy = "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate."
     if is_telemetry:
-        rate_note = (
-            f"the IMU was received over telemetry at {rate_text}, decimated from a higher rate"
-        )
+        rate_note = f"telemetry contains only a part of the IMU samples ({rate_hz:.3g} Hz)"
         remedy = f"Request the IMU message at {needed_hz:g} Hz."
         if flight.log.has_ulog:
-            remedy = (
-                "Give the ULog of this flight as argument LOG, and this recording with --mavlink."
-            )
-    reason = f"{rate_note}; at least {needed_hz:g} Hz are needed"
-    return Unavailable("clock offset", reason, remedy)
+            remedy = "Give the ULog of this flight as LOG, and this recording with --mavlink."
+    return Unavailable("clock offset", f"{rate_note}; at least {needed_hz:g} Hz are needed", remedy)
 
 
 def widen_for_drift(clock: ClockOffset) -> ClockOffset:

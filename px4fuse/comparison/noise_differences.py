@@ -20,7 +20,7 @@ MIN_PART_COUNT = 25
 
 
 class NoisyPart(NamedTuple):
-    """Part of the flight with larger innovations: times (s) and ratio of σ to the rest."""
+    """Part of the flight with larger innovations: times (s), and σ relative to the rest."""
 
     start_s: float
     end_s: float
@@ -29,7 +29,7 @@ class NoisyPart(NamedTuple):
 
 
 def tune_by_axis(comparison: Comparison) -> tuple[AxisTuning, ...]:
-    """Estimate the noises along north and along east; empty if their mean NIS is similar."""
+    """Estimate separate noises along north and east, if their mean NIS differ."""
     axes = north_and_east(comparison)
     summaries = [axis.filters["kf"] for axis in axes]
     nis = [summary.nis_mean for summary in summaries if not isinstance(summary, Unavailable)]
@@ -46,7 +46,7 @@ def tune_by_axis(comparison: Comparison) -> tuple[AxisTuning, ...]:
 def find_noisy_part(
     comparison: Comparison, axis_tuning: AxisTuning | Unavailable | None
 ) -> NoisyPart | None:
-    """Find the contiguous part of the flight in which most innovations are larger.
+    """Find one part of the flight in which most innovations are larger.
 
     ``axis_tuning`` is the noise estimate of both horizontal axes.
     """

@@ -41,7 +41,7 @@ GNSS_AXES = (AISLE, "north", "east")
 
 
 def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False) -> Comparison:
-    """Choose the source, the segment and the axes of a flight; the recordings are already read.
+    """Choose position source, segment and axes of a flight.
 
     ``as_sent`` leaves out the check of the source's axes, unit and clock, and its corrections.
 
@@ -108,7 +108,7 @@ def prepare(flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
 
 
 def select_innovations(flight: Flight, track: PositionTrack) -> Flight:
-    """Return the flight with EKF2's GNSS innovations if GNSS is the source, else unchanged."""
+    """Select EKF2's innovations of the source: GNSS or external vision."""
     if isinstance(flight.ekf2, Unavailable) or not track.origin.fused_as_gnss:
         return flight
     # missing innovations of external vision and missing other sources are not relevant with GNSS
@@ -129,7 +129,7 @@ def _missing_innovations(ekf2: Ekf2) -> tuple[Unavailable, ...]:
 
 
 def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrack, str]:
-    """Choose the position source by preference, or by name.
+    """Choose the position source automatically or by name.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
 
 
 def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
-    """Subtract the lever arm of the sensor, from EKF2 parameters, from the positions."""
+    """Move the positions from the sensor to the vehicle by EKF2's lever arm."""
     attitude = flight.attitude
     if not any(track.lever_arm_m) or isinstance(attitude, Unavailable) or track.frame != "NED":
         return track
@@ -188,7 +188,7 @@ def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
 def _use_barometer_height(
     track: PositionTrack, flight: Flight, height_name: HeightName | None
 ) -> PositionTrack:
-    """Replace the height of a track by the barometer height, if requested or fused by EKF2.
+    """Use the barometer height, if it was requested or EKF2 fused it.
 
     A barometer has no absolute zero, so the median difference to EKF2's height is removed.
     """
@@ -223,7 +223,7 @@ def _use_barometer_height(
 
 
 def explain_missing_source(flight: Flight) -> Unavailable:
-    """Return the reason why the log has no default position source, and the action."""
+    """Return the reason why the log has no position source, and the action."""
     damaged = "the file is damaged, and " if flight.log.damage else ""
     unused_track = next(
         (track.name for track in flight.positions if not track.origin.is_automatic), ""
@@ -266,7 +266,6 @@ def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
 
 
 def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
-    """Add ``clock_offset_s`` to the timestamps of a track."""
     if clock_offset_s == 0.0:
         return track
     shifted_frames = {
@@ -280,7 +279,7 @@ def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
 def choose_segment(
     flight: Flight, track: PositionTrack, start_s: float | None = None, end_s: float | None = None
 ) -> Segment:
-    """Choose the segment to analyse: position source available and vehicle airborne.
+    """Choose the time span to analyse: positions available and vehicle airborne.
 
     Parameters
     ----------

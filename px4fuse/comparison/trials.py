@@ -46,7 +46,7 @@ MAX_ERROR_LEFT = 0.75
 
 
 class RunStatistics(Record, frozen=True, kw_only=True):
-    """Statistics of one filter along one axis in one run (flown, or re-run with a change).
+    """Statistics of one run of a filter along one axis.
 
     Attributes
     ----------
@@ -68,7 +68,6 @@ class RunStatistics(Record, frozen=True, kw_only=True):
     rejected_fraction: Share | None = None
 
     def value(self, statistic: Statistic) -> float | None:
-        """Return the mean NIS, mean NEES or RMS difference KF - EKF2."""
         return {
             "nis": self.nis_mean,
             "nees": self.nees_mean,
@@ -77,7 +76,7 @@ class RunStatistics(Record, frozen=True, kw_only=True):
 
 
 class Trial(Record, frozen=True, kw_only=True):
-    """Re-run of one filter along one axis with one change, or with two.
+    """Re-run of one filter along one axis with a change, and its effect.
 
     Attributes
     ----------
@@ -114,7 +113,7 @@ class Trial(Record, frozen=True, kw_only=True):
 
     @property
     def corrects_sensor(self) -> bool:
-        """True if the change corrects a sensor fault instead of a setting."""
+        """True if the change corrects a fault of a sensor, not a setting."""
         return not SENSOR_CHANGES.isdisjoint(self.change)
 
 
@@ -133,13 +132,13 @@ def explained_fraction(trial: Trial, statistic: Statistic) -> float:
 
 
 def is_sufficient(trial: Trial, statistic: Statistic) -> bool:
-    """Return True if the mean NIS is then in its 95 % band, or the mean NEES below its limit."""
+    """Return True if the change brings the mean NIS or mean NEES inside its limits."""
     low, high = nis_band(trial.after.innovations) if statistic == "nis" else (0.0, MIN_NEES_FINDING)
     return low <= (trial.after.value(statistic) or np.nan) <= high
 
 
 def contradicts_truth(trial: Trial, statistic: Statistic) -> bool:
-    """Return True if the reported σ of a re-run is smaller than the errors against ground truth."""
+    """Return True if the change makes σ smaller than the errors against ground truth."""
     nees, nis, nees_after = trial.before.nees_mean, trial.before.nis_mean, trial.after.nees_mean
     if statistic != "nis" or nis is None or nis >= 1.0 or nees_after is None:
         return False
@@ -149,7 +148,7 @@ def contradicts_truth(trial: Trial, statistic: Statistic) -> bool:
 def find_trials(
     trials: Iterable[Trial], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> list[Trial]:
-    """Return the re-runs of one filter and axis that may explain its mean NIS or NEES."""
+    """Return the re-runs that may explain a mean NIS or mean NEES outside its limits."""
     return [
         trial
         for trial in trials
@@ -160,7 +159,7 @@ def find_trials(
 def find_cause(
     trials: Iterable[Trial], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> Trial | None:
-    """Return the re-run that explains a mean NIS or NEES outside its limits; None without one.
+    """Return the re-run that best explains a mean NIS or mean NEES outside its limits.
 
     A cause explains 50 to 150 % of the logarithm and does not contradict ground truth. Preferred
     are, in this order, complete causes, fewer changes, sensor faults, and fractions near 1.
@@ -186,7 +185,10 @@ def find_cause(
 
 
 def helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]:
-    """Return the re-runs that partly explain a discrepancy, best first; empty if one is enough."""
+    """Return the re-runs that explain a part of a discrepancy, best first.
+
+    The list is empty if one of the changes is sufficient.
+    """
 
     def distance(trial: Trial) -> float:
         return abs(explained_fraction(trial, statistic) - 1.0)
@@ -203,13 +205,13 @@ def helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]
 
 
 def distance_from_one(outcome: RunStatistics) -> float:
-    """Return the sum of |ln σ ratio|, against source and ground truth."""
+    """Return the sum of |ln σ ratio| against source and ground truth."""
     means = [mean for mean in (outcome.nis_mean, outcome.nees_mean) if mean]
     return sum(0.5 * abs(math.log(mean)) for mean in means)
 
 
 def preference(trial: Trial) -> tuple[bool, int, float]:
-    """Return the sort key of re-runs of one kind; the best re-run has the smallest key."""
+    """Return a sort key for re-runs of the same kind; the best one has the smallest key."""
     enters = enters_band(trial)
     return not enters, len(trial.change) if enters else 0, distance_from_one(trial.after)
 
@@ -224,12 +226,12 @@ def ratios(outcome: RunStatistics) -> dict[Reference, float]:
 
 
 def reduction(trial: Trial) -> float:
-    """Return the reduction of :func:`distance_from_one` by a re-run."""
+    """Return the decrease of :func:`distance_from_one` by a re-run."""
     return distance_from_one(trial.before) - distance_from_one(trial.after)
 
 
 def ratio_pairs(trial: Trial) -> list[tuple[Reference, float, float]]:
-    """Return reference (source or ground truth) and σ ratio before and after a re-run."""
+    """Return the reference and the σ ratios before and after a re-run, for each reference."""
     before, after = ratios(trial.before), ratios(trial.after)
     return [(name, before[name], after[name]) for name in before.keys() & after.keys()]
 
@@ -243,7 +245,7 @@ def enters_band(trial: Trial) -> bool:
 
 
 def halves(trial: Trial) -> bool:
-    """Return True if a re-run halves |ln σ ratio| of an inconsistent ratio."""
+    """Return True if a re-run halves |ln σ ratio| of an inconsistent filter."""
     return any(
         classify_ratio(before, name) != "consistent"
         and abs(math.log(after)) <= 0.5 * abs(math.log(before))
@@ -252,7 +254,7 @@ def halves(trial: Trial) -> bool:
 
 
 def leaves_error(trial: Trial) -> bool:
-    """Return True if a filter stays overconfident against ground truth by nearly as much."""
+    """Return True if a filter remains nearly as overconfident against ground truth."""
     return any(
         name == "truth"
         and classify_ratio(before, name) == classify_ratio(after, name) == "overconfident"
@@ -264,7 +266,7 @@ def leaves_error(trial: Trial) -> bool:
 def find_trial(
     trials: Iterable[Trial], owner: FilterName, kind: str, name: str = ""
 ) -> Trial | None:
-    """Return the best re-run of one filter with one kind of change, or None if none improves.
+    """Return the best re-run of one filter with one kind of change, if it improves anything.
 
     Parameters
     ----------
@@ -301,9 +303,9 @@ def has_effect(trial: Trial) -> bool:
 
 
 def can_improve(trial: Trial) -> bool:
-    """Return True if a re-run could show an improvement.
+    """Return True if a re-run is able to show an improvement.
 
-    This requires a known position RMSE, or a σ ratio that is inconsistent without the change.
+    This needs ground truth, or a σ ratio that is inconsistent without the change.
     """
     return trial.before.position_rmse_m is not None or any(
         classify_ratio(before, name) != "consistent" for name, before, _ in ratio_pairs(trial)

@@ -24,11 +24,9 @@ ITERATIONS = 4
 
 
 def estimate_lever_arm(flight: Flight, track: PositionTrack) -> tuple[float, float, float] | None:
-    """Estimate the lever arm in addition to the one that is already subtracted.
+    """Estimate the lever arm (m) of the position sensor that EKF2's parameters do not contain.
 
-    Least squares of the second differences of the positions, with time offset and accelerometer
-    bias. Returns the position forward and right (m, body) with its standard deviation, or None if
-    it is not significant.
+    Returns the distances forward and right and their standard deviation; None if not significant.
     """
     inertial = read_inertial(flight)
     samples = track.samples[Columns.POSITION[:2]].dropna()

@@ -52,7 +52,7 @@ MIN_SAMPLES = 20
 
 
 class Candidate(NamedTuple):
-    """Hypothesis on an orientation, its differences from the reference, and its log likelihood."""
+    """Assumed convention of an orientation, with its difference from the attitude."""
 
     convention: OrientationConvention
     heading_difference_deg: float
@@ -60,14 +60,14 @@ class Candidate(NamedTuple):
 
     @property
     def order_and_frames(self) -> tuple[str, str]:
-        """Order and frames; ENU and NWU differ only by a rotation about the vertical."""
+        """Order and frames; ENU and NWU are equal, because they differ only in heading."""
         return self.convention.order, self.convention.frames.replace("ENU", "NWU")
 
 
 def check_orientation(
     inertial: Inertial, time_s: Array, quaternion: Array
 ) -> tuple[OrientationConvention, Array, Array] | None:
-    """Determine the convention of an orientation.
+    """Determine order and frames of an orientation.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def to_attitude(sent: Array, convention: OrientationConvention) -> Array:
 def _make_candidate(
     time: Array, sent: Array, reference: Array, order: Order, frames: Frames, body_quarters: int
 ) -> Candidate:
-    """Convert an orientation by a hypothesis and compare it with the reference."""
+    """Convert an orientation by an assumed convention and compare it with the attitude."""
     convention = OrientationConvention(verdict="determined", order=order, frames=frames)
     turn = from_vector(np.array([0.0, 0.0, body_quarters * np.pi / 2.0]))
     attitude = multiply(to_attitude(sent, convention), turn)

@@ -53,7 +53,7 @@ def detect_in_aids(
     take_off_s: Sequence[float] = (),
     height_error_m: float | None = None,
 ) -> Findings:
-    """Yield at most one finding per aiding source; unfused ones of one sensor share a finding.
+    """Detect faults of EKF2's aiding sources, at most one for each of them.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def detect_in_aids(
 
 
 def _height_error_in(analysis: Analysis, span_s: Span) -> float | None:
-    """Return EKF2's largest height error (m) in a span; None if unknown or not unusually large."""
+    """Return EKF2's largest height error (m) in a time span, if it is unusually large."""
     down = analysis.axes.get("down")
     if (
         down is None
@@ -174,7 +174,7 @@ def _aid_label(aid: AidResult) -> str:
 
 
 def _sensor_cause(switch: str, source_aid: str) -> str:
-    """Return SENSOR if an aid and KF's position source use one sensor (one parameter), else ""."""
+    """Return SENSOR if an aiding source and KF's positions come from the same sensor."""
     return SENSOR if source_aid and AIDS[source_aid].switch == switch else ""
 
 

@@ -81,7 +81,7 @@ RECORDING = frozenset(
 
 
 def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Sort findings in the order of correction, each cause followed by the findings it explains.
+    """Sort findings in the order of correction: each cause is followed by its effects.
 
     Findings are sorted by severity, then in the order of :data:`TITLES`. A cause is at least as
     severe as the findings that it explains.

@@ -25,7 +25,7 @@ from px4fuse.request import COMPARISON_OPTIONS
 
 
 def classify_cause(analysis: Analysis, cause: Trial | None) -> str:
-    """Return the kind of cause by the change that a re-run tested; a sensor fault comes first."""
+    """Return the kind of cause by the changed quantity of a re-run."""
     if cause is None:
         return kinds.ELSEWHERE
     aid = aid_of(analysis)
@@ -45,7 +45,7 @@ def classify_cause(analysis: Analysis, cause: Trial | None) -> str:
 
 
 def is_refuted(analysis: Analysis, owner: FilterName, cause: Trial) -> bool:
-    """Return True if this change, re-run along the main axis, improves neither position nor σ."""
+    """Return True if a re-run along the main axis shows that the change improves nothing."""
     return any(
         (trial.filter, trial.change) == (owner, cause.change)
         and can_improve(trial)
@@ -64,7 +64,7 @@ def format_change(analysis: Analysis, cause: Trial) -> str:
 
 
 def format_explained_share(cause: Trial, statistic: Statistic) -> str:
-    """Format the fraction of a deviation that disappears in a re-run with a change."""
+    """Format the fraction of ln(mean NIS or NEES) that a change explains."""
     if contradicts_truth(cause, statistic):
         return "contradicts ground truth"
     if statistic != "difference" and is_sufficient(cause, statistic):
@@ -76,7 +76,7 @@ def format_explained_share(cause: Trial, statistic: Statistic) -> str:
 
 
 def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
-    """Format the action for a change that a re-run confirms, one sentence per changed quantity."""
+    """Format the action for a change, with one sentence for each changed quantity."""
     actions, change = [], dict(change)
     is_gnss = analysis.source.origin.is_gnss
     if change.pop(trials.OUTLIERS, None):

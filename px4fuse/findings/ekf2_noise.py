@@ -24,7 +24,7 @@ MIN_NAMED_REJECTION = 0.05
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect a measurement noise whose change makes EKF2's innovations consistent in a replay."""
+    """Detect an EKF2 measurement noise whose correction makes EKF2's innovations consistent."""
     aid = aid_of(analysis)
     trial = find_trial(analysis.main_trials, "ekf2", "noise", aid.noise)
     if trial is None or not _corrects_innovations(trial):

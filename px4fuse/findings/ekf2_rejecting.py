@@ -29,7 +29,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> Findings:
-    """Detect a gate that rejects 1 % of the samples even if their noise is as EKF2 assumes."""
+    """Detect a gate that would reject 1 % of the samples of a consistent filter."""
     ekf2 = analysis.flight.ekf2
     if isinstance(ekf2, Ekf2) and rejections:
         # EKF2 accepts a sample if the normal innovations of both axes are inside: erf(gate/√2)²
@@ -72,7 +72,6 @@ def _detect_rejections(analysis: Analysis) -> Findings:
 
 
 def _remedy(analysis: Analysis, result: AxisComparison) -> str:
-    """Format the change whose re-run prevents most rejections; without one, a check."""
     aid = aid_of(analysis, result.axis.name)
     trials = [trial for trial in analysis.main_trials if _prevents_rejections(trial)]
     if trials and result is analysis.main:

@@ -98,7 +98,7 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect hidden position errors; without any, a position source that may drift."""
+    """Detect position errors that innovations do not show, else a source that may drift."""
     if hidden := find_hidden_errors(analysis):
         yield make_error_finding(analysis, hidden)
     elif analysis.source.origin.may_drift:
@@ -108,7 +108,7 @@ def detect(analysis: Analysis) -> Findings:
 def make_error_finding(
     analysis: Analysis, hidden: list[tuple[FilterName, str, ErrorAboveSigma]]
 ) -> Finding:
-    """Make the finding of hidden errors, with numbers of the main axis if it has one."""
+    """Make the finding of position errors larger than the reported σ."""
     hidden = sorted(hidden, key=lambda entry: entry[1] != analysis.main.axis.name)
     (worst_filter, main_axis, worst), may_drift = hidden[0], analysis.source.origin.may_drift
     evidence: dict[str, float | str] = {"axis": main_axis, "filter": worst_filter}
@@ -206,14 +206,13 @@ def _drift_finding(
 
 
 def _known_closure_error_m(loop: Loop) -> float | None:
-    """Return the closure error (m) of odometry; None if the true landing place is unknown."""
     if isinstance(loop.true_end, Unavailable) or loop.is_end_assumed or loop.is_absolute_track:
         return None
     return loop.closure_error_m
 
 
 def _rmse_after_alignment(comparison: Comparison, filter_name: str) -> AlignedError | None:
-    """Return the horizontal RMSE before and after alignment in yaw; None without truth."""
+    """Return the horizontal RMSE before and after a fit in position and yaw."""
     axes = north_and_east(comparison)
     truths = [result.truth for result in axes if isinstance(result.truth, pd.DataFrame)]
     if len(truths) < 2:
@@ -248,7 +247,7 @@ def _interpolate_ekf2_position(result: AxisComparison, times: Array) -> Array:
 
 
 def make_possible_drift_finding(analysis: Analysis) -> Finding:
-    """Make the note on odometry, with its short-term noise and loop closure error."""
+    """Make the note that odometry may drift."""
     sensor, loop = source_name(analysis.source), analysis.loop
     tuned = analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}

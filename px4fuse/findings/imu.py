@@ -44,7 +44,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_bias(analysis: Analysis) -> Findings:
-    """Detect an accelerometer bias, estimated from the positions, else by EKF2."""
+    """Detect an accelerometer bias, estimated from the positions or by EKF2."""
     fit, ekf2_bias = analysis.bias_scale_jump_fit, _ekf2_bias(analysis)
     if isinstance(fit, BiasScaleJumpFit) and fit.has_bias:
         forward, right, size = fit.forward_bias, fit.right_bias, fit.bias.value
@@ -83,7 +83,7 @@ def detect_bias(analysis: Analysis) -> Findings:
 
 
 def _ekf2_bias(analysis: Analysis) -> list[float] | None:
-    """Return EKF2's median accelerometer bias forward, right and down (m/s²); None if unknown."""
+    """Return EKF2's median accelerometer bias forward, right and down (m/s²), if logged."""
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2) or not isinstance(ekf2.accelerometer_bias, pd.DataFrame):
         return None
@@ -128,7 +128,7 @@ def detect_clipping(analysis: Analysis) -> Findings:
 
 
 def detect_imu_gaps(analysis: Analysis) -> Findings:
-    """Detect gaps of the IMU longer than two prediction steps of KF and two IMU intervals."""
+    """Detect gaps of the IMU that are longer than two prediction steps of KF."""
     gap_s, imu = analysis.main.replay.input_gap_s, analysis.flight.imu
     interval_s = 1.0 / sample_rate(imu) if isinstance(imu, pd.DataFrame) else 0.0
     if gap_s > max(MIN_IMU_GAP_S, 2.0 * interval_s):
@@ -145,7 +145,7 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
 
 
 def detect_missing_imu_samples(analysis: Analysis) -> Findings:
-    """Detect single IMU samples that the logger lost all over the flight."""
+    """Detect a log in which single IMU samples are missing all the time."""
     imu, log = analysis.flight.imu, analysis.flight.log
     if not isinstance(imu, pd.DataFrame) or log.format.startswith("MAVLink"):
         return

@@ -13,7 +13,7 @@ DEFAULT_PROFILE, VISION_PROFILE_BIT = 1, 128
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect data that the log lacks."""
+    """Detect data that are missing from the log."""
     yield from detect_unavailable_data(analysis)
     yield from detect_source_not_logged(analysis)
 

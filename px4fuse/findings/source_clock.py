@@ -22,7 +22,7 @@ CORRECT_AT_SENDER = "Correct the timestamps at the sender."
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect a wrong time offset or EKF2_EV_DELAY, unless EKF2 output is the position source."""
+    """Detect a wrong time offset of the positions, or a wrong EKF2_EV_DELAY."""
     clock, is_reconstructed = analysis.clock, analysis.source.origin.reconstructed
     if isinstance(clock, ClockOffset) and clock.is_determinable and not is_reconstructed:
         yield from detect_offset(analysis, clock)
@@ -30,7 +30,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
-    """Detect a time offset between positions and IMU, or one that changes in flight."""
+    """Detect a time offset between positions and IMU, constant or changing."""
     if find_low_pass(analysis) is not None:  # a low pass delays positions without a time offset
         return
     low, high = clock.interval_s
@@ -96,7 +96,7 @@ def _assumed_delay(analysis: Analysis, clock: ClockOffset) -> str:
 
 
 def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
-    """Return the action at the source; the card adds the actions for KF and EKF2."""
+    """Return the action at the sender."""
     if name := _receiver_delay(analysis):
         return f"Check the delay of the GNSS receiver ({name})."
     if analysis.source.alignment is not None:
@@ -108,16 +108,16 @@ def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
 
 
 def clock_offset_option_s(comparison: Comparison, clock: ClockOffset) -> float:
-    """Return the value (s) for ``--clock-offset``: offset in use plus the estimated remainder.
+    """Return the value (s) for ``--clock-offset``.
 
-    For a position file, the offset in use is part of its alignment.
+    For a position file, the time offset that its alignment applied is added.
     """
     alignment = comparison.source.alignment
     return clock.offset_s + (0.0 if alignment is None else alignment.clock_offset_s)
 
 
 def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
-    """Detect EKF2_EV_DELAY that differs from the estimate by 3 σ and one EKF2 step."""
+    """Detect an EKF2_EV_DELAY that differs from the estimated delay."""
     # For GNSS, the time offset already includes an error of EKF2_GPS_DELAY. EKF2 did not fuse a
     # position file, and its clock is aligned with EKF2's position.
     is_fused = analysis.source.origin.is_vision and analysis.source.alignment is None

@@ -33,7 +33,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def make_frame_finding(analysis: Analysis) -> Finding:
-    """Make the finding of positions in FRD: a note if EKF2 fuses the yaw of the source."""
+    """Make the finding of positions in the frame FRD."""
     ekf2, log = analysis.flight.ekf2, analysis.flight.log
     fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else None
     name = source_name(analysis.source)
@@ -61,7 +61,7 @@ def make_frame_finding(analysis: Analysis) -> Finding:
 
 
 def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
-    """Detect a rotation between the motion in the positions and the motion in the IMU."""
+    """Detect positions that move in another direction than the IMU measures."""
     rotation_deg, sigma_deg = math.remainder(heading.misalignment_deg, 360.0), heading.sigma_deg
     if heading.drifts:
         yield _drift_finding(analysis, heading)
@@ -98,7 +98,6 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
 
 
 def _is_explained_by_bias(analysis: Analysis) -> bool:
-    """Return True if an accelerometer bias explains the data as well as a rotation does."""
     fit = analysis.bias_scale_jump_fit
     if isinstance(fit, Unavailable) or analysis.source.orientation is not None:
         return False
@@ -138,7 +137,7 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
 
 
 def detect_uncertain_alignment(analysis: Analysis) -> Findings:
-    """Detect an uncertain frame, yaw or time of a position file."""
+    """Detect a position file whose frame, yaw or time offset is uncertain."""
     alignment = analysis.source.alignment
     if alignment is None:
         return

@@ -39,7 +39,7 @@ MIN_PART_RATIO_ERROR = 4.0
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect noise that R cannot describe; odometry and EKF2 output as source are not tested."""
+    """Detect position noise that is not white noise with a constant σ."""
     if analysis.source.orientation is not None or analysis.source.origin.reconstructed:
         return
     yield from detect_repeated_positions(analysis)
@@ -81,7 +81,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
 
 
 def _exceeds_sigma(analysis: Analysis) -> bool:
-    """Return True if the mean NEES of a filter is above the consistent band."""
+    """Return True if a filter is overconfident against ground truth."""
     truths = [summary.truth for summary in analysis.main.filters.values()]
     return any(
         isinstance(truth, ErrorsAgainstTruth)

@@ -31,7 +31,7 @@ ANSWER_TIMESYNC = (
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect wrong timestamps, from the clock map of a recording or the ages in a ULog."""
+    """Detect timestamps that are not the time of measurement."""
     clock, positions = analysis.source.clock_map, positions_of(analysis.source)
     if clock is None:
         yield from detect_arrival_times(analysis)
@@ -55,7 +55,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_shared_timestamps(analysis: Analysis, count: int, distinct_count: int) -> Findings:
-    """Make the finding of timestamps with a resolution coarser than the sample interval."""
+    """Make the finding of several positions with the same timestamp."""
     resolution_s = float(np.median(np.diff(analysis.source.samples.index)))
     rate_hz = count / (distinct_count * resolution_s)
     yield error(
@@ -70,7 +70,7 @@ def detect_shared_timestamps(analysis: Analysis, count: int, distinct_count: int
 
 
 def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
-    """Make the finding of timestamps that are not the autopilot's boot time in microseconds."""
+    """Make the finding of timestamps in a wrong unit or from another clock."""
     ekf2, segment = analysis.flight.ekf2, analysis.segment
     fusing = ekf2.fusing if isinstance(ekf2, Ekf2) else ekf2
     effect = ""
@@ -89,7 +89,7 @@ def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
 
 
 def detect_constant_timestamps(positions: str, clock: ClockMap, distinct_count: int) -> Findings:
-    """Make the findings of constant timestamps and of jitter in receive times."""
+    """Make the findings of constant timestamps and of jitter in the receive times."""
     yield error(
         "source_timestamps_constant",
         f"The timestamps of {clock.pairs} {positions} have only {distinct_count} distinct "
@@ -111,10 +111,10 @@ def detect_constant_timestamps(positions: str, clock: ClockMap, distinct_count: 
 
 
 def detect_arrival_times(analysis: Analysis) -> Findings:
-    """Detect timestamps that are arrival times, in the whole flight or until TIMESYNC converged.
+    """Detect timestamps that are arrival times instead of times of measurement.
 
-    Without TIMESYNC, PX4 uses the arrival time as timestamp (Timesync.cpp). Publication time minus
-    timestamp of the positions is then zero instead of the latency.
+    Without TIMESYNC, PX4 uses the arrival time as timestamp (Timesync.cpp). The age of a position
+    when PX4 publishes it is then zero instead of the latency.
     """
     age = _age_s(analysis)
     if age is None:
@@ -151,9 +151,9 @@ def _is_on_ground_until(analysis: Analysis, time_s: float) -> bool:
 
 
 def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
-    """Return the time (s) from which timestamps are measurement times, and the latency (s).
+    """Find the time (s) at which TIMESYNC converged, and the latency (s) of the positions.
 
-    None if timestamps do not change from arrival times to measurement times in flight.
+    Before this time the timestamps are arrival times. None without such a change.
     """
     age = _age_s(analysis)
     if age is None:
@@ -174,7 +174,7 @@ def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
 
 
 def _age_s(analysis: Analysis) -> pd.Series | None:
-    """Return the age (s) of each position when PX4 publishes it; None if not logged."""
+    """Return the age (s) of each position when PX4 publishes it, if logged."""
     ekf2, source, segment = analysis.flight.ekf2, analysis.source, analysis.segment
     record = ekf2.record if isinstance(ekf2, Ekf2) else None
     if not isinstance(record, FusionRecord) or source.origin.reconstructed or source.clock_map:
