@@ -305,7 +305,7 @@ def test_error_beyond_sigma_finding_names_axis_and_action() -> None:
     ekf2 = axis("east", ekf2=statement(0.49), ekf2_truth=against_truth(25.0, 1.0))
     finding = only(hidden_errors.detect, analysis(axes=(axis(), hiding(name="down"), ekf2)))
     assert finding.title == (
-        "Position errors are 2.0 (KF) and 5.0 (EKF2) times σ, which innovations do not show"
+        "Position errors that innovations do not show: KF 2.0 times σ, EKF2 5.0 times σ"
     )
     assert finding.evidence["filter"] == "ekf2"
     # the main axis is preferred

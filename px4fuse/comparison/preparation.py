@@ -225,26 +225,19 @@ def _use_barometer_height(
 def explain_missing_source(flight: Flight) -> Unavailable:
     """Return the reason why the log has no position source, and the action."""
     damaged = "the file is damaged, and " if flight.log.damage else ""
-    unused_track = next(
-        (track.name for track in flight.positions if not track.origin.is_automatic), ""
-    )
-    missing_topics = (
-        "no vehicle_visual_odometry, motion capture or EKF2 innovations of external vision"
-    )
+    topics = "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision"
     remedy = (
-        "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as "
-        "VISION_POSITION_ESTIMATE, or give the position file with --position."
+        "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as VISION_POSITION_ESTIMATE, or "
+        "give the position file with --position."
     )
     if flight.log.format.startswith("MAVLink"):
-        missing_topics = "no VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP"
+        topics = "VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP"
         ulog = ", or the ULog" if flight.log.has_ulog else ""
         remedy = f"give the position file of the positioning system with `position`{ulog}."
-    if unused_track:
-        remedy = (
-            "The log contains only GPS, which EKF2 did not fuse: use it with "
-            f"--position-source {unused_track}, or {remedy}"
-        )
-    reason = f"{damaged}no external position in this log ({missing_topics})"
+    if flight.positions:
+        name = flight.positions[0].name
+        remedy = f"use {name}, which EKF2 did not fuse (--position-source {name}), or {remedy}"
+    reason = f"{damaged}no external position in this log (no {topics})"
     return Unavailable("position source", reason, capitalise_first(remedy))
 
 

@@ -158,13 +158,8 @@ def make_error_finding(
         remedy = FRAME_REMEDY
     elif is_ekf2_alone:
         remedy = EKF2_REMEDY
-    sizes = " and ".join(f"{format_ratio(ratio)} ({label})" for label, ratio in ratios.items())
-    title = f"Position errors are {sizes} times σ, which innovations do not show"
-    if len(ratios) == 1:
-        ((label, ratio),) = ratios.items()
-        title = (
-            f"{label}: position error {format_ratio(ratio)} times σ, which innovations do not show"
-        )
+    sizes = (f"{label} {format_ratio(ratio)} times σ" for label, ratio in ratios.items())
+    title = f"Position errors that innovations do not show: {', '.join(sizes)}"
     return finding(
         "error" if worst.nees >= MIN_NEES_ERROR else "warning",
         "error_exceeds_reported_sigma",

@@ -17,8 +17,8 @@ class CatalogueEntry(Record, frozen=True):
     """Title, group (one of :data:`GROUPS`) and meaning of a finding."""
 
     title: str
-    group: str
     meaning: str
+    group: str = "position source"
 
 
 # Catalogue of findings by id; findings of equal severity are listed in this order
