@@ -131,7 +131,7 @@ def analysis(
 
 def axis(name: str = "north", **parts: Any) -> Any:
     """Make the result of one axis; filters that are not given have no consistency test."""
-    usual = {"ekf2_innovations": NONE, "truth": NONE, "ekf2_state": NONE}
+    usual = dict.fromkeys(("ekf2_innovations", "ekf2_state", "ekf2_variance", "truth"), NONE)
     filters = {
         key: _with_truth(parts.pop(key, NONE), parts.pop(f"{key}_truth", NONE)) for key in FILTERS
     }

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.comparison import position_errors
 from px4fuse.comparison.flight_events import airborne_spans
 from px4fuse.core.record import Span
 from px4fuse.core.text import capitalise_first, format_number, format_ratio
@@ -155,14 +156,10 @@ def detect_in_aids(
 def _height_error_in(analysis: Analysis, span_s: Span) -> float | None:
     """Return EKF2's largest height error (m) in a time span, if it is unusually large."""
     down = analysis.axes.get("down")
-    if (
-        down is None
-        or isinstance(down.ekf2_state, Unavailable)
-        or isinstance(down.truth, Unavailable)
-    ):
+    errors = None if down is None else position_errors(down, "ekf2")
+    if errors is None or isinstance(errors, Unavailable):
         return None
-    height_m, true = down.ekf2_state["position_m"], down.truth["position_m"]
-    error_m = np.abs(height_m - np.interp(height_m.index, true.index, true, np.nan, np.nan))
+    error_m = errors["error_m"].abs()
     is_in_span = (error_m.index >= span_s[0]) & (error_m.index <= span_s[1])
     rmse_outside_m = float(np.sqrt(np.mean(error_m[~is_in_span] ** 2)))
     largest_m = float(error_m[is_in_span].max())  # NaN if no error is known

@@ -9,23 +9,20 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.causal_replays import ErrorAboveSigma, error_above_reported_sigma
+from px4fuse.comparison.comparison import position_errors
 from px4fuse.comparison.model import (
     FILTERS,
-    AxisComparison,
     Comparison,
     ErrorsAgainstTruth,
     FilterName,
     north_and_east,
 )
 from px4fuse.comparison.trials import Trial, find_cause
-from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.errors import TrajectoryError
-from px4fuse.filter.kalman import state_at
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CAUSE
@@ -206,39 +203,29 @@ def _known_closure_error_m(loop: Loop) -> float | None:
     return loop.closure_error_m
 
 
-def _rmse_after_alignment(comparison: Comparison, filter_name: str) -> AlignedError | None:
+def _rmse_after_alignment(comparison: Comparison, filter_name: FilterName) -> AlignedError | None:
     """Return the horizontal RMSE before and after a fit in position and yaw."""
-    axes = north_and_east(comparison)
-    truths = [result.truth for result in axes if isinstance(result.truth, pd.DataFrame)]
-    if len(truths) < 2:
+    error, true_track = [], []
+    for result in north_and_east(comparison):
+        errors, truth = position_errors(result, filter_name), result.truth
+        if isinstance(errors, Unavailable) or isinstance(truth, Unavailable):
+            return None
+        error.append(errors["error_m"])
+        true_track.append(np.interp(errors.index, truth.index, truth["position_m"]))
+    if len(error) < 2:
         return None
-    times = truths[0].index.to_numpy()
-    tracks = [
-        state_at(result.replay, times)[0]
-        if filter_name == "kf"
-        else _interpolate_ekf2_position(result, times)
-        for result in axes
-    ]
-    zero_height = np.zeros(len(times))
-    estimate = np.column_stack([*tracks, zero_height])
-    true_track = np.column_stack([*(truth["position_m"] for truth in truths), zero_height])
-    has_both = np.isfinite(estimate).all(axis=1) & np.isfinite(true_track).all(axis=1)
-    estimate, true_track = estimate[has_both], true_track[has_both]
+    zero_height, known = np.zeros(len(error[0])), np.isfinite(error).all(axis=0)
+    error_m, true_m = (
+        np.column_stack([*columns, zero_height])[known] for columns in (error, true_track)
+    )
     try:
-        aligned = fit_alignment(estimate, true_track, "yaw").apply(estimate)
+        aligned_m = fit_alignment(true_m + error_m, true_m, "yaw").apply(true_m + error_m)
     except TrajectoryError:  # the track is too short to determine a rotation
         return None
-    errors = (estimate - true_track, aligned - true_track)
     rmse_m, aligned_rmse_m = (
-        float(np.linalg.norm(error)) / len(true_track) ** 0.5 for error in errors
+        float(np.linalg.norm(part)) / len(true_m) ** 0.5 for part in (error_m, aligned_m - true_m)
     )
     return AlignedError(rmse_m, aligned_rmse_m)
-
-
-def _interpolate_ekf2_position(result: AxisComparison, times: Array) -> Array:
-    assert isinstance(result.ekf2_state, pd.DataFrame)  # EKF2's error was computed from this state
-    state = result.ekf2_state["position_m"]
-    return np.asarray(np.interp(times, state.index, state, left=np.nan, right=np.nan))
 
 
 def make_possible_drift_finding(analysis: Analysis) -> Finding:

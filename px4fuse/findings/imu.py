@@ -196,12 +196,10 @@ def detect_low_rates(flight: Flight) -> Findings:
             profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE)) | HIGH_RATE_BIT
             action = f"Set SDLOG_PROFILE to {profile} (bit 4 logs {topic} at full rate)."
             if log.format.startswith("MAVLink"):
-                action = f"Request {topic} at {requested_hz:g} Hz (MAV_CMD_SET_MESSAGE_INTERVAL)."
-                if log.has_ulog:
-                    action = (
-                        f"Request {topic} at {requested_hz:g} Hz (PX4 console: mavlink stream -d "
-                        f"DEVICE -s {topic} -r {requested_hz:g}), or add the ULog (--mavlink)."
-                    )
+                ulog = ", or add the ULog (--mavlink)" if log.has_ulog else ""
+                action = (
+                    f"Request {topic} at {requested_hz:g} Hz (MAV_CMD_SET_MESSAGE_INTERVAL){ulog}."
+                )
             yield warning(
                 "imu_rate_too_low",
                 f"The {label} was logged at {rate_hz:.1f} Hz, but {needed_hz:g} Hz are needed. "
