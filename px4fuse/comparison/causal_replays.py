@@ -131,7 +131,7 @@ Rerun = Callable[[AxisComparison, Change], RunStatistics]
 
 
 class _Filter(NamedTuple):
-    """Filter with the function that runs it along an axis with a change; ``model``: of EKF2."""
+    """KF or EKF2, with the function that runs it with a change; only EKF2 has a ``model``."""
 
     name: FilterName
     rerun: Rerun

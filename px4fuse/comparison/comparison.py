@@ -117,8 +117,8 @@ def project_tracks(
     else:
         state = projection.project(ekf2.state, axis, segment)
         variance = projection.project_variance(ekf2, axis, segment)
-    true = projection.project_truth(truth, axis, segment)
-    return {"ekf2_state": state, "ekf2_variance": variance, "truth": true}
+    projected_truth = projection.project_truth(truth, axis, segment)
+    return {"ekf2_state": state, "ekf2_variance": variance, "truth": projected_truth}
 
 
 def _summarise_filter(

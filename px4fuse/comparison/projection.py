@@ -95,7 +95,7 @@ def continuous_state(
 def _continuous_candidates(
     published: pd.DataFrame, resets: list[Reset], axes: list[int]
 ) -> Iterator[pd.DataFrame]:
-    """Yield EKF2's position without resets, once for the frame of each time between resets."""
+    """Yield EKF2's position without resets, in each of the frames between the resets."""
     deltas = np.array([reset.delta for reset in resets])[:, axes]
     is_after = np.array([published.index >= reset.time_s for reset in resets]).T
     for earlier_count in range(len(resets) + 1):

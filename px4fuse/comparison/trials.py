@@ -15,7 +15,7 @@ Statistic = Literal["nis", "nees", "difference"]
 # Statistics that re-runs try to bring inside their limits
 DISCREPANCIES: tuple[Statistic, Statistic] = ("nees", "nis")
 Change = Mapping[str, float]
-# Names of changes of data in Trial.change
+# Keys of Trial.change that are neither settings of KF nor EKF2 parameters
 CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
 FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]

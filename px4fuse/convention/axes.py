@@ -40,7 +40,7 @@ SMALL_ROTATION = np.radians(8.0)
 SMALL_OFFSET_S = 0.3
 # Log prior odds of a rotated frame
 ROTATION_ODDS = -1.0
-# Log prior odds of a large time offset
+# Log prior odds of a time offset above SMALL_OFFSET_S
 OFFSET_ODDS = -2.0
 # Log prior odds of a unit other than metres
 UNIT_ODDS = -2.0
@@ -320,7 +320,7 @@ def _evaluate(
         float(np.sum(weight[0] @ (first * second)[:, :2]))
         for first, second in ((ned, ned), (ned, measured), (measured, measured))
     )
-    if 0.0 in (ned_square, product, square):  # at rest, no hypothesis can be scored
+    if 0.0 in (ned_square, product, square):  # a vehicle at rest shows no convention
         return replace(hypothesis, score=-np.inf), np.zeros(len(hypothesis.parameters))
     jacobian = np.zeros((len(index), 3, len(PRECISION)))
     jacobian[..., 0] = imu.rate_m_s[index]

@@ -53,7 +53,7 @@ def estimate_lever_arm(flight: Flight, track: PositionTrack) -> tuple[float, flo
         covariance = np.linalg.pinv(rows.T @ rows) * sigma_m**2 * len(values) / count
         sigma = float(np.sqrt(np.trace(covariance[:2, :2])))
         is_used &= residual < CLIPPED_SIGMAS * sigma_m
-        time_s = time_s + fit[2]  # the rate's coefficient is the time by which they are early
+        time_s = time_s + fit[2]  # fit[2] is the time by which the timestamps are early
     forward_m, right_m = fit[:2].tolist()
     is_significant = np.hypot(forward_m, right_m) > max(MIN_ARM_M, MIN_ARM_SIGMAS * sigma)
     return (forward_m, right_m, sigma) if is_significant else None

@@ -41,7 +41,7 @@ MAX_TILT_DEG = 6.0
 MAX_HEADING_DEG = 12.0
 # Minimum difference (°) that lowers the score: noise of tilt and heading
 MIN_DIFFERENCE_DEG = 0.7
-# Log likelihood per second, for a factor e of the differences
+# Decrease of the log likelihood per second of flight, if a difference is e times larger
 SCORE_PER_S = 0.5
 # Minimum log likelihood ratio to the second best convention
 MIN_LOG_ODDS = 4.0

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from px4fuse.convention.axes import UNITS
 from px4fuse.convention.model import Axes, Direction, Unit
 
-# In this order, opposite directions are symmetric about the middle
+# Directions in such an order that the reversed order contains the opposite directions
 DIRECTIONS: tuple[Direction, ...] = ("north", "east", "down", "up", "west", "south")
 OPPOSITE = dict(zip(DIRECTIONS, DIRECTIONS[::-1], strict=True))
 FRAME_AXES: dict[str, Axes] = {

@@ -159,7 +159,7 @@ def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
     if age is None:
         return None
     is_arrival = (age.abs() < MAX_ARRIVAL_AGE_S).to_numpy()
-    # wrong_count: positions that contradict a change after each position
+    # for each position: number of timestamps of the wrong kind, if TIMESYNC converged just after it
     wrong_count: Array = np.cumsum(~is_arrival) + np.sum(is_arrival) - np.cumsum(is_arrival)
     cut = int(np.argmin(wrong_count)) + 1
     if np.mean(is_arrival) >= MIN_CONSISTENT_SHARE or min(cut, len(age) - cut) < MIN_SAMPLES:
