@@ -59,7 +59,7 @@ def diagnose(
     *,
     as_sent: bool = False,
 ) -> Analysis:
-    """Read a flight, compare KF with EKF2, explain the differences and find mistakes.
+    """Read a flight, compare KF with EKF2, explain the differences and find faults.
 
     Parameters
     ----------
@@ -99,55 +99,6 @@ def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Ana
         loop=analyse_flight_loop(comparison.flight, progress),
     )
     return replace(analysis, findings=find(analysis))
-
-
-def intervene(
-    comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
-) -> Reruns:
-    """Replay EKF2, replace KF's settings by EKF2's one at a time, and re-run both with changes."""
-    progress("replaying EKF2")
-    corrected = corrected_settings(comparison, estimates.tuning)
-    model = open_model(
-        comparison.flight,
-        lambda inputs: [
-            *explanation_configurations(comparison, inputs, corrected),
-            *planned_configurations(comparison, estimates, inputs),
-        ],
-    )
-    steps = explain_ekf2_difference(comparison, model, estimates.clock, corrected)
-    trials = run_interventions(comparison, estimates, model)
-    if isinstance(model, Model):  # frees most of the memory; a later replay is computed again
-        model = replace(model, runs=(), intervals={})
-    return Reruns(ekf2_model=model, difference_steps=steps, trials=trials)
-
-
-def diagnose_or_check_aids(
-    request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
-) -> Analysis | AidsOnlyAnalysis:
-    """Run :func:`diagnose`; for a flight without positions, check EKF2's aiding sources only.
-
-    Raises
-    ------
-    LogError, MissingDataError, SettingsError
-        See :func:`diagnose`; also if the flight has no positions and no innovations of EKF2.
-    """
-    flight = flight or read_flight(request, progress)
-    has_named_source = request.position_source is not None
-    if has_named_source or any(track.origin.is_automatic for track in flight.positions):
-        return diagnose(request, progress, flight)
-    no_position, aids = explain_missing_source(flight), evaluate_aids(flight)
-    if isinstance(aids, Unavailable):
-        if flight.airborne == ():
-            raise MissingDataError(
-                f"{flight.log.name}: the vehicle did not fly, so no analysis is possible "
-                f"({aids.reason}). px4fuse info {flight.log.name} lists the logged data."
-            )
-        raise MissingDataError(
-            f"{flight.log.name}: {no_position.reason}, and EKF2's aiding sources cannot be "
-            f"checked: {aids.reason}",
-            no_position.remedy,
-        )
-    return AidsOnlyAnalysis(flight, aids, no_position, find_aids(aids))
 
 
 def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress) -> Flight:
@@ -198,7 +149,7 @@ def prepare_comparison(
     *,
     as_sent: bool = False,
 ) -> Comparison:
-    """Read a flight and select position source, time span and axes, without running KF.
+    """Choose position source, time span, axes and time offset of a flight, before KF runs.
 
     Arguments and errors are those of :func:`diagnose`.
     """
@@ -224,26 +175,53 @@ def prepare_comparison(
     return prepare(flight, request, as_sent=as_sent)
 
 
-def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progress) -> Loop:
-    """Read a flight or a trajectory, measure its loop closure error and correct the path.
+def intervene(
+    comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
+) -> Reruns:
+    """Replay EKF2, replace KF's settings by EKF2's one at a time, and re-run both with changes."""
+    progress("replaying EKF2")
+    corrected = corrected_settings(comparison, estimates.tuning)
+    model = open_model(
+        comparison.flight,
+        lambda inputs: [
+            *explanation_configurations(comparison, inputs, corrected),
+            *planned_configurations(comparison, estimates, inputs),
+        ],
+    )
+    steps = explain_ekf2_difference(comparison, model, estimates.clock, corrected)
+    trials = run_interventions(comparison, estimates, model)
+    if isinstance(model, Model):  # frees most of the memory; a later replay is computed again
+        model = replace(model, runs=(), intervals={})
+    return Reruns(ekf2_model=model, difference_steps=steps, trials=trials)
+
+
+def diagnose_or_check_aids(
+    request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
+) -> Analysis | AidsOnlyAnalysis:
+    """Run :func:`diagnose`; for a flight without positions, check EKF2's aiding sources only.
 
     Raises
     ------
-    TrajectoryError, LogError, MissingDataError, SettingsError
-        A file cannot be read or lacks required data, or a setting is out of range.
+    LogError, MissingDataError, SettingsError
+        See :func:`diagnose`; also if the flight has no positions and no innovations of EKF2.
     """
-    from px4fuse.loop.analysis import analyse  # noqa: PLC0415 - not for tune and sync
-    from px4fuse.loop.tracks import read_source  # noqa: PLC0415
-
-    for name in ("start_s", "end_s"):
-        if not math.isfinite(getattr(request, name) or 0.0):
-            raise SettingsError(f"`{name}` {getattr(request, name):g} is not a finite number.")
-    progress(f"reading {display_name(Path(request.source))}")
-    system, reference = request.system, None
-    source = read_source(request.source, frame=request.frame, system=system)
-    if request.reference is not None:
-        reference = read_source(request.reference, default="truth", system=system).trajectory
-    return analyse(source, request, reference, progress)
+    flight = flight or read_flight(request, progress)
+    has_named_source = request.position_source is not None
+    if has_named_source or any(track.origin.is_automatic for track in flight.positions):
+        return diagnose(request, progress, flight)
+    no_position, aids = explain_missing_source(flight), evaluate_aids(flight)
+    if isinstance(aids, Unavailable):
+        if flight.airborne == ():
+            raise MissingDataError(
+                f"{flight.log.name}: the vehicle did not fly, so no analysis is possible "
+                f"({aids.reason}). px4fuse info {flight.log.name} lists the logged data."
+            )
+        raise MissingDataError(
+            f"{flight.log.name}: {no_position.reason}, and EKF2's aiding sources cannot be "
+            f"checked: {aids.reason}",
+            no_position.remedy,
+        )
+    return AidsOnlyAnalysis(flight, aids, no_position, find_aids(aids))
 
 
 def run_what_if(
@@ -305,3 +283,25 @@ def run_what_if(
     return WhatIfAnalysis(
         flight, replays, changes, is_default_change, difference_steps, request.without
     )
+
+
+def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progress) -> Loop:
+    """Read a flight or a trajectory, measure its loop closure error and correct the path.
+
+    Raises
+    ------
+    TrajectoryError, LogError, MissingDataError, SettingsError
+        A file cannot be read or lacks required data, or a setting is out of range.
+    """
+    from px4fuse.loop.analysis import analyse  # noqa: PLC0415 - not for tune and sync
+    from px4fuse.loop.tracks import read_source  # noqa: PLC0415
+
+    for name in ("start_s", "end_s"):
+        if not math.isfinite(getattr(request, name) or 0.0):
+            raise SettingsError(f"`{name}` {getattr(request, name):g} is not a finite number.")
+    progress(f"reading {display_name(Path(request.source))}")
+    system, reference = request.system, None
+    source = read_source(request.source, frame=request.frame, system=system)
+    if request.reference is not None:
+        reference = read_source(request.reference, default="truth", system=system).trajectory
+    return analyse(source, request, reference, progress)
