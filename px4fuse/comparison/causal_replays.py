@@ -97,7 +97,7 @@ class ErrorAboveSigma(NamedTuple):
 def error_above_reported_sigma(
     summary: FilterSummary | UntestedFilter,
 ) -> ErrorAboveSigma | None:
-    """Return the position error if it exceeds the reported σ, but innovations do not show this."""
+    """Return the position error of a filter if it exceeds σ and innovations do not show it."""
     truth = summary.truth
     if isinstance(summary, Unavailable) or isinstance(truth, Unavailable):
         return None
@@ -110,7 +110,7 @@ def error_above_reported_sigma(
 
 @dataclass(frozen=True, kw_only=True)
 class Reruns:
-    """Re-runs of KF and EKF2 with changes.
+    """Replay of EKF2, and re-runs of KF and EKF2 with changes.
 
     Attributes
     ----------
@@ -180,7 +180,7 @@ def run_interventions(
 def planned_configurations(
     comparison: Comparison, estimates: Estimates, inputs: Inputs
 ) -> list[FilterConfiguration]:
-    """Return the EKF2 filter configurations that :func:`run_interventions` replays in any case."""
+    """Return the EKF2 configurations that :func:`run_interventions` needs."""
     if not is_fused_source(comparison, inputs):
         return []
     flown = inputs.settings
@@ -261,9 +261,9 @@ def _try_changes(
 
 
 def _flown_statistics(each: _Filter, result: AxisComparison) -> tuple[RunStatistics, bool]:
-    """Return the statistics as flown, of the same samples as a re-run, and True if logged.
+    """Return the statistics of a filter as flown, and True if EKF2's are those of the log.
 
-    EKF2's statistics are those of the log, if a replay of EKF2 as flown has nearly the same ones.
+    EKF2's statistics are taken from the log if a replay of EKF2 as flown has nearly the same ones.
     """
     replayed, logged = each.rerun(result, {}), result.ekf2_state
     if each.model is None:
@@ -317,7 +317,7 @@ def _statistics(
 
 
 def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
-    """Return an NED direction in the frame of positions that are rotated clockwise."""
+    """Rotate a direction in NED into the frame of positions that are rotated clockwise."""
     return np.asarray(Rotation.from_euler("z", -rotation_deg, degrees=True).apply(direction))
 
 
@@ -402,7 +402,7 @@ def _replay_statistics(
     result: AxisComparison,
     change: Change,
 ) -> RunStatistics:
-    """Return the statistics of a replay; without a change the difference is that of the log."""
+    """Return the statistics of an EKF2 replay along an axis."""
     compared_s, axis = model.flown.evaluated_s, result.axis
     if ROTATION in change and comparison.source.origin.is_gnss:
         # the change corrects the attitude, so the axis keeps its direction relative to north

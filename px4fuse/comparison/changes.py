@@ -102,7 +102,7 @@ def candidate_changes(
 def main_axis_changes(
     comparison: Comparison, estimates: Estimates, inputs: Inputs | None
 ) -> list[Change]:
-    """Return the changes that are re-run along the main axis, each once.
+    """Return the changes to re-run along the main axis.
 
     For KF also both noises together and the default settings; for EKF2 a delay also as a shift of
     the position timestamps.
@@ -225,7 +225,7 @@ def _px4_defaults(log: LogInfo, inputs: Inputs) -> list[Change]:
 
 
 def _vibration_noise(settings: Settings, inputs: Inputs, tuned: AxisTuning) -> list[Change]:
-    """Return the maximum-likelihood process noise for vibration, within PX4's range.
+    """Return a larger EKF2_ACC_NOISE that covers the vibration, within PX4's range.
 
     EKF2 adds (EKF2_ACC_NOISE · step)² to the velocity variance in each step; KF adds
     SIGMA_A² · DT² in each DT.

@@ -39,7 +39,7 @@ def run_kf(
 
 
 def compare(prepared: Comparison, kf_runs: Mapping[str, Replay]) -> Comparison:
-    """Compare the runs of KF with EKF2, and both with ground truth if available."""
+    """Compare KF with EKF2, and both with ground truth, along each axis."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, note = projection.continuous_state(ekf2, prepared.source, prepared.segment)
@@ -109,7 +109,7 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
 def project_tracks(
     ekf2: Ekf2 | Unavailable, truth: Truth | Unavailable, axis: Axis, segment: Segment
 ) -> dict[str, Frame]:
-    """Project EKF2's state and variances and the ground truth onto an axis, in a segment."""
+    """Project EKF2's state and variances, and the ground truth, onto an axis."""
     state: Frame
     variance: Frame
     if isinstance(ekf2, Unavailable):
@@ -179,12 +179,12 @@ def _rmse(error: Array) -> float:
 def kf_error_statistics(
     kf_run: Replay, truth: Frame, ekf2_state: Frame
 ) -> ErrorsAgainstTruth | Unavailable:
-    """Compute KF's errors against ground truth at EKF2's sample times, else at each prediction."""
+    """Compute the errors of KF against ground truth, at EKF2's sample times if available."""
     return error_statistics(*_kf_track(kf_run, ekf2_state), truth)
 
 
 def _kf_track(kf_run: Replay, ekf2_state: Frame) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return state and variances of KF at EKF2's sample times, else at each prediction."""
+    """Return state and variances of KF, at EKF2's sample times if available."""
     frame = kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state
     return kf_state_and_variance(kf_run, frame.index.to_numpy())
 
@@ -201,7 +201,7 @@ def kf_state_and_variance(kf_run: Replay, times: Array) -> tuple[pd.DataFrame, p
 def error_statistics(
     state: Frame, variance: Frame, truth: Frame
 ) -> ErrorsAgainstTruth | Unavailable:
-    """Compute errors of a filter against ground truth along one axis, and its mean NEES.
+    """Compute the errors of a filter against ground truth along one axis.
 
     Variances are interpolated to the times of ``state``, because PX4 logs those of EKF2 at a tenth
     of the rate.
@@ -244,7 +244,7 @@ def _errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Array:
 
 
 def reported_sigma(time_s: Array, variance: Frame, column: str) -> Array:
-    """Return the reported σ, interpolated to other times (s); NaN where unknown."""
+    """Interpolate the reported σ to other times (s); NaN if unknown."""
     known = _known_values(variance, column)
     if known.empty:
         return np.full(len(time_s), np.nan)
@@ -285,7 +285,7 @@ def position_errors(result: AxisComparison, owner: FilterName) -> Frame:
 def normalised_position_errors(
     result: AxisComparison, owner: FilterName
 ) -> tuple[Array, Array] | Unavailable:
-    """Return times (s), and position errors against ground truth divided by the reported σ."""
+    """Return times (s) and position errors divided by the reported σ."""
     errors = position_errors(result, owner)
     if isinstance(errors, Unavailable):
         return errors

@@ -102,10 +102,10 @@ def explain_ekf2_difference(
 
 
 def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, float]:
-    """Return the estimate of each noise of KF that the user set far from its estimate.
+    """Return estimates for the noise settings of KF that are far from their estimate.
 
-    A wrong setting is a separate cause of the difference. Without its correction, each step alone
-    would remove nearly the whole difference.
+    A wrong setting is a separate cause. Without its correction, each step alone would
+    remove nearly the whole difference.
     """
     axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
     if axis_tuning is None or comparison.source.origin.is_gnss:
@@ -133,7 +133,7 @@ def explanation_configurations(
 
 
 def _settings(comparison: Comparison, inputs: Inputs, corrected: Mapping[str, float]) -> Settings:
-    """Return KF's corrected settings; no time offset if EKF2 fused another source."""
+    """Return the corrected settings of KF, without time offset if EKF2 fused another source."""
     settings = _with_changes(comparison.settings, corrected)
     is_same_source = comparison.source.name == inputs.received.source
     return settings if is_same_source else replace(settings, clock_offset_s=0.0)

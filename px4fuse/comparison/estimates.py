@@ -87,7 +87,7 @@ class Estimates:
 
 
 def ignore_progress(_: str) -> None:
-    """Ignore progress messages."""
+    """Do nothing with the name of a step."""
 
 
 def first_axis_tuning(tuning: Tuning, *names: str) -> AxisTuning | None:
@@ -102,7 +102,7 @@ def value_or_bound(noise: Noise, fallback: float) -> float:
 
 
 def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Estimates:
-    """Estimate the noises first, because all other estimates depend on them."""
+    """Estimate noises, time offset, frame misalignment and errors of the source."""
     names = REPORTED_AXES if {"north", "east"} <= {line.name for line in comparison.lines} else None
     tuning, clock = estimate_noises_and_clock(comparison, progress, names)
     fit, low_pass, correlated_noise = _fit_source_errors(comparison, tuning, clock)
@@ -125,7 +125,7 @@ def tuned(
     progress: Progress = ignore_progress,
     cache: SignalCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
-    """Estimate the noises along the axes, without IMU biases if the IMU rate is too low.
+    """Estimate the noises along the axes.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def estimate_noises_and_clock(
     progress: Progress = ignore_progress,
     names: tuple[str, ...] | None = (HORIZONTAL,),
 ) -> tuple[Tuning, ClockOffset | Unavailable]:
-    """Estimate the noises, and the remaining time offset between positions and IMU.
+    """Estimate the noises and the time offset between positions and IMU.
 
     Parameters are those of :func:`tuned`.
     """
@@ -183,7 +183,7 @@ def estimate_frame_rotation(
     clock: ClockOffset | Unavailable,
     progress: Progress = ignore_progress,
 ) -> HeadingError | Unavailable:
-    """Estimate the frame misalignment in yaw with the estimated noise and time offset."""
+    """Estimate the yaw misalignment of the position frame."""
     progress("heading")
     axis_tuning, sigma_z_m = first_axis_tuning(tuning, HORIZONTAL), comparison.settings.sigma_z_m
     if axis_tuning is not None:
@@ -209,7 +209,7 @@ def _fit_source_errors(
     SourceLowPass | Unavailable,
     TimeCorrelatedNoise | Unavailable,
 ]:
-    """Fit biases, scale and jumps, then the time correlation that remains without the jumps."""
+    """Fit biases, scale and jumps, and then the time correlation of the remaining errors."""
     horizontal = _horizontal_axes(comparison, tuning)
     if isinstance(horizontal, Unavailable):
         return horizontal, horizontal, horizontal
@@ -269,7 +269,7 @@ def _horizontal_axes(
 
 
 def missing_imu_rate(flight: Flight) -> Unavailable | None:
-    """Return Unavailable if the IMU rate is too low to estimate a time offset, else None.
+    """Return the reason if the IMU rate is too low to estimate a time offset.
 
     A sample in a ULog is the mean over its interval. A telemetry message contains only the newest
     of several samples, minus EKF2's bias estimate (``HIGHRES_IMU.hpp``), which depends on the
@@ -294,7 +294,7 @@ def missing_imu_rate(flight: Flight) -> Unavailable | None:
 
 
 def widen_for_drift(clock: ClockOffset) -> ClockOffset:
-    """Widen the interval of a time offset for a source that may drift.
+    """Widen the interval of a time offset, because the source may drift.
 
     Scale errors, heading errors and drift of odometry change the estimated offset of each part of
     the flight by more than the noise, so their scatter widens the interval. The time offset changes
@@ -331,10 +331,10 @@ def _weighted_square_sum(offset: Array, weight: Array) -> float:
 
 
 def _largest_step_p_value(offset: Array, weight: Array) -> float | None:
-    """Return the p-value of the largest step of the offset in flight; None for too few parts.
+    """Return the p-value of the largest change of the time offset in flight, if known.
 
-    Student's t-test of the weighted mean offsets before and after each step. The p-value is
-    multiplied by the number of tested steps (Bonferroni), and 1 for steps below ``MIN_CHANGE_S``.
+    Student's t-test of the weighted mean offsets before and after each tested time. The p-value is
+    multiplied by the number of tests (Bonferroni), and 1 for changes below ``MIN_CHANGE_S``.
     """
     count = len(offset)
     split_rows = range(MIN_PARTS, count - MIN_PARTS + 1)

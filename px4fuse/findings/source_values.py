@@ -66,7 +66,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def _consecutive_spans(time_s: Array, valid_s: Array) -> tuple[Span, ...]:
-    """Return the spans of consecutive rows without a valid sample between them."""
+    """Return the time spans of rows without a valid sample between them."""
     # rows of one span have the same valid sample before them
     before = np.searchsorted(valid_s, time_s)
     starts = np.flatnonzero(np.diff(before, prepend=-1))
@@ -75,7 +75,7 @@ def _consecutive_spans(time_s: Array, valid_s: Array) -> tuple[Span, ...]:
 
 
 def detect_invalid_rows(analysis: Analysis) -> Findings:
-    """Detect rows of zeros, of a position that is held, and without a position."""
+    """Detect rows that contain zeros, a repeated last position, or no position."""
     source, segment = analysis.source, analysis.segment
     invalid = source.invalid[segment.start_s : segment.end_s]
     for reason, (name, fault, action) in INVALID.items():
@@ -103,14 +103,14 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
 
 
 def _valid_around(analysis: Analysis, span_s: Span) -> Span:
-    """Return the times of the last measurement before a span and of the first one after it."""
+    """Return the times of the last valid measurement before a span and the first one after it."""
     time_s = analysis.lines[0].measurement_time_s
     at = np.clip(np.searchsorted(time_s, span_s), 1, len(time_s) - 1)
     return float(time_s[at[0] - 1]), float(time_s[at[1]])
 
 
 def detect_rounding(analysis: Analysis) -> Findings:
-    """Detect positions that are rounded to steps above their noise."""
+    """Detect positions that are rounded to coarse steps."""
     source, step_m = analysis.source, analysis.source.step_m
     if step_m < MIN_STEP_M:
         return
@@ -156,7 +156,7 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
 
 
 def detect_two_senders(analysis: Analysis) -> Findings:
-    """Detect positions of two systems in turn: every other position has a constant offset."""
+    """Detect two systems whose positions alternate."""
     samples = cut_to_segment(analysis.source.samples, analysis.segment)[Columns.POSITION]
     samples = samples.dropna(axis=1, how="all").dropna()
     count, rate_hz = (len(samples) - 2) // WINDOW, analysis.source.rate_hz
@@ -224,7 +224,7 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
 
 
 def _difference_m(position_m: Array, time_s: Array, state: pd.DataFrame) -> float:
-    """Return the median distance of positions from EKF2's state in flight at other times."""
+    """Return the median distance (m) of positions from EKF2's position at other times."""
     at = state.index.to_numpy()
     curve = CubicHermiteSpline(at, state[Columns.POSITION], state[Columns.VELOCITY])
     is_moving = np.linalg.norm(curve(time_s, 1), axis=1) > MIN_COPY_SPEED_M_S
