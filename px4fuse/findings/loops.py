@@ -69,7 +69,7 @@ def detect_assumptions(loop: Loop) -> Findings:
         yield note(
             "loop_landing_assumed",
             "The landing place is unknown, so px4fuse assumes the take-off place. The distance "
-            "between landing and take-off is then the closure error.",
+            "between landing and take-off counts as closure error.",
             "Measure the landing place and give --landed-at FORWARD,RIGHT (m, along and to the "
             "right of the nose at take-off).",
             evidence,
