@@ -390,7 +390,7 @@ def test_imu_rate_below_98_percent_of_required_is_reported(imu_hz, attitude_hz, 
     for info, action in (
         (log(), "Set SDLOG_PROFILE to 17 "),
         (log(format="MAVLink tlog", has_ulog=False), "at {:g} Hz (MAV_CMD_SET"),
-        (log(format="MAVLink tlog"), "SET_MESSAGE_INTERVAL), or add the ULog"),
+        (log(format="MAVLink tlog"), "SET_MESSAGE_INTERVAL), or give the ULog"),
     ):
         found = list(imu.detect_low_rates(analysis(flight=flight, log=info).flight))
         assert [finding.evidence["needed_hz"] * 2.0 for finding in found] == expected

@@ -196,7 +196,7 @@ def detect_low_rates(flight: Flight) -> Findings:
             profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE)) | HIGH_RATE_BIT
             action = f"Set SDLOG_PROFILE to {profile} (bit 4 logs {topic} at full rate)."
             if log.format.startswith("MAVLink"):
-                ulog = ", or add the ULog (--mavlink)" if log.has_ulog else ""
+                ulog = ", or give the ULog of the flight" if log.has_ulog else ""
                 action = (
                     f"Request {topic} at {requested_hz:g} Hz (MAV_CMD_SET_MESSAGE_INTERVAL){ulog}."
                 )
