@@ -280,14 +280,14 @@ def test_explore_page_tooltips_show_values(page: Browser) -> None:
     )
     assert re.search(r"KF: *-?[\d.]+ m", tooltips.replace("EKF2", ""))
     assert re.search(r"EKF2: *-?[\d.]+ m", tooltips)
-    back = "Explore.then((e) => e.model('position').background_fill_color)"
-    light = ask(page, back)
+    colour = "Explore.then((e) => e.model('position').renderers.at(-1).glyph.line_color)"
+    light = ask(page, colour)
     page.scheme("dark")
     settle(page)
-    assert ask(page, back) != light
+    assert ask(page, colour) != light
     page.scheme("")
     settle(page)
-    assert ask(page, back) == light
+    assert ask(page, colour) == light
 
 
 def test_explore_page_box_on_map_selects_time_span(page: Browser) -> None:

@@ -42,7 +42,7 @@ MAX_TRACK_POINTS = 2000  # maximum number of drawn points of the track on the ma
 
 
 def flight_data(analysis: Analysis, packer: Packer) -> Data:
-    """Return all data of one flight for JSON; arrays are replaced by their index in the packer.
+    """Return all data of one flight for JSON; the packer contains the arrays.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Da
     }
 
 
-def _nis_bands(count: int, packer: Packer) -> list[int]:
+def _nis_bands(count: int, packer: Packer) -> list[dict[str, int]]:
     """Pack both ends of the 95 % band of the mean NIS for each number of innovations.
 
     The time offset moves measurements into or out of the segment, so their number can change.
@@ -281,8 +281,8 @@ def _truth_data(result: AxisComparison, packer: Packer) -> Data | str:
     }
 
 
-def _pack_frame(table: pd.DataFrame, columns: list[str], packer: Packer) -> list[int]:
-    """Pack the times and some columns of a frame; return their indices."""
+def _pack_frame(table: pd.DataFrame, columns: list[str], packer: Packer) -> list[dict[str, int]]:
+    """Pack the times and some columns of a frame."""
     values = [packer.add(table[column].to_numpy(), COARSE_SCALE) for column in columns]
     return [packer.add_times(table.index.to_numpy()), *values]
 
@@ -302,7 +302,7 @@ def _map_data(analysis: Analysis) -> Data:
     }
 
 
-def _track_data(comparison: Comparison, packer: Packer) -> list[int] | str:
+def _track_data(comparison: Comparison, packer: Packer) -> list[dict[str, int]] | str:
     """Pack time, north and east of the source's track, or return the reason why it is missing."""
     samples = cut_to_segment(comparison.source.samples, comparison.segment)
     track = samples[Columns.POSITION[:2]].dropna()

@@ -1,5 +1,6 @@
 """Bokeh plots of the explore page without data, which the script of the page adds."""
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -60,12 +61,19 @@ class Plot(Record, frozen=True):
     unit: str = ""
 
 
+class View(Record, frozen=True):
+    """View of the page, with the titles of its plots."""
+
+    title: str
+    plots: Mapping[str, str]
+
+
 class Figures(Record, frozen=True):
-    """Plots of ``figures.toml``: titles, columns of the sources, lines and colours."""
+    """Views and plots of ``figures.toml``: titles, columns of the sources, lines and colours."""
 
     event_rows: list[str]
     map_colours: list[str]
-    panels: dict[str, str]
+    views: dict[str, View]
     sources: dict[str, str]
     plots: dict[str, Plot]
 
@@ -127,7 +135,6 @@ def _make_plots(data: Data, time_range: Range1d) -> dict[str, Any]:
         )
         if name == "position":
             _draw_dots(fig, sources["measured"], 3, name="measured")
-            _draw_dots(fig, sources["beyond"], 9, name="measured", **ARROW_MARKER)
         if name == "innovation":
             _draw_innovations(fig, sources, with_ekf2="ekf2" not in missing_kinds)
         if name == "error":
@@ -283,12 +290,9 @@ def _likelihood_map(tuning: Tuning) -> Any:
             image = np.sqrt(2.0 * np.maximum(axis_tuning.map.drop.T, 0.0)).astype(np.float32)
             draw: Any = fig.image  # color_mapper is missing in its type signature
             draw([image], x, y, dw, dh, color_mapper=mapper, name=f"map:{name}", visible=False)
-    trail = _empty_source("trail", "x y")
     best_point = _empty_source("best", "x y")
     point = _empty_source("point", "x y")
     white: Style = {"line_color": "white"}
-    fig.line("x", "y", source=trail, line_width=1.2, name="ekf2")
-    _draw_dots(fig, trail, 3, name="ekf2")
     _draw_dots(fig, best_point, 13, marker="cross", line_width=2.5, **white)
     _draw_dots(fig, point, 12, fill_color="darkorange", line_width=2.0, **white)
     return fig

@@ -27,7 +27,6 @@ const Practice = (() => {
     $("quiz-title").textContent = `Flight ${current + 1} of ${count}: find the fault`;
     // commands need a log file, which a simulated flight does not have
     for (const id of ["as-report", "whatif", "task"]) $(id).hidden = true;
-    for (const button of queryAll(".tour-start")) button.hidden = true;
     const boxes = queryAll("[name=choice]"), fields = [$("quiz-size"), $("quiz-time")];
     const [, ...typed] = answers[current].split("|");
     fields.forEach((field, i) => { field.value = typed[i] ?? ""; });

@@ -85,10 +85,10 @@ class HiddenMistake(Record, frozen=True):
     choice: str
     mistake: str
     sizes: tuple[str, str, str]
-    view: str
     fault: str
     size_text: str
     symptom: str
+    view: str = "errors"
     has_either_sign: bool = False
 
 

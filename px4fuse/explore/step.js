@@ -3,8 +3,7 @@
 const Step = (() => {
   const CORNERS = 120;
   const TRAIL = 60; // number of previous KF steps whose positions and velocities are drawn
-  // duration of a prediction or update in the animation, from slow to fast
-  const STEP_TIMES_MS = [1600, 800, 400, 200, 100, 50];
+  const STEP_TIME_MS = 400; // duration of a prediction or update in the animation
 
   /* Points of the 2σ ellipse, from the Cholesky factor of P */
   function ellipse([p, v, p00, p01, p11]) {
@@ -78,7 +77,7 @@ const Step = (() => {
       if (cached.run !== run) cached = { run, list: run === null ? [] : moments(run) };
       return cached.list;
     };
-    let moment = null, playing = null, speed = 2; // indices of a prediction or update in listNow(), and of STEP_TIMES_MS
+    let moment = null, playing = null; // index of a prediction or update in listNow(), and timer of the animation
 
     /* Show KF after the update with a measurement (index) */
     function goTo(measurement) {
@@ -109,17 +108,10 @@ const Step = (() => {
       const list = listNow();
       if (!list.length) return;
       if (moment === null || moment >= list.length - 1) moment = 0;
-      playing = setInterval(advance, STEP_TIMES_MS[speed]);
+      playing = setInterval(advance, STEP_TIME_MS);
       $("play").textContent = "Pause";
       $("now").ariaLive = "off"; // too fast for a screen reader
     }
-    function faster(by) {
-      speed = clamp(speed + by, 0, STEP_TIMES_MS.length - 1);
-      if (playing !== null) { pause(); play(); }
-      $("slower").disabled = speed === 0;
-      $("faster").disabled = speed === STEP_TIMES_MS.length - 1;
-    }
-
     function draw() {
       const { run } = result;
       if (isVisible("step")) selected.measurement ??= 0; // the view opens at the first update
@@ -187,8 +179,7 @@ const Step = (() => {
     }
 
     const actions = { first: () => goTo(0), previous: () => goTo((selected.measurement ?? 1) - 1),
-      next: () => goTo((selected.measurement ?? -1) + 1), last: () => goTo(Infinity), play,
-      slower: () => faster(-1), faster: () => faster(1) };
+      next: () => goTo((selected.measurement ?? -1) + 1), last: () => goTo(Infinity), play };
     for (const [id, act] of Object.entries(actions)) onClick(id, act);
     $("cursor").addEventListener("input", (event) => goTo(Number(event.target.value)));
     const restart = () => { // a new KF run has other steps but the same measurements

@@ -1,7 +1,7 @@
 /* Time range of the plots, events and map. */
 const Times = (() => {
   // CSS colours (--kf and so on) of the drawn elements with these names
-  const NAMES = ["kf", "ekf2", "truth", "measured", "paper", "ink", "muted", "line", "band"];
+  const NAMES = ["kf", "ekf2", "truth", "measured", "ink", "band"];
 
   function start(page) {
     const { flight, settings, model, setSource, timeRange, figures, redraw, shifted, isVisible, keys: otherKeys } = page;
@@ -41,7 +41,9 @@ const Times = (() => {
       "-": actions.wider, 0: actions.whole, ...otherKeys };
     addEventListener("keydown", (event) => {
       if (event.ctrlKey || event.metaKey || event.altKey) return;
-      if (event.target.matches("input, [role=tab], summary") || (event.key === " " && event.target.matches("button"))) return;
+      const isRadioKey = event.key === " " || event.key.startsWith("Arrow");
+      if (event.target.matches("input:not([type=radio]), summary") || (event.key === " " && event.target.matches("button"))
+        || (isRadioKey && event.target.matches("[type=radio]"))) return;
       if (keys[event.key]) { keys[event.key](); event.preventDefault(); }
     });
 
@@ -101,15 +103,8 @@ const Times = (() => {
       const style = getComputedStyle(document.documentElement);
       const colours = Object.fromEntries(NAMES.map((name) => [name, style.getPropertyValue(`--${name}`)]));
       for (const plot of [...figures, ...["map", "plan", "step"].map(model)]) {
-        plot.background_fill_color = plot.border_fill_color = colours.paper;
-        plot.outline_line_color = colours.line;
-        for (const axis of [...plot.left, ...plot.below]) {
-          axis.axis_label_text_color = axis.major_label_text_color = colours.muted;
-          axis.axis_line_color = axis.major_tick_line_color = axis.minor_tick_line_color = colours.muted;
-        }
         for (const item of plot.center) {
-          if (item.type === "Grid") item.grid_line_color = colours.line;
-          else item.line_color = { cursor: colours.ink, measurement: colours.measured, consistent: colours.band }[item.name] ?? null;
+          if (item.type !== "Grid") item.line_color = { cursor: colours.ink, measurement: colours.measured, consistent: colours.band }[item.name] ?? null;
           if (item.name === "band") item.fill_color = colours.measured;
           if (item.name === "consistent") item.fill_color = colours.band;
         }
