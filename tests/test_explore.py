@@ -290,21 +290,6 @@ def test_explore_page_tooltips_show_values(page: Browser) -> None:
     assert ask(page, colour) == light
 
 
-def test_explore_page_box_on_map_selects_time_span(page: Browser) -> None:
-    span = "document.getElementById('span').textContent"
-    whole = page.ask(span)
-    open_view(page, "step")
-    x, y, width, height = box(page, "plan")
-    # a box over one end of the track, which the vehicle leaves and reaches several times
-    corners = ((0.25, 0.05), (0.5, 0.2), (0.95, 0.35))
-    mouse(page, [(x + across * width, y + down * height) for across, down in corners])
-    low, high = (float(word) for word in re.findall(r"[\d.]+", page.ask(span)))
-    assert page.ask(span) != whole
-    # the vehicle is in the box from 22 s to 106 s
-    assert 15.0 < low < 30.0
-    assert 95.0 < high < 112.0
-
-
 def test_explore_page_shows_markup_in_log_name_as_text(browser: Browser, tmp_path: Path) -> None:
     flight = aisle_flight(duration_s=20.0)
     flight = replace(flight, log=replace(flight.log, name=f"{MARKUP}.ulg"))

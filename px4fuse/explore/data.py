@@ -26,7 +26,7 @@ from px4fuse.filter.settings import (
     SIGMA_Z_RANGE_M,
     Settings,
 )
-from px4fuse.filter.signals import AISLE, Acceleration, Axis, cut_to_segment, imu_gaps, weighted_sum
+from px4fuse.filter.signals import AISLE, Acceleration, Axis, imu_gaps, weighted_sum
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight.ekf2_parameters import PARAMETERS
@@ -37,8 +37,6 @@ from px4fuse.request import ComparisonRequest, WhatIfRequest, command_line
 Data = dict[str, Any]  # data of the page, which become JSON
 # Range of the time offset slider (s) below and above the analysed time offset
 OFFSET_HALF_RANGE_S = 0.6
-RUNNING_MEAN_COUNT = 30  # number of innovations in the running RMS of innovation ÷ √S
-MAX_TRACK_POINTS = 2000  # maximum number of drawn points of the track on the map
 
 
 def flight_data(analysis: Analysis, packer: Packer) -> Data:
@@ -65,7 +63,6 @@ def flight_data(analysis: Analysis, packer: Packer) -> Data:
             for axis_signals, result in zip(signals["axes"], analysis.axes.values(), strict=True)
         ],
         "maps": _map_data(analysis),
-        "plan": _track_data(analysis, packer),
         "events": {
             "gap": list(events.gaps),
             "dropout": list(events.dropouts),
@@ -97,7 +94,6 @@ def ranges() -> Data:
         "sigma-z": list(SIGMA_Z_RANGE_M),
         "dt": list(DT_RANGE_S),
         "lesson": _settings_data(Settings()),
-        "running": RUNNING_MEAN_COUNT,
         "bands": SIGMA_RATIO_BANDS,
         "ends": list(AXIS_ENDS),
         "marks": MARK_PATHS,
@@ -288,11 +284,9 @@ def _pack_frame(table: pd.DataFrame, columns: list[str], packer: Packer) -> list
 
 
 def _map_data(analysis: Analysis) -> Data:
-    """Return limits and estimate of each likelihood map, or the reason why it is missing."""
+    """Return the estimates of each likelihood map, or the reason why the map is missing."""
     return {
         name: {
-            "sigmaA": axis_tuning.map.sigma_a_m_s2[[0, -1]].tolist(),
-            "sigmaZ": axis_tuning.map.sigma_z_m[[0, -1]].tolist(),
             "likely": [axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value],
             "count": axis_tuning.count,
         }
@@ -300,16 +294,6 @@ def _map_data(analysis: Analysis) -> Data:
         else axis_tuning.reason
         for name, axis_tuning in analysis.tuning.items()
     }
-
-
-def _track_data(comparison: Comparison, packer: Packer) -> list[dict[str, int]] | str:
-    """Pack time, north and east of the source's track, or return the reason why it is missing."""
-    samples = cut_to_segment(comparison.source.samples, comparison.segment)
-    track = samples[Columns.POSITION[:2]].dropna()
-    if not len(track):
-        return "the source has no horizontal position"
-    sampled = track.iloc[:: max(1, -(-len(track) // MAX_TRACK_POINTS))]
-    return _pack_frame(sampled, Columns.POSITION[:2], packer)
 
 
 def _ekf2_settings(request: ComparisonRequest, analysis: Analysis) -> Data:

@@ -15,7 +15,6 @@ from bokeh.models import (
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
-from px4fuse.card.model import SIGMA_RATIO_BANDS
 from px4fuse.comparison.estimates import Tuning
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Record, table
@@ -33,9 +32,17 @@ HOLLOW_MARKER: Style = {"fill_color": None, "line_color": "black"}
 ARROW_MARKER: Style = {"angle": "turn", "marker": "triangle"}
 # Band around the values of a consistent filter
 CONSISTENT_BAND: Style = {"level": "underlay", "fill_alpha": 1.0, "name": "consistent"}
+GAP_BAND: Style = {
+    "level": "underlay",
+    "fill_color": None,
+    "line_color": None,
+    "hatch_pattern": "/",
+    "hatch_color": "#888888",
+    "hatch_alpha": 0.6,
+}
 # Innovation ÷ √S: limit of 95 % of the values of a consistent filter, and half the plotted range
 NORMAL_LIMIT, HALF_NORMAL_RANGE = 2.0, 4.6
-# Left border of the plots and, for its longer labels, of the event plot (pixels)
+# Left border (pixels) of the plots and, for its longer labels, of the event plot and the plot above
 LEFT_BORDER, EVENT_BORDER = 50, 82
 STYLES = {
     "kf": KF_LINE,
@@ -97,7 +104,6 @@ def document_json(data: Data, tuning: Tuning) -> tuple[Any, dict[str, str]]:
     plots |= {
         "strip": _event_plot(data, time_range),
         "map": _likelihood_map(tuning),
-        "plan": _track_plot(),
         "step": _phase_plot(),
     }
     with document.models.freeze():  # faster: Bokeh collects the models of all plots once
@@ -126,12 +132,11 @@ def _make_plots(data: Data, time_range: Range1d) -> dict[str, Any]:
             name,
             215,
             x_range=time_range,
-            y_range=_page_range(),
             y_axis_type=plot.scale,
             tools="xbox_zoom,xpan,tap",
             active_drag="xbox_zoom",
             lod_threshold=None,
-            min_border_left=LEFT_BORDER,
+            min_border_left=EVENT_BORDER if name == "position" else LEFT_BORDER,
         )
         if name == "position":
             _draw_dots(fig, sources["measured"], 3, name="measured")
@@ -141,18 +146,19 @@ def _make_plots(data: Data, time_range: Range1d) -> dict[str, Any]:
             fig.varea(
                 "t", "minus", "plus", source=sources["error"], fill_alpha=0.25, name="kf_band"
             )
-        if name == "running":
-            low, high = SIGMA_RATIO_BANDS["source"]
-            fig.add_layout(BoxAnnotation(bottom=low, top=high, **CONSISTENT_BAND))
+        lines: list[Any] = []
         for source, column, style_name, hover_name in plot.lines:
             if style_name in missing_kinds:
                 continue
             line_renderer = fig.line("t", column, source=sources[source], **STYLES[style_name])
+            lines.append(line_renderer)
             if hover_name:
                 _add_hover(fig, line_renderer, (hover_name, f"@{column}{{0.000}} {plot.unit}"))
+        if name == "error":  # the 2σ band is much wider at the initial state
+            fig.y_range.renderers = lines
         _add_cursor(fig, name="cursor")
-        for low, high, style in _event_bands(data):
-            fig.add_layout(BoxAnnotation(left=low, right=high, level="underlay", **style))
+        for low, high in data["events"]["gap"]:
+            fig.add_layout(BoxAnnotation(left=low, right=high, **GAP_BAND))
     return plots
 
 
@@ -212,25 +218,6 @@ def _empty_source(name: str, columns: str) -> ColumnDataSource:
     return ColumnDataSource(empty, name=f"{name}-source")
 
 
-def _event_bands(data: Data) -> list[tuple[float, float, Style]]:
-    """Return start, end (s) and style of shaded flight modes, ground times, gaps and dropouts."""
-    grey: Style = {"fill_color": "#888888", "line_color": None}
-    hatched: Style = {
-        "hatch_pattern": "/",
-        "hatch_color": "#888888",
-        "hatch_alpha": 0.6,
-        "fill_alpha": 0.05,
-    }
-    events = data["events"]
-    sand: Style = {"fill_color": "#b08a3a", "fill_alpha": 0.1, "line_color": None}
-    return [
-        *((low, high, sand) for low, high, _ in events["modes"][1::2]),
-        *((low, high, grey | {"fill_alpha": 0.18}) for low, high in events["ground"]),
-        *((low, high, grey | hatched) for low, high in events["gap"]),
-        *((low, high, grey | {"fill_alpha": 0.45}) for low, high in events["dropout"]),
-    ]
-
-
 def _event_plot(data: Data, time_range: Range1d) -> Any:
     """Make the event plot, with a row per kind of event."""
     source = _empty_source("strip", FIGURES.sources["events"])
@@ -275,12 +262,11 @@ def _likelihood_map(tuning: Tuning) -> Any:
         250,
         x_axis_type="log",
         y_axis_type="log",
-        x_range=_page_range(),
-        y_range=_page_range(),
         tools="tap",
         x_axis_label="SIGMA_A (m/s²)",
         y_axis_label="SIGMA_Z (m)",
     )
+    fig.x_range.only_visible = fig.y_range.only_visible = True
     mapper = LinearColorMapper(palette=FIGURES.map_colours, low=0.0, high=MAP_SIGMAS)
     for name, axis_tuning in tuning.items():
         if isinstance(axis_tuning, AxisTuning):
@@ -309,27 +295,6 @@ def _pixel_extent(values: Array) -> tuple[float, float]:
     half_pixel = float(np.sqrt(values[1] / values[0]))
     start, end = float(values[0]) / half_pixel, float(values[-1]) * half_pixel
     return start, end - start
-
-
-def _track_plot() -> Any:
-    """Make the map of the position source; a box on it sets the time range of all plots."""
-    fig = _figure(
-        "plan",
-        250,
-        match_aspect=True,
-        tools="box_select,tap",
-        active_drag="box_select",
-        x_axis_label="east (m)",
-        y_axis_label="north (m)",
-    )
-    track = _empty_source("plan", "t east north")
-    shown_source = _empty_source("shown", "east north")
-    cursor = _empty_source("here", "east north")
-    fig.line("east", "north", source=track, name="measured")
-    _draw_dots(fig, track, 3, nonselection_fill_alpha=0.6, name="measured")
-    _draw_dots(fig, shown_source, 4, name="kf")
-    _draw_dots(fig, cursor, 12, marker="circle_x", line_width=2.0, name="ekf2", **HOLLOW_MARKER)
-    return fig
 
 
 def _phase_plot() -> Any:

@@ -2,12 +2,6 @@
 const Explore = (async () => {
   const MAX_POINTS = 3000, MAX_DRAG_POINTS = 600; // maximum number of drawn points of a line, also while a slider is dragged
   const read = (id) => $(`${id}${Practice.suffix}`).textContent;
-  if (typeof DecompressionStream === "undefined") {
-    $("problem").textContent = "This browser is too old for this page. Use a browser of 2023 or later.";
-    $("problem").hidden = false;
-    return null;
-  }
-
   // ------------------------------------------------------------------ the flight's data
   const arrays = await Engine.unpack(read("arrays"), JSON.parse(read("content")).packed);
   const withArrays = (_, value) => value?.array === undefined ? value : arrays[value.array];
@@ -175,12 +169,12 @@ const Explore = (async () => {
     return models.get(name);
   };
   const setSource = (name, columns) => { model(`${name}-source`).data = columns; };
-  /* Draw columns, reduced to a few thousand points, in each visible plot with this source; add them to `drawn` */
-  function drawSource(drawn, name, columns, keys) {
-    drawn[name] = decimate(columns, keys);
+  /* Draw columns, reduced to a few thousand points, in each visible plot with this source */
+  function drawSource(name, columns, keys) {
+    const data = decimate(columns, keys);
     for (const plot of PLOTS.filter(isVisible)) {
       const source = model(`${plot}:${name}-source`);
-      if (source !== null) source.data = drawn[name];
+      if (source !== null) source.data = data;
     }
   }
   const timeRange = model("time");
@@ -193,7 +187,7 @@ const Explore = (async () => {
     const last = t.findIndex((time) => time >= timeRange.end), to = last < 0 ? n : Math.min(last + 2, n);
     const names = Object.keys(columns), out = {};
     if (to - from <= pointLimit) {
-      for (const name of names) out[name] = columns[name].subarray(from, to);
+      for (const name of names) out[name] = columns[name].slice(from, to);
       return out;
     }
     const bins = Math.floor(pointLimit / 2 / keys.length), indices = [];
@@ -211,40 +205,22 @@ const Explore = (async () => {
     for (const name of names) out[name] = Float64Array.from(indices, (i) => columns[name][i]);
     return out;
   }
-  const EMPTY = new Float64Array(0);
   const table = (names, columns) => Object.fromEntries(
-    names.map((name, i) => [name, columns.length ? columns[i] : EMPTY]));
+    names.map((name, i) => [name, columns[i] ?? []]));
   const shifted = (t, by) => by ? t.map((x) => x + by) : t;
 
-  /* Set the vertical range of a visible plot */
-  function setRange(name, ends, log = false) {
-    const range = isVisible(name) ? model(name)?.y_range : undefined;
-    if (!range) return;
-    let [low, high] = ends();
-    if (!(high > low)) [low, high] = Number.isFinite(low) ? [0.9 * low - 0.1, 1.1 * low + 0.1] : [0.1, 1];
-    const edge = log ? 1.15 : 0.06 * (high - low);
-    [range.start, range.end] = log ? [Math.max(low, 1e-6) / edge, high * edge] : [low - edge, high + edge];
-  }
   /* Draw arrow heads at the edge for innovations outside the plot */
-  function drawOutsideArrows(drawn) {
-    if (!isVisible("innovation")) return;
+  function drawOutsideArrows() {
     const { end } = model("innovation").y_range;
     for (const [arrows, ...names] of [["beyond", "updates"], ["beyond_ekf2", "fused", "rejected"]]) {
-      const points = names.flatMap((name) => Array.from(drawn[name]?.t ?? [], (t, i) => [t, drawn[name].x[i]]));
+      const sources = names.map((name) => model(`innovation:${name}-source`)).filter(Boolean);
+      const points = sources.flatMap(({ data: { t, x } }) => Array.from(t, (time, i) => [time, x[i]]));
       const out = points.filter(([, x]) => Math.abs(x) > end);
-      if (model(`innovation:${arrows}-source`)) {
+      if (sources.length) {
         setSource(`innovation:${arrows}`, { t: out.map(([t]) => t), y: out.map(([, x]) => 0.93 * end * Math.sign(x)),
           turn: out.map(([, x]) => x > 0 ? 0 : Math.PI) });
       }
     }
-  }
-  function extent(...columns) {
-    let low = Infinity, high = -Infinity;
-    for (const column of columns) for (const y of column) {
-      if (y < low) low = y;
-      if (y > high) high = y;
-    }
-    return [low, high];
   }
 
   // ------------------------------------------------------------------ KF run and its numbers
@@ -357,74 +333,47 @@ const Explore = (async () => {
       add(i, steps, i);
     }
     const rows = { t: updates.time, x: updates.nu.map((nu, i) => nu / Math.sqrt(updates.s[i])),
-      k0: updates.k0, k1: updates.k1, running: running(updates.nu, updates.s) };
-    const drawn = {};
-    drawSource(drawn, "steps", sawtooth, ["p", "sp"]);
-    drawSource(drawn, "updates", rows, ["x"]);
+      k0: updates.k0, k1: updates.k1 };
+    drawSource("steps", sawtooth, ["p", "sp"]);
+    drawSource("updates", rows, ["x"]);
     if (isVisible("position")) {
-      drawSource(drawn, "measured", { t: shifted(axis.time, settings.offset), z: axis.z }, ["z"]);
+      drawSource("measured", { t: shifted(axis.time, settings.offset), z: axis.z }, ["z"]);
     }
     const expected = reference(axis, steps.time);
     if (isVisible("error") && expected !== null) {
       const e = steps.p.map((p, i) => p - expected[i]), plus = steps.p00.map((x) => 2 * Math.sqrt(x));
-      drawSource(drawn, "error", { t: steps.time, e, plus, minus: plus.map((x) => -x) }, ["e", "plus"]);
+      drawSource("error", { t: steps.time, e, plus, minus: plus.map((x) => -x) }, ["e", "plus"]);
     }
-    return drawn;
+    if (isVisible("innovation")) drawOutsideArrows();
   }
   /* Position of ground truth at the given times; without ground truth of EKF2, without both null */
   function reference(axis, times) {
     if (!isText(axis.truth)) return Engine.interp(times, ...axis.truth.p, NaN);
     return isText(axis.ekf2) ? null : Engine.interp(times, ...axis.ekf2.state.slice(0, 2), NaN);
   }
-  function running(nu, s) {
-    const over = ranges.running, out = new Float64Array(nu.length).fill(NaN);
-    for (let i = 0, sum = 0; i < nu.length; i++) {
-      sum += nu[i] * nu[i] / s[i];
-      if (i >= over) sum -= nu[i - over] * nu[i - over] / s[i - over];
-      if (i >= over - 1) out[i] = Math.sqrt(sum / over);
-    }
-    return out;
-  }
   /* Draw EKF2 and ground truth, which depend only on axis and zoom */
   function drawReferences(axis) {
-    const drawn = {}, take = (...source) => drawSource(drawn, ...source);
     if (!isText(axis.ekf2)) {
       const { state, variance, innovations } = axis.ekf2;
-      take("state", table(["t", "p", "v"], state), ["p", "v"]);
-      take("variance", table(["t", "sp", "sv"], variance), ["sp", "sv"]);
+      drawSource("state", table(["t", "p", "v"], state), ["p", "v"]);
+      drawSource("variance", table(["t", "sp", "sv"], variance), ["sp", "sv"]);
       const rows = table(["t", "nu", "sigma", "rejected"], innovations), { t } = rows;
       for (const [name, flag] of [["fused", 0], ["rejected", 1]]) {
         const which = [...t.keys()].filter((i) => rows.rejected[i] === flag);
-        take(name, { t: Float64Array.from(which, (i) => t[i]),
+        drawSource(name, { t: Float64Array.from(which, (i) => t[i]),
           x: Float64Array.from(which, (i) => rows.nu[i] / rows.sigma[i]) }, ["x"]);
       }
-      take("running", { t, running: running(rows.nu, rows.sigma.map((s) => s * s)) }, ["running"]);
     }
     if (!isText(axis.truth)) {
       const { p, v } = axis.truth;
-      take("truth_p", { t: p[0], p: p[1] }, ["p"]);
-      if (v !== null) take("truth_v", { t: v[0], v: v[1] }, ["v"]);
+      drawSource("truth_p", { t: p[0], p: p[1] }, ["p"]);
+      if (v !== null) drawSource("truth_v", { t: v[0], v: v[1] }, ["v"]);
       if (!isText(axis.ekf2)) {
         const [t, position] = axis.ekf2.state, expected = Engine.interp(t, ...p, NaN);
-        take("error_ekf2", { t, e: position.map((x, i) => x - expected[i]) }, ["e"]);
+        drawSource("error_ekf2", { t, e: position.map((x, i) => x - expected[i]) }, ["e"]);
       }
     }
-    return drawn;
   }
-  /* Draw KF and set the vertical ranges of the plots to the drawn values */
-  function drawPlots() {
-    const drawn = { ...drawnReferences, ...drawKf(result) }, { steps, updates } = drawn;
-    const of = (source, column) => drawn[source]?.[column] ?? EMPTY;
-    setRange("position", () => extent(steps.p, of("state", "p"), of("truth_p", "p"), of("measured", "z")));
-    setRange("velocity", () => extent(steps.v, of("state", "v"), of("truth_v", "v")));
-    setRange("error", () => extent(of("error", "e"), of("error_ekf2", "e")));
-    setRange("sigma_p", () => extent(steps.sp, of("variance", "sp")), true);
-    setRange("sigma_v", () => extent(steps.sv, of("variance", "sv")), true);
-    setRange("running", () => extent(updates.running, of("running", "running"), ranges.bands.source), true);
-    setRange("gain", () => extent(updates.k0, updates.k1, [0]));
-    drawOutsideArrows(drawn);
-  }
-
   /* Add RMSE and the percentage of large innovations to the titles of the plots */
   function drawTitles({ axis, numbers: kf }) {
     const title = (name, text) => {
@@ -436,7 +385,6 @@ const Explore = (async () => {
       return text ? [`${name} ${text}`] : [];
     }).join(", ");
     title("innovation", `values outside ±2 (expected 5 %): ${both(({ outside }) => outside === undefined ? "" : `${(100 * outside).toFixed(0)} %`)}`);
-    title("running", `RMS over ${ranges.running} measurements; green: consistent`);
     title("gain", "solid: position gain, dotted: velocity gain (1/s)");
     if (kf === null) return;
     const gaps = flight.events.gap.length ? "; hatched: gap in the position source" : "";
@@ -455,7 +403,7 @@ const Explore = (async () => {
     const map = mapNow(), plot = model("map");
     $("map").hidden = isText(map);
     if (isText(map)) return;
-    const [[a0, a1], [z0, z1]] = [map.sigmaA, map.sigmaZ], name = axisNow().map;
+    const name = axisNow().map;
     if (mapShown !== name) {
       mapShown = name;
       for (const item of plot.renderers) {
@@ -465,8 +413,6 @@ const Explore = (async () => {
       setSource("best", map.likely.includes(null) ? { x: [], y: [] } : { x: [a], y: [z] });
     }
     setSource("point", { x: [settings.sigmaA], y: [settings.sigmaZ] });
-    [plot.x_range.start, plot.x_range.end] = [Math.min(a0, settings.sigmaA / 1.3), Math.max(a1, settings.sigmaA * 1.3)];
-    [plot.y_range.start, plot.y_range.end] = [Math.min(z0, settings.sigmaZ / 1.3), Math.max(z1, settings.sigmaZ * 1.3)];
   }
   function mapNote() {
     const map = mapNow(), initial = flight.settings;
@@ -489,7 +435,7 @@ const Explore = (async () => {
     return words.join(" ");
   }
   // ------------------------------------------------------------------ whole page
-  let axisShown = null, drawnReferences = null; // null: to be drawn
+  let axisShown = null; // null: to be drawn
   /* Run KF and draw the visible views; `quick`, during a drag of a slider: without texts and tables */
   function show(quick = false) {
     cancelAnimationFrame(nextFrame);
@@ -504,11 +450,11 @@ const Explore = (async () => {
     axisShown = settings.axis;
     replay();
     if (isNewAxis) {
-      drawnReferences = drawReferences(result.axis);
+      drawReferences(result.axis);
       card.showAxis(settings.axis, flight.main);
       SETTINGS.forEach(markLikely);
     }
-    if (result.run) drawPlots();
+    if (result.run) drawKf(result);
     drawCard(result);
     drawTitles(result);
     if (isVisible("map")) drawMap();
@@ -525,21 +471,19 @@ const Explore = (async () => {
     drawTable(result);
     $("command").textContent = command();
     if (isNewAxis) times.drawEvents(axis);
-    times.drawTrack();
     stepper.draw();
     toAddress();
   }
   /* Draw the same KF run again after a zoom */
   function redraw() {
-    drawnReferences = drawReferences(result.axis);
-    if (result.run) drawPlots();
-    times.drawTrack();
+    drawReferences(result.axis);
+    if (result.run) drawKf(result);
   }
 
   const stepper = Step.start({ settings, selected, result, model, setSource, figures, isVisible,
     moved: (time) => { times.showTime(time); toAddress(); } });
   const keys = { n: stepper.next, p: stepper.previous, " ": () => { open("step"); stepper.play(); } };
-  const times = Times.start({ flight, settings, model, setSource, timeRange, figures, redraw, shifted, isVisible, keys });
+  const times = Times.start({ flight, model, setSource, timeRange, figures, redraw, keys });
   const { flown, command: example, why: noReplay } = flight.ekf2;
   for (const [name, value] of Object.entries(flown)) $("flown").append(make("dt", name), make("dd", value));
   if (!Object.keys(flown).length) $("flown").append(make("dt", "The log contains none of the EKF2 parameters of this source."));

@@ -64,7 +64,7 @@ const Practice = (() => {
     }
     $("quiz-score").textContent = done === 0 ? "" : `Score: ${sum} of ${done} answered flights${done === count ? ", all answered" : ""}`;
   }
-  /* Show the answer beside the solution, the re-run, and the card of the flight */
+  /* Show the answer beside the solution, and the card of the flight */
   function showSolution(page, solution, boxes) {
     const score = points(answers[current], solution), box = $("quiz-solution");
     const [, size, time] = answers[current].split("|");
@@ -79,7 +79,7 @@ const Practice = (() => {
       body.insertRow().append(make("th", name, { scope: "row" }), make("td", yours || "–", { dir: "auto" }),
         make("td", correct(name) || fallback));
     }
-    box.replaceChildren(heading, table, make("p", solution.rerun));
+    box.replaceChildren(heading, table);
     for (const { symptom, view, span } of solution.mistakes) {
       const button = make("button", "Show in the plots");
       button.addEventListener("click", () => {

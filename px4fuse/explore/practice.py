@@ -16,7 +16,6 @@ from msgspec import structs
 
 from px4fuse.card.build import build_card
 from px4fuse.card.model import Card
-from px4fuse.card.numbers import format_metres, format_ratio
 from px4fuse.core.record import Record, table
 from px4fuse.diagnose import diagnose
 from px4fuse.explore.data import flight_data
@@ -54,7 +53,6 @@ FINDING_WITH_TIME = {
     "jump": "source_position_jump",
     "dropout": "source_gap",
 }
-NO_MISTAKE = "No mistake: about 5 % of the innovations are outside ±2√S, and they are white."
 # Name of the mistake "SIGMA_Z of KF is too small", which is a wrong setting and no fault in the log
 NOISY_UWB = "noisy-uwb"
 
@@ -215,7 +213,6 @@ def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str
     key = {
         "right": practice_flight.correct_answers,
         "mistakes": descriptions,
-        "rerun": _rerun_sentence(card) if descriptions else NO_MISTAKE,
         "card": card_html(_name_mistakes(card, descriptions), has_apply=True),
     }
     compressed_key = base64.b64encode(zlib.compress(json.dumps(key).encode())).decode()
@@ -247,23 +244,6 @@ def size_in_words(size: str) -> list[str]:
     (['5 %', '2 m'], ['-400 ms'], ['0.3'])
     """
     return [re.sub(r"(?<=\d)(?=[^\d.])", " ", part).replace("deg", "°") for part in size.split(",")]
-
-
-def _rerun_sentence(card: Card) -> str:
-    """Describe the most effective re-run with one change: RMSE and innovation before and after."""
-    reruns = (rerun for cause in card.causes for rerun in cause.reruns)
-    best_rerun = next((rerun for rerun in reruns if rerun.improves != "nothing"), None)
-    if best_rerun is None:
-        return "No re-run with one change corrects this flight."
-    changes = [
-        f"{name} {format_value(values[0])} → {format_value(values[1])}{unit}"
-        for name, values, format_value, unit in (
-            ("position RMSE", best_rerun.position_rmse_m, format_metres, " m"),
-            ("innovation ÷ √S", best_rerun.source_ratio, format_ratio, ""),
-        )
-        if values is not None
-    ]
-    return f"Re-run of {best_rerun.label}: {', '.join(changes)}."
 
 
 def _name_mistakes(card: Card, descriptions: Sequence[Mapping[str, Any]]) -> Card:

@@ -165,19 +165,11 @@ const Step = (() => {
         line.location = z;
       }
       // the same scale for the whole run shows changes of the ellipse; only the first ellipses are larger
-      const reach = reachOf(run).map((typical, i) => Math.max(typical, 2.2 * Math.sqrt(now[2 + 2 * i])));
+      const reach = [run.updates.p00, run.updates.p11].map((variances, i) => Math.sqrt(Math.max(
+        8 * variances.toSorted()[Math.floor(0.9 * variances.length)], 5 * now[2 + 2 * i])));
       [plot.x_range.start, plot.x_range.end] = [now[0] - reach[0], now[0] + reach[0]];
       [plot.y_range.start, plot.y_range.end] = [now[1] - reach[1], now[1] + reach[1]];
     }
-    let cachedReach = { run: null, reach: [1, 1] };
-    function reachOf(run) {
-      if (cachedReach.run === run) return cachedReach.reach;
-      const typical = (values) => Float64Array.from(values, Math.sqrt).sort()[Math.floor(0.9 * values.length)];
-      const wide = Math.max(2.5 * typical(run.updates.p00), 2.5 * Math.min(settings.sigmaZ, 20 * typical(run.updates.p00)));
-      cachedReach = { run, reach: [wide, 2.8 * typical(run.updates.p11)] };
-      return cachedReach.reach;
-    }
-
     const actions = { first: () => goTo(0), previous: () => goTo((selected.measurement ?? 1) - 1),
       next: () => goTo((selected.measurement ?? -1) + 1), last: () => goTo(Infinity), play };
     for (const [id, act] of Object.entries(actions)) onClick(id, act);

@@ -170,14 +170,9 @@ class CheckInput:
             return "the answer key contains no right answers to the form"
         return form_points(self.form, self.answer.form)
 
-    def names_mistake(self, *kinds: str) -> bool:
-        """Return True if the student's answer form names a mistake of one of these kinds."""
-        form = self.form
-        return isinstance(form, Answers) and any(mistake.kind in kinds for mistake in form.mistakes)
-
-    def has_finding(self, finding: str) -> bool:
-        """Return True if the report contains a finding with this id."""
-        return any(recorded.id == finding for recorded in self.results.findings)
+    def has_finding(self, *ids: str) -> bool:
+        """Return True if the report contains a finding with one of these ids."""
+        return any(finding.id in ids for finding in self.results.findings)
 
     def missing_reason(self, path: str) -> str:
         """Return the reason why a value is missing, in brackets; "" if the results state none."""
@@ -350,10 +345,7 @@ def _score_tuning(
         reason_text = check_input.missing_reason(f"tuning.{HORIZONTAL}")
         return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
     low, high = interval
-    may_drift = check_input.has_finding("source_may_drift") or check_input.has_finding(
-        "source_drift"
-    )
-    if name == "sigma_z_m" and may_drift:
+    if name == "sigma_z_m" and check_input.has_finding("source_may_drift", "source_drift"):
         # innovations do not show the drift of a source, so each SIGMA_Z up to the error of KF is
         # right
         high = max(high, _largest_source_error_m(comparison))
@@ -438,8 +430,9 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
         statement = f"You applied a time offset of {applied_s:.3f} s"
         if low - self.margin_s <= applied_s <= high + self.margin_s:
             return 1.0, f"{statement}; the estimate is {low:.3f} to {high:.3f} s (95 %)."
-        if any(map(check_input.has_finding, CHANGING_CLOCK_FINDINGS)):
-            if check_input.names_mistake("clock-jump", "clock-drift"):
+        if check_input.has_finding(*CHANGING_CLOCK_FINDINGS):
+            mistakes = check_input.form.mistakes if isinstance(check_input.form, Answers) else ()
+            if any(mistake.kind in ("clock-jump", "clock-drift") for mistake in mistakes):
                 return 1.0, "The time offset changes in your flight, as your form states."
             statement = "The time offset changes in your flight. State the time in your form."
             return self.undeterminable, statement

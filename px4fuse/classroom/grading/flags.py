@@ -14,7 +14,6 @@ from typing import Any
 from px4fuse.classroom.assignment.roster import normalise_text
 from px4fuse.classroom.grading.model import GradedReport
 from px4fuse.core.text import capitalise_first, join_first, one_line
-from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.request import LoopRequest
 from px4fuse.results.contract import LoopResults, ReportedResults
 from px4fuse.simulation import flights
@@ -25,8 +24,6 @@ from px4fuse.verification.model import Verdict
 MIN_SAME_NUMBERS, SAME_NUMBER_TOLERANCE = 3, 0.02
 # Minimum fraction of the log between --start and --end: a report on a shorter segment is flagged
 MIN_SEGMENT_FRACTION = 0.5
-# Maximum factor between SIGMA_A or SIGMA_Z and its maximum-likelihood estimate, above or below
-MAX_SETTING_FACTOR = 30.0
 # Maximum factor between --drift or --heading-drift and its default value, above or below
 MAX_DRIFT_FACTOR = 4.0
 # Maximum number of reports with equal contents that a flag lists
@@ -62,8 +59,6 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
             f"The student analysed only {fraction:.0%} of the log ({settings.start_s:.1f} to "
             f"{settings.end_s:.1f} s of {whole_s:.1f} s). Ask for the reason."
         )
-    if not {"north", "east", "aisle"} & set(results.axes):
-        yield "Only the vertical axis was analysed (--axis)."
     without_imu = any(finding.id == "acceleration_not_logged" for finding in results.findings)
     if settings.input == "zero" and not without_imu:
         yield "The IMU was not used (--input zero)."
@@ -74,19 +69,6 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
             f"The position source is {source.name} ({source.path}), not "
             f"{tracks_as_received[0]}, the positions as received by PX4."
         )
-    estimates = [
-        estimate for estimate in results.tuning.values() if isinstance(estimate, NoiseEstimate)
-    ]
-    for name, label in (("sigma_z_m", "SIGMA_Z"), ("sigma_a_m_s2", "SIGMA_A")):
-        value = getattr(settings, name)
-        ml_values = [ml_value for estimate in estimates if (ml_value := getattr(estimate, name))]
-        if ml_values and not (
-            min(ml_values) / MAX_SETTING_FACTOR < value < MAX_SETTING_FACTOR * max(ml_values)
-        ):
-            yield (
-                f"{label} {value:g} differs by more than a factor of {MAX_SETTING_FACTOR:g} from "
-                f"its maximum-likelihood estimate ({ml_values[0]:.3g})."
-            )
     if results.log.hardware == flights.HARDWARE and not has_key:
         yield "The log is simulated (px4fuse simulate), not a real flight."
 

@@ -8,6 +8,7 @@ without a measurement has points only with the correct size.
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import msgspec
 
@@ -39,24 +40,16 @@ FULL_TOLERANCE, HALF_TOLERANCE = 0.02, 0.10
 HALF_SIZE_TOLERANCE = 0.4
 
 
-@dataclass(frozen=True)
-class _CorrectionRule:
-    """Parameter that corrects mistakes, and its right values, from ``form_points.toml``.
+class _CorrectionRule(NamedTuple):
+    """Parameter that corrects mistakes, with the fraction of the points for each mistake.
 
-    Attributes
-    ----------
-    fraction_by_mistake : mapping
-        Fraction of the points for this correction, by mistake.
-    right_values : (float, float) or str
-        Smallest and largest right value, or the name of a rule in :func:`right_corrections`.
-    only_if_late : bool
-        True if the correction is right for late timestamps only.
+    ``right_values``: smallest and largest right value, or the name of a rule in
+    :func:`right_corrections`.
     """
 
     parameter: str
     fraction_by_mistake: Mapping[str, float]
     right_values: tuple[float, float] | str = ANY_BOUNDS
-    only_if_late: bool = False
 
 
 POINTS_TABLE = table(__file__, "form_points.toml", dict)
@@ -273,7 +266,7 @@ def right_corrections(mistake: TrueMistake, truth: FormTruth) -> tuple[RightCorr
     bounds = {
         "negated": (-high, -low),
         "size": (low, high),
-        "milliseconds": (1e3 * low, 1e3 * high),
+        "late milliseconds": (1e3 * low, 1e3 * high),
         "twice": (2.0 * size, 1e4),
         "factors": (100.0 / (100.0 + high), 100.0 / (100.0 + low)),
         "noise": (0.8 * truth.sigma_z_m, 1.25 * truth.sigma_z_m),
@@ -284,10 +277,12 @@ def right_corrections(mistake: TrueMistake, truth: FormTruth) -> tuple[RightCorr
         (
             rule.parameter,
             bounds[values] if isinstance(values := rule.right_values, str) else values,
-            0.0 if rule.only_if_late and size <= 0.0 else rule.fraction_by_mistake[mistake.kind],
+            rule.fraction_by_mistake[mistake.kind],
         )
         for rule in CORRECTIONS
         if mistake.kind in rule.fraction_by_mistake
+        # EKF2_EV_DELAY cannot be negative
+        and (size > 0.0 or rule.right_values != "late milliseconds")
     )
 
 
