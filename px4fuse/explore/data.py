@@ -34,7 +34,8 @@ from px4fuse.flight.model import Columns, PositionTrack, Unavailable
 from px4fuse.report.card_html import MARK_PATHS
 from px4fuse.request import ComparisonRequest, WhatIfRequest, command_line
 
-Data = dict[str, Any]  # data of the page, which become JSON
+# Data of the page, which become JSON
+Data = dict[str, Any]
 # Range of the time offset slider (s) below and above the analysed time offset
 OFFSET_HALF_RANGE_S = 0.6
 
@@ -150,7 +151,7 @@ def _imu_data(comparison: Comparison, packer: Packer) -> Data | str:
 
 
 def _used_samples(comparison: Comparison, acceleration: Acceleration) -> slice:
-    """Return the slice of IMU samples in the segment, with one more sample at each end."""
+    """Return the IMU samples of the segment as a slice, with one more sample at each end."""
     segment, time = comparison.segment, acceleration.time_s
     low = int(np.searchsorted(time, segment.start_s, side="right")) - 1
     high = int(np.searchsorted(time, segment.end_s)) + 1

@@ -21,7 +21,8 @@ from px4fuse.core.record import Record, table
 from px4fuse.explore.data import Data
 from px4fuse.filter.tuning import AxisTuning
 
-Style = dict[str, Any]  # options of a drawing function of Bokeh
+# Options of a drawing function of Bokeh
+Style = dict[str, Any]
 # The page's script sets the colours by `name`. KF is solid and round, EKF2 dashed and square, as in
 # the report
 KF_LINE: Style = {"line_width": 1.6, "name": "kf"}
@@ -40,17 +41,21 @@ GAP_BAND: Style = {
     "hatch_color": "#888888",
     "hatch_alpha": 0.6,
 }
-# Innovation ÷ √S: limit of 95 % of the values of a consistent filter, and half the plotted range
-NORMAL_LIMIT, HALF_NORMAL_RANGE = 2.0, 4.6
-# Left border (pixels) of the plots and, for its longer labels, of the event plot and the plot above
-LEFT_BORDER, EVENT_BORDER = 50, 82
+# Limit of innovation ÷ √S that contains 95 % of the values of a consistent filter
+NORMAL_LIMIT = 2.0
+# Upper end of the plot of innovation ÷ √S; the lower end has the opposite sign
+NORMAL_END = 4.6
+# Width (pixels) left of the axis of a plot
+LEFT_BORDER = 50
+# Width (pixels) left of the axis of the event plot, which has longer labels, and of the plot above
+EVENT_BORDER = 82
 STYLES = {
     "kf": KF_LINE,
     "dotted": KF_LINE | {"line_dash": [2, 2]},
     "ekf2": EKF2_LINE,
     "truth": TRUTH_LINE,
 }
-# Upper end of the colours of the likelihood map (standard deviations): √(2 · (ln L_max − ln L))
+# Distance from the maximum, √(2 · (ln L_max − ln L)), of the palest colour of the likelihood map
 MAP_SIGMAS = 6.0
 
 
@@ -175,7 +180,7 @@ class _Sources(dict[str, ColumnDataSource]):
 
 def _draw_innovations(fig: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: bool) -> None:
     """Draw innovation ÷ √S of KF and EKF2 as dots, in a band that contains 95 % of them."""
-    fig.y_range = Range1d(start=-HALF_NORMAL_RANGE, end=HALF_NORMAL_RANGE)
+    fig.y_range = Range1d(start=-NORMAL_END, end=NORMAL_END)
     fig.add_layout(BoxAnnotation(bottom=-NORMAL_LIMIT, top=NORMAL_LIMIT, **CONSISTENT_BAND))
     kf_dots = _draw_dots(fig, sources["updates"], 4, name="kf")
     _add_hover(fig, kf_dots, ("KF", "@x{0.00}"))
@@ -208,7 +213,7 @@ def _add_cursor(fig: Any, **options: Any) -> None:
 
 
 def _page_range(name: str | None = None) -> Range1d:
-    """Return a plot range that the page's script sets."""
+    """Return a plot range that the script of the page sets."""
     return Range1d(start=0.1, end=1.0, name=name)
 
 
@@ -285,13 +290,13 @@ def _likelihood_map(tuning: Tuning) -> Any:
 
 
 def _draw_dots(fig: Any, source: ColumnDataSource, size: int, **style: Any) -> Any:
-    """Draw dots without edge lines; x and y are the last two columns of the source."""
+    """Draw the last two columns of the source, x and y, as dots without edge lines."""
     x, y = source.column_names[-2:]
     return fig.scatter(x, y, source=source, size=size, **{"line_color": None} | style)
 
 
 def _pixel_extent(values: Array) -> tuple[float, float]:
-    """Return start and length of an image on a logarithmic axis from the centres of its pixels."""
+    """Return start and length of an image along a logarithmic axis; ``values``: pixel centres."""
     half_pixel = float(np.sqrt(values[1] / values[0]))
     start, end = float(values[0]) / half_pixel, float(values[-1]) * half_pixel
     return start, end - start

@@ -12,10 +12,13 @@ import numpy as np
 
 from px4fuse.core.arrays import Array
 
-# Steps per unit: 1.5e-11 m, m/s or s, 1 % of the tolerance between the page's KF and Python's
+# Steps per unit for values that KF uses: one step is 1.5e-11 m, m/s or s, which is 1 % of the
+# tolerance between KF in the page and KF in Python
 FINE_SCALE = 2.0**36
-COARSE_SCALE = 1e6  # steps per unit for values that are only drawn or averaged
-MAX_EXACT_INTEGER = 2.0**52  # integers up to this are exact in JavaScript (doubles)
+# Steps per unit for values that are only drawn or averaged
+COARSE_SCALE = 1e6
+# Largest integer that JavaScript represents exactly, with a margin of a factor of two
+MAX_EXACT_INTEGER = 2.0**52
 
 
 @dataclass

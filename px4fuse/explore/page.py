@@ -12,7 +12,8 @@ from px4fuse.explore.packing import Packer
 from px4fuse.html.safe import clean_values, inert_json, load_template, policy_hash, read_asset
 from px4fuse.report.card_html import axis_figures, card_html, card_of, card_style
 
-MAX_LOG_TEXT_LENGTH = 2000  # maximum length of a text from a log; longer ones are shortened
+# Maximum length (characters) of a text from a log; longer texts are shortened
+MAX_LOG_TEXT_LENGTH = 2000
 SCRIPT_NAMES = ("card", "step", "times")
 PACKAGE = "px4fuse.explore"
 

@@ -19,12 +19,14 @@ from px4fuse.results.contract import LoopResults, ReportedResults
 from px4fuse.simulation import flights
 from px4fuse.verification.model import Verdict
 
-# Minimum number of equal numbers in two answer forms that are flagged as copies, and relative
-# tolerance of equal numbers, which detects a copy with small changes
-MIN_SAME_NUMBERS, SAME_NUMBER_TOLERANCE = 3, 0.02
-# Minimum fraction of the log between --start and --end: a report on a shorter segment is flagged
+# Minimum number of equal numbers in two answer forms for flagging them as copies
+MIN_SAME_NUMBERS = 3
+# Maximum relative difference of equal numbers: a copy may have small changes
+SAME_NUMBER_TOLERANCE = 0.02
+# Minimum fraction of the log between --start and --end of a report without a flag
 MIN_SEGMENT_FRACTION = 0.5
-# Maximum factor between --drift or --heading-drift and its default value, above or below
+# Maximum factor between --drift or --heading-drift and its default value, for a report without a
+# flag
 MAX_DRIFT_FACTOR = 4.0
 # Maximum number of reports with equal contents that a flag lists
 MAX_LISTED_REPORTS = 4
