@@ -23,6 +23,8 @@ from px4fuse.filter.tuning import AxisTuning
 
 # Options of a drawing function of Bokeh
 Style = dict[str, Any]
+# Columns of the data sources, which the script of the page fills as far as a plot needs them
+COLUMNS = "t p v sp sv k0 k1 e minus plus x y z turn row left right text"
 # The page's script sets the colours by `name`. KF is solid and round, EKF2 dashed and square, as in
 # the report
 KF_LINE: Style = {"line_width": 1.6, "name": "kf"}
@@ -81,12 +83,11 @@ class View(Record, frozen=True):
 
 
 class Figures(Record, frozen=True):
-    """Views and plots of ``figures.toml``: titles, columns of the sources, lines and colours."""
+    """Views and plots of ``figures.toml``: titles, lines and colours."""
 
     event_rows: list[str]
     map_colours: list[str]
     views: dict[str, View]
-    sources: dict[str, str]
     plots: dict[str, Plot]
 
 
@@ -144,7 +145,7 @@ def _make_plots(data: Data, time_range: Range1d) -> dict[str, Any]:
             min_border_left=EVENT_BORDER if name == "position" else LEFT_BORDER,
         )
         if name == "position":
-            _draw_dots(fig, sources["measured"], 3, name="measured")
+            _draw_dots(fig, sources["measured"], "t z", 3, name="measured")
         if name == "innovation":
             _draw_innovations(fig, sources, with_ekf2="ekf2" not in missing_kinds)
         if name == "error":
@@ -174,7 +175,7 @@ class _Sources(dict[str, ColumnDataSource]):
         self.plot = plot
 
     def __missing__(self, name: str) -> ColumnDataSource:
-        self[name] = _empty_source(f"{self.plot}:{name}", FIGURES.sources[name])
+        self[name] = _empty_source(f"{self.plot}:{name}")
         return self[name]
 
 
@@ -182,16 +183,16 @@ def _draw_innovations(fig: Any, sources: dict[str, ColumnDataSource], *, with_ek
     """Draw innovation ÷ √S of KF and EKF2 as dots, in a band that contains 95 % of them."""
     fig.y_range = Range1d(start=-NORMAL_END, end=NORMAL_END)
     fig.add_layout(BoxAnnotation(bottom=-NORMAL_LIMIT, top=NORMAL_LIMIT, **CONSISTENT_BAND))
-    kf_dots = _draw_dots(fig, sources["updates"], 4, name="kf")
+    kf_dots = _draw_dots(fig, sources["updates"], "t x", 4, name="kf")
     _add_hover(fig, kf_dots, ("KF", "@x{0.00}"))
-    _draw_dots(fig, sources["beyond"], 9, name="kf", **ARROW_MARKER)
+    _draw_dots(fig, sources["beyond"], "t y", 9, name="kf", **ARROW_MARKER)
     if with_ekf2:
         square: Style = {"marker": "square", "name": "ekf2"}
-        fused_dots = _draw_dots(fig, sources["fused"], 4, **square)
-        rejected_dots = _draw_dots(fig, sources["rejected"], 7, **square, **HOLLOW_MARKER)
+        fused_dots = _draw_dots(fig, sources["fused"], "t x", 4, **square)
+        rejected_dots = _draw_dots(fig, sources["rejected"], "t x", 7, **square, **HOLLOW_MARKER)
         _add_hover(fig, fused_dots, ("EKF2", "@x{0.00}"))
         _add_hover(fig, rejected_dots, ("EKF2 rejected", "@x{0.00}"))
-        _draw_dots(fig, sources["beyond_ekf2"], 9, name="ekf2", **ARROW_MARKER)
+        _draw_dots(fig, sources["beyond_ekf2"], "t y", 9, name="ekf2", **ARROW_MARKER)
 
 
 def _add_hover(fig: Any, renderer: Any, *rows: tuple[str, str]) -> None:
@@ -217,15 +218,14 @@ def _page_range(name: str | None = None) -> Range1d:
     return Range1d(start=0.1, end=1.0, name=name)
 
 
-def _empty_source(name: str, columns: str) -> ColumnDataSource:
-    """Return an empty source that the page's script fills; `columns` are separated by blanks."""
-    empty: Data = {column: [] for column in columns.split()}
-    return ColumnDataSource(empty, name=f"{name}-source")
+def _empty_source(name: str) -> ColumnDataSource:
+    """Return an empty source with all columns of the page, which the script of the page fills."""
+    return ColumnDataSource({column: [] for column in COLUMNS.split()}, name=f"{name}-source")
 
 
 def _event_plot(data: Data, time_range: Range1d) -> Any:
     """Make the event plot, with a row per kind of event."""
-    source = _empty_source("strip", FIGURES.sources["events"])
+    source = _empty_source("strip")
     rows = FIGURES.event_rows if _has_kind(data, "ekf2") else FIGURES.event_rows[2:]
     fig = _figure(
         "strip",
@@ -281,17 +281,17 @@ def _likelihood_map(tuning: Tuning) -> Any:
             image = np.sqrt(2.0 * np.maximum(axis_tuning.map.drop.T, 0.0)).astype(np.float32)
             draw: Any = fig.image  # color_mapper is missing in its type signature
             draw([image], x, y, dw, dh, color_mapper=mapper, name=f"map:{name}", visible=False)
-    best_point = _empty_source("best", "x y")
-    point = _empty_source("point", "x y")
+    best_point = _empty_source("best")
+    point = _empty_source("point")
     white: Style = {"line_color": "white"}
-    _draw_dots(fig, best_point, 13, marker="cross", line_width=2.5, **white)
-    _draw_dots(fig, point, 12, fill_color="darkorange", line_width=2.0, **white)
+    _draw_dots(fig, best_point, "x y", 13, marker="cross", line_width=2.5, **white)
+    _draw_dots(fig, point, "x y", 12, fill_color="darkorange", line_width=2.0, **white)
     return fig
 
 
-def _draw_dots(fig: Any, source: ColumnDataSource, size: int, **style: Any) -> Any:
-    """Draw the last two columns of the source, x and y, as dots without edge lines."""
-    x, y = source.column_names[-2:]
+def _draw_dots(fig: Any, source: ColumnDataSource, columns: str, size: int, **style: Any) -> Any:
+    """Draw two columns of the source as dots without edge lines, for example "t z"."""
+    x, y = columns.split()
     return fig.scatter(x, y, source=source, size=size, **{"line_color": None} | style)
 
 
@@ -315,11 +315,11 @@ def _phase_plot() -> Any:
     )
     fig.add_layout(BoxAnnotation(name="band", fill_alpha=0.25, line_color=None, visible=False))
     _add_cursor(fig, name="measurement", line_dash=[2, 2])
-    trail = _empty_source("trail-means", "p v")
-    point_before, current_point = _empty_source("before", "p v"), _empty_source("now", "p v")
-    mean = _empty_source("mean", "p v")
+    trail = _empty_source("trail-means")
+    point_before, current_point = _empty_source("before"), _empty_source("now")
+    mean = _empty_source("mean")
     fig.line("p", "v", source=trail, name="measured")
     fig.line("p", "v", source=point_before, **KF_LINE | {"line_dash": [6, 3]})
     fig.patch("p", "v", source=current_point, fill_alpha=0.25, **KF_LINE)
-    _draw_dots(fig, mean, 7, name="kf")
+    _draw_dots(fig, mean, "p v", 7, name="kf")
     return fig

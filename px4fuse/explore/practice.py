@@ -85,8 +85,8 @@ class HiddenMistake(Record, frozen=True):
     mistake: str
     sizes: tuple[str, str, str]
     fault: str
-    size_text: str
     symptom: str
+    size_text: str = "{0}"
     view: str = "errors"
     has_either_sign: bool = False
 
