@@ -131,7 +131,6 @@ CHECKED = [
     ("clock", changed_results(clock__applied_s=0.25), {}, 0.0, "0.250 s"),
     ("clock", UNCLEAR, {}, 0.5, "no acceleration)."),
     ("clock", changed_results(clock=NONE), {}, 0.0, "too few of them"),
-    ("clock", LOOP, {}, 0.0, "is not a compare report"),
     ("clock", changed_results(**JUMPS), {}, 0.5, "State the time in your form"),
     ("clock", with_form(["clock-jump"], **JUMPS), {}, 1.0, "as your form states"),
     ("clock", with_form(["dropout"], **JUMPS), {}, 0.5, "State the time in your form"),
