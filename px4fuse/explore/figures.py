@@ -112,7 +112,7 @@ def document_json(data: Data, tuning: Tuning) -> tuple[Any, dict[str, str]]:
         "map": _likelihood_map(tuning),
         "step": _phase_plot(),
     }
-    with document.models.freeze():  # faster: Bokeh collects the models of all plots once
+    with document.models.freeze():  # Bokeh collects all models once, which is faster
         for plot in plots.values():
             document.add_root(plot)
     return document.to_json(deferred=False), {plot.id: name for name, plot in plots.items()}

@@ -61,10 +61,7 @@ const Explore = (async () => {
       show();
     });
     box.append(label, setting.number, setting.slider, ticks);
-    if (setting.key === "offset" && fixedReason) {
-      setting.number.disabled = setting.slider.disabled = true;
-      box.append(make("p", fixedReason, "note"));
-    }
+    if (setting.key === "offset" && fixedReason) box.append(make("p", fixedReason, "note"));
     $("sliders").append(box);
   }
   const names = axes.map((axis) => axis.name);
@@ -134,7 +131,6 @@ const Explore = (async () => {
       else ignored.push(name);
     };
     for (const setting of SETTINGS) {
-      if (setting.key === "offset" && fixedReason) continue;
       take(setting.id, (text) => isWithinLimits(setting, text), (text) => { settings[setting.key] = Number(text); });
     }
     take("axis", (name) => names.includes(name), (name) => { settings.axis = name; });
@@ -427,8 +423,7 @@ const Explore = (async () => {
     const { base, fixed, input, default_input: defaultInput } = flight.command, lesson = ranges.lesson;
     const words = [settings.offset !== flight.settings.offset ? fixed : base];
     for (const setting of SETTINGS) {
-      const standard = setting.key === "offset" ? 0 : lesson[setting.key];
-      if (setting.key === "offset" && fixedReason) continue;
+      const standard = setting.key !== "offset" ? lesson[setting.key] : fixedReason ? settings.offset : 0;
       if (settings[setting.key] !== standard) words.push(`--${setting.id} ${round(settings[setting.key], 12)}`);
     }
     if (settings.input !== defaultInput || input !== null) words.push(`--input ${settings.input}`);

@@ -92,7 +92,7 @@ class HiddenMistake(Record, frozen=True):
 
 
 class MistakeTable(Record, frozen=True):
-    """Possible answers with their texts, and mistakes of practice flights (``practice.toml``)."""
+    """Possible answers with their texts, and faults of practice flights (``practice.toml``)."""
 
     choices: dict[str, str]
     mistakes: tuple[HiddenMistake, ...]
@@ -122,7 +122,7 @@ class PracticeFlight:
 
     @property
     def correct_answers(self) -> list[str]:
-        """Right answers about the mistakes of the flight, sorted."""
+        """Right answers about the injected faults of the flight, sorted."""
         return sorted({mistake.choice for mistake in self.mistakes}) or ["nothing"]
 
 
@@ -225,7 +225,7 @@ def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str
 def _describe_mistake(
     mistake: HiddenMistake, size: str, findings: tuple[Finding, ...]
 ) -> dict[str, Any]:
-    """Describe a mistake for the page: fault, size, time, symptom, and the view that shows it."""
+    """Describe an injected fault with size, time, symptom, and the view of the page that shows it."""
     finding_id = FINDING_WITH_TIME.get(mistake.mistake)
     spans = [span for finding in findings if finding.id == finding_id for span in finding.spans_s]
     time = f"{spans[0][0]:.1f} to {spans[-1][1]:.1f} s" if spans else "whole flight"
@@ -249,7 +249,7 @@ def size_in_words(size: str) -> list[str]:
 
 
 def _name_mistakes(card: Card, descriptions: Sequence[Mapping[str, Any]]) -> Card:
-    """Replace the headline of the diagnosis if the analysis did not detect the mistake."""
+    """Replace the headline of the diagnosis if the analysis did not detect the injected fault."""
     if card.causes or not descriptions:
         return card
     fault = "; ".join(f"{mistake['fault']}: {mistake['size']}" for mistake in descriptions)

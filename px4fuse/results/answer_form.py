@@ -100,7 +100,7 @@ class StudentMistake(Record, frozen=True):
     panel: str = ""
 
     def size_in_first_unit(self) -> float | None:
-        """Convert the size to the first unit of the mistake, such as a factor of 1.05 to 5 %."""
+        """Convert the size to the first unit of the fault, such as a factor of 1.05 to 5 %."""
         units = MISTAKES[self.kind].units
         if self.size is None or not units:
             return None
@@ -140,7 +140,7 @@ class Answers(Record, frozen=True, kw_only=True):
 
     @property
     def names_no_mistake(self) -> bool:
-        """True if the form states that the flight has no mistake."""
+        """True if the form states that the flight has no injected fault."""
         return [mistake.kind for mistake in self.mistakes] == [NO_MISTAKE_KIND]
 
 
@@ -265,7 +265,7 @@ def _without_blanks(value: Any) -> Any:
 
 
 def check_answers(answers: Answers) -> None:
-    """Raise ValueError if an answer is not allowed, out of range, or names a mistake twice."""
+    """Raise ValueError if an answer is not allowed, out of range, or names a fault twice."""
     kinds = [student_mistake.kind for student_mistake in answers.mistakes]
     for kind in kinds:
         _require_choice("kind", kind, MISTAKES)

@@ -336,7 +336,7 @@ def _verify_with_log(
 
 
 def is_same_number_rounded(pairs: Iterable[tuple[float, float]], number: str, redrawn: str) -> bool:
-    """Return True if two printed numbers are roundings of the two results of one of the pairs.
+    """Return True if a printed number and its redrawn number are roundings of one pair of results.
 
     A pair contains a recorded and a recomputed result that are equal within the tolerances.
     """

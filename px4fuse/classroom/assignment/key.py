@@ -1,4 +1,4 @@
-"""Answer key of an assignment: flight, mistakes and right answers for each student."""
+"""Answer key of an assignment: flight, injected faults and right answers for each student."""
 
 from pathlib import Path
 from typing import Annotated, Literal

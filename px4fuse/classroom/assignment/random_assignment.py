@@ -75,7 +75,7 @@ class AssignableMistake(Record, frozen=True):
     hidden_groups: tuple[str, ...] = ()
 
     def is_detectable_with(self, other_mistake: AssignableMistake) -> bool:
-        """Return True if both mistakes can be detected in the same flight."""
+        """Return True if both injected faults can be detected in the same flight."""
         is_hidden = other_mistake.group in (self.group, *self.hidden_groups)
         return not is_hidden and self.group not in other_mistake.hidden_groups
 

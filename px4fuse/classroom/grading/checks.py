@@ -336,7 +336,8 @@ class TuningItem(RubricItem, frozen=True, tag="tuning"):
 
 
 def _score_tuning(check_input: CheckInput, name: Sigma, factor: float = 2.0) -> FractionAndReason:
-    comparison, (label, unit, option) = check_input.comparison, NOISE_SETTINGS[name]
+    comparison = check_input.comparison
+    label, unit, option = NOISE_SETTINGS[name]
     chosen_value: float = getattr(comparison.settings, name)
     horizontal_tuning = comparison.tuning.get(HORIZONTAL)
     interval = getattr(horizontal_tuning, f"{TUNED_FIELDS[name]}_interval", None)

@@ -7,7 +7,7 @@ px4fuse get the same settings.
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from decimal import Decimal
-from itertools import combinations
+from itertools import chain, combinations, permutations
 from operator import attrgetter
 from typing import Any
 
@@ -93,7 +93,7 @@ def _flag_drift(request: LoopRequest) -> Iterator[str]:
 
 
 def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
-    """Return the numbers in an answer form, by (mistake, "size" or "value") or ("", question)."""
+    """Return the numbers in an answer form, by (fault, "size" or "value") or ("", question)."""
     if report.form is None:
         return {}
     answers: dict[tuple[str, str], object] = {
@@ -159,15 +159,9 @@ def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequenc
         ("The answer form has the same numbers as that of {}.", _copied_forms(reports)),
     ):
         texts_by_submission: dict[str, list[str]] = defaultdict(list)
-        for first_report, second_report in pairs:
-            for report, other_report in (
-                (first_report, second_report),
-                (second_report, first_report),
-            ):
-                file = one_line(other_report.submission, 80)
-                texts_by_submission[report.submission].append(
-                    f"{_student_text(other_report)} ({file})"
-                )
+        for report, other_report in chain.from_iterable(map(permutations, pairs)):
+            file = one_line(other_report.submission, 80)
+            texts_by_submission[report.submission].append(f"{_student_text(other_report)} ({file})")
         for name, texts in texts_by_submission.items():
             flags_by_submission[name].append(
                 sentence.format(join_first(texts, MAX_LISTED_REPORTS, "; "))

@@ -24,7 +24,7 @@ from px4fuse.results.answer_form import (
 
 # Points that are deducted for each false fault, which the flight does not have
 FALSE_MISTAKE_POINTS = 10.0
-# Number of false faults from which the right injected faults have no points either
+# Number of false faults in an answer form from which its right faults have no points either
 MAX_FALSE_MISTAKES = 3
 # Fraction of the points if the answer form names a related injected fault
 NEIGHBOUR_FRACTION = 0.4
@@ -131,7 +131,7 @@ Match = tuple[TrueMistake, StudentMistake | None, float]
 def _mistake_feedback(
     matches: list[Match], false_mistakes: list[StudentMistake], is_clean_named: bool
 ) -> Iterator[str]:
-    """Yield a clause for each right or missed mistake, and one for all false mistakes."""
+    """Yield a clause for each right or missed injected fault, and one for all false faults."""
     if not matches:
         yield f"your flight has no mistake{', as your form states' * is_clean_named}"
     for mistake, student_mistake, _ in matches:
@@ -176,7 +176,7 @@ def _match_mistakes(answers: Answers, truth: FormTruth) -> tuple[list[Match], li
 
 
 def fraction_for_named_kind(kind: str, named_kind: str) -> float:
-    """Return the fraction of the points if a form names ``named_kind``, the flight has ``kind``."""
+    """Return the fraction of the points for naming ``named_kind`` instead of the fault ``kind``."""
     if kind == named_kind:
         return 1.0
     if (kind, named_kind) == ("r-scale", "ekf2-noise"):
@@ -187,7 +187,7 @@ def fraction_for_named_kind(kind: str, named_kind: str) -> float:
 
 
 def _mistake_fractions(matches: list[Match], truth: FormTruth) -> dict[str, float]:
-    """Return the fraction of the points for four parts of the form, as mean over all mistakes."""
+    """Return the fraction of the points for four parts of the form: means over all faults."""
     sized_count = sum(mistake.size is not None for mistake, _, _ in matches)
     fractions = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
     for mistake, student_mistake, fraction in matches:
@@ -223,7 +223,7 @@ def size_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> floa
 
 
 def time_and_panel_fraction(mistake: TrueMistake, student_mistake: StudentMistake) -> float:
-    """Return the fraction of the points for time and report panel of a mistake: half for each."""
+    """Return the fraction of the points for time and report panel of a fault: half for each."""
     if mistake.from_s is None and mistake.until_s is None:
         is_time_right = student_mistake.when == "whole flight"
     else:
@@ -238,7 +238,7 @@ def time_and_panel_fraction(mistake: TrueMistake, student_mistake: StudentMistak
 
 
 def panels(kind: str) -> list[str]:
-    """Return the panels of the report that show a kind of mistake."""
+    """Return the panels of the report that show a kind of injected fault."""
     return [*(panel for panel, kinds in POINTS_TABLE["shows"].items() if kind in kinds), "cover"]
 
 
@@ -269,7 +269,7 @@ RightCorrection = tuple[str, tuple[float, float], float]
 
 
 def right_corrections(mistake: TrueMistake, truth: FormTruth) -> tuple[RightCorrection, ...]:
-    """Return the parameters that correct a mistake, with bounds of their right values."""
+    """Return the parameters that correct an injected fault, with bounds of their right values."""
     size, low, high = (value or 0.0 for value in (mistake.size, mistake.low, mistake.high))
     from_s = mistake.from_s or 0.0
     until_s = from_s if mistake.until_s is None else mistake.until_s

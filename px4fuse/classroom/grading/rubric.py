@@ -183,7 +183,7 @@ def score_report(
 
 
 def _points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[PointsRule, str]:
-    """Return the rule for the points, and the reason; for "pending" the instructor's action."""
+    """Return the rule for the points of a report, and the reason or the instructor's action."""
     verdict = check_input.verdict
     reason = format_reason("".join(verdict.reasons[:1]))
     if verdict.status == "numbers differ":
