@@ -225,7 +225,7 @@ def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str
 def _describe_mistake(
     mistake: HiddenMistake, size: str, findings: tuple[Finding, ...]
 ) -> dict[str, Any]:
-    """Describe an injected fault with size, time, symptom, and the view of the page that shows it."""
+    """Describe an injected fault: size, time, symptom, and the view of the page that shows it."""
     finding_id = FINDING_WITH_TIME.get(mistake.mistake)
     spans = [span for finding in findings if finding.id == finding_id for span in finding.spans_s]
     time = f"{spans[0][0]:.1f} to {spans[-1][1]:.1f} s" if spans else "whole flight"
