@@ -8,7 +8,7 @@ const Explore = (async () => {
   const { flight, ranges, places } = JSON.parse(read("content"), withArrays);
   const { imu, axes } = flight;
   // ------------------------------------------------------------------ settings
-  // `log`: ends of a logarithmic slider (without it: linear); `likely`: maximum-likelihood estimate
+  // `log`: ends of a logarithmic slider; a slider without `log` is linear. `likely`: maximum-likelihood estimate
   const SETTINGS = [
     { id: "sigma-a", key: "sigmaA", title: "SIGMA_A", unit: "m/s²", log: [0.001, 100],
       hint: "process noise", likely: () => mapNow().likely?.[0] },
@@ -342,7 +342,7 @@ const Explore = (async () => {
     }
     if (isVisible("innovation")) drawOutsideArrows();
   }
-  /* Position of ground truth at the given times; without ground truth of EKF2, without both null */
+  /* Position of ground truth at these times; without ground truth that of EKF2; null without both */
   function reference(axis, times) {
     if (!isText(axis.truth)) return Engine.interp(times, ...axis.truth.p, NaN);
     return isText(axis.ekf2) ? null : Engine.interp(times, ...axis.ekf2.state.slice(0, 2), NaN);

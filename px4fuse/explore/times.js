@@ -1,6 +1,6 @@
 /* Time range and colours of the plots, and events. */
 const Times = (() => {
-  // CSS colours (--kf and so on) of the drawn elements with these names
+  // Names of drawn elements; the colour of an element is the CSS variable with its name, such as --kf
   const NAMES = ["kf", "ekf2", "truth", "measured", "ink", "band"];
 
   function start(page) {
