@@ -311,9 +311,7 @@ def _ekf2_settings(request: ComparisonRequest, analysis: Analysis) -> Data:
     parameter = PARAMETERS[aid.noise]
     flown_m = logged_parameters.get(aid.noise, parameter.default)
     changes = {aid.noise: max(float(f"{0.5 * flown_m:.2g}"), parameter.minimum)}
-    example = WhatIfRequest(
-        log=request.log, mavlink=request.mavlink, system=request.system, changes=changes
-    )
+    example = WhatIfRequest(log=request.log, system=request.system, changes=changes)
     return {"flown": flown_settings, "command": command_line(example, for_shell=True)}
 
 
