@@ -12,8 +12,10 @@ from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import FILTER_NAMES, Action, Cause, FilterName, Rerun, Target, Verdict
-from px4fuse.comparison.changes import CLOCK_OFFSET, OUTLIERS, SIGMA_A, SIGMA_Z
+from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
 from px4fuse.comparison.trials import (
+    CLOCK_OFFSET,
+    OUTLIERS,
     Trial,
     enters_band,
     halves,
@@ -116,7 +118,7 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
     for finding in root_findings:
         if finding.severity == "note":
             continue
-        trials = confirming_trials(analysis.trials, finding)
+        trials = confirming_trials(analysis.main_trials, finding)
         if finding.id in VERDICT_FINDINGS:  # a verdict is a cause even if no re-run improves it
             trials = tuple(filter(is_useful, trials))
         elif trials and not any(

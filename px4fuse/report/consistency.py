@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import AxisComparison, FilterSummary, UntestedFilter
-from px4fuse.comparison.trials import Statistic
+from px4fuse.comparison.model import FILTERS, AxisComparison, FilterSummary, UntestedFilter
+from px4fuse.comparison.trials import DISCREPANCIES, Statistic, Trial, find_cause, find_trials
 from px4fuse.core.text import format_number, format_p_value
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
 from px4fuse.findings.cause_text import format_change, format_explained_share
@@ -109,21 +110,26 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 def _write_causes(page: Page, analysis: Analysis) -> None:
     """Write the table of tested causes: KF and EKF2 re-run with one changed setting each."""
     axis = analysis.main.axis
+    tested: list[tuple[Trial, Statistic]] = []
+    for filter_name, statistic in product(FILTERS, DISCREPANCIES):
+        trials = find_trials(analysis.trials, filter_name, axis.name, statistic)
+        tested += [(trial, statistic) for trial in trials]
+        cause = find_cause(trials, filter_name, axis.name, statistic)
+        if cause and cause.before.difference_rms_m and cause.after.difference_rms_m:
+            tested.append((cause, "difference"))
     rows: list[list[Cell]] = []
-    for cause in analysis.causes:
-        if cause.axis == axis.name:
-            filter_label = "KF" if cause.filter == "kf" else "EKF2"
-            statistic, power = CAUSE_STATISTICS[cause.statistic]
-            values = (format_number(value**power, 2) for value in (cause.before, cause.after))
-            rows.append(
-                [
-                    filter_label,
-                    format_change(analysis, cause),
-                    statistic,
-                    *values,
-                    format_explained_share(cause),
-                ]
-            )
+    for trial, statistic in tested:
+        label, power = CAUSE_STATISTICS[statistic]
+        values = (outcome.value(statistic) or 0.0 for outcome in (trial.before, trial.after))
+        rows.append(
+            [
+                trial.filter.upper(),
+                format_change(analysis, trial),
+                label,
+                *(format_number(value**power, 2) for value in values),
+                format_explained_share(trial, statistic),
+            ]
+        )
     if not rows:
         return
     page.heading(f"Tested causes along {axis.label}")
