@@ -292,7 +292,7 @@ def test_batch_hanging_log_does_not_affect_other_logs(tmp_path, monkeypatch):
     assert table.loc["well.ulg", "status"].tolist() == ["done"] * 4
     hang, crash = table.loc["hang.ulg"], table.loc["crash.ulg"]
     assert (hang["status"], crash["status"]) == ("failed", "failed")
-    assert hang["reason"] == "the time limit of 600 s was exceeded"
+    assert hang["reason"] == "the job exceeded the time limit of 600 s"
     assert "--timeout" in hang["remedy"]
     assert crash["reason"] == "the worker process ended during a job (exit code 3)"
 
@@ -411,7 +411,7 @@ def test_find_logs_accepts_folders_globs_and_urls(tmp_path, monkeypatch):
     found = analysed(log.address)
     assert {(row["name"], row["log_sha256"]) for row in found.rows} == {("x.ulg", found.sha256)}
     (small,) = analysed(log.address, max_bytes=10).rows
-    assert small["reason"] == "the file has 1 MB; the limit is 0 MB"
+    assert small["reason"] == "the file has 1 MB, more than the limit of 0 MB"
 
 
 @pytest.mark.reallogs

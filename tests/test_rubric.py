@@ -75,8 +75,8 @@ BAD = {
     "duplicate title": (NOTES + NOTES, "the title 'T' is not unique"),
     "too many": (NOTES * 101, "length <= 100"),
     "invalid others_log": ('others_log = "maybe"\n' + NOTES, "`$.others_log`"),
-    "too large": ("#" * 1_000_001, "the limit is"),
-    "no text": (b"\xff\xfe\x00", "not a UTF-8 text file"),
+    "too large": ("#" * 1_000_001, "more than the limit"),
+    "no text": (b"\xff\xfe\x00", "not a text file in UTF-8"),
 }
 
 

@@ -63,9 +63,9 @@ def _read_attached(path: Path) -> DiffInput | None:
         return None
     limit = MAX_PDF_BYTES if is_report else MAX_RESULTS_BYTES
     advice = (
-        "Give a report, which has less than 2 MB"
+        "Give a report, which has less than 2 MB."
         if is_report
-        else "Give results of px4fuse compare"
+        else "Give results of px4fuse compare."
     )
     content = read_bytes_limited(path, ResultsError, limit, size_remedy=advice)
     results = (attached_results if is_report else read_results)(content, name)

@@ -249,7 +249,7 @@ def _read_secret(file: Path | None) -> bytes | None:
         SettingsError,
         MAX_SECRET_BYTES,
         name=name,
-        size_remedy="Give a file with one line of text",
+        size_remedy="Give a file with one line of text.",
     )
     return encode_secret(text, name)
 
