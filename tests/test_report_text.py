@@ -240,10 +240,10 @@ def test_report_page_on_time_offset_is_printed_only_with_result() -> None:
 @pytest.mark.parametrize(
     ("changes", "delay_ms", "expected"),
     [
-        ({}, 0.0, {"Result": "no significant time offset", "PX4": "0 ms is within"}),
+        ({}, 0.0, {"Result": "no significant time offset", "PX4": "0 ms agrees"}),
         ({}, 175.0, {"PX4": "Set EKF2_EV_DELAY to 0 ms (now 175 ms; 95 % 0 to 20 ms)"}),
         ({"offset_s": -0.25, "interval_s": (-0.28, -0.22)}, 250.0,
-         {"Result": "0.250 s late", "Re-run": "--clock-offset -0.250", "PX4": "is within"}),
+         {"Result": "0.250 s late", "Re-run": "--clock-offset -0.250", "PX4": "agrees"}),
         ({"offset_s": 0.25, "interval_s": (0.22, 0.28)}, 0.0,
          {"Result": "0.250 s early", "PX4": "cannot be negative"}),
         ({"offset_s": 0.009, "interval_s": (0.008, 0.0095)}, 0.0, {"Result": "no significant"}),

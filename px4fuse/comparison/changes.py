@@ -7,7 +7,7 @@ import numpy as np
 
 from px4fuse.comparison.estimates import Estimates, Tuning, first_axis_tuning
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterSummary
-from px4fuse.comparison.remedy import ml_delay_change, noise_change
+from px4fuse.comparison.remedy import horizon_change, ml_delay_change, ml_noise_change
 from px4fuse.comparison.trials import Change, Statistic
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.filter.frame_rotation import HeadingError
@@ -149,14 +149,21 @@ def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
 def _time_offset(
     comparison: Comparison, estimates: Estimates, inputs: Inputs | None
 ) -> list[Change]:
-    """Return a change of the time offset, if its part not yet applied is significant."""
+    """Return a change of the time offset, if its part not yet applied is significant.
+
+    EKF2 discards positions that are older than its fusion horizon, so it may need a longer one.
+    """
     clock, applied_s = estimates.clock, comparison.settings.clock_offset_s
     if isinstance(clock, Unavailable) or not clock.is_determinable:
         return []
     offset_s = applied_s + clock.remaining_s
     unapplied_s = offset_s - (applied_s if inputs is None else 0.0)
     is_significant = abs(unapplied_s) > clock.three_sigma_s
-    return [{CLOCK_OFFSET: round(offset_s, 3)}] if is_significant else []
+    if not is_significant:
+        return []
+    settings = {} if inputs is None else inputs.settings
+    age_ms = 0.0 if inputs is None else settings[inputs.aid.delay] - 1e3 * offset_s
+    return [{CLOCK_OFFSET: round(offset_s, 3), **horizon_change(settings, age_ms)}]
 
 
 def _kf_noises(settings: Settings, tuned: AxisTuning, is_underconfident: bool) -> list[Change]:
@@ -188,16 +195,11 @@ def _without_bias(estimates: Estimates) -> list[Change]:
 
 def _ekf2_noise(inputs: Inputs, summary: FilterSummary, tuned: AxisTuning) -> list[Change]:
     """Return the estimated position noise if its 95 % interval excludes EKF2's value."""
-    aid, flown, noise = inputs.aid, inputs.settings, tuned.sigma_z
-    uses_reported = not aid.noise_mode or flown[aid.noise_mode] != 1.0
-    reported_m2 = inputs.received.variance_m2[:, :2] * uses_reported
-    flown_m = float(np.sqrt(np.median(np.maximum(reported_m2, flown[aid.noise] ** 2))))
-    if (noise.low or 0.0) <= flown_m <= (noise.high or np.inf):
-        return []
-    proposed_noise_m = noise.value
-    if proposed_noise_m is None:  # the RMS of EKF2's innovations is an upper bound of the noise
-        proposed_noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
-    return [noise_change(aid, flown, flown_m, proposed_noise_m)]
+    noise_m = tuned.sigma_z.value
+    if noise_m is None:  # the RMS of EKF2's innovations is an upper bound of the noise
+        noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
+    change = ml_noise_change(inputs, tuned.sigma_z, noise_m)
+    return [change] if change else []
 
 
 def _px4_defaults(log: LogInfo, inputs: Inputs) -> list[Change]:

@@ -54,8 +54,9 @@ MAX_PART_SIGMA_S = 0.15
 # Maximum p-value of the hypothesis "constant time offset", for an offset that counts as changing in
 # flight
 MAX_CHANGE_P = 0.005
-# Minimum significant time offset, in σ: false alarm probability 0.3 %
-MIN_OFFSET_SIGMAS = 3.0
+# Minimum significant time offset, in σ (false alarm probability 0.3 %), and in s: at 1 m/s a third
+# of the noise of good UWB (0.1 m)
+MIN_OFFSET_SIGMAS, MIN_OFFSET_S = 3.0, 0.03
 # Number of simulations of the IMU noise, to estimate the variance of the time offset
 SIMULATION_COUNT = 96
 # Step of ln σ for numerical derivatives of the likelihood with respect to the noises
@@ -120,6 +121,10 @@ class Clock(Record, frozen=True, kw_only=True):
     def three_sigma_s(self) -> float:
         """Minimum significant offset: ``MIN_OFFSET_SIGMAS`` standard deviations (s)."""
         return MIN_OFFSET_SIGMAS * self.sigma_s
+
+    def is_significant(self, offset_s: float) -> bool:
+        """Return True if an offset is larger than the error of the estimate and MIN_OFFSET_S."""
+        return abs(offset_s) > max(MIN_OFFSET_S, self.three_sigma_s)
 
 
 class ClockOffset(Clock, frozen=True, kw_only=True, eq=False):

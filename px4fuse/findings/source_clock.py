@@ -10,7 +10,6 @@ from px4fuse.findings.source_positions import find_low_pass
 from px4fuse.findings.source_stamps import find_synchronisation
 from px4fuse.flight.ekf2_parameters import GNSS_POS, PARAMETERS, RECEIVER_DELAYS
 
-MIN_OFFSET_S = 0.03  # s; offset for a warning; at 1 m/s a third of the noise of good UWB (0.1 m)
 MIN_OFFSET_ERROR_S = 0.10  # s; offset for an error; at 1 m/s the noise of good UWB (0.1 m)
 # Ratio of KF's position RMSE with over without a change, above which the change makes KF worse
 MAX_RMSE_RATIO = 1.005
@@ -49,7 +48,7 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
     size_s = abs(clock.remaining_s)
     # one offset cannot correct timestamps that are arrival times in part of the flight
     if (
-        size_s <= max(MIN_OFFSET_S, clock.three_sigma_s)
+        not clock.is_significant(clock.remaining_s)
         or find_synchronisation(analysis) is not None
         or _contradicts_truth(_find_trial(analysis, "kf", "time offset"))
     ):
@@ -103,7 +102,12 @@ def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
         return f"Run again with --clock-offset {option_s:.3f}."
     size_s = abs(clock.remaining_s)
     verb = f"Subtract {size_s:.3f} s from" if clock.remaining_s < 0 else f"Add {size_s:.3f} s to"
-    return f"{verb} the timestamp (usec) of each position."
+    parameters = analysis.flight.log.parameters
+    horizon = {}
+    if (flown_ms := remedy.delay_ms(analysis)) is not None:
+        horizon = remedy.horizon_change(parameters, flown_ms - 1e3 * clock.remaining_s)
+    also = f", and set {remedy.format_settings(horizon)}" if horizon else ""
+    return f"{verb} the timestamp (usec) of each position{also}."
 
 
 def clock_offset_option_s(comparison: Comparison, clock: ClockOffset) -> float:
@@ -116,14 +120,11 @@ def clock_offset_option_s(comparison: Comparison, clock: ClockOffset) -> float:
 
 
 def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
-    """Detect EKF2_EV_DELAY that differs from the estimate by 3 σ and one EKF2 step."""
+    """Detect EKF2_EV_DELAY that differs from the estimate."""
     # EKF2_GPS_DELAY corrects GNSS timestamps, so the time offset already includes its error
-    # a position file is not what EKF2 fused, and its clock is aligned with EKF2's position
-    is_fused = analysis.source.origin.is_vision and analysis.source.alignment is None
-    delay_ms = remedy.delay_ms(analysis) if is_fused else None
+    delay_ms = remedy.delay_ms(analysis) if analysis.source.origin.is_vision else None
     ml_delay_ms = -1e3 * clock.offset_s
-    tolerance_ms = max(1e3 * clock.three_sigma_s + remedy.PREDICTION_STEP_MS, 1e3 * MIN_OFFSET_S)
-    if delay_ms is None or abs(delay_ms - ml_delay_ms) < tolerance_ms:
+    if delay_ms is None or remedy.wrong_delay_ms(analysis, clock, delay_ms) is None:
         return
     low_ms, high_ms = (-1e3 * end_s for end_s in reversed(clock.interval_s))
     low, high, size = round(low_ms), round(high_ms), round(abs(ml_delay_ms))

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.remedy import aid_of, delay_ms
+from px4fuse.comparison.remedy import aid_of, delay_ms, wrong_delay_ms
 from px4fuse.convention.correction import find_faults
 from px4fuse.core.text import format_p_value
 from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
@@ -20,8 +20,6 @@ CURVE_HEIGHT = 170.0  # height (points) of the axes
 MAX_DROP_NATS = 12.0  # lower end of the log-likelihood axis, in nats below the maximum
 # Range of drawn time offsets on each side of the estimate, in half 95 % intervals
 CURVE_HALF_WIDTH = 2.5
-# Largest time offset (s) without an action: one EKF2 step (EKF2_PREDICT_US)
-NEGLIGIBLE_OFFSET_S = 0.010
 # Ids of the findings for which the report has this page
 CLOCK_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf2_ev_delay_wrong")
 
@@ -59,41 +57,13 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
             "position source."
         ),
     }
-    if not (low <= 0.0 <= high or abs(offset) < NEGLIGIBLE_OFFSET_S):
+    if clock.is_significant(offset):
         side = "late" if offset < 0.0 else "early"
         advice["Result"] = f"The position timestamps are {abs(offset):.3f} s {side}."
         typed_offset = clock_offset_option_s(comparison, clock)
         advice["Re-run"] = f"px4fuse compare LOG --clock-offset {typed_offset:.3f}"
-    configured_delay_ms, delay_name = delay_ms(comparison), aid_of(comparison).delay
-    age_s = comparison.source.age_s
-    min_delay_s, max_delay_s = age_s - high, age_s - low
-    if (
-        configured_delay_ms is not None
-        and min_delay_s - NEGLIGIBLE_OFFSET_S
-        <= configured_delay_ms * 1e-3
-        <= max_delay_s + NEGLIGIBLE_OFFSET_S
-    ):
-        advice["PX4"] = f"{delay_name} {configured_delay_ms:g} ms is within the 95 % interval."
-    elif (
-        configured_delay_ms is not None and 1e3 * (age_s - offset) > PARAMETERS[delay_name].maximum
-    ):
-        advice["PX4"] = (
-            f"{delay_name} cannot exceed {PARAMETERS[delay_name].maximum:g} ms. Correct the "
-            "sender's clock."
-        )
-    elif configured_delay_ms is not None and offset > age_s and configured_delay_ms <= 0.0:
-        advice["PX4"] = (
-            f"The maximum-likelihood {delay_name} is {1e3 * (age_s - offset):.0f} ms, but "
-            f"{delay_name} cannot be negative. Correct the sender's clock."
-        )
-    elif configured_delay_ms is not None:
-        ml_delay_ms, min_ms, max_ms = (
-            max(1e3 * s, 0.0) for s in (age_s - offset, min_delay_s, max_delay_s)
-        )
-        advice["PX4"] = (
-            f"Set {delay_name} to {ml_delay_ms:.0f} ms (now {configured_delay_ms:g} ms; 95 % "
-            f"{min_ms:.0f} to {max_ms:.0f} ms), or correct the sender's clock."
-        )
+    if (flown_ms := delay_ms(comparison)) is not None:
+        advice["PX4"] = _delay_advice(comparison, clock, flown_ms)
     if clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P:
         offset_texts = ", ".join(f"{p.offset_s:+.2f} s from {p.start_s:.0f} s" for p in clock.parts)
         advice["Changes"] = (
@@ -114,6 +84,31 @@ def clock_advice(comparison: Comparison, clock: ClockOffset | Unavailable) -> di
             f"(95 %){note}."
         )
     return advice
+
+
+def _delay_advice(comparison: Comparison, clock: ClockOffset, flown_ms: float) -> str:
+    """Format the action for EKF2's delay parameter of the position source."""
+    name, ml_delay_ms = aid_of(comparison).delay, wrong_delay_ms(comparison, clock, flown_ms)
+    if ml_delay_ms is None:
+        return f"{name} {flown_ms:g} ms agrees with the estimate."
+    limit = ""
+    if ml_delay_ms > PARAMETERS[name].maximum:
+        limit = f"exceed {PARAMETERS[name].maximum:g} ms"
+    elif ml_delay_ms < 0.0 == flown_ms:
+        limit = "be negative"
+    if limit:
+        return (
+            f"The maximum-likelihood {name} is {ml_delay_ms:.0f} ms, but {name} cannot {limit}. "
+            "Correct the sender's clock."
+        )
+    age_s, (low_s, high_s) = comparison.source.age_s, clock.interval_s
+    set_ms, min_ms, max_ms = (
+        max(ms, 0.0) for ms in (ml_delay_ms, 1e3 * (age_s - high_s), 1e3 * (age_s - low_s))
+    )
+    return (
+        f"Set {name} to {set_ms:.0f} ms (now {flown_ms:g} ms; 95 % {min_ms:.0f} to {max_ms:.0f} "
+        "ms), or correct the sender's clock."
+    )
 
 
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
