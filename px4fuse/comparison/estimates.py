@@ -225,6 +225,7 @@ def _fit_source_errors(
         sigma_z_m=value_or_bound(axis_tuning.sigma_z, settings.sigma_z_m),
         outlier_time_s=axis_tuning.outlier_time_s,
         clock_offset_s=offset_s,
+        announced_s=comparison.source.reset_times_s.tolist(),
     )
     jumps = fit.jumps if isinstance(fit, BiasScaleJumpFit) else ()
     # the exact time of a jump is unknown, so measurements just after the jump are excluded

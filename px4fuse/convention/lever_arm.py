@@ -14,7 +14,7 @@ from px4fuse.flight.model import Columns, Flight, PositionTrack
 from px4fuse.trajectory.rotation import to_matrix
 
 # Minimum lever arm: m (twice the noise of good UWB), and σ; sources without one have up to 1.5
-MIN_ARM_M, MIN_ARM_SIGMAS = 0.2, 4.0
+MIN_ARM_M, MIN_ARM_SIGMAS = 0.2, 2.5
 CLIPPED_SIGMAS = 3.0  # residuals beyond are left out
 ITERATIONS = 4
 

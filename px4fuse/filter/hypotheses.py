@@ -15,7 +15,7 @@ A scale factor also multiplies the noise of the acceleration, which would bias t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
@@ -153,6 +153,7 @@ def fit_bias_scale_jumps(
     sigma_z_m: float,
     outlier_time_s: Array,
     clock_offset_s: float,
+    announced_s: Sequence[float] = (),
 ) -> BiasScaleJumpFit | Unavailable:
     """Estimate accelerometer biases and scale factor error, and detect jumps of the source.
 
@@ -169,6 +170,8 @@ def fit_bias_scale_jumps(
         Timestamps of measurements to exclude.
     clock_offset_s : float
         Time offset added to the timestamps.
+    announced_s : sequence of float
+        Timestamps at which the source announced a jump (``reset_counter``).
 
     Returns
     -------
@@ -182,7 +185,9 @@ def fit_bias_scale_jumps(
         return too_few_measurements(ANALYSIS_NAME, count, MIN_MEASUREMENTS)
     sigma_a_grid = sigma_a_m_s2 * SIGMA_A_FACTORS
     sigma_a, fit = _fit_sigma_a(design, sigma_a_grid, is_skipped)
-    jumps, is_skipped = _find_jumps(design, sigma_a, is_skipped)
+    jumps, is_skipped = _find_jumps(
+        design, sigma_a, is_skipped, [time_s + clock_offset_s for time_s in announced_s]
+    )
     if jumps:
         design = replace(
             design, step_columns=unit_steps(design.time_s, [jump.time_s for jump in jumps])
@@ -234,14 +239,14 @@ def _fit_scale(design: DesignMatrix, sigma_a: float, is_skipped: BoolArray) -> E
 
 
 def _find_jumps(
-    design: DesignMatrix, sigma_a: float, is_skipped: BoolArray
+    design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, announced_s: Sequence[float]
 ) -> tuple[tuple[Jump, ...], BoolArray]:
     """Detect lasting jumps of the positions; return the jumps in time order, and an outlier mask.
 
-    Tested times are the best of a scan over all times, and the starts of runs of outliers: the
-    first measurements after a jump look like outliers. Each time is tested without the measurements
-    of the next second, so that a burst of outliers is not detected as a jump. The exact time is
-    determined last, because the length of the jump depends on it.
+    Tested times are announced ones, the best of a scan over all times, and the starts of runs of
+    outliers: the first measurements after a jump look like outliers. Each time is tested without
+    the measurements of the next second, so that a burst of outliers is not detected as a jump. The
+    exact time is determined last, because the length of the jump depends on it.
     """
     jumps: list[Jump] = []
     for _ in range(MAX_JUMPS):
@@ -252,6 +257,7 @@ def _find_jumps(
             np.flatnonzero(is_skipped & ~np.append(False, is_skipped[:-1]))
         ]
         jump_times = [
+            *announced_s,
             *_significant_step_times(design, sigma_a, is_skipped, outlier_run_starts),
             *_significant_step_times(design, sigma_a, is_skipped)[:1],
         ]
@@ -259,7 +265,17 @@ def _find_jumps(
         significant_jumps = [
             jump
             for time_s in jump_times
-            if (jump := _test_step(design, sigma_a, is_skipped, time_s, false_alarm_p)) is not None
+            if (
+                jump := _test_step(
+                    design,
+                    sigma_a,
+                    is_skipped,
+                    time_s,
+                    false_alarm_p,
+                    is_announced=time_s in announced_s,
+                )
+            )
+            is not None
         ]
         if not significant_jumps:
             break
@@ -341,10 +357,21 @@ def _locate_jump(
 
 
 def _test_step(
-    design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, time_s: float, false_alarm_p: float
+    design: DesignMatrix,
+    sigma_a: float,
+    is_skipped: BoolArray,
+    time_s: float,
+    false_alarm_p: float,
+    *,
+    is_announced: bool,
 ) -> Jump | None:
-    """Return the jump at ``time_s`` if it is significant without the data of the next second."""
+    """Return the jump at ``time_s`` if it is significant without the data of the next second.
+
+    An announced jump is no burst of outliers, so the data of the next second are used.
+    """
     is_skipped_with_burst = is_skipped | _is_in_window(design.time_s, time_s, OUTLIER_BURST_S)
+    if is_announced:
+        is_skipped_with_burst = is_skipped & (design.time_s < time_s)
     design, columns = design.with_step(time_s)
     count_before = np.count_nonzero(~is_skipped_with_burst & (design.time_s < time_s))
     if (

@@ -160,7 +160,7 @@ def _delay_remedy(analysis: Analysis, wanted_ms: float, delay_ms: float) -> str:
         return CORRECT_AT_SENDER
     if trial is None:
         return "Check EKF2_EV_DELAY."
-    return f"Set EKF2_EV_DELAY to {trial.change['EKF2_EV_DELAY']:g} ms."
+    return f"Set {remedy.format_settings(trial.change)}."
 
 
 def _improves(trial: Trial) -> bool:

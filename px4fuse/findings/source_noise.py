@@ -19,6 +19,8 @@ from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_NATS, hardly_moved
 from px4fuse.flight.model import Columns, positions_of, source_name
 
+# Minimum ratio of the white noise to the time-correlated error for the white noise to be a fault
+MIN_WHITE_SHARE = 0.1
 MIN_CORRELATION_GAIN_NATS = 5.0  # log-likelihood gain; 1 of 400 flights without mistake exceeds it
 MIN_REPEAT_SHARE = 0.05  # of the positions, for a warning
 MIN_REPEAT_SHARE_ERROR = 0.3  # of the positions, for an error: the true rate is clearly lower
@@ -53,7 +55,9 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     is_gnss, name = analysis.source.origin.is_gnss, source_name(analysis.source)
     evidence = {name: value for name, value in asdict(noise).items() if np.isfinite(value)}
     assumed_m = [analysis.settings.sigma_z_m, *map(ekf2_noise_m, analysis.axes.values())]
-    if (ratio := noise.white_m / float(np.nanmin(assumed_m))) > NOISE_RATIO_TOLERANCE:
+    ratio = noise.white_m / float(np.nanmin(assumed_m))
+    # beside a much larger time-correlated error the white noise is not identifiable
+    if ratio > NOISE_RATIO_TOLERANCE and noise.white_m > MIN_WHITE_SHARE * noise.slow_m:
         evidence[WHITE_RATIO] = ratio
     action = "Check multipath, anchor geometry and filters in the sender."
     if is_gnss:

@@ -22,6 +22,7 @@ import shlex
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -103,7 +104,8 @@ def proposed(outputs: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str
             options = {
                 name: value.rstrip(".,)")
                 for name, value in pairs.items()
-                if name in OPTIONS or name in POSITION_OPTIONS
+                if name in {**OPTIONS, **POSITION_OPTIONS}
+                and re.match(r"[+-]?\d|auto|[a-z]{3}|vehicle", value)
             }
             if options:
                 yield "KF", options, place
@@ -115,7 +117,7 @@ def apply_options(request: ComparisonRequest, options: dict[str, str]) -> Compar
     position: dict[str, Any] = {}
     for name, text in options.items():
         value: Any = text
-        if re.fullmatch(r"[+-]?[\d.]+", text):
+        with suppress(ValueError):
             value = float(text)
         (fields if name in OPTIONS else position)[{**OPTIONS, **POSITION_OPTIONS}[name]] = value
     if position and isinstance(request.position, PositionFile):

@@ -1,3 +1,4 @@
+# ruff: noqa: E501 - one fault per line
 """First findings of flights with one fault of the position source, from small to large.
 
 ``single_faults.py [--flights 300]`` simulates flights over a square and along an aisle, changes the
@@ -195,6 +196,8 @@ def scale(sent: Sent, share: float) -> Sent:
     return sent.moved(sent.position_m * (1.0 + share))
 
 
+# Against ground truth a small error is visible that the IMU does not show
+HIDDEN = ("error_exceeds_reported_sigma",)
 MISALIGNED = ("source_frame_misaligned",)
 TIME = ("source_time_offset",)
 KINDS: dict[str, Kind] = {
@@ -204,7 +207,7 @@ KINDS: dict[str, Kind] = {
     "z up": Kind(axes(1, 2, -3), (0.0,) * 3, ("source_axes_wrong",), ("source_convention_ambiguous",)),
     "y mirrored": Kind(axes(1, -2, 3), (0.0,) * 3, ("source_axes_wrong",), ("source_convention_ambiguous",)),
     "unit": Kind(lambda sent, factor: sent.moved(factor * sent.position_m), (3.281, 100.0, 1000.0), ("source_unit_wrong",)),
-    "yaw": Kind(rotate, (6.0, 12.0, 25.0, 60.0, 120.0, 180.0), MISALIGNED, ("source_axes_wrong",)),
+    "yaw": Kind(rotate, (6.0, 12.0, 25.0, 60.0, 120.0, 180.0), MISALIGNED, ("source_axes_wrong", *HIDDEN)),
     "late": Kind(lambda sent, late: sent.stamped(sent.time_s + late), (0.05, 0.1, 0.2, -0.15, 0.6, 2.0, 5.0), TIME),
     "clock drift": Kind(clock_drift, (0.002, 0.005, 0.01, 0.03), ("source_time_offset_changes",)),
     "milliseconds": Kind(lambda sent, _: sent.stamped(1e-3 * sent.time_s), (0.0,) * 2, ("source_timestamp_unit",)),
@@ -225,7 +228,7 @@ KINDS: dict[str, Kind] = {
     "AR(1) 8 s": Kind(correlated(8.0), (0.2, 0.6, 2.0), ("source_noise_time_correlated",), ("error_exceeds_reported_sigma", "source_drift")),
     "outliers": Kind(outliers, (0.01, 0.05, 0.2), ("source_outliers",)),
     "noise varies": Kind(noisier, (3.0, 10.0, 40.0), ("source_noise_varies",)),
-    "scale": Kind(scale, (0.08, 0.2, 0.4), ("source_scale_error",), ("source_unit_wrong",)),
+    "scale": Kind(scale, (0.08, 0.2, 0.4), ("source_scale_error",), ("source_unit_wrong", *HIDDEN)),
     "variance": Kind(report_variance, (0.01, 0.1, 10.0, 100.0), ("source_reported_variance_wrong",)),
     "two senders": Kind(two_senders, (0.3, 1.0, 5.0), ("source_two_senders",)),
     "lever arm": Kind(lever_arm, (0.3, 0.6, 1.5), ("source_lever_arm",)),
@@ -266,7 +269,8 @@ def fly(job: Job) -> tuple[Job, list[tuple[str, str]]]:
         sent.fields["q"] = np.full_like(sent.fields["q"], np.nan)
     changed = replace(topic, fields=sent.fields)
     topics = tuple(changed if one is topic else one for one in simulation.topics)
-    flight = to_flight(replace(simulation, topics=topics))
+    parameters = {**simulation.parameters, "EKF2_EV_NOISE_MD": 0}
+    flight = to_flight(replace(simulation, topics=topics, parameters=parameters))
     try:
         request = ComparisonRequest(log=flight.log.name, sigma_z_m=scenario.source_sigma_m)
         analysis = diagnose(request, flight=flight)
