@@ -147,7 +147,7 @@ def diagnose_or_check_aids(
             f"checked: {aids.reason}",
             no_position.remedy,
         )
-    return AidsOnlyAnalysis(flight, aids, no_position, find_aids(aids))
+    return AidsOnlyAnalysis(flight, aids, no_position, find_aids(aids, flight.ekf2))
 
 
 def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress) -> Flight:

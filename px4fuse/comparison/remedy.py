@@ -10,13 +10,12 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model
 from px4fuse.filter.signals import AISLE
-from px4fuse.filter.time_offset import MIN_OFFSET_S, ClockOffset
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, Noise
 from px4fuse.flight.ekf2_parameters import EV_POS, PARAMETERS, Aid
 from px4fuse.flight.model import Unavailable
 
-# Prediction step of EKF2 (ms, EKF2_PREDICT_US), and transmission time of a position message (ms)
-PREDICTION_STEP_MS, TRANSMISSION_MS = 10.0, 30.0
+TRANSMISSION_MS = 30.0  # transmission time (ms) of a position message
 # Multiple (ms) to which EKF2_DELAY_MAX is rounded up
 DELAY_MAX_STEP_MS = 50.0
 
@@ -80,8 +79,7 @@ def ml_delay_change(
 def wrong_delay_ms(comparison: Comparison, clock: ClockOffset, flown_ms: float) -> float | None:
     """Return EKF2's maximum-likelihood delay (ms) if the flown one differs significantly."""
     ml_delay_ms = 1e3 * (comparison.source.age_s - clock.offset_s)
-    tolerance_ms = max(1e3 * clock.three_sigma_s + PREDICTION_STEP_MS, 1e3 * MIN_OFFSET_S)
-    return None if abs(flown_ms - ml_delay_ms) < tolerance_ms else ml_delay_ms
+    return ml_delay_ms if clock.is_significant(1e-3 * (flown_ms - ml_delay_ms)) else None
 
 
 def aid_of(comparison: Comparison, axis: str = "") -> Aid:

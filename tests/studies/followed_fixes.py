@@ -105,7 +105,7 @@ def proposed(outputs: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str
                 name: value.rstrip(".,)")
                 for name, value in pairs.items()
                 if name in {**OPTIONS, **POSITION_OPTIONS}
-                and re.match(r"[+-]?\d|auto|[a-z]{3}|vehicle", value)
+                and re.match(r"[+-]?\d|auto|enu|ned|nwu|vehicle_|estimator_", value)
             }
             if options:
                 yield "KF", options, place

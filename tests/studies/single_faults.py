@@ -295,24 +295,25 @@ def judge(job: Job, found: list[tuple[str, str]]) -> str:
     return "acceptable" if first in kind.acceptable else "wrong"
 
 
-def jobs(count: int, only: str) -> Iterator[Job]:
+def jobs(count: int, only: str, first_seed: int) -> Iterator[Job]:
     """Yield flights of all kinds and sizes in turn."""
     pairs = [(name, size) for name, kind in KINDS.items() for size in kind.sizes if only in name]
     for number in range(max(count, len(pairs))):
         name, size = pairs[number % len(pairs)]
-        yield Job(name, size, 5000 + number)
+        yield Job(name, size, first_seed + number)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--flights", type=int, default=100)
+    parser.add_argument("--first", type=int, default=5000, help="first seed")
     parser.add_argument("--only", default="")
     parser.add_argument("--jobs", type=int, default=2)
     options = parser.parse_args()
     counts: defaultdict[str, Counter[str]] = defaultdict(Counter)
     confusion: Counter[tuple[str, str]] = Counter()
     with ProcessPoolExecutor(options.jobs) as pool:
-        for job, found in pool.map(fly, jobs(options.flights, options.only)):
+        for job, found in pool.map(fly, jobs(options.flights, options.only, options.first)):
             result = judge(job, found)
             counts[job.kind][result] += 1
             counts["all" if job.kind != "clean" else "all clean"][result] += 1
