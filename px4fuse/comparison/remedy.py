@@ -82,6 +82,13 @@ def wrong_delay_ms(comparison: Comparison, clock: ClockOffset, flown_ms: float) 
     return ml_delay_ms if clock.is_significant(1e-3 * (flown_ms - ml_delay_ms)) else None
 
 
+def delay_limit(name: str, ml_delay_ms: float, flown_ms: float) -> str:
+    """Return the limit of PX4 that an estimated delay violates: "exceed 300 ms", "be negative"."""
+    if ml_delay_ms > (maximum_ms := PARAMETERS[name].maximum):
+        return f"exceed {maximum_ms:g} ms"
+    return "be negative" if round(ml_delay_ms) <= 0.0 == flown_ms else ""
+
+
 def aid_of(comparison: Comparison, axis: str = "") -> Aid:
     """Return the aiding source as which EKF2 fuses the positions along an axis."""
     return comparison.source.aid(axis) or EV_POS

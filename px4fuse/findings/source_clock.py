@@ -8,7 +8,7 @@ from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
 from px4fuse.findings.model import Findings, error, finding, warning
 from px4fuse.findings.source_positions import find_low_pass
 from px4fuse.findings.source_stamps import find_synchronisation
-from px4fuse.flight.ekf2_parameters import GNSS_POS, PARAMETERS, RECEIVER_DELAYS
+from px4fuse.flight.ekf2_parameters import GNSS_POS, RECEIVER_DELAYS
 
 MIN_OFFSET_ERROR_S = 0.10  # s; offset for an error; at 1 m/s the noise of good UWB (0.1 m)
 # Ratio of KF's position RMSE with over without a change, above which the change makes KF worse
@@ -102,10 +102,8 @@ def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
         return f"Run again with --clock-offset {option_s:.3f}."
     size_s = abs(clock.remaining_s)
     verb = f"Subtract {size_s:.3f} s from" if clock.remaining_s < 0 else f"Add {size_s:.3f} s to"
-    parameters = analysis.flight.log.parameters
-    horizon = {}
-    if (flown_ms := remedy.delay_ms(analysis)) is not None:
-        horizon = remedy.horizon_change(parameters, flown_ms - 1e3 * clock.remaining_s)
+    age_ms = (remedy.delay_ms(analysis) or 0.0) - 1e3 * clock.remaining_s
+    horizon = remedy.horizon_change(analysis.flight.log.parameters, age_ms)
     also = f", and set {remedy.format_settings(horizon)}" if horizon else ""
     return f"{verb} the timestamp (usec) of each position{also}."
 
@@ -135,31 +133,23 @@ def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
     else:
         estimate = f"the positions are {size} ms late"
     wanted_ms = 0.0 if low_ms <= 0.0 else ml_delay_ms
+    limit = remedy.delay_limit("EKF2_EV_DELAY", wanted_ms, delay_ms)
     yield warning(
         "ekf2_ev_delay_wrong",
         f"EKF2_EV_DELAY is {delay_ms:g} ms, but {estimate}. The 95 % interval is {low} to {high} "
         "ms. EKF2 fuses each position at the wrong time, so its track leads or lags."
-        f"{_format_delay_limit(wanted_ms, delay_ms)}",
-        _delay_remedy(analysis, wanted_ms, delay_ms),
+        f"{f' EKF2_EV_DELAY cannot {limit}.' if limit else ''}",
+        CORRECT_AT_SENDER if limit else _delay_remedy(analysis),
         {"ekf2_ev_delay_ms": delay_ms, "asked_ms": ml_delay_ms},
     )
 
 
-def _format_delay_limit(wanted_ms: float, delay_ms: float) -> str:
-    maximum_ms = PARAMETERS["EKF2_EV_DELAY"].maximum
-    if wanted_ms > maximum_ms:
-        return f" PX4 allows at most {maximum_ms:g} ms."
-    if round(wanted_ms) <= 0.0 and delay_ms == 0.0:
-        return " EKF2_EV_DELAY cannot be negative, so it does not correct early timestamps."
-    return ""
-
-
-def _delay_remedy(analysis: Analysis, wanted_ms: float, delay_ms: float) -> str:
+def _delay_remedy(analysis: Analysis) -> str:
     trial = _find_trial(analysis, "ekf2", "delay")
-    if _format_delay_limit(wanted_ms, delay_ms) or (trial is not None and not _improves(trial)):
-        return CORRECT_AT_SENDER
     if trial is None:
         return "Check EKF2_EV_DELAY."
+    if not _improves(trial):
+        return CORRECT_AT_SENDER
     return f"Set {remedy.format_settings(trial.change)}."
 
 

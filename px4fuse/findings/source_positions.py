@@ -34,7 +34,7 @@ from px4fuse.findings.model import (
     zero_length_spans,
 )
 from px4fuse.findings.source_stamps import detect_arrival_times
-from px4fuse.flight.model import Columns, Unavailable, positions_of, source_name
+from px4fuse.flight.model import Columns, Unavailable, positions_of, reset_times_s, source_name
 from px4fuse.flight.position_source import PositionKind
 
 MIN_MOTION_RANGE_M = 0.5  # m; extent (5 to 95 % of the positions); below, the vehicle only hovers
@@ -161,7 +161,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
     if not isinstance(correlated_noise, Unavailable):
         min_jump_m = max(min_jump_m, MIN_JUMP_SIGMAS * correlated_noise.slow_m)
     large = [jump for jump in fit.jumps if jump.size_m >= min_jump_m]
-    reset_s = analysis.source.reset_times_s
+    reset_s = reset_times_s(analysis.source)
     if large:
         largest = max(large, key=lambda jump: jump.size_m)
         size_m, at_s, sigma = largest.size_m, largest.time_s, max(s.sigma for s in largest.step_m)

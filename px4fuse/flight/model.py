@@ -224,12 +224,6 @@ class PositionTrack:
 
     __repr__ = one_line_repr
 
-    @property
-    def reset_times_s(self) -> Array:
-        """Times (s) at which ``reset_counter`` changes."""
-        counter = self.status.get("reset_counter", pd.Series(dtype=float))
-        return np.asarray(counter.index[1:][np.diff(counter) != 0.0], dtype=np.float64)
-
     def aid(self, axis: str) -> Aid | None:
         """Return the aiding source of EKF2 that fuses this track along an axis, if any."""
         return self.origin.aid if axis != "down" or self.barometer is None else BAROMETER
@@ -262,6 +256,12 @@ class PositionTrack:
 def source_name(source: PositionTrack) -> str:
     """Return the usual name of a position source, such as "UWB", instead of its topic."""
     return SOURCE_NAMES[source.origin.kind]
+
+
+def reset_times_s(track: PositionTrack) -> Array:
+    """Return the times at which ``reset_counter`` of the source changes."""
+    counter = track.status.get("reset_counter", pd.Series(dtype=float))
+    return np.asarray(counter.index[1:][np.diff(counter) != 0.0], dtype=np.float64)
 
 
 def positions_of(source: PositionTrack) -> str:

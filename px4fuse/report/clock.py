@@ -4,13 +4,12 @@ from collections.abc import Iterable, Iterator
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.remedy import aid_of, delay_ms, wrong_delay_ms
+from px4fuse.comparison.remedy import aid_of, delay_limit, delay_ms, wrong_delay_ms
 from px4fuse.convention.correction import find_faults
 from px4fuse.core.text import format_p_value
 from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
 from px4fuse.findings import Finding
 from px4fuse.findings.source_clock import clock_offset_option_s
-from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Unavailable
 from px4fuse.report.page import Page, draw_legend_above
 from px4fuse.report.style import KF_BAND_COLOUR, KF_LINE, Axes
@@ -91,12 +90,7 @@ def _delay_advice(comparison: Comparison, clock: ClockOffset, flown_ms: float) -
     name, ml_delay_ms = aid_of(comparison).delay, wrong_delay_ms(comparison, clock, flown_ms)
     if ml_delay_ms is None:
         return f"{name} {flown_ms:g} ms agrees with the estimate."
-    limit = ""
-    if ml_delay_ms > PARAMETERS[name].maximum:
-        limit = f"exceed {PARAMETERS[name].maximum:g} ms"
-    elif ml_delay_ms < 0.0 == flown_ms:
-        limit = "be negative"
-    if limit:
+    if limit := delay_limit(name, ml_delay_ms, flown_ms):
         return (
             f"The maximum-likelihood {name} is {ml_delay_ms:.0f} ms, but {name} cannot {limit}. "
             "Correct the sender's clock."
