@@ -1,7 +1,12 @@
-"""Diagnosis of one flight from its request, stage by stage as in the lab.
+"""Diagnosis of one flight from its request, in the order of the lab.
 
-Read the recordings, prepare source and axes, run KF and compare with EKF2, estimate noises and time
-offset, re-run the filters with one change each, and find mistakes.
+1. read: log → Flight
+2. prepare: position source, time span and axes
+3. filter: run KF along each axis
+4. compare: KF, EKF2 and ground truth
+5. estimate: noises, time offset, frame misalignment, biases
+6. intervene: re-run both filters with one change at a time
+7. find: faults of the flight, with their causes
 """
 
 from __future__ import annotations
@@ -15,7 +20,7 @@ from msgspec import structs
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis, WhatIfAnalysis
 from px4fuse.comparison.causal_replays import Reruns, planned_configurations, run_interventions
-from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.comparison.difference_steps import (
     corrected_settings,
     explain_ekf2_difference,
@@ -35,12 +40,10 @@ from px4fuse.comparison.remedy import ml_ekf2_parameters
 from px4fuse.convention.correction import find_faults
 from px4fuse.core.reading import display_name
 from px4fuse.ekf2.aids import evaluate_aids
-from px4fuse.ekf2.filter_recursion import FilterConfiguration
-from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2.whatif import sweep_values, what_if
-from px4fuse.errors import LogError, MissingDataError, SettingsError
+from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings import find, find_aids
@@ -58,7 +61,7 @@ def diagnose(
     *,
     as_sent: bool = False,
 ) -> Analysis:
-    """Read a flight, compare KF with EKF2, explain the differences and find mistakes.
+    """Read a flight, compare KF with EKF2, explain the differences and find faults.
 
     Parameters
     ----------
@@ -66,7 +69,7 @@ def diagnose(
     progress : callable
         Function that receives the name of each step of the computation.
     flight : Flight, optional
-        Flight from the recordings of the request; without it, the recordings are read.
+        Flight from the files of the request; without it, the files are read.
     as_sent : bool
         True to analyse the positions as sent, without the check of their axes, unit and clock.
 
@@ -75,50 +78,118 @@ def diagnose(
     LogError, MissingDataError, SettingsError
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
+    flight = flight or read_flight(request, progress)
     prepared = prepare_comparison(request, progress, flight, as_sent=as_sent)
-    return replace(explain(compare(prepared, progress), progress), request=request)
+    kf_runs = run_kf(prepared, progress)
+    comparison = compare(prepared, kf_runs)
+    return replace(explain(comparison, progress), request=request)
 
 
-def explain(compared: Comparison, progress: Progress = ignore_progress) -> Analysis:
-    """Estimate noises and time offset, re-run both filters with changes, and find mistakes."""
-    estimates = estimate(compared, progress)
-    convention, clock = compared.convention, estimates.clock
-    is_late = find_faults(convention, compared.flight, compared.source.frame).late_s != 0.0
+def explain(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
+    """Estimate noises and time offset, re-run both filters with changes, and find faults."""
+    estimates = estimate(comparison, progress)
+    convention, clock = comparison.convention, estimates.clock
+    is_late = find_faults(convention, comparison.flight, comparison.source.frame).late_s != 0.0
     if convention and is_late and isinstance(clock, ClockOffset) and clock.is_determinable:
         # the estimate from corrected timestamps is more precise
-        compared = replace(compared, convention=structs.replace(convention, late_s=-clock.offset_s))
-    progress("replaying EKF2")
-    reruns = intervene(compared, estimates)
+        convention = structs.replace(convention, late_s=-clock.offset_s)
+        comparison = replace(comparison, convention=convention)
+    reruns = intervene(comparison, estimates, progress)
     progress("searching for a loop closure")
     from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync
 
     analysis = Analysis(
-        **vars(compared),
+        **vars(comparison),
         **vars(estimates),
         **vars(reruns),
-        events=collect_events(compared),
-        aids=evaluate_aids(compared.flight),
-        loop=analyse_flight_loop(compared.flight, progress),
+        events=collect_events(comparison),
+        aids=evaluate_aids(comparison.flight),
+        loop=analyse_flight_loop(comparison.flight, progress),
     )
     return replace(analysis, findings=find(analysis))
 
 
-def intervene(compared: Comparison, estimates: Estimates) -> Reruns:
-    """Replay EKF2, replace the properties of KF by those of EKF2, and re-run both with changes."""
-    corrected = corrected_settings(compared, estimates.tuning)
+def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress) -> Flight:
+    """Read the log of a request, and add the positions of its position file.
 
-    def needed_configurations(inputs: Inputs) -> list[FilterConfiguration]:
-        return [
-            *explanation_configurations(compared, inputs, corrected),
-            *planned_configurations(compared, estimates, inputs),
-        ]
+    Raises
+    ------
+    LogError, MissingDataError, SettingsError
+        A file cannot be read, or does not belong to the flight.
+    """
+    log = Path(request.log)
+    progress(f"reading {display_name(log)}")
+    flight = read_log(log, system=request.system)
+    position, offset = request.position, request.clock_offset_s
+    if position is None:
+        return flight
+    # imported on demand, as alignment imports scipy.signal and scipy.ndimage, which takes 0.2 s
+    from px4fuse.alignment.placement import align_position_file  # noqa: PLC0415
+    from px4fuse.readers.position_csv import read_position_csv  # noqa: PLC0415
 
-    model = open_model(compared.flight, needed_configurations)
-    steps = explain_ekf2_difference(compared, model, estimates.clock, corrected)
-    causes, trials = run_interventions(compared, estimates, model)
+    units = {"time_unit": position.time_unit, "length_unit": position.length_unit}
+    position_file = read_position_csv(Path(position.path), columns=position.columns, **units)
+    clock_offset_s = None if isinstance(offset, str) else offset
+    return align_position_file(
+        flight,
+        position_file,
+        frame=position.frame,
+        yaw_deg=position.yaw_deg,
+        clock_offset_s=clock_offset_s,
+    )
+
+
+def prepare_comparison(
+    request: ComparisonRequest,
+    progress: Progress = ignore_progress,
+    flight: Flight | None = None,
+    *,
+    as_sent: bool = False,
+) -> Comparison:
+    """Choose position source, time span, axes and time offset of a flight, before KF runs.
+
+    Arguments and errors are those of :func:`diagnose`.
+    """
+    flight = flight or read_flight(request, progress)
+    prepared = prepare(flight, request, as_sent=as_sent)
+    if request.clock_offset_s != AUTO or request.position is not None:
+        return prepared
+    _, clock = estimate_noises_and_clock(prepared, progress)
+    if isinstance(clock, Unavailable) or not clock.is_determinable:
+        raise MissingDataError(
+            f"{flight.log.name}: the time offset cannot be estimated from this flight "
+            f"({clock.reason}).",
+            "Give --clock-offset SECONDS, or omit --clock-offset.",
+        )
+    if not clock.is_significant(clock.remaining_s):
+        low, high = clock.interval_s
+        note = (
+            f"--clock-offset auto: the time offset {clock.offset_s:+.3f} s (95 % {low:+.3f} to "
+            f"{high:+.3f} s) is not significant and was not applied"
+        )
+        return replace(prepared, notes=(*prepared.notes, note))
+    request = structs.replace(request, clock_offset_s=clock.offset_s)
+    return prepare(flight, request, as_sent=as_sent)
+
+
+def intervene(
+    comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
+) -> Reruns:
+    """Replay EKF2, replace KF's settings by EKF2's one at a time, and re-run both with changes."""
+    progress("replaying EKF2")
+    corrected = corrected_settings(comparison, estimates.tuning)
+    model = open_model(
+        comparison.flight,
+        lambda inputs: [
+            *explanation_configurations(comparison, inputs, corrected),
+            *planned_configurations(comparison, estimates, inputs),
+        ],
+    )
+    steps = explain_ekf2_difference(comparison, model, estimates.clock, corrected)
+    trials = run_interventions(comparison, estimates, model)
     if isinstance(model, Model):  # frees most of the memory; a later replay is computed again
         model = replace(model, runs=(), intervals={})
-    return Reruns(ekf2_model=model, difference_steps=steps, causes=causes, trials=trials)
+    return Reruns(ekf2_model=model, difference_steps=steps, trials=trials)
 
 
 def diagnose_or_check_aids(
@@ -150,78 +221,65 @@ def diagnose_or_check_aids(
     return AidsOnlyAnalysis(flight, aids, no_position, find_aids(aids, flight.ekf2))
 
 
-def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress) -> Flight:
-    """Read the recordings of a request and join them into one flight.
+def run_what_if(
+    request: WhatIfRequest, progress: Progress = ignore_progress, flight: Flight | None = None
+) -> WhatIfAnalysis:
+    """Read a flight and replay EKF2 with other parameters; arguments as in :func:`diagnose`.
 
     Raises
     ------
     LogError, MissingDataError, SettingsError
-        A file cannot be read, or does not belong to the flight.
+        A file cannot be read, EKF2 cannot be replayed from it or the replay does not agree with
+        the log, or a parameter is unknown or out of PX4's range.
     """
-    log = Path(request.log)
-    progress(f"reading {display_name(log)}")
-    flight = read_log(log, system=request.system if request.mavlink is None else None)
-    # imported on demand, as alignment imports scipy.signal and scipy.ndimage, which takes 0.2 s
-    if request.mavlink is not None:
-        from px4fuse.alignment.merge_recordings import join  # noqa: PLC0415
-
-        mavlink_flight = read_log(Path(request.mavlink), system=request.system)
-        if not mavlink_flight.log.format.startswith("MAVLink"):
-            raise LogError(
-                f"--mavlink {mavlink_flight.log.name} is a {mavlink_flight.log.format}, not a "
-                "MAVLink recording.",
-                "Give the ULog as LOG and the recording (.tlog) with --mavlink.",
+    changes, sweep = check_parameters(request.changes), request.sweep
+    values: list[float] = []
+    if sweep is not None:
+        values = sweep_values(sweep.parameter, sweep.low, sweep.high, sweep.count)
+        if sweep.parameter in changes:
+            raise SettingsError(
+                f"{sweep.parameter} is both set and swept.", f"Set or sweep {sweep.parameter}."
             )
-        flight = join(flight, mavlink_flight)
-    position, offset = request.position, request.clock_offset_s
-    if position is None:
-        return flight
-    from px4fuse.alignment.placement import align_position_file  # noqa: PLC0415
-    from px4fuse.readers.position_csv import read_position_csv  # noqa: PLC0415
-
-    units = {"time_unit": position.time_unit, "length_unit": position.length_unit}
-    position_file = read_position_csv(Path(position.path), columns=position.columns, **units)
-    clock_offset_s = None if isinstance(offset, str) else offset
-    return align_position_file(
-        flight,
-        position_file,
-        frame=position.frame,
-        yaw_deg=position.yaw_deg,
-        clock_offset_s=clock_offset_s,
-    )
-
-
-def prepare_comparison(
-    request: ComparisonRequest,
-    progress: Progress = ignore_progress,
-    flight: Flight | None = None,
-    *,
-    as_sent: bool = False,
-) -> Comparison:
-    """Read a flight and select position source, time span and axes, without running KF.
-
-    Arguments and errors are those of :func:`diagnose`.
-    """
-    flight = flight or read_flight(request, progress)
-    prepared = prepare(flight, request, as_sent=as_sent)
-    if request.clock_offset_s != AUTO or request.position is not None:
-        return prepared
-    _, clock = estimate_noises_and_clock(prepared, progress)
-    if isinstance(clock, Unavailable) or not clock.is_determinable:
+    recordings = ComparisonRequest(log=request.log, system=request.system)
+    flight = flight or read_flight(recordings, progress)
+    progress("replaying EKF2")
+    model = open_model(flight)
+    if isinstance(model, Unavailable):
+        raise MissingDataError(f"{flight.log.name}: {model.what}: {model.reason}", model.remedy)
+    is_default_change = not changes and sweep is None and not request.without
+    difference_steps: Mapping[str, DifferenceExplanation | Unavailable] = {}
+    comparison = None
+    try:
+        if model.agreement.good:
+            recordings = structs.replace(recordings, axes=("north", "east", AISLE))
+            prepared = prepare(flight, recordings)
+            comparison = compare(prepared, run_kf(prepared))
+    except MissingDataError:  # a replay of EKF2 is possible without a comparison with KF
+        if is_default_change:
+            raise
+    if comparison is not None:
+        tuning, clock = estimate_noises_and_clock(comparison, progress)
+        corrected = corrected_settings(comparison, tuning)
+        difference_steps = explain_ekf2_difference(comparison, model, clock, corrected)
+        if is_default_change:
+            changes = ml_ekf2_parameters(comparison, model, tuning, clock)
+            if not changes:
+                name, noise = comparison.source.name, model.inputs.aid.noise
+                raise MissingDataError(
+                    f"{flight.log.name}: this log shows no better noise or delay for {name}.",
+                    f"Give a changed parameter, for example `changes` {noise}=0.1.",
+                )
+    settings = [changes] if changes or request.without else []
+    settings += [{**changes, sweep.parameter: value} for value in values] if sweep else []
+    progress("replaying EKF2 with other parameters")
+    replays = what_if(model, settings, request.without)
+    if isinstance(replays, Unavailable):
         raise MissingDataError(
-            f"{flight.log.name}: the time offset cannot be estimated from this flight "
-            f"({clock.reason}).",
-            "Give --clock-offset SECONDS, or omit --clock-offset.",
+            f"{flight.log.name}: {replays.what}: {replays.reason}", replays.remedy
         )
-    if not clock.is_significant(clock.remaining_s):
-        low, high = clock.interval_s
-        note = (
-            f"--clock-offset auto: the time offset {clock.offset_s:+.3f} s (95 % {low:+.3f} to "
-            f"{high:+.3f} s) is not significant and was not applied"
-        )
-        return replace(prepared, notes=(*prepared.notes, note))
-    request = structs.replace(request, clock_offset_s=clock.offset_s)
-    return prepare(flight, request, as_sent=as_sent)
+    return WhatIfAnalysis(
+        flight, replays, changes, is_default_change, difference_steps, request.without
+    )
 
 
 def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progress) -> Loop:
@@ -244,72 +302,3 @@ def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progr
     if request.reference is not None:
         reference = read_source(request.reference, default="truth", system=system).trajectory
     return analyse(source, request, reference, progress)
-
-
-def run_what_if(
-    request: WhatIfRequest, progress: Progress = ignore_progress, flight: Flight | None = None
-) -> WhatIfAnalysis:
-    """Read a flight and replay EKF2 with other parameters; arguments as in :func:`diagnose`.
-
-    Raises
-    ------
-    LogError, MissingDataError, SettingsError
-        A file cannot be read, EKF2 cannot be replayed from it or the replay does not agree with
-        the log, or a parameter is unknown or out of PX4's range.
-    """
-    changes, sweep = check_parameters(request.changes), request.sweep
-    values: list[float] = []
-    if sweep is not None:
-        values = sweep_values(sweep.parameter, sweep.low, sweep.high, sweep.count)
-        if sweep.parameter in changes:
-            raise SettingsError(
-                f"{sweep.parameter} is both set and swept.", f"Set or sweep {sweep.parameter}."
-            )
-    recordings = ComparisonRequest(log=request.log, mavlink=request.mavlink, system=request.system)
-    flight = flight or read_flight(recordings, progress)
-    progress("replaying EKF2")
-    model = open_model(flight)
-    if isinstance(model, Unavailable):
-        raise MissingDataError(f"{flight.log.name}: {model.what}: {model.reason}", model.remedy)
-    is_default_change = not changes and sweep is None and not request.without
-    difference_steps: Mapping[str, DifferenceExplanation | Unavailable] = {}
-    comparison = None
-    try:
-        if model.agreement.good:
-            recordings = structs.replace(recordings, axes=("north", "east", AISLE))
-            comparison = compare(prepare(flight, recordings))
-    except MissingDataError:  # a replay of EKF2 is possible without a comparison with KF
-        if is_default_change:
-            raise
-    if comparison is not None:
-        tuning, clock = estimate_noises_and_clock(comparison, progress)
-        corrected = corrected_settings(comparison, tuning)
-        difference_steps = explain_ekf2_difference(comparison, model, clock, corrected)
-        if is_default_change:
-            changes = ml_ekf2_parameters(comparison, model, tuning, clock)
-            if not changes:
-                raise MissingDataError(_explain_missing_change(comparison, model))
-    settings = [changes] if changes or request.without else []
-    settings += [{**changes, sweep.parameter: value} for value in values] if sweep else []
-    progress("replaying EKF2 with other parameters")
-    replays = what_if(model, settings, request.without)
-    if isinstance(replays, Unavailable):
-        raise MissingDataError(
-            f"{flight.log.name}: {replays.what}: {replays.reason}", replays.remedy
-        )
-    return WhatIfAnalysis(
-        flight, replays, changes, is_default_change, difference_steps, request.without
-    )
-
-
-def _explain_missing_change(comparison: Comparison, model: Model) -> str:
-    """Format the error that a log does not determine maximum-likelihood parameters of EKF2."""
-    source = comparison.source
-    reason = f"noise and delay of {source.name} cannot be estimated from this log"
-    if source.origin.is_gnss or source.origin.may_drift:
-        reason = (
-            f"innovations do not show the slow errors of {source.name}, and the delay of "
-            f"{source.name} is correct or cannot be estimated"
-        )
-    name, noise = comparison.flight.log.name, model.inputs.aid.noise
-    return f"{name}: {reason}. Give a changed parameter, for example `changes` {noise}=0.1."

@@ -21,11 +21,12 @@ from px4fuse.filter.tuning import (
     SIGMA_Z_SEARCH_M,
     AxisTuning,
     Noise,
+    log_likelihood_drop,
+    map_grids,
     tune,
     tune_axes,
 )
 from px4fuse.flight.model import Columns, Flight, Unavailable
-from px4fuse.report.sensitivity import format_noise
 
 SIGMA_A, SIGMA_Z, SEEDS = TRUE.sigma_a_m_s2, TRUE.sigma_z_m, 40
 
@@ -116,16 +117,17 @@ def test_tuned_noise_intervals_equal_profile_likelihood() -> None:
         nu, s = innovations(legs, sigma_a, sigma_z)
         return float(-np.sum(norm.logpdf(nu, scale=np.sqrt(s))))
 
-    grid_a, grid_z = found.map.sigma_a_m_s2, found.map.sigma_z_m
+    grid_a, grid_z = map_grids(found)
+    drops = log_likelihood_drop(found, [axis], TRUE, grid_a, grid_z)
     best = total(found.sigma_a.value, found.sigma_z.value)
     for i, j in ((0, 0), (10, 30), (39, 5)):
         drop = total(grid_a[i], grid_z[j]) - best
         # possible outliers have a slightly lower weight
-        assert found.map.drop[i, j] == pytest.approx(drop, rel=0.02, abs=0.02)
-    assert found.map.drop.min() == 0.0
+        assert drops[i, j] == pytest.approx(drop, rel=0.02, abs=0.02)
+    assert drops.min() == 0.0
     ends = ((grid_a, 1, found.sigma_a_two_state), (grid_z, 0, found.sigma_z))
     for grid, axis_of_other, noise in ends:
-        profile = CubicSpline(np.log(grid), found.map.drop.min(axis=axis_of_other))
+        profile = CubicSpline(np.log(grid), drops.min(axis=axis_of_other))
         for end in (noise.low, noise.high):
             assert profile(np.log(end)) == pytest.approx(PROFILE_DROP, abs=0.1)
         # the map contains the whole 95 % interval
@@ -223,20 +225,6 @@ def test_tune_estimates_random_walk_of_drifting_source() -> None:
 
 
 # --- real and simulated logs ---
-
-
-@pytest.mark.parametrize(
-    ("noise", "said"),
-    [
-        (Noise(0.1, 0.05, 0.2), "0.1 m (0.05 to 0.2)"),
-        (Noise(0.1, None, None), "0.1 m or more"),
-        (Noise(None, None, 0.05), "at most 0.05 m"),
-        (Noise(None, 8.0, None), "at least 8 m"),
-        (Noise(None, None, None), "unknown"),
-    ],
-)
-def test_format_noise_without_interval_states_bound(noise: Noise, said: str) -> None:
-    assert format_noise(noise, "m") == said
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,9 @@ from px4fuse.filter.tuning import HORIZONTAL, Noise
 from px4fuse.flight.ekf2_parameters import EV_POS, PARAMETERS, Aid
 from px4fuse.flight.model import Unavailable
 
-TRANSMISSION_MS = 30.0  # transmission time (ms) of a position message
-# Multiple (ms) to which EKF2_DELAY_MAX is rounded up
+# Transmission time (ms) of a position message
+TRANSMISSION_MS = 30.0
+# Step (ms) to which EKF2_DELAY_MAX is rounded up
 DELAY_MAX_STEP_MS = 50.0
 
 
@@ -26,7 +27,7 @@ def ml_ekf2_parameters(
     tuning: Tuning,
     clock: ClockOffset | Unavailable,
 ) -> dict[str, float]:
-    """Return maximum-likelihood EKF2 parameters, by PX4 name and in PX4's units.
+    """Return the maximum-likelihood values of EKF2's noise and delay parameters.
 
     Parameters
     ----------
@@ -69,7 +70,7 @@ def is_fused_source(comparison: Comparison, inputs: Inputs) -> bool:
 def ml_delay_change(
     comparison: Comparison, inputs: Inputs, clock: ClockOffset | Unavailable
 ) -> dict[str, float]:
-    """Return EKF2's estimated delay as a parameter change; empty if not significant."""
+    """Return the estimated delay parameter of EKF2, if it differs significantly."""
     if isinstance(clock, Unavailable) or not clock.is_determinable:
         return {}
     ml_delay_ms = wrong_delay_ms(comparison, clock, inputs.settings[inputs.aid.delay])
@@ -90,15 +91,14 @@ def delay_limit(name: str, ml_delay_ms: float, flown_ms: float) -> str:
 
 
 def aid_of(comparison: Comparison, axis: str = "") -> Aid:
-    """Return the aiding source as which EKF2 fuses the positions along an axis."""
+    """Return EKF2's aiding source for the positions along an axis."""
     return comparison.source.aid(axis) or EV_POS
 
 
 def delay_ms(comparison: Comparison) -> float | None:
-    """Return the position age (ms) that EKF2 subtracts from the timestamps.
+    """Return the delay (ms) that EKF2 subtracts from the timestamps of the positions.
 
-    None if the parameter is not logged, EKF2 never fuses the source (a position file), or the
-    receiver reports measurement times.
+    None if the parameter is not logged or EKF2 does not use it.
     """
     source = comparison.source
     if source.origin.aid is None or source.alignment is not None:
@@ -121,7 +121,7 @@ def ml_noise_change(inputs: Inputs, estimate: Noise, noise_m: float) -> dict[str
 def noise_change(
     aid: Aid, settings: Mapping[str, float], reported_m: float, noise_m: float
 ) -> dict[str, float]:
-    """Return the EKF2 parameters for a position noise ``noise_m``, rounded to two digits.
+    """Return the EKF2 parameters for a position noise ``noise_m``.
 
     ``settings`` are the parameters as flown; ``reported_m`` is the noise (σ) that the sender
     reports, which EKF2_EVP_NOISE does not reduce.
@@ -133,7 +133,7 @@ def noise_change(
 
 
 def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
-    """Return the EKF2 parameters for a position delay ``delay_ms``, for early timestamps 0.
+    """Return the EKF2 parameters for a position delay ``delay_ms``; early timestamps give 0.
 
     Empty if the delay exceeds PX4's range or EKF2 uses the measurement times of the source.
     """
@@ -158,7 +158,7 @@ def horizon_change(settings: Mapping[str, float], age_ms: float) -> dict[str, fl
 
 
 def noise_used_m(inputs: Inputs) -> float:
-    """Return the median √R (m) of the position source that EKF2 used as flown."""
+    """Return the median √R (m) that EKF2 used for the positions."""
     aid, flown = inputs.aid, inputs.settings
     is_fixed = aid.noise_mode and flown[aid.noise_mode] == 1.0
     return max(flown[aid.noise], 0.0 if is_fixed else _reported_noise_m(inputs))

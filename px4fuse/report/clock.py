@@ -12,14 +12,14 @@ from px4fuse.findings import Finding
 from px4fuse.findings.source_clock import clock_offset_option_s
 from px4fuse.flight.model import Unavailable
 from px4fuse.report.page import Page, draw_legend_above
-from px4fuse.report.style import KF_BAND_COLOUR, KF_LINE, Axes
+from px4fuse.report.style import KF_BAND_COLOUR, LINES, Axes
 from px4fuse.results.contract import ComparisonResults
 
 CURVE_HEIGHT = 170.0  # height (points) of the axes
-MAX_DROP_NATS = 12.0  # lower end of the log-likelihood axis, in nats below the maximum
-# Range of drawn time offsets on each side of the estimate, in half 95 % intervals
+MAX_DROP_NATS = 12.0  # maximum drawn decrease (nats) of the log-likelihood from its maximum
+# Maximum distance of a drawn time offset from the estimate, in half widths of its 95 % interval
 CURVE_HALF_WIDTH = 2.5
-# Ids of the findings for which the report has this page
+# Ids of findings on the time offset; with one of them the report has this page
 CLOCK_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf2_ev_delay_wrong")
 
 
@@ -32,7 +32,7 @@ def summary_line(analysis: Analysis, findings: Iterable[Finding]) -> str:
 
 
 def has_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
-    """Return True if the report has the appendix on the time offset: a finding, or no estimate."""
+    """Return True if the time offset is a finding or cannot be estimated."""
     clock = analysis.clock
     if isinstance(clock, Unavailable):
         return False
@@ -95,18 +95,14 @@ def _delay_advice(comparison: Comparison, clock: ClockOffset, flown_ms: float) -
             f"The maximum-likelihood {name} is {ml_delay_ms:.0f} ms, but {name} cannot {limit}. "
             "Correct the sender's clock."
         )
-    age_s, (low_s, high_s) = comparison.source.age_s, clock.interval_s
-    set_ms, min_ms, max_ms = (
-        max(ms, 0.0) for ms in (ml_delay_ms, 1e3 * (age_s - high_s), 1e3 * (age_s - low_s))
-    )
     return (
-        f"Set {name} to {set_ms:.0f} ms (now {flown_ms:g} ms; 95 % {min_ms:.0f} to {max_ms:.0f} "
-        "ms), or correct the sender's clock."
+        f"Set {name} to {max(ml_delay_ms, 0.0):.0f} ms (now {flown_ms:g} ms), or correct the "
+        "sender's clock."
     )
 
 
 def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
-    """Draw the appendix on the time offset if it is a finding or cannot be estimated."""
+    """Draw the appendix on the time offset of the position source if :func:`has_page`."""
     clock = analysis.clock
     if isinstance(clock, Unavailable) or not has_page(analysis, results.findings):
         return
@@ -120,12 +116,12 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
             "same positions, so it is not used."
         ),
     )
-    page.write_labelled_texts(clock_advice(analysis, clock), size=8.5)
+    page.write_labelled_texts(clock_advice(analysis, clock))
     (low, high), estimate_s = clock.interval_s, clock.offset_s
     curve_sentence = (
-        f"Maximum at {estimate_s:+.3f} s; 95 % interval {low:+.3f} to {high:+.3f} s. The "
-        "interval also includes the IMU noise, so it is wider than the curve shows. "
-        f"{clock.count} measurements."
+        f"The log-likelihood has its maximum at {estimate_s:+.3f} s; 95 % interval {low:+.3f} to "
+        f"{high:+.3f} s. The interval also includes the IMU noise, so it is wider than the curve "
+        f"shows. {clock.count} measurements."
     )
     title = "Log-likelihood relative to its maximum (nats, downwards)"
     draw_curve(page.panel(title, curve_sentence, CURVE_HEIGHT, above=14.0), clock)
@@ -136,7 +132,7 @@ def draw_curve(axes: Axes, clock: ClockOffset) -> None:
     """Draw the log-likelihood over the time offset of the source, with the 95 % interval."""
     (low, high), estimate_s, applied_s = clock.interval_s, clock.offset_s, clock.applied_s
     axes.axvspan(low, high, color=KF_BAND_COLOUR, lw=0, label="95 % interval")
-    axes.plot(clock.curve_s, clock.curve_drop, **KF_LINE)
+    axes.plot(clock.curve_s, clock.curve_drop, **LINES["KF"])
     axes.axvline(applied_s, color="black", lw=0.8, ls="--", label="as analysed")
     axes.set_ylim(min(MAX_DROP_NATS, float(clock.curve_drop.max()) * 1.05), 0.0)
     half_width = CURVE_HALF_WIDTH * max(high - estimate_s, estimate_s - low)
