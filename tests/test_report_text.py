@@ -188,7 +188,7 @@ def test_typst_template_cannot_read_files(code: str) -> None:
 
 def offset(**changes: Any) -> ClockOffset:
     curve = np.linspace(-0.1, 0.1, 21)
-    parts = tuple(PartOffset(10.0 * i, 10.0 * i + 9.0, 0.0, 0.02) for i in range(3))
+    parts = tuple(PartOffset(10.0 * i, 10.0 * i + 9.0, 0.06 * (i - 1), 0.02) for i in range(3))
     return replace(
         ClockOffset(
             applied_s=0.0, offset_s=0.005, interval_s=(-0.02, 0.03), sigma_s=0.012,

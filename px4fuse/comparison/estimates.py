@@ -27,7 +27,12 @@ from px4fuse.filter.frame_rotation import HeadingError, estimate_heading_error
 from px4fuse.filter.hypotheses import OUTLIERS_AFTER_STEP_S, BiasScaleJumpFit, fit_bias_scale_jumps
 from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, SignalCache
 from px4fuse.filter.signals import AISLE, Axis
-from px4fuse.filter.time_offset import MAX_HALF_INTERVAL_S, ClockOffset, estimate_time_offset
+from px4fuse.filter.time_offset import (
+    MAX_HALF_INTERVAL_S,
+    MIN_CHANGE_S,
+    ClockOffset,
+    estimate_time_offset,
+)
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
 from px4fuse.flight.model import Flight, Unavailable, reset_times_s
 
@@ -40,8 +45,6 @@ MIN_TELEMETRY_IMU_HZ = 200.0
 CLOCK_RATE_MARGIN = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
-# Minimum change (s) of the time offset in flight: drift of the source may cause a smaller one
-MIN_CHANGE_S = 0.10
 # Minimum number of parts of the flight before and after a change of the time offset
 MIN_PARTS = 2
 

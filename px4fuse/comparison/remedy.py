@@ -50,13 +50,10 @@ def ml_ekf2_parameters(
     changes: dict[str, float] = {}
     inputs = model.inputs
     axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
-    noise_m = None if axis_tuning is None else axis_tuning.sigma_z.value
     has_slow_errors = comparison.source.origin.may_drift or comparison.source.origin.is_gnss
-    if (
-        axis_tuning is not None
-        and noise_m is not None
-        and not (has_slow_errors and noise_m <= noise_used_m(inputs))
-    ):
+    noise_m = None if axis_tuning is None else axis_tuning.sigma_z.value
+    min_noise_m = noise_used_m(inputs) if has_slow_errors else 0.0
+    if axis_tuning and noise_m and noise_m > min_noise_m:
         changes |= ml_noise_change(inputs, axis_tuning.sigma_z, noise_m)
     return changes | ml_delay_change(comparison, inputs, clock)
 
@@ -84,7 +81,7 @@ def wrong_delay_ms(comparison: Comparison, clock: ClockOffset, flown_ms: float) 
 
 
 def delay_limit(name: str, ml_delay_ms: float, flown_ms: float) -> str:
-    """Return the limit of PX4 that an estimated delay violates: "exceed 300 ms", "be negative"."""
+    """Return the limit of PX4 that a delay violates, for example "exceed 300 ms"."""
     if ml_delay_ms > (maximum_ms := PARAMETERS[name].maximum):
         return f"exceed {maximum_ms:g} ms"
     return "be negative" if round(ml_delay_ms) <= 0.0 == flown_ms else ""
@@ -112,7 +109,7 @@ def delay_ms(comparison: Comparison) -> float | None:
 
 
 def ml_noise_change(inputs: Inputs, estimate: Noise, noise_m: float) -> dict[str, float]:
-    """Return EKF2's parameters for ``noise_m`` if the estimate excludes the noise as flown."""
+    """Return EKF2's parameters for ``noise_m`` if the estimate excludes the flown noise."""
     if (estimate.low or 0.0) <= noise_used_m(inputs) <= (estimate.high or math.inf):
         return {}
     return noise_change(inputs.aid, inputs.settings, _reported_noise_m(inputs), noise_m)
@@ -147,10 +144,7 @@ def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
 
 
 def horizon_change(settings: Mapping[str, float], age_ms: float) -> dict[str, float]:
-    """Return the EKF2_DELAY_MAX with which EKF2 fuses positions of this age; empty if sufficient.
-
-    PX4 before v1.14 has no such parameter: the largest delay parameter is the fusion horizon.
-    """
+    """Return the EKF2_DELAY_MAX (from PX4 v1.14) for positions of this age, if it is too short."""
     needed_ms = age_ms + TRANSMISSION_MS
     if needed_ms <= settings.get("EKF2_DELAY_MAX", math.inf):
         return {}

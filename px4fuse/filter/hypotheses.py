@@ -172,7 +172,7 @@ def fit_bias_scale_jumps(
     clock_offset_s : float
         Time offset added to the timestamps.
     announced_s : sequence of float
-        Timestamps at which the source announced a jump (``reset_counter``).
+        Timestamps of announced jumps (``reset_counter``).
 
     Returns
     -------

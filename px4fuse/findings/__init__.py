@@ -35,7 +35,7 @@ from px4fuse.findings import (
 )
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.model import TITLES, group_by_root
-from px4fuse.flight.model import Ekf2, Unavailable
+from px4fuse.flight.model import Ekf2
 from px4fuse.loop.model import Loop
 
 __all__ = [
@@ -84,9 +84,7 @@ def find_loop(loop: Loop) -> tuple[Finding, ...]:
     return group_by_cause(loops.detect_in_loop(loop))
 
 
-def find_aids(
-    results: Mapping[str, AidResult], ekf2: Ekf2 | Unavailable | None = None
-) -> tuple[Finding, ...]:
+def find_aids(results: Mapping[str, AidResult], ekf2: object = None) -> tuple[Finding, ...]:
     """Return the findings about EKF2 and its aids, for a flight without position source."""
     findings = list(aids.detect_in_aids(results))
     if isinstance(ekf2, Ekf2):  # the first entry is the instance at the start

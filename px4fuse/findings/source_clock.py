@@ -6,7 +6,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy
 from px4fuse.comparison.model import Comparison, FilterName
 from px4fuse.comparison.trials import Trial
-from px4fuse.filter.time_offset import MAX_CHANGE_P, ClockOffset
+from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings.model import Findings, error, finding, warning
 from px4fuse.findings.source_positions import find_low_pass
 from px4fuse.findings.source_stamps import find_synchronisation
@@ -33,7 +33,7 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
         return
     low, high = clock.interval_s
     evidence = {"offset_s": clock.offset_s, "interval_low_s": low, "interval_high_s": high}
-    if clock.change_p_value is not None and clock.change_p_value < MAX_CHANGE_P:
+    if clock.changes and clock.change_p_value is not None:
         start_offset_s, end_offset_s = clock.parts[0].offset_s, clock.parts[-1].offset_s
         yield error(
             "source_time_offset_changes",
