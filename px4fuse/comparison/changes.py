@@ -85,7 +85,7 @@ def candidate_changes(
     if tuned is not None and not is_underconfident and len(tuned.outlier_time_s):
         changes.append({OUTLIERS: float(len(tuned.outlier_time_s))})
     delay = {} if inputs is None else ml_delay_change(comparison, inputs, estimates.clock)
-    changes += [delay] if delay else _time_offset(comparison, estimates, inputs)
+    changes += [delay] if delay else _time_offset(estimates, inputs)
     if result.axis.name == "down":
         return changes
     if isinstance(heading := estimates.heading, HeadingError):
@@ -114,7 +114,7 @@ def main_axis_changes(
     )
     if inputs is not None:
         has_delay = any(inputs.aid.delay in change for change in changes)
-        offsets = _time_offset(comparison, estimates, inputs) if has_delay else []
+        offsets = _time_offset(estimates, inputs) if has_delay else []
         return unique_changes([*changes, *offsets])
     noises = [change for change in changes if change.keys() <= SETTING_CHANGES]
     if len(noises) > 1:
@@ -157,24 +157,21 @@ def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
     return first_axis_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
-def _time_offset(
-    comparison: Comparison, estimates: Estimates, inputs: Inputs | None
-) -> list[Change]:
+def _time_offset(estimates: Estimates, inputs: Inputs | None) -> list[Change]:
     """Return the estimated time offset, if the part that is not yet applied is significant.
 
     EKF2 discards positions that are older than its fusion horizon, so it may need a longer one.
     """
-    clock, applied_s = estimates.clock, comparison.settings.clock_offset_s
+    clock = estimates.clock
     if isinstance(clock, Unavailable) or not clock.is_determinable:
         return []
-    offset_s = applied_s + clock.remaining_s
-    unapplied_s = offset_s - (applied_s if inputs is None else 0.0)
-    is_significant = abs(unapplied_s) > clock.three_sigma_s
-    if not is_significant:
+    if not clock.is_significant(clock.remaining_s if inputs is None else clock.offset_s):
         return []
-    settings = {} if inputs is None else inputs.settings
-    age_ms = 0.0 if inputs is None else settings[inputs.aid.delay] - 1e3 * offset_s
-    return [{CLOCK_OFFSET: round(offset_s, 3), **horizon_change(settings, age_ms)}]
+    change = {CLOCK_OFFSET: round(clock.offset_s, 3)}
+    if inputs is not None:
+        age_ms = inputs.settings[inputs.aid.delay] - 1e3 * clock.offset_s
+        change |= horizon_change(inputs.settings, age_ms)
+    return [change]
 
 
 def _kf_noises(settings: Settings, tuned: AxisTuning, is_underconfident: bool) -> list[Change]:

@@ -263,9 +263,8 @@ def _find_jumps(
         outlier_run_starts = design.time_s[
             np.flatnonzero(is_skipped & ~np.append(False, is_skipped[:-1]))
         ]
-        found_s = np.array([jump.time_s for jump in jumps])
         jump_times = [
-            *(at_s for at_s in announced_s if np.all(np.abs(found_s - at_s) > OUTLIER_BURST_S)),
+            *announced_s,
             *_significant_step_times(design, sigma_a, is_skipped, outlier_run_starts),
             *_significant_step_times(design, sigma_a, is_skipped)[:1],
         ]
@@ -280,6 +279,7 @@ def _find_jumps(
         best_jump = max(significant_jumps, key=lambda jump: jump.chi_square)
         best_jump, is_skipped = _locate_jump(design, sigma_a, is_skipped, best_jump)
         jumps.append(best_jump)
+        announced_s = [t for t in announced_s if abs(t - best_jump.time_s) > OUTLIER_BURST_S]
     return tuple(sorted(jumps, key=lambda jump: jump.time_s)), is_skipped
 
 
