@@ -101,7 +101,7 @@ def flight_outputs(request: ComparisonRequest, flight: Flight | None = None) -> 
     outputs["sync"] = clock.clock_advice(comparison, offset)
     outputs["sync_json"] = to_plain(build.sync_results(request, comparison, offset))
     if request.position is None:
-        asked = WhatIfRequest(log=request.log, mavlink=request.mavlink)
+        asked = WhatIfRequest(log=request.log)
         try:
             replayed = run_what_if(asked, flight=flight)
         except Px4FuseError as error:
