@@ -209,7 +209,8 @@ def json_trials(outputs: Outputs) -> Iterator[Statement]:
     for trial in outputs["json"]["trials"]:
         surface, before = f"before of {'+'.join(trial['kinds'])}", trial["before"]
         when = "" if trial.get("from_s") is None else ", time of replay"
-        fact = f"{trial['filter']} {main_axis(outputs)}{when}"
+        axis = "the main axis" if trial["axis"] == "aisle" else trial["axis"]
+        fact = f"{trial['filter']} {axis}{when}"
         for name, field, power in (
             (f"σ ratio {fact}", "nis_mean", 0.5), (f"truth ratio {fact}", "nees_mean", 0.5),
             (f"RMSE {fact}", "position_rmse_m", 1.0), (f"rejected{when}", "rejected_fraction", 1.0),
