@@ -87,7 +87,7 @@ def agreeing(
     # enough digits to show the excess
     (agreeing(published_m=0.1028), 0.0, 0.0, False, "differ by 0.103 m RMS (limit 0.1"),
     (agreeing(published_m=0.10004), 0.0, 0.0, False, "differ by 0.10004 m"),
-    (agreeing(0.949), 0.0, 0.09, False, "the correlation 0.9490"),
+    (agreeing(0.949), 0.0, 0.04, False, "the correlation 0.9490"),
     # with many rejections, shares and NIS decide
     (agreeing(0.5), 0.1, 0.06, True, "rejected 6.0% of the samples (log 10.0%)"),
     (agreeing(0.5), 0.06, 0.1, True, "single innovations differ"),

@@ -41,9 +41,14 @@ from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
 # Flight time (s) of a preliminary filter run that estimates the correlations of the initial state
 CORRELATION_PASS_S = 8.0
 MIN_STATE_VARIANCE = 1e-30  # minimum state variance, to avoid a division by zero
-# A position sample with NIS / gate² from 1/2 to 2 is near the gate limit. If EKF2's rejection of
-# this sample is not logged, the rejection is inferred from the published position
-GATE_EDGE_RATIO = 2.0
+# Maximum |ln(NIS / gate²)| of a position sample near the gate limit. If EKF2's rejection of this
+# sample is not logged, the rejection is inferred from the published position
+MAX_LOG_RATIO = 1.0
+# Scale of the error of ln(NIS / gate²) in the replay (logistic distribution): in flights with all
+# rejections logged, fused samples have NIS / gate² up to 1.19, rejected ones down to 0.84
+LOG_RATIO_SCALE = 0.04 / 1.7
+# Standard deviation (m) of a position correction that is estimated from the published position
+CORRECTION_SIGMA_M = 0.02
 # Number of events for which transition matrices are copied at once: more events need more memory
 EVENT_BATCH_SIZE = 64
 # Measurement variance (m² or rad²) that is so large that the measurement has no effect
@@ -527,20 +532,17 @@ def _rejection_by_output(
     """Infer EKF2's rejection of a position sample from the published position.
 
     Return two masks of filter configurations: True if the sample is near the gate limit, and True
-    if EKF2 rejected the sample. A sample counts as rejected if the correction of the published
-    position (``observed_correction_m``, north and east) is less than half of the expected
-    correction, (1 - R/S)ν. The other arrays have shape (S, 2).
+    if EKF2 rejected the sample. Two likelihood ratios are combined: of the estimated correction
+    of the published position (``observed_correction_m``, north and east), whose expected value is
+    (1 - R/S)ν for a fused sample and 0 for a rejected one, and of the NIS of the replay. The other
+    arrays have shape (S, 2).
     """
     ratio = (nu * nu / (gate_squared * S)).max(axis=1)
-    is_near_gate = (
-        (ratio > 1.0 / GATE_EDGE_RATIO)
-        & (ratio < GATE_EDGE_RATIO)
-        & np.isfinite(observed_correction_m).all()
-    )
+    log_ratio = np.log(np.maximum(ratio, 1e-9))
+    is_near_gate = (np.abs(log_ratio) < MAX_LOG_RATIO) & np.isfinite(observed_correction_m).all()
     correction_m = (1.0 - R / S) * nu
-    return is_near_gate, correction_m @ observed_correction_m < 0.5 * (
-        correction_m * correction_m
-    ).sum(axis=1)
+    surplus_m2 = correction_m @ observed_correction_m - 0.5 * (correction_m**2).sum(axis=1)
+    return is_near_gate, surplus_m2 / CORRECTION_SIGMA_M**2 < log_ratio / LOG_RATIO_SCALE
 
 
 @dataclass

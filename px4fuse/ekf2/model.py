@@ -170,12 +170,15 @@ def _open_without_aids(
     if isinstance(agreement, Unavailable):
         return agreement
     rejected_share = max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
-    if rejected_share > MANY_REJECTIONS_SHARE and np.isfinite(inputs.received.rejected).any():
+    received = inputs.received
+    has_all_decisions = received.correction_m is not None
+    if rejected_share > MANY_REJECTIONS_SHARE and (
+        has_all_decisions or np.isfinite(received.rejected).any()
+    ):
         agreement_with_decisions = agreement_with_log(
             flight, _make_replay(inputs, runs, configurations[1], {})
         )
         if isinstance(agreement_with_decisions, Agreement):
-            has_all_decisions = inputs.received.correction_m is not None
             agreement = with_logged_rejections(
                 agreement, agreement_with_decisions, has_all_decisions=has_all_decisions
             )

@@ -72,7 +72,7 @@ MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
 # Maximum rejected fraction for a comparison of single innovations. With more rejections one sample
 # near the gate limit changes many later samples. Then only rejected fraction and mean NIS are
 # compared, and single innovations in another replay with logged rejections
-MANY_REJECTIONS_SHARE = 0.1
+MANY_REJECTIONS_SHARE = 0.05
 # Maximum difference of the rejected fractions of replay and log
 MAX_REJECTED_DIFFERENCE = 0.05
 # Maximum relative difference of the mean NIS of replay and log
@@ -449,6 +449,8 @@ def _matched_samples(
     """Return the logged innovations in the evaluated times, and the updates of the same samples."""
     matched_updates = match_updates(updates, logged.index.to_numpy(), is_own_topic=is_own_topic)
     is_used = (matched_updates >= 0) & inside_spans(logged.index, replay.evaluated_s)
+    # a sample to which EKF2 resets its state is logged with innovation 0
+    is_used &= logged.filter(regex="innovation_[a-z]+(_m)?$").any(axis=1)
     return logged[is_used], updates.iloc[matched_updates[is_used]]
 
 
