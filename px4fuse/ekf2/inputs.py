@@ -152,6 +152,8 @@ class FusionRules:
     uses_delay_as_horizon : bool
         True if the largest delay parameter sets the fusion horizon; False for EKF2_DELAY_MAX (from
         v1.15).
+    bad_acceleration_s : float
+        Time for which EKF2's flag for a bad vertical acceleration stays set.
     """
 
     start_interval_s: float
@@ -162,6 +164,7 @@ class FusionRules:
     uses_delay_as_horizon: bool
     reset_variance_factor: float = 1.0
     resets_velocity: bool = False
+    bad_acceleration_s: float = 3.0
 
 
 @dataclass(frozen=True)
@@ -387,6 +390,7 @@ def _fusion_rules(record: FusionRecord, step_s: float, *, is_gnss: bool) -> Fusi
             is_horizon_from_delay,
             reset_variance_factor,
             resets_together,
+            bad_acceleration_s=3.0 if record.stores_latitude else 10.0,  # BADACC_PROBATION
         )
     # times: EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h
     limits = (np.inf, 7.0, 7.0, UNLIMITED_RESETS)

@@ -235,7 +235,7 @@ def replay_settings(
         )
         unused_parameters |= dict.fromkeys(
             unmodelled & BAROMETER.own_parameters,
-            height_text if inputs.logged_height_reason else "EKF2 fused no barometer height",
+            "EKF2 fused no barometer height",
         )
     if inputs.rules.uses_delay_as_horizon:
         firmware = model.flight.log.firmware
@@ -245,6 +245,10 @@ def replay_settings(
     if inputs.received.uses_sender_times:
         unused_parameters[GNSS_POS.delay] = "EKF2 uses the measurement times of the receiver driver"
     for name in [name for change in changes for name in change if name in unused_parameters]:
+        if inputs.logged_height_reason and name in BAROMETER.own_parameters:
+            raise SettingsError(
+                f"The effect of {name} cannot be predicted from this log: {height_text}."
+            )
         raise SettingsError(f"{name} has no effect in this log: {unused_parameters[name]}.")
     without = without or {}
     fused_aids = modelled_aids(inputs) if without else []

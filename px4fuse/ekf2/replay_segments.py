@@ -122,8 +122,8 @@ class HeightSamples:
     dead_zone_m : ndarray, shape (m,)
         Dead zone: in ground effect, EKF2 ignores a height that is below the state by up to this
         distance.
-    weight : float
-        Number of barometer samples that EKF2 fused per logged sample.
+    weight : ndarray, shape (m,)
+        Number of barometer samples that EKF2 fused per known sample.
     """
 
     fused: tuple[str, ...]
@@ -133,7 +133,7 @@ class HeightSamples:
     measured_at_s: Array
     down_m: Array
     dead_zone_m: Array
-    weight: float
+    weight: Array
 
     __repr__ = one_line_repr
 
@@ -181,9 +181,15 @@ class ReplaySegment:
         Magnetometer samples (with 21 states); None if the logged EKF2 heading is used.
     heights : HeightSamples or None
         Height samples; None if the height of EKF2 or of external vision is used.
-    bad_acceleration_share : ndarray, shape (n + 1,), or None
-        Fraction of accelerometer axes with a larger noise in the step until each time: all axes
-        while EKF2 reports a bad vertical acceleration, else the clipped axes. None if always 0.
+    clipped_share : ndarray, shape (n + 1,), or None
+        Fraction of clipped accelerometer axes in the step until each time, which have a larger
+        noise. None with external vision only.
+    is_acceleration_bad : ndarray of bool, shape (n + 1,), or None
+        True while EKF2 reports a bad vertical acceleration. None if not logged, or with external
+        vision only.
+    mean_bias_down_m_s2 : float
+        Mean vertical accelerometer bias minus nominal bias, from the acceleration and the change of
+        the published velocity.
     flow : SensorSamples or None
         Optical flow samples, if EKF2 fused optical flow.
     metres : (float, float, float)
@@ -208,7 +214,9 @@ class ReplaySegment:
     fusing: bool = True
     field: SensorSamples | None = None
     heights: HeightSamples | None = None
-    bad_acceleration_share: Array | None = None
+    clipped_share: Array | None = None
+    is_acceleration_bad: BoolArray | None = None
+    mean_bias_down_m_s2: float = 0.0
     flow: SensorSamples | None = None
     metres: tuple[float, float, float] = (1.0, 1.0, 1.0)
     history: "ReplaySegment | None" = None
@@ -371,12 +379,21 @@ def _make_gnss_segment(
     state = segment.state.copy()
     state[POSITION] *= metres
     earth_rotation_rad = earth_rate_rad_s(record) * segment.step_s[:, None]
+    start_s, end_s = segment.time_s[[0, -1]]
+    velocity = np.interp([start_s, end_s], ekf2.state.index, ekf2.state["down_m_s"])
+    velocity_error = segment.imu_velocity_m_s[-1, 2] - np.diff(velocity)[0]
     return replace(
         segment,
         state=state,
         metres=metres,
         correction_rad=segment.correction_rad + earth_rotation_rad,
-        bad_acceleration_share=_bad_acceleration_share(imu, record, segment.time_s),
+        clipped_share=_clipped_share(imu, segment.time_s),
+        is_acceleration_bad=(
+            record.was_in_state(BAD_ACCELERATION, segment.time_s)
+            if BAD_ACCELERATION in record.states
+            else None
+        ),
+        mean_bias_down_m_s2=float(velocity_error / (end_s - start_s)),
     )
 
 
@@ -403,9 +420,9 @@ def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
     return breaks
 
 
-def _bad_acceleration_share(imu: pd.DataFrame, record: FusionRecord, time_s: Array) -> Array:
-    """Return the fraction of accelerometer axes with a larger noise in the step until each time."""
-    share_by_step = record.was_in_state(BAD_ACCELERATION, time_s).astype(float)
+def _clipped_share(imu: pd.DataFrame, time_s: Array) -> Array:
+    """Return the fraction of clipped accelerometer axes in the step until each time."""
+    share_by_step = np.zeros(len(time_s))
     if "clipped" in imu:  # one bit per axis
         clipped = imu.loc[(imu["clipped"] > 0.0) & (imu.index <= time_s[-1]), "clipped"]
         clipped_share = np.unpackbits(clipped.to_numpy(np.uint8)[:, None], axis=1).sum(axis=1) / 3.0

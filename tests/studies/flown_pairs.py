@@ -70,11 +70,14 @@ def describe_agreement(flown: FlownFlight) -> str:
 
 def changed_parameters(before: FlownFlight, after: FlownFlight) -> dict[str, float]:
     """Return the parameters of ``after`` that differ from ``before``."""
-    flown = before.flight.log.parameters
+    first, second = (
+        flown.flight.ekf2.record.parameters  # type: ignore[union-attr]
+        for flown in (before, after)
+    )
     return {
         name: value
-        for name, value in after.flight.log.parameters.items()
-        if name in PARAMETERS and flown.get(name) != value
+        for name, value in second.items()
+        if name in PARAMETERS and first.get(name) != value
     }
 
 
