@@ -1,7 +1,7 @@
 """Sphinx configuration: ``python -m sphinx -W docs docs/_build`` builds without a network.
 
-Three parts are generated from the program: pages of the findings, help of the commands, and the
-figure of the package layers.
+The build also writes pages from the source code: one page per finding, the help of all commands,
+and a figure of the package layers.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ napoleon_use_rtype = False
 
 
 def draw_layers() -> Figure:
-    """Draw the package layers of ``pyproject.toml``; each layer imports those below it."""
+    """Draw the package layers of ``pyproject.toml``. A layer imports only from the layers below."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     layers = settings["tool"]["importlinter"]["contracts"][0]["layers"]
     figure = Figure(figsize=(7.0, 0.34 * len(layers)))

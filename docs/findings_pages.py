@@ -1,8 +1,9 @@
-"""Pages of the findings, made from the catalogue, the detectors and example flights.
+"""Write one Markdown page per finding: meaning, example, action, rates and thresholds.
 
-``write(folder)`` makes ``index.md`` and ``<id>.md`` for each finding. Thresholds come from the
-detectors, examples from flights of the tests and simulated flights, rates from
-``tests/studies/rates.csv``. Run after a change of messages or rates, for ``px4fuse explain``:
+``write(folder)`` writes ``index.md`` and ``<id>.md`` for each finding. The thresholds are read from
+the source code of the detectors, the rates from ``tests/studies/rates.csv``. The examples are
+findings on simulated flights. ``px4fuse explain`` prints them from a file; update this file after a
+change of messages or rates:
 
     python docs/findings_pages.py --examples
 """
@@ -57,7 +58,7 @@ UNEQUAL_M = (0.05, 0.2, 0.1)
 FINDINGS = ROOT / "px4fuse" / "findings"
 EXAMPLES = FINDINGS / "examples.json"
 LABEL_WIDTH = 26  # characters per line of an axis label
-# Mistakes of `px4fuse simulate`, and settings of the comparison, that show a finding
+# By finding id: simulated faults (option --mistake) and KF settings with which the finding appears
 SIMULATED: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
     "accelerometer_bias": (("accel-bias",), {}),
     "ekf2_ev_delay_wrong": (("ekf2-delay=250ms",), {}),
@@ -83,7 +84,7 @@ SIMULATED: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
 
 @dataclass(frozen=True)
 class Example:
-    """Finding of an example flight, a description of the flight, and its analysis for figures."""
+    """Example of a finding: the finding, a description of the flight, and the analysis to plot."""
 
     finding: Finding
     flight: str
@@ -91,7 +92,7 @@ class Example:
 
 
 def examples() -> dict[str, Example]:
-    """Example of each finding by id, from simulated flights and flights of the tests."""
+    """Return an example of each finding, by finding id."""
     made: dict[str, Example] = {}
 
     def keep(found: Any, flight: str, analysis: Analysis | None = None) -> None:
@@ -103,16 +104,20 @@ def examples() -> dict[str, Example]:
         analysis = explain(compare(flight, Settings(**settings)))
         command = " ".join(["px4fuse simulate", *(f"--mistake {each}" for each in typed)])
         options = [f"--{key[:7].replace('_', '-')} {value:g}" for key, value in settings.items()]
-        compared = f", compared with `{' '.join(options)}`" if options else ""
+        compared = f", analysed with `compare {' '.join(options)}`" if options else ""
         found = [one for one in find(analysis) if one.id == name]
-        keep(found, f"`{command}`{compared}", analysis)
+        keep(found, f"a flight of `{command}`{compared}", analysis)
     for model in (slow, partial(held, share=0.2), partial(white, sigma=UNEQUAL_M), louder):
         flight = simulate_flight(Scenario(passes=4, seed=2, ekf2=False))
         truth = flight.truth.samples[Columns.POSITION].dropna()
         known = CubicSpline(truth.index.to_numpy(), truth.to_numpy())
         analysis = explain(compare(laid_over(flight, known, model, 10.0, 2), Settings()))
         found = [one for one in find(analysis) if one.id.startswith("source_")]
-        keep(found, "errors of `tests/studies/source_errors.py` on a simulated flight", analysis)
+        keep(
+            found,
+            "a simulated flight with position errors of `tests/studies/source_errors.py`",
+            analysis,
+        )
     for options, drift_option in (
         ({"source": "sample_logs/loop_vio.ulg", "position_drift_m": 0.3}, "--drift 0.3"),
         ({"source": "sample_logs/aisle_uwb.ulg:ekf2"}, ""),
@@ -120,22 +125,21 @@ def examples() -> dict[str, Example]:
     ):
         made_of = {**options, "source": f"{ROOT}/{options['source']}"}
         typed = f"px4fuse loop {options['source']} {drift_option}".strip()
-        keep(find_loop(px4fuse.close_loop(**made_of)), f"`{typed}`")
-    keep(convention_examples(), "a simulated loop with changed positions")
-    keep(value_examples(), "a flight of the tests")
+        keep(find_loop(px4fuse.close_loop(**made_of)), f"the result of `{typed}`")
+    keep(convention_examples(), "a simulated loop flight with changed positions")
+    keep(value_examples(), "a simulated flight of the tests")
     _, odometry = laps(3, 5, OdometryNoise())
     wrong = GivenClosure(20.0, 21.5 + LAP_S, 0.05)
-    keep(
-        find_loop(px4fuse.close_loop(odometry, closures=(*TRUE, wrong))), "three laps of the tests"
-    )
+    found = find_loop(px4fuse.close_loop(odometry, closures=(*TRUE, wrong)))
+    keep(found, "simulated odometry of three laps")
     _, odometry = laps(3, 5, OdometryNoise(5.0, 20.0))
-    keep(find_loop(px4fuse.close_loop(odometry, closures=TRUE)), "three laps of the tests")
+    keep(find_loop(px4fuse.close_loop(odometry, closures=TRUE)), "simulated odometry of three laps")
     parts = [
         HeadingPart(2.0 * n, 2.0 * n + 2.0, at, 1.0) for n, at in enumerate((-36.0, -20.0, -9.0))
     ]
     still = unexplained(compare(aisle_flight(duration_s=20.0), axes=("north",)))
     drifts = replace(still, heading=combine_heading_parts(tuple(parts), 1e-9, "positions"))
-    keep(source_frame.detect(drifts), "an invented heading estimate")
+    keep(source_frame.detect(drifts), "a heading estimate with simulated drift")
     flight = aisle_flight(duration_s=60.0)
     not_fused = aid_log(enabled=steps((0.0, 1.0)))
     not_fused = replace(not_fused, samples=outage_free(not_fused, 20.0, 41.0))
@@ -144,21 +148,20 @@ def examples() -> dict[str, Example]:
     aids = {"gnss_pos": not_fused, "baro_hgt": aid_log(sigma=1.5), "mag": aid_log(mean=-0.4),
             "mag_heading": changed}  # fmt: skip
     evaluated = evaluate_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
-    keep(find_aids(evaluated), "invented innovations")
+    keep(find_aids(evaluated), "simulated innovations of the aiding sources")
     for fault in FAULTS:
         if fault.id in made:
             continue
         comparison = compare(fault.fly(), Settings(**fault.settings))
         is_tuned = fault.id == "process_noise_near_zero" or "sigma_z_asked_m" in fault.evidence
         analysis = with_noises(comparison) if is_tuned else unexplained(comparison)
-        keep(
-            [one for one in find(analysis) if one.id == fault.id], "a flight of the tests", analysis
-        )
+        found = [one for one in find(analysis) if one.id == fault.id]
+        keep(found, "a simulated flight of the tests", analysis)
     return made
 
 
 def detectors() -> dict[str, str]:
-    """File of the detector of each finding, without ``.py``."""
+    """Return the module name of the detector of each finding, by finding id."""
     found: dict[str, str] = {}
     for path in sorted(FINDINGS.glob("*.py")):
         if path.stem in ("cause_grouping", "cause_text", "model", "__init__"):
@@ -167,7 +170,7 @@ def detectors() -> dict[str, str]:
         for node in ast.walk(tree):
             if isinstance(node, ast.Constant) and node.value in TITLES:
                 found.setdefault(str(node.value), path.stem)
-    # these files compose ids of filter or option and direction
+    # These modules compose finding ids from a filter or parameter name and a suffix
     composed = {
         name: stem
         for name in TITLES
@@ -181,7 +184,7 @@ def detectors() -> dict[str, str]:
 
 
 def thresholds(stem: str) -> Iterator[str]:
-    """Table rows of the thresholds of a file, with their comments."""
+    """Yield a Markdown table row with value and comment of each constant of a detector module."""
     source = (FINDINGS / f"{stem}.py").read_text(encoding="utf-8")
     lines = source.splitlines()
     for node in ast.parse(source).body:
@@ -195,12 +198,12 @@ def thresholds(stem: str) -> Iterator[str]:
 
 
 def measured_rates() -> pd.DataFrame:
-    """Rates of the findings on simulated flights, with and without their mistake."""
+    """Read false alarm and detection rates of the findings, measured on simulated flights."""
     return pd.read_csv(ROOT / "tests" / "studies" / "rates.csv")
 
 
 def rate_rows(name: str) -> Iterator[str]:
-    """Table rows of the rates of one finding."""
+    """Yield Markdown table rows with the false alarm and detection rates of a finding."""
     table = measured_rates()
     for row in table[table["finding"] == name].itertuples():
         yield (
@@ -210,47 +213,51 @@ def rate_rows(name: str) -> Iterator[str]:
 
 
 def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
-    """Paragraphs of the page of one finding."""
+    """Yield the Markdown paragraphs of the page on a finding."""
     entry = CATALOGUE[name]
     yield f"# {entry.title}\n\n`{name}` ({entry.group})\n"
     yield f"## What it means\n\n{entry.meaning}\n"
     causes = [cause for cause in CONSEQUENCES if name in effect_ids(cause)]
     effects = effect_ids(name)
     if causes:
-        yield "It can be a consequence of: " + links(causes) + ".\n"
+        yield "The finding can be a consequence of: " + links(causes) + ".\n"
     if effects:
-        yield "Possible consequences: " + links(effects) + ".\n"
+        yield "Possible consequences of the finding: " + links(effects) + ".\n"
     if name in RECORDING:
-        yield "It concerns the recording, so it is listed before findings about noises.\n"
+        yield "This finding is about the recording. It is listed before findings about noises.\n"
     if example is not None:
         finding = example.finding
-        yield f"## How it looks\n\nSeverity *{finding.severity}*, on {example.flight}:\n"
+        yield f"## Example\n\nFinding of severity *{finding.severity}* on {example.flight}:\n"
         yield f"> {finding.message}\n"
         if example.analysis is not None:
-            yield f"![Position, innovations, σ of that flight]({picture(name, example, folder)})\n"
+            file = picture(name, example, folder)
+            yield f"![Position, innovations and σ of the example flight]({file})\n"
         yield f"## What to do\n\n> {finding.remedy}\n"
     found = list(rate_rows(name))
     if found:
         yield "## False alarms and detection\n"
-        yield "Rates on simulated flights. Mistake `none`: a finding is a false alarm.\n"
-        yield "| mistake | flight | flights | found | 95 % interval |\n|---|---|---|---|---|"
+        yield "The rates were measured on simulated flights. In flights with the fault `none`,"
+        yield "each finding is a false alarm.\n"
+        yield "| fault | kind of flight | number of flights | rate of the finding | 95 % interval |"
+        yield "|---|---|---|---|---|"
         yield "\n".join(found) + "\n"
     stem = detectors()[name]
     rows = list(thresholds(stem))
     if rows:
         yield "## Thresholds\n"
-        yield f"In `px4fuse/findings/{stem}.py`, some of them for its other findings:\n"
+        yield f"The file `px4fuse/findings/{stem}.py` contains these thresholds."
+        yield "Some of them belong to other findings.\n"
         yield "| name | value | meaning |\n|---|---|---|"
         yield "\n".join(rows) + "\n"
 
 
 def links(names: Iterable[str]) -> str:
-    """Links to the pages of other findings."""
+    """Format Markdown links to the pages of other findings."""
     return ", ".join(f"[{TITLES[name]}]({name}.md)" for name in dict.fromkeys(names))
 
 
 def packaged_examples(made: Mapping[str, Example]) -> dict[str, Any]:
-    """Contents of examples.json for ``px4fuse explain``: message, action and rates by id."""
+    """Return message, action and rates of each finding, which ``px4fuse explain`` prints."""
     table, contents = measured_rates(), {}
     for name in TITLES:
         rows = table[table["finding"] == name]
@@ -268,13 +275,13 @@ def packaged_examples(made: Mapping[str, Example]) -> dict[str, Any]:
 
 
 def write_examples() -> None:
-    """Write examples.json of the package."""
+    """Write the examples for ``px4fuse explain`` to ``examples.json``."""
     text = json.dumps(packaged_examples(examples()), ensure_ascii=False, indent=1)
     EXAMPLES.write_text(f"{text}\n", encoding="utf-8")
 
 
 def picture(name: str, example: Example, folder: Path) -> str:
-    """Draw position, innovations and σ of the example's axis; return the file name."""
+    """Plot position, innovations and σ along the axis of an example; return the file name."""
     axis = example.finding.evidence.get("axis")
     assert example.analysis is not None
     shown = example.analysis.axes.get(str(axis)) or example.analysis.main
@@ -289,8 +296,8 @@ def picture(name: str, example: Example, folder: Path) -> str:
 
 
 def index() -> Iterator[str]:
-    """Paragraphs of the index, one table and one chapter of the sidebar per group."""
-    yield "# The findings\n\n`px4fuse explain ID` prints a page in the terminal.\n"
+    """Yield the Markdown paragraphs of the index, with a table for each group of findings."""
+    yield "# Findings\n\n`px4fuse explain ID` prints the page on a finding in the terminal.\n"
     for group in GROUPS:
         names = [name for name, entry in CATALOGUE.items() if entry.group == group]
         caption = group[0].upper() + group[1:]
@@ -301,11 +308,13 @@ def index() -> Iterator[str]:
 
 
 def write(folder: Path) -> None:
-    """Write all pages."""
+    """Write the index and the pages of all findings."""
     mpl.use("Agg")
     folder.mkdir(parents=True, exist_ok=True)
     made = examples()
-    assert set(made) >= set(TITLES), f"no example: {sorted(set(TITLES) - set(made))}"
+    assert set(made) >= set(TITLES), (
+        f"these findings have no example: {sorted(set(TITLES) - set(made))}"
+    )
     for name in TITLES:
         text = "\n".join(page(name, made.get(name), folder))
         (folder / f"{name}.md").write_text(text, encoding="utf-8")

@@ -157,7 +157,7 @@ def sample(sample_log: Path) -> Analysis:
 
 
 def shared(name: str) -> Path:
-    """Return a folder next to the repository; skip the test without it."""
+    """Return a folder of ``../shared``; skip the test if it does not exist."""
     folder = SHARED / name
     if not folder.is_dir():
         pytest.skip(f"the further files ../shared/{name} are not beside the repository")
@@ -166,7 +166,7 @@ def shared(name: str) -> Path:
 
 @pytest.fixture(scope="session")
 def shared_logs() -> Path:
-    """Folder of further flight logs, next to the repository."""
+    """Folder of flight logs that are not part of the repository (``../shared/logs``)."""
     return shared("logs")
 
 
@@ -178,7 +178,7 @@ def model_of() -> Callable[[Path], Model | Unavailable]:
 
 @pytest.fixture
 def read(tmp_path: Path) -> Callable[..., Flight]:
-    """Write a made log or recording and read it as a flight."""
+    """Write a generated log or recording to a file, and read it as a flight."""
 
     def write_and_read(made: Any, *, stamped: bool = True, system: int | None = None) -> Flight:
         if isinstance(made, Log):
@@ -277,15 +277,17 @@ def _diagnose_cached(
     request: ComparisonRequest,
     progress: Progress = ignore_progress,
     flight: Flight | None = None,
+    *,
+    as_sent: bool = False,
 ) -> Analysis:
-    if flight is not None and flight is not _cache.get(_flight_key(request)):
-        return _diagnose(request, progress, flight)
+    if as_sent or (flight is not None and flight is not _cache.get(_flight_key(request))):
+        return _diagnose(request, progress, flight, as_sent=as_sent)
     return _cached(_cache_key(request, "analysis"), lambda: _diagnose(request, progress, flight))
 
 
 @pytest.fixture(scope="module")
 def cached_analyses() -> Iterator[None]:
-    """Analyse equal requests on equal files once; for tests that replace no analysis."""
+    """Analyse equal requests on equal files only once per test file."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(diagnose, "read_flight", _read_cached)
         patch.setattr(tracks, "read_log", _read_log_cached)

@@ -330,7 +330,7 @@ def random_walk(
 
 
 def given_placement(*warnings: str) -> Alignment:
-    """Return the placement of a position file with all values given."""
+    """Return the frame, yaw and clock options of a position file, all set."""
     return Alignment(
         frame="enu", frame_reason="given", yaw_deg=0.0, yaw_reason="given",
         origin_m=(0.0, 0.0, 0.0), clock_offset_s=0.0, clock_reason="given", reference="",

@@ -75,7 +75,6 @@ def replace_stream(holder: Any, key: str, change: Edit) -> Forge:
 
 
 def on_page(number: int, change: Edit) -> Forge:
-    """Change the content stream of a page."""
     return replace_stream(lambda writer: writer.pages[number - 1], "/Contents", change)
 
 
@@ -117,7 +116,6 @@ def text(glyph: int) -> bytes:
 
 
 def entry(key: str, value: Any) -> Callable[[Any], None]:
-    """Put an entry into a dictionary."""
 
     def change(holder: Any) -> None:
         holder[NameObject(key)] = NumberObject(value) if isinstance(value, int) else value
@@ -149,12 +147,10 @@ def stream(data: bytes, **entries: Any) -> DecodedStreamObject:
 
 
 def catalogue(key: str, value: Any) -> Forge:
-    """Set an entry of the document catalogue."""
     return lambda writer: entry(key, value)(writer.root_object)
 
 
 def document_info(**entries: str) -> Forge:
-    """Set entries of the document information."""
     return lambda writer: writer.add_metadata({f"/{key}": held for key, held in entries.items()})
 
 

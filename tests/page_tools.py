@@ -73,7 +73,6 @@ def set_by_typst(*pages: Page) -> list[str]:
 
 
 def pdf_of(*pages: Page) -> bytes:
-    """Set pages as PDF."""
     blocks = to_typst_data([block for page in pages for block in page.blocks], "log.ulg")
     report = {
         "title": "t", "author": "a", "head": "", "student": "", "foot": "", "results": None,

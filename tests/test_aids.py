@@ -1,4 +1,4 @@
-"""EKF2's aids: reading from logs of each release, and consistency of their innovations."""
+"""EKF2's aiding sources: reading from logs of each release, and consistency tests."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -72,7 +72,7 @@ def evaluate(log: AidLog, name: str = "gnss_pos") -> AidResult:
     (0.5, "consistent"), (0.58, "consistent"), (0.68, "overconfident"),
     (0.43, "consistent"), (0.37, "underconfident"),
 ])  # fmt: skip
-def test_aiding_source_verdict_allows_sigma_ratio_tolerance(sigma, verdict) -> None:
+def test_aiding_source_verdict_follows_from_its_sigma_ratio(sigma, verdict) -> None:
     aid = evaluate(aid_log(sigma=sigma))
     assert aid.verdict == verdict
     assert aid.nis_mean == pytest.approx((sigma / 0.5) ** 2, rel=0.06)
@@ -89,12 +89,12 @@ def test_aiding_source_with_large_mean_innovation_is_biased() -> None:
     assert evaluate(aid_log(sigma=0.05, mean=0.11)).verdict == "biased"
 
 
-def test_aiding_source_gap_counts_only_if_begun_while_enabled() -> None:
+def test_gap_of_disabled_aiding_source_is_not_reported() -> None:
     log = aid_log(enabled=steps((0.0, 1.0), (26.0, 0.0), (40.0, 1.0)))
     before_gap = log.samples.loc[:20.0]
     outage = evaluate(replace(log, samples=pd.concat([before_gap, log.samples.loc[40.0:]])))
     assert (outage.verdict, outage.longest_gap_s) == ("not_fused", (20.0, 40.0))
-    # disabled at once: no gap
+    # EKF2 disables the aiding source at once, so there is no gap
     enabled = steps((0.0, 1.0), (20.05, 0.0), (40.0, 1.0))
     given_up = evaluate(replace(log, samples=outage_free(log, 20.0, 40.0), enabled=enabled))
     assert given_up.verdict == "consistent"
@@ -107,7 +107,7 @@ def outage_free(log: AidLog, start_s: float, end_s: float) -> pd.DataFrame:
     return log.samples[(times <= start_s) | (times >= end_s)]
 
 
-def test_unused_aiding_source_verdict_states_the_reason() -> None:
+def test_unfused_aiding_source_verdict_is_disabled_or_not_fused() -> None:
     log = aid_log()
     assert evaluate(replace(log, enabled=steps((0.0, 0.0)))).verdict == "disabled"
     few = evaluate(replace(log, samples=log.samples.iloc[::80], enabled=steps((0.0, 1.0))))
@@ -117,7 +117,7 @@ def test_unused_aiding_source_verdict_states_the_reason() -> None:
                   ).verdict == "too few samples"  # fmt: skip
 
 
-def test_aiding_source_reset_samples_are_counted_and_excluded() -> None:
+def test_samples_that_reset_ekf2_are_excluded_from_mean_nis() -> None:
     log = aid_log()
     samples = log.samples.copy()
     reset = samples.index[[100, 300]]
@@ -128,7 +128,7 @@ def test_aiding_source_reset_samples_are_counted_and_excluded() -> None:
     assert (aid.resets, aid.axes["north"].samples) == (2, evaluate(log).axes["north"].samples - 2)
 
 
-def test_aiding_source_gate_is_read_from_test_ratio_or_param() -> None:
+def test_innovation_gate_is_read_from_test_ratio_or_parameter() -> None:
     assert evaluate(aid_log(gate=3.0)).gate == pytest.approx(3.0)
     assert evaluate(aid_log(own=False, EKF2_GPS_P_GATE=4.0)).gate == 4.0
     assert evaluate(aid_log(own=False, EKF2_GPS_P_GATE=0.0)).gate == 0.01
@@ -149,7 +149,7 @@ def test_aiding_source_gate_is_read_from_test_ratio_or_param() -> None:
     ("mag", {"EKF2_MAG_NOISE": 0.05}, "EKF2_MAG_NOISE"),
     ("gnss_pos", {}, "the accuracy reported by the receiver"),
 ])  # fmt: skip
-def test_aiding_source_noise_names_the_parameter_that_sets_it(
+def test_aiding_source_noise_states_the_parameter_that_sets_it(
     name: str, parameters: dict[str, float], set_by: str
 ) -> None:
     aid = evaluate(aid_log(**parameters), name)
@@ -158,7 +158,7 @@ def test_aiding_source_noise_names_the_parameter_that_sets_it(
     assert evaluate(aid_log(own=False, **parameters), name).noise_from == ""
 
 
-def test_aiding_source_logged_at_low_rate_is_consistent() -> None:
+def test_aiding_source_at_low_log_rate_has_a_longer_gap_limit() -> None:
     """Rows of zeros are samples that EKF2 logged between two measurements."""
     log = aid_log(own=False, enabled=steps((0.0, 1.0)))
     decimated = replace(log, samples=log.samples.iloc[::10])
@@ -193,7 +193,7 @@ def test_aiding_source_findings_state_sensor_and_times() -> None:
                    "EKF2 fused no sample of the barometer for 21 s: height error 0.80 m")),
     ],
 )  # fmt: skip
-def test_unfused_barometer_is_a_fault_only_with_height_error(
+def test_unfused_barometer_is_reported_only_with_height_error(
     take_off_s: tuple[float, ...], height_error_m: float | None, expected: Any
 ) -> None:
     log = aid_log()
@@ -204,7 +204,7 @@ def test_unfused_barometer_is_a_fault_only_with_height_error(
 
 
 @pytest.mark.parametrize(("error_m", "expected_m"), [(0.9, 0.9), (0.2, None)])
-def test_height_error_in_barometer_gap_counts_above_three_rmse(
+def test_height_error_below_three_rmse_in_a_gap_is_ignored(
     error_m: float, expected_m: float | None
 ) -> None:
     time_s = np.arange(0.0, 60.0, 0.1)
@@ -220,7 +220,7 @@ def test_height_error_in_barometer_gap_counts_above_three_rmse(
     assert aids_detector._height_error_in(SimpleNamespace(axes={}), (0.0, 1.0)) is None  # type: ignore[arg-type]
 
 
-def test_aiding_source_change_of_mean_is_reported_with_time() -> None:
+def test_shift_of_mean_innovation_is_reported_with_its_time() -> None:
     log = aid_log()
     # windows of 10 s: from the window with the change, or the next one
     for from_s, expected_s in ((22.0, 20.0), (39.5, 40.0)):
@@ -239,7 +239,7 @@ def test_aiding_source_change_of_mean_is_reported_with_time() -> None:
     )
     # a change of KF's own source is another finding
     assert not [*detect_in_aids({"gnss_vel": found}, "gnss_pos")]
-    # the same for an aid that is rejected after the change
+    # an aiding source that EKF2 rejects after the change has the same finding
     rejected = replace(found, verdict="not_fused")
     (starved,) = detect_in_aids({"gnss_vel": rejected}, "gnss_pos")
     assert starved.evidence[CAUSE] == SENSOR
@@ -281,8 +281,7 @@ def test_compare_checks_option_exits_with_1_on_bad_verdict(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize(("sigma", "bad"), [(0.5, False), (0.25, False), (1.5, True)])
-def test_compare_checks_fail_only_for_overconfident_sources(sigma: float, bad: bool) -> None:
-    """Overconfident aids fail, underconfident ones do not."""
+def test_compare_checks_option_accepts_underconfident_sources(sigma: float, bad: bool) -> None:
     made = with_aids(gnss_pos=aid_log(sigma=sigma))
     alone = AidsOnlyAnalysis(made, evaluate_aids(made), Unavailable("it", "not there", "Log it."))
     assert failed_checks(alone) == ({"GNSS position": "overconfident"} if bad else {})
@@ -298,7 +297,7 @@ def test_compare_without_position_evaluates_aiding_sources(tmp_path: Path) -> No
     assert "contains only EKF2 aiding sources, no KF results" in str(refused)
 
 
-def test_compare_of_log_without_take_off_raises_missing_data(tmp_path: Path) -> None:
+def test_compare_of_log_without_take_off_raises_an_error(tmp_path: Path) -> None:
     made = gnss_log("v1.16")
     made["vehicle_land_detected"]["landed"][:] = 1
     done = run("compare", made.write(tmp_path / "a.ulg"), "-o", tmp_path / "a.pdf")

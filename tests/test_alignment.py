@@ -150,7 +150,7 @@ def true_offset_s(sample_flight: Flight, external: PositionRecording) -> float:
 # -- the sample flight -----------------------------------------------------------------------------
 
 
-def test_align_sample_position_file_needs_no_options(
+def test_align_sample_position_file_detects_frame_and_offset(
     sample_flight, external, true_offset_s
 ) -> None:
     alignment, track = align(sample_flight, external)
@@ -197,7 +197,7 @@ def test_align_position_file_recovers_clock_frame_and_yaw(
     assert alignment.misplaced == alignment.warnings == ()
 
 
-def test_align_position_file_sigma_equals_observed_scatter() -> None:
+def test_align_position_file_sigma_equals_scatter_of_estimates() -> None:
     clock, yaw = [], []
     for seed in range(24):
         flight = flight_along(seed=seed, duration_s=60.0)
@@ -251,7 +251,7 @@ def test_align_position_file_rotates_its_variances(flight: Flight) -> None:
     assert_same_track(track, flight.positions[0], 1e-9)
 
 
-def test_align_position_file_keeps_notes_of_its_reader(flight: Flight) -> None:
+def test_align_position_file_adds_its_positions_to_the_flight(flight: Flight) -> None:
     result = align_position_file(flight, uwb_file(flight))
     track, *others = result.positions
     assert track.name == track.log == "uwb.csv"
@@ -289,7 +289,7 @@ def test_align_position_file_of_misaligned_frame_warns(flight, yaw_deg, origin_m
     (0.01, "in centimetres, not in metres", "Run again with --position-unit cm."),
     (0.3048, "in feet, not in metres", "Multiply x, y and z by 0.3048 in the file."),
 ])  # fmt: skip
-def test_align_position_file_in_another_unit_names_the_unit(
+def test_align_position_file_in_wrong_unit_states_the_unit(
     sample_flight: Flight, unit_m: float, message: str, remedy: str
 ) -> None:
     file = uwb_file(sample_flight)
@@ -474,7 +474,9 @@ def test_align_position_file_with_invalid_option_raises_error(
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", ["v1.14.4_aisle_nominal", "v1.16.1_aisle_nlos"])
-def test_align_position_file_of_sitl_log_recovers_known_clock(shared_logs: Path, name: str) -> None:
+def test_align_position_file_of_sitl_log_recovers_clock_offset(
+    shared_logs: Path, name: str
+) -> None:
     log = shared_logs / "simulated" / f"{name}.ulg"
     record = json.loads(log.with_suffix(".json").read_text())
     stamps = np.array([sample["t_unix"] for sample in record["uwb"]])

@@ -37,7 +37,7 @@ def read(tmp_path: Path, text: str):
     return read_answers(path)
 
 
-def test_empty_answer_form_lists_every_possible_mistake(tmp_path: Path) -> None:
+def test_empty_answer_form_lists_every_possible_fault(tmp_path: Path) -> None:
     found = read(tmp_path, EMPTY)
     assert found.log_sha256 == SHA256
     assert (found.mistakes, found.quantities) == ((), (None, None, None))
@@ -108,7 +108,7 @@ def test_answer_form_questions_depend_on_log_hash() -> None:
         assert found == pytest.approx(by_hand.get(quantity.kind, found), rel=1e-9)
 
 
-def test_correct_answer_for_sigma_after_gap_equals_closed_form() -> None:
+def test_correct_answer_for_predicted_sigma_equals_closed_form() -> None:
     """Closed form: P grows by F P Fᵀ + Q in each step of DT."""
     main = compare(aisle_flight(duration_s=60.0)).main
     quantity = next(

@@ -37,10 +37,10 @@ from px4fuse.simulation.mistakes import parse
 
 pytestmark = pytest.mark.usefixtures("quick_filter")
 SECRET = b"a secret for tests"
-# Flight of student s1 with SECRET: seed, noise and heading, and the mistakes
+# Flight of student s1 with SECRET: seed, noise and heading, and the faults
 PINNED = ((759547191, 0.109, -14.4), ("clock-jump=53ms", "ekf2-off"))
 CLASS = tuple(Person(f"s{n:02d}", f"Name {n}") for n in range(3))
-# Finding that reports each mistake
+# Finding that reports each fault
 FINDINGS = {
     "clock-offset": "source_time_offset", "clock-jump": "source_timestamps_are_arrival_times",
     "yaw": "source_frame_misaligned", "nlos": "source_outliers", "dropout": "source_gap",
@@ -78,13 +78,13 @@ def files(folder):
 
 
 class TestDraw:
-    def test_assigned_flight_of_same_secret_and_id_is_reproduced(self):
+    def test_assigned_flights_of_equal_secret_and_id_are_equal(self):
         given = SECRET, CLASS[0], "aisle", 2, True
         assert simulate_assigned(*given) == assignment.simulate_assigned(*given)
         # the id as another platform may spell it
         assert draw(SECRET, "S1 ", "aisle") == draw(SECRET, "s1", "aisle")
 
-    def test_assigned_flight_of_fixed_secret_never_changes(self):
+    def test_assigned_flight_of_fixed_secret_equals_reference(self):
         drawn = draw(SECRET, "s1", "aisle", 2)
         scenario = drawn.scenario
         # a loop contains no ground truth, which would show the landing
@@ -104,7 +104,7 @@ class TestDraw:
         assert len({(one.sigma_a_m_s2, one.heading_deg, one.speed_m_s) for one in drawn}) > 390
 
     @pytest.mark.parametrize("kind", ["aisle", "loop"])
-    def test_assigned_mistake_counts_have_configured_fractions(self, kind):
+    def test_assigned_flights_have_0_to_2_faults_as_configured(self, kind):
         flights = [draw(SECRET, f"s{n}", kind) for n in range(1000)]
         for count, share in enumerate(COUNT_FRACTIONS[kind]):
             found = sum(len(one.mistake_options) == count for one in flights) / 1000
@@ -112,13 +112,13 @@ class TestDraw:
         names = {choice.mistake for one in flights for choice in choices_of(one)}
         assert names == {choice.mistake for choice in ASSIGNABLE_MISTAKES[kind]}
 
-    def test_mixed_assignment_draws_aisle_and_loop_flights(self):
+    def test_mixed_assignment_contains_aisle_and_loop_flights(self):
         mixed = [draw(SECRET, f"s{n}", "mixed") for n in range(1000)]
         kinds = Counter(one.scenario.kind for one in mixed)
         assert kinds["loop"] / 1000 == pytest.approx(LOOP_FRACTION, abs=0.05)
         assert all(one == draw(SECRET, f"s{n}", one.scenario.kind) for n, one in enumerate(mixed))
 
-    def test_two_assigned_mistakes_are_compatible_and_in_range(self):
+    def test_two_assigned_faults_are_compatible_and_in_range(self):
         signs = Counter()
         for n in range(300):
             drawn = draw(SECRET, f"s{n}", "aisle", 2)
@@ -143,7 +143,7 @@ class TestDraw:
         both = {choice.mistake for choice in ASSIGNABLE_MISTAKES["aisle"] if choice.has_either_sign}
         assert {name for name, positive in signs if not positive} == both
 
-    def test_mistake_size_limits_equal_smallest_detected_sizes(self):
+    def test_fault_size_limits_equal_smallest_detected_sizes(self):
         """From the limit on, 95 % of the flights of tests/studies/rates.csv have the finding."""
         table = rates()
         table = table[~table.condition.str.contains("outdoor")]
@@ -162,7 +162,7 @@ class TestDraw:
             larger = [s for s in sizes if (s < choice.detectable_size) == choice.is_smaller_easier]
             assert set(larger) <= {choice.detectable_size, *found}
 
-    def test_assigned_flights_are_spread_over_difficulty_range(self):
+    def test_difficulties_of_assigned_flights_cover_their_range(self):
         each = [draw(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]
         counts, _ = np.histogram(each, bins=4, range=(EASIEST_DIFFICULTY, HARDEST_DIFFICULTY))
         assert counts.min() > 90
@@ -171,7 +171,7 @@ class TestDraw:
 @pytest.mark.parametrize(
     ("kind", "number", "count"), [("aisle", 0, 2), ("aisle", 1, 2), ("aisle", 2, 1), ("loop", 0, 1)]
 )
-def test_assigned_log_has_a_finding_for_each_mistake_of_key(tmp_path, kind, number, count):
+def test_assigned_log_has_a_finding_for_each_fault_of_key(tmp_path, kind, number, count):
     log, answer = assignment.simulate_assigned(SECRET, CLASS[number], kind, count, True)
     path = tmp_path / answer.file
     path.write_bytes(log)
@@ -191,7 +191,7 @@ def test_assigned_log_has_a_finding_for_each_mistake_of_key(tmp_path, kind, numb
 
 
 class TestAssign:
-    """All tests use flights with two mistakes, which are simulated once."""
+    """All tests use flights with two faults, which are simulated once."""
 
     @pytest.fixture(autouse=True)
     def fixed_secret(self, monkeypatch):
@@ -262,7 +262,7 @@ class TestAssign:
         assert len(read_key(key_file).answers) == 2
         assert assign(CLASS, folder, key_file, None, "aisle", 2) == (read_key(key_file), 1)
 
-    def test_assign_flights_continues_after_unwritable_key_path(self, tmp_path):
+    def test_assign_flights_succeeds_after_unwritable_key_path(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         key_file.mkdir()
         with pytest.raises(SettingsError):
@@ -301,7 +301,7 @@ class TestKey:
         )
         return AnswerKey("aisle", tuple(answers), "s")
 
-    def test_answer_key_written_and_read_again_is_equal(self, tmp_path):
+    def test_answer_key_written_to_file_is_read_back_equal(self, tmp_path):
         path = tmp_path / "key.json"
         path.write_text(key_text(self.key()), encoding="utf-8")
         assert read_key(path) == self.key()

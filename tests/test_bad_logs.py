@@ -91,7 +91,7 @@ def read_and_make_axes(path: Path) -> Flight | None:
         ),
     ],
 )  # fmt: skip
-def test_read_log_of_other_file_format_is_rejected(tmp_path, content, words):
+def test_read_log_of_unsupported_file_format_is_rejected(tmp_path, content, words):
     path = tmp_path / "other.ulg"
     path.write_bytes(content)
     assert words in read_error(path)
@@ -110,7 +110,9 @@ def test_read_log_of_other_file_format_is_rejected(tmp_path, content, words):
         ("log.pdf", b"%PDF-1.7 and so on", "the file is a PDF", "verify log.pdf LOG"),
     ],
 )
-def test_read_log_of_other_file_type_suggests_right_command(tmp_path, name, content, what, command):
+def test_read_log_of_unsuitable_file_suggests_another_command(
+    tmp_path, name, content, what, command
+):
     (tmp_path / name).write_bytes(content)
     message = read_error(tmp_path / name)
     assert message.startswith(f"{name}: {what}")
@@ -187,8 +189,7 @@ def write_and_read(log: Log, tmp_path: Path) -> Flight:
         ("vehicle_land_detected", "airborne"),
     ],
 )
-def test_read_log_without_topic_disables_only_its_data(tmp_path, topic, part):
-    """Only the part of the missing topic is unavailable."""
+def test_read_log_without_one_topic_contains_all_other_data(tmp_path, topic, part):
     flight = write_and_read(make_log("v1.16", 2.0).drop(topic), tmp_path)
     for name in ("imu", "attitude", "ekf2", "airborne"):
         assert isinstance(getattr(flight, name), Unavailable) == (name == part)
@@ -223,7 +224,7 @@ def rich_log() -> Log:
 
 
 @pytest.mark.parametrize("name", sorted(rich_log().names()))
-def test_read_log_succeeds_if_any_one_field_is_missing(tmp_path, name):
+def test_read_log_succeeds_without_any_single_field(tmp_path, name):
     """Fields may be missing in other PX4 releases or in a damaged format."""
     for field in rich_log()[name].keys() - {"timestamp"}:
         log = rich_log()
@@ -242,7 +243,7 @@ def test_read_log_rejects_log_whose_timestamps_are_all_zero(tmp_path):
     assert "all timestamps are zero" in read_error(log.write(tmp_path / "zero.ulg"))
 
 
-def test_read_log_notes_a_topic_with_zero_timestamps(tmp_path):
+def test_read_log_adds_note_on_topic_with_zero_timestamps(tmp_path):
     """ekf2_innovations of a real log of 2016 had this fault."""
     log = make_log("v1.9", 2.0)
     log["ekf2_innovations"]["timestamp"][:] = 0
@@ -256,7 +257,6 @@ def test_read_log_notes_a_topic_with_zero_timestamps(tmp_path):
              "vehicle_local_position", "estimator_aid_src_ev_pos"],
 )  # fmt: skip
 def test_read_log_drops_swapped_timestamps_with_a_note(tmp_path, name):
-    """Samples out of order are dropped and counted; the others keep their times."""
     log = make_log("v1.16", 4.0)
     index = next(i for i, made in enumerate(log.topics) if made.name == name)
     count = len(log[name]["timestamp"])
@@ -274,7 +274,6 @@ def test_read_log_drops_swapped_timestamps_with_a_note(tmp_path, name):
 
 
 def test_read_log_with_reboot_keeps_the_longer_part(tmp_path):
-    """After a reboot during the log, the longer part is kept."""
     log = make_log("v1.16", 4.0)
     for made in log.topics:
         for name in ("timestamp", "timestamp_sample"):
@@ -300,7 +299,6 @@ MISSING_PARTS = {
 @pytest.mark.parametrize("value", [np.nan, -np.inf])
 @pytest.mark.parametrize(("name", "field"), MISSING_PARTS)
 def test_log_field_without_finite_values_is_unavailable(tmp_path, name, field, value):
-    """A part without finite values is unavailable, not zero; other parts stay."""
     log = make_log("v1.16", 2.0)
     log[name][field][:] = value
     flight = read_and_make_axes(log.write(tmp_path / "made.ulg"))
@@ -367,7 +365,7 @@ def test_px4_parameter_out_of_range_is_replaced_by_default(tmp_path, parameter, 
     assert all(aid.parameters.get(parameter) != value for aid in flight.ekf2.aids.values())
 
 
-def test_px4_parameter_at_float32_end_of_range_is_kept(tmp_path):
+def test_px4_parameter_at_float32_limit_of_range_is_accepted(tmp_path):
     log = make_log("v1.16", 2.0)
     lowest = float(np.float32(0.01))  # 0.0099999998
     log.parameters |= {"EKF2_EVP_NOISE": lowest, "EKF2_GYR_NOISE": float(np.float32(0.1))}

@@ -350,8 +350,7 @@ def test_batch_interrupted_run_reuses_finished_results(
 
 
 @pytest.mark.usefixtures("in_this_process")  # one of them
-def test_batch_two_runs_in_one_output_folder_both_succeed(tmp_path):
-    """Both runs succeed, and the table is complete."""
+def test_two_simultaneous_batch_runs_with_one_folder_succeed(tmp_path):
     logs, out = tiny_logs(tmp_path / "logs", 3, truth=False), tmp_path / "out"
     with running(logs, out, "--workers", "1") as other:
         while not out.exists():
@@ -379,7 +378,7 @@ def test_batch_table_has_one_row_per_invalid_log(tmp_path):
     assert table["reason"].str.len().between(10, 300).all()
 
 
-def test_batch_rejects_settings_that_fit_only_one_flight(flights):
+def test_batch_rejects_options_that_apply_to_one_flight_only(flights):
     for settings in ({"mavlink": "a.tlog"}, {"sigma": 1.0}, {"sigma_z_m": 0.0}):
         with pytest.raises(SettingsError):
             px4fuse.run_batch(flights, **settings)
@@ -416,8 +415,8 @@ def test_find_logs_accepts_folders_globs_and_urls(tmp_path, monkeypatch):
 
 
 @pytest.mark.reallogs
-def test_batch_processes_all_shared_logs_without_exception(shared_logs, tmp_path):
-    """All shared logs except those of other tests, two long ones, and second recordings.
+def test_batch_processes_all_test_logs_without_exception(shared_logs, tmp_path):
+    """Analyse all logs of ``../shared/logs``, except long ones and those of other tests.
 
     test_gnss.py has the GNSS flights; test_flown.py and test_whatif_cli.py have other releases.
     """

@@ -39,7 +39,7 @@ CHANGES = {
 def outcome(
     source: float, truth: float | None = None, rmse_m: float | None = None
 ) -> RunStatistics:
-    """Return an outcome with these ratios of actual to reported σ."""
+    """Return the result of a filter run with these σ ratios (actual over reported)."""
     nees = None if truth is None else truth**2
     return RunStatistics(
         innovations=600, nis_mean=source**2, nees_mean=nees, position_rmse_m=rmse_m
@@ -68,13 +68,13 @@ OFFSET = Finding("source_time_offset", "error", "Timestamps are late.", "Subtrac
 NOISE = Finding("sigma_z_too_small", "error", "SIGMA_Z is too small.", "", {})
 
 
-def test_rank_causes_puts_source_fault_before_wrong_setting() -> None:
+def test_rank_causes_lists_source_fault_before_wrong_setting() -> None:
     flight = analysis(trial("noises", outcome(1.0, 1.0, 0.1)), trial("time offset", CORRECTED))
     ranked = rank_causes(flight, [NOISE, OFFSET])
     assert [(each.finding.id, each.tier) for each in ranked] == [
         ("source_time_offset", 1), ("sigma_z_too_small", 1),
     ]  # fmt: skip
-    # the larger reduction is that of the setting
+    # the setting reduces the error more, but a source fault comes first
     assert ranked[1].reduction > ranked[0].reduction
 
 
@@ -85,10 +85,10 @@ def test_rank_causes_puts_source_fault_before_wrong_setting() -> None:
         (outcome(1.0, 3.0, 0.2), "position"),
         (outcome(1.0, 1.0, 0.29), "σ only"),
         (outcome(1.0, 2.9, 0.29), "nothing"),
-        (outcome(0.3, 1.0, 0.29), "nothing"),  # the ratio against the source gets worse
+        (outcome(0.3, 1.0, 0.29), "nothing"),  # the σ ratio against the source becomes worse
     ],
 )
-def test_filter_rerun_improvement_names_position_or_sigma(after, improves) -> None:
+def test_filter_rerun_improves_position_sigma_both_or_nothing(after, improves) -> None:
     assert improvement(trial("noises", after)) == improves
 
 
@@ -102,7 +102,7 @@ def test_correction_without_improvement_is_not_recommended() -> None:
     assert rank_causes(analysis(trial("time offset", FLOWN), fails), [OFFSET]) == []
 
 
-def test_diagnosis_keeps_time_offset_cause_without_ground_truth() -> None:
+def test_diagnosis_without_ground_truth_keeps_time_offset_cause() -> None:
     """Innovations hardly show a time offset, so the re-run cannot refute it."""
     flight = analysis(trial("time offset", outcome(0.98), outcome(1.0)))
     (ranked,) = rank_causes(flight, [OFFSET])
@@ -113,7 +113,7 @@ def test_diagnosis_keeps_time_offset_cause_without_ground_truth() -> None:
     assert rank_causes(analysis(trial("noises", outcome(0.98), outcome(1.0))), [NOISE]) == []
 
 
-def test_verdict_with_process_noise_rerun_sets_the_parameter() -> None:
+def test_cause_with_improving_rerun_recommends_its_parameter() -> None:
     vibration = Finding("ekf2_overconfident", "error", "EKF2 is overconfident.", "Check.", {})
     helps = trial("process noise", CORRECTED, owner="ekf2")
     for trials, commands in (((helps,), ("param set EKF2_ACC_NOISE 0.7",)), ((), ())):
@@ -126,7 +126,7 @@ def test_verdict_with_process_noise_rerun_sets_the_parameter() -> None:
     assert rank_causes(analysis(fails), [vibration])[0].trials == ()
 
 
-def test_same_reason_of_both_filters_is_one_row() -> None:
+def test_diagnosis_card_merges_equal_actions_for_kf_and_ekf2() -> None:
     ratios = [(3.0, "overconfident")] * 4
     gap = Finding("source_gap", "warning", "No position for 8 s.", "Check the link.", {})
     flight = analysis()
@@ -137,7 +137,7 @@ def test_same_reason_of_both_filters_is_one_row() -> None:
     ]  # fmt: skip
 
 
-def test_consistent_filter_without_truth_is_no_reason_to_change_nothing() -> None:
+def test_cause_without_ground_truth_states_that_it_is_untested() -> None:
     ratios = verdicts(*[(1.0, "consistent")] * 4)
     untested = tuple(each for each in ratios if each.against == "source")
     (ranked,) = rank_causes(analysis(), [OFFSET])
@@ -149,7 +149,7 @@ def test_consistent_filter_without_truth_is_no_reason_to_change_nothing() -> Non
         assert cause.actions[-1] == Action("KF, EKF2", reason)
 
 
-def test_card_of_unreadable_log_shows_fault_bytes_and_action(tmp_path) -> None:
+def test_card_of_unreadable_log_shows_first_bytes_and_action(tmp_path) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(b"\xa3\x95\x80\x01" * 300)
     with pytest.raises(LogError) as caught:
@@ -173,7 +173,7 @@ def test_diagnosis_card_of_clean_flight_advises_no_change(sample: Analysis) -> N
     assert card.do_this == ("Change nothing.",)
 
 
-def test_verdicts_that_differ_by_ekf2_delay_refer_to_the_rerun() -> None:
+def test_card_explains_why_the_two_verdicts_on_ekf2_differ() -> None:
     flight = simulate_flight(Scenario(seed=8), parse(("ekf2-delay=0.25",)))
     explained = explain(compare(flight, Settings()))
     card = build_card(explained, REQUEST)

@@ -44,7 +44,7 @@ def test_diagnosis_card_text_has_at_most_40_lines() -> None:
         assert part in whole
 
 
-def test_diagnosis_card_text_marks_alternatives_either_or() -> None:
+def test_diagnosis_card_text_joins_alternatives_by_either_or() -> None:
     cause = replace(SMALL_SIGMA_A.causes[0], alternatives=((SENDER,), (DELAY,)))
     card = replace(SMALL_SIGMA_A, causes=(cause,))
     lines = text_of(card)
@@ -58,7 +58,7 @@ def test_diagnosis_card_text_marks_alternatives_either_or() -> None:
     assert closing.endswith(f"px4fuse explain {card.id}")
 
 
-def test_causes_are_numbered_and_further_notes_are_counted() -> None:
+def test_diagnosis_card_text_numbers_causes_and_counts_notes() -> None:
     notes = tuple(Note(f"note_{number}", f"Text {number}.") for number in range(5))
     card = replace(SMALL_SIGMA_A, causes=2 * SMALL_SIGMA_A.causes, notes=notes)
     lines = text_of(card)

@@ -23,12 +23,12 @@ def one(name: str, severity: str = "warning", **evidence: str) -> Finding:
     return Finding(name, severity, f"{name}.", "Do.", evidence)  # type: ignore[arg-type]
 
 
-def test_consequences_of_causes_name_only_existing_findings() -> None:
+def test_cause_table_contains_only_existing_finding_ids() -> None:
     listed = {name for cause in CONSEQUENCES for name in effect_ids(cause)}
     assert listed | set(CONSEQUENCES) | NOISES | RECORDING <= set(TITLES)
 
 
-def test_nested_causes_of_findings_are_listed_inner_first() -> None:
+def test_cause_table_lists_dependent_causes_before_root_causes() -> None:
     outer = list(CONSEQUENCES)
     for at, cause in enumerate(outer):
         assert set(effect_ids(cause)) & set(outer) <= set(outer[:at]), cause
@@ -40,7 +40,7 @@ UNDERSTATED, REJECTING = "ekf2_overconfident", "ekf2_rejects_positions"
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        # the cause gets the severity of its consequence
+        # the finding that is the cause gets the severity of its consequence
         ([one(REJECTING, "error"), one(UNDERSTATED)],
          [(UNDERSTATED, "error", None), (REJECTING, "error", UNDERSTATED)]),
         # a wrong variance is a consequence of the cause in its evidence
@@ -99,6 +99,6 @@ def test_consistency_notes_of_white_innovations_are_empty(sample: Analysis) -> N
     assert verdict_notes(replace(sample, axes={"east": white})) == []
 
 
-def test_consistency_notes_name_a_source_that_may_drift(sample: Analysis) -> None:
+def test_consistency_note_states_that_odometry_may_drift(sample: Analysis) -> None:
     turning = replace(sample.source, origin=replace(sample.source.origin, kind="vio"))
     assert "source may drift" in verdict_notes(replace(sample, source=turning))[0]

@@ -279,7 +279,7 @@ def test_class_page_click_on_row_opens_report_details(page: Browser) -> None:
     assert page.requests() <= {"file", "data"}
 
 
-def test_class_page_keyboard_steps_through_reports(page: Browser) -> None:
+def test_class_page_keys_select_next_and_previous_report(page: Browser) -> None:
     opened = "[...document.querySelectorAll('tr.open .name')].map((name) => name.textContent)"
     for key, name in (("j", "Zoë"), ("n", "ada"), ("j", "Émile"), ("k", "ada"), ("p", "Zoë")):
         page.press(key, key)
@@ -301,7 +301,7 @@ def test_class_page_links_the_redrawn_report() -> None:
     assert made["rows"][1][3] == []
 
 
-def test_points_histogram_returns_counts_and_lower_edges() -> None:
+def test_points_histogram_has_counts_and_lower_bin_edges() -> None:
     assert count_tenths([0, 5, 5.5, 9, 99], 10) == [
         (count, f"{edge}") for edge, count in enumerate((1, 0, 0, 0, 0, 2, 0, 0, 0, 2))
     ]

@@ -74,7 +74,7 @@ def test_class_table_csv_has_no_formula_cell_for_any_delimiter(text: str) -> Non
 
 
 @given(st.lists(st.tuples(texts, st.dictionaries(texts, finite, max_size=3)), max_size=4))
-def test_class_table_csv_read_again_gives_formula_safe_values(
+def test_class_table_csv_contains_neutralised_formulas(
     rows: list[tuple[str, dict[str, float]]],
 ) -> None:
     head, *rest = cells(csv_text([graded(text, numbers) for text, numbers in rows]))
@@ -110,7 +110,7 @@ def test_class_table_csv_read_again_gives_formula_safe_values(
 
 
 @given(texts)
-def test_neutralise_csv_formulas_twice_equals_once(text: str) -> None:
+def test_neutralise_csv_formulas_is_idempotent(text: str) -> None:
     once = neutralise_formulas(text)
     assert neutralise_formulas(once).replace("'", "") == once.replace("'", "")
     assert not may_be_formula(once)

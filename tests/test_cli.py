@@ -19,7 +19,7 @@ from px4fuse.results.contract import schema
 pytestmark = pytest.mark.usefixtures("cached_analyses")
 
 
-def test_numeric_libraries_use_one_thread_unless_user_sets_it(monkeypatch, capsys):
+def test_numeric_libraries_use_one_thread_by_default(monkeypatch, capsys):
     """With more threads, tune takes twice the CPU time and the same wall time."""
     environment = {"OPENBLAS_NUM_THREADS": "3"}
     monkeypatch.setattr(os, "environ", environment)
@@ -48,7 +48,7 @@ def report(tmp_path_factory, sample_log) -> tuple[Path, str]:
     return folder, result.output
 
 
-def test_compare_report_attaches_results_json_without_paths(report):
+def test_compare_report_pdf_attaches_results_without_paths(report):
     folder, said = report
     assert sorted(p.name for p in folder.iterdir()) == ["notes.md", "report.json", "report.pdf"]
     assert "warning[kf_underconfident]: KF is underconfident along the main axis" in said
@@ -71,7 +71,7 @@ def test_compare_report_prints_special_characters_of_student(report):
 
 @pytest.mark.usefixtures("no_drawing")
 @pytest.mark.parametrize(("severity", "code"), [("note", 1), ("warning", 1), ("error", 0)])
-def test_compare_fail_on_severity_sets_exit_code(tmp_path, sample_log, severity, code):
+def test_compare_fail_on_option_sets_exit_code(tmp_path, sample_log, severity, code):
     command = "compare", sample_log, "-o", tmp_path / "a.pdf", "--fail-on", severity
     run_checked(*command, "--sigma-z", "0.12", code=code)  # the finding is a warning
     run_checked(*command, code=0)  # the flight has no finding

@@ -270,7 +270,7 @@ def test_time_offset_likelihood_equals_joint_normal_density(exact_imu) -> None:
 # --- profiles and parts ---
 
 
-def test_time_offset_parabola_gives_vertex_sigma_and_interval() -> None:
+def test_time_offset_likelihood_parabola_gives_sigma() -> None:
     grid = np.linspace(-0.1, 0.3, 41)
     drop = (grid - 0.123) ** 2 / (2.0 * 0.03**2)
     assert time_offset._minimum_and_sigma(grid, drop) == pytest.approx((0.123, 0.03))
@@ -289,9 +289,7 @@ def test_time_offset_parabola_gives_vertex_sigma_and_interval() -> None:
 
 @pytest.mark.parametrize("offset_s", [0.0, -0.2, -0.21, 0.333])
 @pytest.mark.parametrize("factor", [1.0, 2.5])
-def test_time_offset_of_flight_parts_follows_their_likelihood(
-    monkeypatch, offset_s, factor
-) -> None:
+def test_time_offset_of_flight_parts_maximises_likelihood(monkeypatch, offset_s, factor) -> None:
     """Use parabolas as profiles of the parts."""
     shift, sigma = np.array([-0.05, 0.025, 0.0, 0.0]), np.array([0.03, 0.02, 0.03, 0.5])
 
@@ -355,7 +353,7 @@ def test_simulated_imu_and_source_noise_has_given_variance(monkeypatch) -> None:
 SEEDS = 12
 
 
-def test_time_offset_95_percent_interval_covers_the_truth() -> None:
+def test_time_offset_95_percent_interval_contains_true_value() -> None:
     """12 seeds with random offsets; the estimates are also unbiased."""
     inside, normalised = [], []
     for seed in range(SEEDS):
@@ -389,7 +387,7 @@ def test_time_offset_from_insufficient_data_states_reason() -> None:
     assert "at least 30" in short.reason
 
 
-def test_clock_jump_and_drift_are_found_from_flight_parts() -> None:
+def test_clock_jump_and_drift_are_found_in_parts_of_a_flight() -> None:
     found = estimate(made_flight(4, duration_s=120.0, jump_s=-0.25)[0])
     assert found.change_p_value < MAX_CHANGE_P
     for part in found.parts:
@@ -428,7 +426,7 @@ def test_time_offset_estimate_excludes_position_outliers() -> None:
     assert clock_advice(compared, found)["Offset"].startswith("Add -0.")
 
 
-def test_time_offset_step_p_value_equals_bonferroni_t_test() -> None:
+def test_time_offset_jump_p_value_equals_bonferroni_t_test() -> None:
     """Compare with scipy's two-sample t for equal weights and a scatter above the stated σ."""
     offset = np.array([0.0, 0.03, -0.02, 0.01, 0.2, 0.24, 0.19, 0.22, 0.2])
     weight = np.full(len(offset), 1e6)
@@ -478,12 +476,12 @@ def stated(
         (LOGGED_BY_EKF2, True),
     ],
 )
-def test_vision_source_with_orientation_is_marked_as_drifting(origin, drifts) -> None:
+def test_vision_source_with_orientation_is_treated_as_drifting(origin, drifts) -> None:
     assert with_orientation(origin, turns=True).may_drift is drifts
     assert not with_orientation(origin, turns=False).may_drift
 
 
-def test_time_offset_interval_is_widened_by_scatter_of_parts() -> None:
+def test_time_offset_interval_widens_if_flight_parts_differ() -> None:
     """Offsets of parts as measured on a VIO with correct timestamps."""
     scattered = stated(-0.013, 0.019, 0.076, 0.031, 0.082, 0.107, -0.077, 0.012, -0.007, -0.024)
     found = widen_for_drift(scattered)
@@ -495,7 +493,7 @@ def test_time_offset_interval_is_widened_by_scatter_of_parts() -> None:
     assert found.is_determinable
 
 
-def test_time_offset_interval_is_kept_at_small_scatter_of_parts() -> None:
+def test_time_offset_interval_is_kept_if_flight_parts_agree() -> None:
     found = widen_for_drift(stated(0.01, -0.01, 0.015, -0.02, 0.0))
     assert (found.interval_s, found.sigma_s) == (pytest.approx((-0.021, 0.019)), 0.01)
 

@@ -92,7 +92,7 @@ class TestSample:
                 reported = np.interp(error.index, column.index, column, np.nan, np.nan)
                 assert nees == pytest.approx(np.nanmean(error**2 / reported))
 
-    def test_ekf2_delayed_state_equals_position_before_update(
+    def test_ekf2_state_at_fusion_horizon_is_state_before_update(
         self, sample, sample_flight, sample_log
     ):
         """Published positions include the output predictor's lag, which no variance contains."""
@@ -125,7 +125,7 @@ class TestSample:
             assert found.nees_velocity_mean == pytest.approx(np.mean(ev**2 / vv), rel=1e-9)
 
 
-def test_position_source_kind_sets_drift_and_gnss_flags(sample_flight: Flight) -> None:
+def test_position_source_kind_determines_drift_and_gnss_flags(sample_flight: Flight) -> None:
     plain = compare(sample_flight)
     for kind, drifts, slow in (
         ("uwb", False, False), ("vio", True, False), ("mocap", False, False), ("gnss", False, True),
@@ -180,9 +180,7 @@ class TestSimulatedFlight:
         assert other == pytest.approx(one, rel=0.1)
 
     @pytest.mark.parametrize(("heading", "name"), [(0.0, "north"), (90.0, "east")])
-    def test_aisle_axis_with_north_or_east_heading_equals_that_axis(
-        self, made, heading, name
-    ) -> None:
+    def test_aisle_axis_with_heading_0_equals_north_and_90_east(self, made, heading, name) -> None:
         aisle = compare(made.flight, axes=("aisle",), heading_deg=heading).main
         same = made[name]
         assert asdict(aisle.difference) == pytest.approx(asdict(same.difference))
@@ -220,7 +218,7 @@ class TestMissingParts:
                 assert part == comparison.flight.ekf2
 
     @pytest.mark.parametrize("left_out", ["imu", "attitude_hz"])
-    def test_compare_without_acceleration_notes_constant_velocity(self, left_out) -> None:
+    def test_compare_without_imu_states_constant_velocity_model(self, left_out) -> None:
         flight = aisle_flight(**{left_out: None})
         comparison = compare(flight, Settings(sigma_z_m=0.2))
         assert comparison.settings == Settings(sigma_z_m=0.2, input="zero")
@@ -246,7 +244,7 @@ class TestMissingParts:
             assert result.filters["ekf2"].sigma_p_before_update_m is None
             assert isinstance(result.difference, Difference)
 
-    def test_compare_with_short_ground_truth_interpolates_variance(self, made: Comparison) -> None:
+    def test_ekf2_nees_uses_variance_interpolated_to_ground_truth(self, made: Comparison) -> None:
         """EKF2's variances are logged at 1 Hz: none is within these 0.8 s of ground truth."""
         samples = made.flight.truth.samples.loc[40.1:40.9]
         flight = replace(made.flight, truth=Truth("0.8 s", samples))
@@ -271,7 +269,7 @@ class TestMissingParts:
 
 
 class TestRobustness:
-    def test_compare_removes_and_notes_ekf2_frame_reset(self, made: Comparison) -> None:
+    def test_compare_removes_ekf2_frame_reset_and_adds_note(self, made: Comparison) -> None:
         reset = Reset(60.0, "position", (5.0, -3.0, 0.0))
         comparison = compare(aisle_flight(ekf2=Estimator(resets=(reset,))))
         assert any("resets removed: 1 of horizontal position" in note for note in comparison.notes)

@@ -33,7 +33,7 @@ def test_nis_band_contains_95_percent_of_chi_square_values() -> None:
         assert tails == pytest.approx((0.025, 0.025))
 
 
-def test_white_innovations_are_judged_consistent() -> None:
+def test_white_innovations_have_verdict_consistent() -> None:
     """A small but significant deviation of σ is consistent, so all are; p-values stay exact."""
     found = [assessed(white(seed)) for seed in range(1000)]
     one = np.ones(200)
@@ -49,7 +49,7 @@ def test_white_innovations_are_judged_consistent() -> None:
 
 
 @pytest.mark.parametrize("factor", [0.05, 0.5, 2.0, 90.0])
-def test_scaled_innovation_variance_gives_its_sigma_ratio(factor: float) -> None:
+def test_sigma_ratio_follows_from_scale_of_innovation_variance(factor: float) -> None:
     variance = np.random.default_rng(2).uniform(0.5, 2.0, 2000)
     result = assessed(white(1, 2000) * np.sqrt(variance), factor * variance)
     assert result.sigma_ratio == pytest.approx(factor**-0.5, rel=0.04)

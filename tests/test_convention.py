@@ -1,4 +1,4 @@
-"""Convention of the positions against ground truth: axes, unit, clock and orientation."""
+"""Checks of axes, unit, clock and orientation of a position source with known errors."""
 
 from __future__ import annotations
 
@@ -199,7 +199,7 @@ def test_check_convention_finds_quaternion_order_with_w_last():
     assert (found.verdict, found.order) == ("determined", "x y z w")
 
 
-def test_check_attitude_sent_back_is_copied():
+def test_check_attitude_copied_from_ekf2_is_detected():
     assert check_convention(flown(), copied(flown())).orientation.verdict == "copied"
 
 
@@ -256,13 +256,13 @@ AMBIGUOUS = Convention(
 
 
 @pytest.mark.parametrize(("name", "kind"), FAULTS)
-def test_detect_faulty_convention_is_the_only_finding(name, kind):
+def test_faulty_source_convention_is_the_only_finding(name, kind):
     found = list(source_convention.detect(compared(FAULTS[name, kind](flown()))))
     assert [(one.id, one.evidence[CONVENTION]) for one in found] == [(name, kind)]
 
 
 @pytest.mark.parametrize("name", [name for name, _ in FAULTS if "orientation" not in name])
-def test_prepare_faulty_positions_are_corrected(name):
+def test_compare_corrects_positions_with_wrong_convention(name):
     track = next(FAULTS[one](flown()) for one in FAULTS if one[0] == name)
     samples, truth = compared(track).source.samples, flown().truth.samples
     error = [
@@ -272,18 +272,18 @@ def test_prepare_faulty_positions_are_corrected(name):
     assert np.std(error, axis=1).max() < 0.25
 
 
-def test_prepare_copied_orientation_is_left_out():
+def test_compare_ignores_orientation_copied_from_ekf2():
     source = compared(copied(flown())).source
     assert source.orientation is None
     assert source.origin.kind == "uwb"
 
 
-def test_detect_clean_source_has_no_finding():
+def test_clean_position_source_has_no_convention_finding():
     assert not list(source_convention.detect(prepare(flown())))
     assert not list(source_convention.detect(compared(sent(flown()))))
 
 
-def test_detect_orientation_in_enu_of_ned_positions_names_the_conversion():
+def test_enu_orientation_finding_of_ned_source_names_conversion():
     time, attitude = oriented(flown())
     quaternion = multiply(multiply(np.array(NED_TO["ENU"]), attitude), np.array(NED_TO["NWU"]))
     (found,) = source_convention.detect(compared(with_orientation(sent(flown()), quaternion, time)))
@@ -301,7 +301,7 @@ def fused(flight: Flight) -> Flight:
     (("west", "south", "up"), 20.0, Faults(axes=True, affects_ekf2=True, is_north_unknown=True)),
     (("west", "north", "down"), -32.0, Faults()),
 ])  # fmt: skip
-def test_find_faults_heading_from_source_has_no_rotation(axes, rotation_deg, expected):
+def test_source_that_defines_the_heading_has_no_rotation_fault(axes, rotation_deg, expected):
     convention = Convention(
         verdict="determined", **dict(zip("xyz", axes, strict=True)), rotation_deg=rotation_deg,
         heading_from="gyroscopes", orientation=OrientationConvention(verdict="determined",
@@ -310,13 +310,13 @@ def test_find_faults_heading_from_source_has_no_rotation(axes, rotation_deg, exp
     assert find_faults(convention, fused(flown()), "NED") == expected
 
 
-def test_find_faults_of_frd_has_no_rotation():
+def test_source_in_frame_frd_has_no_rotation_fault():
     convention = Convention(verdict="determined", x="west", y="north", rotation_deg=-32.0)
     assert not find_faults(convention, flown(), "FRD")
     assert find_faults(convention, flown(), "NED").rotation_deg == pytest.approx(58.0)
 
 
-def test_detect_ambiguous_axes_are_listed():
+def test_ambiguous_source_axes_finding_lists_possible_axes():
     (found,) = source_convention.detect(replace(compared(sent(flown())), convention=AMBIGUOUS))
     assert found.id == "source_convention_ambiguous"
     assert "rotated by +12°" in found.message
@@ -326,7 +326,7 @@ def test_detect_ambiguous_axes_are_listed():
     (("north", "east", "up"), "x and y are exchanged: x is east, y north, z down", "(y, x, z)"),
     (("west", "north", "down"), "NWU read as ENU: x is north, y west, z up", "frame nwu."),
 ])  # fmt: skip
-def test_detect_file_read_in_another_frame_names_it(axes, message, remedy):
+def test_position_file_in_wrong_frame_finding_names_the_frame(axes, message, remedy):
     """The axes are those of positions that were converted from ENU."""
     alignment = replace(given_placement(), frame="enu")
     (found,) = source_convention.detect(compared(replace(sent(flown(), axes), alignment=alignment)))
@@ -334,7 +334,7 @@ def test_detect_file_read_in_another_frame_names_it(axes, message, remedy):
     assert remedy in found.remedy
 
 
-def test_apply_convention_effects_follow_with_another_action():
+def test_ekf2_findings_are_consequences_of_wrong_source_axes():
     comparison = compared(sent(flown(), ENU))
     roots = list(source_convention.detect(comparison))
     other = finding("error", "ekf2_rejects_positions", "EKF2 rejects 9 %. Why.", "Set a gate.")
@@ -347,7 +347,7 @@ def test_apply_convention_effects_follow_with_another_action():
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", FLOWN)
-def test_check_flown_convention_is_determined(name):
+def test_check_convention_of_sitl_log_equals_known_convention(name):
     flight = read_log(shared("logs/conventions") / f"{name}.ulg")
     found = check_convention(flight, flight.positions[0])
     expected = dict(FLOWN[name])
@@ -358,7 +358,7 @@ def test_check_flown_convention_is_determined(name):
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", CASES)
-def test_check_shared_case_is_determined(name):
+def test_check_convention_of_test_case_equals_expectation(name):
     file, expected = CASES[name]
     flight = read_log(shared("cases") / file)
     track = next(one for one in flight.positions if one.name == "vehicle_visual_odometry")

@@ -55,7 +55,7 @@ def eventful() -> Analysis:
     return with_noises(comparison)
 
 
-def test_event_marks_in_plots_have_a_label_for_each_event_type(eventful: Analysis) -> None:
+def test_event_symbols_in_plots_are_labelled_by_event_type(eventful: Analysis) -> None:
     labels = [artist.get_label() for artist in event_marks.legend_entries(eventful)]
     assert labels == [
         "flight modes (alternating)", "on the ground", "gap in position source", "log dropout",
@@ -79,7 +79,7 @@ def test_event_marks_in_plots_have_a_label_for_each_event_type(eventful: Analysi
     assert set(axes.lines[1].get_xdata()) <= set(event_marks.outlier_times(eventful))
 
 
-def test_event_marks_of_long_flight_do_not_overlap() -> None:
+def test_event_symbols_of_long_flight_do_not_overlap() -> None:
     time_s = np.linspace(0.0, 3600.0, 20_000)
     visible = event_marks.visible_times(time_s, 3600.0 * event_marks.MIN_MARK_DISTANCE)
     assert len(visible) <= 1.0 / event_marks.MIN_MARK_DISTANCE + 1.0

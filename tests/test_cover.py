@@ -72,7 +72,7 @@ def test_report_cover_prints_texts_of_the_diagnosis_card() -> None:
     assert [each for each in expected if each not in text] == []
 
 
-def test_report_cover_marks_alternative_actions_either_or() -> None:
+def test_report_cover_joins_alternative_actions_by_either_or() -> None:
     sender = Action("sender", "subtract 0.264 s")
     console = Action("EKF2", commands=("param set EKF2_EV_DELAY 264", "reboot"), where="console")
     cause = Cause(
@@ -86,7 +86,7 @@ def test_report_cover_marks_alternative_actions_either_or() -> None:
     assert "console: MAVLink Console of QGroundControl" in text
 
 
-def test_report_cover_counts_notes_beyond_three() -> None:
+def test_report_cover_shows_3_notes_and_counts_the_others() -> None:
     notes = tuple(Note(f"note_{number}", f"Text {number}.") for number in range(5))
     text = text_of(replace(SMALL_SIGMA_A, notes=notes, more_causes=4))
     assert "note[note_2]: Text 2." in text
@@ -100,13 +100,13 @@ def test_report_cover_counts_notes_beyond_three() -> None:
     [("reconcile", ""), ("difference", ""), ("causes", ()), ("notes", ()), ("do_this", ()),
      ("effect_text", ""), ("verdicts", ())],
 )  # fmt: skip
-def test_report_cover_row_without_text_takes_no_space(field: str, empty: Any) -> None:
+def test_report_cover_has_no_space_for_an_empty_row(field: str, empty: Any) -> None:
     card = replace(SMALL_SIGMA_A, reconcile="The two verdicts differ.")
     heights = [cover.free_height(page_of(each)) for each in (card, replace(card, **{field: empty}))]
     assert heights[1] > heights[0] + 8.0
 
 
-def test_report_cover_explained_verdict_is_not_emphasised() -> None:
+def test_explained_verdict_on_report_cover_is_not_bold() -> None:
     card = replace(
         SMALL_SIGMA_A,
         verdicts=tuple(replace(each, is_explained=True) for each in SMALL_SIGMA_A.verdicts[:2]),
@@ -116,7 +116,7 @@ def test_report_cover_explained_verdict_is_not_emphasised() -> None:
     assert all(row["quiet"] and not row["loud"] for row in block["rows"])
 
 
-def test_report_cover_ratio_beyond_scale_is_drawn_as_triangle() -> None:
+def test_sigma_ratio_beyond_plot_scale_is_drawn_as_triangle() -> None:
     ratios = verdicts(
         (0.05, "underconfident"), (0.1, "underconfident"), (10.0, "overconfident"),
         (35.0, "overconfident"),
@@ -196,7 +196,7 @@ def test_report_cover_omits_plots_of_missing_data(changes, titles) -> None:
     assert len(set_by_typst(page)) == 1
 
 
-def test_track_outside_map_is_marked_with_exit_distance() -> None:
+def test_track_outside_map_has_arrow_and_distance_from_map() -> None:
     x = np.array([1.0, 5.0, 12.0, 13.0, 5.0, 5.0, 5.0])
     y = np.array([1.0, 1.0, 1.0, 1.0, 1.0, -3.0, 1.0])
     found = list(cover_panels._map_exits((x, y), LIMITS))
@@ -220,7 +220,7 @@ def test_innovations_beyond_plot_scale_are_drawn_as_triangles(eventful: Analysis
     assert {abs(value) for line in edges for value in line.get_ydata()} == {4.0}
 
 
-def test_error_plot_title_says_if_curve_is_flat_on_its_scale(eventful: Analysis) -> None:
+def test_error_plot_title_states_that_a_small_curve_looks_flat(eventful: Analysis) -> None:
     error, sigma = (pd.Series(pair, [0.0, 9.0]) for pair in ([0.02, -0.05], [0.05, 0.06]))
     label, sigmas = "EKF2 error (m)", {"EKF2": sigma}
     titles = [
@@ -231,7 +231,7 @@ def test_error_plot_title_says_if_curve_is_flat_on_its_scale(eventful: Analysis)
     assert titles[1] == f"{titles[0]}, at most 0.050, flat on this scale"
 
 
-def test_sigma_beyond_plot_scale_is_marked_with_its_value() -> None:
+def test_sigma_beyond_plot_scale_is_annotated_with_its_value() -> None:
     axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
     axes.set(xlim=(0.0, 9.0), ylim=(-1.0, 1.0))
     cover_panels._draw_sigma(axes, pd.Series([0.1, 2.0, 0.1], [0.0, 4.0, 9.0]), "KF")
@@ -254,7 +254,7 @@ def test_report_cover_long_text_moves_plots_to_second_page(eventful: Analysis, c
     assert "Innovations ÷ √S" in second
 
 
-def test_report_sections_stay_with_their_first_plot() -> None:
+def test_report_section_title_is_on_page_of_its_first_plot() -> None:
     sections = [Page(f"Section {number}") for number in range(4)]
     for section in sections:
         section.panel("Panel", "", 210.0)

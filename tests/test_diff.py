@@ -36,7 +36,7 @@ def number(value: float, interval=None) -> ComparedNumber:
         (-0.05, 0.05, True),
     ],
 )  # fmt: skip
-def test_diff_lists_number_changes_beyond_tolerance(a, b, differs):
+def test_diff_lists_numbers_that_differ_beyond_tolerance(a, b, differs):
     found = list(compare_numbers({"it": number(a)}, {"it": number(b)}))
     assert [(one.a, one.b) for one in found] == [(a, b)] * differs
 
@@ -74,7 +74,7 @@ def by_path(found: ChangeResults) -> dict[str, tuple[float | None, float | None]
     return {one.path: (one.a, one.b) for one in found.numbers}
 
 
-def test_diff_of_two_clean_flights_reports_nothing_worse(clean):
+def test_diff_of_two_clean_flights_reports_no_worse_verdict(clean):
     found = list_changes(clean, flown(503))
     assert found.worse == ()
     assert {one.name for one in found.settings} <= {
@@ -161,7 +161,7 @@ def test_diff_with_new_error_finding_is_reported_as_worse(clean):
 # -- the list of measures --------------------------------------------------------------------------
 
 
-def test_diff_numbers_have_unique_paths_and_intervals(clean):
+def test_diff_numbers_have_unique_json_paths_and_intervals(clean):
     paths = [one["path"] for one in MEASURES]
     assert len(set(paths)) == len(paths)
     found = collect_numbers(clean.results)

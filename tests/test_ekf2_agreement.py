@@ -51,7 +51,7 @@ def test_ekf2_replay_evaluation_excludes_first_5_s_of_segments():
     replay = made(Ekf2Replay, stretches_s=((10.0, 30.0), (40.0, 60.0)), flow_only_spans_s=())
     evaluated_spans = replay.evaluated_s
     assert evaluated_spans == ((15.0, 30.0), (45.0, 60.0))
-    # times with flow as the only aid, and the seconds after them, are excluded
+    # times with flow as the only aiding source, and the seconds after them, are excluded
     carried = made(Ekf2Replay, stretches_s=replay.stretches_s,
                    flow_only_spans_s=((20.0, 23.0), (52.0, 58.0)))  # fmt: skip
     assert carried.evaluated_s == ((15.0, 20.0), (28.0, 30.0), (45.0, 52.0))
@@ -110,7 +110,7 @@ def test_ekf2_replay_agreement_verdict_changes_at_its_limits(
     (agreeing(0.949), False), (agreeing(s=1.051), False), (agreeing(published_m=0.29), True),
     (agreeing(published_m=0.31), False),
 ])  # fmt: skip
-def test_ekf2_replay_agreement_is_decided_with_logged_rejections(axis, good):
+def test_ekf2_replay_agreement_is_tested_with_logged_rejections(axis, good):
     """The replay with logged rejections overrides the other verdict, good or bad."""
     own_gate = Agreement(
         north=agreeing(0.5), east=agreeing(0.5), ev_pos={}, samples=50,
@@ -148,7 +148,7 @@ def test_ekf2_replay_agreement_statistics_equal_their_formulas():
     assert found.velocity_rms_difference_m_s == pytest.approx(0.25)
 
 
-def test_constant_innovations_have_no_velocity_statistics():
+def test_constant_velocity_innovations_have_no_correlation():
     """np.corrcoef of a constant is NaN, with a warning."""
     index = pd.Index(10.0 + np.arange(30.0))
     updates = pd.DataFrame(0.1, index=index, columns=VELOCITY_UPDATE_COLUMNS)
@@ -223,7 +223,7 @@ def test_ekf2_replay_agreement_without_state_is_unavailable():
     assert unknown.reason == "EKF2's position is not logged in the replayed time"
 
 
-def test_logged_innovations_without_one_axis_are_an_empty_table():
+def test_logged_innovations_without_one_axis_give_empty_table():
     frame = pd.DataFrame({"innovation_m": [0.1], "innovation_variance_m2": 0.1, "rejected": 0.0})
     for other in (NONE, frame.assign(rejected=np.nan)):
         ekf2 = made(

@@ -259,7 +259,7 @@ def test_logged_rejections_are_matched_by_measurement_time():
 # ---------------------------------------------------------------- segments
 
 
-def test_published_position_corrections_exclude_resets():
+def test_ekf2_position_corrections_by_fusion_exclude_resets():
     """EKF2 flies north at 2 m/s and is reset 3 m east at 5 s; one of three decisions is logged."""
     times = np.arange(0.0, 10.0, 0.1)
     state = pd.DataFrame(0.0, pd.Index(times, name="time_s"), Columns.STATE)
@@ -297,12 +297,12 @@ def test_published_position_corrections_exclude_resets():
     ([2.75] * 7, [0, 6], [3, 6]),
     ([3.2] * 9, [0, 2, 6], [2, 4, 6, 8]),  # 2.5 samples, rounded as the log shows
 ])  # fmt: skip
-def test_ekf2_prediction_step_ends_by_count_or_duration(interval_ms, known, ends):
+def test_ekf2_prediction_step_ends_after_sample_count_or_time(interval_ms, known, ends):
     found = step_ends(np.array(interval_ms) * 1e-3, np.array(known, int), 0.008)
     assert found.tolist() == ends
 
 
-def test_downsampled_imu_velocity_is_rotated_to_final_frame():
+def test_downsampled_delta_velocity_is_in_frame_of_last_sample():
     """With 1 mrad per sample, earlier velocity changes are rotated by the later rotation."""
     turn = np.tile([0.0, 0.0, 0.001], (3, 1))
     gain = np.tile([1.0, 0.0, 0.0], (3, 1))
@@ -337,7 +337,7 @@ def turning(states: np.ndarray) -> tuple[pd.DataFrame, pd.DataFrame, Ekf2, Fusio
     return imu, attitude, made(Ekf2, state=state), record
 
 
-def test_ekf2_replay_segment_of_turning_vehicle_has_known_values():
+def test_ekf2_replay_inputs_of_turning_vehicle_equal_true_motion():
     flown = turning(10.0 + 0.1 * np.arange(21))
     found = _make_segment(*flown, 5, 11.5)
     steps = 10.5 + 0.01 * np.arange(101)

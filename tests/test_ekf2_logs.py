@@ -1,4 +1,4 @@
-"""EKF2 model on all other logs: agreement, steps and what-if, or the reason for their absence."""
+"""EKF2 model on all other logs: agreement with the log, differences to KF, and what-if."""
 
 import sys
 from pathlib import Path

@@ -39,7 +39,7 @@ def vision_of(flight: Flight) -> pd.DataFrame:
     return next(t for t in flight.positions if t.name == "vehicle_visual_odometry").samples
 
 
-def test_ekf2_model_interval_transition_equals_product_of_steps(model: Model) -> None:
+def test_ekf2_model_transition_equals_product_of_step_matrices(model: Model) -> None:
     segment, made = model.inputs.segments[0], next(iter(model.intervals.values()))[0]
     end = made.events.end_step
     starts = np.concatenate([[0], end[:-1]])
@@ -64,7 +64,7 @@ def test_ekf2_model_interval_transition_equals_product_of_steps(model: Model) ->
 
 
 @pytest.mark.parametrize("attitude", [True, False])
-def test_ekf2_model_states_follow_from_start_of_interval(model: Model, attitude: bool) -> None:
+def test_ekf2_model_states_between_updates_equal_predictions(model: Model, attitude: bool) -> None:
     """Without attitude as a state, the nominal attitude is not corrected."""
     configuration = FilterConfiguration(model.inputs.settings, estimates_attitude=attitude)
     (part,) = run_configurations(model.inputs, [configuration], model.intervals)
@@ -82,7 +82,7 @@ def test_ekf2_model_states_follow_from_start_of_interval(model: Model, attitude:
             np.testing.assert_allclose(state[k + 1], x, rtol=0.0, atol=1e-10)
 
 
-def test_ekf2_model_innovations_match_plain_replay(model: Model) -> None:
+def test_ekf2_model_innovations_equal_those_of_simple_filter(model: Model) -> None:
     events = next(iter(model.intervals.values()))[0].events
     nu, S = plain_replay(model.inputs, model.inputs.segments[0], events[events.end_step < 3000])
     updates = model.flown.updates.iloc[: len(nu)]
@@ -199,7 +199,7 @@ def test_ekf2_model_fuses_vision_height_if_enabled(model: Model, sample_flight: 
     assert abs(own.mean() - vision.mean()) > 0.4
 
 
-def test_ekf2_model_with_fixed_accelerometer_bias_is_finite(sample_flight: Flight) -> None:
+def test_ekf2_model_with_constant_accelerometer_bias_is_finite(sample_flight: Flight) -> None:
     record = sample_flight.ekf2.record
     fixed = record.delayed.copy()
     fixed.loc[:, [name for name in fixed if str(name).endswith("m2_s4")]] = 0.0

@@ -48,7 +48,7 @@ def buffered(gain, velocity, position, reset, lag, tau_v, tau_p):
 
 
 @pytest.mark.parametrize("lag", [1, 6, 19])
-def test_ekf2_output_predictor_matches_step_by_step_buffer(lag: int) -> None:
+def test_ekf2_output_predictor_equals_step_by_step_simulation(lag: int) -> None:
     rng = np.random.default_rng(lag)
     n = 400
     turn, turned = Rotation.random(n + 1, rng).as_matrix(), rng.normal(0.0, 0.1, (n + 1, 3))
@@ -99,7 +99,7 @@ def test_ekf2_corrections_are_recovered_from_published_position() -> None:
     np.testing.assert_allclose(partly[~lost], moved[~lost], atol=0.08)
 
 
-def test_ekf2_output_predictor_attitude_matches_recursion() -> None:
+def test_ekf2_output_predictor_attitude_equals_its_recursion() -> None:
     lag, horizon_s = 19, 0.2
     error = np.zeros((600, 3))
     error[100:] = 0.01, 0.0, -0.02

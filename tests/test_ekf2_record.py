@@ -52,7 +52,7 @@ def test_read_ekf2_states_layout_is_equal_for_each_px4_release(read, generation)
     assert row[Columns.DELAYED_VARIANCE[15:]].to_numpy() == pytest.approx(of_fields)
 
 
-def test_quaternion_variance_converts_to_sampled_angle_variance(read):
+def test_attitude_variance_equals_variance_of_sampled_angles(read):
     log = made_log("v1.14")
     variance = np.array([1e-5, 4e-5, 2e-5, 3e-5])
     log["estimator_states"]["covariances"][:, :4] = variance
@@ -87,7 +87,7 @@ def test_read_ekf2_record_lists_other_aiding_sources(read, flag, names):
     assert read(log).ekf2.record.other_aiding == names
 
 
-def test_vision_age_equals_delay_until_publication(read):
+def test_vision_age_is_publication_time_minus_sample_time(read):
     log = made_log("v1.16")
     fields = log["vehicle_visual_odometry"]
     age = read(log).ekf2.record.vision_age_s

@@ -150,7 +150,7 @@ def test_fusion_horizon_equals_length_of_ekf2_buffer(settings, by_delay, timing)
     assert (shifted.delay_s, shifted.horizon_s) == pytest.approx((-0.035, math.inf))
 
 
-def test_ekf2_replay_of_delay_max_for_px4_v1_14_raises_error():
+def test_what_if_with_ekf2_delay_max_on_px4_v1_14_raises_error():
     rules = replace(RULES, uses_delay_as_horizon=True)
     received = made(ReceivedPositions, uses_sender_times=False)
     inputs = made(Inputs, rules=rules, settings={}, aid=EV_POS, received=received)
@@ -172,8 +172,10 @@ GNSS_RULES = replace(
     (7.1, 7.1, True, True), (6.9, 7.1, True, False), (7.1, 6.9, True, False),
     (13.9, 0.0, True, False), (14.1, 0.0, True, True), (7.1, 0.0, False, True),
 ])  # fmt: skip
-def test_gnss_position_is_reset_after_7_or_14_s(gap_s, velocity_gap_s, resets_velocity, resets):
-    """shouldResetGpsFusion of gps_control.cpp; from main of 2026 on aids are independent."""
+def test_ekf2_position_is_reset_to_gnss_after_7_or_14_s(
+    gap_s, velocity_gap_s, resets_velocity, resets
+):
+    """shouldResetGpsFusion: from PX4 main of 2026 on, a position reset ignores the velocity."""
     rules = replace(GNSS_RULES, resets_velocity=resets_velocity)
     _, taken, reset, *_ = deciding(gap_s=gap_s, velocity_gap_s=velocity_gap_s, rules=rules, left=9)
     assert (taken, reset) == (False, resets)
@@ -207,7 +209,7 @@ def on_gnss(north_m: list[float], north_m_s: list[float], **more: Any) -> Segmen
     return at_rest(north_m, aid=GNSS_POS, rules=GNSS_RULES, speed_m_s=speed, **more)
 
 
-def test_ekf2_replay_with_gnss_limits_tilt_variance_to_log():
+def test_tilt_variance_of_gnss_replay_is_at_most_the_logged_one():
     """Tilt is corrected as by a measurement to the logged variance, and only with GNSS."""
     fixes = [0.0] * 20
     free, limited = (on_gnss(fixes, fixes, tilt_rad2=tilt) for tilt in (np.inf, 2.5e-5))
@@ -238,7 +240,7 @@ def test_ekf2_replay_rejects_gnss_velocity_outside_gate(speed_m_s, moves):
     # beyond MAX_LOG_RATIO the motion is not used
     (1.5, -99.0, True), (4.2, 99.0, False),
 ])  # fmt: skip
-def test_ekf2_replay_at_gate_limit_follows_published_motion(north_m, share, fused):
+def test_fusion_near_gate_is_derived_from_published_position(north_m, share, fused):
     """The gate is at 2.515 m; ``share`` is the published motion over the full correction."""
     fixes = [0.0] * 10 + [north_m] + [0.0] * 9
     done = on_gnss(fixes, [0.0] * 20)
@@ -250,7 +252,7 @@ def test_ekf2_replay_at_gate_limit_follows_published_motion(north_m, share, fuse
     assert bool(done.fused[10, 0]) is (north_m < 2.515)
 
 
-def test_ekf2_replay_start_correlation_equals_kalman_filter():
+def test_ekf2_replay_initial_correlation_equals_kalman_filter():
     """Reference: a plain Kalman filter of a vehicle at rest for one minute, facing east."""
     turn = Rotation.from_euler("z", 110.0, degrees=True).as_matrix()
     count = 6000
@@ -286,7 +288,7 @@ def test_ekf2_replay_gnss_reset_sets_position_and_velocity():
 
 
 def test_ekf2_replay_does_not_fuse_a_lost_aiding_source():
-    """Ten fixes at the origin, then ten 1 m north with 0.5 m/s; the aid is lost at 11.05 s."""
+    """Ten fixes at the origin, ten fixes 1 m north with 0.5 m/s; GNSS is lost at 11.05 s."""
     fixes, speeds = [0.0] * 10 + [1.0] * 10, [0.0] * 10 + [0.5] * 10
     done = {name: on_gnss(fixes, speeds, without=dict.fromkeys(name.split(), 11.05))
             for name in ("", "gnss_pos", "gnss_vel", "gnss_pos gnss_vel")}  # fmt: skip
@@ -490,7 +492,7 @@ def test_ekf2_replay_interval_ends_at_step_that_fuses_a_sample():
 @pytest.mark.parametrize(("age_s", "late", "lost"), [
     (0.22, False, False), (0.24, True, False), (0.28, True, False), (0.31, False, True),
 ])  # fmt: skip
-def test_vision_sample_is_late_or_lost_by_age_at_arrival(age_s, late, lost):
+def test_vision_sample_is_late_or_lost_if_it_arrives_too_old(age_s, late, lost):
     """Due 0.2 s after its timestamp: late by more than 0.03 s, lost from 0.1 s on."""
     found = events([10.2, 10.4], age_s=age_s, horizon_s=0.2)
     assert (bool(found.late[0]), bool(found.lost[0])) == (late, lost)

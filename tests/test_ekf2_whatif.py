@@ -1,4 +1,4 @@
-"""EKF2 with other parameters, and steps from KF to EKF2: sums, sweeps and messages."""
+"""EKF2 replay with other parameters, and explanation of the difference between KF and EKF2."""
 
 import math
 from pathlib import Path
@@ -75,7 +75,7 @@ def test_what_if_without_replay_agreement_is_unavailable(model):
         assert "no reason" in result.reason
 
 
-def test_kf_ekf2_difference_steps_add_up_to_total_difference(model):
+def test_contributions_to_kf_ekf2_difference_add_up_to_total(model):
     for axis in explain_by_steps(model).values():
         assert axis.longest_rejection is None
         assert tuple(step.name for step in axis.steps) == STEPS
@@ -104,7 +104,7 @@ def test_kf_ekf2_difference_without_common_time_is_unavailable(model):
 # ----------------------------------------------------------- cases with a known answer
 
 
-def test_each_kf_ekf2_difference_step_changes_one_property():
+def test_kf_ekf2_explanation_changes_one_property_at_a_time():
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(ReceivedPositions)
     plain = (made(ReplaySegment, flow=None, heights=None),)
@@ -170,7 +170,7 @@ def test_longest_run_of_ekf2_rejections_has_start_and_duration():
     assert _longest_rejection(one, still, (22.4, 24.4), ((0.0, 99.0),)) is None
 
 
-def test_rmse_to_ground_truth_uses_only_common_times():
+def test_rmse_against_ground_truth_uses_only_common_times():
     times, direction = np.array([9.0, 10.0, 15.0, 20.0, 21.0]), np.array([0.6, 0.8, 0.0])
     frame = pd.DataFrame(0.0, index=[10.0, 20.0], columns=Columns.STATE)
     truth = made(Truth, samples=frame.assign(north_m=[0.0, 2.0], east_m=2.0))
@@ -231,7 +231,7 @@ def flown(tmp_path: Path, mistake: str, seed: int) -> Model:
     ("ekf2-noise=0.02", 1, {"EKF2_EVP_NOISE": 0.1}),
     ("ekf2-noise=0.02", 2, {"EKF2_EVP_NOISE": 0.1}), ("ekf2-gate=1", 1, {"EKF2_EVP_GATE": 5.0}),
 ])  # fmt: skip
-def test_what_if_on_flight_with_rejections_predicts_correction(tmp_path, mistake, seed, changes):
+def test_what_if_predicts_flight_with_corrected_ekf2_parameter(tmp_path, mistake, seed, changes):
     """Only with the logged rejections does the replay agree with these logs."""
     faulty, correct = flown(tmp_path, mistake, seed), flown(tmp_path, "", seed)
     assert faulty.agreement.rejected_fraction_logged > 0.35
@@ -266,7 +266,7 @@ def test_what_if_with_many_rejections_is_marked_unpredictable(model):
 
 
 def test_what_if_result_sensitive_to_noise_is_unpredictable(model, monkeypatch):
-    """Each of the three numbers just inside and just outside its limit."""
+    """Vary NIS, rejections and RMSE just inside and just outside their limits."""
     north = AxisSummary(1.0, (0.9, 1.1), 0.1, 0.1, 0.1)
     base = Summary(
         changed={"EKF2_EVP_GATE": 3.0}, north=north, east=north, samples=500, rejected_fraction=0.2,

@@ -55,7 +55,7 @@ THREE = {
 
 
 @pytest.mark.parametrize(("attempt", "points"), [("latest", 7.0), ("first", 4.0), ("best", 9.0)])
-def test_class_entry_attempt_rule_selects_the_graded_report(attempt, points) -> None:
+def test_attempt_option_selects_the_graded_report(attempt, points) -> None:
     (ada, grace), _ = make_entries(THREE, Course(RUBRIC, attempt=attempt))
     assert ada.counted_report.points == ada.total == points
     assert len(ada.other_reports) == 2
@@ -171,7 +171,7 @@ def test_file_name_that_imitates_platform_names_is_flagged() -> None:
     )
 
 
-def test_graded_report_is_the_best_of_one_submission() -> None:
+def test_best_report_of_one_attempt_is_graded() -> None:
     files = {blackboard("ada", "19-10-00-00", "a.pdf"): graded_report("", 8.0),
              blackboard("ada", "19-10-00-00", "b.pdf"): graded_report("", 2.0)}  # fmt: skip
     for attempt in ("first", "latest", "best"):
@@ -265,13 +265,15 @@ def test_instructor_overrides_replace_points_and_add_comments(tmp_path) -> None:
         )),
     ], ids=["points above the maximum", "duplicate row"],
 )  # fmt: skip
-def test_instructor_override_with_excess_points_is_noted(rows, points, told, tmp_path) -> None:
+def test_instructor_override_above_maximum_points_gives_a_note(
+    rows, points, told, tmp_path
+) -> None:
     (ada, _), notes = make_entries(TWO, overrides=write_overrides(tmp_path, *rows))
     assert (ada.counted_report.points, ada.total) == points
     assert notes == tuple(f"overrides.csv: {one}." for one in told)
 
 
-def test_instructor_overrides_from_page_include_all_students(tmp_path) -> None:
+def test_overrides_of_class_page_include_all_students(tmp_path) -> None:
     """Includes students without a submission, because the download replaces the file."""
     rows = write_overrides(
         tmp_path, "1,A,9.5,Good.", "1,,,Come.", "1,total,8,Agreed.", "2,total,5,Shown."

@@ -96,7 +96,7 @@ def test_exhausted_memory_prints_one_error_line(monkeypatch, capsys, tmp_path) -
 
 
 @pytest.mark.parametrize("command", ["tune {log} --start 126", "sync {log} --end 3"])
-def test_failed_noise_or_offset_estimate_writes_no_file(
+def test_tune_or_sync_without_estimate_writes_no_file(
     monkeypatch, capsys, tmp_path, command
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -285,7 +285,7 @@ def test_rpe_of_scaled_track_is_proportional_to_distance() -> None:
     steps=st.lists(st.sampled_from([0.0, 0.1, 0.25, 1.0, 3.0]), min_size=3, max_size=40),
     value=st.sampled_from([0.1, 0.3, 0.5, 1.0, 2.0]),
 )
-def test_rpe_pairs_equal_their_definition(steps: list[float], value: float) -> None:
+def test_rpe_pose_pairs_have_the_requested_distance(steps: list[float], value: float) -> None:
     along = np.concatenate(([0.0], np.cumsum(steps)))
     position, time = along[:, None] * [1.0, 0.0, 0.0], np.arange(len(along), dtype=float)
     expected = []
@@ -379,7 +379,7 @@ def test_evaluate_camera_track_removes_mounting_rotation() -> None:
         assert evaluate(same, reference, alignment="se3").body_rotation is None
 
 
-def test_evaluate_with_doubtful_arguments_gives_warnings() -> None:
+def test_evaluate_with_implausible_arguments_gives_warnings() -> None:
     truth = flight()
     vio = transformed(truth, Rotation.from_euler("z", 1.0), SHIFT, kind="vio", name="log:vio")
     slam = replace(vio, kind="slam", name="slam")
@@ -482,7 +482,7 @@ def test_time_offset_of_periodic_motion_is_undetermined() -> None:
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("pair", PUBLISHED, ids=NAMES)
-def test_time_offset_of_shifted_public_data_is_recovered(pair: tuple[str, str]) -> None:
+def test_time_offset_of_shifted_public_trajectory_is_recovered(pair: tuple[str, str]) -> None:
     estimate, reference = map(read_public, pair)
     base = estimate_time_offset(estimate, reference).offset_s
     assert abs(base) < 0.06  # the published clocks have small offsets

@@ -103,7 +103,7 @@ def test_unaligned_rmse_in_evaluation_report_equals_evo() -> None:
     assert ", scale 2 (" in unaligned_sentence(evaluate(half, true, alignment="sim3"))
 
 
-def test_rmse_per_quarter_of_growing_error_equals_integral() -> None:
+def test_rmse_per_quarter_of_trajectory_equals_closed_form() -> None:
     score = evaluate_with_error(across(np.linspace(0.0, 4.0, 2001)))
     ends = np.arange(5.0)  # ∫ x² dx over a quarter
     expected = np.sqrt((ends[1:] ** 3 - ends[:-1] ** 3) / 3.0)

@@ -56,7 +56,7 @@ def page_of(analysis: Analysis, file: Path) -> Path:
 # ------------------------------------------------------------------ without a browser
 
 
-def test_explore_page_content_policy_allows_only_own_scripts(
+def test_explore_page_content_policy_allows_only_its_scripts(
     explored: tuple[Path, Analysis],
 ) -> None:
     text = explored[0].read_text(encoding="utf-8")
@@ -140,7 +140,7 @@ def cells(result: AxisComparison) -> dict[str, list[str]]:
     return expected
 
 
-def test_explore_page_slider_values_match_the_shown_command(
+def test_explore_page_sliders_equal_values_of_shown_command(
     page: Browser, explored: tuple[Path, Analysis], sample_log: Path
 ) -> None:
     before = page.ask(TABLE)
@@ -211,7 +211,7 @@ def test_explore_page_invalid_input_shows_a_message(page: Browser) -> None:
     assert page.ask(VALUES) == ["0.5", "0.2", "0", "0.1"]
 
 
-def test_explore_page_steps_show_numbers_of_each_measurement(
+def test_explore_page_step_view_shows_one_measurement_at_a_time(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     result = explored[1].main

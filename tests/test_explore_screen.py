@@ -160,7 +160,7 @@ ROWS = """Object.fromEntries([...document.querySelectorAll('#card [data-filter]'
 }))"""
 
 
-def test_explore_page_shows_analysed_card_until_settings_change(
+def test_explore_page_shows_card_of_report_until_settings_change(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     card = card_of(explored[1])
@@ -179,7 +179,7 @@ def test_explore_page_shows_analysed_card_until_settings_change(
     assert card.headline in page.ask("document.querySelector('#card h2').textContent")
 
 
-def test_explore_page_card_after_change_equals_python_ratios(
+def test_explore_page_sigma_ratios_after_change_equal_python(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     analysis = explored[1]
@@ -270,7 +270,7 @@ def test_explore_page_address_restores_all_settings(
 # ------------------------------------------------------------------ the step
 
 
-def test_explore_page_ellipse_equals_covariance_in_each_step(
+def test_explore_page_ellipse_shows_covariance_of_each_step(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     open_view(page, "step")
@@ -319,7 +319,7 @@ def test_explore_page_space_key_starts_and_pauses_animation(page: Browser) -> No
 # ------------------------------------------------------------------ the tour
 
 
-def test_explore_page_tour_shows_numbers_of_the_flight(
+def test_explore_page_tour_shows_results_of_the_flight(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
     analysis = explored[1]

@@ -108,7 +108,7 @@ def test_status_flag_before_first_sample_has_first_value() -> None:
     assert spans_with_value(0.0, flag, Segment(40.0, 50.0, "")) == ((40.0, 50.0),)
 
 
-def test_group_findings_lists_consequences_behind_root_cause() -> None:
+def test_group_findings_lists_consequences_below_root_cause() -> None:
     first, other = make_finding("kf_underconfident"), make_finding("no_motion", "note")
     follows = make_finding("kf_underconfident", caused_by="kf_underconfident")
     assert group_by_root([first, follows, other]) == [[first, follows], [other]]
@@ -175,7 +175,7 @@ def test_log_dropouts_outside_evaluated_segment_are_ignored() -> None:
         (60.0, {"ekf2_fusion_interrupted": "warning"}), (59.9, {"ekf2_not_fusing": "error"}),
     ],
 )  # fmt: skip
-def test_ekf2_not_fusing_severity_follows_fraction_of_time(
+def test_severity_of_missing_ekf2_fusion_depends_on_its_duration(
     until_s: float, expected: dict[str, str]
 ) -> None:
     one = analysis(ekf2=with_fusion((0.0, 1.0), (until_s, 0.0)))
@@ -258,7 +258,7 @@ def rejected(count: int, of: int) -> pd.DataFrame:
     ("count", "of", "expected"),
     [(1, 100, "warning"), (1, 101, None), (20, 100, "error"), (19, 100, "warning")],
 )
-def test_ekf2_rejection_severity_follows_rejected_fraction(
+def test_ekf2_rejection_severity_depends_on_rejected_fraction(
     count: int, of: int, expected: str | None
 ) -> None:
     """EKF2 rejects the horizontal vector, so the main axis is used."""
@@ -277,7 +277,7 @@ def test_ekf2_rejection_severity_follows_rejected_fraction(
             assert finding.remedy.endswith(remedy)
 
 
-def test_recommended_action_must_halve_ekf2_rejections() -> None:
+def test_action_is_recommended_only_if_it_halves_ekf2_rejections() -> None:
     frame = rejected(20, 100)
     for after, improves, action in (
         (0.09, True, "Set EKF2_EVP_NOISE to 0.1 m."), (0.1, True, CHECK_FIRST),
@@ -329,7 +329,7 @@ def test_error_beyond_sigma_finding_names_axis_and_action() -> None:
 
 @pytest.mark.parametrize(("left", "frame"), [(0.45, True), (0.55, False)])
 @pytest.mark.parametrize("drifts", [False, True])
-def test_error_beyond_sigma_finding_states_aligned_rmse(
+def test_error_beyond_sigma_finding_tests_rmse_after_alignment(
     left: float, frame: bool, drifts: bool
 ) -> None:
     """Circle of 5 m with a shift and an error that changes its sign with each sample."""
@@ -439,7 +439,6 @@ def test_position_source_not_logged_as_received_is_reported(
 def test_position_gap_above_1_s_and_five_intervals_is_reported(
     rate_hz: float, least_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The limit is five intervals, but at least 1 s."""
     for gap_s, there in ((least_s, False), (least_s + 0.25, True)):
         monkeypatch.setattr(source_intervals, "state_errors_after", lambda *_: "Errors.")
         time = np.concatenate([np.arange(10.0, 20.5, 0.5), [20.0 + gap_s, 20.5 + gap_s]])
@@ -474,7 +473,7 @@ def test_wrong_frame_of_position_file_is_reported_as_error() -> None:
 
 
 @pytest.mark.parametrize(("until_s", "expected"), [(60.0, "warning"), (60.1, "note")])
-def test_severity_of_frame_without_north_depends_on_fused_yaw(
+def test_frd_frame_finding_is_only_a_note_if_ekf2_fused_its_yaw(
     until_s: float, expected: str
 ) -> None:
     frd = source(frame="FRD")
@@ -521,7 +520,7 @@ def test_heading_drift_finding_states_heading_at_both_ends() -> None:
     assert (finding.evidence["from_deg"], finding.evidence["p"]) == (2.0, 1e-300)
 
 
-def test_heading_angles_are_printed_within_half_a_turn() -> None:
+def test_heading_angles_are_printed_from_minus_180_to_180_deg() -> None:
     finding = only(source_frame.detect, analysis(heading=heading_error(170.0, 230.0, p=0.0)))
     assert "It is +170° from 0 to 10 s and -130° from 10 to 20 s" in finding.message
     finding = only(source_frame.detect, analysis(heading=heading_error(340.0)))
@@ -872,7 +871,7 @@ def test_position_jump_finding_states_count_and_largest_jump() -> None:
     assert finding.spans_s == ((30.0, 30.0), (60.0, 60.0))
 
 
-def test_scale_error_finding_states_too_long_or_too_short() -> None:
+def test_scale_error_finding_states_if_distances_are_too_long() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
         finding = only(source_positions.detect_scale_error, scaled(signed))
         assert finding.title == f"UWB distances are 20 % too {word}"
@@ -964,7 +963,7 @@ def test_time_offset_action_includes_the_offset_already_applied() -> None:
 
 
 @pytest.mark.parametrize(("p", "there"), [(0.005, False), (0.0049, True), (None, False)])
-def test_change_of_time_offset_with_small_p_value_is_reported(p: float | None, there: bool) -> None:
+def test_significant_change_of_time_offset_is_reported(p: float | None, there: bool) -> None:
     found = only(source_clock.detect, analysis(clock=late(0.1, change_p_value=p)))
     assert found.id == ("source_time_offset_changes" if there else "source_time_offset")
     if there:
@@ -973,7 +972,7 @@ def test_change_of_time_offset_with_small_p_value_is_reported(p: float | None, t
 
 
 @pytest.mark.parametrize(("after_m", "there"), [(1.005, True), (1.0051, False), (0.5, True)])
-def test_time_offset_that_increases_true_error_has_no_finding(after_m, there) -> None:
+def test_time_offset_correction_that_increases_rmse_is_rejected(after_m, there) -> None:
     shifted = rerun("kf", "time offset", {"clock_offset_s": 0.123}, after_m)
     one = analysis(clock=late(0.12345), trials=(shifted,))
     assert severity(source_clock.detect, one) == ("error" if there else None)

@@ -41,9 +41,9 @@ pytestmark = pytest.mark.usefixtures("quick_filter")
 
 @dataclass(frozen=True)
 class Fault:
-    """A mistake in a flight, the expected finding, and its expected evidence.
+    """Simulated fault, with the expected finding and its evidence.
 
-    The other fields make the flight: options of aisle_flight, filter settings, a change.
+    The other fields define the flight: options of aisle_flight, KF settings, and a change of it.
     """
 
     id: str
@@ -54,7 +54,7 @@ class Fault:
     change: Change = lambda flight: flight
 
     def fly(self, **other: Any) -> Flight:
-        """Make the flight with the mistake."""
+        """Make the flight with the fault."""
         return self.change(aisle_flight(**{**self.flight, **other}))
 
 
@@ -271,7 +271,7 @@ TESTED_ELSEWHERE = {
     "source_timestamps_shared", "source_position_held", "source_zero_positions",
     "source_without_position",
 }  # fmt: skip
-# Second finding of severity error that the mistake causes
+# Second finding of severity error that the fault causes
 ALSO_ERROR = {
     "kf_overconfident": "sigma_z_too_small",
     "kf_underconfident": "sigma_z_too_large",
@@ -304,7 +304,7 @@ MISSING_FIELD: list[tuple[str, dict[str, Any], str | None]] = [
 
 
 def found(comparison: Comparison, *, tuned: bool = False) -> tuple[Finding, ...]:
-    """Find all mistakes of a comparison without re-runs, and check the form of each finding."""
+    """Find all faults of a comparison without re-runs, and check the form of each finding."""
     findings = find(with_noises(comparison) if tuned else unexplained(comparison))
     earlier_ids: set[str | None] = {None}
     for finding in findings:
@@ -349,7 +349,7 @@ def test_crash_flight_lists_tumbling_as_first_finding(shared_logs: Path) -> None
     ("simulated/v1.16.1_aisle_nominal", "case17.csv", "source_stops", 50.9, 0.12),
     ("simulated/v1.16.1_aisle_10hz", "case18.csv", "source_begins", 63.3, 0.05),
 ])  # fmt: skip
-def test_source_of_part_of_flight_is_first_finding(
+def test_source_that_covers_part_of_flight_is_first_finding(
     log: str, file: str | None, finding: str, at_s: float, error_m: float, shared_logs: Path
 ) -> None:
     cases = shared_logs.parent / "cases"
@@ -366,7 +366,7 @@ def test_source_of_part_of_flight_is_first_finding(
 @pytest.mark.parametrize(("gap_s", "reset_s", "cause"), [
     ((-1.0, 40.0), 40.4, "source_begins"), ((80.0, 130.0), 90.0, "source_stops"),
 ])  # fmt: skip
-def test_reset_in_time_without_source_has_it_as_cause(
+def test_ekf2_reset_without_source_has_missing_source_as_cause(
     gap_s: tuple[float, float], reset_s: float, cause: str
 ) -> None:
     resets = (Reset(reset_s, "position", (16.0, 0.0, 0.0)),)
@@ -376,7 +376,7 @@ def test_reset_in_time_without_source_has_it_as_cause(
     assert "by up to 16.00 m" in reset.message
 
 
-def test_positions_lost_by_logger_are_no_gap_of_the_source(sample_flight: Flight) -> None:
+def test_positions_lost_by_logger_are_not_reported_as_source_gap(sample_flight: Flight) -> None:
     samples = sample_flight.positions[0].samples
     lost = with_source(samples=samples.drop(samples.loc[40.0:60.0].index))(sample_flight)
     lost = replace(lost, positions=(*lost.positions, *sample_flight.positions[1:]))
@@ -385,7 +385,7 @@ def test_positions_lost_by_logger_are_no_gap_of_the_source(sample_flight: Flight
     assert finding.spans_s == (pytest.approx((40.0, 60.0), abs=0.2),)
 
 
-def test_each_finding_has_a_test_with_a_simulated_fault() -> None:
+def test_each_finding_is_tested_with_a_simulated_fault() -> None:
     assert set(TITLES) == {fault.id for fault in FAULTS} | TESTED_ELSEWHERE
 
 
@@ -394,7 +394,7 @@ def test_each_finding_has_a_test_with_a_simulated_fault() -> None:
     list(enumerate(FAULTS)),
     ids=[f"{fault.id}-{fault.severity}" for fault in FAULTS],
 )
-def test_each_simulated_fault_gives_only_its_finding_as_error(at: int, fault: Fault) -> None:
+def test_simulated_fault_has_only_its_finding_of_severity_error(at: int, fault: Fault) -> None:
     """Messages and actions are compared with tests/golden/findings.txt (see test_golden)."""
     is_tuned = "sigma_z_asked_m" in fault.evidence or fault.id == "process_noise_near_zero"
     findings = found(compare(fault.fly(), Settings(**fault.settings)), tuned=is_tuned)
@@ -459,7 +459,7 @@ def test_finding_catalogue_entry_has_known_group() -> None:
         assert entry.meaning.endswith(".")
 
 
-def test_explain_command_examples_state_measured_rates() -> None:
+def test_explain_command_examples_state_measured_detection_rates() -> None:
     examples = load_examples()
     assert list(examples) == list(CATALOGUE)
     rows = pd.read_csv(Path(__file__).parent / "studies" / "rates.csv")

@@ -66,7 +66,7 @@ def test_batch_page_sorts_logs_by_severity_and_rmse() -> None:
     assert [log["name"] for log in sort_logs(logs_of(table))] == ["c", "d", "b", "a"]
 
 
-def test_batch_page_row_has_diagnosis_action_and_ratios() -> None:
+def test_batch_page_row_shows_diagnosis_action_and_sigma_ratios() -> None:
     table = artificial_logs(30)
     rows = [row[0] for row in content(html_text(table, "Bench", "px4fuse 1"))["rows"]]
     first = rows[0]

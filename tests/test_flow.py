@@ -106,7 +106,7 @@ def test_optical_flow_mean_is_computed_from_filtered_velocity(tmp_path):
 
 
 @pytest.mark.parametrize("every", [1, 10])
-def test_optical_flow_samples_give_velocity_at_next_update(every):
+def test_optical_flow_mean_equals_velocity_at_time_of_update(every):
     """The motion since a sample is known from the IMU, so corners cause no innovations."""
     (segment,) = model().inputs.segments
     with_flow = add_flow_samples(segment, flow_of(every=every), 3.0)
@@ -161,7 +161,7 @@ def stretches_s(flight: Flight) -> list[tuple[float, float]]:
     return [(float(one.time_s[0]), float(one.time_s[-1])) for one in segments]
 
 
-def test_ekf2_replay_is_split_at_height_resets_and_clipping():
+def test_ekf2_replay_restarts_after_height_reset_or_clipping():
     flight = model().flight
     ((start, end),) = stretches_s(flight)
     for delta, parted in (((0.0, 0.0, 1.0), True), ((1.0, 0.0, 0.0), False)):
@@ -240,7 +240,7 @@ def test_ekf2_model_of_optical_flow_flights_agrees_with_log(name, shared_logs, m
 
 
 @pytest.mark.reallogs
-def test_ekf2_replay_is_split_if_flow_drift_exceeds_limit(shared_logs, monkeypatch):
+def test_ekf2_replay_restarts_if_optical_flow_drift_is_too_large(shared_logs, monkeypatch):
     monkeypatch.setattr("px4fuse.ekf2.replay.MAX_FLOW_ONLY_DIFFERENCE_M", 0.3)
     found = opened(read_log(shared_logs / "gps" / "main202603_gps_outage_flow.ulg"))
     assert set(found.agreement.doubtful) == {"optical_flow"}

@@ -1,4 +1,4 @@
-"""Flights with known faults: expected findings, remedies and steps from KF to EKF2."""
+"""Flights with known faults: expected findings, actions and differences KF - EKF2."""
 
 import json
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ def about(value: float, rel: float = 0.1) -> Any:
 
 
 class Flown(NamedTuple):
-    """Expected findings (id, severity, evidence, text of the remedy) and texts of the steps.
+    """Expected findings (id, severity, evidence, action) and explanation of KF - EKF2.
 
     ``reruns`` are those of the first cause on the card: label, position RMSE (m) before and after,
     √(mean NIS) before and after. ``console`` are the lines that set EKF2's parameters.
@@ -154,7 +154,7 @@ def test_flight_with_known_fault_has_expected_finding(shared_logs, name):
 
 
 @pytest.mark.parametrize("name", [name for name, flown in FLIGHTS.items() if flown.reruns])
-def test_diagnosis_card_of_known_fault_shows_filter_reruns(shared_logs, name):
+def test_diagnosis_card_of_faulty_flight_shows_filter_reruns(shared_logs, name):
     log = shared_logs / "simulated" / f"{name}.ulg"
     analysis, flown = explain(compare(read_log(log))), FLIGHTS[name]
     cause = build_card(analysis, ComparisonRequest(log=log.name)).causes[0]
@@ -177,7 +177,7 @@ OVERSTATED = {
 
 
 @pytest.mark.parametrize(("name", "factor"), OVERSTATED.items())
-def test_motion_capture_flights_are_found_underconfident(shared_logs, name, factor):
+def test_ekf2_on_motion_capture_flights_is_underconfident(shared_logs, name, factor):
     """Sent with an orientation, as odometry is; all noises are defaults."""
     flight = read_log(shared_logs / "real" / f"{name}.ulg")
     whole = compare(flight, start_s=0.0, end_s=flight.log.duration_s)

@@ -75,7 +75,7 @@ CLEAN = FormTruth(
 
 
 def with_claim(**values: Any) -> Answers:
-    """Return the correct form with another first mistake."""
+    """Return the correct form with another first fault."""
     first, second = RIGHT.mistakes
     return replace(RIGHT, mistakes=(replace(first, **values), second))
 
@@ -90,7 +90,7 @@ def parts(answers: Answers, truth: FormTruth = TRUTH) -> list[float]:
     return [round(found[name], 2) for name in PART_NAMES]
 
 
-def test_answer_form_offers_correct_answers_for_each_mistake() -> None:
+def test_answer_form_offers_correct_answers_for_each_fault() -> None:
     assert set(SIMULATED) == set(MISTAKES) - {"none", "vio-drift"}
     assert set(POINTS_TABLE["shows"]) | {"cover"} == set(PANELS)
     for name in SIMULATED:
@@ -100,7 +100,7 @@ def test_answer_form_offers_correct_answers_for_each_mistake() -> None:
         assert set(panels(name)) > {"cover"}
 
 
-def test_correct_answer_form_has_full_and_empty_form_no_points() -> None:
+def test_correct_answer_form_earns_all_and_empty_form_no_points() -> None:
     assert form_points(RIGHT, TRUTH).points_by_part == FULL
     assert parts(Answers(log_sha256=SHA256)) == [0.0] * 6
     assert form_points(RIGHT, TRUTH).is_named_by_mistake == {"clock-offset": True, "dropout": True}
@@ -112,7 +112,7 @@ GATE = {"parameter": "EKF2_EVP_GATE", "value": 3.0, "value_unit": "sd"}
 NO_MISTAKES = {"mistakes": 0.0, "sizes": 0.0, "time and panel": 0.0, "correction": 0.0}
 # A form, and its parts with reduced points
 HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
-    # wrong sign: a third of the points for size and cure of this mistake
+    # wrong sign: a third of the points for the size and the action of this fault
     (with_claim(size=-190.0, value=0.2), {"sizes": 10.0, "correction": 10.0}),
     (with_claim(size=140.0), {"sizes": 11.25}),
     (with_claim(size=900.0, value=-0.9), {"sizes": 7.5, "correction": 11.25}),
@@ -120,9 +120,9 @@ HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
     (with_claim(when=""), {"time and panel": 7.5}),
     (with_claim(**DELAY), {}),
     (with_claim(**GATE), {"correction": 7.5}),
-    # similar mistake: 0.4 of the kind, a third of the size, half of the time
+    # similar fault: 0.4 of the kind, a third of the size, half of the time
     (with_claim(kind="ekf2-delay"), {"mistakes": 21.0, "sizes": 10.0, "time and panel": 7.5}),
-    # each wrong mistake costs 10 points
+    # each wrong fault costs 10 points
     (with_false("yaw"), {"mistakes": 20.0}),
     (with_false("yaw", "nlos", "scale"), NO_MISTAKES),
     (replace(RIGHT, mistakes=(StudentMistake("none"),)), NO_MISTAKES),
@@ -141,7 +141,7 @@ def test_partly_correct_answer_form_has_partial_points(
     assert form_points(answers, TRUTH).points_by_part == pytest.approx({**FULL, **less}, abs=0.01)
 
 
-def test_answer_form_for_clean_flight_must_name_no_mistake() -> None:
+def test_answer_form_for_clean_flight_must_name_no_fault() -> None:
     none = Answers(log_sha256=SHA256, mistakes=(StudentMistake("none"),))
     assert parts(none, CLEAN) == [40.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     assert form_points(none, CLEAN).fraction == 0.4
@@ -153,7 +153,7 @@ def test_answer_form_for_clean_flight_must_name_no_mistake() -> None:
     assert parts(RIGHT, CLEAN)[:4] == [0.0] * 4
 
 
-def test_loop_open_end_answer_needs_its_size_for_all_points() -> None:
+def test_open_loop_end_answer_earns_all_points_only_with_size() -> None:
     landed = TrueMistake("open-end", 5.0, 4.25, 5.75, 60.0, None)
     truth = replace(CLEAN, mistakes=(landed,), quantities=())
     claim = StudentMistake("open-end", None, "", "", 60.0, None, "--open", None, "", "loop")
@@ -163,7 +163,7 @@ def test_loop_open_end_answer_needs_its_size_for_all_points() -> None:
     assert parts(measured, truth)[:4] == [30.0, 15.0, 10.0, 15.0]
 
 
-def test_same_answers_for_all_loop_flights_earn_few_points() -> None:
+def test_guessed_answers_for_all_loop_flights_earn_few_points() -> None:
     """300 drawn loops with their closure errors and verdicts.
 
     Most have no update outside the gate, so an empty list is not counted as an answer.
@@ -183,7 +183,7 @@ def test_same_answers_for_all_loop_flights_earn_few_points() -> None:
             assert np.mean([form_points(form, one).fraction for one in truths]) <= 0.35
 
 
-def test_correct_loop_open_end_size_includes_odometry_drift() -> None:
+def test_correct_size_of_open_loop_end_includes_odometry_drift() -> None:
     """A student cannot separate the drift from the measured closure error."""
     scenario = Scenario(kind="loop", passes=1, vio_drift=0.02, seed=4, truth=False)
     (wrong,) = form_truth(flights.simulate(scenario, parse(("open-end=5m",))), SHA256).mistakes
@@ -283,7 +283,7 @@ def test_answer_form_points_agree_with_manual_grading(shared_logs: Path) -> None
 
 
 def test_random_answer_forms_earn_at_most_20_percent() -> None:
-    """500 random forms on flights with two mistakes, one and none."""
+    """500 random forms on flights with two faults, one and none."""
     rng = np.random.default_rng(5)
     truths = (TRUTH, replace(TRUTH, mistakes=(LATE,)), CLEAN)
     earned = [form_points(at_random(rng), truths[n % 3]).fraction for n in range(500)]

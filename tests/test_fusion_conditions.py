@@ -99,7 +99,7 @@ def clock(name: str) -> ClockMap:
         (gnss(states={"yaw_align": on(0.0)}), "alignment", ("heading",)),
     ],
 )  # fmt: skip
-def test_first_unmet_condition_has_values_limits_and_action(
+def test_first_unmet_fusion_condition_states_value_and_action(
     tried: Attempt, name: str | None, texts: tuple[str, ...]
 ) -> None:
     found = find_unmet(tried)
@@ -115,7 +115,7 @@ def unfused(**parts: Any) -> Any:
     return analysis(ekf2=ekf2, source=source(**parts.pop("source", {})), **parts)
 
 
-def test_constant_positions_are_not_to_be_fused() -> None:
+def test_constant_positions_without_fusion_are_only_a_note() -> None:
     still = unfused(source={"samples": positions(np.arange(0.0, 120.0, 0.1), 2.0)},
                     ekf2={"parameters": {"EKF2_EV_CTRL": 2.0}})  # fmt: skip
     finding = only(ekf2_not_fusing.detect, still)
@@ -123,7 +123,7 @@ def test_constant_positions_are_not_to_be_fused() -> None:
     assert finding.remedy == "Leave bit 0 of EKF2_EV_CTRL unset."
 
 
-def test_position_file_that_ekf2_did_not_get_has_no_finding() -> None:
+def test_position_file_not_sent_to_ekf2_has_no_fusion_finding() -> None:
     beside = unfused(source={"origin": POSITION_FILE}, ekf2={"parameters": {"EKF2_EV_CTRL": 0.0}})
     assert named(ekf2_not_fusing.detect, beside) == {}
     # EKF2 received the same or another source
@@ -134,7 +134,9 @@ def test_position_file_that_ekf2_did_not_get_has_no_finding() -> None:
 @pytest.mark.parametrize(
     ("valid_until_s", "expected"), [(109.0, {}), (90.0, "warning"), (40.0, "error")]
 )
-def test_invalid_position_is_reported_with_its_error(valid_until_s: float, expected: Any) -> None:
+def test_position_that_ekf2_declares_invalid_is_reported(
+    valid_until_s: float, expected: Any
+) -> None:
     valid = pd.Series([1.0, 0.0], index=[0.0, valid_until_s])
     state = positions(np.arange(0.0, 120.0), 2e6)
     one = unfused(ekf2={"states": {"xy_valid": valid}, "state": state, "fusing": NONE},
@@ -161,7 +163,7 @@ def test_invalid_position_is_reported_with_its_error(valid_until_s: float, expec
         ("logs/flown/eg1_base.ulg", None, ()),
     ],
 )
-def test_logged_flight_has_first_unmet_condition(
+def test_unmet_fusion_condition_of_logged_flight_is_found(
     path: str, source_name: str | None, texts: tuple[str, ...], shared_logs: Path
 ) -> None:
     flight = read_log(shared_logs.parent / path)
@@ -172,11 +174,11 @@ def test_logged_flight_has_first_unmet_condition(
         assert text in f"{found[0].message} {found[0].remedy}"
 
 
-def test_global_position_shows_gnss_fusion_without_flags() -> None:
+def test_gnss_fusion_without_flags_follows_from_global_position() -> None:
     ekf2 = made(Ekf2, aids={}, states={"xy_global": on(1.0)})
     assert fused_aid(ekf2)
     assert not fused_aid(ekf2, "baro_hgt")
     assert not fused_aid(made(Ekf2, aids={}, states={"xy_global": on(0.0)}))
-    # flags without an aid mean that EKF2 did not fuse it
+    # flags without an aiding source mean that EKF2 did not fuse it
     flags = {"xy_global": on(1.0), "tilt_align": on(1.0)}
     assert not fused_aid(made(Ekf2, aids={}, states=flags))

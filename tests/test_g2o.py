@@ -191,7 +191,6 @@ SQUARE = "".join(f"EDGE_SE2 {i} {i + 1} 1 0 1.57 {{}}\n" for i in range(4))
 def test_loop_on_g2o_with_extreme_information_stays_finite(
     tmp_path, monkeypatch, capsys, entry, edge
 ):
-    """A square path with two loop closures; no warnings, and no NaN in the JSON."""
     numbers = UNIT_2.split()
     numbers[0 if edge == 1 else 5] = entry  # information of a position or a heading
     text = SQUARE + "EDGE_SE2 0 4 0.1 0.1 6.2 {}\nEDGE_SE2 0 3 0.1 1.1 4.7 {}\n"

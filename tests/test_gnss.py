@@ -297,7 +297,7 @@ def test_ground_truth_of_gnss_flight_is_relative_to_ekf2_origin(fused, tmp_path)
 @pytest.mark.parametrize(("least_m", "eph_m", "expected"), [
     (2.0, 0.3, True), (0.5, 0.45, False), (0.5, 0.9, False), (None, 0.3, False),
 ])  # fmt: skip
-def test_gnss_noise_is_reduced_only_if_above_receiver_accuracy(
+def test_smaller_gnss_noise_is_advised_if_above_receiver_sigma(
     least_m, eph_m, expected, tmp_path, monkeypatch
 ):
     log = outdoors(eph_m=eph_m)
@@ -316,7 +316,7 @@ def test_gnss_noise_is_reduced_only_if_above_receiver_accuracy(
 
 # -------------------------------------------------------------------- flights of PX4's EKF2
 
-# First finding above a note, if any; verdicts of some aids; reason why EKF2 is not replayed
+# By flight: first finding above a note; verdicts of aiding sources; reason without EKF2 replay
 FLIGHTS: dict[str, tuple[str | None, dict[str, str], str]] = {
     "main202603_gps_outage_flow":
         ("source_gap", {"gnss_pos": "not_fused", "gnss_vel": "not_fused"}, ""),
@@ -344,7 +344,7 @@ OF_OTHERS = ("EKF2_EV", "vision", "anchor", "UWB", "line of sight", " tag ")
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", FLIGHTS)
-def test_compare_of_real_gnss_flights_gives_known_numbers(name, shared_logs):
+def test_compare_of_real_gnss_flights_equals_reference_numbers(name, shared_logs):
     folder = shared_logs / "gps"
     analysis = px4fuse.compare(folder / f"{name}.ulg")
     injected = json.loads((folder / f"{name}.json").read_text())
@@ -381,7 +381,7 @@ def test_compare_of_real_gnss_flights_gives_known_numbers(name, shared_logs):
 
 
 def as_in_the_log(found: dict[str, AidResult], truth: dict[str, Any]) -> int:
-    """Compare the NIS of aids with numbers computed without px4fuse; return their count."""
+    """Compare the mean NIS of aiding sources with independent values; return their number."""
     stated = {
         # the stated number excludes rejected samples otherwise
         aid: one["mean_nis" if one["rejected_share"] > 0.0 else "mean_nis_fused"]
@@ -415,7 +415,7 @@ def models(shared_logs: Path, model_of: Any) -> dict[str, Model]:
 
 @pytest.mark.reallogs
 def test_ekf2_model_of_real_gnss_flights_agrees_with_log(models):
-    """Flights without rejections, and one that rejects almost half."""
+    """EKF2 rejects no fix on most of the flights, and almost half of the fixes on one."""
     for name in ("delay0", "fullrate", "nominal"):
         agreement = models[name].agreement
         assert agreement.good
@@ -462,7 +462,7 @@ def test_what_if_gnss_settings_match_independent_replay(models):
 
 
 @pytest.mark.reallogs
-def test_what_if_with_other_gnss_delay_changes_heading(models):
+def test_what_if_with_correct_gnss_delay_reduces_heading_error(models):
     """An independent replay with a magnetometer gives 4.7° before and 1.5° after."""
 
     def heading_deg(name: str, **settings: float) -> tuple[float, float]:
@@ -489,7 +489,7 @@ def test_what_if_with_other_gnss_delay_changes_heading(models):
 
 @pytest.mark.reallogs
 def test_what_if_without_aiding_source_predicts_position_error(models):
-    """93 s without an aid: the error agrees with the noise of the remaining aids."""
+    """The error after 93 s agrees with the noise of the remaining aiding sources."""
 
     def without(*names: str) -> tuple[Summary, float]:
         found = what_if(models["nominal"], [{}], dict.fromkeys(names, 60.0))

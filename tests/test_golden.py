@@ -179,7 +179,7 @@ def spread(kind: str, *mistakes: str) -> list[str]:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_simulated_flight_values_match_reference_file(kind: str) -> None:
-    """Flight without mistakes, then the lines that differ with each mistake."""
+    """Flight without faults, then the lines that differ with each fault."""
     clean = spread(kind)
     lines = [*clean]
     for name, mistake in MISTAKES.items():

@@ -85,7 +85,6 @@ def test_grade_table_lists_every_submitted_file(submitted, tmp_path) -> None:
 
 @pytest.mark.usefixtures("jobs_in_process", "cached_pages")
 def test_grade_report_beyond_time_limit_cannot_be_verified(tmp_path, monkeypatch) -> None:
-    """The comparison of pages exceeds its time limit."""
     folder = tmp_path / "in"
     folder.mkdir()
     (folder / "a.pdf").write_bytes(
@@ -204,8 +203,7 @@ def test_grade_report_without_its_log_makes_points_pending(tmp_path) -> None:
 
 
 @pytest.mark.usefixtures("jobs_in_process")
-def test_interrupted_grade_command_tells_how_to_continue(tmp_path, monkeypatch) -> None:
-    """Each name is one line; an interrupted run prints how to continue."""
+def test_interrupted_grade_command_prints_how_to_continue(tmp_path, monkeypatch) -> None:
     import px4fuse.classroom.grading.grade as module
 
     one = GradedReport("a.pdf", "Ada\nPoints 120\n" + "A" * 100_000, "1", UNKNOWN)

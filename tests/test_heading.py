@@ -66,7 +66,7 @@ def test_constant_heading_misalignment_is_recovered(misalignment_deg):
 
 
 @pytest.mark.parametrize("by", ["positions", "orientation"])
-def test_drifting_heading_misalignment_is_followed(by):
+def test_drifting_heading_misalignment_is_estimated_over_time(by):
     """A source with an orientation gives the misalignment more accurately than positions."""
     plain = simulated(passes=6 if by == "positions" else 4)
     flight, turn = with_heading_drift(plain)

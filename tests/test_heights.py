@@ -155,7 +155,7 @@ def test_height_innovation_refers_to_sample_time() -> None:
     np.testing.assert_allclose(found["fused_at_s"], [0.2, 0.2, 0.3, 0.5])
 
 
-def test_height_sample_weight_equals_repeated_samples() -> None:
+def test_weighted_height_sample_equals_repeated_samples() -> None:
     """R = 0.25 m² with weight 2 acts as two samples; S is that of one."""
     P = np.zeros((1, 9, 9))
     P[0, 8, 8] = 0.5
@@ -172,7 +172,7 @@ def test_height_sample_weight_equals_repeated_samples() -> None:
 @pytest.mark.parametrize(
     ("innovation", "expected"), [(-0.5, -0.5), (0.5, 0.0), (3.9, 0.0), (4.5, 0.5)]
 )
-def test_ground_effect_dead_zone_ignores_low_barometer_height(innovation, expected) -> None:
+def test_barometer_innovation_in_ground_effect_dead_zone_is_zero(innovation, expected) -> None:
     """Dead zone EKF2_GND_EFF_DZ of baro_height_control.cpp."""
     _, found = standing(of_baro([10], [innovation], dead_zone_m=4.0))
     assert found["innovation_down_m"].item() == pytest.approx(expected)
@@ -202,7 +202,7 @@ def opened_once() -> Model:
     return opened(outdoors())
 
 
-def test_what_if_barometer_noise_matches_flight_with_that_noise() -> None:
+def test_what_if_barometer_noise_equals_flight_with_this_noise() -> None:
     model = opened_once()
     assert model.agreement.baro_hgt["down"].innovation_correlation > 0.999
     assert model.agreement.baro_hgt["down"].position_rms_difference_m < 0.02
@@ -275,7 +275,7 @@ def test_ekf2_replay_of_heights_without_data_states_reason() -> None:
     record = ekf2.record
 
     def why(enabled: dict[str, float], rows: int = 1, **parameters: float) -> str:
-        """Return the reason for aids enabled from the start (1) or from 60 s on (0)."""
+        """Return the reason for aiding sources enabled from the start (1) or from 60 s on (0)."""
         found = {
             name: made(
                 AidLog, enabled=pd.Series([share, 1.0], index=[0.0, 60.0]), samples=pd.DataFrame()
@@ -320,7 +320,7 @@ def test_clipped_acceleration_has_noise_of_4_9_m_s2() -> None:
     np.testing.assert_allclose(ran(clipped).variance, expected, rtol=1e-9)
 
 
-def test_clipped_imu_axes_increase_fraction_of_bad_acceleration() -> None:
+def test_bad_acceleration_fraction_is_that_of_clipped_imu_axes() -> None:
     flight = outdoors()
     (plain,) = opened_once().inputs.segments
     clipped = pd.Series(0, flight.imu.index)

@@ -177,9 +177,7 @@ def test_clean_flight_has_no_bias_scale_error_or_jump() -> None:
         ("r-scale=4", "source_reported_variance_wrong", "note", {"variance_factor": (4.0, 0.8)}),
     ],
 )
-def test_simulated_mistake_is_first_finding_with_its_size(
-    mistake, name, severity, evidence
-) -> None:
+def test_simulated_fault_is_first_finding_with_its_size(mistake, name, severity, evidence) -> None:
     named = found(flown(mistake))
     assert next(iter(named)) == name
     assert ("source_low_pass_filtered" in named) == (name == "source_low_pass_filtered")
@@ -199,7 +197,7 @@ def test_simulated_mistake_is_first_finding_with_its_size(
         ("sigma_a_too_large", "", {"sigma_a_m_s2": 2.0}, "error", "--sigma-a 0.2|--sigma-a 0.3"),
     ],
 )
-def test_finding_of_simulated_mistake_gives_a_command(
+def test_finding_of_simulated_fault_contains_a_command(
     name, mistake, settings, severity, remedy
 ) -> None:
     named = found(analysed(flight(), replace(RIGHT, **settings)) if settings else flown(mistake))
@@ -250,7 +248,7 @@ def with_ekf2(*mistakes: str) -> Analysis:
 
 
 @pytest.mark.parametrize(("jump", "severity"), [("50ms", "warning"), ("300ms", "error")])
-def test_clock_jump_severity_follows_its_size(jump, severity):
+def test_clock_jump_severity_depends_on_its_size(jump, severity):
     (finding,) = stamps.detect_arrival_times(with_ekf2(f"clock-jump={jump}"))
     assert finding.severity == severity
     assert finding.evidence["until_s"] == pytest.approx(50.0, abs=0.5)

@@ -71,7 +71,7 @@ def test_consistent_flight_has_no_causes_of_inconsistency() -> None:
         ("ekf2-delay=0.175", {}, "ekf2", "nees", {"EKF2_EV_DELAY": (0, 0)}),
     ],
 )  # fmt: skip
-def test_cause_found_for_simulated_mistake_is_that_mistake(
+def test_cause_found_for_simulated_fault_is_that_fault(
     mistake, settings, owner, of, change
 ) -> None:
     analysis = flown(*filter(None, (mistake,)), **settings)
@@ -82,7 +82,7 @@ def test_cause_found_for_simulated_mistake_is_that_mistake(
     assert found.is_complete_cause
 
 
-def test_kf_rerun_without_bias_equals_corrected_acceleration() -> None:
+def test_kf_rerun_without_bias_equals_run_on_unbiased_imu() -> None:
     analysis = flown("accel-bias=0.5")
     found, imu = cause(analysis, "kf"), analysis.flight.imu
     without = imu[Columns.SPECIFIC_FORCE] - [
@@ -95,7 +95,7 @@ def test_kf_rerun_without_bias_equals_corrected_acceleration() -> None:
     assert found.after == pytest.approx(again.nis_mean, rel=1e-6)
 
 
-def test_filter_rerun_for_vibration_raises_ekf2_acc_noise() -> None:
+def test_filter_rerun_for_vibration_increases_ekf2_acc_noise() -> None:
     analysis = flown("vibration=1.5")
     found = cause(analysis, "ekf2", "nis")
     assert found.change == {"EKF2_ACC_NOISE": 1.0}  # PX4's maximum
@@ -103,7 +103,7 @@ def test_filter_rerun_for_vibration_raises_ekf2_acc_noise() -> None:
     assert not any("EKF2_ACC_NOISE" in row.change for row in flown("nlos=7%").causes)
 
 
-def test_time_offset_applied_to_kf_is_tried_for_ekf2() -> None:
+def test_time_offset_applied_to_kf_is_also_tested_for_ekf2() -> None:
     bare = flown("clock-offset=-0.19")
     offset_s = cause(bare, "kf", "nees").change[CLOCK_OFFSET]
     analysis = explain(compare(bare.flight, replace(RIGHT, clock_offset_s=offset_s)))
@@ -133,7 +133,7 @@ def test_kf_rerun_equals_compare_with_the_changed_setting(analysis, of) -> None:
     )
 
 
-def test_ekf2_rerun_equals_what_if_with_the_same_change() -> None:
+def test_ekf2_rerun_equals_what_if_with_the_same_parameters() -> None:
     analysis = flown("ekf2-noise=0.03")
     found = [find_cause(analysis.causes, "ekf2", axis) for axis in ("north", "east")]
     model, change = analysis.ekf2_model, found[0].change  # type: ignore[union-attr]
@@ -165,7 +165,7 @@ def test_cause_states_position_difference_before_and_after() -> None:
     assert row.change == cause(kf_case, "kf").change
     assert row.explained_fraction == pytest.approx(1.0 - (row.after / row.before) ** 2)
     assert row.explained_fraction > 0.8
-    # corrected EKF2 differs from KF as much as EKF2 in the same flight without the mistake
+    # corrected EKF2 differs from KF as much as EKF2 in the same flight without the fault
     ekf2_case = flown("ekf2-gate=1", passes=6)
     right = compare(simulate_flight(Scenario(seed=5)), RIGHT)
     (row,) = [
@@ -205,7 +205,7 @@ def test_ekf2_rerun_candidates_include_non_default_parameters() -> None:
     assert tried[1:] == [{"EKF2_ACC_NOISE": 0.35}, {"EKF2_GYR_NOISE": 0.015}]
 
 
-def test_cause_must_explain_50_to_150_percent_of_inconsistency() -> None:
+def test_cause_explains_50_to_150_percent_of_inconsistency() -> None:
     def one(change: Any, explains: float, *, into: bool = False) -> Intervention:
         return Intervention(
             statistic="nis", filter="kf", axis="aisle", change=change, before=9.0,

@@ -122,7 +122,6 @@ def test_shift_times_also_shifts_times_inside_records(sample_flight):
 
 
 def test_joined_recording_lists_only_data_missing_in_both(record):
-    """Parts that the copied EKF2 lacks are listed."""
     bare = record(Aisle(uwb=None), "bare.tlog", "ODOMETRY", "HIGHRES_IMU")
     full = record(Aisle(), "full.tlog")
     assert {"EKF2", "IMU"} <= {part.what for part in bare.missing}

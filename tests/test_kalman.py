@@ -95,7 +95,7 @@ def axis() -> Axis:
 
 @settings(max_examples=60)
 @given(axis=any_axis(), chosen=any_settings)
-def test_kf_replay_of_any_axis_equals_plain_recursion(axis: Axis, chosen: Settings) -> None:
+def test_kf_replay_of_any_axis_equals_textbook_recursion(axis: Axis, chosen: Settings) -> None:
     run = replay(axis, chosen)
     states, updates = plain_replay(axis, chosen)
     np.testing.assert_allclose(run.steps[STATE], states, rtol=1e-9, atol=1e-9)
@@ -223,7 +223,7 @@ def test_kf_prediction_formulas_equal_matrix_products(dt: float) -> None:
     )
 
 
-def test_kf_continuous_process_noise_is_limit_of_short_steps() -> None:
+def test_kf_process_noise_sum_of_short_steps_equals_closed_form() -> None:
     count, total = 10_000, 0.7
     dt = total / count
     covariance = (0.0, 0.0, 0.0)

@@ -139,7 +139,7 @@ def test_loop_correction_by_distance_shifts_positions_linearly(sample_loop) -> N
     assert plain.trajectory.rotation is odometry.rotation
 
 
-def test_loop_correction_with_heading_keeps_rpe_over_10_m(sample_loop: Loop) -> None:
+def test_loop_correction_with_heading_does_not_increase_rpe(sample_loop: Loop) -> None:
     """The sample's heading drifts, so a correction of positions only increases the RPE."""
     over = [
         next(e.translation_m for e in score(sample_loop, way).rpe if e.delta_text == "10 m")
@@ -150,7 +150,7 @@ def test_loop_correction_with_heading_keeps_rpe_over_10_m(sample_loop: Loop) -> 
     assert plain > 1.1 * before
 
 
-def test_loop_correction_without_heading_has_only_one_path(sample, sample_loop) -> None:
+def test_loop_corrections_without_heading_error_are_equal(sample, sample_loop) -> None:
     assert [part.name for part in sample_loop.reported_paths[1:3]] == [POSITIONS_ONLY, BY_DISTANCE]
     found = analyse_loop(sample, landed_at=Landing(0.0, 0.0))
     assert isinstance(found.heading_error_deg, Unavailable)
@@ -161,7 +161,7 @@ def test_loop_correction_without_heading_has_only_one_path(sample, sample_loop) 
     np.testing.assert_allclose(plain.position_m, turned.position_m, atol=1e-9)
 
 
-def test_given_landing_point_gives_closure_error_of_ground_truth(
+def test_loop_closure_error_to_given_landing_equals_true_error(
     sample: LoopSource, sample_loop: Loop
 ) -> None:
     forward, right, _ = sample_loop.true_end.displacement  # the vehicle heads along x
@@ -173,12 +173,12 @@ def test_given_landing_point_gives_closure_error_of_ground_truth(
 
 
 @pytest.mark.reallogs
-def test_loop_from_tlog_has_closure_error_of_ground_truth(shared_logs: Path) -> None:
+def test_loop_closure_error_from_tlog_equals_ground_truth(shared_logs: Path) -> None:
     found = analyse(read_source(str(shared_logs / "mavlink" / "v1.16.1_loop_vio.tlog")))
     assert found.closure_error_m == pytest.approx(true_closure_error_m(), abs=0.05)
 
 
-def test_loop_on_absolute_positions_is_reported() -> None:
+def test_loop_on_absolute_positions_instead_of_odometry_warns() -> None:
     source = read_source(str(REPOSITORY / "sample_logs" / "aisle_uwb.ulg"))
     assert source.trajectory.kind == "ekf2"
     found = analyse(source)
@@ -251,7 +251,7 @@ def test_loop_closure_gate_p_value_at_true_landing_is_uniform() -> None:
         assert np.mean(np.array(p) < share) == pytest.approx(share, abs=0.2)
 
 
-def test_loop_with_open_end_is_rejected_and_not_corrected() -> None:
+def test_loop_that_does_not_return_to_start_is_not_corrected() -> None:
     _, odometry = laps(1, 3, OdometryNoise())
     half = odometry[: len(odometry) // 2]
     found = close_loop(half)
@@ -272,7 +272,7 @@ def test_loop_with_open_end_is_rejected_and_not_corrected() -> None:
     assert find_loop(opened) == ()
 
 
-def test_loop_closes_heading_only_if_start_and_end_are_similar() -> None:
+def test_loop_closure_corrects_heading_only_if_headings_agree() -> None:
     _, odometry = laps(1, 4, OdometryNoise())
     turned = close_loop(odometry)  # the vehicle lands with another heading
     assert isinstance(turned.heading_error_deg, Unavailable)
@@ -317,7 +317,7 @@ def test_loop_with_assumed_landing_point_is_reported(sample: LoopSource, sample_
     assert find_loop(analyse_loop(sample, landed_at=Landing(0.0, 0.0))) == ()
 
 
-def test_loop_of_odometry_that_stops_in_flight_has_no_end(sample: LoopSource) -> None:
+def test_loop_of_odometry_that_stops_in_flight_has_no_closure(sample: LoopSource) -> None:
     """Without ground truth; the place at which the odometry stops is not the landing place."""
     flight = replace(sample.flight, truth=Unavailable("ground truth", "not logged", "Log it."))
     (start_s, landing_s), trajectory = flight.airborne[0], sample.trajectory
@@ -369,7 +369,7 @@ def test_loop_closure_times_may_be_unix_or_from_first_pose() -> None:
     assert relative.closures[1] == stamped.closures[1]
 
 
-def test_loop_on_slam_file_levels_the_camera_frame() -> None:
+def test_loop_on_slam_file_rotates_camera_frame_to_z_down() -> None:
     source = read_source(str(SLAM))
     found = analyse_loop(source, landed_at=Landing(0.0, 0.0))
     assert found.odometry.trajectory.frame == "FRD"

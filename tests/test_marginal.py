@@ -105,7 +105,7 @@ def test_banded_solver_equals_dense_normal_equations(seed: int) -> None:
     np.testing.assert_allclose(system.position_variance(), variance, rtol=1e-6)
 
 
-def test_banded_factorisation_with_singular_q_stays_accurate() -> None:
+def test_banded_factorisation_with_singular_q_is_accurate() -> None:
     """Q of a single step has rank one, so the term that makes it invertible is below rounding."""
     step, joined = np.full(19, 0.09755900000000004), np.ones(19, dtype=bool)
     unit = 0.1 * step * np.stack([step**2 / 4.0, step / 2.0, np.ones(19)])
@@ -210,7 +210,7 @@ def joint_normal(
     return signals[:, 0], covariance + block_diag(*(each[2] for each in made)), made
 
 
-def test_unknown_imu_constants_add_covariance_to_likelihood() -> None:
+def test_likelihood_with_imu_biases_equals_dense_joint_normal() -> None:
     """Equal at all offsets and noises, except for a constant."""
     part = with_constants()
 
@@ -239,7 +239,6 @@ def test_unknown_imu_constants_add_covariance_to_likelihood() -> None:
 
 @pytest.mark.parametrize("start_known", [True, False])
 def test_single_position_in_a_segment_adds_no_likelihood(start_known: bool) -> None:
-    """A single position in a stretch has the same likelihood as none."""
     part = with_constants()
     if not start_known:
         part = replace(part, prior_precision=np.zeros((COUNT, 2)))
@@ -252,7 +251,7 @@ def test_single_position_in_a_segment_adds_no_likelihood(start_known: bool) -> N
         np.testing.assert_allclose(one.constants(), none.constants(), rtol=1e-9, atol=1e-12)
 
 
-def test_fitted_imu_constants_equal_dense_solution() -> None:
+def test_fitted_imu_biases_equal_dense_least_squares() -> None:
     part = with_constants(offsets=1)
     # without the third axis, which has too few measurements
     part = replace(part, measurement_m=part.measurement_m * [1.0, 1.0, np.nan])
@@ -279,7 +278,7 @@ def test_fitted_imu_constants_equal_dense_solution() -> None:
         np.testing.assert_array_equal(count, np.isfinite(part.measurement_m).sum(axis=1))
 
 
-def test_banded_products_by_segment_equal_dense_covariance() -> None:
+def test_products_with_banded_covariance_equal_dense_products() -> None:
     part, noises = with_constants(offsets=1), Noises(0.5, 0.1)
     signal = np.random.default_rng(8).normal(0.0, 1.0, (COUNT, 3, 2))
     still = np.zeros((3, 2, COUNT - 1))
@@ -301,7 +300,7 @@ def test_banded_products_by_segment_equal_dense_covariance() -> None:
         np.testing.assert_allclose(found_values[stretch], expected[1], rtol=1e-4, atol=1e-4)
 
 
-def test_centring_positions_on_imu_path_keeps_likelihood() -> None:
+def test_subtracting_imu_path_from_positions_keeps_likelihood() -> None:
     part = with_constants()
     given = [arguments(each, SOME_NOISES[0], WEIGHT) for each in (part, centre_on_path(part))]
     plain, found_values = (fit_positions(*each).scores()[0] for each in given)
@@ -321,7 +320,7 @@ def test_centring_positions_on_imu_path_keeps_likelihood() -> None:
 
 
 @pytest.mark.parametrize("which", ["filter", "constants"])
-def test_interpolated_noise_likelihood_equals_direct_value(which: str) -> None:
+def test_interpolated_likelihood_of_noises_equals_computed_one(which: str) -> None:
     """Equal over four decades of the ratio and of SIGMA_Z, except for a constant."""
     parts = [filter_positions(preintegrate(modelled(seed, COUNT), TRUE)) for seed in (1, 2)]
     if which == "constants":
@@ -464,7 +463,7 @@ def test_maximum_likelihood_fit_finds_simulated_outliers(clean, share, size_m, l
 
 
 @pytest.mark.parametrize(("axes", "share", "width"), [(1, 0.15, 4.0), (2, 0.1, 5.0), (2, 0.3, 3.0)])
-def test_sigma_widening_for_outliers_equals_likelihood_curvature(axes, share, width):
+def test_sigma_of_noise_estimate_equals_likelihood_curvature(axes, share, width):
     """Without motion the likelihood has a closed form."""
     rng = np.random.default_rng(axes)
     wrong = rng.random(4000) < share
@@ -495,7 +494,7 @@ def test_sigma_widening_for_outliers_equals_likelihood_curvature(axes, share, wi
     assert widening == pytest.approx(curved * 2.0 * axes * 4000, rel=0.01)
 
 
-def test_maximum_likelihood_without_outliers_keeps_weights() -> None:
+def test_maximum_likelihood_without_outlier_model_keeps_weights() -> None:
     weight = np.random.default_rng(1).uniform(0.2, 1.0, MANY)
     parts = [filter_positions(preintegrate(pair(1)[0], TRUE))]
     found = maximise_likelihood(parts, Noises(0.5, 0.1), weight, outliers=False)

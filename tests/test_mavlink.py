@@ -126,7 +126,7 @@ def test_read_mavlink_version_1_equals_version_2(read):
     assert_frame_equal(as_2.positions[0].samples, as_1.positions[0].samples)
 
 
-def test_read_mavlink_removes_duplicates_of_two_links(read):
+def test_read_mavlink_removes_messages_recorded_on_two_links(read):
     """MAVProxy with two radios records every message twice, with a delay."""
     aisle = Aisle(asks=True)
     once = aisle.record()
@@ -269,7 +269,7 @@ def test_mavlink_odometry_estimator_type_selects_source_name(read, estimator, na
         assert_allclose(given.iloc[0], POSE_VARIANCE, rtol=1e-6)
 
 
-def test_mavlink_mocap_besides_other_source_is_ground_truth(read):
+def test_mavlink_mocap_is_ground_truth_if_other_source_exists(read):
     aisle = Aisle(asks=True)
     recorder = aisle.record()
     add(recorder, 50.0, lambda t: message(

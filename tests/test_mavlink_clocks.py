@@ -77,7 +77,7 @@ def test_mavlink_clock_fit_of_messages_without_delay_is_exact(span, slope):
 
 @pytest.mark.parametrize("speed", [0.04, 0.5, 10.0])
 @pytest.mark.parametrize("span", [10.0, 100.0])
-def test_mavlink_clock_fit_of_replayed_file_recovers_its_speed(speed, span):
+def test_mavlink_clock_fit_recovers_speed_of_replayed_recording(speed, span):
     x = np.linspace(0.0, span, 600)
     delay = np.random.default_rng(1).exponential(0.01, len(x))
     line = fit_least_delay(x, 5.0 + speed * x + delay)
@@ -423,7 +423,7 @@ def test_timesync_that_contradicts_receive_time_is_ignored():
     np.testing.assert_allclose(found.to_boot.at(stamps), received, atol=1e-6)
 
 
-def test_mavlink_clock_mapping_by_reported_offset_is_equal():
+def test_mavlink_clock_mapping_equals_reported_offset_and_drift():
     """boot = timestamp + offset + drift · (timestamp - middle of the timestamps)."""
     received = 20.0 + 1.0001 * np.arange(0.0, 100.0, 0.1)
     stamps, found = map_unix_timestamps(received, *NO_EXCHANGES)

@@ -452,7 +452,7 @@ def test_read_mavlink_memory_per_frame_is_bounded(tmp_path, make, each_bytes, mo
     assert peak < path.stat().st_size + each_bytes * len(parts) + more_bytes
 
 
-def test_truncated_tlog_is_marked_as_ending_in_flight(tmp_path, sample_log):
+def test_truncated_tlog_is_reported_to_end_in_flight(tmp_path, sample_log):
     content = sample_log.with_suffix(".tlog").read_bytes()
     path = tmp_path / "half.tlog"
     path.write_bytes(content[: len(content) // 2])

@@ -75,7 +75,7 @@ def trial(
         (0.101, Noise(0.033, 0.032, 0.034), ("warning", 3.06)),
     ],
 )  # fmt: skip
-def test_noise_setting_severity_changes_at_limit_ratios(
+def test_severity_of_wrong_noise_setting_depends_on_its_factor(
     chosen: float, estimate: Noise, expected: Any
 ) -> None:
     off = noises.setting_deviation("sigma_z_m", chosen, estimate)
@@ -134,7 +134,7 @@ def test_rerun_of_consistent_kf_does_not_refute_noise_estimate(
     assert (finding.severity, finding.remedy) == expected
 
 
-def test_wrong_noise_finding_states_factor_and_estimate() -> None:
+def test_wrong_noise_finding_states_factor_and_estimated_noise() -> None:
     fitted = tuned(Noise(0.5, 0.45, 0.55), Noise(0.1, 0.09, 0.11))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=fitted))
     assert worse.evidence["factor"] == pytest.approx(10.0)
@@ -174,7 +174,7 @@ def test_recommended_sigma_z_is_at_least_5_mm() -> None:
          ["sigma_a_too_large", "sigma_z_too_small"]),
     ],
 )  # fmt: skip
-def test_wrong_noise_of_drifting_source_has_no_finding(
+def test_too_large_noise_for_odometry_has_no_finding(
     parts: dict[str, Any], expected: list[str]
 ) -> None:
     estimate = 3.0 * (parts.get("settings") or CHOSEN).sigma_z_m
@@ -250,7 +250,7 @@ def test_inconsistent_filter_severity_changes_at_nis_of_4() -> None:
     )
 
 
-def test_inconsistent_filter_finding_groups_horizontal_axes() -> None:
+def test_inconsistent_filter_finding_combines_north_and_east() -> None:
     axes = (kf(0.1, "aisle"), kf(2.0), kf(3.0, "east"), kf(9.0, "down"))
     found = tuple(noises.detect_inconsistent_variances(analysis(axes=axes)))
     assert [(one.id, one.caused_by, one.evidence["axis"]) for one in found] == [
@@ -264,7 +264,7 @@ def test_inconsistent_filter_finding_groups_horizontal_axes() -> None:
     assert group_by_cause(found) == found
 
 
-def test_underconfident_filter_on_drifting_source_keeps_noise() -> None:
+def test_smaller_noise_on_odometry_is_not_recommended() -> None:
     for nis, is_kept, level in ((0.2, True, "note"), (5.0, False, "error")):
         finding = only(
             noises.detect_inconsistent_variances, analysis(axes=(kf(nis),), source=ODOMETRY)
@@ -301,7 +301,7 @@ def fused(noise_m: float, nis: float = 5.0, name: str = "north", **parts: Any) -
     [({}, 0.1, True), ({"EKF2_EVP_NOISE": 0.1}, 0.1, True), ({"EKF2_EVP_NOISE": 0.11}, 0.1, False),
      ({}, 0.124, True), ({}, 0.126, False), ({}, 0.081, True), ({}, 0.079, False)],
 )  # fmt: skip
-def test_ekf2_noise_is_default_unless_sender_reports_another(flown, used_m, default):
+def test_ekf2_noise_counts_as_default_within_25_percent(flown, used_m, default):
     assert (
         _has_default_noises(analysis(log=log(parameters=flown)), "ekf2", fused(used_m)) is default
     )
@@ -330,7 +330,7 @@ def test_ekf2_noise_is_default_unless_sender_reports_another(flown, used_m, defa
         ("ekf2", {"EKF2_ACC_NOISE": 0.35}, "process noise", "Set EKF2_ACC_NOISE to 0.35 m/s²."),
     ],
 )  # fmt: skip
-def test_inconsistent_filter_action_follows_from_its_cause(owner, change, kind, action) -> None:
+def test_action_for_inconsistent_filter_depends_on_its_cause(owner, change, kind, action) -> None:
     # changes that explain less than 0.5 or more than 1.5 are not causes
     causes = (tried(owner, {"sigma_z_m": 7.0}, explained_fraction=0.4), tried(owner, change),
               tried(owner, {"sigma_z_m": 7.0}, explained_fraction=1.6))  # fmt: skip
@@ -340,7 +340,7 @@ def test_inconsistent_filter_action_follows_from_its_cause(owner, change, kind, 
     assert finding.evidence["cause"] == kind
 
 
-def test_filter_rerun_that_improves_nothing_is_not_advised() -> None:
+def test_filter_rerun_without_improvement_is_not_recommended() -> None:
     change = {"sigma_z_m": 2.0}
     for after, action in ((1.0, "Set SIGMA_Z to 2 m (--sigma-z 2)."), (9.0, noises.NOT_EXPLAINED)):
         one = analysis(axes=(kf(9.0),), causes=(tried("kf", change),), tuning=tuned(),
@@ -358,7 +358,7 @@ def test_inconsistent_filter_without_cause_recommends_a_check() -> None:
     assert unknown.remedy == noises.UNKNOWN_NOISE
 
 
-def test_smaller_noise_that_contradicts_truth_is_not_advised() -> None:
+def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
     contradicted = replace(tried("kf", {"sigma_z_m": 0.5}, before=0.2), contradicts_truth=True)
     one = analysis(axes=(kf(0.2),), causes=(contradicted,))
     finding = only(noises.detect_inconsistent_variances, one)
@@ -382,7 +382,7 @@ def test_smaller_noise_that_contradicts_truth_is_not_advised() -> None:
         (fused(0.1), Noise(None, None, 0.2), {}, "Set EKF2_EVP_NOISE to 0.2 m (EKF2 uses 0.1 m)."),
     ],
 )  # fmt: skip
-def test_overconfident_ekf2_without_replay_gets_noise_advice(
+def test_noise_of_overconfident_ekf2_is_advised_without_replay(
     one, estimate, parameters, text
 ) -> None:
     flown = analysis(axes=(one,), log=log(parameters=parameters), tuning=tuned(estimate))

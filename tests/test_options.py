@@ -63,12 +63,12 @@ def outcome(request: ComparisonRequest) -> str:
     return repr((*inputs, source.description, compared.segment, compared.settings, numbers))
 
 
-def test_changed_values_contain_each_field_of_the_request() -> None:
+def test_tested_option_values_include_each_field_of_request() -> None:
     assert set(CHANGED) == set(ComparisonRequest.__struct_fields__)
 
 
 @pytest.mark.parametrize("name", CHANGED)
-def test_each_field_of_the_request_changes_the_results(name: str) -> None:
+def test_each_field_of_analysis_request_changes_the_results(name: str) -> None:
     request = ComparisonRequest(log=ULOG)
     if name == "system":
         request = ComparisonRequest(log=TLOG)
@@ -77,14 +77,14 @@ def test_each_field_of_the_request_changes_the_results(name: str) -> None:
     assert outcome(replace(request, **{name: CHANGED[name]})) != outcome(request)
 
 
-def test_each_field_of_the_request_is_described_in_the_guide() -> None:
+def test_files_to_change_for_a_new_option_are_documented() -> None:
     guide = (Path(__file__).parents[1] / "docs" / "built.md").read_text(encoding="utf-8")
-    (row,) = [line for line in guide.splitlines() if line.startswith("| new option of")]
+    (row,) = [line for line in guide.splitlines() if line.startswith("- **New option of")]
     for place in ("request.py", "cli/options.py", "api.py", "comparison/preparation.py"):
         assert place in row
 
 
-def test_unknown_kind_of_position_source_is_named_in_the_error() -> None:
+def test_unknown_kind_of_position_source_raises_an_error() -> None:
     for origin in ORIGINS:
         assert find_origin(origin.kind, origin.path) is origin
     with pytest.raises(ValueError, match="'lidar', 'as received' is not in ORIGINS"):

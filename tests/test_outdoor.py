@@ -116,7 +116,7 @@ def test_simulated_magnetometer_and_height_have_stated_noise(tmp_path: Path) -> 
     assert error[20:].std() == pytest.approx(reported, rel=0.3)
 
 
-def test_outdoor_flight_without_mistake_is_consistent() -> None:
+def test_outdoor_flight_without_fault_is_consistent() -> None:
     analysis = flown()
     assert roots(analysis) == []
     for name, axes in {"gnss_pos": 2, "gnss_vel": 3}.items():
@@ -155,8 +155,8 @@ def test_outdoor_flight_without_mistake_is_consistent() -> None:
         ("slow-error=0.5,30", "source_noise_time_correlated"),
     ],
 )
-def test_simulated_outdoor_mistake_is_first_finding(mistake: str, root: str) -> None:
-    """Mistakes for which GNSS takes other branches in the findings than indoor positions."""
+def test_simulated_outdoor_fault_is_first_finding(mistake: str, root: str) -> None:
+    """Faults for which GNSS takes other branches in the findings than indoor positions."""
     assert roots(flown(mistake))[0] == root
 
 
@@ -168,7 +168,7 @@ def test_simulated_outdoor_mistake_is_first_finding(mistake: str, root: str) -> 
         ("r-scale=0.1", "nis", "EKF2_GPS_P_NOISE", 0.4, 0.02),
     ],
 )
-def test_simulated_outdoor_mistake_is_cause_of_ekf2_error(
+def test_simulated_outdoor_fault_is_cause_of_ekf2_error(
     mistake: str, of: Any, name: str, value: float, within: float
 ) -> None:
     analysis = flown(mistake)
@@ -209,9 +209,9 @@ def test_what_if_with_correct_gnss_delay_equals_correct_flight() -> None:
     assert result.logged.position_rmse_to_truth_m > 1.4 * true.position_rmse_to_truth_m
 
 
-def test_what_if_without_magnetometer_keeps_heading(tmp_path: Path) -> None:
+def test_what_if_without_magnetometer_replay_uses_logged_heading(tmp_path: Path) -> None:
     log = tmp_path / "a.ulg"  # a log file has the true attitude, a flight in memory has not
-    # with a heading mistake EKF2 fuses the magnetic heading only
+    # with a heading fault EKF2 fuses the magnetic heading only
     log.write_bytes(to_ulog(simulate(OUTDOOR, parse(["ekf2-delay=0", "heading=3"]))))
     model = opened(read_log(log))
     result = what_if(model, [{"EKF2_GPS_DELAY": 110.0}])
@@ -236,7 +236,7 @@ def test_time_offset_message_names_gnss_receiver_delay() -> None:
     assert int(estimate_ms) == pytest.approx(110 + 250, abs=60)
 
 
-def test_magnetometer_change_is_the_cause_of_its_rejections() -> None:
+def test_magnetometer_disturbance_is_cause_of_missing_fusion() -> None:
     changed, starved = [item for item in find(flown("mag=0.2")) if item.id.startswith("aid_")]
     assert (changed.id, starved.id) == ("aid_innovation_shift", "aid_not_fused")
     assert starved.caused_by == "aid_innovation_shift"

@@ -530,7 +530,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
 
 
 @pytest.mark.parametrize("kind", FORGERIES)
-def test_pdf_comparison_finds_forged_report_page(pdf: bytes, kind: str) -> None:
+def test_pdf_comparison_detects_forged_report_page(pdf: bytes, kind: str) -> None:
     forge, said, structural = FORGERIES[kind]
     found = compare(forged(pdf, forge), pdf)
     assert any(one.what.startswith(said) for one in found), found
@@ -602,7 +602,7 @@ FILES: dict[str, tuple[Callable[[bytes], bytes], str]] = {
 
 
 @pytest.mark.parametrize("kind", FILES)
-def test_pdf_comparison_finds_forged_file_structure(pdf: bytes, kind: str) -> None:
+def test_pdf_comparison_detects_forged_file_structure(pdf: bytes, kind: str) -> None:
     forge, said = FILES[kind]
     made = forge(pdf)
     assert made != pdf
@@ -610,7 +610,7 @@ def test_pdf_comparison_finds_forged_file_structure(pdf: bytes, kind: str) -> No
     assert any(one.what.startswith(said) for one in found), found
 
 
-def test_pdf_comparison_finds_changed_fill_pattern() -> None:
+def test_pdf_comparison_detects_changed_fill_pattern() -> None:
     pdf = REPORT.read_bytes()
     (at,) = (at for at, sheet in enumerate(PdfReader(REPORT).pages, 1)
              if "/Pattern" in sheet["/Resources"])  # type: ignore[operator] # fmt: skip

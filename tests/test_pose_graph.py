@@ -230,7 +230,7 @@ def test_solve_invalid_pose_graph_states_reason() -> None:
 # --- starts --------------------------------------------------------------------------------------
 
 
-def test_pose_graph_of_star_edges_is_initialised_exactly() -> None:
+def test_star_shaped_pose_graph_is_initialised_exactly() -> None:
     # star of vertices with edges in both directions
     unit = "1 0 0 1 0 1"
     text = "".join(f"EDGE_SE2 {9 if k % 2 else k} {k if k % 2 else 9} 1 0 1 {unit}\n" for k in (
@@ -319,7 +319,7 @@ def test_gnc_pose_graph_keeps_weight_1_of_true_loop_closures() -> None:
         assert robust.cost == pytest.approx(solve(graph).cost, rel=1e-8)
 
 
-def test_robust_pose_graph_reweights_only_given_loop_closures() -> None:
+def test_robust_pose_graph_changes_weights_of_given_closures() -> None:
     graph, _, true = laps(0)
     plain = solve(graph).cost
     sure = solve(graph, robust=True, is_closure=np.zeros(len(true), dtype=bool))

@@ -199,7 +199,7 @@ def test_read_position_csv_keeps_microseconds_of_ns_timestamps(read):
 
 
 @pytest.mark.parametrize("rate", [0.2, 200])
-def test_read_position_csv_with_rate_at_limit_adds_no_note(read, rate):
+def test_read_position_csv_with_0_2_or_200_hz_adds_no_note(read, rate):
     stamps = [str(round(1e9 * (0.98 * i / rate + 1795253650))) for i in range(ROWS)]
     file = read(table({"t": stamps, "x": X, "y": Y, "z": Z}))
     assert np.diff(file.samples.index) == pytest.approx(0.98 / rate, abs=1e-6)
@@ -277,7 +277,7 @@ def test_read_position_csv_detects_frame_from_column_names(read, case, separator
     ("mm unsaid", ("mm", "m is too large for an indoor flight", "--position-unit")),
     ("two tracks", ("'raw_x', 'raw_y', 'raw_z' as x, y, z",)),
 ])  # fmt: skip
-def test_read_position_csv_notes_used_position_columns(read, case, words):
+def test_read_position_csv_states_the_used_position_columns(read, case, words):
     assert_stated(read(table({"time": UNIX_S, **POSITIONS[case][0]})), "position: ", *words)
 
 

@@ -1,4 +1,4 @@
-"""Practice page: random sets, symptoms of each mistake, questions, answers and score."""
+"""Practice page: random sets, symptoms of each fault, questions, answers and score."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-# A set without a mistake, with one of the source, and with one of the frame
+# A set without a fault, with one of the source, and with one of the frame
 SEED, COUNT = 5, 3
 
 
@@ -41,7 +41,7 @@ SEED, COUNT = 5, 3
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3), st.integers(1, 20))
-def test_practice_flights_contain_each_mistake_equally_often(
+def test_practice_flights_contain_each_fault_equally_often(
     seed: int, level: int, count: int
 ) -> None:
     rounds = draw(seed, level, count)
@@ -58,7 +58,7 @@ def test_practice_flights_contain_each_mistake_equally_often(
             assert mistake.has_either_sign or not size.startswith("-")
 
 
-def test_practice_level_3_has_some_flights_with_two_mistakes() -> None:
+def test_practice_level_3_has_some_flights_with_two_faults() -> None:
     rounds = [one for seed in range(5) for one in draw(seed, 3, 12)]
     two = sum(len(one.mistakes) == 2 for one in rounds)
     assert 0.15 * len(rounds) < two < 0.5 * len(rounds)
@@ -68,7 +68,7 @@ def test_practice_level_3_has_some_flights_with_two_mistakes() -> None:
 
 
 def flown(mistake: HiddenMistake | None, level: int, seed: int) -> Flight:
-    """Simulate a practice flight with one mistake of a level, or without a mistake."""
+    """Simulate a practice flight with one fault of a level, or without a fault."""
     size = "" if mistake is None else mistake.sizes[level - 1]
     noisy = mistake is not None and mistake.mistake == NOISY_UWB
     scenario = Scenario(
@@ -96,12 +96,12 @@ LEVELS_AND_SEEDS = [(1, 1), (3, 3)]
 
 
 def hidden(name: str) -> HiddenMistake:
-    """Return the mistake with this name in px4fuse simulate."""
+    """Return the fault with this name in px4fuse simulate."""
     return next(one for one in practice.HIDDEN_MISTAKES if one.mistake == name)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_practice_flight_without_mistake_is_consistent(seed: int) -> None:
+def test_practice_flight_without_fault_is_consistent(seed: int) -> None:
     found = compared(flown(None, 1, seed))
     assert {one.verdict for one in found.main.filters.values()} == {"consistent"}
     assert 0.01 < np.mean(_sigmas(found.main) > 2.0) < 0.09
@@ -114,7 +114,7 @@ def _sigmas(result: AxisComparison) -> Any:
 
 
 @pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
-def test_practice_flight_shows_symptoms_of_its_source_mistake(level: int, seed: int) -> None:
+def test_practice_flight_shows_symptoms_of_its_source_fault(level: int, seed: int) -> None:
     found = compared(flown(hidden("nlos"), level, seed))
     far = [np.mean(_sigmas(found.axes[name]) > 4.0) for name in ("north", "east")]
     assert 0.01 < max(far) < 0.2
@@ -152,7 +152,7 @@ def test_clock_offset_setting_does_not_correct_misaligned_frame(level: int, seed
 
 
 @pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
-def test_practice_noise_mistake_is_corrected_by_its_setting(level: int, seed: int) -> None:
+def test_practice_noise_fault_is_corrected_by_its_setting(level: int, seed: int) -> None:
     noisy = flown(hidden(NOISY_UWB), level, seed)
     assert kf_statistics(noisy).nis_mean > 2.0
     size = float(hidden(NOISY_UWB).sizes[level - 1])
@@ -194,7 +194,7 @@ def keys(file: Path) -> list[dict[str, Any]]:
     return [json.loads(zlib.decompress(base64.b64decode(text))) for text in packed]
 
 
-def test_practice_page_source_does_not_reveal_answers(quiz: Path) -> None:
+def test_practice_page_html_source_does_not_show_solutions(quiz: Path) -> None:
     source = quiz.read_text(encoding="utf-8")
     answers = keys(quiz)
     assert [one["right"] for one in answers] == [
@@ -208,7 +208,7 @@ def test_practice_page_source_does_not_reveal_answers(quiz: Path) -> None:
     for one in answers:
         assert one["rerun"]
         assert "px4fuse-card" in one["card"]
-        # a flight with a mistake is never called consistent
+        # a flight with a fault is never called consistent
         assert ("No fault found" in one["card"]) == (one["right"] == ["nothing"])
         for mistake in one["mistakes"]:
             assert mistake["size"] not in source
@@ -322,7 +322,7 @@ def test_practice_page_gives_half_a_point_for_half_an_answer(browser: Browser, q
     assert points == [0.5, 1, 0, 0.5]
 
 
-def test_practice_page_summary_names_undetected_mistake() -> None:
+def test_practice_page_summary_names_undetected_fault() -> None:
     clean = structs.replace(SMALL_SIGMA_A, severity="clean", causes=(), headline="No fault found")
     described = [{"fault": "gate of EKF2 too small", "size": "EKF2_EVP_GATE 1.4"}]
     named = practice._name_mistakes(clean, described)

@@ -383,7 +383,7 @@ def test_ekf2_is_unavailable_if_other_estimator_was_active(read, parameters, rea
     assert flight.positions[0].name == "vehicle_visual_odometry"
 
 
-def test_ekf2_gate_is_read_if_estimator_group_selects_ekf2(read):
+def test_ekf2_gate_of_px4_v1_11_log_is_read_from_parameter(read):
     log = make_log("v1.11")
     log.parameters |= {"SYS_MC_EST_GROUP": 2, "EKF2_EVP_GATE": 3.0}
     ekf2 = read(log).ekf2
@@ -430,7 +430,7 @@ def test_position_sources_are_listed_in_order_of_preference(read):
         assert "--position-source" in reason
 
 
-def test_choosing_missing_position_source_lists_available_ones(read):
+def test_choosing_missing_position_source_lists_other_sources(read):
     flight = read(make_log("v1.16"))
     with pytest.raises(MissingDataError, match="vehicle_mocap_odometry") as error:
         choose_source(flight, "vehicle_mocap_odometry")
@@ -451,7 +451,7 @@ def test_unfused_gnss_is_used_as_source_only_on_request(read):
 
 
 @pytest.mark.parametrize("delay_ms", [0.0, 175.0])
-def test_estimator_aid_src_ev_pos_times_exclude_ekf2_delay(read, delay_ms):
+def test_times_of_estimator_aid_src_ev_pos_exclude_ekf2_delay(read, delay_ms):
     """EKF2 subtracts EKF2_EV_DELAY and half its prediction interval from the timestamp."""
     log = make_log("v1.16").drop("vehicle_visual_odometry")
     log.parameters["EKF2_EV_DELAY"] = delay_ms
@@ -462,7 +462,7 @@ def test_estimator_aid_src_ev_pos_times_exclude_ekf2_delay(read, delay_ms):
     assert_equals_external_vision(track)
 
 
-def test_estimator_aid_src_height_logged_at_other_time_is_nan(read):
+def test_position_sample_without_logged_height_has_nan_height(read):
     """The logger decimates heights separately, so their times may differ from the positions."""
     log = make_log("v1.16").drop("vehicle_visual_odometry")
     stamped = log["estimator_aid_src_ev_hgt"]["timestamp_sample"]
@@ -508,7 +508,7 @@ def test_read_ulog_reads_ground_truth_of_simulation(read):
     assert (flight.truth.samples[Columns.VELOCITY] == 0.25).all(axis=None)
 
 
-def test_motion_capture_is_ground_truth_only_beside_other_source(read):
+def test_motion_capture_is_ground_truth_if_other_source_exists(read):
     log = make_log("v1.16").add(odometry("vehicle_mocap_odometry", 10.0, 16))
     assert read(log).truth.name == "vehicle_mocap_odometry"
     log.drop(*(n for n in log.names() if "_ev_" in n or n == "vehicle_visual_odometry"))
@@ -527,7 +527,7 @@ STREAMS = {
 
 
 @pytest.mark.parametrize("generation", STREAMS)
-def test_data_streams_name_their_topics_clock_and_file(read, generation):
+def test_data_streams_state_their_topics_clock_and_file(read, generation):
     streams = read(make_log(generation)).streams
     of_ekf2 = ("ekf2_innovations", "ekf2_fusing", "ekf2_variance")
     assert [streams[part].topics[0] for part in of_ekf2] == STREAMS[generation]
@@ -645,7 +645,7 @@ REAL = {
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", REAL)
-def test_read_log_of_real_logs_gives_known_duration_and_source(shared_logs, name):
+def test_read_log_of_real_logs_gives_their_duration_and_source(shared_logs, name):
     duration_s, source = REAL[name]
     flight = read_log(shared_logs / "real" / f"{name}.ulg")
     assert flight.log.duration_s == pytest.approx(duration_s, abs=0.06)

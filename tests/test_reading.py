@@ -109,7 +109,7 @@ def test_file_search_by_sha256_ignores_special_and_huge_files(desk, monkeypatch,
 # --- the limit, and its option ---
 
 
-def test_max_size_option_applies_to_only_one_command(desk, monkeypatch, capsys) -> None:
+def test_max_size_option_does_not_change_later_commands(desk, monkeypatch, capsys) -> None:
     monkeypatch.chdir(desk)
     assert 1_000_000 < (desk / "l.ulg").stat().st_size < 10_000_000
     before = max_log_bytes.get()

@@ -81,7 +81,7 @@ def test_recommended_actions_do_not_increase_rmse_when_applied(settings, mistake
 
 
 @pytest.mark.parametrize(("seed", "mistakes"), [(1, ()), (2, ("ekf2-noise=50cm",))])
-def test_drifting_vio_is_the_first_finding(seed, mistakes) -> None:
+def test_drift_of_vio_is_the_first_finding(seed, mistakes) -> None:
     """With PX4's default noise, and with an EKF2 noise of 50 times the short-term noise."""
     analysis = flown(replace(LOOP, seed=seed), Settings(), *mistakes)
     findings = find(analysis)
@@ -114,13 +114,15 @@ def trial(after: RunStatistics, change: str = "sigma_z_m", kind: str = "noises")
         (13.3, 9.0, 0.5, "nothing", False),
     ],
 )
-def test_filter_rerun_improvement_names_improved_quantity(nis, nees, rmse_m, expected, has) -> None:
+def test_filter_rerun_improvement_states_improved_quantity(
+    nis, nees, rmse_m, expected, has
+) -> None:
     one = trial(RunStatistics(nis_mean=nis, nees_mean=nees, position_rmse_m=rmse_m))
     assert improvement(one) == expected
     assert has_effect(one) is has
 
 
-def test_recommended_rerun_is_smallest_sufficient_change() -> None:
+def test_recommended_rerun_has_the_fewest_sufficient_changes() -> None:
     right, near = (
         RunStatistics(nis_mean=1.0, nees_mean=1.0),
         RunStatistics(nis_mean=1.2, nees_mean=1.2),
@@ -149,7 +151,7 @@ def offset(analysis: Analysis, offset_s: float) -> Analysis:
     return replace(changed, causes=causes, trials=trials)
 
 
-def test_estimated_ekf2_parameters_follow_noise_and_time_offset(sample: Analysis) -> None:
+def test_recommended_ekf2_parameters_equal_noise_and_delay(sample: Analysis) -> None:
     model, comparison = sample.ekf2_model, sample
 
     def estimated(analysis: Analysis) -> dict[str, float]:

@@ -17,7 +17,7 @@ from px4fuse.trajectory.rotation import (
 )
 
 
-def test_tiny_quaternion_to_rotation_vector_keeps_angle() -> None:
+def test_rotation_vector_of_tiny_quaternion_has_its_angle() -> None:
     tiny = np.array([1.0, 2e-14, -4e-14, 6e-14])
     for sign in (1.0, -1.0):
         np.testing.assert_allclose(to_vector(sign * tiny), [4e-14, -8e-14, 12e-14])

@@ -69,7 +69,7 @@ def with_form(kinds, results=EXAMPLE, **values):
 # ------------------------------------------------------------------ checks
 
 
-def test_rubric_check_verified_without_log_gives_zero_points():
+def test_report_without_log_earns_no_points_for_verification():
     pdf = (ROOT / "reports" / "example" / "aisle_uwb.pdf").read_bytes()
     verdict = verify(read_report(pdf, "a.pdf"), pdf, {})
     assert check_points("verified", verdict=verdict)[0] == 0.0
@@ -156,11 +156,11 @@ def test_rubric_check_gives_points_and_comment(check, results, given, points, sa
     assert said in comment
 
 
-def test_rubric_check_clock_of_assigned_flight_gives_full_points():
+def test_unclear_time_offset_of_assigned_flight_earns_all_points():
     assert check_points("clock", UNCLEAR, key=key())[0] == 1.0
 
 
-# ------------------------------------------------------------------ mistakes
+# ------------------------------------------------------------------ faults
 
 
 TRUTH = FormTruth(
@@ -218,7 +218,7 @@ class TestForm:
         items = assess_results(mistyped, key=key(), submitter_id=submitter_id).items
         assert [item.points for item in items if "Mistakes" in item.title] == [points]
 
-    def test_student_notes_await_points_of_instructor(self):
+    def test_points_for_student_notes_are_pending_until_graded(self):
         for notes, awaits_points in (("", False), ("I saw a gap.", True)):
             made = assess_results(with_notes(notes, student__id="s01"), key=key())
             assert (made.awaits_points, made.counted_points is None, made.items[-1].points) == (
@@ -250,7 +250,7 @@ class TestScore:
         assert zero.instructor_action == ""
 
     @pytest.mark.parametrize("student_id", ["s02", "S02", "ѕ02", "s77", "", " "])
-    def test_report_on_log_of_other_student_follows_rubric_rule(self, student_id):
+    def test_report_on_log_of_other_student_is_graded_by_rubric_rule(self, student_id):
         given = changed_results(student__id=student_id)
         said = f"id in the report is {student_id}" if student_id.strip() else "report has no id"
         assert (
@@ -419,7 +419,7 @@ class TestClassFlags:
         assert "The id in this report is also in that of" in made["5.pdf"][0]
         assert "identical to that of" in made["8.pdf"][0]
 
-    def test_two_reports_of_one_student_are_flagged_only_for_the_id(self):
+    def test_two_reports_of_one_student_are_flagged_for_their_id(self):
         two = [
             report(1, log_sha256="x"),
             report(1, log_sha256="x", sha256="z", submission="b.pdf"),

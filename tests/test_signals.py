@@ -307,7 +307,7 @@ WHOLE = Segment(0.0, 19.9, "")
     ("at", "good"),
     [([2.0], 0), ([6.0], 0), ([17.0], 0), *(([5.0, 15.0], good) for good in range(3))],
 )
-def test_continuous_state_removes_reset_that_moves_frame(at, good):
+def test_ekf2_reset_that_moves_the_frame_is_removed(at, good):
     """The source is in the frame of the first, middle or last stretch between resets."""
     deltas = np.array([[1.0, 0.5, 0.0], [-3.0, 2.0, 0.0]])[: len(at)]
     later = STATE_TIME[:, None] >= np.array(at)
@@ -321,7 +321,7 @@ def test_continuous_state_removes_reset_that_moves_frame(at, good):
 
 
 @pytest.mark.parametrize("reset_s", [4.0, 10.0, 15.0])
-def test_continuous_state_keeps_reset_that_corrects_error(reset_s):
+def test_ekf2_reset_that_corrects_an_error_is_kept(reset_s):
     """EKF2 drifts by 2 m and a reset moves it back to the source."""
     drift = np.where(reset_s > STATE_TIME, 2.0 * STATE_TIME / reset_s, 0.0)
     resets = [Reset(reset_s, kind, (-2.0, 0.0, 0.0)) for kind in ("position", "velocity")]
@@ -333,7 +333,7 @@ def test_continuous_state_keeps_reset_that_corrects_error(reset_s):
     assert "undone" not in statement
 
 
-def test_continuous_state_treats_height_resets_separately():
+def test_ekf2_height_reset_is_kept_if_position_reset_is_removed():
     frame_change = np.where(STATE_TIME >= 8.0, 3.0, 0.0)
     drift = np.where(STATE_TIME < 12.0, 0.1 * STATE_TIME, 0.0)
     offset = np.stack([frame_change, 0.0 * drift, drift], axis=1)
@@ -346,7 +346,7 @@ def test_continuous_state_treats_height_resets_separately():
     assert "height" in statement.split("kept")[1]
 
 
-def test_continuous_state_keeps_reset_on_unmeasured_axis():
+def test_ekf2_reset_along_an_unmeasured_axis_is_kept():
     """A source without height contains no information on a change of the frame."""
     track = noisy_track()
     blind = replace(track, samples=track.samples.assign(down_m=np.nan))
@@ -361,7 +361,7 @@ def test_continuous_state_keeps_reset_on_unmeasured_axis():
 @pytest.mark.parametrize(("reset_s", "said"), [
     (0.5, ""), (1.0, ""), (1.1, "kept"), (17.9, "kept"), (18.0, "kept"), (18.5, ""),
 ])  # fmt: skip
-def test_ekf2_resets_outside_the_segment_change_no_state(reset_s, said):
+def test_ekf2_resets_outside_evaluated_segment_are_not_removed(reset_s, said):
     """A reset at the start defines the frame; one at the end affects the last sample only."""
     ekf2 = ekf2_of(np.zeros(3), [Reset(reset_s, "position", (5.0, 5.0, 0.0))])
     state, statement = continuous_state(ekf2, noisy_track(), Segment(1.0, 18.0, ""))
@@ -370,7 +370,7 @@ def test_ekf2_resets_outside_the_segment_change_no_state(reset_s, said):
     assert bool(said) == bool(statement)
 
 
-def test_axis_label_of_aisle_is_main_axis() -> None:
+def test_axis_aisle_of_wide_track_is_labelled_main_axis() -> None:
     flight = aisle_flight()
     labels = {axis.name: axis.label for axis in make_axes(flight, flight.positions[0], ALL)}
     assert (labels["north"], labels["aisle"]) == ("north", "the main axis")

@@ -1,4 +1,4 @@
-"""Simulated flights against ground truth: motion, sensors, mistakes, ULog and command."""
+"""Simulated flights against ground truth: motion, sensors, faults, ULog and command."""
 
 import json
 from dataclasses import fields
@@ -100,7 +100,7 @@ class TestMotion:
 
 
 @pytest.mark.parametrize(("left_out", "texts"), [(0.0, []), (2.5, ["open-end=2.5m"])])
-def test_simulated_open_end_equals_loop_closure_error(left_out, texts):
+def test_simulated_loop_with_open_end_has_given_closure_error(left_out, texts):
     scenario = replace(LOOP, passes=2)
     flown = simulate(scenario, parse(texts))
     first, last = flown.motion.at(np.array([0.0, flown.motion.duration_s])).position_m
@@ -111,7 +111,7 @@ def test_simulated_open_end_equals_loop_closure_error(left_out, texts):
 
 
 @pytest.mark.parametrize("yaw", ["fixed", "follow"])
-def test_simulated_aisle_path_has_given_length_and_yaw_mode(yaw):
+def test_simulated_aisle_flight_has_given_length_and_yaw_mode(yaw):
     motion = motion_of(replace(AISLE, wander_m=0.0, yaw=yaw))
     state = motion.at(np.linspace(0.0, motion.duration_s, 5001))
     assert (state.position_m @ direction(30.0)).max() == pytest.approx(12.0, abs=1e-9)
@@ -175,7 +175,7 @@ def test_simulated_vio_drift_has_given_rate():
     assert source.distance_m == pytest.approx(32.0, rel=0.1)
 
 
-# --- mistakes
+# --- faults
 
 
 class TestMistakes:
@@ -256,7 +256,7 @@ class TestMistakes:
         noisy = simulate(replace(AISLE, ekf2=False), parse(["smoothed=1s"])).positions.error_m
         assert np.std(noisy[:25]) < 0.07  # on the ground; 0.10 m without the filter
 
-    def test_no_vvo_mistake_removes_vehicle_visual_odometry(self):
+    def test_no_vvo_fault_removes_vehicle_visual_odometry(self):
         remaining = to_flight(simulate(AISLE, parse(["no-vvo"]))).positions
         assert [round(track.rate_hz) for track in remaining] == [2, 2]
         flight = to_flight(simulate(replace(AISLE, ekf2=False), parse(["no-vvo"])))
@@ -317,7 +317,7 @@ def test_simulation_scenario_with_invalid_value_raises_error(changes):
     (Scenario(passes=100, length_m=100.0), [], "limited to 3600 s"),
     (AISLE, ["dropout=600s,0s"], "vehicle_visual_odometry contains no data"),
 ])  # fmt: skip
-def test_simulate_with_unsuitable_mistake_raises_error(scenario, texts, expected):
+def test_simulate_with_unsuitable_fault_raises_error(scenario, texts, expected):
     with pytest.raises(SettingsError, match=expected):
         simulate(scenario, parse(texts))
 
@@ -325,7 +325,7 @@ def test_simulate_with_unsuitable_mistake_raises_error(scenario, texts, expected
 # --- ULog and memory
 
 
-def test_simulated_ulog_contains_no_names_of_mistakes():
+def test_simulated_ulog_contains_no_names_of_faults():
     texts = [name for name, one in MISTAKES.items() if "aisle" in one.kinds and name != "no-vvo"]
     content = to_ulog(simulate(AISLE, parse(texts)))
     for name in (*MISTAKES, *(field for mistake in MISTAKES.values() for field in mistake.fields)):
@@ -365,7 +365,7 @@ def test_kf_with_true_noises_is_consistent(errors, off, share):
 
 @pytest.mark.parametrize("scenario", [Scenario(seed=7, passes=4), LOOP], ids=["aisle", "loop"])
 def test_simulated_clean_flight_has_only_notes_as_findings(scenario):
-    """The VIO of a loop drifts, which is not a mistake; its effect on the filters is reported."""
+    """The VIO of a loop drifts, which is not a fault; its effect on the filters is reported."""
     settings = Settings(sigma_a_m_s2=0.2, sigma_z_m=scenario.source_sigma_m)
     compared = compare(simulate_flight(scenario), settings)
     findings = find(unexplained(compared))

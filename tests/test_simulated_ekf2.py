@@ -79,7 +79,7 @@ def test_simulated_ekf2_of_clean_flight_agrees_with_replay(clean):
     (("ekf2-delay=175ms",), AISLE),
     ((), Scenario(kind="loop", passes=1, seed=5)),
 ], ids=["outliers", "delay", "loop"])  # fmt: skip
-def test_simulated_ekf2_with_mistakes_agrees_with_replay(texts, scenario):
+def test_simulated_ekf2_with_faults_agrees_with_replay(texts, scenario):
     found = agreement(flown(*texts, scenario=scenario))
     assert found.good
     assert found.decisions_same > 0.99
@@ -108,7 +108,7 @@ def test_simulated_ekf2_of_clean_flights_is_consistent():
     assert np.median(stated) == pytest.approx(0.06, abs=0.01)
 
 
-def test_simulated_ekf2_delayed_state_is_consistent(clean):
+def test_simulated_ekf2_is_consistent_at_its_fusion_horizon(clean):
     """Position and velocity at the fusion horizon, their variances, and the estimated biases."""
     record, truth = clean.ekf2.record, clean.truth.samples
     later = record.delayed[record.delayed.index > 15.0]
@@ -121,7 +121,7 @@ def test_simulated_ekf2_delayed_state_is_consistent(clean):
     assert last["accelerometer_bias_down_m_s2"] == pytest.approx(bias[2], abs=0.05)
 
 
-def test_simulated_ekf2_start_at_rest_levels_attitude():
+def test_simulated_ekf2_at_rest_estimates_level_attitude():
     tilt = Rotation.from_euler("x", 0.1).as_matrix()
     gravity = np.array([0.0, 0.0, 9.80665])
     bias, rate = np.array([0.03, -0.02, 0.05]), np.array([0.002, -0.001, 0.003])
@@ -173,7 +173,7 @@ def test_imu_samples_per_ekf2_step_are_rounded_to_nearest():
     assert samples_per_step(0.01, 0.004 + 1e-12) == samples_per_step(0.01, 0.004 - 1e-12) == 3
 
 
-def test_imu_samples_per_ekf2_step_at_half_follow_the_log():
+def test_imu_samples_per_ekf2_step_near_2_5_follow_the_log():
     """EKF2 rounds a measured mean: 2.5 samples become two or three."""
     by_two, by_three = 2 * np.arange(0, 60, 7), 3 * np.arange(0, 60, 7)
     ends = by_two, by_three, [5], [0, 25, 50]
@@ -196,7 +196,7 @@ def test_simulated_ekf2_ignores_samples_with_older_timestamps():
     assert np.all(np.diff(rows.stamp_s) > 0)
 
 
-# --- mistakes in EKF2 parameters
+# --- faults in EKF2 parameters
 
 
 def test_simulated_ekf2_holds_position_if_fusion_is_disabled(clean):
@@ -218,7 +218,7 @@ def test_simulated_ekf2_holds_position_if_fusion_is_disabled(clean):
 # --- the log
 
 
-def test_simulated_log_notes_that_ekf2_is_simulated(clean, tmp_path):
+def test_simulated_log_has_note_that_ekf2_is_simulated(clean, tmp_path):
     path = tmp_path / "flight.ulg"
     path.write_bytes(to_ulog(simulate(AISLE)))
     assert read_log(path).log.notes == clean.log.notes == (MODEL_NOTE,)

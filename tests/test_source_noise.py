@@ -147,7 +147,7 @@ def test_outliers_and_jumps_are_not_reported_as_correlated_noise() -> None:
     ("model", "sigma_z_m", "contradicts"),
     [(partial(errors.coloured, tau_s=20.0), 0.10, True), (errors.white, 0.14, False)],
 )
-def test_filter_rerun_with_smaller_noise_is_checked_with_truth(
+def test_smaller_noise_is_advised_only_if_ground_truth_agrees(
     model, sigma_z_m, contradicts
 ) -> None:
     """The estimate is 0.7 SIGMA_Z in both cases; the first one has time-correlated errors too."""
@@ -164,7 +164,7 @@ def test_filter_rerun_with_smaller_noise_is_checked_with_truth(
 
 
 @pytest.mark.parametrize(("tau_s", "seed"), [(5.0, 1), (20.0, 2)])
-def test_slow_position_errors_are_found_with_ground_truth(tau_s: float, seed: int) -> None:
+def test_slow_position_error_is_found_only_with_ground_truth(tau_s: float, seed: int) -> None:
     """Correlation times of IMU errors, so the innovations do not show them."""
     analysis = analysed(partial(errors.coloured, tau_s=tau_s), 5.0, seed, truth_for=0.10)
     found = root_findings(analysis)
@@ -250,7 +250,7 @@ def test_time_correlation_fit_without_imu_is_unavailable() -> None:
     assert fit_time_correlation(blind, (axis,), RIGHT, Noises(0.3, 0.1), **given) == blind.imu
 
 
-def test_time_correlation_fit_tries_zero_and_estimated_offset(
+def test_time_correlation_fit_tests_zero_and_estimated_offset(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     analysis, tried = analysed(MIXED), []

@@ -1,4 +1,4 @@
-"""Values and timestamps of a source that are no measurement: reading, findings, shared cases."""
+"""Invalid values and timestamps of a position source: reading, findings and logged flights."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ def track(count: int = 60) -> pd.DataFrame:
 
 
 def invalid(samples: pd.DataFrame) -> dict[str, list[int]]:
-    """Return the rows of each reason."""
+    """Return the row numbers of invalid positions by reason."""
     reason = find_invalid(samples, ["x", "y", "z"]).to_numpy()
     return {name: np.flatnonzero(reason == name).tolist() for name in sorted({*reason} - {""})}
 
 
-def test_find_invalid_rows_states_each_reason():
+def test_invalid_positions_are_found_with_their_reason():
     samples = track()
     samples.iloc[5:7] = np.nan
     samples.iloc[[10, 20]] = 0.0
@@ -67,26 +67,26 @@ def test_find_invalid_rows_states_each_reason():
     assert invalid(samples) == {"NaN": [5, 6], "held": [*range(30, 45)], "zero": [10, 20]}
 
 
-def test_find_invalid_keeps_zeros_at_the_origin():
+def test_zero_position_near_the_origin_is_valid():
     samples = track() - 8.0
     assert samples.iloc[30].abs().max() < 1e-9
     samples.iloc[30] = 0.0
     assert invalid(samples) == {}
 
 
-def test_find_invalid_keeps_positions_sent_twice():
+def test_positions_sent_twice_are_valid():
     samples = track()
     assert invalid(samples.set_axis(samples.index, axis=0).iloc[np.arange(60) // 2 * 2]) == {}
 
 
-def test_find_invalid_keeps_a_source_at_rest():
+def test_constant_positions_at_rest_are_valid():
     samples = track()
     samples.iloc[10:] = samples.iloc[10].to_numpy()
     assert invalid(samples) == {}
 
 
 @pytest.mark.parametrize(("origin", "step"), [(5_334_567.0, 0.5), (691_234.0, 0.0625)])
-def test_rounding_step_of_32_bit_floats_is_their_resolution(origin, step):
+def test_rounding_step_of_float32_positions_is_found(origin, step):
     values = origin + np.random.default_rng(1).normal(0.0, 5.0, 400)
     assert rounding_step(values.astype(np.float32).astype(float)) == step
     assert rounding_step(values) < 0.01
@@ -99,7 +99,7 @@ def test_rounding_step_of_32_bit_floats_is_their_resolution(origin, step):
     (lambda us: us + 1_795_251_250_000_000, "UNIX time in microseconds"),
     (lambda us: us + 3_600_000_000, "another clock"),
 ])  # fmt: skip
-def test_read_log_names_the_clock_of_timestamps(tmp_path, stamp, clock):
+def test_read_log_detects_unit_and_clock_of_timestamps(tmp_path, stamp, clock):
     log = make_log("v1.16", 40.0).drop("vehicle_visual_odometry")
     source = odometry("vehicle_visual_odometry", 40.0, 16)
     source.fields["timestamp_sample"] = stamp(source.fields["timestamp_sample"])
@@ -119,7 +119,7 @@ def test_read_log_reads_reset_counter_and_quality(tmp_path):
     assert set(status["quality"]) == {-1.0}
 
 
-def test_read_position_csv_keeps_the_times_without_position(tmp_path):
+def test_read_position_csv_lists_times_of_rows_without_position(tmp_path):
     rows = [f"{0.1 * at:.1f},{at + 5},{at},{at}" for at in range(40)]
     rows[10:12] = ["1.0,nan,nan,nan", "1.1,,,"]
     rows[20] = "2.0,0,0,0"
@@ -134,7 +134,7 @@ def with_track(flight: Flight, **changes: object) -> Flight:
     return replace(flight, positions=(replace(flight.positions[0], **changes),))
 
 
-def test_detect_invalid_rows_states_times_and_effect():
+def test_invalid_position_finding_states_times_and_effect():
     flight = aisle_flight(uwb=Uwb(gap_s=(40.0, 46.0)))
     at = pd.Index([*np.arange(40.2, 46.0, 0.2), 80.1, 80.2])
     reasons = pd.Series(["held"] * (len(at) - 2) + ["zero"] * 2, at)
@@ -148,14 +148,14 @@ def test_detect_invalid_rows_states_times_and_effect():
     assert [one.id for one in detected(flight)] == ["source_gap"]
 
 
-def test_detect_single_row_without_position_is_a_note():
+def test_single_sample_without_position_is_only_a_note():
     invalid_rows = pd.Series(["NaN"], pd.Index([60.05]))
     (one,) = detected(with_track(aisle_flight(), invalid=invalid_rows))
     assert (one.id, one.severity) == ("source_without_position", "note")
 
 
 @pytest.mark.parametrize(("step_m", "words"), [(0.5, "double precision"), (0.1, "more digits")])
-def test_detect_rounding_names_the_remedy(step_m, words):
+def test_rounded_positions_finding_recommends_more_digits(step_m, words):
     (one,) = detected(with_track(aisle_flight(), step_m=step_m))
     assert words in one.remedy
 
@@ -221,29 +221,29 @@ def examples() -> Iterator[Finding]:
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_detect_fault_is_the_only_finding(name):
+def test_each_position_value_fault_is_the_only_finding(name):
     assert [one.id for one in detected(FAULTS[name](aisle_flight()))] == [name]
 
 
 @pytest.mark.parametrize("lost", [0, 1])
-def test_detect_two_senders_states_the_distance(lost):
+def test_two_senders_finding_states_distance_of_positions(lost):
     (one,) = detected(alternating(aisle_flight(uwb=Uwb(rate_hz=10.0)), lost))
     assert one.evidence["distance_m"] == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize("is_fused", [0.0, 1.0])
-def test_detect_copied_estimate_states_the_delay(is_fused):
+def test_copied_ekf2_position_finding_states_the_delay(is_fused):
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, is_fused),)))
     first, *_ = detected(copied(flight))
     assert first.evidence["delay_s"] == pytest.approx(0.03, abs=0.01)
     assert "source_is_ekf2_estimate" not in {one.id for one in detected(copied(flight, 0.02))}
 
 
-def test_detect_clean_flight_has_no_finding():
+def test_valid_positions_of_clean_flight_have_no_finding():
     assert detected(aisle_flight()) == ()
 
 
-def test_detect_timestamp_unit_states_that_ekf2_never_fused():
+def test_timestamp_unit_finding_states_that_ekf2_never_fused():
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, 0.0),)))
     flight = replace(flight, log=replace(flight.log, parameters={"EKF2_EV_CTRL": 15}))
     first, second = detected(with_clock(flight, "milliseconds"))
@@ -252,14 +252,14 @@ def test_detect_timestamp_unit_states_that_ekf2_never_fused():
     assert "the timestamps are in milliseconds" in second.title
 
 
-def test_detect_shared_timestamps_states_the_resolution():
+def test_equal_timestamps_finding_states_clock_resolution():
     (one,) = detected(with_clock(aisle_flight(uwb=Uwb(rate_hz=1.0)), "local", SHARED_STAMPS, 120))
     assert one.evidence["resolution_s"] == pytest.approx(1.0)
     assert "(5 Hz)" in one.message
 
 
 @pytest.mark.parametrize(("quality", "words"), [(20.0, "light"), (0.0, "ODOMETRY")])
-def test_detect_low_quality_is_the_reason(quality, words):
+def test_not_fusing_finding_states_quality_below_ekf2_ev_qmin(quality, words):
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, 0.0),)))
     parameters = {"EKF2_EV_CTRL": 15, "EKF2_EV_QMIN": 50}
     flight = replace(flight, log=replace(flight.log, parameters=parameters))
@@ -269,7 +269,7 @@ def test_detect_low_quality_is_the_reason(quality, words):
     assert words in one.remedy
 
 
-def test_find_unusable_source_leaves_no_other_estimate():
+def test_two_senders_finding_removes_findings_that_depend_on_it():
     analysis = unexplained(compare(aisle_flight()))
     findings = [
         finding("error", name, "m.", "r.")
@@ -292,20 +292,20 @@ def mounted(arm_m: tuple[float, float]) -> Analysis:
     return replace(analysis, convention=Convention(verdict="determined"))
 
 
-def test_detect_lever_arm_equals_truth():
+def test_estimated_lever_arm_equals_simulated_one():
     (one,) = source_values.detect_lever_arm(mounted((0.4, -0.3)))
     found_m = one.evidence["forward_m"], one.evidence["right_m"]
     assert found_m == pytest.approx((0.4, -0.3), abs=0.1)
     assert "Set EKF2_EV_POS_X to 0." in one.remedy
 
 
-def test_detect_no_lever_arm_has_no_finding():
+def test_source_without_lever_arm_has_no_lever_arm_finding():
     assert not [*source_values.detect_lever_arm(mounted((0.0, 0.0)))]
 
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", CASES)
-def test_findings_of_shared_case_are_as_expected(name):
+def test_findings_of_logged_test_case_equal_expected_findings(name):
     folder = shared("cases")
     case = json.loads((folder / "EXPECTED.json").read_text())["cases"][name]
     result, first, harmful = judge(case, run(case["command"], folder))

@@ -157,7 +157,7 @@ def test_find_submissions_reads_gradescope_metadata(tmp_path):
         assert found.origin.time.isoformat() == "2026-11-20T22:59:01.123456+00:00"
 
 
-def test_find_submissions_notes_unreadable_gradescope_metadata(tmp_path):
+def test_unreadable_gradescope_metadata_give_a_note(tmp_path):
     bomb = zipped({"submission_metadata.yml": b" " * 5_000_000, "submission_3.pdf": PDF})
     (found,), (note,) = find_submissions([write(tmp_path / "export.zip", bomb)])
     assert found.origin.person == Person("", numbers={"gradescope": "3"})
@@ -166,7 +166,7 @@ def test_find_submissions_notes_unreadable_gradescope_metadata(tmp_path):
     )
 
 
-def test_find_submissions_keeps_times_of_zip_entries(tmp_path):
+def test_find_submissions_reads_times_of_zip_entries(tmp_path):
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         archive.writestr(zipfile.ZipInfo("a.pdf", (2026, 11, 20, 12, 34, 56)), PDF)
@@ -261,7 +261,7 @@ def test_find_submissions_searches_1500_nested_folders(tmp_path):
 # ------------------------------------------------------------------ names
 
 
-def test_find_submissions_cleans_file_names(tmp_path):
+def test_find_submissions_removes_control_characters_from_names(tmp_path):
     shown_as = {
         "../../../etc/x.pdf": "etc/x.pdf",
         "C:\\Windows\\system32\\y.pdf": "Windows/system32/y.pdf",

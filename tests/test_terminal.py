@@ -248,7 +248,7 @@ def test_default_report_does_not_replace_another_file(made, name) -> None:
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_report_of_log_with_same_name_keeps_the_first_report(desk, sample_log) -> None:
+def test_report_is_not_replaced_by_report_on_log_of_same_name(desk, sample_log) -> None:
     (desk / "b").mkdir()
     shutil.copy(sample_log, desk / "b" / "l.ulg")
     run_checked("compare", "l.ulg")

@@ -44,7 +44,7 @@ def many() -> tuple[AxisTuning, ...]:
 
 
 @pytest.mark.parametrize(("name", "true"), [("sigma_z", SIGMA_Z), ("sigma_a", SIGMA_A)])
-def test_tuned_noise_95_percent_interval_covers_true_value(name: str, true: float) -> None:
+def test_tuned_noise_95_percent_interval_contains_true_value(name: str, true: float) -> None:
     """With 1000 seeds of 400 measurements the coverage was 95.2 % (SIGMA_Z), 95.5 % (SIGMA_A)."""
     noises = [getattr(found, name) for found in many()]
     inside = sum(noise.low <= true <= noise.high for noise in noises)
@@ -62,7 +62,7 @@ def test_tune_finds_no_outliers_in_clean_data() -> None:
     assert sum(len(found.outlier_time_s) for found in many()) <= 0.001 * SEEDS * COUNT
 
 
-def test_held_out_data_with_true_noises_show_no_likelihood_gain() -> None:
+def test_true_noises_have_no_likelihood_gain_on_held_out_data() -> None:
     gains = np.array([found.held_out.log_likelihood_gain_per_measurement for found in many()])
     assert np.mean(gains) < 0.0
     assert np.median(gains) <= 0.0
@@ -73,7 +73,7 @@ def test_held_out_data_with_true_noises_show_no_likelihood_gain() -> None:
     assert np.mean(seen) == pytest.approx(1.0, abs=2.6 / np.sqrt(SEEDS))
 
 
-def test_held_out_data_with_wrong_noises_show_likelihood_gain() -> None:
+def test_wrong_noises_show_likelihood_gain_on_held_out_data() -> None:
     bad = Settings(sigma_a_m_s2=5.0, sigma_z_m=0.02, input="zero")
     found = tuned(modelled(1), chosen=bad)
     assert found.held_out.log_likelihood_gain_per_measurement > 0.1
@@ -106,7 +106,7 @@ def test_tune_with_two_axes_narrows_the_noise_interval() -> None:
 # --- the map ---
 
 
-def test_tuned_noise_intervals_equal_likelihood_profile() -> None:
+def test_tuned_noise_intervals_equal_profile_likelihood() -> None:
     axis = modelled(5)
     found = tuned(axis)
     assert len(found.outlier_time_s) == 0

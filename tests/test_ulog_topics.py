@@ -40,7 +40,7 @@ def test_kept_ulog_timestamps_are_positive_and_increasing(stamps):
 
 
 @given(few_timestamps)
-def test_kept_ulog_timestamps_are_the_longest_increasing_run(stamps):
+def test_kept_ulog_timestamps_are_longest_increasing_sequence(stamps):
     assert len(kept_indices(stamps)) == longest_run_length(stamps)
 
 
@@ -136,7 +136,7 @@ def test_read_ulog_joins_two_subscriptions_of_one_topic(order):
     np.testing.assert_allclose(read["x"], expected, rtol=1e-6)
 
 
-def test_logged_default_of_firmware_precedes_the_table() -> None:
+def test_logged_parameter_default_replaces_default_of_px4_table() -> None:
     key = b"float EKF2_EV_DELAY"
     body = struct.pack("<BB", 1, len(key)) + key + struct.pack("<f", 175.0)
     message = struct.pack("<HB", len(body), ord("Q")) + body

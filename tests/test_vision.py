@@ -1,4 +1,4 @@
-"""External vision besides GNSS in the EKF2 model.
+"""External vision in addition to GNSS in the EKF2 model.
 
 References are a plain EKF that fuses both one after the other at their own steps, and the scalar
 equations of PX4's bias estimator.
@@ -209,7 +209,7 @@ def update_log(done: SegmentRun, at: int = 0) -> pd.DataFrame:
 @pytest.mark.parametrize(("rate_hz", "late_s", "settings"), [
     (30.0, 0.0, {}), (12.0, 0.1, {"EKF2_EV_DELAY": 100.0}), (30.0, 0.0, {"EKF2_EVP_NOISE": 0.8}),
 ])  # fmt: skip
-def test_ekf2_replay_of_vision_and_gnss_matches_plain_filter(
+def test_ekf2_replay_of_vision_and_gnss_equals_simple_filter(
     rate_hz: float, late_s: float, settings: dict[str, float]
 ) -> None:
     inputs = flying(sent(rate_hz, late_s=late_s), **settings)
@@ -235,7 +235,7 @@ def test_ekf2_replay_of_vision_and_gnss_matches_plain_filter(
     assert found["fused"].all()
 
 
-def test_vision_noise_besides_gnss_is_at_least_gnss_noise() -> None:
+def test_vision_noise_during_gnss_fusion_is_at_least_gnss_noise() -> None:
     """R is the largest of EKF2_EVP_NOISE, EKF2_GPS_P_NOISE and the reported variance."""
     inputs = flying(sent(), EKF2_GPS_P_NOISE=0.5)
     noises = ({**inputs.settings, "EKF2_EVP_NOISE": noise_m} for noise_m in (0.01, 0.5, 0.7))
@@ -276,7 +276,6 @@ def test_vision_position_bias_estimates_frame_offset() -> None:
 
 
 def test_vision_jump_is_rejected_until_its_bias_is_reset() -> None:
-    """A jump of vision by 20 m does not move EKF2."""
     vision = sent(sigma_m=0.05)
     at_s = float(on_gnss().inputs.segments[0].time_s[0]) + 20.0
     jumped = replace(vision, position_m=vision.position_m + 20.0 * (vision.stamp_s > at_s)[:, None])
@@ -333,7 +332,7 @@ def test_loss_of_gnss_resets_position_to_vision() -> None:
     assert after["fused"].all()
 
 
-def test_vision_position_bias_follows_gnss_reset() -> None:
+def test_vision_position_bias_changes_with_gnss_position_reset() -> None:
     """Position and bias move together (resetHorizontalPositionTo): vision is fused as before."""
     inputs = flying(sent(sigma_m=0.05))
     for resets_velocity in (False, True):
@@ -465,7 +464,7 @@ def test_ekf2_model_of_gnss_and_vision_agrees_with_log() -> None:
     assert model().inputs.settings["EKF2_EVP_NOISE"] == pytest.approx(0.1)
 
 
-def test_what_if_vision_noise_equals_flight_with_that_noise() -> None:
+def test_what_if_vision_noise_equals_flight_with_this_noise() -> None:
     other = opened(flown(EKF2_EVP_NOISE=1.0))
     for one, value, then in ((model(), 1.0, other), (other, 0.1, model())):
         found, true = what_if(one, [{"EKF2_EVP_NOISE": value}]), what_if(then, [])
@@ -548,7 +547,7 @@ def test_ekf2_model_with_incomplete_vision_is_unavailable() -> None:
     assert "changes of the vision position" in refused.reason
 
 
-def test_kf_ekf2_difference_steps_include_vision_besides_gnss() -> None:
+def test_kf_ekf2_explanation_on_gnss_flight_includes_vision() -> None:
     found = steps.explain_by_steps(model())
     for why in found.values():
         names = [step.name for step in why.steps]

@@ -39,7 +39,7 @@ def swept(sample_log: Path) -> WhatIfAnalysis:
     return run_what_if(request)
 
 
-def test_whatif_command_writes_logged_replayed_and_changed(sample_log: Path) -> None:
+def test_whatif_command_writes_logged_and_replayed_ekf2_results(sample_log: Path) -> None:
     options = "--set", "EKF2_EVP_NOISE=0.3", "--json", "-"
     text = run_checked("whatif", sample_log, *options).stdout
     said = json.loads(text)
@@ -51,7 +51,7 @@ def test_whatif_command_writes_logged_replayed_and_changed(sample_log: Path) -> 
     assert said["whatif"]["north"]["nis_mean"] < 0.3 * said["replayed"]["north"]["nis_mean"]
 
 
-def test_whatif_command_without_vision_drifts_afterwards(sample_log: Path) -> None:
+def test_whatif_command_without_vision_predicts_position_drift(sample_log: Path) -> None:
     options = "--without", "ev_pos", "--from", "100", "--json", "-"
     said = json.loads(run_checked("whatif", sample_log, *options).stdout)
     jsonschema.validate(said, schema())
@@ -92,7 +92,7 @@ def test_whatif_command_without_set_uses_estimated_parameters(estimated: WhatIfA
     assert all(len(cells) == len(column_heads(estimated)) == 3 for cells in table.values())
 
 
-def test_whatif_sweep_keeps_parameters_given_with_set(swept: WhatIfAnalysis) -> None:
+def test_whatif_sweep_also_applies_parameters_of_set_option(swept: WhatIfAnalysis) -> None:
     first, *values = swept.whatif.whatif
     assert dict(first.changed) == {"EKF2_EVP_GATE": 3.0}
     assert [v.changed["EKF2_EVP_NOISE"] for v in values] == pytest.approx([0.05, 0.1, 0.2])

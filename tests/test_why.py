@@ -1,4 +1,4 @@
-"""Difference KF - EKF2: steps, sentences, and cases without a page."""
+"""Explanation of the difference KF - EKF2: contributions, texts, and cases without a page."""
 
 from typing import Any
 
@@ -32,7 +32,7 @@ def explain_again(analysis: Analysis, settings: Settings, **choices: Any) -> Dif
     return explain_ekf2_difference(comparison, analysis.ekf2_model, analysis.clock, {})["aisle"]
 
 
-def test_explained_kf_ekf2_difference_equals_kf_minus_ekf2(sample: Analysis) -> None:
+def test_position_difference_on_report_page_is_kf_minus_ekf2(sample: Analysis) -> None:
     explanation = of(sample)
     result = next(r for r in sample.axes.values() if r.axis.name == "aisle")
     position, speed = state_at(result.replay, explanation.times_s)
@@ -47,7 +47,7 @@ def test_explained_kf_ekf2_difference_equals_kf_minus_ekf2(sample: Analysis) -> 
     )
 
 
-def test_kf_setting_changes_only_its_step_of_kf_ekf2_difference(sample: Analysis) -> None:
+def test_kf_setting_changes_only_its_part_of_kf_ekf2_difference(sample: Analysis) -> None:
     plain = of(sample)
     zero = explain_again(sample, Settings(input="zero"))
     assert zero.steps[0].name == SAMPLES
@@ -63,7 +63,7 @@ def test_kf_setting_changes_only_its_step_of_kf_ekf2_difference(sample: Analysis
     assert [o.unexplained_mean_square_m2 for o in (zero, small, late)] == [left] * 3
 
 
-def test_explained_kf_ekf2_difference_covers_only_the_segment(sample: Analysis) -> None:
+def test_kf_ekf2_explanation_covers_only_evaluated_segment(sample: Analysis) -> None:
     explanation = explain_again(sample, Settings(), start_s=30.0, end_s=60.0)
     assert explanation.spans_s[0][0] == pytest.approx(30.0, abs=0.2)
     assert explanation.spans_s[0][1] == pytest.approx(60.0, abs=0.3)

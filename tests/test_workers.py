@@ -77,7 +77,7 @@ def test_worker_job_above_memory_limit_is_ended():
     assert before != after
 
 
-def test_worker_process_is_replaced_after_given_number_of_jobs(monkeypatch):
+def test_worker_process_is_replaced_after_maximum_job_count(monkeypatch):
     monkeypatch.setattr(workers, "JOBS_PER_WORKER", 2)
     results, _ = run([("process", 0)] * 5, processes=1)
     assert len(set(results)) == 3

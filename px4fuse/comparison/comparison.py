@@ -58,7 +58,7 @@ def compare(prepared: Comparison, progress: Callable[[str], None] = lambda _: No
 def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay) -> AxisComparison:
     """Compare KF and EKF2 along one axis; ``ekf2`` is without the removed resets."""
     axis, segment, flight = kf_run.axis, prepared.segment, prepared.flight
-    tracks = _project_tracks(ekf2, flight.truth, axis, segment)
+    tracks = project_tracks(ekf2, flight.truth, axis, segment)
     state, variance, truth = tracks.values()
     innovations: Frame
     if isinstance(ekf2, Unavailable):
@@ -98,11 +98,11 @@ def _compare_axis(prepared: Comparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
         replay=kf_run,
         ekf2_innovations=innovations,
         **tracks,
-        flight_tracks=_project_tracks(ekf2, flight.truth, axis, segment.flight),
+        flight_tracks=project_tracks(ekf2, flight.truth, axis, segment.flight),
     )
 
 
-def _project_tracks(
+def project_tracks(
     ekf2: Ekf2 | Unavailable, truth: Truth | Unavailable, axis: Axis, segment: Segment
 ) -> dict[str, Frame]:
     """Project EKF2's state and variances and the ground truth onto an axis, in a segment."""

@@ -126,6 +126,23 @@ class Axis:
         return "the main axis" if self.name == AISLE else self.name
 
 
+def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unavailable:
+    """Return the IMU samples for which the attitude is known, and the attitude."""
+    imu, attitude = flight.imu, flight.attitude
+    if isinstance(imu, Unavailable):
+        return imu
+    if isinstance(attitude, Unavailable):
+        return attitude
+    imu = imu.loc[attitude.index[0] : attitude.index[-1]]
+    if len(imu) < 2:
+        return Unavailable(
+            "acceleration in NED",
+            "IMU and attitude data do not overlap in time",
+            "Log both from boot (SDLOG_MODE 1).",
+        )
+    return imu, attitude
+
+
 def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     """Return the acceleration in NED without gravity, at the IMU's timestamps.
 
@@ -136,21 +153,12 @@ def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     -------
     DataFrame, shape (n, 3), m/s², or Unavailable
     """
-    if isinstance(flight.imu, Unavailable):
-        return flight.imu
-    if isinstance(flight.attitude, Unavailable):
-        return flight.attitude
-    attitude_s = flight.attitude.index.to_numpy()
-    imu = flight.imu[(flight.imu.index >= attitude_s[0]) & (flight.imu.index <= attitude_s[-1])]
-    if len(imu) < 2:
-        return Unavailable(
-            "acceleration in NED",
-            "IMU and attitude data do not overlap in time",
-            "Log both from boot (SDLOG_MODE 1).",
-        )
-    quaternions = flight.attitude[Columns.QUATERNION].to_numpy(copy=True)
+    if isinstance(recorded := imu_and_attitude(flight), Unavailable):
+        return recorded
+    imu, attitude = recorded
+    quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     rotations = Rotation.from_quat(quaternions, scalar_first=True)
-    body_to_ned = Slerp(attitude_s, rotations)(imu.index.to_numpy())
+    body_to_ned = Slerp(attitude.index.to_numpy(), rotations)(imu.index.to_numpy())
     acceleration = body_to_ned.apply(imu[Columns.SPECIFIC_FORCE].to_numpy(copy=True))
     acceleration[:, 2] += constants.g
     return pd.DataFrame(acceleration, index=imu.index, columns=list(AXIS_NAMES))

@@ -78,6 +78,8 @@ def detect_source_not_logged(analysis: Comparison) -> Findings:
         action,
         {"rate_hz": rate_hz, "sdlog_profile": profile},
     )
+    if not analysis.axes:  # px4fuse info runs no filter
+        return
     for interval in LOGGER_INTERVALS_S.get(source.name, ()):
         is_limited = abs(1.0 / rate_hz / interval - 1.0) < LOGGER_TOLERANCE
         weak = next(

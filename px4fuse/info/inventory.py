@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from px4fuse.comparison.comparison import compare
+from px4fuse.comparison.comparison import project_tracks
 from px4fuse.comparison.flight_events import max_interval_s
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import prepare, select_innovations
+from px4fuse.comparison.projection import project_innovations
 from px4fuse.core.text import capitalise_first, to_json_types, utc_time
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.inputs import prepare_inputs
@@ -20,16 +21,14 @@ from px4fuse.filter.signals import (
     IMU_GAP_S,
     Segment,
     cut_to_segment,
-    ned_acceleration,
+    imu_and_attitude,
 )
 from px4fuse.findings import ekf2_not_fusing, finding_title, imu, missing, recording
 from px4fuse.flight.log import Stream
 from px4fuse.flight.model import (
-    Columns,
     Ekf2,
     Flight,
     PositionTrack,
-    Truth,
     Unavailable,
     sample_rate,
 )
@@ -52,12 +51,12 @@ PART_LABELS = {
     "truth": "ground truth",
     "airborne": "land detector",
 }
-# Analyses of px4fuse compare, with the data (EKF2 or ground truth) that each of them requires
-PARTS_OF_COMPARE = {
-    "EKF2 states": "ekf2_state",
-    "EKF2 variances": "ekf2_variance",
-    "EKF2 consistency": "ekf2_innovations",
-    "error": "truth",
+# Samples that each analysis of px4fuse compare needs, by the name of the analysis
+SAMPLES_BY_ANALYSIS = {
+    "EKF2 states": "samples of EKF2's position and velocity",
+    "EKF2 variances": "samples of EKF2's variances",
+    "EKF2 consistency": "EKF2 innovations",
+    "error": "samples of ground truth",
 }
 NO_COMPARISON = Unavailable("comparison", "the log contains no position to compare with", "")
 TimeSpans = tuple[tuple[float, float], ...]
@@ -180,7 +179,7 @@ def take_inventory(flight: Flight) -> Inventory:
     """List the contents of a flight, the possible analyses and the advice on logging."""
     comparison, reason, remedy = None, "", ""
     try:
-        comparison = compare(prepare(flight, ComparisonRequest(log=flight.log.name)))
+        comparison = prepare(flight, ComparisonRequest(log=flight.log.name), as_sent=True)
         reason = comparison.source_reason
     except Px4FuseError as error:
         reason = with_options(error.reason).removeprefix(f"{flight.log.name}: ")
@@ -308,8 +307,6 @@ def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
 def _analysis_options(
     flight: Flight, comparison: Comparison | None, reason: str
 ) -> Iterator[AnalysisOption]:
-    acceleration: object = ned_acceleration(flight)
-    rows_by_name: dict[str, tuple[object, str]] = {}
     if comparison is None:
         yield AnalysisOption("compare", False, reason)
     else:
@@ -317,26 +314,18 @@ def _analysis_options(
         count, span = len(cut_to_segment(source.samples, segment)), (segment.start_s, segment.end_s)
         description = "KF with position source {}, {} samples, {:.1f} s to {:.1f} s"
         yield AnalysisOption("compare", True, description.format(source.name, count, *span))
-        acceleration = comparison.lines[0].acceleration
-        rows_by_name = _ekf2_and_truth_rows(comparison)
     imu_reason = " ".join(finding.message for finding in imu.detect_low_rates(flight))
-    if isinstance(acceleration, Unavailable):
-        imu_reason = f"{acceleration.reason}; KF assumes constant velocity"
+    if isinstance(missing_data := imu_and_attitude(flight), Unavailable):
+        imu_reason = f"{missing_data.reason}; KF assumes constant velocity"
     acceleration_text = "IMU rotated into NED with the attitude, gravity removed"
     yield AnalysisOption("acceleration", not imu_reason, imu_reason or acceleration_text)
-    data_by_part = _data_by_part(flight)
-    for name, key in PARTS_OF_COMPARE.items():
-        result, description = rows_by_name.get(name, (NO_COMPARISON, ""))
-        logged_data = data_by_part.get(key, flight.ekf2)
-        if isinstance(logged_data, Unavailable):
-            result = logged_data
-        yield _analysis_option(name, result, description)
-    aids, ekf2 = evaluate_aids(flight), flight.ekf2
+    yield from _comparison_options(flight, comparison)
+    aids, ekf2, description = evaluate_aids(flight), flight.ekf2, ""
     if isinstance(aids, dict) and isinstance(ekf2, Ekf2):
         rates = (f"{aid.label} {_rate_text(ekf2.aids[name].samples)}" for name, aid in aids.items())
         description = ", ".join(rates)
     yield _analysis_option("aids", aids, description)
-    inputs = prepare_inputs(flight)
+    inputs, description = prepare_inputs(flight), ""
     if not isinstance(inputs, Unavailable):
         replayed_s = sum(float(np.ptp(segment.time_s)) for segment in inputs.segments)
         description = f"EKF2 replay with {inputs.aid.label}, {replayed_s:.0f} s"
@@ -353,40 +342,27 @@ def _analysis_option(name: str, part: object, description: str) -> AnalysisOptio
     return AnalysisOption(name, True, description)
 
 
-def _ekf2_and_truth_rows(comparison: Comparison) -> dict[str, tuple[object, str]]:
-    first_axis, truth = next(iter(comparison.axes.values())), comparison.flight.truth
-    innovations = {name: axis.ekf2_innovations for name, axis in comparison.axes.items()}
-    counts = [
-        f"{axis_name} {len(innovation_table)}"
-        for axis_name, innovation_table in innovations.items()
-        if isinstance(innovation_table, pd.DataFrame)
-    ]
-    summaries = [axis.filters["ekf2"] for axis in comparison.axes.values()]
-    quantities_text = "position only"
-    if isinstance(truth, Truth) and truth.samples[Columns.VELOCITY].notna().any(axis=None):
-        quantities_text = "position and velocity"
-    return {
-        "EKF2 states": (
-            first_axis.difference,
-            f"{_count_text(first_axis.ekf2_state)} of EKF2 position and velocity",
-        ),
-        "EKF2 variances": (first_axis.ekf2_variance, _count_text(first_axis.ekf2_variance)),
-        "EKF2 consistency": (
-            next(
-                (summary for summary in summaries if not isinstance(summary, Unavailable)),
-                summaries[0],
-            ),
-            f"number of EKF2 innovations: {', '.join(counts)}",
-        ),
-        "error": (
-            first_axis.truth,
-            f"RMSE and NEES of {quantities_text} against {getattr(truth, 'name', '')}",
-        ),
-    }
-
-
-def _count_text(part: pd.DataFrame | Unavailable) -> str:
-    return "" if isinstance(part, Unavailable) else f"{len(part)} samples"
+def _comparison_options(flight: Flight, comparison: Comparison | None) -> Iterator[AnalysisOption]:
+    """Yield the analyses that compare KF with EKF2 and with ground truth."""
+    parts: dict[str, object] = dict.fromkeys(SAMPLES_BY_ANALYSIS, flight.ekf2)
+    parts["error"] = flight.truth
+    if comparison is not None:
+        line, segment, ekf2 = comparison.lines[0], comparison.segment, flight.ekf2
+        state, variance, truth = project_tracks(
+            ekf2, comparison.flight.truth, line, segment
+        ).values()
+        innovations = (
+            ekf2
+            if isinstance(ekf2, Unavailable)
+            else project_innovations(flight, ekf2, comparison.source, line, segment)
+        )
+        parts = dict(zip(parts, (state, variance, innovations, truth), strict=True))
+    for name, part in parts.items():
+        has_data = not isinstance(part, Unavailable)
+        count = f"{len(part)} {SAMPLES_BY_ANALYSIS[name]}" if isinstance(part, pd.DataFrame) else ""
+        yield _analysis_option(
+            name, NO_COMPARISON if comparison is None and has_data else part, count
+        )
 
 
 def _logging_advice(
@@ -400,10 +376,7 @@ def _logging_advice(
             *missing.detect_source_not_logged(comparison),
             *ekf2_not_fusing.detect_missing_fusion(comparison),
         ]
-        findings += [
-            *missing.detect_missing_innovations(comparison),
-            *recording.detect_dropouts(comparison),
-        ]
+        findings += recording.detect_dropouts(comparison)
     findings += imu.detect_low_rates(flight)
     actions_and_purposes += [
         (finding.remedy, finding_title(finding.id)) for finding in findings if finding.remedy

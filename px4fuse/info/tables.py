@@ -15,7 +15,7 @@ from msgspec import structs
 from px4fuse.comparison.preparation import choose_source, select_innovations
 from px4fuse.core.text import to_json_types
 from px4fuse.errors import MissingDataError
-from px4fuse.filter.signals import ned_acceleration
+from px4fuse.filter.signals import imu_and_attitude, ned_acceleration
 from px4fuse.flight.model import Ekf2, Flight, PositionTrack, Truth, Unavailable
 
 SCHEMA_NAME = "px4fuse-flight"
@@ -87,9 +87,7 @@ def unavailable_parts(flight: Flight) -> tuple[Unavailable, ...]:
     sections: list[object] = [flight.imu, flight.attitude, ekf2]
     if isinstance(ekf2, Ekf2):
         sections += [*ekf2.innovations.values(), ekf2.variance, ekf2.fusing]
-    if not any(isinstance(section, Unavailable) for section in (flight.imu, flight.attitude)):
-        sections.append(ned_acceleration(flight))
-    sections += [flight.airborne, flight.truth]
+    sections += [imu_and_attitude(flight), flight.airborne, flight.truth]
     unavailable = [section for section in sections if isinstance(section, Unavailable)]
     if not flight.positions:
         unavailable.append(NO_POSITION)

@@ -111,9 +111,8 @@ def waterfalls(models: dict[str, Model]) -> dict[str, float]:
 def agreement_page(models: dict[str, Model], left: dict[str, float]) -> str:
     """Return the table of agreement for the documentation."""
     lines = [
-        "| flight | innovations | correlation (north / east) | S replayed / logged, 5 to 95 % | "
-        "rejected (replayed / logged) | published position, RMS difference (m, north / east) | "
-        "unexplained | height: correlation GNSS / barometer, RMS difference (m) |",
+        "| flight | innovations | correlation | S replayed / logged | rejected | "
+        "position difference (m) | unexplained | height |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for name, model in models.items():
@@ -133,7 +132,7 @@ def height_cell(agreement: Agreement) -> str:
     """Return the table cell of a flight with replayed heights."""
     heights = [*agreement.gnss_hgt.values(), *agreement.baro_hgt.values()]
     if not heights or agreement.doubtful:
-        return "from the log"
+        return "logged"
     both = " / ".join(f"{axis.innovation_correlation:.4f}" for axis in heights)
     return f"{both}, {heights[0].position_rms_difference_m:.3f}"
 

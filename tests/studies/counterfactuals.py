@@ -22,8 +22,8 @@ from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Kind, make_scenario
 
 NIS_WITHIN, REJECTED_WITHIN, ERROR_WITHIN = 0.10, 0.03, 0.10
-# By mistake of ``simulate``: PX4 parameter, correct value, sizes of the mistake, and the factor
-# from the unit of the mistake to that of the parameter
+# By fault of ``simulate``: PX4 parameter, correct value, sizes of the fault, and the factor
+# from the unit of the fault to that of the parameter
 KNOBS: dict[Kind, dict[str, tuple[str, float, tuple[float, ...], float]]] = {
     "aisle": {
         "ekf2-noise": ("EKF2_EVP_NOISE", 0.1, (0.02, 0.03, 0.05, 0.2, 0.5, 1.0), 1.0),
@@ -37,7 +37,7 @@ KNOBS: dict[Kind, dict[str, tuple[str, float, tuple[float, ...], float]]] = {
         "ekf2-gate": ("EKF2_GPS_P_GATE", 5.0, (1.0, 1.5, 2.0, 3.0, 10.0), 1.0),
     },
 }
-# Kind, seed, mistakes of the first and the second flight, predicted parameter and its value
+# Kind, seed, faults of the first and the second flight, predicted parameter and its value
 Pair = tuple[Kind, int, str, str, str, float]
 
 
@@ -52,19 +52,19 @@ def pairs(seeds: int, kind: Kind = "aisle") -> Iterator[Pair]:
 
 
 def opened(kind: Kind, seed: int, mistake: str) -> Model | Unavailable:
-    """Open the EKF2 model of a flight with a mistake."""
+    """Open the EKF2 model of a flight with a fault."""
     scenario = make_scenario(kind, seed=seed, passes=3)
     return open_model(simulate_flight(scenario, parse((mistake,) if mistake else ())))
 
 
 def flown(kind: Kind, seed: int, mistake: str) -> WhatIf | Unavailable:
-    """Replay EKF2 of a flight with a mistake."""
+    """Replay EKF2 of a flight with a fault."""
     model = opened(kind, seed, mistake)
     return model if isinstance(model, Unavailable) else what_if(model, [])
 
 
 def tried(pair: Pair) -> tuple[Pair, str, tuple[float, ...]]:
-    """Return the verdict on a pair, and predicted and flown NIS, rejected share and RMSE (m)."""
+    """Return verdict, mean NIS, rejected share and RMSE (m) of prediction and second flight."""
     kind, seed, first, then, name, value = pair
     model = opened(kind, seed, first)
     found = model if isinstance(model, Unavailable) else what_if(model, [{name: value}])

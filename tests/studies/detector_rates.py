@@ -167,7 +167,7 @@ class Job:
 
 
 def clean(scenario: str) -> Condition:
-    """Return the condition of flights without a mistake."""
+    """Return the condition of flights without a fault."""
     return Condition("", SCENARIOS[scenario].options)
 
 
@@ -235,7 +235,7 @@ def jobs(
     scenarios: Iterable[str] = tuple(SCENARIOS),
     conditions: Iterable[Condition] = CONDITIONS,
 ) -> list[Job]:
-    """Return all flights: those without mistakes by scenario, and those of each mistake.
+    """Return all flights: those without faults by scenario, and those of each fault.
 
     Conditions that differ in settings only share their flights.
     """
@@ -254,7 +254,7 @@ def measure(flown: list[Job]) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        ``finding``, ``scenario``, ``condition`` ("none" for flights without a mistake: the rate is
+        ``finding``, ``scenario``, ``condition`` ("none" for flights without a fault: the rate is
         that of false alarms), ``flights``, ``rate``, its 95 % interval ``low``, ``high`` (Clopper
         and Pearson 1934), and ``first``, the share of flights with that finding first.
     """

@@ -2,7 +2,7 @@
 
 ``python tests/studies/form_guesses.py`` draws assignments like ``simulate --assignment`` and prints
 the mean share of the points of random forms, of "none" everywhere, of the best constant form (the
-most frequent mistake with the most frequent answers), and of correct forms. ``--students`` sets the
+most frequent fault with the most frequent answers), and of correct forms. ``--students`` sets the
 number of flights.
 """
 
@@ -67,7 +67,7 @@ def at_random(rng: np.random.Generator) -> Answers:
 
 
 def constants(truths: Sequence[FormTruth], kind: str) -> Iterator[Answers]:
-    """Yield constant forms: one mistake of several sizes, and the most frequent other answers."""
+    """Yield constant forms: one fault of several sizes, and the most frequent other answers."""
 
     def common(values: list[str]) -> str:
         return Counter(values).most_common(1)[0][0]

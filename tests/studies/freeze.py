@@ -34,7 +34,7 @@ SHARED = ROOT.parent / "shared"
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-9, 1e-12
 TIMEOUT_S = 600.0
 SHOWN_DIFFERENCES = 12  # per case
-# 24 simulated flights: each mistake once, three clean flights, loops and outdoor flights
+# 24 simulated flights: each fault once, three clean flights, loops and outdoor flights
 SIMULATED = {
     "clean": "", "clean_60": "--heading 60 --passes 4", "clean_10hz": "--uwb-rate 10 --passes 4",
     "late": "--mistake clock-offset", "clock_drift": "--mistake clock-drift",

@@ -531,7 +531,6 @@ def _reject_constant(name: str) -> None:
 def run_command(
     command: tuple[str, ...], log: Path, out: Path, outcome: Outcome, label: str, *, draw: bool
 ) -> bool:
-    """Run one command on a log and count its outcome; return True if it had results."""
     words = [word.format(log=log, out=out) for word in command]
     where = f"{label}: {command[0]}"
     outcome.counts["commands"] += 1

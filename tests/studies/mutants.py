@@ -103,7 +103,7 @@ def mutants(path: Path) -> Iterator[Mutant]:
         return ast.get_source_segment(source, node) or ""
 
     tree = ast.parse(source)
-    # zip(..., strict=False) has an effect only after another mistake
+    # zip(..., strict=False) has an effect only after another fault
     keywords = (node for node in ast.walk(tree) if isinstance(node, ast.keyword))
     left_out = {id(keyword.value) for keyword in keywords if keyword.arg == "strict"}
     for node in ast.walk(tree):
