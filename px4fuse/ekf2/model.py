@@ -31,6 +31,7 @@ from px4fuse.ekf2.filter_recursion import (
     run_segment,
     with_correlation,
 )
+from px4fuse.ekf2.heights import MIN_GATE
 from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, prepare_inputs, same_sample
 from px4fuse.ekf2.intervals import Intervals, Timing, make_intervals
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
@@ -468,9 +469,13 @@ def _position_updates(run: SegmentRun, configuration_index: int) -> pd.DataFrame
     )
     variance_after = run.variance[rows + 1, configuration_index]
     fused_at_s = run.segment.time_s[events.end_step[rows], None]
+    settings = run.configurations[configuration_index].settings
+    # a clipped innovation is at the gate limit, apart from rounding, and was fused
+    limit = (1.0 + 1e-9) * max(settings.get(GNSS_VEL.gate, 1.0), MIN_GATE) ** 2
+    velocity_rejected = (nu[:, :3] ** 2 > limit * S[:, :3]).any(axis=1, keepdims=True)
     # position along north and east (m), then velocity along north, east and down (m/s)
     position = [nu[:, 3:5], S[:, 3:5], flags, variance_after[:, 6:8], variance_after[:, 3:5]]
-    values = np.hstack([*position, R[:, 3:5], fused_at_s, nu[:, :3], S[:, :3]])
+    values = np.hstack([*position, R[:, 3:5], fused_at_s, nu[:, :3], S[:, :3], velocity_rejected])
     index = pd.Index(events.time_s[rows], name="time_s")
     updates = pd.DataFrame(values, index, [*UPDATE_COLUMNS, *VELOCITY_UPDATE_COLUMNS])
     return updates if np.isfinite(nu[:, :3]).any() else updates[UPDATE_COLUMNS]

@@ -50,6 +50,7 @@ UPDATE_COLUMNS = [
 VELOCITY_UPDATE_COLUMNS = [
     *(f"innovation_{axis}_m_s" for axis in AXIS_NAMES),
     *(f"innovation_variance_{axis}_m2_s2" for axis in AXIS_NAMES),
+    "velocity_rejected",
 ]
 MIN_SAMPLES = 20  # minimum number of logged innovations for a comparison with the replay
 CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
@@ -210,7 +211,7 @@ class Ekf2Replay(Replayed, frozen=True, kw_only=True, eq=False):
     ----------
     changed : mapping
         Values of the parameters that differ from the log, by PX4 name.
-    updates : DataFrame, shape (m, 14), or (m, 20) with velocity
+    updates : DataFrame, shape (m, 14), or (m, 21) with velocity
         One row per position sample, at EKF2's measurement time (timestamp - delay - half a step).
         Columns: :data:`UPDATE_COLUMNS`, and with velocity :data:`VELOCITY_UPDATE_COLUMNS`.
         Variances of position and velocity are after the update. ``fused_at_s`` is the end of the

@@ -31,7 +31,7 @@ from px4fuse.ekf2.replay import (
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.frame_rotation import heading_rad
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, MAG, check_parameters
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, MAG, check_parameters
 from px4fuse.flight.model import AxisName, Columns, Ekf2, Flight, Unavailable
 
 ANALYSIS_NAME = "EKF2 what-if"
@@ -135,6 +135,8 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     north, east : AxisSummary
     samples : int
     rejected_fraction : float
+    velocity_rejected_fraction : float or None
+        Rejected fraction of the GNSS velocities; None if EKF2 fused no GNSS velocity.
     longest_without_fusion_s : float or Unavailable
     resets : int
         Number of resets of the horizontal position.
@@ -166,6 +168,7 @@ class Summary(Record, frozen=True, kw_only=True, omit_defaults=False):
     late: Count = 0
     lost: Count = 0
     is_predictable: bool = True
+    velocity_rejected_fraction: Share | None = None
     without: Mapping[str, float] = {}
 
     @property
@@ -415,6 +418,9 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
         resets=int(resets),
         late=replay.late,
         lost=replay.lost,
+        velocity_rejected_fraction=_mean_rejected(
+            evaluated_updates, "velocity_rejected", evaluated_s
+        ),
     )
 
 
@@ -452,7 +458,18 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
         changed={},
         longest_without_fusion_s=longest_gap_s,
         resets=len(resets),
+        velocity_rejected_fraction=(
+            _mean_rejected(ekf2.aids[GNSS_VEL.name].samples, "rejected", evaluated_s)
+            if "velocity_rejected" in replay.updates and GNSS_VEL.name in ekf2.aids
+            else None
+        ),
     )
+
+
+def _mean_rejected(samples: pd.DataFrame, column: str, evaluated_s: Spans) -> float | None:
+    """Return the mean of a column over the evaluated times; None without samples."""
+    is_rejected = samples.loc[inside_spans(samples.index, evaluated_s)].get(column)
+    return None if is_rejected is None or is_rejected.empty else float(is_rejected.mean())
 
 
 def _make_summary(

@@ -35,6 +35,12 @@ OVERALL_ROWS: Rows = (
     ("longest time without fusion (s)", lambda s: _format_number(s.longest_without_fusion_s, 2)),
     ("position resets", lambda s: f"{s.resets}"),
 )
+VELOCITY_ROW = (
+    "GNSS velocities rejected",
+    lambda s: (
+        f"{s.velocity_rejected_fraction:.1%}" if s.velocity_rejected_fraction is not None else "n/a"
+    ),
+)
 # Table rows of replays that estimate heading and height instead of taking them from the log
 HEADING_ROW = ("mean heading error (°)", lambda s: _format_number(s.heading_error_mean_deg, 1))
 HEIGHT_ROW = ("height RMSE (m)", lambda s: _format_number(s.height_rmse_to_truth_m))
@@ -62,6 +68,8 @@ def rows(analysis: WhatIfAnalysis) -> list[list[str]]:
     """Return the table rows: label, then the statistic of the logged, replayed and changed EKF2."""
     whatif_result = analysis.whatif
     overall_rows, heights = list(OVERALL_ROWS), whatif_result.replayed.heights
+    if whatif_result.replayed.velocity_rejected_fraction is not None:
+        overall_rows.append(VELOCITY_ROW)
     if isinstance(whatif_result.replayed.heading_error_mean_deg, float):
         overall_rows.append(HEADING_ROW)
     if heights:
