@@ -62,7 +62,6 @@ def compare(
     source_kind: request.SourceKind | None = None,
     height: request.HeightName | None = None,
     position: Pathlike | request.PositionFile | None = None,
-    mavlink: Pathlike | None = None,
     system: int | None = None,
     progress: Progress = lambda _: None,
 ) -> Analysis:
@@ -91,8 +90,6 @@ def compare(
         Height source of the axis "down" with GNSS; default: the height source that EKF2 fused.
     position : str, Path or px4fuse.request.PositionFile, optional
         Recording of the positioning system (CSV).
-    mavlink : str or Path, optional
-        MAVLink recording of the same flight.
     system : int, optional
         MAVLink system id of the vehicle; default: the id with the most messages.
     progress : callable
@@ -116,9 +113,9 @@ def compare(
         raise SettingsError(
             f"`axes` {unknown_axes.pop()!r} is unknown. Choose from {', '.join(known)}."
         )
-    if isinstance(log, Flight) and (position, mavlink, system) != (None, None, None):
+    if isinstance(log, Flight) and (position, system) != (None, None):
         raise SettingsError(
-            "the arguments position, mavlink and system are not possible with a Flight, because "
+            "the arguments position and system are not possible with a Flight, because "
             "they determine how a log is read.",
             "Give the path of the log instead of the Flight.",
         )
@@ -128,8 +125,6 @@ def compare(
         )
     fields = {name: arguments[name] for name in request.ComparisonRequest.__struct_fields__}
     fields |= {"log": log.log.name if isinstance(log, Flight) else str(log), "axes": axis_names}
-    if mavlink is not None:
-        fields["mavlink"] = str(mavlink)
     if isinstance(position, str | Path):
         fields["position"] = request.PositionFile(path=str(position))
     if isinstance(clock_offset_s, int):

@@ -1,6 +1,6 @@
 """Diagnosis of one flight from its request, stage by stage as in the lab.
 
-Read the recordings, prepare source and axes, run KF and compare with EKF2, estimate noises and time
+Read the log, prepare source and axes, run KF and compare with EKF2, estimate noises and time
 offset, re-run the filters with one change each, and find mistakes.
 """
 
@@ -39,7 +39,7 @@ from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2.whatif import sweep_values, what_if
-from px4fuse.errors import LogError, MissingDataError, SettingsError
+from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import AISLE
 from px4fuse.findings import find, find_aids
 from px4fuse.flight.ekf2_parameters import check_parameters
@@ -64,7 +64,7 @@ def diagnose(
     progress : callable
         Function that receives the name of each step of the computation.
     flight : Flight, optional
-        Flight from the recordings of the request; without it, the recordings are read.
+        Flight from the files of the request; without it, the files are read.
     as_sent : bool
         True to analyse the positions as sent, without the check of their axes, unit and clock.
 
@@ -144,7 +144,7 @@ def diagnose_or_check_aids(
 
 
 def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress) -> Flight:
-    """Read the recordings of a request and join them into one flight.
+    """Read the log of a request, and add the positions of its position file.
 
     Raises
     ------
@@ -153,22 +153,11 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
     """
     log = Path(request.log)
     progress(f"reading {display_name(log)}")
-    flight = read_log(log, system=request.system if request.mavlink is None else None)
-    # imported on demand, as alignment imports scipy.signal and scipy.ndimage, which takes 0.2 s
-    if request.mavlink is not None:
-        from px4fuse.alignment.merge_recordings import join  # noqa: PLC0415
-
-        mavlink_flight = read_log(Path(request.mavlink), system=request.system)
-        if not mavlink_flight.log.format.startswith("MAVLink"):
-            raise LogError(
-                f"--mavlink {mavlink_flight.log.name} is a {mavlink_flight.log.format}, not a "
-                "MAVLink recording.",
-                "Give the ULog as LOG and the recording (.tlog) with --mavlink.",
-            )
-        flight = join(flight, mavlink_flight)
+    flight = read_log(log, system=request.system)
     position, offset = request.position, request.clock_offset_s
     if position is None:
         return flight
+    # imported on demand, as alignment imports scipy.signal and scipy.ndimage, which takes 0.2 s
     from px4fuse.alignment.placement import align_position_file  # noqa: PLC0415
     from px4fuse.readers.position_csv import read_position_csv  # noqa: PLC0415
 
@@ -258,7 +247,7 @@ def run_what_if(
             raise SettingsError(
                 f"{sweep.parameter} is both set and swept.", f"Set or sweep {sweep.parameter}."
             )
-    recordings = ComparisonRequest(log=request.log, mavlink=request.mavlink, system=request.system)
+    recordings = ComparisonRequest(log=request.log, system=request.system)
     flight = flight or read_flight(recordings, progress)
     progress("replaying EKF2")
     model = open_model(flight)

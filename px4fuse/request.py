@@ -54,7 +54,7 @@ class PositionFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 # Fields of requests that contain a path
-_PATHS = ("log", "mavlink", "source", "estimate", "reference")
+_PATHS = ("log", "source", "estimate", "reference")
 
 
 class _RequestBase(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -81,8 +81,6 @@ class ComparisonRequest(
     ----------
     log : str
         Path of the ULog or MAVLink recording; in results its file name.
-    mavlink : str or None
-        Path of the MAVLink recording of the same flight.
     system : int or None
         MAVLink system id of the vehicle; None: the id with the most messages.
     position : PositionFile or None
@@ -110,7 +108,6 @@ class ComparisonRequest(
     """
 
     log: str
-    mavlink: str | None = None
     system: System | None = None
     position: PositionFile | None = None
     position_source: str | None = None
@@ -207,8 +204,6 @@ class WhatIfRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command"
     ----------
     log : str
         Path of the ULog; in results its file name.
-    mavlink : str or None
-        Path of the MAVLink recording of the same flight.
     system : int or None
         MAVLink system id of the vehicle; None: the id with the most messages.
     changes : mapping from PX4 name to value
@@ -221,7 +216,6 @@ class WhatIfRequest(_RequestBase, frozen=True, kw_only=True, tag_field="command"
     """
 
     log: str
-    mavlink: str | None = None
     system: System | None = None
     changes: dict[str, float] = {}
     sweep: Sweep | None = None
@@ -356,13 +350,13 @@ def quote_command(words: Sequence[str]) -> str:
 def settings_name(request: ComparisonRequest | EvaluationRequest | LoopRequest) -> str:
     """Format the settings that differ from their defaults as a part of a file name.
 
-    >>> settings_name(ComparisonRequest(log="a.ulg", sigma_z_m=0.05, mavlink="b/c.tlog"))
-    '_mavlink-c_sigma-z-0.05'
+    >>> file = PositionFile(path="b/c.csv")
+    >>> settings_name(ComparisonRequest(log="a.ulg", sigma_z_m=0.05, position=file))
+    '_sigma-z-0.05_position-c'
     """
     name_suffix = ""
     for option, value in _all_options(request.without_paths()):
-        is_file = option in ("--mavlink", "--position")
-        text = PurePath(value).stem if is_file and value is not None else value
+        text = PurePath(value).stem if option == "--position" and value is not None else value
         name_suffix += f"_{option[2:]}" + ("" if text is None else f"-{text}")
     return re.sub(r"[^\w.,+-]+", "-", name_suffix)
 

@@ -31,11 +31,8 @@ from ulog_tools import Log
 
 from px4fuse import api, diagnose
 from px4fuse.analysis import Analysis
-from px4fuse.classroom.assignment import truth
-from px4fuse.comparison import comparison
 from px4fuse.comparison.estimates import Progress, ignore_progress
 from px4fuse.ekf2.model import Model, open_model
-from px4fuse.filter.fast_replay import quick_replay
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop import tracks
 from px4fuse.readers import read_log
@@ -235,21 +232,20 @@ _cache: dict[tuple[str | bytes, ...] | None, Any] = {}
 def _cache_key(request: ComparisonRequest, what: str) -> tuple[str | bytes, ...] | None:
     """Return the cache key: names and contents of the files, without their folders."""
     position = request.position
-    paths = [request.log, request.mavlink, None if position is None else position.path]
+    paths = [request.log, None if position is None else position.path]
     files = [Path(path) for path in paths if path is not None]
     if any(not file.is_file() for file in files):
         return None
     named = replace(
         request,
         log=Path(request.log).name,
-        mavlink=request.mavlink and Path(request.mavlink).name,
         position=position and replace(position, path=Path(position.path).name),
     )
     return (what, repr(named), *(sha256(file.read_bytes()).digest() for file in files))
 
 
 def _flight_key(request: ComparisonRequest) -> tuple[str | bytes, ...] | None:
-    names = ("log", "mavlink", "system", "position", "clock_offset_s")
+    names = ("log", "system", "position", "clock_offset_s")
     return _cache_key(
         ComparisonRequest(**{name: getattr(request, name) for name in names}), "flight"
     )
@@ -294,10 +290,3 @@ def cached_analyses() -> Iterator[None]:
         for place in (diagnose, api):
             patch.setattr(place, "diagnose", _diagnose_cached)
         yield
-
-
-@pytest.fixture
-def quick_filter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replace KF by the fast filter, which agrees within 1e-9 (test_likelihood.py)."""
-    for module in (comparison, truth):
-        monkeypatch.setattr(module, "replay", quick_replay)

@@ -20,7 +20,6 @@ from px4fuse.results.answer_form import form_text
 # Command, its inputs, its options for an output file (with the required ending), and the names that
 # it writes to the folder of -o ("" for the folder itself)
 RUNS = [
-    ("compare l.ulg --mavlink m.tlog", "l.ulg m.tlog", "--json -o.pdf", None),
     ("compare l.ulg --position pos.csv", "l.ulg pos.csv", "--json -o.pdf", None),
     ("compare l.ulg --notes notes.md --answers form.toml", "notes.md form.toml", "--json", None),
     ("diff r.pdf q.json", "r.pdf q.json", "--json", None),
@@ -60,7 +59,6 @@ def make_desk(folder: Path) -> Path:
     report = make_report("Ada", "1")
     for name, content in {
         "l.ulg": log, "logs/x.ulg": log,
-        "m.tlog": (SAMPLES / "aisle_uwb.tlog").read_bytes()[:200_000],
         "pos.csv": (SAMPLES / "aisle_uwb_external.csv").read_bytes(),
         "notes.md": b"words", "form.toml": form_text("l.ulg", "0" * 64).encode(),
         "r.pdf": report, "subs/s1.pdf": report,

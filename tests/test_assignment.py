@@ -35,7 +35,6 @@ from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.results.answer_form import Answers, read_answers
 from px4fuse.simulation.mistakes import parse
 
-pytestmark = pytest.mark.usefixtures("quick_filter")
 SECRET = b"a secret for tests"
 # Flight of student s1 with SECRET: seed, noise and heading, and the faults
 PINNED = ((759547191, 0.109, -14.4), ("clock-jump=53ms", "ekf2-off"))

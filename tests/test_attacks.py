@@ -208,9 +208,6 @@ KF_ACTION = {
 FILES: dict[str, tuple[Change, str, str]] = {
     "--position uwb.csv": (forge_position_file, "cannot verify", "Add uwb.csv to --logs."),
     "--position with a hash": (forge_joined_file, "cannot verify", "Add uwb.csv to --logs."),
-    "--mavlink file not available": (
-        set_value("a.tlog", "request", "mavlink"), "cannot verify", "Add a.tlog to --logs.",
-    ),
     "changed printed command": (
         set_value("px4fuse compare s01.ulg --position uwb.csv", "provenance", "command"),
         "numbers differ", "",

@@ -16,8 +16,6 @@ from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import Settings
 from px4fuse.flight.model import Flight, Reset, Truth, Unavailable
 
-pytestmark = pytest.mark.usefixtures("quick_filter")
-
 
 @pytest.fixture(scope="module")
 def made() -> Comparison:

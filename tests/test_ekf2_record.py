@@ -5,7 +5,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from ulog_tools import GENERATIONS, covariances, make_log, stamps, topic
 
-from px4fuse.alignment.merge_recordings import shift_times
 from px4fuse.flight.model import Columns, Unavailable
 from px4fuse.readers import read_log
 
@@ -93,10 +92,6 @@ def test_vision_age_is_publication_time_minus_sample_time(read):
     age = read(log).ekf2.record.vision_age_s
     expected = (fields["timestamp"].astype(float) - fields["timestamp_sample"]) * 1e-6
     assert age.to_numpy() == pytest.approx(expected)
-    moved = shift_times(read(log).ekf2.record, 2.5)
-    assert moved.vision_age_s.index[0] == pytest.approx(age.index[0] + 2.5)
-    assert moved.delayed.index[0] == pytest.approx(read(log).ekf2.record.delayed.index[0] + 2.5)
-    assert moved.vision_age_s.to_numpy() == pytest.approx(age.to_numpy())
 
 
 def test_read_ekf2_states_without_topic_is_unavailable(read):

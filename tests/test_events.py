@@ -11,7 +11,6 @@ from comparisons import compare
 from exchange import replace
 from flights import Estimator, Uwb, aisle_flight
 
-from px4fuse.alignment.merge_recordings import join
 from px4fuse.comparison.flight_events import collect_events, source_gaps
 from px4fuse.flight.log import Dropout
 from px4fuse.flight.model import Flight, FlightMode, Reset, Unavailable
@@ -39,9 +38,6 @@ def test_flight_modes_of_mavlink_recording_equal_those_of_ulog(
     # heartbeats are sent at 1 Hz
     for logged, received in zip(sample_flight.modes[1:], recording.modes[2:], strict=True):
         assert 0.0 <= received.start_s + shift - logged.start_s <= 1.1
-    joined = join(replace(sample_flight, modes=Unavailable("modes", "", "")), recording)
-    assert joined.modes[2].start_s == pytest.approx(recording.modes[2].start_s + shift)
-    assert join(sample_flight, recording).modes == sample_flight.modes
 
 
 def test_consecutive_equal_flight_modes_are_merged() -> None:

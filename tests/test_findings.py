@@ -36,7 +36,6 @@ SIDESTEP = Reset(60.0, "position", (3.0, 0.0, 0.0))
 STEP_UP = Reset(60.0, "position", (0.0, 0.0, -0.4))
 NOT_A_NUMBER = re.compile(r"\b(nan|inf|none)\b", re.IGNORECASE)
 Change = Callable[[Flight], Flight]
-pytestmark = pytest.mark.usefixtures("quick_filter")
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,6 @@ from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario, make_scenario
 
 SHA256 = "a" * 64
-pytestmark = pytest.mark.usefixtures("quick_filter")
 LATE = TrueMistake("clock-offset", 0.2, 0.17, 0.23)
 GAP = TrueMistake("dropout", 3.0, 2.55, 3.45, 50.0, 53.0)
 TRUTH = FormTruth(

@@ -74,7 +74,7 @@ NOT_READ, NO_TABLE, NO_VERTEX = (
 INVALID_TEXTS = {
     "no edges": ("VERTEX_SE2 0 0 0 0\n", "no edges"),
     "empty": ("", "no edges"),
-    "mixed": (PLANE + SPACE, "line 4: the file contains both SE2 and SE3 poses"),
+    "mixed": (PLANE + SPACE, "line 4: the file contains both SE2 and SE3"),
     "unknown edge": (
         PLANE + f"EDGE_SE2_XY 0 1 1 0 {UNIT_2}",
         f"line 4: lines with the tag 'EDGE_SE2_XY' {NOT_READ}",

@@ -29,7 +29,6 @@ from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 
-pytestmark = pytest.mark.usefixtures("quick_filter")
 RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
 OF_CAUSES = (
     imu.detect_bias,
@@ -70,7 +69,7 @@ def found(analysis: Analysis, detectors: tuple[Any, ...] = DETECTORS) -> dict[st
 
 
 def test_bias_regression_columns_equal_kf_step_responses() -> None:
-    """Compare innovations with and without a step with filterpy replays."""
+    """Compare innovations with and without a step with KF replays."""
     north = compare(aisle_flight(duration_s=30.0), RIGHT, axes=("north",))["north"].axis
     step = np.where(north.measurement_time_s >= 12.0, 0.7, 0.0)
     intervals = preintegrate(north, RIGHT)
@@ -100,21 +99,16 @@ def test_bias_regression_with_imu_gap_equals_kf_innovations() -> None:
     analysis = flown()
     axes = tuple(analysis.axes[name].axis for name in ("north", "east"))
     model = make_design_matrix(analysis.flight, axes, RIGHT, 0.10, 0.0)
-    north, east = model.intervals
-    gap = np.zeros_like(east.noise_fixed)
+    gap = np.zeros_like(model.signals.noise_fixed)
     gap[200] = 0.5, 0.5, 1.0
-    unlike = replace(model, intervals=(north, replace(east, noise_fixed=gap)))
+    with_gap = replace(model, signals=replace(model.signals, noise_fixed=gap))
     skip = np.zeros(len(model.time_s), dtype=bool)
-    for each in (model, unlike):
+    for each in (model, with_gap):
         fits, (data, columns, _) = each.fit(0.27, skip), each.whitened_design(0.27, skip)
-        for at, legs in enumerate(each.intervals):
-            own = replace(
-                legs,
-                measurement_m=legs.measurement_m[:, 0],
-                delta_position_m=legs.delta_position_m[:, 0],
-                delta_velocity_m_s=legs.delta_velocity_m_s[:, 0],
-            )
-            nu, s = innovations(own, 0.27, 0.10)
+        arrays = "measurement_m", "delta_position_m", "delta_velocity_m_s"
+        for at, column in enumerate((0, 4)):
+            own = {name: getattr(each.signals, name)[:, column] for name in arrays}
+            nu, s = innovations(replace(each.signals, **own), 0.27, 0.10)
             np.testing.assert_allclose(data[at], nu / np.sqrt(s), atol=1e-9)
             residual = data[at] - columns[at] @ fits.coefficients
             np.testing.assert_allclose(fits.residual[fits.axis == at], residual, atol=1e-9)

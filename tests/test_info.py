@@ -24,7 +24,6 @@ from px4fuse.info.inventory import AnalysisOption, Inventory, Source, take_inven
 from px4fuse.readers import read_log
 
 WIDTH = 80
-pytestmark = pytest.mark.usefixtures("quick_filter")
 
 
 @pytest.fixture(autouse=True)

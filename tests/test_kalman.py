@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 import pytest
 from filter_tools import any_axis, any_settings
 from flights import line
@@ -58,7 +59,10 @@ def plain_replay(axis: Axis, chosen: Settings) -> tuple[list[list[float]], list[
     z_at = dict(zip(measured, axis.measurement_m.tolist(), strict=True))
     steps = steps_of(measured, chosen.dt_s)
     if chosen.input == "imu":
-        imu = axis.acceleration.time_s.tolist(), axis.acceleration.value_m_s2.tolist()
+        imu = (
+            axis.acceleration.time_s.tolist(),
+            (axis.acceleration.ned_m_s2 @ axis.direction).tolist(),
+        )
     q, r = chosen.sigma_a_m_s2**2 * chosen.dt_s, chosen.sigma_z_m**2
     x = [z_at[measured[0]], 0.0]
     P = [[0.5**2, 0.0], [0.0, 1.0**2]]
@@ -172,7 +176,7 @@ def test_kf_state_does_not_depend_on_later_measurements(axis, chosen, data) -> N
     arrival = axis.measurement_time_s[changed]
     measured = axis.measurement_m.copy()
     measured[changed] += 100.0
-    imu = axis.acceleration.time_s, axis.acceleration.value_m_s2
+    imu = axis.acceleration.time_s, (axis.acceleration.ned_m_s2 @ axis.direction)
     other = line(axis.measurement_time_s, measured, imu)
     times = np.append(np.linspace(axis.measurement_time_s[0], arrival - 1e-9, 50), arrival)
 
@@ -200,6 +204,14 @@ def test_kf_replay_adds_process_noise_during_imu_gap() -> None:
     at = whole.steps.index[(whole.steps.index > 4.05) & (whole.steps.index < 4.95)]
     raised = broken.steps.loc[at, "position_variance_m2"]
     assert np.all(raised > whole.steps.loc[at, "position_variance_m2"])
+
+
+def test_kf_fast_replay_equals_replay_with_filterpy(axis: Axis) -> None:
+    chosen = Settings(sigma_a_m_s2=0.7, sigma_z_m=0.2)
+    with_filterpy, fast = replay(axis, chosen), replay(axis, chosen, fast=True)
+    for name in ("steps", "updates"):
+        expected, actual = getattr(with_filterpy, name), getattr(fast, name)
+        pd.testing.assert_frame_equal(actual, expected, rtol=1e-9)
 
 
 # ---- formulas by elements against their matrices ----

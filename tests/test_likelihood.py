@@ -1,7 +1,6 @@
-"""Fast filter against the filterpy replay, and likelihoods of the noises."""
+"""KF of many settings against the KF replay, and likelihoods of the noises."""
 
 import numpy as np
-import pandas as pd
 import pytest
 from exchange import replace
 from filter_tools import any_axis, any_settings, sample_axes
@@ -10,7 +9,6 @@ from hypothesis import given, settings
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from px4fuse.filter.fast_replay import quick_replay
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import (
     filter_states,
@@ -30,7 +28,7 @@ ZERO = Settings(sigma_a_m_s2=0.5, input="zero")
 
 
 def replayed(axis: Axis, chosen: Settings) -> NDArray[np.float64]:
-    """ν and S of the filterpy replay, shape (2, m)."""
+    """ν and S of the KF replay, shape (2, m)."""
     return replay(axis, chosen).updates[["innovation_m", "innovation_variance_m2"]].to_numpy().T
 
 
@@ -57,10 +55,6 @@ def test_fast_kf_on_noise_grid_equals_kf_replay(sample_flight: Flight) -> None:
 def test_fast_kf_innovations_of_any_axis_equal_kf_replay(axis: Axis, chosen: Settings) -> None:
     found = innovations(preintegrate(axis, chosen), chosen.sigma_a_m_s2, chosen.sigma_z_m)
     np.testing.assert_allclose(found, replayed(axis, chosen), rtol=1e-9, atol=1e-9)
-    quick, exact = quick_replay(axis, chosen), replay(axis, chosen)
-    for table in ("steps", "updates"):
-        frames = getattr(quick, table), getattr(exact, table)
-        pd.testing.assert_frame_equal(*frames, rtol=1e-9, atol=1e-9)
 
 
 def test_fast_kf_innovations_with_imu_gap_equal_kf_replay() -> None:
@@ -85,7 +79,6 @@ def test_fast_kf_states_equal_kf_replay(axis: Axis, chosen: Settings) -> None:
         (grid.gain, updates["gain_position"]),
         (grid.velocity_m_s, after["velocity_m_s"]),
         (grid.sigma_p_m**2, after["position_variance_m2"]),
-        (grid.sigma_v_m_s**2, after["velocity_variance_m2_s2"]),
         (grid.nis, updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]),
     ):
         assert values.shape == (len(updates), 2, 1)

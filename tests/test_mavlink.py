@@ -162,7 +162,7 @@ def test_mavlink_raw_imu_is_unavailable_with_reason(read):
     ))  # fmt: skip
     flight = read(recorder)
     assert isinstance(flight.imu, Unavailable)
-    assert "2000 RAW_IMU messages were not used, because raw counts" in reason(flight, "IMU")
+    assert "2000 RAW_IMU messages were not used: raw counts" in reason(flight, "IMU")
     assert [(u.name, u.count) for u in flight.unused] == [("RAW_IMU", 2000)]
 
 

@@ -24,7 +24,6 @@ ULOG, TLOG = (str(SAMPLES / f"aisle_uwb.{ending}") for ending in ("ulg", "tlog")
 # A value of each field that differs from its default
 CHANGED: dict[str, Any] = {
     "log": TLOG,
-    "mavlink": TLOG,
     "system": 250,
     "position": PositionFile(path=str(SAMPLES / "aisle_uwb_external.csv")),
     "position_source": "estimator_aid_src_ev_pos",
@@ -87,5 +86,5 @@ def test_files_to_change_for_a_new_option_are_documented() -> None:
 def test_unknown_kind_of_position_source_raises_an_error() -> None:
     for origin in ORIGINS:
         assert find_origin(origin.kind, origin.path) is origin
-    with pytest.raises(ValueError, match="'lidar', 'as received' is not in ORIGINS"):
+    with pytest.raises(KeyError, match="'lidar', 'as received'"):
         find_origin("lidar", "as received")

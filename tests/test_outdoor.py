@@ -39,7 +39,6 @@ from px4fuse.simulation.scenario import Scenario, make_scenario
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
 OUTDOOR = make_scenario("outdoor", seed=5)
-pytestmark = pytest.mark.usefixtures("quick_filter")
 
 
 @cache

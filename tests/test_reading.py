@@ -50,7 +50,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 OF_FOLDERS = "verify r.pdf {}", "grade r.pdf --logs {} -o out"
 OF_FILES = (
     "info {}", "compare {} -o out/c.pdf", "tune {}", "sync {}", "extract {} -o out", "loop {}",
-    "loop {}:vio", "evaluate {} s.tum", "evaluate s.tum {}", "verify {}", "info l.ulg --mavlink {}",
+    "loop {}:vio", "evaluate {} s.tum", "evaluate s.tum {}", "verify {}",
     "info l.ulg --position {}", "compare l.ulg --notes {} -o out/c.pdf",
     "loop s.tum --reference {}", "simulate --assignment {} -o out",
     "simulate --assignment roster.csv --secret-file {} -o out",

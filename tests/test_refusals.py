@@ -37,7 +37,6 @@ def desk(tmp_path_factory):
     for name, content in {
         "a.ulg": (SAMPLES / "aisle_uwb.ulg").read_bytes(),
         "deep.md": b"*" * 500 + b"a" + b"*" * 500,
-        "a.tlog": (SAMPLES / "aisle_uwb.tlog").read_bytes(),
         "c.csv": (SAMPLES / "aisle_uwb_external.csv").read_bytes(),
         "l.ulg": (SAMPLES / "loop_vio.ulg").read_bytes(), "straight.ulg": make_log().encode(),
         "empty.ulg": b"", "bad.ulg": b"no log at all", "empty.tum": b"", "junk.bin": binary,
@@ -117,8 +116,6 @@ REFUSED = {
         "compare a.ulg --system 1",
         "a.ulg: --system is only for MAVLink recordings",
     ),
-    "a ULog as MAVLink": ("compare a.ulg --mavlink a.ulg", "--mavlink a.ulg is a ULog"),
-    "itself again": ("compare a.tlog --mavlink a.tlog", "is the same recording as LOG"),
     "far time offset": ("evaluate l.ulg:vio s.tum --time-offset 9e5", "give --time-offset auto"),
     "loop of no drift": ("loop l.ulg --drift 0", "--drift 0 is out of range (0.0001 to 100)"),
     # simulations, pages and invalid logs
@@ -127,7 +124,6 @@ REFUSED = {
     "page of nothing": ("explore missing.ulg", "missing.ulg"),
     "page as PDF": ("explore a.ulg -o page.pdf", "ending in .html"),
     "page of three": ("explore a.ulg a.ulg a.ulg", "unexpected extra argument"),
-    "page of two and more": ("explore a.ulg a.ulg --mavlink a.tlog", "unexpected extra argument"),
     "too long a name": (f"info a.ulg --json {'x' * 300}.json", "File name too long"),
     "no name": ("extract a.ulg -o ''", "the file name is empty"),
     "no name of a log": ("batch '' -o out", "the name of a log is empty"),

@@ -27,7 +27,6 @@ def maybe(strategy: st.SearchStrategy) -> st.SearchStrategy:
 COMPARISONS = st.builds(
     ComparisonRequest,
     log=NAMES,
-    mavlink=maybe(NAMES),
     system=maybe(st.integers(0, 255)),
     position=maybe(
         st.builds(
@@ -90,10 +89,8 @@ def test_analysis_request_written_as_json_is_read_back_equal(request: Request) -
 
 
 def test_analysis_request_without_paths_has_only_file_names() -> None:
-    request = ComparisonRequest(
-        log="/home/eve/a.ulg", mavlink="b/c.tlog", position=PositionFile(path="../d.csv")
-    )
-    assert command_line(request) == "px4fuse compare a.ulg --mavlink c.tlog --position d.csv"
+    request = ComparisonRequest(log="/home/eve/a.ulg", position=PositionFile(path="../d.csv"))
+    assert command_line(request) == "px4fuse compare a.ulg --position d.csv"
     assert "eve" not in msgspec.json.encode(request.without_paths()).decode()
     assert LoopRequest(source="x/l.ulg:vio", reference="y/s.tum").without_paths() == LoopRequest(
         source="l.ulg:vio", reference="s.tum"

@@ -37,7 +37,6 @@ from px4fuse.simulation.mistakes import parse
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
-pytestmark = pytest.mark.usefixtures("quick_filter")
 LAST = {"tracking_lost", "exact_zeros", "nan_rows", "quality_low", "ekf2_own_back", "two_senders"}
 CASES = sorted(
     LAST

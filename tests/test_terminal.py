@@ -119,7 +119,7 @@ def test_text_output_modules_do_not_import_matplotlib() -> None:
 
 def test_printed_commands_contain_typed_files_and_options() -> None:
     request = ComparisonRequest(
-        log="my flights/a'b.ulg", mavlink="-t.tlog", position=PositionFile(path="u w/b.csv"),
+        log="my flights/a'b.ulg", position=PositionFile(path="u w/b.csv"),
         start_s=12.5, sigma_z_m=0.3,
     )  # fmt: skip
     text, (command, loops) = expand_commands(
@@ -132,7 +132,7 @@ def test_printed_commands_contain_typed_files_and_options() -> None:
         "LOG.ulg."
     )
     assert shlex.split(command) == [
-        "px4fuse", "compare", "my flights/a'b.ulg", "--mavlink", "-t.tlog", "--sigma-z", "0.3",
+        "px4fuse", "compare", "my flights/a'b.ulg", "--sigma-z", "0.3",
         "--start", "12.5", "--position", "u w/b.csv", "--sigma-z", "0.2", "--clock-offset",
         "-0.125",
     ]  # fmt: skip

@@ -7,6 +7,7 @@ The flight is straight, level and at constant speed, so all values have a closed
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -67,7 +68,8 @@ class Log:
 
     def encode(self) -> bytes:
         """Return the file content; a repeated topic gets two subscriptions."""
-        return encode(self.topics, self.parameters, self.info, START_US, self.dropouts_ms)
+        dropouts = (struct.pack("<HcH", 2, b"O", length) for length in self.dropouts_ms)
+        return encode(self.topics, self.parameters, self.info, START_US) + b"".join(dropouts)
 
 
 def load(path: Path) -> Log:

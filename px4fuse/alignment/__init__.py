@@ -1,1 +1,1 @@
-"""Joining of two recordings of one flight, and alignment of a position file with a flight."""
+"""Alignment of a position file with a flight."""

@@ -1,4 +1,4 @@
-"""Convention of a position file that matches neither EKF2 nor the IMU as stated."""
+"""Axes and unit of a position file that does not match the motion of the flight."""
 
 import pandas as pd
 
@@ -10,7 +10,8 @@ from px4fuse.convention.texts import FRAME_AXES, UNIT_NAMES, describe_axes, desc
 from px4fuse.flight.model import Columns, Flight, PositionTrack, time_index
 from px4fuse.flight.position_source import POSITION_FILE
 
-MAX_SPAN_S = 7200.0  # of file and log; the search takes 1 s per hour
+# Maximum time span (s) of file and log for the check: the search takes 1 s per hour
+MAX_SPAN_S = 7200.0
 
 
 def explain_mismatch(

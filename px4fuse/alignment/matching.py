@@ -17,35 +17,38 @@ from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, SampledTr
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_PEAK_RATIO
 
-# Frames to try if yaw is estimated; nwu is not tried, because it is enu rotated by 90°
+# Frames that are tried if yaw is estimated; nwu is not tried, because it is enu rotated by 90°
 YAW_FREE_FRAMES = ("ned", "enu")
 # Maximum time span (s) of a position file: matching a day of positions takes five seconds
 MAX_SPAN_S = 86400.0
 # Minimum value of Lin's concordance correlation coefficient (1989) for a good match, by reference:
-# a worse match gets a warning and does not overrule options
+# a match below it is printed with a warning, and does not show that the frame is rotated
 GOOD_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
 # Maximum standard deviation (s) of an accepted time offset
 MAX_CLOCK_SIGMA_S = 0.5
 # Minimum ratio of the residual in the second best frame to the residual in the best frame
 MIN_FRAME_RATIO = 1.3
-# Limits for a misaligned frame: minimum ratio of the residual with the given yaw to the residual
-# with estimated yaw and origin, and minimum residual (m) with the given yaw
-MIN_ROTATION_RATIO, MIN_ROTATION_RMS_M = 2.0, 0.3
+# Minimum ratio of the residual with the user's yaw to the residual with estimated yaw and origin,
+# for a frame that is misaligned
+MIN_ROTATION_RATIO = 2.0
+# Minimum residual (m, RMS) with the user's yaw, for a frame that is misaligned
+MIN_ROTATION_RMS_M = 0.3
 
 
 @dataclass(frozen=True)
 class AlignmentProblem:
-    """Position file, with the alignment parameters from options; None if a parameter is estimated.
+    """Positions of a file, and the alignment parameters that the user gave.
 
     Attributes
     ----------
     samples : DataFrame
         Positions of the file, on the clock of the file.
     frame : str or None
+        Frame of the file; None: to be estimated.
     yaw_rad : float or None
-        Rotation of the frame of the file relative to the frame of EKF2.
+        Rotation of the frame of the file relative to the frame of EKF2; None: to be estimated.
     lag_s : float or None
-        Flight time of the first sample of the file.
+        Flight time of the first sample of the file; None: to be estimated.
     """
 
     samples: pd.DataFrame
@@ -65,7 +68,7 @@ class Match:
     residuals_m : dict from frame to float
         Residual in each frame that was tried, best first.
     fit : Fit
-        Fit with the given yaw; with estimated yaw if none was given.
+        Fit with the yaw of the user; without it, with estimated yaw.
     free_yaw_fit : Fit
         Fit with estimated yaw.
     is_rotated : bool
@@ -93,28 +96,30 @@ class Match:
 
 
 def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
-    """Match the position file with the first suitable reference: EKF2, or else the IMU.
+    """Match the position file with EKF2's position, or else with the IMU.
 
-    Return None if no reference is suitable and no parameter has to be estimated.
+    Return None if neither is suitable and no parameter has to be estimated.
 
     Raises
     ------
     NoMatchError
         A parameter cannot be estimated; the error contains an action.
     """
-    given_parameters = {
+    value_by_option = {
         "clock_offset_s": problem.lag_s,
         "frame": problem.frame,
         "yaw_deg": problem.yaw_rad,
     }
-    missing_options = [f"`{name}`" for name, value in given_parameters.items() if value is None]
+    missing_options = [f"`{name}`" for name, value in value_by_option.items() if value is None]
     reasons = []
-    # If options give clock offset, frame and yaw, they are only checked, and only against EKF2:
-    # the band-passed IMU motion is not accurate enough for a check
-    reference_kinds = (tracks.make_ekf2_references, tracks.make_imu_references)
-    for references in reference_kinds if missing_options else reference_kinds[:1]:
+    makers = [tracks.make_ekf2_references]
+    # Parameters that the user gave are only checked against EKF2, because the band-pass filtered
+    # motion of the IMU is not accurate enough for a check
+    if missing_options:
+        makers.append(tracks.make_imu_references)
+    for make_references in makers:
         try:
-            match = _match(references(flight), problem)
+            match = _match(make_references(flight), problem)
             _check_match(match)
             return _refit_with_corrected_resets(flight, match, problem)
         except NoMatchError as error:
@@ -130,7 +135,6 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
 
 def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
     samples = problem.samples
-    frame = problem.frame
     yaw_rad = problem.yaw_rad
     if samples.index[-1] - samples.index[0] > MAX_SPAN_S:
         raise NoMatchError("the position file is longer than one day; cut the file to the flight")
@@ -138,23 +142,22 @@ def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
         raise NoMatchError(
             f"the positions in the file change by less than {tracks.MIN_MOTION_M:g} m"
         )
-    frames = (frame,) if frame else YAW_FREE_FRAMES if yaw_rad is None else tuple(tracks.FRAMES)
+    frames = YAW_FREE_FRAMES if yaw_rad is None else tuple(tracks.FRAMES)
+    if problem.frame:
+        frames = (problem.frame,)
     matches = []
     for reference in references:
         name = reference.name
         fit_frame = partial(_best_fit, problem, reference)
-        fits = {tried_frame: fit_frame(tried_frame, yaw_rad) for tried_frame in frames}
-        residuals_m = {
-            tried_frame: fits[tried_frame].rms_m
-            for tried_frame in sorted(fits, key=lambda f: fits[f].rms_m)
-        }
-        best_frame = next(iter(residuals_m))
-        fit = fits[best_frame]
+        fits = [(frame, fit_frame(frame, yaw_rad)) for frame in frames]
+        fits.sort(key=lambda frame_and_fit: frame_and_fit[1].rms_m)
+        best_frame, fit = fits[0]
         free_yaw_fit = fit if yaw_rad is None else fit_frame(best_frame, None)
         is_rotated = is_good_fit(free_yaw_fit, name) and (
             fit.concordance < MIN_CONCORDANCE[name]
             or needs_rotation(fit.horizontal_rms_m, free_yaw_fit, name)
         )
+        residuals_m = {frame: fit.rms_m for frame, fit in fits}
         matches.append(Match(reference, best_frame, residuals_m, fit, free_yaw_fit, is_rotated))
     return min(matches, key=lambda match: match.time_offset_fit.rms_m)
 
@@ -167,7 +170,7 @@ def needs_rotation(horizontal_rms_m: float, free_yaw_fit: Fit, reference: str) -
 
 
 def is_good_fit(fit: Fit, reference: str) -> bool:
-    """Return True if the concordance is at least GOOD_CONCORDANCE and no other lag fits as well."""
+    """Return True if the tracks agree well, and no other lag fits as well."""
     return (
         fit.concordance >= GOOD_CONCORDANCE[reference]
         and fit.second_peak_ratio >= MIN_SECOND_PEAK_RATIO
@@ -179,14 +182,14 @@ def _check_match(match: Match) -> None:
     fit = match.time_offset_fit
     if fit.concordance < MIN_CONCORDANCE[name]:
         raise NoMatchError(
-            f"the position file does not match the {name}: the concordance correlation is "
-            f"{fit.concordance:.2f} (at least {MIN_CONCORDANCE[name]:g} is needed)"
+            f"the position file does not match the {name}: Lin's concordance correlation "
+            f"coefficient is {fit.concordance:.2f} (at least {MIN_CONCORDANCE[name]:g} is needed)"
         )
     ambiguity = ""
     if fit.second_peak_ratio < MIN_SECOND_PEAK_RATIO:
         ambiguity = f"two offsets that differ by {abs(fit.second_peak_s):.1f} s fit equally well"
     elif fit.lag_sigma_s is not None and fit.lag_sigma_s > MAX_CLOCK_SIGMA_S:
-        ambiguity = f"the standard deviation exceeds {MAX_CLOCK_SIGMA_S:g} s"
+        ambiguity = f"its standard deviation exceeds {MAX_CLOCK_SIGMA_S:g} s"
     if ambiguity:
         raise NoMatchError(
             f"the time offset against the {name} cannot be estimated: {ambiguity}",
@@ -203,18 +206,18 @@ def _check_match(match: Match) -> None:
 
 
 def _refit_with_corrected_resets(flight: Flight, match: Match, problem: AlignmentProblem) -> Match:
-    """Repeat the fit to EKF2 with EKF2's resets removed as in the comparison with the file."""
+    """Repeat the fit to EKF2 with EKF2's resets removed as in the comparison of EKF2 and file."""
     ekf2 = flight.ekf2
-    clock = match.time_offset_fit
+    fit = match.time_offset_fit
     if match.reference.name == IMU or isinstance(ekf2, Unavailable) or not ekf2.resets:
         return match
-    samples = problem.samples
-    frame = match.frame
-    aligned = tracks.align_samples(samples, frame, clock.yaw_rad, clock.origin_m, clock.lag_s)
+    aligned = tracks.align_samples(
+        problem.samples, match.frame, fit.yaw_rad, fit.origin_m, fit.lag_s
+    )
     track = tracks.ekf2_track_without_resets(ekf2, aligned)
     fit_again = partial(
         time_and_pose_fit.fit_by_least_squares,
-        tracks.convert_to_ned(samples, frame),
+        tracks.convert_to_ned(problem.samples, match.frame),
         track,
         is_lag_free=problem.lag_s is None,
     )
@@ -226,23 +229,19 @@ def _refit_with_corrected_resets(flight: Flight, match: Match, problem: Alignmen
 def _best_fit(
     problem: AlignmentProblem, reference: SampledTrack, frame: str, yaw_rad: float | None
 ) -> Fit:
-    """Find the lag by correlation, unless it is given; then fit by least squares."""
+    """Find the lag by correlation, unless the user gave it; then fit by least squares."""
     track = tracks.convert_to_ned(problem.samples, frame)
     lag_s = problem.lag_s
     grid_track = tracks.resample_to_grid(tracks.remove_spikes(track))
     if reference.name == IMU:
         if len(grid_track.time_s) * GRID_STEP_S < tracks.MIN_OVERLAP_S:
             raise NoMatchError("the position file is too short for a match with the IMU")
-        track = grid_track = tracks.mark_transients(
-            replace(
-                grid_track, position_m=tracks.band_pass(tracks.band_pass(grid_track.position_m))
-            )
-        )
-    peak = (
-        time_and_pose_fit.find_correlation_peak(grid_track, reference, yaw_rad)
-        if lag_s is None
-        else CorrelationPeak(lag_s)
-    )
+        position_m = tracks.band_pass(tracks.band_pass(grid_track.position_m))
+        track = grid_track = tracks.mark_transients(replace(grid_track, position_m=position_m))
+    if lag_s is None:
+        peak = time_and_pose_fit.find_correlation_peak(grid_track, reference, yaw_rad)
+    else:
+        peak = CorrelationPeak(lag_s)
     return time_and_pose_fit.fit_by_least_squares(
         track, reference, peak, yaw_rad, is_lag_free=lag_s is None
     )

@@ -1,8 +1,11 @@
 """Alignment of an external position file with a flight: time offset, frame, yaw and origin.
 
 The computer of a UWB system records with a separate clock and frame. The track of the file is
-matched with a reference in the log: EKF2's position, or, if EKF2's position is not suitable, the
-acceleration of the IMU integrated twice. In the second case both tracks are band-passed.
+matched with a reference in the log:
+
+1. EKF2's position;
+2. if EKF2's position is not suitable, the acceleration of the IMU integrated twice. Both tracks are
+   then band-pass filtered.
 
 Horizontal positions are complex numbers, north + i·east, so a rotation in yaw is a factor e^{iψ}.
 The time offset is found by masked cross-correlation over all lags (FFT, Padfield 2012), then
@@ -31,12 +34,13 @@ from px4fuse.flight.position_source import POSITION_FILE
 from px4fuse.readers.common import finite_rows
 from px4fuse.readers.position_csv import PositionRecording
 
-# Maximum ratio of the residual at another time offset to the residual at the best time offset for a
-# warning that the offset is ambiguous, by reference: IMU noise gives ratios of 1.4 to 1.7
+# Maximum ratio of the residual at the second best time offset to the residual at the best one, for
+# a warning that the time offset is ambiguous, by reference: IMU noise gives ratios of 1.4 to 1.7
 MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}
+# Maximum fraction of rows with distinct timestamps for a finding that timestamps are too coarse
+MAX_DISTINCT_FRACTION = 0.5
 # Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
 # indicates another flight
-MAX_DISTINCT_FRACTION = 0.5  # of the rows, if their timestamps are too coarse
 MAX_UNIX_DIFFERENCE_S = 60.0
 
 
@@ -48,17 +52,16 @@ def align_position_file(
     yaw_deg: float | Literal["auto"] | None = None,
     clock_offset_s: float | None = None,
 ) -> Flight:
-    """Add an external position file to a flight, as its first position track.
+    """Convert the positions of a file to the frame and clock of a flight, and add them to it.
 
     Parameters
     ----------
     frame : {"ned", "enu", "nwu"}, optional
-        Axes x, y, z of the file; by default from the column names, or else the frame that fits
-        best.
+        Directions of the axes x, y, z; by default from the column names, or else the frame that
+        fits best.
     yaw_deg : float or "auto", optional
-        Rotation of the file about down, clockwise seen from above, after the frame conversion. None
-        means 0 with the same origin: the file's frame differs from EKF2's only in the axes. "auto"
-        estimates yaw and origin.
+        Rotation of the positions about down, clockwise seen from above, after the conversion to
+        NED; 0 by default. "auto" estimates yaw and origin.
     clock_offset_s : float, optional
         Boot clock of the autopilot minus clock of the file; by default estimated relative to the
         reference. If EKF2 fused late positions, EKF2's track lags, and the estimate includes this
@@ -67,8 +70,8 @@ def align_position_file(
     Returns
     -------
     Flight
-        Flight with the file's track first in ``positions``, the file in ``inputs``, and the notes
-        of its reader in ``log.notes``. Samples outside of the flight are kept.
+        The file is the first track in ``positions`` and is listed in ``inputs``. The notes of its
+        reader are in ``log.notes``. Samples outside of the flight are kept.
 
     Raises
     ------
@@ -85,8 +88,7 @@ def align_position_file(
             f"{tracks.MIN_SAMPLES} are needed",
             "Check the position file.",
         )
-    start_s = float(samples.index[0])
-    end_s = float(samples.index[-1])
+    start_s, end_s = samples.index[[0, -1]].tolist()
     boot_s = flight.log.boot_time_s
     spans_text = (
         f"log {boot_s:.2f} s to {boot_s + flight.log.duration_s:.2f} s on the boot clock, file "
@@ -109,8 +111,14 @@ def align_position_file(
         raise MissingDataError(
             f"{recording.name}: {error}; {spans_text}", f"{error.remedy}."
         ) from None
+    yaw_reason = "given with --position-yaw"
+    if yaw_deg is None:
+        yaw_reason = "assumed: the file has the yaw of EKF2's frame"
+    frame_reason = "from the column names of the file"
+    if frame:
+        frame_reason = "given with --position-frame"
     alignment, aligned_samples = _describe_alignment(
-        flight, recording, problem, match, frame, yaw_deg, clock_offset_s
+        flight, recording, problem, match, frame_reason, yaw_reason, clock_offset_s
     )
     clock_source = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
@@ -133,23 +141,22 @@ def align_position_file(
         ),
         step_m=recording.step_m,
     )
-    reader_notes = tuple(
-        f"{recording.name}: {text}" for text in (*recording.detected, *recording.notes)
+    notes = [f"{recording.name}: {text}" for text in (*recording.detected, *recording.notes)]
+    dropped = dict(flight.log.dropped)
+    if recording.dropped and not clock_map:
+        dropped[recording.name] = recording.dropped
+    return replace(
+        flight,
+        log=structs.replace(flight.log, notes=(*flight.log.notes, *notes), dropped=dropped),
+        positions=(track, *flight.positions),
+        inputs=(InputFile(recording.name, recording.sha256, recording.size_bytes, "position"),),
     )
-    dropped = {recording.name: recording.dropped} if recording.dropped and not clock_map else {}
-    notes = (*flight.log.notes, *reader_notes)
-    dropped = {**flight.log.dropped, **dropped}
-    log = structs.replace(flight.log, notes=notes, dropped=dropped)
-    inputs = (
-        *flight.inputs,
-        InputFile(recording.name, recording.sha256, recording.size_bytes, "position"),
-    )
-    return replace(flight, log=log, positions=(track, *flight.positions), inputs=inputs)
 
 
 def _shared_timestamps(recording: PositionRecording) -> ClockMap | None:
-    """Describe a clock whose timestamps are shared by most rows; None for another clock."""
-    distinct, count = len(recording.samples), len(recording.samples) + recording.dropped
+    """Describe the file's clock if most rows share a timestamp; None for any other clock."""
+    distinct = len(recording.samples)
+    count = distinct + recording.dropped
     if distinct > MAX_DISTINCT_FRACTION * count:
         return None
     return ClockMap(recording.clock, "as sent", count, 0.0, 0.0, 0.0, SHARED_STAMPS, distinct)
@@ -158,7 +165,7 @@ def _shared_timestamps(recording: PositionRecording) -> ClockMap | None:
 def _check_options(
     frame: str | None, yaw_deg: float | str | None, clock_offset_s: float | None
 ) -> None:
-    if frame is not None and frame not in tracks.FRAMES:
+    if frame not in (None, *tracks.FRAMES):
         raise SettingsError(
             f"`frame` {frame} is not valid.", f"Use one of {', '.join(tracks.FRAMES)}."
         )
@@ -174,8 +181,8 @@ def _describe_alignment(
     recording: PositionRecording,
     problem: AlignmentProblem,
     match: Match | None,
-    frame_option: str | None,
-    yaw_deg: float | Literal["auto"] | None,
+    frame_reason: str,
+    yaw_reason: str,
     clock_offset_s: float | None,
 ) -> tuple[Alignment, pd.DataFrame]:
     samples = problem.samples
@@ -183,20 +190,14 @@ def _describe_alignment(
     is_yaw_free = problem.yaw_rad is None
     yaw_rad = problem.yaw_rad or 0.0
     lag_s = problem.lag_s or 0.0
-    yaw_sigma_deg = clock_sigma_s = correlation = None
+    yaw_sigma_deg = clock_sigma_s = correlation = residual_rms_m = None
     origin_m = np.zeros(3)
     reference = ""
-    yaw_reason = "given with --position-yaw"
     clock_reason = "given with --clock-offset"
-    if yaw_deg is None:
-        yaw_reason = "assumed: the file has the yaw of EKF2's frame"
-    frame_reason = "from the column names of the file"
-    if frame_option:
-        frame_reason = "given with --position-frame"
     if match:
         frame = match.frame
         reference = match.reference.name
-        if not (frame_option or recording.frame):
+        if problem.frame is None:
             frame_reason = f"smallest residual against {reference} ({match.residuals_text})"
             if is_yaw_free and frame == "enu":
                 frame_reason += "; nwu differs from enu only in yaw, which was estimated"
@@ -213,23 +214,31 @@ def _describe_alignment(
         correlation = float((np.exp(-1j * yaw_rad) * match.time_offset_fit.coherence).real)
     aligned_samples = tracks.align_samples(samples, frame, yaw_rad, origin_m, lag_s)
     ekf2_comparison = None if reference == IMU else _compare_with_ekf2(flight, aligned_samples)
+    distance_m = None
     if ekf2_comparison:
         reference = EKF2_POSITION
-        correlation = ekf2_comparison[1]
-    frame_conflicts = (
-        [] if is_yaw_free else [*_find_frame_conflicts(match, ekf2_comparison, yaw_rad)]
-    )
-    unexplained_correlation = (
-        ekf2_comparison[1] if ekf2_comparison and not frame_conflicts else None
-    )
-    warnings = _find_warnings(
-        flight,
-        recording,
-        match,
-        is_yaw_free,
-        correlation=unexplained_correlation,
-        clock_offset_s=clock_offset_s,
-    )
+        distance_m, correlation = ekf2_comparison
+        residual_rms_m = float(np.sqrt(np.mean(distance_m**2) / 2.0))
+    frame_conflict = "" if is_yaw_free else _describe_frame_conflict(match, distance_m, yaw_rad)
+    warnings = [*_find_warnings(match, is_yaw_free)]
+    if (
+        ekf2_comparison
+        and not (is_yaw_free or frame_conflict)
+        and correlation is not None
+        and correlation < MIN_CONCORDANCE[EKF2_POSITION]
+    ):
+        warnings.append(
+            f"The position file does not match the EKF2 position (correlation {correlation:.2f}). "
+            "Check time offset, frame and yaw."
+        )
+    unix_start_s = flight.log.start_unix_s
+    if recording.clock == "UNIX" and unix_start_s is not None and clock_offset_s is not None:
+        difference_s = abs(flight.log.boot_time_s - clock_offset_s - unix_start_s)
+        if difference_s >= MAX_UNIX_DIFFERENCE_S:
+            warnings.append(
+                f"The UNIX times of position file and log differ by {difference_s:.0f} s. Check "
+                "that both are of the same flight."
+            )
     alignment = Alignment(
         frame=frame,
         frame_reason=frame_reason,
@@ -242,10 +251,8 @@ def _describe_alignment(
         clock_reason=clock_reason,
         reference=reference,
         correlation=correlation,
-        residual_rms_m=float(np.sqrt(np.mean(ekf2_comparison[0] ** 2) / 2.0))
-        if ekf2_comparison
-        else None,
-        misplaced=tuple(frame_conflicts),
+        residual_rms_m=residual_rms_m,
+        misplaced=(frame_conflict,) if frame_conflict else (),
         warnings=tuple(warnings),
     )
     return alignment, aligned_samples
@@ -254,10 +261,10 @@ def _describe_alignment(
 def _compare_with_ekf2(
     flight: Flight, aligned_samples: pd.DataFrame
 ) -> tuple[Array, float | None] | None:
-    """Return the horizontal distances (m) of the file from EKF2, and their correlation.
+    """Return the horizontal distances (m) of the file from EKF2, and the correlation of the tracks.
 
-    The correlation (of both tracks) is None if EKF2 hardly moves. The result is None if EKF2 has no
-    position at the times of the file.
+    The correlation is None if EKF2 hardly moves. The result is None if EKF2 has no position at the
+    times of the file.
     """
     if isinstance(flight.ekf2, Unavailable):
         return None
@@ -278,72 +285,52 @@ def _compare_with_ekf2(
     ekf2_position = ekf2_position - np.mean(ekf2_position)
     has_motion = max(np.ptp(ekf2_position.real), np.ptp(ekf2_position.imag)) >= tracks.MIN_MOTION_M
     power = float(np.linalg.norm(file_position) * np.linalg.norm(ekf2_position))
-    return distance_m, float(
-        np.vdot(file_position, ekf2_position).real
-    ) / power if has_motion and power > 0.0 else None
+    covariance = float(np.vdot(file_position, ekf2_position).real)
+    return distance_m, covariance / power if has_motion and power > 0.0 else None
 
 
-def _find_frame_conflicts(
-    match: Match | None, comparison: tuple[Array, float | None] | None, yaw_rad: float
-) -> Iterator[str]:
+def _describe_frame_conflict(match: Match | None, distance_m: Array | None, yaw_rad: float) -> str:
+    """Return the sentence that the frame of the file is rotated; "" if it is not rotated.
+
+    ``distance_m`` is the distance from EKF2, None if the file is not compared with EKF2.
+    """
+    if match is None:
+        return ""
+    name = match.reference.name
+    fit = match.free_yaw_fit
+    is_rotated = match.is_rotated
+    shift_text = ""
+    if distance_m is not None:
+        rms_m = truncated_rms(distance_m) / np.sqrt(2.0)
+        is_rotated = matching.is_good_fit(fit, name) and matching.needs_rotation(rms_m, fit, name)
+        shift_text = f" and shifted by {np.hypot(*fit.origin_m[:2]):.1f} m"
+    if not is_rotated:
+        return ""
+    yaw_deg = np.degrees(np.angle(np.exp(1j * (fit.yaw_rad - yaw_rad))))
+    return (
+        f"The frame of the file is rotated by {yaw_deg:.1f}°{shift_text} against the {name}. "
+        "Give --position-yaw auto."
+    )
+
+
+def _find_warnings(match: Match | None, is_yaw_free: bool) -> Iterator[str]:
     if match is None:
         return
     name = match.reference.name
-    is_rotated = match.is_rotated
-    if comparison:
-        rms_m = truncated_rms(comparison[0]) / np.sqrt(2.0)
-        is_rotated = matching.is_good_fit(match.free_yaw_fit, name) and matching.needs_rotation(
-            rms_m, match.free_yaw_fit, name
-        )
-    if is_rotated:
-        yaw_deg = np.degrees(np.angle(np.exp(1j * (match.free_yaw_fit.yaw_rad - yaw_rad))))
-        shift_m = np.hypot(*match.free_yaw_fit.origin_m[:2])
-        shift_text = f" and shifted by {shift_m:.1f} m" if comparison else ""
+    fit = match.time_offset_fit
+    if fit.concordance < matching.GOOD_CONCORDANCE[name]:
         yield (
-            f"The frame of the file is rotated by {yaw_deg:.1f}°{shift_text} against the "
-            f"{name}. Give --position-yaw auto."
+            f"The match of the position file with the {name} is poor: Lin's concordance "
+            f"correlation coefficient is {fit.concordance:.2f}."
         )
-
-
-def _find_warnings(
-    flight: Flight,
-    recording: PositionRecording,
-    match: Match | None,
-    is_yaw_free: bool,
-    *,
-    correlation: float | None,
-    clock_offset_s: float | None,
-) -> Iterator[str]:
-    if match:
-        name = match.reference.name
-        fit = match.time_offset_fit
-        if fit.concordance < matching.GOOD_CONCORDANCE[name]:
-            yield (
-                f"The match of the position file with the {name} is poor: the concordance "
-                f"correlation is {fit.concordance:.2f}."
-            )
-        if fit.second_peak_ratio < MAX_SIMILAR_RESIDUAL_RATIO[name]:
-            yield (
-                f"A time offset that differs by {fit.second_peak_s:+.1f} s fits nearly as well: "
-                f"the residual is {fit.second_peak_ratio:.1f} times larger. Check the offset, or "
-                "give --clock-offset."
-            )
-        if is_yaw_free and name == IMU:
-            yield (
-                "The yaw estimated against the IMU has an error of 1° to 6°. The origin of the "
-                "file's frame is unknown and set to 0."
-            )
-    if not is_yaw_free and correlation is not None and correlation < MIN_CONCORDANCE[EKF2_POSITION]:
+    if fit.second_peak_ratio < MAX_SIMILAR_RESIDUAL_RATIO[name]:
         yield (
-            f"The position file does not match the EKF2 position (correlation {correlation:.2f}). "
-            "Check time offset, frame and yaw."
+            f"A time offset that differs by {fit.second_peak_s:+.1f} s fits nearly as well: the "
+            f"residual is {fit.second_peak_ratio:.1f} times larger. Check the offset, or give "
+            "--clock-offset."
         )
-    # a large difference of UNIX times indicates another flight
-    start_s = flight.log.start_unix_s
-    if recording.clock == "UNIX" and start_s is not None and clock_offset_s is not None:
-        difference_s = abs(flight.log.boot_time_s - clock_offset_s - start_s)
-        if difference_s >= MAX_UNIX_DIFFERENCE_S:
-            yield (
-                f"The UNIX times of position file and log differ by {difference_s:.0f} s. Check "
-                "that both are of the same flight."
-            )
+    if is_yaw_free and name == IMU:
+        yield (
+            "The yaw estimated against the IMU has an error of 1° to 6°. The origin of the file's "
+            "frame is unknown and set to 0."
+        )

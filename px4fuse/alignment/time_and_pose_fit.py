@@ -16,12 +16,12 @@ MAX_LAG_SHIFT_S = 1.0
 # Minimum value of Lin's concordance correlation coefficient (1989) for an accepted match, by
 # reference
 MIN_CONCORDANCE = {EKF2_POSITION: 0.7, IMU: 0.5}
-# Lower limit of 1 - concordance in the likelihood: with it, the longest of several nearly perfect
-# matches has the greatest likelihood
+# Minimum of 1 minus the concordance coefficient in the likelihood: with it, the longest of several
+# nearly perfect matches has the greatest likelihood
 MIN_DISCORDANCE = 1e-4
 # Minimum distance (s) between the lags of two separate correlation peaks
 MIN_PEAK_DISTANCE_S = 3.0
-# Residual (m) of a perfect match, caused by the time grid
+# Residual (m) of a perfect match that the time grid causes
 GRID_RESIDUAL_M = 0.05
 # Maximum residual (m): larger residuals are truncated, because they may be outliers
 MAX_RESIDUAL_M = 1.0
@@ -29,20 +29,20 @@ MAX_RESIDUAL_M = 1.0
 
 @dataclass(frozen=True)
 class CorrelationPeak:
-    """Peak of the cross-correlation between position file and reference.
+    """Lag with the best match between position file and reference.
 
     Attributes
     ----------
     lag_s : float
         Flight time of the first sample of the file.
     concordance : float
-        Lin's concordance correlation coefficient with free means, 2·Re(e^{-iψ}cov) / (sum of both
-        variances): 1 if the tracks are equal up to a position offset, smaller if their extents
-        differ. NaN if the lag was given.
+        Lin's concordance correlation coefficient of the tracks, each minus its mean:
+        2·Re(e^{-iψ}cov) / (sum of both variances). It is 1 for equal tracks, and smaller if their
+        shapes or extents differ. NaN if the user gave the lag.
     second_peak_s : float
-        Lag of the second peak minus lag of this peak; NaN without a second peak.
+        Second best lag minus best lag; NaN without a second peak.
     second_peak_ratio : float
-        Residual (RMS) at the second peak over the residual at this peak.
+        Residual (RMS) at the second best lag over the residual at the best lag.
     """
 
     lag_s: float
@@ -58,10 +58,10 @@ class Fit(CorrelationPeak):
     Attributes
     ----------
     concordance : float
-        Concordance at the peak; if the time offset was given, concordance of the fit.
+        Concordance coefficient at the peak; if the user gave the time offset, that of the fit.
     yaw_rad : float
     lag_sigma_s, yaw_sigma_rad : float or None
-        Standard deviations; None if the parameter was given.
+        Standard deviations; None if the user gave the parameter.
     origin_m : ndarray, shape (3,)
         Position of the file's origin: north, east, down.
     coherence : complex
@@ -84,7 +84,7 @@ class Fit(CorrelationPeak):
 def find_correlation_peak(
     file_track: SampledTrack, reference: SampledTrack, yaw_rad: float | None
 ) -> CorrelationPeak:
-    """Find the lag with the greatest likelihood gain on the grid; yaw is estimated if None.
+    """Find the lag at which the file matches the reference best; also estimate yaw if it is None.
 
     With a free origin the residual sum of squares of file f and reference g over an overlap of N
     grid points is Σ|f - f̄|² + Σ|g - ḡ|² - 2·Re(e^{-iψ}cov). The log-likelihood minus the
@@ -129,15 +129,14 @@ def find_correlation_peak(
     peak_start = np.max(low_indices[low_indices < best_index], initial=-1)
     peak_end = np.min(low_indices[low_indices > best_index], initial=len(count))
     is_other_peak = (
-        (count >= 0.5 * count[best_index]) & (power >= 0.25 * power[best_index]) & has_overlap
+        has_overlap
+        & (count >= 0.5 * count[best_index])
+        & (power >= 0.25 * power[best_index])
+        & (concordance >= MIN_CONCORDANCE[reference.name])
     )
-    is_other_peak &= concordance >= MIN_CONCORDANCE[reference.name]
     min_distance = round(MIN_PEAK_DISTANCE_S / GRID_STEP_S)
-    is_other_peak[
-        max(peak_start + 1, best_index - min_distance) : min(
-            peak_end, best_index + min_distance + 1
-        )
-    ] = False
+    same_peak_start = max(peak_start + 1, best_index - min_distance)
+    is_other_peak[same_peak_start : min(peak_end, best_index + min_distance + 1)] = False
     peak = CorrelationPeak(lag_at(best_index), float(concordance[best_index]))
     if not is_other_peak.any():
         return peak
@@ -160,12 +159,13 @@ def fit_by_least_squares(
     *,
     is_lag_free: bool,
 ) -> Fit:
-    """Fit origin and, if free, lag and yaw by robust least squares (soft L1).
+    """Fit the file to the reference by robust least squares (soft L1).
 
-    The origin is always fitted, even if the caller does not use it. Otherwise a position offset of
-    the file would be mistaken for a lag if the vehicle flies mostly in one direction. The
-    covariance is σ²(JᵀJ)⁻¹ at the optimum, with σ from the median residual. It is multiplied by
-    1 + 2Σρ for autocorrelated residuals (sum to the first zero of ρ).
+    1. The origin is always fitted. Otherwise a position offset of the file would be mistaken for a
+       lag if the vehicle flies mostly in one direction.
+    2. The lag is fitted if ``is_lag_free``, and the yaw if ``yaw_rad`` is None.
+    3. The covariance is σ²(JᵀJ)⁻¹ at the optimum, with σ from the median residual. It is multiplied
+       by 1 + 2Σρ for autocorrelated residuals (sum to the first zero of ρ).
 
     Raises
     ------
@@ -182,51 +182,40 @@ def fit_by_least_squares(
     file_m = file_track.horizontal_m[is_used]
     target_m = (reference_m[:, 0] + 1j * reference_m[:, 1])[is_used]
     centre_m = np.mean(file_m)
-    file_m = file_m - centre_m  # so that yaw and origin are uncorrelated
+    file_m = file_m - centre_m  # makes yaw and origin uncorrelated
     power = float(np.sqrt(np.var(file_m) * np.var(target_m)))
     coherence = complex(np.vdot(file_m, target_m) / len(file_m) / power) if power > 0 else 0j
     mean_square = float(np.var(file_m) + np.var(target_m)) / 2.0
     horizontal = reference.horizontal_m
 
-    def unpack(parameters: Array) -> tuple[complex, float, float]:
-        """Return origin, lag relative to the peak, and yaw."""
-        lag_shift_s = float(parameters[2]) if is_lag_free else 0.0
-        return (
-            complex(parameters[0], parameters[1]),
-            lag_shift_s,
-            float(parameters[-1]) if yaw_rad is None else yaw_rad,
-        )
+    # Parameters: origin north, origin east, lag relative to the peak, yaw
+    parameters = np.array([target_m.mean().real, target_m.mean().imag, 0.0, np.angle(coherence)])
+    bounds = np.array([np.inf, np.inf, MAX_LAG_SHIFT_S, np.inf])
+    is_free = np.array([True, True, is_lag_free, yaw_rad is None])
+    if yaw_rad is not None:
+        parameters[3] = yaw_rad
 
-    def residuals_at(parameters: Array) -> Array:
-        origin, lag_shift_s, yaw = unpack(parameters)
-        residuals = (
-            np.exp(1j * yaw) * file_m
-            + origin
-            - np.interp(time + lag_shift_s, reference.time_s, horizontal)
-        )
+    def residuals_at(free_parameters: Array) -> Array:
+        parameters[is_free] = free_parameters
+        north, east, lag_shift_s, yaw = parameters
+        target = np.interp(time + lag_shift_s, reference.time_s, horizontal)
+        residuals = np.exp(1j * yaw) * file_m + complex(north, east) - target
         return np.concatenate([residuals.real, residuals.imag])
 
-    start_origin = complex(np.mean(target_m))
-    # Free parameters: origin (north, east), lag, yaw
-    is_free = [True, True, is_lag_free, yaw_rad is None]
-    start_parameters = np.array(
-        [start_origin.real, start_origin.imag, 0.0, float(np.angle(coherence))]
-    )[is_free]
-    bounds = np.array([np.inf, np.inf, MAX_LAG_SHIFT_S, np.inf])[is_free]
     solution = least_squares(
         residuals_at,
-        start_parameters,
-        bounds=(-bounds, bounds),
+        parameters[is_free],
+        bounds=(-bounds[is_free], bounds[is_free]),
         loss="soft_l1",
-        f_scale=_robust_scale(residuals_at(start_parameters)),
+        f_scale=_robust_scale(residuals_at(parameters[is_free])),
     )
-    (origin, lag_shift_s, yaw), residuals = unpack(solution.x), residuals_at(solution.x)
+    residuals = residuals_at(solution.x)
+    north, east, lag_shift_s, yaw = parameters.tolist()
     complex_residuals = residuals[: len(file_m)] + 1j * residuals[len(file_m) :]
     jacobian = np.asarray(solution.jac)
     information = jacobian.T @ jacobian
-    information += 1e-9 * np.diag(
-        np.diag(information) + 1e-12
-    )  # a singular matrix gives a huge variance
+    # The added diagonal gives a huge variance instead of an error for a singular matrix
+    information += 1e-9 * np.diag(np.diag(information) + 1e-12)
     variance = (
         np.diag(np.linalg.inv(information))
         * _robust_scale(residuals) ** 2
@@ -244,7 +233,7 @@ def fit_by_least_squares(
     if np.isnan(concordance):
         real_covariance = float((np.exp(-1j * yaw) * coherence).real)
         concordance = real_covariance * power / mean_square if power > 0 else 0.0
-    origin -= np.exp(1j * yaw) * centre_m
+    origin = complex(north, east) - np.exp(1j * yaw) * centre_m
     return Fit(
         lag_s=peak.lag_s + lag_shift_s,
         lag_sigma_s=(np.inf if is_at_limit else float(sigma[2])) if is_lag_free else None,

@@ -17,7 +17,7 @@ from px4fuse.readers.common import finite_rows
 from px4fuse.trajectory.association import gap_limit, is_bracketed
 from px4fuse.trajectory.time_offset import GRID_STEP_S
 
-# Indices of north, east, down in (x, y, z), and their signs, by frame
+# Indices of north, east and down in (x, y, z), and the signs of these components, by frame
 FRAMES = {
     "ned": ([0, 1, 2], [1.0, 1.0, 1.0]),
     "enu": ([1, 0, 2], [1.0, 1.0, -1.0]),
@@ -25,20 +25,23 @@ FRAMES = {
 }
 EKF2_POSITION, IMU = "EKF2 position", "IMU"
 
-# Minimum length (s) of a gap; a gap is also longer than three median intervals
+# Minimum length (s) of a gap in a track; a gap is also longer than three median intervals
 MIN_GAP_LIMIT_S = 0.5
-# Minimum horizontal motion (m), number of positions and overlap (s) for a match; of short tracks,
-# half of the shorter track must overlap
+# Minimum horizontal motion (m) of a track for a match
 MIN_MOTION_M = 0.5
+# Minimum number of positions for a match
 MIN_SAMPLES = 10
+# Minimum overlap (s) of two tracks for a match; of short tracks, half of the shorter one
 MIN_OVERLAP_S = 10.0
 # σ (s) of the Gaussian filter without delay that smooths EKF2's steps at updates
 SMOOTHING_S = 0.2
 # Frequency band in which acceleration integrated twice equals position; at lower frequencies the
 # integral drifts
 BAND_HZ = (0.1, 1.0)
-# Length (s) of the transients of the band-pass filter, and of the padding at both ends of a track
-TRANSIENT_S, BAND_PADDING_S = 2.0, 10.0
+# Length (s) of the transients of the band-pass filter
+TRANSIENT_S = 2.0
+# Length (s) of the padding at both ends of a track that is band-pass filtered
+BAND_PADDING_S = 10.0
 
 
 class NoMatchError(Exception):
@@ -88,13 +91,16 @@ class SampledTrack:
 def convert_to_ned(samples: pd.DataFrame, frame: str) -> SampledTrack:
     """Convert a position file to north, east, down; times count from the first sample."""
     order, sign = FRAMES[frame]
-    time = samples.index.to_numpy()
     position = samples[["x_m", "y_m", "z_m"]].to_numpy()[:, order] * sign
-    return SampledTrack(time - time[0], position, np.ones(len(time), bool))
+    return _track_without_gaps(samples.index.to_numpy() - samples.index[0], position)
+
+
+def _track_without_gaps(time_s: Array, position_m: Array) -> SampledTrack:
+    return SampledTrack(time_s, position_m, np.ones(len(time_s), bool))
 
 
 def resample_to_grid(track: SampledTrack) -> SampledTrack:
-    """Resample a track to a regular grid, with gaps marked."""
+    """Resample a track to a regular time grid; samples inside gaps are invalid."""
     grid = np.arange(track.time_s[0], track.time_s[-1], GRID_STEP_S)
     is_known = is_bracketed(grid, track.time_s, gap_limit(track.time_s, MIN_GAP_LIMIT_S))
     return SampledTrack(grid, track.at(grid)[0], is_known)
@@ -131,13 +137,8 @@ def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
     finite_state = finite_rows(state, Columns.POSITION[:2])
     if len(finite_state) < MIN_SAMPLES:
         raise NoMatchError("no horizontal EKF2 position in the log")
-    grid = resample_to_grid(
-        SampledTrack(
-            finite_state.index.to_numpy(),
-            finite_state[Columns.POSITION].to_numpy(),
-            np.ones(len(finite_state), bool),
-        )
-    )
+    position_m = finite_state[Columns.POSITION].to_numpy()
+    grid = resample_to_grid(_track_without_gaps(finite_state.index.to_numpy(), position_m))
     smooth = gaussian_filter1d(grid.position_m, SMOOTHING_S / GRID_STEP_S, axis=0, mode="nearest")
     return replace(grid, position_m=smooth, name=EKF2_POSITION)
 
@@ -153,9 +154,7 @@ def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
     states = [state]
     resets = [r for r in flight.ekf2.resets if r.quantity == "position" and any(r.delta[:2])]
     if resets:
-        is_after_reset = state.index.to_numpy()[:, None] >= np.array(
-            [reset.time_s for reset in resets]
-        )
+        is_after_reset = state.index.to_numpy()[:, None] >= [reset.time_s for reset in resets]
         reset_sum_m = is_after_reset @ np.array([(*reset.delta[:2], 0.0) for reset in resets])
         states.append(state.assign(**(state[Columns.POSITION] - reset_sum_m)))
     references = [_smooth_ekf2_track(state) for state in states]
@@ -171,7 +170,7 @@ def make_imu_references(flight: Flight) -> list[SampledTrack]:
         raise NoMatchError("the log has no acceleration in NED")
     time = acceleration.index.to_numpy()
     velocity = cumulative_trapezoid(acceleration.to_numpy(), time, axis=0, initial=0)
-    grid = resample_to_grid(SampledTrack(time, velocity, np.ones(len(time), bool)))
+    grid = resample_to_grid(_track_without_gaps(time, velocity))
     if len(grid.time_s) * GRID_STEP_S < MIN_OVERLAP_S:
         raise NoMatchError("the IMU data are too short")
     position = cumulative_trapezoid(band_pass(grid.position_m), dx=GRID_STEP_S, axis=0, initial=0)
@@ -187,20 +186,18 @@ def align_samples(
     diagonal of R·C·diag(σ²)·Cᵀ·Rᵀ.
     """
     track = convert_to_ned(samples, frame)
-    position = track.position_m.copy()
+    position = track.position_m
     order, _ = FRAMES[frame]
     variance = samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()[:, order] ** 2
     if yaw_rad:  # without rotation, a missing sigma of one axis does not make the other missing
-        c = np.cos(yaw_rad)
-        s = np.sin(yaw_rad)
+        c, s = np.cos(yaw_rad), np.sin(yaw_rad)
         rotation = np.array([[c, -s], [s, c]])
         position[:, :2] = position[:, :2] @ rotation.T
         variance[:, :2] = variance[:, :2] @ (rotation**2).T
-    columns = Columns.POSITION + Columns.POSITION_VARIANCE
-    values = np.hstack([position + origin_m, variance])
     return pd.DataFrame(
-        dict(zip(columns, values.T, strict=True)),
-        index=time_index(track.time_s + lag_s),
+        np.hstack([position + origin_m, variance]),
+        time_index(track.time_s + lag_s),
+        Columns.POSITION + Columns.POSITION_VARIANCE,
     )
 
 

@@ -191,10 +191,8 @@ def run(
         request = ComparisonRequest(log="LOG", **settings)
     except TypeError as error:
         raise SettingsError(f"a setting is unknown ({error}).") from error
-    if request.mavlink is not None or request.position is not None:
-        raise SettingsError(
-            "`mavlink` and `position` are files of one flight and not available for many logs."
-        )
+    if request.position is not None:
+        raise SettingsError("`position` is the file of one flight and not possible for many logs.")
     sigma_z_m = Settings().sigma_z_m if request.sigma_z_m is None else request.sigma_z_m
     # not used; raises SettingsError if a setting is out of range
     Settings(request.sigma_a_m_s2, sigma_z_m, request.dt_s)

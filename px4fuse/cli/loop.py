@@ -244,10 +244,10 @@ def _solve_graph(
     outputs.check_targets([json_path, g2o])
     with outputs.progress(json_path) as show_progress:
         show_progress(f"reading {display_name(source)}")
-        solved_graph = analyse_graph(
+        results, solved_graph = analyse_graph(
             display_name(source), read_g2o(path), show_progress, run_robust=robust
         )
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
-    contents = {} if g2o is None else {g2o: g2o_text(solved_graph.graph).encode()}
-    contents |= outputs.result_files(graph_results(solved_graph, command), json_path)
-    outputs.write_and_print(contents, graph_summary(solved_graph))
+    contents = {} if g2o is None else {g2o: g2o_text(solved_graph).encode()}
+    contents |= outputs.result_files(graph_results(results, command), json_path)
+    outputs.write_and_print(contents, graph_summary(results))

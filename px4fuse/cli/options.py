@@ -227,16 +227,6 @@ _clock_option = click.option(
     help="Time (s) to add to the timestamps of the position source; auto estimates it.  [default: "
     "0; auto with --position]",
 )
-#: Options for the recordings of one flight
-recording_options = _combine_options(
-    click.option(
-        "--mavlink",
-        type=InputPath(str),
-        metavar="FILE.tlog",
-        help="MAVLink recording of the same flight, which adds the data that LOG does not contain.",
-    ),
-    system_option,
-)
 #: Options for a position file; the names of their parameters begin with ``position``
 position_options = _combine_options(
     click.option(
@@ -353,9 +343,7 @@ filter_options = _combine_options(
     ),
 )
 #: Options for the recordings of one flight, the position file and the clock offset
-flight_options = _combine_options(
-    recording_options, position_options, _clock_option, max_size_option
-)
+flight_options = _combine_options(system_option, position_options, _clock_option, max_size_option)
 #: Options of commands that run KF on one flight
 analysis_options = _combine_options(filter_options, flight_options)
 #: Options of commands that run KF on many logs: all except the files of one flight

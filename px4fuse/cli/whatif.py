@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     help="Time after the first data (s) from which EKF2 does not fuse the aiding sources of "
     "--without.  [default: 0]",
 )
-@options.recording_options
+@options.system_option
 @options.max_size_option
 @options.json_option
 def whatif(

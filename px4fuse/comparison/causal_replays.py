@@ -56,7 +56,7 @@ from px4fuse.ekf2.replay import HORIZONTAL as HORIZONTAL_AXES
 from px4fuse.ekf2.replay import UPDATE_COLUMNS, Ekf2Replay, inside_spans
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.filter.consistency import nis_band
-from px4fuse.filter.fast_replay import quick_replay
+from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import (
     Acceleration,
@@ -507,7 +507,7 @@ def _rerun_kf(
         measurement_time_s=time_s[is_used] + shift_s,
         measurement_m=axis.measurement_m[is_used],
     )
-    run, state = quick_replay(axis, settings), result.ekf2_state
+    run, state = replay(axis, settings, fast=True), result.ekf2_state
     return _statistics(
         run.updates["innovation_m"].to_numpy(),
         run.updates["innovation_variance_m2"].to_numpy(),

@@ -22,8 +22,7 @@ from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.replay import Spans, inside_spans
 from px4fuse.ekf2.steps import DifferenceExplanation, Step, UnreplayedDifference
-from px4fuse.filter.fast_replay import quick_replay
-from px4fuse.filter.kalman import Replay, state_at
+from px4fuse.filter.kalman import Replay, replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
@@ -77,7 +76,7 @@ def explain_ekf2_difference(
     settings = _settings(comparison, model.inputs, corrected)
     changed = _with_changes(comparison.settings, corrected)
     runs = {
-        name: quick_replay(axis.axis, changed) if corrected else axis.replay
+        name: replay(axis.axis, changed, fast=True) if corrected else axis.replay
         for name, axis in results.items()
     }
     explanations = steps.explain_by_steps(model, settings, runs)

@@ -195,7 +195,6 @@ def estimate_frame_rotation(
         comparison.flight,
         comparison.source,
         comparison.segment,
-        comparison.lines[0].acceleration,
         comparison.settings,
         sigma_z_m,
         offset_s,
@@ -292,9 +291,7 @@ def missing_imu_rate(flight: Flight) -> Unavailable | None:
         )
         remedy = f"Request the IMU message at {needed_hz:g} Hz."
         if flight.log.has_ulog:
-            remedy = (
-                "Give the ULog of this flight as argument LOG, and this recording with --mavlink."
-            )
+            remedy = "Give the ULog of this flight as argument LOG."
     reason = f"{rate_note}; at least {needed_hz:g} Hz are needed"
     return Unavailable("clock offset", reason, remedy)
 

@@ -641,5 +641,6 @@ def _vision_track(flight: Flight) -> PositionTrack | Unavailable:
     return Unavailable(
         ANALYSIS_NAME,
         "; ".join(reasons),
-        "Set SDLOG_PROFILE to 129 (default and vision), or add the MAVLink recording (--mavlink).",
+        "Set SDLOG_PROFILE to 129 (default and vision), or give the file of the positioning system "
+        "with --position.",
     )

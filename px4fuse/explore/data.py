@@ -28,7 +28,7 @@ from px4fuse.filter.settings import (
 )
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, cut_to_segment, imu_gaps, weighted_sum
 from px4fuse.filter.time_offset import ClockOffset
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, map_grids
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, PositionTrack, Unavailable
 from px4fuse.report.card_html import MARK_PATHS
@@ -291,8 +291,8 @@ def _map_data(analysis: Analysis) -> Data:
     """Return limits and estimate of each likelihood map, or the reason why it is missing."""
     return {
         name: {
-            "sigmaA": axis_tuning.map.sigma_a_m_s2[[0, -1]].tolist(),
-            "sigmaZ": axis_tuning.map.sigma_z_m[[0, -1]].tolist(),
+            "sigmaA": map_grids(axis_tuning)[0][[0, -1]].tolist(),
+            "sigmaZ": map_grids(axis_tuning)[1][[0, -1]].tolist(),
             "likely": [axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value],
             "count": axis_tuning.count,
         }
@@ -326,9 +326,7 @@ def _ekf2_settings(request: ComparisonRequest, analysis: Analysis) -> Data:
     parameter = PARAMETERS[aid.noise]
     flown_m = logged_parameters.get(aid.noise, parameter.default)
     changes = {aid.noise: max(float(f"{0.5 * flown_m:.2g}"), parameter.minimum)}
-    example = WhatIfRequest(
-        log=request.log, mavlink=request.mavlink, system=request.system, changes=changes
-    )
+    example = WhatIfRequest(log=request.log, system=request.system, changes=changes)
     return {"flown": flown_settings, "command": command_line(example, for_shell=True)}
 
 

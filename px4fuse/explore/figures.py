@@ -14,12 +14,12 @@ from bokeh.models import (
 from bokeh.models.annotations import BoxAnnotation, Span
 from bokeh.plotting import figure
 
+from px4fuse.analysis import Analysis
 from px4fuse.card.model import SIGMA_RATIO_BANDS
-from px4fuse.comparison.estimates import Tuning
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Record, table
 from px4fuse.explore.data import Data
-from px4fuse.filter.tuning import AxisTuning
+from px4fuse.filter.tuning import AxisTuning, log_likelihood_drop, map_grids
 
 Style = dict[str, Any]  # options of a drawing function of Bokeh
 # The page's script sets the colours by `name`. KF is solid and round, EKF2 dashed and square, as in
@@ -73,22 +73,22 @@ class Figures(Record, frozen=True):
 FIGURES = table(__file__, "figures.toml", Figures)
 
 
-def document_json(data: Data, tuning: Tuning) -> tuple[Any, dict[str, str]]:
+def document_json(data: Data, analysis: Analysis) -> tuple[Any, dict[str, str]]:
     """Return Bokeh's document, and the id of the page element for each plot.
 
     Parameters
     ----------
     data : dict
         From :func:`px4fuse.explore.data.flight_data`.
-    tuning : mapping
-        Contains the likelihood maps.
+    analysis : Analysis
+        Contains the noise estimates and the data of the likelihood maps.
     """
     document = Document()
     time_range = _page_range("time")
     plots = _make_plots(data, time_range)
     plots |= {
         "strip": _event_plot(data, time_range),
-        "map": _likelihood_map(tuning),
+        "map": _likelihood_map(analysis),
         "plan": _track_plot(),
         "step": _phase_plot(),
     }
@@ -261,7 +261,7 @@ def _event_plot(data: Data, time_range: Range1d) -> Any:
     return fig
 
 
-def _likelihood_map(tuning: Tuning) -> Any:
+def _likelihood_map(analysis: Analysis) -> Any:
     """Make the map of the log-likelihood over SIGMA_A and SIGMA_Z, with the current settings."""
     fig = _figure(
         "map",
@@ -275,12 +275,14 @@ def _likelihood_map(tuning: Tuning) -> Any:
         y_axis_label="SIGMA_Z (m)",
     )
     mapper = LinearColorMapper(palette=FIGURES.map_colours, low=0.0, high=MAP_SIGMAS)
-    for name, axis_tuning in tuning.items():
+    for name, axis_tuning in analysis.tuning.items():
         if isinstance(axis_tuning, AxisTuning):
-            x, dw = _pixel_extent(axis_tuning.map.sigma_a_m_s2)
-            y, dh = _pixel_extent(axis_tuning.map.sigma_z_m)
+            grids = map_grids(axis_tuning)
+            (x, dw), (y, dh) = map(_pixel_extent, grids)
+            kf_axes = (result.axis for result in analysis.axes.values())
+            drop = log_likelihood_drop(axis_tuning, kf_axes, analysis.settings, *grids)
             # rows: SIGMA_Z, columns: SIGMA_A
-            image = np.sqrt(2.0 * np.maximum(axis_tuning.map.drop.T, 0.0)).astype(np.float32)
+            image = np.sqrt(2.0 * drop.T).astype(np.float32)
             draw: Any = fig.image  # color_mapper is missing in its type signature
             draw([image], x, y, dw, dh, color_mapper=mapper, name=f"map:{name}", visible=False)
     trail = _empty_source("trail", "x y")

@@ -24,7 +24,7 @@ from px4fuse.core.record import (
 )
 from px4fuse.core.text import count_noun
 
-# "underconfident": the reported σ is too large; "overconfident": the reported σ is too small
+# Verdict on the reported σ: "underconfident" if it is too large, "overconfident" if it is too small
 Verdict = Literal["consistent", "underconfident", "overconfident"]
 
 Interval = tuple[float, float]
@@ -32,8 +32,9 @@ Interval = tuple[float, float]
 # than 0.3 to 2.1
 MIN_INNOVATIONS = 10
 CONFIDENCE_LEVEL = 0.95
-LJUNG_BOX_LAGS = 10  # number of lags of the Ljung-Box whiteness test
-# Ratios of actual to reported σ that count as consistent. Against ground truth, the ratio of EKF2
+# Number of lags of the Ljung-Box whiteness test
+LJUNG_BOX_LAGS = 10
+# Ratios of actual to reported σ of a consistent filter. Against ground truth, the ratio of EKF2
 # is 0.84 to 1.22 in simulated flights without faults, because its σ excludes the lag of its output
 # predictor
 Reference = Literal["source", "truth"]

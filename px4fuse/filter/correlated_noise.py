@@ -65,7 +65,8 @@ MIN_GAIN_NATS = 2.0
 OFFSET_PENALTY_NATS = 2.0
 # Search range (s) of the time constant of a low pass
 LOW_PASS_TAU_S = (0.02, 3.0)
-LOG_TAU_TOLERANCE = 0.05  # tolerance of ln τ of a low pass
+# Tolerance of ln τ of a low pass
+LOG_TAU_TOLERANCE = 0.05
 # Maximum number of measurements in the fit to ground truth, to limit the computing time
 MAX_TRUTH_MEASUREMENTS = 300
 # Minimum gain of log-likelihood over white noise in the fit to ground truth: likelihood ratio 150,
@@ -84,7 +85,7 @@ CORRELATED_FRACTIONS = np.linspace(0.05, 0.999, 20)
 
 @dataclass(frozen=True)
 class SourceLowPass:
-    """Low-pass filter by which the sender averages the positions.
+    """Low-pass filter of the position source, which averages successive positions.
 
     Attributes
     ----------
@@ -132,11 +133,6 @@ class TimeCorrelatedNoise:
     white_m: float
     gain_nats: float
     lag_nats: float
-
-    @property
-    def share(self) -> float:
-        """Time-correlated fraction of the variance of the position errors."""
-        return self.slow_m**2 / (self.slow_m**2 + self.white_m**2)
 
 
 def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
@@ -236,12 +232,12 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     (white_fit, _), (correlated_fit, offset_s) = (
         min(
             ((_fit_noises_at(prepared_motion, offset, start_noises), offset) for offset in offsets),
-            key=lambda fit_and_offset: _score_of_fit(fit_and_offset[0]),
+            key=lambda fit_and_offset: fit_and_offset[0].lowest_score,
         )
         for start_noises in (noises, correlated_start)
     )
-    white_full_score = _score_of_fit(white_fit)
-    correlated_score = _score_of_fit(correlated_fit)
+    white_full_score = white_fit.lowest_score
+    correlated_score = correlated_fit.lowest_score
     # time-correlated noise explains much of the effect of a low pass, so a low pass is only fitted
     # if time-correlated noise is significant
     if white_full_score - correlated_score < MIN_GAIN_NATS:
@@ -252,7 +248,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         # always available: the white-noise model used the same measurements
         assert not isinstance(prepared_motion, Unavailable)
         fit = _fit_noises_at(prepared_motion, 0.0, white_fit.noises)
-        return _score_of_fit(fit) + jacobian_term, fit.noises
+        return fit.lowest_score + jacobian_term, fit.noises
 
     low, high = np.log(LOW_PASS_TAU_S)
     log_tau = minimize_scalar(
@@ -364,16 +360,13 @@ def _fit_noises_at(
     )
 
 
-def _score_of_fit(fit: NoiseFit) -> float:
-    return fit.score(fit.noises)
-
-
 def _best_of_grid(
     prepared_motion: PreparedMotion, offsets_s: Sequence[float], candidate_noises: Sequence[Noises]
 ) -> tuple[float, Noises]:
-    """Return the lowest -ln p over all time offsets and scaled candidate noises, and the noises.
+    """Find the time offset and the noises with the lowest -ln p on a coarse grid.
 
-    First SIGMA_A and then all noises together are multiplied by the factors of the coarse search.
+    Return -ln p and the noises. First SIGMA_A, then all noises together are multiplied by the
+    factors of the coarse search.
     """
     results = []
     for positions in map(prepared_motion.at, offsets_s):

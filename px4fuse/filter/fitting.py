@@ -28,19 +28,24 @@ from px4fuse.filter.marginal_likelihood import (
 )
 from px4fuse.filter.model import INITIAL_COVARIANCE
 
-SIGMA_A_SEARCH_M_S2 = (1e-3, 30.0)  # search range of the acceleration noise
+# Search range of the acceleration noise
+SIGMA_A_SEARCH_M_S2 = (1e-3, 30.0)
 # Search range of the measurement noise: no positioning system is better than 1 mm
 SIGMA_Z_SEARCH_M = (1e-3, 10.0)
 # Maximum number of expectation maximisation iterations that estimate the outliers
 MAX_OUTLIER_ITERATIONS = 12
-# Maximum number of iterations of L-BFGS-B: with final outlier probabilities, and while these
-# probabilities still change
-MAX_ITERATIONS, COARSE_MAX_ITERATIONS = 50, 3
+# Maximum number of L-BFGS-B iterations for the final noises
+MAX_ITERATIONS = 50
+# Maximum number of L-BFGS-B iterations while the outlier probabilities still change
+COARSE_MAX_ITERATIONS = 3
 # Minimum ratio of the outliers' σ to SIGMA_Z: outliers with a smaller σ cannot be distinguished
 MIN_OUTLIER_WIDTH = 3.0
-# Initial values of the fraction of outliers, and of the ratio of their σ to SIGMA_Z
-START_OUTLIER_SHARE, START_OUTLIER_WIDTH = 0.005, 10.0
-MAX_OUTLIER_SHARE = 0.4  # maximum fraction of outliers
+# Initial value of the fraction of outliers
+START_OUTLIER_SHARE = 0.005
+# Initial value of the ratio of the outliers' σ to SIGMA_Z
+START_OUTLIER_WIDTH = 10.0
+# Maximum fraction of outliers
+MAX_OUTLIER_SHARE = 0.4
 # Maximum ratio of SIGMA_Z to its estimate from the median of the squared errors
 MAX_SIGMA_Z_RATIO = 1.2
 # Maximum change of an outlier probability in the last iteration
@@ -49,9 +54,10 @@ MAX_PROBABILITY_CHANGE = 0.01
 UNCOMPUTABLE_SCORE = 1e6
 # Step of ln σ for numerical derivatives of the likelihood
 DERIVATIVE_LOG_STEP = 1e-4
-# Number and distance (in ln σ) of the nodes between which the likelihood is interpolated: with
-# final outlier probabilities, and while these probabilities still change
-LIKELIHOOD_NODES, COARSE_LIKELIHOOD_NODES = (10, 0.25), (6, 0.2)
+# Number of nodes of the interpolated likelihood, and their distance in ln σ
+LIKELIHOOD_NODES = 10, 0.25
+# The same while the outlier probabilities still change: an approximate maximum is then sufficient
+COARSE_LIKELIHOOD_NODES = 6, 0.2
 # Precision of a known initial position (1/m²) and velocity (s²/m²): σ of 1 µm and 1 µm/s
 KNOWN_START_PRECISION = 1e12
 
@@ -163,7 +169,10 @@ def _barycentric_signs(count: int) -> Array:
 
 
 def _interpolation_weights(position: float, count: int) -> Array:
-    """Return barycentric weights of the values at 0, 1, ... (Berrut and Trefethen 2004)."""
+    """Return the weights of the values at 0, 1, ... for interpolation at a position.
+
+    The method is barycentric interpolation (Berrut and Trefethen 2004).
+    """
     distances = position - np.arange(count)
     if not distances.all():
         return np.asarray(distances == 0.0, dtype=np.float64)
@@ -255,6 +264,11 @@ class NoiseFit:
     score: Likelihood
     sigma_z_variance_factor: float
 
+    @property
+    def lowest_score(self) -> float:
+        """Value of ``score`` at the maximum-likelihood noises."""
+        return self.score(self.noises)
+
 
 def filter_positions(intervals: Preintegrated) -> Positions:
     """Convert the input of KF to positions with unknown constants: errors of KF's initial state."""
@@ -343,10 +357,10 @@ def maximise_likelihood(
 def _expected_squares_of_axes(
     axis_positions: Sequence[Positions], noises: Noises, weight: Array
 ) -> tuple[Array, Array]:
-    """Return the sum of the expected squared errors (m²) over the axes, and the number of axes.
+    """Compute the expected squared error (m²) of each measurement, summed over its axes.
 
-    Both are arrays over the measurements. Biases and initial states have their maximum-likelihood
-    values.
+    Return also the number of axes of each measurement. Biases and initial states have their
+    maximum-likelihood values.
     """
     results = []
     for positions in axis_positions:

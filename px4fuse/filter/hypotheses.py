@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache
 
 import numpy as np
 import pandas as pd
@@ -53,7 +53,8 @@ FORWARD, RIGHT, ROTATION = range(3)
 CONSTANT_COUNT = 3
 # Grid of factors on KF's SIGMA_A: less acceleration noise remains after biases and tilt are fitted
 SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
-SCALE_GRID = np.linspace(0.7, 1.3, 7)  # scale factors of the source that are tested
+# Tested scale factors of the position source
+SCALE_GRID = np.linspace(0.7, 1.3, 7)
 # Maximum number of times at which a jump of the positions is tested
 MAX_TESTED_TIMES = 800
 # Number of jump times that are tested together, to limit memory
@@ -197,14 +198,14 @@ def fit_bias_scale_jumps(
 def _fit_sigma_a(
     design: DesignMatrix, sigma_a_grid: Array, is_skipped: BoolArray
 ) -> tuple[float, DesignFit]:
-    """Return the maximum-likelihood SIGMA_A of a grid, and the fit with this SIGMA_A."""
+    """Find the maximum-likelihood SIGMA_A on a grid; return it with the fit of all columns."""
     fit_at = cache(lambda index: design.fit(float(sigma_a_grid[index]), is_skipped))
     best_index = _index_of_minimum(lambda index: fit_at(index).score, len(sigma_a_grid))
     return float(sigma_a_grid[best_index]), fit_at(best_index)
 
 
 def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
-    """Return the index of the minimum of a unimodal sequence, searched from its middle."""
+    """Find the minimum of a sequence with a single minimum, starting in the middle."""
     index = count // 2
     step = 1 if index + 1 < count and score(index + 1) < score(index) else -1
     while 0 <= index + step < count and score(index + step) < score(index):
@@ -213,7 +214,7 @@ def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
 
 
 def _fit_scale(design: DesignMatrix, sigma_a: float, is_skipped: BoolArray) -> Estimate:
-    """Estimate the scale factor error from a grid of scales, corrected for the frame's rotation."""
+    """Estimate the scale factor error of the positions from fits with several scales."""
     fit_at = cache(
         lambda grid_index: design.fit(sigma_a, is_skipped, float(SCALE_GRID[grid_index]))
     )
@@ -276,14 +277,17 @@ def _is_in_window(time_s: Array, start_s: float, length_s: float) -> BoolArray:
 def _significant_step_times(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, times: Array | None = None
 ) -> list[float]:
-    """Return the times (by default of all measurements) of significant jumps, largest χ² first."""
+    """Test a jump at each of ``times``; return the significant times, largest χ² first.
+
+    By default the times of all measurements are tested.
+    """
     if times is None:
         times = design.time_s[MIN_SIDE_MEASUREMENTS:-MIN_SIDE_MEASUREMENTS]
         times = times[:: max(1, -(-len(times) // MAX_TESTED_TIMES))]
     if not len(times):
         return []
     chi_square = _step_chi_squares(design, sigma_a, is_skipped, times)
-    threshold = chdtri(len(design.intervals), MAX_STEP_FALSE_ALARM_P / len(design.time_s))
+    threshold = chdtri(design.axis_count, MAX_STEP_FALSE_ALARM_P / len(design.time_s))
     order = np.argsort(-chi_square)
     return [float(times[index]) for index in order if chi_square[index] >= threshold]
 
@@ -291,17 +295,17 @@ def _significant_step_times(
 def _step_chi_squares(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, times: Array
 ) -> Array:
-    """Return χ² of a jump at each time: reduction of the squared residuals, summed over axes."""
+    """Compute χ² of a jump at each time: the decrease of the sum of squared residuals."""
     data, columns, log_variance_sum = design.whitened_design(sigma_a, is_skipped)
     base_fit = design.regress(data, columns, log_variance_sum, is_skipped)
     chi_square = np.zeros(len(times))
     for batch in np.array_split(np.arange(len(times)), -(-len(times) // STEP_BATCH_SIZE)):
         step_signals = unit_steps(design.time_s, times[batch])
-        for axis, intervals in enumerate(design.intervals):
-            if axis in (axis_group[0] for axis_group in design.axis_groups):
-                zero_signal = np.broadcast_to(0.0, step_signals.shape)
-                step_interval = _replace_signals(intervals, zero_signal, zero_signal, step_signals)
-                step_response = design.whitened(step_interval, sigma_a, is_skipped)[0][~is_skipped]
+        zero_signal = np.broadcast_to(0.0, step_signals.shape)
+        step_response = design.whitened(
+            zero_signal, zero_signal, step_signals, sigma_a, is_skipped
+        )[0][~is_skipped]
+        for axis in range(design.axis_count):
             residual = base_fit.residual[base_fit.axis == axis]
             cross_product = columns[axis][~is_skipped].T @ step_response
             information = np.sum(step_response**2, axis=0) - np.sum(
@@ -316,12 +320,12 @@ def _step_chi_squares(
 def _locate_jump(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, jump: Jump
 ) -> tuple[Jump, BoolArray]:
-    """Determine time and length of a jump near its detected time; also return an outlier mask."""
+    """Find the exact time and the length of a detected jump; return also a mask of outliers."""
     is_near = np.abs(design.time_s - jump.time_s) <= OUTLIER_BURST_S
     # exclude measurements close to the jump; use later outliers again if they agree with the jump
     chi_square = design.with_step(jump.time_s)[0].residual_squares(sigma_a, is_skipped | is_near)
     is_after = is_near | _is_in_window(design.time_s, jump.time_s, OUTLIERS_AFTER_STEP_S)
-    threshold = chdtri(len(design.intervals), MAX_FALSE_OUTLIER_P)
+    threshold = chdtri(design.axis_count, MAX_FALSE_OUTLIER_P)
     is_skipped = np.where(is_after & ~is_near, chi_square > threshold, is_skipped)
     times = design.time_s[is_near]
     best_indices = np.argsort(-_step_chi_squares(design, sigma_a, is_skipped & ~is_near, times))[
@@ -343,7 +347,7 @@ def _locate_jump(
 def _test_step(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, time_s: float, false_alarm_p: float
 ) -> Jump | None:
-    """Return the jump at ``time_s`` if it is significant without the data of the next second."""
+    """Test a jump without the data of the next second; return None if it is not significant."""
     is_skipped_with_burst = is_skipped | _is_in_window(design.time_s, time_s, OUTLIER_BURST_S)
     design, columns = design.with_step(time_s)
     count_before = np.count_nonzero(~is_skipped_with_burst & (design.time_s < time_s))
@@ -405,18 +409,19 @@ class DesignFit:
 class DesignMatrix:
     """Innovations of all axes and the columns of all hypotheses, before whitening.
 
-    Symbols in shapes: m measurements, a axes, k columns, h hat functions, j jumps.
+    Symbols in shapes: m measurements, a axes, k columns, j jumps.
 
     Attributes
     ----------
     time_s : ndarray, shape (m,)
         Timestamps of the measurements.
-    intervals : tuple of Preintegrated
-        Input of KF along each axis, integrated between measurements. Columns: the data, then the
-        effects of unit biases forward and right, and of a unit rotation of the frame.
-    hat_signals : (ndarray, ndarray), shape (m, h)
-        Position and velocity increments by a slow acceleration error, interpolated between knots
-        (hat functions of time); each axis has separate coefficients.
+    axis_count : int
+        Number of axes, a.
+    signals : Preintegrated
+        Input of KF, integrated between measurements. Columns for each axis: the data, then the
+        effects of unit biases forward and right, and of a unit rotation of the frame. Last columns,
+        for all axes: the effect of a slow acceleration error, interpolated between knots (hat
+        functions of time); each axis has separate coefficients.
     prior_sigma : ndarray, shape (k,)
         Prior standard deviations of the coefficients, except the coefficients of jumps.
     sigma_z_m : float
@@ -425,8 +430,8 @@ class DesignMatrix:
     """
 
     time_s: Array
-    intervals: tuple[Preintegrated, ...]
-    hat_signals: ArrayPair
+    axis_count: int
+    signals: Preintegrated
     prior_sigma: Array
     sigma_z_m: float
     step_columns: Array
@@ -438,23 +443,16 @@ class DesignMatrix:
         )
         first_step_column = len(self.prior_sigma)
         count = design.step_columns.shape[1]
-        return design, first_step_column + count * (1 + np.arange(len(self.intervals))) - 1
-
-    @cached_property
-    def axis_groups(self) -> list[list[int]]:
-        """Groups of axes with equal gains: one group, unless IMU gaps affect axes differently."""
-        shares_filter = all(
-            np.array_equal(intervals.noise_fixed, self.intervals[0].noise_fixed)
-            for intervals in self.intervals
-        )
-        all_axes = list(range(len(self.intervals)))
-        return [all_axes] if shares_filter else [[axis] for axis in all_axes]
+        return design, first_step_column + count * (1 + np.arange(self.axis_count)) - 1
 
     def whitened(
-        self, intervals: Preintegrated, sigma_a: float, is_skipped: BoolArray
+        self, dp: Array, dv: Array, measured_m: Array, sigma_a: float, is_skipped: BoolArray
     ) -> tuple[Array, float]:
         """Return ν/√S of k signals, shape (m, k), and Σ ln S of the fused measurements."""
-        nu, s = innovations(intervals, sigma_a, self.sigma_z_m, is_skipped)
+        signals = replace(
+            self.signals, delta_position_m=dp, delta_velocity_m_s=dv, measurement_m=measured_m
+        )
+        nu, s = innovations(signals, sigma_a, self.sigma_z_m, is_skipped)
         nu /= np.sqrt(s)[:, None]
         return nu, float(np.sum(np.log(s[~is_skipped])))
 
@@ -504,58 +502,37 @@ class DesignMatrix:
 
         With a axes, m measurements and k unknowns, the shapes are (a, m) and (a, m, k).
         """
-        hat_count = self.hat_signals[0].shape[1]
-        step_count = self.step_columns.shape[1]
-        axes = len(self.intervals)
+        signals, axes, step_count = self.signals, self.axis_count, self.step_columns.shape[1]
         column_count = len(self.prior_sigma)
         data = np.empty((axes, len(is_skipped)))
         columns = np.zeros((axes, len(is_skipped), column_count + axes * step_count))
         # the scale multiplies the measured acceleration and the signal of a frame rotation, not the
         # biases
-        scale_factors = np.ones(1 + CONSTANT_COUNT)
-        scale_factors[[0, 1 + ROTATION]] = scale
-        zero_signal = np.zeros_like(self.hat_signals[0])
-        log_variance_sum = 0.0
-        for axis_group in self.axis_groups:
-            intervals = [self.intervals[axis] for axis in axis_group]
-            dp = [
-                *(scale_factors * signal.delta_position_m for signal in intervals),
-                self.hat_signals[0],
+        data_columns = (1 + CONSTANT_COUNT) * np.arange(axes)
+        scales = np.ones(signals.measurement_m.shape[1])
+        scales[np.append(data_columns, data_columns + 1 + ROTATION)] = scale
+        no_motion = 0.0 * self.step_columns
+        normalised, log_variance_sum = self.whitened(
+            np.hstack([scales * signals.delta_position_m, no_motion]),
+            np.hstack([scales * signals.delta_velocity_m_s, no_motion]),
+            np.hstack([signals.measurement_m, self.step_columns]),
+            scale * sigma_a,
+            is_skipped,
+        )
+        *axis_signals, common_signals = np.split(
+            normalised, (1 + CONSTANT_COUNT) * np.arange(1, 1 + axes), 1
+        )
+        hat_count = common_signals.shape[1] - step_count
+        for axis, axis_signal in enumerate(axis_signals):
+            data[axis] = axis_signal[:, 0]
+            first_hat = CONSTANT_COUNT + hat_count * axis
+            first_step = column_count + step_count * axis
+            columns[axis][:, :CONSTANT_COUNT] = axis_signal[:, 1:]
+            common_columns = np.r_[
+                first_hat : first_hat + hat_count, first_step : first_step + step_count
             ]
-            dv = [
-                *(scale_factors * signal.delta_velocity_m_s for signal in intervals),
-                self.hat_signals[1],
-            ]
-            measurements = [
-                *(signal.measurement_m for signal in intervals),
-                zero_signal,
-                self.step_columns,
-            ]
-            dp, dv = ([*signal, 0.0 * self.step_columns] for signal in (dp, dv))
-            group_signals = _replace_signals(intervals[0], *map(np.hstack, (dp, dv, measurements)))
-            normalised, group_log_variance_sum = self.whitened(
-                group_signals, scale * sigma_a, is_skipped
-            )
-            log_variance_sum += len(axis_group) * group_log_variance_sum
-            *axis_signals, common_signals = np.split(
-                normalised, len(scale_factors) * np.arange(1, 1 + len(intervals)), 1
-            )
-            for axis, signals in zip(axis_group, axis_signals, strict=True):
-                data[axis] = signals[:, 0]
-                first_hat = CONSTANT_COUNT + hat_count * axis
-                first_step = column_count + step_count * axis
-                columns[axis][:, :CONSTANT_COUNT] = signals[:, 1:]
-                common_columns = np.r_[
-                    first_hat : first_hat + hat_count, first_step : first_step + step_count
-                ]
-                columns[axis][:, common_columns] = common_signals
-        return data, columns, log_variance_sum
-
-
-def _replace_signals(
-    intervals: Preintegrated, dp: Array, dv: Array, measured_m: Array
-) -> Preintegrated:
-    return replace(intervals, delta_position_m=dp, delta_velocity_m_s=dv, measurement_m=measured_m)
+            columns[axis][:, common_columns] = common_signals
+        return data, columns, axes * log_variance_sum
 
 
 def make_design_matrix(
@@ -583,33 +560,38 @@ def make_design_matrix(
     settings = replace(settings, input="imu")
     timeline = make_timeline(shifted_axes[0], settings)
     common_accelerations = _common_accelerations(attitude, acceleration)
-    intervals = []
-    for axis in shifted_axes:
-        interval_input = preintegrate(axis, settings)
-        columns = [(interval_input.delta_position_m, interval_input.delta_velocity_m_s)]
-        columns += [
+    axis_inputs = [preintegrate(axis, settings) for axis in shifted_axes]
+    column_pairs: list[ArrayPair] = []
+    for axis, interval_input in zip(axes, axis_inputs, strict=True):
+        column_pairs.append((interval_input.delta_position_m, interval_input.delta_velocity_m_s))
+        column_pairs += [
             _integrate_signal(value @ axis.direction, input_time_s, timeline)
             for input_time_s, value in common_accelerations
         ]
-        dp, dv = (np.stack(arrays, axis=1) for arrays in zip(*columns, strict=True))
-        measured_m = np.zeros_like(dp)
-        # positions relative to the first measurement, which is KF's initial position
-        measured_m[:, 0] = interval_input.measurement_m - interval_input.initial.position_m
-        initial_state = replace(interval_input.initial, position_m=0.0)
-        intervals.append(
-            replace(_replace_signals(interval_input, dp, dv, measured_m), initial=initial_state)
-        )
-    time_s = axes[0].measurement_time_s[-len(measured_m) :]
+    time_s = axes[0].measurement_time_s[-len(axis_inputs[0].measurement_m) :]
     hat_time_s, hat_functions = _hat_functions(
         time_s[0] + clock_offset_s, time_s[-1] + clock_offset_s
     )
-    hat_responses = [_integrate_signal(hat, hat_time_s, timeline) for hat in hat_functions]
-    position, velocity = (np.stack(arrays, axis=1) for arrays in zip(*hat_responses, strict=True))
+    column_pairs += [_integrate_signal(hat, hat_time_s, timeline) for hat in hat_functions]
+    dp, dv = (np.stack(arrays, axis=1) for arrays in zip(*column_pairs, strict=True))
+    measured_m = np.zeros_like(dp)
+    for index, interval_input in enumerate(axis_inputs):
+        # positions relative to the first measurement, which is KF's initial position
+        measured_m[:, index * (1 + CONSTANT_COUNT)] = (
+            interval_input.measurement_m - interval_input.initial.position_m
+        )
+    signals = replace(
+        axis_inputs[0],
+        delta_position_m=dp,
+        delta_velocity_m_s=dv,
+        measurement_m=measured_m,
+        # one filter for all axes: in gaps of the IMU with the mean of their process noises
+        noise_fixed=np.mean([each.noise_fixed for each in axis_inputs], axis=0),
+        initial=replace(axis_inputs[0].initial, position_m=0.0),
+    )
     tilt_sigma = np.full(len(axes) * len(hat_functions), TILT_SIGMA_RAD * constants.g)
     prior_sigma = np.append(np.full(CONSTANT_COUNT, np.inf), tilt_sigma)
-    return DesignMatrix(
-        time_s, tuple(intervals), (position, velocity), prior_sigma, sigma_z, unit_steps(time_s, [])
-    )
+    return DesignMatrix(time_s, len(axes), signals, prior_sigma, sigma_z, unit_steps(time_s, []))
 
 
 def _integrate_signal(acceleration_m_s2: Array, time_s: ArrayLike, timeline: Timeline) -> ArrayPair:
@@ -622,7 +604,7 @@ def _integrate_signal(acceleration_m_s2: Array, time_s: ArrayLike, timeline: Tim
 def _common_accelerations(
     attitude: pd.DataFrame, acceleration: Acceleration
 ) -> list[tuple[Array, Array]]:
-    """Return times and NED accelerations of unit biases forward and right, and a unit rotation."""
+    """Return times and NED accelerations of unit biases forward and right and a unit rotation."""
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
     attitude_s = attitude.index.to_numpy()
@@ -632,7 +614,7 @@ def _common_accelerations(
 
 
 def _hat_functions(start_s: float, end_s: float) -> ArrayPair:
-    """Return times (s), shape (n,), and hat functions for linear interpolation, shape (h, n)."""
+    """Make hat functions for linear interpolation between knots: times (n,) and values (h, n)."""
     knot_count = int(np.clip(np.ceil((end_s - start_s) / KNOT_SPACING_S), 1, MAX_KNOTS)) + 1
     time = np.linspace(start_s, end_s, 20 * (knot_count - 1) + 1)
     knots = np.linspace(start_s, end_s, knot_count)

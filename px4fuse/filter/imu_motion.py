@@ -33,9 +33,11 @@ from px4fuse.filter.signals import imu_gaps
 from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.trajectory.rotation import cumulative_product, from_vector, multiply, rotate, to_matrix
 
+# Prior σ (rad) of the tilt and heading at the start of a segment
+HEADING_SIGMA_RAD = 0.05
 # Prior σ of the unknown constants, wide for consumer sensors: initial tilt and heading (rad), gyro
 # bias (rad/s), accelerometer bias (m/s²), scale of the positions (1)
-CONSTANT_SIGMAS = np.repeat([0.05, 0.004, 0.3, 0.1], [3, 3, 3, 1])
+CONSTANT_SIGMAS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
 # Maximum length (s) of a segment: the linearisation requires small angles. In 30 s a gyro bias of
 # 0.004 rad/s rotates the attitude by 0.12 rad, with a second-order error of 0.07 m/s²
 MAX_SEGMENT_S = 30.0
@@ -49,8 +51,10 @@ COARSE_MEASUREMENTS = 600
 SIGNALS_PER_BATCH = 2**16
 # Minimum number of time offsets that are computed together
 MIN_BATCH_OFFSETS = 3
-# Minimum number of measurements in all segments together, and in each segment
-MIN_MEASUREMENTS, MIN_SEGMENT_MEASUREMENTS = 30, 15
+# Minimum number of measurements in all segments together
+MIN_MEASUREMENTS = 30
+# Minimum number of measurements in a segment
+MIN_SEGMENT_MEASUREMENTS = 15
 # Minimum number of measurements in a segment after downsampling
 MIN_KEPT_MEASUREMENTS = 5
 # Interval (s) over which the IMU is averaged before integration
@@ -64,7 +68,7 @@ MAX_IMU_INTERVAL_S = 0.025
 
 @dataclass(frozen=True)
 class Signals:
-    """Motion of one segment from the IMU, and sensitivity of the motion to each unknown constant.
+    """Motion of one segment from the IMU, and its sensitivity to constant attitude and IMU errors.
 
     ``table`` contains position, velocity and acceleration along each axis of NED at each time; its
     shape is (n, 3, 3, 1 + constants). Index 0 of the last dimension is the motion with all
@@ -123,7 +127,7 @@ class PreparedMotion:
     directions: Array
     dt_s: float
     imu_interval_s: float
-    heading_sigma_rad: float = float(CONSTANT_SIGMAS[2])
+    heading_sigma_rad: float = HEADING_SIGMA_RAD
 
     def downsample(self, count: int) -> PreparedMotion:
         """Keep about ``count`` of the measurements; all if these would be too few per segment."""
@@ -219,7 +223,8 @@ def prepare_motion(
     dt_s: float,
     weight: Array | None = None,
     signals: SignalCache | None = None,
-    heading_sigma_rad: float = float(CONSTANT_SIGMAS[2]),
+    heading_sigma_rad: float = HEADING_SIGMA_RAD,
+    max_segment_s: float = MAX_SEGMENT_S,
 ) -> PreparedMotion | Unavailable:
     """Cut measurements into segments without a gap in IMU or attitude.
 
@@ -232,6 +237,8 @@ def prepare_motion(
         See :class:`PreparedMotion`; weights are 1 by default.
     signals : dict, optional
         Signals of this flight to reuse; new signals are added to it.
+    max_segment_s : float
+        Maximum length of a segment.
 
     Returns
     -------
@@ -255,7 +262,7 @@ def prepare_motion(
         if not len(covered_rows):
             continue
         covered_s = time_s[covered_rows]
-        count = max(1, int(np.ceil((covered_s[-1] - covered_s[0]) / MAX_SEGMENT_S)))
+        count = max(1, int(np.ceil((covered_s[-1] - covered_s[0]) / max_segment_s)))
         cut_times_s = np.linspace(covered_s[0], covered_s[-1], count + 1)[1:-1]
         for segment_rows in np.split(covered_rows, np.searchsorted(covered_s, cut_times_s)):
             if len(segment_rows) >= MIN_SEGMENT_MEASUREMENTS:
@@ -294,7 +301,7 @@ def prepare_motion(
 
 
 def _covered_spans(imu_s: Array, attitude_s: Array) -> list[Span]:
-    """Return the spans (s) without a gap in IMU or attitude; none if the IMU rate is too low."""
+    """Find the time spans (s) without a gap in IMU or attitude; none if the IMU rate is too low."""
     if len(imu_s) < 2 or np.median(np.diff(imu_s)) > MAX_IMU_INTERVAL_S:
         return []
     gaps = np.flatnonzero(imu_gaps(imu_s))

@@ -7,25 +7,25 @@ State x = [position, velocity] along one axis; the input u is the acceleration o
                x = x + Ky         P = (I - KH)P
 
 F, B, Q and H are defined in :mod:`px4fuse.filter.model`, the prediction steps in
-:mod:`px4fuse.filter.steps`.
-:mod:`~px4fuse.filter.fast_replay` and :mod:`~px4fuse.filter.likelihood` run KF many times; their
-faster recursions have the same results to 1e-9.
+:mod:`px4fuse.filter.steps`. :mod:`~px4fuse.filter.likelihood` runs KF for many settings together;
+the results are equal to 1e-9.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.arrays import Array, BoolArray, IntArray
 from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.filter import model
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
-from px4fuse.filter.steps import Timeline, make_timeline
+from px4fuse.filter.steps import make_timeline
 
-StateRow = tuple[float, ...]
+Rows = list[tuple[float, ...]]
 # Columns of ``Replay.updates``
 UPDATE_COLUMNS = [
     "measurement_m",
@@ -65,12 +65,14 @@ class Replay:
     settings: Settings
     steps: pd.DataFrame
     updates: pd.DataFrame
-    input_gap_s: float = field(default=0.0)
+    input_gap_s: float = 0.0
 
     __repr__ = one_line_repr
 
 
-def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) -> Replay:
+def replay(
+    axis: Axis, settings: Settings, initial: InitialState | None = None, *, fast: bool = False
+) -> Replay:
     """Run KF along one axis.
 
     Parameters
@@ -80,82 +82,103 @@ def replay(axis: Axis, settings: Settings, initial: InitialState | None = None) 
     initial : InitialState, optional
         By default the position of the first measurement and velocity zero; the first measurement is
         then not fused.
+    fast : bool
+        True for repeated runs: floats instead of filterpy, with the same results to 1e-9.
 
     Raises
     ------
     SettingsError
         ``settings.input`` is "imu" and the axis has no acceleration.
     """
-    from px4fuse.filter.filterpy_import import KalmanFilter  # noqa: PLC0415 - takes 0.1 s
-
     timeline = make_timeline(axis, settings, initial)
     initial_state = initial or InitialState(timeline.time_s[0], axis.measurement_m[0])
-    kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
-    kalman.x = np.array([[initial_state.position_m], [initial_state.velocity_m_s]])
-    kalman.P = model.symmetric_matrix(model.INITIAL_COVARIANCE)
-    kalman.H = model.H
-    kalman.R = np.array([[settings.sigma_z_m**2]])
-    kalman.inv = np.reciprocal  # S is 1 by 1
-    states = [_state_row(kalman.x, kalman.P)]
-    updates = []
-    for dt_s, acceleration, gap_variance, measurement_index in zip(
-        np.diff(timeline.time_s),
-        timeline.acceleration_m_s2,
-        timeline.input_variance_m2_s4,
-        timeline.measurement_index[1:],
-        strict=True,
-    ):
-        Q = (
-            (settings.sigma_a_m_s2**2 + gap_variance)
-            * settings.dt_s
-            * model.symmetric_matrix(model.process_noise_unit(dt_s))
-        )
-        kalman.predict(
-            u=np.array([[acceleration]]), B=model.input_matrix(dt_s), F=model.transition(dt_s), Q=Q
-        )
-        if measurement_index >= 0:
-            z = axis.measurement_m[measurement_index]
-            kalman.update(z)
-            y = kalman.y[0, 0]
-            S = kalman.S[0, 0]
-            K = kalman.K[:, 0]
-            x = kalman.x_prior
-            P = kalman.P_prior
-            updates.append((z, y, S, *K, x[0, 0], P[0, 0], P[1, 1]))
-        states.append(_state_row(kalman.x, kalman.P))
-    return make_replay(axis, settings, timeline, states, updates)
-
-
-def make_replay(
-    axis: Axis,
-    settings: Settings,
-    timeline: Timeline,
-    states: Sequence[StateRow],
-    updates: Sequence[StateRow],
-) -> Replay:
-    """Build a run of KF from the rows (state, covariance) of ``steps`` and those of ``updates``."""
+    run_filter = _run_floats if fast else _run_filterpy
+    states, updates = run_filter(
+        initial_state,
+        settings.sigma_z_m**2,
+        np.diff(timeline.time_s).tolist(),
+        timeline.acceleration_m_s2.tolist(),
+        ((settings.sigma_a_m_s2**2 + timeline.input_variance_m2_s4) * settings.dt_s).tolist(),
+        [
+            axis.measurement_m[index] if index >= 0 else None
+            for index in timeline.measurement_index[1:]
+        ],
+    )
     time_arrays = timeline.time_s, timeline.time_s[timeline.measurement_index >= 0]
     time, update_index = (pd.Index(times_s, name="time_s") for times_s in time_arrays)
     steps = pd.DataFrame(states, index=time, columns=model.STATE_COLUMNS + model.COVARIANCE_COLUMNS)
     steps["acceleration_m_s2"] = np.append(timeline.acceleration_m_s2, 0.0)
     steps["input_variance_m2_s4"] = np.append(timeline.input_variance_m2_s4, 0.0)
-    return Replay(
-        axis,
-        settings,
-        steps,
-        pd.DataFrame(updates, update_index, UPDATE_COLUMNS),
-        timeline.input_gap_s,
+    update_table = pd.DataFrame(updates, update_index, UPDATE_COLUMNS)
+    return Replay(axis, settings, steps, update_table, timeline.input_gap_s)
+
+
+def _run_filterpy(
+    initial: InitialState, measurement_variance: float, *inputs: Sequence[Any]
+) -> tuple[Rows, Rows]:
+    """Predict and update KF with filterpy.
+
+    ``inputs`` has for each step its length (s), the acceleration (m/s²), the noise density SIGMA_A²
+    · DT (m²/s³), and the measured position (m) at its end, or None. Return the rows of
+    :attr:`Replay.steps` (states and covariances) and of :attr:`Replay.updates`.
+    """
+    from px4fuse.filter.filterpy_import import KalmanFilter  # noqa: PLC0415 - takes 0.1 s
+
+    kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
+    kalman.x = np.array([[initial.position_m], [initial.velocity_m_s]])
+    kalman.P = model.symmetric_matrix(model.INITIAL_COVARIANCE)
+    kalman.H = np.array([[1.0, 0.0]])
+    kalman.R = np.array([[measurement_variance]])
+    kalman.inv = np.reciprocal  # S is 1 by 1
+    states: Rows = [(initial.position_m, initial.velocity_m_s, *model.INITIAL_COVARIANCE)]
+    updates: Rows = []
+    for dt_s, acceleration, noise_density, z in zip(*inputs, strict=True):
+        kalman.predict(
+            u=np.array([[acceleration]]),
+            B=np.array([[dt_s**2 / 2.0], [dt_s]]),
+            F=model.transition(dt_s),
+            Q=noise_density * model.symmetric_matrix(model.process_noise_unit(dt_s)),
+        )
+        if z is not None:
+            kalman.update(z)
+            x, P, K = kalman.x_prior, kalman.P_prior, kalman.K
+            updates.append(
+                (z, kalman.y[0, 0], kalman.S[0, 0], K[0, 0], K[1, 0], x[0, 0], P[0, 0], P[1, 1])
+            )
+        x, P = kalman.x, kalman.P
+        states.append((x[0, 0], x[1, 0], P[0, 0], P[0, 1], P[1, 1]))
+    return states, updates
+
+
+def _run_floats(
+    initial: InitialState, measurement_variance: float, *inputs: Sequence[Any]
+) -> tuple[Rows, Rows]:
+    """Predict and update KF with floats; arguments and results of :func:`_run_filterpy`."""
+    position, velocity, covariance = (
+        initial.position_m,
+        initial.velocity_m_s,
+        model.INITIAL_COVARIANCE,
     )
-
-
-def _state_row(x: Array, P: Array) -> StateRow:
-    return x[0, 0], x[1, 0], P[0, 0], P[0, 1], P[1, 1]
+    states: Rows = [(position, velocity, *covariance)]
+    updates: Rows = []
+    for dt_s, acceleration, noise_density, z in zip(*inputs, strict=True):
+        position, velocity, covariance = model.predict_step(
+            position, velocity, covariance, acceleration, noise_density, dt_s
+        )
+        if z is not None:
+            innovation_and_gains, updated_state = model.update_step(
+                position, velocity, covariance, z, measurement_variance
+            )
+            updates.append((z, *innovation_and_gains, position, covariance[0], covariance[2]))
+            position, velocity, covariance = updated_state
+        states.append((position, velocity, *covariance))
+    return states, updates
 
 
 def _step_before(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
-    """Return the last prediction step before each time, and the time since that step (s).
+    """Find KF's last prediction step before each time.
 
-    Return also a mask of times outside the run.
+    Return the index of the step, the time since the step (s), and a mask of times outside the run.
     """
     step_times_s = run.steps.index.to_numpy()
     step_index = np.clip(
@@ -168,22 +191,22 @@ def _step_before(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArra
     )
 
 
-def state_at(run: Replay, times_s: Array) -> ArrayPair:
+def state_at(run: Replay, times_s: Array) -> Array:
     """Predict position (m) and velocity (m/s) at each time from KF's last step before that time.
 
     Interpolation between two prediction steps would use a measurement before it is received. The
-    result is NaN outside the run.
+    result has the shape (2, n); it is NaN outside the run.
     """
     index, elapsed_s, is_outside = _step_before(run, times_s)
     position, velocity, acceleration = (
         run.steps[column].to_numpy()[index]
         for column in (*model.STATE_COLUMNS, "acceleration_m_s2")
     )
-    position, velocity = model.propagate_state(position, velocity, acceleration, elapsed_s)
-    return np.where(is_outside, np.nan, position), np.where(is_outside, np.nan, velocity)
+    state = model.propagate_state(position, velocity, acceleration, elapsed_s)
+    return np.where(is_outside, np.nan, state)
 
 
-def variance_at(run: Replay, times_s: Array) -> ArrayPair:
+def variance_at(run: Replay, times_s: Array) -> Array:
     """Return the variances (m², m²/s²) of the results of :func:`state_at`: FPFᵀ + Q."""
     index, elapsed_s, is_outside = _step_before(run, times_s)
     p00, p01, p11 = run.steps[model.COVARIANCE_COLUMNS].to_numpy()[index].T
@@ -191,6 +214,5 @@ def variance_at(run: Replay, times_s: Array) -> ArrayPair:
     noise_density = (run.settings.sigma_a_m_s2**2 + gap_variance) * run.settings.dt_s
     p00, _, p11 = model.propagate_covariance((p00, p01, p11), elapsed_s)
     q00, _, q11 = model.process_noise_unit(elapsed_s)
-    return np.where(is_outside, np.nan, p00 + noise_density * q00), np.where(
-        is_outside, np.nan, p11 + noise_density * q11
-    )
+    variances = p00 + noise_density * q00, p11 + noise_density * q11
+    return np.where(is_outside, np.nan, variances)

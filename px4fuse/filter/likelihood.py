@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import brentq
+from scipy.optimize import brentq, minimize_scalar
 from scipy.special import chdtri
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
@@ -34,11 +34,10 @@ from px4fuse.filter.steps import Timeline, make_timeline
 PROFILE_DROP = float(chdtri(1, 0.05)) / 2.0
 # Distance in ln σ from the maximum at which the search for the end of a 95 % interval starts
 START_LOG_DISTANCE = 0.05
-# Step of ln σ between the three points of a parabola whose minimum is searched
-CURVATURE_STEP = 0.05
-# Maximum change of ln σ in one iteration of the search, in units of CURVATURE_STEP
-MAX_PARABOLA_STEPS = 6.0
-MAX_PARABOLA_ITERATIONS = 4
+# Maximum change of the other parameter's logarithm between two points of a likelihood profile
+MAX_OTHER_LOG_STEP = 1.0
+# Tolerance of the other parameter's logarithm at each point of a likelihood profile
+OTHER_LOG_TOLERANCE = 2e-3
 
 
 @dataclass(frozen=True)
@@ -122,17 +121,15 @@ def integrate_acceleration(timeline: Timeline, acceleration_m_s2: Array) -> Arra
         zeros,
         remaining_s,
     )
-    # the type annotations of numpy declare weighted bincounts as integers
-    return np.asarray(np.bincount(interval_index, dp), float), np.asarray(
-        np.bincount(interval_index, dv), float
-    )
+    dp, dv = (np.bincount(interval_index, increment).astype(float) for increment in (dp, dv))
+    return dp, dv
 
 
 def _interval_index(timeline: Timeline) -> tuple[IntArray, IntArray, Array]:
-    """Return the last prediction step of each interval between measurements.
+    """Assign the prediction steps to the intervals between measurements.
 
-    Return also, for each prediction step, the index of its interval and the time (s) from the step
-    to the end of this interval.
+    Return the last step of each interval, and for each step the index of its interval and the time
+    (s) until the interval ends.
     """
     last_steps = np.flatnonzero(timeline.measurement_index >= 0)
     interval_index = np.searchsorted(last_steps, np.arange(1, len(timeline.time_s)))
@@ -163,7 +160,6 @@ class FilterStates:
     gain: Array
     velocity_m_s: Array
     sigma_p_m: Array
-    sigma_v_m_s: Array
     nis: Array
 
 
@@ -175,8 +171,8 @@ def filter_states(
     ``sigma_a_m_s2`` and ``sigma_z_m`` are broadcast against each other to a grid.
     """
     rows = [
-        (k0, v, np.sqrt(p00), np.sqrt(p11), nu**2 / s)
-        for nu, s, k0, _, v, (p00, _, p11) in run_filter(intervals, sigma_a_m_s2, sigma_z_m, None)
+        (k0, v, np.sqrt(p00), nu**2 / s)
+        for nu, s, k0, _, v, (p00, _, _) in run_filter(intervals, sigma_a_m_s2, sigma_z_m, None)
     ]
     return FilterStates(*(np.array(column) for column in zip(*rows, strict=True)))
 
@@ -245,7 +241,7 @@ def run_filter(
 
 
 def _values_by_measurement(values: Array) -> list[Any]:
-    """Return a list with the value of each measurement: a number, or an array of k columns."""
+    """List the value of each measurement: a number, or an array of k columns."""
     return values.tolist() if values.ndim == 1 else list(values)
 
 
@@ -346,10 +342,13 @@ def profile_ends(
             nonlocal other_log
             if distance == 0.0:
                 return -max_root_drop
-            lowest_score, other_log = _minimise_by_parabolas(
-                lambda log_value: score(best_logs[0] + direction * distance, log_value), other_log
+            result = minimize_scalar(
+                lambda log_value: score(best_logs[0] + direction * distance, log_value),
+                bounds=(other_log - MAX_OTHER_LOG_STEP, other_log + MAX_OTHER_LOG_STEP),
+                options={"xatol": OTHER_LOG_TOLERANCE},
             )
-            return float(np.sqrt(max(lowest_score - best_score, 0.0)) - max_root_drop)
+            other_log = float(result.x)
+            return float(np.sqrt(max(result.fun - best_score, 0.0)) - max_root_drop)
 
         max_distance = direction * (float(np.log(bound)) - best_logs[0])
         distance_limit = min(START_LOG_DISTANCE, max_distance)
@@ -361,18 +360,3 @@ def profile_ends(
         return float(np.exp(best_logs[0] + direction * distance))
 
     return find_end(-1.0, bounds[0]), find_end(1.0, bounds[1])
-
-
-def _minimise_by_parabolas(score: Callable[[float], float], position: float) -> tuple[float, float]:
-    """Return the minimum of a score, and its position; the search starts at ``position``."""
-    for _ in range(MAX_PARABOLA_ITERATIONS):
-        profile = np.array([score(position + k * CURVATURE_STEP) for k in (-1.0, 0.0, 1.0)])
-        middle_score = float(profile[1])
-        if np.ptp(profile) == 0.0:  # the score does not depend on another parameter
-            return middle_score, position
-        shift, curvature = parabola_vertex(profile, 1)
-        step = shift if curvature > 0.0 else np.sign(profile[0] - profile[2]) * MAX_PARABOLA_STEPS
-        position += float(np.clip(step, -MAX_PARABOLA_STEPS, MAX_PARABOLA_STEPS)) * CURVATURE_STEP
-        if curvature > 0.0 and abs(step) <= 1.0:
-            return middle_score - 0.5 * shift**2 * curvature, position
-    return score(position), position

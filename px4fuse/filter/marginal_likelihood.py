@@ -35,7 +35,7 @@ from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 UNIT_SCALE = np.ones(1)
 # SIGMA_A (m/s²) and SIGMA_Z (m) of the smooth path that is subtracted from the positions
 PATH_NOISES = 0.5, 0.1
-# Minimum precision (1/m²) of an initial position that counts as known
+# Minimum precision (1/m²) of a known initial position
 MIN_KNOWN_START_PRECISION = 1e-3
 # Minimum position noise of an interval, relative to the measurement noise and to the interval's Q:
 # it makes Q invertible if Q is from a single step (rank one) or zero
@@ -188,10 +188,13 @@ class FittedPositions:
         log_determinant = self.log_determinant + 2.0 * self.degrees_of_freedom * math.log(sigma)
         return replace(self, gram=self.gram / sigma**2, log_determinant=log_determinant)
 
+    def information(self) -> Array:
+        """Return the inverse covariance of the unknown constants, shape (s, T, c, c)."""
+        return np.asarray(self.gram[..., 1:, 1:] + np.diag(self.constant_sigma**-2.0))
+
     def constants(self) -> Array:
         """Return the maximum-likelihood values of the unknown constants, shape (s, T, c)."""
-        information = self.gram[..., 1:, 1:] + np.diag(self.constant_sigma**-2.0)
-        return np.asarray(-np.linalg.solve(information, self.gram[..., 1:, :1])[..., 0])
+        return np.asarray(-np.linalg.solve(self.information(), self.gram[..., 1:, :1])[..., 0])
 
     def scores_by_segment(self, scales: Array = UNIT_SCALE) -> Array:
         """Return -ln p of each segment without the log-determinant, shape (k, s, T).
@@ -452,7 +455,7 @@ class BandedSystem:
         return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.state_count))
 
     def _interval_sides(self, measured_m: Array, dp: Array, dv: Array) -> tuple[ArrayPair, Array]:
-        """Return whitened intervals, and the right-hand side of the normal equations.
+        """Whiten the intervals, and compute the right-hand side of the normal equations.
 
         The right-hand side has the shape (signals, states · m).
         """

@@ -25,7 +25,6 @@ COVARIANCE_COLUMNS = ["position_variance_m2", "covariance_m2_s", "velocity_varia
 INITIAL_SIGMA_P_M = 0.5
 INITIAL_SIGMA_V_M_S = 1.0
 INITIAL_COVARIANCE = (INITIAL_SIGMA_P_M**2, 0.0, INITIAL_SIGMA_V_M_S**2)
-H = np.array([[1.0, 0.0]])
 
 T = TypeVar("T", float, Array)
 # Elements 00, 01, 11 of a symmetric 2 × 2 matrix
@@ -41,11 +40,6 @@ def symmetric_matrix(covariance: Symmetric[float]) -> Array:
 def transition(dt_s: float) -> Array:
     """Return KF's transition matrix F, shape (2, 2)."""
     return np.array([[1.0, dt_s], [0.0, 1.0]])
-
-
-def input_matrix(dt_s: float) -> Array:
-    """Return KF's input matrix B, shape (2, 1)."""
-    return np.array([[dt_s**2 / 2.0], [dt_s]])
 
 
 def process_noise_unit(dt_s: T) -> Symmetric[T]:

@@ -27,7 +27,8 @@ AISLE = "aisle"
 IMU_GAP_S = 0.1
 # Maximum interval between IMU samples in median intervals: a longer interval is a gap
 IMU_GAP_INTERVALS = 5.0
-MIN_MEASUREMENTS = 3  # minimum number of position measurements along an axis
+# Minimum number of position measurements along an axis
+MIN_MEASUREMENTS = 3
 
 
 @dataclass(frozen=True)
@@ -83,11 +84,6 @@ class Acceleration:
     rms_m_s2: float
 
     __repr__ = one_line_repr
-
-    @property
-    def value_m_s2(self) -> Array:
-        """Acceleration along the axis, shape (n,)."""
-        return np.asarray(self.ned_m_s2 @ self.direction)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis, step_means
 from px4fuse.flight.model import Unavailable
 
-# Maximum difference (s) of two times that count as equal: timestamps have a resolution of 1 µs
+# Maximum difference (s) of two equal timestamps: timestamps have a resolution of 1 µs
 MAX_SAME_TIME_S = 5e-7
 
 
@@ -58,11 +58,9 @@ def make_timeline(
     count = int(np.floor((measured_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
     grid_s = start_s + settings.dt_s * np.arange(count)
     # the timestamp of a measurement replaces an equal time of the grid
-    next_s = measured_s[np.clip(np.searchsorted(measured_s, grid_s), 0, len(measured_s) - 1)]
-    previous_s = measured_s[
-        np.clip(np.searchsorted(measured_s, grid_s) - 1, 0, len(measured_s) - 1)
-    ]
-    distance_s = np.minimum(np.abs(next_s - grid_s), np.abs(previous_s - grid_s))
+    next_index = np.searchsorted(measured_s, grid_s)
+    neighbours = np.clip([next_index - 1, next_index], 0, len(measured_s) - 1)
+    distance_s = np.abs(measured_s[neighbours] - grid_s).min(axis=0)
     time_s = np.union1d(grid_s[distance_s > MAX_SAME_TIME_S], measured_s)
     if time_s[0] > start_s + MAX_SAME_TIME_S:
         time_s = np.append(start_s, time_s)

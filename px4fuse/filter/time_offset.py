@@ -27,7 +27,7 @@ from px4fuse.filter.fitting import Noises, fit_noises, fit_ratios, maximise_like
 from px4fuse.filter.imu_motion import (
     COARSE_MEASUREMENTS,
     COARSE_OFFSETS,
-    CONSTANT_SIGMAS,
+    HEADING_SIGMA_RAD,
     MAX_OFFSET_S,
     PreparedMotion,
     SignalCache,
@@ -43,16 +43,15 @@ from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 FINE_OFFSETS = 11
 # Number of time offsets of the reported likelihood curve, interpolated between the FINE_OFFSETS
 CURVE_OFFSETS = 121
-# Prior σ (rad) of EKF2's heading, by default and with GNSS. With a GNSS delay that is wrong by
-# 0.2 s, EKF2 rotates its heading by 5° to fit the positions: a narrow prior would hide the offset
-HEADING_SIGMA_RAD, GNSS_HEADING_SIGMA_RAD = float(CONSTANT_SIGMAS[2]), 0.2
-# Maximum half-width (s) of the 95 % interval of a time offset that counts as determined
+# Prior σ (rad) of EKF2's heading with GNSS: wide, because with a GNSS delay that is wrong by 0.2 s
+# EKF2 rotates its heading by 5° to fit the positions, and a narrow prior would hide the offset
+GNSS_HEADING_SIGMA_RAD = 0.2
+# Maximum half-width (s) of the 95 % interval for accepting a time offset
 MAX_HALF_INTERVAL_S = 0.15
 # Maximum σ (s) of the time offset in a part of the flight: parts with a larger σ are ignored in the
 # test for a change of the offset
 MAX_PART_SIGMA_S = 0.15
-# Maximum p-value of the hypothesis "constant time offset", for an offset that counts as changing in
-# flight
+# Maximum p-value of the hypothesis "constant time offset" for reporting a change in flight
 MAX_CHANGE_P = 0.005
 # Minimum significant time offset, in σ: false alarm probability 0.3 %
 MIN_OFFSET_SIGMAS = 3.0
@@ -349,7 +348,7 @@ def _simulate_variance_factor(
 
 
 def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
-    """Return the minimum of a profile by a parabola, and σ from the curvature of the parabola."""
+    """Find the minimum of a profile by a parabola; return position, and σ from the curvature."""
     index = int(np.clip(np.argmin(profile), 1, len(grid) - 2))
     step = grid[1] - grid[0]
     shift, curvature = parabola_vertex(profile, index)
@@ -387,7 +386,7 @@ def _offset_per_part(
 
 
 def _fit_clock_drift(part_offsets: tuple[PartOffset, ...]) -> tuple[float | None, float | None]:
-    """Return the drift of the source's clock (ppm) and its standard deviation."""
+    """Fit the drift of the source's clock to the offsets of the parts: drift and σ (ppm)."""
     if len(part_offsets) < 3:
         return None, None
     rows = [

@@ -8,21 +8,21 @@ estimated separately.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from px4fuse.core.arrays import Array, BoolArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray
 from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import Count, NotNegative, OrUnavailable, Record
 from px4fuse.filter.consistency import Consistency, assess
 from px4fuse.filter.fitting import (
     SIGMA_A_SEARCH_M_S2,
     SIGMA_Z_SEARCH_M,
+    START_OUTLIER_WIDTH,
     NoiseFit,
     Noises,
     filter_positions,
@@ -46,15 +46,16 @@ NoiseInterval = tuple[NotNegative, NotNegative | None]
 GRID_SIZE = 40
 # Half-width of the likelihood map along each side, in σ of the estimate
 MAP_HALF_WIDTH_SIGMAS = 4.5
-MIN_MEASUREMENTS = 30  # minimum number of positions for an estimate of the noises
+# Minimum number of positions for an estimate of the noises
+MIN_MEASUREMENTS = 30
 # Maximum fraction of outliers for an estimate of the noises
 MAX_OUTLIER_SHARE = 0.3
 # Factors on KF's SIGMA_A that give initial values for the fit with biases
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value of the random walk (m/√s) of a source that may drift
 START_RANDOM_WALK_M = 0.02
-# Maximum ratio between an estimate and an end of the search range at which the maximum of the
-# likelihood counts as being at this end
+# Maximum ratio between an estimate and an end of the search range for reporting a bound instead of
+# the estimate
 MAX_SEARCH_END_RATIO = 1.001
 
 
@@ -85,17 +86,6 @@ class Noise(Record, frozen=True):
         is_bounded = self.low is not None or self.high is not None
         interval = (self.low or 0.0, self.high) if is_bounded else None
         return {name: self.value, f"{name}_interval": interval}
-
-
-@dataclass(frozen=True)
-class LikelihoodMap:
-    """Decrease of the log-likelihood from its maximum, (n, m), at n SIGMA_A and m SIGMA_Z."""
-
-    sigma_a_m_s2: Array
-    sigma_z_m: Array
-    drop: Array
-
-    __repr__ = one_line_repr
 
 
 class HeldOutCheck(Record, frozen=True):
@@ -176,8 +166,8 @@ class NoiseEstimate(Record, frozen=True, kw_only=True):
         return Noise.of(self.sigma_z_m, self.sigma_z_m_interval)
 
 
-class AxisTuning(NoiseEstimate, frozen=True, kw_only=True, eq=False, dict=True):
-    """Estimated noises of one axis, or of both horizontal axes, with outliers and likelihood map.
+class AxisTuning(NoiseEstimate, frozen=True, kw_only=True, eq=False):
+    """Estimated noises of one axis, or of both horizontal axes, with outliers.
 
     Attributes
     ----------
@@ -187,22 +177,14 @@ class AxisTuning(NoiseEstimate, frozen=True, kw_only=True, eq=False, dict=True):
         Timestamps of the outliers.
     noises : Noises
         Maximum-likelihood noises, including the random walk of a drifting source.
-    make_map : callable
-        Function that computes :attr:`map` on demand, because the map takes as long as a fit.
     """
 
     schema_type = NoiseEstimate
     name: str
     outlier_time_s: Array
     noises: Noises
-    make_map: Callable[[], LikelihoodMap]
 
     __repr__ = one_line_repr
-
-    @cached_property
-    def map(self) -> LikelihoodMap:
-        """Map of KF's log-likelihood around the maximum."""
-        return self.make_map()
 
 
 def tune(
@@ -344,7 +326,6 @@ def tune_axes(
         held_out=_check_held_out(name, intervals, chosen_noises, kf_fit),
         noises=best_fit.noises,
         biases_fitted=motion_fit is not None,
-        make_map=partial(_make_map, intervals, kf_fit.weight, kf_sigma_a, sigma_z, final_noises),
     )
 
 
@@ -384,7 +365,7 @@ def _noise_with_interval(
     search_range: tuple[float, float],
     variance_factor: float = 1.0,
 ) -> Noise:
-    """Return a noise with its 95 % interval, without a value at an end of the search range."""
+    """Add the 95 % interval to a noise; omit a value at an end of the search range."""
     value = float(np.exp(best_logs[0]))
     low, high = profile_ends(score, best_logs, search_range, variance_factor)
     is_inside = (
@@ -394,25 +375,39 @@ def _noise_with_interval(
     return Noise(value if is_inside and is_closed else None, low, high)
 
 
-def _make_map(
-    intervals: list[Preintegrated],
-    weight: Array,
-    sigma_a: Noise,
-    sigma_z: Noise,
-    best_noises: Noises,
-) -> LikelihoodMap:
+def map_grids(tuning: AxisTuning) -> ArrayPair:
+    """Return SIGMA_A (m/s²) and SIGMA_Z (m) around their estimates, for a likelihood map."""
     grids = []
-    for noise, best_value, (low, high) in (
-        (sigma_a, best_noises.sigma_a_m_s2, SIGMA_A_SEARCH_M_S2),
-        (sigma_z, best_noises.sigma_z_m, SIGMA_Z_SEARCH_M),
+    for noise, fitted, (low, high) in (
+        (tuning.sigma_a_two_state, tuning.noises.sigma_a_m_s2, SIGMA_A_SEARCH_M_S2),
+        (tuning.sigma_z, tuning.noises.sigma_z_m, SIGMA_Z_SEARCH_M),
     ):
+        best_value = noise.value or noise.high or fitted
         interval = np.array([noise.low or low, noise.high or high])
         ends = best_value * (interval / best_value) ** (MAP_HALF_WIDTH_SIGMAS / 1.96)
         lowest, highest = np.clip(ends, low, high)
         grids.append(np.geomspace(lowest, highest, GRID_SIZE))
-    sigma_a_grid, sigma_z_grid = grids
-    scores = score_grid(intervals, sigma_a_grid[:, None], sigma_z_grid[None, :], weight)
-    return LikelihoodMap(sigma_a_grid, sigma_z_grid, scores - scores.min())
+    return grids[0], grids[1]
+
+
+def log_likelihood_drop(
+    tuning: AxisTuning,
+    axes: Iterable[Axis],
+    settings: Settings,
+    sigma_a_m_s2: Array,
+    sigma_z_m: Array,
+) -> Array:
+    """Return KF's log-likelihood below its maximum on a grid; rows: SIGMA_A, columns: SIGMA_Z.
+
+    Of ``axes``, those are used for which the noises were estimated.
+    """
+    names = ("north", "east") if tuning.name == HORIZONTAL else (tuning.name,)
+    tuned_axes = [axis for axis in axes if axis.name in names]
+    intervals = [preintegrate(axis, settings) for axis in tuned_axes]
+    time_s = tuned_axes[0].measurement_time_s[-len(intervals[0].measurement_m) :]
+    weight = np.where(np.isin(time_s, tuning.outlier_time_s), START_OUTLIER_WIDTH**-2.0, 1.0)
+    scores = score_grid(intervals, sigma_a_m_s2[:, None], sigma_z_m[None, :], weight)
+    return np.asarray(scores - scores.min())
 
 
 def _assess_innovations(
@@ -425,7 +420,7 @@ def _assess_innovations(
 def _check_held_out(
     name: str, intervals: list[Preintegrated], chosen_noises: Noises, fit: NoiseFit
 ) -> HeldOutCheck | Unavailable:
-    """Estimate the noises with the first half of the measurements, test them with the second."""
+    """Estimate the noises from the first half of the measurements, and test them on the rest."""
     half_count = len(fit.weight) // 2
     if half_count < MIN_MEASUREMENTS:
         return Unavailable(

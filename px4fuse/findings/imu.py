@@ -191,7 +191,7 @@ def detect_low_rates(flight: Flight) -> Findings:
                 if log.has_ulog:
                     action = (
                         f"Request {topic} at {requested_hz:g} Hz (PX4 console: mavlink stream -d "
-                        f"DEVICE -s {topic} -r {requested_hz:g}), or add the ULog (--mavlink)."
+                        f"DEVICE -s {topic} -r {requested_hz:g}), or give the ULog of the flight."
                     )
             yield warning(
                 "imu_rate_too_low",

@@ -124,7 +124,7 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
             "innovations_need_ulog",
             f"A MAVLink recording contains EKF2's states{variances}, but no innovations. The "
             "consistency of EKF2 cannot be tested.",
-            "Give the ULog of this flight as argument LOG, and this recording with --mavlink."
+            "Give the ULog of this flight as argument LOG."
             if log.has_ulog
             else "The innovations are in the autopilot's DataFlash log (.BIN), which px4fuse does "
             "not read.",

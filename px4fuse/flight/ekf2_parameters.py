@@ -25,8 +25,10 @@ class Aid:
         PX4's name, as in ``estimator_aid_src_<name>``.
     switch : str
         Name of the parameter that enables fusion, from PX4 v1.14 on; before, EKF2_AID_MASK does.
-    noise, gate, delay : str
-        Names of the parameters for measurement noise (σ), gate (√S) and age (ms).
+    noise, gate : str
+        Names of the parameters for measurement noise (σ) and gate (√S).
+    delay : str
+        Name of the parameter for the age (ms) of positions and heights; else empty.
     noise_mode : str
         Name of the parameter that, if 1, makes EKF2 ignore reported variances; else empty.
     lever_arm : tuple of str

@@ -107,7 +107,7 @@ class InputFile(Record, frozen=True):
     name: str
     sha256: Sha256
     bytes: Count
-    role: Literal["mavlink", "position"]
+    role: Literal["position"]
 
 
 class LogInfo(Record, frozen=True, omit_defaults=False):

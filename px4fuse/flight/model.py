@@ -11,7 +11,7 @@ empty plot or a "pass".
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal, TypeAlias
 
@@ -300,7 +300,7 @@ HORIZON_NOT_LOGGED = Unavailable(
 RECORD_NOT_LOGGED = Unavailable(
     "EKF2 state at the fusion horizon",
     "estimator_states is not logged",
-    "Add a ULog of PX4 v1.12 or newer, recorded with SDLOG_PROFILE bit 0 (default).",
+    "Give a ULog of PX4 v1.12 or newer, recorded with SDLOG_PROFILE bit 0 (default).",
 )
 
 
@@ -568,14 +568,9 @@ class Flight:
 
 
 def time_index(time_s: NDArray[Any]) -> pd.Index[float]:
-    """Return the index ``time_s`` (s) of a table of a flight."""
+    """Return times (s) as the index "time_s" of a DataFrame."""
     index: pd.Index[float] = pd.Index(time_s, name="time_s")
     return index
-
-
-def sort_by_preference(tracks: Iterable[PositionTrack]) -> tuple[PositionTrack, ...]:
-    """Sort position tracks by preference for a comparison, best first."""
-    return tuple(sorted(tracks, key=lambda track: track.origin.preference))
 
 
 def sample_rate(samples: pd.DataFrame) -> float:

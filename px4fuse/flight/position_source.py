@@ -71,8 +71,7 @@ class Origin(Record, frozen=True):
     @property
     def preference(self) -> int:
         """Index in :data:`ORIGINS`; the position source with the smallest index is preferred."""
-        origins = [(origin.aid, origin.path) for origin in ORIGINS]
-        return origins.index((self.aid, self.path))
+        return [(origin.aid, origin.path) for origin in ORIGINS].index((self.aid, self.path))
 
 
 POSITION_FILE = Origin("file", "given file", EV_POS)
@@ -88,10 +87,7 @@ ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FRO
 
 def find_origin(kind: str, path: str) -> Origin:
     """Return the origin in :data:`ORIGINS` with this kind of source and data path."""
-    for origin in ORIGINS:
-        if (origin.kind, origin.path) == (kind, path):
-            return origin
-    raise ValueError(f"{kind!r}, {path!r} is not in ORIGINS of {__name__}: add an Origin")
+    return {(origin.kind, origin.path): origin for origin in ORIGINS}[kind, path]  # type: ignore[index]
 
 
 def with_orientation(origin: Origin, *, turns: bool) -> Origin:

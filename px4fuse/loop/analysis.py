@@ -23,14 +23,15 @@ from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Trajectory, components_by_axis, cumulative_distance
 
-# Minimum time (s) in options that counts as UNIX time, if the timestamps of the trajectory are UNIX
-# time: smaller times count from the first pose
+# Minimum UNIX time (s) in options, if the timestamps of the trajectory are UNIX time: smaller times
+# are times after the first pose
 MIN_UNIX_TIME_S = 1e6
 # Minimum path length (m) of a loop
 MIN_PATH_M = 2.0
-# Limits for a loop analysis in ``px4fuse compare``: minimum path length (m), and maximum distance
-# between both ends of the path as fraction of the path length
+# Minimum path length (m) for a loop analysis in ``px4fuse compare``
 MIN_FLIGHT_LOOP_PATH_M = 10.0
+# Maximum distance between both ends of the path for a loop analysis in ``px4fuse compare``, as
+# fraction of the path length
 MAX_END_DISTANCE_FRACTION = 0.10
 # Maximum value (m or °) of the options for drift, key frame spacing and σ
 MAX_OPTION_VALUE = 100.0
@@ -144,7 +145,6 @@ def analyse(
         closures=gated_closures,
         corrections=score_paths(path, distance_corrections | graph_corrections, references),
         notes=tuple(note for note in notes if note),
-        nodes=frame_indices,
         distance_m=distance_m,
         graph=graph,
         references=references,
@@ -155,7 +155,7 @@ def analyse(
 def _find_true_end(
     path: Trajectory, request: LoopRequest, truth_end: TrueEnd | str | None, segment: Segment
 ) -> TrueEnd | Unavailable:
-    """Return the landing place: as measured, or from ground truth, or else the take-off place."""
+    """Find the landing place: as measured, from ground truth, or assumed at the take-off place."""
     if request.landed_at is not None:
         if not request.closed_loop:
             raise SettingsError(
@@ -189,7 +189,7 @@ def _is_absolute(trajectory: Trajectory, flight: Flight) -> bool:
 
 
 def _choose_key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
-    """Return the indices of the key frames, and at each pose the distance along the key frames."""
+    """Choose key frames; return their indices, and the distance along them at each pose (m)."""
     _require_in_range("key_frames_m", spacing_m, 1e-3)
     frame_indices = choose_key_frames(path.position_m, spacing_m)
     distance_m = cumulative_distance(path.position_m[frame_indices])

@@ -35,10 +35,12 @@ _TO_Z_DOWN: dict[Frame, tuple[list[int], list[float], Frame, str]] = {
         "the frame is unknown, so z is assumed to be up",
     ),
 }
-# Default key frame spacing as fraction of the extent of the path, because the radius of curves
-# grows with the extent; then minimum and maximum of the default spacing (m)
+# Default key frame spacing as fraction of the extent of the path: the radius of curves grows with
+# the extent
 SPACING_FRACTION = 0.02
-MIN_SPACING_M, MAX_SPACING_M = 0.02, 0.5
+# Minimum and maximum of the default key frame spacing (m)
+MIN_SPACING_M = 0.02
+MAX_SPACING_M = 0.5
 
 
 def to_z_down(trajectory: Trajectory) -> Trajectory:
@@ -67,7 +69,7 @@ def from_z_down(trajectory: Trajectory, frame: Frame) -> Trajectory:
 
 
 def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
-    """Rotate poses to another frame, and convert camera axes to body axes or back."""
+    """Rotate a trajectory to another frame; convert camera axes to body axes, or back."""
     rotation = Rotation.from_matrix(matrix)
     rotated = replace(
         trajectory.with_positions(trajectory.position_m @ matrix.T, rotation), frame=frame

@@ -102,10 +102,10 @@ def solve_pose_graphs(
     Return the corrected paths, and the closures with their weights from robust optimisation.
     """
     corrections: dict[Any, Corrected] = {}
-    if isinstance(graph, Unavailable) or not closures:
-        no_closure = Unavailable("pose graph", "the path has no loop closure", "Give --closure.")
-        unavailable = graph if isinstance(graph, Unavailable) else no_closure
-        corrections |= {f"pose_graph_{solution_name}": unavailable for solution_name in SOLUTIONS}
+    if not closures and not isinstance(graph, Unavailable):
+        graph = Unavailable("pose graph", "the path has no loop closure", "Give --closure.")
+    if isinstance(graph, Unavailable):
+        corrections = {f"pose_graph_{solution_name}": graph for solution_name in SOLUTIONS}
         return corrections, ()
     edges = np.arange(len(graph.first))
     is_closure = edges >= len(edges) - len(closures)
@@ -145,7 +145,7 @@ def solve_pose_graphs(
 def _interpolate_corrections(
     path: Trajectory, nodes: IntArray, graph_poses: Array, solved_poses: Array
 ) -> Trajectory:
-    """Correct all poses by interpolation between the corrections of neighbouring graph nodes."""
+    """Correct each pose by interpolation between the corrections of neighbouring graph nodes."""
     rotation = (
         Rotation.from_quat(solved_poses[:, 3:]) * Rotation.from_quat(graph_poses[:, 3:]).inv()
     )
@@ -193,7 +193,6 @@ def score_paths(
         return CorrectedPath(
             name=CORRECTION_LABELS[name],
             trajectory=path,
-            moved_m=displacement_m,
             correction_max_m=float(displacement_m.max()),
             correction_rms_m=float(np.sqrt(np.mean(displacement_m**2))),
             scores={reference.name: score(path, reference) for reference in references},

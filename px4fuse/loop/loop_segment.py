@@ -14,9 +14,9 @@ from px4fuse.loop.model import TrueEnd
 from px4fuse.request import Landing
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, components_by_axis, format_vector
 
-# Time (s) over which poses on the ground are averaged, and maximum range (m) of their positions:
-# with a larger range the vehicle is not at rest
+# Time (s) over which poses on the ground are averaged
 REST_TIME_S = 1.0
+# Maximum range (m) of the positions of a vehicle at rest
 MAX_REST_RANGE_M = 0.15
 # Maximum heading change (°) of the odometry for which the true heading change is assumed to be zero
 MAX_SAME_HEADING_DEG = 15.0

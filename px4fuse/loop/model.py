@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.arrays import Array
 from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import Count, NotNegative, OrUnavailable, Record, Share, Unavailable
 from px4fuse.errors import MissingDataError
@@ -143,8 +143,6 @@ class CorrectedPath(Correction, frozen=True, kw_only=True, eq=False):
     name : str
     trajectory : Trajectory
         All poses of the segment, corrected.
-    moved_m : ndarray, shape (n,)
-        Distance by which each pose was corrected.
     solution : Solution or None
         Solution of the pose graph; None for a correction without pose graph.
     """
@@ -153,7 +151,6 @@ class CorrectedPath(Correction, frozen=True, kw_only=True, eq=False):
     scores: Mapping[str, Evaluation | Unavailable]
     name: str
     trajectory: Trajectory
-    moved_m: Array
     solution: Solution | None = None
 
     __repr__ = one_line_repr
@@ -199,8 +196,6 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
     Attributes
     ----------
     corrections : mapping from correction name to CorrectedPath or Unavailable
-    nodes : ndarray of int, shape (k,)
-        Indices of the poses that are key frames.
     distance_m : ndarray, shape (n,)
         Distance along the key frames at each pose.
     graph : PoseGraph or Unavailable
@@ -212,7 +207,6 @@ class Loop(LoopResult, frozen=True, kw_only=True, eq=False):
 
     schema_type = LoopResult
     corrections: Mapping[CorrectionName, CorrectedPath | Unavailable]
-    nodes: IntArray
     distance_m: Array
     graph: PoseGraph | Unavailable
     references: tuple[Trajectory, ...]

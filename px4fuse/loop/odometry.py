@@ -77,7 +77,7 @@ def odometry_variances(
 
 
 def _variance_growth(variance: Array | None, nodes: IntArray) -> Array | None:
-    """Return the growth of reported variances between nodes, (k - 1, 3); None if too small."""
+    """Compute the growth of reported variances between nodes, (k - 1, 3); None if too small."""
     if variance is None:
         return None
     end_count = max(1, int(END_FRACTION * len(variance)))

@@ -117,7 +117,7 @@ def _make_trajectory(
     notes: tuple[str, ...],
     frame: Frame = "NED",
 ) -> Trajectory:
-    """Make a trajectory at the times of the positions, with interpolated orientations (slerp)."""
+    """Make a trajectory at the times of the positions; interpolate the orientations (slerp)."""
     samples = finite_rows(samples, Columns.POSITION)
     rotation = None
     rotation_variance = None

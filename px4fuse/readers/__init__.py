@@ -8,8 +8,8 @@ from px4fuse.flight.model import Flight
 
 _SNIFF_BYTES = 16
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
-# Unsupported formats that users often give by mistake: first bytes of the file, suffixes of its
-# name, fault for the error message, action for the error message
+# Formats that px4fuse does not read, but users try: first bytes of the file, suffixes of its name,
+# and fault and action of the error message
 _FOREIGN_FORMATS = (
     # Header bytes of ArduPilot, libraries/AP_Logger/LogStructure.h
     (
@@ -56,12 +56,12 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
         :data:`px4fuse.core.reading.max_log_bytes`, of an unknown format, or contains no usable
         data.
     SettingsError
-        ``system`` is not a system id in the recording, or is given for a ULog.
+        ``system`` is not a system id in the recording, or the log is a ULog.
     """
     path = Path(path)
     name = display_name(path)
     head = read_head(path, _SNIFF_BYTES, LogError)
-    # Imports are local, because importing pyulog or pymavlink takes a noticeable time
+    # Imports are local, because the import of pyulog or pymavlink takes 0.1 s or more
     if head.startswith(ULOG_MAGIC):
         if system is not None:
             raise SettingsError(f"{name}: `system` is only for MAVLink recordings.")

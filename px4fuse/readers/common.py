@@ -16,17 +16,21 @@ MAX_VALID_VALUE = 1e9
 MAX_IMU_VALUE = 1e4
 # Minimum distance (m) of rows 0, 0, 0 from the positions beside them: 3 σ of good UWB (0.1 m)
 MIN_ZERO_DISTANCE_M = 0.3
-# Minimum duration (s) and number of equal positions that are one position held: a source that sends
-# each position several times repeats it for less
-MIN_HELD_S, MIN_HELD_COUNT = 1.0, 5
-MAX_HELD_FRACTION = 0.5  # of the rows; a source that is at rest for longer may repeat its position
-MAX_MULTIPLE_ERROR = 0.01  # distance from whole multiples of a rounding step
+# Minimum duration (s) of equal positions that are one position held: a source that sends each
+# position several times repeats it for a shorter time
+MIN_HELD_S = 1.0
+# Minimum number of equal positions that are one position held
+MIN_HELD_COUNT = 5
+# Maximum fraction of held positions: with more, the source is at rest and may repeat its position
+MAX_HELD_FRACTION = 0.5
+# Maximum distance (rounding steps) of a difference of values from a whole multiple of the step
+MAX_MULTIPLE_ERROR = 0.01
 # Minimum norm of a valid quaternion: senders without attitude send zeros
 MIN_QUATERNION_NORM = 0.5
 
 
 def collect_unavailable(*flight_data: object) -> tuple[Unavailable, ...]:
-    """Return the unavailable data of a flight, including the unavailable data of EKF2."""
+    """Return those data of a flight that are Unavailable, also inside :class:`Ekf2`."""
     for data in flight_data:
         if isinstance(data, Ekf2):
             flight_data += (data.variance, *data.innovations.values(), data.fusing)
@@ -63,7 +67,7 @@ def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
 
 
 def mode_spans(names: pd.Series, end_s: float) -> tuple[FlightMode, ...]:
-    """Convert a time series of flight mode names to intervals with one mode (s)."""
+    """Convert flight mode names over time to intervals (s) with one mode."""
     return tuple(FlightMode(*span) for span in constant_spans(names, end_s))
 
 
@@ -76,7 +80,7 @@ def finite_rows(
 
 
 def find_invalid(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
-    """Return the reason why each row is no measurement (NaN, zero, held), "" for measurements.
+    """Return "NaN", "zero" or "held" for each row that is not a measurement, and "" for the others.
 
     ``columns`` are the coordinates that a measurement needs.
     """
@@ -105,13 +109,18 @@ def find_invalid(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
 
 
 def rounding_step(values: Array) -> float:
-    """Return the step of which all differences of the values are multiples; 0 without one."""
+    """Return the rounding step: all differences of the values are multiples of it; else 0."""
     steps = np.diff(np.unique(values[np.isfinite(values)]))
     if not len(steps):
         return 0.0
     multiples = steps / steps.min()
     is_multiple = np.abs(multiples - np.rint(multiples)) < MAX_MULTIPLE_ERROR
     return float(steps.min()) if is_multiple.all() else 0.0
+
+
+def interpolate_inside(time_s: pd.Index | Array, values: "pd.Series[float]") -> Array:
+    """Interpolate a time series at times; NaN before its first and after its last sample."""
+    return np.asarray(np.interp(time_s, values.index, values, left=np.nan, right=np.nan))
 
 
 def join_nearest(

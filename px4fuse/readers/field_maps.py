@@ -1,4 +1,4 @@
-"""Message fields with their DataFrame columns: format of the rows of two tables.
+"""Maps from message fields to DataFrame columns, in the format of two tables.
 
 The tables are ``px4_topics.toml`` (PX4 topics) and ``mavlink_messages.toml`` (MAVLink messages).
 """
@@ -19,7 +19,7 @@ GLOBAL_COLUMNS = ["latitude_deg", "longitude_deg", "altitude_m"]
 
 @dataclass(frozen=True)
 class Layout:
-    """Fields of one topic or message, and the DataFrame columns to which they are converted.
+    """Fields of a topic or message, and the DataFrame columns to which they are converted.
 
     Attributes
     ----------

@@ -9,33 +9,31 @@ import numpy as np
 from px4fuse.core.arrays import Array
 from px4fuse.core.reading import display_name, read_bytes_limited
 from px4fuse.errors import TrajectoryError
-from px4fuse.readers.text_table import Rows, decode_text, format_line_error, quote
-from px4fuse.readers.trajectory import MAX_COORDINATE_M
+from px4fuse.readers.text_table import Rows, decode_text, line_error, quote
+from px4fuse.readers.trajectory import MAX_COORDINATE_M, UNIT_NORM_TOLERANCE
 from px4fuse.trajectory.graph.initialisation import initialise
 from px4fuse.trajectory.graph.model import FROM_FILE, PoseGraph
 
 MAX_FILE_BYTES = 500_000_000
-# Number of vertex ids, and number of values after the ids, by tag at the beginning of the line
+# Number of vertex ids, and number of values after the ids, by the tag that begins a line
 _TAGS = {
     "VERTEX_SE2": (1, 3),
     "VERTEX_SE3:QUAT": (1, 7),
     "EDGE_SE2": (2, 3 + 6),
     "EDGE_SE3:QUAT": (2, 7 + 21),
 }
-# Beginnings of the tags of lines that are skipped: laser scans and parameters
+# Tags of lines that are skipped, or their first letters: laser scans and parameters
 _SKIPPED_TAGS = ("PARAMS", "ROBOTLASER", "RAWLASER", "FLASER", "RLASER")
 _REMEDY = (
     "Give poses as VERTEX_SE2 or VERTEX_SE3:QUAT, and edges as EDGE_SE2 or EDGE_SE3:QUAT. Remove "
     "other lines."
 )
 _VERTEX_ID = re.compile("[+-]?[0-9]{1,18}")
-# Maximum ratio of a negative eigenvalue of an information matrix to its largest eigenvalue: a
-# smaller ratio is a rounding error of the printed digits
+# Maximum ratio of a negative eigenvalue of an information matrix to its largest eigenvalue, due to
+# rounding of the printed digits
 _EIGENVALUE_TOLERANCE = 1e-9
-# Maximum deviation of a quaternion from norm 1 that is not corrected: a rounding error of float64
-_UNIT_NORM_TOLERANCE = 1e-15
-# Minimum and maximum valid entry (1/m², 1/rad²) of an information matrix: real measurements are
-# inside, and squares of the limits do not overflow
+# Minimum and maximum valid entry (1/m², 1/rad²) of an information matrix: squares of the limits do
+# not overflow
 _MIN_INFORMATION, _MAX_INFORMATION = 1e-50, 1e50
 
 
@@ -54,11 +52,12 @@ def read_g2o(path: str | Path) -> PoseGraph:
         vertex, a repeated vertex, an invalid information matrix, or both SE2 and SE3 poses. The
         error message contains the file name and the line number.
     """
-    path_object = Path(path)
-    text = decode_text(read_bytes_limited(path_object, TrajectoryError, MAX_FILE_BYTES))
+    path = Path(path)
+    name = display_name(path)
+    text = decode_text(read_bytes_limited(path, TrajectoryError, MAX_FILE_BYTES))
     if text is None:
-        raise TrajectoryError(f"{display_name(path_object)} is not a text file", _REMEDY)
-    return parse_g2o(text, display_name(path_object))
+        raise TrajectoryError(f"{name} is not a text file", _REMEDY)
+    return parse_g2o(text, name)
 
 
 def parse_g2o(text: str, name: str) -> PoseGraph:
@@ -74,8 +73,7 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     dimension, tag_kind, pose_width = (2, "SE2", 3) if in_plane else (3, "SE3:QUAT", 7)
     for tag, rows in rows_by_tag.items():
         if rows.lines and not tag.endswith(tag_kind):
-            fault = "the file contains both SE2 and SE3 poses or edges"
-            raise rows.row_error(0, fault, "Use either SE2 or SE3 in a file.")
+            raise rows.row_error(0, "the file contains both SE2 and SE3", "Use SE2 or SE3.")
     vertices = rows_by_tag[f"VERTEX_{tag_kind}"]
     edges = rows_by_tag[f"EDGE_{tag_kind}"]
     if not edges.lines:
@@ -93,10 +91,9 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         is_repeated[order[1:]] = ids[1:] == ids[:-1]
         vertices.raise_where(is_repeated, "this vertex id is repeated", "Remove one of the lines.")
     vertex_index = np.minimum(np.searchsorted(ids, edge_vertex_ids), len(ids) - 1)
-    fault = "the edge connects a vertex that is not in the file"
     edges.raise_where(
         ids[vertex_index] != edge_vertex_ids,
-        fault,
+        "the edge connects a vertex that is not in the file",
         "Add the VERTEX line, or remove all VERTEX lines.",
     )
     edges.raise_where(
@@ -156,20 +153,15 @@ def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
         elif tag == "FIX":
             fixed_ids.update(" ".join(values).split())
             if len(fixed_ids) > 1:
-                raise TrajectoryError(
-                    format_line_error(
-                        name,
-                        line_number,
-                        "the line fixes a second vertex",
-                        "Remove the line, or connect both vertices by an edge.",
-                    )
+                raise line_error(
+                    name,
+                    line_number,
+                    "the line fixes a second vertex",
+                    "Remove the line, or connect both vertices by an edge.",
                 )
         elif not tag.startswith(_SKIPPED_TAGS):
-            raise TrajectoryError(
-                format_line_error(
-                    name, line_number, f"lines with the tag {quote(tag)} are not supported", _REMEDY
-                )
-            )
+            fault = f"lines with the tag {quote(tag)} are not supported"
+            raise line_error(name, line_number, fault, _REMEDY)
     return rows_by_tag
 
 
@@ -186,9 +178,10 @@ def _parse(rows: Rows, tag: str) -> tuple[np.ndarray[Any, np.dtype[np.int64]], A
     remedy = "Correct or remove the line."
     rows.raise_where(~np.isfinite(numbers), "a number is not finite", remedy)
     # The first three numbers are x, y, z (m) or, in SE2, x, y (m) and the angle (rad)
-    is_too_large = np.abs(numbers[:, :3]) >= MAX_COORDINATE_M
     rows.raise_where(
-        is_too_large, f"a position or angle is outside ±{MAX_COORDINATE_M:.0e}", remedy
+        np.abs(numbers[:, :3]) >= MAX_COORDINATE_M,
+        f"a position or angle is outside ±{MAX_COORDINATE_M:.0e}",
+        remedy,
     )
     return cells[:, 1:].astype(np.int64), numbers
 
@@ -204,7 +197,7 @@ def _normalise_quaternions(rows: Rows, poses: Array) -> Array:
         "Give the unit quaternion qx qy qz qw after the position.",
     )
     # Unit quaternions are not changed, so that a written file is read back with the same digits
-    norm[np.abs(norm - 1.0) <= _UNIT_NORM_TOLERANCE] = 1.0
+    norm[np.abs(norm - 1.0) <= UNIT_NORM_TOLERANCE] = 1.0
     return np.hstack([poses[:, :3], poses[:, 3:] / norm[:, None]])
 
 
@@ -215,15 +208,15 @@ def _information_matrices(rows: Rows, numbers: Array, size: int) -> Array:
     matrices[:, row, column] = matrices[:, column, row] = numbers
     magnitude = np.abs(numbers)
     is_too_small = (row == column) & (magnitude > 0.0) & (magnitude < _MIN_INFORMATION)
-    fault = "the information matrix has an invalid entry"
-    remedy = f"Give 0, or {_MIN_INFORMATION:g} to {_MAX_INFORMATION:g}."
-    rows.raise_where(is_too_small | (magnitude > _MAX_INFORMATION), fault, remedy)
+    rows.raise_where(
+        is_too_small | (magnitude > _MAX_INFORMATION),
+        "the information matrix has an invalid entry",
+        f"Give 0, or {_MIN_INFORMATION:g} to {_MAX_INFORMATION:g}.",
+    )
     eigenvalues = np.linalg.eigvalsh(matrices)
-    fault = "the information matrix has a negative eigenvalue"
-    remedy = "Give the upper triangle of an inverse covariance, row by row."
     rows.raise_where(
         eigenvalues[:, 0] < -_EIGENVALUE_TOLERANCE * np.maximum(eigenvalues[:, -1], 0.0),
-        fault,
-        remedy,
+        "the information matrix has a negative eigenvalue",
+        "Give the upper triangle of an inverse covariance, row by row.",
     )
     return matrices

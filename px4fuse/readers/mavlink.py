@@ -32,7 +32,7 @@ from px4fuse.readers import common
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import mavlink_senders as senders
 from px4fuse.readers.mavlink_clocks import MIN_UNIX_TIME_S
-from px4fuse.readers.mavlink_frames import MESSAGE_IDS, read_frames
+from px4fuse.readers.mavlink_frames import MESSAGE_IDS, VEHICLE_TYPES, read_frames
 from px4fuse.readers.mavlink_positions import pressure_altitude, read_positions, read_truth
 from px4fuse.readers.mavlink_recording import (
     RECEIPT_CLOCK,
@@ -97,8 +97,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     pressure_hpa = recording.read(messages.LAYOUTS["pressure"])["pressure_hpa"]
     modes = _read_modes(recording) if autopilot == "PX4" else messages.NO_MODES
     return Flight(
-        # Evaluated after all readers, because the log description counts the samples that they
-        # dropped
+        # The log description is made last, because it counts the samples that the readers dropped
         log=_describe_log(recording, parameters, parameter_faults, autopilot, in_flight),
         imu=imu,
         attitude=attitude,
@@ -123,21 +122,14 @@ def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
     candidates = [(layout, recording.rows(layout.topic)) for layout in messages.IMU_LAYOUTS]
     # HIGHRES_IMU is preferred, because it has SI units and µs timestamps; without HIGHRES_IMU, the
     # message with most samples is used
-    layout, rows = (
-        candidates[0]
-        if len(candidates[0][1]) > 1
-        else max(candidates, key=lambda pair: len(pair[1]))
-    )
+    layout, rows = candidates[0]
     if len(rows) < 2:
-        raw_count = len(recording.rows("RAW_IMU"))
-        ignored_note = (
-            f"; {raw_count} RAW_IMU messages were not used, because raw counts have no unit"
-            if raw_count
-            else ""
-        )
-        return Unavailable(
-            "IMU", f"the recording contains no HIGHRES_IMU or SCALED_IMU{ignored_note}", remedy
-        )
+        layout, rows = max(candidates, key=lambda pair: len(pair[1]))
+    if len(rows) < 2:
+        reason = "the recording contains no HIGHRES_IMU or SCALED_IMU"
+        if raw_count := len(recording.rows("RAW_IMU")):
+            reason += f"; {raw_count} RAW_IMU messages were not used: raw counts have no unit"
+        return Unavailable("IMU", reason, remedy)
     table = recording.frames.table(layout.topic, rows)
     if "id" in (table.dtype.names or ()):
         rows = rows[table["id"] == np.bincount(table["id"]).argmax()]
@@ -158,12 +150,8 @@ def _read_attitude(recording: Recording, remedy: str) -> TableOrUnavailable:
     layout = max(messages.ATTITUDE_LAYOUTS, key=lambda layout: len(recording.rows(layout.topic)))
     attitude = common.with_attitude(recording.read(layout))[Columns.QUATERNION]
     if len(attitude) < 2:
-        *other_topics, last_topic = (layout.topic for layout in messages.ATTITUDE_LAYOUTS)
-        return Unavailable(
-            "attitude",
-            f"the recording contains no usable {', '.join(other_topics)} or {last_topic}",
-            remedy,
-        )
+        names = " or ".join(layout.topic for layout in messages.ATTITUDE_LAYOUTS)
+        return Unavailable("attitude", f"the recording contains no usable {names}", remedy)
     recording.record_stream("attitude", layout.topic)
     return attitude
 
@@ -175,12 +163,11 @@ def _read_ekf2(
     counts = {layout.topic: len(recording.rows(layout.topic)) for layout in messages.STATE_LAYOUTS}
     # ODOMETRY has variances, so it is preferred unless its message rate is below half of the
     # highest message rate
-    frequent_layouts = (
-        candidate
-        for candidate in messages.STATE_LAYOUTS
-        if 2 * counts[candidate.topic] >= max(counts.values())
+    layout = next(
+        layout
+        for layout in messages.STATE_LAYOUTS
+        if 2 * counts[layout.topic] >= max(counts.values())
     )
-    layout = next(frequent_layouts)
     message = layout.topic
     if counts[message] < 2:
         return Unavailable(
@@ -329,10 +316,8 @@ def _describe_log(
         firmware_hash = hash_hex if hash_hex.strip("0") else "unknown"
         uid = bytes(version["uid2"]).hex()
         vehicle = uid if uid.strip("0") else ""
-    heartbeats = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))
-    vehicle_name = messages.VEHICLE_TYPES.get(
-        next(iter(heartbeats["type"].tolist()), -1), "vehicle"
-    )
+    vehicle_types = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))["type"].tolist()
+    vehicle_name = VEHICLE_TYPES.get(next(iter(vehicle_types), -1), "vehicle")
     dropped = sorted(recording.dropped.items())
     return LogInfo(
         name=frames.name,

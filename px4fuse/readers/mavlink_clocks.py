@@ -16,13 +16,13 @@ from scipy.stats import theilslopes
 from px4fuse.core.arrays import Array
 from px4fuse.flight.log import ClockMap
 
-# Maximum median difference (s) between the timestamps of a sender and the boot time of receipt, for
-# timestamps that count as boot time
+# Maximum median difference (s) between timestamps of a sender and the boot time of receipt: with a
+# larger difference the timestamps are not boot time
 MAX_BOOT_CLOCK_DISTANCE_S = 10.0
-# Minimum reduction (s) of the difference between timestamps and receive time by TIMESYNC, for a
-# sender that counts as having a separate clock
+# Minimum reduction (s) by TIMESYNC of the difference between timestamps and receive time: with a
+# smaller reduction the sender uses the boot clock
 MIN_TIMESYNC_IMPROVEMENT_S = 0.1
-# Minimum time (s) that counts as UNIX time, 2001-09-09: smaller times count from boot
+# Minimum UNIX time (s), 2001-09-09: smaller times are times since boot
 MIN_UNIX_TIME_S = 1e9
 # Interval length (s) of the lower envelope, which uses the message with the least delay in each
 # interval
@@ -31,8 +31,8 @@ MAX_ENVELOPE_INTERVALS = 200
 # Minimum time span (s) to estimate a clock drift: in a shorter span both clocks are assumed to have
 # the same rate
 MIN_DRIFT_SPAN_S = 30.0
-# Maximum relative difference of the rates of two real clocks: a larger difference is from a
-# replayed link, and is estimated even in a time span below MIN_DRIFT_SPAN_S
+# Maximum relative difference between the rates of two clocks in real time: a link that is replayed
+# has a larger difference, which is estimated even below MIN_DRIFT_SPAN_S
 MAX_RATE_DIFFERENCE = 0.01
 # Maximum ratio of the rates of two clocks: above any replay speed or wrong unit of time (s for ns
 # is 1e9)
@@ -48,8 +48,8 @@ MAX_REGULAR_INTERVAL_S = 1.0
 class Line:
     """Linear map between two clocks: y = y0 + slope · (x - x0).
 
-    ``pairs`` is the number of clock readings, and ``jitter`` (unit of y) their standard deviation
-    about the line, 1.4826 · median absolute deviation.
+    ``pairs`` is the number of simultaneous readings of both clocks. ``jitter`` (unit of y) is their
+    standard deviation from the line, 1.4826 · median absolute deviation.
     """
 
     x0: float
@@ -92,11 +92,8 @@ def fit_least_delay(x: Array, y: Array) -> Line:
     middle_rows = [rows[len(rows) // 2] for rows in interval_rows]
     if len(middle_rows) > 1 and x[middle_rows[-1]] > x[middle_rows[0]]:
         initial_slope = _median_slope(x[middle_rows], y[middle_rows])
-        slope = (
-            initial_slope
-            if abs(initial_slope - 1.0) > MAX_RATE_DIFFERENCE and _is_rate_ratio(initial_slope)
-            else 1.0
-        )
+        if abs(initial_slope - 1.0) > MAX_RATE_DIFFERENCE and _is_rate_ratio(initial_slope):
+            slope = initial_slope
     residual = y - slope * (x - x0)
     envelope_rows = [rows[np.argmin(residual[rows])] for rows in interval_rows]
     if span_s >= MIN_DRIFT_SPAN_S and len(envelope_rows) > 1:
@@ -110,7 +107,7 @@ def fit_least_delay(x: Array, y: Array) -> Line:
 
 
 def _median_slope(x: Array, y: Array) -> float:
-    """Return the Theil-Sen slope of y over x; not finite if all x are almost equal."""
+    """Return the Theil-Sen slope of y over x; it is not finite if all x are almost equal."""
     with np.errstate(over="ignore", invalid="ignore"):
         return float(theilslopes(y, x)[0])
 
@@ -133,8 +130,7 @@ def robust_std(values: Array) -> float:
 class ClockMapping:
     """Map from a sender's timestamps to the boot clock, and its description for results.
 
-    ``to_boot`` is None if the timestamps are not from a running clock; the receive time is then
-    used instead.
+    ``to_boot`` is None if most timestamps are equal; the receive time is then used instead.
     """
 
     to_boot: Line | None
@@ -171,7 +167,8 @@ def map_clock(
     map_boot_to_unix : Line or None
         Map from boot clock to UNIX time by the autopilot's SYSTEM_TIME.
     has_receipt : bool
-        True if the recording contains receive times; False if only the order of messages is known.
+        True if the recording contains receive times; False if it contains only the order of the
+        messages.
     """
     time_source = "receive time" if has_receipt else "position in the stream"
     boot_at_receipt = boot_of_receipt.at(received_s)
@@ -183,25 +180,23 @@ def map_clock(
         )
         # Jitter of the receive time if samples are sent at regular intervals; gaps are excluded
         intervals_s = np.diff(received_s)
-        regular_intervals_s = intervals_s[intervals_s < MAX_REGULAR_INTERVAL_S]
-        jitter_s = (
-            float(np.std(regular_intervals_s) / np.sqrt(2.0))
-            if len(regular_intervals_s) > 1
-            else 0.0
+        intervals_s = intervals_s[intervals_s < MAX_REGULAR_INTERVAL_S]
+        jitter_s = float(np.std(intervals_s) / np.sqrt(2.0)) if len(intervals_s) else 0.0
+        description = ClockMap(
+            name, time_source, len(stamp_s), 0.0, 0.0, jitter_s, note, distinct_count
         )
-        return ClockMapping(
-            None,
-            ClockMap(name, time_source, len(stamp_s), 0.0, 0.0, jitter_s, note, distinct_count),
-        )
+        return ClockMapping(None, description)
+
+    def distance_s(boot_s: Array) -> float:
+        return abs(float(np.median(boot_at_receipt - boot_s)))
+
     timesync_line = _fit_timesync(replies, answers)
-    unmapped_distance_s = abs(float(np.median(boot_at_receipt - stamp_s)))
+    unmapped_distance_s = distance_s(stamp_s)
     # A separate clock that started only seconds after the autopilot's clock looks like the boot
     # clock; only TIMESYNC distinguishes them
     improvement_s = 0.0
     if timesync_line is not None:
-        improvement_s = unmapped_distance_s - abs(
-            float(np.median(boot_at_receipt - timesync_line.at(stamp_s)))
-        )
+        improvement_s = unmapped_distance_s - distance_s(timesync_line.at(stamp_s))
     if (
         unmapped_distance_s <= MAX_BOOT_CLOCK_DISTANCE_S
         and improvement_s < MIN_TIMESYNC_IMPROVEMENT_S
@@ -216,15 +211,14 @@ def map_clock(
         unix_note = "sender and autopilot are assumed to have the same UNIX time"
         candidates.append(("SYSTEM_TIME", map_boot_to_unix.inverse(), unix_note))
     for method, line, note in candidates:
-        # A map that moves messages far from their receive time belongs to another clock
-        if abs(float(np.median(line.at(stamp_s) - boot_at_receipt))) <= MAX_BOOT_CLOCK_DISTANCE_S:
+        # With the map of another clock, the boot times are far from the receive times
+        if distance_s(line.at(stamp_s)) <= MAX_BOOT_CLOCK_DISTANCE_S:
             return ClockMapping(line, _clock_map(clock_name, method, line, stamp_s, note))
-    receipt_line = fit_least_delay(stamp_s, received_s)
-    boot_y0_s = float(boot_of_receipt.at(receipt_line.y0))
-    slope = receipt_line.slope * boot_of_receipt.slope
-    boot_line = replace(receipt_line, y0=boot_y0_s, slope=slope)
+    line = fit_least_delay(stamp_s, received_s)
+    slope = line.slope * boot_of_receipt.slope
+    line = replace(line, y0=float(boot_of_receipt.at(line.y0)), slope=slope)
     note = "without TIMESYNC and SYSTEM_TIME the mapped times are late by the minimum link delay"
-    return ClockMapping(boot_line, _clock_map(clock_name, time_source, boot_line, stamp_s, note))
+    return ClockMapping(line, _clock_map(clock_name, time_source, line, stamp_s, note))
 
 
 def _fit_timesync(replies: tuple[Array, Array], answers: tuple[Array, Array]) -> Line | None:

@@ -37,8 +37,8 @@ RECEIVE_TIME_BYTES = 8
 BLOCK_BYTES = 1 << 16
 # Number of frames that are decoded at once, to limit the memory
 DECODE_BATCH_SIZE = 1 << 12
-# Minimum fraction of a MAVLink recording's bytes that are in valid frames. Random data contain one
-# valid frame in about eight million bytes.
+# Minimum fraction of a MAVLink recording's bytes that are in valid frames: random data contain one
+# valid frame in about eight million bytes
 MIN_VALID_FRACTION = 0.01
 # Maximum difference (µs) of a receive time from the median receive time (limit of pymavlink): a
 # receive time with a larger difference is damaged
@@ -46,12 +46,17 @@ MAX_RECEIVE_TIME_DISTANCE_US = 3 * 24 * 3600 * 1_000_000
 MESSAGE_IDS: Mapping[str, int] = {
     message.msgname: at for at, message in dialect.mavlink_map.items()
 }
+# Vehicle type by number of the MAV_TYPE: "quadrotor" for MAV_TYPE_QUADROTOR
+VEHICLE_TYPES = {
+    number: entry.name.removeprefix("MAV_TYPE_").replace("_", " ").lower()
+    for number, entry in dialect.enums["MAV_TYPE"].items()
+} | {6: "ground station", 18: "companion computer"}
 # CRC_EXTRA by message id, the last byte in the checksum; -1 for unknown messages
 _CRC_EXTRA = np.full(
     max(1 << 16, *(number + 1 for number in dialect.mavlink_map)), -1, dtype=np.int16
 )
 _CRC_EXTRA[[*dialect.mavlink_map]] = [message.crc_extra for message in dialect.mavlink_map.values()]
-# Checksum of each single byte, for the last step of the checksum with CRC_EXTRA
+# Checksums of single bytes, for the last step of the checksum with CRC_EXTRA
 _BYTE_CHECKSUMS = np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], dtype=np.uint16)
 
 
@@ -260,12 +265,13 @@ def _remove_nested_frames(frames: Integers) -> Integers:
 def _find_possible_frames(
     content_bytes: NDArray[np.uint8], block_start: int
 ) -> tuple[Integers, Integers]:
-    """Return two arrays about possible frames: start, end and message id; and checksum offset."""
+    """Find the bytes of a block at which frames may begin.
+
+    Return start, end and message id of the possible frames, shape (n, 3), and the offsets of their
+    checksums.
+    """
     block = content_bytes[block_start : block_start + BLOCK_BYTES]
-    start = (
-        np.flatnonzero((block == MAGIC_BYTE_1) | (block == MAGIC_BYTE_2)).astype(np.int64)
-        + block_start
-    )
+    start = block_start + np.flatnonzero((block == MAGIC_BYTE_1) | (block == MAGIC_BYTE_2))
     header_bytes = np.where(content_bytes[start] == MAGIC_BYTE_2, HEADER_BYTES_2, HEADER_BYTES_1)
     has_whole_header = start + header_bytes + CHECKSUM_BYTES <= len(content_bytes)
     start = start[has_whole_header]
@@ -292,13 +298,11 @@ def _find_possible_frames(
 def _has_receive_times(start: Integers, end: Integers) -> bool:
     """Return True if most frames are separated by the eight bytes of a receive time."""
     gap_bytes = start[1:] - end[:-1]
-    stamped_count = np.count_nonzero(gap_bytes == RECEIVE_TIME_BYTES)
-    bare_count = np.count_nonzero(gap_bytes == 0)
-    return (
-        bool(stamped_count > bare_count)
-        if stamped_count + bare_count
-        else bool(start[0] == RECEIVE_TIME_BYTES)
-    )
+    with_time_count = int(np.count_nonzero(gap_bytes == RECEIVE_TIME_BYTES))
+    without_time_count = int(np.count_nonzero(gap_bytes == 0))
+    if with_time_count + without_time_count:
+        return with_time_count > without_time_count
+    return bool(start[0] == RECEIVE_TIME_BYTES)
 
 
 def _count_other_bytes(
@@ -332,16 +336,9 @@ def _count_other_bytes(
             offset += size
         bad_bytes += gap_end - offset
         last_bytes = content[offset:gap_end] if gap_end == len(content) else b""
-    begins_frame = last_bytes[time_bytes : time_bytes + 1] in (
-        b"",
-        bytes([MAGIC_BYTE_1]),
-        bytes([MAGIC_BYTE_2]),
-    )
-    return (
-        unknown_frame_count,
-        bad_bytes,
-        0 < len(last_bytes) < time_bytes + MAX_FRAME_BYTES and begins_frame,
-    )
+    begins_frame = {*last_bytes[time_bytes : time_bytes + 1]} <= {MAGIC_BYTE_1, MAGIC_BYTE_2}
+    ends_in_frame = 0 < len(last_bytes) < time_bytes + MAX_FRAME_BYTES and begins_frame
+    return unknown_frame_count, bad_bytes, ends_in_frame
 
 
 def _unknown_frames(content: bytes, offset: int, gap_end: int, time_bytes: int) -> Iterator[int]:

@@ -94,9 +94,9 @@ _TABLE = table(__file__, "mavlink_messages.toml", dict[str, dict[str, Any]])
 LAYOUTS = expand_layouts(_TABLE["layouts"])
 _INPUTS = msgspec.convert(_TABLE["positions"], dict[str, PositionInput])
 FRAMES_OF_REFERENCE = msgspec.convert(_TABLE["frames"], dict[int, FrameOfReference], strict=False)
-AUTOPILOTS, VEHICLE_TYPES, MAIN_MODES, AUTO_MODES = (
+AUTOPILOTS, MAIN_MODES, AUTO_MODES = (
     msgspec.convert(_TABLE[name], dict[int, str], strict=False)
-    for name in ("autopilots", "vehicle_types", "main_modes", "auto_modes")
+    for name in ("autopilots", "main_modes", "auto_modes")
 )
 UNUSED_MESSAGES: Mapping[str, str] = _TABLE["unused"]
 POSITION_INPUTS = tuple(replace(row, name=name) for name, row in _INPUTS.items())

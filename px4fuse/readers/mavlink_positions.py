@@ -9,7 +9,7 @@ import pandas as pd
 from msgspec import structs
 from scipy import constants
 
-from px4fuse.flight.model import Columns, PositionTrack, Truth, Unavailable, sort_by_preference
+from px4fuse.flight.model import Columns, PositionTrack, Truth, Unavailable
 from px4fuse.flight.position_source import GNSS, with_orientation
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import px4_positions
@@ -24,8 +24,8 @@ from px4fuse.readers.px4_positions import GeodeticPosition, project_to_ned, unpr
 # Maximum median difference (s) between GNSS timestamps and the boot time of receipt: with a larger
 # difference the timestamps are not boot time
 MAX_BOOT_CLOCK_DISTANCE_S = 5.0
-# Maximum time difference (s) between the global and the local position from which the origin is
-# computed: error of 5 cm at 1 m/s
+# Maximum time difference (s) between a global and a local position to compute the origin: an error
+# of 5 cm at 1 m/s
 MAX_STATE_DISTANCE_S = 0.05
 
 
@@ -60,10 +60,7 @@ def read_positions(
         ]
     fixes = (_read_gnss(recording, layout, delay_s) for layout in messages.GNSS_LAYOUTS)
     tracks_and_missing += [track for track in fixes if track]
-    missing_tracks = tuple(item for item in tracks_and_missing if isinstance(item, Unavailable))
-    return sort_by_preference(
-        item for item in tracks_and_missing if isinstance(item, PositionTrack)
-    ), missing_tracks
+    return px4_positions.split_tracks(tracks_and_missing)
 
 
 def _read_track(
@@ -120,9 +117,10 @@ def _read_gnss(
 ) -> PositionTrack | Unavailable | None:
     """Read the fixes of a GNSS receiver as NED positions from the autopilot's origin.
 
-    None without fixes. PX4 and ArduPilot give a fix the timestamp of their boot clock, and repeat
-    the fix until the next one. The track may be chosen by default only if the autopilot sends a
-    global position.
+    1. PX4 and ArduPilot give a fix the timestamp of their boot clock, and repeat the fix until the
+       next one.
+    2. px4fuse selects GNSS by default only if the autopilot sends a global position.
+    3. The result is None without fixes.
     """
     rows = recording.rows(layout.topic)
     rows = rows[np.diff(recording.frames.table(layout.topic, rows)["time_usec"], prepend=0) > 0]
@@ -185,10 +183,10 @@ def read_truth(
 ) -> Truth | Unavailable:
     """Read ground truth from the simulation, or from motion capture if EKF2 uses another source.
 
-    Simulation ground truth has no usable timestamps (``HIL_STATE_QUATERNION.time_usec`` is 0 in
-    PX4), so receive times are used. The ground truth's geodetic positions are projected from the
-    autopilot's origin for a GNSS source. Otherwise the origin is the first sample of ground truth,
-    the start of the simulated vehicle.
+    1. Simulation ground truth has no usable timestamps (``HIL_STATE_QUATERNION.time_usec`` is 0 in
+       PX4), so receive times are used.
+    2. Its latitude and longitude are projected from the autopilot's origin if the source is GNSS;
+       otherwise from the first sample, the start of the simulated vehicle.
     """
     for layout in messages.TRUTH_LAYOUTS:
         rows = recording.rows(layout.topic)

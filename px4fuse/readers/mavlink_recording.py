@@ -28,16 +28,14 @@ BOOT_CLOCK = "autopilot boot clock"
 RECEIPT_CLOCK = "receive time minus minimum link delay"
 # Minimum backward step (s) of the boot clock at a restart; a smaller step is a late packet
 MIN_RESTART_STEP_S = 5.0
-# Distance (messages) before and after a suspected restart at which boot times are compared to
-# confirm the restart
+# Number of messages before and after a backward step whose boot times have to confirm a restart
 RESTART_CHECK_MESSAGES = 20
 # Minimum size of a group of timestamps between two gaps, as fraction of the largest group: smaller
 # groups are damaged timestamps
 MIN_GROUP_FRACTION = 0.01
-# Maximum gap (s) between valid timestamps, and maximum distance (s) of valid timestamps from the
-# analysed session
+# Maximum distance (s) of valid timestamps from each other, and from the analysed session
 MAX_OUTSIDE_S = 60.0
-# Maximum fraction of bytes outside of MAVLink frames in a file that counts as not damaged
+# Maximum fraction of bytes outside of MAVLink frames in a file without damage
 MAX_LOST_FRACTION = 0.002
 # Minimum number of equal boot timestamps that show that the field is not a clock
 MIN_CONSTANT_TIMESTAMPS = 10
@@ -149,7 +147,6 @@ class Recording:
 
     def _select_rows(self, name: str, boot_s: Array) -> IntArray:
         """Return the indices of valid, strictly increasing boot times; count the dropped ones."""
-        # Comparisons with NaN are False, so NaN is dropped
         time_s = boot_s - self.zero_s
         is_inside = (time_s >= -MAX_OUTSIDE_S) & (time_s <= self.duration_s + MAX_OUTSIDE_S)
         rows = np.flatnonzero(is_inside & (boot_s > 0.0))
@@ -199,12 +196,8 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     ned_samples = samples.copy()
     ned_samples[Columns.STATE + Columns.POSITION_VARIANCE] = np.nan
     ned_samples[Columns.VELOCITY_VARIANCE + orientation] = np.nan
-    used_frames = {*samples["frame_id"].unique(), *samples["child_frame_id"].unique()}
-    for number in used_frames & FRAMES_OF_REFERENCE.keys():
-        frame = FRAMES_OF_REFERENCE[number]
-        order = frame.order
-        signs = frame.signs
-        is_body = frame.body
+    for number, frame in FRAMES_OF_REFERENCE.items():
+        order, signs, is_body = frame.order, frame.signs, frame.body
         frame_samples = samples[(samples["frame_id"] == number) & (not is_body)]
         position = frame_samples[Columns.POSITION].to_numpy()[:, order]
         variance = frame_samples[Columns.POSITION_VARIANCE].to_numpy()[:, order]
@@ -222,7 +215,7 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
                 child_samples[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
             ).as_matrix()
             velocity = np.einsum("nij,nj->ni", rotation, velocity)
-            # Variances: diagonal of R diag(σ²) Rᵀ
+            # The variances in NED are the diagonal of R diag(σ²) Rᵀ
             velocity_variance = np.einsum("nij,nj->ni", rotation**2, velocity_variance)
         ned_samples.loc[child_samples.index, Columns.VELOCITY] = velocity
         ned_samples.loc[child_samples.index, Columns.VELOCITY_VARIANCE] = velocity_variance
@@ -230,24 +223,22 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
 
 
 def _read_boot_times(frames: Frames, address: Address) -> tuple[IntArray, Array]:
-    """Return the autopilot frames that contain the boot time, and the boot time (s) of each."""
+    """Return the indices of the autopilot's frames with a boot time, and these boot times (s)."""
     is_from_autopilot = frames.sent_by(address)
     all_rows = [np.zeros(0, dtype=np.intp)]
     all_times_s = [np.zeros(0)]
     for message_id in np.unique(frames.message_id[is_from_autopilot]).tolist():
         name = message_name(message_id)
         if "time_boot_ms" in (wire_layout(message_id).names or ()):
-            field_name = "time_boot_ms"
-            unit = 1e-3
+            field_name, unit_s = "time_boot_ms", 1e-3
         elif name in STAMPED_BY_BOOT_CLOCK:
-            field_name = "time_usec"
-            unit = 1e-6
+            field_name, unit_s = "time_usec", 1e-6
         else:
             continue
         rows = frames.rows(name)
         rows = rows[is_from_autopilot[rows]]
         all_rows.append(rows)
-        all_times_s.append(frames.table(name, rows)[field_name] * unit)
+        all_times_s.append(frames.table(name, rows)[field_name] * unit_s)
     rows = np.concatenate(all_rows)
     times_s = np.concatenate(all_times_s)
     is_boot_time = (times_s > 0.0) & (times_s < MIN_UNIX_TIME_S)
@@ -268,38 +259,31 @@ def read_recording(frames: Frames, address: Address) -> Recording:
     rows, boot_s = _read_boot_times(frames, address)
     session = slice(0, len(frames))
     restarts = np.flatnonzero(np.diff(boot_s) < -MIN_RESTART_STEP_S) + 1
-    # A single late or early packet is not a restart, so packets before and after are compared, too
+    # A single late or early packet is not a restart: the packets before and after have to agree
     boot_before_s = boot_s[np.maximum(restarts - 1 - RESTART_CHECK_MESSAGES, 0)]
     boot_after_s = boot_s[np.minimum(restarts + RESTART_CHECK_MESSAGES, len(boot_s) - 1)]
     restarts = restarts[
         boot_after_s < np.minimum(boot_before_s, boot_s[restarts - 1]) - MIN_RESTART_STEP_S
     ]
     if len(restarts):
-        session_rows = np.split(np.arange(len(rows)), restarts)
-        longest_index = max(
-            range(len(session_rows)), key=lambda rows_of_session: len(session_rows[rows_of_session])
+        row_limits = [0, *restarts.tolist(), len(rows)]
+        index = int(np.argmax(np.diff(row_limits)))
+        used = slice(row_limits[index], row_limits[index + 1])
+        used_fraction = (used.stop - used.start) / len(rows)
+        rows, boot_s = rows[used], boot_s[used]
+        session = slice(
+            int(rows[0]) if index else 0,
+            int(rows[-1]) + 1 if index < len(restarts) else len(frames),
         )
-        rows_of_session = session_rows[longest_index]
-        first_frame = int(rows[rows_of_session[0]]) if longest_index else 0
-        end_frame = (
-            len(frames)
-            if longest_index == len(session_rows) - 1
-            else int(rows[rows_of_session[-1]]) + 1
-        )
-        session = slice(first_frame, end_frame)
-        used_fraction = len(rows_of_session) / len(rows)
-        rows = rows[rows_of_session]
-        boot_s = boot_s[rows_of_session]
         notes.append(
-            f"restarts of the boot clock: {len(restarts)}; session {longest_index + 1} of "
-            f"{len(session_rows)} is used, {boot_s[0]:.1f} s to {boot_s[-1]:.1f} s after boot "
+            f"restarts of the boot clock: {len(restarts)}; session {index + 1} of "
+            f"{len(restarts) + 1} is used, {boot_s[0]:.1f} s to {boot_s[-1]:.1f} s after boot "
             f"({used_fraction:.0%} of the data)"
         )
     increasing_rows = _remove_stray_timestamps(
         boot_s, longest_increasing_run(np.rint(boot_s * 1e6).astype(np.int64))
     )
-    rows = rows[increasing_rows]
-    boot_s = boot_s[increasing_rows]
+    rows, boot_s = rows[increasing_rows], boot_s[increasing_rows]
     line = Line(0.0, 0.0, 1.0, 0.0, len(rows))
     received_s = np.zeros(len(frames))
     if frames.received_us is not None:
@@ -332,9 +316,7 @@ def read_recording(frames: Frames, address: Address) -> Recording:
     if frames.bad_bytes and not is_damaged:
         notes.append(lost_text)
     # Without a boot clock, flight time is receive time
-    data_span_s = boot_s if len(boot_s) else np.array([0.0, received_s.max()])
-    zero_s = float(data_span_s[0])
-    end_s = float(data_span_s[-1])
+    zero_s, end_s = (boot_s if len(boot_s) else np.array([0.0, received_s.max()]))[[0, -1]].tolist()
     return Recording(
         frames,
         address,
@@ -351,9 +333,10 @@ def read_recording(frames: Frames, address: Address) -> Recording:
 
 
 def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
-    """Remove groups of timestamps at both ends that are small and follow or precede a long gap.
+    """Remove small groups of timestamps before the first and after the last large group.
 
-    Small is below MIN_GROUP_FRACTION of the largest group; long is more than MAX_OUTSIDE_S.
+    A group ends at a gap of more than MAX_OUTSIDE_S. A large group has at least MIN_GROUP_FRACTION
+    of the timestamps of the largest group.
     """
     groups = np.split(rows, np.flatnonzero(np.diff(times_s[rows]) > MAX_OUTSIDE_S) + 1)
     min_count = MIN_GROUP_FRACTION * max(len(group) for group in groups)

@@ -17,18 +17,16 @@ from px4fuse.readers.mavlink_clocks import (
     is_running_clock,
     map_clock,
 )
-from px4fuse.readers.mavlink_frames import Address, Frames
+from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, Address, Frames
 from px4fuse.readers.mavlink_recording import MIN_RESTART_STEP_S, Recording, map_boot_to_unix
 
-# Maximum number of senders that are read and described; those with most messages are chosen
+# Maximum number of senders that are read and described: the senders with the most messages
 MAX_SENDERS = 32
-# Maximum fraction of lost messages: a larger fraction shows that the sender does not set sequence
-# numbers, which are then ignored
+# Maximum fraction of lost messages: with a larger fraction the sender does not set sequence numbers
 MAX_LOST_FRACTION = 0.9
-# Maximum lateness, in sequence numbers, of a message that counts as received over a slower link
+# Maximum lateness (sequence numbers) of a message that was received over a slower link
 MAX_LATE_MESSAGES = 16
-# Maximum difference (s) between timestamps of one clock: a sender with a larger difference uses two
-# clocks
+# Maximum difference (s) between timestamps of one clock
 MAX_SAME_CLOCK_DISTANCE_S = 1e5
 
 
@@ -56,9 +54,9 @@ def _is_vehicle(vehicle_type: int, autopilot: int) -> bool:
 
 
 def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
-    """Return address and type of the autopilot with the system id ``system``.
+    """Return the address and the type of the autopilot with a system id.
 
-    Without ``system``, choose the autopilot with most messages.
+    Without a system id, the autopilot with the most messages is chosen.
 
     Raises
     ------
@@ -86,13 +84,10 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
             address for address in {*vehicle_addresses, *candidates} if address[0] == system
         ]
         if not candidates:
-            system_ids = (
-                ", ".join(str(number) for number in sorted({s[0] for s in vehicle_addresses}))
-                or "none"
-            )
+            ids = ", ".join(map(str, sorted({s[0] for s in vehicle_addresses}))) or "none"
             raise SettingsError(
                 f"{frames.name}: no autopilot has MAVLink system id {system}. Autopilots in "
-                f"this file: {system_ids}."
+                f"this file: {ids}."
             )
     best_address = max(candidates, key=lambda address: counts.get(address, 0))
     name = messages.AUTOPILOTS.get(vehicles[best_address][1]) if best_address in vehicles else None
@@ -140,8 +135,7 @@ def _map_sender_clock(
     is_reply = (reply_s != 0.0) & (
         np.abs(request_s - recording.receipt_boot_s(rows)) <= MIN_RESTART_STEP_S
     )
-    # The timestamps of TIMESYNC requests are used, too: requests are sent at their timestamp, so
-    # they have a small delay
+    # Requests are sent at their timestamp, so their timestamps have a small delay and are used, too
     is_request = (
         has_running_clock
         & (reply_s == 0.0)
@@ -190,14 +184,10 @@ def clock_maps(
                 "from the messages with least delay, used only to order messages and to map clocks"
             )
         offset_s = line.y0 - line.x0 - float(received_us[0]) * 1e-6
-        line_values = line.pairs, offset_s, (line.slope - 1.0) * 1e6, line.jitter
+        name = "receive time (UNIX time of the recording computer)"
+        drift_ppm = (line.slope - 1.0) * 1e6
         clocks.append(
-            ClockMap(
-                "receive time (UNIX time of the recording computer)",
-                "receive time",
-                *line_values,
-                note,
-            )
+            ClockMap(name, "receive time", line.pairs, offset_s, drift_ppm, line.jitter, note)
         )
     return tuple(clocks)
 
@@ -206,27 +196,25 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
     """Describe the senders in the recording, most messages first."""
     frames = recording.frames
     vehicles = _read_vehicle_types(recording.frames)
-    sender_rows = []
+    described = []
     for address, count in _count_frames(frames)[:MAX_SENDERS]:
         description = "sender without heartbeat"
         if address in vehicles:
             vehicle_type, autopilot = vehicles[address]
-            description = messages.VEHICLE_TYPES.get(
-                vehicle_type, f"vehicle of MAV_TYPE {vehicle_type}"
-            )
+            description = VEHICLE_TYPES.get(vehicle_type, f"vehicle of MAV_TYPE {vehicle_type}")
             if autopilot != messages.INVALID_AUTOPILOT:
                 description = f"{messages.AUTOPILOTS.get(autopilot, 'autopilot')} {description}"
         lost_fraction = _lost_fraction(frames, address)
         is_chosen = address == recording.address
-        sender_rows.append(Sender(*address, description, count, lost_fraction, is_chosen))
-    return tuple(sender_rows)
+        described.append(Sender(*address, description, count, lost_fraction, is_chosen))
+    return tuple(described)
 
 
 def _lost_fraction(frames: Frames, address: Address) -> float | None:
     """Return the fraction of a sender's messages that are missing, from the sequence numbers.
 
-    Repeated or slightly late messages do not count as lost. None if the sender does not set
-    sequence numbers, or sets them separately on two links.
+    Repeated and slightly late messages are not lost. None if the sender does not set sequence
+    numbers, or sets them separately on two links.
     """
     sequence = frames.sequence[frames.sent_by(address)].astype(np.int64)
     step = np.mod(np.diff(sequence) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES

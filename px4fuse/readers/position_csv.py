@@ -33,17 +33,21 @@ SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
 # Maximum file size (bytes): several days of UWB positions
 MAX_FILE_BYTES = 500_000_000
 MIN_ROWS = 3
-# Limits (s) of plausible intervals: UWB systems have rates of 0.2 Hz to 200 Hz, with 10 % variation
-MIN_INTERVAL_S, MAX_INTERVAL_S = 0.9 / 200, 1.1 / 0.2
-# Maximum interval (s) between timestamps that count as UNIX time in s: boot time in µs reaches
-# equally large numbers half an hour after boot, but with larger intervals
+# Minimum plausible median interval (s): UWB systems send at most 200 positions per second, ±10 %
+MIN_INTERVAL_S = 0.9 / 200
+# Maximum plausible median interval (s): UWB systems send a position every 5 s or more often, ±10 %
+MAX_INTERVAL_S = 1.1 / 0.2
+# Maximum median interval (s) of timestamps in UNIX time: boot times in µs can be equally large
+# numbers, but they have larger intervals
 MAX_UNIX_TIME_INTERVAL_S = 60.0
 # Maximum extent (m) of an indoor flight: a larger extent shows that the unit of length is mm
 MAX_INDOOR_EXTENT_M = 200.0
 # Maximum absolute coordinate in any unit of length: larger values are timestamps or damaged text
 MAX_COORDINATE = 1e9
-# Number of lines and characters at the beginning of the file in which the header is searched
-MAX_HEADER_LINES, MAX_HEADER_CHARS = 1000, 200_000
+# Number of lines at the beginning of the file in which the header is searched
+MAX_HEADER_LINES = 1000
+# Number of characters at the beginning of the file in which the header is searched
+MAX_HEADER_CHARS = 200_000
 MAX_COLUMNS = 200
 _COLUMNS_OPTION = "`columns` TIME,X,Y,Z"
 _SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "space"}
@@ -99,16 +103,16 @@ class PositionRecording:
 
 @dataclass(frozen=True)
 class _Table:
-    """Column names and rows of the table in a text file."""
+    """Table in a text file: column names, and ``body``, the text of the lines below the header."""
 
     file_name: str
     separator: str
-    names: list[str]  # column names
-    body: str  # complete lines after the header
+    names: list[str]
+    body: str
     header_line: int
 
     def label(self, *columns: int | None) -> str:
-        """Format the names of columns for messages, without repetition; skip None."""
+        """Format the names of columns for messages, each once; skip None."""
         labels = dict.fromkeys(
             quote(self.names[index]) if self.names[index] else f"column {index + 1}"
             for index in columns
@@ -186,7 +190,7 @@ def read_position_csv(
         table, meanings, chosen_columns, numbers
     )
     axes = [index for index in position if index is not None]
-    # Numbers such as 1e999 are read as infinite
+    # pandas reads numbers such as 1e999 as infinite
     has_time = np.isfinite(numbers[time])
     is_usable = has_time & (numbers[axes].abs() < MAX_COORDINATE).all(axis=1)
     if unusable_count := int(np.count_nonzero(~is_usable)):
@@ -202,7 +206,8 @@ def read_position_csv(
     times = numbers[time].to_numpy()
     name_unit = meanings[time].unit
     unit, unit_text = _time_unit(times, name_unit if name_unit in TIME_UNITS else "", time_unit)
-    seconds = times / round(1.0 / TIME_UNITS[unit])
+    units_per_second = round(1.0 / TIME_UNITS[unit])
+    seconds = times / units_per_second
     usable_rows = np.flatnonzero(np.abs(seconds) < UNIX_END_S)
     # Ranks instead of times, because the function requires positive values
     ranks = np.unique(seconds[usable_rows], return_inverse=True)[1].astype(np.int64)
@@ -225,14 +230,13 @@ def read_position_csv(
             "--position-time-unit"
         )
     scale_by_column, length_unit_text = _length_units(numbers, axes, meanings, length_unit)
-    column_of_name = zip(SAMPLE_COLUMNS, (*position, *sigma), strict=True)
     columns_m = {
         name: np.nan if index is None else numbers[index] * scale_by_column[index]
-        for name, index in column_of_name
+        for name, index in zip(SAMPLE_COLUMNS, (*position, *sigma), strict=True)
     }
     samples = pd.DataFrame(columns_m, index=numbers.index).replace([np.inf, -np.inf], np.nan)
     reason = find_invalid(samples, SAMPLE_COLUMNS[: len(axes)])
-    invalid = reason[reason != ""], pd.Series("NaN", empty_times / round(1.0 / TIME_UNITS[unit]))
+    invalid = reason[reason != ""], pd.Series("NaN", empty_times / units_per_second)
     samples = samples[reason == ""]
     is_not_positive = samples[SIGMA_COLUMNS] <= 0.0
     if bad_row_count := int(is_not_positive.any(axis=1).sum()):
@@ -295,10 +299,7 @@ def _find_table(
     """Find the table in a text file; also return a note if an incomplete last line was dropped."""
     text = decode_text(content)
     if text is None:
-        raise LogError(
-            f"{file_name} is a binary file, not a text table",
-            "Give a CSV file.",
-        )
+        raise LogError(f"{file_name} is a binary file, not a text table", "Give a CSV file.")
     notes = []
     whole_lines, _, last_line = text.replace('"', "").rpartition("\n")
     text = f"{whole_lines}\n"
@@ -372,34 +373,29 @@ def _choose_columns(
 ) -> tuple[int, _Columns, _Columns, str | None, str]:
     """Choose the columns of time, position and sigma; also return frame and time description.
 
-    Without the option ``columns``, the columns with known names are used. A non-empty column with
-    the time of measurement is preferred to a column with the time of recording.
+    1. Columns that the user chose are used.
+    2. Otherwise the names determine the columns. A non-empty column with the time of measurement is
+       preferred to a column with the time of recording.
     """
     if chosen_columns:
         time = chosen_columns[0]
-        time_text = table.label(chosen_columns[0])
+        time_text = table.label(time)
+        frame = None
+        position: _Columns = (*chosen_columns[1:4], None)[:3]
         # The column names may contain the frame, which determines the order of the axes
         chosen_meanings = [
-            meaning if index in chosen_columns[1:4] else ColumnMeaning()
+            meaning if index in position else ColumnMeaning()
             for index, meaning in enumerate(meanings)
         ]
-        frame_and_position = position_names.find_position(chosen_meanings)
-        position: _Columns = (*chosen_columns[1:4], None)[:3]
-        frame, position = (
-            frame_and_position
-            if frame_and_position and {*frame_and_position[1]} == {*position}
-            else (None, position)
-        )
+        named = position_names.find_position(chosen_meanings)
+        if named and {*named[1]} == {*position}:
+            frame, position = named
     else:
         time_columns = [index for index, column in enumerate(meanings) if column.kind == "time"]
         is_mostly_empty = numbers[time_columns].fillna(0.0).eq(0.0).mean() >= 0.5
         rank = position_names.TIME_KINDS.index
         time, *other_times = sorted(
-            time_columns,
-            key=lambda index: (
-                bool(is_mostly_empty[index]),
-                rank(meanings[index].key),
-            ),
+            time_columns, key=lambda index: (is_mostly_empty[index], rank(meanings[index].key))
         )
         time_text = table.label(time)
         if other_times:
@@ -423,8 +419,7 @@ def _time_unit(times: Array, name_unit: str, option: str | None) -> tuple[str, s
     if name_unit and abs(median) * TIME_UNITS[name_unit] < UNIX_END_S:
         return name_unit, f"{name_unit} (from the column name)"
     steps = np.diff(times)
-    steps = steps[steps > 0]
-    median_step = float(np.median(steps)) if len(steps) else 0.0
+    median_step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     plausible_units = []
     for unit, scale in TIME_UNITS.items():
         is_unix = UNIX_START_S <= median * scale < UNIX_END_S
@@ -435,7 +430,7 @@ def _time_unit(times: Array, name_unit: str, option: str | None) -> tuple[str, s
     if not plausible_units:
         return "s", (
             "s (assumed, because no unit gives a plausible UWB rate; "
-            "--position-time-unit sets another)"
+            "--position-time-unit sets another unit)"
         )
     unit = plausible_units[0]
     description = f"{unit} (from the median interval {median_step * TIME_UNITS[unit]:.3g} s)"
@@ -468,10 +463,11 @@ def _length_units(
     elif MAX_INDOOR_EXTENT_M < max_extent <= MAX_INDOOR_EXTENT_M / LENGTH_UNITS["mm"]:
         unit = "mm"
         reason = (
-            f"{max_extent:.0f} m is too large for an indoor flight; if cm, give --position-unit"
+            f"{max_extent:.0f} m is too large for an indoor flight; if the unit is cm, give "
+            "--position-unit"
         )
     elif max_extent > MAX_INDOOR_EXTENT_M:
-        reason = "assumed, because no unit gives an indoor flight; --position-unit sets another"
+        reason = "assumed, as no unit gives an indoor flight; --position-unit sets another unit"
     unit_by_column = {index: name_units.get(index, unit) for index in map(int, numbers.columns)}
     scale_by_column = {index: LENGTH_UNITS[name] for index, name in unit_by_column.items()}
     span_m = max(float(extents[index]) * scale_by_column[index] for index in axes)

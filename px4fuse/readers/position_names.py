@@ -25,7 +25,7 @@ _ROLES = {role: {*column_words.split()} for role, column_words in _TABLE["roles"
 _TIME_ROLES = _ROLES["time"] | _ROLES["measured"] | _ROLES["recorded"] | _ROLES["context"]
 # Kinds of time columns, in order of preference
 TIME_KINDS = ["time of measurement", "time", "time of recording"]
-# Names without separator, such as "px" (position, x) and "xstd" (x, sigma)
+# Column names without separator, such as "px" (position, x) and "xstd" (x, sigma)
 _GLUED_NAMES = re.compile(r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)")
 # Coordinate frames with the names of their axes. The first frame with both horizontal axes in the
 # file is used
@@ -40,12 +40,23 @@ _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
 
 @dataclass(frozen=True)
 class ColumnMeaning:
-    """Meaning of one column name; all fields are "" for an unknown name."""
+    """Meaning of one column name; all fields are "" for an unknown name.
 
-    kind: str = ""  # "time", "position", "sigma" or "tag"
-    key: str = ""  # axis name, or element of `TIME_KINDS`
+    Attributes
+    ----------
+    kind : str
+        "time", "position", "sigma" or "tag".
+    key : str
+        Name of the axis, or an element of :data:`TIME_KINDS`.
+    unit : str
+    group : str
+        Name without axis and unit, which is the same for x, y and z of one position.
+    """
+
+    kind: str = ""
+    key: str = ""
     unit: str = ""
-    group: str = ""  # name without axis and unit: the same for x, y and z of one position
+    group: str = ""
 
 
 def read_column_name(name: str) -> ColumnMeaning:
@@ -86,28 +97,22 @@ def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, Positi
     for index, column in enumerate(meanings):
         if column.kind == "position":
             groups.setdefault(column.group, {}).setdefault(column.key, index)
-    for needs_height in (True, False):
+    for axis_count in (3, 2):
         for axes in groups.values():
-            for frame, (first_axis, second_axis, third_axis) in _FRAMES:
-                if (
-                    first_axis in axes
-                    and second_axis in axes
-                    and (third_axis in axes or not needs_height)
-                ):
-                    return frame, (axes[first_axis], axes[second_axis], axes.get(third_axis))
+            for frame, names in _FRAMES:
+                if {*names[:axis_count]} <= axes.keys():
+                    return frame, (axes[names[0]], axes[names[1]], axes.get(names[2]))
     return None
 
 
 def find_sigma(meanings: Sequence[ColumnMeaning], frame: str | None) -> tuple[int | None, ...]:
-    """Return the index of the sigma column of each axis; a sigma column without axis is for all."""
-    # Reversed, so that the first of several columns with the same meaning is used
-    sigmas = {
-        meaning.key: index
-        for index, meaning in [*enumerate(meanings)][::-1]
-        if meaning.kind == "sigma"
-    }
+    """Return the index of the sigma column of each axis, or of the sigma column without axis."""
+    sigmas: dict[str, int] = {}
+    for index, meaning in enumerate(meanings):
+        if meaning.kind == "sigma":
+            sigmas.setdefault(meaning.key, index)
     axes = next(axes for name, axes in _FRAMES if name == frame)
-    axes_and_letters = zip(axes, "xyz", strict=True)
     return tuple(
-        sigmas.get(axis, sigmas.get(letter, sigmas.get(""))) for axis, letter in axes_and_letters
+        sigmas.get(axis, sigmas.get(letter, sigmas.get("")))
+        for axis, letter in zip(axes, "xyz", strict=True)
     )

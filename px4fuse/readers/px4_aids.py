@@ -7,7 +7,6 @@ field names are in ``ekf2_parameters.toml``.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -35,12 +34,12 @@ def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
     for name, aid in AIDS.items():
         aid_enabled = enabled_aids.get(name)
         log = _read_aid_topic(topics, aid, aid_enabled)
-        # Without fusion of an aid, the common topics contain outdated values or values of other
-        # aids
+        # While EKF2 does not fuse an aid, the common topics contain its old values or the values of
+        # other aids
         if log is None and (name.startswith("ev_") if aid_enabled is None else aid_enabled.any()):
             log = _read_common_topics(topics, aid, aid_enabled)
         if log is not None:
-            logs[name] = replace(log, parameters=aid.logged_parameters(topics.ekf2_parameters))
+            logs[name] = log
     return logs
 
 
@@ -56,9 +55,8 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     flag_names = {flag for aid in all_aids for group in aid.flags for flag in group}
     logged_flags = sorted(flag_names.intersection(*tables)) if tables else []
     if logged_flags:
-        flags = topics.primary_samples(
-            Layout(px4.STATUS_FLAGS, dict(zip(logged_flags, logged_flags, strict=True))), step=True
-        )
+        layout = Layout(px4.STATUS_FLAGS, {name: name for name in logged_flags})
+        flags = topics.primary_samples(layout, step=True)
         for aid in all_aids if len(flags) else ():
             group = next((group for group in aid.flags if {*group} <= {*logged_flags}), None)
             if group is not None:
@@ -94,7 +92,7 @@ def _read_aid_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) 
     samples = topics.primary_samples(layout).dropna()
     if enabled is not None and aid.name in px4.FLAG_ALWAYS_SET:
         samples["fused"] = step_values_at(enabled, samples.index)
-    return _make_aid_log((layout.topic,), aid, samples, enabled)
+    return _make_aid_log(topics, (layout.topic,), aid, samples, enabled)
 
 
 def _read_common_topics(
@@ -103,21 +101,15 @@ def _read_common_topics(
     is_in_gauss = aid.name == "mag_heading" and any(
         "cs_mag" in table for table in topics.of(px4.STATUS_FLAGS)
     )
-    layouts = (
-        []
-        if is_in_gauss or not aid.fields
-        else [
-            tuple(
-                Layout(topic, _columns_by_axis(quantity, aid, aid.fields))
-                for topic, quantity in zip(px4.INNOVATIONS, ("innovation", "variance"), strict=True)
-            )
-        ]
-    )
+    layouts = []
+    if aid.fields and not is_in_gauss:
+        pairs = zip(px4.INNOVATIONS, ("innovation", "variance"), strict=True)
+        layouts.append([Layout(t, _columns_by_axis(name, aid, aid.fields)) for t, name in pairs])
     if aid.old_fields:
         fields = _columns_by_axis("innovation", aid, aid.old_fields)
         variance_fields = (field.replace("innov", "innov_var") for field in aid.old_fields)
         fields |= _columns_by_axis("variance", aid, variance_fields)
-        layouts.append((Layout(px4.OLD_INNOVATIONS, fields),) * 2)
+        layouts.append([Layout(px4.OLD_INNOVATIONS, fields)] * 2)
     for values, variances in layouts:
         samples = topics.primary_samples(values, select=_drop_repeats)
         if variances is not values:
@@ -128,7 +120,8 @@ def _read_common_topics(
         if enabled is not None:
             samples = samples[step_values_at(enabled, samples.index) > 0.0]
         used_topics = tuple(dict.fromkeys((values.topic, variances.topic)))
-        if (log := _make_aid_log(used_topics, aid, samples, enabled, excluded_count)) is not None:
+        log = _make_aid_log(topics, used_topics, aid, samples, enabled, excluded_count)
+        if log is not None:
             return log
     return None
 
@@ -145,7 +138,8 @@ def _columns_by_axis(name: str, aid: Aid, fields: Iterable[str]) -> dict[str, st
 
 
 def _make_aid_log(
-    topics: tuple[str, ...],
+    topics: Topics,
+    used_topics: tuple[str, ...],
     aid: Aid,
     samples: pd.DataFrame,
     enabled: pd.Series[float] | None,
@@ -156,8 +150,9 @@ def _make_aid_log(
     Innovations are negated, because PX4 logs predicted minus measured.
     """
     samples = samples[(samples[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
+    if samples.empty:
+        return None
     negated = {column: -samples[column] for column in _columns_by_axis("innovation", aid, aid.axes)}
-    aid_log = AidLog(
-        topics, aid.axes, samples.assign(**negated), enabled, excluded_count=excluded_count
-    )
-    return aid_log if len(samples) else None
+    parameters = aid.logged_parameters(topics.ekf2_parameters)
+    samples = samples.assign(**negated)
+    return AidLog(used_topics, aid.axes, samples, enabled, parameters, excluded_count)

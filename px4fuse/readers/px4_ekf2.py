@@ -25,12 +25,14 @@ from px4fuse.flight.model import (
     time_index,
 )
 from px4fuse.readers import px4_topics as px4
-from px4fuse.readers.field_maps import Layout, expand_columns
+from px4fuse.readers.field_maps import Layout
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, read_aids, read_enabled_aids
 from px4fuse.readers.px4_innovations import innovations_by_axis
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
 VISION_TOPIC = "vehicle_visual_odometry"
+# Fields of vehicle_local_position: 1 while EKF2 declares its horizontal position valid
+VALIDITY_FLAGS = ("xy_valid", "xy_global")
 # Number of EKF2 states that are read: attitude, velocity, position, biases and magnetic fields, but
 # not wind and terrain
 STATE_COUNT = 22
@@ -38,10 +40,11 @@ STATE_COUNT = 22
 MAG_3D_BIT = 5
 # Minimum rate (Hz) of a magnetometer topic that contains all samples: EKF2 uses 14 per second
 MIN_COMPLETE_FIELD_HZ = 10.0
-# Maximum distance (IMU samples) of the prediction interval from n + 0.5 samples at which EKF2 may
-# round to n or to n + 1 samples
+# Maximum distance (IMU samples) between prediction interval and n + 0.5 samples with which EKF2 may
+# round to n as well as to n + 1 samples
 MAX_HALF_DISTANCE = 0.05
-# Maximum interval (s) between two optical flow velocities whose difference is used
+# Maximum interval (s) between two rows of low-pass filtered optical flow to compute the mean flow
+# between them
 MAX_FLOW_INTERVAL_S = 0.5
 # Aiding sources of horizontal position and velocity other than external vision position
 OTHER_HORIZONTAL_AIDS = (
@@ -106,12 +109,20 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         for log in (aids[name] for name in ("ev_pos", "ev_hgt") if name in aids)
         if log.excluded_count
     ]
+    states = dict(enabled_aids)
+    states |= {name: local_position[name] for name in VALIDITY_FLAGS if name in local_position}
+    failed_checks = topics.primary_samples(px4.LAYOUTS["gnss_checks"], step=True)["failed"].dropna()
+    if len(failed_checks):
+        states["failed_checks"] = failed_checks
     step_s = _step_s(topics)
-    delayed_state = _read_delayed_state(topics, step_s)
-    states = _read_states(topics, local_position, enabled_aids)
-    variance = _delayed_variance(delayed_state)
-    if not isinstance(variance, Unavailable):
-        topics.record_stream("ekf2_variance", _state_vector(topics)[0])
+    delayed_state = variance = _read_delayed_state(topics, step_s)
+    if isinstance(delayed_state, pd.DataFrame):
+        variance = delayed_state[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
+        variance = variance[(variance > 0.0).all(axis=1)]
+        if variance.empty:
+            variance = VARIANCES_NOT_LOGGED
+        else:
+            topics.record_stream("ekf2_variance", _state_vector(topics)[0])
     return Ekf2(
         state=state,
         variance=variance,
@@ -163,9 +174,8 @@ def _read_delayed_state(topics: Topics, step_s: float) -> TableOrUnavailable:
         )
     states = [f"states[{i}]" for i in range(STATE_COUNT)]
     variances = [f"covariances[{i}]" for i in range(STATE_COUNT - 4 + attitude)]
-    samples = topics.primary_samples(
-        Layout(topic, {name: name for name in states + variances})
-    ).dropna()
+    layout = Layout(topic, {name: name for name in states + variances})
+    samples = topics.primary_samples(layout).dropna()
     samples = samples[(samples[variances] >= 0.0).all(axis=1)]
     state = samples[states].to_numpy(copy=True)
     variance = samples[variances].to_numpy(copy=True)
@@ -177,35 +187,20 @@ def _read_delayed_state(topics: Topics, step_s: float) -> TableOrUnavailable:
     return pd.DataFrame(np.hstack([state, variance]), index=samples.index, columns=columns)
 
 
-def _delayed_variance(delayed_state: TableOrUnavailable) -> TableOrUnavailable:
-    if isinstance(delayed_state, Unavailable):
-        return delayed_state
-    variance = delayed_state[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
-    variance = variance[(variance > 0.0).all(axis=1)]
-    return variance if len(variance) else VARIANCES_NOT_LOGGED
-
-
-def target_step_s(topics: Topics) -> float:
+def configured_step_s(topics: Topics) -> float:
     """Return the configured prediction interval, EKF2_PREDICT_US, in s."""
     return topics.log.parameters.get("EKF2_PREDICT_US", flight.EKF2_STEP_S * 1e6) * 1e-6
 
 
 def _step_s(topics: Topics) -> float:
     """Return the actual prediction interval (s): whole IMU intervals (ImuDownSampler.cpp)."""
-    target_s = target_step_s(topics)
-    imu = topics.read(px4.IMU)
-    if len(imu) < 2:
-        return target_s
-    imu_s = imu.index.to_numpy()
-    interval_s = median_interval(imu_s)
-    if interval_s >= target_s:
-        return target_s
-    step_ends_s = topics.primary_samples(
-        Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})
-    ).index
-    return (
-        samples_per_step(target_s, interval_s, rows_of_timestamps(imu_s, step_ends_s)) * interval_s
-    )
+    configured_s = configured_step_s(topics)
+    imu_s = topics.read(px4.IMU).index.to_numpy()
+    if len(imu_s) < 2 or (interval_s := median_interval(imu_s)) >= configured_s:
+        return configured_s
+    layout = Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})
+    step_ends = rows_of_timestamps(imu_s, topics.primary_samples(layout).index)
+    return samples_per_step(configured_s, interval_s, step_ends) * interval_s
 
 
 def rows_of_timestamps(times_s: Array, other_s: ArrayLike) -> IntArray:
@@ -215,22 +210,24 @@ def rows_of_timestamps(times_s: Array, other_s: ArrayLike) -> IntArray:
     )
 
 
-def samples_per_step(target_s: float, interval_s: float, ends: ArrayLike = ()) -> int:
+def samples_per_step(
+    configured_step_s: float, imu_interval_s: float, step_ends: ArrayLike = ()
+) -> int:
     """Return the number of IMU samples per EKF2 prediction: the nearest whole number.
 
-    EKF2 divides ``target_s`` by a mean of the measured intervals and rounds, so a ratio near
-    n + 0.5 may be rounded up or down. This function rounds up, unless only the smaller number is
-    consistent with ``ends``, the logged ends of predictions in IMU samples.
+    EKF2 divides ``configured_step_s`` by a mean of the measured intervals and rounds, so a ratio
+    near n + 0.5 may be rounded up or down. This function rounds up, unless only the smaller number
+    is consistent with ``step_ends``, the logged ends of predictions (index of the IMU sample).
 
     >>> samples_per_step(0.010, 0.00375), samples_per_step(0.010, 0.004)
     (3, 3)
     >>> samples_per_step(0.010, 0.004, [0, 4, 6, 14])
     2
     """
-    ratio_plus_half = target_s / interval_s + 0.5
+    ratio_plus_half = configured_step_s / imu_interval_s + 0.5
     # The added 1e-6 makes the result independent of the rounding of timestamps to µs
     samples = max(int(ratio_plus_half + 1e-6), 1)
-    gaps = np.diff(np.asarray(ends, dtype=float))
+    gaps = np.diff(np.asarray(step_ends, dtype=float))
     if samples > 1 and abs(ratio_plus_half - samples) < MAX_HALF_DISTANCE and len(gaps):
         fits_larger, fits_smaller = (
             np.mean(gaps % count == 0.0) > 0.9 for count in (samples, samples - 1)
@@ -268,17 +265,6 @@ def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
             age_us = table["timestamp"].astype(np.int64) - measured_us
             return pd.Series(age_us * 1e-6, index=times)
     return pd.Series(dtype=np.float64)
-
-
-def _read_states(
-    topics: Topics, local_samples: pd.DataFrame, enabled_aids: StepFunctions
-) -> StepFunctions:
-    """Read the step functions of :attr:`Ekf2.states`."""
-    checks = topics.primary_samples(px4.LAYOUTS["gnss_checks"], step=True)["failed"].dropna()
-    validity = {
-        name: local_samples[name] for name in ("xy_valid", "xy_global") if name in local_samples
-    }
-    return {**enabled_aids, **validity, **({"failed_checks": checks} if len(checks) else {})}
 
 
 def _read_fusing(topics: Topics, enabled_aids: StepFunctions) -> TableOrUnavailable:
@@ -372,20 +358,10 @@ def _read_field(topics: Topics, step_s: float) -> pd.DataFrame:
     A topic with all samples that EKF2 uses is preferred, then a topic with EKF2's low-pass filtered
     innovation.
     """
-    candidates = []
-    for topic, name in px4.MAGNETOMETER:
-        measured_columns = expand_columns({"forward_gauss right_gauss down_gauss": f"{name}[]"})
-        field_samples = topics.primary_samples(
-            Layout(
-                topic,
-                measured_columns,
-                expand_columns({"FIELD_INNOVATION": "innovation_filtered[]"}),
-            )
-        ).dropna()
-        if name == "observation":  # EKF2 subtracts delay and half a step from measurement times
-            delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3
-            field_samples = field_samples.set_axis(field_samples.index + delay_s + 0.5 * step_s)
-        candidates.append(field_samples)
+    candidates = [topics.primary_samples(layout).dropna() for layout in px4.MAGNETOMETER]
+    # EKF2 subtracts its delay and half a step from the times of its observations
+    shift_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
+    candidates[1] = candidates[1].set_axis(candidates[1].index + shift_s)
     complete = [
         field for field in candidates if len(field) > MIN_COMPLETE_FIELD_HZ * topics.log.duration_s
     ]
@@ -409,12 +385,8 @@ def _read_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
         return pd.DataFrame()
     times = velocity.index.to_numpy()
     # After longer intervals the low-pass filter no longer contains the samples of the previous row
-    rows = (
-        np.flatnonzero(
-            (np.diff(times) > 0.5 * interval_s) & (np.diff(times) <= MAX_FLOW_INTERVAL_S)
-        )
-        + 1
-    )
+    steps_s = np.diff(times)
+    rows = np.flatnonzero((steps_s > 0.5 * interval_s) & (steps_s <= MAX_FLOW_INTERVAL_S)) + 1
     if FLOW.name in enabled_aids:
         rows = rows[step_values_at(enabled_aids[FLOW.name], times[rows]) > 0.0]
     sample_count = np.rint((times[rows] - times[rows - 1]) / interval_s)
@@ -423,10 +395,9 @@ def _read_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
     forward, right = (
         (low_passed[rows] - filter_memory * low_passed[rows - 1]) / (1.0 - filter_memory)
     ).T
-    velocity_rows = velocity.iloc[rows]
-    squared_range = (
-        velocity_rows["newest_forward_m_s"] ** 2 + velocity_rows["newest_right_m_s"] ** 2
-    ) / (velocity_rows["x_rad_s"] ** 2 + velocity_rows["y_rad_s"] ** 2)
+    velocity = velocity.iloc[rows]
+    newest, rates = ["newest_forward_m_s", "newest_right_m_s"], ["x_rad_s", "y_rad_s"]
+    squared_range = (velocity[newest] ** 2).sum(axis=1) / (velocity[rates] ** 2).sum(axis=1)
     flow = pd.DataFrame(
         {
             "forward_m_s": forward,
@@ -435,7 +406,7 @@ def _read_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
             "interval_s": interval_s,
             "noise_m2_s2": squared_range * np.interp(times[rows], noise.index, noise["noise"]),
         },
-        index=velocity_rows.index,
+        index=velocity.index,
     )
     return flow.replace(np.inf, np.nan).dropna()
 

@@ -6,6 +6,7 @@ import pandas as pd
 from px4fuse.core.arrays import Array
 from px4fuse.flight.model import Columns, Ekf2, Unavailable, time_index
 from px4fuse.readers import px4_topics as px4
+from px4fuse.readers.common import interpolate_inside
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.readers.ulog_topics import Topics
 
@@ -67,13 +68,13 @@ def read_unlogged_fixes(
 
 def reconstruct_fixes(
     fixes: pd.DataFrame, ekf2: Ekf2 | Unavailable, delay_s: float
-) -> tuple[pd.DataFrame, tuple[str, ...]]:
+) -> tuple[pd.DataFrame, str]:
     """Reconstruct unlogged fixes between logged fixes as EKF2 position plus innovation.
 
-    Up to v1.15, innovations are logged at 2 Hz. An innovation belongs to the last fix before its
-    log time. That fix is a whole number n of receiver intervals after a logged fix. For n = 0 the
-    fix itself is logged, which gives the reconstruction error. If the reconstruction error exceeds
-    MAX_RECONSTRUCTION_ERROR_M, no fixes are returned.
+    1. Up to v1.15, innovations are logged at 2 Hz. An innovation belongs to the last fix before its
+       log time. That fix is a whole number n of receiver intervals after a logged fix.
+    2. For n = 0 the fix itself is logged, which gives the reconstruction error. If the error
+       exceeds MAX_RECONSTRUCTION_ERROR_M, no fixes are returned.
 
     Parameters
     ----------
@@ -87,64 +88,54 @@ def reconstruct_fixes(
 
     Returns
     -------
-    (DataFrame, tuple of str)
-        Fixes that are not in ``fixes``, with interpolated heights, and a note.
+    (DataFrame, str)
+        Fixes that are not in ``fixes``, with interpolated heights, and a note; empty if no fix can
+        be reconstructed.
     """
-    no_fixes = pd.DataFrame(columns=fixes.columns)
+    no_fixes = pd.DataFrame(columns=fixes.columns), ""
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.horizon_s, Unavailable) or len(fixes) < 3:
-        return no_fixes, ()
+        return no_fixes
     gnss_innovations = with_gnss_innovations(ekf2).innovations
-    north = gnss_innovations["north"]
-    east = gnss_innovations["east"]
-    interval_s = _interval_s(fixes.index.to_numpy())
-    if interval_s is None or isinstance(north, Unavailable) or isinstance(east, Unavailable):
-        return no_fixes, ()
-    delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
+    north, east = gnss_innovations["north"], gnss_innovations["east"]
     fix_s = fixes.index.to_numpy()
-    innovation_s = north.index.to_numpy()
-    previous_fix = np.searchsorted(fix_s, innovation_s - delay_beyond_horizon_s) - 1
+    interval_s = _interval_s(fix_s)
+    if interval_s is None or isinstance(north, Unavailable) or isinstance(east, Unavailable):
+        return no_fixes
+    delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
+    fused_s = north.index.to_numpy() - delay_beyond_horizon_s
+    previous_fix = np.searchsorted(fix_s, fused_s) - 1
+    intervals_passed = (fused_s - fix_s[previous_fix]) / interval_s
     is_between_fixes = (previous_fix >= 0) & (previous_fix < len(fix_s) - 1)
-    innovation_s = innovation_s[is_between_fixes]
-    previous_fix = previous_fix[is_between_fixes]
-    intervals_passed = (innovation_s - delay_beyond_horizon_s - fix_s[previous_fix]) / interval_s
     # Skip innovations logged within one EKF2 step of a fix: they may belong to this fix or to the
     # previous fix
-    is_unambiguous = intervals_passed % 1.0 > ekf2.step_s / interval_s
-    innovation_s = innovation_s[is_unambiguous]
-    previous_fix = previous_fix[is_unambiguous]
-    intervals_passed = np.floor(intervals_passed[is_unambiguous])
+    is_used = is_between_fixes & (intervals_passed % 1.0 > ekf2.step_s / interval_s)
+    previous_fix = previous_fix[is_used]
+    intervals_passed = np.floor(intervals_passed[is_used])
     fix_time_s = fix_s[previous_fix] + intervals_passed * interval_s
     reconstructed = pd.DataFrame(
         {
-            column: np.interp(
-                fix_time_s + delay_beyond_horizon_s,
-                ekf2.state.index,
-                ekf2.state[column],
-                np.nan,
-                np.nan,
-            )
-            + innovations["innovation_m"].to_numpy()[is_between_fixes][is_unambiguous]
+            column: interpolate_inside(fix_time_s + delay_beyond_horizon_s, ekf2.state[column])
+            + innovations["innovation_m"].to_numpy()[is_used]
             for column, innovations in zip(Columns.POSITION, (north, east), strict=False)
         },
         index=time_index(fix_time_s),
     )
     is_logged = intervals_passed == 0.0
-    error = (reconstructed - fixes[reconstructed.columns].to_numpy()[previous_fix])[
-        is_logged
-    ].dropna()
-    error_m = (
-        float(np.sqrt(np.mean(error.to_numpy() ** 2))) if len(error) >= MIN_LOGGED_FIXES else np.inf
-    )
+    error = reconstructed - fixes[reconstructed.columns].to_numpy()[previous_fix]
+    error = error[is_logged].dropna()
     reconstructed = reconstructed[~is_logged].dropna()
     reconstructed = reconstructed[~reconstructed.index.duplicated()]
-    if error_m > MAX_RECONSTRUCTION_ERROR_M or reconstructed.empty:
-        return no_fixes, ()
+    if len(error) < MIN_LOGGED_FIXES or reconstructed.empty:
+        return no_fixes
+    error_m = float(np.sqrt(np.mean(error.to_numpy() ** 2)))
+    if error_m > MAX_RECONSTRUCTION_ERROR_M:
+        return no_fixes
     for column in (Columns.POSITION[2], *Columns.POSITION_VARIANCE):
         if column in fixes:
             reconstructed[column] = np.interp(reconstructed.index, fix_s, fixes[column])
     return reconstructed, (
         f"{len(reconstructed)} unlogged GNSS fixes are reconstructed as EKF2 position plus "
-        f"innovation (RMS error {error_m:.2f} m per axis at {len(error)} logged fixes)",
+        f"innovation (RMS error {error_m:.2f} m per axis at {len(error)} logged fixes)"
     )
 
 
@@ -155,9 +146,8 @@ def _interval_s(times: Array) -> float | None:
     multiple is then unknown.
     """
     gaps = np.diff(times)[:, None]
-    grid_error_s = (
-        np.abs(gaps / FIX_INTERVALS_S - np.round(gaps / FIX_INTERVALS_S)) * FIX_INTERVALS_S
-    )
+    multiples = gaps / FIX_INTERVALS_S
+    grid_error_s = np.abs(multiples - np.round(multiples)) * FIX_INTERVALS_S
     worst_error_s = np.percentile(grid_error_s, 98, axis=0)
     fitting_periods = np.flatnonzero(worst_error_s <= MAX_GRID_ERROR_S)
     if not len(fitting_periods):

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
-from px4fuse.flight.ekf2_parameters import GNSS_POS, TABLES
+from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, TABLES
 from px4fuse.flight.model import AXIS_NAMES, AidLog, AxisName, Ekf2, TableOrUnavailable, Unavailable
 
 Innovations = dict[AxisName, TableOrUnavailable]
@@ -28,9 +28,16 @@ class Ekf2Source:
     height: str = ""
 
 
-VISION, GNSS, GNSS_AND_BAROMETER = (
-    msgspec.convert(TABLES["sources"][name], Ekf2Source)
-    for name in ("vision", "gnss", "gnss_and_barometer")
+VISION, GNSS = (msgspec.convert(TABLES["sources"][name], Ekf2Source) for name in ("vision", "gnss"))
+GNSS_AND_BAROMETER = replace(
+    GNSS,
+    vertical=BAROMETER.name,
+    height="the barometer",
+    remedies={
+        **GNSS.remedies,
+        "vertical": "Set EKF2_BARO_CTRL to 1 (EKF2_HGT_MODE to 0 before v1.14) to fuse the "
+        "barometer height.",
+    },
 )
 
 

@@ -20,7 +20,6 @@ from px4fuse.flight.model import (
     Truth,
     Unavailable,
     sample_rate,
-    sort_by_preference,
     time_index,
 )
 from px4fuse.flight.position_source import Origin, with_orientation
@@ -28,13 +27,14 @@ from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import (
     find_invalid,
     finite_rows,
+    interpolate_inside,
     join_nearest,
     read_attitude,
     read_orientation,
     rounding_step,
 )
 from px4fuse.readers.field_maps import GLOBAL_COLUMNS
-from px4fuse.readers.px4_ekf2 import target_step_s
+from px4fuse.readers.px4_ekf2 import configured_step_s
 from px4fuse.readers.px4_fixes import read_unlogged_fixes, reconstruct_fixes
 from px4fuse.readers.px4_innovations import fused_aid
 from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S
@@ -45,19 +45,18 @@ EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo
 GPS_3D_FIX = 3
 # Maximum delay (µs) from timestamp to publication of a sample whose timestamp is the arrival time
 MAX_ARRIVAL_DELAY_US = 100
-# Minimum fraction of samples with arrival time, for a topic that counts as having arrival times
-# only
+# Minimum fraction of arrival times among the timestamps of a topic that has no measurement times
 MIN_ARRIVAL_FRACTION = 0.9
-# Maximum time difference (s) of a height and a horizontal position that are joined: 2.5 cm error at
-# a climb rate of 0.5 m/s
+# Maximum time difference (s) between a height and the horizontal position to which it is added:
+# 2.5 cm error at a climb rate of 0.5 m/s
 MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
-# Maximum rate (Hz) of logged GNSS fixes that count as downsampled: receivers send 5 to 20 fixes per
-# second
+# Maximum rate (Hz) of GNSS fixes in a log with missing fixes: receivers send 5 to 20 per second
 MAX_DOWNSAMPLED_HZ = 4.0
 STATUS_COLUMNS = ["reset_counter", "quality", "age_s"]
-# Units of timestamps by name, in µs
+# Length (µs) of each unit of timestamps
 STAMP_UNITS = {"microseconds": 1.0, "milliseconds": 1e3, "seconds": 1e6, "nanoseconds": 1e-3}
-MAX_RATE_ERROR = 0.05  # of a clock, to recognise the unit of its timestamps
+# Maximum relative error of the rate of a clock, to recognise the unit of its timestamps
+MAX_RATE_ERROR = 0.05
 AUTOPILOT_CLOCK = "autopilot boot clock (PX4 converted the sender's timestamps)"
 # Latitude and longitude in degrees, optionally altitude in m
 GeodeticPosition = tuple[float, ...]
@@ -71,16 +70,23 @@ def read_positions(
     # EKF2's position observations contain no orientation; if EKF2 also fused the source's yaw, the
     # source is odometry
     turns = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
-    tracks_and_missing = [
-        *(_read_logged(topics, name) for name in px4.SOURCE_TRACKS),
-        _read_ev_pos_aid(topics, turns),
-        _reconstruct(topics, ekf2, turns),
-        _read_gps(topics, ekf2),
-    ]
-    missing_tracks = tuple(track for track in tracks_and_missing if isinstance(track, Unavailable))
-    return sort_by_preference(
-        track for track in tracks_and_missing if isinstance(track, PositionTrack)
-    ), missing_tracks
+    return split_tracks(
+        [
+            *(_read_logged(topics, name) for name in px4.SOURCE_TRACKS),
+            _read_ev_pos_aid(topics, turns),
+            _reconstruct(topics, ekf2, turns),
+            _read_gps(topics, ekf2),
+        ]
+    )
+
+
+def split_tracks(
+    tracks: list[PositionTrack | Unavailable],
+) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
+    """Return the position tracks, best first, and the reasons for missing tracks."""
+    available_tracks = [track for track in tracks if isinstance(track, PositionTrack)]
+    available_tracks.sort(key=lambda track: track.origin.preference)
+    return tuple(available_tracks), tuple(t for t in tracks if isinstance(t, Unavailable))
 
 
 def unavailable(name: str, reason: str, remedy: str = "") -> Unavailable:
@@ -125,10 +131,9 @@ def make_track(
             remedy,
         )
     variance = samples[Columns.POSITION_VARIANCE]
-    samples = samples.assign(**variance.where(variance > 0))
     return PositionTrack(
         name=name,
-        samples=samples,
+        samples=samples.assign(**variance.where(variance > 0)),
         origin=origin,
         invalid=invalid,
         status=status,
@@ -149,18 +154,13 @@ def _make_ulog_track(
     """Make a ULog track; ``turns`` is True if the source has a changing orientation."""
     source = px4.TRACKS[name]
     origin = with_orientation(source.origin, turns=turns)
-    arm_parameters = ("", "", "") if origin.aid is None else origin.aid.lever_arm
-    default_fields = {
-        "description": source.description,
-        "topics": topic_names,
-        "log": topics.log.name,
-        "frame": "NED",
-        "clock": AUTOPILOT_CLOCK,
-        "lever_arm_m": tuple(
-            float(topics.ekf2_parameters.get(parameter, 0.0)) for parameter in arm_parameters
-        ),
-    }
-    return make_track(name, samples, origin, **(default_fields | track_fields))
+    if origin.aid is not None:
+        parameters = topics.ekf2_parameters
+        arm_m = tuple(parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm)
+        track_fields = {"lever_arm_m": arm_m, **track_fields}
+    fields = {"frame": "NED", "clock": AUTOPILOT_CLOCK, **track_fields}
+    fields |= {"description": source.description, "topics": topic_names, "log": topics.log.name}
+    return make_track(name, samples, origin, **fields)
 
 
 def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
@@ -193,7 +193,7 @@ def _read_logged(topics: Topics, name: str) -> PositionTrack | Unavailable:
 
 
 def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
-    """Describe the clock of a topic with arrival times instead of measurement times; else None.
+    """Describe the clock of a topic whose timestamps are no measurement times; None for others.
 
     PX4 uses the arrival time until it has received 500 TIMESYNC replies (``Timesync.cpp``). px4fuse
     uses it if ``timestamp_sample`` is not the boot clock in microseconds.
@@ -246,7 +246,7 @@ def _read_ev_pos_aid(topics: Topics, turns: bool) -> PositionTrack | Unavailable
         used_topics.append(vertical.topic)
     # EKF2 subtracts its delay and half its prediction interval from the sender's timestamp
     # (estimator_interface.cpp)
-    samples = _shift_times(samples, _delay_s(topics) + 0.5 * target_step_s(topics))
+    samples = _shift_times(samples, _delay_s(topics) + 0.5 * configured_step_s(topics))
     return _make_ulog_track(
         topics,
         px4.FUSED_OBSERVATION,
@@ -294,18 +294,18 @@ def _reconstruct(
     """
     if isinstance(ekf2, Unavailable):
         return unavailable(px4.RECONSTRUCTION, "the log contains no EKF2 state")
-    tracks = {}
-    for column, innovations in zip(Columns.POSITION, ekf2.innovations.values(), strict=True):
-        if isinstance(innovations, pd.DataFrame):
-            tracks[column] = innovations["innovation_m"] + np.interp(
-                innovations.index, ekf2.state.index, ekf2.state[column], left=np.nan, right=np.nan
-            )
-    if not {"north_m", "east_m"} <= tracks.keys():
+    positions = {
+        column: innovations["innovation_m"]
+        + interpolate_inside(innovations.index, ekf2.state[column])
+        for column, innovations in zip(Columns.POSITION, ekf2.innovations.values(), strict=True)
+        if isinstance(innovations, pd.DataFrame)
+    }
+    if not {"north_m", "east_m"} <= positions.keys():
         return unavailable(px4.RECONSTRUCTION, "EKF2 fused no horizontal external vision position")
-    samples = pd.DataFrame({name: tracks[name] for name in Columns.POSITION[:2]})
+    samples = pd.DataFrame({name: positions[name] for name in Columns.POSITION[:2]})
     notes: tuple[str, ...] = ()
-    if "down_m" in tracks:
-        samples, notes = _with_height(samples, tracks["down_m"].to_frame("down_m"))
+    if "down_m" in positions:
+        samples, notes = _with_height(samples, positions["down_m"].to_frame("down_m"))
     return _make_ulog_track(
         topics,
         px4.RECONSTRUCTION,
@@ -325,15 +325,11 @@ def project(
 
     Source: PX4 ``MapProjection::project``, src/lib/geo/geo.cpp (Snyder 1987, equation 25-2).
     """
-    latitude = np.radians(latitude_deg)
-    longitude = np.radians(longitude_deg)
-    latitude_0 = np.radians(origin[0])
-    difference = longitude - np.radians(origin[1])
-    sine = np.sin(latitude)
-    cosine = np.cos(latitude)
+    latitude, latitude_0 = np.radians(latitude_deg), np.radians(origin[0])
+    difference = np.radians(longitude_deg) - np.radians(origin[1])
+    sine, cosine = np.sin(latitude), np.cos(latitude)
+    sine_0, cosine_0 = np.sin(latitude_0), np.cos(latitude_0)
     cosine_difference = np.cos(difference)
-    sine_0 = np.sin(latitude_0)
-    cosine_0 = np.cos(latitude_0)
     angle = np.arccos(np.clip(sine_0 * sine + cosine_0 * cosine * cosine_difference, -1.0, 1.0))
     arc_over_chord = np.where(angle > 0, angle / np.where(angle > 0, np.sin(angle), 1.0), 1.0)
     north = arc_over_chord * (cosine_0 * sine - sine_0 * cosine * cosine_difference)
@@ -346,15 +342,12 @@ def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[
 
     Source: PX4 ``MapProjection::reproject``, src/lib/geo/geo.cpp (Snyder 1987, equation 20-14).
     """
-    x = north_m / EARTH_RADIUS_M
-    y = east_m / EARTH_RADIUS_M
-    latitude_0 = np.radians(origin[0])
-    longitude_0 = np.radians(origin[1])
+    x, y = north_m / EARTH_RADIUS_M, east_m / EARTH_RADIUS_M
+    latitude_0, longitude_0 = np.radians(origin[0]), np.radians(origin[1])
+    sine, cosine = np.sin(latitude_0), np.cos(latitude_0)
     angle = np.hypot(x, y)
     # sin(c)/c, with the limit 1 at the origin
     sine_ratio = np.sinc(angle / np.pi)
-    sine = np.sin(latitude_0)
-    cosine = np.cos(latitude_0)
     latitude = np.arcsin(np.cos(angle) * sine + x * sine_ratio * cosine)
     longitude = longitude_0 + np.arctan2(
         y * sine_ratio, cosine * np.cos(angle) - x * sine * sine_ratio
@@ -364,15 +357,10 @@ def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[
 
 def _local_origin(topics: Topics) -> GeodeticPosition | None:
     """Return EKF2's origin: latitude, longitude (degrees), altitude (m); None without an origin."""
-    local_samples = topics.read(px4.LOCAL_POSITION)
     columns = ["ref_lat", "ref_lon", "ref_alt"]
-    if not {*columns} <= {*local_samples}:
-        return None
-    origin = finite_rows(local_samples[columns], columns)
+    origin = finite_rows(topics.read(px4.LOCAL_POSITION).reindex(columns=columns), columns)
     origin = origin[origin["ref_lat"] != 0]
-    if origin.empty:
-        return None
-    return tuple(origin.iloc[-1].tolist())
+    return tuple(origin.iloc[-1].tolist()) if len(origin) else None
 
 
 def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
@@ -424,28 +412,28 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
         samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2
         samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
     # The velocity is added before the check, so that it is dropped together with a damaged position
-    samples = samples.assign(**_velocity(gps).set_axis(samples.index))
+    # The variance per axis is the reported accuracy squared
+    velocity = gps.reindex(columns=Columns.VELOCITY).set_axis(samples.index)
+    accuracy = gps.get("speed_accuracy_m_s", pd.Series(np.nan, gps.index)).to_numpy()
+    samples = samples.assign(**velocity, **dict.fromkeys(Columns.VELOCITY_VARIANCE, accuracy**2))
     samples = finite_rows(samples, Columns.POSITION)
     rate_hz = sample_rate(samples)
-    notes = tuple[str, ...]()
-    if rate_hz < MAX_DOWNSAMPLED_HZ and not len(unlogged_fixes):
-        reconstructed_fixes, notes = reconstruct_fixes(samples, ekf2, delay_ms * 1e-3)
-        samples = (
-            pd.concat([samples, reconstructed_fixes]).sort_index()
-            if len(reconstructed_fixes)
-            else samples
-        )
+    notes: list[str] = []
     if rate_hz < MAX_DOWNSAMPLED_HZ:
-        notes = (
+        notes.append(
             f"the logger dropped GNSS fixes (logged rate {rate_hz:.1f} Hz). Set SDLOG_PROFILE bit "
-            "1 to log all",
-            *notes,
+            "1 to log all"
         )
     if len(unlogged_fixes):
-        notes += (
+        notes.append(
             f"{len(unlogged_fixes)} GNSS fixes that were not logged are read from "
-            f"estimator_aid_src_gnss_pos ({interpolated} with interpolated height)",
+            f"estimator_aid_src_gnss_pos ({interpolated} with interpolated height)"
         )
+    elif rate_hz < MAX_DOWNSAMPLED_HZ:
+        reconstructed_fixes, note = reconstruct_fixes(samples, ekf2, delay_ms * 1e-3)
+        if note:
+            samples = pd.concat([samples, reconstructed_fixes]).sort_index()
+            notes.append(note)
     track_fields: dict[str, Any] = {}
     if set(px4.ANTENNA_COLUMNS) <= set(gps.columns):  # logged per receiver since v1.17
         track_fields["lever_arm_m"] = tuple(gps[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
@@ -455,14 +443,15 @@ def _read_gps(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unava
         samples,
         (layout.topic,),
         clock=clock,
-        notes=notes,
+        notes=tuple(notes),
         velocity=samples[Columns.VELOCITY + Columns.VELOCITY_VARIANCE],
         age_s=delay_ms * 1e-3,
         **track_fields,
     )
-    if isinstance(track, Unavailable):
-        return track
-    return replace(track, origin=structs.replace(track.origin, is_automatic=fused_aid(ekf2)))
+    if isinstance(track, PositionTrack):
+        origin = structs.replace(track.origin, is_automatic=fused_aid(ekf2))
+        return replace(track, origin=origin)
+    return track
 
 
 def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFrame | None:
@@ -471,13 +460,6 @@ def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFram
     if len(heights) < MIN_TRACK_SAMPLES:
         return None
     return _shift_times(-heights.to_frame("down_m"), -delay_s)
-
-
-def _velocity(gps: pd.DataFrame) -> pd.DataFrame:
-    """Return the GNSS velocity (m/s, NED), and its variance per axis: reported accuracy squared."""
-    velocity = gps.reindex(columns=Columns.VELOCITY)
-    accuracy = gps.get("speed_accuracy_m_s", np.nan)
-    return velocity.assign(**dict.fromkeys(Columns.VELOCITY_VARIANCE, accuracy**2))
 
 
 def read_truth(
@@ -489,25 +471,24 @@ def read_truth(
     differs from the origin of the simulation, so the ground truth is shifted to EKF2's origin.
     """
     attitude = read_attitude(topics.read(px4.LAYOUTS["truth_attitude"]))
-    logged_local = topics.read(px4.LAYOUTS["truth_local"])
+    local, in_degrees = px4.LAYOUTS["truth_local"], px4.LAYOUTS["truth_global"]
+    logged_local = topics.read(local)
     local_samples = finite_rows(logged_local, logged_local.columns.tolist())
-    global_positions = finite_rows(topics.read(px4.LAYOUTS["truth_global"]), GLOBAL_COLUMNS[:2])
-    if len(local_samples):
-        if len(global_positions) and fused_aid(ekf2):
-            local_samples = _move_to_origin(
-                local_samples, project_to_ned(global_positions, _local_origin(topics))
-            )
-        return Truth(px4.LAYOUTS["truth_local"].topic, local_samples, attitude)
+    global_positions = finite_rows(topics.read(in_degrees), GLOBAL_COLUMNS[:2])
     if len(global_positions):
-        samples = project_to_ned(global_positions, _local_origin(topics)).join(
-            global_positions.reindex(columns=Columns.VELOCITY)
-        )
-        return Truth(px4.LAYOUTS["truth_global"].topic, samples, attitude)
+        projected = project_to_ned(global_positions, _local_origin(topics))
+        if local_samples.empty:
+            velocity = global_positions.reindex(columns=Columns.VELOCITY)
+            return Truth(in_degrees.topic, projected.join(velocity), attitude)
+        if fused_aid(ekf2):
+            local_samples = _move_to_origin(local_samples, projected)
+    if len(local_samples):
+        return Truth(local.topic, local_samples, attitude)
     mocap_truth = motion_capture(positions, "vehicle_mocap_odometry")
     if mocap_truth is None and len(logged_local):
         return Unavailable(
             "ground truth",
-            f"{px4.LAYOUTS['truth_local'].topic} has no finite sample",
+            f"{local.topic} has no finite sample",
             "Check the simulation that writes the ground truth.",
         )
     return mocap_truth or Unavailable(
@@ -521,13 +502,7 @@ def _move_to_origin(local_samples: pd.DataFrame, global_samples: pd.DataFrame) -
     """Shift local positions to the origin of ``global_samples`` by the median difference."""
     moved_samples = local_samples.copy()
     for column in Columns.POSITION:
-        local_at_global = np.interp(
-            global_samples.index,
-            local_samples.index,
-            local_samples[column],
-            left=np.nan,
-            right=np.nan,
-        )
+        local_at_global = interpolate_inside(global_samples.index, local_samples[column])
         shift = (global_samples[column] - local_at_global).median()
         moved_samples[column] += shift if np.isfinite(shift) else 0.0
     return moved_samples
@@ -535,12 +510,8 @@ def _move_to_origin(local_samples: pd.DataFrame, global_samples: pd.DataFrame) -
 
 def motion_capture(positions: tuple[PositionTrack, ...], topic: str) -> Truth | None:
     """Return motion capture as ground truth if the log also has external vision, else None."""
-    if any(track.origin.is_vision for track in positions):
-        for track in positions:
-            if track.topics[0] == topic:
-                return Truth(
-                    track.name,
-                    track.samples.reindex(columns=Columns.STATE),
-                    read_attitude(track.orientation),
-                )
-    return None
+    track = next((track for track in positions if track.topics[0] == topic), None)
+    if track is None or not any(track.origin.is_vision for track in positions):
+        return None
+    samples = track.samples.reindex(columns=Columns.STATE)
+    return Truth(track.name, samples, read_attitude(track.orientation))

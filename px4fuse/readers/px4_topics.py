@@ -50,11 +50,8 @@ HEIGHT_BIAS = {name: LAYOUTS[f"bias_of_{name}"] for name in ("baro_hgt", "gnss_h
 DEFAULT_PROFILE = "Record with SDLOG_PROFILE bit 0 (default)."
 # Topics with EKF2's state vector and variances, in order of preference
 ESTIMATOR_STATES = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
-# Topic and field of the measured magnetic field: magnetometer, and EKF2's observation (since v1.14)
-MAGNETOMETER = (
-    ("vehicle_magnetometer", "magnetometer_ga"),
-    ("estimator_aid_src_mag", "observation"),
-)
+# Layouts of the measured magnetic field: magnetometer, and EKF2's observation (since v1.14)
+MAGNETOMETER = LAYOUTS["magnetometer"], LAYOUTS["observed_field"]
 # Number of attitude variances by the array lengths of states and variances in the log. 4: filter
 # with quaternion states, with biases as increments per prediction. 3: error-state filter
 # (EKF/python/ekf_derivation/generated/state.h at v1.15.4 and v1.16)
@@ -99,6 +96,4 @@ def topics() -> list[str]:
     named_topics |= {row.topic for row in LAYOUTS.values() if row.topic}
     named_topics |= {f"estimator_aid_src_{name}" for name in AIDS}
     aid_topics = {STATUS_FLAGS, *INNOVATIONS, OLD_INNOVATIONS}
-    return sorted(
-        named_topics | UNUSED_TOPICS.keys() | aid_topics | {*ESTIMATOR_STATES, MAGNETOMETER[0][0]}
-    )
+    return sorted(named_topics | UNUSED_TOPICS.keys() | aid_topics | {*ESTIMATOR_STATES})

@@ -14,10 +14,11 @@ from px4fuse.errors import TrajectoryError
 
 # Minimum and maximum valid UNIX time (s): the years 2000 and 2100
 UNIX_START_S, UNIX_END_S = 946_684_800.0, 4_102_444_800.0
-# Number of characters at the beginning of a file that are searched for control characters: a file
-# with a control character there, or with a NUL anywhere, is binary
+# Number of characters at the beginning of a file in which a control character shows that the file
+# is binary; a NUL shows this anywhere
 _CHECKED_CHARS = 100_000
-_UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")  # byte order marks, written by Windows shells
+# Byte order marks of UTF-16, which Windows shells write
+_UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 _CONTROL_CHARACTER = re.compile("[\x00-\x08\x0e-\x1b]")
 _NUMBER = re.compile(
     r"[+-]?(?:(?:[0-9]+\.?|[0-9]*\.[0-9]+)(?:e[+-]?[0-9]+)?|nan|inf)", re.IGNORECASE
@@ -52,13 +53,13 @@ def quote(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
-def format_line_error(name: str, number: int, description: str, remedy: str) -> str:
-    """Format an error message on one line of a file.
+def line_error(name: str, number: int, fault: str, remedy: str) -> TrajectoryError:
+    """Make an error about one line of a file.
 
-    >>> format_line_error("uwb.csv", 7, "'x' is not a number", "Correct or remove that line.")
+    >>> str(line_error("uwb.csv", 7, "'x' is not a number", "Correct or remove that line."))
     "uwb.csv, line 7: 'x' is not a number. Correct or remove that line."
     """
-    return f"{name}, line {number}: {description}. {remedy}"
+    return TrajectoryError(f"{name}, line {number}: {fault}. {remedy}")
 
 
 @dataclass(frozen=True)
@@ -77,13 +78,11 @@ class Rows:
     lines: list[tuple[int, str]] = field(default_factory=list)
 
     def row_error(self, row: int, description: str, remedy: str) -> TrajectoryError:
-        """Return a TrajectoryError that contains the line number of a row."""
-        return TrajectoryError(
-            format_line_error(self.file_name, self.lines[row][0], description, remedy)
-        )
+        """Make an error with the line number of a row."""
+        return line_error(self.file_name, self.lines[row][0], description, remedy)
 
     def raise_where(self, is_invalid: BoolArray, description: str, remedy: str) -> None:
-        """Raise TrajectoryError for the first row with a True in the mask, (n,) or (n, k)."""
+        """Raise TrajectoryError for the first row with a True in the mask, shape (n,) or (n, k)."""
         invalid_indices = np.argwhere(is_invalid)
         if len(invalid_indices):
             raise self.row_error(int(invalid_indices[0, 0]), description, remedy)

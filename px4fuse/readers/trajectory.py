@@ -29,9 +29,10 @@ EUROC_COLUMNS = (8, 17)
 # Maximum median interval (s) between poses without a note on the unit of time: a longer interval
 # may be in milliseconds
 MAX_USUAL_INTERVAL_S = 10.0
-# Maximum and minimum plausible median interval (s) between poses: key frames may have minutes
-# between them, and frame rates are below 1 kHz
-MAX_INTERVAL_S, MIN_INTERVAL_S = 1000.0, 1e-3
+# Maximum plausible median interval (s) between poses: key frames may have minutes between them
+MAX_INTERVAL_S = 1000.0
+# Minimum plausible median interval (s) between poses: frame rates are below 1 kHz
+MIN_INTERVAL_S = 1e-3
 UNITS_PER_SECOND = {"nanoseconds": 10**9, "microseconds": 10**6, "milliseconds": 10**3}
 # Maximum deviation of a valid quaternion from norm 1
 MAX_NORM_ERROR = 0.1
@@ -42,17 +43,22 @@ UNIT_NORM_TOLERANCE = 1e-15
 # Maximum fraction of repeated timestamps: a larger fraction shows that timestamps have too few
 # digits
 MAX_REPEATED_FRACTION = 0.01
-# Maximum position (m) and rotation (rad) of a first pose that counts as the identity
-MAX_IDENTITY_M, MAX_IDENTITY_RAD = 1e-6, 1e-6
-# Limits for motion that counts as level, from its RMS extents along the three principal axes:
-# maximum ratio of third to second extent, minimum ratio of second to first extent, and maximum
-# angle between the third axis and y
-MAX_THICKNESS_RATIO, MIN_WIDTH_RATIO, MAX_TILT_RAD = 1 / 3, 0.1, math.radians(20.0)
-# Limits for a regular frame rate: minimum fraction of intervals that are close to the median, and
-# maximum relative deviation of these intervals from the median
-MIN_REGULAR_FRACTION, MAX_INTERVAL_DEVIATION = 0.9, 0.5
-# Minimum interval between poses that counts as a gap, in median intervals and in s
-MIN_GAP_INTERVALS, MIN_GAP_S = 2.5, 0.3
+# Maximum coordinate (m) and rotation angle (rad) of a first pose that is the identity
+MAX_IDENTITY = 1e-6
+# Maximum ratio of height to width of a level motion (RMS extents along the principal axes)
+MAX_THICKNESS_RATIO = 1 / 3
+# Minimum ratio of width to length of a level motion: a straight motion does not show the vertical
+MIN_WIDTH_RATIO = 0.1
+# Maximum angle (rad) between the vertical of a level motion and the y axis of a camera frame
+MAX_TILT_RAD = math.radians(20.0)
+# Minimum fraction of intervals between poses near the median interval, for a regular frame rate
+MIN_REGULAR_FRACTION = 0.9
+# Maximum relative deviation of a regular interval from the median interval
+MAX_INTERVAL_DEVIATION = 0.5
+# Minimum length of a gap between poses (median intervals)
+MIN_GAP_INTERVALS = 2.5
+# Minimum length (s) of a gap between poses
+MIN_GAP_S = 0.3
 
 _TUM = "TUM (time x y z qx qy qz qw)"
 _EUROC = "EuRoC (time, x, y, z, qw, qx, qy, qz with commas)"
@@ -111,9 +117,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
     position = values[:, :3]
     rotation = _read_rotation(rows, values[:, 3:7], is_w_first)
     is_kept, dropped_note = _increasing_rows(rows, time)
-    time = time[is_kept]
-    position = position[is_kept]
-    rotation = rotation[is_kept]
+    time, position, rotation = time[is_kept], position[is_kept], rotation[is_kept]
     kind, kind_note = _detect_kind(path, columns, comments, position, rotation)
     frame, frame_note = _detect_frame(kind, position)
     is_unix = UNIX_START_S <= time[0] < UNIX_END_S
@@ -165,36 +169,29 @@ def tum_text(trajectory: Trajectory) -> str:
 
 
 def _split_rows(name: str, content: bytes) -> tuple[Rows, str, str]:
-    """Split a file into numeric rows and comments (with header); note an incomplete last row."""
+    """Return the numeric rows, the comments (with header), and a note on an incomplete last row."""
     text = decode_text(content)
     if text is None:
-        is_ulog = content.startswith(b"ULog")
-        remedy = f"Choose a track of the log: {name}:vio or {name}:ekf2." if is_ulog else _REMEDY
-        raise TrajectoryError(
-            f"{name} is {'a PX4 log' if is_ulog else 'a binary file'}, not a trajectory file",
-            remedy,
-        )
+        fault, remedy = "a binary file", _REMEDY
+        if content.startswith(b"ULog"):
+            fault, remedy = "a PX4 log", f"Choose a track of the log: {name}:vio or {name}:ekf2."
+        raise TrajectoryError(f"{name} is {fault}, not a trajectory file", remedy)
     lines = [(number, line) for number, line in enumerate(text.split("\n"), 1) if line.strip()]
     comments = [line for _, line in lines if line.lstrip().startswith("#")]
     numeric_rows = [row for row in lines if not row[1].lstrip().startswith("#")]
-    if (
-        len(numeric_rows) > 1
-        and not _is_numeric_row(numeric_rows[0][1])
-        and _is_numeric_row(numeric_rows[1][1])
-    ):
-        comments.append(numeric_rows.pop(0)[1])  # header without #
-    if numeric_rows and not _is_numeric_row(numeric_rows[0][1]):
+    # A line that is not numeric is a header without #, if a numeric line is below it
+    is_numeric = [_is_numeric_row(line) for _, line in numeric_rows[:2]]
+    if is_numeric == [False, True]:
+        comments.append(numeric_rows.pop(0)[1])
+    elif is_numeric and not is_numeric[0]:
         raise TrajectoryError(
             f"{name} is not a trajectory file: the first line is {quote(numeric_rows[0][1])}",
             _REMEDY,
         )
     truncation_note = ""
-    is_short = len(numeric_rows) > 1 and len(_fields(numeric_rows[-1][1])) < len(
-        _fields(numeric_rows[0][1])
-    )
-    if is_short and not text.endswith("\n"):
-        truncation_note = f"The incomplete last line ({numeric_rows[-1][0]}) was dropped."
-        numeric_rows.pop()
+    widths = [len(_fields(line)) for _, line in (*numeric_rows[:1], *numeric_rows[-1:])]
+    if not text.endswith("\n") and widths != sorted(widths):
+        truncation_note = f"The incomplete last line ({numeric_rows.pop()[0]}) was dropped."
     if len(numeric_rows) < MIN_POSES:
         raise TrajectoryError(
             f"{name} contains {len(numeric_rows)} poses; at least {MIN_POSES} are needed",
@@ -244,11 +241,12 @@ def _convert_timestamps(rows: Rows, timestamps: list[str]) -> tuple[Array, str]:
     values = np.array(timestamps, dtype=np.float64)
     median_interval = float(np.median(np.abs(np.diff(values))))
     if median_interval <= MAX_INTERVAL_S and np.abs(values).max() < UNIX_END_S:
-        interval_note = (
+        if median_interval < MAX_USUAL_INTERVAL_S:
+            return values, ""
+        return values, (
             f"The timestamps are read as seconds; the median interval is {median_interval:.0f} s. "
             "Check that the unit is not milliseconds."
         )
-        return values, interval_note if median_interval >= MAX_USUAL_INTERVAL_S else ""
     for unit, units_per_second in UNITS_PER_SECOND.items():
         first_s = float(values[0]) / units_per_second
         latest_s = float(np.abs(values).max()) / units_per_second
@@ -259,12 +257,9 @@ def _convert_timestamps(rows: Rows, timestamps: list[str]) -> tuple[Array, str]:
             and MIN_INTERVAL_S <= median_interval / units_per_second <= MAX_INTERVAL_S
         ):
             counts = np.array([int(Decimal(timestamp)) for timestamp in timestamps], dtype=np.int64)
-            unit_note = f"The timestamps are {unit} and were divided by {units_per_second:.0e}."
             # Seconds and remainder are divided separately: float64 cannot represent UNIX time in ns
-            return (
-                counts // units_per_second + counts % units_per_second / units_per_second,
-                unit_note,
-            )
+            seconds = counts // units_per_second + counts % units_per_second / units_per_second
+            return seconds, f"The timestamps are {unit} and were divided by {units_per_second:.0e}."
     raise TrajectoryError(
         f"{rows.file_name}: the median interval of the timestamps, {median_interval:.3g}, is not "
         "valid in any unit from seconds to nanoseconds",
@@ -307,17 +302,14 @@ def _detect_kind(
     path: Path, columns: int, comments: str, position: Array, rotation: Rotation
 ) -> tuple[Kind, str]:
     if columns == EUROC_COLUMNS[1]:
-        return (
-            "truth",
-            "The kind is ground truth, according to its 17 columns.",
-        )
+        return "truth", "The kind is ground truth, according to its 17 columns."
     # EuRoC files are always called data.csv; their folder name indicates the kind
     folder = path.absolute().parent.name if path.name == "data.csv" else ""
     text_by_source = {"a comment": comments, "the file name": path.name, "the folder name": folder}
     for source, text in text_by_source.items():
         if _TRUTH_WORDS.search(text):
             return "truth", f"The kind is ground truth, according to {source}."
-    if np.abs(position[0]).max() < MAX_IDENTITY_M and rotation[0].magnitude() < MAX_IDENTITY_RAD:
+    if max(np.abs(position[0]).max(), rotation[0].magnitude()) < MAX_IDENTITY:
         return "slam", "The kind is SLAM, because the first pose is the identity."
     return "unknown", ""
 

@@ -25,7 +25,7 @@ from px4fuse.readers.px4_positions import GPS_3D_FIX, barometer, read_positions,
 from px4fuse.readers.ulog_topics import Topics, dropped_notes, longest_increasing_run, read_topics
 
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
-# Minimum interval (s) between IMU samples that counts as missing data: normal intervals are 4 ms
+# Minimum interval (s) between IMU samples for a gap in the IMU data: normal intervals are 4 ms
 MIN_IMU_GAP_S = 0.2
 # Minimum and maximum valid UTC (UNIX time, s) of a GNSS receiver: GPS_EPOCH_SECS of PX4
 # (gps_helper.h), and the year 2100
@@ -58,6 +58,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
     delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
     in_flight = common.ends_in_flight(airborne, topics.log.duration_s)
     dropped = [(topic, count) for (topic, _), count in sorted(topics.dropped.items())]
+    tilt_failures = topics.read(px4.LAYOUTS["failure"], step=True)[["roll", "pitch"]]
     return Flight(
         log=structs.replace(
             topics.log,
@@ -74,7 +75,7 @@ def read_ulog(name: str, content: bytes) -> Flight:
         truth=truth,
         airborne=airborne,
         modes=_read_modes(topics),
-        tumble_spans=_read_tumble_spans(topics),
+        tumble_spans=common.flight_spans(tilt_failures.max(axis=1) == 0.0, topics.log.duration_s),
         barometer=barometer(altitude_m, delay_s),
         missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *missing_positions),
         streams=topics.streams,
@@ -149,13 +150,6 @@ def _read_airborne(topics: Topics) -> Spans | Unavailable:
         )
     topics.record_stream("airborne", px4.LAYOUTS["land_detected"].topic)
     return common.flight_spans(land_detected["landed"], topics.log.duration_s)
-
-
-def _read_tumble_spans(topics: Topics) -> Spans:
-    is_upright = (
-        topics.read(px4.LAYOUTS["failure"], step=True)[["roll", "pitch"]].max(axis=1) == 0.0
-    )
-    return common.flight_spans(is_upright, topics.log.duration_s)
 
 
 def _read_modes(topics: Topics) -> tuple[FlightMode, ...] | Unavailable:

@@ -14,7 +14,7 @@ from px4fuse.report.page import PAGE_WIDTH, Page, halves
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Axes, Colormap
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
-from px4fuse.trajectory.scores import Interval, PairwiseError, Statistics
+from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
 
 # Indices of the coordinates drawn to the right, drawn upwards, and vertical; True if that is down
 PAGE_AXES: Mapping[Frame, tuple[int, int, int, bool]] = {
@@ -234,7 +234,7 @@ def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
     axes.set_xlabel("delta")
 
 
-def _rpe_statistics(evaluation: Evaluation) -> list[tuple[PairwiseError, Statistics]]:
+def _rpe_statistics(evaluation: Evaluation) -> list[tuple[RelativeError, Statistics]]:
     return [(e, e.translation_m) for e in evaluation.rpe if isinstance(e.translation_m, Statistics)]
 
 
@@ -306,7 +306,7 @@ def write_evaluation(page: Page, evaluation: Evaluation) -> None:
 
 def error_rows(evaluation: Evaluation) -> list[list[str]]:
     """Return the table rows of the ATE and of each RPE, with the columns of ERROR_TABLE_HEAD."""
-    errors: dict[str, AbsoluteError | PairwiseError] = {"ATE (m)": evaluation.ate}
+    errors: dict[str, AbsoluteError | RelativeError] = {"ATE (m)": evaluation.ate}
     errors |= {f"RPE {error.delta_text} (m)": error for error in evaluation.rpe}
     rows = []
     for name, error in errors.items():
@@ -393,7 +393,7 @@ def quarters_sentence(evaluation: Evaluation) -> str:
     )
 
 
-def rpe_growth_sentence(rpe: tuple[PairwiseError, ...]) -> str:
+def rpe_growth_sentence(rpe: tuple[RelativeError, ...]) -> str:
     """Caption of the RPE panel: growth of the RPE with delta, which separates noise from drift."""
     interval_note = "RMSE with its 95 % interval."
     rmse: dict[tuple[str, float], float] = {

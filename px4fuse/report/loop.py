@@ -19,7 +19,7 @@ from px4fuse.report.phrases import student_line, write_finding
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, LINES, MUTED_COLOUR, Axes, set_map_axes
 from px4fuse.results.contract import LoopResults
 from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.graph.analysis import MAX_ROBUST_CLOSURES, SOLUTIONS, SolvedGraph
+from px4fuse.trajectory.graph.analysis import MAX_ROBUST_CLOSURES, SOLUTIONS, Graph
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 from px4fuse.trajectory.model import AXES_OF_FRAME, format_vector
 from px4fuse.trajectory.scores import Interval, Statistics
@@ -352,7 +352,7 @@ def format_correction(correction: CorrectedPath) -> str:
     return f"{correction.correction_rms_m:.2f} / {correction.correction_max_m:.2f}"
 
 
-def graph_summary(solved_graph: SolvedGraph) -> Page:
+def graph_summary(solved_graph: Graph) -> Page:
     """Make the terminal page of a pose graph: gate, solver and costs."""
     page = Page()
     page.write_labelled(
@@ -374,13 +374,10 @@ def graph_summary(solved_graph: SolvedGraph) -> Page:
         page.write_labelled(
             "Gate", f"{len(rejected_gates)} of {len(gates)} closures rejected", *listed_closures
         )
-    if (
-        len(solved_graph.solutions) == 1
-        and (~solved_graph.graph.is_successive).sum() > MAX_ROBUST_CLOSURES
-    ):
-        page.write_labelled(
-            "Robust", "not solved for this many closures; add --robust (takes some minutes)"
-        )
+        if len(gates) > MAX_ROBUST_CLOSURES and len(solved_graph.solutions) == 1:
+            page.write_labelled(
+                "Robust", "not solved for this many closures; add --robust (takes some minutes)"
+            )
     unconverged = [
         SOLUTIONS[key] for key, solution in solved_graph.solutions.items() if not solution.converged
     ]

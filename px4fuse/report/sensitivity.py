@@ -6,12 +6,17 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import AxisComparison, Comparison
+from px4fuse.comparison.model import AxisComparison
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_factor, format_number
-from px4fuse.filter.fitting import START_OUTLIER_WIDTH
-from px4fuse.filter.likelihood import FilterStates, filter_states, preintegrate, score_grid
-from px4fuse.filter.tuning import HORIZONTAL, MIN_MEASUREMENTS, AxisTuning, Noise
+from px4fuse.filter.likelihood import FilterStates, filter_states, preintegrate
+from px4fuse.filter.tuning import (
+    HORIZONTAL,
+    MIN_MEASUREMENTS,
+    AxisTuning,
+    Noise,
+    log_likelihood_drop,
+)
 from px4fuse.flight.model import Unavailable
 from px4fuse.report.page import Page, draw_legend_above, halves
 from px4fuse.report.style import KF_COLOUR, set_plain_ticks
@@ -79,9 +84,9 @@ def _draw_map(page: Page, analysis: Analysis) -> None:
     used_noises = settings.sigma_a_m_s2, settings.sigma_z_m
     noises = tuned_noises.sigma_a_two_state, tuned_noises.sigma_z
     (a, a_limits), (z, z_limits) = map(_noise_grid, used_noises, noises)
-    axes.contourf(
-        z, a, _log_likelihood_drop(analysis, name, tuned_noises, a, z), LEVELS_NATS, colors=SHADES
-    )
+    kf_axes = (result.axis for result in analysis.axes.values())
+    drop = log_likelihood_drop(tuned_noises, kf_axes, settings, a, z)
+    axes.contourf(z, a, drop, LEVELS_NATS, colors=SHADES)
     for factor in (1.0 / NOISE_FACTOR, 1.0, NOISE_FACTOR):
         sigma_a_of_gain = factor * used_noises[0] / used_noises[1] * z[[0, -1]]
         axes.plot(z[[0, -1]], sigma_a_of_gain, color="black", lw=0.7, ls=(0, (1, 1.5)))
@@ -171,23 +176,6 @@ def format_noise(noise: Noise, unit: str) -> str:
 
 def _best_value(noise: Noise) -> float:
     return noise.value or noise.high or noise.low or float("nan")
-
-
-def _log_likelihood_drop(
-    comparison: Comparison, name: str, tuned_noises: AxisTuning, a: Array, z: Array
-) -> Array:
-    """Return the log-likelihood below its maximum (nats); rows: SIGMA_A, columns: SIGMA_Z."""
-    axes = [
-        axis_comparison.axis
-        for axis_comparison in comparison.axes.values()
-        if axis_comparison.axis.name == name
-        or (name == HORIZONTAL and axis_comparison.axis.name in ("north", "east"))
-    ]
-    preintegrated = [preintegrate(axis, comparison.settings) for axis in axes]
-    time = axes[0].measurement_time_s[-len(preintegrated[0].measurement_m) :]
-    weight = np.where(np.isin(time, tuned_noises.outlier_time_s), START_OUTLIER_WIDTH**-2.0, 1.0)
-    total = score_grid(preintegrated, a[:, None], z[None, :], weight)
-    return np.asarray(total - total.min())
 
 
 def _second_half_median(values: Array) -> Array:

@@ -27,7 +27,7 @@ from px4fuse.results.bounds import within_bounds
 from px4fuse.results.contract import AvailableTrack, ChosenSettings, Log, PositionSource
 from px4fuse.results.model import NO_STUDENT, Student, provenance, schema_of
 from px4fuse.trajectory.evaluation import Evaluation
-from px4fuse.trajectory.graph.analysis import SolvedGraph
+from px4fuse.trajectory.graph.analysis import Graph
 
 # Fields of an Analysis that the results contain without change
 _COPIED_FIELDS = (
@@ -147,7 +147,7 @@ def evaluation_results(request: EvaluationRequest, score: Evaluation) -> contrac
     )
 
 
-def graph_results(solved_graph: SolvedGraph, command: str) -> contract.GraphResults:
+def graph_results(solved_graph: Graph, command: str) -> contract.GraphResults:
     """Return the results of ``px4fuse loop`` for a pose graph file."""
     return within_bounds(
         contract.GraphResults(

@@ -65,7 +65,8 @@ from px4fuse.trajectory.rotation import (
     to_vector,
 )
 
-PREDICTION_STEP_US = 10_000  # µs; EKF2's prediction step (EKF2_PREDICT_US)
+# EKF2's prediction step (µs): EKF2_PREDICT_US
+PREDICTION_STEP_US = 10_000
 # Initial σ (gauss) per axis of earth field and magnetometer bias, after alignment on the ground
 FIELD_SIGMA_GAUSS = 0.03
 # Rules by which EKF2 (v1.14 and later) starts, stops and resets fusion of external vision:
@@ -89,19 +90,21 @@ NO_AID_TIMEOUT_S = 5.0
 # Initial σ of tilt, velocity, position, gyro bias and accelerometer bias: EKF2_ANGERR_INIT,
 # EKF2_GPS_V_NOISE, EKF2_GPS_P_NOISE, EKF2_GBIAS_INIT and EKF2_ABIAS_INIT (covariance.cpp)
 INITIAL_SIGMA = np.repeat([0.1, 0.3, 0.5, 0.1, 0.2], 3)
-# Time (s) at rest before the log, and σ of specific force (m/s²), angular rate (rad/s) and velocity
-# (m/s) at rest. With them the model has the σ that EKF2 v1.16 reports on the ground: gyro bias
-# 0.0005 rad/s, velocity 0.06 m/s, horizontal accelerometer bias 0.17 m/s²
+# Time (s) at rest before the log
 REST_BEFORE_LOG_S = 10.0
+# σ of specific force (m/s²), angular rate (rad/s) and velocity (m/s) at rest. With these values the
+# model has the σ that EKF2 v1.16 reports on the ground: gyro bias 0.0005 rad/s, velocity 0.06 m/s,
+# horizontal accelerometer bias 0.17 m/s²
 REST_SIGMA = np.repeat([0.05, 0.0005, 0.06], 3)
-# σ of EKF2's heading (rad) and height (m) as PX4 v1.16 logs them in flight
-HEADING_SIGMA_RAD, HEIGHT_SIGMA_M = 0.03, 0.15
+# σ of EKF2's heading (rad) as PX4 v1.16 logs it in flight
+HEADING_SIGMA_RAD = 0.03
+# σ of EKF2's height (m) as PX4 v1.16 logs it in flight
+HEIGHT_SIGMA_M = 0.15
 # Maximum interval (s) between times at which the model computes variances for estimator_states
 MAX_EVENT_INTERVAL_S = 0.1
 
 
 def _fused_aids(scenario: Scenario) -> tuple[Aid, ...]:
-    """Return the aiding sources that EKF2 fuses in this scenario."""
     return (scenario.aid, MAG, BAROMETER) if scenario.aid == GNSS_POS else (scenario.aid,)
 
 
@@ -187,7 +190,10 @@ def simulate_ekf2(
 def _make_segment(
     scenario: Scenario, mistakes: Mistakes, motion: Motion, imu: Topic
 ) -> tuple[ReplaySegment, IntArray, Array]:
-    """Return the input of the EKF2 model, the times (µs) of its steps, and true quaternions."""
+    """Prepare the input of the EKF2 model.
+
+    Return also the times (µs) and the true attitudes of its prediction steps.
+    """
     time_us = imu.fields["timestamp"].astype(np.int64) - sensors.START_US
     interval_s = np.diff(time_us) * 1e-6
     step_end_indices = step_ends(interval_s, np.array([], dtype=np.intp), PREDICTION_STEP_US * 1e-6)
@@ -244,7 +250,7 @@ def _make_segment(
 
 
 def _with_field(segment: ReplaySegment, magnetometer: Topic) -> ReplaySegment:
-    """Add earth field and magnetometer bias, as aligned on the ground, to the states."""
+    """Add earth field and magnetometer bias to the states, as aligned at rest on the ground."""
     measured_at_s = sensors.time_s(magnetometer) - 0.5 * float(np.median(segment.step_s))
     gauss = magnetometer.fields["magnetometer_ga"].astype(np.float64)
     fields = np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)])
@@ -254,7 +260,7 @@ def _with_field(segment: ReplaySegment, magnetometer: Topic) -> ReplaySegment:
 
 
 def _barometer_heights(segment: ReplaySegment, barometer: Topic) -> HeightSamples:
-    """Return the barometer heights, the only height source of EKF2 in outdoor flights."""
+    """Make the height samples of the barometer, the only height source of EKF2 outdoors."""
     measured_at_s = sensors.time_s(barometer) - 0.5 * float(np.median(segment.step_s))
     down_m = sensors.HOME_POSITION[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
     no_dead_zone, weight = np.zeros(len(down_m)), np.ones(len(down_m))
@@ -265,10 +271,10 @@ def _barometer_heights(segment: ReplaySegment, barometer: Topic) -> HeightSample
 def _initial_state_at_rest(
     rotation: Array, force_m_s2: Array, rate_rad_s: Array, heading_error_rad: float
 ) -> tuple[Array, Array]:
-    """Return EKF2's error state and covariance at the start of the log.
+    """Compute EKF2's error state and covariance at the start of the log, after a time at rest.
 
-    PX4's initial state is updated with the facts that the vehicle is at rest: specific force -g,
-    angular rate and velocity 0. The update correlates tilt error and accelerometer bias.
+    PX4's initial covariance is updated with the known values at rest: specific force -g, angular
+    rate and velocity 0. This update correlates tilt error and accelerometer bias.
     """
     H = np.zeros((9, STATE_COUNT))
     H[0:3, THETA] = -skew(rotation @ force_m_s2)
@@ -287,7 +293,7 @@ def _initial_state_at_rest(
 
 
 def _received_positions(source: sensors.SimulatedPositions) -> ReceivedPositions:
-    """Return the positions in order of arrival, without positions older than a preceding one.
+    """List the positions in order of arrival, without those older than an earlier one.
 
     EKF2 ignores late positions (estimator_interface.cpp).
     """
@@ -358,10 +364,10 @@ def _make_topic_track(
 def _hold_without_aiding(
     model_run: SegmentRun, state: Array
 ) -> tuple[list[tuple[int, Array]], BoolArray]:
-    """Hold the position in ``state`` (in place) while EKF2 has no aiding source.
+    """Hold the position in ``state`` (in place) while EKF2 fuses no aiding source.
 
-    EKF2 then fuses a constant position, which is not part of the model. Returns the position resets
-    (step, size in m), and True for each step with an aiding source.
+    EKF2 then fuses a constant position, which the model does not contain. Return the position
+    resets (step, size in m), and a mask of the steps with an aiding source.
     """
     events, time = model_run.events[0], model_run.segment.time_s
     horizontal = slice(NORTH, EAST + 1)

@@ -16,12 +16,17 @@ from px4fuse.readers.px4_positions import unproject
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ulog_writer import Topic, topic
 
-# Logging rates (Hz) of PX4 v1.16 (logged_topics.cpp). A vehicle logs estimator_aid_src_ev_pos at 2
-# Hz; PX4's simulation (SITL) logs all messages
+# Logging rate (Hz) of estimator_aid_src_ev_pos on a vehicle (PX4 v1.16, logged_topics.cpp); PX4's
+# simulation (SITL) logs all messages
 VEHICLE_AID_SOURCE_HZ = 2.0
-STATES_HZ, LOCAL_POSITION_HZ, FLAGS_HZ = 2.0, 10.0, 1.0
-MAGNETOMETER_HZ, OTHER_AIDS_HZ = 2.0, 2.0
-PUBLICATION_DELAY_US = 100  # µs from the newest IMU sample to the publication
+# Logging rates (Hz) of other topics of PX4 v1.16 (logged_topics.cpp)
+STATES_HZ = 2.0
+LOCAL_POSITION_HZ = 10.0
+FLAGS_HZ = 1.0
+MAGNETOMETER_HZ = 2.0
+OTHER_AIDS_HZ = 2.0
+# Time (µs) from the newest IMU sample to the publication
+PUBLICATION_DELAY_US = 100
 
 
 @dataclass(frozen=True)
@@ -119,7 +124,7 @@ def _local_position_topic(track: TopicTrack, *, is_gnss: bool) -> Topic:
 
 
 def _states_topic(model_run: SegmentRun, track: TopicTrack, *, is_gnss: bool) -> Topic:
-    """Return estimator_states of v1.16: states (horizontal positions are 0) and variances."""
+    """Make estimator_states as PX4 v1.16 logs it: horizontal positions are 0."""
     end = model_run.events[0].end_step
     events = track.logged_events(np.diff(end, prepend=0) > 0, end, STATES_HZ)
     rows = end[events]
@@ -139,7 +144,7 @@ def _states_topic(model_run: SegmentRun, track: TopicTrack, *, is_gnss: bool) ->
 def _aid_sources(
     inputs: Inputs, model_run: SegmentRun, track: TopicTrack, rate_hz: float
 ) -> tuple[Topic, ...]:
-    """Return estimator_aid_src_* of the position source: one message per usable position."""
+    """Make estimator_aid_src_* of the position source, with one message per usable position."""
     events, run, aid = model_run.events[0], model_run, inputs.aid
     event_rows = track.logged_events(events.usable, events.end_step, rate_hz)
     rows, sample, received = events.end_step[event_rows], events.sample[event_rows], inputs.received
@@ -193,7 +198,7 @@ def _aid_sources(
 
 
 def _barometer_topics(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) -> list[Topic]:
-    """Return estimator_aid_src_baro_hgt; an empty list without barometer."""
+    """Make estimator_aid_src_baro_hgt; the list is empty without barometer."""
     heights, end = model_run.segment.heights, model_run.events[0].end_step
     if heights is None or model_run.heights is None:
         return []
@@ -224,7 +229,7 @@ def _barometer_topics(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) 
 def _magnetometer_topics(
     inputs: Inputs, model_run: SegmentRun, track: TopicTrack, attitude_hz: float
 ) -> list[Topic]:
-    """Return the topics that need a magnetometer; an empty list without magnetometer."""
+    """Make the topics that need a magnetometer; the list is empty without magnetometer."""
     field, settings, end = model_run.segment.field, inputs.settings, model_run.events[0].end_step
     if field is None:
         return []
@@ -297,7 +302,7 @@ def _aid_source(
 
 
 def _flags_topic(inputs: Inputs, model_run: SegmentRun, track: TopicTrack) -> Topic:
-    """Return estimator_status_flags: once a second, and at each start and stop of fusion."""
+    """Make estimator_status_flags: once a second, and when fusion starts or stops."""
     events, run, time = model_run.events[0], model_run, model_run.segment.time_s
     attempts = np.flatnonzero(run.fused[:, 0] | run.rejected[:, 0] | run.reset[:, 0])
     is_fusing = np.zeros(len(time), np.bool_)

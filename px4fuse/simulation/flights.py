@@ -23,9 +23,12 @@ from px4fuse.simulation.ulog_writer import Topic, encode
 NO_MISTAKES = Mistakes()
 # Values of the PX4 parameters that let EKF2 fuse horizontal positions, with GNSS also velocity
 FUSION_ON_VALUES = {EV_POS.switch: 1, GNSS_POS.switch: 5}
-# SDLOG_PROFILE with and without the topics of external vision
-PROFILE_WITH_VISION, PROFILE_DEFAULT = 129, 1
-PX4_RELEASE = 1 << 24 | 16 << 16 | 255  # v1.16.0, whose topics are simulated
+# SDLOG_PROFILE that logs the topics of external vision
+PROFILE_WITH_VISION = 129
+# SDLOG_PROFILE that does not log the topics of external vision
+PROFILE_DEFAULT = 1
+# PX4 v1.16.0, whose topics are simulated
+PX4_RELEASE = 1 << 24 | 16 << 16 | 255
 HARDWARE = "px4fuse simulation"
 ANSWER_SCHEMA = {"name": "px4fuse-answer", "version": 1}
 
@@ -57,12 +60,12 @@ class Simulation:
 
 
 def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation:
-    """Simulate a flight with mistakes.
+    """Simulate a flight with injected faults.
 
     Raises
     ------
     SettingsError
-        A mistake is not possible in this scenario.
+        An injected fault is not possible in this scenario.
     """
     for name in active_mistakes(mistakes):
         if scenario.kind not in (kinds := MISTAKES[name].kinds):
@@ -98,7 +101,7 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
     for topic in topics:
         if len(topic.fields["timestamp"]) < 2:
             raise SettingsError(
-                f"With these mistakes {topic.name} contains no data. Reduce the mistakes."
+                f"With these injected faults {topic.name} contains no data. Reduce the faults."
             )
     if scenario.ekf2:
         ekf2_topics = ekf2.simulate_ekf2(
@@ -117,7 +120,7 @@ def simulate_flight(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Fli
 
 
 def to_ulog(simulation: Simulation) -> bytes:
-    """Encode the flight as a ULog file, which contains no information about the mistakes."""
+    """Encode the flight as a ULog file, which contains no information about the injected faults."""
     info: dict[str, int | str] = {
         "sys_name": "PX4",
         "ver_hw": HARDWARE,
@@ -152,7 +155,7 @@ def answer(simulation: Simulation) -> dict[str, Any]:
     Keys
     ----
     mistakes
-        Help text and expected finding of each mistake, by name.
+        Help text and expected finding of each injected fault, by name.
     truth
         Biases, noises, time offset to add to the position timestamps, outliers (index and time in
         the logged topic), and loop closure error.

@@ -1,7 +1,7 @@
-"""Mistakes of a simulated flight; ``mistakes.toml`` describes them.
+"""Injected faults of a simulated flight; ``mistakes.toml`` describes them.
 
 Examples of sizes on the command line: ``0.08``, ``80ms``, ``5%``, ``8s,40s``. Without a size, the
-mistake has a default size that px4fuse detects easily.
+fault has a default size that px4fuse detects easily.
 """
 
 from collections.abc import Iterable, Mapping
@@ -15,9 +15,9 @@ from px4fuse.simulation.scenario import KINDS, Kind, bounded_number, quantities
 
 @dataclass(frozen=True)
 class Mistakes:
-    """Sizes of all mistakes; the defaults are a flight without mistakes.
+    """Sizes of all injected faults; the defaults are a flight without faults.
 
-    :data:`MISTAKES` explains each mistake. Outliers occur in bursts with one horizontal direction
+    :data:`MISTAKES` explains each fault. Outliers occur in bursts with one horizontal direction
     and the mean size ``nlos_size_m``. Default times: gaps in the middle of the flight, jumps at two
     thirds, heading errors from the start. A rate of 0 is the rate of the scenario, an EKF2 noise of
     0 the σ that the source reports, and an EKF2 delay of None the correct delay. ``r_scale``
@@ -61,29 +61,29 @@ class Mistakes:
 
 
 QUANTITIES = quantities(Mistakes)
-# ASCII spelling of units, for values of mistakes on the command line
+# ASCII spelling of units, for sizes of injected faults on the command line
 _ASCII_UNITS = {"°": "deg", "m/s²": "m/s2"}
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """Mistake that a simulated flight can have (table ``mistakes.toml``).
+    """Fault that can be injected into a simulated flight (table ``mistakes.toml``).
 
     Attributes
     ----------
     default : float or True
-        Default of the first field; True for a mistake without a size.
+        Default of the first field; True for a fault without a size.
     help : str
-        Description of the mistake, for instructors.
+        Description of the fault, for instructors.
     finding : str
         Finding that a student is expected to report.
     kinds : tuple of str
-        Kinds of flight in which the mistake is possible.
+        Kinds of flight in which the fault is possible.
     changes_ekf2 : bool
-        True if the mistake changes EKF2 parameters.
+        True if the fault changes EKF2 parameters.
     fields : tuple of str
-        Fields of :class:`Mistakes` that the mistake sets: those whose name begins with the name of
-        the mistake. The command line requires the first value; the others are optional.
+        Fields of :class:`Mistakes` that the fault sets: their names begin with the name of the
+        fault. The command line requires the first value; the others are optional.
     """
 
     default: float | bool
@@ -95,12 +95,12 @@ class Mistake:
 
     @property
     def sizes(self) -> tuple[str, ...]:
-        """Fields that are sizes or times; empty for a mistake without a size."""
+        """Fields that are sizes or times; empty for a fault without a size."""
         return () if self.default is True else self.fields
 
     @property
     def usage(self) -> str:
-        """Syntax of the values after the mistake's name, such as ``=PERCENT[,SIZE]``."""
+        """Syntax of the values after the name of the fault, such as ``=PERCENT[,SIZE]``."""
         required, *optional = [f"={QUANTITIES[name].cli_name}" for name in self.sizes] or [""]
         return required + "".join(f"[,{name[1:]}]" for name in optional)
 
@@ -117,7 +117,7 @@ MISTAKES: Mapping[str, Mistake] = {
 
 
 def parse(texts: Iterable[str]) -> Mistakes:
-    """Parse mistakes from the command line.
+    """Parse injected faults from the command line.
 
     >>> parse(["clock-offset=80ms", "nlos=5%,3m"]).clock_offset_s
     0.08
@@ -125,7 +125,7 @@ def parse(texts: Iterable[str]) -> Mistakes:
     Parameters
     ----------
     texts : iterable of str
-        ``NAME``, ``NAME=VALUE`` or ``NAME=VALUE,VALUE``; of repeated names the last one counts.
+        ``NAME``, ``NAME=VALUE`` or ``NAME=VALUE,VALUE``; a repeated name replaces the previous one.
 
     Raises
     ------
@@ -137,7 +137,7 @@ def parse(texts: Iterable[str]) -> Mistakes:
         name, equals, values = text.strip().partition("=")
         if name not in MISTAKES:
             raise SettingsError(
-                f"--mistake {text}: {name} is not a mistake that px4fuse simulates",
+                f"--mistake {text}: px4fuse cannot inject the fault {name}",
                 f"{suggest_name(name, MISTAKES)}Choose from {', '.join(MISTAKES)}.",
             )
         mistake = MISTAKES[name]
@@ -160,7 +160,7 @@ def parse(texts: Iterable[str]) -> Mistakes:
 
 
 def active_mistakes(mistakes: Mistakes) -> tuple[str, ...]:
-    """Return the names of the mistakes whose size is not the default."""
+    """Return the names of the injected faults: their size is not the default."""
     defaults = Mistakes()
     return tuple(
         name
@@ -170,7 +170,7 @@ def active_mistakes(mistakes: Mistakes) -> tuple[str, ...]:
 
 
 def format_mistake(name: str, mistakes: Mistakes) -> str:
-    """Format one mistake with its values, in the notation of the option --mistake.
+    """Format one injected fault with its values, in the notation of the option --mistake.
 
     >>> format_mistake("nlos", parse(["nlos=5"]))
     'nlos=5%,2m'

@@ -1,7 +1,7 @@
-"""True motion of a simulated flight: a smooth path, and the attitude that a quadrotor needs for it.
+"""True motion of a simulated flight: a smooth path, and the attitude of a quadrotor on this path.
 
-Each velocity change Δv is a ramp Δv · S(x), x = (t - start) / length, with the quintic
-S = 6x⁵ - 15x⁴ + 10x³, so that the acceleration is continuous and the jerk bounded. In the air, a
+Each velocity change is a quintic ramp, so that the acceleration is continuous and the jerk bounded.
+In the air, a
 slow deviation (sum of sines) is added to the path. Thrust is along the body z axis and there is no
 drag, so the direction of the specific force a - g determines roll and pitch (Mellinger and Kumar
 2011, eq. 6 to 8).
@@ -14,93 +14,54 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import constants
+from scipy.interpolate import BPoly, PPoly
 
-from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.arrays import Array
 from px4fuse.errors import SettingsError
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.scenario import CORNER_DURATION_S, START_STOP_S, Scenario
 
 # Time (s) on the ground before take-off and after landing
 TIME_ON_GROUND_S = 6.0
-CLIMB_M_S = 0.75  # m/s; climb and descent rate
-CLIMB_RAMP_S = 1.5  # s; duration of each change of the climb rate
+# Maximum climb and descent rate (m/s)
+CLIMB_M_S = 0.75
+# Duration (s) of each change of the climb rate
+CLIMB_RAMP_S = 1.5
 # Maximum flight time (s): the log then has 70 MB
 MAX_FLIGHT_S = 3600.0
 # Time (s) in which the slow deviation grows after take-off and decreases before landing
 FADE_S = 3.0
 # Time (s) of a 180° turn at the end of the aisle with --yaw follow
 TURN_ROUND_S = 4.0
-# Range of periods (s), and number, of the sines of the slow deviation from the path
-DEVIATION_PERIODS_S, DEVIATION_SINE_COUNT = (3.0, 20.0), 4
+# Maximum time (s) between the end of a ramp and the start of the next ramp that continues it
+MIN_RAMP_DISTANCE_S = 1e-9
+# Range of the periods (s) of the sines that are the slow deviation from the path
+DEVIATION_PERIODS_S = (3.0, 20.0)
+# Number of sines in the slow deviation from the path
+DEVIATION_SINE_COUNT = 4
 
 
-def _quintic(x: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the quintic S(x), which rises from 0 to 1, and its three derivatives."""
-    x_squared, slope, complement = x * x, x * (1.0 - x), 1.0 - x
-    value = x_squared * x * (6.0 * x_squared - 15.0 * x + 10.0)
-    return (
-        value,
-        30.0 * slope**2,
-        60.0 * x * complement * (complement - x),
-        60.0 * (1.0 - 6.0 * x * complement),
-    )
+def _ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
+    """Return a function of time that changes in quintic ramps, and is constant between them.
 
-
-@dataclass(frozen=True)
-class Ramps:
-    """Sequence of n velocity ramps on k axes.
-
-    Attributes
-    ----------
-    start_s, length_s : ndarray, shape (n,)
-        Start and duration of each velocity ramp.
-    velocity_change : ndarray, shape (n, k)
+    ``ramps`` are tuples of start (s), duration (s) and change; the function is zero before the
+    first ramp.
     """
+    start_s, length_s, change = (np.array(values) for values in zip(*ramps, strict=True))
+    level = np.concatenate([0.0 * change[:1], np.cumsum(change, axis=0)])
+    end_s = start_s + length_s
+    times_s = np.r_[start_s[0] - 1.0, np.column_stack([start_s, end_s]).ravel(), end_s[-1] + 1.0]
+    # a ramp that starts at the end of the previous ramp continues it
+    is_used = np.diff(times_s, prepend=-np.inf) > MIN_RAMP_DISTANCE_S
+    values = np.repeat(level, 2, axis=0)[is_used]
+    derivatives = np.stack([values, 0.0 * values, 0.0 * values], axis=1)
+    return PPoly.from_bernstein_basis(BPoly.from_derivatives(times_s[is_used], derivatives))
 
-    start_s: Array
-    length_s: Array
-    velocity_change: Array
 
-    @classmethod
-    def of(cls, ramps: Sequence[tuple[float, float, Array]]) -> Ramps:
-        """Make ramps from tuples of start (s), duration (s) and velocity change."""
-        start_s, length_s, velocity_change = zip(*ramps, strict=True)
-        return cls(np.array(start_s), np.array(length_s), np.array(velocity_change))
-
-    def at(self, time_s: Array) -> tuple[Array, Array, Array, Array]:
-        """Return position, velocity, acceleration and jerk at given times, each of shape (t, k).
-
-        Position and velocity are 0 before the first ramp.
-        """
-        velocity_before = np.cumsum(self.velocity_change, axis=0) - self.velocity_change
-        # distance from the start of one ramp to the start of the next: velocity before the ramp ·
-        # interval, plus velocity change · (interval - half of the ramp duration)
-        position_gained = (
-            velocity_before[:-1] * np.diff(self.start_s)[:, None]
-            + self.velocity_change[:-1]
-            * (np.diff(self.start_s) - self.length_s[:-1] / 2.0)[:, None]
-        )
-        position_before = np.vstack(
-            [np.zeros((1, self.velocity_change.shape[1])), np.cumsum(position_gained, 0)]
-        )
-        ramp_index = np.maximum(np.searchsorted(self.start_s, time_s, side="right") - 1, 0)
-        length = self.length_s[ramp_index]
-        time_in_ramp = time_s - self.start_s[ramp_index]
-        x = np.clip(time_in_ramp / length, 0.0, 1.0)
-        integral = length * (x * x) ** 2 * (x * x - 3.0 * x + 2.5)
-        integral += np.maximum(time_in_ramp - length, 0.0)
-        value, first, second, _ = _quintic(x)
-        # take() is several times faster than indexing with an array
-        change = self.velocity_change.take(ramp_index, axis=0)
-        initial_velocity = velocity_before.take(ramp_index, axis=0)
-        return (
-            position_before.take(ramp_index, axis=0)
-            + initial_velocity * time_in_ramp[:, None]
-            + change * integral[:, None],
-            initial_velocity + change * value[:, None],
-            change * (first / length)[:, None],
-            change * (second / length**2)[:, None],
-        )
+def _derivatives(function: PPoly, time_s: Array, orders: Sequence[int]) -> list[Array]:
+    """Return derivatives of :func:`_ramps`, each of shape (t, k); order -1 is the integral."""
+    inside_s = np.clip(time_s, *function.x[[0, -1]])
+    return [np.asarray(function.derivative(order)(inside_s)) for order in orders]
 
 
 @dataclass(frozen=True)
@@ -166,16 +127,15 @@ class Motion:
 
     Attributes
     ----------
-    path, yaw : Ramps
-        Position on 3 axes (NED), and yaw on one axis; the "velocity" of the yaw ramps is the yaw
-        angle (rad).
+    velocity, yaw : PPoly
+        Velocity along the path (NED), and yaw angle (rad), as functions of time.
     deviation : Sines
         Slow deviation from the path.
     take_off_s, touch_down_s, duration_s : float
     """
 
-    path: Ramps
-    yaw: Ramps
+    velocity: PPoly
+    yaw: PPoly
     deviation: Sines
     take_off_s: float
     touch_down_s: float
@@ -183,49 +143,26 @@ class Motion:
 
     def at(self, time_s: Array) -> State:
         """Return the true state at given times, in seconds from the first data."""
-        position, velocity, acceleration, jerk = self.path.at(time_s)
-        deviation = self.deviation.at(time_s, 4)
-        fade, fading_indices = self._fade_factors(time_s)
-        # derivatives of the product fade · deviation (Leibniz rule), at times with a changing
-        # factor
-        fading = [derivative[fading_indices] for derivative in deviation]
-        velocity[fading_indices] += fade[1] * fading[0]
-        acceleration[fading_indices] += 2 * fade[1] * fading[1] + fade[2] * fading[0]
-        jerk[fading_indices] += (
-            3 * fade[1] * fading[2] + 3 * fade[2] * fading[1] + fade[3] * fading[0]
+        position, velocity, acceleration, jerk = _derivatives(self.velocity, time_s, (-1, 0, 1, 2))
+        yaw, yaw_rate = _derivatives(self.yaw, time_s, (0, 1))
+        # factor of the deviation: 1 in the air, 0 on the ground
+        fade = _ramps(
+            [
+                (self.take_off_s, FADE_S, np.array([1.0])),
+                (self.touch_down_s - FADE_S, FADE_S, np.array([-1.0])),
+            ]
         )
-        yaw, yaw_rate = self.yaw.at(time_s)[1:3]
+        # derivatives of the product fade · deviation (Leibniz rule)
+        f0, f1, f2, f3 = _derivatives(fade, time_s, range(4))
+        d0, d1, d2, d3 = self.deviation.at(time_s, 4)
         return State(
-            position_m=position + fade[0] * deviation[0],
-            velocity_m_s=velocity + fade[0] * deviation[1],
-            acceleration_m_s2=acceleration + fade[0] * deviation[2],
-            jerk_m_s3=jerk + fade[0] * deviation[3],
+            position_m=position + f0 * d0,
+            velocity_m_s=velocity + f0 * d1 + f1 * d0,
+            acceleration_m_s2=acceleration + f0 * d2 + 2.0 * f1 * d1 + f2 * d0,
+            jerk_m_s3=jerk + f0 * d3 + 3.0 * (f1 * d2 + f2 * d1) + f3 * d0,
             yaw_rad=yaw[:, 0],
             yaw_rate_rad_s=yaw_rate[:, 0],
         )
-
-    def _fade_factors(self, time_s: Array) -> tuple[tuple[Array, Array, Array, Array], IntArray]:
-        """Return the factor of the slow deviation, its derivatives, and their time indices.
-
-        The factor is 1 in the air and 0 on the ground, shape (t, 1). Its first three derivatives,
-        shape (m, 1), are for the m times at which the factor changes.
-        """
-        fade_in = np.clip((time_s - self.take_off_s) / FADE_S, 0.0, 1.0)
-        fade_out = np.clip((time_s - self.touch_down_s) / FADE_S + 1.0, 0.0, 1.0)
-        fading_indices = np.flatnonzero(
-            (fade_in * (1.0 - fade_in) > 0.0) | (fade_out * (1.0 - fade_out) > 0.0)
-        )
-        # fade-in and fade-out do not overlap
-        is_fading_out = fade_out[fading_indices] > 0.0
-        sign = np.where(is_fading_out, -1.0, 1.0)
-        _, *derivatives = _quintic(
-            np.where(is_fading_out, fade_out[fading_indices], fade_in[fading_indices])
-        )
-        first, second, third = (
-            (sign * part / FADE_S**order)[:, None] for order, part in enumerate(derivatives, 1)
-        )
-        factor = _quintic(fade_in)[0] - _quintic(fade_out)[0]
-        return (factor[:, None], first, second, third), fading_indices
 
 
 @dataclass(frozen=True)
@@ -306,8 +243,8 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
         )
     flight_plan.add_velocity_change(up, CLIMB_RAMP_S, 0.0)
     return Motion(
-        path=Ramps.of(flight_plan.path),
-        yaw=Ramps.of(flight_plan.yaw),
+        velocity=_ramps(flight_plan.path),
+        yaw=_ramps(flight_plan.yaw),
         deviation=Sines.draw(
             rng, np.full(3, scenario.wander_m), DEVIATION_PERIODS_S, DEVIATION_SINE_COUNT
         ),

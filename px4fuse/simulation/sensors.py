@@ -1,4 +1,4 @@
-"""Simulated sensor topics as PX4 v1.16 logs them, with the mistakes of the flight."""
+"""Simulated sensor topics as PX4 v1.16 logs them, with the injected faults of the flight."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,36 +22,50 @@ from px4fuse.simulation.ulog_writer import Topic, topic
 
 # Boot time (µs) of the first data
 START_US = 12_000_000
-# Latency (s) of positions from measurement to arrival in PX4: mean, standard deviation, minimum
-LATENCY_S, LATENCY_SIGMA_S, MIN_LATENCY_S = 0.030, 0.003, 0.005
+# Mean latency (s) of positions from measurement to arrival in PX4
+LATENCY_S = 0.030
+# Standard deviation (s) of the latency of positions
+LATENCY_SIGMA_S = 0.003
+# Minimum latency (s) of positions
+MIN_LATENCY_S = 0.005
 # Standard deviation of the position measurement times, as a fraction of the source interval
 INTERVAL_JITTER = 0.02
 # Time (s) of the first position
 FIRST_POSITION_S = 0.1
 # Time (s) until PX4 stops using arrival times: 500 TIMESYNC replies at 10 Hz (Timesync.cpp)
 TIMESYNC_CONVERGED_S = 50.0
-MEAN_BURST_LENGTH = 3  # mean number of positions per outlier burst
+# Mean number of positions in a burst of outliers
+MEAN_BURST_LENGTH = 3
 # Origin of the local frame outdoors: latitude, longitude (degrees) and altitude (m)
 HOME_POSITION = (47.397742, 8.545594, 488.0)
-# Age (s) of a GNSS fix at its timestamp; factors on the GNSS noise north, east and down
+# Age (s) of a GNSS fix at its timestamp
 FIX_AGE_S = 1e-3 * PARAMETERS[GNSS_POS.delay].default
+# Factors on the GNSS noise north, east and down
 GNSS_SIGMA_FACTORS = np.array([1.0, 1.0, 1.5])
-# Magnetic field (gauss, NED) at HOME_POSITION; noise of magnetometer (gauss) and barometer (m)
+# Magnetic field (gauss, NED) at HOME_POSITION
 EARTH_FIELD_GAUSS = np.array([0.217, 0.013, 0.430])
-SIGMA_FIELD_GAUSS, SIGMA_BAROMETER_M = 0.02, 0.4
-FIELD_RATE_HZ, BAROMETER_RATE_HZ = 14.0, 10.0
+# White noise (1 σ, gauss) and rate (Hz) of the magnetometer
+SIGMA_FIELD_GAUSS = 0.02
+FIELD_RATE_HZ = 14.0
+# White noise (1 σ, m) and rate (Hz) of the barometer
+SIGMA_BAROMETER_M = 0.4
+BAROMETER_RATE_HZ = 10.0
 # RMS (m) of the slow height error that weather and wind cause
 HEIGHT_ERROR_M = 0.03
 # Time constant (s) with which EKF2's heading follows a compass error that starts in flight
 HEADING_TIME_CONSTANT_S = 3.0
-# Range of periods (s), and number, of the sines of slow attitude and height errors
-SLOW_ERROR_PERIODS_S, SLOW_ERROR_SINE_COUNT = (20.0, 60.0), 4
+# Range of the periods (s) of the sines that are the slow attitude and height errors
+SLOW_ERROR_PERIODS_S = (20.0, 60.0)
+# Number of sines in a slow attitude or height error
+SLOW_ERROR_SINE_COUNT = 4
+# Time (µs) from the measurement to the publication of vehicle_attitude
 ATTITUDE_LATENCY_US = 200
+# Publication interval (µs) of vehicle_land_detected
 LAND_DETECTOR_INTERVAL_US = 1_000_000
 
 
-# Separate streams of random numbers: a mistake of one sensor does not change the noise of the
-# others
+# Separate streams of random numbers: an injected fault of one sensor does not change the noise of
+# other sensors
 Stream = IntEnum(
     "Stream",
     "WANDER BIAS IMU ATTITUDE TIMING SOURCE DRIFT NLOS VIBRATION HEIGHT REST SLOW FIX_VELOCITY "
@@ -67,15 +81,13 @@ def random_stream(scenario: Scenario, name: Stream) -> np.random.Generator:
 
 @dataclass(frozen=True)
 class SimulatedPositions:
-    """Simulated positions, without those that the mistakes remove.
+    """Simulated positions, without those that injected faults remove.
 
     Attributes
     ----------
     topic : Topic
     is_outlier : ndarray of bool, shape (n,)
         True for positions that are simulated outliers.
-    error_m : ndarray, shape (n, 3)
-        Measured minus true position, NED.
     position_m : ndarray, shape (n, 3)
         Measured position, NED.
     velocity_m_s : ndarray, shape (n, 3), or None
@@ -88,7 +100,6 @@ class SimulatedPositions:
 
     topic: Topic
     is_outlier: BoolArray
-    error_m: Array
     position_m: Array
     velocity_m_s: Array | None
     measured_s: Array
@@ -266,7 +277,7 @@ def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
 
 
 def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SimulatedPositions:
-    """Simulate UWB (aisle), VIO (loop) or GNSS (outdoor) positions with the mistakes."""
+    """Simulate UWB (aisle), VIO (loop) or GNSS (outdoor) positions with injected faults."""
     timing_rng = random_stream(scenario, Stream.TIMING)
     interval_s = 1.0 / scenario.source_rate_hz
     count = int((motion.duration_s - FIRST_POSITION_S) / interval_s)
@@ -325,7 +336,6 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Simulat
     return SimulatedPositions(
         topic=topic,
         is_outlier=is_outlier[is_logged],
-        error_m=(position_m - state.position_m)[is_logged],
         position_m=position_m[is_logged],
         velocity_m_s=velocity_m_s,
         measured_s=time_s[is_logged],
@@ -403,7 +413,7 @@ def keep_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
 def _source_times_us(
     mistakes: Mistakes, time_s: Array, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Simulate arrival times and timestamps of positions, µs from the first data."""
+    """Simulate arrival time and timestamp of each position (µs from the first data)."""
     mean_latency_s = mistakes.clock_jump_s or LATENCY_S
     latency_s = np.maximum(rng.normal(mean_latency_s, LATENCY_SIGMA_S, len(time_s)), MIN_LATENCY_S)
     arrival_us = np.maximum.accumulate(np.rint((time_s + latency_s) * 1e6).astype(np.int64))
@@ -436,7 +446,7 @@ def _gnss_topic(
     sigma_m: float,
     scenario: Scenario,
 ) -> Topic:
-    """Make vehicle_gps_position (msg/SensorGps.msg) from positions relative to HOME_POSITION."""
+    """Make vehicle_gps_position from positions relative to HOME_POSITION."""
     latitude, longitude = unproject(position_m[:, 0], position_m[:, 1], HOME_POSITION[:2])
     accuracy_fields = {
         "eph": sigma_m,
@@ -465,7 +475,7 @@ def _low_pass(position_m: Array, interval_s: float, time_constant_s: float) -> A
 def _is_outside_gap(
     time_s: Array, gap_s: float, at_s: float | None, duration_s: float
 ) -> BoolArray:
-    """Return True outside a gap, which is in the middle of the flight if ``at_s`` is None."""
+    """Return a mask of times outside a gap; by default the gap is in the middle of the flight."""
     start_s = (duration_s - gap_s) / 2.0 if at_s is None else at_s
     return np.asarray((time_s <= start_s) | (time_s >= start_s + gap_s))
 

@@ -52,7 +52,8 @@ def topic(name: str, field_values: Mapping[str, ArrayLike], table_row: str = "")
     table_row : str
         Name in ``topics.toml``, if it differs from the topic name.
     """
-    rows = [row.split() for row in TOPIC_FIELDS[table_row or name].splitlines()]
+    rows = [["uint64", field] for field in ("timestamp", "timestamp_sample")]
+    rows += [row.split() for row in TOPIC_FIELDS[table_row or name].splitlines()]
     unknown_fields = field_values.keys() - {field for _, field, *_ in rows}
     assert not unknown_fields, f"{name} has no {unknown_fields}"
     count, fields = np.size(field_values["timestamp"]), {}
@@ -71,7 +72,6 @@ def encode(
     parameters: Mapping[str, int | float],
     info: Mapping[str, int | str],
     start_us: int,
-    dropouts_ms: Sequence[int] = (),
 ) -> bytes:
     """Encode a ULog file; equal input gives equal bytes.
 
@@ -85,8 +85,6 @@ def encode(
         An int is written as uint32.
     start_us : int
         Boot time (µs) at which logging starts.
-    dropouts_ms : sequence of int
-        Durations (ms) of logger dropouts; their messages are written after the data.
     """
     content = [
         ULOG_MAGIC + _ULOG_VERSION,
@@ -116,7 +114,6 @@ def encode(
         data_messages[index]
         for index in np.argsort(np.concatenate(timestamps_us), kind="stable").tolist()
     ]
-    content += [_message("O", struct.pack("<H", length)) for length in dropouts_ms]
     return b"".join(content)
 
 

@@ -1,4 +1,4 @@
-"""Alignment of an estimated trajectory with a reference: transform that does not count as error.
+"""Alignment of an estimated trajectory with a reference before the error is computed.
 
 Estimators that use gravity are aligned in yaw and position (4 degrees of freedom), so tilt counts
 as error (Zhang & Scaramuzza 2018). SLAM with the frame of its first key frame is aligned in
@@ -17,13 +17,16 @@ from px4fuse.trajectory.model import MIN_POSES
 
 AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 
-# Minimum extent of a motion that determines a rotation: as fraction of the largest extent, and RMS
-# (m)
-MIN_EXTENT_FRACTION, MIN_EXTENT_M = 1e-6, 1e-6
-# Maximum ratios of the residual to the extent of the motion that determine a rotation: in the
-# plane, and around a line. The standard deviation of the rotation is residual / (extent · √n). Pure
-# noise has a ratio of √2 in the plane and √6 around a line
-MAX_PLANE_RATIO, MAX_LINE_RATIO = 1.0, 2.0
+# Minimum extent of a motion that determines a rotation, as fraction of the largest extent
+MIN_EXTENT_FRACTION = 1e-6
+# Minimum extent (m, RMS) of a motion that determines a rotation
+MIN_EXTENT_M = 1e-6
+# Maximum ratio of the residual to the extent of a horizontal motion that determines yaw: pure noise
+# has √2. The standard deviation of the rotation is residual / (extent · √n)
+MAX_PLANE_RATIO = 1.0
+# Maximum ratio of the residual to the extent across a line, for a motion that determines the
+# rotation around the line: pure noise has √6
+MAX_LINE_RATIO = 2.0
 
 
 class Transform(Record, frozen=True):
@@ -133,7 +136,7 @@ def _align_means(
 
 
 def _principal_extents(position_m: Array) -> Array:
-    """Return the RMS extents (m) about the mean along the principal directions, descending."""
+    """Compute the RMS extents (m) along the principal directions, largest first."""
     centred_m = position_m - position_m.mean(axis=0)
     return np.asarray(np.linalg.svd(centred_m, compute_uv=False) / np.sqrt(len(centred_m)))
 

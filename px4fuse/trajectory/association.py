@@ -13,9 +13,10 @@ from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
 Method = Literal["interpolate", "nearest"]
 
-# Default of the longest interval of the reference that is interpolated: number of median intervals,
-# but at least MIN_GAP_LIMIT_S (s)
-MAX_GAP_INTERVALS, MIN_GAP_LIMIT_S = 3.0, 0.1
+# Default of the longest interpolated interval of the reference, in median intervals
+MAX_GAP_INTERVALS = 3.0
+# Minimum (s) of the default of the longest interpolated interval
+MIN_GAP_LIMIT_S = 0.1
 # Maximum time difference (s) of two poses that are paired: default of the evo package
 MAX_NEAREST_DIFFERENCE_S = 0.01
 
@@ -156,9 +157,9 @@ def positions_at(trajectory: Trajectory, time_s: Array) -> Array:
 def _pair_nearest(
     estimate_s: Array, reference_s: Array, limit_s: float, offset_s: float
 ) -> tuple[IntArray, IntArray]:
-    """Pair each time of the shorter series with the nearest time of the longer; return indices.
+    """Pair each pose of the shorter trajectory with the pose of the other that is nearest in time.
 
-    Pairs with a time difference above ``limit_s`` are omitted.
+    Return the pose indices of both. Pairs with a time difference above ``limit_s`` are omitted.
     """
     # The offset is added to the longer series, to have the same rounding as evo
     has_more = len(estimate_s) > len(reference_s)

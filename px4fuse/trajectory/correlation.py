@@ -69,7 +69,7 @@ def autocovariance(values: Array | Complex) -> Array:
 
 
 def _correlate(a: Array | Complex, b: Array | Complex) -> Complex:
-    """Compute Σ a conj(b) over the overlap, at each lag."""
+    """Compute Σ a conj(b) over the common samples, at each lag."""
     # Local import, because it takes 0.1 s and most flights need no correlation
     from scipy.signal import correlate  # noqa: PLC0415
 

@@ -12,7 +12,6 @@ from typing import Literal
 
 import numpy as np
 from msgspec import structs
-from scipy.spatial.transform import Rotation
 
 from px4fuse.core.arrays import Array, median_interval
 from px4fuse.core.notebook_display import one_line_repr
@@ -37,8 +36,10 @@ MIN_DOUBTFUL_OFFSET_S = 0.1
 # estimate are probably interchanged
 MAX_INTERVAL_RATIO = 5.0
 
-# Frames with vertical z axis
-_Z_DOWN_FRAMES, _Z_UP_FRAMES = ("NED", "FRD"), ("ENU",)
+# Frames with the z axis down
+_Z_DOWN_FRAMES = ("NED", "FRD")
+# Frames with the z axis up
+_Z_UP_FRAMES = ("ENU",)
 # Kinds of trajectories in a frame with unknown vertical direction
 _KINDS_WITHOUT_VERTICAL = ("slam", "unknown")
 # File names of monocular SLAM, of which the scale is unknown
@@ -90,7 +91,6 @@ class Evaluation(Score, frozen=True, kw_only=True, eq=False):
     ----------
     estimate, reference : Trajectory
         Complete trajectories, before association and alignment.
-    rpe : tuple of PairwiseError
     time_s : ndarray, shape (n,)
         Times of the compared poses, on the clock of the estimate.
     distance_m : ndarray, shape (n,)
@@ -98,14 +98,9 @@ class Evaluation(Score, frozen=True, kw_only=True, eq=False):
     unaligned_m, estimate_m, reference_m : ndarray, shape (n, 3)
         Positions of the estimate before and after alignment, and of the reference.
     position_error_m : ndarray, shape (n,)
-    rotation_error_deg : ndarray, shape (n,), or None
-    body_rotation : Rotation or None
-        Constant rotation from the body axes of the reference to the body axes of the estimate. It
-        does not count as error. None if the body axes are the same.
     """
 
     schema_type = Score
-    rpe: tuple[scores.PairwiseError, ...]
     estimate: Trajectory
     reference: Trajectory
     time_s: Array
@@ -114,8 +109,6 @@ class Evaluation(Score, frozen=True, kw_only=True, eq=False):
     estimate_m: Array
     reference_m: Array
     position_error_m: Array
-    rotation_error_deg: Array | None
-    body_rotation: Rotation | None
 
     __repr__ = one_line_repr
 
@@ -166,21 +159,16 @@ def evaluate(
     aligned_estimate = matched_estimate.with_positions(
         transform.apply(matched_estimate.position_m), transform.rotation
     )
-    body_rotation, notes = _estimate_body_rotation(aligned_estimate, matched_reference)
-    if body_rotation is not None and aligned_estimate.rotation is not None:
-        aligned_estimate = replace(
-            aligned_estimate, rotation=aligned_estimate.rotation * body_rotation
-        )
+    aligned_estimate, notes = _with_reference_body_axes(aligned_estimate, matched_reference)
     distance_m = cumulative_distance(matched_reference.position_m)
     error_m = np.linalg.norm(aligned_estimate.position_m - matched_reference.position_m, axis=1)
     rotations = scores.get_rotations(aligned_estimate, matched_reference, "ATE of the rotation")
-    rotation_error: Array | None = None
     rotation_statistics: OrUnavailable[Statistics]
     if isinstance(rotations, Unavailable):
         rotation_statistics = rotations
     else:
-        rotation_error = np.degrees((rotations[0].inv() * rotations[1]).magnitude())
-        rotation_statistics = scores.statistics(rotation_error)
+        rotation_deg = np.degrees((rotations[0].inv() * rotations[1]).magnitude())
+        rotation_statistics = scores.statistics(rotation_deg)
     if rpe_deltas is None:
         rpe_deltas = scores.default_deltas(distance_m, matched_estimate.time_s)
     return Evaluation(
@@ -204,8 +192,6 @@ def evaluate(
         estimate_m=aligned_estimate.position_m,
         reference_m=matched_reference.position_m,
         position_error_m=error_m,
-        rotation_error_deg=rotation_error,
-        body_rotation=body_rotation,
         notes=notes,
         warnings=(
             *_swap_warnings(estimate, reference),
@@ -277,7 +263,7 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
 def _choose_time_offset(
     estimate: Trajectory, reference: Trajectory, given_s: float | Literal["auto"] | None
 ) -> tuple[TimeOffset, list[str]]:
-    """Return the offset to add to the timestamps of the estimate, and warnings."""
+    """Choose the offset to add to the timestamps of the estimate; return also warnings."""
     if isinstance(given_s, float | int):
         return TimeOffset(
             offset_s=given_s, is_determinable=True, reason="The time offset is as requested."
@@ -349,12 +335,13 @@ def _comparison_warnings(
         )
 
 
-def _estimate_body_rotation(
+def _with_reference_body_axes(
     aligned_estimate: Trajectory, reference: Trajectory
-) -> tuple[Rotation | None, tuple[str, ...]]:
-    """Estimate the constant rotation between different body axes (camera and vehicle)."""
-    if aligned_estimate.rotation is None or reference.rotation is None:
-        return None, ()
+) -> tuple[Trajectory, tuple[str, ...]]:
+    """Rotate the body axes of the estimate to those of the reference: camera against vehicle.
+
+    The constant rotation between them is estimated, so it is no error.
+    """
     vehicle_frames = (*_Z_DOWN_FRAMES, *_Z_UP_FRAMES)
     axes_differ = (aligned_estimate.frame == "camera") != (reference.frame == "camera") or any(
         track.kind == "slam"
@@ -362,11 +349,11 @@ def _estimate_body_rotation(
         and track.frame not in vehicle_frames
         for track, other_track in ((aligned_estimate, reference), (reference, aligned_estimate))
     )
-    if not axes_differ:
-        return None, ()
+    if aligned_estimate.rotation is None or reference.rotation is None or not axes_differ:
+        return aligned_estimate, ()
     # chordal mean (Hartley 2013, section 5.3)
     rotation = (aligned_estimate.rotation.inv() * reference.rotation).mean()
-    return rotation, (
+    return replace(aligned_estimate, rotation=aligned_estimate.rotation * rotation), (
         "Rotation errors exclude the estimated constant rotation from vehicle to camera axes, "
         f"{np.degrees(rotation.magnitude()):.1f}°. Position errors include their lever arm.",
     )

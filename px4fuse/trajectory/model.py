@@ -32,7 +32,7 @@ AXES_OF_FRAME: Mapping[Frame, tuple[str, str, str]] = {
 AxisComponents = Annotated[dict[str, float], Meta(min_length=3, max_length=3)]
 
 
-# Name of the opposite direction of each direction
+# Opposite direction, by direction
 OPPOSITE_DIRECTIONS = {
     "north": "south",
     "east": "west",
@@ -151,16 +151,16 @@ class Trajectory:
 
         ``world_rotation`` is one rotation of the frame, or one rotation for each pose.
         """
-        rotation = (
-            self.rotation
-            if self.rotation is None or world_rotation is None
-            else world_rotation * self.rotation
+        rotation = self.rotation
+        if rotation is not None and world_rotation is not None:
+            rotation = world_rotation * rotation
+        return replace(
+            self,
+            position_m=position_m,
+            rotation=rotation,
+            position_variance_m2=None,
+            rotation_variance_rad2=None,
         )
-        no_variances: dict[str, Any] = {
-            "position_variance_m2": None,
-            "rotation_variance_rad2": None,
-        }
-        return replace(self, position_m=position_m, rotation=rotation, **no_variances)
 
     def track(self) -> Track:
         """Return the description of the trajectory for results.json."""

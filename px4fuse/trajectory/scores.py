@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, stdtrit
 
 from px4fuse.core.arrays import Array, IntArray, median_interval
-from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.core.record import Count, NotNegative, OrUnavailable, Record
 from px4fuse.errors import SettingsError
 from px4fuse.flight.model import Unavailable
@@ -23,15 +22,22 @@ Unit = Literal["frames", "m", "s"]
 # Maximum relative deviation of the distance of an RPE pair from delta, if all pairs are used:
 # default of the evo package
 DELTA_TOLERANCE = 0.1
-# Default distances and times of RPE pairs, which are used if they are between MIN_DELTA_FRACTION
-# and MAX_DELTA_FRACTION of path length or duration
+# Default distances (m) of RPE pairs
 DEFAULT_DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
+# Default times (s) between the two poses of an RPE pair
 DEFAULT_TIMES_S = (1.0, 10.0, 60.0)
-# Maximum number of default RPE deltas: distances (m) and times (s)
-MAX_DISTANCE_DELTAS, MAX_TIME_DELTAS = 3, 2
-MIN_DELTA_FRACTION, MAX_DELTA_FRACTION = 1 / 200, 1 / 5
-# Number of resamples and random seed of the bootstrap, and probability of its interval
-BOOTSTRAP_RESAMPLES, BOOTSTRAP_SEED, CONFIDENCE_LEVEL = 2000, 20120101, 0.95
+# Maximum number of default distances and of default times of RPE pairs
+MAX_DISTANCE_DELTAS = 3
+MAX_TIME_DELTAS = 2
+# Minimum and maximum of a default distance or time, as fraction of path length or duration
+MIN_DELTA_FRACTION = 1 / 200
+MAX_DELTA_FRACTION = 1 / 5
+# Number of bootstrap resamples
+BOOTSTRAP_RESAMPLES = 2000
+# Seed of the random bootstrap resamples
+BOOTSTRAP_SEED = 20120101
+# Probability of the bootstrap interval
+CONFIDENCE_LEVEL = 0.95
 # Length of a bootstrap block, in integrated autocorrelation times of the squared errors
 BLOCK_CORRELATION_TIMES = 3.0
 # Number of lags in the sum of autocorrelations, in integrated autocorrelation times (Sokal 1997)
@@ -110,26 +116,6 @@ class RelativeError(Record, frozen=True):
     def delta_text(self) -> str:
         """Distance between the two poses of a pair, with unit."""
         return str(Delta(self.delta, self.unit))
-
-
-class PairwiseError(RelativeError, frozen=True, kw_only=True, eq=False):
-    """:class:`RelativeError` with the error of each pair.
-
-    Attributes
-    ----------
-    start, end : ndarray of int, shape (k,)
-        Indices of the two poses of each pair in the arrays of the evaluation.
-    translation_error_m, rotation_error_deg : ndarray, shape (k,)
-        Empty if the RPE is unavailable.
-    """
-
-    schema_type = RelativeError
-    start: IntArray
-    end: IntArray
-    translation_error_m: Array
-    rotation_error_deg: Array
-
-    __repr__ = one_line_repr
 
 
 def statistics(errors: Array) -> Statistics:
@@ -227,7 +213,7 @@ def _consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
 
 def relative_error(
     aligned_estimate: Trajectory, reference: Trajectory, delta: Delta, *, all_pairs: bool = True
-) -> PairwiseError:
+) -> RelativeError:
     """Compute the RPE over one delta: E = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j), Sturm (2012), eq. 1.
 
     Parameters
@@ -245,13 +231,9 @@ def relative_error(
         rotations = Unavailable(
             analysis_name, f"no pair of poses with a distance of {delta}", "Use another delta."
         )
-    result_fields: tuple[
-        OrUnavailable[Statistics], OrUnavailable[Interval], OrUnavailable[Statistics]
-    ]
+    scores: tuple[OrUnavailable[Statistics], OrUnavailable[Interval], OrUnavailable[Statistics]]
     if isinstance(rotations, Unavailable):
-        start = end = np.empty(0, dtype=np.intp)
-        translation = rotation = np.empty(0)
-        result_fields = rotations, rotations, rotations
+        scores = rotations, rotations, rotations
     else:
         estimate_inverse, reference_inverse = (
             rotation_series[start].inv() for rotation_series in rotations
@@ -263,24 +245,14 @@ def relative_error(
             reference.position_m[end] - reference.position_m[start]
         )
         # The rotation Q_j⁻¹ Q_i in E does not change the length of the translation
-        translation = np.linalg.norm(estimate_motion - reference_motion, axis=1)
+        translation_m = np.linalg.norm(estimate_motion - reference_motion, axis=1)
         estimate_rotation = estimate_inverse * rotations[0][end]
         reference_rotation = reference_inverse * rotations[1][end]
-        rotation = np.degrees((reference_rotation.inv() * estimate_rotation).magnitude())
+        rotation_deg = np.degrees((reference_rotation.inv() * estimate_rotation).magnitude())
         overlap = int(np.median(end - start)) if all_pairs else 1
-        interval = rmse_interval(translation, analysis_name, min_block=overlap)
-        result_fields = statistics(translation), interval, statistics(rotation)
-    return PairwiseError(
-        delta.value,
-        delta.unit,
-        all_pairs,
-        "reference",
-        *result_fields,
-        start=start,
-        end=end,
-        translation_error_m=translation,
-        rotation_error_deg=rotation,
-    )
+        interval_m = rmse_interval(translation_m, analysis_name, min_block=overlap)
+        scores = statistics(translation_m), interval_m, statistics(rotation_deg)
+    return RelativeError(delta.value, delta.unit, all_pairs, "reference", *scores)
 
 
 def get_rotations(
@@ -297,7 +269,7 @@ def get_rotations(
 
 
 def rmse_interval(
-    errors: Array, analysis_name: str, *, min_block: int = 1, resamples: int = BOOTSTRAP_RESAMPLES
+    errors: Array, analysis_name: str, *, min_block: int = 1
 ) -> Interval | Unavailable:
     """Compute the 95 % interval of the RMSE of correlated errors by circular block bootstrap.
 
@@ -337,7 +309,7 @@ def rmse_interval(
     ) / length  # mean squared error of each circular block
     block_count = n / length
     block_starts = np.random.default_rng(BOOTSTRAP_SEED).integers(
-        0, n, (resamples, round(block_count))
+        0, n, (BOOTSTRAP_RESAMPLES, round(block_count))
     )
     means = block_means[block_starts].mean(axis=1)
     quantile = float(stdtrit(block_count - 1.0, 0.5 + CONFIDENCE_LEVEL / 2.0))

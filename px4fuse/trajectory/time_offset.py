@@ -26,19 +26,25 @@ from px4fuse.trajectory.association import gap_limit, is_bracketed, positions_at
 from px4fuse.trajectory.correlation import autocovariance, moments
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
-# Step (s) and maximum number of samples of the time grid on which speeds are correlated
-GRID_STEP_S, MAX_GRID_SAMPLES = 0.05, 200_000
+# Minimum step (s) of the time grid on which speeds are correlated
+GRID_STEP_S = 0.05
+# Maximum number of samples of the time grid on which speeds are correlated
+MAX_GRID_SAMPLES = 200_000
 # Standard deviation (s) of the filter for speeds, because differentiated positions are noisy
 SMOOTHING_S = 0.25
-# Minimum overlap in time of the two trajectories, in s and as fraction of the shorter trajectory
-MIN_OVERLAP_S, MIN_OVERLAP_FRACTION = 5.0, 0.5
+# Minimum overlap (s) of the two trajectories in time
+MIN_OVERLAP_S = 5.0
+# Minimum overlap of the two trajectories in time, as fraction of the shorter trajectory
+MIN_OVERLAP_FRACTION = 0.5
 # Minimum fraction of the poses in the time of the shorter trajectory that overlap the other
 # trajectory
 MIN_POSES_FRACTION = 0.3
 # Maximum number of correlation peaks for which the ATE is computed
 MAX_CANDIDATES = 12
-# Half-width (s) of the least-squares search: around a correlation peak, and around the first result
-SEARCH_WINDOW_S, FINE_SEARCH_WINDOW_S = 0.5, 0.1
+# Half-width (s) of the least-squares search around a correlation peak
+SEARCH_WINDOW_S = 0.5
+# Half-width (s) of the least-squares search around the first result
+FINE_SEARCH_WINDOW_S = 0.1
 # Minimum distance (s) between two correlation peaks
 MIN_PEAK_DISTANCE_S = 1.0
 # Minimum correlation of the speeds at a peak
@@ -49,13 +55,16 @@ MIN_CORRELATION = 0.3
 MIN_SECOND_PEAK_RATIO = 1.2
 # Maximum number of poses in the least-squares fit
 MAX_FITTED_POSES = 2000
-# Ratio of the residual to the extent of the motion: maximum of an accepted fit, and value below
-# which two fits are equally good
-MAX_MISFIT, MIN_MISFIT = 0.5, 1e-3
-# Limits for the part of the velocity that a similarity transform cannot explain, which determines
-# the time offset: minimum fraction of the speed (RMS), and minimum correlation between the two
-# trajectories, which excludes noise
-MIN_FREE_SPEED_FRACTION, MIN_FREE_CORRELATION = 0.05, 0.5
+# Maximum ratio of the residual to the extent of the motion for accepting a fit
+MAX_MISFIT = 0.5
+# Ratio of the residual to the extent of the motion below which two fits are equally good
+MIN_MISFIT = 1e-3
+# The free velocity is the component of the velocity that a similarity transform cannot explain:
+# only this component determines the time offset
+# Minimum free velocity (RMS) as fraction of the speed
+MIN_FREE_SPEED_FRACTION = 0.05
+# Minimum correlation of the free velocities of both trajectories, which excludes noise
+MIN_FREE_CORRELATION = 0.5
 # Window of the long-run variance of the likelihood score, in correlation lengths
 WINDOW_CORRELATION_LENGTHS = 4
 # Maximum half-width (s) of the 95 % interval of an accepted time offset
@@ -185,7 +194,7 @@ def _not_determinable(reason: str) -> TimeOffset:
 
 
 def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]:
-    """Return a regular time grid and the smoothed velocities on it."""
+    """Compute smoothed velocities (m/s) on a regular time grid."""
     time = trajectory.time_s
     grid = time[0] + step_s * np.arange(int((time[-1] - time[0]) / step_s) + 1)
     sigma = max(SMOOTHING_S, median_interval(trajectory.time_s)) / step_s
@@ -201,7 +210,7 @@ def _velocity(trajectory: Trajectory, time_s: Array) -> Array:
 
 
 def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArray]:
-    """Return speed, and angular speed if known, on a grid, and a mask of known samples."""
+    """Compute speed, and angular speed with orientations, on a time grid; mask the gaps."""
     time = trajectory.time_s
     grid, velocity = _grid_velocity(trajectory, step_s)
     # Interpolated between key frames, but not across gaps with lost tracking
@@ -217,7 +226,7 @@ def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArr
 
 
 def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[float]:
-    """Return offsets with correlated speeds, best first (Padfield 2012, eqs. 3 to 9)."""
+    """Find the offsets with correlated speeds, best first (Padfield 2012, eqs. 3 to 9)."""
     spans_s = [float(track.time_s[-1] - track.time_s[0]) for track in (sparse_track, dense_track)]
     step_s = max(GRID_STEP_S, max(spans_s) / MAX_GRID_SAMPLES)
     if min(spans_s) < 10 * step_s:
@@ -228,7 +237,8 @@ def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[
     min_count = max(MIN_OVERLAP_S, MIN_OVERLAP_FRACTION * min(spans_s)) / step_s
     min_count = min(min_count, 0.5 * min(spans_s) / step_s)
     correlations = []
-    for a, b in zip(sparse_speeds, dense_speeds, strict=False):  # angular speeds if both have them
+    # angular speeds are only compared if both trajectories have orientations
+    for a, b in zip(sparse_speeds, dense_speeds, strict=False):
         speed_moments = moments(a, b, is_known_sparse, is_known_dense)
         # Exclude lags at which a trajectory is at rest: its variance is a rounding error
         is_usable = speed_moments.count >= min_count
@@ -290,9 +300,9 @@ class _OffsetFit:
 
 
 def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _OffsetFit) -> float:
-    """Return the half-width of the 95 % interval (s).
+    """Compute the half-width (s) of the 95 % interval.
 
-    Infinite if a change of position, rotation or scale has the same effect as a time offset.
+    It is infinite if a change of position, rotation or scale has the same effect as a time offset.
     """
     n = len(fit.time_s)
     centred_m = fit.aligned_m - fit.aligned_m.mean(axis=0)

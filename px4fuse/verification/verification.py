@@ -176,9 +176,6 @@ def _repeat_comparison(
         recorded_request,
         log=link_file(recorded_request.log, submitted_results.log.sha256, "the log"),
     )
-    if recorded_request.mavlink is not None:
-        link = link_file(recorded_request.mavlink, hash_by_role.get("mavlink"), "--mavlink")
-        request = replace(request, mavlink=link)
     if (position := recorded_request.position) is not None:
         link = link_file(position.path, hash_by_role.get("position"), "--position")
         request = replace(request, position=replace(position, path=link))

@@ -1,6 +1,6 @@
 """Speed of tuning and of the clock estimate; prints times and asserts nothing.
 
-A grid of 64 × 64 settings against filterpy replays of single settings, on the sample log; then
+A grid of 64 × 64 settings against KF replays of single settings, on the sample log; then
 ``tune`` and the clock estimate on a ten-minute flight, 5 Hz positions and 250 Hz IMU, in memory
 (without reading the log).
 
@@ -40,7 +40,7 @@ def main() -> None:
     grid = seconds(lambda: score_grid([preintegrate(axis, Settings())], a, z, weight), RUNS)
     print(
         f"64 x 64 settings, {len(weight)} measurements: {grid:.2f} s, {4096 / grid:.0f} a second; "
-        f"filterpy {single:.2f} s for one; {4096 * single / grid:.0f} times as fast"
+        f"KF replay {single:.2f} s for one; {4096 * single / grid:.0f} times as fast"
     )
     filter_tools.IMU_HZ, settings = 250.0, filter_tools.SETTINGS
     flight, _ = filter_tools.made_flight(1, duration_s=600.0, offset_s=-0.1)

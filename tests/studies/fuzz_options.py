@@ -92,7 +92,7 @@ VALUES: dict[str, Draw] = {
     "position_source": one_of("vehicle_visual_odometry"),
     "gnss.ulg position_source": one_of("vehicle_gps_position"),
     "m.tlog position_source": one_of("VISION_POSITION_ESTIMATE"),
-    "mavlink": one_of("m.tlog"), "position": one_of("pos.csv"),
+    "position": one_of("pos.csv"),
     "position_yaw": lambda rng: rng.choice(("auto", between(-360.0, 360.0)(rng))),
     "position_columns": one_of("time_s,x_m,y_m,z_m", "1,2,3,4", "1,2,3,4,5", "1,3,2,4"),
     "student": _NAME, "student_id": _NAME, "title": _NAME,
@@ -203,8 +203,8 @@ def drawn_words(name: str, command: click.Command, rng: random.Random, out: Path
         chosen &= {"assignment", "secret_file", "mistakes", "preview", "no_truth", "answer"}
     if arguments == "g.g2o":
         chosen &= {"g2o", "json_path", "robust"}
-    if arguments not in ("", "aisle.ulg"):  # the other recordings are of this flight
-        chosen -= {"mavlink", "position", *(one for one in NEEDS if NEEDS[one] == "position")}
+    if arguments not in ("", "aisle.ulg"):  # the position file is of this flight
+        chosen -= {"position", *(one for one in NEEDS if NEEDS[one] == "position")}
     for pair in EXCLUDED:
         if pair <= chosen:
             chosen.discard(sorted(pair)[0])

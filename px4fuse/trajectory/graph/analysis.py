@@ -10,7 +10,7 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.graph.covariance import GateResult, gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
-from px4fuse.trajectory.graph.solver import GraphSolution, Solution, solve
+from px4fuse.trajectory.graph.solver import GraphSolution, solve
 
 # Maximum number of closures for robust optimisation by default: with more closures the optimisation
 # takes minutes
@@ -48,27 +48,13 @@ class Graph(Record, frozen=True, kw_only=True):
     solutions: Mapping[str, GraphSolution]
 
 
-class SolvedGraph(Graph, frozen=True, kw_only=True, eq=False):
-    """:class:`Graph` with complete poses.
-
-    Attributes
-    ----------
-    graph : PoseGraph
-        Pose graph with the poses of the solution with all closures.
-    """
-
-    schema_type = Graph
-    solutions: Mapping[str, Solution]
-    graph: PoseGraph
-
-
 def analyse_graph(
     name: str,
     graph: PoseGraph,
     progress: Callable[[str], None] = lambda _: None,
     *,
     run_robust: bool | None = None,
-) -> SolvedGraph:
+) -> tuple[Graph, PoseGraph]:
     """Test the closures of a pose graph, and optimise it by least squares and robustly.
 
     Edges between successive vertices are odometry, all other edges are closures.
@@ -79,6 +65,11 @@ def analyse_graph(
         Name of the graph.
     run_robust : bool, optional
         True for robust optimisation, too; by default True with up to 1000 closures.
+
+    Returns
+    -------
+    (Graph, PoseGraph)
+        Results, and the pose graph with the poses of the solution with all closures.
 
     Raises
     ------
@@ -99,7 +90,7 @@ def analyse_graph(
     if count > 1 and (count <= MAX_ROBUST_CLOSURES if run_robust is None else run_robust):
         progress(f"optimising: {SOLUTIONS[ROBUST]}")
         solutions[ROBUST] = solve(graph, robust=True, is_closure=is_closure)
-    return SolvedGraph(
+    results = Graph(
         name=name,
         dimension=graph.dimension,
         poses=len(graph),
@@ -107,5 +98,5 @@ def analyse_graph(
         initialised=graph.initialised,
         gates=gates,
         solutions=solutions,
-        graph=replace(graph, poses=solutions["all"].poses),
     )
+    return results, replace(graph, poses=solutions["all"].poses)

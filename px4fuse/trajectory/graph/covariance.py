@@ -132,7 +132,7 @@ def _test_edge(
 
 
 def _covariances(graph: model.PoseGraph, chain_edges: IntArray) -> Array:
-    """Return the covariances of odometry edges in the axes of the later pose."""
+    """Compute the covariances of odometry edges, in the axes of the later pose."""
     scale, scaled_information = model.scale_to_unit_diagonal(graph.information[chain_edges])
     is_full_rank = np.linalg.eigvalsh(scaled_information)[:, 0] > 1e-12
     if not np.all(is_full_rank):

@@ -95,7 +95,7 @@ def _solve_positions(
     value: Array,
     first_pose: Array,
 ) -> Array:
-    """Return the least-squares solution of :func:`normal_equations`, shape (n, d, k)."""
+    """Solve :func:`normal_equations` by least squares; the result has the shape (n, d, k)."""
     solution = solve_normal_equations(
         *normal_equations(
             graph, first_coefficient, second_coefficient, information, value, first_pose

@@ -13,8 +13,7 @@ from px4fuse.core.notebook_display import one_line_repr
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
 
-# Minimum eigenvalue of an information matrix with unit diagonal: directions with smaller
-# eigenvalues count as not measured
+# Minimum eigenvalue of an information matrix with unit diagonal for a measured direction
 MIN_OBSERVED_EIGENVALUE = 1e-9
 # Sources of the initial poses
 FROM_FILE = "the file's vertices"
@@ -88,8 +87,6 @@ class Residuals:
         Second pose of each edge relative to the first.
     residual : ndarray, shape (m, d)
         ``r = log(Z^-1 X_i^-1 X_j)``, as in GTSAM's BetweenFactor.
-    weighted : ndarray, shape (m, d)
-        ``Omega r``.
     chi2 : ndarray, shape (m,)
         ``r' Omega r``, the squared Mahalanobis distance.
     """
@@ -97,7 +94,6 @@ class Residuals:
     poses: Array
     relative: Array
     residual: Array
-    weighted: Array
     chi2: Array
 
 
@@ -106,7 +102,7 @@ def residuals(graph: PoseGraph, poses: Array) -> Residuals:
     relative = lie.between(poses[graph.first], poses[graph.second])
     residual = lie.log(lie.between(graph.measurements, relative))
     weighted = (graph.information @ residual[..., None])[..., 0]
-    return Residuals(poses, relative, residual, weighted, np.sum(residual * weighted, axis=-1))
+    return Residuals(poses, relative, residual, np.sum(residual * weighted, axis=-1))
 
 
 def cost(graph: PoseGraph) -> float:

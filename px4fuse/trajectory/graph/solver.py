@@ -14,14 +14,22 @@ from px4fuse.trajectory.graph.model import PoseGraph, Residuals
 from px4fuse.trajectory.graph.system import normal_equations, solve_normal_equations
 
 MAX_ITERATIONS = 100
-# Defaults of LevenbergMarquardtParams in GTSAM
-_INITIAL_DAMPING, _DAMPING_FACTOR, _MAX_DAMPING = 1e-5, 10.0, 1e5
+# Initial damping of Levenberg-Marquardt, as in GTSAM
+_INITIAL_DAMPING = 1e-5
+# Factor on the damping after a rejected step, as in GTSAM
+_DAMPING_FACTOR = 10.0
+# Maximum damping, as in GTSAM
+_MAX_DAMPING = 1e5
+# Minimum ratio of the decrease of the cost to its predicted decrease for accepting a step, as in
+# GTSAM
 _MIN_FIDELITY = 1e-3
+# Tolerance of the cost, relative and absolute
 _TOLERANCE = 1e-10
 _FLOAT_EPSILON = float(np.finfo(float).eps)
-# Tolerance and maximum number of iterations in the intermediate stages of graduated non-convexity,
-# which need less precision
-_STAGE_TOLERANCE, _STAGE_ITERATIONS = 1e-6, 20
+# Tolerance in the intermediate stages of graduated non-convexity, which need less precision
+_STAGE_TOLERANCE = 1e-6
+# Maximum number of iterations in an intermediate stage of graduated non-convexity
+_STAGE_ITERATIONS = 20
 
 # Probability that the squared residual of a true closure is not truncated
 GNC_PROBABILITY = 0.99
@@ -81,10 +89,7 @@ class Solution(GraphSolution, frozen=True, kw_only=True, eq=False):
 
 @dataclass(frozen=True)
 class _Minimum:
-    """Result of one minimisation by Levenberg-Marquardt."""
-
     state: Residuals
-    cost: float
     iterations: int
     converged: bool
 
@@ -171,7 +176,6 @@ def _minimise(
             is_flat = False
             step = solve_normal_equations(matrix, gradient, damping)
             if step is not None:
-                # Decrease of the linearised cost
                 predicted_drop = 0.5 * float(np.sum(step * (damping * step + gradient)))
                 tangent = np.concatenate([np.zeros(graph.degrees_of_freedom), step[:, 0]])
                 trial = model.residuals(
@@ -186,21 +190,21 @@ def _minimise(
                 break
             damping *= _DAMPING_FACTOR
         if not is_accepted:
-            return _Minimum(state, cost, iterations, is_flat)
+            return _Minimum(state, iterations, is_flat)
         state = trial
         cost_before = cost
         cost = cost - drop
         iterations += 1
         damping /= _DAMPING_FACTOR
         if drop <= max(tolerance * cost_before, _TOLERANCE):
-            return _Minimum(state, cost, iterations, True)
-    return _Minimum(state, cost, iterations, cost <= _TOLERANCE)
+            return _Minimum(state, iterations, True)
+    return _Minimum(state, iterations, cost <= _TOLERANCE)
 
 
 def _solve_gnc(
     graph: PoseGraph, start: Residuals, plain_minimum: _Minimum, is_doubtful: BoolArray
 ) -> tuple[_Minimum, Array]:
-    """Solve least squares, truncated for the edges that may be false, from two starts."""
+    """Minimise truncated least squares from two starts; truncate only edges that may be false."""
     _, scaled_information = model.scale_to_unit_diagonal(graph.information)
     degrees_of_freedom = np.sum(
         np.linalg.eigvalsh(scaled_information) > model.MIN_OBSERVED_EIGENVALUE, axis=1
@@ -234,7 +238,7 @@ def _solve_gnc(
             minimum = trial
             weights = trial_weights
     model.require_connected(graph, weights > 0.0, "the edges that gnc did not drop")
-    return _Minimum(minimum.state, minimum.cost, iteration_count, minimum.converged), weights
+    return _Minimum(minimum.state, iteration_count, minimum.converged), weights
 
 
 def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tuple[_Minimum, Array]:
@@ -264,4 +268,4 @@ def _descend_graduated(graph: PoseGraph, start: Residuals, bound: Array) -> tupl
         if np.array_equal(new_weights, weights):
             break
         weights = new_weights
-    return _Minimum(state, minimum_state.cost, iteration_count, minimum_state.converged), weights
+    return _Minimum(state, iteration_count, minimum_state.converged), weights

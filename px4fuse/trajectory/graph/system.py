@@ -11,10 +11,11 @@ from scipy.sparse.linalg import splu
 from px4fuse.core.arrays import Array
 from px4fuse.trajectory.graph.model import PoseGraph
 
-# Options relax and panel_size of scipy's SuperLU: with values above the defaults (10 and 20)
-# SuperLU writes outside its workspace (scipy 1.17, shown by valgrind). relax 1 gives the least
-# fill-in
-_RELAX, _PANEL = 1, 4
+# Option relax of SuperLU: 1 gives the least fill-in. With a value above the default of 10, SuperLU
+# writes outside its workspace (scipy 1.17, shown by valgrind)
+_RELAX = 1
+# Option panel_size of SuperLU; a value above the default of 20 has the same effect
+_PANEL = 4
 if TYPE_CHECKING:  # scipy before 1.16 has no generic arrays
     Matrix = sparse.csc_array[np.float64]
 
