@@ -59,6 +59,8 @@ MIN_SEGMENT_S = 10.0  # minimum length of a replayed segment
 MAX_RESET_DELAY_S = 0.5
 # Maximum fraction of clipped IMU samples within 1 s; above, the replay is interrupted
 MAX_CLIPPED_SHARE = 0.05
+# Maximum fraction of IMU samples outside gaps that the log lacks, to count only logged samples
+MAX_LOST_IMU_SHARE = 0.02
 
 GRAVITY_M_S2 = np.array([0.0, 0.0, 9.80665])  # NED; CONSTANTS_ONE_G in PX4
 
@@ -662,19 +664,25 @@ def step_ends(interval_s: Array, logged_ends: IntArray, target_s: float) -> IntA
     ndarray of int
         Ends of steps; the last end is at most n.
     """
-    samples_needed = samples_per_step(target_s, float(np.median(interval_s)), logged_ends)
+    median_s = float(np.median(interval_s))
+    # number of samples in each interval; a single gap may be a gap of the IMU itself
+    sample_counts = np.maximum(np.rint(interval_s / median_s), 1.0)
+    if sample_counts.mean() <= 1.0 + MAX_LOST_IMU_SHARE:
+        sample_counts[:] = 1.0
+    end_counts = np.append(0.0, np.cumsum(sample_counts))[logged_ends]
+    samples_needed = samples_per_step(target_s, median_s, end_counts)
     logged_end_set = set(logged_ends.tolist())
     ends = []
-    count = 0
-    total = 0.0
-    for sample, interval in enumerate(interval_s.tolist(), start=1):
-        count = count + 1
+    count = total = 0.0
+    for sample, (interval, sample_count) in enumerate(
+        zip(interval_s.tolist(), sample_counts.tolist(), strict=True), start=1
+    ):
+        count = count + sample_count
         total = total + interval
         is_complete = count >= samples_needed and total > 0.5 * target_s
         if is_complete or total > target_s or sample in logged_end_set:
             ends.append(sample)
-            count = 0
-            total = 0.0
+            count = total = 0.0
     return np.array(ends, dtype=np.intp)
 
 

@@ -436,7 +436,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
     longest_gap_s: float | Unavailable = Unavailable(
         "longest time without fusion",
         f"the log contains only {len(evaluated_updates)} of about {replayed} innovations",
-        "Log estimator_aid_src_ev_pos at full rate.",
+        f"Log {ekf2.innovation_topics[0]} at full rate.",
     )
     if len(evaluated_updates) > MIN_COMPLETE_SHARE * replayed:
         fused_s = evaluated_updates.index[evaluated_updates["rejected"] == 0].to_numpy()
