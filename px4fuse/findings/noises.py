@@ -39,8 +39,9 @@ from px4fuse.findings.cause_text import (
 from px4fuse.findings.hidden_errors import find_hidden_errors
 from px4fuse.findings.model import Findings, error, finding, format_percent, lower_severity
 from px4fuse.findings.source_positions import hardly_moved
-from px4fuse.flight.ekf2_parameters import BAROMETER
+from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable, sample_rate
+from px4fuse.readers.px4_innovations import fused_aid
 from px4fuse.request import COMPARISON_OPTIONS
 
 MIN_NOISE_RATIO = 1.5  # setting over estimate (σ) or its inverse; below, the track hardly changes
@@ -314,6 +315,8 @@ def _variance_finding(
         cause = NOISE if remedy_text else ELSEWHERE
         fallback = KEEP_NOISES_CORRELATED.format("a barometer" if is_barometer else "GNSS")
         severity, remedy_text = severity if remedy_text else "note", remedy_text or fallback
+    elif is_underconfident and filter_name == "ekf2" and (floor := _noise_minimum(analysis)):
+        severity, remedy_text, cause = "note", floor, ELSEWHERE
     elif is_underconfident and any(
         name_with_error == filter_name for name_with_error, *_ in find_hidden_errors(analysis)
     ):
@@ -364,6 +367,19 @@ def _format_excessive_noise(analysis: Analysis) -> str:
     return (
         f"{name} is {parameter_m:g} m, but the receiver reports {reported_m:.2g} m: test this "
         "value with px4fuse whatif."
+    )
+
+
+def _noise_minimum(analysis: Analysis) -> str:
+    """Describe EKF2's minimum noise of vision positions if GNSS sets it, else return ""."""
+    parameters = analysis.flight.log.parameters
+    gnss_m = parameters.get(GNSS_POS.noise, PARAMETERS[GNSS_POS.noise].default)
+    is_besides_gnss = analysis.source.origin.is_vision and fused_aid(analysis.flight.ekf2)
+    if not is_besides_gnss or parameters.get(EV_POS.noise, 0.0) > gnss_m:
+        return ""
+    return (
+        "No change: while EKF2 fuses GNSS, it assumes for vision positions at least "
+        f"{GNSS_POS.noise} ({gnss_m:g} m)."
     )
 
 
