@@ -606,6 +606,16 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
             f"While EKF2 fuses GNSS, the noise of vision positions is at least {GNSS_POS.noise} "
             f"({min_noise:g} m)"
         )
+    segment = model.inputs.segments[0]
+    if (
+        segment.heights
+        and segment.is_acceleration_bad is not None
+        and segment.is_acceleration_bad[0]
+    ):
+        yield (
+            "The replay starts with the height that EKF2 estimated with the logged parameters, "
+            "while it declared its acceleration bad: the height may differ at the start"
+        )
     if replay.late or replay.lost:
         remedy = "" if model.inputs.rules.uses_delay_as_horizon else ": raise EKF2_DELAY_MAX"
         # EKF2 fuses only the newer of two samples in a prediction step: updates may be fewer
